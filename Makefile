@@ -1,0 +1,54 @@
+# Every target sets up what it needs: a virtual environment in .venv with the versions of constraints.txt.
+
+PYTHON ?= $(shell command -v python3.11 || command -v python3)
+BIN := .venv/bin
+READY := .venv/.ready
+MAPS := envs/ring/map/map.net.xml envs/merge/map/map.net.xml envs/grid4x4/map/map.net.xml
+
+.PHONY: help demo test check bench soak maps clean
+.DEFAULT_GOAL := help
+
+help: ## say what there is
+	@awk -F':.*## ' '/^[a-z]+:.*## / { printf "make %-6s  %s\n", $$1, $$2 }' Makefile
+
+demo: $(READY) ## train on merge, evaluate, drive through town, leave a video (some minutes)
+	$(BIN)/cavmarl demo
+
+test: $(READY) ## the tests
+	$(BIN)/pytest -m "not slow"
+
+check: $(READY) ## style, types, and the direction of imports
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/mypy
+	$(BIN)/lint-imports
+
+bench: $(READY) ## agent-steps a second, next to highway-env
+	$(BIN)/cavmarl bench step
+
+soak: $(READY) ## the slow tests: long episodes, the wheel
+	$(BIN)/pytest -m slow
+
+# Without the comment that netconvert and netgenerate begin with (date, version, options), the same
+# options give the same bytes.
+maps: $(READY) ## make the maps of ring, merge and grid4x4 anew from the options beside them
+	cd envs/ring/map && ../../../$(BIN)/netconvert --configuration-file map.netccfg
+	cd envs/merge/map && ../../../$(BIN)/netconvert --configuration-file map.netccfg
+	cd envs/grid4x4/map && ../../../$(BIN)/netgenerate --configuration-file map.netgcfg
+	sed --in-place '2,/^-->$$/d' $(MAPS)
+
+clean: ## remove .venv, builds and caches; runs/ stays
+	rm -rf .venv build dist .mypy_cache .ruff_cache .pytest_cache .hypothesis .import_linter_cache
+	find cavmarl agents train tests -name __pycache__ -prune -exec rm -rf {} +
+
+# torch comes first and alone, so that a CPU build that pip is told of (PIP_EXTRA_INDEX_URL,
+# PIP_FIND_LINKS) is taken instead of several GB of CUDA libraries.
+$(READY): pyproject.toml constraints.txt
+	@"$(PYTHON)" -c 'import sys; sys.exit(sys.version_info < (3, 11))' || { \
+	    echo "cavmarl needs Python 3.11 or newer: make PYTHON=/path/to/python3.11" >&2; exit 1; }
+	@"$(PYTHON)" -c 'import ensurepip, venv' 2>/dev/null || { \
+	    echo "Python's venv is missing; on Debian: sudo apt-get install python3-venv" >&2; exit 1; }
+	test -x $(BIN)/pip || "$(PYTHON)" -m venv --clear .venv
+	$(BIN)/python -m pip install $$(grep '^torch==' constraints.txt) --constraint constraints.txt
+	$(BIN)/python -m pip install --editable '.[dev]' --constraint constraints.txt
+	@touch $@

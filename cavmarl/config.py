@@ -1,0 +1,410 @@
+"""What a world is: `EnvConfig`, frozen dataclasses whose fields are the keys of `env.yaml`.
+
+A unit ends the name of every bare number. Each class refuses, in `__post_init__`, the values and
+the combinations that cannot work, and says what to change. Types and unknown keys are checked at
+the border by `registry.load_config`.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+from itertools import pairwise
+from typing import Literal
+
+from cavmarl.errors import ConfigError
+
+__all__ = [
+    "TERMS",
+    "ActionConfig",
+    "ClockConfig",
+    "EnvConfig",
+    "LidarConfig",
+    "MapConfig",
+    "NeighborsConfig",
+    "ObservationConfig",
+    "PopulationConfig",
+    "RouteAheadConfig",
+    "SensorsConfig",
+    "SignalAheadConfig",
+    "TermsConfig",
+    "TrafficConfig",
+    "ZonesConfig",
+]
+
+# The named terms of one step, in the order of every terms array; shard/terms.py computes them.
+TERMS = (
+    "progress",
+    "speed",
+    "comfort",
+    "time_to_collision",
+    "collision",
+    "off_road",
+    "wrong_way",
+    "red_light",
+    "arrival",
+    "delay",
+)
+
+
+def _check(holds: bool, key: str, value: object, expected: str) -> None:
+    """Raise a ConfigError that names key, value and expectation unless `holds`."""
+    if not holds:
+        raise ConfigError(f"{key} = {value!r}: {expected}")
+
+
+def _check_finite(key: str, value: float, low: float, high: float) -> None:
+    _check(
+        math.isfinite(value) and low <= value <= high,
+        key,
+        value,
+        f"must be a number from {low:g} to {high:g}",
+    )
+
+
+@dataclass(frozen=True)
+class MapConfig:
+    """Where the roads come from.
+
+    Attributes:
+        source: a map file: relative to the entry's folder, absolute, or `sumo:PATH` for a file of
+            the eclipse-sumo wheel.
+    """
+
+    source: str
+
+    def __post_init__(self) -> None:
+        _check(bool(self.source), "map.source", self.source, "must name a map file")
+
+
+@dataclass(frozen=True)
+class ClockConfig:
+    """Time: the integer tick is the truth, seconds = tick · sim_dt_s.
+
+    Attributes:
+        sim_dt_s: seconds a tick.
+        ctrl_dt_s: seconds an agent's decision (step); a whole number of ticks.
+        control_latency_ticks: ticks between an action and its effect.
+    """
+
+    sim_dt_s: float = 0.05
+    ctrl_dt_s: float = 0.1
+    control_latency_ticks: int = 0
+
+    def __post_init__(self) -> None:
+        _check_finite("clock.sim_dt_s", self.sim_dt_s, 0.001, 0.2)
+        _check_finite("clock.ctrl_dt_s", self.ctrl_dt_s, 0.001, 10.0)
+        ticks = self.ctrl_dt_s / self.sim_dt_s
+        _check(
+            round(ticks) >= 1 and abs(ticks - round(ticks)) < 1e-9,
+            "clock.ctrl_dt_s",
+            self.ctrl_dt_s,
+            f"must be a whole number of ticks of clock.sim_dt_s = {self.sim_dt_s:g}; "
+            f"try {max(1, round(ticks)) * self.sim_dt_s:g}",
+        )
+        _check(
+            0 <= self.control_latency_ticks <= 16,
+            "clock.control_latency_ticks",
+            self.control_latency_ticks,
+            "must be a whole number from 0 to 16",
+        )
+
+    @property
+    def ticks_per_step(self) -> int:
+        """Ticks in one agent step."""
+        return round(self.ctrl_dt_s / self.sim_dt_s)
+
+
+@dataclass(frozen=True)
+class ZonesConfig:
+    """How the map is divided. This version runs one zone; the shard boundaries are in place.
+
+    Attributes:
+        layout: how zones are cut.
+        count: number of zones.
+    """
+
+    layout: Literal["grid"] = "grid"
+    count: int = 1
+
+    def __post_init__(self) -> None:
+        _check(self.count == 1, "zones.count", self.count, "this version runs one zone; use 1")
+
+
+@dataclass(frozen=True)
+class PopulationConfig:
+    """Who is in the world.
+
+    Attributes:
+        mode: `closed`: all enter at reset, nobody later. `entering`: agents also enter during the
+            episode, every id once, `budget` in all. `seats`: `agents` fixed ids; when a seat's
+            vehicle ends, the seat gets a new one.
+        agents: vehicles driven by policies at any one time.
+        background: vehicles driven by the built-in drivers. In `closed` worlds they are placed at
+            reset; else each arrival orders a new departure, so that their number holds.
+        budget: `entering` only: how many agents may enter in one episode (default 4 · agents).
+    """
+
+    mode: Literal["closed", "entering", "seats"] = "closed"
+    agents: int = 4
+    background: int = 20
+    budget: int | None = None
+
+    def __post_init__(self) -> None:
+        _check(
+            1 <= self.agents <= 100_000,
+            "population.agents",
+            self.agents,
+            "must be a whole number from 1 to 100000",
+        )
+        _check(
+            0 <= self.background <= 1_000_000,
+            "population.background",
+            self.background,
+            "must be a whole number from 0 to 1000000",
+        )
+        if self.budget is not None:
+            _check(
+                self.mode == "entering",
+                "population.budget",
+                self.budget,
+                f"only with population.mode = entering, here {self.mode}",
+            )
+            _check(
+                self.budget >= self.agents,
+                "population.budget",
+                self.budget,
+                f"must be at least population.agents = {self.agents}",
+            )
+
+    @property
+    def num_ids(self) -> int:
+        """How many agent ids an episode can use."""
+        if self.mode == "entering":
+            return self.budget if self.budget is not None else 4 * self.agents
+        return self.agents
+
+
+@dataclass(frozen=True)
+class TrafficConfig:
+    """Where departures come from.
+
+    Attributes:
+        source: `native`: the seeded generator.
+        goals: how many destination edges the generator uses; lane-level plans are made for each.
+        origins: edges that agents start on, by id; empty: all that lead somewhere.
+        destinations: edges that agents drive to, by id; empty: the generator's goals.
+        min_trip_m: shortest way between an origin and its destination.
+        max_trip_m: longest way of an agent; 0: no limit.
+        speed_factor_spread: half width of the drivers' uniform spread of desired speed over limit.
+    """
+
+    source: Literal["native"] = "native"
+    goals: int = 32
+    origins: tuple[str, ...] = ()
+    destinations: tuple[str, ...] = ()
+    min_trip_m: float = 100.0
+    max_trip_m: float = 0.0
+    speed_factor_spread: float = 0.1
+
+    def __post_init__(self) -> None:
+        _check(1 <= self.goals <= 1024, "traffic.goals", self.goals, "must be from 1 to 1024")
+        _check_finite("traffic.min_trip_m", self.min_trip_m, 0.0, 1e6)
+        _check_finite("traffic.max_trip_m", self.max_trip_m, 0.0, 1e6)
+        _check(
+            self.max_trip_m == 0.0 or self.max_trip_m > self.min_trip_m,
+            "traffic.max_trip_m",
+            self.max_trip_m,
+            f"must be 0 (no limit) or above traffic.min_trip_m = {self.min_trip_m:g}",
+        )
+        _check_finite("traffic.speed_factor_spread", self.speed_factor_spread, 0.0, 0.5)
+
+
+@dataclass(frozen=True)
+class ActionConfig:
+    """What an agent can do.
+
+    Attributes:
+        kind: `continuous`: (throttle, steering) in [-1, 1]; `discrete`: highway-env's five
+            meta-actions LANE_LEFT, IDLE, LANE_RIGHT, FASTER, SLOWER.
+        acceleration_mps2: what throttle ±1 means.
+        steering_rad: what steering ±1 means (front wheels, left positive).
+        target_speeds_mps: `discrete`: the speeds that FASTER and SLOWER step through.
+        out_of_range: continuous values beyond ±1: `error`, or `clip` (counted in the infos).
+        missing_action: a live agent without an action: `error`, or `hold` its last one (counted).
+        late_actions: an action for an agent that has left: `error`, or `ignore` (counted).
+    """
+
+    kind: Literal["continuous", "discrete"] = "continuous"
+    acceleration_mps2: float = 5.0
+    steering_rad: float = 0.7853981633974483
+    target_speeds_mps: tuple[float, ...] = (0.0, 3.0, 6.0, 9.0, 12.0, 15.0, 20.0, 25.0, 30.0)
+    out_of_range: Literal["error", "clip"] = "error"
+    missing_action: Literal["error", "hold"] = "error"
+    late_actions: Literal["error", "ignore"] = "error"
+
+    def __post_init__(self) -> None:
+        _check_finite("action.acceleration_mps2", self.acceleration_mps2, 0.1, 20.0)
+        _check_finite("action.steering_rad", self.steering_rad, 0.01, 1.2)
+        speeds = self.target_speeds_mps
+        _check(
+            len(speeds) >= 2
+            and all(math.isfinite(v) and 0.0 <= v <= 60.0 for v in speeds)
+            and all(a < b for a, b in pairwise(speeds)),
+            "action.target_speeds_mps",
+            speeds,
+            "must be at least two rising speeds from 0 to 60",
+        )
+
+
+@dataclass(frozen=True)
+class RouteAheadConfig:
+    """Points of the route ahead, in the ego frame.
+
+    Attributes:
+        points: how many; 0 switches the sensor off.
+        spacing_m: way between one and the next.
+    """
+
+    points: int = 8
+    spacing_m: float = 6.0
+
+    def __post_init__(self) -> None:
+        _check(0 <= self.points <= 64, "sensors.route.points", self.points, "must be from 0 to 64")
+        _check_finite("sensors.route.spacing_m", self.spacing_m, 0.5, 100.0)
+
+
+@dataclass(frozen=True)
+class NeighborsConfig:
+    """The nearest vehicles, in the ego frame.
+
+    Attributes:
+        count: how many at most; 0 switches the sensor off.
+        range_m: distance up to which a vehicle is seen.
+    """
+
+    count: int = 8
+    range_m: float = 60.0
+
+    def __post_init__(self) -> None:
+        _check(0 <= self.count <= 64, "sensors.neighbors.count", self.count, "must be from 0 to 64")
+        _check_finite("sensors.neighbors.range_m", self.range_m, 1.0, 300.0)
+
+
+@dataclass(frozen=True)
+class SignalAheadConfig:
+    """The next signal or duty to give way on the route.
+
+    Attributes:
+        range_m: how far ahead it is seen.
+    """
+
+    range_m: float = 80.0
+
+    def __post_init__(self) -> None:
+        _check_finite("sensors.signal.range_m", self.range_m, 1.0, 300.0)
+
+
+@dataclass(frozen=True)
+class LidarConfig:
+    """Distances around the vehicle.
+
+    Attributes:
+        rays: how many, equally spaced; 0 switches the sensor off.
+        range_m: how far a ray reaches.
+        speeds: adds the relative speed of what each ray hits.
+    """
+
+    rays: int = 64
+    range_m: float = 60.0
+    speeds: bool = False
+
+    def __post_init__(self) -> None:
+        _check(0 <= self.rays <= 1024, "sensors.lidar.rays", self.rays, "must be from 0 to 1024")
+        _check_finite("sensors.lidar.range_m", self.range_m, 1.0, 300.0)
+
+
+@dataclass(frozen=True)
+class SensorsConfig:
+    """The sensors of every agent; 0 points, neighbours or rays switch one off."""
+
+    route: RouteAheadConfig = field(default_factory=RouteAheadConfig)
+    neighbors: NeighborsConfig = field(default_factory=NeighborsConfig)
+    signal: SignalAheadConfig = field(default_factory=SignalAheadConfig)
+    lidar: LidarConfig = field(default_factory=LidarConfig)
+
+
+@dataclass(frozen=True)
+class ObservationConfig:
+    """The form of an observation.
+
+    Attributes:
+        kind: `flat`: one Box. `dict`: one Box a sensor.
+    """
+
+    kind: Literal["flat", "dict"] = "flat"
+
+
+@dataclass(frozen=True)
+class TermsConfig:
+    """Reward = Σ weight · term; see `TERMS` and docs/environments.md for what each term is.
+
+    Attributes:
+        weights: weight of each named term; terms that are not named weigh 0.
+        team_share: share of the reward that is the mean over all live agents: 0 individual, 1 team.
+    """
+
+    weights: dict[str, float] = field(
+        default_factory=lambda: {
+            "progress": 0.1,
+            "comfort": -0.01,
+            "time_to_collision": -0.1,
+            "collision": -10.0,
+            "off_road": -10.0,
+            "wrong_way": -1.0,
+            "red_light": -5.0,
+            "arrival": 10.0,
+        }
+    )
+    team_share: float = 0.0
+
+    def __post_init__(self) -> None:
+        for name, weight in self.weights.items():
+            _check(
+                name in TERMS, "terms.weights", name, f"no such term; there are {', '.join(TERMS)}"
+            )
+            _check_finite(f"terms.weights.{name}", weight, -1e6, 1e6)
+        _check_finite("terms.team_share", self.team_share, 0.0, 1.0)
+
+
+@dataclass(frozen=True)
+class EnvConfig:
+    """The whole decision process of one environment: the keys of `env.yaml`.
+
+    Attributes:
+        name: of the entry, as its folder.
+        version: goes up whenever results change that others may have reported.
+        horizon_s: when an episode is truncated.
+    """
+
+    name: str
+    map: MapConfig
+    version: int = 0
+    clock: ClockConfig = field(default_factory=ClockConfig)
+    zones: ZonesConfig = field(default_factory=ZonesConfig)
+    population: PopulationConfig = field(default_factory=PopulationConfig)
+    traffic: TrafficConfig = field(default_factory=TrafficConfig)
+    action: ActionConfig = field(default_factory=ActionConfig)
+    observation: ObservationConfig = field(default_factory=ObservationConfig)
+    sensors: SensorsConfig = field(default_factory=SensorsConfig)
+    terms: TermsConfig = field(default_factory=TermsConfig)
+    horizon_s: float = 60.0
+
+    def __post_init__(self) -> None:
+        _check(self.version >= 0, "version", self.version, "must be 0 or more")
+        _check_finite("horizon_s", self.horizon_s, self.clock.ctrl_dt_s, 1e6)
+
+    @property
+    def max_steps(self) -> int:
+        """Steps until truncation."""
+        return max(1, round(self.horizon_s / self.clock.ctrl_dt_s))

@@ -1,0 +1,56 @@
+"""Compiled kernels: arrays and scalars in, arrays out. They know no object and no setting.
+
+`kernel` is the one place for compiler flags: no fastmath (results must not depend on how a world is
+divided), serial (processes give the parallelism), GIL released, cached on disk.
+
+The cache lives in a folder named after the content of all kernel sources: Numba itself only watches
+the file that defines a function, not the functions which that one calls, and would hand out stale code.
+Set `CAVMARL_CACHE_DIR` to move it (default: `~/.cache/cavmarl`). With `NUMBA_DISABLE_JIT=1` every
+kernel is plain Python.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+from collections.abc import Callable
+from pathlib import Path
+from typing import ParamSpec, TypeVar
+
+import numba
+
+__all__ = ["cache_dir", "kernel", "kernel_cache_dir"]
+
+P = ParamSpec("P")
+R = TypeVar("R")
+
+
+def cache_dir() -> Path:
+    """The folder for everything cavmarl keeps between runs (compiled kernels, converted maps)."""
+    home = os.environ.get("CAVMARL_CACHE_DIR")
+    return Path(home) if home else Path.home() / ".cache" / "cavmarl"
+
+
+def kernel_cache_dir() -> Path:
+    """The folder of this version's compiled kernels: one per content of the kernel sources."""
+    digest = hashlib.sha256(numba.__version__.encode())
+    package = Path(__file__).parent
+    for source in sorted(package.glob("*.py")):
+        digest.update(source.name.encode() + b"\0" + source.read_bytes())
+    return cache_dir() / "kernels" / digest.hexdigest()[:16]
+
+
+_CACHE_DIR = kernel_cache_dir()
+
+
+def kernel(function: Callable[P, R]) -> Callable[P, R]:
+    """Compile `function` with the flags that all kernels share."""
+    before = numba.config.CACHE_DIR
+    numba.config.CACHE_DIR = str(_CACHE_DIR)
+    try:
+        compiled: Callable[P, R] = numba.njit(
+            cache=True, fastmath=False, parallel=False, nogil=True, error_model="numpy"
+        )(function)
+    finally:
+        numba.config.CACHE_DIR = before
+    return compiled

@@ -1,0 +1,311 @@
+"""Background drivers: what each wants to do in this tick, from the committed state alone.
+
+Car following is the Intelligent Driver Model, lane changing MOBIL; this file finds what they are applied
+to: the leader across lane and junction borders, the lower speed limit ahead, the stop line of a signal
+or of a right of way, the end of a lane, the vehicle that wants to merge, the lane that the route needs.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cavmarl.kernels import kernel
+from cavmarl.kernels.arrays import RoadArrays, Scratch
+from cavmarl.kernels.car_following import (
+    ACCEL_LIMIT,
+    ACCEL_MAX,
+    DECEL_COMFORT,
+    JAM_DISTANCE_M,
+    TIME_HEADWAY_S,
+    idm_free,
+    idm_interaction,
+)
+from cavmarl.kernels.codes import HOLD_NONE
+from cavmarl.kernels.junctions import conflict_inside, may_enter
+from cavmarl.kernels.lane_change import mobil_accepts
+from cavmarl.kernels.lanes import last_on_lane, neighbor_ahead, neighbor_behind
+from cavmarl.kernels.scalars import clamp
+
+__all__ = ["LOOK_AHEAD_M", "decide"]
+
+LOOK_AHEAD_M = 250.0  # no driver looks further
+LOOK_BACK_M = 60.0  # how far back a lane change looks for followers
+REFERENCE_LENGTH_M = 5.0  # JAM_DISTANCE_M is measured between centres of cars of this length
+LINE_MARGIN_M = 1.0  # a driver stops with its front this far before a line
+STOP_LINE_M = 5.0  # standing with the front nearer than this counts as standing at the line
+LIMIT_DECEL = 2.0  # m/s², how a driver slows for a lower limit ahead
+SHARED_START_M = 7.0  # two links from one lane share about this much of their way
+COURTESY_DECEL = 2.0  # m/s², the hardest braking to let somebody merge
+DECIDE_EVERY_TICKS = 10  # how often a driver thinks of changing to one side
+CHANGE_EARLY_M = 80.0  # a change that the route needs is made this far before it must be,
+CHANGE_EARLY_S = 12.0  # plus the way of this time
+SIDE_GAP_M = 1.0  # m between bumpers, the least with which a lane change starts
+
+
+@kernel
+def _behind(row: np.void, distance: float, other: np.void) -> float:
+    """IDM's interaction with a leader whose centre is `distance` m ahead."""
+    net = distance - 0.5 * (row["length"] + other["length"])
+    return idm_interaction(
+        row["speed"],
+        max(net, 0.1) + REFERENCE_LENGTH_M,
+        other["speed"],
+        ACCEL_MAX,
+        DECEL_COMFORT,
+        JAM_DISTANCE_M,
+        TIME_HEADWAY_S,
+    )
+
+
+@kernel
+def _before_line(row: np.void, distance: float) -> float:
+    """IDM's interaction with a line `distance` m ahead of the vehicle's front."""
+    return idm_interaction(
+        row["speed"],
+        max(distance - LINE_MARGIN_M, 0.1 - JAM_DISTANCE_M + REFERENCE_LENGTH_M) + JAM_DISTANCE_M,
+        0.0,
+        ACCEL_MAX,
+        DECEL_COMFORT,
+        JAM_DISTANCE_M,
+        TIME_HEADWAY_S,
+    )
+
+
+@kernel
+def _look_ahead_m(speed: float) -> float:
+    return min(30.0 + 2.0 * speed + 0.2 * speed * speed, LOOK_AHEAD_M)
+
+
+@kernel
+def _shared_start(
+    roads: RoadArrays,
+    rows: NDArray[np.void],
+    i: int,
+    lane: int,
+    chosen: int,
+    distance: float,
+    scratch: Scratch,
+) -> float:
+    """Interaction with vehicles that have just turned off from the same lane into another link."""
+    row = rows[i]
+    strongest = 0.0
+    first = roads.lanes[lane]["first_link"]
+    for link in range(first, first + roads.lanes[lane]["num_links"]):
+        beside = roads.links[link]["first_internal"]
+        if link == chosen or beside < 0:
+            continue
+        j, s = last_on_lane(i, beside, scratch)
+        if j >= 0 and s - 0.5 * rows[j]["length"] < SHARED_START_M:
+            strongest = max(strongest, _behind(row, distance + s, rows[j]))
+    return strongest
+
+
+@kernel
+def _road_ahead(
+    roads: RoadArrays,
+    plans: NDArray[np.void],
+    rows: NDArray[np.void],
+    i: int,
+    phase: NDArray[np.int32],
+    scratch: Scratch,
+) -> tuple[float, float, int, int]:
+    """Walk row i's way: (strongest interaction, allowed speed, why it holds, link whose line is near)."""
+    row = rows[i]
+    lane = row["lane"]
+    half = 0.5 * row["length"]
+    strongest = 0.0
+    allowed = roads.lanes[lane]["speed_mps"] * row["speed_factor"]
+    look = _look_ahead_m(row["speed"])
+    distance = -row["s"]
+    hold = HOLD_NONE
+    link_ahead = -1
+    j, s = neighbor_ahead(rows, i, lane, row["s"], scratch)
+    if roads.lanes[lane]["internal"]:
+        link = roads.lanes[lane]["link"]
+        place = roads.lanes[lane]["link_offset_m"] + row["s"]
+        to_foe = conflict_inside(roads, rows, i, link, place, scratch)
+        if to_foe < math.inf:
+            strongest = _before_line(row, to_foe)
+    while True:
+        if j >= 0:
+            strongest = max(strongest, _behind(row, distance + s, rows[j]))
+            break
+        distance += roads.lanes[lane]["length_m"]
+        if distance > look:
+            break
+        step = plans[row["goal"], lane]
+        if step["next"] < 0:
+            if step["to_go"] == math.inf or step["change"] != 0:
+                strongest = max(strongest, _before_line(row, distance - half))
+            break
+        if step["link"] >= 0:
+            if distance - half < STOP_LINE_M and link_ahead < 0:
+                link_ahead = step["link"]
+            hold = may_enter(roads, rows, i, step["link"], distance, phase, scratch)
+            if hold != HOLD_NONE:
+                strongest = max(strongest, _before_line(row, distance - half))
+                break
+            shared = _shared_start(roads, rows, i, lane, step["link"], distance, scratch)
+            strongest = max(strongest, shared)
+        lane = step["next"]
+        limit = roads.lanes[lane]["speed_mps"] * row["speed_factor"]
+        allowed = min(allowed, math.sqrt(limit * limit + 2.0 * LIMIT_DECEL * max(distance, 0.0)))
+        j, s = last_on_lane(i, lane, scratch)
+    return strongest, allowed, hold, link_ahead
+
+
+@kernel
+def _courtesy(
+    roads: RoadArrays, rows: NDArray[np.void], i: int, scratch: Scratch
+) -> float:
+    """Interaction with vehicles on neighbour lanes that need to come into ours, softly."""
+    row = rows[i]
+    strongest = 0.0
+    for side in (1, -1):
+        beside = roads.lanes[row["lane"]]["left"] if side > 0 else roads.lanes[row["lane"]]["right"]
+        if beside < 0:
+            continue
+        j, s = neighbor_ahead(rows, i, beside, row["s"], scratch)
+        if j < 0 or rows[j]["blinker"] != -side or rows[j]["lane"] != beside:
+            continue
+        distance = s - row["s"]
+        if distance > 0.5 * (row["length"] + rows[j]["length"]) and distance < LOOK_BACK_M:
+            strongest = max(strongest, _behind(row, distance, rows[j]))
+    return min(strongest, COURTESY_DECEL + ACCEL_MAX)
+
+
+@kernel
+def _accel_behind(row: np.void, target_speed: float, distance: float, leader: np.void) -> float:
+    return idm_free(row["speed"], target_speed, ACCEL_MAX) - _behind(row, distance, leader)
+
+
+@kernel
+def _change_is_safe(
+    roads: RoadArrays,
+    plans: NDArray[np.void],
+    rows: NDArray[np.void],
+    i: int,
+    target: int,
+    accel: float,
+    mandatory: bool,
+    scratch: Scratch,
+) -> bool:
+    """MOBIL's question for row i and lane `target`, with the gaps that it takes for granted."""
+    row = rows[i]
+    s = row["s"] * roads.lanes[target]["length_m"] / roads.lanes[row["lane"]]["length_m"]
+    desired = roads.lanes[target]["speed_mps"] * row["speed_factor"]
+    after = idm_free(row["speed"], desired, ACCEL_MAX)
+    j, ahead_s = neighbor_ahead(rows, i, target, s, scratch)
+    ahead = ahead_s - s
+    beyond = plans[row["goal"], target]["next"]
+    if j < 0 and beyond >= 0:
+        j, ahead_s = last_on_lane(i, beyond, scratch)
+        ahead = ahead_s + roads.lanes[target]["length_m"] - s
+    if j >= 0:
+        if ahead < 0.5 * (row["length"] + rows[j]["length"]) + SIDE_GAP_M:
+            return False
+        after = _accel_behind(row, desired, ahead, rows[j])
+    follower_before = 0.0
+    follower_after = 0.0
+    k, gap = neighbor_behind(roads, rows, i, target, s, LOOK_BACK_M, scratch)
+    if k >= 0:
+        follower = rows[k]
+        if gap < 0.5 * (row["length"] + follower["length"]) + SIDE_GAP_M:
+            return False
+        limit = roads.lanes[target]["speed_mps"] * follower["speed_factor"]
+        follower_before = idm_free(follower["speed"], limit, ACCEL_MAX)
+        if j >= 0:
+            follower_before = _accel_behind(follower, limit, gap + ahead, rows[j])
+        follower_after = _accel_behind(follower, limit, gap, row)
+    return mobil_accepts(
+        accel, after, follower_before, follower_after, 0.0, 0.0, mandatory
+    )
+
+
+@kernel
+def _choose_lane(
+    roads: RoadArrays,
+    plans: NDArray[np.void],
+    rows: NDArray[np.void],
+    i: int,
+    tick: int,
+    accel: float,
+    scratch: Scratch,
+) -> tuple[int, int]:
+    """(lane change to make now, side that the route needs), 1 left, -1 right, 0 none."""
+    row = rows[i]
+    lane = roads.lanes[row["lane"]]
+    step = plans[row["goal"], row["lane"]]
+    if lane["internal"] or row["side_lane"] >= 0:
+        return 0, 0
+    early = CHANGE_EARLY_M + CHANGE_EARLY_S * row["speed"]
+    wanted = step["change"]
+    if wanted != 0 and step["room"] - row["s"] > early * step["changes"]:
+        wanted = 0
+    # In even ticks drivers may only change to the left, in odd ones to the right: two of them never
+    # take the same gap from both sides in one tick, whoever is asked first.
+    side = 1 if tick % 2 == 0 else -1
+    if (tick // 2 + row["id"]) % DECIDE_EVERY_TICKS != 0:
+        return 0, wanted
+    target = lane["left"] if side > 0 else lane["right"]
+    if target < 0 or (wanted != 0 and wanted != side):
+        return 0, wanted
+    if wanted == 0:
+        beyond = plans[row["goal"], target]
+        if beyond["to_go"] == math.inf or row["speed"] < 1.0:
+            return 0, wanted
+        if beyond["change"] != 0 and beyond["room"] - row["s"] < 2.0 * early * beyond["changes"]:
+            return 0, wanted
+        if lane["length_m"] - row["s"] < row["length"] + 2.0 * row["speed"]:
+            return 0, wanted
+    if _change_is_safe(roads, plans, rows, i, target, accel, wanted != 0, scratch):
+        return side, wanted
+    return 0, wanted
+
+
+@kernel
+def decide(
+    roads: RoadArrays,
+    plans: NDArray[np.void],
+    rows: NDArray[np.void],
+    num: int,
+    driver: int,
+    tick: int,
+    phase: NDArray[np.int32],
+    scratch: Scratch,
+) -> None:
+    """Decide acceleration and lane change of all vehicles of one kind of driver in one world.
+
+    Args:
+        roads: the road arrays.
+        plans: PLAN (G, L).
+        rows: VEHICLE (C,), the committed state; not written.
+        num: rows to decide for, the first of `rows`; all rows stand in the indices.
+        driver: DRIVER_* whose rows are decided for.
+        tick: of the committed state.
+        phase: (num_signals,) PHASE rows that are on.
+        scratch: with the lane and link indices of this tick; accel (m/s²), lane_change, blinker, hold
+            and link_ahead are written.
+    """
+    for i in range(num):
+        row = rows[i]
+        if row["driver"] != driver:
+            continue
+        strongest, allowed, hold, link_ahead = _road_ahead(roads, plans, rows, i, phase, scratch)
+        side = row["side_lane"]
+        if side >= 0:
+            s = row["s"] * roads.lanes[side]["length_m"] / roads.lanes[row["lane"]]["length_m"]
+            j, ahead_s = neighbor_ahead(rows, i, side, s, scratch)
+            if j >= 0:
+                strongest = max(strongest, _behind(row, ahead_s - s, rows[j]))
+        strongest = max(strongest, _courtesy(roads, rows, i, scratch))
+        accel = idm_free(row["speed"], allowed, ACCEL_MAX) - strongest
+        change, wanted = _choose_lane(roads, plans, rows, i, tick, accel, scratch)
+        scratch.accel[i] = clamp(accel, -ACCEL_LIMIT, ACCEL_LIMIT)
+        scratch.lane_change[i] = change
+        scratch.blinker[i] = wanted
+        scratch.hold[i] = hold
+        scratch.link_ahead[i] = link_ahead

@@ -1,0 +1,207 @@
+"""Motion of one vehicle over one tick, from the committed record to the next one.
+
+Background vehicles move along their lanes: arc length by the decided acceleration, lateral offset
+towards the lane's centre, heading trailing the lane's direction. Agents' vehicles are kinematic bicycles
+that go where they are steered; `tracking.locate` then finds their place on the lanes.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cavmarl.kernels import kernel
+from cavmarl.kernels.arrays import LaneGrid, RoadArrays
+from cavmarl.kernels.codes import (
+    EVENT_ARRIVED,
+    EVENT_RED_LIGHT,
+    SIGNAL_RED,
+    SIGNAL_RED_YELLOW,
+)
+from cavmarl.kernels.geometry import lane_pose, wrap_angle
+from cavmarl.kernels.junctions import link_signal
+from cavmarl.kernels.kinematics import bicycle_step
+from cavmarl.kernels.scalars import clamp
+from cavmarl.kernels.tracking import locate, side_lane
+
+__all__ = ["ARRIVE_M", "MAX_SPEED_MPS", "move_agent", "move_background", "place_on_lane"]
+
+LATERAL_MPS = 1.4  # fastest sideways motion of a lane change
+LATERAL_RATIO = 0.35  # and no faster than this share of the speed
+TRAIL_M = 2.0  # how quickly the heading follows the lane's direction
+STANDING_MPS = 0.1
+ARRIVE_M = 5.0  # a trip ends this far before the end of its goal edge
+MAX_SPEED_MPS = 60.0
+CROSSINGS_PER_TICK = 16  # lane borders that one tick can cross
+
+
+@kernel
+def place_on_lane(roads: RoadArrays, row: np.void) -> tuple[float, float]:
+    """Set x, y, z and pitch from lane, s and d; returns cos and sin of the lane's direction."""
+    lane = roads.lanes[row["lane"]]
+    x, y, z, cos, sin, slope = lane_pose(
+        roads.points, lane["first_point"], lane["num_points"], row["s"]
+    )
+    row["x"] = x - row["d"] * sin
+    row["y"] = y + row["d"] * cos
+    row["z"] = z
+    row["pitch"] = math.atan(slope)
+    return cos, sin
+
+
+@kernel
+def _account(row: np.void, old: np.void, roads: RoadArrays, dt: float) -> None:
+    """What motion of both kinds leaves in the record: rates, ways, waiting time."""
+    row["accel"] = (row["speed"] - old["speed"]) / dt
+    row["jerk"] = (row["accel"] - old["accel"]) / dt
+    row["yaw_rate"] = wrap_angle(row["heading"] - old["heading"]) / dt
+    driven = abs(old["speed"]) * dt
+    row["distance_m"] = old["distance_m"] + driven
+    row["free_s"] = old["free_s"] + driven / roads.lanes[old["lane"]]["speed_mps"]
+    row["wait"] = old["wait"] + 1 if abs(row["speed"]) < STANDING_MPS else 0
+    row["step_jerk"] = old["step_jerk"] + abs(row["jerk"]) * dt
+    row["tick"] = old["tick"] + 1
+
+
+@kernel
+def _cross_borders(roads: RoadArrays, plans: NDArray[np.void], row: np.void) -> bool:
+    """Carry s beyond lane ends over to the lanes that the plan names; False where the way ends."""
+    for _ in range(CROSSINGS_PER_TICK):
+        length = roads.lanes[row["lane"]]["length_m"]
+        if row["s"] < length:
+            return True
+        step = plans[row["goal"], row["lane"]]
+        if step["next"] < 0:
+            row["s"] = length
+            return False
+        row["s"] -= length
+        row["lane"] = step["next"]
+        row["target_lane"] = step["next"]
+        if step["link"] >= 0:
+            row["link"] = step["link"]
+            row["stopped_at"] = -1
+    return True
+
+
+@kernel
+def move_background(
+    roads: RoadArrays,
+    plans: NDArray[np.void],
+    old: np.void,
+    row: np.void,
+    accel: float,
+    lane_change: int,
+    dt: float,
+) -> None:
+    """Advance a background vehicle by one tick.
+
+    Args:
+        roads: the road arrays.
+        plans: PLAN (G, L).
+        old: VEHICLE, the committed record.
+        row: VEHICLE, a copy of it that becomes the next one.
+        accel: decided acceleration in m/s².
+        lane_change: 1 to the left, -1 to the right, 0 none.
+        dt: seconds of the tick.
+    """
+    speed = old["speed"]
+    row["throttle"] = accel
+    row["speed"] = clamp(speed + accel * dt, 0.0, MAX_SPEED_MPS)
+    row["s"] = old["s"] + speed * dt
+    if lane_change != 0:
+        lane = roads.lanes[old["lane"]]
+        target = lane["left"] if lane_change > 0 else lane["right"]
+        row["s"] *= roads.lanes[target]["length_m"] / lane["length_m"]
+        apart = 0.5 * (lane["width_m"] + roads.lanes[target]["width_m"])
+        row["d"] = old["d"] - lane_change * apart
+        row["lane"] = target
+        row["target_lane"] = target
+        row["last_change"] = old["tick"]
+    if not _cross_borders(roads, plans, row):
+        row["speed"] = 0.0
+    sideways = min(LATERAL_MPS, LATERAL_RATIO * speed) * dt
+    before = row["d"]
+    row["d"] = before - clamp(before, -sideways, sideways)
+    row["side_lane"] = side_lane(roads.lanes, row["lane"], row["d"], row["width"])
+    cos, sin = place_on_lane(roads, row)
+    direction = math.atan2(sin, cos)
+    if speed > STANDING_MPS:
+        direction += math.atan2((row["d"] - before) / dt, speed)
+    error = wrap_angle(direction - old["heading"])
+    row["heading"] = wrap_angle(old["heading"] + error * min(1.0, speed * dt / TRAIL_M))
+    row["steering"] = clamp(math.atan2(row["length"] * error, 2.0 * TRAIL_M), -0.8, 0.8)
+    step = plans[row["goal"], row["lane"]]
+    row["to_go"] = step["to_go"] - row["s"]
+    if row["to_go"] <= ARRIVE_M:
+        row["events"] |= EVENT_ARRIVED
+    _account(row, old, roads, dt)
+
+
+@kernel
+def move_agent(
+    roads: RoadArrays,
+    plans: NDArray[np.void],
+    grid: LaneGrid,
+    old: np.void,
+    row: np.void,
+    throttle: float,
+    steering: float,
+    latency_ticks: int,
+    phase: NDArray[np.int32],
+    dt: float,
+) -> None:
+    """Advance an agent's vehicle by one tick.
+
+    Args:
+        roads: the road arrays.
+        plans: PLAN (G, L).
+        grid: which lanes lie near a place.
+        old: VEHICLE, the committed record.
+        row: VEHICLE, a copy of it that becomes the next one.
+        throttle: commanded acceleration in m/s².
+        steering: commanded angle of the front wheels in rad.
+        latency_ticks: ticks between command and effect.
+        phase: (num_signals,) PHASE rows that are on.
+        dt: seconds of the tick.
+    """
+    if latency_ticks > 0:
+        last = latency_ticks - 1
+        delayed_throttle = old["pending"][0, 0]
+        delayed_steering = old["pending"][0, 1]
+        for k in range(last):
+            row["pending"][k, 0] = old["pending"][k + 1, 0]
+            row["pending"][k, 1] = old["pending"][k + 1, 1]
+        row["pending"][last, 0] = throttle
+        row["pending"][last, 1] = steering
+        throttle = delayed_throttle
+        steering = delayed_steering
+    # No reverse gear: the brake ends at a standstill.
+    throttle = max(throttle, -old["speed"] / dt)
+    x, y, heading, speed, _ = bicycle_step(
+        old["x"], old["y"], old["heading"], old["speed"], throttle, steering, old["length"], dt
+    )
+    row["x"] = x
+    row["y"] = y
+    row["heading"] = wrap_angle(heading)
+    row["speed"] = clamp(speed, 0.0, MAX_SPEED_MPS)
+    row["throttle"] = throttle
+    row["steering"] = steering
+    row["events"] |= locate(roads, plans, grid, row)
+    if row["link"] != old["link"] and row["link"] >= 0:
+        signal = link_signal(roads, row["link"], phase)
+        if signal == SIGNAL_RED or signal == SIGNAL_RED_YELLOW:
+            row["events"] |= EVENT_RED_LIGHT
+    row["side_lane"] = side_lane(roads.lanes, row["lane"], row["d"], row["width"])
+    lane = roads.lanes[row["lane"]]
+    _, _, z, _, _, slope = lane_pose(
+        roads.points, lane["first_point"], lane["num_points"], row["s"]
+    )
+    row["z"] = z
+    row["pitch"] = math.atan(slope)
+    step = plans[row["goal"], row["lane"]]
+    row["to_go"] = step["to_go"] - row["s"]
+    if row["to_go"] <= ARRIVE_M:
+        row["events"] |= EVENT_ARRIVED
+    _account(row, old, roads, dt)

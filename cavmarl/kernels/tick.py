@@ -1,0 +1,235 @@
+"""The phases of one tick over many worlds: decide and move, find contacts, take out, let in.
+
+Each phase reads the committed rows and writes the next ones; no phase depends on the order of rows.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cavmarl.kernels import kernel
+from cavmarl.kernels.arrays import LaneGrid, RoadArrays, Scratch, Worlds
+from cavmarl.kernels.codes import (
+    ACTION_FASTER,
+    ACTION_IDLE,
+    ACTION_LANE_LEFT,
+    ACTION_LANE_RIGHT,
+    ACTION_SLOWER,
+    COUNT_CONTACTS,
+    DRIVER_AGENT,
+    DRIVER_BACKGROUND,
+    EVENT_COLLIDED,
+    EVENTS_THAT_END,
+)
+from cavmarl.kernels.contacts import find_contacts
+from cavmarl.kernels.control import speed_control
+from cavmarl.kernels.drivers import decide
+from cavmarl.kernels.junctions import STOP_SIGN_TICKS, register_links
+from cavmarl.kernels.lanes import index_lanes
+from cavmarl.kernels.motion import move_agent, move_background
+from cavmarl.kernels.neighbors import Grid, fill_grid
+from cavmarl.kernels.scalars import clamp
+from cavmarl.kernels.steering import nearest_speed, steer_to_lane, take_meta_action
+
+__all__ = ["advance", "begin_step", "resolve", "suggest", "switch_signals"]
+
+
+@kernel
+def switch_signals(roads: RoadArrays, worlds: Worlds, dt: float) -> None:
+    """Set every signal to the phase of its fixed-time program at the worlds' ticks."""
+    for w in range(worlds.ticks.shape[0]):
+        time = worlds.ticks[w] * dt
+        for k in range(roads.signals.shape[0]):
+            signal = roads.signals[k]
+            left = (time + signal["offset_s"]) % signal["cycle_s"]
+            phase = signal["first_phase"]
+            last = phase + signal["num_phases"] - 1
+            # Half a tick of slack: sums of ticks are not exact.
+            while phase < last and left + 0.5 * dt >= roads.phases[phase]["duration_s"]:
+                left -= roads.phases[phase]["duration_s"]
+                phase += 1
+            worlds.signal_phase[w, k] = phase
+
+
+@kernel
+def begin_step(
+    roads: RoadArrays,
+    worlds: Worlds,
+    discrete: bool,
+    meta_actions: NDArray[np.int64],
+    target_speeds: NDArray[np.float64],
+) -> None:
+    """Clear the accounts of the step and, with discrete actions, set the targets of the controllers.
+
+    Args:
+        roads: the road arrays.
+        worlds: the rows of agents are written.
+        discrete: whether actions are meta-actions.
+        meta_actions: (W, A), ACTION_*; not read for continuous actions.
+        target_speeds: m/s, rising.
+    """
+    for w in range(worlds.ticks.shape[0]):
+        for i in range(worlds.num_owned[w]):
+            row = worlds.rows[w, i]
+            row["events"] = 0
+            row["step_to_go"] = row["to_go"]
+            row["step_jerk"] = 0.0
+            if discrete and row["driver"] == DRIVER_AGENT:
+                take_meta_action(roads, row, meta_actions[w, row["agent"]], target_speeds)
+
+
+@kernel
+def advance(
+    roads: RoadArrays,
+    plans: NDArray[np.void],
+    lane_grid: LaneGrid,
+    worlds: Worlds,
+    scratch: Scratch,
+    commands: NDArray[np.float64],
+    discrete: bool,
+    accel_limit: float,
+    steering_limit: float,
+    latency_ticks: int,
+    dt: float,
+) -> None:
+    """Decide all controls from the committed rows, then move every owned row into `next_rows`.
+
+    Args:
+        roads: the road arrays.
+        plans: PLAN (G, L).
+        lane_grid: which lanes lie near a place.
+        worlds: next_rows is written.
+        scratch: room.
+        commands: (W, A, 2) throttle in m/s² and steering in rad of continuous actions.
+        discrete: whether agents are driven by the controllers instead.
+        accel_limit: m/s², of the agents' throttle.
+        steering_limit: rad, of the agents' front wheels.
+        latency_ticks: between an agent's command and its effect.
+        dt: seconds of the tick.
+    """
+    for w in range(worlds.ticks.shape[0]):
+        rows = worlds.rows[w]
+        owned = worlds.num_owned[w]
+        phase = worlds.signal_phase[w]
+        index_lanes(roads.lanes, rows, worlds.num_rows[w], scratch)
+        register_links(roads, plans, rows, worlds.num_rows[w], scratch)
+        decide(roads, plans, rows, owned, DRIVER_BACKGROUND, worlds.ticks[w], phase, scratch)
+        for i in range(owned):
+            old = rows[i]
+            worlds.next_rows[w, i] = old
+            row = worlds.next_rows[w, i]
+            if old["driver"] == DRIVER_BACKGROUND:
+                row["hold"] = scratch.hold[i]
+                row["blinker"] = scratch.blinker[i]
+                if scratch.link_ahead[i] >= 0 and old["wait"] >= STOP_SIGN_TICKS:
+                    row["stopped_at"] = scratch.link_ahead[i]
+                move_background(
+                    roads, plans, old, row, scratch.accel[i], scratch.lane_change[i], dt
+                )
+                continue
+            if old["events"] & EVENTS_THAT_END:
+                row["tick"] = old["tick"] + 1
+                continue
+            throttle = commands[w, old["agent"], 0]
+            steering = commands[w, old["agent"], 1]
+            if discrete:
+                throttle = speed_control(old["speed"], old["target_speed"])
+                steering = steer_to_lane(roads, plans, old, old["target_lane"])
+            throttle = clamp(throttle, -accel_limit, accel_limit)
+            steering = clamp(steering, -steering_limit, steering_limit)
+            move_agent(
+                roads,
+                plans,
+                lane_grid,
+                old,
+                row,
+                throttle,
+                steering,
+                latency_ticks,
+                phase,
+                dt,
+            )
+
+
+@kernel
+def resolve(worlds: Worlds, scratch: Scratch, grid: Grid) -> None:
+    """Mark in `next_rows` who touches whom.
+
+    Args:
+        worlds: events and hit of the owned next_rows are written; counts[:, COUNT_CONTACTS] rises by
+            one for each vehicle when it begins to touch another.
+        scratch: room.
+        grid: spatial index over the vehicles of one world, filled here.
+    """
+    for w in range(worlds.ticks.shape[0]):
+        rows = worlds.next_rows[w]
+        fill_grid(rows, worlds.num_rows[w], grid)
+        find_contacts(worlds.num_rows[w], grid, scratch.hit)
+        for i in range(worlds.num_owned[w]):
+            row = rows[i]
+            other = scratch.hit[i]
+            if other >= 0:
+                if row["hit"] < 0:
+                    worlds.counts[w, COUNT_CONTACTS] += 1
+                row["events"] |= EVENT_COLLIDED
+            row["hit"] = other
+
+
+@kernel
+def suggest(
+    roads: RoadArrays,
+    plans: NDArray[np.void],
+    worlds: Worlds,
+    scratch: Scratch,
+    discrete: bool,
+    target_speeds: NDArray[np.float64],
+    lookahead_s: float,
+    out: NDArray[np.float64],
+) -> None:
+    """What the built-in driver would do in the agents' place.
+
+    Args:
+        roads: the road arrays.
+        plans: PLAN (G, L).
+        worlds: not written.
+        scratch: room.
+        discrete: whether to answer with meta-actions.
+        target_speeds: m/s, rising; discrete only.
+        lookahead_s: horizon in which a target speed is to be reached; discrete only.
+        out: (W, A, 2): throttle in m/s² and steering in rad, or the meta-action in [..., 0]. Rows of
+            absent agents are left as they are.
+    """
+    for w in range(worlds.ticks.shape[0]):
+        rows = worlds.rows[w]
+        owned = worlds.num_owned[w]
+        phase = worlds.signal_phase[w]
+        index_lanes(roads.lanes, rows, worlds.num_rows[w], scratch)
+        register_links(roads, plans, rows, worlds.num_rows[w], scratch)
+        decide(roads, plans, rows, owned, DRIVER_AGENT, worlds.ticks[w], phase, scratch)
+        for i in range(owned):
+            row = rows[i]
+            if row["driver"] != DRIVER_AGENT:
+                continue
+            agent = row["agent"]
+            lane = roads.lanes[row["lane"]]
+            target = row["lane"]
+            change = scratch.lane_change[i]
+            if change > 0:
+                target = lane["left"]
+            elif change < 0:
+                target = lane["right"]
+            out[w, agent, 0] = scratch.accel[i]
+            out[w, agent, 1] = steer_to_lane(roads, plans, row, target)
+            if discrete:
+                wanted = nearest_speed(
+                    target_speeds, max(row["speed"] + scratch.accel[i] * lookahead_s, 0.0)
+                )
+                present = nearest_speed(target_speeds, row["target_speed"])
+                out[w, agent, 0] = ACTION_IDLE
+                if wanted > present:
+                    out[w, agent, 0] = ACTION_FASTER
+                elif wanted < present:
+                    out[w, agent, 0] = ACTION_SLOWER
+                elif change != 0:
+                    out[w, agent, 0] = ACTION_LANE_LEFT if change > 0 else ACTION_LANE_RIGHT

@@ -1,0 +1,243 @@
+"""Is this map fit to drive on? Statistics, and everything about a network that looks wrong.
+
+Lengths are those that the map states (SUMO's `length`), so sums equal what sumolib computes. Edges
+and lanes are those open to passenger cars, unless a name says otherwise.
+"""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cavmarl.maps.components import strong_components
+from cavmarl.roads.cache import load_network
+from cavmarl.roads.network import SIGNAL_STATES, VEHICLE_CLASSES, RoadNetwork
+
+__all__ = ["MapReport", "check_map"]
+
+_CAR = 1 << VEHICLE_CLASSES.index("passenger")
+# Slower than a walk or faster than any car: likelier a wrong unit than a speed limit.
+_SPEED_RANGE_MPS = (1.0, 70.0)
+_STEEP = 0.25
+_WELL_CONNECTED = 0.9
+_GREEN = [SIGNAL_STATES.index(letter) for letter in "gGosOY"]
+
+
+@dataclass(frozen=True)
+class MapReport:
+    """What `check_map` found.
+
+    Attributes:
+        name, source_hash: of the network.
+        road_km, lane_km: stated length of all edges, of all lanes.
+        edges, lanes: how many.
+        junctions: where more than two edges meet.
+        junctions_by_type: all nodes of the map by SUMO's type.
+        signals: traffic lights.
+        extent_m: min x, min y, max x, max y of the lanes.
+        elevation_m: lowest and highest point of the lanes.
+        max_grade: steepest slope of a lane, as a ratio.
+        connected_edges: edges in the largest part in which every edge reaches every other.
+        connected_share: of all edges.
+        dead_ends: edges that lead nowhere.
+        lanes_without_successor: lanes that lead nowhere on edges that go on.
+        junctions_without_right_of_way: where lanes meet and the map has no rule.
+        signals_without_lanes: traffic lights that control no lane.
+        lanes_never_green: lanes whose signal never opens for a movement.
+        self_loops: edges that end where they begin.
+        speed_outliers: lanes with a speed limit below 1 or above 70 m/s.
+        problems: why the map cannot be driven; empty if it can.
+        notes: what else to know.
+    """
+
+    name: str
+    source_hash: str
+    road_km: float
+    lane_km: float
+    edges: int
+    lanes: int
+    junctions: int
+    junctions_by_type: dict[str, int]
+    signals: int
+    extent_m: tuple[float, float, float, float]
+    elevation_m: tuple[float, float]
+    max_grade: float
+    connected_edges: int
+    connected_share: float
+    dead_ends: tuple[str, ...]
+    lanes_without_successor: tuple[str, ...]
+    junctions_without_right_of_way: tuple[str, ...]
+    signals_without_lanes: tuple[str, ...]
+    lanes_never_green: tuple[str, ...]
+    self_loops: tuple[str, ...]
+    speed_outliers: tuple[str, ...]
+    problems: tuple[str, ...]
+    notes: tuple[str, ...]
+
+    @property
+    def drivable(self) -> bool:
+        """No problem stands against driving here."""
+        return not self.problems
+
+    def to_dict(self) -> dict[str, Any]:
+        """As plain types for JSON."""
+        return asdict(self) | {"drivable": self.drivable}
+
+
+def check_map(source: str | Path | RoadNetwork) -> MapReport:
+    """Gather statistics of a SUMO network and look for what makes it unfit.
+
+    Raises:
+        MapError: the network cannot be read at all; see `read_network`.
+    """
+    network = source if isinstance(source, RoadNetwork) else load_network(source)
+    cars = _Cars(network)
+    findings = {
+        "dead_ends": cars.dead_ends(),
+        "lanes_without_successor": cars.lanes_without_successor(),
+        "junctions_without_right_of_way": _lawless_junctions(network),
+        "signals_without_lanes": _idle_signals(network),
+        "lanes_never_green": _lanes_never_green(network),
+        "self_loops": cars.self_loops(),
+        "speed_outliers": cars.speed_outliers(),
+    }
+    connected = cars.largest_component()
+    share = connected / len(cars.edges) if len(cars.edges) else 0.0
+    heights = (float(network.points["z"].min()), float(network.points["z"].max()))
+    grade = float(np.abs(network.points["slope"]).max())
+    return MapReport(
+        name=network.name,
+        source_hash=network.source_hash,
+        road_km=float(network.edges["length_m"][cars.edges].sum()) / 1e3,
+        lane_km=float(network.edges["length_m"][cars.edge_of_lane].sum()) / 1e3,
+        edges=len(cars.edges),
+        lanes=len(cars.lanes),
+        junctions=_crossroads(network),
+        junctions_by_type=_junctions_by_type(network),
+        signals=len(network.signals),
+        extent_m=network.extent_m,
+        elevation_m=heights,
+        max_grade=grade,
+        connected_edges=connected,
+        connected_share=share,
+        **findings,
+        problems=tuple(cars.problems()),
+        notes=tuple(_notes(findings, share, grade)),
+    )
+
+
+class _Cars:
+    """The part of a network that passenger cars may use."""
+
+    def __init__(self, network: RoadNetwork) -> None:
+        self.network = network
+        allowed = network.lanes["permissions"] & _CAR != 0
+        self.lanes = np.flatnonzero(allowed & ~network.lanes["internal"])
+        self.edge_of_lane = network.lanes["edge"][self.lanes]
+        self.edges = np.unique(self.edge_of_lane)
+        links = network.links
+        passable = (
+            allowed[links["from_lane"]] & allowed[links["to_lane"]] & allowed[links["next_lane"]]
+        )
+        self.links = links[passable]
+
+    def largest_component(self) -> int:
+        """How many edges the largest strongly connected part has."""
+        if not len(self.edges):
+            return 0
+        of_lane = self.network.lanes["edge"]
+        arcs = np.stack([of_lane[self.links["from_lane"]], of_lane[self.links["to_lane"]]], axis=1)
+        component = strong_components(len(self.network.edges), arcs)[self.edges]
+        return int(np.bincount(component).max())
+
+    def dead_ends(self) -> tuple[str, ...]:
+        leads_on = self.network.lanes["edge"][self.links["from_lane"]]
+        return self._edge_ids(np.setdiff1d(self.edges, leads_on))
+
+    def lanes_without_successor(self) -> tuple[str, ...]:
+        leads_on = np.unique(self.network.lanes["edge"][self.links["from_lane"]])
+        closed = np.setdiff1d(self.lanes, self.links["from_lane"])
+        closed = closed[np.isin(self.network.lanes["edge"][closed], leads_on)]
+        return self._lane_ids(closed)
+
+    def self_loops(self) -> tuple[str, ...]:
+        edges = self.network.edges[self.edges]
+        return self._edge_ids(self.edges[edges["from_junction"] == edges["to_junction"]])
+
+    def speed_outliers(self) -> tuple[str, ...]:
+        low, high = _SPEED_RANGE_MPS
+        speed = self.network.lanes["speed_mps"][self.lanes]
+        return self._lane_ids(self.lanes[(speed < low) | (speed > high)])
+
+    def problems(self) -> list[str]:
+        if not len(self.edges):
+            return ["no edge is open to passenger cars: check permissions (--keep-edges.by-vclass)"]
+        if not len(self.links) and len(self.edges) > 1:
+            return ["no edge leads to another: the map has no connections (build it again)"]
+        return []
+
+    def _edge_ids(self, rows: NDArray[np.int64]) -> tuple[str, ...]:
+        return tuple(self.network.edge_ids[row] for row in rows)
+
+    def _lane_ids(self, rows: NDArray[np.int64]) -> tuple[str, ...]:
+        return tuple(self.network.lane_ids[row] for row in rows)
+
+
+def _crossroads(network: RoadNetwork) -> int:
+    normal = network.edges[~network.edges["internal"]]
+    ends = np.concatenate([normal["from_junction"], normal["to_junction"]])
+    return int((np.bincount(ends) > 2).sum())
+
+
+def _junctions_by_type(network: RoadNetwork) -> dict[str, int]:
+    counts = np.bincount(network.junctions["kind"], minlength=len(network.junction_kinds))
+    return {kind: int(count) for kind, count in zip(network.junction_kinds, counts, strict=True)}
+
+
+def _lawless_junctions(network: RoadNetwork) -> tuple[str, ...]:
+    """Junctions where two movements end in the same lane and no rule says who goes first."""
+    links = network.links
+    owner = np.repeat(np.arange(len(links)), links["num_conflicts"])
+    foe = network.conflicts["foe"]
+    ruled = owner[links["to_lane"][owner] == links["to_lane"][foe]]
+    _, lane, count = np.unique(links["to_lane"], return_inverse=True, return_counts=True)
+    lawless = count[lane] > 1
+    lawless[ruled] = False
+    rows = np.unique(links["junction"][lawless])
+    return tuple(network.junction_ids[row] for row in rows)
+
+
+def _idle_signals(network: RoadNetwork) -> tuple[str, ...]:
+    rows = np.setdiff1d(np.arange(len(network.signals)), network.links["signal"])
+    return tuple(network.signal_ids[row] for row in rows)
+
+
+def _lanes_never_green(network: RoadNetwork) -> tuple[str, ...]:
+    shut: set[int] = set()
+    for link in network.links[network.links["signal"] >= 0]:
+        signal = network.signals[link["signal"]]
+        first = signal["first_phase"]
+        phases = network.phases[first : first + signal["num_phases"]]
+        letters = network.phase_states[phases["first_state"] + link["signal_index"]]
+        if not np.isin(letters, _GREEN).any():
+            shut.add(int(link["from_lane"]))
+    return tuple(network.lane_ids[row] for row in sorted(shut))
+
+
+def _notes(findings: dict[str, tuple[str, ...]], share: float, grade: float) -> list[str]:
+    notes = []
+    if share < _WELL_CONNECTED:
+        notes.append(
+            f"only {share:.0%} of the edges reach one another: trips elsewhere end at the map's rim"
+        )
+    for name, ids in findings.items():
+        if ids:
+            shown = ", ".join(ids[:5]) + (", …" if len(ids) > 5 else "")
+            notes.append(f"{len(ids)} {name.replace('_', ' ')}: {shown}")
+    if grade > _STEEP:
+        notes.append(f"the steepest lane climbs {grade:.0%}: check the elevation data")
+    return notes

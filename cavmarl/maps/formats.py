@@ -1,0 +1,45 @@
+"""What kind of map a file holds, told by its content and not by its name."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any, Literal
+from xml.sax.handler import ContentHandler
+
+from cavmarl.errors import MapError
+from cavmarl.roads.xml_source import read_xml
+
+__all__ = ["MAP_ENDINGS", "MapKind", "map_kind"]
+
+MapKind = Literal["sumo", "osm", "opendrive"]
+
+MAP_ENDINGS = (".net.xml", ".net.xml.gz", ".osm", ".osm.gz", ".osm.xml", ".osm.xml.gz", ".xodr")
+
+_ROOTS: dict[str, MapKind] = {"net": "sumo", "osm": "osm", "OpenDRIVE": "opendrive"}
+
+
+class _Root(ContentHandler):
+    """Remembers the root element; the parser around it finds what is broken or hostile."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.name = ""
+
+    def startElement(self, name: str, attrs: Any) -> None:
+        self.name = self.name or name
+
+
+def map_kind(path: Path) -> MapKind:
+    """Read a map file to its end and tell its kind by its root element.
+
+    Raises:
+        MapError: the file cannot be read, is broken or hostile XML, or is no map.
+    """
+    root = _Root()
+    read_xml(path, root)
+    if root.name not in _ROOTS:
+        raise MapError(
+            f"{path}: <{root.name}> is the root of no map: give a SUMO network (<net>), an "
+            "OpenStreetMap extract (<osm>) or an OpenDRIVE file (<OpenDRIVE>)"
+        )
+    return _ROOTS[root.name]

@@ -1,0 +1,240 @@
+"""OpenStreetMap and OpenDRIVE made into SUMO networks by netconvert of the `eclipse-sumo` wheel.
+
+The same source and options give the same bytes: netconvert's comment with the date is dropped.
+"""
+
+from __future__ import annotations
+
+import gzip
+import hashlib
+import os
+import re
+import subprocess
+import tempfile
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+from cavmarl.errors import ConfigError, MapError, require
+from cavmarl.kernels import cache_dir
+from cavmarl.maps.build_log import BuildLog
+from cavmarl.maps.formats import MapKind, map_kind
+from cavmarl.roads.reader import map_name, read_network, source_hash
+from cavmarl.roads.xml_source import read_bytes
+
+__all__ = ["OPENDRIVE_OPTIONS", "OSM_OPTIONS", "Box", "BuildResult", "build_network", "map_file"]
+
+Box = tuple[float, float, float, float]
+
+OSM_OPTIONS = (
+    "--geometry.remove",
+    "--ramps.guess",
+    "--junctions.join",
+    "--tls.guess-signals",
+    "--tls.discard-simple",
+    "--tls.join",
+    "--keep-edges.by-vclass=passenger",
+    "--remove-edges.isolated",
+)
+OPENDRIVE_OPTIONS = ("--opendrive.import-all-lanes=false",)
+
+_INPUT = {"sumo": "--sumo-net-file", "osm": "--osm-files", "opendrive": "--opendrive-files"}
+_TYPE_MAP = {"osm": "osmNetconvert.typ.xml", "opendrive": "opendriveNetconvert.typ.xml"}
+_OPTIONS = {"sumo": (), "osm": OSM_OPTIONS, "opendrive": OPENDRIVE_OPTIONS}
+
+_COMMENT = re.compile(rb"<!-- generated on .*?-->\s*", re.DOTALL)
+_SHOWN_LINES = 10
+
+
+@dataclass(frozen=True)
+class BuildResult:
+    """What a build did.
+
+    Attributes:
+        path: the SUMO network.
+        source: the file it was made from.
+        kind: of the source.
+        options: netconvert's options; empty where a SUMO network was taken as it is.
+        warnings: netconvert's warnings, counted by their text without names and numbers.
+        corrections: what netconvert says it changed: junctions joined, roundabouts guessed …
+        dropped: with `tolerant`, the errors that netconvert ignored: what they name was left out.
+    """
+
+    path: Path
+    source: Path
+    kind: MapKind
+    options: tuple[str, ...]
+    warnings: dict[str, int]
+    corrections: tuple[str, ...]
+    dropped: tuple[str, ...]
+
+    def to_dict(self) -> dict[str, Any]:
+        """As plain types for JSON."""
+        return asdict(self) | {"path": str(self.path), "source": str(self.source)}
+
+
+def build_network(
+    source: str | Path,
+    target: str | Path | None = None,
+    *,
+    options: Sequence[str] = (),
+    bbox: Box | None = None,
+    tolerant: bool = False,
+    timeout_s: float = 600.0,
+) -> BuildResult:
+    """Make a SUMO network of a map file and prove that it can be read.
+
+    Args:
+        source: OpenStreetMap or OpenDRIVE, which netconvert turns into a network, or a SUMO
+            network, which is taken as it is. Plain or gzipped.
+        target: where the network goes, gzipped if it ends in `.gz`. By default the cache, or the
+            source itself where nothing has to be done.
+        options: more options for netconvert.
+        bbox: keep the roads within (min, min, max, max): longitude and latitude in degrees for
+            OSM, else metres in the source's own frame.
+        tolerant: let netconvert leave out what it cannot use instead of giving up.
+        timeout_s: how long netconvert may take.
+
+    Raises:
+        ConfigError: an empty `bbox`.
+        MapError: the source is broken, hostile or no map, netconvert refuses it (its own lines are
+            in the message), nothing in the result can be driven, or the target cannot be written.
+        MissingExtraError: netconvert is needed and not installed.
+    """
+    source = Path(source)
+    kind = map_kind(source)
+    chosen = (*_OPTIONS[kind], *_crop(kind, bbox), *options)
+    if tolerant and chosen:
+        chosen += ("--ignore-errors",)
+    log = BuildLog()
+    if target is None and not chosen:
+        read_network(source)
+        place = source
+    else:
+        place = _cache_entry(source, chosen) if target is None else Path(target)
+        try:
+            log = _build(kind, source, place, chosen, timeout_s)
+        except OSError as error:
+            raise MapError(f"{place}: cannot be written ({error.strerror or error})") from error
+    return BuildResult(
+        path=place,
+        source=source,
+        kind=kind,
+        options=chosen,
+        warnings=log.warnings(),
+        corrections=log.corrections(),
+        dropped=log.errors(),
+    )
+
+
+def map_file(path: str | Path) -> Path:
+    """The SUMO network of any map file: the file itself, or what netconvert once made of it.
+
+    Raises:
+        MapError: see `build_network`.
+    """
+    path = Path(path)
+    if path.name.endswith((".net.xml", ".net.xml.gz")):
+        return path
+    kind = map_kind(path)
+    if kind == "sumo":
+        return path
+    entry = _cache_entry(path, _OPTIONS[kind])
+    return entry if entry.exists() else build_network(path).path
+
+
+def _cache_entry(source: Path, options: Sequence[str]) -> Path:
+    version = require("sumo", "sumo").__version__
+    digest = hashlib.sha256("\0".join([source_hash(source), version, *options]).encode())
+    return cache_dir() / "maps" / digest.hexdigest()[:32] / f"{map_name(source)}.net.xml"
+
+
+def _crop(kind: MapKind, bbox: Box | None) -> tuple[str, ...]:
+    if bbox is None:
+        return ()
+    if not (bbox[0] < bbox[2] and bbox[1] < bbox[3]):
+        raise ConfigError(f"bbox {bbox} is empty: give min x, min y, max x, max y")
+    option = "--keep-edges.in-geo-boundary" if kind == "osm" else "--keep-edges.in-boundary"
+    return (f"{option}={','.join(map(repr, bbox))}",)
+
+
+def _build(
+    kind: MapKind, source: Path, place: Path, options: Sequence[str], timeout_s: float
+) -> BuildLog:
+    """Put the network in its place, whole or not at all."""
+    if place.exists() and place.samefile(source):
+        raise MapError(f"{place}: the target is the source: give another target")
+    place.parent.mkdir(parents=True, exist_ok=True)
+    with tempfile.TemporaryDirectory(dir=place.parent, prefix=".build-") as folder:
+        draft = Path(folder) / f"{map_name(place)}.net.xml"
+        log = BuildLog()
+        if options:
+            log = _run(kind, source, draft, options, timeout_s)
+            content = _COMMENT.sub(b"", draft.read_bytes(), count=1)
+        else:
+            content = read_bytes(source)
+        draft.write_bytes(gzip.compress(content, mtime=0) if place.suffix == ".gz" else content)
+        _check_readable(source, draft, log)
+        os.replace(draft, place)
+    return log
+
+
+def _run(
+    kind: MapKind, source: Path, draft: Path, options: Sequence[str], timeout_s: float
+) -> BuildLog:
+    """Run netconvert.
+
+    Raises:
+        MapError: it fails or takes too long.
+    """
+    home = Path(require("sumo", "sumo").SUMO_HOME)
+    command = [str(home / "bin" / "netconvert"), _INPUT[kind], str(source), "-o", str(draft)]
+    if kind in _TYPE_MAP:
+        command += ["-t", str(home / "data" / "typemap" / _TYPE_MAP[kind])]
+    command += [*options, "--verbose", "--aggregate-warnings=1000000", "--xml-validation=never"]
+    projections = str(home / "data" / "proj")
+    own = {"SUMO_HOME": str(home), "PROJ_DATA": projections, "PROJ_LIB": projections}
+    try:
+        done = subprocess.run(
+            command,
+            capture_output=True,
+            text=True,
+            errors="replace",
+            timeout=timeout_s,
+            env=os.environ | own,
+            check=False,
+        )
+    except subprocess.TimeoutExpired as error:
+        raise MapError(
+            f"{source}: netconvert took longer than {timeout_s:g} s: crop the map (--bbox) or "
+            "allow more time"
+        ) from error
+    log = BuildLog(done.stdout, done.stderr)
+    if done.returncode != 0 or not draft.exists():
+        tolerant = "--ignore-errors" in options
+        cure = "mend the source"
+        cure += "" if tolerant else ", or leave out what is broken (--tolerant)"
+        raise MapError(
+            f"{source}: netconvert gave up (exit code {done.returncode}):\n"
+            f"{_quote(log.complaint())}\nCure: {cure}."
+        )
+    return log
+
+
+def _check_readable(source: Path, draft: Path, log: BuildLog) -> None:
+    try:
+        read_network(draft)
+    except MapError as error:
+        message = f"{source}: {str(error).removeprefix(f'{draft}: ')}"
+        said = (*log.errors(), *log.warnings())
+        if said:
+            message += f"\nnetconvert said:\n{_quote(said)}"
+        raise MapError(message) from error
+
+
+def _quote(lines: Sequence[str]) -> str:
+    shown = [f"  {line}" for line in lines[:_SHOWN_LINES]]
+    if len(lines) > _SHOWN_LINES:
+        shown.append(f"  … and {len(lines) - _SHOWN_LINES} more")
+    return "\n".join(shown)

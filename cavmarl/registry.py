@@ -1,0 +1,205 @@
+"""The finder of entries: what stands in `envs/` and `agents/` is what there is.
+
+A name is looked up in the working directory first, then in what the wheel carries, else beside the
+package in a checkout. A path to a folder or to a map file works wherever a name does.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import difflib
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+from cavmarl.config import EnvConfig, MapConfig
+from cavmarl.errors import ConfigError, MapError, UnknownEnvironmentError, require
+
+__all__ = [
+    "MAP_SUFFIXES",
+    "agent_entries",
+    "entries",
+    "find_entry",
+    "load_config",
+    "places",
+    "resolve_map",
+]
+
+MAP_SUFFIXES = (".net.xml", ".net.xml.gz", ".osm", ".osm.gz", ".osm.xml", ".xodr")
+
+_PACKAGE = Path(__file__).resolve().parent
+_SUMO_PREFIX = "sumo:"
+
+
+def places(kind: str) -> list[Path]:
+    """The folders that hold entries of `kind` (`envs`, `agents`, `configs`), first wins."""
+    packaged = _PACKAGE / "data" / kind
+    ours = packaged if packaged.is_dir() else _PACKAGE.parent / kind
+    return [place for place in (Path.cwd() / kind, ours) if place.is_dir()]
+
+
+def entries() -> dict[str, Path]:
+    """Every environment that a name can mean: name → its folder, sorted by name."""
+    return _collect("envs", _environment_name)
+
+
+def agent_entries() -> dict[str, Path]:
+    """Every driver that can take a seat: name → `NAME.py`, or the folder of a trained one."""
+    return _collect("agents", _agent_name)
+
+
+def find_entry(env: str | Path) -> Path:
+    """The entry folder or the map file that `env` means.
+
+    Args:
+        env: a name from `entries()`, a folder with an `env.yaml`, or a map file.
+
+    Raises:
+        UnknownEnvironmentError: nothing there; the message says what there is.
+    """
+    known = entries()
+    if isinstance(env, str) and env in known:
+        return known[env]
+    path = Path(env)
+    if (path / "env.yaml").is_file():
+        return path
+    if path.is_file():
+        if not path.name.endswith(MAP_SUFFIXES):
+            raise UnknownEnvironmentError(
+                f"{path}: not a map file; their names end in {', '.join(MAP_SUFFIXES)}"
+            )
+        return path
+    if path.is_dir():
+        raise UnknownEnvironmentError(f"{path}: a folder without an env.yaml")
+    raise UnknownEnvironmentError(
+        f"no environment, folder or map file '{env}'; {_advice(env, known)}"
+    )
+
+
+def load_config(
+    env: str | Path,
+    *,
+    zones: int | None = None,
+    agents: int | None = None,
+    background: int | None = None,
+    max_cycles: int | None = None,
+    overrides: Mapping[str, object] | None = None,
+) -> tuple[EnvConfig, Path]:
+    """The configuration of an environment, and the folder that its map's source is relative to.
+
+    Args:
+        env: what `find_entry` takes; a map file gets a default environment.
+        zones: shadows `zones.count`.
+        agents: shadows `population.agents`.
+        background: shadows `population.background`.
+        max_cycles: shadows `horizon_s`, in steps: exactly that many.
+        overrides: dotted key → value, for every other key: `{"sensors.lidar.rays": 64}`.
+
+    Raises:
+        UnknownEnvironmentError: nothing of that name.
+        ConfigError: a key, a type or a value that cannot work, with the nearest that can.
+    """
+    from cavmarl.config_io import read_yaml, validate
+
+    found = find_entry(env)
+    if found.is_dir():
+        base_dir, where = found, str(found / "env.yaml")
+        config = validate(EnvConfig, read_yaml(found / "env.yaml"), where)
+    else:
+        base_dir, where = found.parent, str(found)
+        config = EnvConfig(name=_map_name(found), map=MapConfig(source=found.name))
+    keywords = {
+        "zones.count": zones,
+        "population.agents": agents,
+        "population.background": background,
+        "horizon_s": max_cycles,
+    }
+    given = {key: value for key, value in keywords.items() if value is not None}
+    shadows = dict(overrides or {})
+    if twice := given.keys() & shadows.keys():
+        raise ConfigError(f"{min(twice)} stands in overrides and is given as a keyword; use one")
+    shadows |= {key: value for key, value in given.items() if key != "horizon_s"}
+    if shadows:
+        raw = dataclasses.asdict(config)
+        for key, value in shadows.items():
+            _shadow(raw, key, value)
+        config = validate(EnvConfig, raw, f"{where}, overridden")
+    if max_cycles is not None:
+        config = _with_max_steps(config, max_cycles)
+    return config, base_dir
+
+
+def resolve_map(config: EnvConfig, base_dir: Path) -> Path:
+    """The file that `map.source` means.
+
+    Args:
+        config: of the environment.
+        base_dir: the folder that a relative source starts from.
+
+    Raises:
+        MapError: no such file.
+        MissingExtraError: the source lies in the eclipse-sumo wheel, which is not installed.
+    """
+    source = config.map.source
+    if source.startswith(_SUMO_PREFIX):
+        home = Path(require("sumo", "sumo").SUMO_HOME).resolve()
+        path = (home / source.removeprefix(_SUMO_PREFIX)).resolve()
+        if not path.is_relative_to(home):
+            raise MapError(f"map.source = {source!r}: leads out of the eclipse-sumo wheel")
+    else:
+        path = base_dir / source
+    if not path.is_file():
+        raise MapError(f"map.source = {source!r}: no file {path}")
+    return path
+
+
+def _collect(kind: str, name_of: Callable[[Path], str | None]) -> dict[str, Path]:
+    """Name → path of all entries of `kind`, sorted by name; of equal names the first place wins."""
+    found = {
+        name: path
+        for place in reversed(places(kind))
+        for path in place.iterdir()
+        if (name := name_of(path)) is not None
+    }
+    return dict(sorted(found.items()))
+
+
+def _environment_name(path: Path) -> str | None:
+    return path.name if (path / "env.yaml").is_file() else None
+
+
+def _agent_name(path: Path) -> str | None:
+    if path.suffix == ".py" and not path.name.startswith("_"):
+        return path.stem
+    return path.name if (path / "model.safetensors").is_file() else None
+
+
+def _advice(env: str | Path, known: Mapping[str, Path]) -> str:
+    """What was probably meant by an unknown name, and what there is."""
+    close = difflib.get_close_matches(str(env), known, n=3)
+    meant = f"did you mean {' or '.join(close)}? " if close else ""
+    return f"{meant}There are: {', '.join(known) or 'none'}"
+
+
+def _map_name(path: Path) -> str:
+    """A map file's name without its ending."""
+    ending = max((s for s in MAP_SUFFIXES if path.name.endswith(s)), key=len)
+    return path.name.removesuffix(ending)
+
+
+def _shadow(raw: dict[str, Any], key: str, value: object) -> None:
+    """Put `value` at a dotted key of nested mappings."""
+    *parents, last = key.split(".")
+    inner: Any = raw
+    for depth, parent in enumerate(parents):
+        inner = inner.setdefault(parent, {})
+        if not isinstance(inner, dict):
+            raise ConfigError(f"{key}: {'.'.join(parents[: depth + 1])} has no keys inside")
+    inner[last] = value
+
+
+def _with_max_steps(config: EnvConfig, max_cycles: int) -> EnvConfig:
+    """The same world with another horizon, counted in steps."""
+    if not isinstance(max_cycles, int) or isinstance(max_cycles, bool) or max_cycles < 1:
+        raise ConfigError(f"max_cycles = {max_cycles!r}: must be a whole number from 1")
+    return dataclasses.replace(config, horizon_s=max_cycles * config.clock.ctrl_dt_s)

@@ -1,0 +1,102 @@
+"""Networks kept between runs: one file a source, named after the hash of what went into it."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import tempfile
+import zipfile
+from dataclasses import fields
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cavmarl.kernels import cache_dir
+from cavmarl.roads.network import (
+    CONFLICT,
+    EDGE,
+    JUNCTION,
+    LANE,
+    LINK,
+    PHASE,
+    POINT,
+    SIGNAL,
+    RoadNetwork,
+)
+from cavmarl.roads.reader import map_name, read_network, source_hash
+
+__all__ = ["load_network"]
+
+# Raise this when the reader gives other rows for the same file; record types count by themselves.
+FORMAT = 2
+
+_DTYPES = {
+    "points": POINT,
+    "lanes": LANE,
+    "edges": EDGE,
+    "links": LINK,
+    "conflicts": CONFLICT,
+    "junctions": JUNCTION,
+    "into": np.dtype(np.int32),
+    "signals": SIGNAL,
+    "phases": PHASE,
+    "phase_states": np.dtype(np.uint8),
+}
+_IDS = ("lane_ids", "edge_ids", "junction_ids", "signal_ids", "junction_kinds")
+
+
+def load_network(path: str | Path) -> RoadNetwork:
+    """`read_network` with a cache beside the compiled kernels; a broken cache entry is built again.
+
+    Raises:
+        MapError: see `read_network`.
+    """
+    path = Path(path)
+    digest = source_hash(path)
+    entry = _entry(digest)
+    network = _restore(entry, map_name(path), digest)
+    if network is None:
+        network = read_network(path)
+        _store(entry, network)
+    return network
+
+
+def _entry(digest: str) -> Path:
+    layout = hashlib.sha256(repr((FORMAT, [dtype.descr for dtype in _DTYPES.values()])).encode())
+    return cache_dir() / "maps" / f"{digest}-{layout.hexdigest()[:12]}.npz"
+
+
+def _restore(entry: Path, name: str, digest: str) -> RoadNetwork | None:
+    """The network of a cache entry, or None if there is no whole one."""
+    try:
+        with entry.open("rb") as stream, np.load(stream, allow_pickle=False) as stored:
+            values: dict[str, Any] = {
+                key: _thaw(stored[key], kind) for key, kind in _DTYPES.items()
+            }
+            values |= {key: tuple(json.loads(stored[key].tobytes())) for key in _IDS}
+    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile):
+        return None
+    return RoadNetwork(name=name, source_hash=digest, **values)
+
+
+def _store(entry: Path, network: RoadNetwork) -> None:
+    """Write an entry whole or not at all: other processes may read it at any time."""
+    stored: dict[str, NDArray[np.uint8]] = {}
+    for field in fields(network):
+        value = getattr(network, field.name)
+        if field.name in _DTYPES:
+            stored[field.name] = np.frombuffer(value.tobytes(), dtype=np.uint8)
+        elif field.name in _IDS:
+            stored[field.name] = np.frombuffer(json.dumps(value).encode(), dtype=np.uint8)
+    entry.parent.mkdir(parents=True, exist_ok=True)
+    with tempfile.NamedTemporaryFile(dir=entry.parent, suffix=".tmp", delete=False) as target:
+        np.savez(target, allow_pickle=False, **stored)
+    os.replace(target.name, entry)
+
+
+def _thaw(raw: NDArray[np.uint8], dtype: np.dtype[np.generic]) -> NDArray[np.void]:
+    # No array copy: it would leave the padding of the records undefined, and hashes read it.
+    return np.frombuffer(raw.tobytes(), dtype=dtype)

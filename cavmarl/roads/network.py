@@ -1,0 +1,246 @@
+"""`RoadNetwork`: a road map as a handful of immutable record arrays.
+
+Frames and units: metres, radians, metres a second; x east, y north, z up, right-handed; headings are
+counter-clockwise from east. A lane is a polyline along its centre in driving direction; `s` is the arc
+length on it and `d` the lateral offset, positive to the left.
+
+Every lane has one row, junction-internal lanes included. A *link* is one permitted movement over a
+junction: from the end of a lane, along a chain of internal lanes, to the start of an outgoing lane.
+Records instead of many plain arrays: a kernel takes one argument where it would take ten.
+
+Indices that point at nothing are -1.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from dataclasses import dataclass, fields
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cavmarl.kernels.arrays import RoadArrays
+
+__all__ = [
+    "CONFLICT",
+    "EDGE",
+    "JUNCTION",
+    "LANE",
+    "LINK",
+    "PHASE",
+    "POINT",
+    "SIGNAL",
+    "SIGNAL_STATES",
+    "RoadNetwork",
+    "VEHICLE_CLASSES",
+]
+
+# The permission bits of LANE["permissions"], SUMO's abstract vehicle classes that drive on roads.
+VEHICLE_CLASSES = ("passenger", "truck", "bus", "motorcycle", "emergency", "delivery", "taxi", "tram", "bicycle")
+
+# SUMO's signal letters in the order of their codes in `phase_states`.
+SIGNAL_STATES = "rugGysoOY"
+
+POINT = np.dtype(
+    [
+        ("x", np.float64),  # m
+        ("y", np.float64),  # m
+        ("z", np.float64),  # m
+        ("s", np.float64),  # m from the start of its lane, in the plane
+        ("cos", np.float64),  # direction of the segment that starts here (the last point repeats the one before)
+        ("sin", np.float64),
+        ("slope", np.float64),  # dz/ds of that segment
+    ],
+    align=True,
+)
+
+LANE = np.dtype(
+    [
+        ("edge", np.int32),  # EDGE row; internal lanes too
+        ("index", np.int32),  # position on its edge, 0 = rightmost
+        ("internal", np.bool_),  # lies inside a junction
+        ("length_m", np.float64),  # arc length of the polyline in the plane: the `s` of its last point
+        ("width_m", np.float64),
+        ("speed_mps", np.float64),  # speed limit
+        ("permissions", np.uint32),  # bit k set: VEHICLE_CLASSES[k] may drive here
+        ("first_point", np.int32),  # POINT rows [first_point, first_point + num_points)
+        ("num_points", np.int32),  # at least 2
+        ("left", np.int32),  # LANE row of the neighbour to the left in the same direction
+        ("right", np.int32),
+        ("first_link", np.int32),  # LINK rows of the movements that leave this lane's end, sorted by
+        ("num_links", np.int32),  # from-lane; 0 for internal lanes (see `successor`)
+        ("successor", np.int32),  # internal lanes: the one LANE that follows (internal or normal)
+        ("link", np.int32),  # internal lanes: the LINK that this lane is part of
+        ("link_offset_m", np.float64),  # internal lanes: path length of the link before this lane starts
+        ("first_into", np.int32),  # into[first_into : first_into + num_into]: LANE rows whose ends lead here
+        ("num_into", np.int32),  # (internal lanes where the map has them)
+        ("min_x", np.float64),  # bounding box of the polyline, m
+        ("min_y", np.float64),
+        ("max_x", np.float64),
+        ("max_y", np.float64),
+    ],
+    align=True,
+)
+
+EDGE = np.dtype(
+    [
+        ("first_lane", np.int32),  # LANE rows [first_lane, first_lane + num_lanes), from right to left
+        ("num_lanes", np.int32),
+        ("internal", np.bool_),
+        ("from_junction", np.int32),  # JUNCTION rows; both the same for internal edges
+        ("to_junction", np.int32),
+        ("length_m", np.float64),
+        ("speed_mps", np.float64),
+    ],
+    align=True,
+)
+
+LINK = np.dtype(
+    [
+        ("from_lane", np.int32),  # LANE it leaves; its end is the stop line
+        ("to_lane", np.int32),  # LANE it reaches
+        ("first_internal", np.int32),  # first LANE of the chain inside the junction
+        ("next_lane", np.int32),  # where a vehicle is after the end of from_lane: first_internal, or to_lane
+        ("length_m", np.float64),  # of the chain of internal lanes
+        ("junction", np.int32),
+        ("index", np.int32),  # the link's bit in its junction's request, response and foes
+        ("signal", np.int32),  # SIGNAL row
+        ("signal_index", np.int32),  # which letter of the signal's state
+        ("direction", np.uint8),  # ord of SUMO's dir: s t l r L R
+        ("state", np.uint8),  # ord of SUMO's link state without a signal: M m = s w Z o …
+        ("first_conflict", np.int32),  # CONFLICT rows, sorted by the foe's LINK row
+        ("num_conflicts", np.int32),
+    ],
+    align=True,
+)
+
+CONFLICT = np.dtype(
+    [
+        ("foe", np.int32),  # LINK whose path crosses or merges with this link's path (a `foes` bit)
+        ("must_yield", np.bool_),  # this link has to give way to the foe (a `response` bit)
+        ("enter_m", np.float64),  # where on this link's path the shared area begins and ends,
+        ("leave_m", np.float64),  # from the stop line; leave = the whole length where both merge
+        ("foe_enter_m", np.float64),  # the same area on the foe's path
+        ("foe_leave_m", np.float64),
+    ],
+    align=True,
+)
+
+JUNCTION = np.dtype(
+    [
+        ("x", np.float64),
+        ("y", np.float64),
+        ("z", np.float64),
+        ("kind", np.int32),  # index into RoadNetwork.junction_kinds
+        ("signal", np.int32),  # SIGNAL row of a traffic light here
+    ],
+    align=True,
+)
+
+SIGNAL = np.dtype(
+    [
+        ("first_phase", np.int32),  # PHASE rows of the first program
+        ("num_phases", np.int32),
+        ("num_links", np.int32),  # letters in a state
+        ("offset_s", np.float64),
+        ("cycle_s", np.float64),  # sum of the phases' durations
+    ],
+    align=True,
+)
+
+PHASE = np.dtype(
+    [
+        ("duration_s", np.float64),
+        ("first_state", np.int32),  # phase_states[first_state : first_state + num_links]
+    ],
+    align=True,
+)
+
+
+@dataclass(frozen=True, eq=False)
+class RoadNetwork:
+    """An immutable road map; see the module's docstring for frames and the dtypes for fields.
+
+    Attributes:
+        name: the source file's name without its endings.
+        source_hash: SHA-256 of the source, hex; part of every manifest and cache key.
+        points, lanes, edges, links, conflicts, junctions, signals, phases: record arrays, read-only.
+        into: LANE rows, see LANE["first_into"].
+        phase_states: signal letters as codes, see PHASE.
+        lane_ids, edge_ids, junction_ids, signal_ids: the source's names, by row.
+        junction_kinds: SUMO's junction types that occur, by `JUNCTION["kind"]`.
+    """
+
+    name: str
+    source_hash: str
+    points: NDArray[np.void]
+    lanes: NDArray[np.void]
+    edges: NDArray[np.void]
+    links: NDArray[np.void]
+    conflicts: NDArray[np.void]
+    junctions: NDArray[np.void]
+    into: NDArray[np.int32]
+    signals: NDArray[np.void]
+    phases: NDArray[np.void]
+    phase_states: NDArray[np.uint8]
+    lane_ids: tuple[str, ...]
+    edge_ids: tuple[str, ...]
+    junction_ids: tuple[str, ...]
+    signal_ids: tuple[str, ...]
+    junction_kinds: tuple[str, ...]
+
+    def __post_init__(self) -> None:
+        for field in fields(self):
+            value = getattr(self, field.name)
+            if isinstance(value, np.ndarray):
+                value.setflags(write=False)
+
+    @cached_property
+    def arrays(self) -> RoadArrays:
+        """The arrays that kernels take."""
+        return RoadArrays(
+            self.points,
+            self.lanes,
+            self.edges,
+            self.links,
+            self.conflicts,
+            self.into,
+            self.signals,
+            self.phases,
+            self.phase_states,
+        )
+
+    @cached_property
+    def extent_m(self) -> tuple[float, float, float, float]:
+        """(min_x, min_y, max_x, max_y) over all lanes: roads, not stray nodes."""
+        lanes = self.lanes
+        return (
+            float(lanes["min_x"].min()),
+            float(lanes["min_y"].min()),
+            float(lanes["max_x"].max()),
+            float(lanes["max_y"].max()),
+        )
+
+    @cached_property
+    def max_speed_mps(self) -> float:
+        """The highest speed limit on the map."""
+        return float(self.lanes["speed_mps"].max())
+
+    def lane_polyline(self, lane: int) -> NDArray[np.float64]:
+        """The centre line of a lane as (num_points, 3) x, y, z in metres."""
+        row = self.lanes[lane]
+        points = self.points[row["first_point"] : row["first_point"] + row["num_points"]]
+        return np.stack([points["x"], points["y"], points["z"]], axis=1)
+
+    @cached_property
+    def content_hash(self) -> str:
+        """SHA-256 over all arrays and ids, hex: two equal networks have equal hashes."""
+        digest = hashlib.sha256()
+        for field in fields(self):
+            value = getattr(self, field.name)
+            if isinstance(value, np.ndarray):
+                digest.update(value.tobytes())
+            elif isinstance(value, tuple):
+                digest.update("\0".join(value).encode())
+        return digest.hexdigest()

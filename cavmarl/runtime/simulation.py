@@ -1,0 +1,200 @@
+"""`Simulation`: W worlds of one environment, stepped together. The tick is written here, once."""
+
+from __future__ import annotations
+
+import hashlib
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cavmarl.config import EnvConfig
+from cavmarl.errors import CapacityError
+from cavmarl.kernels.arrays import Outputs
+from cavmarl.kernels.codes import (
+    COUNT_ARRIVED,
+    COUNT_CONTACTS,
+    COUNT_DEPARTED,
+    COUNT_REMOVED,
+    SUM_DELAY_S,
+    SUM_DISTANCE_M,
+    SUM_TIME_S,
+)
+from cavmarl.kernels.rng import world_key
+from cavmarl.roads.network import RoadNetwork
+from cavmarl.runtime.executor import Executor, SerialExecutor
+from cavmarl.shard.shard import Commands, Shard
+from cavmarl.shard.vehicles import STATE_FIELDS, blank_vehicle
+from cavmarl.traffic.native import NativeTraffic
+
+__all__ = ["Simulation", "TrafficStats"]
+
+
+@dataclass(frozen=True)
+class TrafficStats:
+    """Traffic of one world since its reset; agents count as vehicles.
+
+    Attributes:
+        departed: vehicles that have entered, those placed at reset included.
+        waiting: departures that wait for a safe gap.
+        running: vehicles in the world.
+        arrived: vehicles that reached their goal.
+        contacts: vehicles that began to touch another one.
+        removed: agents taken out after a collision or off the road.
+        mean_speed_mps: over the vehicles in the world now.
+        mean_trip_m: over the arrived ones.
+        mean_trip_s: over the arrived ones.
+        mean_delay_s: over the arrived ones, time above what the way takes at the limit.
+    """
+
+    departed: int
+    waiting: int
+    running: int
+    arrived: int
+    contacts: int
+    removed: int
+    mean_speed_mps: float
+    mean_trip_m: float
+    mean_trip_s: float
+    mean_delay_s: float
+
+
+class Simulation:
+    """W worlds of one environment on one map.
+
+    Args:
+        config: the environment.
+        network: its roads.
+        num_worlds: W.
+    """
+
+    def __init__(self, config: EnvConfig, network: RoadNetwork, num_worlds: int = 1) -> None:
+        self.config = config
+        self.network = network
+        self.num_worlds = num_worlds
+        self._traffic = NativeTraffic(network, config.traffic, config.population, blank_vehicle())
+        shard = Shard(config, network, self._traffic.plans, num_worlds)
+        self._shard = shard
+        self._executor: Executor = SerialExecutor([shard])
+        self._episodes = np.zeros(num_worlds, dtype=np.int64)
+
+    @property
+    def outputs(self) -> Outputs:
+        """What the agents got at the end of the last step; arrays that the next step overwrites."""
+        return self._shard.outputs
+
+    @property
+    def goal_edges(self) -> NDArray[np.int32]:
+        """EDGE rows of the goals, by `VEHICLE["goal"]`."""
+        return self._traffic.goal_edges
+
+    def vehicles(self, world: int = 0) -> NDArray[np.void]:
+        """The live vehicles of one world: a view of VEHICLE records, in no order."""
+        worlds = self._shard.worlds
+        return worlds.rows[world, : worlds.num_owned[world]]
+
+    def signal_phases(self, world: int = 0) -> NDArray[np.int32]:
+        """PHASE rows that are on, (num_signals,)."""
+        return self._shard.worlds.signal_phase[world]
+
+    def ticks(self) -> NDArray[np.int64]:
+        """(W,) ticks since each world's reset."""
+        return self._shard.worlds.ticks
+
+    def reset(self, seed: int, chosen: NDArray[np.bool_] | None = None) -> None:
+        """Begin a new episode in the chosen worlds (W,), all by default, and sense.
+
+        World w's episode is a function of (`seed`, w, the number of its resets with this seed).
+
+        Raises:
+            CapacityError: the map has no room for that many agents.
+        """
+        everyone = chosen is None
+        if chosen is None:
+            chosen = np.ones(self.num_worlds, dtype=np.bool_)
+            self._episodes[:] = 0
+        worlds = self._shard.worlds
+        for w in np.flatnonzero(chosen):
+            worlds.keys[w] = world_key(seed, int(w), int(self._episodes[w]))
+            worlds.ticks[w] = 0
+        self._episodes[chosen] += 1
+        self._traffic.populate(worlds, chosen)
+        self._executor.each(Shard.switch_signals)
+        self._executor.each(Shard.sense)
+        agents = self.config.population.agents
+        seated = self.outputs.present[chosen].sum(axis=1)
+        if self.config.population.mode == "closed" and everyone and (seated < agents).any():
+            raise CapacityError(
+                f"population.agents = {agents}: the map '{self.network.name}' has free places for "
+                f"{int(seated.min())}; use fewer agents, or population.mode = entering or seats, "
+                "where the others wait until there is room"
+            )
+
+    def step(self, commands: Commands) -> None:
+        """One agent step: its ticks, then what the agents sense."""
+        self._executor.each(lambda shard: shard.begin_step(commands))
+        for _ in range(self.config.clock.ticks_per_step):
+            self._tick(commands)
+        self._executor.each(Shard.sense)
+
+    def _tick(self, commands: Commands) -> None:
+        """traffic → advance → (exchange) → resolve → departures → (migrate) → commit."""
+        self._executor.each(Shard.switch_signals)
+        self._executor.each(lambda shard: shard.advance(commands))
+        self._executor.each(Shard.resolve)
+        self._traffic.exchange(self._shard.worlds, self._shard.scratch, self.config.clock.sim_dt_s)
+        self._executor.each(Shard.commit)
+
+    def retire_agents(self) -> None:
+        """Take out the agents whose trip ended in the last step; to be called after it is read."""
+        self._traffic.retire_agents(self._shard.worlds, self.config.clock.sim_dt_s)
+
+    def suggest(self, out: NDArray[np.float64]) -> None:
+        """Write what the built-in driver would do in the agents' place into `out` (W, A, 2)."""
+        self._executor.each(lambda shard: shard.suggest(out))
+
+    def state_hash(self, world: int = 0) -> str:
+        """Hex digest of everything that the future of a world depends on.
+
+        Over all vehicles in the order of their ids, the queue, the signals, the tick and the key of
+        all random numbers; not over where a record lives.
+        """
+        worlds = self._shard.worlds
+        rows = self.vehicles(world)
+        rows = rows[np.argsort(rows["id"])]
+        digest = hashlib.blake2b(digest_size=16)
+        for name in STATE_FIELDS:
+            digest.update(np.ascontiguousarray(rows[name]).tobytes())
+        queue = worlds.queue[world, : worlds.num_queue[world]]
+        for name in queue.dtype.names or ():
+            digest.update(np.ascontiguousarray(queue[name]).tobytes())
+        for array in (
+            worlds.signal_phase[world],
+            worlds.ticks[world],
+            worlds.keys[world],
+            worlds.next_id[world],
+            worlds.num_entered[world],
+        ):
+            digest.update(array.tobytes())
+        return digest.hexdigest()
+
+    def traffic_stats(self, world: int = 0) -> TrafficStats:
+        """Counts and means since the world's reset."""
+        worlds = self._shard.worlds
+        counts = worlds.counts[world]
+        sums = worlds.sums[world]
+        rows = self.vehicles(world)
+        arrived = int(counts[COUNT_ARRIVED])
+        trips = max(arrived, 1)
+        return TrafficStats(
+            departed=int(counts[COUNT_DEPARTED]),
+            waiting=int(worlds.num_queue[world]),
+            running=len(rows),
+            arrived=arrived,
+            contacts=int(counts[COUNT_CONTACTS]),
+            removed=int(counts[COUNT_REMOVED]),
+            mean_speed_mps=float(np.sort(rows["speed"]).mean()) if len(rows) else 0.0,
+            mean_trip_m=float(sums[SUM_DISTANCE_M]) / trips,
+            mean_trip_s=float(sums[SUM_TIME_S]) / trips,
+            mean_delay_s=float(sums[SUM_DELAY_S]) / trips,
+        )

@@ -1,0 +1,193 @@
+"""`Shard`: the running sub-worlds of one zone, W of them side by side.
+
+It owns the arrays of its vehicles and runs the phases of a tick on them. It knows its part of the map,
+its sensors and its terms, and neither the coordinator nor another shard.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cavmarl.config import TERMS, EnvConfig
+from cavmarl.kernels.arrays import LaneGrid, Outputs, RoadArrays, Scratch, Worlds
+from cavmarl.kernels.codes import NUM_COUNTS, NUM_SUMS
+from cavmarl.kernels.neighbors import make_grid
+from cavmarl.kernels.sense import sense
+from cavmarl.kernels.tick import advance, begin_step, resolve, suggest, switch_signals
+from cavmarl.roads.network import RoadNetwork
+from cavmarl.roads.routing import lane_grid
+from cavmarl.shard.sensors import layout, sensor_arrays
+from cavmarl.shard.vehicles import VEHICLE
+from cavmarl.traffic.departures import DEPARTURE
+
+__all__ = ["Commands", "Shard"]
+
+CELL_M = 25.0  # of the spatial index over vehicles
+SUGGESTED_HORIZON_S = 1.0  # in which a suggested target speed is to be reached
+
+
+@dataclass(frozen=True)
+class Commands:
+    """Decoded actions of one step.
+
+    Attributes:
+        controls: (W, A, 2) throttle in m/s² and steering in rad; continuous actions.
+        meta_actions: (W, A) ACTION_* codes; discrete actions.
+    """
+
+    controls: NDArray[np.float64]
+    meta_actions: NDArray[np.int64]
+
+
+class Shard:
+    """The sub-worlds of one zone.
+
+    Args:
+        config: the environment.
+        network: the roads.
+        plans: PLAN (G, L).
+        num_worlds: W.
+    """
+
+    def __init__(
+        self, config: EnvConfig, network: RoadNetwork, plans: NDArray[np.void], num_worlds: int
+    ) -> None:
+        self._config = config
+        self._roads: RoadArrays = network.arrays
+        self._plans = plans
+        self._lane_grid: LaneGrid = lane_grid(network)
+        capacity = config.population.agents + config.population.background
+        self._sensors = sensor_arrays(config.sensors)
+        self._grid = make_grid(network.extent_m, CELL_M, capacity)
+        self.scratch = _make_scratch(len(network.lanes), len(network.links), capacity)
+        self.worlds = _make_worlds(num_worlds, capacity, len(network.signals))
+        self.outputs = _make_outputs(config, num_worlds)
+        self._weights = np.array([config.terms.weights.get(name, 0.0) for name in TERMS])
+        self._target_speeds = np.array(config.action.target_speeds_mps)
+        self._discrete = config.action.kind == "discrete"
+
+    def switch_signals(self) -> None:
+        """Bring the signals to the present tick."""
+        switch_signals(self._roads, self.worlds, self._config.clock.sim_dt_s)
+
+    def begin_step(self, commands: Commands) -> None:
+        """Open the accounts of a step and take its meta-actions."""
+        begin_step(
+            self._roads, self.worlds, self._discrete, commands.meta_actions, self._target_speeds
+        )
+
+    def advance(self, commands: Commands) -> None:
+        """Decide every control from the committed rows and move the owned ones into `next_rows`."""
+        action = self._config.action
+        advance(
+            self._roads,
+            self._plans,
+            self._lane_grid,
+            self.worlds,
+            self.scratch,
+            commands.controls,
+            self._discrete,
+            action.acceleration_mps2,
+            action.steering_rad,
+            self._config.clock.control_latency_ticks,
+            self._config.clock.sim_dt_s,
+        )
+
+    def resolve(self) -> None:
+        """Find who touches whom in `next_rows`."""
+        resolve(self.worlds, self.scratch, self._grid)
+
+    def commit(self) -> None:
+        """Make `next_rows` the committed state of the next tick."""
+        worlds = self.worlds
+        self.worlds = worlds._replace(rows=worlds.next_rows, next_rows=worlds.rows)
+        worlds.ticks[:] += 1
+
+    def sense(self) -> None:
+        """Write observations, terms and rewards of all agents into `outputs`."""
+        sense(
+            self._roads,
+            self._plans,
+            self.worlds,
+            self._grid,
+            self._sensors,
+            self._weights,
+            self._config.terms.team_share,
+            self._config.clock.ctrl_dt_s,
+            self.outputs,
+        )
+
+    def suggest(self, out: NDArray[np.float64]) -> None:
+        """Write what the built-in driver would do in the agents' place into `out` (W, A, 2)."""
+        suggest(
+            self._roads,
+            self._plans,
+            self.worlds,
+            self.scratch,
+            self._discrete,
+            self._target_speeds,
+            SUGGESTED_HORIZON_S,
+            out,
+        )
+
+
+def _make_worlds(num_worlds: int, capacity: int, num_signals: int) -> Worlds:
+    shape = (num_worlds, capacity)
+    return Worlds(
+        rows=np.zeros(shape, dtype=VEHICLE),
+        next_rows=np.zeros(shape, dtype=VEHICLE),
+        num_owned=np.zeros(num_worlds, dtype=np.int64),
+        num_rows=np.zeros(num_worlds, dtype=np.int64),
+        ticks=np.zeros(num_worlds, dtype=np.int64),
+        keys=np.zeros(num_worlds, dtype=np.uint64),
+        signal_phase=np.zeros((num_worlds, num_signals), dtype=np.int32),
+        queue=np.zeros(shape, dtype=DEPARTURE),
+        num_queue=np.zeros(num_worlds, dtype=np.int64),
+        next_id=np.zeros(num_worlds, dtype=np.int64),
+        num_entered=np.zeros(num_worlds, dtype=np.int64),
+        counts=np.zeros((num_worlds, NUM_COUNTS), dtype=np.int64),
+        sums=np.zeros((num_worlds, NUM_SUMS), dtype=np.float64),
+    )
+
+
+def _make_scratch(num_lanes: int, num_links: int, capacity: int) -> Scratch:
+    def integers(size: int) -> NDArray[np.int32]:
+        return np.zeros(size, dtype=np.int32)
+
+    def floats(size: int) -> NDArray[np.float64]:
+        return np.zeros(size, dtype=np.float64)
+
+    return Scratch(
+        lane_start=integers(num_lanes + 2),
+        entry_row=integers(2 * capacity),
+        entry_s=floats(2 * capacity),
+        link_start=integers(num_links + 2),
+        link_row=integers(3 * capacity),
+        link_dist=floats(3 * capacity),
+        pair_link=integers(3 * capacity),
+        pair_row=integers(3 * capacity),
+        pair_dist=floats(3 * capacity),
+        accel=floats(capacity),
+        link_ahead=integers(capacity),
+        lane_change=integers(capacity),
+        blinker=integers(capacity),
+        hold=integers(capacity),
+        hit=np.zeros(capacity, dtype=np.int64),
+    )
+
+
+def _make_outputs(config: EnvConfig, num_worlds: int) -> Outputs:
+    agents = (num_worlds, config.population.num_ids)
+    size = max(place.stop for place in layout(config.sensors).values())
+    return Outputs(
+        observations=np.zeros((*agents, size), dtype=np.float32),
+        terms=np.zeros((*agents, len(TERMS)), dtype=np.float32),
+        rewards=np.zeros(agents, dtype=np.float32),
+        terminated=np.zeros(agents, dtype=np.bool_),
+        present=np.zeros(agents, dtype=np.bool_),
+        events=np.zeros(agents, dtype=np.int32),
+        vehicle_ids=np.full(agents, -1, dtype=np.int64),
+    )

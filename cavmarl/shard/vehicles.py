@@ -1,0 +1,117 @@
+"""`VEHICLE`: everything that is known of one vehicle, as one record.
+
+A shard holds one array of these: owned rows first, ghosts after. Migration is a row assignment, a
+snapshot a copy, a halo a slice, the wire format the bytes. So the record carries more than the next
+tick needs: ownership, delayed actions, the random stream, sensor phase and returns travel with the row.
+
+Frames as in `roads.network`: x, y, z is the centre of the body; heading counter-clockwise from east;
+`s` and `d` are the centre's place on the lane, d positive to the left. Indices that point at nothing
+are -1. The codes (DRIVER_*, HOLD_*, EVENT_*) are those of `kernels.codes`. Units: metres,
+seconds and radians unless the name says otherwise.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+__all__ = [
+    "MAX_LATENCY_TICKS",
+    "PLACEMENT_FIELDS",
+    "RECORD_VERSION",
+    "STATE_FIELDS",
+    "VEHICLE",
+    "blank_vehicle",
+]
+
+RECORD_VERSION = 1
+MAX_LATENCY_TICKS = 16
+
+VEHICLE = np.dtype(
+    [
+        # identity and ownership
+        ("id", np.int64),  # given by the coordinator, never used twice in a run; orders all ties
+        ("agent", np.int32),  # index of the PettingZoo agent that drives it
+        ("owner", np.int32),  # zone that may change this row
+        ("source_zone", np.int32),  # of the transfer in flight
+        ("target_zone", np.int32),
+        ("epoch", np.int32),  # how often it has changed owner
+        # kinematics
+        ("x", np.float64),
+        ("y", np.float64),
+        ("z", np.float64),
+        ("heading", np.float64),  # rad, in (-pi, pi]
+        ("pitch", np.float64),  # rad, positive uphill
+        ("speed", np.float64),  # m/s along the heading; negative backwards
+        ("accel", np.float64),  # m/s², of the last tick
+        ("yaw_rate", np.float64),  # rad/s, of the last tick
+        ("jerk", np.float64),  # m/s³, change of accel over the last tick
+        # control
+        ("throttle", np.float64),  # commanded acceleration, m/s²; negative brakes
+        ("steering", np.float64),  # front wheel angle, rad
+        ("target_speed", np.float64),  # of the speed controller, m/s
+        ("target_lane", np.int32),  # of the lane controller or lane change in progress
+        ("pending", np.float64, (MAX_LATENCY_TICKS, 2)),  # delayed (throttle, steering), next first
+        # lane context and route
+        ("lane", np.int32),
+        ("side_lane", np.int32),  # neighbour lane that the body also covers
+        ("s", np.float64),
+        ("d", np.float64),
+        ("goal", np.int32),  # where it drives to: row of the plans' table
+        ("leg", np.int32),  # how many goals it has had; the next one is a function of its random key
+        ("to_go", np.float64),  # m left to the goal, along the plan
+        # configuration
+        ("vtype", np.int32),  # row of the vehicle types' table
+        ("driver", np.int32),  # DRIVER_*
+        ("length", np.float64),
+        ("width", np.float64),
+        ("height", np.float64),
+        ("speed_factor", np.float64),  # desired speed over the limit
+        ("sensor_phase", np.int32),  # ticks until slow sensors fire
+        # driver's mind (agent-logic state)
+        ("hold", np.int32),  # HOLD_*
+        ("wait", np.int32),  # ticks that it has stood still
+        ("stopped_at", np.int32),  # link before which it has stood last
+        ("blinker", np.int32),  # lane change wanted: 1 left, -1 right
+        ("last_change", np.int64),  # tick of its last lane change
+        ("link", np.int32),  # link it is on, or has entered last
+        # clock, transfer, random stream
+        ("tick", np.int64),  # the world's tick that this state belongs to
+        ("transfer", np.int32),  # AUTHORITATIVE, or a state of the protocol
+        ("rng_key", np.uint64),  # its random numbers: a function of (rng_key, id, tick, stream)
+        ("departed", np.int64),  # tick of insertion
+        # accounts
+        ("step_to_go", np.float64),  # to_go when the current step began
+        ("step_jerk", np.float64),  # integral of |jerk| over the current step, m/s²
+        ("events", np.int32),  # EVENT_* bits of the current step
+        ("hit", np.int64),  # id of the vehicle it collided with
+        ("distance_m", np.float64),  # driven since departure
+        ("free_s", np.float64),  # time the driven way would have taken at the limit, s
+        ("episode_return", np.float64),  # sum of rewards since it was seated
+        ("memory", np.int64),  # handle of a recurrent policy's state
+    ],
+    align=True,
+)
+
+# Fields that say where the row lives and not what the vehicle is: not part of the state's hash.
+PLACEMENT_FIELDS = ("owner", "source_zone", "target_zone", "epoch", "transfer")
+
+# Fields of the state's hash, in record order.
+STATE_FIELDS = tuple(name for name in VEHICLE.names or () if name not in PLACEMENT_FIELDS)
+
+
+def blank_vehicle() -> NDArray[np.void]:
+    """VEHICLE (1,): the record that a new vehicle starts from, a passenger car.
+
+    The size is highway-env's (5 m × 2 m).
+    """
+    blank = np.zeros(1, dtype=VEHICLE)
+    for name in ("agent", "source_zone", "target_zone", "side_lane", "link", "stopped_at", "hit"):
+        blank[name] = -1
+    blank["last_change"] = -1
+    blank["memory"] = -1
+    blank["length"] = 5.0
+    blank["width"] = 2.0
+    blank["height"] = 1.6
+    blank["speed_factor"] = 1.0
+    return blank

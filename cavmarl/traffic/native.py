@@ -1,0 +1,179 @@
+"""The seeded traffic generator: which trips there are, and the tables that departures are drawn from."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cavmarl.config import PopulationConfig, TrafficConfig
+from cavmarl.errors import ConfigError, RouteError
+from cavmarl.kernels.arrays import Demand, Scratch, Worlds
+from cavmarl.kernels.codes import DRIVER_AGENT, DRIVER_BACKGROUND
+from cavmarl.kernels.departures import choose_goals, let_in, populate, take_out
+from cavmarl.roads.network import VEHICLE_CLASSES, RoadNetwork
+from cavmarl.roads.routing import make_plans
+
+__all__ = ["NativeTraffic"]
+
+PASSENGER = 1 << VEHICLE_CLASSES.index("passenger")
+MIN_ORIGIN_M = 15.0  # lanes shorter than this are no place to start
+MIN_GOAL_M = 10.0  # nor to arrive
+DENSITY_M = 25.0  # a lane is drawn at reset once for each such length
+MAX_TRIPS = 200_000  # of a table; longer ones are thinned evenly
+
+
+@dataclass(frozen=True)
+class NativeTraffic:
+    """Departures on one map for one population; a TrafficSource.
+
+    Attributes:
+        network: the roads.
+        traffic: settings of the generator.
+        population: who is in the world.
+        blank: VEHICLE (1,), the record that every vehicle starts from.
+    """
+
+    network: RoadNetwork
+    traffic: TrafficConfig
+    population: PopulationConfig
+    blank: NDArray[np.void]
+
+    @cached_property
+    def goal_edges(self) -> NDArray[np.int32]:
+        """EDGE rows that trips lead to: the named destinations first, then a spread over the map."""
+        named = [self._edge(name, "destinations") for name in self.traffic.destinations]
+        edges = self._drivable_edges(MIN_GOAL_M)
+        leaves = [e for e in edges if self._is_way_out(e)]
+        rest = [e for e in edges if e not in set(leaves)]
+        # Ways out of the map first; the others evenly over the rows, whatever the seed.
+        candidates = leaves + rest
+        wanted = max(self.traffic.goals, len(named))
+        if len(leaves) < wanted and rest:
+            picks = np.linspace(0, len(rest) - 1, min(wanted - len(leaves), len(rest)))
+            candidates = leaves + [rest[int(round(p))] for p in picks]
+        chosen = list(dict.fromkeys(named + candidates))[:wanted]
+        return np.array(chosen, dtype=np.int32)
+
+    @cached_property
+    def plans(self) -> NDArray[np.void]:
+        """PLAN (G, L) of the goal edges."""
+        return make_plans(self.network, [int(edge) for edge in self.goal_edges])
+
+    @cached_property
+    def demand(self) -> Demand:
+        """The tables that departures are drawn from.
+
+        Raises:
+            ConfigError: no trip of the wanted length exists on this map.
+        """
+        lanes = self.network.lanes
+        edges = set(self._drivable_edges(MIN_ORIGIN_M))
+        named = [self._edge(name, "origins") for name in self.traffic.origins]
+        start = self._lanes_of(named or sorted(edges))
+        entries = [e for e in edges if self._is_way_in(e)]
+        enter = self._lanes_of(sorted(entries)) if entries else self._lanes_of(sorted(edges))
+        anywhere = self._lanes_of(sorted(edges))
+        copies = np.ceil(lanes["length_m"][anywhere] / DENSITY_M).astype(np.int64)
+        goals = np.arange(len(self.goal_edges))
+        targets = goals[: len(self.traffic.destinations)] if self.traffic.destinations else goals
+        closed = self.population.mode == "closed"
+        minimum, maximum = self.traffic.min_trip_m, self.traffic.max_trip_m
+        background = self._trips(np.repeat(anywhere, copies), goals, 0.0, 0.0)
+        return Demand(
+            agent_trips=self._trips(start, targets, minimum, maximum),
+            start_trips=background,
+            enter_trips=self._trips(enter, goals, 0.0, 0.0),
+            enter_at_start=bool(entries),
+            num_agents=self.population.agents,
+            num_ids=self.population.num_ids,
+            num_background=self.population.background,
+            reenter=not closed,
+            seats=self.population.mode == "seats",
+            speed_factor_spread=self.traffic.speed_factor_spread,
+            blank=self.blank,
+        )
+
+    def populate(self, worlds: Worlds, chosen: NDArray[np.bool_]) -> None:
+        """Fill the chosen worlds (W,) for a new episode."""
+        populate(self.demand, self.network.arrays, self.plans, worlds, chosen)
+
+    def exchange(self, worlds: Worlds, scratch: Scratch, dt: float) -> None:
+        """Who has arrived leaves `next_rows`, wanderers pick new goals, and who waits may enter."""
+        choose_goals(self.demand, self.network.arrays, self.plans, worlds)
+        take_out(
+            self.demand, self.network.arrays, worlds, worlds.next_rows, DRIVER_BACKGROUND, dt
+        )
+        let_in(self.demand, self.network.arrays, self.plans, worlds, scratch)
+
+    def retire_agents(self, worlds: Worlds, dt: float) -> None:
+        """Take agents whose trip has ended out of the committed rows, and order those that follow."""
+        take_out(self.demand, self.network.arrays, worlds, worlds.rows, DRIVER_AGENT, dt)
+
+    def _edge(self, name: str, key: str) -> int:
+        try:
+            return self.network.edge_ids.index(name)
+        except ValueError:
+            some = [n for n in self.network.edge_ids if not n.startswith(":")][:8]
+            raise ConfigError(
+                f"traffic.{key}: the map '{self.network.name}' has no edge '{name}'; "
+                f"it has {', '.join(some)} …"
+            ) from None
+
+    def _drivable_edges(self, least_m: float) -> list[int]:
+        """EDGE rows outside junctions with a lane for cars that is at least `least_m` long."""
+        lanes = self.network.lanes
+        good = (
+            ~lanes["internal"]
+            & (lanes["permissions"] & PASSENGER != 0)
+            & (lanes["length_m"] >= least_m)
+        )
+        found = [int(edge) for edge in np.unique(lanes["edge"][good])]
+        if not found:
+            raise RouteError(
+                f"map '{self.network.name}': no edge for cars is {least_m:g} m long or more"
+            )
+        return found
+
+    def _lanes_of(self, edges: list[int]) -> NDArray[np.int64]:
+        lanes = self.network.lanes
+        on_edge = np.isin(lanes["edge"], edges) & (lanes["permissions"] & PASSENGER != 0)
+        return np.flatnonzero(on_edge & (lanes["length_m"] >= MIN_ORIGIN_M))
+
+    def _is_way_out(self, edge: int) -> bool:
+        row = self.network.edges[edge]
+        lanes = self.network.lanes[row["first_lane"] : row["first_lane"] + row["num_lanes"]]
+        return not bool(lanes["num_links"].any())
+
+    def _is_way_in(self, edge: int) -> bool:
+        row = self.network.edges[edge]
+        lanes = self.network.lanes[row["first_lane"] : row["first_lane"] + row["num_lanes"]]
+        return not bool(lanes["num_into"].any())
+
+    def _trips(
+        self, origins: NDArray[np.int64], goals: NDArray[np.int64], least_m: float, most_m: float
+    ) -> NDArray[np.int32]:
+        """(P, 2) pairs of origin lane and goal whose way has a length from `least_m` to `most_m`."""
+        to_go = self.plans["to_go"][np.ix_(goals, origins)]
+        fits = np.isfinite(to_go) & (to_go >= least_m)
+        if most_m > 0.0:
+            fits &= to_go <= most_m
+        goal, origin = np.nonzero(fits)
+        if not len(goal):
+            reachable = to_go[np.isfinite(to_go)]
+            longest = (
+                f"the longest way is {reachable.max():.0f} m"
+                if reachable.size
+                else "no way leads to a goal"
+            )
+            raise ConfigError(
+                f"traffic.min_trip_m = {least_m:g}, traffic.max_trip_m = {most_m:g}: no trip of that "
+                f"length on the map '{self.network.name}' ({longest}); change the limits, "
+                "traffic.origins or traffic.destinations"
+            )
+        trips = np.stack([origins[origin], goals[goal]], axis=1).astype(np.int32)
+        if len(trips) > MAX_TRIPS:
+            trips = trips[:: -(-len(trips) // MAX_TRIPS)]
+        return np.ascontiguousarray(trips)

@@ -1,0 +1,104 @@
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+from typer.testing import CliRunner
+
+from cavmarl.cli.map import app
+from cavmarl.errors import ConfigError, MapError
+
+runner = CliRunner()
+
+
+@pytest.fixture(autouse=True)
+def cache_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("CAVMARL_CACHE_DIR", str(tmp_path / "cache"))
+
+
+def test_build_writes_the_network_and_its_statistics(shared_maps: Path, tmp_path: Path) -> None:
+    out = tmp_path / "town.net.xml"
+    source = shared_maps / "xodr" / "Town10HD.xodr"
+    report = tmp_path / "report.json"
+
+    result = runner.invoke(app, ["build", str(source), "-o", str(out), "--json", str(report)])
+    assert result.exit_code == 0, result.output
+    assert "1.64 km / 3.10 km" in result.output
+    statistics = json.loads((tmp_path / "town.stats.json").read_text())
+    assert statistics == json.loads(report.read_text())
+    assert statistics["map"]["edges"] == 46
+    assert statistics["build"]["kind"] == "opendrive"
+    assert out.exists()
+
+
+def test_build_names_its_target_after_the_source(
+    shared_maps: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+
+    source = shared_maps / "osm" / "laufamholz.osm.xml"
+    assert runner.invoke(app, ["build", str(source)]).exit_code == 0
+    assert (tmp_path / "laufamholz.net.xml").exists()
+
+
+def test_build_lists_what_was_dropped(shared_maps: Path, tmp_path: Path) -> None:
+    source = str(shared_maps / "xodr" / "newmarket.xodr")
+    out = str(tmp_path / "out.net.xml")
+
+    refused = runner.invoke(app, ["build", source, "-o", out])
+    assert isinstance(refused.exception, MapError)
+    tolerated = runner.invoke(app, ["build", source, "-o", out, "--tolerant"])
+    assert tolerated.exit_code == 0
+    assert "dropped: In laneLink-element" in tolerated.output
+
+
+@pytest.mark.parametrize("name", ["net/mcity/mcity.net.xml", "osm/berlin_siegessaeule.osm.gz"])
+def test_check_takes_networks_and_sources(shared_maps: Path, tmp_path: Path, name: str) -> None:
+    report = tmp_path / "deep" / "report.json"
+
+    result = runner.invoke(app, ["check", str(shared_maps / name), "--json", str(report)])
+    assert result.exit_code == 0, result.output
+    assert json.loads(report.read_text())["drivable"] is True
+    assert "note: " in result.output
+
+
+def test_check_fails_on_a_map_that_cannot_be_driven(tmp_path: Path) -> None:
+    path = tmp_path / "buses.net.xml"
+    path.write_text(
+        """<net version="1.20">
+        <edge id="a" from="A" to="B">
+          <lane id="a_0" index="0" allow="bus" speed="9" length="50" shape="0,0 50,0"/>
+        </edge>
+        <junction id="A" type="dead_end" x="0" y="0" incLanes="" intLanes="" shape=""/>
+        <junction id="B" type="dead_end" x="50" y="0" incLanes="a_0" intLanes="" shape=""/>
+        </net>"""
+    )
+
+    result = runner.invoke(app, ["check", str(path)])
+    assert result.exit_code == 1
+    assert "no edge is open to passenger cars" in result.output
+
+
+@pytest.mark.parametrize("box", ["1,2,3", "a,b,c,d", ""])
+def test_a_malformed_box_is_wrong_use(shared_maps: Path, tmp_path: Path, box: str) -> None:
+    source = str(shared_maps / "xodr" / "fabriksgatan.xodr")
+
+    result = runner.invoke(app, ["build", source, "-o", str(tmp_path / "x"), "--bbox", box])
+    assert result.exit_code == 2
+
+
+def test_missing_files_and_unknown_options_are_wrong_use(tmp_path: Path) -> None:
+    assert runner.invoke(app, ["check", str(tmp_path / "none.net.xml")]).exit_code == 2
+    assert runner.invoke(app, ["build", str(tmp_path)]).exit_code == 2
+    assert runner.invoke(app, ["check"]).exit_code == 2
+    assert runner.invoke(app, ["check", __file__, "--nonsense"]).exit_code == 2
+
+
+def test_an_unwritable_report_is_an_error(shared_maps: Path, tmp_path: Path) -> None:
+    source = str(shared_maps / "xodr" / "fabriksgatan.xodr")
+    taken = tmp_path / "file"
+    taken.write_text("")
+
+    result = runner.invoke(app, ["check", source, "--json", str(taken / "report.json")])
+    assert isinstance(result.exception, ConfigError)

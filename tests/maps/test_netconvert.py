@@ -1,0 +1,210 @@
+from __future__ import annotations
+
+import gzip
+import subprocess
+from pathlib import Path
+
+import pytest
+
+from cavmarl.errors import ConfigError, MapError
+from cavmarl.maps import netconvert
+from cavmarl.maps.netconvert import OSM_OPTIONS, build_network, map_file
+from cavmarl.roads.reader import read_network
+
+pytest.importorskip("sumo", reason="needs the extra 'sumo'")
+
+TOWN = """<osm version="0.6">
+  <node id="1" lat="48.000" lon="11.000"/><node id="2" lat="48.001" lon="11.000"/>
+  <node id="3" lat="48.002" lon="11.000"/><node id="4" lat="48.001" lon="11.002"/>
+  <way id="5"><nd ref="1"/><nd ref="2"/><nd ref="3"/><tag k="highway" v="KIND"/></way>
+  <way id="6"><nd ref="2"/><nd ref="4"/><tag k="highway" v="KIND"/></way>
+</osm>
+"""
+REFUSED = {
+    "xodr/newmarket.xodr": "In laneLink-element: incoming road '8' is not known.",
+    "xodr/soderleden_invalid.xodr": "Attribute 'connectingRoad' is missing in definition",
+}
+
+
+@pytest.fixture
+def town(tmp_path: Path) -> Path:
+    path = tmp_path / "town.osm"
+    path.write_text(TOWN.replace("KIND", "residential"))
+    return path
+
+
+def test_an_osm_file_becomes_a_network(town: Path, tmp_path: Path) -> None:
+    result = build_network(town, tmp_path / "out" / "town.net.xml")
+
+    assert result.kind == "osm"
+    assert result.options == OSM_OPTIONS
+    assert result.dropped == ()
+    network = read_network(result.path)
+    assert len(network.links) > 0
+    assert list(result.path.parent.iterdir()) == [result.path]
+
+
+def test_builds_are_equal_byte_for_byte(town: Path, tmp_path: Path) -> None:
+    one = build_network(town, tmp_path / "one.net.xml").path.read_bytes()
+    other = build_network(town, tmp_path / "other" / "town.net.xml").path.read_bytes()
+    packed = build_network(town, tmp_path / "packed.net.xml.gz").path.read_bytes()
+
+    assert one == other == gzip.decompress(packed)
+    assert b"generated on" not in one
+    assert str(tmp_path).encode() not in one
+
+
+def test_an_extension_does_not_matter(town: Path, tmp_path: Path) -> None:
+    odd = town.rename(tmp_path / "download.bin")
+
+    assert build_network(odd, tmp_path / "town.net.xml").kind == "osm"
+
+
+@pytest.mark.parametrize("name", REFUSED)
+def test_what_netconvert_refuses_is_refused_in_its_words(
+    shared_maps: Path, tmp_path: Path, name: str
+) -> None:
+    with pytest.raises(MapError) as caught:
+        build_network(shared_maps / name, tmp_path / "out.net.xml")
+
+    message = str(caught.value)
+    assert REFUSED[name] in message
+    assert "--tolerant" in message
+    assert "exit code 1" in message
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("name", REFUSED)
+def test_tolerant_builds_list_what_was_dropped(
+    shared_maps: Path, tmp_path: Path, name: str
+) -> None:
+    result = build_network(shared_maps / name, tmp_path / "out.net.xml", tolerant=True)
+
+    assert any(REFUSED[name] in line for line in result.dropped)
+    assert result.options[-1] == "--ignore-errors"
+
+
+def test_corrections_and_warnings_are_counted_by_kind(shared_maps: Path, tmp_path: Path) -> None:
+    result = build_network(shared_maps / "osm" / "monaco.osm.gz", tmp_path / "monaco.net.xml")
+
+    assert "Joined 18 junction cluster(s)" in result.corrections
+    assert "Guessed 9 roundabout(s)" in result.corrections
+    assert result.warnings["Ambiguity in turnarounds computation at junction '%'."] == 5
+    assert sum(count for text, count in result.warnings.items() if "Speed of" in text) == 74
+
+
+def test_a_box_crops_the_map(shared_maps: Path, tmp_path: Path) -> None:
+    monaco = shared_maps / "osm" / "monaco.osm.gz"
+    result = build_network(monaco, tmp_path / "part.net.xml", bbox=(7.41, 43.73, 7.42, 43.74))
+
+    min_x, min_y, max_x, max_y = read_network(result.path).extent_m
+    assert 800.0 < max_x - min_x < 1500.0
+    assert 1000.0 < max_y - min_y < 1500.0
+
+
+def test_a_box_elsewhere_is_refused(town: Path, tmp_path: Path) -> None:
+    with pytest.raises(MapError, match="No edges loaded"):
+        build_network(town, tmp_path / "out.net.xml", bbox=(1.0, 1.0, 2.0, 2.0))
+    with pytest.raises(ConfigError, match="is empty"):
+        build_network(town, tmp_path / "out.net.xml", bbox=(2.0, 1.0, 1.0, 2.0))
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        (TOWN.replace("KIND", "footway"), "No edges loaded"),
+        ('<osm version="0.6"/>', "No nodes loaded"),
+        (TOWN.replace("48.001", "nan").replace("KIND", "residential"), "town.osm: "),
+        ("<html/>", "root of no map"),
+        (TOWN[:200], "line 4: broken XML"),
+        ("", "broken XML"),
+        ('<!DOCTYPE o [<!ENTITY a "aa">]><osm>&a;</osm>', "no entities"),
+        ('<!DOCTYPE o SYSTEM "http://example.org/x.dtd"><osm/>', "no document type"),
+    ],
+)
+def test_useless_and_hostile_sources_are_refused(
+    tmp_path: Path, content: str, message: str
+) -> None:
+    path = tmp_path / "town.osm"
+    path.write_text(content)
+
+    for tolerant in (False, True):
+        with pytest.raises(MapError, match=message):
+            build_network(path, tmp_path / "out.net.xml", tolerant=tolerant)
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def test_broken_networks_do_not_pass_through(shared_maps: Path, tmp_path: Path) -> None:
+    text = (shared_maps / "net" / "Town10HD.net.xml").read_text()
+    path = tmp_path / "town.net.xml"
+    path.write_text(text.replace('speed="13.89" length', 'speed="nan" length', 1))
+
+    with pytest.raises(MapError, match="speed='nan'"):
+        build_network(path)
+    with pytest.raises(MapError, match="speed='nan'"):
+        build_network(path, tmp_path / "out.net.xml")
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def test_a_network_is_copied_unchanged(shared_maps: Path, tmp_path: Path) -> None:
+    source = shared_maps / "net" / "Town10HD.net.xml"
+
+    result = build_network(source, tmp_path / "copy.net.xml")
+    assert result.path.read_bytes() == source.read_bytes()
+    assert (result.kind, result.options) == ("sumo", ())
+    assert build_network(source).path == source
+
+
+def test_the_source_is_never_overwritten(town: Path) -> None:
+    before = town.read_bytes()
+
+    with pytest.raises(MapError, match="target is the source"):
+        build_network(town, town)
+    assert town.read_bytes() == before
+
+
+def test_an_unwritable_target_is_an_error(town: Path, tmp_path: Path) -> None:
+    with pytest.raises(MapError, match="cannot be written"):
+        build_network(town, town / "below" / "out.net.xml")
+    with pytest.raises(MapError, match="cannot be written"):
+        build_network(town, tmp_path)
+
+
+def test_netconvert_has_limited_time(town: Path, tmp_path: Path) -> None:
+    with pytest.raises(MapError, match=r"longer than 0\.0001 s"):
+        build_network(town, tmp_path / "out.net.xml", timeout_s=0.0001)
+
+
+def test_map_file_builds_once(town: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("CAVMARL_CACHE_DIR", str(tmp_path / "cache"))
+
+    first = map_file(town)
+    assert first.name == "town.net.xml"
+    assert first.is_relative_to(tmp_path / "cache")
+
+    def refuse(*args: object, **kwargs: object) -> None:
+        raise AssertionError("netconvert ran again")
+
+    monkeypatch.setattr(subprocess, "run", refuse)
+    assert map_file(town) == first
+    town.write_text(TOWN.replace("KIND", "tertiary"))
+    with pytest.raises(AssertionError, match="ran again"):
+        map_file(town)
+
+
+def test_map_file_takes_networks_as_they_are(tmp_path: Path) -> None:
+    assert map_file(tmp_path / "x.net.xml") == tmp_path / "x.net.xml"
+    plain = tmp_path / "x.xml"
+    plain.write_text("<net/>")
+    assert map_file(plain) == plain
+
+
+def test_without_sumo_the_extra_is_named(
+    town: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def missing(module: str, extra: str) -> None:
+        raise MapError(f"no {module}, install {extra}")
+
+    monkeypatch.setattr(netconvert, "require", missing)
+    with pytest.raises(MapError, match="no sumo, install sumo"):
+        build_network(town, tmp_path / "out.net.xml")

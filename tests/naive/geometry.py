@@ -1,0 +1,87 @@
+"""Plane geometry by the shortest way that is plainly right."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+Point = tuple[float, float]
+
+
+def wrap_angle(angle: float) -> float:
+    """IEEE remainder, with the lower end moved to the upper one."""
+    wrapped = math.remainder(angle, 2.0 * math.pi)
+    return math.pi if wrapped == -math.pi else wrapped
+
+
+def lane_pose(corners: NDArray[np.float64], s: float) -> tuple[float, ...]:
+    """Walk along (n, 3) corners until `s` is used up; the last segment has no end."""
+    left = s
+    for i in range(len(corners) - 1):
+        step = corners[i + 1] - corners[i]
+        length = math.hypot(step[0], step[1])
+        if left < length or i == len(corners) - 2:
+            break
+        left -= length
+    unit = step / length
+    return (*(corners[i] + left * unit), *unit)
+
+
+def nearest_on_polyline(corners: NDArray[np.float64], x: float, y: float) -> tuple[float, float]:
+    """Distance to the polyline (n, 2) and the arc length of its nearest point."""
+    best = (math.inf, 0.0)
+    start = 0.0
+    for a, b in zip(corners[:-1], corners[1:], strict=True):
+        length = math.hypot(*(b - a))
+        unit = (b - a) / length
+        along = min(max((np.array([x, y]) - a) @ unit, 0.0), length)
+        distance = math.hypot(*(np.array([x, y]) - (a + along * unit)))
+        best = min(best, (distance, start + along))
+        start += length
+    return best
+
+
+def box_corners(
+    x: float, y: float, heading: float, half_length: float, half_width: float
+) -> list[Point]:
+    """Counter-clockwise from the front left."""
+    cos, sin = math.cos(heading), math.sin(heading)
+    return [
+        (x + a * cos - b * sin, y + a * sin + b * cos)
+        for a, b in (
+            (half_length, half_width),
+            (-half_length, half_width),
+            (-half_length, -half_width),
+            (half_length, -half_width),
+        )
+    ]
+
+
+def common_area(one: list[Point], other: list[Point]) -> float:
+    """Area shared by two convex counter-clockwise polygons: clip one by each side of the other."""
+    shape = one
+    for i, a in enumerate(other):
+        shape = _clip(shape, a, other[(i + 1) % len(other)])
+    twice = sum(
+        p[0] * q[1] - q[0] * p[1] for p, q in zip(shape, shape[1:] + shape[:1], strict=True)
+    )
+    return 0.5 * twice
+
+
+def _clip(shape: list[Point], a: Point, b: Point) -> list[Point]:
+    """What of `shape` lies to the left of the line from a to b."""
+
+    def side(p: Point) -> float:
+        return (b[0] - a[0]) * (p[1] - a[1]) - (b[1] - a[1]) * (p[0] - a[0])
+
+    kept: list[Point] = []
+    for i, p in enumerate(shape):
+        q = shape[(i + 1) % len(shape)]
+        if side(p) >= 0.0:
+            kept.append(p)
+        if (side(p) > 0.0) != (side(q) > 0.0) and side(p) != side(q):
+            share = side(p) / (side(p) - side(q))
+            kept.append((p[0] + share * (q[0] - p[0]), p[1] + share * (q[1] - p[1])))
+    return kept

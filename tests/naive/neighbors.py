@@ -1,0 +1,19 @@
+"""The nearest vehicles by looking at all of them."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+
+def k_nearest(
+    rows: NDArray[np.void], row: int, x: float, y: float, z: float, radius_m: float, k: int
+) -> list[tuple[float, int]]:
+    """(squared distance, row) of at most k others on the level, by distance, then id."""
+    found = [
+        ((other["x"] - x) ** 2 + (other["y"] - y) ** 2, other["id"], i)
+        for i, other in enumerate(rows)
+        if i != row and abs(other["z"] - z) <= 4.0
+    ]
+    near = sorted(entry for entry in found if entry[0] <= radius_m * radius_m)
+    return [(float(squared), i) for squared, _, i in near[:k]]

@@ -1,0 +1,44 @@
+"""Philox4x32-10 on Python's unlimited integers, as the paper writes it."""
+
+from __future__ import annotations
+
+MASK_32 = (1 << 32) - 1
+
+
+def philox4x32(counter: list[int], key: list[int]) -> list[int]:
+    """Ten rounds, each of two 32 x 32 -> 64 bit multiplications."""
+    for _ in range(10):
+        high_0, low_0 = divmod(counter[0] * 0xD2511F53, 1 << 32)
+        high_1, low_1 = divmod(counter[2] * 0xCD9E8D57, 1 << 32)
+        counter = [high_1 ^ counter[1] ^ key[0], low_1, high_0 ^ counter[3] ^ key[1], low_0]
+        key = [(key[0] + 0x9E3779B9) & MASK_32, (key[1] + 0xBB67AE85) & MASK_32]
+    return counter
+
+
+def random_bits(key: int, vehicle: int, tick: int, stream: int) -> int:
+    """The first 64 bits at the counter layout of `kernels.rng`, first word on top."""
+    counter = [
+        vehicle & MASK_32,
+        tick & MASK_32,
+        (vehicle >> 32) | (tick >> 32) << 16,
+        stream,
+    ]
+    words = philox4x32(counter, [key & MASK_32, key >> 32])
+    return words[0] << 32 | words[1]
+
+
+def uniform(key: int, vehicle: int, tick: int, stream: int) -> float:
+    """Upper 27 and 26 bits of the first two words."""
+    bits = random_bits(key, vehicle, tick, stream)
+    return ((bits >> 32 >> 5) * 2**26 + ((bits & MASK_32) >> 6)) / 2**53
+
+
+def below(key: int, vehicle: int, tick: int, stream: int, n: int) -> int:
+    """The 64 bits as a fraction of 1, times n, rounded down."""
+    return random_bits(key, vehicle, tick, stream) * n >> 64
+
+
+def world_key(seed: int, world: int, episode: int) -> int:
+    """The words in the other order, as one number."""
+    bits = random_bits(seed, world, episode, 0)
+    return (bits & MASK_32) << 32 | bits >> 32

@@ -1,0 +1,91 @@
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import fields
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from cavmarl.roads import cache
+from cavmarl.roads.cache import load_network
+from cavmarl.roads.network import RoadNetwork
+from cavmarl.roads.reader import read_network
+
+
+@pytest.fixture
+def cache_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.setenv("CAVMARL_CACHE_DIR", str(tmp_path / "cache"))
+    return tmp_path / "cache" / "maps"
+
+
+def count_reads(monkeypatch: pytest.MonkeyPatch) -> list[Path]:
+    reads: list[Path] = []
+
+    def read(path: Path) -> RoadNetwork:
+        reads.append(path)
+        return read_network(path)
+
+    monkeypatch.setattr(cache, "read_network", read)
+    return reads
+
+
+def test_a_second_load_restores_every_array(
+    crossing: Callable[..., Path], cache_folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = crossing()
+    reads = count_reads(monkeypatch)
+
+    first, second = load_network(path), load_network(path)
+    assert len(reads) == 1
+    assert first.content_hash == second.content_hash == read_network(path).content_hash
+    for field in fields(first):
+        one, other = getattr(first, field.name), getattr(second, field.name)
+        if isinstance(one, np.ndarray):
+            assert one.dtype == other.dtype
+            assert not other.flags.writeable
+        else:
+            assert one == other
+    assert [entry.suffix for entry in cache_folder.iterdir()] == [".npz"]
+
+
+def test_a_changed_source_is_read_again(crossing: Callable[..., Path], cache_folder: Path) -> None:
+    before = load_network(crossing())
+    after = load_network(crossing(('speed="5"', 'speed="6"')))
+
+    assert before.content_hash != after.content_hash
+    assert len(list(cache_folder.iterdir())) == 2
+
+
+@pytest.mark.parametrize("content", [b"", b"PK\x03\x04 nonsense", b"text"])
+def test_a_broken_entry_is_built_again(
+    crossing: Callable[..., Path], cache_folder: Path, content: bytes
+) -> None:
+    path = crossing()
+    whole = load_network(path)
+    (entry,) = cache_folder.iterdir()
+    entry.write_bytes(content)
+
+    assert load_network(path).content_hash == whole.content_hash
+    assert entry.read_bytes() != content
+
+
+def test_a_truncated_entry_is_built_again(
+    crossing: Callable[..., Path], cache_folder: Path
+) -> None:
+    path = crossing()
+    whole = load_network(path)
+    (entry,) = cache_folder.iterdir()
+    entry.write_bytes(entry.read_bytes()[:-500])
+
+    assert load_network(path).content_hash == whole.content_hash
+
+
+def test_the_name_is_the_files_and_not_the_caches(
+    crossing: Callable[..., Path], cache_folder: Path
+) -> None:
+    path = crossing()
+    load_network(path)
+    renamed = path.rename(path.with_name("other.net.xml"))
+
+    assert load_network(renamed).name == "other"

@@ -1,0 +1,85 @@
+"""The documentation says what the code does."""
+
+from __future__ import annotations
+
+import inspect
+import re
+from dataclasses import MISSING, fields, is_dataclass
+from pathlib import Path
+from typing import Any, Literal, get_args, get_origin, get_type_hints
+
+import pytest
+
+from cavmarl.config import TERMS, EnvConfig
+from cavmarl.config_io import dotted_keys
+from tests.generated import check_block, table
+
+ROOT = Path(__file__).resolve().parents[1]
+PAGES = sorted([*ROOT.glob("*.md"), *ROOT.glob("docs/**/*.md"), *ROOT.glob("envs/*/README.md")])
+UNITS = {"m": "m", "s": "s", "mps": "m/s", "mps2": "m/s²", "rad": "rad", "ticks": "ticks"}
+
+
+def test_the_page_of_environments_lists_every_key() -> None:
+    rows = key_rows(EnvConfig)
+    assert [row[0].strip("`") for row in rows] == dotted_keys(EnvConfig)
+    assert all(row[-1] for row in rows), "a key without a word under Attributes:"
+    header = ("key", "type", "unit", "default", "meaning")
+    check_block(ROOT / "docs/environments.md", "keys", table(header, rows))
+
+
+def test_the_page_of_environments_explains_every_term() -> None:
+    text = (ROOT / "docs/environments.md").read_text(encoding="utf-8")
+    assert tuple(re.findall(r"^\| `(\w+)` \|", text.split("## Terms")[1], re.MULTILINE)) == TERMS
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
+def test_links_between_pages_lead_somewhere(page: Path) -> None:
+    for target in re.findall(r"\]\((?!https?:)([^)#]+)", page.read_text(encoding="utf-8")):
+        assert (page.parent / target).exists(), target
+
+
+def key_rows(kind: type[Any], prefix: str = "") -> list[tuple[str, str, str, str, str]]:
+    """(key, type, unit, default, meaning) of every key of a configuration class."""
+    hints, meanings, rows = get_type_hints(kind), attribute_texts(kind), []
+    for field in fields(kind):
+        key, hint = f"{prefix}{field.name}", hints[field.name]
+        if is_dataclass(hint):
+            rows += key_rows(hint, f"{key}.")
+            continue
+        default = field.default if field.default_factory is MISSING else field.default_factory()
+        unit = UNITS.get(key.rpartition("_")[2], "")
+        rows.append((f"`{key}`", type_text(hint), unit, default_text(default), meanings[field.name]))
+    return rows
+
+
+def attribute_texts(kind: type[Any]) -> dict[str, str]:
+    """Field → its words under `Attributes:` of the class's docstring, on one line."""
+    _, _, section = (inspect.getdoc(kind) or "").partition("Attributes:\n")
+    items = re.findall(r"^    (\w+): (.*(?:\n {8}.*)*)", section, re.MULTILINE)
+    return {name: " ".join(text.split()).replace("|", "\\|") for name, text in items}
+
+
+def type_text(hint: Any) -> str:
+    if get_origin(hint) is Literal:
+        return " or ".join(f"`{choice}`" for choice in get_args(hint))
+    if get_origin(hint) is None:
+        return {int: "whole number", float: "number", bool: "bool", str: "text"}[hint]
+    inner = [type_text(part) for part in get_args(hint) if part not in (..., type(None))]
+    return {tuple: "list of ", dict: "mapping of "}.get(get_origin(hint), "") + " to ".join(inner)
+
+
+def default_text(value: object) -> str:
+    match value:
+        case _ if value is MISSING:
+            return "needed"
+        case None | () | {}:
+            return ""
+        case bool():
+            return f"`{str(value).lower()}`"
+        case tuple():
+            return f"`[{', '.join(f'{item:g}' for item in value)}]`"
+        case dict():
+            return ", ".join(f"`{key}` {item:g}" for key, item in value.items())
+        case float():
+            return f"`{value:.6g}`"
+    return f"`{value}`"
