@@ -142,7 +142,8 @@ class PopulationConfig:
         agents: vehicles driven by policies at any one time.
         background: vehicles driven by the built-in drivers. In `closed` worlds they are placed at
             reset; else each arrival orders a new departure, so that their number holds.
-        budget: `entering` only: how many agents may enter in one episode (default 4 · agents).
+        budget: how many agents may enter in one episode of an `entering` world (default 4 · agents);
+            the other modes do not read it.
     """
 
     mode: Literal["closed", "entering", "seats"] = "closed"
@@ -163,13 +164,7 @@ class PopulationConfig:
             self.background,
             "must be a whole number from 0 to 1000000",
         )
-        if self.budget is not None:
-            _check(
-                self.mode == "entering",
-                "population.budget",
-                self.budget,
-                f"only with population.mode = entering, here {self.mode}",
-            )
+        if self.budget is not None and self.mode == "entering":
             _check(
                 self.budget >= self.agents,
                 "population.budget",

@@ -171,6 +171,8 @@ def _explain(kind: type[Any], details: ErrorDetails) -> str:
             return f"{path}: missing; it has no default"
         case "dataclass_type":
             return f"{path} = {details['input']!r}: must be a mapping of keys"
+        case "tuple_type":
+            return f"{path} = {details['input']!r}: must be a list"
     return f"{path} = {details['input']!r}: {details['msg'].replace('Input should', 'must')}"
 
 

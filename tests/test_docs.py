@@ -43,12 +43,14 @@ def key_rows(kind: type[Any], prefix: str = "") -> list[tuple[str, str, str, str
     hints, meanings, rows = get_type_hints(kind), attribute_texts(kind), []
     for field in fields(kind):
         key, hint = f"{prefix}{field.name}", hints[field.name]
-        if is_dataclass(hint):
+        if isinstance(hint, type) and is_dataclass(hint):
             rows += key_rows(hint, f"{key}.")
             continue
         default = field.default if field.default_factory is MISSING else field.default_factory()
         unit = UNITS.get(key.rpartition("_")[2], "")
-        rows.append((f"`{key}`", type_text(hint), unit, default_text(default), meanings[field.name]))
+        rows.append(
+            (f"`{key}`", type_text(hint), unit, default_text(default), meanings[field.name])
+        )
     return rows
 
 
@@ -72,7 +74,7 @@ def default_text(value: object) -> str:
     match value:
         case _ if value is MISSING:
             return "needed"
-        case None | () | {}:
+        case None | ():
             return ""
         case bool():
             return f"`{str(value).lower()}`"

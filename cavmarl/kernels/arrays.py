@@ -130,5 +130,6 @@ class Outputs(NamedTuple):
     rewards: NDArray[np.float32]  # (W, A)
     terminated: NDArray[np.bool_]  # (W, A) the vehicle ended in this step
     present: NDArray[np.bool_]  # (W, A) had a vehicle at the end of the step
+    acted: NDArray[np.bool_]  # (W, A) and had it during the whole step
     events: NDArray[np.int32]  # (W, A) EVENT_* bits of the step
     vehicle_ids: NDArray[np.int64]  # (W, A) -1 where absent

@@ -17,7 +17,6 @@ def bodies_touch(one: np.void, other: np.void) -> bool:
     """Whether two BODY records overlap: their rectangles share area and their heights overlap.
 
     Vehicles on and under a bridge do not touch: their `z` differ by half the sum of their heights.
-    The body with the smaller id goes first into the test: the answer does not depend on who asks.
     """
     dx = one["x"] - other["x"]
     dy = one["y"] - other["y"]
@@ -26,20 +25,19 @@ def bodies_touch(one: np.void, other: np.void) -> bool:
         return False
     if not abs(one["z"] - other["z"]) < 0.5 * (one["height"] + other["height"]):
         return False
-    first, second = (one, other) if one["id"] < other["id"] else (other, one)
     return boxes_overlap(
-        first["x"],
-        first["y"],
-        first["cos"],
-        first["sin"],
-        first["half_length"],
-        first["half_width"],
-        second["x"],
-        second["y"],
-        second["cos"],
-        second["sin"],
-        second["half_length"],
-        second["half_width"],
+        one["x"],
+        one["y"],
+        one["cos"],
+        one["sin"],
+        one["half_length"],
+        one["half_width"],
+        other["x"],
+        other["y"],
+        other["cos"],
+        other["sin"],
+        other["half_length"],
+        other["half_width"],
     )
 
 

@@ -47,6 +47,7 @@ ENTER_SHARE = 0.7  # of the speed limit
 ENTER_REACH_M = 80.0
 WANDER_M = 150.0  # nearer to its goal than this a vehicle of a closed world picks another
 GOAL_TRIES = 8
+GIVE_UP_TICKS = 200  # a driver that waits longer than this to change lanes takes another way
 
 
 @kernel
@@ -182,23 +183,35 @@ def populate(
 
 
 @kernel
+def _needs_goal(demand: Demand, plans: NDArray[np.void], row: np.void) -> bool:
+    """Whether a background vehicle picks another goal: near it in a closed world, or stuck.
+
+    Stuck is who has stood for `GIVE_UP_TICKS` at the end of a lane that its way does not follow.
+    """
+    if not demand.reenter and row["to_go"] <= WANDER_M:
+        return True
+    step = plans[row["goal"], row["lane"]]
+    stuck: bool = row["wait"] > GIVE_UP_TICKS and step["next"] < 0 and step["change"] != 0
+    return stuck
+
+
+@kernel
 def choose_goals(
     demand: Demand, roads: RoadArrays, plans: NDArray[np.void], worlds: Worlds
 ) -> None:
-    """In closed worlds give background vehicles that come near their goal another one."""
-    if demand.reenter:
-        return
+    """Give the background vehicles of `next_rows` that need one another goal, if one is in reach."""
     for w in range(worlds.ticks.shape[0]):
         for i in range(worlds.num_owned[w]):
             row = worlds.next_rows[w, i]
-            if row["driver"] != DRIVER_BACKGROUND or row["to_go"] > WANDER_M:
+            if row["driver"] != DRIVER_BACKGROUND or not _needs_goal(demand, plans, row):
                 continue
             for attempt in range(GOAL_TRIES):
                 goal = below(
                     worlds.keys[w], row["id"], row["tick"], STREAM_ROUTE + attempt, plans.shape[0]
                 )
-                to_go = plans[goal, row["lane"]]["to_go"] - row["s"]
-                if to_go < math.inf and to_go > row["to_go"]:
+                step = plans[goal, row["lane"]]
+                to_go = step["to_go"] - row["s"]
+                if to_go < math.inf and to_go > WANDER_M and step["change"] == 0:
                     row["goal"] = goal
                     row["leg"] += 1
                     row["to_go"] = to_go
@@ -214,11 +227,12 @@ def take_out(
     rows: NDArray[np.void],
     driver: int,
     dt: float,
+    ticks_per_step: int,
 ) -> None:
     """Take out the vehicles of one kind of driver that are through, and order those that follow.
 
-    Background vehicles are through when they have arrived; agents also after a collision or off the
-    road.
+    Background vehicles are through when they have arrived; agents that have acted also after a
+    collision or off the road.
 
     Args:
         demand: the generator's tables.
@@ -227,13 +241,15 @@ def take_out(
         rows: VEHICLE (W, C), the rows to take from.
         driver: DRIVER_*.
         dt: seconds of a tick.
+        ticks_per_step: ticks a step; agents that entered within the last of them have not acted.
     """
     ending = EVENTS_THAT_END if driver == DRIVER_AGENT else EVENT_ARRIVED
     for w in range(worlds.ticks.shape[0]):
         i = 0
         while i < worlds.num_owned[w]:
             row = rows[w, i]
-            if row["driver"] != driver or not row["events"] & ending:
+            fresh = driver == DRIVER_AGENT and row["departed"] > row["tick"] - ticks_per_step
+            if row["driver"] != driver or fresh or not row["events"] & ending:
                 i += 1
                 continue
             agent = row["agent"]

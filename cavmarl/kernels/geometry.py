@@ -179,8 +179,8 @@ def boxes_overlap(
 ) -> bool:
     """Whether two oriented rectangles share area; touching does not count.
 
-    Separating axes (Gottschalk, Lin, Manocha: "OBBTree", SIGGRAPH 1996), in the plane. Swapping the
-    boxes may change the last bit of a comparison: callers order them by id.
+    Separating axes (Gottschalk, Lin, Manocha: "OBBTree", SIGGRAPH 1996), in the plane. Written so
+    that swapping the boxes swaps the comparisons and changes no bit of them.
 
     Args:
         x1: centre of the first box, m.

@@ -29,7 +29,8 @@ from cavmarl.kernels.tracking import locate, side_lane
 __all__ = ["ARRIVE_M", "MAX_SPEED_MPS", "move_agent", "move_background", "place_on_lane"]
 
 LATERAL_MPS = 1.4  # fastest sideways motion of a lane change
-LATERAL_RATIO = 0.35  # and no faster than this share of the speed
+LATERAL_RATIO = 0.35  # and no faster than this share of the speed,
+LATERAL_MIN_MPS = 0.2  # but never stuck between two lanes
 TRAIL_M = 2.0  # how quickly the heading follows the lane's direction
 STANDING_MPS = 0.1
 ARRIVE_M = 5.0  # a trip ends this far before the end of its goal edge
@@ -121,7 +122,7 @@ def move_background(
         row["last_change"] = old["tick"]
     if not _cross_borders(roads, plans, row):
         row["speed"] = 0.0
-    sideways = min(LATERAL_MPS, LATERAL_RATIO * speed) * dt
+    sideways = min(LATERAL_MPS, max(LATERAL_RATIO * speed, LATERAL_MIN_MPS)) * dt
     before = row["d"]
     row["d"] = before - clamp(before, -sideways, sideways)
     row["side_lane"] = side_lane(roads.lanes, row["lane"], row["d"], row["width"])

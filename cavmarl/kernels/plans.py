@@ -18,6 +18,33 @@ from cavmarl.kernels.arrays import RoadArrays
 __all__ = ["LANE_CHANGE_COST_S", "plan_goal"]
 
 LANE_CHANGE_COST_S = 5.0  # what a lane change is worth in travel time, s
+TURNAROUND = ord("t")
+
+
+@kernel
+def _is_allowed(roads: RoadArrays, link: int) -> bool:
+    """Whether plans use a link: turnarounds only where the road ends."""
+    if roads.links[link]["direction"] != TURNAROUND:
+        return True
+    edge = roads.edges[roads.lanes[roads.links[link]["from_lane"]]["edge"]]
+    for lane in range(edge["first_lane"], edge["first_lane"] + edge["num_lanes"]):
+        row = roads.lanes[lane]
+        for other in range(row["first_link"], row["first_link"] + row["num_links"]):
+            if roads.links[other]["direction"] != TURNAROUND:
+                return False
+    return True
+
+
+@kernel
+def _leads_to(roads: RoadArrays, before: int, lane: int) -> bool:
+    """Whether an allowed movement goes from the end of lane `before` to the start of `lane`."""
+    row = roads.lanes[before]
+    if row["internal"]:
+        return True
+    for link in range(row["first_link"], row["first_link"] + row["num_links"]):
+        if roads.links[link]["next_lane"] == lane and _is_allowed(roads, link):
+            return True
+    return False
 
 
 @kernel
@@ -33,7 +60,7 @@ def _lane_cost(roads: RoadArrays, lane: int, cost: NDArray[np.float64]) -> tuple
     else:
         for link in range(row["first_link"], row["first_link"] + row["num_links"]):
             candidate = roads.links[link]["next_lane"]
-            if cost[candidate] < best:
+            if cost[candidate] < best and _is_allowed(roads, link):
                 best = cost[candidate]
                 best_next = candidate
                 best_link = link
@@ -120,6 +147,8 @@ def plan_goal(
             before = roads.into[k]
             other = roads.lanes[before]
             if settled[before] or not other["permissions"] & permission:
+                continue
+            if not _leads_to(roads, before, lane):
                 continue
             reached = here + other["length_m"] / other["speed_mps"]
             if reached < cost[before]:

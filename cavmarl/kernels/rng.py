@@ -123,7 +123,7 @@ def _block(
 
 
 @kernel
-def world_key(seed: int, world: int, episode: int) -> np.uint64:
+def world_key(seed: int | np.uint64, world: int, episode: int) -> np.uint64:
     """The key of one world in one episode, mixed from the run's seed.
 
     Args:

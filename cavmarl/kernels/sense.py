@@ -30,10 +30,15 @@ def sense(
     sensors: Sensors,
     weights: NDArray[np.float64],
     team_share: float,
-    step_s: float,
+    tick_s: float,
+    ticks_per_step: int,
+    chosen: NDArray[np.bool_],
     outputs: Outputs,
 ) -> None:
-    """Write what every agent gets, at its own index.
+    """Write what every agent of the chosen worlds gets, at its own index.
+
+    A vehicle that entered during the step has not acted: it is observed, its terms and reward are 0, and
+    it does not end.
 
     Args:
         roads: the road arrays.
@@ -42,17 +47,23 @@ def sense(
         grid: room for the spatial index of one world.
         sensors: settings and room.
         weights: (NUM_TERMS,) of the reward.
-        team_share: share of the reward that is the mean over the agents present.
-        step_s: seconds a step.
-        outputs: overwritten.
+        team_share: share of the reward that is the mean over the agents that acted.
+        tick_s: seconds a tick.
+        ticks_per_step: ticks a step.
+        chosen: (W,) which worlds.
+        outputs: overwritten where chosen.
     """
+    step_s = tick_s * ticks_per_step
     for w in range(worlds.ticks.shape[0]):
+        if not chosen[w]:
+            continue
         rows = worlds.rows[w]
         outputs.observations[w] = 0.0
         outputs.terms[w] = 0.0
         outputs.rewards[w] = 0.0
         outputs.terminated[w] = False
         outputs.present[w] = False
+        outputs.acted[w] = False
         outputs.events[w] = 0
         outputs.vehicle_ids[w] = -1
         fill_grid(rows, worlds.num_rows[w], grid)
@@ -67,11 +78,14 @@ def sense(
             observe_neighbors(rows, i, grid, sensors, out)
             observe_signal(roads, plans, row, worlds.signal_phase[w], sensors, out)
             observe_lidar(rows, i, grid, sensors, out)
-            write_terms(roads, rows, i, grid, step_s, outputs.terms[w, agent])
             outputs.present[w, agent] = True
+            outputs.vehicle_ids[w, agent] = row["id"]
+            if row["departed"] > row["tick"] - ticks_per_step:
+                continue
+            write_terms(roads, rows, i, grid, step_s, outputs.terms[w, agent])
+            outputs.acted[w, agent] = True
             outputs.terminated[w, agent] = row["events"] & EVENTS_THAT_END != 0
             outputs.events[w, agent] = row["events"]
-            outputs.vehicle_ids[w, agent] = row["id"]
         _reward(worlds, w, weights, team_share, outputs)
 
 
@@ -81,20 +95,20 @@ def _reward(
 ) -> None:
     """Weighted sums of the terms, mixed with the team's mean; summed in agent order."""
     team = 0.0
-    present = 0
+    acted = 0
     for agent in range(outputs.rewards.shape[1]):
-        if outputs.present[w, agent]:
+        if outputs.acted[w, agent]:
             own = 0.0
             for k in range(NUM_TERMS):
                 own += weights[k] * outputs.terms[w, agent, k]
             outputs.rewards[w, agent] = own
             team += own
-            present += 1
-    if present == 0:
+            acted += 1
+    if acted == 0:
         return
-    team /= present
+    team /= acted
     for agent in range(outputs.rewards.shape[1]):
-        if outputs.present[w, agent]:
+        if outputs.acted[w, agent]:
             own = outputs.rewards[w, agent]
             outputs.rewards[w, agent] = (1.0 - team_share) * own + team_share * team
     rows = worlds.rows[w]

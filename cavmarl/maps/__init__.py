@@ -1,0 +1,1 @@
+"""Map files: built into SUMO networks, and checked."""

@@ -1,0 +1,1 @@
+"""Road networks: immutable arrays, read from SUMO networks."""

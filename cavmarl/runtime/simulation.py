@@ -76,7 +76,9 @@ class Simulation:
         shard = Shard(config, network, self._traffic.plans, num_worlds)
         self._shard = shard
         self._executor: Executor = SerialExecutor([shard])
+        self._seed = 0
         self._episodes = np.zeros(num_worlds, dtype=np.int64)
+        self._everywhere = np.ones(num_worlds, dtype=np.bool_)
 
     @property
     def outputs(self) -> Outputs:
@@ -101,29 +103,32 @@ class Simulation:
         """(W,) ticks since each world's reset."""
         return self._shard.worlds.ticks
 
-    def reset(self, seed: int, chosen: NDArray[np.bool_] | None = None) -> None:
+    def seed(self, seed: int) -> None:
+        """Set the root of all random numbers; the next reset of each world is its first episode."""
+        self._seed = seed
+        self._episodes[:] = 0
+
+    def reset(self, chosen: NDArray[np.bool_] | None = None) -> None:
         """Begin a new episode in the chosen worlds (W,), all by default, and sense.
 
-        World w's episode is a function of (`seed`, w, the number of its resets with this seed).
+        World w's episode is a function of (seed, w, the number of its resets since `seed`).
 
         Raises:
-            CapacityError: the map has no room for that many agents.
+            CapacityError: the map has no room for that many agents of a closed world.
         """
-        everyone = chosen is None
         if chosen is None:
-            chosen = np.ones(self.num_worlds, dtype=np.bool_)
-            self._episodes[:] = 0
+            chosen = self._everywhere
         worlds = self._shard.worlds
         for w in np.flatnonzero(chosen):
-            worlds.keys[w] = world_key(seed, int(w), int(self._episodes[w]))
+            worlds.keys[w] = world_key(self._seed, int(w), int(self._episodes[w]))
             worlds.ticks[w] = 0
         self._episodes[chosen] += 1
         self._traffic.populate(worlds, chosen)
         self._executor.each(Shard.switch_signals)
-        self._executor.each(Shard.sense)
+        self._executor.each(lambda shard: shard.sense(chosen))
         agents = self.config.population.agents
         seated = self.outputs.present[chosen].sum(axis=1)
-        if self.config.population.mode == "closed" and everyone and (seated < agents).any():
+        if self.config.population.mode == "closed" and (seated < agents).any():
             raise CapacityError(
                 f"population.agents = {agents}: the map '{self.network.name}' has free places for "
                 f"{int(seated.min())}; use fewer agents, or population.mode = entering or seats, "
@@ -135,7 +140,7 @@ class Simulation:
         self._executor.each(lambda shard: shard.begin_step(commands))
         for _ in range(self.config.clock.ticks_per_step):
             self._tick(commands)
-        self._executor.each(Shard.sense)
+        self._executor.each(lambda shard: shard.sense(self._everywhere))
 
     def _tick(self, commands: Commands) -> None:
         """traffic → advance → (exchange) → resolve → departures → (migrate) → commit."""
@@ -147,7 +152,15 @@ class Simulation:
 
     def retire_agents(self) -> None:
         """Take out the agents whose trip ended in the last step; to be called after it is read."""
-        self._traffic.retire_agents(self._shard.worlds, self.config.clock.sim_dt_s)
+        clock = self.config.clock
+        self._traffic.retire_agents(self._shard.worlds, clock.sim_dt_s, clock.ticks_per_step)
+
+    def agents_to_come(self) -> NDArray[np.bool_]:
+        """(W,) whether an agent waits to enter."""
+        worlds = self._shard.worlds
+        waiting = np.arange(worlds.queue.shape[1]) < worlds.num_queue[:, None]
+        found: NDArray[np.bool_] = (waiting & (worlds.queue["agent"] >= 0)).any(axis=1)
+        return found
 
     def suggest(self, out: NDArray[np.float64]) -> None:
         """Write what the built-in driver would do in the agents' place into `out` (W, A, 2)."""

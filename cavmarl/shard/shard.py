@@ -106,8 +106,8 @@ class Shard:
         self.worlds = worlds._replace(rows=worlds.next_rows, next_rows=worlds.rows)
         worlds.ticks[:] += 1
 
-    def sense(self) -> None:
-        """Write observations, terms and rewards of all agents into `outputs`."""
+    def sense(self, chosen: NDArray[np.bool_]) -> None:
+        """Write observations, terms and rewards of the chosen worlds' agents into `outputs`."""
         sense(
             self._roads,
             self._plans,
@@ -116,7 +116,9 @@ class Shard:
             self._sensors,
             self._weights,
             self._config.terms.team_share,
-            self._config.clock.ctrl_dt_s,
+            self._config.clock.sim_dt_s,
+            self._config.clock.ticks_per_step,
+            chosen,
             self.outputs,
         )
 
@@ -188,6 +190,7 @@ def _make_outputs(config: EnvConfig, num_worlds: int) -> Outputs:
         rewards=np.zeros(agents, dtype=np.float32),
         terminated=np.zeros(agents, dtype=np.bool_),
         present=np.zeros(agents, dtype=np.bool_),
+        acted=np.zeros(agents, dtype=np.bool_),
         events=np.zeros(agents, dtype=np.int32),
         vehicle_ids=np.full(agents, -1, dtype=np.int64),
     )

@@ -102,15 +102,15 @@ class NativeTraffic:
 
     def exchange(self, worlds: Worlds, scratch: Scratch, dt: float) -> None:
         """Who has arrived leaves `next_rows`, wanderers pick new goals, and who waits may enter."""
-        choose_goals(self.demand, self.network.arrays, self.plans, worlds)
-        take_out(
-            self.demand, self.network.arrays, worlds, worlds.next_rows, DRIVER_BACKGROUND, dt
-        )
-        let_in(self.demand, self.network.arrays, self.plans, worlds, scratch)
+        roads = self.network.arrays
+        choose_goals(self.demand, roads, self.plans, worlds)
+        take_out(self.demand, roads, worlds, worlds.next_rows, DRIVER_BACKGROUND, dt, 1)
+        let_in(self.demand, roads, self.plans, worlds, scratch)
 
-    def retire_agents(self, worlds: Worlds, dt: float) -> None:
+    def retire_agents(self, worlds: Worlds, dt: float, ticks_per_step: int) -> None:
         """Take agents whose trip has ended out of the committed rows, and order those that follow."""
-        take_out(self.demand, self.network.arrays, worlds, worlds.rows, DRIVER_AGENT, dt)
+        roads = self.network.arrays
+        take_out(self.demand, roads, worlds, worlds.rows, DRIVER_AGENT, dt, ticks_per_step)
 
     def _edge(self, name: str, key: str) -> int:
         try:
@@ -155,9 +155,13 @@ class NativeTraffic:
     def _trips(
         self, origins: NDArray[np.int64], goals: NDArray[np.int64], least_m: float, most_m: float
     ) -> NDArray[np.int32]:
-        """(P, 2) pairs of origin lane and goal whose way has a length from `least_m` to `most_m`."""
-        to_go = self.plans["to_go"][np.ix_(goals, origins)]
-        fits = np.isfinite(to_go) & (to_go >= least_m)
+        """(P, 2) pairs of origin lane and goal whose way has a length from `least_m` to `most_m`.
+
+        Vehicles start on a lane that their way can follow: no trip begins with a lane change.
+        """
+        pairs = np.ix_(goals, origins)
+        to_go = self.plans["to_go"][pairs]
+        fits = np.isfinite(to_go) & (to_go >= least_m) & (self.plans["change"][pairs] == 0)
         if most_m > 0.0:
             fits &= to_go <= most_m
         goal, origin = np.nonzero(fits)

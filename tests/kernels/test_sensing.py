@@ -28,9 +28,7 @@ def scan(
     crowds(most=8), st.integers(0, 7), st.sampled_from([1, 4, 16, 33]),
     st.sampled_from([5.0, 20.0, 60.0]),
 )  # fmt: skip
-def test_lidar_equals_twin(
-    rows: NDArray[np.void], row: int, num_rays: int, range_m: float
-) -> None:
+def test_lidar_equals_twin(rows: NDArray[np.void], row: int, num_rays: int, range_m: float) -> None:
     row %= len(rows)
     out = scan(rows, row, num_rays, range_m)
     # Rounding decides whether a ray that grazes a side meets it: sizes differ by a micrometre.
@@ -98,6 +96,11 @@ def test_range_and_levels_limit_the_view() -> None:
     assert scan(rows, 0, 4)["distance"] == pytest.approx([59.9, 60.0, 60.0, 60.0])
     rows["x"][1] = 62.6
     assert np.all(scan(rows, 0, 4)["id"] == -1)
+
+
+def test_the_end_of_a_truck_is_seen_when_its_centre_is_out_of_range() -> None:
+    rows = vehicles([(-15.0, 0.0, 0.0), (13.0, 0.0, 0.0)], length=[5.0, 18.0])
+    assert scan(rows, 0, 4, range_m=20.0)["distance"] == pytest.approx([19.0, 20.0, 20.0, 20.0])
 
 
 @given(st.floats(-1e3, 1e3), st.floats(-1e3, 1e3))

@@ -151,6 +151,7 @@ def test_odd_things_are_named(check: Callable[..., MapReport]) -> None:
     report = check(
         ('</edge>\n  <edge id="b"', f'{second}</edge>\n  <edge id="b"'),
         ('id="x" from="B" to="C"', 'id="x" from="B" to="B"'),
+        ('incLanes="x_0"', 'incLanes=""'),
         ('id="x_0" index="0" speed="10"', 'id="x_0" index="0" speed="0.5"'),
     )
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -33,7 +34,7 @@ def nearest_on_polyline(corners: NDArray[np.float64], x: float, y: float) -> tup
     """Distance to the polyline (n, 2) and the arc length of its nearest point."""
     best = (math.inf, 0.0)
     start = 0.0
-    for a, b in zip(corners[:-1], corners[1:], strict=True):
+    for a, b in pairwise(corners):
         length = math.hypot(*(b - a))
         unit = (b - a) / length
         along = min(max((np.array([x, y]) - a) @ unit, 0.0), length)
@@ -64,10 +65,8 @@ def common_area(one: list[Point], other: list[Point]) -> float:
     shape = one
     for i, a in enumerate(other):
         shape = _clip(shape, a, other[(i + 1) % len(other)])
-    twice = sum(
-        p[0] * q[1] - q[0] * p[1] for p, q in zip(shape, shape[1:] + shape[:1], strict=True)
-    )
-    return 0.5 * twice
+    around = pairwise([*shape, *shape[:1]])
+    return 0.5 * sum(p[0] * q[1] - q[0] * p[1] for p, q in around)
 
 
 def _clip(shape: list[Point], a: Point, b: Point) -> list[Point]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -39,17 +40,17 @@ def lidar(
 
 def ray_to_polygon(direction: Point, corners: list[Point]) -> float:
     """Distance from the origin along a unit vector to a convex counter-clockwise polygon."""
-    sides = list(zip(corners, corners[1:] + corners[:1], strict=True))
+    sides = list(pairwise([*corners, corners[0]]))
     if all(a[0] * b[1] - b[0] * a[1] >= 0.0 for a, b in sides):
         return 0.0
-    return min((_ray_to_side(direction, a, b) for a, b in sides), default=math.inf)
+    return min(_ray_to_side(direction, a, b) for a, b in sides)
 
 
 def _ray_to_side(direction: Point, a: Point, b: Point) -> float:
     edge = (b[0] - a[0], b[1] - a[1])
     slant = direction[0] * edge[1] - direction[1] * edge[0]
-    if slant == 0.0:
-        return math.inf
+    if abs(slant) < 1e-12:
+        return math.inf  # runs along the side; the neighbouring sides tell
     distance = (a[0] * edge[1] - a[1] * edge[0]) / slant
     share = (a[0] * direction[1] - a[1] * direction[0]) / slant
     return distance if distance >= 0.0 and 0.0 <= share <= 1.0 else math.inf

@@ -152,6 +152,23 @@ def test_internal_lanes_of_no_length_get_one(crossing: Crossing) -> None:
     assert (point["cos"], point["sin"]) == pytest.approx((1.0, 0.0))
 
 
+def test_a_stub_is_level_even_behind_a_slope(crossing: Crossing) -> None:
+    climb = ('shape="-100,0 -50,0', 'shape="-100,0,-9 -50,0,-6')
+    network = read_network(crossing(climb, ('shape="-5,0 5,0"', 'shape="-5,0 -5,0"')))
+
+    point = network.points[network.lanes[lane(network, ":c_0_0")]["first_point"]]
+    assert point["slope"] == 0.0
+
+
+def test_connections_for_others_are_no_links(crossing: Crossing) -> None:
+    cyclists = ('from="s" to="n"', 'allow="bicycle" from="s" to="n"')
+    network = read_network(crossing(cyclists))
+
+    assert network.links["index"].tolist() == [0, 2]
+    assert ":c_1_0" not in network.lane_ids
+    assert network.conflicts["foe"].tolist() == [1, 0]
+
+
 def test_a_map_without_internal_lanes_leads_straight_on(crossing: Crossing) -> None:
     vias = [(f' via=":c_{k}_0"', "") for k in range(4)]
     network = read_network(crossing(*vias))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import subprocess
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -85,6 +86,9 @@ def check_lanes(network: RoadNetwork) -> None:
     assert (lanes["edge"][lanes["left"][has_left]] == lanes["edge"][has_left]).all()
     assert (lanes["speed_mps"] > 0.0).all()
     assert (lanes["permissions"] > 0).all()
+    lanes_of_link = np.bincount(lanes["link"][lanes["internal"]], minlength=1)
+    inside = lanes["internal"] & (has_left | has_right)
+    assert (lanes_of_link[lanes["link"][inside]] == 1).all()
     internal = edges["internal"]
     assert (edges["from_junction"][internal] == edges["to_junction"][internal]).all()
 
@@ -195,6 +199,23 @@ def test_a_real_map_is_read_whole(built_map: BuiltMap, name: str) -> None:
 @pytest.mark.parametrize("name", GAMES)
 def test_a_network_of_sumo_is_read_whole(name: str) -> None:
     check_everything(game(name))
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        ["--grid", "--grid.number=4", "--default.lanenumber=2", "--tls.guess"],
+        ["--spider", "--spider.arm-number=7", "--default-junction-type=allway_stop"],
+        ["--rand", "--rand.iterations=30", "--seed=3", "--no-internal-links"],
+    ],
+)
+def test_a_generated_network_is_read_whole(tmp_path: Path, options: list[str]) -> None:
+    sumo = pytest.importorskip("sumo")
+    path = tmp_path / "made.net.xml"
+    command = [str(Path(sumo.SUMO_HOME) / "bin" / "netgenerate"), *options, "-o", str(path)]
+    subprocess.run(command, check=True, capture_output=True)
+
+    check_everything(path)
 
 
 @pytest.mark.parametrize("name", NOT_FOR_CARS)

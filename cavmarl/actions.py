@@ -1,0 +1,190 @@
+"""Actions at the border: checked before any state changes, then decoded for the shards."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cavmarl.config import ActionConfig
+from cavmarl.errors import InvalidActionError, MissingActionError, UnknownAgentError
+from cavmarl.kernels.codes import ACTION_IDLE, ACTION_SLOWER
+from cavmarl.shard.shard import Commands
+
+__all__ = ["ActionDecoder"]
+
+
+class ActionDecoder:
+    """Checks and decodes the actions of W worlds with A agents each.
+
+    Args:
+        config: what an agent can do.
+        num_worlds: W.
+        agents: the A agent ids.
+
+    Attributes:
+        clipped: values beyond ±1 that were clipped so far (`out_of_range = clip`).
+        held: missing actions that were replaced by the last one so far (`missing_action = hold`).
+        ignored: actions for agents that had left, so far (`late_actions = ignore`).
+    """
+
+    def __init__(self, config: ActionConfig, num_worlds: int, agents: Sequence[str]) -> None:
+        self._config = config
+        self._agents = tuple(agents)
+        self._index = {agent: k for k, agent in enumerate(agents)}
+        self._continuous = config.kind == "continuous"
+        shape = (num_worlds, len(agents))
+        self._last: NDArray[Any] = (
+            np.zeros((*shape, 2), dtype=np.float64)
+            if self._continuous
+            else np.full(shape, ACTION_IDLE, dtype=np.int64)
+        )
+        self._idle = self._last.copy()
+        self._scale = np.array([config.acceleration_mps2, config.steering_rad])
+        self.clipped = 0
+        self.held = 0
+        self.ignored = 0
+
+    def forget(self, chosen: NDArray[np.bool_]) -> None:
+        """Forget the last actions of the chosen worlds (W,)."""
+        self._last[chosen] = self._idle[chosen]
+
+    def idle(self) -> Commands:
+        """Commands of a step in which no agent acts."""
+        return self._commands(self._idle)
+
+    def from_dict(
+        self, actions: Mapping[str, Any], live: Sequence[str], needed: Sequence[str]
+    ) -> Commands:
+        """Decode the actions of one world.
+
+        Args:
+            actions: by agent id.
+            live: ids in the episode.
+            needed: those of them that have a vehicle and must act.
+
+        Raises:
+            UnknownAgentError: an id that never was, or has left (unless `late_actions = ignore`).
+            MissingActionError: a needed agent without an action (unless `missing_action = hold`).
+            InvalidActionError: wrong shape, dtype or value.
+        """
+        if not isinstance(actions, Mapping):
+            raise InvalidActionError(
+                f"actions are a {type(actions).__name__}: pass a dict from agent id to action"
+            )
+        ignored = self._check_ids(actions, live)
+        missing = [agent for agent in needed if agent not in actions]
+        if missing and self._config.missing_action == "error":
+            raise MissingActionError(
+                f"no action for {', '.join(missing)}: pass one for each id in env.agents, or set "
+                "action.missing_action = hold"
+            )
+        given = [agent for agent in live if agent in actions]
+        batch = self._last.copy()
+        rows = [self._index[agent] for agent in given]
+        if given:
+            stacked = self._stack([actions[agent] for agent in given], given)
+            batch[0, rows] = stacked
+        checked, clipped = self._check_values(batch, np.isin(np.arange(len(self._agents)), rows))
+        self.ignored += ignored
+        self.held += len(missing)
+        self.clipped += clipped
+        self._last = checked
+        return self._commands(checked)
+
+    def from_array(self, actions: Any, mask: NDArray[np.bool_]) -> Commands:
+        """Decode the actions of all worlds; entries where `mask` (W, A) is False are not read.
+
+        Raises:
+            InvalidActionError: wrong shape, dtype or value.
+        """
+        array = self._as_numbers(np.asarray(actions), "actions")
+        if array.shape != self._last.shape:
+            raise InvalidActionError(
+                f"actions have shape {array.shape}: must be {self._last.shape}, "
+                "(num_envs, num_agents" + (", 2)" if self._continuous else ")")
+            )
+        batch = np.where(mask[..., None] if self._continuous else mask, array, self._idle)
+        checked, clipped = self._check_values(batch, mask)
+        self.clipped += clipped
+        self._last = checked
+        return self._commands(checked)
+
+    def encode(self, raw: NDArray[np.float64]) -> NDArray[Any]:
+        """The inverse of decoding: actions (W, A, …) for what `Simulation.suggest` wrote (W, A, 2)."""
+        if self._continuous:
+            return np.clip(raw / self._scale, -1.0, 1.0).astype(np.float32)
+        return raw[..., 0].astype(np.int64)
+
+    def _check_ids(self, actions: Mapping[str, Any], live: Sequence[str]) -> int:
+        """How many actions are for agents that are not there; refuses those that never could be."""
+        strangers = [agent for agent in actions if agent not in self._index]
+        if strangers:
+            raise UnknownAgentError(
+                f"no agent {strangers[0]!r}: the ids are {self._agents[0]} … {self._agents[-1]}"
+            )
+        alive = set(live)
+        late = [agent for agent in actions if agent not in alive]
+        if late and self._config.late_actions == "error":
+            raise UnknownAgentError(
+                f"{', '.join(late)}: not in the world now; pass actions for the ids in env.agents "
+                "only, or set action.late_actions = ignore"
+            )
+        return len(late)
+
+    def _stack(self, values: list[Any], agents: list[str]) -> NDArray[Any]:
+        """The actions as one array; refuses the first that has another shape or is no number."""
+        shape = self._last.shape[2:]
+        arrays = [np.asarray(value) for value in values]
+        for agent, array in zip(agents, arrays, strict=True):
+            if array.shape != shape:
+                raise InvalidActionError(
+                    f"{agent}: the action has shape {array.shape}, must be {shape}"
+                )
+            self._as_numbers(array, agent)
+        return np.stack(arrays)
+
+    def _as_numbers(self, array: NDArray[Any], who: str) -> NDArray[Any]:
+        """Refuse dtypes that cannot be cast without loss."""
+        wanted = "fiu" if self._continuous else "iu"
+        if array.dtype.kind not in wanted:
+            kind = "numbers" if self._continuous else "whole numbers"
+            raise InvalidActionError(f"{who}: dtype {array.dtype} given, {kind} needed")
+        return array
+
+    def _check_values(
+        self, batch: NDArray[Any], given: NDArray[np.bool_]
+    ) -> tuple[NDArray[Any], int]:
+        """(values in range, how many were clipped)."""
+        if not self._continuous:
+            wrong = (batch < 0) | (batch > ACTION_SLOWER)
+            if wrong.any():
+                self._refuse(batch, wrong, f"must be from 0 to {ACTION_SLOWER}")
+            return batch, 0
+        if not np.isfinite(batch).all():
+            self._refuse(batch, ~np.isfinite(batch), "must be finite")
+        beyond = np.abs(batch) > 1.0
+        if not beyond.any():
+            return batch, 0
+        if self._config.out_of_range == "error":
+            self._refuse(
+                batch, beyond, "must be within [-1, 1]; action.out_of_range = clip cuts it off"
+            )
+        return np.clip(batch, -1.0, 1.0), int(beyond.sum())
+
+    def _refuse(self, batch: NDArray[Any], wrong: NDArray[np.bool_], why: str) -> None:
+        place = tuple(int(k) for k in np.argwhere(wrong)[0])
+        where = f"{self._agents[place[1]]}"
+        if batch.shape[0] > 1:
+            where = f"world {place[0]}, {where}"
+        if len(place) > 2:
+            where += f", {('throttle', 'steering')[place[2]]}"
+        raise InvalidActionError(f"{where}: the action is {batch[place]}, {why}")
+
+    def _commands(self, batch: NDArray[Any]) -> Commands:
+        shape = self._last.shape[:2]
+        if self._continuous:
+            return Commands(batch * self._scale, np.full(shape, ACTION_IDLE, dtype=np.int64))
+        return Commands(np.zeros((*shape, 2)), batch)

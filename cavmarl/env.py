@@ -1,0 +1,345 @@
+"""`CavEnv`: one world as a PettingZoo parallel environment, a thin view on the batched simulation."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from gymnasium import spaces
+from numpy.typing import NDArray
+from pettingzoo import ParallelEnv
+
+from cavmarl.actions import ActionDecoder
+from cavmarl.config import TERMS, EnvConfig
+from cavmarl.errors import ConfigError, EpisodeEndedError, ResetNeededError
+from cavmarl.kernels.codes import EVENTS_THAT_END
+from cavmarl.render.view import WorldView
+from cavmarl.roads.network import RoadNetwork
+from cavmarl.runtime.simulation import Simulation
+from cavmarl.shard.sensors import layout
+from cavmarl.spaces import action_space, observation_space, state_space
+from cavmarl.state import global_state
+from cavmarl.worlds import check_placement, load_world
+
+__all__ = ["CavEnv", "parallel_env"]
+
+RENDER_MODES = ("human", "rgb_array")
+SEED_BITS = 63
+
+Observation = NDArray[np.float32] | dict[str, NDArray[np.float32]]
+
+
+def parallel_env(
+    env: str | Path = "merge",
+    *,
+    zones: int | None = None,
+    workers: int | None = None,
+    agents: int | None = None,
+    background: int | None = None,
+    seed: int | None = None,
+    max_cycles: int | None = None,
+    render_mode: str | None = None,
+    overrides: Mapping[str, Any] | None = None,
+) -> CavEnv:
+    """Make a PettingZoo parallel environment.
+
+    Args:
+        env: name of an entry of `envs/`, a folder with an env.yaml, or a map file.
+        zones: shadows zones.count; this version runs 1.
+        workers: processes that run the shards; this version runs them in the caller's (0).
+        agents: shadows population.agents.
+        background: shadows population.background.
+        seed: of the first reset, if that is given none.
+        max_cycles: steps until truncation; shadows horizon_s.
+        render_mode: `human`, `rgb_array` or None.
+        overrides: values for any other key, such as `{"sensors.lidar.rays": 32}`.
+
+    Raises:
+        ConfigError: a key, value or combination that cannot work.
+        MapError: the map cannot be read or driven.
+    """
+    check_placement(workers)
+    config, network = load_world(
+        env,
+        zones=zones,
+        agents=agents,
+        background=background,
+        max_cycles=max_cycles,
+        overrides=overrides,
+    )
+    return CavEnv(config, network, seed=seed, render_mode=render_mode)
+
+
+class CavEnv(ParallelEnv[str, Any, Any]):
+    """One world.
+
+    Observations, actions and rewards are described in docs/environments.md. The infos of each agent
+    hold every term by its name, and `active` (it has a vehicle), `vehicle_done` (that vehicle's trip
+    ended in this step) and `vehicle_id`; all are plain numbers.
+
+    Args:
+        config: the environment.
+        network: its roads.
+        seed: of the first reset, if that is given none.
+        render_mode: `human`, `rgb_array` or None.
+    """
+
+    metadata: dict[str, Any] = {  # noqa: RUF012 - PettingZoo declares it as an instance's attribute
+        "name": "cavmarl",
+        "render_modes": list(RENDER_MODES),
+        "render_fps": 10,
+        "is_parallelizable": True,
+    }
+
+    def __init__(
+        self,
+        config: EnvConfig,
+        network: RoadNetwork,
+        *,
+        seed: int | None = None,
+        render_mode: str | None = None,
+    ) -> None:
+        if render_mode is not None and render_mode not in RENDER_MODES:
+            raise ConfigError(
+                f"render_mode = {render_mode!r}: must be {' or '.join(RENDER_MODES)}, or None"
+            )
+        self.config = config
+        self.network = network
+        self.render_mode = render_mode
+        self.metadata = {
+            **self.metadata,
+            "name": f"cavmarl/{config.name}-v{config.version}",
+            "render_fps": max(1, round(1.0 / config.clock.ctrl_dt_s)),
+        }
+        self.possible_agents = [f"car_{k}" for k in range(config.population.num_ids)]
+        self.agents: list[str] = []
+        self.max_cycles = config.max_steps
+        self.state_space = state_space(config)
+        one_observation, one_action = observation_space(config), action_space(config.action)
+        self.observation_spaces = dict.fromkeys(self.possible_agents, one_observation)
+        self.action_spaces = dict.fromkeys(self.possible_agents, one_action)
+        self._seats = config.population.mode == "seats"
+        self._places = layout(config.sensors) if config.observation.kind == "dict" else None
+        self._index = {agent: k for k, agent in enumerate(self.possible_agents)}
+        self._simulation = Simulation(config, network)
+        self._decoder = ActionDecoder(config.action, 1, self.possible_agents)
+        self._first_seed = seed
+        self._seeded = False
+        self._steps = -1
+        self._view: WorldView | None = None
+
+    @property
+    def step_s(self) -> float:
+        """Seconds a step."""
+        return self.config.clock.ctrl_dt_s
+
+    @property
+    def simulation(self) -> Simulation:
+        """The world behind this view, for tools that draw or measure it."""
+        return self._simulation
+
+    def observation_space(self, agent: str) -> spaces.Space[Any]:
+        """The same object at each call and for each agent."""
+        return self.observation_spaces[agent]
+
+    def action_space(self, agent: str) -> spaces.Space[Any]:
+        """The same object at each call and for each agent."""
+        return self.action_spaces[agent]
+
+    def reset(
+        self, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[dict[str, Observation], dict[str, dict[str, float]]]:
+        """Begin an episode.
+
+        Args:
+            seed: root of all random numbers; None goes on with the next episode of the last seed.
+            options: not used; accepted because the API has it.
+        """
+        if seed is None and not self._seeded:
+            seed = self._first_seed
+            if seed is None:
+                seed = int(np.random.SeedSequence().generate_state(1, np.uint64)[0] >> 1)
+        if seed is not None:
+            self._simulation.seed(check_seed(seed))
+            self._seeded = True
+        self._simulation.reset()
+        self._decoder.forget(np.ones(1, dtype=np.bool_))
+        self._steps = 0
+        present = self._simulation.outputs.present[0]
+        self.agents = [
+            agent for k, agent in enumerate(self.possible_agents) if self._seats or present[k]
+        ]
+        if not self.agents:
+            self._wait_for_agents()
+        return self._observations(self.agents), self._infos(self.agents)
+
+    def step(
+        self, actions: Mapping[str, Any]
+    ) -> tuple[
+        dict[str, Observation],
+        dict[str, float],
+        dict[str, bool],
+        dict[str, bool],
+        dict[str, dict[str, float]],
+    ]:
+        """Let every agent act and the world go on for `step_s` seconds.
+
+        Agents that enter during the step are in the results, with reward 0. When everybody has left
+        and more are to come, the world goes on until one enters.
+
+        Raises:
+            ResetNeededError: before the first reset.
+            EpisodeEndedError: actions after everybody has left.
+            ActionError: a refused action; nothing has changed and the step can be repeated.
+        """
+        if self._steps < 0:
+            raise ResetNeededError("step() before reset(): call env.reset(seed=…) first")
+        if not self.agents:
+            if actions:
+                raise EpisodeEndedError("the episode is over: call env.reset()")
+            return {}, {}, {}, {}, {}
+        outputs = self._simulation.outputs
+        active = outputs.present[0] & ~outputs.terminated[0]
+        needed = [agent for agent in self.agents if active[self._index[agent]]]
+        commands = self._decoder.from_dict(actions, self.agents, needed)
+        self._simulation.step(commands)
+        self._steps += 1
+        return self._report()
+
+    def _report(
+        self,
+    ) -> tuple[
+        dict[str, Observation],
+        dict[str, float],
+        dict[str, bool],
+        dict[str, bool],
+        dict[str, dict[str, float]],
+    ]:
+        """What the agents get after a step; decides who stays."""
+        outputs = self._simulation.outputs
+        truncated = self._steps >= self.max_cycles
+        present = outputs.present[0]
+        known = set(self.agents)
+        entered = [
+            agent
+            for k, agent in enumerate(self.possible_agents)
+            if present[k] and agent not in known and not truncated
+        ]
+        shown = self.agents + entered
+        ended = outputs.terminated[0].tolist() if not self._seats else [False] * present.size
+        rewards = outputs.rewards[0].tolist()
+        index = self._index
+        observations = self._observations(shown)
+        infos = self._infos(shown)
+        reward_by_agent = {agent: rewards[index[agent]] for agent in shown}
+        terminations = {agent: ended[index[agent]] for agent in shown}
+        truncations = {agent: truncated and not ended[index[agent]] for agent in shown}
+        self._simulation.retire_agents()
+        self.agents = [] if truncated else [agent for agent in shown if not terminations[agent]]
+        if not self.agents and not truncated:
+            for agent in self._wait_for_agents():
+                observations.update(self._observations([agent]))
+                infos.update(self._infos([agent]))
+                reward_by_agent[agent] = 0.0
+                terminations[agent] = truncations[agent] = False
+        if self.render_mode == "human":
+            self.render()
+        return observations, reward_by_agent, terminations, truncations, infos
+
+    def _wait_for_agents(self) -> list[str]:
+        """Let an empty world go on until an agent enters; ends without one at the horizon."""
+        while self._steps < self.max_cycles and self._simulation.agents_to_come()[0]:
+            self._simulation.step(self._decoder.idle())
+            self._steps += 1
+            present = self._simulation.outputs.present[0]
+            if present.any() and self._steps < self.max_cycles:
+                self.agents = [self.possible_agents[k] for k in np.flatnonzero(present)]
+                break
+        return self.agents
+
+    def _observations(self, agents: list[str]) -> dict[str, Observation]:
+        rows = self._simulation.outputs.observations[0].copy()
+        index = self._index
+        if self._places is None:
+            return {agent: rows[index[agent]] for agent in agents}
+        return {
+            agent: {name: rows[index[agent], place] for name, place in self._places.items()}
+            for agent in agents
+        }
+
+    def _infos(self, agents: list[str]) -> dict[str, dict[str, float]]:
+        outputs = self._simulation.outputs
+        terms = outputs.terms[0].tolist()
+        present = outputs.present[0].tolist()
+        done = (outputs.events[0] & EVENTS_THAT_END != 0).tolist()
+        ids = outputs.vehicle_ids[0].tolist()
+        infos = {}
+        for agent in agents:
+            k = self._index[agent]
+            info: dict[str, float] = dict(zip(TERMS, terms[k], strict=True))
+            info["active"] = float(present[k] and not done[k])
+            info["vehicle_done"] = float(done[k])
+            info["vehicle_id"] = ids[k]
+            infos[agent] = info
+        return infos
+
+    def state(self) -> NDArray[np.float32]:
+        """The global state, within `state_space`: see `cavmarl.state.global_state`."""
+        return global_state(self.network, self._simulation.vehicles(), self.state_space)
+
+    def state_hash(self) -> str:
+        """Hex digest over all live vehicles in id order, signals, queue and random keys."""
+        return self._simulation.state_hash()
+
+    def traffic_stats(self) -> dict[str, float]:
+        """Traffic since reset: departed, waiting, running, arrived, contacts, mean_speed_mps, …
+
+        All fields of `runtime.simulation.TrafficStats`, and how many actions were clipped, held and
+        ignored since the environment was made.
+        """
+        tolerated = {
+            "actions_clipped": self._decoder.clipped,
+            "actions_held": self._decoder.held,
+            "actions_ignored": self._decoder.ignored,
+        }
+        return {**asdict(self._simulation.traffic_stats()), **tolerated}
+
+    def suggest_actions(self) -> dict[str, Any]:
+        """What the built-in driver (IDM, MOBIL, lane controller) would do in each agent's place."""
+        raw = np.zeros((1, len(self.possible_agents), 2))
+        self._simulation.suggest(raw)
+        batch = self._decoder.encode(raw)[0]
+        return {agent: batch[self._index[agent]] for agent in self.agents}
+
+    def render(self) -> NDArray[np.uint8] | None:
+        """A frame (height, width, 3) for `rgb_array`; None and a window for `human`."""
+        if self.render_mode is None:
+            raise ConfigError("render() without a render_mode: make the environment with one")
+        if self._steps < 0:
+            raise ResetNeededError("render() before reset(): call env.reset(seed=…) first")
+        if self._view is None:
+            self._view = WorldView(self.network, self.render_mode, self.metadata["render_fps"])
+        time_s = self._steps * self.step_s
+        return self._view.show(self._simulation, time_s)
+
+    def close(self) -> None:
+        """Close the window, if there is one; the environment can be used on."""
+        if self._view is not None:
+            self._view.close()
+            self._view = None
+
+
+def check_seed(seed: Any) -> int:
+    """A seed that all random numbers can be rooted in.
+
+    Raises:
+        ConfigError: not a whole number from 0 to 2**63 - 1.
+    """
+    if isinstance(seed, bool) or not isinstance(seed, (int, np.integer)):
+        raise ConfigError(f"seed = {seed!r}: must be a whole number")
+    if not 0 <= int(seed) < 1 << SEED_BITS:
+        raise ConfigError(f"seed = {seed}: must be from 0 to 2**{SEED_BITS} - 1")
+    return int(seed)

@@ -1,0 +1,74 @@
+"""`Camera`: which part of the plane a picture shows."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+__all__ = ["Bounds", "Camera"]
+
+Bounds = tuple[float, float, float, float]  # min_x, min_y, max_x, max_y in metres
+
+
+@dataclass(frozen=True)
+class Camera:
+    """A view from straight above, north up, the same scale both ways.
+
+    Attributes:
+        x: of the picture's centre, m.
+        y: of the picture's centre, m.
+        scale: pixels a metre.
+        size: width and height in pixels.
+    """
+
+    x: float
+    y: float
+    scale: float
+    size: tuple[int, int]
+
+    @classmethod
+    def fit(cls, bounds: Bounds, size: tuple[int, int], margin: float = 0.05) -> Camera:
+        """The closest view of all of `bounds`; `margin` is the share of the picture left at each side."""
+        min_x, min_y, max_x, max_y = bounds
+        room = 1.0 - 2.0 * margin
+        scale = min(
+            size[0] * room / max(max_x - min_x, 1.0),
+            size[1] * room / max(max_y - min_y, 1.0),
+        )
+        return cls((min_x + max_x) / 2.0, (min_y + max_y) / 2.0, scale, size)
+
+    @property
+    def bounds(self) -> Bounds:
+        """What the picture shows, m."""
+        half_width = self.size[0] / 2.0 / self.scale
+        half_height = self.size[1] / 2.0 / self.scale
+        return (
+            self.x - half_width,
+            self.y - half_height,
+            self.x + half_width,
+            self.y + half_height,
+        )
+
+    def to_pixels(self, xy: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Metres (…, 2) as pixels (…, 2) from the picture's upper left corner."""
+        pixels = np.empty(xy.shape)
+        pixels[..., 0] = (xy[..., 0] - self.x) * self.scale + self.size[0] / 2.0
+        pixels[..., 1] = (self.y - xy[..., 1]) * self.scale + self.size[1] / 2.0
+        return pixels
+
+    def enlarged(self, factor: int) -> Camera:
+        """The same view on `factor` times as many pixels each way."""
+        return Camera(
+            self.x, self.y, self.scale * factor, (self.size[0] * factor, self.size[1] * factor)
+        )
+
+    def towards(self, target: Camera, share: float) -> Camera:
+        """A view that has come `share` of the way to `target`; the scale moves by ratios."""
+        return Camera(
+            self.x + share * (target.x - self.x),
+            self.y + share * (target.y - self.y),
+            self.scale * (target.scale / self.scale) ** share,
+            target.size,
+        )

@@ -1,0 +1,96 @@
+"""pygame, loaded late and quietly, and the one way in which we draw smooth polygons with it."""
+
+from __future__ import annotations
+
+import math
+import os
+from collections.abc import Sequence
+from functools import lru_cache
+from types import ModuleType
+from typing import TYPE_CHECKING
+
+from cavmarl.errors import require
+
+if TYPE_CHECKING:
+    from pygame import Font, Surface
+
+__all__ = ["Part", "blank", "lettering", "load_pygame", "stamp"]
+
+Part = tuple[Sequence[int], Sequence[Sequence[float]]]  # colour with alpha, corners in pixels
+
+# Stamps are drawn this many times larger and then reduced: their edges move by fractions of a pixel.
+STAMP_DETAIL = 4
+# Small letters of a font stand unevenly; reduced large ones do not.
+TEXT_DETAIL = 4
+_QUIET = "PYGAME_HIDE_SUPPORT_PROMPT"
+
+
+def load_pygame() -> ModuleType:
+    """Pygame without the greeting that it prints; no window is opened and the environment is kept.
+
+    Raises:
+        MissingExtraError: pygame-ce is not installed.
+    """
+    before = os.environ.get(_QUIET)
+    os.environ[_QUIET] = "1"
+    try:
+        return require("pygame", "render")
+    finally:
+        if before is None:
+            del os.environ[_QUIET]
+        else:
+            os.environ[_QUIET] = before
+
+
+@lru_cache(maxsize=256)
+def lettering(text: str, height_px: int, color: tuple[int, int, int]) -> Surface:
+    """A text in pygame's own font, the same on every machine; transparent around the letters."""
+    pygame = load_pygame()
+    large = _font(height_px * TEXT_DETAIL).render(text, True, color)
+    size = (math.ceil(large.get_width() / TEXT_DETAIL), math.ceil(large.get_height() / TEXT_DETAIL))
+    reduced: Surface = pygame.transform.smoothscale(large, size)
+    return reduced
+
+
+@lru_cache
+def _font(height_px: int) -> Font:
+    pygame = load_pygame()
+    pygame.font.init()
+    font: Font = pygame.font.Font(None, height_px)
+    return font
+
+
+def blank(size: tuple[int, int], *, transparent: bool = False) -> Surface:
+    """An off-screen surface of 32 bits; no display is needed."""
+    pygame = load_pygame()
+    flags = pygame.SRCALPHA if transparent else 0
+    surface: Surface = pygame.Surface(size, flags, 32)
+    return surface
+
+
+def stamp(target: Surface, parts: Sequence[Part]) -> None:
+    """Draw polygons over one another with smooth edges.
+
+    Args:
+        target: where to.
+        parts: colours (red, green, blue, alpha; the first three already multiplied by alpha) and
+            corners in pixels of `target`, fractions allowed.
+    """
+    pygame = load_pygame()
+    corners = [corner for _, polygon in parts for corner in polygon]
+    left = math.floor(min(corner[0] for corner in corners)) - 1
+    top = math.floor(min(corner[1] for corner in corners)) - 1
+    width = math.ceil(max(corner[0] for corner in corners)) + 1 - left
+    height = math.ceil(max(corner[1] for corner in corners)) + 1 - top
+    if not target.get_rect().colliderect((left, top, width, height)):
+        return
+    large = blank((width * STAMP_DETAIL, height * STAMP_DETAIL), transparent=True)
+    for color, polygon in parts:
+        pygame.draw.polygon(
+            large,
+            color,
+            [((x - left) * STAMP_DETAIL, (y - top) * STAMP_DETAIL) for x, y in polygon],
+        )
+    # Averages of premultiplied colours are premultiplied colours: no dark seams at the edges.
+    small = pygame.transform.smoothscale(large, (width, height))
+    target.blit(small, (left, top), special_flags=pygame.BLEND_PREMULTIPLIED)

@@ -1,0 +1,131 @@
+"""Vehicles, seen from above."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cavmarl.kernels.codes import EVENT_COLLIDED
+from cavmarl.render.camera import Camera
+from cavmarl.render.canvas import Part, stamp
+from cavmarl.render.palette import (
+    BACKGROUND_CAR,
+    BLINKER,
+    BRAKE,
+    COLLIDED,
+    GLASS,
+    HEADLIGHT,
+    Color,
+    agent_color,
+)
+
+if TYPE_CHECKING:
+    from pygame import Surface
+
+__all__ = ["BRAKING_MPS2", "draw_cars", "in_view"]
+
+BRAKING_MPS2 = -1.0  # below this acceleration the brake lights are on
+
+# Seen from far above, a car is drawn larger than it is.
+MIN_LENGTH_PX = 8.0
+MIN_WIDTH_PX = 3.8
+AGENT_MIN_LENGTH_PX = 13.0
+AGENT_MIN_WIDTH_PX = 6.4
+WIDTH_OF_DETAILS_PX = 5.0
+OUTLINE_PX = 1.6
+
+# Polygons of a car of half length and half width 1, nose at +x, left at +y.
+BODY = ((1.0, 0.5), (0.86, 0.92), (0.6, 1.0), (-0.88, 1.0), (-1.0, 0.8))
+BODY = (*BODY, *((x, -y) for x, y in reversed(BODY)))
+WINDSCREEN = ((0.42, 0.62), (0.42, -0.62), (0.12, -0.78), (0.12, 0.78))
+REAR_WINDOW = ((-0.58, 0.74), (-0.58, -0.74), (-0.78, -0.6), (-0.78, 0.6))
+RIGHT_HEADLIGHT = ((0.98, -0.5), (0.86, -0.9), (0.78, -0.82), (0.88, -0.46))
+RIGHT_REAR_LIGHT = ((-1.02, -0.36), (-1.02, -0.86), (-0.86, -0.96), (-0.86, -0.36))
+RIGHT_FRONT_BLINKER = ((0.92, -0.72), (0.84, -1.06), (0.62, -1.06), (0.66, -0.78))
+RIGHT_REAR_BLINKER = ((-1.0, -0.7), (-1.0, -1.06), (-0.72, -1.06), (-0.72, -0.76))
+REAR_BAR = ((-1.04, 0.86), (-1.04, -0.86), (-0.66, -0.86), (-0.66, 0.86))
+
+Shape = tuple[tuple[float, float], ...]
+
+
+def in_view(vehicles: NDArray[np.void], camera: Camera) -> NDArray[np.void]:
+    """The VEHICLE rows that a picture shows, background first, lower ones before higher ones."""
+    min_x, min_y, max_x, max_y = camera.bounds
+    margin = max(float(vehicles["length"].max(initial=0.0)), MIN_LENGTH_PX / camera.scale)
+    seen = vehicles[
+        (vehicles["x"] > min_x - margin)
+        & (vehicles["x"] < max_x + margin)
+        & (vehicles["y"] > min_y - margin)
+        & (vehicles["y"] < max_y + margin)
+    ]
+    return seen[np.lexsort((seen["id"], seen["z"], seen["agent"] >= 0))]
+
+
+def draw_cars(surface: Surface, vehicles: NDArray[np.void], camera: Camera) -> None:
+    """Paint VEHICLE rows, later rows over earlier ones.
+
+    Agents have the colours of `palette.agent_color`; brake lights shine below `BRAKING_MPS2`; a red
+    outline is a vehicle that has collided.
+    """
+    centers = camera.to_pixels(np.stack([vehicles["x"], vehicles["y"]], axis=1)).tolist()
+    for row, center in zip(vehicles, centers, strict=True):
+        _draw_car(surface, row, center, camera.scale)
+
+
+def _draw_car(surface: Surface, row: np.void, center: list[float], scale: float) -> None:
+    agent = int(row["agent"])
+    is_agent = agent >= 0
+    color = agent_color(agent) if is_agent else BACKGROUND_CAR
+    half_length = max(row["length"] * scale, AGENT_MIN_LENGTH_PX if is_agent else MIN_LENGTH_PX) / 2
+    half_width = max(row["width"] * scale, AGENT_MIN_WIDTH_PX if is_agent else MIN_WIDTH_PX) / 2
+    heading = float(row["heading"])
+    # Columns of the turn, y down.
+    forward = np.cos(heading), -np.sin(heading)
+    left = -np.sin(heading), -np.cos(heading)
+
+    def place(
+        shape: Shape, grown_px: float = 0.0, moved_px: float = 0.0
+    ) -> list[tuple[float, float]]:
+        ahead, aside = half_length + grown_px, half_width + grown_px
+        return [
+            (
+                center[0] + moved_px + x * ahead * forward[0] + y * aside * left[0],
+                center[1] + moved_px + x * ahead * forward[1] + y * aside * left[1],
+            )
+            for x, y in shape
+        ]
+
+    parts: list[Part] = [((0, 0, 0, 46), place(BODY, 0.3, half_width * 0.22))]
+    if row["hit"] >= 0 or row["events"] & EVENT_COLLIDED:
+        parts.append((_opaque(COLLIDED), place(BODY, OUTLINE_PX + 1.0)))
+    elif is_agent:
+        parts.append(((236, 236, 236, 236), place(BODY, OUTLINE_PX / 2)))
+    parts.append((_opaque(color), place(BODY)))
+    braking = row["accel"] < BRAKING_MPS2
+    if 2 * half_width < WIDTH_OF_DETAILS_PX:
+        if braking:
+            parts.append((_opaque(BRAKE), place(REAR_BAR)))
+    else:
+        parts += [(_opaque(tint), place(shape)) for tint, shape in _details(row, braking)]
+    stamp(surface, parts)
+
+
+def _details(row: np.void, braking: bool) -> list[tuple[Color, Shape]]:
+    details: list[tuple[Color, Shape]] = [(GLASS, WINDSCREEN), (GLASS, REAR_WINDOW)]
+    details += [(HEADLIGHT, RIGHT_HEADLIGHT), (HEADLIGHT, _mirrored(RIGHT_HEADLIGHT))]
+    if braking:
+        details += [(BRAKE, RIGHT_REAR_LIGHT), (BRAKE, _mirrored(RIGHT_REAR_LIGHT))]
+    if row["blinker"]:
+        for shape in (RIGHT_FRONT_BLINKER, RIGHT_REAR_BLINKER):
+            details.append((BLINKER, _mirrored(shape) if row["blinker"] > 0 else shape))
+    return details
+
+
+def _mirrored(shape: Shape) -> Shape:
+    return tuple((x, -y) for x, y in shape)
+
+
+def _opaque(color: Color) -> tuple[int, int, int, int]:
+    return (*color, 255)

@@ -1,0 +1,192 @@
+"""The still part of a picture: land, roads, markings; and the stop lines in their signals' colours."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cavmarl.kernels.codes import SIGNAL_NONE
+from cavmarl.render.camera import Camera
+from cavmarl.render.canvas import blank, load_pygame, stamp
+from cavmarl.render.palette import (
+    ASPHALT,
+    CENTRE_LINE,
+    KERB,
+    LAND,
+    MARKING,
+    PATH,
+    SIGNALS,
+    Color,
+)
+from cavmarl.render.shapes import RoadShapes
+from cavmarl.roads.network import SIGNAL_STATES, RoadNetwork
+
+if TYPE_CHECKING:
+    from pygame import Surface
+
+__all__ = ["draw_ground", "draw_stop_lines", "signal_codes", "signal_letter"]
+
+KERB_M = 0.6
+# Pixels a metre from which details are worth their ink.
+SCALE_OF_MARKINGS = 0.9
+SCALE_OF_BORDERS = 3.0
+MARKING_M = 0.15
+MIN_ROAD_PX = 1.6
+MIN_STOP_LINE_PX = 4.0
+
+
+def signal_codes(
+    network: RoadNetwork, signal_phases: NDArray[np.int32]
+) -> NDArray[np.uint8]:
+    """What each link's signal shows, (num_links,): positions in SIGNAL_STATES, or SIGNAL_NONE.
+
+    Args:
+        network: the map.
+        signal_phases: (num_signals,) PHASE rows that are on.
+    """
+    codes = np.full(len(network.links), SIGNAL_NONE, dtype=np.uint8)
+    signalled = np.flatnonzero(network.links["signal"] >= 0)
+    links = network.links[signalled]
+    first = network.phases["first_state"][signal_phases[links["signal"]]]
+    codes[signalled] = network.phase_states[first + links["signal_index"]]
+    return codes
+
+
+def signal_letter(network: RoadNetwork, link: int, signal_phases: NDArray[np.int32]) -> str:
+    """The SUMO letter that a link's signal shows; empty without a signal."""
+    code = int(signal_codes(network, signal_phases)[link])
+    return "" if code == SIGNAL_NONE else SIGNAL_STATES[code]
+
+
+def draw_ground(shapes: RoadShapes, camera: Camera, detail: int) -> Surface:
+    """Land, roads and markings as seen by `camera`.
+
+    Args:
+        shapes: of the network.
+        camera: the view.
+        detail: drawn this many times larger, then reduced: the smoothness of edges.
+    """
+    pygame = load_pygame()
+    large = camera.enlarged(detail)
+    surface = blank(large.size)
+    surface.fill(LAND)
+    painter = _Painter(shapes, large, surface, detail)
+    for level in np.unique(shapes.levels):
+        for cars in (False, True):
+            painter.roads(level, cars, KERB_M, KERB)
+            painter.roads(level, cars, 0.0, ASPHALT if cars else PATH)
+    if camera.scale >= SCALE_OF_MARKINGS:
+        painter.lines(shapes.dashes, MARKING)
+        painter.lines(shapes.centre_lines, CENTRE_LINE)
+    if camera.scale >= SCALE_OF_BORDERS:
+        painter.lines(shapes.borders, MARKING)
+    reduced: Surface = pygame.transform.smoothscale(surface, camera.size)
+    return reduced
+
+
+def draw_stop_lines(
+    surface: Surface, shapes: RoadShapes, codes: NDArray[np.uint8], camera: Camera
+) -> None:
+    """Paint each signalled link's part of the stop line.
+
+    Args:
+        surface: where to.
+        shapes: of the network.
+        codes: (num_links,) as from `signal_codes`.
+        camera: the view.
+    """
+    links = np.flatnonzero(codes != SIGNAL_NONE)
+    quads = camera.to_pixels(shapes.stop_lines[links])
+    depth = np.hypot(*(quads[:, 3] - quads[:, 0]).T)[:, None]
+    stretch = np.maximum(MIN_STOP_LINE_PX / depth, 1.0)
+    quads[:, 2] = quads[:, 1] + (quads[:, 2] - quads[:, 1]) * stretch
+    quads[:, 3] = quads[:, 0] + (quads[:, 3] - quads[:, 0]) * stretch
+    for link, quad in zip(links, quads.tolist(), strict=True):
+        stamp(surface, [((*SIGNALS[codes[link]], 255), quad)])
+
+
+class _Painter:
+    """Draws many shapes of a kind on one surface, those in view only."""
+
+    def __init__(
+        self, shapes: RoadShapes, camera: Camera, surface: Surface, detail: int
+    ) -> None:
+        self._pygame = load_pygame()
+        self._shapes = shapes
+        self._camera = camera
+        self._surface = surface
+        self._detail = detail
+        self._min_half_px = MIN_ROAD_PX * detail / 2.0
+        low = np.minimum(shapes.starts, shapes.ends) - shapes.half_widths[:, None]
+        high = np.maximum(shapes.starts, shapes.ends) + shapes.half_widths[:, None]
+        self._in_view = self._visible(low, high)
+
+    def roads(self, level: int, cars: bool, grown_m: float, color: Color) -> None:
+        """Lanes and junction insides of one level, each side wider by `grown_m`."""
+        shapes, scale = self._shapes, self._camera.scale
+        grown_px = grown_m * scale
+        if grown_m:
+            grown_px = max(grown_px, self._min_half_px)
+        chosen = np.flatnonzero(
+            self._in_view & (shapes.levels == level) & (shapes.for_cars == cars)
+        )
+        half_px = np.maximum(shapes.half_widths[chosen] * scale, self._min_half_px) + grown_px
+        starts = self._camera.to_pixels(shapes.starts[chosen])
+        ends = self._camera.to_pixels(shapes.ends[chosen])
+        self._bars(starts, ends, half_px, color)
+        joined = shapes.joined[chosen] & (half_px >= 1.0)
+        circle = self._pygame.draw.circle
+        for center, radius in zip(ends[joined].tolist(), half_px[joined].tolist(), strict=True):
+            circle(self._surface, color, center, radius)
+        for patch in shapes.junctions:
+            if patch.level == level and patch.for_cars == cars:
+                self._patch(patch.outline, grown_px, color)
+
+    def lines(self, pieces: NDArray[np.float64], color: Color) -> None:
+        """Straight lines (k, 2, 2) on asphalt; those thinner than a pixel are paler instead."""
+        chosen = pieces[self._visible(pieces.min(axis=1), pieces.max(axis=1))]
+        pixels = self._camera.to_pixels(chosen)
+        width_px = MARKING_M * self._camera.scale / self._detail
+        share = min(max(width_px, 0.3), 1.0)
+        ink = tuple(round(share * c + (1.0 - share) * a) for c, a in zip(color, ASPHALT, strict=True))
+        half_px = np.full(len(chosen), max(width_px, 1.0) * self._detail / 2.0)
+        self._bars(pixels[:, 0], pixels[:, 1], half_px, (ink[0], ink[1], ink[2]))
+
+    def _visible(self, low: NDArray[Any], high: NDArray[Any]) -> NDArray[np.bool_]:
+        min_x, min_y, max_x, max_y = self._camera.bounds
+        return np.asarray(
+            (high[:, 0] > min_x)
+            & (low[:, 0] < max_x)
+            & (high[:, 1] > min_y)
+            & (low[:, 1] < max_y)
+        )
+
+    def _bars(
+        self,
+        starts: NDArray[np.float64],
+        ends: NDArray[np.float64],
+        half_px: NDArray[np.float64],
+        color: Color,
+    ) -> None:
+        along = ends - starts
+        length = np.maximum(np.hypot(along[:, 0], along[:, 1]), 1e-9)
+        aside = np.stack([-along[:, 1], along[:, 0]], axis=1) * (half_px / length)[:, None]
+        quads = np.stack([starts + aside, ends + aside, ends - aside, starts - aside], axis=1)
+        polygon = self._pygame.draw.polygon
+        for quad in quads.tolist():
+            polygon(self._surface, color, quad)
+
+    def _patch(self, outline: NDArray[np.float64], grown_px: float, color: Color) -> None:
+        if len(outline) < 3 or not self._visible(
+            outline.min(axis=0)[None], outline.max(axis=0)[None]
+        ).any():
+            return
+        corners = self._camera.to_pixels(outline)
+        self._pygame.draw.polygon(self._surface, color, corners.tolist())
+        if grown_px >= 1.0:
+            after = np.roll(corners, -1, axis=0)
+            self._bars(corners, after, np.full(len(corners), grown_px), color)
+            for corner in corners.tolist():
+                self._pygame.draw.circle(self._surface, color, corner, grown_px)

@@ -1,0 +1,172 @@
+"""What is written over the map: numbers of agents, destinations, the clock, the scale, the legend."""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cavmarl.render.camera import Camera
+from cavmarl.render.canvas import blank, lettering, load_pygame, stamp
+from cavmarl.render.palette import (
+    BACKGROUND_CAR,
+    COLLIDED,
+    INK,
+    MUTED_INK,
+    PANEL,
+    Color,
+    agent_color,
+)
+
+if TYPE_CHECKING:
+    from pygame import Surface
+
+__all__ = ["Overlay", "clock_text", "scale_bar_m"]
+
+MARGIN_PX = 14
+PADDING_PX = 9
+PANEL_ALPHA = 225
+TITLE_PX = 23
+TEXT_PX = 17
+LABEL_PX = 15
+SCALE_BAR_PX = 140
+LEGEND = (("agent", agent_color(0)), ("background", BACKGROUND_CAR), ("collided", COLLIDED))
+
+
+def clock_text(seconds: float) -> str:
+    """Minutes, seconds and tenths."""
+    tenths = round(seconds * 10)
+    return f"{tenths // 600}:{tenths // 10 % 60:02d}.{tenths % 10}"
+
+
+def scale_bar_m(scale: float) -> float:
+    """The longest 1, 2 or 5 times a power of ten metres that fits the bar's room."""
+    room = SCALE_BAR_PX / scale
+    power = 10.0 ** math.floor(math.log10(room))
+    return power * max(step for step in (1, 2, 5) if step * power <= room)
+
+
+class Overlay:
+    """Writes on pictures; keeps the agents' labels."""
+
+    def __init__(self) -> None:
+        self._labels: dict[int, Surface] = {}
+
+    def agents(self, surface: Surface, vehicles: NDArray[np.void], camera: Camera) -> None:
+        """The agents' numbers, above their vehicles."""
+        rows = vehicles[vehicles["agent"] >= 0]
+        centers = camera.to_pixels(np.stack([rows["x"], rows["y"]], axis=1))
+        for agent, center in zip(rows["agent"].tolist(), centers.tolist(), strict=True):
+            label = self._label(agent)
+            lift = max(1.4 * camera.scale, 5.0) + label.get_height() * 0.75
+            surface.blit(label, label.get_rect(center=(center[0], center[1] - lift)))
+
+    def destinations(
+        self,
+        surface: Surface,
+        agents: NDArray[np.int64],
+        places: NDArray[np.float64],
+        camera: Camera,
+    ) -> None:
+        """A ring in the agent's colour at each destination, (n, 2) metres."""
+        for agent, (x, y) in zip(agents.tolist(), camera.to_pixels(places).tolist(), strict=True):
+            color = agent_color(agent)
+            parts = [
+                ((0, 0, 0, 50), _disc(x + 0.8, y + 0.8, 6.0)),
+                ((255, 255, 255, 255), _disc(x, y, 5.6)),
+                ((*color, 255), _disc(x, y, 4.4)),
+                ((255, 255, 255, 255), _disc(x, y, 2.0)),
+            ]
+            stamp(surface, parts)
+
+    def title(self, surface: Surface, title: str, note: str) -> None:
+        """A panel at the upper left: a title, and a quieter note under it."""
+        lines = [lettering(title, TITLE_PX, INK)] if title else []
+        if note:
+            lines.append(lettering(note, TEXT_PX, MUTED_INK))
+        if not lines:
+            return
+        width = max(line.get_width() for line in lines)
+        height = sum(line.get_height() for line in lines) + 5 * (len(lines) - 1)
+        self._panel(surface, MARGIN_PX, MARGIN_PX, width, height)
+        top = MARGIN_PX + PADDING_PX
+        for line in lines:
+            surface.blit(line, (MARGIN_PX + PADDING_PX, top))
+            top += line.get_height() + 5
+
+    def scale_bar(self, surface: Surface, camera: Camera) -> None:
+        """A bar of round length at the lower left."""
+        pygame = load_pygame()
+        length_m = scale_bar_m(camera.scale)
+        length_px = round(length_m * camera.scale)
+        text = lettering(f"{length_m:g} m", TEXT_PX, INK)
+        height = text.get_height() + 8
+        top = surface.get_height() - MARGIN_PX - height - 2 * PADDING_PX
+        self._panel(surface, MARGIN_PX, top, max(length_px, text.get_width()), height)
+        left, bottom = MARGIN_PX + PADDING_PX, top + PADDING_PX + height
+        surface.blit(text, (left, top + PADDING_PX))
+        pygame.draw.rect(surface, INK, (left, bottom - 2, length_px, 2))
+        for x in (left, left + length_px - 2):
+            pygame.draw.rect(surface, INK, (x, bottom - 6, 2, 6))
+
+    def legend(self, surface: Surface) -> None:
+        """What the colours mean, at the lower right."""
+        texts = [lettering(name, TEXT_PX, INK) for name, _ in LEGEND]
+        width = sum(text.get_width() for text in texts) + 22 * len(texts) + 12 * (len(texts) - 1)
+        height = texts[0].get_height()
+        left = surface.get_width() - MARGIN_PX - 2 * PADDING_PX - width
+        top = surface.get_height() - MARGIN_PX - 2 * PADDING_PX - height
+        self._panel(surface, left, top, width, height)
+        x, middle = left + PADDING_PX, top + PADDING_PX + height / 2
+        for (name, color), text in zip(LEGEND, texts, strict=True):
+            inner = BACKGROUND_CAR if name == "collided" else color
+            outer = [((*color, 255), _bar(x, middle - 5, 16, 10))]
+            stamp(surface, [*outer, ((*inner, 255), _bar(x + 2, middle - 3, 12, 6))])
+            surface.blit(text, (x + 22, top + PADDING_PX))
+            x += 22 + text.get_width() + 12
+
+    def _label(self, agent: int) -> Surface:
+        if agent not in self._labels:
+            text = lettering(str(agent), TEXT_PX, _ink_on(agent_color(agent)))
+            width, height = max(text.get_width() + 9, LABEL_PX), LABEL_PX
+            label = blank((width + 2, height + 2), transparent=True)
+            stamp(label, [((255, 255, 255, 255), _pill(0.0, 0.0, width + 2, height + 2))])
+            stamp(label, [((*agent_color(agent), 255), _pill(1.0, 1.0, width, height))])
+            label.blit(text, text.get_rect(center=(width / 2 + 1, height / 2 + 1.5)))
+            self._labels[agent] = label
+        return self._labels[agent]
+
+    def _panel(self, surface: Surface, left: int, top: int, width: int, height: int) -> None:
+        pygame = load_pygame()
+        size = (width + 2 * PADDING_PX, height + 2 * PADDING_PX)
+        panel = blank(size, transparent=True)
+        pygame.draw.rect(panel, (*PANEL, PANEL_ALPHA), panel.get_rect(), border_radius=7)
+        surface.blit(panel, (left, top))
+
+
+def _ink_on(color: Color) -> Color:
+    """Dark or light ink, whichever reads better (luma of ITU-R BT.601)."""
+    luma = 0.299 * color[0] + 0.587 * color[1] + 0.114 * color[2]
+    return INK if luma > 140 else PANEL
+
+
+def _disc(x: float, y: float, radius: float) -> list[tuple[float, float]]:
+    angles = [2.0 * math.pi * k / 32 for k in range(32)]
+    return [(x + radius * math.cos(a), y + radius * math.sin(a)) for a in angles]
+
+
+def _bar(x: float, y: float, width: float, height: float) -> list[tuple[float, float]]:
+    return [(x, y), (x + width, y), (x + width, y + height), (x, y + height)]
+
+
+def _pill(x: float, y: float, width: float, height: float) -> list[tuple[float, float]]:
+    radius = height / 2.0
+    turns = [math.pi * k / 12 for k in range(13)]
+    right = [
+        (x + width - radius + radius * math.sin(a), y + radius - radius * math.cos(a))
+        for a in turns
+    ]
+    left = [(x + radius - radius * math.sin(a), y + radius + radius * math.cos(a)) for a in turns]
+    return right + left

@@ -1,0 +1,77 @@
+"""The colours of all pictures, red green blue: a quiet map, so that the agents stand out."""
+
+from __future__ import annotations
+
+__all__ = [
+    "AGENTS",
+    "ASPHALT",
+    "BACKGROUND_CAR",
+    "BLINKER",
+    "BRAKE",
+    "CENTRE_LINE",
+    "COLLIDED",
+    "GLASS",
+    "HEADLIGHT",
+    "INK",
+    "KERB",
+    "LAND",
+    "MARKING",
+    "MUTED_INK",
+    "PANEL",
+    "PATH",
+    "SIGNALS",
+    "Color",
+    "agent_color",
+]
+
+Color = tuple[int, int, int]
+
+LAND: Color = (235, 237, 230)
+KERB: Color = (205, 208, 200)
+ASPHALT: Color = (98, 107, 119)
+PATH: Color = (212, 211, 203)  # lanes that are closed to cars
+MARKING: Color = (214, 219, 224)
+CENTRE_LINE: Color = (226, 206, 150)
+
+BACKGROUND_CAR: Color = (186, 204, 225)
+GLASS: Color = (48, 58, 72)
+HEADLIGHT: Color = (255, 250, 225)
+BRAKE: Color = (255, 56, 48)
+BLINKER: Color = (255, 178, 36)
+COLLIDED: Color = (222, 22, 34)
+
+# Alternating hues, so that agents with neighbouring numbers differ most.
+AGENTS: tuple[Color, ...] = (
+    (255, 127, 14),
+    (30, 144, 255),
+    (236, 64, 122),
+    (46, 184, 92),
+    (255, 202, 40),
+    (149, 97, 226),
+    (0, 188, 212),
+    (244, 81, 60),
+    (156, 204, 40),
+    (205, 92, 190),
+)
+
+# By signal code, the positions in roads.network.SIGNAL_STATES = "rugGysoOY".
+SIGNALS: tuple[Color, ...] = (
+    (232, 58, 52),
+    (245, 132, 42),
+    (88, 196, 116),
+    (38, 208, 98),
+    (250, 204, 56),
+    (150, 110, 220),
+    (224, 190, 120),
+    (170, 176, 182),
+    (250, 204, 56),
+)
+
+PANEL: Color = (252, 252, 250)
+INK: Color = (44, 52, 62)
+MUTED_INK: Color = (112, 120, 130)
+
+
+def agent_color(agent: int) -> Color:
+    """The colour of an agent, by its index."""
+    return AGENTS[agent % len(AGENTS)]

@@ -1,0 +1,210 @@
+"""What a map looks like from above, as plain arrays in metres: surfaces, markings, stop lines.
+
+Made once per network; no drawing here.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cavmarl.roads.network import RoadNetwork
+
+__all__ = ["Patch", "RoadShapes", "convex_hull", "offset_polyline", "road_shapes"]
+
+Points = NDArray[np.float64]
+
+DASH_M = 3.0
+DASH_PERIOD_M = 9.0
+# Roads this much higher than others are drawn over them.
+LEVEL_M = 4.0
+STOP_LINE_M = 0.7
+# SUMO's link directions from left to right: turn, left, half left, straight, half right, right.
+DIRECTIONS_FROM_LEFT = "tlLsRr"
+CAR_BIT = 1  # VEHICLE_CLASSES[0], passenger
+
+
+@dataclass(frozen=True)
+class Patch:
+    """The inside of a junction: a convex polygon (n, 2)."""
+
+    outline: Points
+    level: int
+    for_cars: bool
+
+
+@dataclass(frozen=True)
+class RoadShapes:
+    """All shapes of a network, in metres.
+
+    Attributes:
+        starts: (n, 2), each straight piece of a lane begins here and
+        ends: (n, 2) ends here.
+        half_widths: (n,) of the pieces.
+        joined: (n,) the lane goes on beyond the piece's end.
+        levels: (n,) height in steps of `LEVEL_M`.
+        for_cars: (n,) the lane is open to cars.
+        junctions: the insides of junctions.
+        dashes: (k, 2, 2) from and to, between lanes of one direction.
+        borders: (k, 2, 2) at the outer edges of roads.
+        centre_lines: (k, 2, 2) between opposite directions.
+        stop_lines: (num_links, 4, 2) the link's part of the bar at the end of its lane.
+    """
+
+    starts: Points
+    ends: Points
+    half_widths: Points
+    joined: NDArray[np.bool_]
+    levels: NDArray[np.int64]
+    for_cars: NDArray[np.bool_]
+    junctions: tuple[Patch, ...]
+    dashes: Points
+    borders: Points
+    centre_lines: Points
+    stop_lines: Points
+
+
+def road_shapes(network: RoadNetwork) -> RoadShapes:
+    """Work out the shapes of a network."""
+    lanes = network.lanes
+    counts = lanes["num_points"]
+    lane_of_point = np.repeat(np.arange(len(lanes)), counts)
+    order = np.repeat(lanes["first_point"] - (np.cumsum(counts) - counts), counts)
+    points = network.points[order + np.arange(len(order))]
+    plane = np.stack([points["x"], points["y"]], axis=1)
+    pieces = np.flatnonzero(lane_of_point[:-1] == lane_of_point[1:])
+    lane = lane_of_point[pieces]
+    last = np.append(lane[1:] != lane[:-1], True)
+    for_cars = (lanes["permissions"] & CAR_BIT).astype(bool)
+    outer, centre = _road_edges(network)
+    return RoadShapes(
+        starts=plane[pieces],
+        ends=plane[pieces + 1],
+        half_widths=lanes["width_m"][lane] / 2.0,
+        joined=~last,
+        levels=np.round(points["z"][pieces] / LEVEL_M).astype(np.int64),
+        for_cars=for_cars[lane],
+        junctions=_junction_patches(network, for_cars),
+        dashes=_dashes(network),
+        borders=outer,
+        centre_lines=centre,
+        stop_lines=_stop_lines(network),
+    )
+
+
+def offset_polyline(polyline: Points, offset_m: float) -> Points:
+    """A polyline (n, 2) moved to its left by `offset_m`, corners mitred (at most twice the offset)."""
+    steps = np.diff(polyline, axis=0)
+    normals = np.stack([-steps[:, 1], steps[:, 0]], axis=1)
+    normals /= np.hypot(normals[:, 0], normals[:, 1])[:, None]
+    before = np.vstack([normals[:1], normals])
+    after = np.vstack([normals, normals[-1:]])
+    cosine = (before * after).sum(axis=1)
+    return np.asarray(polyline + offset_m * (before + after) / np.maximum(1.0 + cosine, 0.5)[:, None])
+
+
+def convex_hull(points: Points) -> Points:
+    """The corners (k, 2) of the convex hull of (n, 2) points (Andrew's monotone chain, 1979)."""
+    unique = sorted(set(map(tuple, points.tolist())))
+    if len(unique) < 3:
+        return np.array(unique)
+    chains = []
+    for sequence in (unique, unique[::-1]):
+        chain: list[tuple[float, ...]] = []
+        for point in sequence:
+            while len(chain) > 1 and _turn(chain[-2], chain[-1], point) <= 0.0:
+                chain.pop()
+            chain.append(point)
+        chains.append(chain[:-1])
+    return np.array(chains[0] + chains[1])
+
+
+def _turn(a: tuple[float, ...], b: tuple[float, ...], c: tuple[float, ...]) -> float:
+    return (b[0] - a[0]) * (c[1] - a[1]) - (b[1] - a[1]) * (c[0] - a[0])
+
+
+def _side(network: RoadNetwork, lane: int, offset_m: float) -> Points:
+    return offset_polyline(network.lane_polyline(lane)[:, :2], offset_m)
+
+
+def _junction_patches(network: RoadNetwork, for_cars: NDArray[np.bool_]) -> tuple[Patch, ...]:
+    """The hull of the lane mouths at each junction and of the paths between them."""
+    corners: dict[tuple[int, bool], list[Points]] = {}
+    lanes, links = network.lanes, network.links
+    for link in links:
+        mouths = corners.setdefault((int(link["junction"]), bool(for_cars[link["from_lane"]])), [])
+        for lane, end in ((link["from_lane"], -1), (link["to_lane"], 0)):
+            half = lanes[lane]["width_m"] / 2.0
+            mouths.extend(_side(network, lane, side)[end][None] for side in (half, -half))
+    for lane in np.flatnonzero(lanes["internal"] & (lanes["link"] >= 0)):
+        link = links[lanes[lane]["link"]]
+        half = lanes[lane]["width_m"] / 2.0
+        paths = corners[int(link["junction"]), bool(for_cars[link["from_lane"]])]
+        paths.extend(_side(network, lane, side) for side in (half, -half))
+    patches = []
+    for (junction, cars), shapes in corners.items():
+        outline = convex_hull(np.vstack(shapes))
+        level = round(float(network.junctions[junction]["z"]) / LEVEL_M)
+        patches.append(Patch(outline, level, cars))
+    return tuple(patches)
+
+
+def _dashes(network: RoadNetwork) -> Points:
+    dashes = [np.zeros((0, 2, 2))]
+    lanes = network.lanes
+    for lane in np.flatnonzero((lanes["left"] >= 0) & ~lanes["internal"]):
+        line = _side(network, lane, lanes[lane]["width_m"] / 2.0)
+        s = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(line, axis=0).T))])
+        begins = np.arange(DASH_PERIOD_M / 3.0, s[-1] - DASH_M, DASH_PERIOD_M)
+        at = np.stack([begins, begins + DASH_M], axis=1)
+        dashes.append(np.stack([np.interp(at, s, line[:, k]) for k in (0, 1)], axis=2))
+    return np.concatenate(dashes)
+
+
+def _road_edges(network: RoadNetwork) -> tuple[Points, Points]:
+    """Lines at the outer edges of roads, and between a road and its opposite direction."""
+    edges, lanes = network.edges, network.lanes
+    ways = {(int(e["from_junction"]), int(e["to_junction"])) for e in edges if not e["internal"]}
+    outer, centre = [np.zeros((0, 2, 2))], [np.zeros((0, 2, 2))]
+    for edge in edges:
+        if edge["internal"]:
+            continue
+        rightmost, leftmost = edge["first_lane"], edge["first_lane"] + edge["num_lanes"] - 1
+        way = int(edge["from_junction"]), int(edge["to_junction"])
+        if lanes[rightmost]["permissions"] & CAR_BIT:
+            half = lanes[rightmost]["width_m"] / 2.0
+            outer.append(_pieces(_side(network, rightmost, 0.2 - half)))
+        if lanes[leftmost]["permissions"] & CAR_BIT:
+            half = lanes[leftmost]["width_m"] / 2.0
+            if way[::-1] not in ways:
+                outer.append(_pieces(_side(network, leftmost, half - 0.2)))
+            elif way < way[::-1]:
+                centre.append(_pieces(_side(network, leftmost, half)))
+    return np.concatenate(outer), np.concatenate(centre)
+
+
+def _pieces(line: Points) -> Points:
+    return np.stack([line[:-1], line[1:]], axis=1)
+
+
+def _stop_lines(network: RoadNetwork) -> Points:
+    """Each link's share of its lane's stop line, the left turn's at the left."""
+    links, lanes = network.links, network.lanes
+    quads = np.zeros((len(links), 4, 2))
+    for lane in np.flatnonzero(lanes["num_links"] > 0):
+        row = lanes[lane]
+        rows = np.arange(row["first_link"], row["first_link"] + row["num_links"])
+        rank = [DIRECTIONS_FROM_LEFT.find(chr(links[link]["direction"])) for link in rows]
+        end = network.points[row["first_point"] + row["num_points"] - 1]
+        forward = np.array([end["cos"], end["sin"]])
+        left = np.array([-end["sin"], end["cos"]])
+        corner = np.array([end["x"], end["y"]]) + left * (row["width_m"] / 2.0 - 0.1)
+        share = (row["width_m"] - 0.2) / len(rows)
+        for place, link in enumerate(rows[np.argsort(rank, kind="stable")]):
+            near = corner - left * share * place
+            far = near - left * share
+            back = -forward * STOP_LINE_M
+            quads[link] = near, far, far + back, near + back
+    return quads

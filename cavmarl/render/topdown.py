@@ -1,0 +1,203 @@
+"""`TopDownRenderer`: a world from above, as a picture."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cavmarl.render.camera import Bounds, Camera
+from cavmarl.render.canvas import load_pygame
+from cavmarl.render.cars import draw_cars, in_view
+from cavmarl.render.ground import draw_ground, draw_stop_lines, signal_codes
+from cavmarl.render.overlay import Overlay, clock_text
+from cavmarl.render.shapes import road_shapes
+from cavmarl.render.window import Window
+from cavmarl.roads.network import RoadNetwork
+
+if TYPE_CHECKING:
+    from pygame import Surface
+
+__all__ = ["TopDownRenderer"]
+
+# Pixels of a picture whose size is not given, and how much wider than high it may be.
+PICTURE_PX = 960 * 720
+MAX_ASPECT = 3.0
+# Smallest part of the world that a following camera shows, and how fast it turns to a new aim.
+FOLLOW_M = 150.0
+FOLLOW_SHARE = 0.12
+STILL_DETAIL = 3
+MOVING_DETAIL = 2
+
+
+class TopDownRenderer:
+    """Draws the vehicles and signals of one map, off screen.
+
+    Args:
+        network: the map.
+        size: width and height of the picture in pixels; by default what suits the map's shape.
+        focus: (min_x, min_y, max_x, max_y) in metres to show; all roads by default.
+        goal_edges: EDGE rows by `VEHICLE["goal"]`; given, each agent's destination is marked.
+
+    Raises:
+        MissingExtraError: pygame-ce is not installed.
+    """
+
+    def __init__(
+        self,
+        network: RoadNetwork,
+        size: tuple[int, int] | None = None,
+        focus: Bounds | None = None,
+        goal_edges: NDArray[np.int32] | None = None,
+    ) -> None:
+        load_pygame()
+        self.network = network
+        bounds = focus or network.extent_m
+        self.size = size or _suitable_size(bounds)
+        self._home = Camera.fit(bounds, self.size)
+        self._camera = self._home
+        self._following = False
+        self._goals = None if goal_edges is None else _edge_ends(network, goal_edges)
+        self._shapes = road_shapes(network)
+        self._overlay = Overlay()
+        self._ground: tuple[Camera, Surface] | None = None
+        self._scene: tuple[Camera, bytes, Surface] | None = None
+        self._window: Window | None = None
+
+    @property
+    def camera(self) -> Camera:
+        """The view of the last picture."""
+        return self._camera
+
+    def draw(
+        self,
+        vehicles: NDArray[np.void],
+        signal_phases: NDArray[np.int32] | None = None,
+        *,
+        title: str = "",
+        clock_s: float | None = None,
+        follow: tuple[float, float] | Sequence[int] | None = None,
+    ) -> Surface:
+        """Draw one picture.
+
+        Args:
+            vehicles: VEHICLE rows, in any order.
+            signal_phases: (num_signals,) PHASE rows that are on; without them signals are not shown.
+            title: for the upper left corner.
+            clock_s: time for the upper left corner.
+            follow: what the camera stays close to: a place (two floats, m), or agents by index; it
+                stays where it is while none of these is in the world. None: it shows `focus`.
+
+        Returns:
+            A new surface; see `frame` for an array.
+        """
+        self._aim(vehicles, follow)
+        camera = self._camera
+        surface = self._background(signal_phases).copy()
+        seen = in_view(vehicles, camera)
+        if self._goals is not None:
+            agents = vehicles[vehicles["agent"] >= 0]
+            self._overlay.destinations(
+                surface, agents["agent"], self._goals[agents["goal"]], camera
+            )
+        draw_cars(surface, seen, camera)
+        self._overlay.agents(surface, seen, camera)
+        notes = [] if clock_s is None else [clock_text(clock_s)]
+        notes.append(f"{len(vehicles)} vehicles")
+        self._overlay.title(surface, title, "   ".join(notes))
+        self._overlay.scale_bar(surface, camera)
+        self._overlay.legend(surface)
+        return surface
+
+    def frame(
+        self,
+        vehicles: NDArray[np.void],
+        signal_phases: NDArray[np.int32] | None = None,
+        *,
+        title: str = "",
+        clock_s: float | None = None,
+        follow: tuple[float, float] | Sequence[int] | None = None,
+    ) -> NDArray[np.uint8]:
+        """The picture of `draw` as uint8 (height, width, 3), red green blue."""
+        surface = self.draw(vehicles, signal_phases, title=title, clock_s=clock_s, follow=follow)
+        data = load_pygame().image.tobytes(surface, "RGB")
+        return np.frombuffer(data, dtype=np.uint8).reshape(*self.size[::-1], 3).copy()
+
+    def show(self, surface: Surface, title: str, fps: float) -> None:
+        """Put a picture of `draw` in a window, no sooner than 1/`fps` s after the last one."""
+        if self._window is None:
+            self._window = Window(title, fps)
+        self._window.show(surface)
+
+    def close(self) -> None:
+        """Close the window and let go of all pictures; drawing again makes them anew."""
+        if self._window is not None:
+            self._window.close()
+            self._window = None
+        self._ground = None
+        self._scene = None
+
+    def _aim(
+        self, vehicles: NDArray[np.void], follow: tuple[float, float] | Sequence[int] | None
+    ) -> None:
+        if follow is None:
+            self._camera, self._following = self._home, False
+            return
+        target = self._closeup(vehicles, follow)
+        if target is not None:
+            share = FOLLOW_SHARE if self._following else 1.0
+            self._camera = self._camera.towards(target, share)
+            self._following = True
+
+    def _closeup(
+        self, vehicles: NDArray[np.void], follow: tuple[float, float] | Sequence[int]
+    ) -> Camera | None:
+        if len(follow) == 2 and isinstance(follow[0], float):
+            places = np.array([follow], dtype=np.float64)
+        else:
+            rows = vehicles[np.isin(vehicles["agent"], follow)]
+            places = np.stack([rows["x"], rows["y"]], axis=1)
+        if not len(places):
+            return None
+        low, high = places.min(axis=0), places.max(axis=0)
+        middle = (low + high) / 2.0
+        half = np.maximum((high - low) * 0.6, FOLLOW_M / 2.0)
+        low, high = middle - half, middle + half
+        return Camera.fit((low[0], low[1], high[0], high[1]), self.size, margin=0.0)
+
+    def _background(self, signal_phases: NDArray[np.int32] | None) -> Surface:
+        """Roads and stop lines, made anew when the camera moves or a signal switches."""
+        camera = self._camera
+        if self._ground is None or self._ground[0] != camera:
+            detail = MOVING_DETAIL if self._following else STILL_DETAIL
+            self._ground = camera, draw_ground(self._shapes, camera, detail)
+        if signal_phases is None or not len(self.network.signals):
+            return self._ground[1]
+        codes = signal_codes(self.network, signal_phases)
+        key = codes.tobytes()
+        if self._scene is None or self._scene[:2] != (camera, key):
+            scene = self._ground[1].copy()
+            draw_stop_lines(scene, self._shapes, codes, camera)
+            self._scene = camera, key, scene
+        return self._scene[2]
+
+
+def _suitable_size(bounds: Bounds) -> tuple[int, int]:
+    """A size in the proportions of `bounds`, in steps of 16 pixels, which all video coders take."""
+    min_x, min_y, max_x, max_y = bounds
+    aspect = max(max_x - min_x, 1.0) / max(max_y - min_y, 1.0)
+    aspect = min(max(aspect, 1.0), MAX_ASPECT)
+    width, height = (PICTURE_PX * aspect) ** 0.5, (PICTURE_PX / aspect) ** 0.5
+    return round(width / 16) * 16, round(height / 16) * 16
+
+
+def _edge_ends(network: RoadNetwork, edges: NDArray[np.int32]) -> NDArray[np.float64]:
+    """Where edges end, (n, 2) m: the middle of their last points."""
+    ends = np.zeros((len(edges), 2))
+    for row, edge in enumerate(network.edges[edges]):
+        first = edge["first_lane"]
+        lanes = range(first, first + edge["num_lanes"])
+        ends[row] = np.mean([network.lane_polyline(lane)[-1, :2] for lane in lanes], axis=0)
+    return ends

@@ -1,0 +1,230 @@
+"""`CavVectorEnv`: many worlds in one process, arrays in and out.
+
+No Python loop runs over agents or vehicles in a step: all worlds go through the same kernels together.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from gymnasium import spaces
+from gymnasium.vector import AutoresetMode
+from numpy.typing import NDArray
+
+from cavmarl.actions import ActionDecoder
+from cavmarl.config import EnvConfig
+from cavmarl.env import check_seed
+from cavmarl.errors import ConfigError, ResetNeededError
+from cavmarl.kernels.codes import EVENTS_THAT_END
+from cavmarl.roads.network import RoadNetwork
+from cavmarl.runtime.simulation import Simulation, TrafficStats
+from cavmarl.spaces import action_space, flat_observation_space
+from cavmarl.worlds import check_placement, load_world
+
+__all__ = ["CavVectorEnv", "make_vec"]
+
+MAX_WORLDS = 65_536
+
+StepResult = tuple[
+    NDArray[np.float32],
+    NDArray[np.float32],
+    NDArray[np.bool_],
+    NDArray[np.bool_],
+    dict[str, NDArray[Any]],
+]
+
+
+def make_vec(
+    env: str | Path = "merge",
+    *,
+    num_envs: int = 1,
+    zones: int | None = None,
+    workers: int | None = None,
+    agents: int | None = None,
+    background: int | None = None,
+    seed: int | None = None,
+    max_cycles: int | None = None,
+    overrides: Mapping[str, Any] | None = None,
+) -> CavVectorEnv:
+    """Make `num_envs` worlds of one environment that are stepped together.
+
+    Args:
+        env: name of an entry of `envs/`, a folder with an env.yaml, or a map file.
+        num_envs: number of worlds.
+        zones: shadows zones.count; this version runs 1.
+        workers: processes that run the shards; this version runs them in the caller's (0).
+        agents: shadows population.agents.
+        background: shadows population.background.
+        seed: of the first reset, if that is given none.
+        max_cycles: steps until truncation; shadows horizon_s.
+        overrides: values for any other key.
+
+    Raises:
+        ConfigError: a key, value or combination that cannot work.
+        MapError: the map cannot be read or driven.
+    """
+    check_placement(workers)
+    if isinstance(num_envs, bool) or not isinstance(num_envs, (int, np.integer)):
+        raise ConfigError(f"num_envs = {num_envs!r}: must be a whole number")
+    if not 1 <= num_envs <= MAX_WORLDS:
+        raise ConfigError(f"num_envs = {num_envs}: must be from 1 to {MAX_WORLDS}")
+    config, network = load_world(
+        env,
+        zones=zones,
+        agents=agents,
+        background=background,
+        max_cycles=max_cycles,
+        overrides=overrides,
+    )
+    return CavVectorEnv(config, network, int(num_envs), seed=seed)
+
+
+class CavVectorEnv:
+    """W worlds with A agent seats each; flat observations.
+
+    Arrays have the shape (num_envs, num_agents, …). `infos["mask"]` says which agents have a vehicle and
+    will be asked for the next action; the others' observations are 0 and their actions are not read.
+    A world whose episode is over (truncated, or all agents gone and none to come) is reset in the same
+    step: the observations returned are those of the new episode, `infos["final_observations"]` keeps the
+    last ones of the old (Gymnasium's `AutoresetMode.SAME_STEP`).
+
+    Args:
+        config: the environment.
+        network: its roads.
+        num_envs: W.
+        seed: of the first reset, if that is given none.
+    """
+
+    def __init__(
+        self, config: EnvConfig, network: RoadNetwork, num_envs: int, *, seed: int | None = None
+    ) -> None:
+        self.config = config
+        self.network = network
+        self.num_envs = num_envs
+        self.possible_agents = [f"car_{k}" for k in range(config.population.num_ids)]
+        self.num_agents = len(self.possible_agents)
+        self.single_observation_space: spaces.Box = flat_observation_space(config)
+        self.single_action_space = action_space(config.action)
+        self.max_cycles = config.max_steps
+        self.metadata = {
+            "name": f"cavmarl/{config.name}-v{config.version}",
+            "autoreset_mode": AutoresetMode.SAME_STEP,
+        }
+        self._simulation = Simulation(config, network, num_envs)
+        self._decoder = ActionDecoder(config.action, num_envs, self.possible_agents)
+        self._steps = np.zeros(num_envs, dtype=np.int64)
+        self._mask = np.zeros((num_envs, self.num_agents), dtype=np.bool_)
+        self._first_seed = seed
+        self._ready = False
+
+    @property
+    def step_s(self) -> float:
+        """Seconds a step."""
+        return self.config.clock.ctrl_dt_s
+
+    @property
+    def simulation(self) -> Simulation:
+        """The worlds behind this view, for tools that draw or measure them."""
+        return self._simulation
+
+    def reset(
+        self, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[NDArray[np.float32], dict[str, NDArray[Any]]]:
+        """Begin an episode in every world.
+
+        Args:
+            seed: root of all random numbers; world w's episodes depend on (seed, w) alone. None goes
+                on with the next episodes of the last seed.
+            options: not used; accepted because the API has it.
+
+        Returns:
+            observations (W, A, D) and infos.
+        """
+        if seed is None and not self._ready:
+            seed = self._first_seed
+            if seed is None:
+                seed = int(np.random.SeedSequence().generate_state(1, np.uint64)[0] >> 1)
+        if seed is not None:
+            self._simulation.seed(check_seed(seed))
+        everywhere = np.ones(self.num_envs, dtype=np.bool_)
+        self._simulation.reset()
+        self._decoder.forget(everywhere)
+        self._steps[:] = 0
+        self._mask = self._simulation.outputs.present.copy()
+        self._ready = True
+        return self._simulation.outputs.observations.copy(), {"mask": self._mask.copy()}
+
+    def step(self, actions: NDArray[Any]) -> StepResult:
+        """Let every agent of every world act.
+
+        Args:
+            actions: (W, A, 2) floats in [-1, 1], or (W, A) meta-actions. Not read where the mask is
+                False.
+
+        Returns:
+            observations (W, A, D), rewards (W, A), terminations (W, A): the agent's vehicle ended;
+            truncations (W, A): the episode was cut at the horizon; and infos:
+            `mask` (W, A) who acts next; `acted` (W, A) who acted in this step, so whose reward counts;
+            `terms` (W, A, T) in the order of `config.TERMS`; `episode_over` (W,) which worlds were
+            reset; `final_observations` (W, A, D) before that reset.
+
+        Raises:
+            ResetNeededError: before the first reset.
+            InvalidActionError: wrong shape, dtype or value; nothing has changed.
+        """
+        if not self._ready:
+            raise ResetNeededError("step() before reset(): call vec.reset(seed=…) first")
+        commands = self._decoder.from_array(actions, self._mask)
+        simulation = self._simulation
+        simulation.step(commands)
+        self._steps += 1
+        outputs = simulation.outputs
+        horizon = self._steps >= self.max_cycles
+        rewards = outputs.rewards.copy()
+        acted = outputs.acted.copy()
+        terminations = outputs.terminated.copy()
+        truncations = acted & horizon[:, None] & ~terminations
+        final_observations = outputs.observations.copy()
+        infos: dict[str, NDArray[Any]] = {
+            "acted": acted,
+            "terms": outputs.terms.copy(),
+            "vehicle_done": outputs.events & EVENTS_THAT_END != 0,
+            "final_observations": final_observations,
+        }
+        simulation.retire_agents()
+        staying = outputs.present & ~terminations
+        over = horizon | ~(staying.any(axis=1) | simulation.agents_to_come())
+        observations = final_observations
+        if over.any():
+            simulation.reset(over)
+            self._decoder.forget(over)
+            self._steps[over] = 0
+            staying[over] = simulation.outputs.present[over]
+            observations = np.where(
+                over[:, None, None], simulation.outputs.observations, final_observations
+            )
+        observations = np.where(staying[..., None], observations, np.float32(0.0))
+        self._mask = staying
+        infos["mask"] = staying.copy()
+        infos["episode_over"] = over
+        return observations, rewards, terminations, truncations, infos
+
+    def suggest_actions(self) -> NDArray[Any]:
+        """What the built-in driver (IDM, MOBIL, lane controller) would do in each agent's place."""
+        raw = np.zeros((self.num_envs, self.num_agents, 2))
+        self._simulation.suggest(raw)
+        return self._decoder.encode(raw)
+
+    def state_hash(self, world: int = 0) -> str:
+        """Hex digest of one world, as `CavEnv.state_hash`."""
+        return self._simulation.state_hash(world)
+
+    def traffic_stats(self, world: int = 0) -> TrafficStats:
+        """Traffic of one world since its reset."""
+        return self._simulation.traffic_stats(world)
+
+    def close(self) -> None:
+        """Nothing to release: all worlds live in this process."""

@@ -1,0 +1,54 @@
+"""From a name to what a world is made of: config and roads."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from cavmarl.config import EnvConfig
+from cavmarl.errors import ConfigError
+from cavmarl.maps.netconvert import map_file
+from cavmarl.registry import load_config, resolve_map
+from cavmarl.roads.cache import load_network
+from cavmarl.roads.network import RoadNetwork
+
+__all__ = ["check_placement", "load_world"]
+
+
+def load_world(
+    env: str | Path,
+    *,
+    zones: int | None = None,
+    agents: int | None = None,
+    background: int | None = None,
+    max_cycles: int | None = None,
+    overrides: Mapping[str, Any] | None = None,
+) -> tuple[EnvConfig, RoadNetwork]:
+    """Config and roads of an entry, a folder or a map file; keywords as in `parallel_env`.
+
+    Raises:
+        ConfigError: a key, value or combination that cannot work.
+        MapError: the map cannot be read or driven.
+    """
+    config, base_dir = load_config(
+        env,
+        zones=zones,
+        agents=agents,
+        background=background,
+        max_cycles=max_cycles,
+        overrides=overrides,
+    )
+    return config, load_network(map_file(resolve_map(config, base_dir)))
+
+
+def check_placement(workers: int | None) -> None:
+    """Refuse a number of workers that this version does not run.
+
+    Raises:
+        ConfigError: not None or 0.
+    """
+    if workers not in (None, 0):
+        raise ConfigError(
+            f"workers = {workers!r}: this version runs all shards in the caller's process; use 0"
+        )

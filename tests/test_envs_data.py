@@ -1,0 +1,114 @@
+"""Every folder of `envs/` is complete: a card, a configuration, a map."""
+
+from __future__ import annotations
+
+import importlib.metadata
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from cavmarl.config import EnvConfig
+from cavmarl.errors import MissingExtraError
+from cavmarl.maps.check import check_map
+from cavmarl.registry import load_config, resolve_map
+from tests.generated import check_block, table
+
+ROOT = Path(__file__).resolve().parents[1]
+FOLDERS = sorted(path for path in (ROOT / "envs").iterdir() if path.is_dir())
+RECIPES = sorted((ROOT / "envs").glob("*/map/map.net*cfg"))
+
+each_folder = pytest.mark.parametrize("folder", FOLDERS, ids=lambda folder: folder.name)
+
+
+@each_folder
+def test_the_folder_has_the_name_of_its_environment(folder: Path) -> None:
+    config, base_dir = load_config(folder.name)
+    assert config.name == folder.name
+    assert base_dir.samefile(folder)
+
+
+@each_folder
+def test_the_map_can_be_driven_and_has_the_edges_that_are_named(folder: Path) -> None:
+    config, base_dir = load_config(folder.name)
+    map_path = map_or_skip(config, base_dir)
+    assert check_map(map_path).drivable
+    text = map_path.read_text(encoding="utf-8")
+    for edge in (*config.traffic.origins, *config.traffic.destinations):
+        assert f'<edge id="{edge}"' in text
+
+
+@each_folder
+def test_the_card_says_what_the_configuration_says(folder: Path) -> None:
+    config, base_dir = load_config(folder.name)
+    card = folder / "README.md"
+    check_block(card, "facts", facts(config, map_or_skip(config, base_dir)))
+    text = card.read_text(encoding="utf-8")
+    assert f'cavmarl.parallel_env("{config.name}")' in text
+    assert re.search(rf"## Versions\n\n- {config.version}: ", text), (
+        "the newest version comes first"
+    )
+
+
+@pytest.mark.parametrize("recipe", RECIPES, ids=lambda recipe: recipe.parts[-3])
+def test_a_generated_map_is_what_its_options_make(recipe: Path, tmp_path: Path) -> None:
+    pinned = re.search(
+        r"^eclipse-sumo==(.*)$", (ROOT / "constraints.txt").read_text(), re.MULTILINE
+    )
+    assert pinned
+    try:
+        installed = importlib.metadata.version("eclipse-sumo")
+    except importlib.metadata.PackageNotFoundError:
+        pytest.skip("eclipse-sumo is not installed")
+    if installed != pinned[1]:
+        pytest.skip(f"maps were made by eclipse-sumo {pinned[1]}, here is {installed}")
+    program = {".netccfg": "netconvert", ".netgcfg": "netgenerate"}[recipe.suffix]
+    built = tmp_path / "map.net.xml"
+    options = ("--configuration-file", recipe.name, "--output-file", str(built))
+    subprocess.run(
+        [sys.executable, "-c", f"import sumo; sumo.{program}()", *options],
+        cwd=recipe.parent,
+        check=True,
+        capture_output=True,
+    )
+    # The comment at the top has the date, the version and the options.
+    text = re.sub(
+        r"\n<!-- generated on .*?\n-->\n", "", built.read_text(), count=1, flags=re.DOTALL
+    )
+    assert text == (recipe.parent / "map.net.xml").read_text()
+
+
+def map_or_skip(config: EnvConfig, base_dir: Path) -> Path:
+    try:
+        return resolve_map(config, base_dir)
+    except MissingExtraError as error:
+        pytest.skip(str(error))
+
+
+def facts(config: EnvConfig, map_path: Path) -> str:
+    """The table of facts of a card."""
+    report, people, clock = check_map(map_path), config.population, config.clock
+    budget = f", {people.num_ids} in an episode" if people.mode == "entering" else ""
+    trip = f"from {config.traffic.min_trip_m:g} m"
+    if config.traffic.max_trip_m:
+        trip += f" to {config.traffic.max_trip_m:g} m"
+    weights = (f"`{name}` {weight:g}" for name, weight in config.terms.weights.items())
+    rows = (
+        ("map", f"`{config.map.source}`"),
+        (
+            "roads",
+            f"{report.road_km:.2f} km, {report.lanes} lanes, {report.signals} traffic lights",
+        ),
+        ("population", f"`{people.mode}`: {people.agents} agents{budget}"),
+        ("background", f"{people.background} vehicles"),
+        ("trips", trip),
+        ("horizon", f"{config.horizon_s:g} s = {config.max_steps} steps"),
+        ("step", f"{clock.ctrl_dt_s:g} s = {clock.ticks_per_step} ticks of {clock.sim_dt_s:g} s"),
+        ("action", f"`{config.action.kind}`"),
+        ("observation", f"`{config.observation.kind}`"),
+        ("terms · weights", ", ".join(weights)),
+        ("team share", f"{config.terms.team_share:g}"),
+    )
+    return table(("fact", "value"), rows)
