@@ -23,13 +23,13 @@ from cavmarl.kernels.car_following import (
     idm_free,
     idm_interaction,
 )
-from cavmarl.kernels.codes import HOLD_NONE
+from cavmarl.kernels.codes import DRIVER_AGENT, HOLD_NONE
 from cavmarl.kernels.junctions import conflict_inside, may_enter
 from cavmarl.kernels.lane_change import mobil_accepts
 from cavmarl.kernels.lanes import last_on_lane, neighbor_ahead, neighbor_behind
 from cavmarl.kernels.scalars import clamp
 
-__all__ = ["LOOK_AHEAD_M", "decide"]
+__all__ = ["LOOK_AHEAD_M", "decide", "needed_change"]
 
 LOOK_AHEAD_M = 250.0  # no driver looks further
 LOOK_BACK_M = 60.0  # how far back a lane change looks for followers
@@ -42,6 +42,8 @@ COURTESY_DECEL = 2.0  # m/s², the hardest braking to let somebody merge
 DECIDE_EVERY_TICKS = 10  # how often a driver thinks of changing to one side
 CHANGE_EARLY_M = 80.0  # a change that the route needs is made this far before it must be,
 CHANGE_EARLY_S = 12.0  # plus the way of this time
+MERGE_ROOM_M = 12.0  # a driver that has to leave a lane waits this far before its end,
+MERGE_ROOM_SHARE = 0.25  # or this share of the lane's length
 SIDE_GAP_M = 1.0  # m between bumpers, the least with which a lane change starts
 
 
@@ -139,7 +141,9 @@ def _road_ahead(
         step = plans[row["goal"], lane]
         if step["next"] < 0:
             if step["to_go"] == math.inf or step["change"] != 0:
-                strongest = max(strongest, _before_line(row, distance - half))
+                # Stop with room enough to swing out into the next lane.
+                room = min(MERGE_ROOM_M, MERGE_ROOM_SHARE * roads.lanes[lane]["length_m"])
+                strongest = max(strongest, _before_line(row, distance - half - room))
             break
         if step["link"] >= 0:
             if distance - half < STOP_LINE_M and link_ahead < 0:
@@ -226,44 +230,73 @@ def _change_is_safe(
 
 
 @kernel
+def needed_change(roads: RoadArrays, plans: NDArray[np.void], row: np.void) -> int:
+    """The side that a vehicle's way needs it to change to by now: 1 left, -1 right, 0 none."""
+    step = plans[row["goal"], row["lane"]]
+    if step["change"] == 0 or roads.lanes[row["lane"]]["internal"]:
+        return 0
+    early = (CHANGE_EARLY_M + CHANGE_EARLY_S * row["speed"]) * step["changes"]
+    return int(step["change"]) if step["room"] - row["s"] <= early else 0
+
+
+@kernel
+def _may_change(
+    roads: RoadArrays,
+    plans: NDArray[np.void],
+    rows: NDArray[np.void],
+    i: int,
+    side: int,
+    needed: int,
+    accel: float,
+    scratch: Scratch,
+) -> bool:
+    """Whether row i wants to and can change to one side: for its way, or to drive faster."""
+    row = rows[i]
+    lane = roads.lanes[row["lane"]]
+    target = lane["left"] if side > 0 else lane["right"]
+    if lane["internal"] or target < 0 or (needed != 0 and needed != side):
+        return False
+    if needed == 0:
+        beyond = plans[row["goal"], target]
+        if beyond["to_go"] == math.inf or row["speed"] < 1.0:
+            return False
+        early = (CHANGE_EARLY_M + CHANGE_EARLY_S * row["speed"]) * beyond["changes"]
+        if beyond["change"] != 0 and beyond["room"] - row["s"] < 2.0 * early:
+            return False
+        if lane["length_m"] - row["s"] < row["length"] + 2.0 * row["speed"]:
+            return False
+    return _change_is_safe(roads, plans, rows, i, target, accel, needed != 0, scratch)
+
+
+@kernel
 def _choose_lane(
     roads: RoadArrays,
     plans: NDArray[np.void],
     rows: NDArray[np.void],
     i: int,
     tick: int,
+    needed: int,
     accel: float,
     scratch: Scratch,
-) -> tuple[int, int]:
-    """(lane change to make now, side that the route needs), 1 left, -1 right, 0 none."""
+) -> int:
+    """The lane change that row i makes now: 1 left, -1 right, 0 none.
+
+    In even ticks background drivers may only change to the left, in odd ones to the right: two of them
+    never take the same gap from both sides in one tick, whoever is asked first. A suggestion for an
+    agent is made anew at each step and binds nobody, so it has no such rule.
+    """
     row = rows[i]
-    lane = roads.lanes[row["lane"]]
-    step = plans[row["goal"], row["lane"]]
-    if lane["internal"] or row["side_lane"] >= 0:
-        return 0, 0
-    early = CHANGE_EARLY_M + CHANGE_EARLY_S * row["speed"]
-    wanted = step["change"]
-    if wanted != 0 and step["room"] - row["s"] > early * step["changes"]:
-        wanted = 0
-    # In even ticks drivers may only change to the left, in odd ones to the right: two of them never
-    # take the same gap from both sides in one tick, whoever is asked first.
+    if row["driver"] == DRIVER_AGENT:
+        for side in (1, -1):
+            if _may_change(roads, plans, rows, i, side, needed, accel, scratch):
+                return side
+        return 0
+    if row["side_lane"] >= 0 or (tick // 2 + row["id"]) % DECIDE_EVERY_TICKS != 0:
+        return 0
     side = 1 if tick % 2 == 0 else -1
-    if (tick // 2 + row["id"]) % DECIDE_EVERY_TICKS != 0:
-        return 0, wanted
-    target = lane["left"] if side > 0 else lane["right"]
-    if target < 0 or (wanted != 0 and wanted != side):
-        return 0, wanted
-    if wanted == 0:
-        beyond = plans[row["goal"], target]
-        if beyond["to_go"] == math.inf or row["speed"] < 1.0:
-            return 0, wanted
-        if beyond["change"] != 0 and beyond["room"] - row["s"] < 2.0 * early * beyond["changes"]:
-            return 0, wanted
-        if lane["length_m"] - row["s"] < row["length"] + 2.0 * row["speed"]:
-            return 0, wanted
-    if _change_is_safe(roads, plans, rows, i, target, accel, wanted != 0, scratch):
-        return side, wanted
-    return 0, wanted
+    if _may_change(roads, plans, rows, i, side, needed, accel, scratch):
+        return side
+    return 0
 
 
 @kernel
@@ -303,9 +336,10 @@ def decide(
                 strongest = max(strongest, _behind(row, ahead_s - s, rows[j]))
         strongest = max(strongest, _courtesy(roads, rows, i, scratch))
         accel = idm_free(row["speed"], allowed, ACCEL_MAX) - strongest
-        change, wanted = _choose_lane(roads, plans, rows, i, tick, accel, scratch)
+        needed = needed_change(roads, plans, row)
+        change = _choose_lane(roads, plans, rows, i, tick, needed, accel, scratch)
         scratch.accel[i] = clamp(accel, -ACCEL_LIMIT, ACCEL_LIMIT)
         scratch.lane_change[i] = change
-        scratch.blinker[i] = wanted
+        scratch.blinker[i] = needed
         scratch.hold[i] = hold
         scratch.link_ahead[i] = link_ahead

@@ -24,7 +24,7 @@ from cavmarl.kernels.codes import (
 )
 from cavmarl.kernels.contacts import find_contacts
 from cavmarl.kernels.control import speed_control
-from cavmarl.kernels.drivers import decide
+from cavmarl.kernels.drivers import decide, needed_change
 from cavmarl.kernels.junctions import STOP_SIGN_TICKS, register_links
 from cavmarl.kernels.lanes import index_lanes
 from cavmarl.kernels.motion import move_agent, move_background
@@ -150,6 +150,8 @@ def advance(
                 phase,
                 dt,
             )
+            # The indicator is automatic: drivers behind make room for who has to change lanes.
+            row["blinker"] = needed_change(roads, plans, row)
 
 
 @kernel

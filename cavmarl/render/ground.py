@@ -29,9 +29,8 @@ if TYPE_CHECKING:
 __all__ = ["draw_ground", "draw_stop_lines", "signal_codes", "signal_letter"]
 
 KERB_M = 0.6
-# Pixels a metre from which details are worth their ink.
+# Pixels a metre from which markings are worth their ink.
 SCALE_OF_MARKINGS = 0.9
-SCALE_OF_BORDERS = 3.0
 MARKING_M = 0.15
 MIN_ROAD_PX = 1.6
 MIN_STOP_LINE_PX = 4.0
@@ -80,8 +79,6 @@ def draw_ground(shapes: RoadShapes, camera: Camera, detail: int) -> Surface:
     if camera.scale >= SCALE_OF_MARKINGS:
         painter.lines(shapes.dashes, MARKING)
         painter.lines(shapes.centre_lines, CENTRE_LINE)
-    if camera.scale >= SCALE_OF_BORDERS:
-        painter.lines(shapes.borders, MARKING)
     reduced: Surface = pygame.transform.smoothscale(surface, camera.size)
     return reduced
 

@@ -48,7 +48,6 @@ class RoadShapes:
         for_cars: (n,) the lane is open to cars.
         junctions: the insides of junctions.
         dashes: (k, 2, 2) from and to, between lanes of one direction.
-        borders: (k, 2, 2) at the outer edges of roads.
         centre_lines: (k, 2, 2) between opposite directions.
         stop_lines: (num_links, 4, 2) the link's part of the bar at the end of its lane.
     """
@@ -61,7 +60,6 @@ class RoadShapes:
     for_cars: NDArray[np.bool_]
     junctions: tuple[Patch, ...]
     dashes: Points
-    borders: Points
     centre_lines: Points
     stop_lines: Points
 
@@ -78,7 +76,6 @@ def road_shapes(network: RoadNetwork) -> RoadShapes:
     lane = lane_of_point[pieces]
     last = np.append(lane[1:] != lane[:-1], True)
     for_cars = (lanes["permissions"] & CAR_BIT).astype(bool)
-    outer, centre = _road_edges(network)
     return RoadShapes(
         starts=plane[pieces],
         ends=plane[pieces + 1],
@@ -88,8 +85,7 @@ def road_shapes(network: RoadNetwork) -> RoadShapes:
         for_cars=for_cars[lane],
         junctions=_junction_patches(network, for_cars),
         dashes=_dashes(network),
-        borders=outer,
-        centre_lines=centre,
+        centre_lines=_centre_lines(network),
         stop_lines=_stop_lines(network),
     )
 
@@ -163,30 +159,19 @@ def _dashes(network: RoadNetwork) -> Points:
     return np.concatenate(dashes)
 
 
-def _road_edges(network: RoadNetwork) -> tuple[Points, Points]:
-    """Lines at the outer edges of roads, and between a road and its opposite direction."""
+def _centre_lines(network: RoadNetwork) -> Points:
+    """Along the left side of each road that has an opposite direction, once for both."""
     edges, lanes = network.edges, network.lanes
-    ways = {(int(e["from_junction"]), int(e["to_junction"])) for e in edges if not e["internal"]}
-    outer, centre = [np.zeros((0, 2, 2))], [np.zeros((0, 2, 2))]
-    for edge in edges:
-        if edge["internal"]:
-            continue
-        rightmost, leftmost = edge["first_lane"], edge["first_lane"] + edge["num_lanes"] - 1
+    roads = edges[~edges["internal"]]
+    ways = set(zip(roads["from_junction"].tolist(), roads["to_junction"].tolist(), strict=True))
+    pieces = [np.zeros((0, 2, 2))]
+    for edge in roads:
+        leftmost = edge["first_lane"] + edge["num_lanes"] - 1
         way = int(edge["from_junction"]), int(edge["to_junction"])
-        if lanes[rightmost]["permissions"] & CAR_BIT:
-            half = lanes[rightmost]["width_m"] / 2.0
-            outer.append(_pieces(_side(network, rightmost, 0.2 - half)))
-        if lanes[leftmost]["permissions"] & CAR_BIT:
-            half = lanes[leftmost]["width_m"] / 2.0
-            if way[::-1] not in ways:
-                outer.append(_pieces(_side(network, leftmost, half - 0.2)))
-            elif way < way[::-1]:
-                centre.append(_pieces(_side(network, leftmost, half)))
-    return np.concatenate(outer), np.concatenate(centre)
-
-
-def _pieces(line: Points) -> Points:
-    return np.stack([line[:-1], line[1:]], axis=1)
+        if way < way[::-1] and way[::-1] in ways and lanes[leftmost]["permissions"] & CAR_BIT:
+            line = _side(network, leftmost, lanes[leftmost]["width_m"] / 2.0)
+            pieces.append(np.stack([line[:-1], line[1:]], axis=1))
+    return np.concatenate(pieces)
 
 
 def _stop_lines(network: RoadNetwork) -> Points:

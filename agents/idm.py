@@ -1,0 +1,39 @@
+"""The built-in driver: IDM along the route, MOBIL and the route for lane changes, a lane controller.
+
+It drives as background vehicles do, from the world's state and not from observations. As an agent it is
+the yardstick for policies that have only their sensors.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cavmarl.env import CavEnv
+from cavmarl.errors import PolicyError
+from cavmarl.policies import Policy
+from cavmarl.vector_env import CavVectorEnv
+
+
+class IdmPolicy(Policy):
+    """Does what the built-in driver would do in each agent's place."""
+
+    def act_batch(self, observations: NDArray[np.float32], mask: NDArray[np.bool_]) -> NDArray[Any]:
+        """The built-in driver's actions (W, A, …) in the worlds as they are now."""
+        if not isinstance(self.env, CavVectorEnv):
+            raise PolicyError("act_batch() drives a make_vec; a parallel_env is driven by act()")
+        return self.env.suggest_actions()
+
+    def act(self, observations: Mapping[str, Any]) -> dict[str, Any]:
+        """The built-in driver's actions in the world as it is now."""
+        if not isinstance(self.env, CavEnv):
+            raise PolicyError("act() drives a parallel_env; a make_vec is driven by act_batch()")
+        return self.env.suggest_actions()
+
+
+def make_policy(env: CavEnv | CavVectorEnv) -> Policy:
+    """Seat the built-in driver."""
+    return IdmPolicy(env)

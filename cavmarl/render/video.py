@@ -1,0 +1,115 @@
+"""`VideoWriter`: pictures into an MP4 file that any browser plays."""
+
+from __future__ import annotations
+
+from collections.abc import Generator
+from pathlib import Path
+from types import TracebackType
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cavmarl.errors import ConfigError, require
+
+__all__ = ["VideoWriter"]
+
+# Constant rate factor of x264: lower is better and larger; 18 is visually lossless, 23 its default.
+QUALITY = 20
+
+
+class VideoWriter:
+    """Writes uint8 frames to an H.264 file (yuv420p); use it in a `with` block.
+
+    The folder is made if need be. The first frame sets the size; a file without frames is not written.
+
+    Args:
+        path: ends in `.mp4`.
+        fps: frames a second.
+
+    Raises:
+        ConfigError: the path cannot be written, or is no `.mp4`.
+        MissingExtraError: imageio-ffmpeg is not installed.
+    """
+
+    def __init__(self, path: str | Path, fps: float) -> None:
+        self.path = Path(path)
+        self.fps = fps
+        self.num_frames = 0
+        self._shape: tuple[int, ...] = ()
+        self._sink: Generator[None, bytes, None] | None = None
+        self._ffmpeg = require("imageio_ffmpeg", "render")
+        if self.path.suffix != ".mp4":
+            raise ConfigError(f"{path}: a video's name ends in .mp4")
+        if not 0.0 < fps <= 240.0:
+            raise ConfigError(f"fps = {fps!r}: must be above 0 and at most 240")
+        try:
+            self.path.parent.mkdir(parents=True, exist_ok=True)
+            with self.path.open("ab"):
+                pass
+        except OSError as error:
+            raise self._unwritable(error) from error
+        if not self.path.stat().st_size:
+            self.path.unlink()
+
+    def __enter__(self) -> VideoWriter:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        traceback: TracebackType | None,
+    ) -> None:
+        self.close()
+
+    def write(self, frame: NDArray[np.uint8]) -> None:
+        """Append a frame, (height, width, 3).
+
+        Raises:
+            ConfigError: not uint8 (height, width, 3), another size than the first frame's, or the
+                file cannot be written.
+        """
+        if frame.dtype != np.uint8 or frame.ndim != 3 or frame.shape[2] != 3:
+            raise ConfigError(
+                f"frame of {frame.dtype} {frame.shape}: must be uint8 (height, width, 3)"
+            )
+        if self._sink is None:
+            self._shape = frame.shape
+            self._sink = self._open(frame.shape)
+        if frame.shape != self._shape:
+            raise ConfigError(f"frame of {frame.shape}: the video began with {self._shape}")
+        # yuv420p holds one colour for four pixels: odd sides repeat their last row or column.
+        height, width = frame.shape[:2]
+        even = np.pad(frame, ((0, height % 2), (0, width % 2), (0, 0)), mode="edge")
+        try:
+            self._sink.send(np.ascontiguousarray(even).tobytes())
+        except OSError as error:
+            raise self._unwritable(error) from error
+        self.num_frames += 1
+
+    def close(self) -> None:
+        """Finish the file."""
+        if self._sink is not None:
+            self._sink.close()
+            self._sink = None
+
+    def _open(self, shape: tuple[int, ...]) -> Generator[None, bytes, None]:
+        size = (shape[1] + shape[1] % 2, shape[0] + shape[0] % 2)
+        sink: Generator[None, bytes, None] = self._ffmpeg.write_frames(
+            str(self.path),
+            size,
+            fps=self.fps,
+            codec="libx264",
+            pix_fmt_in="rgb24",
+            pix_fmt_out="yuv420p",
+            macro_block_size=1,
+            quality=None,
+            output_params=["-crf", str(QUALITY), "-movflags", "+faststart"],
+            ffmpeg_log_level="error",
+        )
+        sink.send(None)  # type: ignore[arg-type]  # starts the generator
+        return sink
+
+    def _unwritable(self, error: OSError) -> ConfigError:
+        reason = error.strerror or error
+        return ConfigError(f"{self.path}: cannot write a video there: {reason}")
