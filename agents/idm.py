@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from cavmarl.env import CavEnv
+from cavmarl.cav_env import CavEnv
 from cavmarl.errors import PolicyError
 from cavmarl.policies import Policy
 from cavmarl.vector_env import CavVectorEnv

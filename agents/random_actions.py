@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from cavmarl.env import CavEnv
+from cavmarl.cav_env import CavEnv
 from cavmarl.policies import Policy
 from cavmarl.vector_env import CavVectorEnv
 

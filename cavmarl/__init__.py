@@ -1,10 +1,68 @@
 """Multi-agent reinforcement learning for connected and automated vehicles on real road networks.
 
     import cavmarl
-    env = cavmarl.parallel_env("town", agents=25, background=100, seed=0)   # PettingZoo ParallelEnv
-    vec = cavmarl.make_vec("merge", num_envs=16)                            # batched arrays
+    env = cavmarl.parallel_env("town", agents=25, background=100, seed=0)  # PettingZoo ParallelEnv
+    aec = cavmarl.env("town")                                              # PettingZoo AEC form
+    vec = cavmarl.make_vec("merge", num_envs=16)                           # batched arrays
     policy = cavmarl.load_policy("idm", env)
+
+Importing it registers the entries of `envs/` with Gymnasium and PettingZoo.
 """
 
+from cavmarl.cav_env import CavEnv, parallel_env
+from cavmarl.config import TERMS, EnvConfig
+from cavmarl.errors import (
+    ActionError,
+    CapacityError,
+    CavmarlError,
+    ConfigError,
+    EpisodeEndedError,
+    EpisodeError,
+    InvalidActionError,
+    MapError,
+    MissingActionError,
+    MissingExtraError,
+    PolicyError,
+    ResetNeededError,
+    RouteError,
+    UnknownAgentError,
+    UnknownEnvironmentError,
+)
+from cavmarl.policies import Policy, load_policy
+from cavmarl.registration import env, raw_env, register_all
+from cavmarl.registry import entries
 from cavmarl.vector_env import CavVectorEnv, make_vec
-from cavmarl.env import CavEnv, parallel_env
+
+__version__ = "0.1.0"
+
+__all__ = [
+    "TERMS",
+    "ActionError",
+    "CapacityError",
+    "CavEnv",
+    "CavVectorEnv",
+    "CavmarlError",
+    "ConfigError",
+    "EnvConfig",
+    "EpisodeEndedError",
+    "EpisodeError",
+    "InvalidActionError",
+    "MapError",
+    "MissingActionError",
+    "MissingExtraError",
+    "Policy",
+    "PolicyError",
+    "ResetNeededError",
+    "RouteError",
+    "UnknownAgentError",
+    "UnknownEnvironmentError",
+    "entries",
+    "env",
+    "load_policy",
+    "make_vec",
+    "parallel_env",
+    "raw_env",
+]
+
+register_all()
+del register_all

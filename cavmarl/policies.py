@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from pettingzoo import ParallelEnv
 
 from cavmarl.config import EnvConfig
-from cavmarl.env import CavEnv
+from cavmarl.cav_env import CavEnv
 from cavmarl.errors import PolicyError, require
 from cavmarl.registry import agent_entries
 from cavmarl.spaces import flat_observation_space

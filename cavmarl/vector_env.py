@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from cavmarl.actions import ActionDecoder
 from cavmarl.config import EnvConfig
-from cavmarl.env import check_seed
+from cavmarl.cav_env import check_seed
 from cavmarl.errors import ConfigError, ResetNeededError
 from cavmarl.kernels.codes import EVENTS_THAT_END
 from cavmarl.roads.network import RoadNetwork

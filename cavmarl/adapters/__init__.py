@@ -1,0 +1,1 @@
+"""Views of a world for libraries that do not read PettingZoo."""

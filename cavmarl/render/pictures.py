@@ -1,0 +1,98 @@
+"""The pictures of the README and the entries' cards: `python -m cavmarl.render.pictures docs/images`.
+
+Each is one moment of a seeded world in which the built-in driver has all seats.
+"""
+
+from __future__ import annotations
+
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from cavmarl.registry import load_config, resolve_map
+from cavmarl.render.camera import Bounds
+from cavmarl.render.canvas import load_pygame
+from cavmarl.render.topdown import TopDownRenderer
+from cavmarl.roads.cache import load_network
+from cavmarl.runtime.simulation import Simulation
+from cavmarl.shard.shard import Commands
+
+if TYPE_CHECKING:
+    from pygame import Surface
+
+__all__ = ["PICTURES", "Picture", "draw_picture", "write_pictures"]
+
+SEED = 0
+
+
+@dataclass(frozen=True)
+class Picture:
+    """What to draw.
+
+    Attributes:
+        env: the entry.
+        time_s: how long the world has run.
+        size: in pixels; by default what suits the map.
+        focus: the part of the map to show, m; by default all of it.
+        agents: instead of the entry's number.
+        background: instead of the entry's number.
+    """
+
+    env: str
+    time_s: float
+    size: tuple[int, int] | None = None
+    focus: Bounds | None = None
+    agents: int | None = None
+    background: int | None = None
+
+
+PICTURES = {
+    "ring": Picture("ring", 20.0),
+    "merge": Picture("merge", 12.0),
+    "grid4x4": Picture("grid4x4", 16.0),
+    "town": Picture("town", 40.0, background=250),
+    "hero": Picture("town", 30.0, (1280, 720), (1230, 560, 1720, 835), agents=60, background=240),
+}
+
+
+def draw_picture(picture: Picture) -> Surface:
+    """Run the world up to the moment of the picture, and draw it."""
+    config, folder = load_config(
+        picture.env, agents=picture.agents, background=picture.background
+    )
+    network = load_network(resolve_map(config, folder))
+    simulation = Simulation(config, network)
+    simulation.seed(SEED)
+    simulation.reset()
+    suggested = np.zeros((1, config.population.num_ids, 2))
+    for _ in range(round(picture.time_s / config.clock.ctrl_dt_s)):
+        simulation.suggest(suggested)
+        meta = suggested[..., 0].astype(np.int64)
+        simulation.step(Commands(suggested, meta))
+        simulation.retire_agents()
+    renderer = TopDownRenderer(network, picture.size, picture.focus, simulation.goal_edges)
+    return renderer.draw(
+        simulation.vehicles(),
+        simulation.signal_phases(),
+        title=config.name,
+        clock_s=float(simulation.ticks()[0]) * config.clock.sim_dt_s,
+    )
+
+
+def write_pictures(folder: Path) -> list[Path]:
+    """Draw all `PICTURES` into a folder, one PNG each."""
+    folder.mkdir(parents=True, exist_ok=True)
+    paths = []
+    for name, picture in PICTURES.items():
+        path = folder / f"{name}.png"
+        load_pygame().image.save(draw_picture(picture), str(path))
+        paths.append(path)
+    return paths
+
+
+if __name__ == "__main__":
+    for written in write_pictures(Path(sys.argv[1])):
+        print(written)

@@ -1,0 +1,505 @@
+"""PPO with one network shared by all agents (IPPO), on batched worlds.
+
+    python train/ippo_torch.py --env merge --minutes 2
+    python train/ippo_torch.py --resume runs/merge_ippo_1 --total-agent-steps 8000000
+
+Every agent learns from its own observations and rewards; all of them share the weights (Schulman et
+al. 2017; de Witt et al. 2020). A run's folder holds the driver (`model.safetensors` and `config.json`,
+which `cavmarl evaluate --policy FOLDER` takes), `progress.csv`, TensorBoard's files, and what `--resume`
+needs. With the same seed, threads and machine a run repeats itself, unless the clock ends it
+(`--minutes`). A resumed run begins new episodes.
+"""
+
+from __future__ import annotations
+
+import argparse
+import csv
+import json
+import os
+import sys
+import time
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, fields, replace
+from pathlib import Path
+from typing import Annotated, Any, get_args, get_type_hints
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from rich.console import Console
+from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
+from torch import Tensor, nn
+
+from cavmarl.config import TERMS
+from cavmarl.errors import CavmarlError, ConfigError, PolicyError, require
+from cavmarl.networks import ActorCritic, NetworkConfig, load_network, save_network
+from cavmarl.vector_env import CavVectorEnv, make_vec
+
+ARRIVAL, COLLISION, OFF_ROAD = (TERMS.index(t) for t in ("arrival", "collision", "off_road"))
+OPTIMIZER_FILE = "optimizer.pt"
+STATE_FILE = "training.json"
+CSV_FILE = "progress.csv"
+
+
+@dataclass(frozen=True)
+class Args:
+    """The settings of a run; each is an option of the command line."""
+
+    env: Annotated[str, "environment: a name, a folder or a map file"] = "merge"
+    agents: Annotated[int, "agents a world; 0: as the environment says"] = 0
+    background: Annotated[int, "background vehicles a world; -1: as the environment says"] = -1
+    num_envs: Annotated[int, "worlds that are stepped together"] = 16
+    seed: Annotated[int, "root of all random numbers"] = 0
+    total_agent_steps: Annotated[int, "decisions to learn from"] = 4_000_000
+    minutes: Annotated[float, "stop after this time, whatever is left; 0: no limit"] = 0.0
+    num_steps: Annotated[int, "steps of every world between two updates"] = 128
+    epochs: Annotated[int, "passes over the decisions of an update"] = 4
+    minibatches: Annotated[int, "parts that a pass is cut into"] = 8
+    learning_rate: Annotated[float, "of Adam, at the start"] = 1e-3
+    anneal: Annotated[bool, "let the learning rate fall to 0 at the end"] = True
+    gamma: Annotated[float, "discount a step"] = 0.99
+    gae_lambda: Annotated[float, "of generalised advantage estimation"] = 0.95
+    clip: Annotated[float, "how far the ratio of probabilities may leave 1"] = 0.2
+    entropy_weight: Annotated[float, "of the entropy in the loss"] = 0.0
+    value_weight: Annotated[float, "of the value loss"] = 0.5
+    max_gradient_norm: Annotated[float, "longer gradients are shortened"] = 0.5
+    initial_std: Annotated[float, "standard deviation of continuous actions at the start"] = 0.5
+    hidden: Annotated[int, "width of the two hidden layers"] = 128
+    threads: Annotated[int, "of torch; 0: its own choice"] = 2
+    checkpoint_updates: Annotated[int, "updates between two checkpoints"] = 20
+    runs: Annotated[str, "folder of all runs"] = "runs"
+    name: Annotated[str, "folder of this run; empty: ENV_ippo_SEED"] = ""
+    resume: Annotated[
+        str, "folder of a run to go on with; its settings hold but for the length"
+    ] = ""
+    tensorboard: Annotated[bool, "write TensorBoard's files"] = False
+
+    def __post_init__(self) -> None:
+        at_least = {
+            "agents": 0, "background": -1, "num_envs": 1, "seed": 0, "total_agent_steps": 1,
+            "minutes": 0.0, "num_steps": 1, "epochs": 1, "minibatches": 1, "entropy_weight": 0.0,
+            "value_weight": 0.0, "hidden": 1, "threads": 0, "checkpoint_updates": 1,
+        }  # fmt: skip
+        for name, least in at_least.items():
+            value = getattr(self, name)
+            if not least <= value < float("inf"):
+                raise ConfigError(f"--{name.replace('_', '-')} {value}: must be at least {least}")
+        for name in ("learning_rate", "clip", "max_gradient_norm", "initial_std"):
+            if not 0.0 < getattr(self, name) < float("inf"):
+                value = getattr(self, name)
+                raise ConfigError(f"--{name.replace('_', '-')} {value}: must be above 0")
+        for name in ("gamma", "gae_lambda"):
+            if not 0.0 <= getattr(self, name) <= 1.0:
+                value = getattr(self, name)
+                raise ConfigError(f"--{name.replace('_', '-')} {value}: must be from 0 to 1")
+
+    @property
+    def folder(self) -> Path:
+        """Where this run lies."""
+        if self.resume:
+            return Path(self.resume)
+        stem = Path(self.env).name.split(".")[0]
+        return Path(self.runs) / (self.name or f"{stem}_ippo_{self.seed}")
+
+
+def parse_args(words: Sequence[str] | None = None) -> Args:
+    """The settings that the command line asks for; of a resumed run, those that it began with."""
+    parser = argparse.ArgumentParser(
+        description=(__doc__ or "").splitlines()[0],
+        formatter_class=argparse.ArgumentDefaultsHelpFormatter,
+        argument_default=argparse.SUPPRESS,
+    )
+    hints = get_type_hints(Args, include_extras=True)
+    for field in fields(Args):
+        kind, text = get_args(hints[field.name])
+        option = f"--{field.name.replace('_', '-')}"
+        action: Any = argparse.BooleanOptionalAction if kind is bool else "store"
+        extra = {} if kind is bool else {"type": kind, "metavar": kind.__name__.upper()}
+        shown = f"{text} (default: {field.default!r})"
+        parser.add_argument(option, action=action, help=shown, **extra)
+    given = vars(parser.parse_args(words))
+    if not given.get("resume"):
+        return Args(**given)
+    began_with = read_state(Path(given["resume"]))["args"]
+    allowed = {
+        "total_agent_steps",
+        "minutes",
+        "resume",
+        "threads",
+        "tensorboard",
+        "checkpoint_updates",
+    }
+    if refused := given.keys() - allowed:
+        names = ", ".join(f"--{name.replace('_', '-')}" for name in sorted(refused))
+        raise ConfigError(f"{names}: cannot change when a run is resumed")
+    return Args(**{**began_with, **given})
+
+
+def read_state(folder: Path) -> dict[str, Any]:
+    """What `save_checkpoint` noted of a run.
+
+    Raises:
+        ConfigError: no checkpoint there, or a broken one.
+    """
+    path = folder / STATE_FILE
+    try:
+        state = json.loads(path.read_text(encoding="utf-8"))
+        known = {field.name for field in fields(Args)}
+        whole = set(state) == {"args", "agent_steps", "updates", "seconds"}
+        if not whole or set(state["args"]) != known:
+            raise ConfigError(f"--resume {folder}: {STATE_FILE} is not of this version")
+    except OSError as error:
+        raise ConfigError(f"--resume {folder}: no checkpoint there ({error.strerror})") from error
+    except (json.JSONDecodeError, UnicodeDecodeError, TypeError) as error:
+        raise ConfigError(f"--resume {folder}: {STATE_FILE} is broken ({error})") from error
+    return dict(state)
+
+
+@dataclass
+class Batch:
+    """What one round of `num_steps` steps brought; T steps, W worlds, A agents.
+
+    Attributes:
+        observations: (T, W, A, D).
+        actions: (T, W, A, …) as sampled.
+        log_probs: (T, W, A) of them.
+        values: (T, W, A).
+        rewards: (T, W, A).
+        acted: (T, W, A) which entries are decisions.
+        next_values: (T, W, A) what was to be expected after the step; 0 where a vehicle ended.
+        goes_on: (T, W, A) whether entry t + 1 is of the same vehicle and episode.
+    """
+
+    observations: Tensor
+    actions: Tensor
+    log_probs: Tensor
+    values: Tensor
+    rewards: Tensor
+    acted: Tensor
+    next_values: Tensor
+    goes_on: Tensor
+
+    def advantages(self, gamma: float, gae_lambda: float) -> Tensor:
+        """(T, W, A) generalised advantage estimates; 0 where nobody acted."""
+        advantages = torch.zeros_like(self.values)
+        following = torch.zeros_like(self.values[0])
+        for t in reversed(range(self.values.shape[0])):
+            delta = self.rewards[t] + gamma * self.next_values[t] - self.values[t]
+            following = delta + gamma * gae_lambda * self.goes_on[t] * following
+            following = following * self.acted[t]
+            advantages[t] = following
+        return advantages
+
+
+class Trips:
+    """Ends and returns of vehicles' trips, while they go on in W worlds with A agents."""
+
+    def __init__(self, num_envs: int, num_agents: int) -> None:
+        self._returns = np.zeros((num_envs, num_agents))
+        self._ended: list[float] = []
+        self._counts = np.zeros(3)
+
+    def add(
+        self, rewards: NDArray[Any], done: NDArray[Any], cut: NDArray[Any], terms: NDArray[Any]
+    ) -> None:
+        """Count one step; `done` (W, A) ends trips, `cut` (W, A) forgets them."""
+        self._returns += rewards
+        self._ended += self._returns[done].tolist()
+        self._counts += terms[done][:, [ARRIVAL, COLLISION, OFF_ROAD]].sum(axis=0)
+        self._returns[done | cut] = 0.0
+
+    def take(self) -> dict[str, float]:
+        """Means over the trips that ended since the last call."""
+        trips = len(self._ended)
+        rates = self._counts / trips if trips else np.full(3, np.nan)
+        mean = float(np.mean(self._ended)) if trips else float("nan")
+        self._ended, self._counts = [], np.zeros(3)
+        success, collision, off_road = rates.tolist()
+        return {
+            "trips": trips, "trip_return": mean, "success": success, "collision": collision,
+            "off_road": off_road,
+        }  # fmt: skip
+
+
+class Collector:
+    """Drives the worlds with the network and keeps what comes of it."""
+
+    def __init__(self, vec: CavVectorEnv, network: ActorCritic, args: Args, seed: int) -> None:
+        self.vec = vec
+        self.network = network
+        self.trips = Trips(vec.num_envs, vec.num_agents)
+        self._num_steps = args.num_steps
+        self._observations, infos = vec.reset(seed=seed)
+        self._mask: NDArray[np.bool_] = infos["mask"]
+
+    @torch.inference_mode()
+    def collect(self) -> Batch:
+        """`num_steps` steps of all worlds."""
+        shape = (self._num_steps, *self._mask.shape)
+        network, continuous = self.network, self.network.continuous
+        observations = torch.zeros((*shape, self._observations.shape[-1]))
+        actions = torch.zeros((*shape, 2)) if continuous else torch.zeros(shape, dtype=torch.int64)
+        log_probs, values, rewards, next_values = (torch.zeros(shape) for _ in range(4))
+        acted, goes_on, cut = (torch.zeros(shape, dtype=torch.bool) for _ in range(3))
+        for t in range(self._num_steps):
+            observations[t] = torch.from_numpy(self._observations)
+            flat = observations[t].flatten(0, 1)
+            sampled, log_prob = network.sample(flat)
+            actions[t] = sampled.view_as(actions[t])
+            log_probs[t] = log_prob.view_as(log_probs[t])
+            values[t] = network.value(flat).view_as(values[t])
+            given = actions[t].clamp(-1.0, 1.0) if continuous else actions[t]
+            self._observations, reward, ended, cut_off, infos = self.vec.step(given.numpy())
+            self._mask = infos["mask"]
+            rewards[t] = torch.from_numpy(reward)
+            acted[t] = torch.from_numpy(infos["acted"])
+            cut[t] = torch.from_numpy(cut_off)
+            goes_on[t] = torch.from_numpy(infos["acted"] & self._mask & ~ended & ~cut_off)
+            if cut_off.any():
+                last = torch.from_numpy(infos["final_observations"][cut_off])
+                next_values[t, cut[t]] = network.value(last)
+            self.trips.add(reward, infos["vehicle_done"], cut_off, infos["terms"])
+        after = network.value(torch.from_numpy(self._observations).flatten(0, 1))
+        following = torch.cat([values[1:], after.view_as(values[0])[None]])
+        next_values = torch.where(goes_on, following, next_values)
+        return Batch(observations, actions, log_probs, values, rewards, acted, next_values, goes_on)
+
+
+class Learner:
+    """The network, its optimiser, and PPO's update."""
+
+    def __init__(self, network: ActorCritic, args: Args) -> None:
+        self.network = network
+        self.optimizer = torch.optim.Adam(network.parameters(), lr=args.learning_rate, eps=1e-5)
+        self._args = args
+
+    def update(self, batch: Batch, left: float) -> dict[str, float]:
+        """Learn from the decisions of a batch; `left` is the share of the run that is left."""
+        args, network = self._args, self.network
+        rate = args.learning_rate * (left if args.anneal else 1.0)
+        for group in self.optimizer.param_groups:
+            group["lr"] = rate
+        acted = batch.acted
+        advantages = batch.advantages(args.gamma, args.gae_lambda)
+        b_returns = (advantages + batch.values)[acted]
+        b_advantages = advantages[acted]
+        b_observations = batch.observations[acted]
+        b_actions, b_log_probs = batch.actions[acted], batch.log_probs[acted]
+        size = b_returns.shape[0]
+        sums = dict.fromkeys(("policy_loss", "value_loss", "entropy", "kl", "clipped"), 0.0)
+        parts = 0
+        for _ in range(args.epochs):
+            for mb in torch.randperm(size).tensor_split(args.minibatches):
+                if mb.numel() < 2:  # one decision has no advantage over others
+                    continue
+                log_prob, entropy = network.evaluate(b_observations[mb], b_actions[mb])
+                change = log_prob - b_log_probs[mb]
+                ratio = change.exp()
+                mb_advantages = b_advantages[mb]
+                mb_advantages = (mb_advantages - mb_advantages.mean()) / (
+                    mb_advantages.std() + 1e-8
+                )
+                bounded = ratio.clamp(1.0 - args.clip, 1.0 + args.clip)
+                policy_loss = -torch.min(mb_advantages * ratio, mb_advantages * bounded).mean()
+                value_loss = (network.value(b_observations[mb]) - b_returns[mb]).square().mean()
+                loss = (
+                    policy_loss
+                    + 0.5 * args.value_weight * value_loss
+                    - args.entropy_weight * entropy.mean()
+                )
+                self.optimizer.zero_grad()
+                loss.backward()  # type: ignore[no-untyped-call]
+                nn.utils.clip_grad_norm_(network.parameters(), args.max_gradient_norm)
+                self.optimizer.step()
+                with torch.no_grad():
+                    parts += 1
+                    sums["policy_loss"] += policy_loss.item()
+                    sums["value_loss"] += value_loss.item()
+                    sums["entropy"] += entropy.mean().item()
+                    sums["kl"] += (ratio - 1.0 - change).mean().item()
+                    sums["clipped"] += ((ratio - 1.0).abs() > args.clip).float().mean().item()
+        means = {name: value / max(parts, 1) for name, value in sums.items()}
+        return {**means, "learning_rate": rate}
+
+
+def save_checkpoint(
+    folder: Path, learner: Learner, config: NetworkConfig, state: dict[str, Any]
+) -> None:
+    """The driver, and what goes on from here; an interrupted write leaves the old files whole."""
+    save_network(folder, learner.network, replace(config, agent_steps=state["agent_steps"]))
+    optimizer = folder / f".{OPTIMIZER_FILE}"
+    torch.save(learner.optimizer.state_dict(), optimizer)
+    os.replace(optimizer, folder / OPTIMIZER_FILE)
+    noted = folder / f".{STATE_FILE}"
+    noted.write_text(json.dumps(state, indent=2) + "\n", encoding="utf-8")
+    os.replace(noted, folder / STATE_FILE)
+
+
+def load_checkpoint(folder: Path, learner: Learner, config: NetworkConfig) -> None:
+    """Put a run's weights and optimiser into `learner`.
+
+    Raises:
+        PolicyError: a broken file, or a run on an environment that has changed since.
+    """
+    network, saved = load_network(folder)
+    if replace(saved, agent_steps=0) != config:
+        raise PolicyError(
+            f"--resume {folder}: the environment's sensors or actions have changed since that run"
+        )
+    learner.network.load_state_dict(network.state_dict())
+    path = folder / OPTIMIZER_FILE
+    try:
+        learner.optimizer.load_state_dict(torch.load(path, weights_only=True))
+    except (OSError, RuntimeError, ValueError, EOFError, KeyError) as error:
+        raise PolicyError(f"{path}: cannot be read ({error})") from error
+
+
+class Log:
+    """Writes the numbers of every update to CSV, and to TensorBoard where asked for."""
+
+    def __init__(self, args: Args) -> None:
+        path = args.folder / CSV_FILE
+        self._file = path.open("a" if args.resume else "w", encoding="utf-8", newline="")
+        self._writer: csv.DictWriter[str] | None = None
+        self._with_header = not args.resume
+        self._board: Any = None
+        if args.tensorboard:
+            board = require("torch.utils.tensorboard", "torch")
+            self._board = board.SummaryWriter(str(args.folder))
+
+    def write(self, row: dict[str, float]) -> None:
+        """One update's numbers by name."""
+        if self._writer is None:
+            self._writer = csv.DictWriter(self._file, list(row))
+            if self._with_header:
+                self._writer.writeheader()
+        self._writer.writerow({name: f"{value:.6g}" for name, value in row.items()})
+        self._file.flush()
+        if self._board is not None:
+            for name, value in row.items():
+                self._board.add_scalar(name, value, int(row["agent_steps"]))
+
+    def close(self) -> None:
+        """End the files."""
+        self._file.close()
+        if self._board is not None:
+            self._board.close()
+
+
+def progress_bar(console: Console) -> Progress:
+    """A bar over the run, with the numbers that say whether it learns."""
+    return Progress(
+        TextColumn("{task.percentage:3.0f} %"),
+        BarColumn(bar_width=24),
+        TimeElapsedColumn(),
+        TextColumn("{task.description}"),
+        console=console,
+    )
+
+
+def make_world(args: Args) -> CavVectorEnv:
+    """The worlds that the run learns in."""
+    return make_vec(
+        args.env,
+        num_envs=args.num_envs,
+        agents=args.agents or None,
+        background=None if args.background < 0 else args.background,
+    )
+
+
+def train(args: Args, console: Console) -> Path:
+    """Run PPO; returns the folder of the run.
+
+    Raises:
+        CavmarlError: settings, environment or checkpoint that cannot work.
+    """
+    resumed = read_state(args.folder) if args.resume else None
+    agent_steps = int(resumed["agent_steps"]) if resumed else 0
+    updates = int(resumed["updates"]) if resumed else 0
+    seconds_before = float(resumed["seconds"]) if resumed else 0.0
+    if agent_steps >= args.total_agent_steps:
+        raise ConfigError(
+            f"--total-agent-steps {args.total_agent_steps}: the run has {agent_steps} already"
+        )
+    if args.threads:
+        torch.set_num_threads(args.threads)
+    torch.manual_seed(args.seed + updates)
+    vec = make_world(args)
+    config = NetworkConfig(
+        environment=vec.config.name,
+        observation_size=vec.single_observation_space.shape[0],
+        sensors=vec.config.sensors,
+        action=vec.config.action,
+        hidden=(args.hidden, args.hidden),
+        seed=args.seed,
+    )
+    network = ActorCritic(config, args.initial_std)
+    learner = Learner(network, args)
+    if resumed:
+        load_checkpoint(args.folder, learner, config)
+    args.folder.mkdir(parents=True, exist_ok=True)
+    log = Log(args)
+    with console.status("compiling kernels (once, up to a minute) …"):
+        collector = Collector(vec, network, args, args.seed + updates)
+        vec.step(vec.suggest_actions())
+    began_at, began_with = time.perf_counter(), agent_steps
+    with progress_bar(console) as bar:
+        task = bar.add_task("", total=1.0)
+        done = 0.0
+        while done < 1.0:
+            started = time.perf_counter()
+            batch = collector.collect()
+            numbers = learner.update(batch, 1.0 - done)
+            new = int(batch.acted.sum())
+            agent_steps += new
+            updates += 1
+            seconds = time.perf_counter() - began_at
+            row = {
+                "updates": updates,
+                "agent_steps": agent_steps,
+                "seconds": seconds_before + seconds,
+                "agent_steps_per_s": new / (time.perf_counter() - started),
+                **collector.trips.take(),
+                **numbers,
+                "std": float(network.log_std.exp().mean()) if network.continuous else 0.0,
+            }
+            log.write(row)
+            done = (agent_steps - began_with) / (args.total_agent_steps - began_with)
+            if args.minutes:
+                done = max(done, seconds / (60.0 * args.minutes))
+            done = min(done, 1.0)
+            if done == 1.0 or updates % args.checkpoint_updates == 0:
+                state = {
+                    "args": asdict(replace(args, resume="")),
+                    "agent_steps": agent_steps,
+                    "updates": updates,
+                    "seconds": seconds_before + seconds,
+                }
+                save_checkpoint(args.folder, learner, config, state)
+            bar.update(task, completed=done, description=describe(row))
+    log.close()
+    return args.folder
+
+
+def describe(row: dict[str, float]) -> str:
+    """The numbers of an update that a person wants to see."""
+    return (
+        f"{row['agent_steps']:,.0f} decisions, {row['agent_steps_per_s']:,.0f}/s · return "
+        f"{row['trip_return']:.1f} · success {row['success']:.0%} · collision "
+        f"{row['collision']:.0%} · off road {row['off_road']:.0%}"
+    )
+
+
+def main(words: Sequence[str] | None = None) -> int:
+    """Train; 0: trained, 2: wrong use."""
+    try:
+        folder = train(parse_args(words), Console())
+    except CavmarlError as error:
+        Console(stderr=True).print(f"error: {error}", style="red", markup=False)
+        return 2
+    print(f"driver: {folder}  (cavmarl evaluate ENV --policy {folder})")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
