@@ -1,13 +1,13 @@
-"""The built-in driver: IDM along the route, MOBIL and the route for lane changes, a lane controller.
+"""The built-in driver: IDM, MOBIL with the needs of the route, and a lane controller.
 
-It drives as background vehicles do, from the world's state and not from observations. As an agent it is
-the yardstick for policies that have only their sensors.
+It drives as background vehicles do, from the world's state and not from observations. As an agent
+it is the yardstick for policies that have only their sensors.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,13 +23,13 @@ class IdmPolicy(Policy):
 
     def act_batch(self, observations: NDArray[np.float32], mask: NDArray[np.bool_]) -> NDArray[Any]:
         """The built-in driver's actions (W, A, …) in the worlds as they are now."""
-        if not isinstance(self.env, CavVectorEnv):
+        if isinstance(self.env, CavEnv):
             raise PolicyError("act_batch() drives a make_vec; a parallel_env is driven by act()")
-        return self.env.suggest_actions()
+        return cast(NDArray[Any], self.env.suggest_actions())
 
     def act(self, observations: Mapping[str, Any]) -> dict[str, Any]:
         """The built-in driver's actions in the world as it is now."""
-        if not isinstance(self.env, CavEnv):
+        if isinstance(self.env, CavVectorEnv):
             raise PolicyError("act() drives a parallel_env; a make_vec is driven by act_batch()")
         return self.env.suggest_actions()
 

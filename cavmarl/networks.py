@@ -2,8 +2,8 @@
 
 Importing this module loads torch; nothing that `import cavmarl` loads imports it.
 
-A driver's folder holds `model.safetensors` (weights, no code) and `config.json` (a `NetworkConfig`: what
-the driver was made for, so that a seat that does not fit is refused and not driven badly).
+A driver's folder holds `model.safetensors` (weights, no code) and `config.json` (a `NetworkConfig`:
+what the driver was made for, so that a seat that does not fit is refused and not driven badly).
 """
 
 from __future__ import annotations
@@ -84,8 +84,9 @@ class NetworkConfig:
 class ActorCritic(nn.Module):
     """A policy and a value function, each a small tanh network of its own.
 
-    Continuous actions are normal around the actor's output, with one learned deviation an action; the
-    environment gets them clipped to [-1, 1], learning the raw ones. Discrete actions are categorical.
+    Continuous actions are normal around the actor's output, with one learned deviation an action:
+    the environment gets them clipped to [-1, 1], learning the raw ones. Discrete actions are
+    categorical.
 
     Args:
         config: sizes and kind of action.
@@ -97,7 +98,8 @@ class ActorCritic(nn.Module):
         self.continuous = config.action.kind == "continuous"
         actions = CONTINUOUS_ACTIONS if self.continuous else META_ACTIONS
         sizes = (config.observation_size, *config.hidden)
-        # Small last weights: the first policy does nothing in particular (Andrychowicz et al. 2021).
+        # Small last weights: the first policy does nothing in particular (Andrychowicz et al.
+        # 2021).
         self.actor = _perceptron((*sizes, actions), last_gain=0.01)
         self.critic = _perceptron((*sizes, 1), last_gain=1.0)
         if self.continuous:
@@ -166,7 +168,8 @@ def load_network(folder: Path) -> tuple[ActorCritic, NetworkConfig]:
     """Read what `save_network` wrote.
 
     Raises:
-        PolicyError: a file is missing, broken, or does not fit the other; or weights are not finite.
+        PolicyError: a file is missing, broken, or does not fit the other; or weights are not
+            finite.
     """
     config = _read_config(folder / CONFIG_FILE)
     path = folder / WEIGHTS_FILE

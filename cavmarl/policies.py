@@ -1,7 +1,7 @@
 """Policies: what maps observations to actions, and how a name or a path becomes one.
 
-`agents/` holds the policies that come with cavmarl: `NAME.py` defines `make_policy(env)`; a folder holds
-the weights of a trained network. Both are files that are read, not modules that are imported.
+`agents/` holds the policies that come with cavmarl: `NAME.py` defines `make_policy(env)`; a folder
+holds the weights of a trained network. Both are files that are read, not modules that are imported.
 """
 
 from __future__ import annotations
@@ -19,8 +19,8 @@ import numpy as np
 from numpy.typing import NDArray
 from pettingzoo import ParallelEnv
 
-from cavmarl.config import EnvConfig
 from cavmarl.cav_env import CavEnv
+from cavmarl.config import EnvConfig
 from cavmarl.errors import PolicyError, require
 from cavmarl.registry import agent_entries
 from cavmarl.spaces import flat_observation_space
@@ -92,11 +92,13 @@ class NetworkPolicy(Policy):
     Args:
         env: where it drives.
         network: maps flat observations to actions.
+        weights_file: where the network was read from.
     """
 
-    def __init__(self, env: Environment, network: ActorCritic) -> None:
+    def __init__(self, env: Environment, network: ActorCritic, weights_file: Path) -> None:
         super().__init__(env)
         self.network = network
+        self.weights_file = weights_file
 
     def act_batch(self, observations: NDArray[np.float32], mask: NDArray[np.bool_]) -> NDArray[Any]:
         """The network's most likely actions where `mask`, 0 elsewhere."""
@@ -113,13 +115,13 @@ def load_policy(policy: str | Path, env: Environment) -> Policy:
     """Seat a policy in an environment.
 
     Args:
-        policy: a name of `agents/`, a folder with model.safetensors and config.json, or a `.py` file that
-            defines `make_policy(env)`.
+        policy: a name of `agents/`, a folder with model.safetensors and config.json, or a `.py`
+            file that defines `make_policy(env)`.
         env: a `CavEnv`, also wrapped, or a `CavVectorEnv`.
 
     Raises:
-        PolicyError: nothing of that name, a broken file, or a network made for other observations or
-            actions than this environment's.
+        PolicyError: nothing of that name, a broken file, or a network made for other observations
+            or actions than this environment's.
         MissingExtraError: a network, without torch.
     """
     if isinstance(env, ParallelEnv):
@@ -146,7 +148,7 @@ def _find(policy: str | Path) -> Path:
         return path
     if path.exists():
         raise PolicyError(
-            f"{path}: no policy; give a folder with model.safetensors, or a .py file with make_policy"
+            f"{path}: no policy; give a folder with model.safetensors, or a .py with make_policy"
         )
     close = difflib.get_close_matches(str(policy), known, n=3)
     meant = f"did you mean {' or '.join(close)}? " if close else ""
@@ -179,26 +181,27 @@ def _load_script(path: Path, env: Environment) -> Policy:
 def _load_network_policy(folder: Path, env: Environment) -> NetworkPolicy:
     require("torch", "torch")
     require("safetensors", "torch")
-    from cavmarl.networks import load_network
+    from cavmarl.networks import WEIGHTS_FILE, load_network
 
     network, config = load_network(folder)
-    if unlike := _differences(config, env.config):
-        size = flat_observation_space(env.config).shape[0]
+    name, here = folder.name, env.config
+    size = flat_observation_space(here).shape[0]
+    if unlike := _differences(config, here):
         raise PolicyError(
-            f"{folder.name} does not fit {env.config.name}: it observes {config.observation_size} "
-            f"numbers and acts {config.action.kind}, here {size} and {env.config.action.kind}; make "
-            f"the environment with overrides={unlike}"
+            f"{name} does not fit {here.name}: it observes {config.observation_size} numbers and "
+            f"acts {config.action.kind}, here {size} and {here.action.kind}; make the environment "
+            f"with overrides={unlike}"
         )
-    if config.observation_size != flat_observation_space(env.config).shape[0]:
+    if config.observation_size != size:
         raise PolicyError(
-            f"{folder.name}: observes {config.observation_size} numbers, but its sensors give "
-            f"{flat_observation_space(env.config).shape[0]} in this version: train it again"
+            f"{name}: observes {config.observation_size} numbers, but its sensors give {size} in "
+            "this version: train it again"
         )
-    return NetworkPolicy(env, network)
+    return NetworkPolicy(env, network, folder / WEIGHTS_FILE)
 
 
 def _differences(config: NetworkConfig, here: EnvConfig) -> dict[str, Any]:
-    """Keys that must change here so that observations and actions mean what they did in training."""
+    """Keys to change here so that observations and actions mean what they did in training."""
     kind = config.action.kind
     scales = {
         "continuous": ("acceleration_mps2", "steering_rad"),

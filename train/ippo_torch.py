@@ -4,10 +4,10 @@
     python train/ippo_torch.py --resume runs/merge_ippo_1 --total-agent-steps 8000000
 
 Every agent learns from its own observations and rewards; all of them share the weights (Schulman et
-al. 2017; de Witt et al. 2020). A run's folder holds the driver (`model.safetensors` and `config.json`,
-which `cavmarl evaluate --policy FOLDER` takes), `progress.csv`, TensorBoard's files, and what `--resume`
-needs. With the same seed, threads and machine a run repeats itself, unless the clock ends it
-(`--minutes`). A resumed run begins new episodes.
+al. 2017; de Witt et al. 2020). A run's folder holds the driver (`model.safetensors` and
+`config.json`, which `cavmarl evaluate --policy FOLDER` takes), `progress.csv`, TensorBoard's files,
+and what `--resume` needs. With the same seed, threads and machine a run repeats itself, unless the
+clock ends it (`--minutes`). A resumed run begins new episodes.
 """
 
 from __future__ import annotations
@@ -440,8 +440,9 @@ def train(args: Args, console: Console) -> Path:
     args.folder.mkdir(parents=True, exist_ok=True)
     log = Log(args)
     with console.status("compiling kernels (once, up to a minute) …"):
-        collector = Collector(vec, network, args, args.seed + updates)
+        vec.reset(seed=args.seed)
         vec.step(vec.suggest_actions())
+        collector = Collector(vec, network, args, args.seed + updates)
     began_at, began_with = time.perf_counter(), agent_steps
     with progress_bar(console) as bar:
         task = bar.add_task("", total=1.0)
@@ -461,7 +462,7 @@ def train(args: Args, console: Console) -> Path:
                 "agent_steps_per_s": new / (time.perf_counter() - started),
                 **collector.trips.take(),
                 **numbers,
-                "std": float(network.log_std.exp().mean()) if network.continuous else 0.0,
+                "std": network.log_std.detach().exp().mean().item() if network.continuous else 0.0,
             }
             log.write(row)
             done = (agent_steps - began_with) / (args.total_agent_steps - began_with)

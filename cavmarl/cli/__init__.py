@@ -1,0 +1,40 @@
+"""The command line, `cavmarl`: one small file a command; each loads what it needs when it runs."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Sequence
+
+import typer
+
+from cavmarl.cli import bench, demo, evaluate, listing, map, view
+from cavmarl.cli.output import print_error
+from cavmarl.errors import CavmarlError
+
+__all__ = ["app", "main"]
+
+app = typer.Typer(
+    help="Multi-agent reinforcement learning for automated vehicles on real road networks.",
+    no_args_is_help=True,
+    pretty_exceptions_enable=False,
+)
+app.command()(evaluate.evaluate)
+app.command()(view.view)
+app.command()(demo.demo)
+app.command("list")(listing.list_entries)
+app.add_typer(map.app, name="map")
+app.add_typer(bench.app, name="bench")
+
+
+@app.callback()
+def _exit_codes() -> None:
+    """Exit codes: 0 done, and it held; 1 it did not hold; 2 wrong use or bad input."""
+
+
+def main(words: Sequence[str] | None = None) -> None:
+    """Run a command; an error that cavmarl raises on purpose is one line and exit code 2."""
+    try:
+        app(args=None if words is None else list(words))
+    except CavmarlError as error:
+        print_error(str(error))
+        sys.exit(2)

@@ -13,6 +13,12 @@ from numpy.typing import NDArray
 
 from cavmarl.kernels import kernel
 from cavmarl.kernels.arrays import Demand, RoadArrays, Scratch, Worlds
+from cavmarl.kernels.car_following import (
+    ACCEL_MAX,
+    DECEL_COMFORT,
+    JAM_DISTANCE_M,
+    TIME_HEADWAY_S,
+)
 from cavmarl.kernels.codes import (
     COUNT_ARRIVED,
     COUNT_DEPARTED,
@@ -40,9 +46,11 @@ __all__ = ["choose_goals", "let_in", "populate", "take_out"]
 
 PLACE_TRIES = 24  # places tried for a vehicle at reset before it has to queue
 PLACE_GAP_M = 10.0  # m between bumpers of vehicles placed at reset
+END_ROOM_M = 12.0  # nobody starts nearer than this to the end of a lane, unless it is shorter
 ENTER_GAP_M = 3.0  # m between bumpers, the least with which a vehicle enters
-ENTER_HEADWAY_S = 1.0  # and this time behind the one ahead, and before the one behind
-ENTER_DECEL = 2.0  # m/s², braking that an entering vehicle may need, and may impose
+ENTER_HEADWAY_S = 1.0  # and this time before the one behind
+ENTER_DECEL = 2.0  # m/s², braking that an entering vehicle may impose, or need at the lane's end
+REFERENCE_LENGTH_M = 5.0  # JAM_DISTANCE_M is measured between centres of cars of this length
 ENTER_SHARE = 0.7  # of the speed limit
 ENTER_REACH_M = 80.0
 WANDER_M = 150.0  # nearer to its goal than this a vehicle of a closed world picks another
@@ -70,7 +78,7 @@ def _order(
     departure["speed_factor"] = 1.0 + demand.speed_factor_spread * spread
     length = roads.lanes[departure["lane"]]["length_m"]
     half = 0.5 * demand.blank[0]["length"]
-    free = max(length - 2.0 * half - 2.0, 0.0)
+    free = max(length - 2.0 * half - END_ROOM_M, 0.0)
     departure["s"] = half + 1.0
     if agent >= 0 or not demand.enter_at_start:
         departure["s"] += free * uniform(key, vehicle, 0, STREAM_PLACE)
@@ -169,7 +177,7 @@ def populate(
                 departure["goal"] = trips[trip, 1]
                 length = roads.lanes[departure["lane"]]["length_m"]
                 share = uniform(worlds.keys[w], vehicle, 0, STREAM_PLACE + attempt)
-                departure["s"] = half + 1.0 + share * max(length - 2.0 * half - 2.0, 0.0)
+                departure["s"] = half + 1.0 + share * max(length - 2.0 * half - END_ROOM_M, 0.0)
                 num = worlds.num_rows[w]
                 if _is_free(worlds.rows[w], num, departure["lane"], departure["s"], half):
                     worlds.rows[w, num] = demand.blank[0]
@@ -220,6 +228,22 @@ def choose_goals(
 
 
 @kernel
+def _next_through(rows: NDArray[np.void], num: int, driver: int, ticks_per_step: int) -> int:
+    """Row of the smallest id among the vehicles of one kind of driver that are through, or -1."""
+    ending = EVENTS_THAT_END if driver == DRIVER_AGENT else EVENT_ARRIVED
+    first = -1
+    for i in range(num):
+        row = rows[i]
+        if row["driver"] != driver or not row["events"] & ending:
+            continue
+        if driver == DRIVER_AGENT and row["departed"] > row["tick"] - ticks_per_step:
+            continue
+        if first < 0 or row["id"] < rows[first]["id"]:
+            first = i
+    return first
+
+
+@kernel
 def take_out(
     demand: Demand,
     roads: RoadArrays,
@@ -231,6 +255,7 @@ def take_out(
 ) -> None:
     """Take out the vehicles of one kind of driver that are through, and order those that follow.
 
+    They go in the order of their ids, so that who follows gets the same number wherever the rows lie.
     Background vehicles are through when they have arrived; agents that have acted also after a
     collision or off the road.
 
@@ -243,15 +268,12 @@ def take_out(
         dt: seconds of a tick.
         ticks_per_step: ticks a step; agents that entered within the last of them have not acted.
     """
-    ending = EVENTS_THAT_END if driver == DRIVER_AGENT else EVENT_ARRIVED
     for w in range(worlds.ticks.shape[0]):
-        i = 0
-        while i < worlds.num_owned[w]:
+        while True:
+            i = _next_through(rows[w], worlds.num_owned[w], driver, ticks_per_step)
+            if i < 0:
+                break
             row = rows[w, i]
-            fresh = driver == DRIVER_AGENT and row["departed"] > row["tick"] - ticks_per_step
-            if row["driver"] != driver or fresh or not row["events"] & ending:
-                i += 1
-                continue
             agent = row["agent"]
             if row["events"] & EVENT_ARRIVED:
                 time = (row["tick"] - row["departed"]) * dt
@@ -278,6 +300,19 @@ def take_out(
 
 
 @kernel
+def _speed_behind(gap: float, leader_speed: float) -> float:
+    """The speed at which `gap` m between bumpers is just what IDM wants behind a leader.
+
+    The positive root of jam + v·T + v·(v - leader) / (2·sqrt(a·b)) = gap, or 0.
+    """
+    scale = 2.0 * math.sqrt(ACCEL_MAX * DECEL_COMFORT)
+    linear = TIME_HEADWAY_S - leader_speed / scale
+    room = gap + REFERENCE_LENGTH_M - JAM_DISTANCE_M
+    root = linear * linear + 4.0 * room / scale
+    return max(0.5 * scale * (math.sqrt(max(root, 0.0)) - linear), 0.0) if room > 0.0 else 0.0
+
+
+@kernel
 def _gap_speed(
     roads: RoadArrays,
     rows: NDArray[np.void],
@@ -291,12 +326,10 @@ def _gap_speed(
     half = 0.5 * rows[i]["length"]
     j, ahead_s = neighbor_ahead(rows, i, lane, s, scratch)
     if j >= 0:
-        gap = ahead_s - s - half - 0.5 * rows[j]["length"] - ENTER_GAP_M
-        if gap < 0.0:
+        gap = ahead_s - s - half - 0.5 * rows[j]["length"]
+        if gap < ENTER_GAP_M:
             return -1.0
-        leader = rows[j]["speed"]
-        speed = min(speed, math.sqrt(leader * leader + 2.0 * ENTER_DECEL * gap))
-        speed = min(speed, max(leader, gap / ENTER_HEADWAY_S))
+        speed = min(speed, _speed_behind(gap, rows[j]["speed"]))
     k, behind = neighbor_behind(roads, rows, i, lane, s, ENTER_REACH_M, scratch)
     if k >= 0:
         follower = rows[k]["speed"]

@@ -42,8 +42,16 @@ COURTESY_DECEL = 2.0  # m/s², the hardest braking to let somebody merge
 DECIDE_EVERY_TICKS = 10  # how often a driver thinks of changing to one side
 CHANGE_EARLY_M = 80.0  # a change that the route needs is made this far before it must be,
 CHANGE_EARLY_S = 12.0  # plus the way of this time
-MERGE_ROOM_M = 12.0  # a driver that has to leave a lane waits this far before its end,
-MERGE_ROOM_SHARE = 0.25  # or this share of the lane's length
+# A driver that has to leave a lane waits this far before its end to change right, twice as far to
+# change left: two that want to swap lanes do not stand side by side for ever.
+MERGE_ROOM_M = 10.0
+MERGE_ROOM_SHARE = 0.25  # at most this share of the lane's length
+LATERAL_ACCEL = 2.5  # m/s², with which a steered car takes a bend: where a lane turns
+MIN_BEND_RAD = 0.2  # by more than this
+BEND_M = 6.0  # within this length
+MAX_BRAKING_ACCEPTED = 4.0  # m/s², harder braking behind the new leader is never worth it
+SIDEWAYS_S = 2.5  # a lane change takes about this long, and has to end before the lane does
+BRAKE_TIME_S = 0.5  # a braking that ends within this time is not felt
 SIDE_GAP_M = 1.0  # m between bumpers, the least with which a lane change starts
 
 
@@ -82,6 +90,37 @@ def _look_ahead_m(speed: float) -> float:
 
 
 @kernel
+def _bend_speed(roads: RoadArrays, lane: int, distance: float) -> float:
+    """The speed in m/s, now, with which a steered car can take all bends of a lane in comfort.
+
+    `distance` is the way to the start of the lane in m, negative on it.
+    """
+    row = roads.lanes[lane]
+    first = row["first_point"]
+    last = first + row["num_points"] - 1
+    slowest = math.inf
+    for k in range(first + 1, last):
+        to_bend = distance + roads.points[k]["s"]
+        if to_bend < -BEND_M:
+            continue
+        before = roads.points[k - 1]
+        m = k
+        while m < last - 1 and roads.points[m + 1]["s"] - roads.points[k]["s"] < BEND_M:
+            m += 1
+        after = roads.points[m]
+        bend = abs(
+            math.atan2(
+                before["cos"] * after["sin"] - before["sin"] * after["cos"],
+                before["cos"] * after["cos"] + before["sin"] * after["sin"],
+            )
+        )
+        if bend > MIN_BEND_RAD:
+            squared = LATERAL_ACCEL * BEND_M / bend + 2.0 * LIMIT_DECEL * max(to_bend, 0.0)
+            slowest = min(slowest, math.sqrt(squared))
+    return slowest
+
+
+@kernel
 def _shared_start(
     roads: RoadArrays,
     rows: NDArray[np.void],
@@ -112,14 +151,20 @@ def _road_ahead(
     rows: NDArray[np.void],
     i: int,
     phase: NDArray[np.int32],
+    merge_room_m: float,
     scratch: Scratch,
 ) -> tuple[float, float, int, int]:
-    """Walk row i's way: (strongest interaction, allowed speed, why it holds, link whose line is near)."""
+    """Walk row i's way: (strongest interaction, allowed speed, why it holds, link whose line is near).
+
+    Before the end of a lane that its way does not follow it stops `merge_room_m` early.
+    """
     row = rows[i]
     lane = row["lane"]
     half = 0.5 * row["length"]
     strongest = 0.0
     allowed = roads.lanes[lane]["speed_mps"] * row["speed_factor"]
+    if row["driver"] == DRIVER_AGENT:
+        allowed = min(allowed, _bend_speed(roads, lane, -row["s"]))
     look = _look_ahead_m(row["speed"])
     distance = -row["s"]
     hold = HOLD_NONE
@@ -141,9 +186,12 @@ def _road_ahead(
         step = plans[row["goal"], lane]
         if step["next"] < 0:
             if step["to_go"] == math.inf or step["change"] != 0:
-                # Stop with room enough to swing out into the next lane.
-                room = min(MERGE_ROOM_M, MERGE_ROOM_SHARE * roads.lanes[lane]["length_m"])
-                strongest = max(strongest, _before_line(row, distance - half - room))
+                # Stop with room enough to swing out, but on this lane and not before it.
+                length = roads.lanes[lane]["length_m"]
+                room = merge_room_m if step["change"] < 0 else 2.0 * merge_room_m
+                room = min(room, MERGE_ROOM_SHARE * length)
+                place = max(length - half - room, min(2.0 * LINE_MARGIN_M, 0.5 * length))
+                strongest = max(strongest, _before_line(row, distance - length + place))
             break
         if step["link"] >= 0:
             if distance - half < STOP_LINE_M and link_ahead < 0:
@@ -156,6 +204,8 @@ def _road_ahead(
             strongest = max(strongest, shared)
         lane = step["next"]
         limit = roads.lanes[lane]["speed_mps"] * row["speed_factor"]
+        if row["driver"] == DRIVER_AGENT:
+            allowed = min(allowed, _bend_speed(roads, lane, distance))
         allowed = min(allowed, math.sqrt(limit * limit + 2.0 * LIMIT_DECEL * max(distance, 0.0)))
         j, s = last_on_lane(i, lane, scratch)
     return strongest, allowed, hold, link_ahead
@@ -176,7 +226,8 @@ def _courtesy(
         if j < 0 or rows[j]["blinker"] != -side or rows[j]["lane"] != beside:
             continue
         distance = s - row["s"]
-        if distance > 0.5 * (row["length"] + rows[j]["length"]) and distance < LOOK_BACK_M:
+        alongside = 0.5 * (row["length"] + rows[j]["length"]) + SIDE_GAP_M
+        if distance > alongside and distance < LOOK_BACK_M:
             strongest = max(strongest, _behind(row, distance, rows[j]))
     return min(strongest, COURTESY_DECEL + ACCEL_MAX)
 
@@ -224,9 +275,12 @@ def _change_is_safe(
         if j >= 0:
             follower_before = _accel_behind(follower, limit, gap + ahead, rows[j])
         follower_after = _accel_behind(follower, limit, gap, row)
-    return mobil_accepts(
-        accel, after, follower_before, follower_after, 0.0, 0.0, mandatory
-    )
+        # Who stands or creeps cannot brake for long, whatever the model answers at short distances.
+        follower_after = max(follower_after, -follower["speed"] / BRAKE_TIME_S)
+    after = max(after, -row["speed"] / BRAKE_TIME_S)
+    if after < -MAX_BRAKING_ACCEPTED:
+        return False
+    return mobil_accepts(accel, after, follower_before, follower_after, 0.0, 0.0, mandatory)
 
 
 @kernel
@@ -256,14 +310,14 @@ def _may_change(
     target = lane["left"] if side > 0 else lane["right"]
     if lane["internal"] or target < 0 or (needed != 0 and needed != side):
         return False
+    if lane["length_m"] - row["s"] < 0.5 * row["length"] + SIDEWAYS_S * row["speed"]:
+        return False
     if needed == 0:
         beyond = plans[row["goal"], target]
         if beyond["to_go"] == math.inf or row["speed"] < 1.0:
             return False
         early = (CHANGE_EARLY_M + CHANGE_EARLY_S * row["speed"]) * beyond["changes"]
         if beyond["change"] != 0 and beyond["room"] - row["s"] < 2.0 * early:
-            return False
-        if lane["length_m"] - row["s"] < row["length"] + 2.0 * row["speed"]:
             return False
     return _change_is_safe(roads, plans, rows, i, target, accel, needed != 0, scratch)
 
@@ -300,6 +354,31 @@ def _choose_lane(
 
 
 @kernel
+def _accel_swinging_out(
+    roads: RoadArrays,
+    plans: NDArray[np.void],
+    rows: NDArray[np.void],
+    i: int,
+    side: int,
+    phase: NDArray[np.int32],
+    scratch: Scratch,
+) -> float:
+    """Acceleration of a steered vehicle on its way into a neighbour lane, in m/s².
+
+    It still has to mind its own lane, to the very end, and already the leader in the other one.
+    """
+    row = rows[i]
+    lane = roads.lanes[row["lane"]]
+    target = lane["left"] if side > 0 else lane["right"]
+    strongest, allowed, _, _ = _road_ahead(roads, plans, rows, i, phase, 0.0, scratch)
+    s = row["s"] * roads.lanes[target]["length_m"] / lane["length_m"]
+    j, ahead_s = neighbor_ahead(rows, i, target, s, scratch)
+    if j >= 0:
+        strongest = max(strongest, _behind(row, ahead_s - s, rows[j]))
+    return idm_free(row["speed"], allowed, ACCEL_MAX) - strongest
+
+
+@kernel
 def decide(
     roads: RoadArrays,
     plans: NDArray[np.void],
@@ -327,7 +406,9 @@ def decide(
         row = rows[i]
         if row["driver"] != driver:
             continue
-        strongest, allowed, hold, link_ahead = _road_ahead(roads, plans, rows, i, phase, scratch)
+        strongest, allowed, hold, link_ahead = _road_ahead(
+            roads, plans, rows, i, phase, MERGE_ROOM_M, scratch
+        )
         side = row["side_lane"]
         if side >= 0:
             s = row["s"] * roads.lanes[side]["length_m"] / roads.lanes[row["lane"]]["length_m"]
@@ -338,6 +419,8 @@ def decide(
         accel = idm_free(row["speed"], allowed, ACCEL_MAX) - strongest
         needed = needed_change(roads, plans, row)
         change = _choose_lane(roads, plans, rows, i, tick, needed, accel, scratch)
+        if change != 0 and driver == DRIVER_AGENT:
+            accel = _accel_swinging_out(roads, plans, rows, i, change, phase, scratch)
         scratch.accel[i] = clamp(accel, -ACCEL_LIMIT, ACCEL_LIMIT)
         scratch.lane_change[i] = change
         scratch.blinker[i] = needed

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from cavmarl.kernels import kernel
 from cavmarl.kernels.arrays import RoadArrays, Scratch
 from cavmarl.kernels.codes import (
+    DRIVER_AGENT,
     HOLD_EXIT_BLOCKED,
     HOLD_NONE,
     HOLD_SIGNAL,
@@ -46,6 +47,7 @@ ENTRY_ACCEL = 2.5  # m/s², how a driver thinks others and itself speed up over 
 COMFORT_STOP = 3.0  # m/s², a driver stops for yellow where this braking is enough
 HARD_STOP = 5.0  # m/s², a vehicle that needs more to stop before the line will not stop
 GAP_S = 1.0  # s between the last of one and the first of the other in a shared area
+STEERED_MPS = 5.0  # a steered car is taken to turn no faster than this
 STANDING_MPS = 0.5
 ROOM_M = 3.0  # free way left behind a vehicle that clears a junction
 IMPATIENT_TICKS = 60  # a vehicle that stands this long without reason is not waited for
@@ -188,6 +190,8 @@ def _blocked_by_foes(
     row = rows[i]
     half = 0.5 * row["length"]
     limit = roads.lanes[roads.links[link]["next_lane"]]["speed_mps"]
+    if row["driver"] == DRIVER_AGENT:
+        limit = min(limit, STEERED_MPS)
     first = roads.links[link]["first_conflict"]
     for c in range(first, first + roads.links[link]["num_conflicts"]):
         conflict = roads.conflicts[c]

@@ -31,6 +31,7 @@ __all__ = ["ARRIVE_M", "MAX_SPEED_MPS", "move_agent", "move_background", "place_
 LATERAL_MPS = 1.4  # fastest sideways motion of a lane change
 LATERAL_RATIO = 0.35  # and no faster than this share of the speed,
 LATERAL_MIN_MPS = 0.2  # but never stuck between two lanes
+MAX_DRIFT_RAD = 0.12  # largest angle between a car that changes lanes and its lane
 TRAIL_M = 2.0  # how quickly the heading follows the lane's direction
 STANDING_MPS = 0.1
 ARRIVE_M = 5.0  # a trip ends this far before the end of its goal edge
@@ -129,7 +130,8 @@ def move_background(
     cos, sin = place_on_lane(roads, row)
     direction = math.atan2(sin, cos)
     if speed > STANDING_MPS:
-        direction += math.atan2((row["d"] - before) / dt, speed)
+        drift = math.atan2((row["d"] - before) / dt, speed)
+        direction += clamp(drift, -MAX_DRIFT_RAD, MAX_DRIFT_RAD)
     error = wrap_angle(direction - old["heading"])
     row["heading"] = wrap_angle(old["heading"] + error * min(1.0, speed * dt / TRAIL_M))
     row["steering"] = clamp(math.atan2(row["length"] * error, 2.0 * TRAIL_M), -0.8, 0.8)

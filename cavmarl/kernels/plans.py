@@ -1,7 +1,7 @@
 """Lane-level plans: for one goal, what to do next from every lane of the map.
 
 Dijkstra's algorithm backwards from the goal's lanes over the lane graph. Driving along a lane costs the
-time it takes at the speed limit, a lane change a fixed time.
+time it takes at the speed limit; a lane change costs a fixed time, and more on a short lane.
 """
 
 from __future__ import annotations
@@ -17,7 +17,8 @@ from cavmarl.kernels.arrays import RoadArrays
 
 __all__ = ["LANE_CHANGE_COST_S", "plan_goal"]
 
-LANE_CHANGE_COST_S = 5.0  # what a lane change is worth in travel time, s
+LANE_CHANGE_COST_S = 5.0  # what a lane change is worth in travel time, s,
+SHORT_LANE_M = 50.0  # and one second more for every metre that the lane is shorter than this
 TURNAROUND = ord("t")
 
 
@@ -45,6 +46,12 @@ def _leads_to(roads: RoadArrays, before: int, lane: int) -> bool:
         if roads.links[link]["next_lane"] == lane and _is_allowed(roads, link):
             return True
     return False
+
+
+@kernel
+def _change_cost(roads: RoadArrays, lane: int) -> float:
+    """Cost in s of leaving a lane sideways: plans change lanes where there is room to."""
+    return LANE_CHANGE_COST_S + max(SHORT_LANE_M - roads.lanes[lane]["length_m"], 0.0)
 
 
 @kernel
@@ -87,19 +94,23 @@ def _settle(
     best = through
     change = 0
     beside = -1
-    if row["left"] >= 0 and cost[row["left"]] + LANE_CHANGE_COST_S < best:
-        best = cost[row["left"]] + LANE_CHANGE_COST_S
+    sideways = _change_cost(roads, lane)
+    if row["left"] >= 0 and cost[row["left"]] + sideways < best:
+        best = cost[row["left"]] + sideways
         change = 1
         beside = row["left"]
-    if row["right"] >= 0 and cost[row["right"]] + LANE_CHANGE_COST_S < best:
-        best = cost[row["right"]] + LANE_CHANGE_COST_S
+    if row["right"] >= 0 and cost[row["right"]] + sideways < best:
         change = -1
         beside = row["right"]
     step["change"] = change
     if change == 0:
+        step["turnarounds"] = plan[next_lane]["turnarounds"]
+        if link >= 0 and roads.links[link]["direction"] == TURNAROUND:
+            step["turnarounds"] += 1
         step["room"] = length + plan[next_lane]["room"]
         step["to_go"] = length + plan[next_lane]["to_go"]
     else:
+        step["turnarounds"] = plan[beside]["turnarounds"]
         step["changes"] = 1 + plan[beside]["changes"]
         step["room"] = length
         step["to_go"] = plan[beside]["to_go"]
@@ -127,6 +138,7 @@ def plan_goal(
         step["link"] = -1
         step["change"] = 0
         step["changes"] = 0
+        step["turnarounds"] = 0
         step["room"] = 0.0
         step["to_go"] = math.inf
     heap = [(0.0, -1)]
@@ -159,7 +171,7 @@ def plan_goal(
                 continue
             if not roads.lanes[beside]["permissions"] & permission:
                 continue
-            reached = here + LANE_CHANGE_COST_S
+            reached = here + _change_cost(roads, beside)
             if reached < cost[beside]:
                 cost[beside] = reached
                 heapq.heappush(heap, (reached, np.int64(beside)))

@@ -20,7 +20,7 @@ from cavmarl.kernels.geometry import lane_pose, project, wrap_angle
 
 __all__ = ["nearest_speed", "steer_to_lane", "take_meta_action"]
 
-PURSUIT_M = 1.0  # real roads have corners: the lane's direction is read at least this far ahead
+CHORD_M = 1.5  # real lanes have corners: their direction is that of a chord, this far to both sides
 
 
 @kernel
@@ -71,16 +71,40 @@ def steer_to_lane(
     s, d, _, _ = project(
         roads.points, here["first_point"], here["num_points"], row["x"], row["y"]
     )
-    ahead = s + PURSUIT_M + row["speed"] * PURSUIT_S
-    if ahead > here["length_m"]:
-        following = plans[row["goal"], lane]["next"]
-        if following >= 0:
-            ahead -= here["length_m"]
-            here = roads.lanes[following]
-            if s > roads.lanes[lane]["length_m"]:
-                _, d, _, _ = project(
-                    roads.points, here["first_point"], here["num_points"], row["x"], row["y"]
-                )
-    _, _, _, cos, sin, _ = lane_pose(roads.points, here["first_point"], here["num_points"], ahead)
-    error = wrap_angle(math.atan2(sin, cos) - row["heading"])
-    return steering_control(row["speed"], d, error, row["length"])
+    ahead = s + row["speed"] * PURSUIT_S
+    following = plans[row["goal"], lane]["next"]
+    if s > here["length_m"] and following >= 0:
+        ahead -= here["length_m"]
+        lane = following
+        here = roads.lanes[lane]
+        _, d, _, _ = project(
+            roads.points, here["first_point"], here["num_points"], row["x"], row["y"]
+        )
+    direction = _direction_at(roads, plans, row["goal"], lane, ahead)
+    return steering_control(
+        row["speed"], d, wrap_angle(direction - row["heading"]), row["length"]
+    )
+
+
+@kernel
+def _point_at(
+    roads: RoadArrays, plans: NDArray[np.void], goal: int, lane: int, s: float
+) -> tuple[float, float]:
+    """The place at `s` of a lane, beyond its end on the one that the plan names."""
+    here = roads.lanes[lane]
+    following = plans[goal, lane]["next"]
+    if s > here["length_m"] and following >= 0:
+        s -= here["length_m"]
+        here = roads.lanes[following]
+    x, y, _, _, _, _ = lane_pose(roads.points, here["first_point"], here["num_points"], s)
+    return x, y
+
+
+@kernel
+def _direction_at(
+    roads: RoadArrays, plans: NDArray[np.void], goal: int, lane: int, s: float
+) -> float:
+    """Direction of the way around place `s` of a lane in rad."""
+    x0, y0 = _point_at(roads, plans, goal, lane, s - CHORD_M)
+    x1, y1 = _point_at(roads, plans, goal, lane, s + CHORD_M)
+    return math.atan2(y1 - y0, x1 - x0)

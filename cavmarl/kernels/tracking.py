@@ -22,14 +22,14 @@ __all__ = ["locate", "side_lane"]
 JUNCTION_MARGIN_M = 2.0  # inside junctions lanes are guides: this much beyond their sides is still road
 END_MARGIN_M = 1.0  # lanes may leave gaps up to this between end and start
 WINDOW_M = 40.0
-SIDE_MARGIN_M = 0.1
+SIDE_MARGIN_M = 0.1  # a body this near to a neighbour lane counts as in it: it may stand askew
 LEVEL_M = 4.0  # lanes further above or below are another road
 
 
 @kernel
 def side_lane(lanes: NDArray[np.void], lane: int, d: float, width: float) -> int:
     """The neighbour lane that a body `width` wide at offset `d` also covers, or -1."""
-    free = 0.5 * (lanes[lane]["width_m"] - width) + SIDE_MARGIN_M
+    free = 0.5 * (lanes[lane]["width_m"] - width) - SIDE_MARGIN_M
     if d > free:
         return int(lanes[lane]["left"])
     if d < -free:

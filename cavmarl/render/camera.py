@@ -29,14 +29,11 @@ class Camera:
     size: tuple[int, int]
 
     @classmethod
-    def fit(cls, bounds: Bounds, size: tuple[int, int], margin: float = 0.05) -> Camera:
-        """The closest view of all of `bounds`; `margin` is the share of the picture left at each side."""
+    def fit(cls, bounds: Bounds, size: tuple[int, int], margin_px: float = 0.0) -> Camera:
+        """The closest view of all of `bounds` with a margin (up to a quarter) at each side."""
         min_x, min_y, max_x, max_y = bounds
-        room = 1.0 - 2.0 * margin
-        scale = min(
-            size[0] * room / max(max_x - min_x, 1.0),
-            size[1] * room / max(max_y - min_y, 1.0),
-        )
+        width, height = (max(side - 2.0 * margin_px, side / 2.0) for side in size)
+        scale = min(width / max(max_x - min_x, 1.0), height / max(max_y - min_y, 1.0))
         return cls((min_x + max_x) / 2.0, (min_y + max_y) / 2.0, scale, size)
 
     @property
@@ -52,8 +49,8 @@ class Camera:
         )
 
     def to_pixels(self, xy: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Metres (…, 2) as pixels (…, 2) from the picture's upper left corner."""
-        pixels = np.empty(xy.shape)
+        """Metres (…, 2 or 3) as pixels (…, 2) from the picture's upper left corner."""
+        pixels = np.empty((*xy.shape[:-1], 2))
         pixels[..., 0] = (xy[..., 0] - self.x) * self.scale + self.size[0] / 2.0
         pixels[..., 1] = (self.y - xy[..., 1]) * self.scale + self.size[1] / 2.0
         return pixels

@@ -18,7 +18,7 @@ __all__ = ["Part", "blank", "lettering", "load_pygame", "stamp"]
 
 Part = tuple[Sequence[int], Sequence[Sequence[float]]]  # colour with alpha, corners in pixels
 
-# Stamps are drawn this many times larger and then reduced: their edges move by fractions of a pixel.
+# Stamps are drawn so many times larger, then reduced: edges move by fractions of a pixel.
 STAMP_DETAIL = 4
 # Small letters of a font stand unevenly; reduced large ones do not.
 TEXT_DETAIL = 4

@@ -37,8 +37,8 @@ WIDTH_OF_DETAILS_PX = 5.0
 OUTLINE_PX = 1.6
 
 # Polygons of a car of half length and half width 1, nose at +x, left at +y.
-BODY = ((1.0, 0.5), (0.86, 0.92), (0.6, 1.0), (-0.88, 1.0), (-1.0, 0.8))
-BODY = (*BODY, *((x, -y) for x, y in reversed(BODY)))
+LEFT_SIDE = ((1.0, 0.5), (0.86, 0.92), (0.6, 1.0), (-0.88, 1.0), (-1.0, 0.8))
+BODY = (*LEFT_SIDE, *((x, -y) for x, y in reversed(LEFT_SIDE)))
 WINDSCREEN = ((0.42, 0.62), (0.42, -0.62), (0.12, -0.78), (0.12, 0.78))
 REAR_WINDOW = ((-0.58, 0.74), (-0.58, -0.74), (-0.78, -0.6), (-0.78, 0.6))
 RIGHT_HEADLIGHT = ((0.98, -0.5), (0.86, -0.9), (0.78, -0.82), (0.88, -0.46))

@@ -1,4 +1,4 @@
-"""The still part of a picture: land, roads, markings; and the stop lines in their signals' colours."""
+"""The still part of a picture: land, roads, markings; and stop lines in their signals' colours."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from cavmarl.render.palette import (
     SIGNALS,
     Color,
 )
-from cavmarl.render.shapes import RoadShapes
+from cavmarl.render.shapes import RoadShapes, level_of
 from cavmarl.roads.network import SIGNAL_STATES, RoadNetwork
 
 if TYPE_CHECKING:
@@ -31,14 +31,14 @@ __all__ = ["draw_ground", "draw_stop_lines", "signal_codes", "signal_letter"]
 KERB_M = 0.6
 # Pixels a metre from which markings are worth their ink.
 SCALE_OF_MARKINGS = 0.9
-MARKING_M = 0.15
+SCALE_OF_ARROWS = 2.5
+MARKING_M = 0.2
+SEAM_PX = 0.25  # lanes overlap by as much, so that no land shines through between them
 MIN_ROAD_PX = 1.6
 MIN_STOP_LINE_PX = 4.0
 
 
-def signal_codes(
-    network: RoadNetwork, signal_phases: NDArray[np.int32]
-) -> NDArray[np.uint8]:
+def signal_codes(network: RoadNetwork, signal_phases: NDArray[np.int32]) -> NDArray[np.uint8]:
     """What each link's signal shows, (num_links,): positions in SIGNAL_STATES, or SIGNAL_NONE.
 
     Args:
@@ -76,9 +76,11 @@ def draw_ground(shapes: RoadShapes, camera: Camera, detail: int) -> Surface:
         for cars in (False, True):
             painter.roads(level, cars, KERB_M, KERB)
             painter.roads(level, cars, 0.0, ASPHALT if cars else PATH)
-    if camera.scale >= SCALE_OF_MARKINGS:
-        painter.lines(shapes.dashes, MARKING)
-        painter.lines(shapes.centre_lines, CENTRE_LINE)
+        if camera.scale >= SCALE_OF_MARKINGS:
+            painter.lines(level, shapes.dashes, MARKING)
+            painter.lines(level, shapes.centre_lines, CENTRE_LINE)
+        if camera.scale >= SCALE_OF_ARROWS:
+            painter.polygons(level, shapes.arrows, MARKING)
     reduced: Surface = pygame.transform.smoothscale(surface, camera.size)
     return reduced
 
@@ -107,9 +109,7 @@ def draw_stop_lines(
 class _Painter:
     """Draws many shapes of a kind on one surface, those in view only."""
 
-    def __init__(
-        self, shapes: RoadShapes, camera: Camera, surface: Surface, detail: int
-    ) -> None:
+    def __init__(self, shapes: RoadShapes, camera: Camera, surface: Surface, detail: int) -> None:
         self._pygame = load_pygame()
         self._shapes = shapes
         self._camera = camera
@@ -130,6 +130,7 @@ class _Painter:
             self._in_view & (shapes.levels == level) & (shapes.for_cars == cars)
         )
         half_px = np.maximum(shapes.half_widths[chosen] * scale, self._min_half_px) + grown_px
+        half_px += SEAM_PX * self._detail
         starts = self._camera.to_pixels(shapes.starts[chosen])
         ends = self._camera.to_pixels(shapes.ends[chosen])
         self._bars(starts, ends, half_px, color)
@@ -141,23 +142,30 @@ class _Painter:
             if patch.level == level and patch.for_cars == cars:
                 self._patch(patch.outline, grown_px, color)
 
-    def lines(self, pieces: NDArray[np.float64], color: Color) -> None:
-        """Straight lines (k, 2, 2) on asphalt; those thinner than a pixel are paler instead."""
-        chosen = pieces[self._visible(pieces.min(axis=1), pieces.max(axis=1))]
-        pixels = self._camera.to_pixels(chosen)
+    def lines(self, level: int, pieces: NDArray[np.float64], color: Color) -> None:
+        """Straight lines (k, 2, 3) on asphalt; those thinner than a pixel are paler instead."""
+        pixels = self._camera.to_pixels(self._chosen(level, pieces))
         width_px = MARKING_M * self._camera.scale / self._detail
         share = min(max(width_px, 0.3), 1.0)
-        ink = tuple(round(share * c + (1.0 - share) * a) for c, a in zip(color, ASPHALT, strict=True))
-        half_px = np.full(len(chosen), max(width_px, 1.0) * self._detail / 2.0)
+        ink = tuple(
+            round(share * c + (1.0 - share) * a) for c, a in zip(color, ASPHALT, strict=True)
+        )
+        half_px = np.full(len(pixels), max(width_px, 1.0) * self._detail / 2.0)
         self._bars(pixels[:, 0], pixels[:, 1], half_px, (ink[0], ink[1], ink[2]))
+
+    def polygons(self, level: int, corners: NDArray[np.float64], color: Color) -> None:
+        """Polygons (k, n, 3)."""
+        for polygon in self._camera.to_pixels(self._chosen(level, corners)).tolist():
+            self._pygame.draw.polygon(self._surface, color, polygon)
+
+    def _chosen(self, level: int, corners: NDArray[np.float64]) -> NDArray[np.float64]:
+        on_level = corners[level_of(corners[:, 0, 2]) == level]
+        return np.asarray(on_level[self._visible(on_level.min(axis=1), on_level.max(axis=1))])
 
     def _visible(self, low: NDArray[Any], high: NDArray[Any]) -> NDArray[np.bool_]:
         min_x, min_y, max_x, max_y = self._camera.bounds
         return np.asarray(
-            (high[:, 0] > min_x)
-            & (low[:, 0] < max_x)
-            & (high[:, 1] > min_y)
-            & (low[:, 1] < max_y)
+            (high[:, 0] > min_x) & (low[:, 0] < max_x) & (high[:, 1] > min_y) & (low[:, 1] < max_y)
         )
 
     def _bars(
@@ -176,9 +184,10 @@ class _Painter:
             polygon(self._surface, color, quad)
 
     def _patch(self, outline: NDArray[np.float64], grown_px: float, color: Color) -> None:
-        if len(outline) < 3 or not self._visible(
-            outline.min(axis=0)[None], outline.max(axis=0)[None]
-        ).any():
+        if (
+            len(outline) < 3
+            or not self._visible(outline.min(axis=0)[None], outline.max(axis=0)[None]).any()
+        ):
             return
         corners = self._camera.to_pixels(outline)
         self._pygame.draw.polygon(self._surface, color, corners.tolist())

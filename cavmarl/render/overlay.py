@@ -1,4 +1,4 @@
-"""What is written over the map: numbers of agents, destinations, the clock, the scale, the legend."""
+"""What stands over the map: numbers of agents, destinations, the clock, the scale, the legend."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cavmarl.render.camera import Camera
-from cavmarl.render.canvas import blank, lettering, load_pygame, stamp
+from cavmarl.render.canvas import Part, blank, lettering, load_pygame, stamp
 from cavmarl.render.palette import (
     BACKGROUND_CAR,
     COLLIDED,
@@ -31,8 +31,10 @@ PANEL_ALPHA = 225
 TITLE_PX = 23
 TEXT_PX = 17
 LABEL_PX = 15
+SCALE_OF_LABELS_ON_CARS = 8.0  # pixels a metre: a car is wider than its number
 SCALE_BAR_PX = 140
-LEGEND = (("agent", agent_color(0)), ("background", BACKGROUND_CAR), ("collided", COLLIDED))
+SWATCH_PX = 16
+LEGEND = ("agents", "destination", "background", "collided")
 
 
 def clock_text(seconds: float) -> str:
@@ -55,12 +57,14 @@ class Overlay:
         self._labels: dict[int, Surface] = {}
 
     def agents(self, surface: Surface, vehicles: NDArray[np.void], camera: Camera) -> None:
-        """The agents' numbers, above their vehicles."""
+        """The agents' numbers, above their vehicles, or on them from near."""
         rows = vehicles[vehicles["agent"] >= 0]
         centers = camera.to_pixels(np.stack([rows["x"], rows["y"]], axis=1))
         for agent, center in zip(rows["agent"].tolist(), centers.tolist(), strict=True):
             label = self._label(agent)
             lift = max(1.4 * camera.scale, 5.0) + label.get_height() * 0.75
+            if camera.scale >= SCALE_OF_LABELS_ON_CARS:
+                lift = 0.0
             surface.blit(label, label.get_rect(center=(center[0], center[1] - lift)))
 
     def destinations(
@@ -72,14 +76,7 @@ class Overlay:
     ) -> None:
         """A ring in the agent's colour at each destination, (n, 2) metres."""
         for agent, (x, y) in zip(agents.tolist(), camera.to_pixels(places).tolist(), strict=True):
-            color = agent_color(agent)
-            parts = [
-                ((0, 0, 0, 50), _disc(x + 0.8, y + 0.8, 6.0)),
-                ((255, 255, 255, 255), _disc(x, y, 5.6)),
-                ((*color, 255), _disc(x, y, 4.4)),
-                ((255, 255, 255, 255), _disc(x, y, 2.0)),
-            ]
-            stamp(surface, parts)
+            stamp(surface, _target(x, y, agent_color(agent)))
 
     def title(self, surface: Surface, title: str, note: str) -> None:
         """A panel at the upper left: a title, and a quieter note under it."""
@@ -111,21 +108,21 @@ class Overlay:
         for x in (left, left + length_px - 2):
             pygame.draw.rect(surface, INK, (x, bottom - 6, 2, 6))
 
-    def legend(self, surface: Surface) -> None:
+    def legend(self, surface: Surface, *, destinations: bool) -> None:
         """What the colours mean, at the lower right."""
-        texts = [lettering(name, TEXT_PX, INK) for name, _ in LEGEND]
-        width = sum(text.get_width() for text in texts) + 22 * len(texts) + 12 * (len(texts) - 1)
+        names = [name for name in LEGEND if destinations or name != "destination"]
+        texts = [lettering(name, TEXT_PX, INK) for name in names]
+        width = sum(SWATCH_PX + 6 + text.get_width() for text in texts) + 12 * (len(texts) - 1)
         height = texts[0].get_height()
         left = surface.get_width() - MARGIN_PX - 2 * PADDING_PX - width
         top = surface.get_height() - MARGIN_PX - 2 * PADDING_PX - height
         self._panel(surface, left, top, width, height)
-        x, middle = left + PADDING_PX, top + PADDING_PX + height / 2
-        for (name, color), text in zip(LEGEND, texts, strict=True):
-            inner = BACKGROUND_CAR if name == "collided" else color
-            outer = [((*color, 255), _bar(x, middle - 5, 16, 10))]
-            stamp(surface, [*outer, ((*inner, 255), _bar(x + 2, middle - 3, 12, 6))])
-            surface.blit(text, (x + 22, top + PADDING_PX))
-            x += 22 + text.get_width() + 12
+        x, middle = float(left + PADDING_PX), top + PADDING_PX + height / 2
+        for name, text in zip(names, texts, strict=True):
+            stamp(surface, _swatch(name, x, middle))
+            x += SWATCH_PX + 6
+            surface.blit(text, (x, top + PADDING_PX))
+            x += text.get_width() + 12
 
     def _label(self, agent: int) -> Surface:
         if agent not in self._labels:
@@ -144,6 +141,30 @@ class Overlay:
         panel = blank(size, transparent=True)
         pygame.draw.rect(panel, (*PANEL, PANEL_ALPHA), panel.get_rect(), border_radius=7)
         surface.blit(panel, (left, top))
+
+
+def _target(x: float, y: float, color: Color) -> list[Part]:
+    return [
+        ((0, 0, 0, 50), _disc(x + 0.8, y + 0.8, 6.0)),
+        ((255, 255, 255, 255), _disc(x, y, 5.6)),
+        ((*color, 255), _disc(x, y, 4.4)),
+        ((255, 255, 255, 255), _disc(x, y, 2.0)),
+    ]
+
+
+def _swatch(name: str, x: float, y: float) -> list[Part]:
+    """The legend's sample, `SWATCH_PX` wide, y its middle."""
+    top = y - 5.0
+    if name == "destination":
+        return _target(x + SWATCH_PX / 2.0, y, agent_color(0))
+    if name == "agents":
+        step = SWATCH_PX / 4.0
+        return [((*agent_color(k), 255), _bar(x + k * step, top, step, 10.0)) for k in range(4)]
+    if name == "collided":
+        inside = _bar(x + 2.0, top + 2.0, SWATCH_PX - 4.0, 6.0)
+        outside = _bar(x, top, SWATCH_PX, 10.0)
+        return [((*COLLIDED, 255), outside), ((*BACKGROUND_CAR, 255), inside)]
+    return [((*BACKGROUND_CAR, 255), _bar(x, top, SWATCH_PX, 10.0))]
 
 
 def _ink_on(color: Color) -> Color:

@@ -1,5 +1,6 @@
-"""The pictures of the README and the entries' cards: `python -m cavmarl.render.pictures docs/images`.
+"""The pictures of the README and of the entries' cards.
 
+`python -m cavmarl.render.pictures docs/images` draws them anew.
 Each is one moment of a seeded world in which the built-in driver has all seats.
 """
 
@@ -50,19 +51,19 @@ class Picture:
 
 
 PICTURES = {
-    "ring": Picture("ring", 20.0),
-    "merge": Picture("merge", 12.0),
+    "ring": Picture("ring", 8.0),
+    "merge": Picture("merge", 9.0, (1280, 400), (150.0, -76.0, 660.0, 40.0)),
     "grid4x4": Picture("grid4x4", 16.0),
-    "town": Picture("town", 40.0, background=250),
-    "hero": Picture("town", 30.0, (1280, 720), (1230, 560, 1720, 835), agents=60, background=240),
+    "town": Picture("town", 20.0, background=250),
+    "hero": Picture(
+        "town", 30.0, (1280, 720), (1230.0, 560.0, 1720.0, 835.0), agents=60, background=240
+    ),
 }
 
 
 def draw_picture(picture: Picture) -> Surface:
     """Run the world up to the moment of the picture, and draw it."""
-    config, folder = load_config(
-        picture.env, agents=picture.agents, background=picture.background
-    )
+    config, folder = load_config(picture.env, agents=picture.agents, background=picture.background)
     network = load_network(resolve_map(config, folder))
     simulation = Simulation(config, network)
     simulation.seed(SEED)

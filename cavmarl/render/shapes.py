@@ -6,13 +6,15 @@ Made once per network; no drawing here.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from cavmarl.render.arrows import lane_arrows
 from cavmarl.roads.network import RoadNetwork
 
-__all__ = ["Patch", "RoadShapes", "convex_hull", "offset_polyline", "road_shapes"]
+__all__ = ["Patch", "RoadShapes", "convex_hull", "level_of", "offset_polyline", "road_shapes"]
 
 Points = NDArray[np.float64]
 
@@ -21,6 +23,9 @@ DASH_PERIOD_M = 9.0
 # Roads this much higher than others are drawn over them.
 LEVEL_M = 4.0
 STOP_LINE_M = 0.7
+# A hull that covers more than so many times the area of its paths is land with roads around it.
+MAX_HULL_SHARE = 1.2
+MIN_HULL_M2 = 150.0  # smaller ones are filled in any case
 # SUMO's link directions from left to right: turn, left, half left, straight, half right, right.
 DIRECTIONS_FROM_LEFT = "tlLsRr"
 CAR_BIT = 1  # VEHICLE_CLASSES[0], passenger
@@ -28,9 +33,11 @@ CAR_BIT = 1  # VEHICLE_CLASSES[0], passenger
 
 @dataclass(frozen=True)
 class Patch:
-    """The inside of a junction: a convex polygon (n, 2)."""
+    """The inside of a junction: a convex polygon (n, 2), and its bounding box."""
 
     outline: Points
+    low: Points
+    high: Points
     level: int
     for_cars: bool
 
@@ -43,12 +50,13 @@ class RoadShapes:
         starts: (n, 2), each straight piece of a lane begins here and
         ends: (n, 2) ends here.
         half_widths: (n,) of the pieces.
-        joined: (n,) the lane goes on beyond the piece's end.
-        levels: (n,) height in steps of `LEVEL_M`.
+        joined: (n,) a round joint at the piece's end belongs to the road and covers no other level.
+        levels: (n,) as from `level_of`.
         for_cars: (n,) the lane is open to cars.
         junctions: the insides of junctions.
-        dashes: (k, 2, 2) from and to, between lanes of one direction.
-        centre_lines: (k, 2, 2) between opposite directions.
+        dashes: (k, 2, 3) from and to, x y z, between lanes of one direction.
+        centre_lines: (k, 2, 3) between opposite directions.
+        arrows: (k, 4, 3) on lanes before junctions.
         stop_lines: (num_links, 4, 2) the link's part of the bar at the end of its lane.
     """
 
@@ -61,6 +69,7 @@ class RoadShapes:
     junctions: tuple[Patch, ...]
     dashes: Points
     centre_lines: Points
+    arrows: Points
     stop_lines: Points
 
 
@@ -75,30 +84,43 @@ def road_shapes(network: RoadNetwork) -> RoadShapes:
     pieces = np.flatnonzero(lane_of_point[:-1] == lane_of_point[1:])
     lane = lane_of_point[pieces]
     last = np.append(lane[1:] != lane[:-1], True)
+    half_widths = lanes["width_m"][lane] / 2.0
+    levels = level_of(points["z"][pieces])
+    same_after = np.append(levels[1:] == levels[:-1], False)
+    same_before = np.roll(same_after & ~last, 1)
+    is_long = np.hypot(*(plane[pieces + 1] - plane[pieces]).T) >= half_widths
     for_cars = (lanes["permissions"] & CAR_BIT).astype(bool)
     return RoadShapes(
         starts=plane[pieces],
         ends=plane[pieces + 1],
-        half_widths=lanes["width_m"][lane] / 2.0,
-        joined=~last,
-        levels=np.round(points["z"][pieces] / LEVEL_M).astype(np.int64),
+        half_widths=half_widths,
+        joined=np.where(last, _goes_on_level(network)[lane], same_after) & (same_before | is_long),
+        levels=levels,
         for_cars=for_cars[lane],
         junctions=_junction_patches(network, for_cars),
         dashes=_dashes(network),
         centre_lines=_centre_lines(network),
+        arrows=lane_arrows(network),
         stop_lines=_stop_lines(network),
     )
 
 
+def level_of(z: Points) -> NDArray[np.int64]:
+    """Heights in m as levels: where two roads cross, the higher level is the bridge."""
+    return np.asarray(np.round(z / LEVEL_M).astype(np.int64))
+
+
 def offset_polyline(polyline: Points, offset_m: float) -> Points:
-    """A polyline (n, 2) moved to its left by `offset_m`, corners mitred (at most twice the offset)."""
+    """A polyline (n, 2) moved to its left by `offset_m`, corners mitred up to twice of it."""
     steps = np.diff(polyline, axis=0)
     normals = np.stack([-steps[:, 1], steps[:, 0]], axis=1)
     normals /= np.hypot(normals[:, 0], normals[:, 1])[:, None]
     before = np.vstack([normals[:1], normals])
     after = np.vstack([normals, normals[-1:]])
     cosine = (before * after).sum(axis=1)
-    return np.asarray(polyline + offset_m * (before + after) / np.maximum(1.0 + cosine, 0.5)[:, None])
+    return np.asarray(
+        polyline + offset_m * (before + after) / np.maximum(1.0 + cosine, 0.5)[:, None]
+    )
 
 
 def convex_hull(points: Points) -> Points:
@@ -121,41 +143,63 @@ def _turn(a: tuple[float, ...], b: tuple[float, ...], c: tuple[float, ...]) -> f
     return (b[0] - a[0]) * (c[1] - a[1]) - (b[1] - a[1]) * (c[0] - a[0])
 
 
-def _side(network: RoadNetwork, lane: int, offset_m: float) -> Points:
-    return offset_polyline(network.lane_polyline(lane)[:, :2], offset_m)
+def _side(network: RoadNetwork, lane: int | np.integer[Any], offset_m: float) -> Points:
+    """The line `offset_m` to the left of a lane's centre, (n, 3)."""
+    centre = network.lane_polyline(int(lane))
+    return np.column_stack([offset_polyline(centre[:, :2], offset_m), centre[:, 2]])
+
+
+def _goes_on_level(network: RoadNetwork) -> NDArray[np.bool_]:
+    """Whether a road follows the end of each lane, on the level of its last piece."""
+    lanes, z = network.lanes, network.points["z"]
+    link = np.where(lanes["num_links"] > 0, lanes["first_link"], -1)
+    after = np.where(link >= 0, network.links["next_lane"][link], lanes["successor"])
+    last_piece = lanes["first_point"] + lanes["num_points"] - 2
+    same = level_of(z[last_piece]) == level_of(z[lanes["first_point"][after]])
+    return np.asarray((after >= 0) & same)
 
 
 def _junction_patches(network: RoadNetwork, for_cars: NDArray[np.bool_]) -> tuple[Patch, ...]:
     """The hull of the lane mouths at each junction and of the paths between them."""
     corners: dict[tuple[int, bool], list[Points]] = {}
+    areas: dict[tuple[int, bool], float] = {}
     lanes, links = network.lanes, network.links
     for link in links:
         mouths = corners.setdefault((int(link["junction"]), bool(for_cars[link["from_lane"]])), [])
         for lane, end in ((link["from_lane"], -1), (link["to_lane"], 0)):
             half = lanes[lane]["width_m"] / 2.0
-            mouths.extend(_side(network, lane, side)[end][None] for side in (half, -half))
+            mouths.extend(_side(network, lane, side)[end][None, :2] for side in (half, -half))
     for lane in np.flatnonzero(lanes["internal"] & (lanes["link"] >= 0)):
         link = links[lanes[lane]["link"]]
         half = lanes[lane]["width_m"] / 2.0
-        paths = corners[int(link["junction"]), bool(for_cars[link["from_lane"]])]
-        paths.extend(_side(network, lane, side) for side in (half, -half))
+        key = int(link["junction"]), bool(for_cars[link["from_lane"]])
+        corners[key].extend(_side(network, lane, side)[:, :2] for side in (half, -half))
+        areas[key] = areas.get(key, 0.0) + 2.0 * half * float(lanes[lane]["length_m"])
     patches = []
     for (junction, cars), shapes in corners.items():
         outline = convex_hull(np.vstack(shapes))
-        level = round(float(network.junctions[junction]["z"]) / LEVEL_M)
-        patches.append(Patch(outline, level, cars))
+        if _area(outline) <= MAX_HULL_SHARE * areas.get((junction, cars), 0.0) + MIN_HULL_M2:
+            level = int(level_of(network.junctions["z"][junction]))
+            box = outline.min(axis=0), outline.max(axis=0)
+            patches.append(Patch(outline, *box, level, cars))
     return tuple(patches)
 
 
+def _area(polygon: Points) -> float:
+    """Of a polygon (n, 2), by the shoelace formula."""
+    x, y = polygon[:, 0], polygon[:, 1]
+    return abs(float(x @ np.roll(y, -1) - y @ np.roll(x, -1))) / 2.0
+
+
 def _dashes(network: RoadNetwork) -> Points:
-    dashes = [np.zeros((0, 2, 2))]
+    dashes = [np.zeros((0, 2, 3))]
     lanes = network.lanes
     for lane in np.flatnonzero((lanes["left"] >= 0) & ~lanes["internal"]):
         line = _side(network, lane, lanes[lane]["width_m"] / 2.0)
-        s = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(line, axis=0).T))])
+        s = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(line[:, :2], axis=0).T))])
         begins = np.arange(DASH_PERIOD_M / 3.0, s[-1] - DASH_M, DASH_PERIOD_M)
         at = np.stack([begins, begins + DASH_M], axis=1)
-        dashes.append(np.stack([np.interp(at, s, line[:, k]) for k in (0, 1)], axis=2))
+        dashes.append(np.stack([np.interp(at, s, line[:, k]) for k in range(3)], axis=2))
     return np.concatenate(dashes)
 
 
@@ -164,7 +208,7 @@ def _centre_lines(network: RoadNetwork) -> Points:
     edges, lanes = network.edges, network.lanes
     roads = edges[~edges["internal"]]
     ways = set(zip(roads["from_junction"].tolist(), roads["to_junction"].tolist(), strict=True))
-    pieces = [np.zeros((0, 2, 2))]
+    pieces = [np.zeros((0, 2, 3))]
     for edge in roads:
         leftmost = edge["first_lane"] + edge["num_lanes"] - 1
         way = int(edge["from_junction"]), int(edge["to_junction"])

@@ -24,11 +24,13 @@ __all__ = ["TopDownRenderer"]
 
 # Pixels of a picture whose size is not given, and how much wider than high it may be.
 PICTURE_PX = 960 * 720
+MIN_ASPECT = 1.25
 MAX_ASPECT = 3.0
 # Smallest part of the world that a following camera shows, and how fast it turns to a new aim.
 FOLLOW_M = 150.0
 FOLLOW_SHARE = 0.12
-STILL_DETAIL = 3
+MARGIN_PX = 50.0  # for what stands in the corners
+STILL_DETAIL = 4
 MOVING_DETAIL = 2
 
 
@@ -56,7 +58,7 @@ class TopDownRenderer:
         self.network = network
         bounds = focus or network.extent_m
         self.size = size or _suitable_size(bounds)
-        self._home = Camera.fit(bounds, self.size)
+        self._home = Camera.fit(bounds, self.size, MARGIN_PX)
         self._camera = self._home
         self._following = False
         self._goals = None if goal_edges is None else _edge_ends(network, goal_edges)
@@ -78,22 +80,24 @@ class TopDownRenderer:
         *,
         title: str = "",
         clock_s: float | None = None,
-        follow: tuple[float, float] | Sequence[int] | None = None,
+        follow: Sequence[int] | None = None,
+        center: tuple[float, float] | None = None,
     ) -> Surface:
         """Draw one picture.
 
         Args:
             vehicles: VEHICLE rows, in any order.
-            signal_phases: (num_signals,) PHASE rows that are on; without them signals are not shown.
+            signal_phases: (num_signals,) PHASE rows that are on; by default none is shown.
             title: for the upper left corner.
             clock_s: time for the upper left corner.
-            follow: what the camera stays close to: a place (two floats, m), or agents by index; it
-                stays where it is while none of these is in the world. None: it shows `focus`.
+            follow: agents, by index, that the camera stays close to; it waits while none of them
+                is in the world. By default it shows `focus`.
+            center: (x, y) in metres that the camera stays close to, instead of agents.
 
         Returns:
             A new surface; see `frame` for an array.
         """
-        self._aim(vehicles, follow)
+        self._aim(vehicles, follow, center)
         camera = self._camera
         surface = self._background(signal_phases).copy()
         seen = in_view(vehicles, camera)
@@ -108,7 +112,7 @@ class TopDownRenderer:
         notes.append(f"{len(vehicles)} vehicles")
         self._overlay.title(surface, title, "   ".join(notes))
         self._overlay.scale_bar(surface, camera)
-        self._overlay.legend(surface)
+        self._overlay.legend(surface, destinations=self._goals is not None)
         return surface
 
     def frame(
@@ -118,10 +122,13 @@ class TopDownRenderer:
         *,
         title: str = "",
         clock_s: float | None = None,
-        follow: tuple[float, float] | Sequence[int] | None = None,
+        follow: Sequence[int] | None = None,
+        center: tuple[float, float] | None = None,
     ) -> NDArray[np.uint8]:
         """The picture of `draw` as uint8 (height, width, 3), red green blue."""
-        surface = self.draw(vehicles, signal_phases, title=title, clock_s=clock_s, follow=follow)
+        surface = self.draw(
+            vehicles, signal_phases, title=title, clock_s=clock_s, follow=follow, center=center
+        )
         data = load_pygame().image.tobytes(surface, "RGB")
         return np.frombuffer(data, dtype=np.uint8).reshape(*self.size[::-1], 3).copy()
 
@@ -140,32 +147,30 @@ class TopDownRenderer:
         self._scene = None
 
     def _aim(
-        self, vehicles: NDArray[np.void], follow: tuple[float, float] | Sequence[int] | None
+        self,
+        vehicles: NDArray[np.void],
+        follow: Sequence[int] | None,
+        center: tuple[float, float] | None,
     ) -> None:
-        if follow is None:
+        if follow is None and center is None:
             self._camera, self._following = self._home, False
             return
-        target = self._closeup(vehicles, follow)
-        if target is not None:
+        if center is not None:
+            places = np.array([center], dtype=np.float64)
+        else:
+            rows = vehicles[np.isin(vehicles["agent"], follow or ())]
+            places = np.stack([rows["x"], rows["y"]], axis=1)
+        if len(places):
             share = FOLLOW_SHARE if self._following else 1.0
-            self._camera = self._camera.towards(target, share)
+            self._camera = self._camera.towards(self._closeup(places), share)
             self._following = True
 
-    def _closeup(
-        self, vehicles: NDArray[np.void], follow: tuple[float, float] | Sequence[int]
-    ) -> Camera | None:
-        if len(follow) == 2 and isinstance(follow[0], float):
-            places = np.array([follow], dtype=np.float64)
-        else:
-            rows = vehicles[np.isin(vehicles["agent"], follow)]
-            places = np.stack([rows["x"], rows["y"]], axis=1)
-        if not len(places):
-            return None
+    def _closeup(self, places: NDArray[np.float64]) -> Camera:
         low, high = places.min(axis=0), places.max(axis=0)
         middle = (low + high) / 2.0
         half = np.maximum((high - low) * 0.6, FOLLOW_M / 2.0)
-        low, high = middle - half, middle + half
-        return Camera.fit((low[0], low[1], high[0], high[1]), self.size, margin=0.0)
+        (min_x, min_y), (max_x, max_y) = (middle - half).tolist(), (middle + half).tolist()
+        return Camera.fit((min_x, min_y, max_x, max_y), self.size)
 
     def _background(self, signal_phases: NDArray[np.int32] | None) -> Surface:
         """Roads and stop lines, made anew when the camera moves or a signal switches."""
@@ -188,7 +193,7 @@ def _suitable_size(bounds: Bounds) -> tuple[int, int]:
     """A size in the proportions of `bounds`, in steps of 16 pixels, which all video coders take."""
     min_x, min_y, max_x, max_y = bounds
     aspect = max(max_x - min_x, 1.0) / max(max_y - min_y, 1.0)
-    aspect = min(max(aspect, 1.0), MAX_ASPECT)
+    aspect = min(max(aspect, MIN_ASPECT), MAX_ASPECT)
     width, height = (PICTURE_PX * aspect) ** 0.5, (PICTURE_PX / aspect) ** 0.5
     return round(width / 16) * 16, round(height / 16) * 16
 

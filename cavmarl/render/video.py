@@ -20,7 +20,7 @@ QUALITY = 20
 class VideoWriter:
     """Writes uint8 frames to an H.264 file (yuv420p); use it in a `with` block.
 
-    The folder is made if need be. The first frame sets the size; a file without frames is not written.
+    Missing folders are made. The first frame sets the size; without frames there is no file.
 
     Args:
         path: ends in `.mp4`.

@@ -11,11 +11,11 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["NEAR_M", "LinkPath", "Overlap", "overlap", "sample_path"]
+__all__ = ["NEAR_M", "LinkPath", "Overlap", "least_distance", "overlap", "sample_path"]
 
 SAMPLE_M = 0.5
-# Half a car (1.8 m wide) on either path and a margin that covers corners cut in a turn.
-NEAR_M = 0.9 + 0.9 + 0.4
+# Half a car (2 m wide) on either path and a margin that covers corners cut in a turn.
+NEAR_M = 1.0 + 1.0 + 0.6
 # Paths further apart than this in height are a bridge and the road below it.
 CLEARANCE_M = 3.0
 # The half length of the stretch where foes never come near each other in the plane.
@@ -80,6 +80,14 @@ def overlap(path: LinkPath, foe: LinkPath, *, merging: bool) -> Overlap | None:
     if merging:
         found = found._replace(leave_m=path.s[-1], foe_leave_m=foe.s[-1])
     return Overlap(*map(float, found))
+
+
+def least_distance(path: LinkPath, foe: LinkPath) -> float:
+    """The least distance in m of two paths in the plane, where they are on one level; else inf."""
+    plane = path.xyz[:, None, :2] - foe.xyz[None, :, :2]
+    square = plane[..., 0] * plane[..., 0] + plane[..., 1] * plane[..., 1]
+    level = np.abs(path.xyz[:, None, 2] - foe.xyz[None, :, 2]) <= CLEARANCE_M
+    return float(np.sqrt(square[level].min())) if level.any() else float("inf")
 
 
 def _stretch(path: LinkPath, start: float, end: float) -> tuple[float, float]:

@@ -10,11 +10,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cavmarl.errors import MapError
-from cavmarl.roads.conflicts import LinkPath, Overlap, overlap
+from cavmarl.roads.conflicts import LinkPath, Overlap, least_distance, overlap
 from cavmarl.roads.network import CONFLICT
 from cavmarl.roads.selection import Movement
 
 __all__ = ["conflict_rows"]
+
+# Cars on paths that come nearer than this touch, as they stand askew in the bend.
+NEAR_MISS_M = 2.9
 
 Row = tuple[int, bool, float, float, float, float]
 
@@ -25,7 +28,9 @@ def conflict_rows(
     """All conflicts of all links, and each link's first row with the end as last entry.
 
     Two links are foes if either names the other: some maps set the bit on one side only, but a
-    shared area is shared. Links over a bridge and below it are none, whatever the map says.
+    shared area is shared. Links over a bridge and below it are none, whatever the map says. Links from
+    different lanes that the map calls free of each other, but that pass so narrowly that cars would
+    touch, are foes too; of these a left turn gives way.
 
     Args:
         movements: one a LINK row.
@@ -41,15 +46,20 @@ def conflict_rows(
     for links in by_node.values():
         for one, other in combinations(links, 2):
             a, b = movements[one], movements[other]
-            if not (_bit(a, b, a.node._foes) or _bit(b, a, a.node._foes)):
+            if _bit(a, b, a.node._foes) or _bit(b, a, a.node._foes):
+                merging = a.connection.getToLane() is b.connection.getToLane()
+                shared = _shared(paths[one], paths[other], merging=merging)
+                yields = _bit(a, b, a.node._prohibits), _bit(b, a, a.node._prohibits)
+            elif a.connection.getFromLane() is not b.connection.getFromLane():
+                shared = _near_miss(paths[one], paths[other])
+                yields = _turns_left(a) and not _turns_left(b), _turns_left(b)
+            else:
                 continue
-            merging = a.connection.getToLane() is b.connection.getToLane()
-            shared = _shared(paths[one], paths[other], merging=merging)
             if shared is None:
                 continue
             mine, theirs = shared[:2], shared[2:]
-            found[one].append((other, _bit(a, b, a.node._prohibits), *mine, *theirs))
-            found[other].append((one, _bit(b, a, a.node._prohibits), *theirs, *mine))
+            found[one].append((other, yields[0], *mine, *theirs))
+            found[other].append((one, yields[1], *theirs, *mine))
 
     counts = [len(rows) for rows in found]
     conflicts = np.zeros(sum(counts), CONFLICT)
@@ -68,6 +78,17 @@ def _bit(mine: Movement, foe: Movement, requests: dict[int, str]) -> bool:
             "the network again with netconvert"
         )
     return row[-1 - foe.index] == "1"
+
+
+def _turns_left(movement: Movement) -> bool:
+    return movement.connection.getDirection() in "lLt"
+
+
+def _near_miss(path: LinkPath | None, foe: LinkPath | None) -> Overlap | None:
+    """The stretch where cars on two paths would touch, or None where they pass each other."""
+    if path is None or foe is None or least_distance(path, foe) > NEAR_MISS_M:
+        return None
+    return overlap(path, foe, merging=False)
 
 
 def _shared(path: LinkPath | None, foe: LinkPath | None, *, merging: bool) -> Overlap | None:

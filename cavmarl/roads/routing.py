@@ -24,6 +24,7 @@ PLAN = np.dtype(
         ("link", np.int32),  # LINK that leads there; -1 inside junctions
         ("change", np.int32),  # side of the better lane: 1 left, -1 right, 0 this one is best
         ("changes", np.int32),  # lane changes to the best lane of this edge
+        ("turnarounds", np.int32),  # U-turns on the way: where a road ends, plans turn round
         ("room", np.float64),  # m from the lane's start that can be driven before a change is needed
         ("to_go", np.float64),  # m from the lane's start to the end of the goal edge; inf: no way
     ],

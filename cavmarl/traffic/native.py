@@ -157,11 +157,13 @@ class NativeTraffic:
     ) -> NDArray[np.int32]:
         """(P, 2) pairs of origin lane and goal whose way has a length from `least_m` to `most_m`.
 
-        Vehicles start on a lane that their way can follow: no trip begins with a lane change.
+        Vehicles start on a lane that their way can follow: no trip begins with a lane change. And no
+        trip has a U-turn, for which a car's turning circle is too wide on most roads.
         """
         pairs = np.ix_(goals, origins)
         to_go = self.plans["to_go"][pairs]
-        fits = np.isfinite(to_go) & (to_go >= least_m) & (self.plans["change"][pairs] == 0)
+        fits = np.isfinite(to_go) & (to_go >= least_m)
+        fits &= (self.plans["change"][pairs] == 0) & (self.plans["turnarounds"][pairs] == 0)
         if most_m > 0.0:
             fits &= to_go <= most_m
         goal, origin = np.nonzero(fits)

@@ -105,8 +105,8 @@ def test_crossing_paths_share_the_middle_and_merging_paths_the_end(crossing: Cro
     cross, merge = network.conflicts[0], network.conflicts[1]
 
     for side in ("", "foe_"):
-        assert cross[f"{side}enter_m"] == pytest.approx(5.0 - 2.2, abs=0.5)
-        assert cross[f"{side}leave_m"] == pytest.approx(5.0 + 2.2, abs=0.5)
+        assert cross[f"{side}enter_m"] == pytest.approx(5.0 - 2.6, abs=0.5)
+        assert cross[f"{side}leave_m"] == pytest.approx(5.0 + 2.6, abs=0.5)
     assert merge["leave_m"] == network.links["length_m"][0]
     assert merge["foe_leave_m"] == network.links["length_m"][2]
     assert 0.0 < merge["enter_m"] < 10.0

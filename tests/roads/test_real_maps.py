@@ -174,7 +174,8 @@ def check_against_sumolib(network: RoadNetwork, net: Any) -> None:
         for foe in np.flatnonzero(links["junction"] == link["junction"]) if node._foes else ():
             a, b = int(link["index"]), int(links["index"][foe])
             either = foe != mine and (node.areFoes(a, b) or node.areFoes(b, a))
-            assert (foe in listed) == either
+            # Beyond the map's own foes there are those that pass too narrowly, never fewer.
+            assert foe in listed or not either
             if either:
                 assert listed[foe] == node.forbids(connections[foe], connections[mine])
 

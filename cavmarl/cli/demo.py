@@ -1,0 +1,96 @@
+"""`cavmarl demo`: from nothing to a trained driver that has been judged and filmed."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from rich.console import Console
+
+from cavmarl.cli.evaluate import evaluate_showing, report_table
+from cavmarl.cli.output import JsonPath, Seed, write_json
+from cavmarl.cli.view import record
+from cavmarl.errors import ConfigError
+
+__all__ = ["demo"]
+
+_SCRIPT = Path(__file__).resolve().parents[2] / "train" / "ippo_torch.py"
+
+EVALUATION_SEED = 1000  # far from the seeds of training
+EPISODES = 32
+
+
+def demo(
+    minutes: Annotated[float, typer.Option(help="Of training.")] = 2.0,
+    seconds: Annotated[float, typer.Option(help="That each video shows.")] = 60.0,
+    out: Annotated[Path, typer.Option(help="Folder of everything that is made.")] = Path(
+        "runs/demo"
+    ),
+    seed: Seed = 0,
+    json_path: JsonPath = None,
+) -> None:
+    """Train on `merge`, evaluate beside `idm` and `random_actions`, drive `town`, leave videos."""
+    from cavmarl.cav_env import parallel_env
+    from cavmarl.errors import require
+
+    if not _SCRIPT.is_file():
+        raise ConfigError(
+            "the demo trains with train/ippo_torch.py, which an installed wheel does not carry: "
+            "run it in a checkout of the repository"
+        )
+    if not 0.0 < minutes <= 600.0 or not 0.0 < seconds <= 3600.0:
+        raise ConfigError("--minutes must be above 0, at most 600; --seconds above 0, at most 3600")
+    require("torch", "torch")
+    require("imageio_ffmpeg", "render")
+    console = Console()
+    console.print(f"[bold]1. train[/] on merge, {minutes:g} min")
+    trained = _train(out, minutes, seed)
+
+    console.print("[bold]2. evaluate[/] on merge, on other seeds")
+    drivers = {"trained": str(trained), "idm": "idm", "random_actions": "random_actions"}
+    reports = {
+        name: evaluate_showing(console, "merge", policy, episodes=EPISODES, seed=EVALUATION_SEED)
+        for name, policy in drivers.items()
+    }
+    console.print(report_table(reports))
+
+    console.print(f"[bold]3. drive[/] {seconds:g} s")
+    videos = {"merge": str(trained), "town": "idm"}
+    stats = {}
+    for env, policy in videos.items():
+        world = parallel_env(env, render_mode="rgb_array")
+        video = out / f"{env}.mp4"
+        stats[env] = record(world, policy, seconds, EVALUATION_SEED, video, console)
+        console.print(f"{Path(policy).name} in {env}: {_traffic(stats[env])}")
+    console.print("[bold]made:[/]")
+    for made in (trained, *(out / f"{env}.mp4" for env in videos)):
+        console.print(f"  {made}", highlight=False)
+    write_json(
+        json_path,
+        {
+            "driver": str(trained),
+            "reports": {name: report.to_dict() for name, report in reports.items()},
+            "traffic": stats,
+            "videos": [str(out / f"{env}.mp4") for env in videos],
+        },
+    )
+
+
+def _train(out: Path, minutes: float, seed: int) -> Path:
+    """Run the training program; the folder of the driver."""
+    command = [sys.executable, str(_SCRIPT), "--env", "merge", "--minutes", str(minutes)]
+    command += ["--seed", str(seed), "--runs", str(out), "--name", "driver"]
+    done = subprocess.run(command, check=False)
+    if done.returncode:
+        raise typer.Exit(done.returncode)
+    return out / "driver"
+
+
+def _traffic(stats: dict[str, float]) -> str:
+    return (
+        f"{stats['departed']} departed, {stats['arrived']} arrived, {stats['contacts']} contacts, "
+        f"mean speed {stats['mean_speed_mps']:.1f} m/s"
+    )

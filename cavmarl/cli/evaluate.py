@@ -1,0 +1,121 @@
+"""`cavmarl evaluate`: seeded episodes of a driver, and what they say about it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+from rich.console import Console
+from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
+from rich.table import Table
+
+from cavmarl.cli.output import (
+    Agents,
+    Background,
+    Environment,
+    JsonPath,
+    PolicyName,
+    Seed,
+    Settings,
+    number,
+    parse_settings,
+    write_json,
+)
+
+if TYPE_CHECKING:
+    from cavmarl.evaluate import EvaluationReport
+    from cavmarl.evaluate.statistics import Interval
+
+__all__ = ["evaluate", "evaluate_showing", "progress_bar", "report_table"]
+
+
+def evaluate(
+    env: Environment,
+    policy: PolicyName = "idm",
+    episodes: Annotated[int, typer.Option("--episodes", "-n", help="How many.")] = 32,
+    seed: Seed = 0,
+    agents: Agents = None,
+    background: Background = None,
+    settings: Settings = None,
+    json_path: JsonPath = None,
+) -> None:
+    """Drive seeded episodes and show success, collisions, comfort, delay and speed."""
+    console = Console()
+    report = evaluate_showing(
+        console,
+        env,
+        policy,
+        episodes=episodes,
+        seed=seed,
+        agents=agents,
+        background=background,
+        overrides=parse_settings(settings),
+    )
+    write_json(json_path, report.to_dict())
+    console.print(report_table({policy: report}))
+
+
+def evaluate_showing(console: Console, env: str, policy: str, **settings: Any) -> EvaluationReport:
+    """`cavmarl.evaluate.evaluate` with a progress bar."""
+    from cavmarl.evaluate import evaluate as run
+
+    with progress_bar(console) as bar:
+        task = bar.add_task(f"{policy} drives {env}")
+
+        def progress(steps: int, most: int) -> None:
+            bar.update(task, completed=steps, total=most)
+
+        return run(env, policy, progress=progress, **settings)
+
+
+def progress_bar(console: Console) -> Progress:
+    """A bar that goes away when the work is done."""
+    return Progress(
+        TextColumn("{task.description}"),
+        BarColumn(bar_width=24),
+        TimeElapsedColumn(),
+        console=console,
+        transient=True,
+    )
+
+
+def report_table(reports: dict[str, EvaluationReport]) -> Table:
+    """Reports side by side, one column a driver."""
+    first = next(iter(reports.values()))
+    title = f"{first.manifest.environment}, {first.episodes} episodes of seed {first.manifest.seed}"
+    table = Table("mean (95 % interval)", title=title)
+    for name in reports:
+        table.add_column(name, justify="right")
+    columns = [_cells(report) for report in reports.values()]
+    for row in columns[0]:
+        table.add_row(row, *(column[row] for column in columns))
+    return table
+
+
+def _cells(report: EvaluationReport) -> dict[str, str]:
+    speed = report.speed
+    return {
+        "trips": str(report.trips),
+        "success": _interval(report.success, unit="%"),
+        "collision": _interval(report.collision, unit="%"),
+        "off road": _interval(report.off_road, unit="%"),
+        "unfinished at the horizon": _interval(report.unfinished, unit="%"),
+        "red light": _interval(report.red_light, unit="%"),
+        "wrong way": _interval(report.wrong_way, unit="%"),
+        "episode return": _interval(report.episode_return),
+        "least time to collision of a trip, s": _interval(report.mean_least_ttc_s),
+        "jerk, m/s³": _interval(report.mean_jerk_mps3),
+        "delay of an arrival, s": _interval(report.mean_delay_s),
+        "speed, m/s": number(report.mean_speed_mps),
+        "step of a world, ms": f"{speed.step_ms:.3f} + {speed.policy_ms:.3f} policy",
+        "agent-steps/s": f"{speed.agent_steps_per_s:,.0f}",
+    }
+
+
+def _interval(interval: Interval, unit: str = "") -> str:
+    bounds: Sequence[float | None] = (interval.low, interval.high)
+    if None in bounds:
+        return number(interval.mean, unit=unit)
+    low, high = (number(bound, unit=unit).removesuffix(" %") for bound in bounds)
+    return f"{number(interval.mean, unit=unit)} ({low} … {high})"

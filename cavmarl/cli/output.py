@@ -1,0 +1,92 @@
+"""What the commands share: reading overrides, writing JSON, saying what went wrong."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+from rich.console import Console
+from rich.text import Text
+
+from cavmarl.errors import ConfigError
+
+__all__ = [
+    "Agents",
+    "Background",
+    "Environment",
+    "JsonPath",
+    "PolicyName",
+    "Seed",
+    "Settings",
+    "number",
+    "parse_settings",
+    "print_error",
+    "write_json",
+]
+
+Environment = Annotated[
+    str, typer.Argument(metavar="ENV", help="Name, folder or map file of an environment.")
+]
+PolicyName = Annotated[
+    str, typer.Option("--policy", "-p", help="A name of `cavmarl list`, or the path of a policy.")
+]
+Seed = Annotated[int, typer.Option(help="Root of all random numbers.")]
+Agents = Annotated[int | None, typer.Option(help="Agents a world; default: the environment's.")]
+Background = Annotated[
+    int | None, typer.Option(help="Background vehicles a world; default: the environment's.")
+]
+Settings = Annotated[
+    list[str] | None,
+    typer.Option("--set", metavar="KEY=VALUE", help="Any key of env.yaml; may be repeated."),
+]
+JsonPath = Annotated[Path | None, typer.Option("--json", help="Write the result here as JSON.")]
+
+
+def parse_settings(settings: Sequence[str] | None) -> dict[str, Any]:
+    """`sensors.lidar.rays=32` and the like as overrides; a value is JSON, else text.
+
+    Raises:
+        ConfigError: no `=`, or a key twice.
+    """
+    overrides: dict[str, Any] = {}
+    for setting in settings or ():
+        key, equals, text = setting.partition("=")
+        if not equals or not key:
+            raise ConfigError(f"--set {setting}: must be KEY=VALUE, as sensors.lidar.rays=32")
+        if key in overrides:
+            raise ConfigError(f"--set {key}: given twice")
+        try:
+            overrides[key] = json.loads(text)
+        except json.JSONDecodeError:
+            overrides[key] = text
+    return overrides
+
+
+def write_json(path: Path | None, document: dict[str, Any]) -> None:
+    """Write `document` where `--json` asks for it.
+
+    Raises:
+        ConfigError: the path cannot be written.
+    """
+    if path is None:
+        return
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(json.dumps(document, indent=2) + "\n", encoding="utf-8")
+    except OSError as error:
+        raise ConfigError(f"{path}: cannot be written ({error.strerror or error})") from error
+
+
+def number(value: float | None, digits: int = 2, unit: str = "") -> str:
+    """A number for a table; a dash where there is none."""
+    if value is None:
+        return "-"
+    return f"{100.0 * value:.1f} %" if unit == "%" else f"{value:.{digits}f}{unit and f' {unit}'}"
+
+
+def print_error(message: str) -> None:
+    """Say on stderr, in red, what went wrong."""
+    Console(stderr=True).print(Text(f"error: {message}", style="red"), soft_wrap=True)

@@ -1,0 +1,94 @@
+"""`cavmarl view`: watch a driver, in a window or in a video."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+from rich.console import Console
+
+from cavmarl.cli.evaluate import progress_bar
+from cavmarl.cli.output import (
+    Agents,
+    Background,
+    Environment,
+    JsonPath,
+    PolicyName,
+    Seed,
+    Settings,
+    parse_settings,
+    write_json,
+)
+from cavmarl.errors import ConfigError
+
+if TYPE_CHECKING:
+    from cavmarl.cav_env import CavEnv
+
+__all__ = ["record", "view"]
+
+
+def view(
+    env: Environment,
+    policy: PolicyName = "idm",
+    seconds: Annotated[float, typer.Option(help="Of simulated time.")] = 30.0,
+    video: Annotated[
+        Path | None, typer.Option(help="Write an .mp4 here; default: show a window.")
+    ] = None,
+    seed: Seed = 0,
+    agents: Agents = None,
+    background: Background = None,
+    settings: Settings = None,
+    json_path: JsonPath = None,
+) -> None:
+    """Drive one world and show it from above."""
+    from cavmarl.cav_env import parallel_env
+
+    if not 0.0 < seconds <= 3600.0:
+        raise ConfigError(f"--seconds {seconds:g}: must be above 0 and at most 3600")
+    world = parallel_env(
+        env,
+        agents=agents,
+        background=background,
+        render_mode="human" if video is None else "rgb_array",
+        overrides=parse_settings(settings),
+    )
+    console = Console()
+    stats = record(world, policy, seconds, seed, video, console)
+    write_json(json_path, {"video": str(video) if video else None, "traffic": stats})
+    if video is not None:
+        console.print(f"video: {video}")
+
+
+def record(
+    world: CavEnv, policy: str, seconds: float, seed: int, video: Path | None, console: Console
+) -> dict[str, float]:
+    """Drive `world` for some seconds, episode after episode, and film it where `video` is a path.
+
+    Returns:
+        the traffic of the last episode.
+    """
+    from contextlib import ExitStack
+
+    from cavmarl.policies import load_policy
+    from cavmarl.render.video import VideoWriter
+
+    driver = load_policy(policy, world)
+    steps = max(1, round(seconds / world.step_s))
+    with ExitStack() as stack:
+        stack.callback(world.close)
+        writer = None
+        if video is not None:
+            writer = stack.enter_context(VideoWriter(video, world.metadata["render_fps"]))
+        bar = stack.enter_context(progress_bar(console))
+        observations, _ = world.reset(seed=seed)
+        driver.reset(seed)
+        for _ in bar.track(range(steps), description=f"{policy} drives {world.config.name}"):
+            if not world.agents:
+                observations, _ = world.reset()
+            observations, *_ = world.step(driver.act(observations))
+            if writer is not None:
+                frame = world.render()
+                assert frame is not None  # the render mode is rgb_array
+                writer.write(frame)
+        return world.traffic_stats()

@@ -1,0 +1,54 @@
+"""The comparison with highway-env, small: both sides run, on the same road."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import pytest
+
+from cavmarl.errors import ConfigError, MissingExtraError
+from cavmarl.evaluate import step_speed
+from cavmarl.evaluate.step_speed import measure_step_speed
+from cavmarl.maps.check import check_map
+
+
+def test_both_sides_are_measured() -> None:
+    pytest.importorskip("highway_env")
+    told: list[str] = []
+    found = measure_step_speed(agents=3, worlds=2, repeats=2, progress=told.append)
+    for rates in (found.batched, found.single, found.highway_env):
+        assert 0.0 < rates.low <= rates.median <= rates.high
+    assert found.ratio == found.batched.median / found.highway_env.median
+    assert any("compiling" in text for text in told)
+
+
+def test_the_road_can_be_driven(tmp_path: Path) -> None:
+    path = tmp_path / "road.net.xml"
+    path.write_text(step_speed._straight_road(500.0))
+    report = check_map(path)
+    assert report.drivable
+    assert report.road_km == pytest.approx((500.0 + step_speed.RUN_OUT_M) / 1000.0)
+
+
+@pytest.mark.skipif(not hasattr(os, "sched_getaffinity"), reason="no affinity on this system")
+def test_the_cores_are_given_back() -> None:
+    before = os.sched_getaffinity(0)
+    with step_speed._one_core():
+        assert len(os.sched_getaffinity(0)) == 1
+    assert os.sched_getaffinity(0) == before
+
+
+@pytest.mark.parametrize("wrong", [{"agents": 0}, {"worlds": 0}, {"repeats": 0}, {"agents": 10**6}])
+def test_numbers_out_of_range_are_refused(wrong: dict[str, int]) -> None:
+    with pytest.raises(ConfigError, match=next(iter(wrong))):
+        measure_step_speed(**wrong)
+
+
+def test_without_highway_env_it_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
+    def absent(module: str) -> None:
+        raise ModuleNotFoundError(name=module)
+
+    monkeypatch.setattr("cavmarl.errors.importlib.import_module", absent)
+    with pytest.raises(MissingExtraError, match=r"pip install 'cavmarl\[highway\]'"):
+        measure_step_speed(agents=1)

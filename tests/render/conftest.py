@@ -1,0 +1,37 @@
+"""Small real maps and vehicles to draw on them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from cavmarl.registry import load_config, resolve_map
+from cavmarl.roads.cache import load_network
+from cavmarl.roads.network import RoadNetwork
+from cavmarl.shard.vehicles import blank_vehicle
+
+
+@pytest.fixture(scope="session")
+def ring() -> RoadNetwork:
+    return load_network(resolve_map(*load_config("ring")))
+
+
+@pytest.fixture(scope="session")
+def grid() -> RoadNetwork:
+    return load_network(resolve_map(*load_config("grid4x4")))
+
+
+@pytest.fixture
+def car() -> Callable[..., NDArray[np.void]]:
+    """One VEHICLE row; keywords set its fields: `car(x=3.0, agent=1)`."""
+
+    def make(**fields: float) -> NDArray[np.void]:
+        row = blank_vehicle()
+        for name, value in fields.items():
+            row[name] = value
+        return row
+
+    return make

@@ -1,0 +1,240 @@
+from __future__ import annotations
+
+import importlib
+import os
+from collections.abc import Callable, Iterator
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from cavmarl.errors import MissingExtraError
+from cavmarl.render import palette
+from cavmarl.render.canvas import load_pygame
+from cavmarl.render.cars import BRAKING_MPS2
+from cavmarl.render.ground import signal_codes, signal_letter
+from cavmarl.render.topdown import TopDownRenderer
+from cavmarl.roads.network import SIGNAL_STATES, RoadNetwork
+from cavmarl.shard.vehicles import VEHICLE
+
+pytest.importorskip("pygame")
+
+SIZE = (320, 240)
+Car = Callable[..., NDArray[np.void]]
+
+
+@pytest.fixture
+def headless(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    monkeypatch.setenv("SDL_VIDEODRIVER", "dummy")
+    yield
+    load_pygame().display.quit()
+
+
+def middle(frame: NDArray[np.uint8]) -> tuple[int, ...]:
+    height, width = frame.shape[:2]
+    return tuple(int(c) for c in frame[height // 2, width // 2])
+
+
+def count(frame: NDArray[np.uint8], color: palette.Color) -> int:
+    return int((np.abs(frame.astype(int) - color).sum(axis=2) < 30).sum())
+
+
+def test_frame_is_rgb_of_the_asked_size(ring: RoadNetwork, car: Car) -> None:
+    frame = TopDownRenderer(ring, SIZE).frame(car(agent=-1), title="ring", clock_s=1.0)
+    assert frame.shape == (240, 320, 3)
+    assert frame.dtype == np.uint8
+    assert middle(frame) != palette.LAND  # the car
+    assert tuple(frame[120, 130]) == palette.LAND
+
+
+def test_size_suits_the_map(grid: RoadNetwork) -> None:
+    width, height = TopDownRenderer(grid).size
+    wide = TopDownRenderer(grid, focus=(0.0, 0.0, 5000.0, 10.0)).size
+    assert width > height
+    assert wide[0] > 2.5 * wide[1]
+    assert width % 16 == height % 16 == 0
+
+
+def test_same_world_same_bytes(grid: RoadNetwork, car: Car) -> None:
+    rows = np.concatenate([car(x=100.0 * k, y=300.0, id=k, agent=k - 1) for k in range(5)])
+    phases = grid.signals["first_phase"].astype(np.int32)
+    one = TopDownRenderer(grid, SIZE).frame(rows, phases, clock_s=2.0)
+    assert (TopDownRenderer(grid, SIZE).frame(rows[::-1], phases, clock_s=2.0) == one).all()
+
+
+@pytest.mark.parametrize("agent", [-1, 0, 3, 25])
+def test_vehicle_has_its_colour_at_its_place(ring: RoadNetwork, car: Car, agent: int) -> None:
+    renderer = TopDownRenderer(ring, SIZE, focus=(40.0, -20.0, 80.0, 10.0))
+    row = car(agent=agent, x=60.0, y=-5.0, heading=1.0)
+    expected = palette.BACKGROUND_CAR if agent < 0 else palette.agent_color(agent)
+    assert middle(renderer.frame(row)) == expected
+    assert middle(renderer.frame(row[:0])) != expected
+
+
+def test_vehicle_is_as_long_and_wide_as_it_is(ring: RoadNetwork, car: Car) -> None:
+    renderer = TopDownRenderer(ring, SIZE, focus=(-10.0, -7.5, 10.0, 7.5))
+    frame = renderer.frame(car(agent=2, length=12.0, width=3.0))
+    scale = renderer.camera.scale
+    body = np.abs(frame.astype(int) - palette.agent_color(2)).sum(axis=2) < 30
+    rows, columns = np.nonzero(
+        body & (np.arange(240) > 60)[:, None] & (np.arange(240) < 200)[:, None]
+    )
+    assert np.ptp(columns) + 1 == pytest.approx(12.0 * scale, abs=3.0)
+    assert rows.max() - 120 == pytest.approx(1.5 * scale, abs=2.0)
+
+
+@pytest.mark.parametrize(
+    ("fields", "color"),
+    [
+        ({"accel": BRAKING_MPS2 - 0.5}, palette.BRAKE),
+        ({"blinker": 1}, palette.BLINKER),
+        ({"hit": 4}, palette.COLLIDED),
+        ({"events": 1}, palette.COLLIDED),
+    ],
+)
+def test_vehicle_shows_its_state(
+    ring: RoadNetwork, car: Car, fields: dict[str, float], color: palette.Color
+) -> None:
+    renderer = TopDownRenderer(ring, SIZE, focus=(-8.0, -6.0, 8.0, 6.0))
+    calm = renderer.frame(car(agent=-1))
+    shown = renderer.frame(car(agent=-1, **fields))
+    assert count(shown, color) > count(calm, color)
+
+
+def test_left_blinker_is_at_the_left(ring: RoadNetwork, car: Car) -> None:
+    renderer = TopDownRenderer(ring, SIZE, focus=(-8.0, -6.0, 8.0, 6.0))
+    left = renderer.frame(car(agent=-1, blinker=1))  # heads east: its left is up
+    assert count(left[:120], palette.BLINKER) > 0
+    assert count(left[120:200], palette.BLINKER) == 0
+
+
+def test_signal_letters_are_those_of_the_phase(grid: RoadNetwork) -> None:
+    phases = grid.signals["first_phase"].astype(np.int32)
+    codes = signal_codes(grid, phases)
+    signalled = grid.links["signal"] >= 0
+    assert signalled.any()
+    assert (codes[~signalled] == 255).all()
+    for link in np.flatnonzero(signalled)[:20]:
+        signal = grid.signals[grid.links[link]["signal"]]
+        phase = grid.phases[signal["first_phase"]]
+        states = grid.phase_states[phase["first_state"] :][: signal["num_links"]]
+        letter = SIGNAL_STATES[states[grid.links[link]["signal_index"]]]
+        assert signal_letter(grid, int(link), phases) == letter
+
+
+def test_stop_lines_switch_with_their_signal(grid: RoadNetwork) -> None:
+    signal = grid.signals[0]
+    first = grid.signals["first_phase"].astype(np.int32)
+    red, green = palette.SIGNALS[0], palette.SIGNALS[3]
+    links = np.flatnonzero(grid.links["signal"] == 0)
+    renderer = TopDownRenderer(grid, SIZE)
+    seen = set()
+    for step in range(signal["num_phases"]):
+        phases = first.copy()
+        phases[0] += step
+        link = int(links[0])
+        lane = grid.lanes[grid.links[link]["from_lane"]]
+        end = grid.points[lane["first_point"] + lane["num_points"] - 1]
+        near = renderer.frame(
+            np.zeros(0, dtype=VEHICLE), phases, center=(float(end["x"]), float(end["y"]))
+        )
+        letter = signal_letter(grid, link, phases)
+        around = near[115:125, 155:165]
+        if letter in "rG":
+            seen.add(letter)
+            assert count(around, red if letter == "r" else green) > 0
+            assert count(around, green if letter == "r" else red) == 0
+    assert seen == {"r", "G"}
+
+
+def test_camera_follows_agents_and_waits_for_them(grid: RoadNetwork, car: Car) -> None:
+    renderer = TopDownRenderer(grid, SIZE)
+    row = car(agent=5, x=150.0, y=200.0)
+    renderer.draw(row, follow=[5])
+    assert (renderer.camera.x, renderer.camera.y) == (150.0, 200.0)
+    row["x"] += 20.0
+    renderer.draw(row, follow=[5])
+    assert 150.0 < renderer.camera.x < 170.0
+    before = renderer.camera
+    renderer.draw(row[:0], follow=[5])
+    assert renderer.camera == before
+    renderer.draw(row)
+    assert renderer.camera.x == pytest.approx(300.0)
+
+
+def test_destinations_are_marked(grid: RoadNetwork, car: Car) -> None:
+    goals = np.flatnonzero(~grid.edges["internal"])[:1].astype(np.int32)
+    lane = grid.lanes[grid.edges[goals[0]]["first_lane"]]
+    end = grid.points[lane["first_point"] + lane["num_points"] - 1]
+    row = car(agent=4, x=-1e6, goal=0)
+    place = (float(end["x"]), float(end["y"]))
+    plain = TopDownRenderer(grid, SIZE).frame(row, center=place)
+    marked = TopDownRenderer(grid, SIZE, goal_edges=goals).frame(row, center=place)
+    part = np.s_[90:150, 130:190]
+    assert count(plain[part], palette.agent_color(4)) == 0
+    assert count(marked[part], palette.agent_color(4)) > 10
+
+
+def test_pictures_need_no_display_and_leave_the_environment_alone(
+    ring: RoadNetwork, car: Car, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("SDL_VIDEODRIVER", "no-such-driver")
+    before = dict(os.environ)
+    TopDownRenderer(ring, SIZE).frame(car())
+    assert dict(os.environ) == before
+    assert not load_pygame().display.get_init()
+
+
+def test_window_shows_what_was_drawn(headless: None, ring: RoadNetwork, car: Car) -> None:
+    renderer = TopDownRenderer(ring, SIZE)
+    for _ in range(3):
+        renderer.show(renderer.draw(car()), "ring", fps=1000.0)
+    renderer.close()
+    renderer.close()
+    assert renderer.frame(car()).shape == (240, 320, 3)
+
+
+def test_window_keeps_pace(headless: None, ring: RoadNetwork, car: Car) -> None:
+    pygame = load_pygame()
+    renderer = TopDownRenderer(ring, SIZE)
+    picture = renderer.draw(car())
+    renderer.show(picture, "ring", fps=50.0)
+    start = pygame.time.get_ticks()
+    for _ in range(5):
+        renderer.show(picture, "ring", fps=50.0)
+    assert pygame.time.get_ticks() - start >= 90
+    renderer.close()
+
+
+def test_run_goes_on_when_the_window_is_closed(
+    headless: None, ring: RoadNetwork, car: Car, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pygame = load_pygame()
+    opened = []
+    window = pygame.Window
+
+    def open_window(*arguments: object) -> object:
+        opened.append(window(*arguments))
+        return opened[-1]
+
+    monkeypatch.setattr(pygame, "Window", open_window)
+    renderer = TopDownRenderer(ring, SIZE)
+    picture = renderer.draw(car())
+    renderer.show(picture, "ring", fps=1000.0)
+    pygame.event.post(pygame.event.Event(pygame.QUIT))
+    renderer.show(picture, "ring", fps=1000.0)
+    with pytest.raises(pygame.error):
+        opened[0].get_surface()
+    renderer.show(picture, "ring", fps=1000.0)
+    assert len(opened) == 1
+
+
+def test_without_pygame_the_extra_is_named(
+    ring: RoadNetwork, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def missing(module: str) -> None:
+        raise ModuleNotFoundError(f"No module named '{module}'", name=module)
+
+    monkeypatch.setattr(importlib, "import_module", missing)
+    with pytest.raises(MissingExtraError, match=r"cavmarl\[render\]"):
+        TopDownRenderer(ring)
