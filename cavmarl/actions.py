@@ -113,9 +113,10 @@ class ActionDecoder:
         return self._commands(checked)
 
     def encode(self, raw: NDArray[np.float64]) -> NDArray[Any]:
-        """The inverse of decoding: actions (W, A, …) for what `Simulation.suggest` wrote (W, A, 2)."""
+        """The inverse of decoding: actions (W, A, …) for raw controls (W, A, 2) as suggested."""
         if self._continuous:
-            return np.clip(raw / self._scale, -1.0, 1.0).astype(np.float32)
+            shares: NDArray[Any] = np.clip(raw / self._scale, -1.0, 1.0).astype(np.float32)
+            return shares
         return raw[..., 0].astype(np.int64)
 
     def _check_ids(self, actions: Mapping[str, Any], live: Sequence[str]) -> int:

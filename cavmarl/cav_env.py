@@ -1,4 +1,4 @@
-"""`CavEnv`: one world as a PettingZoo parallel environment, a thin view on the batched simulation."""
+"""`CavEnv`: one world as a PettingZoo parallel environment, a view on the batched simulation."""
 
 from __future__ import annotations
 
@@ -73,12 +73,12 @@ def parallel_env(
     return CavEnv(config, network, seed=seed, render_mode=render_mode)
 
 
-class CavEnv(ParallelEnv[str, Any, Any]):
+class CavEnv(ParallelEnv[str, Any, Any]):  # type: ignore[misc] # PettingZoo is not typed
     """One world.
 
     Observations, actions and rewards are described in docs/environments.md. The infos of each agent
-    hold every term by its name, and `active` (it has a vehicle), `vehicle_done` (that vehicle's trip
-    ended in this step) and `vehicle_id`; all are plain numbers.
+    hold every term by its name, and `active` (it has a vehicle), `vehicle_done` (that vehicle's
+    trip ended in this step) and `vehicle_id`; all are plain numbers.
 
     Args:
         config: the environment.
@@ -295,7 +295,7 @@ class CavEnv(ParallelEnv[str, Any, Any]):
         return self._simulation.state_hash()
 
     def traffic_stats(self) -> dict[str, float]:
-        """Traffic since reset: departed, waiting, running, arrived, contacts, mean_speed_mps, …
+        """Traffic since reset: departed, waiting, running, arrived, contacts, mean speed and more.
 
         All fields of `runtime.simulation.TrafficStats`, and how many actions were clipped, held and
         ignored since the environment was made.
@@ -321,9 +321,13 @@ class CavEnv(ParallelEnv[str, Any, Any]):
         if self._steps < 0:
             raise ResetNeededError("render() before reset(): call env.reset(seed=…) first")
         if self._view is None:
-            self._view = WorldView(self.network, self.render_mode, self.metadata["render_fps"])
-        time_s = self._steps * self.step_s
-        return self._view.show(self._simulation, time_s)
+            self._view = WorldView(
+                self._simulation,
+                self.render_mode,
+                self.metadata["name"],
+                self.metadata["render_fps"],
+            )
+        return self._view.show()
 
     def close(self) -> None:
         """Close the window, if there is one; the environment can be used on."""

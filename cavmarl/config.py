@@ -142,8 +142,8 @@ class PopulationConfig:
         agents: vehicles driven by policies at any one time.
         background: vehicles driven by the built-in drivers. In `closed` worlds they are placed at
             reset; else each arrival orders a new departure, so that their number holds.
-        budget: how many agents may enter in one episode of an `entering` world (default 4 · agents);
-            the other modes do not read it.
+        budget: how many agents may enter in one episode of an `entering` world (default 4 ·
+            agents); the other modes do not read it.
     """
 
     mode: Literal["closed", "entering", "seats"] = "closed"

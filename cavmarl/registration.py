@@ -28,7 +28,7 @@ def raw_env(name: str = "merge", **arguments: Any) -> AECEnv[str, Any, Any]:
 
 
 def env(name: str = "merge", **arguments: Any) -> AECEnv[str, Any, Any]:
-    """The AEC form: agents act one after the other, the world moves when all have; with order checks."""
+    """The AEC form: agents act one after the other and the world moves when all have."""
     return wrappers.OrderEnforcingWrapper(raw_env(name, **arguments))
 
 

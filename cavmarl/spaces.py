@@ -77,5 +77,5 @@ def _lines(sensor: str, start: int, features: list[Feature]) -> list[str]:
         if len(members) > 2:
             index += f" … {start + members[-1]}"
         first = features[members[0]]
-        lines.append(f"| {index} | {sensor} | {name} | {first.meaning} | {first.scale or '–'} |")
+        lines.append(f"| {index} | {sensor} | {name} | {first.meaning} | {first.scale or '-'} |")
     return lines

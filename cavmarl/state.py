@@ -19,7 +19,8 @@ def global_state(
 ) -> NDArray[np.float32]:
     """All vehicles in the order of their ids: present, x, y, cos, sin of the heading, speed.
 
-    x and y go from -1 to 1 over the map's extent, speed is over 40 m/s; places without a vehicle are 0.
+    x and y go from -1 to 1 over the map's extent, speed is over 40 m/s; places without a vehicle
+    are 0.
 
     Args:
         network: the roads.

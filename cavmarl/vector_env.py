@@ -1,6 +1,7 @@
 """`CavVectorEnv`: many worlds in one process, arrays in and out.
 
-No Python loop runs over agents or vehicles in a step: all worlds go through the same kernels together.
+No Python loop runs over agents or vehicles in a step: all worlds go through the same kernels
+together.
 """
 
 from __future__ import annotations
@@ -15,8 +16,8 @@ from gymnasium.vector import AutoresetMode
 from numpy.typing import NDArray
 
 from cavmarl.actions import ActionDecoder
-from cavmarl.config import EnvConfig
 from cavmarl.cav_env import check_seed
+from cavmarl.config import EnvConfig
 from cavmarl.errors import ConfigError, ResetNeededError
 from cavmarl.kernels.codes import EVENTS_THAT_END
 from cavmarl.roads.network import RoadNetwork
@@ -85,11 +86,12 @@ def make_vec(
 class CavVectorEnv:
     """W worlds with A agent seats each; flat observations.
 
-    Arrays have the shape (num_envs, num_agents, …). `infos["mask"]` says which agents have a vehicle and
-    will be asked for the next action; the others' observations are 0 and their actions are not read.
-    A world whose episode is over (truncated, or all agents gone and none to come) is reset in the same
-    step: the observations returned are those of the new episode, `infos["final_observations"]` keeps the
-    last ones of the old (Gymnasium's `AutoresetMode.SAME_STEP`).
+    Arrays have the shape (num_envs, num_agents, …). `infos["mask"]` says which agents have a
+    vehicle and will be asked for the next action; the others' observations are 0 and their actions
+    are not read. A world whose episode is over (truncated, or all agents gone and none to come) is
+    reset in the same step: the observations returned are those of the new episode,
+    `infos["final_observations"]` keeps the last ones of the old (Gymnasium's
+    `AutoresetMode.SAME_STEP`).
 
     Args:
         config: the environment.
@@ -136,8 +138,8 @@ class CavVectorEnv:
         """Begin an episode in every world.
 
         Args:
-            seed: root of all random numbers; world w's episodes depend on (seed, w) alone. None goes
-                on with the next episodes of the last seed.
+            seed: root of all random numbers; world w's episodes depend on (seed, w) alone. None
+                goes on with the next episodes of the last seed.
             options: not used; accepted because the API has it.
 
         Returns:
@@ -166,10 +168,10 @@ class CavVectorEnv:
 
         Returns:
             observations (W, A, D), rewards (W, A), terminations (W, A): the agent's vehicle ended;
-            truncations (W, A): the episode was cut at the horizon; and infos:
-            `mask` (W, A) who acts next; `acted` (W, A) who acted in this step, so whose reward counts;
-            `terms` (W, A, T) in the order of `config.TERMS`; `episode_over` (W,) which worlds were
-            reset; `final_observations` (W, A, D) before that reset.
+            truncations (W, A): the episode was cut at the horizon; and infos: `mask` (W, A) who
+            acts next; `acted` (W, A) who acted in this step, so whose reward counts; `terms` (W, A,
+            T) in the order of `config.TERMS`; `episode_over` (W,) which worlds were reset;
+            `final_observations` (W, A, D) before that reset.
 
         Raises:
             ResetNeededError: before the first reset.

@@ -245,7 +245,7 @@ def test_without_torch_a_network_says_what_to_install(
 
 def test_scripted_drivers_load_no_torch() -> None:
     code = (
-        "import sys; from cavmarl.policies import load_policy; from cavmarl.vector_env import make_vec;"
+        "import sys; from cavmarl import load_policy, make_vec; "
         "load_policy('idm', make_vec('merge')); print('torch' in sys.modules)"
     )
     out = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)

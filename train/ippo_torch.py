@@ -21,6 +21,7 @@ import time
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
+from pickle import UnpicklingError
 from typing import Annotated, Any, get_args, get_type_hints
 
 import numpy as np
@@ -350,7 +351,7 @@ def load_checkpoint(folder: Path, learner: Learner, config: NetworkConfig) -> No
     path = folder / OPTIMIZER_FILE
     try:
         learner.optimizer.load_state_dict(torch.load(path, weights_only=True))
-    except (OSError, RuntimeError, ValueError, EOFError, KeyError) as error:
+    except (OSError, RuntimeError, ValueError, EOFError, KeyError, UnpicklingError) as error:
         raise PolicyError(f"{path}: cannot be read ({error})") from error
 
 

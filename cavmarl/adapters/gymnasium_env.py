@@ -34,7 +34,7 @@ class CavEgoEnv(gymnasium.Env[Any, Any]):
         arguments: other keywords of `parallel_env`.
     """
 
-    metadata: dict[str, Any] = CavEnv.metadata  # noqa: RUF012 - as gymnasium.Env declares it
+    metadata: dict[str, Any] = CavEnv.metadata
 
     def __init__(
         self,
@@ -94,10 +94,10 @@ class CavEgoEnv(gymnasium.Env[Any, Any]):
 class CavAgentRows(gymnasium.vector.VectorEnv[Any, Any, Any]):
     """The agents of one world as rows, for programs written for vectors of single agents.
 
-    Always in `seats`: a row whose vehicle ended gets a new one. Rows end singly (terminations), all of
-    them at the horizon (truncations). `infos["active"]` says which rows have a vehicle; the others'
-    observations are 0 and their actions are not read. Rows that ended carry their last observation in
-    `infos["final_obs"]`.
+    Always in `seats`: a row whose vehicle ended gets a new one. Rows end singly (terminations), all
+    of them at the horizon (truncations). `infos["active"]` says which rows have a vehicle; the
+    others' observations are 0 and their actions are not read. Rows that ended carry their last
+    observation in `infos["final_obs"]`.
 
     Args:
         env: as for `make_vec`.

@@ -1,8 +1,8 @@
 """How fast a step is, next to highway-env's, on the same road with the same number of vehicles.
 
 Both sides drive N controlled vehicles by the meta-action IDLE on a straight road of four lanes, as
-densely as highway-env sets them out, at 20 Hz with 10 decisions a second. They observe by a lidar of
-64 rays, distances and relative speeds over 60 m; nobody else is on the road.
+densely as highway-env sets them out, at 20 Hz with 10 decisions a second. They observe by a lidar
+of 64 rays, distances and relative speeds over 60 m; nobody else is on the road.
 """
 
 from __future__ import annotations

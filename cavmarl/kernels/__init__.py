@@ -4,9 +4,9 @@
 divided), serial (processes give the parallelism), GIL released, cached on disk.
 
 The cache lives in a folder named after the content of all kernel sources: Numba itself only watches
-the file that defines a function, not the functions which that one calls, and would hand out stale code.
-Set `CAVMARL_CACHE_DIR` to move it (default: `~/.cache/cavmarl`). With `NUMBA_DISABLE_JIT=1` every
-kernel is plain Python.
+the file that defines a function, not the functions which that one calls, and would hand out stale
+code. Set `CAVMARL_CACHE_DIR` to move it (default: `~/.cache/cavmarl`). With `NUMBA_DISABLE_JIT=1`
+every kernel is plain Python.
 """
 
 from __future__ import annotations
@@ -15,9 +15,10 @@ import hashlib
 import os
 from collections.abc import Callable
 from pathlib import Path
-from typing import ParamSpec, TypeVar
+from typing import Any, ParamSpec, TypeVar
 
 import numba
+import numba.core.config
 
 __all__ = ["cache_dir", "kernel", "kernel_cache_dir"]
 
@@ -45,12 +46,13 @@ _CACHE_DIR = kernel_cache_dir()
 
 def kernel(function: Callable[P, R]) -> Callable[P, R]:
     """Compile `function` with the flags that all kernels share."""
-    before = numba.config.CACHE_DIR
-    numba.config.CACHE_DIR = str(_CACHE_DIR)
+    settings: Any = numba.core.config
+    before = settings.CACHE_DIR
+    settings.CACHE_DIR = str(_CACHE_DIR)
     try:
         compiled: Callable[P, R] = numba.njit(
             cache=True, fastmath=False, parallel=False, nogil=True, error_model="numpy"
         )(function)
     finally:
-        numba.config.CACHE_DIR = before
+        settings.CACHE_DIR = before
     return compiled

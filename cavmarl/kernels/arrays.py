@@ -1,8 +1,8 @@
 """Bundles of arrays that kernels take together, so that no kernel has twenty arguments.
 
-W is the number of worlds stepped together, C the rows a world can hold, A the agents, L lanes, K links,
-G goals. The record dtypes are described where they are made: `roads.network`, `roads.routing`,
-`shard.vehicles`, `traffic.native`.
+W is the number of worlds stepped together, C the rows a world can hold, A the agents, L lanes, K
+links, G goals. The record dtypes are described where they are made: `roads.network`,
+`roads.routing`, `shard.vehicles`, `traffic.native`.
 """
 
 from __future__ import annotations
@@ -91,7 +91,7 @@ class Scratch(NamedTuple):
     pair_row: NDArray[np.int32]
     pair_dist: NDArray[np.float64]
     accel: NDArray[np.float64]  # (C,) decided accelerations
-    link_ahead: NDArray[np.int32]  # (C,) the link whose line each row is next to, within STOP_LINE_M
+    link_ahead: NDArray[np.int32]  # (C,) the link whose stop line each row is next to
     lane_change: NDArray[np.int32]  # (C,) decided lane changes: 1 left, -1 right
     blinker: NDArray[np.int32]  # (C,)
     hold: NDArray[np.int32]  # (C,)

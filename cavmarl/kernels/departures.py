@@ -1,7 +1,7 @@
 """Who enters and who leaves: the seeded demand generator and the queue before the gates.
 
-A departure is numbered and drawn when it is ordered, and enters when there is a safe gap at its place;
-until then it waits in the queue, in the order of ids. None is dropped.
+A departure is numbered and drawn when it is ordered, and enters when there is a safe gap at its
+place; until then it waits in the queue, in the order of ids. None is dropped.
 """
 
 from __future__ import annotations
@@ -121,7 +121,7 @@ def _speed_at(roads: RoadArrays, lane: int, s: float, half: float) -> float:
     """A speed to start with at a place: below the limit, and slow before the end of the lane."""
     row = roads.lanes[lane]
     rest = max(row["length_m"] - s - half - 2.0, 0.0)
-    return min(ENTER_SHARE * row["speed_mps"], math.sqrt(2.0 * ENTER_DECEL * rest))
+    return min(ENTER_SHARE * float(row["speed_mps"]), math.sqrt(2.0 * ENTER_DECEL * rest))
 
 
 @kernel
@@ -170,9 +170,7 @@ def populate(
             departure = worlds.queue[w, worlds.num_queue[w] - 1]
             vehicle = departure["id"]
             for attempt in range(PLACE_TRIES):
-                trip = below(
-                    worlds.keys[w], vehicle, 0, STREAM_ORIGIN + attempt, trips.shape[0]
-                )
+                trip = below(worlds.keys[w], vehicle, 0, STREAM_ORIGIN + attempt, trips.shape[0])
                 departure["lane"] = trips[trip, 0]
                 departure["goal"] = trips[trip, 1]
                 length = roads.lanes[departure["lane"]]["length_m"]
@@ -207,7 +205,7 @@ def _needs_goal(demand: Demand, plans: NDArray[np.void], row: np.void) -> bool:
 def choose_goals(
     demand: Demand, roads: RoadArrays, plans: NDArray[np.void], worlds: Worlds
 ) -> None:
-    """Give the background vehicles of `next_rows` that need one another goal, if one is in reach."""
+    """Give the background vehicles of `next_rows` that need it another goal, if one is in reach."""
     for w in range(worlds.ticks.shape[0]):
         for i in range(worlds.num_owned[w]):
             row = worlds.next_rows[w, i]
@@ -255,8 +253,8 @@ def take_out(
 ) -> None:
     """Take out the vehicles of one kind of driver that are through, and order those that follow.
 
-    They go in the order of their ids, so that who follows gets the same number wherever the rows lie.
-    Background vehicles are through when they have arrived; agents that have acted also after a
+    They go in the order of their ids, so that who follows gets the same number wherever the rows
+    lie. Background vehicles are through when they have arrived; agents that have acted also after a
     collision or off the road.
 
     Args:

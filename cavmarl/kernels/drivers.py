@@ -1,8 +1,9 @@
 """Background drivers: what each wants to do in this tick, from the committed state alone.
 
-Car following is the Intelligent Driver Model, lane changing MOBIL; this file finds what they are applied
-to: the leader across lane and junction borders, the lower speed limit ahead, the stop line of a signal
-or of a right of way, the end of a lane, the vehicle that wants to merge, the lane that the route needs.
+Car following is the Intelligent Driver Model, lane changing MOBIL; this file finds what they are
+applied to: the leader across lane and junction borders, the lower speed limit ahead, the stop line
+of a signal or of a right of way, the end of a lane, the vehicle that wants to merge, the lane that
+the route needs.
 """
 
 from __future__ import annotations
@@ -154,7 +155,7 @@ def _road_ahead(
     merge_room_m: float,
     scratch: Scratch,
 ) -> tuple[float, float, int, int]:
-    """Walk row i's way: (strongest interaction, allowed speed, why it holds, link whose line is near).
+    """Walk row i's way: (strongest interaction, allowed speed, why it holds, link near its line).
 
     Before the end of a lane that its way does not follow it stops `merge_room_m` early.
     """
@@ -212,9 +213,7 @@ def _road_ahead(
 
 
 @kernel
-def _courtesy(
-    roads: RoadArrays, rows: NDArray[np.void], i: int, scratch: Scratch
-) -> float:
+def _courtesy(roads: RoadArrays, rows: NDArray[np.void], i: int, scratch: Scratch) -> float:
     """Interaction with vehicles on neighbour lanes that need to come into ours, softly."""
     row = rows[i]
     strongest = 0.0
@@ -335,9 +334,9 @@ def _choose_lane(
 ) -> int:
     """The lane change that row i makes now: 1 left, -1 right, 0 none.
 
-    In even ticks background drivers may only change to the left, in odd ones to the right: two of them
-    never take the same gap from both sides in one tick, whoever is asked first. A suggestion for an
-    agent is made anew at each step and binds nobody, so it has no such rule.
+    In even ticks background drivers may only change to the left, in odd ones to the right: two of
+    them never take the same gap from both sides in one tick, whoever is asked first. A suggestion
+    for an agent is made anew at each step and binds nobody, so it has no such rule.
     """
     row = rows[i]
     if row["driver"] == DRIVER_AGENT:
@@ -399,8 +398,8 @@ def decide(
         driver: DRIVER_* whose rows are decided for.
         tick: of the committed state.
         phase: (num_signals,) PHASE rows that are on.
-        scratch: with the lane and link indices of this tick; accel (m/s²), lane_change, blinker, hold
-            and link_ahead are written.
+        scratch: with the lane and link indices of this tick; accel (m/s²), lane_change, blinker,
+            hold and link_ahead are written.
     """
     for i in range(num):
         row = rows[i]

@@ -1,9 +1,9 @@
 """Right of way: who approaches which link, and whether a driver may enter one.
 
-Every vehicle announces itself to the links ahead on its way and to the one it is on. A driver enters a
-link if no foe is in the shared area when it would be, if it gives way to those it must give way to, and
-if there is room behind the junction. All questions are minima and any-ofs over the foes: the order of
-rows plays no part.
+Every vehicle announces itself to the links ahead on its way and to the one it is on. A driver
+enters a link if no foe is in the shared area when it would be, if it gives way to those it must
+give way to, and if there is room behind the junction. All questions are minima and any-ofs over the
+foes: the order of rows plays no part.
 """
 
 from __future__ import annotations
@@ -186,7 +186,7 @@ def _blocked_by_foes(
     phase: NDArray[np.int32],
     scratch: Scratch,
 ) -> bool:
-    """Whether a foe is, or will be, where row i would be on `link`; `distance` centre to stop line."""
+    """Whether a foe is, or will be, where row i would be on `link`, `distance` m from its line."""
     row = rows[i]
     half = 0.5 * row["length"]
     limit = roads.lanes[roads.links[link]["next_lane"]]["speed_mps"]

@@ -1,7 +1,7 @@
 """Who is where on which lane: an index over the vehicles of one world, and searches along it.
 
-The index lists, lane by lane, the vehicles on it by rising (s, id). A vehicle whose body also covers a
-neighbour lane stands in both lists. Nothing here depends on the order of rows.
+The index lists, lane by lane, the vehicles on it by rising (s, id). A vehicle whose body also
+covers a neighbour lane stands in both lists. Nothing here depends on the order of rows.
 """
 
 from __future__ import annotations
@@ -20,7 +20,9 @@ MAX_LOOK_BACK_LANES = 4
 
 
 @kernel
-def index_lanes(lanes: NDArray[np.void], rows: NDArray[np.void], num: int, scratch: Scratch) -> None:
+def index_lanes(
+    lanes: NDArray[np.void], rows: NDArray[np.void], num: int, scratch: Scratch
+) -> None:
     """Sort the vehicles of one world by (lane, s, id) into `scratch.entry_*`.
 
     Args:
@@ -84,14 +86,12 @@ def _sort(
 @kernel
 def _first_after(rows: NDArray[np.void], own_id: int, lane: int, s: float, scratch: Scratch) -> int:
     """Position in the index of the first entry on `lane` beyond (s, own_id)."""
-    low = scratch.lane_start[lane]
-    high = scratch.lane_start[lane + 1]
+    low = int(scratch.lane_start[lane])
+    high = int(scratch.lane_start[lane + 1])
     while low < high:
         middle = (low + high) // 2
         other_s = scratch.entry_s[middle]
-        if other_s < s or (
-            other_s == s and rows[scratch.entry_row[middle]]["id"] <= own_id
-        ):
+        if other_s < s or (other_s == s and rows[scratch.entry_row[middle]]["id"] <= own_id):
             low = middle + 1
         else:
             high = middle
@@ -152,8 +152,8 @@ def neighbor_behind(
 ) -> tuple[int, float]:
     """The nearest vehicle behind place `s` of `lane`: (row, distance in m) or (-1, inf).
 
-    Looks back over lane borders, up to `reach_m` and along every lane that leads here; of several the
-    nearest counts, at equal distances the smallest id.
+    Looks back over lane borders, up to `reach_m` and along every lane that leads here; of several
+    the nearest counts, at equal distances the smallest id.
     """
     best, best_s = _first_behind(rows, i, lane, s, scratch)
     if best >= 0:

@@ -1,8 +1,8 @@
 """Motion of one vehicle over one tick, from the committed record to the next one.
 
 Background vehicles move along their lanes: arc length by the decided acceleration, lateral offset
-towards the lane's centre, heading trailing the lane's direction. Agents' vehicles are kinematic bicycles
-that go where they are steered; `tracking.locate` then finds their place on the lanes.
+towards the lane's centre, heading trailing the lane's direction. Agents' vehicles are kinematic
+bicycles that go where they are steered; `tracking.locate` then finds their place on the lanes.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """What each sensor writes into an agent's observation: scaled numbers in [-1, 1].
 
-One function a sensor: it writes its features from position `at` on. The scales stand here; the names and
-meanings of the features in `shard/sensors/`.
+One function a sensor: it writes its features from position `at` on. The scales stand here; the
+names and meanings of the features in `shard/sensors/`.
 """
 
 from __future__ import annotations

@@ -1,13 +1,14 @@
 """Lane-level plans: for one goal, what to do next from every lane of the map.
 
-Dijkstra's algorithm backwards from the goal's lanes over the lane graph. Driving along a lane costs the
-time it takes at the speed limit; a lane change costs a fixed time, and more on a short lane.
+Dijkstra's algorithm backwards from the goal's lanes over the lane graph. Driving along a lane costs
+the time it takes at the speed limit; a lane change costs a fixed time, and more on a short lane.
 """
 
 from __future__ import annotations
 
 import heapq
 import math
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -51,7 +52,7 @@ def _leads_to(roads: RoadArrays, before: int, lane: int) -> bool:
 @kernel
 def _change_cost(roads: RoadArrays, lane: int) -> float:
     """Cost in s of leaving a lane sideways: plans change lanes where there is room to."""
-    return LANE_CHANGE_COST_S + max(SHORT_LANE_M - roads.lanes[lane]["length_m"], 0.0)
+    return LANE_CHANGE_COST_S + max(SHORT_LANE_M - float(roads.lanes[lane]["length_m"]), 0.0)
 
 
 @kernel
@@ -117,9 +118,7 @@ def _settle(
 
 
 @kernel
-def plan_goal(
-    roads: RoadArrays, goal_edge: int, permission: int, plan: NDArray[np.void]
-) -> None:
+def plan_goal(roads: RoadArrays, goal_edge: int, permission: int, plan: NDArray[np.void]) -> None:
     """Fill the plan of one goal.
 
     Args:
@@ -141,7 +140,7 @@ def plan_goal(
         step["turnarounds"] = 0
         step["room"] = 0.0
         step["to_go"] = math.inf
-    heap = [(0.0, -1)]
+    heap: list[tuple[float, Any]] = [(0.0, -1)]  # tells the compiler the type; -1 is no lane
     edge = roads.edges[goal_edge]
     for lane in range(edge["first_lane"], edge["first_lane"] + edge["num_lanes"]):
         row = roads.lanes[lane]

@@ -37,8 +37,8 @@ def sense(
 ) -> None:
     """Write what every agent of the chosen worlds gets, at its own index.
 
-    A vehicle that entered during the step has not acted: it is observed, its terms and reward are 0, and
-    it does not end.
+    A vehicle that entered during the step has not acted: it is observed, its terms and reward are
+    0, and it does not end.
 
     Args:
         roads: the road arrays.

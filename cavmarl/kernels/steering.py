@@ -39,8 +39,8 @@ def take_meta_action(
 ) -> None:
     """Set target lane and target speed of a vehicle as highway-env's `MDPVehicle` does.
 
-    FASTER and SLOWER step from the present target speed; a lane change asks for the neighbour of the
-    present lane and is ignored where there is none.
+    FASTER and SLOWER step from the present target speed; a lane change asks for the neighbour of
+    the present lane and is ignored where there is none.
     """
     k = nearest_speed(target_speeds, row["target_speed"])
     if action == ACTION_FASTER:
@@ -60,17 +60,15 @@ def steer_to_lane(
 ) -> float:
     """The steering angle in rad that brings a vehicle to the middle of a lane.
 
-    A target that is neither the vehicle's lane nor a neighbour of it counts as the lane it is on. Beyond
-    the lane's end the lane that the plan names goes on.
+    A target that is neither the vehicle's lane nor a neighbour of it counts as the lane it is on.
+    Beyond the lane's end the lane that the plan names goes on.
     """
     lane = row["lane"]
     here = roads.lanes[lane]
     if target_lane >= 0 and (target_lane == here["left"] or target_lane == here["right"]):
         lane = target_lane
         here = roads.lanes[lane]
-    s, d, _, _ = project(
-        roads.points, here["first_point"], here["num_points"], row["x"], row["y"]
-    )
+    s, d, _, _ = project(roads.points, here["first_point"], here["num_points"], row["x"], row["y"])
     ahead = s + row["speed"] * PURSUIT_S
     following = plans[row["goal"], lane]["next"]
     if s > here["length_m"] and following >= 0:
@@ -81,9 +79,7 @@ def steer_to_lane(
             roads.points, here["first_point"], here["num_points"], row["x"], row["y"]
         )
     direction = _direction_at(roads, plans, row["goal"], lane, ahead)
-    return steering_control(
-        row["speed"], d, wrap_angle(direction - row["heading"]), row["length"]
-    )
+    return steering_control(row["speed"], d, wrap_angle(direction - row["heading"]), row["length"])
 
 
 @kernel

@@ -33,8 +33,10 @@ TTC_WIDTH_M = 2.2  # two vehicles that would pass further apart than this do not
 
 @kernel
 def _progress(row: np.void, step_s: float) -> float:
-    """Way towards the goal in m. A new plan after a wrong turn may be longer by far: that counts as no
-    more than driving backwards at the present speed."""
+    """Way towards the goal in m.
+
+    A new plan after a wrong turn may be longer by far: that counts as no more than driving backwards.
+    """
     most = max(row["speed"], 1.0) * step_s * 2.0
     return clamp(row["step_to_go"] - row["to_go"], -most, most)
 

@@ -60,7 +60,7 @@ def begin_step(
     meta_actions: NDArray[np.int64],
     target_speeds: NDArray[np.float64],
 ) -> None:
-    """Clear the accounts of the step and, with discrete actions, set the targets of the controllers.
+    """Clear the accounts of the step and, with discrete actions, set the controllers' targets.
 
     Args:
         roads: the road arrays.
@@ -159,8 +159,8 @@ def resolve(worlds: Worlds, scratch: Scratch, grid: Grid) -> None:
     """Mark in `next_rows` who touches whom.
 
     Args:
-        worlds: events and hit of the owned next_rows are written; counts[:, COUNT_CONTACTS] rises by
-            one for each vehicle when it begins to touch another.
+        worlds: events and hit of the owned next_rows are written; counts[:, COUNT_CONTACTS] rises
+            by one for each vehicle when it begins to touch another.
         scratch: room.
         grid: spatial index over the vehicles of one world, filled here.
     """
@@ -199,8 +199,8 @@ def suggest(
         discrete: whether to answer with meta-actions.
         target_speeds: m/s, rising; discrete only.
         lookahead_s: horizon in which a target speed is to be reached; discrete only.
-        out: (W, A, 2): throttle in m/s² and steering in rad, or the meta-action in [..., 0]. Rows of
-            absent agents are left as they are.
+        out: (W, A, 2): throttle in m/s² and steering in rad, or the meta-action in [..., 0]. Rows
+            of absent agents are left as they are.
     """
     for w in range(worlds.ticks.shape[0]):
         rows = worlds.rows[w]

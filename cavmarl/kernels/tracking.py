@@ -1,8 +1,8 @@
 """Where on the lanes a freely steered vehicle is.
 
-The vehicle stays with its lane, its neighbours and the lanes that follow, as long as it is on one of
-them. Off those, every lane near the place is asked: it may have cut across to another road, or be on
-the wrong side, or off the road.
+The vehicle stays with its lane, its neighbours and the lanes that follow, as long as it is on one
+of them. Off those, every lane near the place is asked: it may have cut across to another road, or
+be on the wrong side, or off the road.
 """
 
 from __future__ import annotations
@@ -19,7 +19,9 @@ from cavmarl.kernels.geometry import project, project_near
 
 __all__ = ["locate", "side_lane"]
 
-JUNCTION_MARGIN_M = 2.0  # inside junctions lanes are guides: this much beyond their sides is still road
+JUNCTION_MARGIN_M = (
+    2.0  # inside junctions lanes are guides: this much beyond their sides is still road
+)
 END_MARGIN_M = 1.0  # lanes may leave gaps up to this between end and start
 WINDOW_M = 40.0
 SIDE_MARGIN_M = 0.1  # a body this near to a neighbour lane counts as in it: it may stand askew
@@ -38,7 +40,9 @@ def side_lane(lanes: NDArray[np.void], lane: int, d: float, width: float) -> int
 
 
 @kernel
-def _on(roads: RoadArrays, lane: int, x: float, y: float, hint: float) -> tuple[float, float, float]:
+def _on(
+    roads: RoadArrays, lane: int, x: float, y: float, hint: float
+) -> tuple[float, float, float]:
     """(s, d, how far outside the lane in m) of a place with respect to `lane`."""
     row = roads.lanes[lane]
     s, d, _, _ = project_near(

@@ -119,6 +119,9 @@ class _Painter:
         low = np.minimum(shapes.starts, shapes.ends) - shapes.half_widths[:, None]
         high = np.maximum(shapes.starts, shapes.ends) + shapes.half_widths[:, None]
         self._in_view = self._visible(low, high)
+        boxes = shapes.junction_boxes
+        patches = np.flatnonzero(self._visible(boxes[:, 0], boxes[:, 1]))
+        self._patches = [shapes.junctions[patch] for patch in patches]
 
     def roads(self, level: int, cars: bool, grown_m: float, color: Color) -> None:
         """Lanes and junction insides of one level, each side wider by `grown_m`."""
@@ -138,7 +141,7 @@ class _Painter:
         circle = self._pygame.draw.circle
         for center, radius in zip(ends[joined].tolist(), half_px[joined].tolist(), strict=True):
             circle(self._surface, color, center, radius)
-        for patch in shapes.junctions:
+        for patch in self._patches:
             if patch.level == level and patch.for_cars == cars:
                 self._patch(patch.outline, grown_px, color)
 
@@ -184,11 +187,6 @@ class _Painter:
             polygon(self._surface, color, quad)
 
     def _patch(self, outline: NDArray[np.float64], grown_px: float, color: Color) -> None:
-        if (
-            len(outline) < 3
-            or not self._visible(outline.min(axis=0)[None], outline.max(axis=0)[None]).any()
-        ):
-            return
         corners = self._camera.to_pixels(outline)
         self._pygame.draw.polygon(self._surface, color, corners.tolist())
         if grown_px >= 1.0:

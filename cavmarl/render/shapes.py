@@ -33,11 +33,9 @@ CAR_BIT = 1  # VEHICLE_CLASSES[0], passenger
 
 @dataclass(frozen=True)
 class Patch:
-    """The inside of a junction: a convex polygon (n, 2), and its bounding box."""
+    """The inside of a junction: a convex polygon (n, 2)."""
 
     outline: Points
-    low: Points
-    high: Points
     level: int
     for_cars: bool
 
@@ -54,6 +52,7 @@ class RoadShapes:
         levels: (n,) as from `level_of`.
         for_cars: (n,) the lane is open to cars.
         junctions: the insides of junctions.
+        junction_boxes: (num junctions, 2, 2) their lower left and upper right corners.
         dashes: (k, 2, 3) from and to, x y z, between lanes of one direction.
         centre_lines: (k, 2, 3) between opposite directions.
         arrows: (k, 4, 3) on lanes before junctions.
@@ -67,6 +66,7 @@ class RoadShapes:
     levels: NDArray[np.int64]
     for_cars: NDArray[np.bool_]
     junctions: tuple[Patch, ...]
+    junction_boxes: Points
     dashes: Points
     centre_lines: Points
     arrows: Points
@@ -90,6 +90,8 @@ def road_shapes(network: RoadNetwork) -> RoadShapes:
     same_before = np.roll(same_after & ~last, 1)
     is_long = np.hypot(*(plane[pieces + 1] - plane[pieces]).T) >= half_widths
     for_cars = (lanes["permissions"] & CAR_BIT).astype(bool)
+    patches = _junction_patches(network, for_cars)
+    boxes = [(patch.outline.min(axis=0), patch.outline.max(axis=0)) for patch in patches]
     return RoadShapes(
         starts=plane[pieces],
         ends=plane[pieces + 1],
@@ -97,7 +99,8 @@ def road_shapes(network: RoadNetwork) -> RoadShapes:
         joined=np.where(last, _goes_on_level(network)[lane], same_after) & (same_before | is_long),
         levels=levels,
         for_cars=for_cars[lane],
-        junctions=_junction_patches(network, for_cars),
+        junctions=patches,
+        junction_boxes=np.array(boxes).reshape(-1, 2, 2),
         dashes=_dashes(network),
         centre_lines=_centre_lines(network),
         arrows=lane_arrows(network),
@@ -164,11 +167,9 @@ def _junction_patches(network: RoadNetwork, for_cars: NDArray[np.bool_]) -> tupl
     corners: dict[tuple[int, bool], list[Points]] = {}
     areas: dict[tuple[int, bool], float] = {}
     lanes, links = network.lanes, network.links
-    for link in links:
-        mouths = corners.setdefault((int(link["junction"]), bool(for_cars[link["from_lane"]])), [])
-        for lane, end in ((link["from_lane"], -1), (link["to_lane"], 0)):
-            half = lanes[lane]["width_m"] / 2.0
-            mouths.extend(_side(network, lane, side)[end][None, :2] for side in (half, -half))
+    for link, mouth in zip(links, _mouths(network), strict=True):
+        key = int(link["junction"]), bool(for_cars[link["from_lane"]])
+        corners.setdefault(key, []).append(mouth)
     for lane in np.flatnonzero(lanes["internal"] & (lanes["link"] >= 0)):
         link = links[lanes[lane]["link"]]
         half = lanes[lane]["width_m"] / 2.0
@@ -178,11 +179,25 @@ def _junction_patches(network: RoadNetwork, for_cars: NDArray[np.bool_]) -> tupl
     patches = []
     for (junction, cars), shapes in corners.items():
         outline = convex_hull(np.vstack(shapes))
-        if _area(outline) <= MAX_HULL_SHARE * areas.get((junction, cars), 0.0) + MIN_HULL_M2:
+        room = MAX_HULL_SHARE * areas.get((junction, cars), 0.0) + MIN_HULL_M2
+        if len(outline) > 2 and _area(outline) <= room:
             level = int(level_of(network.junctions["z"][junction]))
-            box = outline.min(axis=0), outline.max(axis=0)
-            patches.append(Patch(outline, *box, level, cars))
+            patches.append(Patch(outline, level, cars))
     return tuple(patches)
+
+
+def _mouths(network: RoadNetwork) -> Points:
+    """Both sides of where each link leaves its lane and reaches the next, (num_links, 4, 2)."""
+    lanes, links = network.lanes, network.links
+    start, reached = lanes[links["from_lane"]], lanes[links["to_lane"]]
+    last = network.points[start["first_point"] + start["num_points"] - 1]
+    first = network.points[reached["first_point"]]
+    corners = []
+    for point, lane in ((last, start), (first, reached)):
+        place = np.stack([point["x"], point["y"]], axis=1)
+        left = np.stack([-point["sin"], point["cos"]], axis=1) * (lane["width_m"] / 2.0)[:, None]
+        corners += [place + left, place - left]
+    return np.stack(corners, axis=1)
 
 
 def _area(polygon: Points) -> float:

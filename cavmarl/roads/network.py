@@ -1,8 +1,8 @@
 """`RoadNetwork`: a road map as a handful of immutable record arrays.
 
-Frames and units: metres, radians, metres a second; x east, y north, z up, right-handed; headings are
-counter-clockwise from east. A lane is a polyline along its centre in driving direction; `s` is the arc
-length on it and `d` the lateral offset, positive to the left.
+Frames and units: metres, radians, metres a second; x east, y north, z up, right-handed; headings
+are counter-clockwise from east. A lane is a polyline along its centre in driving direction; `s` is
+the arc length on it and `d` the lateral offset, positive to the left.
 
 Every lane has one row, junction-internal lanes included. A *link* is one permitted movement over a
 junction: from the end of a lane, along a chain of internal lanes, to the start of an outgoing lane.
@@ -32,12 +32,22 @@ __all__ = [
     "POINT",
     "SIGNAL",
     "SIGNAL_STATES",
-    "RoadNetwork",
     "VEHICLE_CLASSES",
+    "RoadNetwork",
 ]
 
 # The permission bits of LANE["permissions"], SUMO's abstract vehicle classes that drive on roads.
-VEHICLE_CLASSES = ("passenger", "truck", "bus", "motorcycle", "emergency", "delivery", "taxi", "tram", "bicycle")
+VEHICLE_CLASSES = (
+    "passenger",
+    "truck",
+    "bus",
+    "motorcycle",
+    "emergency",
+    "delivery",
+    "taxi",
+    "tram",
+    "bicycle",
+)
 
 # SUMO's signal letters in the order of their codes in `phase_states`.
 SIGNAL_STATES = "rugGysoOY"
@@ -48,7 +58,10 @@ POINT = np.dtype(
         ("y", np.float64),  # m
         ("z", np.float64),  # m
         ("s", np.float64),  # m from the start of its lane, in the plane
-        ("cos", np.float64),  # direction of the segment that starts here (the last point repeats the one before)
+        (
+            "cos",
+            np.float64,
+        ),  # direction of the segment that starts here (the last point repeats the one before)
         ("sin", np.float64),
         ("slope", np.float64),  # dz/ds of that segment
     ],
@@ -60,7 +73,10 @@ LANE = np.dtype(
         ("edge", np.int32),  # EDGE row; internal lanes too
         ("index", np.int32),  # position on its edge, 0 = rightmost
         ("internal", np.bool_),  # lies inside a junction
-        ("length_m", np.float64),  # arc length of the polyline in the plane: the `s` of its last point
+        (
+            "length_m",
+            np.float64,
+        ),  # arc length of the polyline in the plane: the `s` of its last point
         ("width_m", np.float64),
         ("speed_mps", np.float64),  # speed limit
         ("permissions", np.uint32),  # bit k set: VEHICLE_CLASSES[k] may drive here
@@ -68,12 +84,21 @@ LANE = np.dtype(
         ("num_points", np.int32),  # at least 2
         ("left", np.int32),  # LANE row of the neighbour to the left in the same direction
         ("right", np.int32),
-        ("first_link", np.int32),  # LINK rows of the movements that leave this lane's end, sorted by
+        (
+            "first_link",
+            np.int32,
+        ),  # LINK rows of the movements that leave this lane's end, sorted by
         ("num_links", np.int32),  # from-lane; 0 for internal lanes (see `successor`)
         ("successor", np.int32),  # internal lanes: the one LANE that follows (internal or normal)
         ("link", np.int32),  # internal lanes: the LINK that this lane is part of
-        ("link_offset_m", np.float64),  # internal lanes: path length of the link before this lane starts
-        ("first_into", np.int32),  # into[first_into : first_into + num_into]: LANE rows whose ends lead here
+        (
+            "link_offset_m",
+            np.float64,
+        ),  # internal lanes: path length of the link before this lane starts
+        (
+            "first_into",
+            np.int32,
+        ),  # into[first_into : first_into + num_into]: LANE rows whose ends lead here
         ("num_into", np.int32),  # (internal lanes where the map has them)
         ("min_x", np.float64),  # bounding box of the polyline, m
         ("min_y", np.float64),
@@ -85,7 +110,10 @@ LANE = np.dtype(
 
 EDGE = np.dtype(
     [
-        ("first_lane", np.int32),  # LANE rows [first_lane, first_lane + num_lanes), from right to left
+        (
+            "first_lane",
+            np.int32,
+        ),  # LANE rows [first_lane, first_lane + num_lanes), from right to left
         ("num_lanes", np.int32),
         ("internal", np.bool_),
         ("from_junction", np.int32),  # JUNCTION rows; both the same for internal edges
@@ -101,7 +129,10 @@ LINK = np.dtype(
         ("from_lane", np.int32),  # LANE it leaves; its end is the stop line
         ("to_lane", np.int32),  # LANE it reaches
         ("first_internal", np.int32),  # first LANE of the chain inside the junction
-        ("next_lane", np.int32),  # where a vehicle is after the end of from_lane: first_internal, or to_lane
+        (
+            "next_lane",
+            np.int32,
+        ),  # where a vehicle is after the end of from_lane: first_internal, or to_lane
         ("length_m", np.float64),  # of the chain of internal lanes
         ("junction", np.int32),
         ("index", np.int32),  # the link's bit in its junction's request, response and foes
@@ -164,8 +195,8 @@ class RoadNetwork:
 
     Attributes:
         name: the source file's name without its endings.
-        source_hash: SHA-256 of the source, hex; part of every manifest and cache key.
-        points, lanes, edges, links, conflicts, junctions, signals, phases: record arrays, read-only.
+        source_hash: SHA-256 of the source, hex; part of every manifest and cache key. points,
+        lanes, edges, links, conflicts, junctions, signals, phases: record arrays, read-only.
         into: LANE rows, see LANE["first_into"].
         phase_states: signal letters as codes, see PHASE.
         lane_ids, edge_ids, junction_ids, signal_ids: the source's names, by row.

@@ -28,9 +28,9 @@ def conflict_rows(
     """All conflicts of all links, and each link's first row with the end as last entry.
 
     Two links are foes if either names the other: some maps set the bit on one side only, but a
-    shared area is shared. Links over a bridge and below it are none, whatever the map says. Links from
-    different lanes that the map calls free of each other, but that pass so narrowly that cars would
-    touch, are foes too; of these a left turn gives way.
+    shared area is shared. Links over a bridge and below it are none, whatever the map says. Links
+    from different lanes that the map calls free of each other, but that pass so narrowly that cars
+    would touch, are foes too; of these a left turn gives way.
 
     Args:
         movements: one a LINK row.

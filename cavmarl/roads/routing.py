@@ -1,12 +1,13 @@
 """Plans: for each goal, the lane-level way from everywhere.
 
-A plan is a table over all lanes and not a list of edges: a vehicle that misses a turn, or is made to
-change lanes, has a new way at once, and a record that migrates carries its way as one number.
+A plan is a table over all lanes and not a list of edges: a vehicle that misses a turn, or is made
+to change lanes, has a new way at once, and a record that migrates carries its way as one number.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,7 +26,10 @@ PLAN = np.dtype(
         ("change", np.int32),  # side of the better lane: 1 left, -1 right, 0 this one is best
         ("changes", np.int32),  # lane changes to the best lane of this edge
         ("turnarounds", np.int32),  # U-turns on the way: where a road ends, plans turn round
-        ("room", np.float64),  # m from the lane's start that can be driven before a change is needed
+        (
+            "room",
+            np.float64,
+        ),  # m from the lane's start that can be driven before a change is needed
         ("to_go", np.float64),  # m from the lane's start to the end of the goal edge; inf: no way
     ],
     align=True,
@@ -86,7 +90,7 @@ def lane_grid(network: RoadNetwork, cell_m: float = 25.0) -> LaneGrid:
     members: list[set[int]] = [set() for _ in range(num_x * num_y)]
     for lane, row in enumerate(network.lanes):
         line = network.lane_polyline(lane)
-        for (x0, y0, _), (x1, y1, _) in zip(line[:-1], line[1:], strict=True):
+        for (x0, y0, _), (x1, y1, _) in pairwise(line):
             # Pieces no longer than a cell: the boxes of long diagonal segments would cover the map.
             pieces = int(np.hypot(x1 - x0, y1 - y0) // cell_m) + 1
             xs = np.linspace(x0, x1, pieces + 1)

@@ -1,0 +1,1 @@
+"""The worlds that run: the tick, its executor, and the first compilation."""

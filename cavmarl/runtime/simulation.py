@@ -12,6 +12,7 @@ from cavmarl.config import EnvConfig
 from cavmarl.errors import CapacityError
 from cavmarl.kernels.arrays import Outputs
 from cavmarl.kernels.codes import (
+    ACTION_IDLE,
     COUNT_ARRIVED,
     COUNT_CONTACTS,
     COUNT_DEPARTED,
@@ -22,6 +23,7 @@ from cavmarl.kernels.codes import (
 )
 from cavmarl.kernels.rng import world_key
 from cavmarl.roads.network import RoadNetwork
+from cavmarl.runtime.compilation import first_compilation
 from cavmarl.runtime.executor import Executor, SerialExecutor
 from cavmarl.shard.shard import Commands, Shard
 from cavmarl.shard.vehicles import STATE_FIELDS, blank_vehicle
@@ -72,13 +74,26 @@ class Simulation:
         self.config = config
         self.network = network
         self.num_worlds = num_worlds
-        self._traffic = NativeTraffic(network, config.traffic, config.population, blank_vehicle())
-        shard = Shard(config, network, self._traffic.plans, num_worlds)
-        self._shard = shard
-        self._executor: Executor = SerialExecutor([shard])
         self._seed = 0
         self._episodes = np.zeros(num_worlds, dtype=np.int64)
         self._everywhere = np.ones(num_worlds, dtype=np.bool_)
+        with first_compilation() as is_first:
+            blank = blank_vehicle()
+            self._traffic = NativeTraffic(network, config.traffic, config.population, blank)
+            self._shard = Shard(config, network, self._traffic.plans, num_worlds)
+            self._executor: Executor = SerialExecutor([self._shard])
+            if is_first:
+                self._call_every_kernel()
+
+    def _call_every_kernel(self) -> None:
+        """Run one step of a world that the first reset forgets."""
+        shape = self.outputs.present.shape
+        controls = np.zeros((*shape, 2))
+        self._populate(self._everywhere)
+        self.suggest(controls)
+        self.step(Commands(controls, np.full(shape, ACTION_IDLE, dtype=np.int64)))
+        self.retire_agents()
+        self._episodes[:] = 0
 
     @property
     def outputs(self) -> Outputs:
@@ -97,7 +112,8 @@ class Simulation:
 
     def signal_phases(self, world: int = 0) -> NDArray[np.int32]:
         """PHASE rows that are on, (num_signals,)."""
-        return self._shard.worlds.signal_phase[world]
+        phases: NDArray[np.int32] = self._shard.worlds.signal_phase[world]
+        return phases
 
     def ticks(self) -> NDArray[np.int64]:
         """(W,) ticks since each world's reset."""
@@ -118,14 +134,7 @@ class Simulation:
         """
         if chosen is None:
             chosen = self._everywhere
-        worlds = self._shard.worlds
-        for w in np.flatnonzero(chosen):
-            worlds.keys[w] = world_key(self._seed, int(w), int(self._episodes[w]))
-            worlds.ticks[w] = 0
-        self._episodes[chosen] += 1
-        self._traffic.populate(worlds, chosen)
-        self._executor.each(Shard.switch_signals)
-        self._executor.each(lambda shard: shard.sense(chosen))
+        self._populate(chosen)
         agents = self.config.population.agents
         seated = self.outputs.present[chosen].sum(axis=1)
         if self.config.population.mode == "closed" and (seated < agents).any():
@@ -135,6 +144,16 @@ class Simulation:
                 "where the others wait until there is room"
             )
 
+    def _populate(self, chosen: NDArray[np.bool_]) -> None:
+        worlds = self._shard.worlds
+        for w in np.flatnonzero(chosen):
+            worlds.keys[w] = world_key(self._seed, int(w), int(self._episodes[w]))
+            worlds.ticks[w] = 0
+        self._episodes[chosen] += 1
+        self._traffic.populate(worlds, chosen)
+        self._executor.each(Shard.switch_signals)
+        self._executor.each(lambda shard: shard.sense(chosen))
+
     def step(self, commands: Commands) -> None:
         """One agent step: its ticks, then what the agents sense."""
         self._executor.each(lambda shard: shard.begin_step(commands))
@@ -143,7 +162,7 @@ class Simulation:
         self._executor.each(lambda shard: shard.sense(self._everywhere))
 
     def _tick(self, commands: Commands) -> None:
-        """traffic → advance → (exchange) → resolve → departures → (migrate) → commit."""
+        """Traffic → advance → (exchange) → resolve → departures → (migrate) → commit."""
         self._executor.each(Shard.switch_signals)
         self._executor.each(lambda shard: shard.advance(commands))
         self._executor.each(Shard.resolve)
@@ -159,8 +178,8 @@ class Simulation:
         """(W,) whether an agent waits to enter."""
         worlds = self._shard.worlds
         waiting = np.arange(worlds.queue.shape[1]) < worlds.num_queue[:, None]
-        found: NDArray[np.bool_] = (waiting & (worlds.queue["agent"] >= 0)).any(axis=1)
-        return found
+        found = np.any(waiting & (worlds.queue["agent"] >= 0), axis=1)
+        return np.asarray(found, dtype=np.bool_)
 
     def suggest(self, out: NDArray[np.float64]) -> None:
         """Write what the built-in driver would do in the agents' place into `out` (W, A, 2)."""

@@ -1,7 +1,7 @@
 """`Shard`: the running sub-worlds of one zone, W of them side by side.
 
-It owns the arrays of its vehicles and runs the phases of a tick on them. It knows its part of the map,
-its sensors and its terms, and neither the coordinator nor another shard.
+It owns the arrays of its vehicles and runs the phases of a tick on them. It knows its part of the
+map, its sensors and its terms, and neither the coordinator nor another shard.
 """
 
 from __future__ import annotations

@@ -2,11 +2,12 @@
 
 A shard holds one array of these: owned rows first, ghosts after. Migration is a row assignment, a
 snapshot a copy, a halo a slice, the wire format the bytes. So the record carries more than the next
-tick needs: ownership, delayed actions, the random stream, sensor phase and returns travel with the row.
+tick needs: ownership, delayed actions, the random stream, sensor phase and returns travel with the
+row.
 
-Frames as in `roads.network`: x, y, z is the centre of the body; heading counter-clockwise from east;
-`s` and `d` are the centre's place on the lane, d positive to the left. Indices that point at nothing
-are -1. The codes (DRIVER_*, HOLD_*, EVENT_*) are those of `kernels.codes`. Units: metres,
+Frames as in `roads.network`: x, y, z is the centre of the body; heading counter-clockwise from
+east; `s` and `d` are the centre's place on the lane, d positive to the left. Indices that point at
+nothing are -1. The codes (DRIVER_*, HOLD_*, EVENT_*) are those of `kernels.codes`. Units: metres,
 seconds and radians unless the name says otherwise.
 """
 
@@ -58,7 +59,10 @@ VEHICLE = np.dtype(
         ("s", np.float64),
         ("d", np.float64),
         ("goal", np.int32),  # where it drives to: row of the plans' table
-        ("leg", np.int32),  # how many goals it has had; the next one is a function of its random key
+        (
+            "leg",
+            np.int32,
+        ),  # how many goals it has had; the next one is a function of its random key
         ("to_go", np.float64),  # m left to the goal, along the plan
         # configuration
         ("vtype", np.int32),  # row of the vehicle types' table

@@ -1,0 +1,1 @@
+"""Who drives where: departures and the seeded generator."""

@@ -1,4 +1,4 @@
-"""The seeded traffic generator: which trips there are, and the tables that departures are drawn from."""
+"""The seeded traffic generator: which trips there are, and what departures are drawn from."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ class NativeTraffic:
 
     @cached_property
     def goal_edges(self) -> NDArray[np.int32]:
-        """EDGE rows that trips lead to: the named destinations first, then a spread over the map."""
+        """EDGE rows that trips lead to: named destinations first, then a spread over the map."""
         named = [self._edge(name, "destinations") for name in self.traffic.destinations]
         edges = self._drivable_edges(MIN_GOAL_M)
         leaves = [e for e in edges if self._is_way_out(e)]
@@ -53,7 +53,7 @@ class NativeTraffic:
         wanted = max(self.traffic.goals, len(named))
         if len(leaves) < wanted and rest:
             picks = np.linspace(0, len(rest) - 1, min(wanted - len(leaves), len(rest)))
-            candidates = leaves + [rest[int(round(p))] for p in picks]
+            candidates = leaves + [rest[round(p)] for p in picks]
         chosen = list(dict.fromkeys(named + candidates))[:wanted]
         return np.array(chosen, dtype=np.int32)
 
@@ -108,7 +108,7 @@ class NativeTraffic:
         let_in(self.demand, roads, self.plans, worlds, scratch)
 
     def retire_agents(self, worlds: Worlds, dt: float, ticks_per_step: int) -> None:
-        """Take agents whose trip has ended out of the committed rows, and order those that follow."""
+        """Take agents whose trip has ended out of the committed rows; order those that follow."""
         roads = self.network.arrays
         take_out(self.demand, roads, worlds, worlds.rows, DRIVER_AGENT, dt, ticks_per_step)
 
@@ -157,8 +157,8 @@ class NativeTraffic:
     ) -> NDArray[np.int32]:
         """(P, 2) pairs of origin lane and goal whose way has a length from `least_m` to `most_m`.
 
-        Vehicles start on a lane that their way can follow: no trip begins with a lane change. And no
-        trip has a U-turn, for which a car's turning circle is too wide on most roads.
+        Vehicles start on a lane that their way can follow: no trip begins with a lane change. And
+        no trip has a U-turn, for which a car's turning circle is too wide on most roads.
         """
         pairs = np.ix_(goals, origins)
         to_go = self.plans["to_go"][pairs]
@@ -175,8 +175,8 @@ class NativeTraffic:
                 else "no way leads to a goal"
             )
             raise ConfigError(
-                f"traffic.min_trip_m = {least_m:g}, traffic.max_trip_m = {most_m:g}: no trip of that "
-                f"length on the map '{self.network.name}' ({longest}); change the limits, "
+                f"traffic.min_trip_m = {least_m:g}, traffic.max_trip_m = {most_m:g}: no trip of "
+                f"that length on the map '{self.network.name}' ({longest}); change the limits, "
                 "traffic.origins or traffic.destinations"
             )
         trips = np.stack([origins[origin], goals[goal]], axis=1).astype(np.int32)

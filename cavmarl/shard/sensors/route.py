@@ -9,7 +9,7 @@ __all__ = ["features", "reach_m"]
 
 
 def features(config: SensorsConfig) -> list[Feature]:
-    """x (forward) and y (left) of each point in the ego frame."""
+    """X (forward) and y (left) of each point in the ego frame."""
     route = config.route
     scale = f"{route.points * route.spacing_m:g} m"
     return [

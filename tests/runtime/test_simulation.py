@@ -1,0 +1,152 @@
+"""Traffic that nobody steers: nobody is lost, nobody crashes, nobody breaks a rule, nobody stands for ever."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from cavmarl.errors import CapacityError
+from cavmarl.kernels.codes import DRIVER_BACKGROUND, SIGNAL_RED, SIGNAL_RED_YELLOW
+from cavmarl.kernels.junctions import link_signal
+from cavmarl.runtime.simulation import Simulation
+from tests.driving import drive, make_simulation, make_traffic, start
+
+# Entries with as many background vehicles as flow freely there.
+FREE_FLOW = {"ring": 12, "merge": 14, "grid4x4": 40, "town": 60}
+PER_TICK = {"clock.ctrl_dt_s": 0.05}
+
+
+def minutes(simulation: Simulation, many: float) -> Iterator[int]:
+    """Let the worlds go on; yields the step after each."""
+    for step in range(round(many * 60.0 / simulation.config.clock.ctrl_dt_s)):
+        drive(simulation)
+        yield step
+
+
+@pytest.mark.parametrize("env", FREE_FLOW)
+@pytest.mark.parametrize("mode", ["closed", "entering", "seats"])
+def test_no_vehicle_is_lost(env: str, mode: str) -> None:
+    background = FREE_FLOW[env]
+    simulation = make_simulation(env, mode=mode, agents=4, background=background, num_worlds=2)
+    start(simulation, seed=3)
+    for _ in minutes(simulation, 0.75):
+        for world in range(2):
+            stats = simulation.traffic_stats(world)
+            assert stats.departed == stats.running + stats.arrived + stats.removed
+            ids = simulation.vehicles(world)["id"]
+            assert np.unique(ids).size == ids.size
+            ordered = simulation._shard.worlds.next_id[world]
+            assert ordered == stats.departed + stats.waiting, "a departure was dropped"
+            if mode != "closed":
+                drivers = simulation.vehicles(world)["driver"]
+                waiting = simulation._shard.worlds.queue[world, : stats.waiting]
+                here = np.count_nonzero(drivers == DRIVER_BACKGROUND)
+                assert here + np.count_nonzero(waiting["agent"] < 0) == background
+
+
+def test_those_for_whom_there_is_no_room_wait_and_enter_later() -> None:
+    simulation = make_traffic("merge", background=120)
+    start(simulation, seed=0)
+    least = simulation.traffic_stats().waiting
+    assert least > 20
+    oldest = simulation._shard.worlds.queue[0, 0]["id"]
+    for _ in minutes(simulation, 1.0):
+        queue = simulation._shard.worlds.queue[0, : simulation.traffic_stats().waiting]
+        assert (np.diff(queue["id"]) > 0).all(), "the queue is in the order of ids"
+    assert oldest not in queue["id"]
+
+
+def test_a_closed_world_too_full_for_its_agents_is_refused() -> None:
+    simulation = make_simulation("ring", mode="closed", agents=200, background=0)
+    with pytest.raises(CapacityError, match=r"population\.agents = 200.*free places for \d+"):
+        start(simulation, seed=0)
+
+
+@pytest.mark.parametrize("env", FREE_FLOW)
+@pytest.mark.parametrize("seed", [0, 1])
+def test_drivers_neither_touch_nor_stand_for_ever(env: str, seed: int) -> None:
+    simulation = make_traffic(env, background=FREE_FLOW[env], num_worlds=3)
+    start(simulation, seed)
+    longest = 0
+    for _ in minutes(simulation, 3.0):
+        for world in range(3):
+            vehicles = simulation.vehicles(world)
+            touching = vehicles[vehicles["hit"] >= 0]
+            assert not touching.size, (
+                f"world {world}, tick {simulation.ticks()[world]}: {touching['id']} touch"
+            )
+            longest = max(longest, int(vehicles["wait"].max()))
+    assert longest * simulation.config.clock.sim_dt_s < 120.0
+    for world in range(3):
+        assert simulation.traffic_stats(world).contacts == 0
+
+
+@pytest.mark.parametrize("env", FREE_FLOW)
+def test_speed_limits_hold_for_every_driver_in_his_own_measure(env: str) -> None:
+    simulation = make_traffic(env, background=FREE_FLOW[env], num_worlds=2)
+    start(simulation, seed=7)
+    lanes = simulation.network.lanes
+    fastest = []
+    for _ in minutes(simulation, 1.0):
+        for world in range(2):
+            vehicles = simulation.vehicles(world)
+            limit = lanes["speed_mps"][vehicles["lane"]] * vehicles["speed_factor"]
+            fastest.append((vehicles["speed"] / limit).max())
+    # Who comes to a slower lane may still be braking in its first metres.
+    assert max(fastest) < 1.2
+    assert np.median(fastest) < 1.0 + 1e-6
+    assert max(fastest) > 0.9, "nobody drives at the limit where the road is free"
+
+
+@pytest.mark.parametrize("env", ["grid4x4", "town"])
+def test_nobody_drives_through_red(env: str) -> None:
+    simulation = make_traffic(env, background=60, num_worlds=2, overrides=PER_TICK)
+    start(simulation, seed=2)
+    roads = simulation.network.arrays
+    crossed = 0
+    before: list[dict[int, int]] = [{}, {}]
+    for _ in minutes(simulation, 2.0):
+        for world in range(2):
+            vehicles = simulation.vehicles(world)
+            now = dict(zip(vehicles["id"].tolist(), vehicles["link"].tolist(), strict=True))
+            entered = {now[i] for i in now if now[i] >= 0 and before[world].get(i, now[i]) != now[i]}
+            before[world] = now
+            phases = simulation.signal_phases(world)
+            for link in entered:
+                shown = link_signal(roads, link, phases)
+                assert shown not in (SIGNAL_RED, SIGNAL_RED_YELLOW), f"link {link}"
+                crossed += int(roads.links[link]["signal"] >= 0)
+    assert crossed > 50
+
+
+OVERPASS = """<?xml version="1.0" encoding="UTF-8"?>
+<net version="1.20">
+  <location netOffset="0,0" convBoundary="0,0,0,0" origBoundary="0,0,0,0" projParameter="!"/>
+  <edge id="we" from="W" to="E">
+    <lane id="we_0" index="0" speed="14" length="300" shape="-150,0,0 150,0,0"/>
+  </edge>
+  <edge id="sn" from="S" to="N">
+    <lane id="sn_0" index="0" speed="14" length="300" shape="0,-150,{z} 0,150,{z}"/>
+  </edge>
+  <junction id="W" type="dead_end" x="-150" y="0" incLanes="" intLanes="" shape=""/>
+  <junction id="E" type="dead_end" x="150" y="0" incLanes="we_0" intLanes="" shape=""/>
+  <junction id="S" type="dead_end" x="0" y="-150" incLanes="" intLanes="" shape=""/>
+  <junction id="N" type="dead_end" x="0" y="150" incLanes="sn_0" intLanes="" shape=""/>
+</net>
+"""
+
+
+@pytest.mark.parametrize(("z", "collide"), [(0.0, True), (7.0, False)])
+def test_a_bridge_is_no_crossing(tmp_path: Path, z: float, collide: bool) -> None:
+    roads = tmp_path / "overpass.net.xml"
+    roads.write_text(OVERPASS.format(z=z), encoding="utf-8")
+    simulation = make_traffic(roads, background=24)
+    start(simulation, seed=0)
+    for _ in minutes(simulation, 2.0):
+        pass
+    stats = simulation.traffic_stats()
+    assert stats.arrived > 20
+    assert (stats.contacts > 0) == collide
