@@ -77,7 +77,8 @@ class NetworkConfig:
             1 <= width <= MAX_WIDTH for width in self.hidden
         ):
             raise ConfigError(
-                f"hidden = {list(self.hidden)}: must be 1 to {MAX_LAYERS} widths from 1 to {MAX_WIDTH}"
+                f"hidden = {list(self.hidden)}: must be 1 to {MAX_LAYERS} widths from 1 to "
+                f"{MAX_WIDTH}"
             )
 
 

@@ -104,8 +104,13 @@ class NetworkPolicy(Policy):
         """The network's most likely actions where `mask`, 0 elsewhere."""
         import torch
 
-        with torch.inference_mode():
-            best = self.network.best(torch.from_numpy(observations[mask])).numpy()
+        threads = torch.get_num_threads()
+        torch.set_num_threads(1)  # for so small a network, more cost many times what they bring
+        try:
+            with torch.inference_mode():
+                best = self.network.best(torch.from_numpy(observations[mask])).numpy()
+        finally:
+            torch.set_num_threads(threads)
         actions = np.zeros((*mask.shape, *best.shape[1:]), dtype=best.dtype)
         actions[mask] = best
         return actions

@@ -18,6 +18,7 @@ import json
 import os
 import sys
 import time
+from collections import deque
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
@@ -32,14 +33,21 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 from torch import Tensor, nn
 
 from cavmarl.config import TERMS
+from cavmarl.config_io import validate
 from cavmarl.errors import CavmarlError, ConfigError, PolicyError, require
 from cavmarl.networks import ActorCritic, NetworkConfig, load_network, save_network
 from cavmarl.vector_env import CavVectorEnv, make_vec
 
 ARRIVAL, COLLISION, OFF_ROAD = (TERMS.index(t) for t in ("arrival", "collision", "off_road"))
+WINDOW = 400  # trips
 OPTIMIZER_FILE = "optimizer.pt"
 STATE_FILE = "training.json"
 CSV_FILE = "progress.csv"
+
+# Settings that a resumed run may be given anew.
+CAN_CHANGE = frozenset(
+    ("total_agent_steps", "minutes", "resume", "threads", "tensorboard", "checkpoint_updates")
+)
 
 
 @dataclass(frozen=True)
@@ -66,7 +74,7 @@ class Args:
     max_gradient_norm: Annotated[float, "longer gradients are shortened"] = 0.5
     initial_std: Annotated[float, "standard deviation of continuous actions at the start"] = 0.5
     hidden: Annotated[int, "width of the two hidden layers"] = 128
-    threads: Annotated[int, "of torch; 0: its own choice"] = 2
+    threads: Annotated[int, "of torch; more cost small networks more than they bring"] = 1
     checkpoint_updates: Annotated[int, "updates between two checkpoints"] = 20
     runs: Annotated[str, "folder of all runs"] = "runs"
     name: Annotated[str, "folder of this run; empty: ENV_ippo_SEED"] = ""
@@ -79,7 +87,7 @@ class Args:
         at_least = {
             "agents": 0, "background": -1, "num_envs": 1, "seed": 0, "total_agent_steps": 1,
             "minutes": 0.0, "num_steps": 1, "epochs": 1, "minibatches": 1, "entropy_weight": 0.0,
-            "value_weight": 0.0, "hidden": 1, "threads": 0, "checkpoint_updates": 1,
+            "value_weight": 0.0, "hidden": 1, "threads": 1, "checkpoint_updates": 1,
         }  # fmt: skip
         for name, least in at_least.items():
             value = getattr(self, name)
@@ -106,9 +114,7 @@ class Args:
 def parse_args(words: Sequence[str] | None = None) -> Args:
     """The settings that the command line asks for; of a resumed run, those that it began with."""
     parser = argparse.ArgumentParser(
-        description=(__doc__ or "").splitlines()[0],
-        formatter_class=argparse.ArgumentDefaultsHelpFormatter,
-        argument_default=argparse.SUPPRESS,
+        description=(__doc__ or "").splitlines()[0], argument_default=argparse.SUPPRESS
     )
     hints = get_type_hints(Args, include_extras=True)
     for field in fields(Args):
@@ -121,22 +127,30 @@ def parse_args(words: Sequence[str] | None = None) -> Args:
     given = vars(parser.parse_args(words))
     if not given.get("resume"):
         return Args(**given)
-    began_with = read_state(Path(given["resume"]))["args"]
-    allowed = {
-        "total_agent_steps",
-        "minutes",
-        "resume",
-        "threads",
-        "tensorboard",
-        "checkpoint_updates",
-    }
-    if refused := given.keys() - allowed:
+    if refused := given.keys() - CAN_CHANGE:
         names = ", ".join(f"--{name.replace('_', '-')}" for name in sorted(refused))
         raise ConfigError(f"{names}: cannot change when a run is resumed")
-    return Args(**{**began_with, **given})
+    return replace(read_state(Path(given["resume"])).args, **given)
 
 
-def read_state(folder: Path) -> dict[str, Any]:
+@dataclass(frozen=True)
+class State:
+    """How far a run has come.
+
+    Attributes:
+        args: its settings.
+        agent_steps: decisions that it learned from.
+        updates: of the network.
+        seconds: spent on them.
+    """
+
+    args: Args
+    agent_steps: int = 0
+    updates: int = 0
+    seconds: float = 0.0
+
+
+def read_state(folder: Path) -> State:
     """What `save_checkpoint` noted of a run.
 
     Raises:
@@ -144,16 +158,12 @@ def read_state(folder: Path) -> dict[str, Any]:
     """
     path = folder / STATE_FILE
     try:
-        state = json.loads(path.read_text(encoding="utf-8"))
-        known = {field.name for field in fields(Args)}
-        whole = set(state) == {"args", "agent_steps", "updates", "seconds"}
-        if not whole or set(state["args"]) != known:
-            raise ConfigError(f"--resume {folder}: {STATE_FILE} is not of this version")
+        raw = json.loads(path.read_text(encoding="utf-8"))
     except OSError as error:
         raise ConfigError(f"--resume {folder}: no checkpoint there ({error.strerror})") from error
-    except (json.JSONDecodeError, UnicodeDecodeError, TypeError) as error:
-        raise ConfigError(f"--resume {folder}: {STATE_FILE} is broken ({error})") from error
-    return dict(state)
+    except (json.JSONDecodeError, UnicodeDecodeError) as error:
+        raise ConfigError(f"{path}: is broken ({error})") from error
+    return validate(State, raw, str(path))
 
 
 @dataclass
@@ -193,33 +203,28 @@ class Batch:
 
 
 class Trips:
-    """Ends and returns of vehicles' trips, while they go on in W worlds with A agents."""
+    """Returns and ends of the last `WINDOW` trips, and those under way in W worlds, A agents."""
 
     def __init__(self, num_envs: int, num_agents: int) -> None:
         self._returns = np.zeros((num_envs, num_agents))
-        self._ended: list[float] = []
-        self._counts = np.zeros(3)
+        self._ended: deque[list[float]] = deque(maxlen=WINDOW)
+        self._count = 0
 
     def add(
         self, rewards: NDArray[Any], done: NDArray[Any], cut: NDArray[Any], terms: NDArray[Any]
     ) -> None:
-        """Count one step; `done` (W, A) ends trips, `cut` (W, A) forgets them."""
+        """Take in one step; `done` (W, A) ends trips, `cut` (W, A) forgets them."""
         self._returns += rewards
-        self._ended += self._returns[done].tolist()
-        self._counts += terms[done][:, [ARRIVAL, COLLISION, OFF_ROAD]].sum(axis=0)
+        ends = terms[done][:, [ARRIVAL, COLLISION, OFF_ROAD]]
+        self._ended.extend(np.column_stack([self._returns[done], ends]).tolist())
+        self._count += len(ends)
         self._returns[done | cut] = 0.0
 
-    def take(self) -> dict[str, float]:
-        """Means over the trips that ended since the last call."""
-        trips = len(self._ended)
-        rates = self._counts / trips if trips else np.full(3, np.nan)
-        mean = float(np.mean(self._ended)) if trips else float("nan")
-        self._ended, self._counts = [], np.zeros(3)
-        success, collision, off_road = rates.tolist()
-        return {
-            "trips": trips, "trip_return": mean, "success": success, "collision": collision,
-            "off_road": off_road,
-        }  # fmt: skip
+    def means(self) -> dict[str, float]:
+        """Of the last trips; and how many there have been."""
+        names = ("trip_return", "success", "collision", "off_road")
+        columns = np.array(self._ended).mean(axis=0) if self._ended else np.full(4, np.nan)
+        return {"trips": self._count, **dict(zip(names, columns.tolist(), strict=True))}
 
 
 class Collector:
@@ -240,7 +245,7 @@ class Collector:
         network, continuous = self.network, self.network.continuous
         observations = torch.zeros((*shape, self._observations.shape[-1]))
         actions = torch.zeros((*shape, 2)) if continuous else torch.zeros(shape, dtype=torch.int64)
-        log_probs, values, rewards, next_values = (torch.zeros(shape) for _ in range(4))
+        log_probs, rewards, next_values = (torch.zeros(shape) for _ in range(3))
         acted, goes_on, cut = (torch.zeros(shape, dtype=torch.bool) for _ in range(3))
         for t in range(self._num_steps):
             observations[t] = torch.from_numpy(self._observations)
@@ -248,7 +253,6 @@ class Collector:
             sampled, log_prob = network.sample(flat)
             actions[t] = sampled.view_as(actions[t])
             log_probs[t] = log_prob.view_as(log_probs[t])
-            values[t] = network.value(flat).view_as(values[t])
             given = actions[t].clamp(-1.0, 1.0) if continuous else actions[t]
             self._observations, reward, ended, cut_off, infos = self.vec.step(given.numpy())
             self._mask = infos["mask"]
@@ -260,6 +264,7 @@ class Collector:
                 last = torch.from_numpy(infos["final_observations"][cut_off])
                 next_values[t, cut[t]] = network.value(last)
             self.trips.add(reward, infos["vehicle_done"], cut_off, infos["terms"])
+        values = network.value(observations.flatten(0, 2)).view(shape)
         after = network.value(torch.from_numpy(self._observations).flatten(0, 1))
         following = torch.cat([values[1:], after.view_as(values[0])[None]])
         next_values = torch.where(goes_on, following, next_values)
@@ -323,16 +328,14 @@ class Learner:
         return {**means, "learning_rate": rate}
 
 
-def save_checkpoint(
-    folder: Path, learner: Learner, config: NetworkConfig, state: dict[str, Any]
-) -> None:
+def save_checkpoint(folder: Path, learner: Learner, config: NetworkConfig, state: State) -> None:
     """The driver, and what goes on from here; an interrupted write leaves the old files whole."""
-    save_network(folder, learner.network, replace(config, agent_steps=state["agent_steps"]))
+    save_network(folder, learner.network, replace(config, agent_steps=state.agent_steps))
     optimizer = folder / f".{OPTIMIZER_FILE}"
     torch.save(learner.optimizer.state_dict(), optimizer)
     os.replace(optimizer, folder / OPTIMIZER_FILE)
     noted = folder / f".{STATE_FILE}"
-    noted.write_text(json.dumps(state, indent=2) + "\n", encoding="utf-8")
+    noted.write_text(json.dumps(asdict(state), indent=2) + "\n", encoding="utf-8")
     os.replace(noted, folder / STATE_FILE)
 
 
@@ -408,78 +411,99 @@ def make_world(args: Args) -> CavVectorEnv:
     )
 
 
-def train(args: Args, console: Console) -> Path:
-    """Run PPO; returns the folder of the run.
+class Run:
+    """A run of PPO: where it stands and how it goes on.
+
+    Args:
+        args: its settings.
 
     Raises:
         CavmarlError: settings, environment or checkpoint that cannot work.
     """
-    resumed = read_state(args.folder) if args.resume else None
-    agent_steps = int(resumed["agent_steps"]) if resumed else 0
-    updates = int(resumed["updates"]) if resumed else 0
-    seconds_before = float(resumed["seconds"]) if resumed else 0.0
-    if agent_steps >= args.total_agent_steps:
-        raise ConfigError(
-            f"--total-agent-steps {args.total_agent_steps}: the run has {agent_steps} already"
-        )
-    if args.threads:
+
+    def __init__(self, args: Args) -> None:
+        self.began = read_state(args.folder) if args.resume else State(args)
+        self.agent_steps, self.updates = self.began.agent_steps, self.began.updates
+        if self.agent_steps >= args.total_agent_steps:
+            raise ConfigError(
+                f"--total-agent-steps {args.total_agent_steps}: the run has {self.agent_steps}"
+            )
+        self.args = args
         torch.set_num_threads(args.threads)
-    torch.manual_seed(args.seed + updates)
-    vec = make_world(args)
-    config = NetworkConfig(
-        environment=vec.config.name,
-        observation_size=vec.single_observation_space.shape[0],
-        sensors=vec.config.sensors,
-        action=vec.config.action,
-        hidden=(args.hidden, args.hidden),
-        seed=args.seed,
-    )
-    network = ActorCritic(config, args.initial_std)
-    learner = Learner(network, args)
-    if resumed:
-        load_checkpoint(args.folder, learner, config)
-    args.folder.mkdir(parents=True, exist_ok=True)
-    log = Log(args)
-    with console.status("compiling kernels (once, up to a minute) …"):
-        vec.reset(seed=args.seed)
-        vec.step(vec.suggest_actions())
-        collector = Collector(vec, network, args, args.seed + updates)
-    began_at, began_with = time.perf_counter(), agent_steps
+        torch.manual_seed(args.seed + self.updates)
+        vec = make_world(args)
+        self.config = NetworkConfig(
+            environment=vec.config.name,
+            observation_size=vec.single_observation_space.shape[0],
+            sensors=vec.config.sensors,
+            action=vec.config.action,
+            hidden=(args.hidden, args.hidden),
+            seed=args.seed,
+        )
+        self.network = ActorCritic(self.config, args.initial_std)
+        self.learner = Learner(self.network, args)
+        if args.resume:
+            load_checkpoint(args.folder, self.learner, self.config)
+        self.collector = Collector(vec, self.network, args, args.seed + self.updates)
+        args.folder.mkdir(parents=True, exist_ok=True)
+        self.log = Log(args)
+        self._began_at = time.perf_counter()
+
+    def done(self) -> float:
+        """The share of the run that is over, by decisions or by the clock."""
+        already = self.began.agent_steps
+        done = (self.agent_steps - already) / (self.args.total_agent_steps - already)
+        if self.args.minutes:
+            seconds = time.perf_counter() - self._began_at
+            done = max(done, seconds / (60.0 * self.args.minutes))
+        return min(done, 1.0)
+
+    def update(self) -> dict[str, float]:
+        """Collect, learn, and log the numbers, which are returned."""
+        started = time.perf_counter()
+        batch = self.collector.collect()
+        numbers = self.learner.update(batch, 1.0 - self.done())
+        new = int(batch.acted.sum())
+        self.agent_steps += new
+        self.updates += 1
+        now = time.perf_counter()
+        network = self.network
+        row = {
+            "updates": self.updates,
+            "agent_steps": self.agent_steps,
+            "seconds": self.began.seconds + now - self._began_at,
+            "agent_steps_per_s": new / (now - started),
+            **self.collector.trips.means(),
+            **numbers,
+            "std": network.log_std.detach().exp().mean().item() if network.continuous else 0.0,
+        }
+        self.log.write(row)
+        return row
+
+    def save(self, row: dict[str, float]) -> None:
+        """A checkpoint after the update that gave `row`."""
+        args = replace(self.args, resume="")
+        state = State(args, self.agent_steps, self.updates, row["seconds"])
+        save_checkpoint(self.args.folder, self.learner, self.config, state)
+
+
+def train(args: Args, console: Console) -> Path:
+    """Run PPO until its decisions or its minutes are used up; returns the folder of the run.
+
+    Raises:
+        CavmarlError: settings, environment or checkpoint that cannot work.
+    """
+    run = Run(args)
     with progress_bar(console) as bar:
         task = bar.add_task("", total=1.0)
         done = 0.0
         while done < 1.0:
-            started = time.perf_counter()
-            batch = collector.collect()
-            numbers = learner.update(batch, 1.0 - done)
-            new = int(batch.acted.sum())
-            agent_steps += new
-            updates += 1
-            seconds = time.perf_counter() - began_at
-            row = {
-                "updates": updates,
-                "agent_steps": agent_steps,
-                "seconds": seconds_before + seconds,
-                "agent_steps_per_s": new / (time.perf_counter() - started),
-                **collector.trips.take(),
-                **numbers,
-                "std": network.log_std.detach().exp().mean().item() if network.continuous else 0.0,
-            }
-            log.write(row)
-            done = (agent_steps - began_with) / (args.total_agent_steps - began_with)
-            if args.minutes:
-                done = max(done, seconds / (60.0 * args.minutes))
-            done = min(done, 1.0)
-            if done == 1.0 or updates % args.checkpoint_updates == 0:
-                state = {
-                    "args": asdict(replace(args, resume="")),
-                    "agent_steps": agent_steps,
-                    "updates": updates,
-                    "seconds": seconds_before + seconds,
-                }
-                save_checkpoint(args.folder, learner, config, state)
+            row = run.update()
+            done = run.done()
+            if done == 1.0 or run.updates % args.checkpoint_updates == 0:
+                run.save(row)
             bar.update(task, completed=done, description=describe(row))
-    log.close()
+    run.log.close()
     return args.folder
 
 

@@ -14,6 +14,7 @@ from __future__ import annotations
 import hashlib
 import os
 from collections.abc import Callable
+from functools import cache
 from pathlib import Path
 from typing import Any, ParamSpec, TypeVar
 
@@ -32,6 +33,7 @@ def cache_dir() -> Path:
     return Path(home) if home else Path.home() / ".cache" / "cavmarl"
 
 
+@cache
 def kernel_cache_dir() -> Path:
     """The folder of this version's compiled kernels: one per content of the kernel sources."""
     digest = hashlib.sha256(numba.__version__.encode())
@@ -41,14 +43,11 @@ def kernel_cache_dir() -> Path:
     return cache_dir() / "kernels" / digest.hexdigest()[:16]
 
 
-_CACHE_DIR = kernel_cache_dir()
-
-
 def kernel(function: Callable[P, R]) -> Callable[P, R]:
     """Compile `function` with the flags that all kernels share."""
     settings: Any = numba.core.config
     before = settings.CACHE_DIR
-    settings.CACHE_DIR = str(_CACHE_DIR)
+    settings.CACHE_DIR = str(kernel_cache_dir())
     try:
         compiled: Callable[P, R] = numba.njit(
             cache=True, fastmath=False, parallel=False, nogil=True, error_model="numpy"

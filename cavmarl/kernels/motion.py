@@ -32,6 +32,7 @@ LATERAL_MPS = 1.4  # fastest sideways motion of a lane change
 LATERAL_RATIO = 0.35  # and no faster than this share of the speed,
 LATERAL_MIN_MPS = 0.2  # but never stuck between two lanes
 MAX_DRIFT_RAD = 0.12  # largest angle between a car that changes lanes and its lane
+STUB_M = 1.0  # lanes shorter than this, of which real maps have many, have no direction
 TRAIL_M = 2.0  # how quickly the heading follows the lane's direction
 STANDING_MPS = 0.1
 ARRIVE_M = 5.0  # a trip ends this far before the end of its goal edge
@@ -133,6 +134,8 @@ def move_background(
         drift = math.atan2((row["d"] - before) / dt, speed)
         direction += clamp(drift, -MAX_DRIFT_RAD, MAX_DRIFT_RAD)
     error = wrap_angle(direction - old["heading"])
+    if roads.lanes[row["lane"]]["length_m"] < STUB_M:
+        error = 0.0
     row["heading"] = wrap_angle(old["heading"] + error * min(1.0, speed * dt / TRAIL_M))
     row["steering"] = clamp(math.atan2(row["length"] * error, 2.0 * TRAIL_M), -0.8, 0.8)
     step = plans[row["goal"], row["lane"]]

@@ -35,7 +35,7 @@ TTC_WIDTH_M = 2.2  # two vehicles that would pass further apart than this do not
 def _progress(row: np.void, step_s: float) -> float:
     """Way towards the goal in m.
 
-    A new plan after a wrong turn may be longer by far: that counts as no more than driving backwards.
+    A new plan after a wrong turn may be longer by far: that counts as no more than driving back.
     """
     most = max(row["speed"], 1.0) * step_s * 2.0
     return clamp(row["step_to_go"] - row["to_go"], -most, most)

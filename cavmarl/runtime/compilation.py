@@ -38,5 +38,6 @@ def first_compilation() -> Iterator[bool]:
     )
     started = time.perf_counter()
     yield True
+    kernel_cache_dir().mkdir(parents=True, exist_ok=True)
     (kernel_cache_dir() / "complete").touch()
     print(f" done in {time.perf_counter() - started:.0f} s", file=sys.stderr, flush=True)

@@ -50,13 +50,13 @@ def test_no_vehicle_is_lost(env: str, mode: str) -> None:
 def test_those_for_whom_there_is_no_room_wait_and_enter_later() -> None:
     simulation = make_traffic("merge", background=120)
     start(simulation, seed=0)
-    least = simulation.traffic_stats().waiting
-    assert least > 20
-    oldest = simulation._shard.worlds.queue[0, 0]["id"]
+    worlds = simulation._shard.worlds
+    first = set(worlds.queue[0, : worlds.num_queue[0]]["id"].tolist())
+    assert len(first) > 20
     for _ in minutes(simulation, 1.0):
-        queue = simulation._shard.worlds.queue[0, : simulation.traffic_stats().waiting]
-        assert (np.diff(queue["id"]) > 0).all(), "the queue is in the order of ids"
-    assert oldest not in queue["id"]
+        queue = worlds.queue[0, : worlds.num_queue[0]]["id"]
+        assert (np.diff(queue) > 0).all(), "the queue is in the order of ids"
+    assert len(first & set(queue.tolist())) < 0.75 * len(first)
 
 
 def test_a_closed_world_too_full_for_its_agents_is_refused() -> None:
@@ -89,16 +89,19 @@ def test_speed_limits_hold_for_every_driver_in_his_own_measure(env: str) -> None
     simulation = make_traffic(env, background=FREE_FLOW[env], num_worlds=2)
     start(simulation, seed=7)
     lanes = simulation.network.lanes
-    fastest = []
+    ratios, roads = [], []
     for _ in minutes(simulation, 1.0):
         for world in range(2):
             vehicles = simulation.vehicles(world)
-            limit = lanes["speed_mps"][vehicles["lane"]] * vehicles["speed_factor"]
-            fastest.append((vehicles["speed"] / limit).max())
-    # Who comes to a slower lane may still be braking in its first metres.
-    assert max(fastest) < 1.2
-    assert np.median(fastest) < 1.0 + 1e-6
-    assert max(fastest) > 0.9, "nobody drives at the limit where the road is free"
+            lane = lanes[vehicles["lane"]]
+            ratio = vehicles["speed"] / (lane["speed_mps"] * vehicles["speed_factor"])
+            ratios.append(ratio)
+            roads.append(~lane["internal"])
+    ratio = np.concatenate(ratios)
+    # Who comes into a slower bend may still be braking in its first metres.
+    assert ratio.max() < 1.2
+    assert np.mean(ratio[np.concatenate(roads)] > 1.001) < 0.02
+    assert ratio.max() > 0.9, "nobody drives at the limit where the road is free"
 
 
 @pytest.mark.parametrize("env", ["grid4x4", "town"])

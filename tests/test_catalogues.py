@@ -1,0 +1,153 @@
+"""Every entry of `envs/` in every population, and bare map files, against PettingZoo's tests and ours."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Callable, Iterator
+from functools import partial
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+import cavmarl
+from cavmarl.cav_env import CavEnv
+from cavmarl.registry import entries
+
+with warnings.catch_warnings():
+    # PettingZoo's tests import its own environments the way that it has deprecated.
+    warnings.simplefilter("ignore", DeprecationWarning)
+    from pettingzoo.test import (
+        api_test,
+        max_cycles_test,
+        parallel_api_test,
+        render_test,
+        state_test,
+    )
+
+MODES = ("closed", "entering", "seats")
+STEPS = 60
+BARE_MAPS = ("net/Town10HD.net.xml", "xodr/Town01.xodr", "osm/laufamholz.osm.xml")
+
+Make = Callable[..., Any]
+
+
+@pytest.fixture(params=[*sorted(entries()), *BARE_MAPS])
+def source(request: pytest.FixtureRequest) -> str | Path:
+    """The name of an entry, or a map file."""
+    if request.param in BARE_MAPS:
+        shared: Path = request.getfixturevalue("shared_maps")
+        return shared / request.param
+    return str(request.param)
+
+
+@pytest.fixture(params=MODES)
+def arguments(request: pytest.FixtureRequest, source: str | Path) -> dict[str, Any]:
+    """What `parallel_env` is called with: a small population of each kind, short episodes."""
+    return {
+        "env": source,
+        "agents": 3,
+        "background": 6,
+        "seed": 0,
+        "max_cycles": STEPS,
+        "overrides": {"population.mode": request.param, "population.budget": 6},
+    }
+
+
+@pytest.fixture
+def make(arguments: dict[str, Any]) -> Make:
+    return partial(cavmarl.parallel_env, **arguments)
+
+
+@pytest.fixture
+def make_aec(arguments: dict[str, Any]) -> Make:
+    arguments = dict(arguments)
+    return partial(cavmarl.env, arguments.pop("env"), **arguments)
+
+
+# An episode ends at its horizon also when some of the declared agents never got to enter.
+@pytest.mark.filterwarnings("ignore:No agents present but not all possible_agents")
+def test_parallel_api(make: Make) -> None:
+    parallel_api_test(make(), num_cycles=STEPS)
+
+
+# A seat that waits for a vehicle observes nothing.
+@pytest.mark.filterwarnings("ignore:Observation numpy array is all zeros")
+def test_aec_api(make_aec: Make) -> None:
+    api_test(make_aec(), num_cycles=STEPS)
+
+
+def test_max_cycles(arguments: dict[str, Any], make: Make, make_aec: Make) -> None:
+    # It wants most of the possible agents to act until the end, so none may be left to come.
+    whole = {**arguments["overrides"], "population.budget": arguments["agents"]}
+    max_cycles_test(
+        SimpleNamespace(
+            parallel_env=partial(make, overrides=whole), env=partial(make_aec, overrides=whole)
+        )
+    )
+
+
+def test_state(make: Make, make_aec: Make) -> None:
+    state_test(make_aec(), make(), num_cycles=STEPS)
+
+
+def test_render(make_aec: Make, monkeypatch: pytest.MonkeyPatch) -> None:
+    pytest.importorskip("pygame", reason="frames need the extra 'render'")
+    monkeypatch.setenv("SDL_VIDEODRIVER", "dummy")
+    render_test(make_aec)
+
+
+Step = tuple[Any, ...]
+
+
+def episode(env: CavEnv, seed: int, actions_seed: int = 0) -> Iterator[Step]:
+    """Everything that an episode of random actions gives, step by step."""
+    rng = np.random.default_rng(actions_seed)
+    observations, infos = env.reset(seed=seed)
+    yield observations, {}, {}, {}, infos, env.state(), env.state_hash()
+    while env.agents:
+        actions = {
+            agent: rng.uniform(-1.0, 1.0, 2).astype(np.float32) * (1.0, 0.2) for agent in env.agents
+        }
+        yield *env.step(actions), env.state(), env.state_hash()
+
+
+def assert_equal(one: Step, other: Step, where: str) -> None:
+    *mine, my_state, my_hash = one
+    *theirs, their_state, their_hash = other
+    assert my_hash == their_hash, where
+    np.testing.assert_array_equal(my_state, their_state, where)
+    assert mine[0].keys() == theirs[0].keys(), where
+    for agent, observation in mine[0].items():
+        np.testing.assert_array_equal(observation, theirs[0][agent], f"{where}, {agent}")
+    for what, left, right in zip("rewards ends cuts infos".split(), mine[1:], theirs[1:]):
+        assert left == right, f"{where}: {what}"
+
+
+def test_the_seed_decides_every_step(make: Make) -> None:
+    fresh, used = make(), make()
+    for _ in episode(used, seed=99, actions_seed=1):
+        pass
+    steps = 0
+    for steps, (one, other) in enumerate(
+        zip(episode(fresh, seed=4), episode(used, seed=4), strict=True)
+    ):
+        assert_equal(one, other, f"step {steps}")
+    assert steps > 5
+    hashes = [step[-1] for step in episode(fresh, seed=4)]
+    assert hashes == [step[-1] for step in episode(used, seed=4)], "a second episode of one seed"
+    assert len(set(hashes)) == len(hashes)
+    others = [step[-1] for step in episode(fresh, seed=5)]
+    assert not set(hashes) & set(others), "another seed gives another world"
+
+
+def test_resets_without_a_seed_go_on_and_repeat(make: Make) -> None:
+    env = make()
+    runs = []
+    for seed in (7, None, None, 7, None):
+        env.reset(seed=seed)
+        runs.append(env.state_hash())
+    assert runs[3:] == runs[:2]
+    assert len(set(runs[:3])) == 3
