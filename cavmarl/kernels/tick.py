@@ -80,6 +80,14 @@ def begin_step(
 
 
 @kernel
+def _any_driver(rows: NDArray[np.void], num: int, driver: int) -> bool:
+    for i in range(num):
+        if rows[i]["driver"] == driver:
+            return True
+    return False
+
+
+@kernel
 def advance(
     roads: RoadArrays,
     plans: NDArray[np.void],
@@ -112,9 +120,10 @@ def advance(
         rows = worlds.rows[w]
         owned = worlds.num_owned[w]
         phase = worlds.signal_phase[w]
-        index_lanes(roads.lanes, rows, worlds.num_rows[w], scratch)
-        register_links(roads, plans, rows, worlds.num_rows[w], scratch)
-        decide(roads, plans, rows, owned, DRIVER_BACKGROUND, worlds.ticks[w], phase, scratch)
+        if _any_driver(rows, owned, DRIVER_BACKGROUND):
+            index_lanes(roads.lanes, rows, worlds.num_rows[w], scratch)
+            register_links(roads, plans, rows, worlds.num_rows[w], scratch)
+            decide(roads, plans, rows, owned, DRIVER_BACKGROUND, worlds.ticks[w], phase, scratch)
         for i in range(owned):
             old = rows[i]
             worlds.next_rows[w, i] = old

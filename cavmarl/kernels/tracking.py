@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from cavmarl.kernels import kernel
 from cavmarl.kernels.arrays import LaneGrid, RoadArrays
 from cavmarl.kernels.codes import EVENT_OFF_ROAD, EVENT_WRONG_WAY
-from cavmarl.kernels.geometry import project, project_near
+from cavmarl.kernels.geometry import lane_pose, project, project_near
 
 __all__ = ["locate", "side_lane"]
 
@@ -184,14 +184,8 @@ def locate(roads: RoadArrays, plans: NDArray[np.void], grid: LaneGrid, row: np.v
 def _drives_along(roads: RoadArrays, row: np.void) -> bool:
     """Whether the vehicle heads within 90° of its lane's direction."""
     lane = roads.lanes[row["lane"]]
-    _, _, cos, sin = project_near(
-        roads.points,
-        lane["first_point"],
-        lane["num_points"],
-        row["x"],
-        row["y"],
-        row["s"],
-        WINDOW_M,
+    _, _, _, cos, sin, _ = lane_pose(
+        roads.points, lane["first_point"], lane["num_points"], row["s"]
     )
     along: bool = math.cos(row["heading"]) * cos + math.sin(row["heading"]) * sin >= 0.0
     return along
