@@ -47,6 +47,14 @@ class ActionDecoder:
         self.held = 0
         self.ignored = 0
 
+    def tolerated(self) -> dict[str, int]:
+        """How many actions were clipped, held and ignored so far, by the names of traffic_stats."""
+        return {
+            "actions_clipped": self.clipped,
+            "actions_held": self.held,
+            "actions_ignored": self.ignored,
+        }
+
     def forget(self, chosen: NDArray[np.bool_]) -> None:
         """Forget the last actions of the chosen worlds (W,)."""
         self._last[chosen] = self._idle[chosen]

@@ -300,12 +300,7 @@ class CavEnv(ParallelEnv[str, Any, Any]):  # type: ignore[misc] # PettingZoo is 
         All fields of `runtime.simulation.TrafficStats`, and how many actions were clipped, held and
         ignored since the environment was made.
         """
-        tolerated = {
-            "actions_clipped": self._decoder.clipped,
-            "actions_held": self._decoder.held,
-            "actions_ignored": self._decoder.ignored,
-        }
-        return {**asdict(self._simulation.traffic_stats()), **tolerated}
+        return {**asdict(self._simulation.traffic_stats()), **self._decoder.tolerated()}
 
     def suggest_actions(self) -> dict[str, Any]:
         """What the built-in driver (IDM, MOBIL, lane controller) would do in each agent's place."""

@@ -7,6 +7,7 @@ together.
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +22,7 @@ from cavmarl.config import EnvConfig
 from cavmarl.errors import ConfigError, ResetNeededError
 from cavmarl.kernels.codes import EVENTS_THAT_END
 from cavmarl.roads.network import RoadNetwork
-from cavmarl.runtime.simulation import Simulation, TrafficStats
+from cavmarl.runtime.simulation import Simulation
 from cavmarl.spaces import action_space, flat_observation_space
 from cavmarl.worlds import check_placement, load_world
 
@@ -224,9 +225,9 @@ class CavVectorEnv:
         """Hex digest of one world, as `CavEnv.state_hash`."""
         return self._simulation.state_hash(world)
 
-    def traffic_stats(self, world: int = 0) -> TrafficStats:
-        """Traffic of one world since its reset."""
-        return self._simulation.traffic_stats(world)
+    def traffic_stats(self, world: int = 0) -> dict[str, float]:
+        """Traffic of one world since its reset, as `CavEnv.traffic_stats`; actions of all worlds."""
+        return {**asdict(self._simulation.traffic_stats(world)), **self._decoder.tolerated()}
 
     def close(self) -> None:
         """Nothing to release: all worlds live in this process."""

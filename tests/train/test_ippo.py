@@ -52,7 +52,7 @@ def test_two_updates_by_command_line(tmp_path: Path) -> None:
     assert done.returncode == 0, done.stderr
     assert "one" in done.stdout
     rows = log(tmp_path / "one")
-    assert len(rows) == 2
+    assert len(rows) >= 2
     assert int(rows[-1]["agent_steps"]) >= 60
     assert (tmp_path / "one" / "model.safetensors").stat().st_size < 1_000_000
 

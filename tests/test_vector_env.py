@@ -1,0 +1,216 @@
+"""`CavVectorEnv`: many worlds at once are the same worlds as one by one, bit for bit."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+from gymnasium.vector import AutoresetMode
+from numpy.typing import NDArray
+
+from cavmarl import TERMS, CavVectorEnv, make_vec, parallel_env
+
+MODES = ("closed", "entering", "seats")
+
+
+def make(num_envs: int, mode: str = "seats", env: str = "merge", **arguments: Any) -> CavVectorEnv:
+    overrides = {"population.mode": mode, "population.budget": 7, **arguments.pop("overrides", {})}
+    return make_vec(
+        env,
+        num_envs=num_envs,
+        **{"agents": 4, "background": 8, "max_cycles": 40, **arguments},
+        overrides=overrides,
+    )
+
+
+def wild(rng: np.random.Generator, vec: CavVectorEnv) -> NDArray[np.float32]:
+    """(W, A, 2) full throttle and any steering: most leave the road or hit somebody soon."""
+    actions = rng.uniform(-1.0, 1.0, (vec.num_envs, vec.num_agents, 2)).astype(np.float32)
+    actions[..., 0] = 1.0
+    return actions
+
+
+@pytest.mark.parametrize("mode", MODES)
+@pytest.mark.parametrize("env", ["merge", "grid4x4"])
+def test_the_first_world_of_many_is_the_world_alone(mode: str, env: str) -> None:
+    many, alone = make(3, mode, env), make(1, mode, env)
+    rng = np.random.default_rng(0)
+    (observations, infos), (lone, lone_infos) = many.reset(seed=11), alone.reset(seed=11)
+    np.testing.assert_array_equal(observations[:1], lone)
+    for step in range(100):
+        actions = wild(rng, many)
+        *many_out, infos = many.step(actions)
+        *lone_out, lone_infos = alone.step(actions[:1])
+        assert many.state_hash(0) == alone.state_hash(), f"step {step}"
+        for name, mine, other in zip("obs rew term trunc".split(), many_out, lone_out, strict=True):
+            np.testing.assert_array_equal(mine[:1], other, f"step {step}: {name}")
+        assert infos.keys() == lone_infos.keys()
+        for key, value in infos.items():
+            np.testing.assert_array_equal(value[:1], lone_infos[key], f"step {step}: {key}")
+        assert many.traffic_stats(0) == alone.traffic_stats()
+
+
+@pytest.mark.parametrize("mode", MODES)
+def test_a_world_of_arrays_is_the_parallel_environment(mode: str) -> None:
+    vec = make(2, mode)
+    env = parallel_env(
+        "merge",
+        agents=4,
+        background=8,
+        max_cycles=40,
+        overrides={"population.mode": mode, "population.budget": 7},
+    )
+    rng = np.random.default_rng(1)
+    arrays, infos = vec.reset(seed=5)
+    dicts, _ = env.reset(seed=5)
+    for _ in range(40):
+        active = [agent for k, agent in enumerate(vec.possible_agents) if infos["mask"][0, k]]
+        for agent in active:
+            np.testing.assert_array_equal(arrays[0, int(agent[4:])], dicts[agent])
+        if not active:
+            break  # the parallel form waits within its step for who comes next
+        actions = wild(rng, vec)
+        arrays, rewards, terminations, truncations, infos = vec.step(actions)
+        dicts, paid, ended, cut, told = env.step({a: actions[0, int(a[4:])] for a in active})
+        for agent in active:
+            k = int(agent[4:])
+            assert rewards[0, k] == np.float32(paid[agent])
+            np.testing.assert_array_equal(
+                infos["terms"][0, k], np.float32([told[agent][term] for term in TERMS])
+            )
+            assert infos["vehicle_done"][0, k] == told[agent]["vehicle_done"]
+            assert terminations[0, k] == bool(told[agent]["vehicle_done"])
+            assert truncations[0, k] == (cut[agent] and not told[agent]["vehicle_done"])
+            if mode != "seats":
+                assert terminations[0, k] == ended[agent]
+            np.testing.assert_array_equal(infos["final_observations"][0, k], dicts[agent])
+        assert infos["episode_over"][0] == (not env.agents)
+        if not env.agents:
+            break
+        if not infos["mask"][0].any():
+            break
+        assert vec.state_hash(0) == env.state_hash()
+
+
+def test_worlds_do_not_touch_each_other() -> None:
+    calm, shaken = make(3), make(3)
+    calm.reset(seed=2)
+    shaken.reset(seed=2)
+    rng = np.random.default_rng(0)
+    for _ in range(60):
+        actions = wild(rng, calm)
+        calm.step(actions)
+        actions[1] = -actions[1]
+        shaken.step(actions)
+        assert calm.state_hash(0) == shaken.state_hash(0)
+        assert calm.state_hash(2) == shaken.state_hash(2)
+    assert calm.state_hash(1) != shaken.state_hash(1)
+    assert len({calm.state_hash(w) for w in range(3)}) == 3
+
+
+def test_the_seed_decides_and_no_seed_goes_on() -> None:
+    vec, again = make(2), make(2)
+    hashes = []
+    for seed in (3, None, 3, None):
+        vec.reset(seed=seed)
+        hashes.append((vec.state_hash(0), vec.state_hash(1)))
+    assert hashes[:2] == hashes[2:]
+    assert hashes[0] != hashes[1]
+    again.reset(seed=3)
+    assert again.state_hash(1) == hashes[0][1]
+    assert make(1, seed=3).reset()[0].tobytes() == again.reset(seed=3)[0][:1].tobytes()
+
+
+@pytest.mark.parametrize("mode", MODES)
+def test_a_world_that_is_over_begins_anew_in_the_same_step(mode: str) -> None:
+    vec = make(2, mode)
+    assert vec.metadata["autoreset_mode"] is AutoresetMode.SAME_STEP
+    observations, infos = vec.reset(seed=0)
+    rng = np.random.default_rng(4)
+    over_early, steps = 0, np.zeros(2, dtype=int)
+    for _ in range(130):
+        acting = infos["mask"]
+        observations, _, terminations, truncations, infos = vec.step(wild(rng, vec))
+        steps += 1
+        over = infos["episode_over"]
+        np.testing.assert_array_equal(over[steps >= 40], True)
+        # Whoever acted and has not ended is cut where the horizon is reached, and only there.
+        expected = infos["acted"] & ~terminations & (steps >= 40)[:, None]
+        np.testing.assert_array_equal(truncations, expected)
+        np.testing.assert_array_equal(infos["acted"], acting)
+        for world in np.flatnonzero(over):
+            over_early += steps[world] < 40
+            steps[world] = 0
+            first = vec.simulation.outputs.observations[world]
+            shown = np.where(infos["mask"][world][:, None], first, 0.0)
+            np.testing.assert_array_equal(observations[world], shown)
+            assert vec.simulation.ticks()[world] == 0
+            assert infos["final_observations"][world].any()
+            assert not np.array_equal(observations[world], infos["final_observations"][world])
+        for world in np.flatnonzero(~over):
+            going_on = infos["mask"][world] & ~terminations[world]
+            np.testing.assert_array_equal(
+                observations[world][going_on], infos["final_observations"][world][going_on]
+            )
+    assert (over_early > 0) == (mode != "seats")
+
+
+@pytest.mark.parametrize("mode", MODES)
+def test_the_mask_says_who_acts(mode: str) -> None:
+    vec = make(3, mode)
+    observations, infos = vec.reset(seed=1)
+    rng = np.random.default_rng(0)
+    for _ in range(100):
+        mask = infos["mask"]
+        assert not observations[~mask].any(), "who has no vehicle observes nothing"
+        assert observations[mask].any(axis=-1).all()
+        actions = wild(rng, vec)
+        actions[~mask] = np.nan  # not read
+        observations, rewards, terminations, _, infos = vec.step(actions)
+        assert not rewards[~mask].any()
+        assert not infos["terms"][~mask].any()
+        assert not terminations[~mask].any()
+        np.testing.assert_array_equal(terminations, infos["vehicle_done"] & mask)
+        assert not (terminations & infos["mask"])[~infos["episode_over"]].any()
+
+
+def test_the_arrays_have_the_shapes_and_dtypes_of_the_spaces() -> None:
+    vec = make(3)
+    shape = (3, 4)
+    size = vec.single_observation_space.shape[0]
+    observations, infos = vec.reset(seed=0)
+    assert (observations.shape, observations.dtype) == ((*shape, size), np.float32)
+    actions = vec.suggest_actions()
+    assert (actions.shape, actions.dtype) == ((*shape, 2), np.float32)
+    observations, rewards, terminations, truncations, infos = vec.step(actions)
+    assert (observations.shape, observations.dtype) == ((*shape, size), np.float32)
+    assert (rewards.shape, rewards.dtype) == (shape, np.float32)
+    for ends in (terminations, truncations, infos["mask"], infos["acted"], infos["vehicle_done"]):
+        assert (ends.shape, ends.dtype) == (shape, np.bool_)
+    assert infos["terms"].shape == (*shape, len(TERMS))
+    assert infos["final_observations"].shape == observations.shape
+    assert infos["episode_over"].shape == (3,)
+    assert vec.step_s == vec.config.clock.ctrl_dt_s
+    vec.close()
+
+
+def test_results_are_the_callers_to_keep() -> None:
+    vec = make(2)
+    kept = [vec.reset(seed=0)]
+    for _ in range(45):
+        kept.append(vec.step(vec.suggest_actions()))
+        if len(kept) == 2:
+            early = [np.copy(array) for array in kept[1][:4]]
+    for array, copy in zip(kept[1][:4], early, strict=True):
+        np.testing.assert_array_equal(array, copy)
+
+
+def test_discrete_actions_are_whole_numbers() -> None:
+    vec = make(2, overrides={"action.kind": "discrete"})
+    vec.reset(seed=0)
+    for _ in range(10):
+        actions = vec.suggest_actions()
+        assert (actions.shape, actions.dtype.kind) == ((2, 4), "i")
+        assert all(vec.single_action_space.contains(action) for action in actions.ravel())
+        vec.step(actions)
