@@ -66,7 +66,7 @@ class ActionDecoder:
     def from_dict(
         self, actions: Mapping[str, Any], live: Sequence[str], needed: Sequence[str]
     ) -> Commands:
-        """Decode the actions of one world.
+        """Decode the actions of one world; those of live agents without a vehicle are not read.
 
         Args:
             actions: by agent id.
@@ -89,8 +89,10 @@ class ActionDecoder:
                 f"no action for {', '.join(missing)}: pass one for each id in env.agents, or set "
                 "action.missing_action = hold"
             )
-        given = [agent for agent in live if agent in actions]
-        batch = self._last.copy()
+        given = [agent for agent in needed if agent in actions]
+        batch = self._idle.copy()
+        held = [self._index[agent] for agent in missing]
+        batch[0, held] = self._last[0, held]
         rows = [self._index[agent] for agent in given]
         if given:
             stacked = self._stack([actions[agent] for agent in given], given)

@@ -225,7 +225,7 @@ class ActionConfig:
         acceleration_mps2: what throttle ±1 means.
         steering_rad: what steering ±1 means (front wheels, left positive).
         target_speeds_mps: `discrete`: the speeds that FASTER and SLOWER step through.
-        out_of_range: continuous values beyond ±1: `error`, or `clip` (counted in `traffic_stats()`).
+        out_of_range: continuous values beyond ±1: `error`, or `clip` (see `traffic_stats`).
         missing_action: a live agent without an action: `error`, or `hold` its last one (counted).
         late_actions: an action for an agent that has left: `error`, or `ignore` (counted).
     """

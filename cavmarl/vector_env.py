@@ -226,7 +226,7 @@ class CavVectorEnv:
         return self._simulation.state_hash(world)
 
     def traffic_stats(self, world: int = 0) -> dict[str, float]:
-        """Traffic of one world since its reset, as `CavEnv.traffic_stats`; actions of all worlds."""
+        """Traffic of one world since its reset, as `CavEnv`'s; actions of all worlds."""
         return {**asdict(self._simulation.traffic_stats(world)), **self._decoder.tolerated()}
 
     def close(self) -> None:

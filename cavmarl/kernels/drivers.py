@@ -37,7 +37,8 @@ LOOK_BACK_M = 60.0  # how far back a lane change looks for followers
 REFERENCE_LENGTH_M = 5.0  # JAM_DISTANCE_M is measured between centres of cars of this length
 LINE_MARGIN_M = 1.0  # a driver stops with its front this far before a line
 STOP_LINE_M = 5.0  # standing with the front nearer than this counts as standing at the line
-LIMIT_DECEL = 2.0  # m/s², how a driver slows for a lower limit ahead
+LIMIT_DECEL = 2.0  # m/s², how a driver slows for a lower limit ahead,
+LIMIT_LEAD_S = 1.0  # to be down this time before it, as the model lags behind what is allowed
 SHARED_START_M = 7.0  # two links from one lane share about this much of their way
 COURTESY_DECEL = 2.0  # m/s², the hardest braking to let somebody merge
 DECIDE_EVERY_TICKS = 10  # how often a driver thinks of changing to one side
@@ -207,7 +208,8 @@ def _road_ahead(
         limit = roads.lanes[lane]["speed_mps"] * row["speed_factor"]
         if row["driver"] == DRIVER_AGENT:
             allowed = min(allowed, _bend_speed(roads, lane, distance))
-        allowed = min(allowed, math.sqrt(limit * limit + 2.0 * LIMIT_DECEL * max(distance, 0.0)))
+        slowing = max(distance - LIMIT_LEAD_S * row["speed"], 0.0)
+        allowed = min(allowed, math.sqrt(limit * limit + 2.0 * LIMIT_DECEL * slowing))
         j, s = last_on_lane(i, lane, scratch)
     return strongest, allowed, hold, link_ahead
 
