@@ -110,7 +110,7 @@ class ActionDecoder:
         Raises:
             InvalidActionError: wrong shape, dtype or value.
         """
-        array = self._as_numbers(np.asarray(actions), "actions")
+        array = self._as_numbers(actions, "actions")
         if array.shape != self._last.shape:
             raise InvalidActionError(
                 f"actions have shape {array.shape}: must be {self._last.shape}, "
@@ -148,21 +148,28 @@ class ActionDecoder:
     def _stack(self, values: list[Any], agents: list[str]) -> NDArray[Any]:
         """The actions as one array; refuses the first that has another shape or is no number."""
         shape = self._last.shape[2:]
-        arrays = [np.asarray(value) for value in values]
-        for agent, array in zip(agents, arrays, strict=True):
+        arrays = []
+        for agent, value in zip(agents, values, strict=True):
+            array = self._as_numbers(value, agent)
             if array.shape != shape:
                 raise InvalidActionError(
                     f"{agent}: the action has shape {array.shape}, must be {shape}"
                 )
-            self._as_numbers(array, agent)
+            arrays.append(array)
         return np.stack(arrays)
 
-    def _as_numbers(self, array: NDArray[Any], who: str) -> NDArray[Any]:
-        """Refuse dtypes that cannot be cast without loss."""
-        wanted = "fiu" if self._continuous else "iu"
-        if array.dtype.kind not in wanted:
-            kind = "numbers" if self._continuous else "whole numbers"
+    def _as_numbers(self, value: Any, who: str) -> NDArray[Any]:
+        """An array of a dtype that loses nothing when it is cast; refuses what is none."""
+        kind = "numbers" if self._continuous else "whole numbers"
+        try:
+            array = np.asarray(value)
+        except ValueError as error:
+            raise InvalidActionError(f"{who}: no array of {kind}: {error}") from error
+        if array.dtype.kind not in ("fiu" if self._continuous else "iu"):
             raise InvalidActionError(f"{who}: dtype {array.dtype} given, {kind} needed")
+        if array.dtype == np.uint64:
+            # Cast to int64 the largest ones would wrap around.
+            array = np.minimum(array, np.uint64(np.iinfo(np.int64).max)).astype(np.int64)
         return array
 
     def _check_values(

@@ -394,7 +394,7 @@ def progress_bar(console: Console) -> Progress:
     """A bar over the run, with the numbers that say whether it learns."""
     return Progress(
         TextColumn("{task.percentage:3.0f} %"),
-        BarColumn(bar_width=24),
+        BarColumn(bar_width=10),
         TimeElapsedColumn(),
         TextColumn("{task.description}"),
         console=console,
@@ -508,11 +508,11 @@ def train(args: Args, console: Console) -> Path:
 
 
 def describe(row: dict[str, float]) -> str:
-    """The numbers of an update that a person wants to see."""
+    """What a person wants to see of an update: agent-steps, their rate, and the last trips."""
     return (
-        f"{row['agent_steps']:,.0f} decisions, {row['agent_steps_per_s']:,.0f}/s · return "
-        f"{row['trip_return']:.1f} · success {row['success']:.0%} · collision "
-        f"{row['collision']:.0%} · off road {row['off_road']:.0%}"
+        f"{row['agent_steps'] / 1e6:.2f} M at {row['agent_steps_per_s'] / 1e3:.0f} k/s · "
+        f"return {row['trip_return']:.1f} · success {row['success']:.0%} · "
+        f"hit {row['collision']:.0%} · off {row['off_road']:.0%}"
     )
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
@@ -84,7 +83,7 @@ def report_table(reports: dict[str, EvaluationReport]) -> Table:
     """Reports side by side, one column a driver."""
     first = next(iter(reports.values()))
     title = f"{first.manifest.environment}, {first.episodes} episodes of seed {first.manifest.seed}"
-    table = Table("mean (95 % interval)", title=title)
+    table = Table("mean ± half its 95 % interval", title=title)
     for name in reports:
         table.add_column(name, justify="right")
     columns = [_cells(report) for report in reports.values()]
@@ -100,22 +99,24 @@ def _cells(report: EvaluationReport) -> dict[str, str]:
         "success": _interval(report.success, unit="%"),
         "collision": _interval(report.collision, unit="%"),
         "off road": _interval(report.off_road, unit="%"),
-        "unfinished at the horizon": _interval(report.unfinished, unit="%"),
+        "unfinished": _interval(report.unfinished, unit="%"),
         "red light": _interval(report.red_light, unit="%"),
         "wrong way": _interval(report.wrong_way, unit="%"),
         "episode return": _interval(report.episode_return),
-        "least time to collision of a trip, s": _interval(report.mean_least_ttc_s),
+        "least time to collision, s": _interval(report.mean_least_ttc_s),
         "jerk, m/s³": _interval(report.mean_jerk_mps3),
+        "speed above the limit": _interval(report.mean_speeding, unit="%"),
         "delay of an arrival, s": _interval(report.mean_delay_s),
         "speed, m/s": number(report.mean_speed_mps),
-        "step of a world, ms": f"{speed.step_ms:.3f} + {speed.policy_ms:.3f} policy",
+        "step of a world, ms": f"{speed.step_ms:.3f}",
+        "policy for a world, ms": f"{speed.policy_ms:.3f}",
         "agent-steps/s": f"{speed.agent_steps_per_s:,.0f}",
     }
 
 
 def _interval(interval: Interval, unit: str = "") -> str:
-    bounds: Sequence[float | None] = (interval.low, interval.high)
-    if None in bounds:
+    """The mean and half the width of its interval."""
+    if interval.low is None or interval.high is None:
         return number(interval.mean, unit=unit)
-    low, high = (number(bound, unit=unit).removesuffix(" %") for bound in bounds)
-    return f"{number(interval.mean, unit=unit)} ({low} … {high})"
+    half = number((interval.high - interval.low) / 2.0, unit=unit)
+    return f"{number(interval.mean, unit=unit).removesuffix(' %')} ± {half}"

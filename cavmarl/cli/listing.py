@@ -16,7 +16,7 @@ __all__ = ["list_entries"]
 def list_entries(json_path: JsonPath = None) -> None:
     """Show the environments and the drivers that a name can mean."""
     console = Console()
-    environments = Table("environment", "population", "background", "action", "map", "folder")
+    environments = Table("environment", "population", "background", "action", "folder")
     names = {}
     for name, folder in entries().items():
         config, _ = load_config(folder)
@@ -26,14 +26,13 @@ def list_entries(json_path: JsonPath = None) -> None:
             f"{population.agents} {population.mode}",
             str(population.background),
             config.action.kind,
-            config.map.source,
-            str(folder),
+            _shown(folder),
         )
         names[name] = str(folder)
     drivers = Table("driver", "kind", "path")
     paths = {}
     for name, path in agent_entries().items():
-        drivers.add_row(name, _kind(path), str(path))
+        drivers.add_row(name, _kind(path), _shown(path))
         paths[name] = str(path)
     console.print(environments)
     console.print(drivers)
@@ -42,3 +41,8 @@ def list_entries(json_path: JsonPath = None) -> None:
 
 def _kind(path: Path) -> str:
     return "scripted" if path.suffix == ".py" else "trained"
+
+
+def _shown(path: Path) -> str:
+    """The path as one would write it here."""
+    return str(path.relative_to(Path.cwd()) if path.is_relative_to(Path.cwd()) else path)

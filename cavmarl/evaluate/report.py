@@ -52,6 +52,7 @@ class EvaluationReport:
         least_ttc_s: least time to collision of all trips, 4 at most.
         mean_least_ttc_s: mean over the trips of each one's least.
         mean_jerk_mps3: mean over the trips of their mean |jerk|.
+        mean_speeding: mean over the trips of their mean speed above the limit, as a share of it.
         mean_delay_s: mean over the arrived trips.
         mean_speed_mps: way made towards goals over time on the way, all trips.
         mean_trip_s: mean duration of the arrived trips.
@@ -71,6 +72,7 @@ class EvaluationReport:
     least_ttc_s: float | None
     mean_least_ttc_s: Interval
     mean_jerk_mps3: Interval
+    mean_speeding: Interval
     mean_delay_s: Interval
     mean_speed_mps: float | None
     mean_trip_s: Interval
@@ -107,6 +109,7 @@ def make_report(
         least_ttc_s=float(trips.least_ttc_s.min()) if total else None,
         mean_least_ttc_s=mean_interval(trips.least_ttc_s),
         mean_jerk_mps3=mean_interval(trips.mean_jerk_mps3),
+        mean_speeding=mean_interval(trips.mean_speeding),
         mean_delay_s=mean_interval(trips.delay_s[arrived]),
         mean_speed_mps=float(trips.distance_m.sum() / trips.duration_s.sum()) if total else None,
         mean_trip_s=mean_interval(trips.duration_s[arrived]),

@@ -64,6 +64,7 @@ class Trips:
         distance_m: way made towards the goal.
         delay_s: time lost against driving at the limit.
         mean_jerk_mps3: mean |jerk|.
+        mean_speeding: mean speed above the limit, as a share of it.
         least_ttc_s: least time to collision; TTC_HORIZON_S stands for that and above.
     """
 
@@ -76,6 +77,7 @@ class Trips:
     distance_m: NDArray[np.float64]
     delay_s: NDArray[np.float64]
     mean_jerk_mps3: NDArray[np.float64]
+    mean_speeding: NDArray[np.float64]
     least_ttc_s: NDArray[np.float64]
 
     @property
@@ -151,5 +153,6 @@ class TripRecorder:
             distance_m=rows[:, _TERM["progress"]],
             delay_s=rows[:, _TERM["delay"]],
             mean_jerk_mps3=10.0 * rows[:, _TERM["comfort"]] / np.maximum(steps, 1.0),
+            mean_speeding=rows[:, _TERM["speed"]] / np.maximum(steps, 1.0),
             least_ttc_s=TTC_HORIZON_S * (1.0 - worst_ttc),
         )

@@ -110,7 +110,7 @@ def measure_step_speed(
         road_m = float(max(along) - min(along)) + LANES * 10.0
         map_file = Path(folder) / "highway.net.xml"
         map_file.write_text(_straight_road(road_m), encoding="utf-8")
-        progress("compiling kernels (once, up to a minute) …")
+        progress("making our worlds on that road")
         batched, single = (_ours(map_file, agents, count) for count in (worlds, 1))
         rates: dict[str, list[float]] = {"batched": [], "single": [], "highway_env": []}
         for repeat in range(repeats):

@@ -49,6 +49,7 @@ HARD_STOP = 5.0  # m/s², a vehicle that needs more to stop before the line will
 GAP_S = 1.0  # s between the last of one and the first of the other in a shared area
 STEERED_MPS = 5.0  # a steered car is taken to turn no faster than this
 STANDING_MPS = 0.5
+LAST_CHANCE_M = 3.0  # with the front this near to the line
 ROOM_M = 3.0  # free way left behind a vehicle that clears a junction
 IMPATIENT_TICKS = 60  # a vehicle that stands this long without reason is not waited for
 STOP_SIGN_TICKS = 10  # ticks that one stands at a stop sign, and before a tie is broken
@@ -161,6 +162,8 @@ def _ignores(row: np.void, foe: np.void, signal: int) -> bool:
     """Whether a driver need not wait for an approaching foe that has the right of way."""
     if signal == SIGNAL_RED or signal == SIGNAL_RED_YELLOW:
         return True
+    if signal == SIGNAL_YELLOW_MINOR or signal == SIGNAL_YELLOW_MAJOR:
+        return True  # who cannot stop any more has been looked at before
     if foe["speed"] > STANDING_MPS:
         return False
     if foe["hold"] == HOLD_SIGNAL or foe["hold"] == HOLD_EXIT_BLOCKED:
@@ -283,7 +286,9 @@ def may_enter(
     if signal == SIGNAL_RED or signal == SIGNAL_RED_YELLOW:
         return HOLD_SIGNAL
     if (signal == SIGNAL_YELLOW_MINOR or signal == SIGNAL_YELLOW_MAJOR) and needed < COMFORT_STOP:
-        return HOLD_SIGNAL
+        # Who gave way at the line all through green goes now, as the others stop.
+        if row["hold"] != HOLD_YIELD or front > LAST_CHANCE_M:
+            return HOLD_SIGNAL
     target = roads.links[link]
     if target["num_conflicts"] == 0:
         return HOLD_NONE

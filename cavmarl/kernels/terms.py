@@ -42,10 +42,15 @@ def _progress(row: np.void, step_s: float) -> float:
 
 
 @kernel
-def _speed(roads: RoadArrays, row: np.void) -> float:
-    """Speed over the lane's limit."""
+def _of_limit(roads: RoadArrays, row: np.void) -> float:
     ratio: float = row["speed"] / roads.lanes[row["lane"]]["speed_mps"]
     return ratio
+
+
+@kernel
+def _speed(roads: RoadArrays, row: np.void) -> float:
+    """Speed above the lane's limit, as a share of it; what is lost below it is `delay`."""
+    return max(_of_limit(roads, row) - 1.0, 0.0)
 
 
 @kernel
@@ -102,7 +107,7 @@ def _event(row: np.void, bit: int) -> float:
 @kernel
 def _delay(roads: RoadArrays, row: np.void, step_s: float) -> float:
     """Time lost against driving at the limit, in s."""
-    return step_s * max(1.0 - _speed(roads, row), 0.0)
+    return step_s * max(1.0 - _of_limit(roads, row), 0.0)
 
 
 @kernel

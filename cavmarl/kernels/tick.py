@@ -42,7 +42,7 @@ def switch_signals(roads: RoadArrays, worlds: Worlds, dt: float) -> None:
         time = worlds.ticks[w] * dt
         for k in range(roads.signals.shape[0]):
             signal = roads.signals[k]
-            left = (time + signal["offset_s"]) % signal["cycle_s"]
+            left = (time - signal["offset_s"]) % signal["cycle_s"]
             phase = signal["first_phase"]
             last = phase + signal["num_phases"] - 1
             # Half a tick of slack: sums of ticks are not exact.

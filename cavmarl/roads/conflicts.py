@@ -11,11 +11,15 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["NEAR_M", "LinkPath", "Overlap", "least_distance", "overlap", "sample_path"]
+__all__ = ["LinkPath", "Overlap", "grazing", "overlap", "sample_path"]
 
 SAMPLE_M = 0.5
 # Half a car (2 m wide) on either path and a margin that covers corners cut in a turn.
 NEAR_M = 1.0 + 1.0 + 0.6
+# Half a car with a margin, and how quickly its heading follows the path (kernels.motion.TRAIL_M).
+HALF_LENGTH_M = 2.6
+HALF_WIDTH_M = 1.1
+TRAIL_M = 2.0
 # Paths further apart than this in height are a bridge and the road below it.
 CLEARANCE_M = 3.0
 # The half length of the stretch where foes never come near each other in the plane.
@@ -82,12 +86,60 @@ def overlap(path: LinkPath, foe: LinkPath, *, merging: bool) -> Overlap | None:
     return Overlap(*map(float, found))
 
 
-def least_distance(path: LinkPath, foe: LinkPath) -> float:
-    """The least distance in m of two paths in the plane, where they are on one level; else inf."""
+def grazing(path: LinkPath, foe: LinkPath) -> Overlap | None:
+    """Where cars on two paths would touch as they stand askew in their bends, or None.
+
+    Cars are boxes whose heading trails the path, as background vehicles drive. The answer is in places of
+    a front bumper that comes and a rear bumper that leaves, as in `overlap`.
+    """
     plane = path.xyz[:, None, :2] - foe.xyz[None, :, :2]
     square = plane[..., 0] * plane[..., 0] + plane[..., 1] * plane[..., 1]
     level = np.abs(path.xyz[:, None, 2] - foe.xyz[None, :, 2]) <= CLEARANCE_M
-    return float(np.sqrt(square[level].min())) if level.any() else float("inf")
+    reach = 2.0 * np.hypot(HALF_LENGTH_M, HALF_WIDTH_M)
+    rows, columns = np.nonzero(level & (square < reach * reach))
+    if not rows.size:
+        return None
+    mine, theirs = _headings(path)[rows], _headings(foe)[columns]
+    touching = ~_apart(plane[rows, columns], mine, theirs)
+    if not touching.any():
+        return None
+    here, there = path.s[rows[touching]], foe.s[columns[touching]]
+    return Overlap(*map(float, (*_from_centres(path, here), *_from_centres(foe, there))))
+
+
+def _headings(path: LinkPath) -> NDArray[np.float64]:
+    """Heading at each sample of a car whose heading follows the path within `TRAIL_M`."""
+    steps = np.diff(path.xyz[:, :2], axis=0)
+    directions = np.arctan2(steps[:, 1], steps[:, 0])
+    headings = np.empty(len(path.s))
+    headings[0] = directions[0]
+    for k, direction in enumerate(directions):
+        error = (direction - headings[k] + np.pi) % (2.0 * np.pi) - np.pi
+        share = min(1.0, (path.s[k + 1] - path.s[k]) / TRAIL_M)
+        headings[k + 1] = headings[k] + error * share
+    return headings
+
+
+def _apart(
+    apart: NDArray[np.float64], mine: NDArray[np.float64], theirs: NDArray[np.float64]
+) -> NDArray[np.bool_]:
+    """Whether pairs of car boxes have a separating axis; centres `apart` (n, 2), headings (n,)."""
+    across = np.abs(np.sin(mine - theirs))
+    along = np.abs(np.cos(mine - theirs))
+    separated = np.zeros(len(apart), dtype=np.bool_)
+    for heading in (mine, theirs):
+        forward = np.abs(apart[:, 0] * np.cos(heading) + apart[:, 1] * np.sin(heading))
+        sideways = np.abs(apart[:, 1] * np.cos(heading) - apart[:, 0] * np.sin(heading))
+        separated |= forward > HALF_LENGTH_M * (1.0 + along) + HALF_WIDTH_M * across
+        separated |= sideways > HALF_WIDTH_M * (1.0 + along) + HALF_LENGTH_M * across
+    return separated
+
+
+def _from_centres(path: LinkPath, centres: NDArray[np.float64]) -> tuple[float, float]:
+    """The stretch that a car covers of the shared area, from the places of its centre there."""
+    enter, leave = centres.min() + HALF_LENGTH_M, centres.max() - HALF_LENGTH_M
+    middle = 0.5 * (enter + leave)
+    return _stretch(path, min(enter, middle), max(leave, middle))
 
 
 def _stretch(path: LinkPath, start: float, end: float) -> tuple[float, float]:

@@ -174,7 +174,7 @@ SIGNAL = np.dtype(
         ("first_phase", np.int32),  # PHASE rows of the first program
         ("num_phases", np.int32),
         ("num_links", np.int32),  # letters in a state
-        ("offset_s", np.float64),
+        ("offset_s", np.float64),  # by which all phases are late
         ("cycle_s", np.float64),  # sum of the phases' durations
     ],
     align=True,

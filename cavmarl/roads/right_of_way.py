@@ -10,14 +10,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cavmarl.errors import MapError
-from cavmarl.roads.conflicts import LinkPath, Overlap, least_distance, overlap
+from cavmarl.roads.conflicts import LinkPath, Overlap, grazing, overlap
 from cavmarl.roads.network import CONFLICT
 from cavmarl.roads.selection import Movement
 
 __all__ = ["conflict_rows"]
-
-# Cars on paths that come nearer than this touch, as they stand askew in the bend.
-NEAR_MISS_M = 2.9
 
 Row = tuple[int, bool, float, float, float, float]
 
@@ -46,12 +43,16 @@ def conflict_rows(
     for links in by_node.values():
         for one, other in combinations(links, 2):
             a, b = movements[one], movements[other]
+            merging = a.connection.getToLane() is b.connection.getToLane()
             if _bit(a, b, a.node._foes) or _bit(b, a, a.node._foes):
-                merging = a.connection.getToLane() is b.connection.getToLane()
                 shared = _shared(paths[one], paths[other], merging=merging)
                 yields = _bit(a, b, a.node._prohibits), _bit(b, a, a.node._prohibits)
             elif a.connection.getFromLane() is not b.connection.getFromLane():
-                shared = _near_miss(paths[one], paths[other])
+                shared = (
+                    _shared(paths[one], paths[other], merging=True)
+                    if merging
+                    else _grazing(paths[one], paths[other])
+                )
                 yields = _turns_left(a) and not _turns_left(b), _turns_left(b)
             else:
                 continue
@@ -84,11 +85,8 @@ def _turns_left(movement: Movement) -> bool:
     return movement.connection.getDirection() in "lLt"
 
 
-def _near_miss(path: LinkPath | None, foe: LinkPath | None) -> Overlap | None:
-    """The stretch where cars on two paths would touch, or None where they pass each other."""
-    if path is None or foe is None or least_distance(path, foe) > NEAR_MISS_M:
-        return None
-    return overlap(path, foe, merging=False)
+def _grazing(path: LinkPath | None, foe: LinkPath | None) -> Overlap | None:
+    return None if path is None or foe is None else grazing(path, foe)
 
 
 def _shared(path: LinkPath | None, foe: LinkPath | None, *, merging: bool) -> Overlap | None:

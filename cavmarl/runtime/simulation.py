@@ -162,12 +162,12 @@ class Simulation:
         self._executor.each(lambda shard: shard.sense(self._everywhere))
 
     def _tick(self, commands: Commands) -> None:
-        """Traffic → advance → (exchange) → resolve → departures → (migrate) → commit."""
-        self._executor.each(Shard.switch_signals)
+        """Advance → (exchange) → resolve → departures → (migrate) → commit → signals."""
         self._executor.each(lambda shard: shard.advance(commands))
         self._executor.each(Shard.resolve)
         self._traffic.exchange(self._shard.worlds, self._shard.scratch, self.config.clock.sim_dt_s)
         self._executor.each(Shard.commit)
+        self._executor.each(Shard.switch_signals)
 
     def retire_agents(self) -> None:
         """Take out the agents whose trip ended in the last step; to be called after it is read."""

@@ -41,6 +41,10 @@ class NativeTraffic:
     population: PopulationConfig
     blank: NDArray[np.void]
 
+    def __post_init__(self) -> None:
+        # Trips that do not exist are refused when the world is made, not at its first reset.
+        _ = self.demand
+
     @cached_property
     def goal_edges(self) -> NDArray[np.int32]:
         """EDGE rows that trips lead to: named destinations first, then a spread over the map."""

@@ -73,7 +73,13 @@ class Worlds:
 def test_a_trip_is_the_sum_of_its_steps() -> None:
     worlds = Worlds()
     worlds.add(progress=(2.0, 1.0), comfort=(0.1, 0.0), time_to_collision=(0.25, 0.0))
-    worlds.add(progress=(4.0, 1.0), comfort=(0.3, 0.0), delay=(0.2, 0.0), red_light=(1.0, 0.0))
+    worlds.add(
+        progress=(4.0, 1.0),
+        comfort=(0.3, 0.0),
+        delay=(0.2, 0.0),
+        red_light=(1.0, 0.0),
+        speed=(0.3, 0.0),
+    )
     worlds.add(done=(True, True), progress=(6.0, 1.0), arrival=(1.0, 0.0), collision=(0.0, 1.0))
     trips = worlds.recorder.trips()
     assert trips.count == 2
@@ -83,6 +89,7 @@ def test_a_trip_is_the_sum_of_its_steps() -> None:
     assert trips.distance_m.tolist() == [12.0, 3.0]
     assert trips.duration_s.tolist() == [3 * STEP_S] * 2
     assert trips.delay_s == pytest.approx([0.2, 0.0])
+    assert trips.mean_speeding == pytest.approx([0.1, 0.0])
     assert trips.mean_jerk_mps3 == pytest.approx([4.0 / 3.0, 0.0])
     assert trips.least_ttc_s == pytest.approx([3.0, 4.0])
 

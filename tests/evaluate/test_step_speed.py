@@ -20,7 +20,10 @@ def test_both_sides_are_measured() -> None:
     for rates in (found.batched, found.single, found.highway_env):
         assert 0.0 < rates.low <= rates.median <= rates.high
     assert found.ratio == found.batched.median / found.highway_env.median
-    assert any("compiling" in text for text in told)
+    assert [text for text in told if text.startswith("measuring")] == [
+        "measuring, 1 of 2",
+        "measuring, 2 of 2",
+    ]
 
 
 def test_the_road_can_be_driven(tmp_path: Path) -> None:

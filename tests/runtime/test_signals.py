@@ -55,8 +55,7 @@ def test_signals_show_what_the_map_plans(env: str, offset: str | None, tmp_path:
     for k in range(0, 2400):
         now = letters(simulation)
         if k % 13 == 0 or k < 3:
-            # The state stands for the tick that led here.
-            assert now == planned(source, max(k - 1, 0) * tick), f"tick {k}"
+            assert now == planned(source, k * tick), f"tick {k}"
         seen.add(tuple(now.values()))
         simulation.step(idle(simulation))
     assert len(seen) > 3

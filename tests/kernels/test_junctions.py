@@ -1,0 +1,289 @@
+"""Right of way, acted out: a few cars put by hand on the arms of one crossing, and who goes first."""
+
+from __future__ import annotations
+
+import subprocess
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from cavmarl.runtime.simulation import Simulation
+from tests.driving import drive, make_traffic, start
+from tests.kernels.traffic import on_lane
+
+sumo = pytest.importorskip("sumo", reason="crossings are made by netconvert of the extra 'sumo'")
+
+ARM_M = 150
+NODES = {"W": (-ARM_M, 0), "E": (ARM_M, 0), "S": (0, -ARM_M), "N": (0, ARM_M)}
+
+
+@pytest.fixture(scope="module")
+def crossing(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], Path]:
+    """A crossing of a west-east main road and a south-north side road, by SUMO's type of its node."""
+    folder = tmp_path_factory.mktemp("crossings")
+
+    def build(kind: str) -> Path:
+        target = folder / f"{kind}.net.xml"
+        if target.exists():
+            return target
+        nodes = "".join(f'<node id="{n}" x="{x}" y="{y}"/>' for n, (x, y) in NODES.items())
+        edges = "".join(
+            f'<edge id="{arm}_in" from="{arm}" to="c" numLanes="1" speed="14" priority="{priority}"/>'
+            f'<edge id="{arm}_out" from="c" to="{arm}" numLanes="1" speed="14" priority="{priority}"/>'
+            for arm, priority in (("W", 9), ("E", 9), ("S", 1), ("N", 1))
+        )
+        (folder / "c.nod.xml").write_text(
+            f'<nodes>{nodes}<node id="c" x="0" y="0" type="{kind}"/></nodes>'
+        )
+        (folder / "c.edg.xml").write_text(f"<edges>{edges}</edges>")
+        binary = Path(sumo.SUMO_HOME) / "bin" / "netconvert"
+        command = [str(binary), "-n", "c.nod.xml", "-e", "c.edg.xml", "-o", target.name]
+        subprocess.run([*command, "--no-turnarounds"], cwd=folder, check=True, capture_output=True)
+        return target
+
+    return build
+
+
+class Scene:
+    """A crossing with the cars that were put on it; goes on tick by tick."""
+
+    def __init__(self, path: Path) -> None:
+        self.simulation: Simulation = make_traffic(
+            path, background=12, renewed=False, overrides={"clock.ctrl_dt_s": 0.05}
+        )
+        traffic = self.simulation._traffic
+        vars(traffic)["demand"] = traffic.demand._replace(num_background=0)
+        start(self.simulation, seed=0)
+        self.names: list[str] = []
+
+    def put(self, name: str, lane: str, to_line_m: float, goal: str, **fields: Any) -> None:
+        """A car whose front is `to_line_m` before the end of a lane and that drives to edge `goal`."""
+        network, worlds = self.simulation.network, self.simulation._shard.worlds
+        row = network.lane_ids.index(lane)
+        s = float(network.lanes[row]["length_m"]) - to_line_m - 2.5
+        goals = [network.edge_ids[edge] for edge in self.simulation.goal_edges]
+        car = on_lane(network, row, s, goal=goals.index(goal), **fields)
+        plan = self.simulation._traffic.plans[car[0]["goal"], row]
+        car["to_go"] = plan["to_go"] - s
+        car["id"] = worlds.next_id[0]
+        worlds.next_id[0] += 1
+        worlds.rows[0, worlds.num_owned[0]] = car[0]
+        worlds.num_owned[0] += 1
+        worlds.num_rows[0] += 1
+        self.names.append(name)
+
+    def __getitem__(self, name: str) -> Any:
+        """The record of a car that is still there."""
+        vehicles = self.simulation.vehicles()
+        return vehicles[vehicles["id"] == self.names.index(name)][0]
+
+    def run(self, seconds: float) -> Iterator[float]:
+        """Yields the time after each tick; nobody may touch anybody."""
+        for _ in range(round(seconds / 0.05)):
+            drive(self.simulation)
+            vehicles = self.simulation.vehicles()
+            assert (vehicles["hit"] < 0).all(), "a crash"
+            yield float(self.simulation.ticks()[0]) * 0.05
+
+    def entries(self, seconds: float) -> dict[str, float]:
+        """When each car's front crossed its line."""
+        times: dict[str, float] = {}
+        network = self.simulation.network
+        for time in self.run(seconds):
+            for car in self.simulation.vehicles():
+                name = self.names[car["id"]]
+                lane = network.lanes[car["lane"]]
+                front_is_over = car["s"] + 2.5 > lane["length_m"] and lane["num_links"] > 0
+                if name not in times and (front_is_over or lane["internal"]):
+                    times[name] = time
+        return times
+
+
+@pytest.fixture
+def scene(crossing: Callable[[str], Path]) -> Callable[[str], Scene]:
+    return lambda kind: Scene(crossing(kind))
+
+
+Make = Callable[[str], Scene]
+
+
+def test_alone_on_the_main_road_one_drives_through(scene: Make) -> None:
+    here = scene("priority")
+    here.put("main", "W_in_0", 60.0, "E_out", speed=14.0)
+    lowest = min(float(here["main"]["speed"]) for _ in here.run(8.0))
+    assert lowest > 12.0
+
+
+def test_the_side_road_gives_way_to_the_main_road(scene: Make) -> None:
+    here = scene("priority")
+    here.put("side", "S_in_0", 25.0, "N_out", speed=10.0)
+    here.put("main", "W_in_0", 45.0, "E_out", speed=14.0)
+    times = here.entries(12.0)
+    assert times["main"] < times["side"]
+    assert times["main"] < 4.5, "who has the right of way need not brake"
+
+
+def test_the_side_road_goes_first_where_the_gap_is_large(scene: Make) -> None:
+    here = scene("priority")
+    here.put("side", "S_in_0", 5.0, "N_out", speed=5.0)
+    here.put("main", "W_in_0", 135.0, "E_out", speed=12.0)
+    times = here.entries(15.0)
+    assert times["side"] < 3.0
+    assert times["side"] < times["main"]
+
+
+def test_the_side_road_waits_for_a_whole_column_and_then_goes(scene: Make) -> None:
+    here = scene("priority")
+    here.put("side", "S_in_0", 20.0, "N_out", speed=8.0)
+    for k in range(5):
+        here.put(f"main{k}", "W_in_0", 10.0 + 25.0 * k, "E_out", speed=13.0)
+    times = here.entries(30.0)
+    assert times["side"] > max(times[f"main{k}"] for k in range(5))
+
+
+def test_a_left_turn_gives_way_to_who_comes_straight(scene: Make) -> None:
+    here = scene("priority")
+    here.put("left", "W_in_0", 20.0, "N_out", speed=10.0)
+    here.put("straight", "E_in_0", 30.0, "W_out", speed=13.0)
+    times = here.entries(15.0)
+    assert times["straight"] < times["left"]
+
+
+def test_right_comes_before_left_between_equals(scene: Make) -> None:
+    here = scene("right_before_left")
+    here.put("west", "W_in_0", 30.0, "E_out", speed=10.0)
+    here.put("south", "S_in_0", 30.0, "N_out", speed=10.0)
+    times = here.entries(15.0)
+    assert times["south"] < times["west"], "who comes from the right goes first"
+
+
+def test_four_at_once_between_equals_get_through(scene: Make) -> None:
+    here = scene("right_before_left")
+    ways = {"W": "E", "E": "W", "S": "N", "N": "S"}
+    for arm, goal in ways.items():
+        here.put(arm, f"{arm}_in_0", 30.0, f"{goal}_out", speed=10.0)
+    assert here.entries(40.0).keys() == set(ways)
+
+
+def test_a_stop_sign_makes_one_stand_even_if_nobody_comes(scene: Make) -> None:
+    here = scene("priority_stop")
+    here.put("side", "S_in_0", 40.0, "N_out", speed=12.0)
+    slowest = np.inf
+    stood = 0
+    for _ in here.run(20.0):
+        lane = here.simulation.network.lane_ids[here["side"]["lane"]]
+        if lane == "S_in_0":
+            slowest = min(slowest, float(here["side"]["speed"]))
+            stood = max(stood, int(here["side"]["wait"]))
+    assert slowest < 0.05
+    assert stood * 0.05 >= 0.5
+    assert here.simulation.network.lane_ids[here["side"]["lane"]] != "S_in_0", "then it goes on"
+
+
+def test_an_all_way_stop_lets_one_after_the_other_through(scene: Make) -> None:
+    here = scene("allway_stop")
+    ways = {"W": "E", "E": "W", "S": "N", "N": "S"}
+    for k, (arm, goal) in enumerate(ways.items()):
+        here.put(arm, f"{arm}_in_0", 30.0 + 10.0 * k, f"{goal}_out", speed=10.0)
+    slowest = dict.fromkeys(ways, np.inf)
+    lanes = here.simulation.network.lane_ids
+    passed = set()
+    for _ in here.run(45.0):
+        for car in here.simulation.vehicles():
+            arm = here.names[car["id"]]
+            if lanes[car["lane"]] == f"{arm}_in_0":
+                slowest[arm] = min(slowest[arm], float(car["speed"]))
+            else:
+                passed.add(arm)
+    assert passed == set(ways)
+    assert max(slowest.values()) < 0.1, "everybody stood"
+
+
+def red_for(here: Scene, link: int) -> str:
+    """The letter that a link's signal shows."""
+    network = here.simulation.network
+    row = network.links[link]
+    phase = network.phases[here.simulation.signal_phases()[row["signal"]]]
+    return "rugGysoOY"[network.phase_states[phase["first_state"] + row["signal_index"]]]
+
+
+def test_at_red_one_stops_before_the_line_and_goes_at_green(scene: Make) -> None:
+    here = scene("traffic_light")
+    network = here.simulation.network
+    for arm, goal in (("W", "E_out"), ("S", "N_out")):
+        here.put(arm, f"{arm}_in_0", 60.0, goal, speed=13.0)
+    links = {
+        arm: int(here.simulation._traffic.plans[here[arm]["goal"], here[arm]["lane"]]["link"])
+        for arm in ("W", "S")
+    }
+    stood = set()
+    crossed: dict[str, str] = {}
+    for _ in here.run(100.0):
+        for car in here.simulation.vehicles():
+            arm = here.names[car["id"]]
+            if network.lane_ids[car["lane"]] == f"{arm}_in_0":
+                front = float(network.lanes[car["lane"]]["length_m"] - car["s"] - 2.5)
+                if car["speed"] < 0.05:
+                    stood.add(arm)
+                    assert 0.0 < front < 3.0
+                    assert red_for(here, links[arm]) in "ry"
+            elif arm not in crossed:
+                crossed[arm] = red_for(here, links[arm])
+    assert stood, "one of them met red"
+    assert set(crossed) == {"W", "S"}
+    assert set(crossed.values()) <= set("gG")
+
+
+@pytest.mark.parametrize(("to_line_m", "goes"), [(8.0, True), (60.0, False)])
+def test_at_yellow_one_goes_on_only_if_stopping_would_be_hard(
+    scene: Make, to_line_m: float, goes: bool
+) -> None:
+    here = scene("traffic_light")
+    network = here.simulation.network
+    here.put("probe", "W_in_0", 140.0, "E_out")
+    link = int(here.simulation._traffic.plans[here["probe"]["goal"], here["probe"]["lane"]]["link"])
+    # On to the first tick of yellow, then put the car where it is to decide.
+    here.simulation._shard.worlds.num_owned[0] = here.simulation._shard.worlds.num_rows[0] = 0
+    for _ in here.run(200.0):
+        if red_for(here, link) == "y":
+            break
+    assert red_for(here, link) == "y"
+    here.names.append("car")
+    here.simulation._shard.worlds.next_id[0] = 1
+    here.names.pop()
+    here.put("car", "W_in_0", to_line_m, "E_out", speed=13.0)
+    crossed_at = None
+    for _ in here.run(8.0):
+        on_arm = network.lane_ids[here["car"]["lane"]] == "W_in_0"
+        if not on_arm and crossed_at is None:
+            crossed_at = red_for(here, link)
+    assert (crossed_at == "y") == goes
+    if not goes:
+        assert crossed_at is None
+        assert here["car"]["speed"] < 1.0
+
+
+def test_nobody_enters_where_there_is_no_room_beyond(scene: Make) -> None:
+    here = scene("priority")
+    network = here.simulation.network
+    length = float(network.lanes[network.lane_ids.index("E_out_0")]["length_m"])
+    # A car that stands for ever right behind the junction: its way ends there.
+    here.put("block", "E_out_0", length - 9.0, "E_out", speed=0.0, hit=-1)
+    block = here.simulation.vehicles()[0]
+    block["driver"] = 1
+    block["agent"] = 0
+    here.put("next", "W_in_0", 40.0, "E_out", speed=12.0)
+    here.put("cross", "S_in_0", 60.0, "N_out", speed=10.0)
+    lanes = network.lane_ids
+    seen_cross = False
+    for _ in here.run(25.0):
+        vehicles = here.simulation.vehicles()
+        stuck = vehicles[vehicles["id"] == here.names.index("block")]
+        stuck["speed"] = 0.0
+        assert lanes[here["next"]["lane"]] == "W_in_0", "it keeps the junction free"
+        crossing = vehicles[vehicles["id"] == here.names.index("cross")]
+        seen_cross |= bool(len(crossing) and lanes[crossing[0]["lane"]] == "N_out_0")
+    assert seen_cross, "so that others can cross"

@@ -1,0 +1,74 @@
+"""Vehicles on the lanes of the entries' maps, for the kernels that need roads."""
+
+from __future__ import annotations
+
+from functools import cache
+
+import numpy as np
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+
+from cavmarl.kernels.arrays import Scratch
+from cavmarl.kernels.motion import place_on_lane
+from cavmarl.registry import load_config, resolve_map
+from cavmarl.roads.cache import load_network
+from cavmarl.roads.network import RoadNetwork
+from cavmarl.roads.routing import make_plans
+from cavmarl.shard.shard import _make_scratch
+from cavmarl.shard.vehicles import VEHICLE, blank_vehicle
+
+NAMES = ("ring", "merge", "grid4x4")
+
+
+@cache
+def network(name: str) -> RoadNetwork:
+    """The roads of an entry."""
+    return load_network(resolve_map(*load_config(name)))
+
+
+@cache
+def plans(name: str) -> NDArray[np.void]:
+    """PLAN (4, L): four goals spread over the edges outside junctions."""
+    roads = network(name)
+    outside = np.flatnonzero(~roads.edges["internal"])
+    picks = np.linspace(0, len(outside) - 1, 4).astype(int)
+    return make_plans(roads, [int(edge) for edge in outside[picks]])
+
+
+def scratch(roads: RoadNetwork, capacity: int) -> Scratch:
+    """Room for the kernels."""
+    return _make_scratch(len(roads.lanes), len(roads.links), capacity)
+
+
+def on_lane(roads: RoadNetwork, lane: int, s: float, **fields: object) -> NDArray[np.void]:
+    """VEHICLE (1,): a car on a lane, in its direction; `fields` override columns."""
+    row = blank_vehicle()
+    row["lane"], row["target_lane"], row["s"] = lane, lane, s
+    for field, value in fields.items():
+        row[field] = value
+    cos, sin = place_on_lane(roads.arrays, row[0])
+    if "heading" not in fields:
+        row["heading"] = np.arctan2(sin, cos)
+    return row
+
+
+@st.composite
+def crowds_on_lanes(draw: st.DrawFn, name: str, most: int = 24) -> NDArray[np.void]:
+    """Cars on a few lanes of an entry, many at equal places, ids in random order."""
+    roads = network(name)
+    lanes = draw(st.lists(st.integers(0, len(roads.lanes) - 1), min_size=1, max_size=5))
+    places = draw(
+        st.lists(
+            st.tuples(st.sampled_from(lanes), st.integers(0, 4), st.booleans()),
+            min_size=1,
+            max_size=most,
+        )
+    )
+    rows = np.zeros(len(places), VEHICLE)
+    rows["id"] = draw(st.permutations(range(len(places))))
+    for row, (lane, quarter, astride) in zip(rows, places, strict=True):
+        here = roads.lanes[lane]
+        row["lane"], row["s"] = lane, 0.25 * quarter * here["length_m"]
+        row["side_lane"] = max(here["left"], here["right"]) if astride else -1
+        row["length"] = 5.0
+    return rows

@@ -1,0 +1,81 @@
+"""Who is where on which lane, by looking at all vehicles."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cavmarl.roads.network import RoadNetwork
+
+Entry = tuple[float, int, int]  # s, id, row
+
+
+def on_lane(roads: RoadNetwork, rows: NDArray[np.void], lane: int) -> list[Entry]:
+    """Who is on a lane or covers it from the side, by (s, id)."""
+    found = []
+    for i, row in enumerate(rows):
+        if row["lane"] == lane:
+            found.append((float(row["s"]), int(row["id"]), i))
+        if row["side_lane"] == lane:
+            share = roads.lanes[lane]["length_m"] / roads.lanes[row["lane"]]["length_m"]
+            # In the order of the kernel: s · length / length.
+            s = row["s"] * roads.lanes[lane]["length_m"] / roads.lanes[row["lane"]]["length_m"]
+            assert math.isclose(s, row["s"] * share)
+            found.append((float(s), int(row["id"]), i))
+    return sorted(found)
+
+
+def ahead(
+    roads: RoadNetwork, rows: NDArray[np.void], i: int, lane: int, s: float
+) -> tuple[int, float]:
+    """The next one beyond (s, own id): (row, s) or (-1, inf)."""
+    for other_s, other_id, j in on_lane(roads, rows, lane):
+        if j != i and (other_s, other_id) > (s, rows[i]["id"]):
+            return j, other_s
+    return -1, math.inf
+
+
+def _behind_here(
+    roads: RoadNetwork, rows: NDArray[np.void], i: int, lane: int, s: float
+) -> tuple[int, float]:
+    for other_s, other_id, j in reversed(on_lane(roads, rows, lane)):
+        if j != i and (other_s, other_id) <= (s, rows[i]["id"]):
+            return j, other_s
+    return -1, -math.inf
+
+
+def behind(
+    roads: RoadNetwork, rows: NDArray[np.void], i: int, lane: int, s: float, reach_m: float
+) -> tuple[int, float]:
+    """The nearest one behind, over lane borders: (row, distance) or (-1, inf)."""
+    j, other_s = _behind_here(roads, rows, i, lane, s)
+    if j >= 0:
+        return j, s - other_s
+    found = []
+    for before in _into(roads, lane):
+        distance = s
+        for _ in range(4):
+            if distance > reach_m:
+                break
+            length = float(roads.lanes[before]["length_m"])
+            j, other_s = _behind_here(roads, rows, i, before, math.inf)
+            if j >= 0:
+                found.append((distance + length - other_s, int(rows[j]["id"]), j))
+                break
+            distance += length
+            following = _into(roads, before)
+            if not following:
+                break
+            before = following[0]
+    if not found:
+        return -1, math.inf
+    distance, _, j = min(found)
+    return j, distance
+
+
+def _into(roads: RoadNetwork, lane: int) -> list[int]:
+    row = roads.lanes[lane]
+    first = row["first_into"]
+    return [int(before) for before in roads.into[first : first + row["num_into"]]]

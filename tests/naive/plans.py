@@ -1,0 +1,75 @@
+"""Least travel times over the lane graph by repeating the definition until nothing changes."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cavmarl.roads.network import RoadNetwork
+
+LANE_CHANGE_COST_S = 5.0
+SHORT_LANE_M = 50.0
+
+
+def followers(roads: RoadNetwork, lane: int) -> list[tuple[int, int]]:
+    """(next lane, link or -1) of the movements that a way may take from the end of a lane.
+
+    Turning round is one only where the whole road leads nowhere else.
+    """
+    row = roads.lanes[lane]
+    if row["internal"]:
+        return [(int(row["successor"]), -1)]
+    edge = roads.edges[row["edge"]]
+    beside = range(edge["first_lane"], edge["first_lane"] + edge["num_lanes"])
+    dead_end = all(_turns_round(roads, link) for other in beside for link in _links(roads, other))
+    return [
+        (int(roads.links[link]["next_lane"]), link)
+        for link in _links(roads, lane)
+        if dead_end or not _turns_round(roads, link)
+    ]
+
+
+def _links(roads: RoadNetwork, lane: int) -> range:
+    row = roads.lanes[lane]
+    return range(int(row["first_link"]), int(row["first_link"] + row["num_links"]))
+
+
+def _turns_round(roads: RoadNetwork, link: int) -> bool:
+    return chr(roads.links[link]["direction"]) == "t"
+
+
+def neighbours(roads: RoadNetwork, lane: int, permission: int) -> list[int]:
+    """The lanes beside a lane that may be driven."""
+    row = roads.lanes[lane]
+    beside = [int(row["left"]), int(row["right"])]
+    return [b for b in beside if b >= 0 and roads.lanes[b]["permissions"] & permission]
+
+
+def change_cost(roads: RoadNetwork, lane: int) -> float:
+    """What it costs to leave a lane sideways, in s."""
+    return LANE_CHANGE_COST_S + max(SHORT_LANE_M - float(roads.lanes[lane]["length_m"]), 0.0)
+
+
+def costs(roads: RoadNetwork, goal_edge: int, permission: int) -> NDArray[np.float64]:
+    """(L,) travel time in s from the start of each lane to the end of the goal edge, or inf."""
+    drive = roads.lanes["length_m"] / roads.lanes["speed_mps"]
+    allowed = roads.lanes["permissions"] & permission != 0
+    cost = np.full(len(roads.lanes), math.inf)
+    while True:
+        before = cost.copy()
+        for lane in np.flatnonzero(allowed):
+            if roads.lanes[lane]["edge"] == goal_edge:
+                cost[lane] = drive[lane]
+                continue
+            through = [
+                drive[lane] + before[n] for n, _ in followers(roads, lane) if allowed[n]
+            ]
+            sideways = [
+                change_cost(roads, lane) + before[beside]
+                for beside in neighbours(roads, lane, permission)
+            ]
+            cost[lane] = min([*through, *sideways, before[lane]])
+        if np.array_equal(cost, before):
+            return cost

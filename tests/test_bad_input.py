@@ -1,0 +1,450 @@
+"""Wrong input: a typed error that names the place and the cure, and a world that has not changed."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from cavmarl import (
+    ActionError,
+    CapacityError,
+    CavEnv,
+    ConfigError,
+    EpisodeEndedError,
+    InvalidActionError,
+    MapError,
+    MissingActionError,
+    ResetNeededError,
+    RouteError,
+    UnknownAgentError,
+    UnknownEnvironmentError,
+    make_vec,
+    parallel_env,
+)
+
+FINE = np.zeros(2, dtype=np.float32)
+
+
+def make(mode: str = "closed", **overrides: Any) -> CavEnv:
+    env = parallel_env(
+        "ring",
+        agents=3,
+        background=4,
+        seed=0,
+        overrides={"population.mode": mode, **{k.replace("__", "."): v for k, v in overrides.items()}},
+    )
+    env.reset()
+    return env
+
+
+def refused(env: CavEnv, actions: Any, error: type[Exception], *words: str) -> None:
+    """`actions` are refused by `error`, whose message holds `words`, and the step can be repeated."""
+    before, stats, agents = env.state_hash(), env.traffic_stats(), list(env.agents)
+    with pytest.raises(error) as caught:
+        env.step(actions)
+    for word in words:
+        assert word in str(caught.value)
+    assert isinstance(caught.value, ActionError)
+    assert (env.state_hash(), env.traffic_stats(), env.agents) == (before, stats, agents)
+    twin = make(env.config.population.mode, **{"action__kind": env.config.action.kind})
+    fine = env.suggest_actions()
+    assert twin.state_hash() == before
+    env.step(fine)
+    twin.step(fine)
+    assert env.state_hash() == twin.state_hash(), "the refused step left a trace"
+
+
+# Actions
+
+
+@pytest.mark.parametrize(
+    ("value", "words"),
+    [
+        (np.array([0.0, np.nan]), ("car_1", "steering", "nan", "finite")),
+        (np.array([np.inf, 0.0]), ("car_1", "throttle", "inf", "finite")),
+        (np.array([-np.inf, 0.0]), ("car_1", "throttle", "finite")),
+        (np.array([1e9, 0.0]), ("car_1", "throttle", "[-1, 1]", "clip")),
+        (np.array([0.0, -1.001]), ("car_1", "steering", "-1.001", "[-1, 1]")),
+        (np.zeros(3), ("car_1", "(3,)", "(2,)")),
+        (np.zeros(1), ("car_1", "(1,)", "(2,)")),
+        (np.zeros((1, 2)), ("car_1", "(1, 2)")),
+        (np.zeros(()), ("car_1", "()", "(2,)")),
+        (0.5, ("car_1", "()", "(2,)")),
+        (None, ("car_1",)),
+        ([], ("car_1", "(0,)", "(2,)")),
+        ([[0.0], [0.0, 0.0]], ("car_1",)),
+        (["a", "b"], ("car_1", "numbers")),
+        ("ab", ("car_1",)),
+        (np.array([0.0, 0.0], dtype=object), ("car_1", "object", "numbers")),
+        (np.array([0j, 0j]), ("car_1", "complex", "numbers")),
+        (np.array([True, False]), ("car_1", "bool", "numbers")),
+        ({"throttle": 0.0}, ("car_1",)),
+        ([10**400, 0], ("car_1",)),
+    ],
+    ids=repr,
+)
+def test_a_wrong_continuous_action_is_refused(value: Any, words: tuple[str, ...]) -> None:
+    refused(make(), {"car_0": FINE, "car_1": value, "car_2": FINE}, InvalidActionError, *words)
+
+
+@pytest.mark.parametrize("dtype", [np.float16, np.float32, np.float64, np.int8, np.int64, np.uint8])
+def test_dtypes_that_cast_without_loss_are_accepted(dtype: type[np.generic]) -> None:
+    env, twin = make(), make()
+    value = np.array([1, 0], dtype=dtype)
+    env.step(dict.fromkeys(env.agents, value))
+    twin.step(dict.fromkeys(twin.agents, [1.0, 0.0]))
+    assert env.state_hash() == twin.state_hash()
+
+
+@pytest.mark.parametrize(
+    ("value", "words"),
+    [
+        (5, ("car_1", "5", "0 to 4")),
+        (-1, ("car_1", "-1", "0 to 4")),
+        (99, ("car_1", "99")),
+        (2**63, ("car_1",)),
+        (2**64, ("car_1",)),
+        (1.0, ("car_1", "float", "whole")),
+        (np.nan, ("car_1", "float", "whole")),
+        (True, ("car_1", "bool", "whole")),
+        ("3", ("car_1", "whole")),
+        (None, ("car_1", "whole")),
+        (np.array([1]), ("car_1", "(1,)")),
+    ],
+    ids=repr,
+)
+def test_a_wrong_meta_action_is_refused(value: Any, words: tuple[str, ...]) -> None:
+    env = make(action__kind="discrete")
+    refused(env, {"car_0": 1, "car_1": value, "car_2": 1}, InvalidActionError, *words)
+
+
+def test_missing_actions_are_named_all() -> None:
+    refused(make(), {"car_1": FINE}, MissingActionError, "car_0, car_2", "missing_action")
+    refused(make(), {}, MissingActionError, "car_0, car_1, car_2")
+
+
+@pytest.mark.parametrize("stranger", ["car_3", "Car_0", "", 0, None, ("car_0",)])
+def test_actions_for_nobody_are_refused(stranger: Any) -> None:
+    actions = {**dict.fromkeys(["car_0", "car_1", "car_2"], FINE), stranger: FINE}
+    refused(make(), actions, UnknownAgentError, repr(stranger), "car_0", "car_2")
+
+
+@pytest.mark.parametrize("actions", [None, [FINE] * 3, np.zeros((3, 2)), "car_0", 3])
+def test_actions_that_are_no_dict_are_refused(actions: Any) -> None:
+    refused(make(), actions, InvalidActionError, "dict")
+
+
+def lose_one(env: CavEnv) -> str:
+    """Drive one agent off the road."""
+    while "car_0" in env.agents:
+        actions = env.suggest_actions()
+        actions["car_0"] = np.array([1.0, 1.0], np.float32)
+        env.step(actions)
+    assert env.agents
+    return "car_0"
+
+
+def test_actions_for_an_agent_that_has_left_are_refused() -> None:
+    env = make()
+    gone = lose_one(env)
+    before = env.state_hash()
+    with pytest.raises(UnknownAgentError, match=r"car_0.*not in the world.*late_actions = ignore"):
+        env.step({**env.suggest_actions(), gone: FINE})
+    assert env.state_hash() == before
+
+
+def test_late_actions_can_be_ignored_and_are_counted() -> None:
+    env, twin = make(action__late_actions="ignore"), make()
+    gone = lose_one(env)
+    lose_one(twin)
+    env.step({**env.suggest_actions(), gone: np.array([np.nan, 7.0])})
+    twin.step(twin.suggest_actions())
+    assert env.state_hash() == twin.state_hash()
+    assert env.traffic_stats()["actions_ignored"] == 1
+    with pytest.raises(UnknownAgentError):
+        env.step({**env.suggest_actions(), "car_99": FINE})
+
+
+def test_values_beyond_the_range_can_be_clipped_and_are_counted() -> None:
+    env, twin = make(action__out_of_range="clip"), make()
+    env.step({**env.suggest_actions(), "car_1": np.array([1e9, -2.0])})
+    twin.step({**twin.suggest_actions(), "car_1": np.array([1.0, -1.0])})
+    assert env.state_hash() == twin.state_hash()
+    assert env.traffic_stats()["actions_clipped"] == 2
+    before = env.state_hash()
+    for value in (np.nan, np.inf):
+        with pytest.raises(InvalidActionError, match="finite"):
+            env.step({**env.suggest_actions(), "car_1": np.array([value, 0.0])})
+    assert env.state_hash() == before
+    assert env.traffic_stats()["actions_clipped"] == 2
+
+
+@pytest.mark.parametrize(("kind", "first", "idle"), [("continuous", [0.5, 0.1], [0, 0]), ("discrete", 3, 1)])
+def test_missing_actions_can_be_held_and_are_counted(kind: str, first: Any, idle: Any) -> None:
+    env = make(action__missing_action="hold", action__kind=kind)
+    twin = make(action__kind=kind)
+    for given in ({"car_1": first}, {}, {"car_0": first}):
+        env.step(given)
+    car_0, car_1, car_2 = env.possible_agents
+    for one, other in ((idle, first), (idle, first), (first, first)):
+        twin.step({car_0: one, car_1: other, car_2: idle})
+    assert env.state_hash() == twin.state_hash()
+    assert env.traffic_stats()["actions_held"] == 2 + 3 + 2
+    env.reset(seed=0)
+    twin.reset(seed=0)
+    env.step({})
+    twin.step(dict.fromkeys(twin.agents, idle))
+    assert env.state_hash() == twin.state_hash(), "a new episode holds nothing of the old"
+
+
+# Calls that do not fit the episode
+
+
+def test_step_and_render_before_reset_are_refused() -> None:
+    env = parallel_env("ring", render_mode="rgb_array")
+    for call in (lambda: env.step({"car_0": FINE}), lambda: env.step({}), env.render):
+        with pytest.raises(ResetNeededError, match=r"reset\(seed"):
+            call()
+    with pytest.raises(ResetNeededError, match=r"reset\(seed"):
+        make_vec("ring").step(np.zeros((1, 4, 2)))
+
+
+def test_actions_after_the_end_are_refused() -> None:
+    env = parallel_env("ring", agents=2, background=0, seed=0, max_cycles=2)
+    env.reset()
+    for _ in range(2):
+        env.step(env.suggest_actions())
+    before = env.state_hash()
+    with pytest.raises(EpisodeEndedError, match=r"env\.reset\(\)"):
+        env.step({"car_0": FINE})
+    assert env.step({}) == ({}, {}, {}, {}, {})
+    assert env.state_hash() == before
+
+
+def test_render_without_a_mode_is_refused() -> None:
+    with pytest.raises(ConfigError, match="render_mode"):
+        make().render()
+
+
+@pytest.mark.parametrize("seed", [-1, 2**63, 1.5, "0", True, np.nan, [1]])
+def test_seeds_that_are_none_are_refused(seed: Any) -> None:
+    env, vec = make(), make_vec("ring")
+    before = env.state_hash()
+    for call in (env.reset, vec.reset):
+        with pytest.raises(ConfigError, match="seed"):
+            call(seed=seed)
+    assert env.state_hash() == before
+    with pytest.raises(ConfigError, match="seed"):
+        parallel_env("ring", seed=seed).reset()
+
+
+# Many worlds
+
+
+@pytest.mark.parametrize(
+    ("actions", "words"),
+    [
+        (np.zeros((1, 3, 2)), ("(1, 3, 2)", "(2, 3, 2)", "num_envs")),
+        (np.zeros((3, 3, 2)), ("(3, 3, 2)", "(2, 3, 2)")),
+        (np.zeros((2, 4, 2)), ("(2, 4, 2)",)),
+        (np.zeros((2, 3)), ("(2, 3)",)),
+        (np.zeros((2, 3, 3)), ("(2, 3, 3)",)),
+        (np.zeros(()), ("()",)),
+        (None, ("numbers",)),
+        ({"car_0": FINE}, ("numbers",)),
+        ([[1.0], [1.0, 2.0]], ("numbers",)),
+        (np.zeros((2, 3, 2), dtype=complex), ("complex", "numbers")),
+        (np.zeros((2, 3, 2), dtype=bool), ("bool", "numbers")),
+        (np.full((2, 3, 2), np.nan), ("world 0", "car_0", "throttle", "finite")),
+        (np.full((2, 3, 2), 1.5), ("world 0", "car_0", "[-1, 1]")),
+    ],
+    ids=lambda value: str(getattr(value, "shape", value)),
+)
+def test_wrong_arrays_are_refused_before_any_world_moves(
+    actions: Any, words: tuple[str, ...]
+) -> None:
+    vec = make_vec("ring", num_envs=2, agents=3, background=4, seed=0)
+    vec.reset()
+    before = [vec.state_hash(world) for world in range(2)]
+    with pytest.raises(InvalidActionError) as caught:
+        vec.step(actions)
+    for word in words:
+        assert word in str(caught.value)
+    assert [vec.state_hash(world) for world in range(2)] == before
+    vec.step(vec.suggest_actions())
+
+
+def test_the_world_with_the_wrong_value_is_named() -> None:
+    vec = make_vec("ring", num_envs=3, agents=3, background=0, seed=0)
+    vec.reset()
+    actions = np.zeros((3, 3, 2))
+    actions[2, 1, 1] = np.inf
+    with pytest.raises(InvalidActionError, match="world 2, car_1, steering"):
+        vec.step(actions)
+
+
+@pytest.mark.parametrize("num_envs", [0, -1, 65_537, 1.5, "2", None, True])
+def test_a_number_of_worlds_that_cannot_be_is_refused(num_envs: Any) -> None:
+    with pytest.raises(ConfigError, match="num_envs"):
+        make_vec("ring", num_envs=num_envs)
+
+
+# Configuration
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        ({"agents": 0}, ("population.agents", "0", "from 1")),
+        ({"agents": -3}, ("population.agents", "-3")),
+        ({"agents": 2.5}, ("population.agents", "2.5")),
+        ({"agents": True}, ("population.agents", "True")),
+        ({"background": -1}, ("population.background", "-1")),
+        ({"background": "many"}, ("population.background", "many")),
+        ({"zones": 4}, ("zones.count", "4", "use 1")),
+        ({"workers": 2}, ("workers", "2", "use 0")),
+        ({"max_cycles": 0}, ("max_cycles", "0")),
+        ({"max_cycles": -5}, ("max_cycles", "-5")),
+        ({"max_cycles": 1.5}, ("max_cycles", "1.5")),
+        ({"max_cycles": float("nan")}, ("max_cycles", "nan")),
+        ({"render_mode": "ascii"}, ("render_mode", "ascii", "rgb_array")),
+        ({"overrides": {"sensors.lidar.ray": 3}}, ("sensors.lidar.ray", "sensors.lidar.rays")),
+        ({"overrides": {"sensor.lidar.rays": 3}}, ("sensor", "sensors")),
+        ({"overrides": {"sensors.lidar.range_km": 1.0}}, ("range_km", "range_m", "unit")),
+        ({"overrides": {"lidar.rays": 3}}, ("lidar",)),
+        ({"overrides": {"sensors.lidar.rays": -1}}, ("sensors.lidar.rays", "-1", "0 to 1024")),
+        ({"overrides": {"sensors.lidar.rays": "64"}}, ("sensors.lidar.rays", "64")),
+        ({"overrides": {"horizon_s": float("nan")}}, ("horizon_s", "nan")),
+        ({"overrides": {"horizon_s": float("inf")}}, ("horizon_s",)),
+        ({"overrides": {"horizon_s": -1.0}}, ("horizon_s", "-1")),
+        ({"overrides": {"clock.sim_dt_s": 0.0}}, ("clock.sim_dt_s", "0.001")),
+        ({"overrides": {"clock.ctrl_dt_s": 0.12}}, ("clock.ctrl_dt_s", "0.12", "0.05", "try 0.1")),
+        ({"overrides": {"clock.control_latency_ticks": 17}}, ("control_latency_ticks", "0 to 16")),
+        ({"overrides": {"population.mode": "open"}}, ("population.mode", "closed", "seats")),
+        (
+            {"overrides": {"population.mode": "entering", "population.budget": 1}, "agents": 2},
+            ("population.budget", "1", "2"),
+        ),
+        ({"overrides": {"terms.weights": {"speeed": 1.0}}}, ("terms.weights", "speeed", "speed")),
+        ({"overrides": {"terms.weights": {"speed": float("inf")}}}, ("terms.weights",)),
+        ({"overrides": {"traffic.min_trip_m": 1e5}}, ("traffic.min_trip_m", "longest way")),
+        ({"overrides": {"traffic.origins": ["nowhere"]}}, ("traffic.origins", "nowhere")),
+        ({"overrides": {"traffic.destinations": ["x"]}}, ("traffic.destinations", "x")),
+        ({"agents": 3, "overrides": {"population.agents": 4}}, ("population.agents", "keyword")),
+    ],
+    ids=repr,
+)
+def test_a_world_that_cannot_be_is_refused(
+    arguments: dict[str, Any], words: tuple[str, ...]
+) -> None:
+    with pytest.raises(ConfigError) as caught:
+        parallel_env("ring", **arguments)
+    for word in words:
+        assert word in str(caught.value)
+
+
+def test_more_agents_than_the_map_can_take_are_refused() -> None:
+    env = parallel_env("ring", agents=500, background=0, seed=0)
+    with pytest.raises(CapacityError, match=r"population\.agents = 500.*population\.mode"):
+        env.reset()
+    with pytest.raises(ResetNeededError):
+        env.step({})
+
+
+def test_an_unknown_environment_is_refused_with_what_there_is() -> None:
+    with pytest.raises(UnknownEnvironmentError, match=r"mreg.*did you mean merge"):
+        parallel_env("mreg")
+
+
+# Maps: what the reader and netconvert refuse is tested beside them; here, that the environment says it.
+
+NET = """<?xml version="1.0"?>
+<net version="1.20">
+  <location netOffset="0,0" convBoundary="0,0,0,0" origBoundary="0,0,0,0" projParameter="!"/>
+  <edge id="a" from="A" to="B">
+    <lane id="a_0" index="0" speed="14" length="200" shape="0,0 200,0"/>
+  </edge>
+  <edge id="b" from="C" to="D">
+    <lane id="b_0" index="0" speed="14" length="200" shape="0,50 200,50"/>
+  </edge>
+  <junction id="A" type="dead_end" x="0" y="0" incLanes="" intLanes="" shape=""/>
+  <junction id="B" type="dead_end" x="200" y="0" incLanes="a_0" intLanes="" shape=""/>
+  <junction id="C" type="dead_end" x="0" y="50" incLanes="" intLanes="" shape=""/>
+  <junction id="D" type="dead_end" x="200" y="50" incLanes="b_0" intLanes="" shape=""/>
+</net>
+"""
+
+Write = Callable[..., Path]
+
+
+@pytest.fixture
+def write(tmp_path: Path) -> Write:
+    def write_map(text: str, name: str = "small.net.xml") -> Path:
+        path = tmp_path / name
+        path.write_text(text, encoding="utf-8")
+        return path
+
+    return write_map
+
+
+BOMB = '<!DOCTYPE net [<!ENTITY a "aaaa"><!ENTITY b "&a;&a;&a;&a;">]>\n<net>&b;</net>'
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "",
+        "no xml at all",
+        NET[:400],
+        BOMB,
+        "<net/>",
+        NET.replace('shape="0,0 200,0"', 'shape="0,0 nan,0"'),
+        NET.replace('shape="0,0 200,0"', 'shape="0,0"'),
+        NET.replace('shape="0,0 200,0"', 'shape="0,0 0,0"').replace('length="200"', 'length="0"', 1),
+        NET.replace('speed="14"', 'speed="nan"', 1),
+        NET.replace('speed="14"', 'speed="-1"', 1),
+        NET.replace('edge id="b"', 'edge id="a"'),
+    ],
+    ids=["empty", "text", "cut", "bomb", "bare", "nan", "point", "zero", "speed", "back", "twice"],
+)
+def test_a_broken_map_is_refused(write: Write, text: str) -> None:
+    path = write(text)
+    with pytest.raises(MapError, match="small"):
+        parallel_env(path)
+
+
+def test_a_map_in_two_parts_is_driven_and_nobody_goes_across(write: Write) -> None:
+    env = parallel_env(write(NET), agents=2, background=4, seed=0)
+    env.reset()
+    network = env.network
+    for _ in range(30):
+        for vehicle in env.simulation.vehicles():
+            goal = network.edge_ids[env.simulation.goal_edges[vehicle["goal"]]]
+            assert goal == network.edge_ids[network.lanes[vehicle["lane"]]["edge"]]
+        if env.agents:
+            env.step(env.suggest_actions())
+
+
+def test_a_way_across_the_parts_is_refused(write: Write) -> None:
+    with pytest.raises(ConfigError, match=r"no trip|no way"):
+        parallel_env(
+            write(NET), overrides={"traffic.origins": ["a"], "traffic.destinations": ["b"]}
+        )
+
+
+def test_a_map_without_a_road_for_cars_is_refused(write: Write) -> None:
+    text = NET.replace('speed="14"', 'speed="14" allow="pedestrian"')
+    with pytest.raises((RouteError, MapError), match="small"):
+        parallel_env(write(text))
+
+
+def test_a_map_that_is_not_there_is_refused(tmp_path: Path) -> None:
+    folder = tmp_path / "mine"
+    folder.mkdir()
+    (folder / "env.yaml").write_text("name: mine\nmap: {source: lost.net.xml}\n")
+    with pytest.raises(MapError, match=r"map\.source.*lost\.net\.xml"):
+        parallel_env(folder)
