@@ -352,6 +352,7 @@ class TermsConfig:
     weights: dict[str, float] = field(
         default_factory=lambda: {
             "progress": 0.1,
+            "speed": -1.0,
             "comfort": -0.01,
             "time_to_collision": -0.1,
             "collision": -10.0,

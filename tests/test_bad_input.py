@@ -35,7 +35,10 @@ def make(mode: str = "closed", **overrides: Any) -> CavEnv:
         agents=3,
         background=4,
         seed=0,
-        overrides={"population.mode": mode, **{k.replace("__", "."): v for k, v in overrides.items()}},
+        overrides={
+            "population.mode": mode,
+            **{k.replace("__", "."): v for k, v in overrides.items()},
+        },
     )
     env.reset()
     return env
@@ -183,7 +186,9 @@ def test_values_beyond_the_range_can_be_clipped_and_are_counted() -> None:
     assert env.traffic_stats()["actions_clipped"] == 2
 
 
-@pytest.mark.parametrize(("kind", "first", "idle"), [("continuous", [0.5, 0.1], [0, 0]), ("discrete", 3, 1)])
+@pytest.mark.parametrize(
+    ("kind", "first", "idle"), [("continuous", [0.5, 0.1], [0, 0]), ("discrete", 3, 1)]
+)
 def test_missing_actions_can_be_held_and_are_counted(kind: str, first: Any, idle: Any) -> None:
     env = make(action__missing_action="hold", action__kind=kind)
     twin = make(action__kind=kind)
@@ -404,7 +409,9 @@ BOMB = '<!DOCTYPE net [<!ENTITY a "aaaa"><!ENTITY b "&a;&a;&a;&a;">]>\n<net>&b;<
         "<net/>",
         NET.replace('shape="0,0 200,0"', 'shape="0,0 nan,0"'),
         NET.replace('shape="0,0 200,0"', 'shape="0,0"'),
-        NET.replace('shape="0,0 200,0"', 'shape="0,0 0,0"').replace('length="200"', 'length="0"', 1),
+        NET.replace('shape="0,0 200,0"', 'shape="0,0 0,0"').replace(
+            'length="200"', 'length="0"', 1
+        ),
         NET.replace('speed="14"', 'speed="nan"', 1),
         NET.replace('speed="14"', 'speed="-1"', 1),
         NET.replace('edge id="b"', 'edge id="a"'),

@@ -158,8 +158,11 @@ def _earliest(distance: float, speed: float, limit: float) -> float:
 
 
 @kernel
-def _ignores(row: np.void, foe: np.void, signal: int) -> bool:
-    """Whether a driver need not wait for an approaching foe that has the right of way."""
+def _ignores(row: np.void, foe: np.void, link: int, signal: int) -> bool:
+    """Whether a driver at `link` need not wait for an approaching foe that has the right of way.
+
+    `signal` is what the foe's own signal shows.
+    """
     if signal == SIGNAL_RED or signal == SIGNAL_RED_YELLOW:
         return True
     if signal == SIGNAL_YELLOW_MINOR or signal == SIGNAL_YELLOW_MAJOR:
@@ -169,7 +172,9 @@ def _ignores(row: np.void, foe: np.void, signal: int) -> bool:
     if foe["hold"] == HOLD_SIGNAL or foe["hold"] == HOLD_EXIT_BLOCKED:
         return True
     if foe["hold"] == HOLD_YIELD:
-        # Both wait for somebody: who has stood longer goes first.
+        # Both wait for somebody: who has stood longer goes first, and then goes on.
+        if row["hold"] == HOLD_NONE and row["stopped_at"] == link:
+            return True
         if row["wait"] < STOP_SIGN_TICKS or row["speed"] > STANDING_MPS:
             return False
         longer: bool = row["wait"] > foe["wait"]
@@ -224,7 +229,7 @@ def _blocked_by_foes(
             front = max(foe_distance - foe_half, 0.01)
             committed = foe["speed"] * foe["speed"] > 2.0 * HARD_STOP * front
             if not committed:
-                if not (gives_way and conflict["must_yield"]) or _ignores(row, foe, foe_signal):
+                if not (gives_way and conflict["must_yield"]) or _ignores(row, foe, link, foe_signal):
                     continue
             if cleared + GAP_S < time_in:
                 continue

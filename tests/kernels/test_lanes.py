@@ -92,7 +92,9 @@ def test_the_order_of_rows_does_not_matter(
 
 def test_of_two_at_one_place_the_larger_id_leads() -> None:
     roads = network("ring")
-    rows = np.zeros(2, crowd := np.dtype([("id", "i8"), ("lane", "i4"), ("side_lane", "i4"), ("s", "f8")]))
+    rows = np.zeros(
+        2, crowd := np.dtype([("id", "i8"), ("lane", "i4"), ("side_lane", "i4"), ("s", "f8")])
+    )
     assert crowd
     rows["id"], rows["side_lane"], rows["s"] = [7, 3], -1, 10.0
     room = indexed(roads, rows)

@@ -58,7 +58,11 @@ def test_distances_add_up_along_the_way(name: str) -> None:
             while plan[lanes[changes]]["change"] != 0:
                 changes += 1
             assert plan[lane]["changes"] == changes
-            turns = [chr(roads.links[plan[k]["link"]]["direction"]) for k in driven if plan[k]["link"] >= 0]
+            turns = [
+                chr(roads.links[plan[k]["link"]]["direction"])
+                for k in driven
+                if plan[k]["link"] >= 0
+            ]
             assert plan[lane]["turnarounds"] == turns.count("t")
 
 

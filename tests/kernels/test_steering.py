@@ -59,7 +59,9 @@ def test_in_the_middle_of_a_straight_lane_the_wheels_are_straight() -> None:
     assert steer_to_lane(roads.arrays, plans("merge"), row[0], lane) == pytest.approx(0.0, abs=1e-9)
     for d, sign in ((0.5, -1.0), (-0.5, 1.0)):
         aside = on_lane(roads, lane, 50.0, speed=10.0, d=d)
-        assert math.copysign(1.0, steer_to_lane(roads.arrays, plans("merge"), aside[0], lane)) == sign
+        assert (
+            math.copysign(1.0, steer_to_lane(roads.arrays, plans("merge"), aside[0], lane)) == sign
+        )
     left = steer_to_lane(roads.arrays, plans("merge"), row[0], int(roads.lanes[lane]["left"]))
     assert left > 0.0
 

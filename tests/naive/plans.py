@@ -63,9 +63,7 @@ def costs(roads: RoadNetwork, goal_edge: int, permission: int) -> NDArray[np.flo
             if roads.lanes[lane]["edge"] == goal_edge:
                 cost[lane] = drive[lane]
                 continue
-            through = [
-                drive[lane] + before[n] for n, _ in followers(roads, lane) if allowed[n]
-            ]
+            through = [drive[lane] + before[n] for n, _ in followers(roads, lane) if allowed[n]]
             sideways = [
                 change_cost(roads, lane) + before[beside]
                 for beside in neighbours(roads, lane, permission)

@@ -15,7 +15,7 @@ from cavmarl.runtime.simulation import Simulation
 from tests.driving import drive, make_simulation, make_traffic, start
 
 # Entries with as many background vehicles as flow freely there.
-FREE_FLOW = {"ring": 12, "merge": 14, "grid4x4": 40, "town": 60}
+FREE_FLOW = {"ring": 12, "merge": 14, "grid4x4": 40, "town": 40}
 PER_TICK = {"clock.ctrl_dt_s": 0.05}
 
 
@@ -96,8 +96,8 @@ def test_speed_limits_hold_for_every_driver_in_his_own_measure(env: str) -> None
             ratios.append(ratio)
             roads.append(~lane["internal"])
     ratio = np.concatenate(ratios)
-    # Who comes into a slower bend may still be braking in its first metres.
-    assert ratio.max() < 1.2
+    # The model closes in on a lower limit from above, so a last few per cent remain.
+    assert ratio.max() < 1.05
     assert np.mean(ratio[np.concatenate(roads)] > 1.001) < 0.02
     assert ratio.max() > 0.9, "nobody drives at the limit where the road is free"
 
@@ -113,7 +113,9 @@ def test_nobody_drives_through_red(env: str) -> None:
         for world in range(2):
             vehicles = simulation.vehicles(world)
             now = dict(zip(vehicles["id"].tolist(), vehicles["link"].tolist(), strict=True))
-            entered = {now[i] for i in now if now[i] >= 0 and before[world].get(i, now[i]) != now[i]}
+            entered = {
+                now[i] for i in now if now[i] >= 0 and before[world].get(i, now[i]) != now[i]
+            }
             before[world] = now
             phases = simulation.signal_phases(world)
             for link in entered:

@@ -1,0 +1,123 @@
+"""What `import cavmarl` gives, and what it costs."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+import types
+from pathlib import Path
+
+import gymnasium
+import pettingzoo
+import pytest
+
+import cavmarl
+from cavmarl import registry
+
+ROOT = Path(__file__).resolve().parents[1]
+
+LATE = (
+    "torch",
+    "stable_baselines3",
+    "highway_env",
+    "libsumo",
+    "sumolib",
+    "sumo",
+    "pydantic",
+    "pygame",
+    "imageio",
+    "typer",
+    "rich",
+    "fastapi",
+    "ray",
+)
+
+PROBE = """
+import json, sys, time
+start = time.process_time()
+import cavmarl
+spent = time.process_time() - start
+print(json.dumps([spent, sorted(name.split(".")[0] for name in sys.modules)]))
+"""
+
+
+@pytest.fixture(scope="module")
+def imported() -> tuple[float, set[str]]:
+    """Least CPU seconds of three imports in fresh processes, and the packages that they load."""
+    runs = []
+    for _ in range(3):
+        done = subprocess.run(
+            [sys.executable, "-c", PROBE], cwd=ROOT, check=True, capture_output=True, text=True
+        )
+        runs.append(json.loads(done.stdout))
+    return min(spent for spent, _ in runs), set(runs[0][1])
+
+
+def test_the_import_is_quick(imported: tuple[float, set[str]]) -> None:
+    assert imported[0] < 1.5
+
+
+@pytest.mark.parametrize("package", LATE)
+def test_optional_and_heavy_packages_are_loaded_when_they_are_needed(
+    imported: tuple[float, set[str]], package: str
+) -> None:
+    assert package not in imported[1]
+
+
+def test_all_lists_the_public_names_in_order() -> None:
+    constants, classes = str.isupper, str.istitle
+    assert cavmarl.__all__ == sorted(
+        cavmarl.__all__, key=lambda name: (not constants(name), not classes(name[0]), name)
+    )
+    public = {
+        name
+        for name, value in vars(cavmarl).items()
+        if not name.startswith("_") and not isinstance(value, types.ModuleType)
+    }
+    assert set(cavmarl.__all__) - {"__version__"} == public
+
+
+def test_what_the_readme_promises_is_there() -> None:
+    for name in ("parallel_env", "env", "raw_env", "make_vec", "load_policy"):
+        assert name in cavmarl.__all__
+        assert callable(getattr(cavmarl, name))
+        assert getattr(cavmarl, name).__doc__
+
+
+def test_every_public_error_is_one_of_ours() -> None:
+    errors = [
+        value
+        for name in cavmarl.__all__
+        if isinstance(value := getattr(cavmarl, name), type) and issubclass(value, Exception)
+    ]
+    assert len(errors) > 10
+    assert all(issubclass(error, cavmarl.CavmarlError) for error in errors)
+
+
+def test_every_entry_has_its_ids() -> None:
+    names = list(registry.entries())
+    for name in names:
+        assert f"cavmarl/{name}-v0" in gymnasium.registry
+        assert f"cavmarl/{name}Agents-v0" in gymnasium.registry
+    ours = {spec for spec in gymnasium.registry if spec.startswith("cavmarl/")}
+    assert len(ours) == 2 * len(names)
+
+
+def test_the_ids_make_environments() -> None:
+    ego = gymnasium.make("cavmarl/ring-v0")
+    observation, _ = ego.reset(seed=0)
+    assert ego.observation_space.contains(observation)
+    assert ego.step(ego.action_space.sample())[0].shape == observation.shape
+    rows = gymnasium.make_vec("cavmarl/ringAgents-v0")
+    observations, _ = rows.reset(seed=0)
+    assert observations.shape == rows.observation_space.shape
+    ego.close()
+    rows.close()
+
+
+@pytest.mark.skipif(not hasattr(pettingzoo, "register"), reason="needs PettingZoo 1.27")
+def test_pettingzoo_makes_them_by_id() -> None:
+    env = pettingzoo.make("parallel", "cavmarl/ring-v0")
+    observations, _ = env.reset(seed=0)
+    assert list(observations) == env.unwrapped.possible_agents
