@@ -1,4 +1,4 @@
-"""Wrong input: a typed error that names the place and the cure, and a world that has not changed."""
+"""Wrong input: a typed error that names place and cure, and a world that has not changed."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def make(mode: str = "closed", **overrides: Any) -> CavEnv:
 
 
 def refused(env: CavEnv, actions: Any, error: type[Exception], *words: str) -> None:
-    """`actions` are refused by `error`, whose message holds `words`, and the step can be repeated."""
+    """`actions` are refused by an `error` that holds `words`, and the step can be repeated."""
     before, stats, agents = env.state_hash(), env.traffic_stats(), list(env.agents)
     with pytest.raises(error) as caught:
         env.step(actions)
@@ -97,9 +97,8 @@ def test_a_wrong_continuous_action_is_refused(value: Any, words: tuple[str, ...]
 @pytest.mark.parametrize("dtype", [np.float16, np.float32, np.float64, np.int8, np.int64, np.uint8])
 def test_dtypes_that_cast_without_loss_are_accepted(dtype: type[np.generic]) -> None:
     env, twin = make(), make()
-    value = np.array([1, 0], dtype=dtype)
-    env.step(dict.fromkeys(env.agents, value))
-    twin.step(dict.fromkeys(twin.agents, [1.0, 0.0]))
+    env.step(dict.fromkeys(env.agents, np.array([1, 0], dtype=dtype)))
+    twin.step(dict.fromkeys(twin.agents, np.array([1.0, 0.0])))
     assert env.state_hash() == twin.state_hash()
 
 
@@ -365,7 +364,7 @@ def test_an_unknown_environment_is_refused_with_what_there_is() -> None:
         parallel_env("mreg")
 
 
-# Maps: what the reader and netconvert refuse is tested beside them; here, that the environment says it.
+# Maps: what the reader and netconvert refuse is tested beside them; here, what a user sees.
 
 NET = """<?xml version="1.0"?>
 <net version="1.20">

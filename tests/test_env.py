@@ -15,7 +15,8 @@ from cavmarl.shard.sensors import layout
 ENDS = ("arrival", "collision", "off_road")
 
 
-def make(env: str = "merge", mode: str = "closed", **arguments: Any) -> CavEnv:
+def make(env: str = "merge", mode: str = "closed", **arguments: Any) -> Any:
+    """A small environment; Any, as observations are arrays in one form and dicts in the other."""
     overrides: Mapping[str, Any] = arguments.pop("overrides", {})
     return parallel_env(
         env,
@@ -50,7 +51,9 @@ def test_entering_agents_come_once_and_no_more_than_declared() -> None:
     env = make("merge", "entering", agents=3, overrides={"population.budget": 9})
     assert len(env.possible_agents) == 9
     observations, infos = env.reset()
-    seen, gone, vehicles = list(env.agents), set(), {}
+    seen = list(env.agents)
+    gone: set[str] = set()
+    vehicles: dict[str, int] = {}
     rng = np.random.default_rng(1)
     while env.agents:
         assert not gone & set(env.agents), "an id came back"
@@ -192,12 +195,12 @@ def test_the_reward_is_the_weighted_sum_of_the_terms(mode: str, share: float) ->
 
 
 def test_terms_that_are_not_named_weigh_nothing() -> None:
-    env = make("ring", overrides={"terms.weights": {"speed": 2.0}})
+    env = make("ring", overrides={"terms.weights": {"delay": 2.0}})
     env.reset()
     for _ in range(5):
         _, rewards, _, _, infos = env.step(env.suggest_actions())
         for agent, reward in rewards.items():
-            assert reward == pytest.approx(2.0 * infos[agent]["speed"], rel=1e-6)
+            assert reward == pytest.approx(2.0 * infos[agent]["delay"], rel=1e-6)
 
 
 @pytest.mark.parametrize("mode", ["closed", "entering", "seats"])
@@ -405,7 +408,7 @@ def test_traffic_stats_count_what_happened() -> None:
     env = make("merge", "seats")
     env.reset()
     rng = np.random.default_rng(5)
-    ended = {term: 0 for term in ENDS}
+    ended = dict.fromkeys(ENDS, 0)
     for _ in range(120):
         _, _, _, _, infos = env.step(wild(env, rng))
         for info in infos.values():

@@ -77,7 +77,7 @@ def test_a_world_of_arrays_is_the_parallel_environment(mode: str) -> None:
             k = int(agent[4:])
             assert rewards[0, k] == np.float32(paid[agent])
             np.testing.assert_array_equal(
-                infos["terms"][0, k], np.float32([told[agent][term] for term in TERMS])
+                infos["terms"][0, k], np.array([told[agent][term] for term in TERMS], np.float32)
             )
             assert infos["vehicle_done"][0, k] == told[agent]["vehicle_done"]
             assert terminations[0, k] == bool(told[agent]["vehicle_done"])
@@ -179,15 +179,20 @@ def test_the_arrays_have_the_shapes_and_dtypes_of_the_spaces() -> None:
     vec = make(3)
     shape = (3, 4)
     size = vec.single_observation_space.shape[0]
+
+    def check(array: NDArray[Any], dtype: type[np.generic], *more: int) -> None:
+        assert array.shape == (*shape, *more)
+        assert array.dtype == dtype
+
     observations, infos = vec.reset(seed=0)
-    assert (observations.shape, observations.dtype) == ((*shape, size), np.float32)
+    check(observations, np.float32, size)
     actions = vec.suggest_actions()
-    assert (actions.shape, actions.dtype) == ((*shape, 2), np.float32)
+    check(actions, np.float32, 2)
     observations, rewards, terminations, truncations, infos = vec.step(actions)
-    assert (observations.shape, observations.dtype) == ((*shape, size), np.float32)
-    assert (rewards.shape, rewards.dtype) == (shape, np.float32)
+    check(observations, np.float32, size)
+    check(rewards, np.float32)
     for ends in (terminations, truncations, infos["mask"], infos["acted"], infos["vehicle_done"]):
-        assert (ends.shape, ends.dtype) == (shape, np.bool_)
+        check(ends, np.bool_)
     assert infos["terms"].shape == (*shape, len(TERMS))
     assert infos["final_observations"].shape == observations.shape
     assert infos["episode_over"].shape == (3,)
@@ -197,12 +202,12 @@ def test_the_arrays_have_the_shapes_and_dtypes_of_the_spaces() -> None:
 
 def test_results_are_the_callers_to_keep() -> None:
     vec = make(2)
-    kept = [vec.reset(seed=0)]
+    vec.reset(seed=0)
+    kept = vec.step(vec.suggest_actions())[:4]
+    copies = [array.copy() for array in kept]
     for _ in range(45):
-        kept.append(vec.step(vec.suggest_actions()))
-        if len(kept) == 2:
-            early = [np.copy(array) for array in kept[1][:4]]
-    for array, copy in zip(kept[1][:4], early, strict=True):
+        vec.step(vec.suggest_actions())
+    for array, copy in zip(kept, copies, strict=True):
         np.testing.assert_array_equal(array, copy)
 
 

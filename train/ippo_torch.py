@@ -1,6 +1,7 @@
 """PPO with one network shared by all agents (IPPO), on batched worlds.
 
     python train/ippo_torch.py --env merge --minutes 2
+    python train/ippo_torch.py --config configs/train/merge_ippo.yaml
     python train/ippo_torch.py --resume runs/merge_ippo_1 --total-agent-steps 8000000
 
 Every agent learns from its own observations and rewards; all of them share the weights (Schulman et
@@ -33,7 +34,7 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 from torch import Tensor, nn
 
 from cavmarl.config import TERMS
-from cavmarl.config_io import validate
+from cavmarl.config_io import read_yaml, validate
 from cavmarl.errors import CavmarlError, ConfigError, PolicyError, require
 from cavmarl.networks import ActorCritic, NetworkConfig, load_network, save_network
 from cavmarl.vector_env import CavVectorEnv, make_vec
@@ -112,7 +113,10 @@ class Args:
 
 
 def parse_args(words: Sequence[str] | None = None) -> Args:
-    """The settings that the command line asks for; of a resumed run, those that it began with."""
+    """The settings that the command line asks for; of a resumed run, those that it began with.
+
+    `--config FILE` is a YAML file of the same settings, which options shadow.
+    """
     parser = argparse.ArgumentParser(
         description=(__doc__ or "").splitlines()[0], argument_default=argparse.SUPPRESS
     )
@@ -124,9 +128,13 @@ def parse_args(words: Sequence[str] | None = None) -> Args:
         extra = {} if kind is bool else {"type": kind, "metavar": kind.__name__.upper()}
         shown = f"{text} (default: {field.default!r})"
         parser.add_argument(option, action=action, help=shown, **extra)
+    parser.add_argument("--config", metavar="FILE", type=Path, help="YAML file of these settings")
     given = vars(parser.parse_args(words))
+    config = given.pop("config", None)
     if not given.get("resume"):
-        return Args(**given)
+        return replace(
+            validate(Args, read_yaml(config), str(config)) if config else Args(), **given
+        )
     if refused := given.keys() - CAN_CHANGE:
         names = ", ".join(f"--{name.replace('_', '-')}" for name in sorted(refused))
         raise ConfigError(f"{names}: cannot change when a run is resumed")

@@ -17,7 +17,9 @@ from cavmarl.errors import ConfigError
 
 __all__ = ["demo"]
 
-_SCRIPT = Path(__file__).resolve().parents[2] / "train" / "ippo_torch.py"
+_CHECKOUT = Path(__file__).resolve().parents[2]
+_SCRIPT = _CHECKOUT / "train" / "ippo_torch.py"
+_SETTINGS = _CHECKOUT / "configs" / "train" / "demo.yaml"
 
 EVALUATION_SEED = 1000  # far from the seeds of training
 EPISODES = 32
@@ -81,7 +83,7 @@ def demo(
 
 def _train(out: Path, minutes: float, seed: int) -> Path:
     """Run the training program; the folder of the driver."""
-    command = [sys.executable, str(_SCRIPT), "--env", "merge", "--minutes", str(minutes)]
+    command = [sys.executable, str(_SCRIPT), "--config", str(_SETTINGS), "--minutes", str(minutes)]
     command += ["--seed", str(seed), "--runs", str(out), "--name", "driver"]
     done = subprocess.run(command, check=False)
     if done.returncode:

@@ -229,7 +229,9 @@ def _blocked_by_foes(
             front = max(foe_distance - foe_half, 0.01)
             committed = foe["speed"] * foe["speed"] > 2.0 * HARD_STOP * front
             if not committed:
-                if not (gives_way and conflict["must_yield"]) or _ignores(row, foe, link, foe_signal):
+                if not (gives_way and conflict["must_yield"]) or _ignores(
+                    row, foe, link, foe_signal
+                ):
                     continue
             if cleared + GAP_S < time_in:
                 continue

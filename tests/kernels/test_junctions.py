@@ -1,4 +1,4 @@
-"""Right of way, acted out: a few cars put by hand on the arms of one crossing, and who goes first."""
+"""Right of way, acted out: a few cars put by hand on the arms of a crossing, and who goes first."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ NODES = {"W": (-ARM_M, 0), "E": (ARM_M, 0), "S": (0, -ARM_M), "N": (0, ARM_M)}
 
 @pytest.fixture(scope="module")
 def crossing(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], Path]:
-    """A crossing of a west-east main road and a south-north side road, by SUMO's type of its node."""
+    """A west-east main road and a south-north side road that cross, by SUMO's type of the node."""
     folder = tmp_path_factory.mktemp("crossings")
 
     def build(kind: str) -> Path:
@@ -32,9 +32,9 @@ def crossing(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], Path]:
             return target
         nodes = "".join(f'<node id="{n}" x="{x}" y="{y}"/>' for n, (x, y) in NODES.items())
         edges = "".join(
-            f'<edge id="{arm}_in" from="{arm}" to="c" numLanes="1" speed="14" priority="{priority}"/>'
-            f'<edge id="{arm}_out" from="c" to="{arm}" numLanes="1" speed="14" priority="{priority}"/>'
+            f'<edge id="{arm}_{way}" from="{start}" to="{end}" speed="14" priority="{priority}"/>'
             for arm, priority in (("W", 9), ("E", 9), ("S", 1), ("N", 1))
+            for way, start, end in (("in", arm, "c"), ("out", "c", arm))
         )
         (folder / "c.nod.xml").write_text(
             f'<nodes>{nodes}<node id="c" x="0" y="0" type="{kind}"/></nodes>'
@@ -61,7 +61,7 @@ class Scene:
         self.names: list[str] = []
 
     def put(self, name: str, lane: str, to_line_m: float, goal: str, **fields: Any) -> None:
-        """A car whose front is `to_line_m` before the end of a lane and that drives to edge `goal`."""
+        """A car whose front is `to_line_m` before a lane's end and that drives to edge `goal`."""
         network, worlds = self.simulation.network, self.simulation._shard.worlds
         row = network.lane_ids.index(lane)
         s = float(network.lanes[row]["length_m"]) - to_line_m - 2.5

@@ -25,7 +25,7 @@ def test_plans_take_the_least_time_from_every_lane(name: str) -> None:
     for goal, plan in zip(edges, make_plans(roads, edges), strict=True):
         cost = naive.costs(roads, goal, PASSENGER)
         np.testing.assert_array_equal(np.isfinite(plan["to_go"]), np.isfinite(cost))
-        for lane in np.flatnonzero(np.isfinite(cost)):
+        for lane in np.flatnonzero(np.isfinite(cost)).tolist():
             step = plan[lane]
             if roads.lanes[lane]["edge"] == goal:
                 assert (step["next"], step["link"], step["change"]) == (-1, -1, 0)
@@ -46,8 +46,8 @@ def test_distances_add_up_along_the_way(name: str) -> None:
     roads = network(name)
     edges = goals(roads)
     for goal, plan in zip(edges, make_plans(roads, edges), strict=True):
-        for lane in np.flatnonzero(np.isfinite(plan["to_go"])):
-            lanes = way(roads, plan, int(lane))
+        for lane in np.flatnonzero(np.isfinite(plan["to_go"])).tolist():
+            lanes = way(roads, plan, lane)
             assert roads.lanes[lanes[-1]]["edge"] == goal
             driven = [k for k in lanes if plan[k]["change"] == 0]
             assert plan[lane]["to_go"] == pytest.approx(roads.lanes["length_m"][driven].sum())

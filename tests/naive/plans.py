@@ -59,7 +59,7 @@ def costs(roads: RoadNetwork, goal_edge: int, permission: int) -> NDArray[np.flo
     cost = np.full(len(roads.lanes), math.inf)
     while True:
         before = cost.copy()
-        for lane in np.flatnonzero(allowed):
+        for lane in np.flatnonzero(allowed).tolist():
             if roads.lanes[lane]["edge"] == goal_edge:
                 cost[lane] = drive[lane]
                 continue

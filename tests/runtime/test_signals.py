@@ -28,7 +28,7 @@ def letters(simulation: Simulation) -> dict[str, str]:
 
 def planned(source: Path, time: Fraction) -> dict[str, str]:
     """What the programs of a SUMO network say, as SUMO runs them: at time - offset in the cycle."""
-    states = {}
+    states: dict[str, str] = {}
     for program in ElementTree.parse(source).getroot().iter("tlLogic"):
         phases = [(Fraction(p.get("duration", "")), p.get("state", "")) for p in program]
         left = (time - Fraction(program.get("offset", "0"))) % sum(d for d, _ in phases)

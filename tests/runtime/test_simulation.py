@@ -1,4 +1,4 @@
-"""Traffic that nobody steers: nobody is lost, nobody crashes, nobody breaks a rule, nobody stands for ever."""
+"""Traffic without agents: nobody is lost, crashes, breaks a rule, or stands for ever."""
 
 from __future__ import annotations
 

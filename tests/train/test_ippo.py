@@ -12,9 +12,12 @@ from types import ModuleType
 
 import pytest
 
+from cavmarl.errors import ConfigError
+
 torch = pytest.importorskip("torch")
 
 SCRIPT = Path(__file__).resolve().parents[2] / "train" / "ippo_torch.py"
+CONFIGS = sorted((SCRIPT.parent.parent / "configs" / "train").glob("*.yaml"))
 TINY = [
     "--env", "merge", "--num-envs", "2", "--agents", "2", "--background", "2", "--hidden", "8",
     "--num-steps", "8", "--epochs", "1", "--minibatches", "2", "--threads", "1",
@@ -37,6 +40,24 @@ def ippo() -> ModuleType:
 def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     monkeypatch.chdir(tmp_path)
     return tmp_path
+
+
+@pytest.mark.parametrize("config", CONFIGS, ids=lambda path: path.stem)
+def test_every_config_loads_and_options_shadow_it(ippo: ModuleType, config: Path) -> None:
+    args = ippo.parse_args(["--config", str(config), "--seed", "77"])
+    assert args.env == "merge"
+    assert args.minutes > 0.0
+    assert args.seed == 77
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [("minute: 3.0", "minute: .*minutes"), ("- 1", "must be a mapping"), ("seed: x", "seed")],
+)
+def test_a_wrong_config_is_refused(ippo: ModuleType, here: Path, text: str, said: str) -> None:
+    (here / "wrong.yaml").write_text(text)
+    with pytest.raises(ConfigError, match=said):
+        ippo.parse_args(["--config", "wrong.yaml"])
 
 
 def log(folder: Path) -> list[dict[str, str]]:
