@@ -1,4 +1,4 @@
-"""Every entry of `envs/` in every population, and bare maps, against PettingZoo's tests and ours."""
+"""Every entry of `envs/` in every population, and bare maps, pass PettingZoo's tests and ours."""
 
 from __future__ import annotations
 
@@ -38,7 +38,8 @@ Make = Callable[..., Any]
 def source(request: pytest.FixtureRequest) -> str | Path:
     """The name of an entry, or a map file."""
     if request.param in BARE_MAPS:
-        return Path(request.getfixturevalue("shared_maps")) / request.param
+        folder: Path = request.getfixturevalue("shared_maps")
+        return folder / str(request.param)
     return str(request.param)
 
 

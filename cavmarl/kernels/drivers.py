@@ -126,23 +126,23 @@ def _bend_speed(roads: RoadArrays, lane: int, distance: float) -> float:
 def _shared_start(
     roads: RoadArrays,
     rows: NDArray[np.void],
-    i: int,
+    row: np.void,
     lane: int,
     chosen: int,
     distance: float,
     scratch: Scratch,
 ) -> float:
     """Interaction with vehicles that have just turned off from the same lane into another link."""
-    row = rows[i]
     strongest = 0.0
     first = roads.lanes[lane]["first_link"]
     for link in range(first, first + roads.lanes[lane]["num_links"]):
-        beside = roads.links[link]["first_internal"]
-        if link == chosen or beside < 0:
+        if link == chosen:
             continue
-        j, s = last_on_lane(i, beside, scratch)
-        if j >= 0 and s - 0.5 * rows[j]["length"] < SHARED_START_M:
-            strongest = max(strongest, _behind(row, distance + s, rows[j]))
+        for k in range(scratch.link_start[link], scratch.link_start[link + 1]):
+            other = rows[scratch.link_row[k]]
+            place = -scratch.link_dist[k]
+            if place > 0.0 and place - 0.5 * other["length"] < SHARED_START_M:
+                strongest = max(strongest, _behind(row, distance + place, other))
     return strongest
 
 
@@ -202,7 +202,7 @@ def _road_ahead(
             if hold != HOLD_NONE:
                 strongest = max(strongest, _before_line(row, distance - half))
                 break
-            shared = _shared_start(roads, rows, i, lane, step["link"], distance, scratch)
+            shared = _shared_start(roads, rows, row, lane, step["link"], distance, scratch)
             strongest = max(strongest, shared)
         lane = step["next"]
         limit = roads.lanes[lane]["speed_mps"] * row["speed_factor"]

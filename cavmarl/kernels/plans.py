@@ -51,7 +51,12 @@ def _leads_to(roads: RoadArrays, before: int, lane: int) -> bool:
 
 @kernel
 def _change_cost(roads: RoadArrays, lane: int) -> float:
-    """Cost in s of leaving a lane sideways: plans change lanes where there is room to."""
+    """Cost in s of leaving a lane sideways: plans change lanes where there is room to.
+
+    Inside junctions nobody changes lanes.
+    """
+    if roads.lanes[lane]["internal"]:
+        return math.inf
     return LANE_CHANGE_COST_S + max(SHORT_LANE_M - float(roads.lanes[lane]["length_m"]), 0.0)
 
 

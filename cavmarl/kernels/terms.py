@@ -37,6 +37,8 @@ def _progress(row: np.void, step_s: float) -> float:
 
     A new plan after a wrong turn may be longer by far: that counts as no more than driving back.
     """
+    if row["step_to_go"] == math.inf:
+        return 0.0  # it came from where no way led to its goal
     most = max(row["speed"], 1.0) * step_s * 2.0
     return clamp(row["step_to_go"] - row["to_go"], -most, most)
 

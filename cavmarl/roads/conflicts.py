@@ -89,8 +89,8 @@ def overlap(path: LinkPath, foe: LinkPath, *, merging: bool) -> Overlap | None:
 def grazing(path: LinkPath, foe: LinkPath) -> Overlap | None:
     """Where cars on two paths would touch as they stand askew in their bends, or None.
 
-    Cars are boxes whose heading trails the path, as background vehicles drive. The answer is in places of
-    a front bumper that comes and a rear bumper that leaves, as in `overlap`.
+    Cars are boxes whose heading trails the path, as background vehicles drive. The answer is in
+    places of a front bumper that comes and a rear bumper that leaves, as in `overlap`.
     """
     plane = path.xyz[:, None, :2] - foe.xyz[None, :, :2]
     square = plane[..., 0] * plane[..., 0] + plane[..., 1] * plane[..., 1]

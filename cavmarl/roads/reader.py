@@ -17,7 +17,6 @@ from cavmarl.roads.polylines import clean_shape, extend_stubs, point_rows
 from cavmarl.roads.right_of_way import conflict_rows
 from cavmarl.roads.selection import Movement, Selection, permission_bits, select
 from cavmarl.roads.signals import SignalRows, read_signals
-from cavmarl.roads.sumo_xml import parse_net
 
 __all__ = ["map_name", "read_network", "source_hash"]
 
@@ -53,6 +52,9 @@ def read_network(path: str | Path) -> RoadNetwork:
     Raises:
         MapError: the file is broken, hostile or inconsistent, or nothing in it can be driven.
     """
+    # sumolib is only loaded where the cache has no network yet.
+    from cavmarl.roads.sumo_xml import parse_net
+
     path = Path(path)
     digest = source_hash(path)
     try:

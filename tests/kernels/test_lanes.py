@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from cavmarl.kernels.arrays import Scratch
 from cavmarl.kernels.lanes import index_lanes, last_on_lane, neighbor_ahead, neighbor_behind
 from cavmarl.roads.network import RoadNetwork
+from cavmarl.shard.vehicles import VEHICLE
 from tests.kernels.traffic import NAMES, crowds_on_lanes, network, scratch
 from tests.naive import lanes as naive
 
@@ -92,10 +93,7 @@ def test_the_order_of_rows_does_not_matter(
 
 def test_of_two_at_one_place_the_larger_id_leads() -> None:
     roads = network("ring")
-    rows = np.zeros(
-        2, crowd := np.dtype([("id", "i8"), ("lane", "i4"), ("side_lane", "i4"), ("s", "f8")])
-    )
-    assert crowd
+    rows = np.zeros(2, VEHICLE)
     rows["id"], rows["side_lane"], rows["s"] = [7, 3], -1, 10.0
     room = indexed(roads, rows)
     assert neighbor_ahead(rows, 1, 0, 10.0, room) == (0, 10.0)
