@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import typer
 from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from cavmarl.errors import ConfigError
+from cavmarl.cli.output import JsonPath, write_json
 from cavmarl.maps.check import MapReport, check_map
 from cavmarl.maps.netconvert import Box, BuildResult, build_network, map_file
 from cavmarl.roads.reader import map_name
@@ -28,7 +27,6 @@ Source = Annotated[
         help="A SUMO network, an OSM or an OpenDRIVE file.", exists=True, dir_okay=False
     ),
 ]
-JsonPath = Annotated[Path | None, typer.Option("--json", help="Write the report here as JSON.")]
 
 _SHOWN_WARNINGS = 12
 
@@ -57,8 +55,8 @@ def build(
         result = build_network(source, target, bbox=_box(bbox), tolerant=tolerant)
         report = check_map(result.path)
     document = {"build": result.to_dict(), "map": report.to_dict()}
-    _write_json(target.with_name(f"{map_name(target)}.stats.json"), document)
-    _write_json(json_path, document)
+    write_json(target.with_name(f"{map_name(target)}.stats.json"), document)
+    write_json(json_path, document)
     _print_build(console, result)
     _print_report(console, report)
     raise typer.Exit(0 if report.drivable else 1)
@@ -70,7 +68,7 @@ def check(source: Source, json_path: JsonPath = None) -> None:
     console = Console()
     with console.status(f"checking {source} …"):
         report = check_map(map_file(source))
-    _write_json(json_path, report.to_dict())
+    write_json(json_path, report.to_dict())
     _print_report(console, report)
     raise typer.Exit(0 if report.drivable else 1)
 
@@ -85,16 +83,6 @@ def _box(text: str | None) -> Box | None:
             f"'{text}' is not four numbers: min,min,max,max", param_hint="--bbox"
         ) from error
     return west, south, east, north
-
-
-def _write_json(path: Path | None, document: dict[str, Any]) -> None:
-    if path is None:
-        return
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_text(json.dumps(document, indent=2) + "\n", encoding="utf-8")
-    except OSError as error:
-        raise ConfigError(f"{path}: cannot be written ({error.strerror or error})") from error
 
 
 def _print_build(console: Console, result: BuildResult) -> None:

@@ -24,8 +24,9 @@ from cavmarl.kernels.codes import (
 )
 from cavmarl.kernels.contacts import find_contacts
 from cavmarl.kernels.control import speed_control
-from cavmarl.kernels.drivers import decide, needed_change
+from cavmarl.kernels.drivers import decide
 from cavmarl.kernels.junctions import STOP_SIGN_TICKS, register_links
+from cavmarl.kernels.lane_choice import needed_change
 from cavmarl.kernels.lanes import index_lanes
 from cavmarl.kernels.motion import move_agent, move_background
 from cavmarl.kernels.neighbors import Grid, fill_grid

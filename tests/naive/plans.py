@@ -41,8 +41,10 @@ def _turns_round(roads: RoadNetwork, link: int) -> bool:
 
 
 def neighbours(roads: RoadNetwork, lane: int, permission: int) -> list[int]:
-    """The lanes beside a lane that may be driven."""
+    """The lanes beside a lane that may be changed to: none inside junctions."""
     row = roads.lanes[lane]
+    if row["internal"]:
+        return []
     beside = [int(row["left"]), int(row["right"])]
     return [b for b in beside if b >= 0 and roads.lanes[b]["permissions"] & permission]
 

@@ -66,19 +66,24 @@ def test_a_closed_world_too_full_for_its_agents_is_refused() -> None:
 
 
 @pytest.mark.parametrize("env", FREE_FLOW)
-@pytest.mark.parametrize("seed", [0, 1])
-def test_drivers_neither_touch_nor_stand_for_ever(env: str, seed: int) -> None:
-    simulation = make_traffic(env, background=FREE_FLOW[env], num_worlds=3)
+@pytest.mark.parametrize(
+    ("seed", "worlds", "length"),
+    [(0, 3, 3.0), (1, 3, 3.0), pytest.param(2, 12, 12.0, marks=pytest.mark.slow)],
+)
+def test_drivers_neither_touch_nor_stand_for_ever(
+    env: str, seed: int, worlds: int, length: float
+) -> None:
+    simulation = make_traffic(env, background=FREE_FLOW[env], num_worlds=worlds)
     start(simulation, seed)
     longest = 0
-    for _ in minutes(simulation, 3.0):
-        for world in range(3):
+    for _ in minutes(simulation, length):
+        for world in range(worlds):
             vehicles = simulation.vehicles(world)
             touching = vehicles["id"][vehicles["hit"] >= 0].tolist()
             assert not touching, f"world {world}, tick {simulation.ticks()[world]}"
             longest = max(longest, int(vehicles["wait"].max()))
     assert longest * simulation.config.clock.sim_dt_s < 120.0
-    for world in range(3):
+    for world in range(worlds):
         assert simulation.traffic_stats(world).contacts == 0
 
 
