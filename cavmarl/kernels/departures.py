@@ -31,6 +31,7 @@ from cavmarl.kernels.codes import (
     SUM_DISTANCE_M,
     SUM_TIME_S,
 )
+from cavmarl.kernels.following import REFERENCE_LENGTH_M
 from cavmarl.kernels.lanes import index_lanes, neighbor_ahead, neighbor_behind
 from cavmarl.kernels.motion import place_on_lane
 from cavmarl.kernels.rng import (
@@ -50,7 +51,6 @@ END_ROOM_M = 12.0  # nobody starts nearer than this to the end of a lane, unless
 ENTER_GAP_M = 3.0  # m between bumpers, the least with which a vehicle enters
 ENTER_HEADWAY_S = 1.0  # and this time before the one behind
 ENTER_DECEL = 2.0  # m/s², braking that an entering vehicle may impose, or need at the lane's end
-REFERENCE_LENGTH_M = 5.0  # JAM_DISTANCE_M is measured between centres of cars of this length
 ENTER_SHARE = 0.7  # of the speed limit
 ENTER_REACH_M = 80.0
 WANDER_M = 150.0  # nearer to its goal than this a vehicle of a closed world picks another

@@ -14,7 +14,7 @@ from cavmarl.kernels.car_following import (
     idm_interaction,
 )
 
-__all__ = ["LINE_MARGIN_M", "accel_behind", "before_line", "behind"]
+__all__ = ["LINE_MARGIN_M", "REFERENCE_LENGTH_M", "accel_behind", "before_line", "behind"]
 
 REFERENCE_LENGTH_M = 5.0  # JAM_DISTANCE_M is measured between centres of cars of this length
 LINE_MARGIN_M = 1.0  # a driver stops with its front this far before a line

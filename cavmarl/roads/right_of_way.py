@@ -47,12 +47,8 @@ def conflict_rows(
             if _bit(a, b, a.node._foes) or _bit(b, a, a.node._foes):
                 shared = _shared(paths[one], paths[other], merging=merging)
                 yields = _bit(a, b, a.node._prohibits), _bit(b, a, a.node._prohibits)
-            elif a.connection.getFromLane() is not b.connection.getFromLane():
-                shared = (
-                    _shared(paths[one], paths[other], merging=True)
-                    if merging
-                    else _grazing(paths[one], paths[other])
-                )
+            elif a.connection.getFromLane() is not b.connection.getFromLane() and not merging:
+                shared = _grazing(paths[one], paths[other])
                 yields = _turns_left(a) and not _turns_left(b), _turns_left(b)
             else:
                 continue
