@@ -352,8 +352,12 @@ def test_a_world_that_cannot_be_is_refused(
 
 
 def test_more_agents_than_the_map_can_take_are_refused() -> None:
-    env = parallel_env("ring", agents=500, background=0, seed=0)
-    with pytest.raises(CapacityError, match=r"population\.agents = 500.*population\.mode"):
+    with pytest.raises(CapacityError, match=r"= 500.*room for \d+ vehicles"):
+        parallel_env("ring", agents=500, background=0)
+    with pytest.raises(CapacityError, match=r"= 3004.*room for \d+ vehicles"):
+        parallel_env("ring", background=3000)
+    env = parallel_env("ring", agents=90, background=0, seed=0)
+    with pytest.raises(CapacityError, match=r"population\.agents = 90.*population\.mode"):
         env.reset()
     with pytest.raises(ResetNeededError):
         env.step({})

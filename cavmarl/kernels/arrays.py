@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["Demand", "LaneGrid", "Outputs", "RoadArrays", "Scratch", "Sensors", "Worlds"]
+__all__ = ["Demand", "Gate", "LaneGrid", "Outputs", "RoadArrays", "Scratch", "Sensors", "Worlds"]
 
 
 class RoadArrays(NamedTuple):
@@ -42,7 +42,7 @@ class LaneGrid(NamedTuple):
 
 
 class Worlds(NamedTuple):
-    """The state of W worlds: everything that a tick reads and writes.
+    """A shard's part of W worlds: the vehicles and signals that a tick reads and writes.
 
     `rows` is the committed state of the tick, `next_rows` the room for the one after; they swap.
     """
@@ -54,11 +54,17 @@ class Worlds(NamedTuple):
     ticks: NDArray[np.int64]  # (W,) since reset
     keys: NDArray[np.uint64]  # (W,) the root of all random numbers of the episode
     signal_phase: NDArray[np.int32]  # (W, num_signals) PHASE row that is on
+    num_contacts: NDArray[np.int64]  # (W,) vehicles that began to touch another, since reset
+
+
+class Gate(NamedTuple):
+    """What one place keeps of each world, however it is divided: ids, the queue, the counts."""
+
     queue: NDArray[np.void]  # DEPARTURE (W, C) vehicles that wait to enter, in id order
     num_queue: NDArray[np.int64]  # (W,)
     next_id: NDArray[np.int64]  # (W,) the next vehicle's id
     num_entered: NDArray[np.int64]  # (W,) agents that have been ordered so far
-    counts: NDArray[np.int64]  # (W, NUM_COUNTS) departed, arrived, contacts … since reset
+    counts: NDArray[np.int64]  # (W, NUM_COUNTS) departed, arrived, removed since reset
     sums: NDArray[np.float64]  # (W, NUM_SUMS) sums over arrived vehicles
 
 

@@ -42,14 +42,13 @@ ACTION_LANE_RIGHT = 2
 ACTION_FASTER = 3
 ACTION_SLOWER = 4
 
-# Worlds.counts, since reset
+# Gate.counts, since reset
 COUNT_DEPARTED = 0  # vehicles that have entered
 COUNT_ARRIVED = 1  # vehicles that reached their goal
-COUNT_CONTACTS = 2  # vehicles that began to touch another
-COUNT_REMOVED = 3  # agents taken out after a collision or off the road
-NUM_COUNTS = 4
+COUNT_REMOVED = 2  # agents taken out after a collision or off the road
+NUM_COUNTS = 3
 
-# Worlds.sums, over vehicles that arrived
+# Gate.sums, over vehicles that arrived
 SUM_DISTANCE_M = 0
 SUM_TIME_S = 1
 SUM_DELAY_S = 2  # time above what the way takes at the limit

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cavmarl.kernels import kernel
-from cavmarl.kernels.arrays import Demand, RoadArrays, Scratch, Worlds
+from cavmarl.kernels.arrays import Demand, Gate, RoadArrays, Scratch, Worlds
 from cavmarl.kernels.car_following import (
     ACCEL_MAX,
     DECEL_COMFORT,
@@ -60,15 +60,21 @@ GIVE_UP_TICKS = 200  # a driver that waits longer than this to change lanes take
 
 @kernel
 def _order(
-    demand: Demand, roads: RoadArrays, worlds: Worlds, w: int, agent: int, trips: NDArray[np.int32]
+    demand: Demand,
+    roads: RoadArrays,
+    gate: Gate,
+    worlds: Worlds,
+    w: int,
+    agent: int,
+    trips: NDArray[np.int32],
 ) -> None:
     """Number and draw one departure and put it at the end of the queue."""
-    vehicle = worlds.next_id[w]
-    worlds.next_id[w] = vehicle + 1
+    vehicle = gate.next_id[w]
+    gate.next_id[w] = vehicle + 1
     key = worlds.keys[w]
     trip = below(key, vehicle, 0, STREAM_ORIGIN, trips.shape[0])
-    departure = worlds.queue[w, worlds.num_queue[w]]
-    worlds.num_queue[w] += 1
+    departure = gate.queue[w, gate.num_queue[w]]
+    gate.num_queue[w] += 1
     departure["id"] = vehicle
     departure["agent"] = agent
     departure["lane"] = trips[trip, 0]
@@ -89,6 +95,7 @@ def _enter(
     demand: Demand,
     roads: RoadArrays,
     plans: NDArray[np.void],
+    gate: Gate,
     worlds: Worlds,
     w: int,
     departure: np.void,
@@ -113,7 +120,7 @@ def _enter(
     row["heading"] = math.atan2(sin, cos)
     row["to_go"] = plans[row["goal"], row["lane"]]["to_go"] - row["s"]
     row["step_to_go"] = row["to_go"]
-    worlds.counts[w, COUNT_DEPARTED] += 1
+    gate.counts[w, COUNT_DEPARTED] += 1
 
 
 @kernel
@@ -138,6 +145,7 @@ def populate(
     demand: Demand,
     roads: RoadArrays,
     plans: NDArray[np.void],
+    gate: Gate,
     worlds: Worlds,
     chosen: NDArray[np.bool_],
 ) -> None:
@@ -149,6 +157,7 @@ def populate(
         demand: the generator's tables.
         roads: the road arrays.
         plans: PLAN (G, L).
+        gate: written where chosen.
         worlds: written where chosen; ticks and keys are already those of the new episode.
         chosen: (W,) which worlds.
     """
@@ -158,16 +167,17 @@ def populate(
             continue
         worlds.num_owned[w] = 0
         worlds.num_rows[w] = 0
-        worlds.num_queue[w] = 0
-        worlds.next_id[w] = 0
-        worlds.counts[w, :] = 0
-        worlds.sums[w, :] = 0.0
-        worlds.num_entered[w] = demand.num_agents
+        worlds.num_contacts[w] = 0
+        gate.num_queue[w] = 0
+        gate.next_id[w] = 0
+        gate.counts[w, :] = 0
+        gate.sums[w, :] = 0.0
+        gate.num_entered[w] = demand.num_agents
         for n in range(demand.num_agents + demand.num_background):
             agent = n if n < demand.num_agents else -1
             trips = demand.agent_trips if agent >= 0 else demand.start_trips
-            _order(demand, roads, worlds, w, agent, trips)
-            departure = worlds.queue[w, worlds.num_queue[w] - 1]
+            _order(demand, roads, gate, worlds, w, agent, trips)
+            departure = gate.queue[w, gate.num_queue[w] - 1]
             vehicle = departure["id"]
             for attempt in range(PLACE_TRIES):
                 trip = below(worlds.keys[w], vehicle, 0, STREAM_ORIGIN + attempt, trips.shape[0])
@@ -181,10 +191,10 @@ def populate(
                     worlds.rows[w, num] = demand.blank[0]
                     speed = _speed_at(roads, departure["lane"], departure["s"], half)
                     row = worlds.rows[w, num]
-                    _enter(demand, roads, plans, worlds, w, departure, speed, row)
+                    _enter(demand, roads, plans, gate, worlds, w, departure, speed, row)
                     worlds.num_rows[w] = num + 1
                     worlds.num_owned[w] = num + 1
-                    worlds.num_queue[w] -= 1
+                    gate.num_queue[w] -= 1
                     break
 
 
@@ -213,7 +223,7 @@ def choose_goals(
                 continue
             for attempt in range(GOAL_TRIES):
                 goal = below(
-                    worlds.keys[w], row["id"], row["tick"], STREAM_ROUTE + attempt, plans.shape[0]
+                    row["rng_key"], row["id"], row["tick"], STREAM_ROUTE + attempt, plans.shape[0]
                 )
                 step = plans[goal, row["lane"]]
                 to_go = step["to_go"] - row["s"]
@@ -245,6 +255,7 @@ def _next_through(rows: NDArray[np.void], num: int, driver: int, ticks_per_step:
 def take_out(
     demand: Demand,
     roads: RoadArrays,
+    gate: Gate,
     worlds: Worlds,
     rows: NDArray[np.void],
     driver: int,
@@ -260,7 +271,8 @@ def take_out(
     Args:
         demand: the generator's tables.
         roads: the road arrays.
-        worlds: counts, sums and queue are written.
+        gate: counts, sums and queue are written.
+        worlds: how many rows there are is written.
         rows: VEHICLE (W, C), the rows to take from.
         driver: DRIVER_*.
         dt: seconds of a tick.
@@ -275,12 +287,12 @@ def take_out(
             agent = row["agent"]
             if row["events"] & EVENT_ARRIVED:
                 time = (row["tick"] - row["departed"]) * dt
-                worlds.counts[w, COUNT_ARRIVED] += 1
-                worlds.sums[w, SUM_DISTANCE_M] += row["distance_m"]
-                worlds.sums[w, SUM_TIME_S] += time
-                worlds.sums[w, SUM_DELAY_S] += max(time - row["free_s"], 0.0)
+                gate.counts[w, COUNT_ARRIVED] += 1
+                gate.sums[w, SUM_DISTANCE_M] += row["distance_m"]
+                gate.sums[w, SUM_TIME_S] += time
+                gate.sums[w, SUM_DELAY_S] += max(time - row["free_s"], 0.0)
             else:
-                worlds.counts[w, COUNT_REMOVED] += 1
+                gate.counts[w, COUNT_REMOVED] += 1
             last = worlds.num_owned[w] - 1
             rows[w, i] = rows[w, last]
             worlds.num_owned[w] = last
@@ -288,13 +300,13 @@ def take_out(
             if not demand.reenter:
                 continue
             if agent < 0:
-                _order(demand, roads, worlds, w, -1, demand.enter_trips)
+                _order(demand, roads, gate, worlds, w, -1, demand.enter_trips)
             elif demand.seats:
-                _order(demand, roads, worlds, w, agent, demand.agent_trips)
-            elif worlds.num_entered[w] < demand.num_ids:
-                follower = worlds.num_entered[w]
-                worlds.num_entered[w] = follower + 1
-                _order(demand, roads, worlds, w, follower, demand.agent_trips)
+                _order(demand, roads, gate, worlds, w, agent, demand.agent_trips)
+            elif gate.num_entered[w] < demand.num_ids:
+                follower = gate.num_entered[w]
+                gate.num_entered[w] = follower + 1
+                _order(demand, roads, gate, worlds, w, follower, demand.agent_trips)
 
 
 @kernel
@@ -343,6 +355,7 @@ def let_in(
     demand: Demand,
     roads: RoadArrays,
     plans: NDArray[np.void],
+    gate: Gate,
     worlds: Worlds,
     scratch: Scratch,
 ) -> None:
@@ -351,7 +364,7 @@ def let_in(
     One a tick: the next one sees it among the rows.
     """
     for w in range(worlds.ticks.shape[0]):
-        waiting = worlds.num_queue[w]
+        waiting = gate.num_queue[w]
         if waiting == 0:
             continue
         rows = worlds.next_rows[w]
@@ -359,7 +372,7 @@ def let_in(
         rows[i] = demand.blank[0]
         index_lanes(roads.lanes, rows, worlds.num_rows[w], scratch)
         for q in range(waiting):
-            departure = worlds.queue[w, q]
+            departure = gate.queue[w, q]
             row = rows[i]
             row["id"] = departure["id"]
             lane = departure["lane"]
@@ -367,10 +380,10 @@ def let_in(
             speed = _gap_speed(roads, rows, i, lane, departure["s"], free, scratch)
             if speed < 0.0:
                 continue
-            _enter(demand, roads, plans, worlds, w, departure, speed, row)
+            _enter(demand, roads, plans, gate, worlds, w, departure, speed, row)
             worlds.num_owned[w] = i + 1
             worlds.num_rows[w] += 1
             for rest in range(q + 1, waiting):
-                worlds.queue[w, rest - 1] = worlds.queue[w, rest]
-            worlds.num_queue[w] = waiting - 1
+                gate.queue[w, rest - 1] = gate.queue[w, rest]
+            gate.num_queue[w] = waiting - 1
             break

@@ -16,7 +16,6 @@ from cavmarl.kernels.codes import (
     ACTION_LANE_LEFT,
     ACTION_LANE_RIGHT,
     ACTION_SLOWER,
-    COUNT_CONTACTS,
     DRIVER_AGENT,
     DRIVER_BACKGROUND,
     EVENT_COLLIDED,
@@ -169,8 +168,8 @@ def resolve(worlds: Worlds, scratch: Scratch, grid: Grid) -> None:
     """Mark in `next_rows` who touches whom.
 
     Args:
-        worlds: events and hit of the owned next_rows are written; counts[:, COUNT_CONTACTS] rises
-            by one for each vehicle when it begins to touch another.
+        worlds: events and hit of the owned next_rows are written; num_contacts rises by one for
+            each vehicle when it begins to touch another.
         scratch: room.
         grid: spatial index over the vehicles of one world, filled here.
     """
@@ -183,7 +182,7 @@ def resolve(worlds: Worlds, scratch: Scratch, grid: Grid) -> None:
             other = scratch.hit[i]
             if other >= 0:
                 if row["hit"] < 0:
-                    worlds.counts[w, COUNT_CONTACTS] += 1
+                    worlds.num_contacts[w] += 1
                 row["events"] |= EVENT_COLLIDED
             row["hit"] = other
 

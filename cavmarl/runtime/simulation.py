@@ -14,7 +14,6 @@ from cavmarl.kernels.arrays import Outputs
 from cavmarl.kernels.codes import (
     ACTION_IDLE,
     COUNT_ARRIVED,
-    COUNT_CONTACTS,
     COUNT_DEPARTED,
     COUNT_REMOVED,
     SUM_DELAY_S,
@@ -27,6 +26,7 @@ from cavmarl.runtime.compilation import first_compilation
 from cavmarl.runtime.executor import Executor, SerialExecutor
 from cavmarl.shard.shard import Commands, Shard
 from cavmarl.shard.vehicles import STATE_FIELDS, blank_vehicle
+from cavmarl.traffic.departures import make_gate
 from cavmarl.traffic.native import NativeTraffic
 
 __all__ = ["Simulation", "TrafficStats"]
@@ -80,6 +80,8 @@ class Simulation:
         with first_compilation() as is_first:
             blank = blank_vehicle()
             self._traffic = NativeTraffic(network, config.traffic, config.population, blank)
+            population = config.population
+            self._gate = make_gate(num_worlds, population.agents + population.background)
             self._shard = Shard(config, network, self._traffic.plans, num_worlds)
             self._executor: Executor = SerialExecutor([self._shard])
             if is_first:
@@ -150,7 +152,7 @@ class Simulation:
             worlds.keys[w] = world_key(self._seed, int(w), int(self._episodes[w]))
             worlds.ticks[w] = 0
         self._episodes[chosen] += 1
-        self._traffic.populate(worlds, chosen)
+        self._traffic.populate(self._gate, worlds, chosen)
         self._executor.each(Shard.switch_signals)
         self._executor.each(lambda shard: shard.sense(chosen))
 
@@ -165,20 +167,23 @@ class Simulation:
         """Advance → (exchange) → resolve → departures → (migrate) → commit → signals."""
         self._executor.each(lambda shard: shard.advance(commands))
         self._executor.each(Shard.resolve)
-        self._traffic.exchange(self._shard.worlds, self._shard.scratch, self.config.clock.sim_dt_s)
+        self._traffic.arrive_and_depart(
+            self._gate, self._shard.worlds, self._shard.scratch, self.config.clock.sim_dt_s
+        )
         self._executor.each(Shard.commit)
         self._executor.each(Shard.switch_signals)
 
     def retire_agents(self) -> None:
         """Take out the agents whose trip ended in the last step; to be called after it is read."""
         clock = self.config.clock
-        self._traffic.retire_agents(self._shard.worlds, clock.sim_dt_s, clock.ticks_per_step)
+        self._traffic.retire_agents(
+            self._gate, self._shard.worlds, clock.sim_dt_s, clock.ticks_per_step
+        )
 
     def agents_to_come(self) -> NDArray[np.bool_]:
         """(W,) whether an agent waits to enter."""
-        worlds = self._shard.worlds
-        waiting = np.arange(worlds.queue.shape[1]) < worlds.num_queue[:, None]
-        found = np.any(waiting & (worlds.queue["agent"] >= 0), axis=1)
+        waiting = np.arange(self._gate.queue.shape[1]) < self._gate.num_queue[:, None]
+        found = np.any(waiting & (self._gate.queue["agent"] >= 0), axis=1)
         return np.asarray(found, dtype=np.bool_)
 
     def suggest(self, out: NDArray[np.float64]) -> None:
@@ -197,15 +202,15 @@ class Simulation:
         digest = hashlib.blake2b(digest_size=16)
         for name in STATE_FIELDS:
             digest.update(np.ascontiguousarray(rows[name]).tobytes())
-        queue = worlds.queue[world, : worlds.num_queue[world]]
+        queue = self._gate.queue[world, : self._gate.num_queue[world]]
         for name in queue.dtype.names or ():
             digest.update(np.ascontiguousarray(queue[name]).tobytes())
         for array in (
             worlds.signal_phase[world],
             worlds.ticks[world],
             worlds.keys[world],
-            worlds.next_id[world],
-            worlds.num_entered[world],
+            self._gate.next_id[world],
+            self._gate.num_entered[world],
         ):
             digest.update(array.tobytes())
         return digest.hexdigest()
@@ -213,17 +218,17 @@ class Simulation:
     def traffic_stats(self, world: int = 0) -> TrafficStats:
         """Counts and means since the world's reset."""
         worlds = self._shard.worlds
-        counts = worlds.counts[world]
-        sums = worlds.sums[world]
+        counts = self._gate.counts[world]
+        sums = self._gate.sums[world]
         rows = self.vehicles(world)
         arrived = int(counts[COUNT_ARRIVED])
         trips = max(arrived, 1)
         return TrafficStats(
             departed=int(counts[COUNT_DEPARTED]),
-            waiting=int(worlds.num_queue[world]),
+            waiting=int(self._gate.num_queue[world]),
             running=len(rows),
             arrived=arrived,
-            contacts=int(counts[COUNT_CONTACTS]),
+            contacts=int(worlds.num_contacts[world]),
             removed=int(counts[COUNT_REMOVED]),
             mean_speed_mps=float(np.sort(rows["speed"]).mean()) if len(rows) else 0.0,
             mean_trip_m=float(sums[SUM_DISTANCE_M]) / trips,

@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 
 from cavmarl.config import TERMS, EnvConfig
 from cavmarl.kernels.arrays import LaneGrid, Outputs, RoadArrays, Scratch, Worlds
-from cavmarl.kernels.codes import NUM_COUNTS, NUM_SUMS
 from cavmarl.kernels.neighbors import make_grid
 from cavmarl.kernels.sense import sense
 from cavmarl.kernels.tick import advance, begin_step, resolve, suggest, switch_signals
@@ -21,7 +20,6 @@ from cavmarl.roads.network import RoadNetwork
 from cavmarl.roads.routing import lane_grid
 from cavmarl.shard.sensors import layout, sensor_arrays
 from cavmarl.shard.vehicles import VEHICLE
-from cavmarl.traffic.departures import DEPARTURE
 
 __all__ = ["Commands", "Shard"]
 
@@ -146,12 +144,7 @@ def _make_worlds(num_worlds: int, capacity: int, num_signals: int) -> Worlds:
         ticks=np.zeros(num_worlds, dtype=np.int64),
         keys=np.zeros(num_worlds, dtype=np.uint64),
         signal_phase=np.zeros((num_worlds, num_signals), dtype=np.int32),
-        queue=np.zeros(shape, dtype=DEPARTURE),
-        num_queue=np.zeros(num_worlds, dtype=np.int64),
-        next_id=np.zeros(num_worlds, dtype=np.int64),
-        num_entered=np.zeros(num_worlds, dtype=np.int64),
-        counts=np.zeros((num_worlds, NUM_COUNTS), dtype=np.int64),
-        sums=np.zeros((num_worlds, NUM_SUMS), dtype=np.float64),
+        num_contacts=np.zeros(num_worlds, dtype=np.int64),
     )
 
 

@@ -1,10 +1,13 @@
-"""`DEPARTURE`: a vehicle that has been ordered and waits to enter."""
+"""`DEPARTURE`: a vehicle that has been ordered and waits to enter; and the gate it waits at."""
 
 from __future__ import annotations
 
 import numpy as np
 
-__all__ = ["DEPARTURE"]
+from cavmarl.kernels.arrays import Gate
+from cavmarl.kernels.codes import NUM_COUNTS, NUM_SUMS
+
+__all__ = ["DEPARTURE", "make_gate"]
 
 DEPARTURE = np.dtype(
     [
@@ -18,3 +21,15 @@ DEPARTURE = np.dtype(
     ],
     align=True,
 )
+
+
+def make_gate(num_worlds: int, capacity: int) -> Gate:
+    """The empty gates of `num_worlds` worlds that hold `capacity` vehicles each."""
+    return Gate(
+        queue=np.zeros((num_worlds, capacity), dtype=DEPARTURE),
+        num_queue=np.zeros(num_worlds, dtype=np.int64),
+        next_id=np.zeros(num_worlds, dtype=np.int64),
+        num_entered=np.zeros(num_worlds, dtype=np.int64),
+        counts=np.zeros((num_worlds, NUM_COUNTS), dtype=np.int64),
+        sums=np.zeros((num_worlds, NUM_SUMS), dtype=np.float64),
+    )

@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cavmarl.config import PopulationConfig, TrafficConfig
-from cavmarl.errors import ConfigError, RouteError
-from cavmarl.kernels.arrays import Demand, Scratch, Worlds
+from cavmarl.errors import CapacityError, ConfigError, RouteError
+from cavmarl.kernels.arrays import Demand, Gate, Scratch, Worlds
 from cavmarl.kernels.codes import DRIVER_AGENT, DRIVER_BACKGROUND
 from cavmarl.kernels.departures import choose_goals, let_in, populate, take_out
 from cavmarl.roads.network import VEHICLE_CLASSES, RoadNetwork
@@ -20,6 +20,7 @@ __all__ = ["NativeTraffic"]
 
 PASSENGER = 1 << VEHICLE_CLASSES.index("passenger")
 MIN_ORIGIN_M = 15.0  # lanes shorter than this are no place to start
+JAM_GAP_M = 2.5  # between the bumpers of vehicles that stand in a queue
 MIN_GOAL_M = 10.0  # nor to arrive
 DENSITY_M = 25.0  # a lane is drawn at reset once for each such length
 MAX_TRIPS = 200_000  # of a table; longer ones are thinned evenly
@@ -44,6 +45,7 @@ class NativeTraffic:
     def __post_init__(self) -> None:
         # Trips that do not exist are refused when the world is made, not at its first reset.
         _ = self.demand
+        self._check_room()
 
     @cached_property
     def goal_edges(self) -> NDArray[np.int32]:
@@ -100,21 +102,39 @@ class NativeTraffic:
             blank=self.blank,
         )
 
-    def populate(self, worlds: Worlds, chosen: NDArray[np.bool_]) -> None:
+    def populate(self, gate: Gate, worlds: Worlds, chosen: NDArray[np.bool_]) -> None:
         """Fill the chosen worlds (W,) for a new episode."""
-        populate(self.demand, self.network.arrays, self.plans, worlds, chosen)
+        populate(self.demand, self.network.arrays, self.plans, gate, worlds, chosen)
 
-    def exchange(self, worlds: Worlds, scratch: Scratch, dt: float) -> None:
+    def arrive_and_depart(self, gate: Gate, worlds: Worlds, scratch: Scratch, dt: float) -> None:
         """Who has arrived leaves `next_rows`, wanderers pick new goals, and who waits may enter."""
         roads = self.network.arrays
         choose_goals(self.demand, roads, self.plans, worlds)
-        take_out(self.demand, roads, worlds, worlds.next_rows, DRIVER_BACKGROUND, dt, 1)
-        let_in(self.demand, roads, self.plans, worlds, scratch)
+        take_out(self.demand, roads, gate, worlds, worlds.next_rows, DRIVER_BACKGROUND, dt, 1)
+        let_in(self.demand, roads, self.plans, gate, worlds, scratch)
 
-    def retire_agents(self, worlds: Worlds, dt: float, ticks_per_step: int) -> None:
+    def retire_agents(self, gate: Gate, worlds: Worlds, dt: float, ticks_per_step: int) -> None:
         """Take agents whose trip has ended out of the committed rows; order those that follow."""
         roads = self.network.arrays
-        take_out(self.demand, roads, worlds, worlds.rows, DRIVER_AGENT, dt, ticks_per_step)
+        take_out(self.demand, roads, gate, worlds, worlds.rows, DRIVER_AGENT, dt, ticks_per_step)
+
+    def _check_room(self) -> None:
+        """Refuse a population that cannot stand on the map, bumper to bumper.
+
+        Raises:
+            CapacityError: more vehicles than that.
+        """
+        lanes = self.network.lanes
+        usable = ~lanes["internal"] & (lanes["permissions"] & PASSENGER != 0)
+        metres = float(lanes["length_m"][usable].sum())
+        room = int(metres / (float(self.blank["length"][0]) + JAM_GAP_M))
+        wanted = self.population.agents + self.population.background
+        if wanted > room:
+            raise CapacityError(
+                f"population.agents + population.background = {wanted}: the map "
+                f"'{self.network.name}' has {metres / 1000.0:.1f} km of lanes, room for {room} "
+                "vehicles bumper to bumper; ask for fewer"
+            )
 
     def _edge(self, name: str, key: str) -> int:
         try:

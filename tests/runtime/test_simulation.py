@@ -38,11 +38,11 @@ def test_no_vehicle_is_lost(env: str, mode: str) -> None:
             assert stats.departed == stats.running + stats.arrived + stats.removed
             ids = simulation.vehicles(world)["id"]
             assert np.unique(ids).size == ids.size
-            ordered = simulation._shard.worlds.next_id[world]
+            ordered = simulation._gate.next_id[world]
             assert ordered == stats.departed + stats.waiting, "a departure was dropped"
             if mode != "closed":
                 drivers = simulation.vehicles(world)["driver"]
-                waiting = simulation._shard.worlds.queue[world, : stats.waiting]
+                waiting = simulation._gate.queue[world, : stats.waiting]
                 here = np.count_nonzero(drivers == DRIVER_BACKGROUND)
                 assert here + np.count_nonzero(waiting["agent"] < 0) == background
 
@@ -50,18 +50,17 @@ def test_no_vehicle_is_lost(env: str, mode: str) -> None:
 def test_those_for_whom_there_is_no_room_wait_and_enter_later() -> None:
     simulation = make_traffic("merge", background=120)
     start(simulation, seed=0)
-    worlds = simulation._shard.worlds
-    first = set(worlds.queue[0, : worlds.num_queue[0]]["id"].tolist())
+    first = set(simulation._gate.queue[0, : simulation._gate.num_queue[0]]["id"].tolist())
     assert len(first) > 20
     for _ in minutes(simulation, 1.0):
-        queue = worlds.queue[0, : worlds.num_queue[0]]["id"]
+        queue = simulation._gate.queue[0, : simulation._gate.num_queue[0]]["id"]
         assert (np.diff(queue) > 0).all(), "the queue is in the order of ids"
     assert len(first & set(queue.tolist())) < 0.75 * len(first)
 
 
 def test_a_closed_world_too_full_for_its_agents_is_refused() -> None:
-    simulation = make_simulation("ring", mode="closed", agents=200, background=0)
-    with pytest.raises(CapacityError, match=r"population\.agents = 200.*free places for \d+"):
+    simulation = make_simulation("ring", mode="closed", agents=90, background=0)
+    with pytest.raises(CapacityError, match=r"population\.agents = 90.*free places for \d+"):
         start(simulation, seed=0)
 
 
