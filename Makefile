@@ -14,7 +14,8 @@ help: ## say what there is
 demo: $(READY) ## train on merge, evaluate, drive through town, leave a video (some minutes)
 	$(BIN)/cavmarl demo
 
-test: $(READY) ## the tests
+test: $(READY) ## the tests; those of the kernels also without the compiler
+	NUMBA_DISABLE_JIT=1 $(BIN)/pytest tests/kernels
 	$(BIN)/pytest -m "not slow"
 
 check: $(READY) ## style, types, and the direction of imports

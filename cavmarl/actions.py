@@ -25,9 +25,9 @@ class ActionDecoder:
         agents: the A agent ids.
 
     Attributes:
-        clipped: values beyond ±1 that were clipped so far (`out_of_range = clip`).
-        held: missing actions that were replaced by the last one so far (`missing_action = hold`).
-        ignored: actions for agents that had left, so far (`late_actions = ignore`).
+        clipped: (W,) values beyond ±1 that were clipped in this episode (`out_of_range = clip`).
+        held: (W,) missing actions that were replaced by the last one (`missing_action = hold`).
+        ignored: (W,) actions for agents that had left (`late_actions = ignore`).
     """
 
     def __init__(self, config: ActionConfig, num_worlds: int, agents: Sequence[str]) -> None:
@@ -43,21 +43,33 @@ class ActionDecoder:
         )
         self._idle = self._last.copy()
         self._scale = np.array([config.acceleration_mps2, config.steering_rad])
-        self.clipped = 0
-        self.held = 0
-        self.ignored = 0
+        self.clipped = np.zeros(num_worlds, dtype=np.int64)
+        self.held = np.zeros(num_worlds, dtype=np.int64)
+        self.ignored = np.zeros(num_worlds, dtype=np.int64)
 
-    def tolerated(self) -> dict[str, int]:
-        """How many actions were clipped, held and ignored so far, by the names of traffic_stats."""
+    def tolerated(self, world: int = 0) -> dict[str, int]:
+        """How many actions of a world's episode were tolerated, by the names of traffic_stats."""
         return {
-            "actions_clipped": self.clipped,
-            "actions_held": self.held,
-            "actions_ignored": self.ignored,
+            "actions_clipped": int(self.clipped[world]),
+            "actions_held": int(self.held[world]),
+            "actions_ignored": int(self.ignored[world]),
         }
 
     def forget(self, chosen: NDArray[np.bool_]) -> None:
-        """Forget the last actions of the chosen worlds (W,)."""
+        """Begin an episode in the chosen worlds (W,): no last actions, nothing tolerated."""
         self._last[chosen] = self._idle[chosen]
+        for count in (self.clipped, self.held, self.ignored):
+            count[chosen] = 0
+
+    def check(self, agent: str, action: Any) -> None:
+        """Refuse an action that cannot be decoded, without decoding it.
+
+        Raises:
+            InvalidActionError: wrong shape, dtype or value.
+        """
+        batch = self._idle[:1].copy()
+        batch[0, self._index[agent]] = self._stack([action], [agent])[0]
+        self._check_values(batch)
 
     def idle(self) -> Commands:
         """Commands of a step in which no agent acts."""
@@ -97,7 +109,7 @@ class ActionDecoder:
         if given:
             stacked = self._stack([actions[agent] for agent in given], given)
             batch[0, rows] = stacked
-        checked, clipped = self._check_values(batch, np.isin(np.arange(len(self._agents)), rows))
+        checked, clipped = self._check_values(batch)
         self.ignored += ignored
         self.held += len(missing)
         self.clipped += clipped
@@ -117,7 +129,7 @@ class ActionDecoder:
                 "(num_envs, num_agents" + (", 2)" if self._continuous else ")")
             )
         batch = np.where(mask[..., None] if self._continuous else mask, array, self._idle)
-        checked, clipped = self._check_values(batch, mask)
+        checked, clipped = self._check_values(batch)
         self.clipped += clipped
         self._last = checked
         return self._commands(checked)
@@ -172,10 +184,8 @@ class ActionDecoder:
             array = np.minimum(array, np.uint64(np.iinfo(np.int64).max)).astype(np.int64)
         return array
 
-    def _check_values(
-        self, batch: NDArray[Any], given: NDArray[np.bool_]
-    ) -> tuple[NDArray[Any], int]:
-        """(values in range, how many were clipped)."""
+    def _check_values(self, batch: NDArray[Any]) -> tuple[NDArray[Any], NDArray[np.int64] | int]:
+        """(values in range, how many were clipped in each world)."""
         if not self._continuous:
             wrong = (batch < 0) | (batch > ACTION_SLOWER)
             if wrong.any():
@@ -190,7 +200,7 @@ class ActionDecoder:
             self._refuse(
                 batch, beyond, "must be within [-1, 1]; action.out_of_range = clip cuts it off"
             )
-        return np.clip(batch, -1.0, 1.0), int(beyond.sum())
+        return np.clip(batch, -1.0, 1.0), beyond.sum(axis=(1, 2))
 
     def _refuse(self, batch: NDArray[Any], wrong: NDArray[np.bool_], why: str) -> None:
         place = tuple(int(k) for k in np.argwhere(wrong)[0])

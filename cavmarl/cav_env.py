@@ -19,6 +19,7 @@ from cavmarl.kernels.codes import EVENTS_THAT_END
 from cavmarl.render.view import WorldView
 from cavmarl.roads.network import RoadNetwork
 from cavmarl.runtime.simulation import Simulation
+from cavmarl.seeds import check_seed, first_seed
 from cavmarl.shard.sensors import layout
 from cavmarl.spaces import action_space, observation_space, state_space
 from cavmarl.state import global_state
@@ -27,7 +28,6 @@ from cavmarl.worlds import check_placement, load_world
 __all__ = ["CavEnv", "parallel_env"]
 
 RENDER_MODES = ("human", "rgb_array")
-SEED_BITS = 63
 
 Observation = NDArray[np.float32] | dict[str, NDArray[np.float32]]
 
@@ -126,8 +126,7 @@ class CavEnv(ParallelEnv[str, Any, Any]):  # type: ignore[misc] # PettingZoo is 
         self._index = {agent: k for k, agent in enumerate(self.possible_agents)}
         self._simulation = Simulation(config, network)
         self._decoder = ActionDecoder(config.action, 1, self.possible_agents)
-        self._first_seed = seed
-        self._seeded = False
+        self._first_seed = None if seed is None else check_seed(seed)
         self._steps = -1
         self._view: WorldView | None = None
 
@@ -158,13 +157,8 @@ class CavEnv(ParallelEnv[str, Any, Any]):  # type: ignore[misc] # PettingZoo is 
             seed: root of all random numbers; None goes on with the next episode of the last seed.
             options: not used; accepted because the API has it.
         """
-        if seed is None and not self._seeded:
-            seed = self._first_seed
-            if seed is None:
-                seed = int(np.random.SeedSequence().generate_state(1, np.uint64)[0] >> 1)
-        if seed is not None:
-            self._simulation.seed(check_seed(seed))
-            self._seeded = True
+        if seed is not None or self._steps < 0:
+            self._simulation.seed(first_seed(seed, self._first_seed))
         self._simulation.reset()
         self._decoder.forget(np.ones(1, dtype=np.bool_))
         self._steps = 0
@@ -286,6 +280,14 @@ class CavEnv(ParallelEnv[str, Any, Any]):  # type: ignore[misc] # PettingZoo is 
             infos[agent] = info
         return infos
 
+    def check_action(self, agent: str, action: Any) -> None:
+        """Refuse an action that `step` would refuse, before anything is kept of it.
+
+        Raises:
+            InvalidActionError: wrong shape, dtype or value.
+        """
+        self._decoder.check(agent, action)
+
     def state(self) -> NDArray[np.float32]:
         """The global state, within `state_space`: see `cavmarl.state.global_state`."""
         return global_state(self.network, self._simulation.vehicles(), self.state_space)
@@ -298,7 +300,7 @@ class CavEnv(ParallelEnv[str, Any, Any]):  # type: ignore[misc] # PettingZoo is 
         """Traffic since reset: departed, waiting, running, arrived, contacts, mean speed and more.
 
         All fields of `runtime.simulation.TrafficStats`, and how many actions were clipped, held and
-        ignored since the environment was made.
+        ignored.
         """
         return {**asdict(self._simulation.traffic_stats()), **self._decoder.tolerated()}
 
@@ -329,16 +331,3 @@ class CavEnv(ParallelEnv[str, Any, Any]):  # type: ignore[misc] # PettingZoo is 
         if self._view is not None:
             self._view.close()
             self._view = None
-
-
-def check_seed(seed: Any) -> int:
-    """A seed that all random numbers can be rooted in.
-
-    Raises:
-        ConfigError: not a whole number from 0 to 2**63 - 1.
-    """
-    if isinstance(seed, bool) or not isinstance(seed, (int, np.integer)):
-        raise ConfigError(f"seed = {seed!r}: must be a whole number")
-    if not 0 <= int(seed) < 1 << SEED_BITS:
-        raise ConfigError(f"seed = {seed}: must be from 0 to 2**{SEED_BITS} - 1")
-    return int(seed)

@@ -32,7 +32,7 @@ __all__ = [
     "ZonesConfig",
 ]
 
-# The named terms of one step, in the order of every terms array; shard/terms.py computes them.
+# The named terms of one step, in the order of every terms array; kernels/terms.py computes them.
 TERMS = (
     "progress",
     "speed",
@@ -189,7 +189,7 @@ class TrafficConfig:
         goals: how many destination edges the generator uses; lane-level plans are made for each.
         origins: edges that agents start on, by id; empty: all that lead somewhere.
         destinations: edges that agents drive to, by id; empty: the generator's goals.
-        min_trip_m: shortest way between an origin and its destination.
+        min_trip_m: shortest way of an agent between origin and destination.
         max_trip_m: longest way of an agent; 0: no limit.
         speed_factor_spread: half width of the drivers' uniform spread of desired speed over limit.
     """
@@ -399,6 +399,14 @@ class EnvConfig:
     def __post_init__(self) -> None:
         _check(self.version >= 0, "version", self.version, "must be 0 or more")
         _check_finite("horizon_s", self.horizon_s, self.clock.ctrl_dt_s, 1e6)
+        steps = self.horizon_s / self.clock.ctrl_dt_s
+        _check(
+            abs(steps - round(steps)) < 1e-6 * steps,
+            "horizon_s",
+            self.horizon_s,
+            f"must be a whole number of steps of clock.ctrl_dt_s = {self.clock.ctrl_dt_s:g}; "
+            f"try {max(1, round(steps)) * self.clock.ctrl_dt_s:g}",
+        )
 
     @property
     def max_steps(self) -> int:

@@ -15,6 +15,7 @@ from dataclasses import fields, is_dataclass
 from pathlib import Path
 from typing import Any, TypeVar, get_type_hints
 
+import numpy as np
 import yaml
 from pydantic import ConfigDict, TypeAdapter, ValidationError
 from pydantic_core import ErrorDetails
@@ -124,14 +125,20 @@ def validate(kind: type[T], raw: object, where: str) -> T:
         raise ConfigError(f"{where}: must be a mapping of keys, not {raw!r}")
     try:
         # By way of JSON: its strict mode knows no difference between list and tuple, or mapping and
-        # dataclass. What JSON cannot carry becomes text, which no number accepts.
-        checked: T = _adapter(kind).validate_json(json.dumps(raw, default=str))
+        # dataclass. NumPy's numbers count as Python's; what else JSON cannot carry becomes text,
+        # which no number accepts.
+        checked: T = _adapter(kind).validate_json(json.dumps(raw, default=_plain))
     except ValidationError as error:
         lines = [_explain(kind, details) for details in error.errors(include_url=False)]
         raise ConfigError("\n".join(f"{where}: {line}" for line in lines)) from error
     except ConfigError as error:
         raise ConfigError(f"{where}: {error}") from error
     return checked
+
+
+def _plain(value: object) -> object:
+    """What JSON takes in place of `value`."""
+    return value.item() if isinstance(value, np.generic) else str(value)
 
 
 def dotted_keys(kind: type[Any], prefix: str = "") -> list[str]:

@@ -12,6 +12,8 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from cavmarl.config import EnvConfig, MapConfig
 from cavmarl.errors import ConfigError, MapError, UnknownEnvironmentError, require
 
@@ -57,6 +59,10 @@ def find_entry(env: str | Path) -> Path:
     Raises:
         UnknownEnvironmentError: nothing there; the message says what there is.
     """
+    if not isinstance(env, (str, Path)):
+        raise UnknownEnvironmentError(
+            f"env = {env!r}: must be the name of an environment, or the path of a folder or a map"
+        )
     known = entries()
     if isinstance(env, str) and env in known:
         return known[env]
@@ -116,16 +122,18 @@ def load_config(
     }
     given = {key: value for key, value in keywords.items() if value is not None}
     shadows = dict(overrides or {})
+    if strange := [key for key in shadows if not isinstance(key, str)]:
+        raise ConfigError(f"overrides: {strange[0]!r} is no key; keys are text, dotted")
     if twice := given.keys() & shadows.keys():
         raise ConfigError(f"{min(twice)} stands in overrides and is given as a keyword; use one")
     shadows |= {key: value for key, value in given.items() if key != "horizon_s"}
-    if shadows:
+    if shadows or max_cycles is not None:
         raw = dataclasses.asdict(config)
         for key, value in shadows.items():
             _shadow(raw, key, value)
+        if max_cycles is not None:
+            raw["horizon_s"] = _horizon_s(max_cycles, raw)
         config = validate(EnvConfig, raw, f"{where}, overridden")
-    if max_cycles is not None:
-        config = _with_max_steps(config, max_cycles)
     return config, base_dir
 
 
@@ -198,8 +206,10 @@ def _shadow(raw: dict[str, Any], key: str, value: object) -> None:
     inner[last] = value
 
 
-def _with_max_steps(config: EnvConfig, max_cycles: int) -> EnvConfig:
-    """The same world with another horizon, counted in steps."""
-    if not isinstance(max_cycles, int) or isinstance(max_cycles, bool) or max_cycles < 1:
+def _horizon_s(max_cycles: int, raw: Mapping[str, Any]) -> object:
+    """The horizon of `max_cycles` steps; of an impossible step, whatever stands there."""
+    whole = isinstance(max_cycles, (int, np.integer)) and not isinstance(max_cycles, bool)
+    if not whole or max_cycles < 1:
         raise ConfigError(f"max_cycles = {max_cycles!r}: must be a whole number from 1")
-    return dataclasses.replace(config, horizon_s=max_cycles * config.clock.ctrl_dt_s)
+    step_s = raw["clock"].get("ctrl_dt_s") if isinstance(raw["clock"], Mapping) else None
+    return int(max_cycles) * step_s if isinstance(step_s, (int, float)) else raw["horizon_s"]

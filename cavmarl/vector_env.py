@@ -14,15 +14,16 @@ from typing import Any
 import numpy as np
 from gymnasium import spaces
 from gymnasium.vector import AutoresetMode
+from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
 from cavmarl.actions import ActionDecoder
-from cavmarl.cav_env import check_seed
 from cavmarl.config import EnvConfig
 from cavmarl.errors import ConfigError, ResetNeededError
 from cavmarl.kernels.codes import EVENTS_THAT_END
 from cavmarl.roads.network import RoadNetwork
 from cavmarl.runtime.simulation import Simulation
+from cavmarl.seeds import check_seed, first_seed
 from cavmarl.spaces import action_space, flat_observation_space
 from cavmarl.worlds import check_placement, load_world
 
@@ -85,7 +86,7 @@ def make_vec(
 
 
 class CavVectorEnv:
-    """W worlds with A agent seats each; flat observations.
+    """W worlds with A agent seats each; observations are flat, whatever `observation.kind` says.
 
     Arrays have the shape (num_envs, num_agents, …). `infos["mask"]` says which agents have a
     vehicle and will be asked for the next action; the others' observations are 0 and their actions
@@ -111,6 +112,12 @@ class CavVectorEnv:
         self.num_agents = len(self.possible_agents)
         self.single_observation_space: spaces.Box = flat_observation_space(config)
         self.single_action_space = action_space(config.action)
+        self.observation_space = batch_space(
+            batch_space(self.single_observation_space, self.num_agents), num_envs
+        )
+        self.action_space = batch_space(
+            batch_space(self.single_action_space, self.num_agents), num_envs
+        )
         self.max_cycles = config.max_steps
         self.metadata = {
             "name": f"cavmarl/{config.name}-v{config.version}",
@@ -120,7 +127,7 @@ class CavVectorEnv:
         self._decoder = ActionDecoder(config.action, num_envs, self.possible_agents)
         self._steps = np.zeros(num_envs, dtype=np.int64)
         self._mask = np.zeros((num_envs, self.num_agents), dtype=np.bool_)
-        self._first_seed = seed
+        self._first_seed = None if seed is None else check_seed(seed)
         self._ready = False
 
     @property
@@ -146,12 +153,8 @@ class CavVectorEnv:
         Returns:
             observations (W, A, D) and infos.
         """
-        if seed is None and not self._ready:
-            seed = self._first_seed
-            if seed is None:
-                seed = int(np.random.SeedSequence().generate_state(1, np.uint64)[0] >> 1)
-        if seed is not None:
-            self._simulation.seed(check_seed(seed))
+        if seed is not None or not self._ready:
+            self._simulation.seed(first_seed(seed, self._first_seed))
         everywhere = np.ones(self.num_envs, dtype=np.bool_)
         self._simulation.reset()
         self._decoder.forget(everywhere)
@@ -226,8 +229,8 @@ class CavVectorEnv:
         return self._simulation.state_hash(world)
 
     def traffic_stats(self, world: int = 0) -> dict[str, float]:
-        """Traffic of one world since its reset, as `CavEnv`'s; actions of all worlds."""
-        return {**asdict(self._simulation.traffic_stats(world)), **self._decoder.tolerated()}
+        """Traffic of one world since its reset, as `CavEnv.traffic_stats`."""
+        return {**asdict(self._simulation.traffic_stats(world)), **self._decoder.tolerated(world)}
 
     def close(self) -> None:
         """Nothing to release: all worlds live in this process."""

@@ -13,12 +13,25 @@ from numpy.typing import NDArray
 
 from cavmarl.cav_env import CavEnv, parallel_env
 from cavmarl.errors import ConfigError
+from cavmarl.registry import load_config
 from cavmarl.vector_env import make_vec
-from cavmarl.worlds import load_world
 
 __all__ = ["CavAgentRows", "CavEgoEnv"]
 
 EGO = "car_0"
+
+
+def _without(
+    overrides: dict[str, Any] | None, arguments: dict[str, Any], fixed: tuple[str, ...]
+) -> dict[str, Any]:
+    """The overrides, or an error for a key that the view itself decides."""
+    given = overrides or {}
+    for key in fixed:
+        if key in given or key in arguments:
+            raise ConfigError(
+                f"{key}: this view decides it; cavmarl.parallel_env and make_vec leave it to you"
+            )
+    return given
 
 
 class CavEgoEnv(gymnasium.Env[Any, Any]):
@@ -45,17 +58,16 @@ class CavEgoEnv(gymnasium.Env[Any, Any]):
         overrides: dict[str, Any] | None = None,
         **arguments: Any,
     ) -> None:
-        if "agents" in arguments:
-            raise ConfigError("agents: this environment has one; use cavmarl.parallel_env")
-        if background is None:
-            population = load_world(env, overrides=overrides)[0].population
+        wanted = _without(overrides, arguments, ("agents", "population.agents", "population.mode"))
+        population = load_config(env, overrides=overrides)[0].population
+        if background is None and "population.background" not in wanted:
             background = population.background + population.agents - 1
         self._env = parallel_env(
             env,
             agents=1,
             background=background,
             render_mode=render_mode,
-            overrides={**(overrides or {}), "population.mode": "closed"},
+            overrides={**wanted, "population.mode": "closed"},
             **arguments,
         )
         self.render_mode = render_mode
@@ -113,11 +125,12 @@ class CavAgentRows(gymnasium.vector.VectorEnv[Any, Any, Any]):
         overrides: dict[str, Any] | None = None,
         **arguments: Any,
     ) -> None:
+        wanted = _without(overrides, arguments, ("agents", "population.agents", "population.mode"))
         self._vec = make_vec(
             env,
             num_envs=1,
             agents=num_envs,
-            overrides={**(overrides or {}), "population.mode": "seats"},
+            overrides={**wanted, "population.mode": "seats"},
             **arguments,
         )
         self.num_envs = num_envs
@@ -151,9 +164,6 @@ class CavAgentRows(gymnasium.vector.VectorEnv[Any, Any, Any]):
         ended = terminations[0] | truncations[0]
         shown: dict[str, Any] = {"active": infos["mask"][0]}
         if ended.any():
-            final = np.empty(self.num_envs, dtype=object)
-            for row in np.flatnonzero(ended):
-                final[row] = infos["final_observations"][0, row]
-            shown["final_obs"] = final
+            shown["final_obs"] = infos["final_observations"][0]
             shown["_final_obs"] = ended
         return observations[0], rewards[0], terminations[0], truncations[0], shown

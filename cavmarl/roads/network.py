@@ -253,11 +253,6 @@ class RoadNetwork:
             float(lanes["max_y"].max()),
         )
 
-    @cached_property
-    def max_speed_mps(self) -> float:
-        """The highest speed limit on the map."""
-        return float(self.lanes["speed_mps"].max())
-
     def lane_polyline(self, lane: int) -> NDArray[np.float64]:
         """The centre line of a lane as (num_points, 3) x, y, z in metres."""
         row = self.lanes[lane]

@@ -191,10 +191,11 @@ class Simulation:
         self._executor.each(lambda shard: shard.suggest(out))
 
     def state_hash(self, world: int = 0) -> str:
-        """Hex digest of everything that the future of a world depends on.
+        """Hex digest of a world's state.
 
         Over all vehicles in the order of their ids, the queue, the signals, the tick and the key of
-        all random numbers; not over where a record lives.
+        all random numbers; not over where a record lives, nor over what a view keeps (steps to the
+        horizon, held actions).
         """
         worlds = self._shard.worlds
         rows = self.vehicles(world)

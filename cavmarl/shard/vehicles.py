@@ -59,19 +59,16 @@ VEHICLE = np.dtype(
         ("s", np.float64),
         ("d", np.float64),
         ("goal", np.int32),  # where it drives to: row of the plans' table
-        (
-            "leg",
-            np.int32,
-        ),  # how many goals it has had; the next one is a function of its random key
+        ("leg", np.int32),  # how many goals it has had before
         ("to_go", np.float64),  # m left to the goal, along the plan
         # configuration
-        ("vtype", np.int32),  # row of the vehicle types' table
+        ("vtype", np.int32),  # row of a table of types; reserved: all are passenger cars
         ("driver", np.int32),  # DRIVER_*
         ("length", np.float64),
         ("width", np.float64),
         ("height", np.float64),
         ("speed_factor", np.float64),  # desired speed over the limit
-        ("sensor_phase", np.int32),  # ticks until slow sensors fire
+        ("sensor_phase", np.int32),  # ticks until slow sensors fire; reserved: all fire each step
         # driver's mind (agent-logic state)
         ("hold", np.int32),  # HOLD_*
         ("wait", np.int32),  # ticks that it has stood still
@@ -92,7 +89,7 @@ VEHICLE = np.dtype(
         ("distance_m", np.float64),  # driven since departure
         ("free_s", np.float64),  # time the driven way would have taken at the limit, s
         ("episode_return", np.float64),  # sum of rewards since it was seated
-        ("memory", np.int64),  # handle of a recurrent policy's state
+        ("memory", np.int64),  # handle of a recurrent policy's state; reserved
     ],
     align=True,
 )

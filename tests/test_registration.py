@@ -1,0 +1,125 @@
+"""The names under which Gymnasium and PettingZoo find the entries, and what they give."""
+
+from __future__ import annotations
+
+import gymnasium
+import numpy as np
+import pettingzoo
+import pytest
+from gymnasium.utils.env_checker import check_env
+
+import cavmarl
+from cavmarl.registry import entries
+from cavmarl.seeds import check_seed, first_seed
+
+ALL = sorted(entries())
+
+
+@pytest.mark.parametrize("name", ALL)
+def test_every_entry_has_its_ids(name: str) -> None:
+    assert f"cavmarl/{name}-v0" in gymnasium.registry
+    assert f"cavmarl/{name}Agents-v0" in gymnasium.registry
+    for kind in ("parallel", "aec"):
+        world = pettingzoo.make(kind, f"cavmarl/{name}-v0", max_cycles=3)
+        world.reset(seed=0)
+        assert world.agents
+
+
+def test_one_vehicle_of_a_world_passes_gymnasiums_checker() -> None:
+    world = gymnasium.make("cavmarl/merge-v0", disable_env_checker=True).unwrapped
+    check_env(world, skip_render_check=True)
+    assert world._env.config.population.background == 19
+
+
+@pytest.mark.parametrize(
+    ("arguments", "key"),
+    [
+        ({"agents": 2}, "agents"),
+        ({"overrides": {"population.mode": "seats"}}, r"population\.mode"),
+        ({"overrides": {"population.agents": 2}}, r"population\.agents"),
+    ],
+)
+def test_a_view_refuses_the_keys_that_it_decides(arguments: dict[str, object], key: str) -> None:
+    with pytest.raises(cavmarl.ConfigError, match=f"^{key}: this view decides it"):
+        gymnasium.make("cavmarl/ring-v0", **arguments)
+    with pytest.raises(cavmarl.ConfigError, match=f"^{key}: this view decides it"):
+        gymnasium.make_vec("cavmarl/ringAgents-v0", num_envs=2, **arguments)
+
+
+def test_one_vehicle_takes_another_background_by_override() -> None:
+    world = gymnasium.make("cavmarl/ring-v0", overrides={"population.background": 3})
+    assert world.unwrapped._env.config.population.background == 3
+
+
+def test_agents_are_rows_that_end_singly() -> None:
+    rows = gymnasium.make_vec("cavmarl/mergeAgents-v0", num_envs=5, max_cycles=60)
+    rows.action_space.seed(0)
+    observations, infos = rows.reset(seed=0)
+    assert observations.shape == rows.observation_space.shape
+    ends = 0
+    for _ in range(60):
+        observations, rewards, ended, cut, infos = rows.step(rows.action_space.sample())
+        assert rewards.shape == ended.shape == cut.shape == (5,)
+        ends += int(ended.sum())
+        if ended.any():
+            assert infos["_final_obs"][ended].all()
+            assert np.abs(infos["final_obs"][ended]).sum() > 0
+        assert not observations[~infos["active"]].any()
+    assert ends > 0
+    assert cut.all() or ended.any()
+
+
+def test_the_aec_form_refuses_a_wrong_action_and_goes_on() -> None:
+    world = cavmarl.env("ring", agents=2, background=0)
+    world.reset(seed=0)
+    before = world.agent_selection
+    with pytest.raises(cavmarl.InvalidActionError, match="car_0"):
+        world.step(np.array([np.nan, 0.0]))
+    assert world.agent_selection == before
+    for _ in range(4):
+        world.step(np.zeros(2))
+    assert world.agent_selection == "car_0"
+
+
+@pytest.mark.parametrize("seed", [-1, 1 << 63, True, 1.0, "a"])
+def test_a_wrong_seed_is_refused_when_the_world_is_made(seed: object) -> None:
+    with pytest.raises(cavmarl.ConfigError, match="seed"):
+        cavmarl.parallel_env("ring", seed=seed)
+    with pytest.raises(cavmarl.ConfigError, match="seed"):
+        cavmarl.make_vec("ring", seed=seed)
+
+
+def test_without_a_seed_no_two_first_resets_agree() -> None:
+    assert first_seed(None, None) != first_seed(None, None)
+    assert first_seed(None, 5) == 5
+    assert first_seed(7, 5) == 7
+    assert check_seed(np.uint64(9)) == 9
+
+
+def test_numpy_numbers_are_numbers() -> None:
+    world = cavmarl.parallel_env(
+        "ring",
+        agents=np.int64(3),
+        background=np.int32(2),
+        max_cycles=np.int16(7),
+        overrides={"sensors.lidar.rays": np.uint8(16), "traffic.goals": np.int64(4)},
+    )
+    assert world.config.population.agents == 3
+    assert world.max_cycles == 7
+    assert world.config.sensors.lidar.rays == 16
+
+
+@pytest.mark.parametrize("env", [None, 3, ["ring"]])
+def test_what_is_no_name_is_refused(env: object) -> None:
+    with pytest.raises(cavmarl.UnknownEnvironmentError, match="must be the name"):
+        cavmarl.parallel_env(env)
+
+
+def test_keys_of_overrides_are_text() -> None:
+    with pytest.raises(cavmarl.ConfigError, match="3 is no key"):
+        cavmarl.parallel_env("ring", overrides={3: 3})
+
+
+def test_a_horizon_is_a_whole_number_of_steps() -> None:
+    with pytest.raises(cavmarl.ConfigError, match=r"horizon_s = 1\.04.*try 1$"):
+        cavmarl.parallel_env("ring", overrides={"horizon_s": 1.04})
