@@ -172,13 +172,16 @@ def load_network(folder: Path) -> tuple[ActorCritic, NetworkConfig]:
         PolicyError: a file is missing, broken, or does not fit the other; or weights are not
             finite.
     """
+    for name in (WEIGHTS_FILE, CONFIG_FILE):
+        if not (folder / name).is_file():
+            raise PolicyError(f"no {name} in {folder}: is this the folder of a trained driver?")
     config = _read_config(folder / CONFIG_FILE)
     path = folder / WEIGHTS_FILE
     network = ActorCritic(config)
     try:
         weights = load_file(path)
     except (OSError, SafetensorError) as error:
-        raise PolicyError(f"{path}: cannot be read ({error})") from error
+        raise _unreadable(path, error) from error
     try:
         network.load_state_dict(weights)
     except RuntimeError as error:
@@ -194,8 +197,13 @@ def _read_config(path: Path) -> NetworkConfig:
     try:
         raw: Any = json.loads(path.read_text(encoding="utf-8"))
     except (OSError, UnicodeDecodeError, json.JSONDecodeError) as error:
-        raise PolicyError(f"{path}: cannot be read ({error})") from error
+        raise _unreadable(path, error) from error
     try:
         return validate(NetworkConfig, raw, str(path))
     except ConfigError as error:
         raise PolicyError(str(error)) from error
+
+
+def _unreadable(path: Path, error: Exception) -> PolicyError:
+    reason = error.strerror if isinstance(error, OSError) else None  # its text repeats the path
+    return PolicyError(f"{path}: cannot be read ({reason or error})")

@@ -143,6 +143,8 @@ def load_policy(policy: str | Path, env: Environment) -> Policy:
 
 def _find(policy: str | Path) -> Path:
     """The file or folder that `policy` means."""
+    if not isinstance(policy, str | Path):
+        raise PolicyError(f"policy = {policy!r}: must be the name of a driver, or a path")
     known = agent_entries()
     if isinstance(policy, str) and policy in known:
         return known[policy]
@@ -192,10 +194,11 @@ def _load_network_policy(folder: Path, env: Environment) -> NetworkPolicy:
     name, here = folder.name, env.config
     size = flat_observation_space(here).shape[0]
     if unlike := _differences(config, here):
+        lines = (f"{key} is {there} there, {ours} here" for key, (there, ours) in unlike.items())
+        cure = {key: there for key, (there, _) in unlike.items()}
         raise PolicyError(
-            f"{name} does not fit {here.name}: it observes {config.observation_size} numbers and "
-            f"acts {config.action.kind}, here {size} and {here.action.kind}; make the environment "
-            f"with overrides={unlike}"
+            f"{name} does not fit {here.name}: {'; '.join(lines)} ({config.observation_size} "
+            f"numbers observed there, {size} here); make the environment with overrides={cure}"
         )
     if config.observation_size != size:
         raise PolicyError(
@@ -205,22 +208,21 @@ def _load_network_policy(folder: Path, env: Environment) -> NetworkPolicy:
     return NetworkPolicy(env, network, folder / WEIGHTS_FILE)
 
 
-def _differences(config: NetworkConfig, here: EnvConfig) -> dict[str, Any]:
-    """Keys to change here so that observations and actions mean what they did in training."""
+def _differences(config: NetworkConfig, here: EnvConfig) -> dict[str, tuple[Any, Any]]:
+    """Keys that make observations or actions mean something else: (in training, here)."""
     kind = config.action.kind
     scales = {
         "continuous": ("acceleration_mps2", "steering_rad"),
         "discrete": ("target_speeds_mps",),
     }[kind]
-    found: dict[str, Any] = {}
-    if here.action.kind != kind:
-        found["action.kind"] = kind
-    for scale in scales:
-        if getattr(config.action, scale) != getattr(here.action, scale):
-            found[f"action.{scale}"] = getattr(config.action, scale)
+    found: dict[str, tuple[Any, Any]] = {}
+    for key in ("kind", *scales):
+        there, ours = getattr(config.action, key), getattr(here.action, key)
+        if there != ours:
+            found[f"action.{key}"] = (there, ours)
     sensors_there, sensors_here = asdict(config.sensors), asdict(here.sensors)
     for sensor, settings in sensors_there.items():
         for key, value in settings.items():
             if sensors_here[sensor][key] != value:
-                found[f"sensors.{sensor}.{key}"] = value
+                found[f"sensors.{sensor}.{key}"] = (value, sensors_here[sensor][key])
     return found

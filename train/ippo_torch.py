@@ -453,8 +453,12 @@ class Run:
         if args.resume:
             load_checkpoint(args.folder, self.learner, self.config)
         self.collector = Collector(vec, self.network, args, args.seed + self.updates)
-        args.folder.mkdir(parents=True, exist_ok=True)
-        self.log = Log(args)
+        try:
+            args.folder.mkdir(parents=True, exist_ok=True)
+            self.log = Log(args)
+        except OSError as error:
+            reason = error.strerror or error
+            raise ConfigError(f"{args.folder}: cannot be written ({reason})") from error
         self._began_at = time.perf_counter()
 
     def done(self) -> float:

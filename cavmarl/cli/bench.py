@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import TYPE_CHECKING, Annotated
 
 import typer
@@ -9,6 +10,7 @@ from rich.console import Console
 from rich.table import Table
 
 from cavmarl.cli.output import JsonPath, write_json
+from cavmarl.errors import ConfigError
 
 if TYPE_CHECKING:
     from cavmarl.evaluate.step_speed import Rates, StepSpeed
@@ -36,14 +38,16 @@ def step(
     """Agent-steps a second next to highway-env's: same road, vehicles, sensor, rates; one core."""
     from cavmarl.evaluate.step_speed import measure_step_speed
 
+    if at_least is not None and not 0.0 < at_least < math.inf:
+        raise ConfigError(f"--at-least {at_least:g}: must be a number above 0")
     console = Console()
     with console.status("") as status:
         found = measure_step_speed(agents, worlds, repeats, status.update)
-    write_json(json_path, found.to_dict())
     console.print(_table(found))
     console.print(
         f"ratio: [bold]{found.ratio:,.0f}[/] batched, {found.ratio_single:,.0f} with one world"
     )
+    write_json(json_path, found.to_dict())
     if at_least is not None and found.ratio < at_least:
         raise typer.Exit(1)
 

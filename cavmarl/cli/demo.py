@@ -11,7 +11,7 @@ import typer
 from rich.console import Console
 
 from cavmarl.cli.evaluate import evaluate_showing, report_table
-from cavmarl.cli.output import JsonPath, Seed, write_json
+from cavmarl.cli.output import JsonPath, Seed, make_folder, write_json
 from cavmarl.cli.view import record
 from cavmarl.errors import ConfigError
 
@@ -47,6 +47,7 @@ def demo(
         raise ConfigError("--minutes must be above 0, at most 600; --seconds above 0, at most 3600")
     require("torch", "torch")
     require("imageio_ffmpeg", "render")
+    make_folder(out)
     console = Console()
     console.print(f"[bold]1. train[/] on merge, {minutes:g} min")
     trained = _train(out, minutes, seed)

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 from rich.console import Console
+from rich.markup import escape
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
@@ -51,8 +52,8 @@ def evaluate(
         background=background,
         overrides=parse_settings(settings),
     )
-    write_json(json_path, report.to_dict())
     console.print(report_table({policy: report}))
+    write_json(json_path, report.to_dict())
 
 
 def evaluate_showing(console: Console, env: str, policy: str, **settings: Any) -> EvaluationReport:
@@ -71,7 +72,7 @@ def evaluate_showing(console: Console, env: str, policy: str, **settings: Any) -
 def progress_bar(console: Console) -> Progress:
     """A bar that goes away when the work is done."""
     return Progress(
-        TextColumn("{task.description}"),
+        TextColumn("{task.description}", markup=False),
         BarColumn(bar_width=24),
         TimeElapsedColumn(),
         console=console,
@@ -83,9 +84,9 @@ def report_table(reports: dict[str, EvaluationReport]) -> Table:
     """Reports side by side, one column a driver."""
     first = next(iter(reports.values()))
     title = f"{first.manifest.environment}, {first.episodes} episodes of seed {first.manifest.seed}"
-    table = Table("mean ± half its 95 % interval", title=title)
+    table = Table("rate [95 % interval], mean ± half of it", title=escape(title))
     for name in reports:
-        table.add_column(name, justify="right")
+        table.add_column(escape(name), justify="right")
     columns = [_cells(report) for report in reports.values()]
     for row in columns[0]:
         table.add_row(row, *(column[row] for column in columns))
@@ -96,12 +97,12 @@ def _cells(report: EvaluationReport) -> dict[str, str]:
     speed = report.speed
     return {
         "trips": str(report.trips),
-        "success": _interval(report.success, unit="%"),
-        "collision": _interval(report.collision, unit="%"),
-        "off road": _interval(report.off_road, unit="%"),
-        "unfinished": _interval(report.unfinished, unit="%"),
-        "red light": _interval(report.red_light, unit="%"),
-        "wrong way": _interval(report.wrong_way, unit="%"),
+        "success": _rate(report.success),
+        "collision": _rate(report.collision),
+        "off road": _rate(report.off_road),
+        "unfinished": _rate(report.unfinished),
+        "red light": _rate(report.red_light),
+        "wrong way": _rate(report.wrong_way),
         "episode return": _interval(report.episode_return),
         "least time to collision, s": _interval(report.mean_least_ttc_s),
         "jerk, m/s³": _interval(report.mean_jerk_mps3),
@@ -112,6 +113,14 @@ def _cells(report: EvaluationReport) -> dict[str, str]:
         "policy for a world, ms": f"{speed.policy_ms:.3f}",
         "agent-steps/s": f"{speed.agent_steps_per_s:,.0f}",
     }
+
+
+def _rate(interval: Interval) -> str:
+    """A share and the ends of its interval, which reaches farther to one side."""
+    share = number(interval.mean, unit="%")
+    if interval.low is None or interval.high is None:
+        return share
+    return f"{share} [{100.0 * interval.low:.1f}, {100.0 * interval.high:.1f}]"
 
 
 def _interval(interval: Interval, unit: str = "") -> str:

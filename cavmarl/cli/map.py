@@ -28,6 +28,7 @@ Source = Annotated[
     ),
 ]
 
+_NETWORK_ENDINGS = (".net.xml", ".net.xml.gz")
 _SHOWN_WARNINGS = 12
 
 
@@ -50,15 +51,19 @@ def build(
 ) -> None:
     """Make a SUMO network of a map file; its statistics go beside it, to NAME.stats.json."""
     target = out or Path(f"{map_name(source)}.net.xml")
+    if not target.name.endswith(_NETWORK_ENDINGS):
+        raise typer.BadParameter(
+            f"'{target}' must end in {' or '.join(_NETWORK_ENDINGS)}", param_hint="--out"
+        )
     console = Console()
     with console.status(f"building {target} …"):
         result = build_network(source, target, bbox=_box(bbox), tolerant=tolerant)
         report = check_map(result.path)
     document = {"build": result.to_dict(), "map": report.to_dict()}
-    write_json(target.with_name(f"{map_name(target)}.stats.json"), document)
-    write_json(json_path, document)
     _print_build(console, result)
     _print_report(console, report)
+    write_json(target.with_name(f"{map_name(target)}.stats.json"), document)
+    write_json(json_path, document)
     raise typer.Exit(0 if report.drivable else 1)
 
 
@@ -68,8 +73,8 @@ def check(source: Source, json_path: JsonPath = None) -> None:
     console = Console()
     with console.status(f"checking {source} …"):
         report = check_map(map_file(source))
-    write_json(json_path, report.to_dict())
     _print_report(console, report)
+    write_json(json_path, report.to_dict())
     raise typer.Exit(0 if report.drivable else 1)
 
 

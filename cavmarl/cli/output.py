@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Sequence
 from pathlib import Path
+from tempfile import TemporaryFile
 from typing import Annotated, Any
 
 import typer
@@ -12,6 +13,7 @@ from rich.console import Console
 from rich.text import Text
 
 from cavmarl.errors import ConfigError
+from cavmarl.seeds import check_seed
 
 __all__ = [
     "Agents",
@@ -21,11 +23,34 @@ __all__ = [
     "PolicyName",
     "Seed",
     "Settings",
+    "make_folder",
     "number",
     "parse_settings",
     "print_error",
     "write_json",
 ]
+
+
+def _writable(path: Path | None) -> Path | None:
+    """Refuse a path that cannot be written before any work is done for it."""
+    if path is None:
+        return None
+    if not path.parent.is_dir():
+        raise ConfigError(f"--json {path}: cannot be written (there is no folder {path.parent})")
+    try:
+        there = path.exists()
+        with path.open("ab"):
+            pass
+        if not there:
+            path.unlink()
+    except OSError as error:
+        raise _unwritable(path, error) from error
+    return path
+
+
+def _unwritable(path: Path, error: OSError) -> ConfigError:
+    return ConfigError(f"{path}: cannot be written ({error.strerror or error})")
+
 
 Environment = Annotated[
     str, typer.Argument(metavar="ENV", help="Name, folder or map file of an environment.")
@@ -33,7 +58,7 @@ Environment = Annotated[
 PolicyName = Annotated[
     str, typer.Option("--policy", "-p", help="A name of `cavmarl list`, or the path of a policy.")
 ]
-Seed = Annotated[int, typer.Option(help="Root of all random numbers.")]
+Seed = Annotated[int, typer.Option(help="Root of all random numbers.", callback=check_seed)]
 Agents = Annotated[int | None, typer.Option(help="Agents a world; default: the environment's.")]
 Background = Annotated[
     int | None, typer.Option(help="Background vehicles a world; default: the environment's.")
@@ -42,14 +67,17 @@ Settings = Annotated[
     list[str] | None,
     typer.Option("--set", metavar="KEY=VALUE", help="Any key of env.yaml; may be repeated."),
 ]
-JsonPath = Annotated[Path | None, typer.Option("--json", help="Write the result here as JSON.")]
+JsonPath = Annotated[
+    Path | None,
+    typer.Option("--json", help="Write the result here as JSON.", callback=_writable),
+]
 
 
 def parse_settings(settings: Sequence[str] | None) -> dict[str, Any]:
     """`sensors.lidar.rays=32` and the like as overrides; a value is JSON, else text.
 
     Raises:
-        ConfigError: no `=`, or a key twice.
+        ConfigError: no `=`, no key, no value, or a key twice.
     """
     overrides: dict[str, Any] = {}
     for setting in settings or ():
@@ -62,7 +90,23 @@ def parse_settings(settings: Sequence[str] | None) -> dict[str, Any]:
             overrides[key] = json.loads(text)
         except json.JSONDecodeError:
             overrides[key] = text
+        if overrides[key] == "":
+            raise ConfigError(f"--set {key}=: has no value")
     return overrides
+
+
+def make_folder(path: Path) -> None:
+    """Make a folder that files can be written into, or see that it is one.
+
+    Raises:
+        ConfigError: it cannot be made or written into.
+    """
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+        with TemporaryFile(dir=path):
+            pass
+    except OSError as error:
+        raise _unwritable(path, error) from error
 
 
 def write_json(path: Path | None, document: dict[str, Any]) -> None:
@@ -74,10 +118,9 @@ def write_json(path: Path | None, document: dict[str, Any]) -> None:
     if path is None:
         return
     try:
-        path.parent.mkdir(parents=True, exist_ok=True)
         path.write_text(json.dumps(document, indent=2) + "\n", encoding="utf-8")
     except OSError as error:
-        raise ConfigError(f"{path}: cannot be written ({error.strerror or error})") from error
+        raise _unwritable(path, error) from error
 
 
 def number(value: float | None, digits: int = 2, unit: str = "") -> str:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -46,6 +48,8 @@ def view(
 
     if not 0.0 < seconds <= 3600.0:
         raise ConfigError(f"--seconds {seconds:g}: must be above 0 and at most 3600")
+    if video is None:
+        _check_display()
     world = parallel_env(
         env,
         agents=agents,
@@ -55,9 +59,20 @@ def view(
     )
     console = Console()
     stats = record(world, policy, seconds, seed, video, console)
-    write_json(json_path, {"video": str(video) if video else None, "traffic": stats})
     if video is not None:
-        console.print(f"video: {video}")
+        console.print(f"video: {video}", markup=False)
+    write_json(json_path, {"video": str(video) if video else None, "traffic": stats})
+
+
+def _check_display() -> None:
+    """Refuse a window where SDL would draw it nowhere and say nothing.
+
+    Raises:
+        ConfigError: Linux without a display.
+    """
+    shows = ("DISPLAY", "WAYLAND_DISPLAY", "SDL_VIDEODRIVER")
+    if sys.platform == "linux" and not any(os.environ.get(name) for name in shows):
+        raise ConfigError("there is no display for a window: use --video FILE")
 
 
 def record(

@@ -15,11 +15,13 @@ from cavmarl.evaluate.manifest import make_manifest
 from cavmarl.evaluate.report import EvaluationReport, Speed, make_report
 from cavmarl.evaluate.statistics import TripRecorder, Trips
 from cavmarl.policies import NetworkPolicy, Policy, load_policy
-from cavmarl.vector_env import CavVectorEnv, make_vec
+from cavmarl.vector_env import CavVectorEnv
+from cavmarl.worlds import load_world
 
 __all__ = ["evaluate"]
 
 MAX_EPISODES = 10_000
+MAX_VEHICLES = 2_000_000  # all worlds are in memory at once
 
 Progress = Callable[[int, int], None]
 
@@ -53,21 +55,28 @@ def evaluate(
         progress: called after every step with its number and with the most there can be.
 
     Raises:
-        ConfigError: a number or a key that cannot work.
+        ConfigError: a number or a key that cannot work, or more than `MAX_VEHICLES` agents and
+            background vehicles in all episodes together.
         PolicyError: the policy cannot be loaded or does not fit.
     """
     if isinstance(episodes, bool) or not isinstance(episodes, int):
         raise ConfigError(f"episodes = {episodes!r}: must be a whole number")
     if not 1 <= episodes <= MAX_EPISODES:
         raise ConfigError(f"episodes = {episodes}: must be from 1 to {MAX_EPISODES}")
-    vec = make_vec(
+    config, network = load_world(
         env,
-        num_envs=episodes,
         agents=agents,
         background=background,
         max_cycles=max_cycles,
         overrides=overrides,
     )
+    vehicles = config.population.agents + config.population.background
+    if episodes * vehicles > MAX_VEHICLES:
+        raise ConfigError(
+            f"episodes = {episodes}: with {vehicles} vehicles each, {episodes * vehicles} in all; "
+            f"at most {MAX_VEHICLES}: take at most {MAX_VEHICLES // vehicles} episodes"
+        )
+    vec = CavVectorEnv(config, network, episodes)
     driver = load_policy(policy, vec)
     trips, returns, speed = _drive(vec, driver, seed, progress)
     manifest = make_manifest(

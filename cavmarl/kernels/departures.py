@@ -55,7 +55,7 @@ ENTER_SHARE = 0.7  # of the speed limit
 ENTER_REACH_M = 80.0
 WANDER_M = 150.0  # nearer to its goal than this a vehicle of a closed world picks another
 GOAL_TRIES = 8
-GIVE_UP_TICKS = 200  # a driver that waits longer than this to change lanes takes another way
+GIVE_UP_S = 10.0  # a driver that waits longer than this to change lanes takes another way
 
 
 @kernel
@@ -202,12 +202,12 @@ def populate(
 def _needs_goal(demand: Demand, plans: NDArray[np.void], row: np.void) -> bool:
     """Whether a background vehicle picks another goal: near it in a closed world, or stuck.
 
-    Stuck is who has stood for `GIVE_UP_TICKS` at the end of a lane that its way does not follow.
+    Stuck is who has stood for `GIVE_UP_S` at the end of a lane that its way does not follow.
     """
     if not demand.reenter and row["to_go"] <= WANDER_M:
         return True
     step = plans[row["goal"], row["lane"]]
-    stuck: bool = row["wait"] > GIVE_UP_TICKS and step["next"] < 0 and step["change"] != 0
+    stuck: bool = row["wait_s"] > GIVE_UP_S and step["next"] < 0 and step["change"] != 0
     return stuck
 
 

@@ -220,6 +220,7 @@ def decide(
     num: int,
     driver: int,
     tick: int,
+    dt: float,
     phase: NDArray[np.int32],
     scratch: Scratch,
 ) -> None:
@@ -232,6 +233,7 @@ def decide(
         num: rows to decide for, the first of `rows`; all rows stand in the indices.
         driver: DRIVER_* whose rows are decided for.
         tick: of the committed state.
+        dt: seconds of a tick.
         phase: (num_signals,) PHASE rows that are on.
         scratch: with the lane and link indices of this tick; accel (m/s²), lane_change, blinker,
             hold and link_ahead are written.
@@ -252,7 +254,7 @@ def decide(
         strongest = max(strongest, _courtesy(roads, rows, i, scratch))
         accel = idm_free(row["speed"], allowed, ACCEL_MAX) - strongest
         needed = needed_change(roads, plans, row)
-        change = choose_lane(roads, plans, rows, i, tick, needed, accel, scratch)
+        change = choose_lane(roads, plans, rows, i, tick, dt, needed, accel, scratch)
         if change != 0 and driver == DRIVER_AGENT:
             accel = _accel_swinging_out(roads, plans, rows, i, change, phase, scratch)
         scratch.accel[i] = clamp(accel, -ACCEL_LIMIT, ACCEL_LIMIT)

@@ -34,7 +34,7 @@ from cavmarl.kernels.lanes import last_on_lane
 
 __all__ = [
     "APPROACH_M",
-    "STOP_SIGN_TICKS",
+    "STOP_SIGN_S",
     "conflict_inside",
     "link_signal",
     "may_enter",
@@ -51,8 +51,8 @@ STEERED_MPS = 5.0  # a steered car is taken to turn no faster than this
 STANDING_MPS = 0.5
 LAST_CHANCE_M = 3.0  # with the front this near to the line
 ROOM_M = 3.0  # free way left behind a vehicle that clears a junction
-IMPATIENT_TICKS = 60  # a vehicle that stands this long without reason is not waited for
-STOP_SIGN_TICKS = 10  # ticks that one stands at a stop sign, and before a tie is broken
+IMPATIENT_S = 3.0  # a vehicle that stands this long without reason is not waited for
+STOP_SIGN_S = 0.5  # how long one stands at a stop sign, and before a tie is broken
 STATE_STOP = ord("s")
 STATE_ALLWAY_STOP = ord("w")
 
@@ -175,11 +175,11 @@ def _ignores(row: np.void, foe: np.void, link: int, signal: int) -> bool:
         # Both wait for somebody: who has stood longer goes first, and then goes on.
         if row["hold"] == HOLD_NONE and row["stopped_at"] == link:
             return True
-        if row["wait"] < STOP_SIGN_TICKS or row["speed"] > STANDING_MPS:
+        if row["wait_s"] < STOP_SIGN_S or row["speed"] > STANDING_MPS:
             return False
-        longer: bool = row["wait"] > foe["wait"]
-        return longer or (row["wait"] == foe["wait"] and row["id"] < foe["id"])
-    waited: bool = foe["wait"] > IMPATIENT_TICKS
+        longer: bool = row["wait_s"] > foe["wait_s"]
+        return longer or (row["wait_s"] == foe["wait_s"] and row["id"] < foe["id"])
+    waited: bool = foe["wait_s"] > IMPATIENT_S
     return waited
 
 

@@ -15,13 +15,12 @@ from cavmarl.kernels.arrays import RoadArrays, Scratch
 from cavmarl.kernels.car_following import ACCEL_MAX, idm_free
 from cavmarl.kernels.codes import DRIVER_AGENT
 from cavmarl.kernels.following import accel_behind
-from cavmarl.kernels.lane_change import mobil_accepts
+from cavmarl.kernels.lane_change import LANE_CHANGE_DELAY_S, mobil_accepts
 from cavmarl.kernels.lanes import last_on_lane, neighbor_ahead, neighbor_behind
 
 __all__ = ["LOOK_BACK_M", "SIDE_GAP_M", "choose_lane", "needed_change"]
 
 LOOK_BACK_M = 60.0  # how far back a lane change looks for followers
-DECIDE_EVERY_TICKS = 10  # how often a driver thinks of changing to one side
 CHANGE_EARLY_M = 80.0  # a change that the route needs is made this far before it must be,
 CHANGE_EARLY_S = 12.0  # plus the way of this time
 MAX_BRAKING_ACCEPTED = 4.0  # m/s², harder braking behind the new leader is never worth it
@@ -122,6 +121,7 @@ def choose_lane(
     rows: NDArray[np.void],
     i: int,
     tick: int,
+    dt: float,
     needed: int,
     accel: float,
     scratch: Scratch,
@@ -138,7 +138,9 @@ def choose_lane(
             if _may_change(roads, plans, rows, i, side, needed, accel, scratch):
                 return side
         return 0
-    if row["side_lane"] >= 0 or (tick // 2 + row["id"]) % DECIDE_EVERY_TICKS != 0:
+    # Every driver thinks of either side once in LANE_CHANGE_DELAY_S, not all in the same ticks.
+    turns = max(1, round(0.5 * LANE_CHANGE_DELAY_S / dt))
+    if row["side_lane"] >= 0 or (tick // 2 + row["id"]) % turns != 0:
         return 0
     side = 1 if tick % 2 == 0 else -1
     if _may_change(roads, plans, rows, i, side, needed, accel, scratch):

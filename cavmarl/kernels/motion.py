@@ -63,7 +63,7 @@ def _account(row: np.void, old: np.void, roads: RoadArrays, dt: float) -> None:
     driven = abs(old["speed"]) * dt
     row["distance_m"] = old["distance_m"] + driven
     row["free_s"] = old["free_s"] + driven / roads.lanes[old["lane"]]["speed_mps"]
-    row["wait"] = old["wait"] + 1 if abs(row["speed"]) < STANDING_MPS else 0
+    row["wait_s"] = old["wait_s"] + dt if abs(row["speed"]) < STANDING_MPS else 0.0
     row["step_jerk"] = old["step_jerk"] + abs(row["jerk"]) * dt
     row["tick"] = old["tick"] + 1
 

@@ -24,7 +24,7 @@ from cavmarl.kernels.codes import (
 from cavmarl.kernels.contacts import find_contacts
 from cavmarl.kernels.control import speed_control
 from cavmarl.kernels.drivers import decide
-from cavmarl.kernels.junctions import STOP_SIGN_TICKS, register_links
+from cavmarl.kernels.junctions import STOP_SIGN_S, register_links
 from cavmarl.kernels.lane_choice import needed_change
 from cavmarl.kernels.lanes import index_lanes
 from cavmarl.kernels.motion import move_agent, move_background
@@ -123,7 +123,9 @@ def advance(
         if _any_driver(rows, owned, DRIVER_BACKGROUND):
             index_lanes(roads.lanes, rows, worlds.num_rows[w], scratch)
             register_links(roads, plans, rows, worlds.num_rows[w], scratch)
-            decide(roads, plans, rows, owned, DRIVER_BACKGROUND, worlds.ticks[w], phase, scratch)
+            decide(
+                roads, plans, rows, owned, DRIVER_BACKGROUND, worlds.ticks[w], dt, phase, scratch
+            )
         for i in range(owned):
             old = rows[i]
             worlds.next_rows[w, i] = old
@@ -131,7 +133,7 @@ def advance(
             if old["driver"] == DRIVER_BACKGROUND:
                 row["hold"] = scratch.hold[i]
                 row["blinker"] = scratch.blinker[i]
-                if scratch.link_ahead[i] >= 0 and old["wait"] >= STOP_SIGN_TICKS:
+                if scratch.link_ahead[i] >= 0 and old["wait_s"] >= STOP_SIGN_S:
                     row["stopped_at"] = scratch.link_ahead[i]
                 move_background(
                     roads, plans, old, row, scratch.accel[i], scratch.lane_change[i], dt
@@ -196,6 +198,7 @@ def suggest(
     discrete: bool,
     target_speeds: NDArray[np.float64],
     lookahead_s: float,
+    dt: float,
     out: NDArray[np.float64],
 ) -> None:
     """What the built-in driver would do in the agents' place.
@@ -208,6 +211,7 @@ def suggest(
         discrete: whether to answer with meta-actions.
         target_speeds: m/s, rising; discrete only.
         lookahead_s: horizon in which a target speed is to be reached; discrete only.
+        dt: seconds of a tick.
         out: (W, A, 2): throttle in m/s² and steering in rad, or the meta-action in [..., 0]. Rows
             of absent agents are left as they are.
     """
@@ -217,7 +221,7 @@ def suggest(
         phase = worlds.signal_phase[w]
         index_lanes(roads.lanes, rows, worlds.num_rows[w], scratch)
         register_links(roads, plans, rows, worlds.num_rows[w], scratch)
-        decide(roads, plans, rows, owned, DRIVER_AGENT, worlds.ticks[w], phase, scratch)
+        decide(roads, plans, rows, owned, DRIVER_AGENT, worlds.ticks[w], dt, phase, scratch)
         for i in range(owned):
             row = rows[i]
             if row["driver"] != DRIVER_AGENT:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 from typing import Any, Literal
+from xml.sax import SAXParseException
 from xml.sax.handler import ContentHandler
 
 from cavmarl.errors import MapError
@@ -15,6 +16,10 @@ MapKind = Literal["sumo", "osm", "opendrive"]
 
 MAP_ENDINGS = (".net.xml", ".net.xml.gz", ".osm", ".osm.gz", ".osm.xml", ".osm.xml.gz", ".xodr")
 
+_KINDS = (
+    "give a SUMO network (<net>, .net.xml), an OpenStreetMap extract (<osm>, .osm or .osm.xml) or "
+    "an OpenDRIVE file (<OpenDRIVE>, .xodr); the first two also gzipped (.gz)"
+)
 _ROOTS: dict[str, MapKind] = {"net": "sumo", "osm": "osm", "OpenDRIVE": "opendrive"}
 
 
@@ -36,10 +41,13 @@ def map_kind(path: Path) -> MapKind:
         MapError: the file cannot be read, is broken or hostile XML, or is no map.
     """
     root = _Root()
-    read_xml(path, root)
+    try:
+        read_xml(path, root)
+    except MapError as error:
+        no_xml = isinstance(error.__cause__, SAXParseException) and not root.name
+        if no_xml and not path.name.endswith(MAP_ENDINGS):
+            raise MapError(f"{path}: is no map: {_KINDS}") from error
+        raise
     if root.name not in _ROOTS:
-        raise MapError(
-            f"{path}: <{root.name}> is the root of no map: give a SUMO network (<net>), an "
-            "OpenStreetMap extract (<osm>) or an OpenDRIVE file (<OpenDRIVE>)"
-        )
+        raise MapError(f"{path}: <{root.name}> is the root of no map: {_KINDS}")
     return _ROOTS[root.name]

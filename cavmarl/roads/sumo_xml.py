@@ -36,6 +36,7 @@ _FINITE = {
     "phase": ("duration",),
 }
 _POSITIVE = {("lane", "speed"), ("lane", "length"), ("lane", "width")}
+_VERSION = re.compile(r"[0-9]+\.[0-9]+(\.[0-9]+)?")
 _BITS = re.compile(r"[01]+")
 
 
@@ -59,6 +60,7 @@ class _CheckedReader(ContentHandler):
             self._root = name
             if name != "net":
                 raise self._error(name, attrs, "is not the root of a SUMO network, which is <net>")
+            self._check_version(attrs)
         self._check(name, attrs)
         try:
             self.reader.startElement(name, attrs)
@@ -96,6 +98,12 @@ class _CheckedReader(ContentHandler):
             for key in ("response", "foes"):
                 if not _BITS.fullmatch(attrs[key]):
                     raise self._error(name, attrs, f"has {key}='{attrs[key]}', which are no bits")
+
+    def _check_version(self, attrs: Mapping[str, str]) -> None:
+        if "version" not in attrs:
+            raise self._error("net", attrs, "has no version attribute: not a SUMO network")
+        if not _VERSION.fullmatch(attrs["version"]):
+            raise self._error("net", attrs, f"has version='{attrs['version']}', none of SUMO's")
 
     def _check_number(self, name: str, key: str, attrs: Mapping[str, str]) -> None:
         try:

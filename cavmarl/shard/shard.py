@@ -130,6 +130,7 @@ class Shard:
             self._discrete,
             self._target_speeds,
             SUGGESTED_HORIZON_S,
+            self._config.clock.sim_dt_s,
             out,
         )
 

@@ -71,7 +71,7 @@ VEHICLE = np.dtype(
         ("sensor_phase", np.int32),  # ticks until slow sensors fire; reserved: all fire each step
         # driver's mind (agent-logic state)
         ("hold", np.int32),  # HOLD_*
-        ("wait", np.int32),  # ticks that it has stood still
+        ("wait_s", np.float64),  # how long it has stood still
         ("stopped_at", np.int32),  # link before which it has stood last
         ("blinker", np.int32),  # lane change wanted: 1 left, -1 right
         ("last_change", np.int64),  # tick of its last lane change
