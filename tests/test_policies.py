@@ -6,6 +6,7 @@ import json
 import shutil
 import subprocess
 import sys
+from operator import attrgetter
 from pathlib import Path
 from typing import Any
 
@@ -164,6 +165,12 @@ def test_a_broken_script_is_named(tmp_path: Path, text: str, message: str) -> No
         load_policy(path, small_vec())
 
 
+@pytest.mark.parametrize("policy", [None, 3, ["idm"]])
+def test_a_policy_is_a_name_or_a_path(policy: Any) -> None:
+    with pytest.raises(PolicyError, match=r"policy = .*: must be"):
+        load_policy(policy, small_vec())
+
+
 def test_a_file_that_is_no_policy_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "model.pkl"
     path.touch()
@@ -185,6 +192,8 @@ def test_a_network_refuses_another_seat(checkpoint: Path, key: str, value: Any) 
     name = key.replace("__", ".")
     with pytest.raises(PolicyError, match=rf"does not fit merge: .*overrides=.*'{name}'") as caught:
         load_policy(checkpoint, vec)
+    at_home = attrgetter(name)(small_vec().config)
+    assert f"{name} is {at_home} there, {value} here" in str(caught.value)
     sizes = {155, vec.single_observation_space.shape[0]}
     assert all(str(size) in str(caught.value) for size in sizes)
 

@@ -63,12 +63,15 @@ def test_list_shows_what_there_is(capsys: pytest.CaptureFixture[str], tmp_path: 
 def test_evaluate_shows_a_table_and_writes_json(
     capsys: pytest.CaptureFixture[str], tmp_path: Path
 ) -> None:
-    path = tmp_path / "deep" / "report.json"
+    path = tmp_path / "report.json"
     words = ("evaluate", "merge", "--policy", "idm", "--episodes", "2", "--seed", "3", *QUICK)
     assert run(*words, "--json", str(path)) == 0
     shown = capsys.readouterr().out
     assert all(word in shown for word in ("success", "collision", "red light", "jerk", "delay"))
     report = json.loads(path.read_text())
+    rate = report["success"]
+    ends = f"{100.0 * rate['low']:.1f}, {100.0 * rate['high']:.1f}"
+    assert f"{100.0 * rate['mean']:.1f} % [{ends}]" in shown
     assert report["episodes"] == 2
     assert report["manifest"]["seed"] == 3
 
@@ -85,6 +88,9 @@ def test_evaluate_shows_a_table_and_writes_json(
         (("evaluate", "merge", "--set", "lidar"), "must be KEY=VALUE"),
         (("evaluate", "merge", "--set", "sensors.lidar.ray=3"), "did you mean sensors.lidar.rays"),
         (("evaluate", "merge", "--set", "horizon_s=NaN"), "horizon_s"),
+        (("evaluate", "merge", "--set", "name="), "--set name=: has no value"),
+        (("evaluate", "merge", "--set", 'name=""'), "--set name=: has no value"),
+        (("evaluate", "merge", "--set", "nonsense=1"), "nonsense: unknown key"),
         (("evaluate",), "Missing argument"),
         (("view", "merge", "--seconds", "0", "--video", "x.mp4"), "must be above 0"),
         (("view", "merge", "--seconds", "nan", "--video", "x.mp4"), "must be above 0"),
@@ -93,9 +99,15 @@ def test_evaluate_shows_a_table_and_writes_json(
         (("bench", "step", "--agents", "0"), "agents = 0"),
         (("bench", "step", "--worlds", "-2"), "worlds = -2"),
         (("bench", "step", "--repeats", "x"), "valid integer"),
+        (("bench", "step", "--at-least", "nan"), "--at-least nan: must be"),
+        (("bench", "step", "--at-least", "inf"), "--at-least inf: must be"),
+        (("bench", "step", "--at-least", "0"), "--at-least 0: must be"),
+        (("bench", "step", "--at-least", "-1"), "--at-least -1: must be"),
         (("demo", "--minutes", "0"), "--minutes must be above 0"),
         (("demo", "--seconds", "-3"), "--seconds above 0"),
         (("demo", "--minutes", "nan"), "--minutes must be above 0"),
+        (("demo", "--seed", "-1"), "seed = -1: must be"),
+        (("demo", "--out", "/dev/null/demo"), "/dev/null/demo: cannot be written"),
         (("list", "--nonsense"), "No such option"),
         (("list", "more"), "unexpected extra argument"),
         (("list", "--json", "/dev/null/list.json"), "cannot be written"),
@@ -111,6 +123,65 @@ def test_wrong_use_is_one_line_and_exit_code_2(
     monkeypatch.setenv("COLUMNS", "200")
     said = refusal(capsys, *(word.replace("x.mp4", str(tmp_path / "x.mp4")) for word in words))
     assert message in said
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_a_json_path_is_tried_before_any_work(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path, command: str
+) -> None:
+    network = tmp_path / "broken.net.xml"
+    network.write_text("no map")
+    words = {
+        "evaluate": ("evaluate", "nowhere"),
+        "view": ("view", "nowhere"),
+        "map": ("map", "check", str(network)),
+        "bench": ("bench", "step", "--agents", "0"),
+    }.get(command, (command,))
+    missing = tmp_path / "missing" / "x.json"
+    assert "there is no folder" in refusal(capsys, *words, "--json", str(missing))
+    assert not missing.parent.exists()
+    assert "Is a directory" in refusal(capsys, *words, "--json", str(tmp_path))
+
+
+def test_trying_a_json_path_leaves_no_trace(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    new, old = tmp_path / "new.json", tmp_path / "old.json"
+    old.write_text("{}")
+    for path in (new, old):
+        assert "no environment" in refusal(capsys, "evaluate", "nowhere", "--json", str(path))
+    assert not new.exists()
+    assert old.read_text() == "{}"
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="elsewhere a window always has a display")
+def test_a_window_without_a_display_is_refused(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for name in ("DISPLAY", "WAYLAND_DISPLAY", "SDL_VIDEODRIVER"):
+        monkeypatch.delenv(name, raising=False)
+    assert "use --video FILE" in refusal(capsys, "view", "ring", "--seconds", "0.1")
+
+
+def test_a_window_opens_where_sdl_is_told_how(monkeypatch: pytest.MonkeyPatch) -> None:
+    pytest.importorskip("pygame")
+    monkeypatch.setenv("SDL_VIDEODRIVER", "dummy")
+    assert run("view", "merge", "--seconds", "0.1", *QUICK) == 0
+
+
+def test_a_folder_without_a_driver_says_what_is_missing(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    pytest.importorskip("torch")
+    said = refusal(capsys, "evaluate", "merge", "--policy", str(tmp_path), *QUICK)
+    assert f"no model.safetensors in {tmp_path}" in said
+    assert "Errno" not in said
+
+
+def test_the_package_runs_as_a_program() -> None:
+    command = [sys.executable, "-m", "cavmarl", "list"]
+    out = subprocess.run(command, capture_output=True, text=True, check=True)
+    assert "merge" in out.stdout
 
 
 def test_an_error_is_one_red_line(capsys: pytest.CaptureFixture[str]) -> None:

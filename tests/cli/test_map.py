@@ -55,7 +55,7 @@ def test_build_lists_what_was_dropped(shared_maps: Path, tmp_path: Path) -> None
 
 @pytest.mark.parametrize("name", ["net/mcity/mcity.net.xml", "osm/berlin_siegessaeule.osm.gz"])
 def test_check_takes_networks_and_sources(shared_maps: Path, tmp_path: Path, name: str) -> None:
-    report = tmp_path / "deep" / "report.json"
+    report = tmp_path / "report.json"
 
     result = runner.invoke(app, ["check", str(shared_maps / name), "--json", str(report)])
     assert result.exit_code == 0, result.output
@@ -84,8 +84,44 @@ def test_check_fails_on_a_map_that_cannot_be_driven(tmp_path: Path) -> None:
 def test_a_malformed_box_is_wrong_use(shared_maps: Path, tmp_path: Path, box: str) -> None:
     source = str(shared_maps / "xodr" / "fabriksgatan.xodr")
 
-    result = runner.invoke(app, ["build", source, "-o", str(tmp_path / "x"), "--bbox", box])
+    result = runner.invoke(app, ["build", source, "-o", str(tmp_path / "x.net.xml"), "--bbox", box])
     assert result.exit_code == 2
+    assert "--bbox" in result.output
+
+
+@pytest.mark.parametrize("name", ["x.txt", "x.xml", "x", "x.net.xml.bz2"])
+def test_a_network_has_a_networks_name(tmp_path: Path, name: str) -> None:
+    source, out = tmp_path / "source.osm", tmp_path / name
+    source.write_text("<osm/>")
+    result = runner.invoke(app, ["build", str(source), "-o", str(out)])
+    assert result.exit_code == 2
+    assert ".net.xml" in result.output
+    assert not out.exists()
+
+
+@pytest.mark.parametrize("command", ["build", "check"])
+def test_what_is_no_map_is_told_what_is_one(tmp_path: Path, command: str) -> None:
+    path = tmp_path / "README.md"
+    path.write_text("# A text\n")
+    error = runner.invoke(app, [command, str(path)]).exception
+    assert isinstance(error, MapError)
+    assert all(word in str(error) for word in ("is no map", ".net.xml", ".osm", ".xodr"))
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("<net></net>", "no version attribute: not a SUMO network"),
+        ('<net version="new"></net>', "version='new'"),
+    ],
+)
+def test_a_network_has_a_version(tmp_path: Path, text: str, message: str) -> None:
+    path = tmp_path / "empty.net.xml"
+    path.write_text(text)
+    error = runner.invoke(app, ["check", str(path)]).exception
+    assert isinstance(error, MapError)
+    assert message in str(error)
+    assert "KeyError" not in str(error)
 
 
 def test_missing_files_and_unknown_options_are_wrong_use(tmp_path: Path) -> None:

@@ -79,6 +79,11 @@ def test_episodes_must_be_a_count(episodes: Any) -> None:
         evaluate("merge", "idm", episodes=episodes)
 
 
+def test_episodes_that_need_too_much_memory_are_refused() -> None:
+    with pytest.raises(ConfigError, match="take at most 1960 episodes"):
+        evaluate("merge", "idm", episodes=10_000, agents=20, background=1000)
+
+
 def test_unknown_names_are_refused() -> None:
     with pytest.raises(UnknownEnvironmentError, match="merg"):
         evaluate("merg", "idm", episodes=1)

@@ -149,6 +149,14 @@ def test_wrong_settings_are_refused(
     assert not (here / "runs").exists()
 
 
+def test_a_folder_that_cannot_be_written_is_refused(
+    ippo: ModuleType, here: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (here / "file").touch()
+    assert ippo.main([*TINY, "--runs", "file", "--name", "run"]) == 2
+    assert "file/run: cannot be written" in " ".join(capsys.readouterr().err.split())
+
+
 @pytest.mark.parametrize("words", [["--num-envs", "x"], ["--nonsense"], ["--minutes"]])
 def test_words_that_are_no_settings_are_wrong_use(ippo: ModuleType, words: list[str]) -> None:
     with pytest.raises(SystemExit, match="2"):
