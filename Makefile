@@ -5,11 +5,11 @@ BIN := .venv/bin
 READY := .venv/.ready
 MAPS := envs/ring/map/map.net.xml envs/merge/map/map.net.xml envs/grid4x4/map/map.net.xml
 
-.PHONY: help demo test check bench soak maps clean
+.PHONY: help demo test check bench soak maps pictures clean
 .DEFAULT_GOAL := help
 
 help: ## say what there is
-	@awk -F':.*## ' '/^[a-z]+:.*## / { printf "make %-6s  %s\n", $$1, $$2 }' Makefile
+	@awk -F':.*## ' '/^[a-z]+:.*## / { printf "make %-8s  %s\n", $$1, $$2 }' Makefile
 
 demo: $(READY) ## train on merge, evaluate, drive through town, leave a video (some minutes)
 	$(BIN)/cavmarl demo
@@ -37,6 +37,9 @@ maps: $(READY) ## make the maps of ring, merge and grid4x4 anew from the options
 	cd envs/merge/map && ../../../$(BIN)/netconvert --configuration-file map.netccfg
 	cd envs/grid4x4/map && ../../../$(BIN)/netgenerate --configuration-file map.netgcfg
 	sed --in-place '2,/^-->$$/d' $(MAPS)
+
+pictures: $(READY) ## draw the pictures of the README and the cards anew
+	$(BIN)/python -m cavmarl.render.pictures docs/images
 
 clean: ## remove .venv, builds and caches; runs/ stays
 	rm -rf .venv build dist .mypy_cache .ruff_cache .pytest_cache .hypothesis .import_linter_cache
