@@ -3,6 +3,8 @@
 PYTHON ?= $(shell command -v python3.11 || command -v python3)
 BIN := .venv/bin
 READY := .venv/.ready
+# Debian keeps Python's venv in a package of its own; root can fetch it.
+VENV_PACKAGE := { test "$$(id -u)" = 0 && apt-get update && apt-get install --yes python3-venv; }
 MAPS := envs/ring/map/map.net.xml envs/merge/map/map.net.xml envs/grid4x4/map/map.net.xml
 
 .PHONY: help demo test check bench soak maps pictures clean
@@ -50,7 +52,7 @@ clean: ## remove .venv, builds and caches; runs/ stays
 $(READY): pyproject.toml constraints.txt
 	@"$(PYTHON)" -c 'import sys; sys.exit(sys.version_info < (3, 11))' || { \
 	    echo "cavmarl needs Python 3.11 or newer: make PYTHON=/path/to/python3.11" >&2; exit 1; }
-	@"$(PYTHON)" -c 'import ensurepip, venv' 2>/dev/null || { \
+	@"$(PYTHON)" -c 'import ensurepip, venv' 2>/dev/null || $(VENV_PACKAGE) || { \
 	    echo "Python's venv is missing; on Debian: sudo apt-get install python3-venv" >&2; exit 1; }
 	test -x $(BIN)/pip || "$(PYTHON)" -m venv --clear .venv
 	$(BIN)/python -m pip install $$(grep '^torch==' constraints.txt) --constraint constraints.txt
