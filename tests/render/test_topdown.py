@@ -178,6 +178,7 @@ def test_destinations_are_marked(grid: RoadNetwork, car: Car) -> None:
 def test_pictures_need_no_display_and_leave_the_environment_alone(
     ring: RoadNetwork, car: Car, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    load_pygame().display.quit()  # another test may have opened a window
     monkeypatch.setenv("SDL_VIDEODRIVER", "no-such-driver")
     before = dict(os.environ)
     TopDownRenderer(ring, SIZE).frame(car())
