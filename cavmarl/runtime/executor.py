@@ -2,24 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from typing import Protocol
+from collections.abc import Sequence
+from typing import Any, Literal, Protocol
 
 from cavmarl.shard.shard import Shard
 
-__all__ = ["Executor", "SerialExecutor"]
+__all__ = ["Executor", "Phase", "SerialExecutor"]
+
+# The methods of a shard that a tick is made of: a name and its arguments can be sent anywhere.
+Phase = Literal["begin_step", "advance", "resolve", "commit", "switch_signals", "sense", "suggest"]
 
 
 class Executor(Protocol):
     """Runs one phase on all shards and returns when all are through with it."""
 
-    @property
-    def shards(self) -> Sequence[Shard]:
-        """The shards, in the order of their zones."""
-        ...
-
-    def each(self, phase: Callable[[Shard], None]) -> None:
-        """Run `phase` on every shard."""
+    def each(self, phase: Phase, *arguments: Any) -> None:
+        """Call the method `phase` of every shard with the same arguments."""
         ...
 
 
@@ -29,12 +27,7 @@ class SerialExecutor:
     def __init__(self, shards: Sequence[Shard]) -> None:
         self._shards = tuple(shards)
 
-    @property
-    def shards(self) -> Sequence[Shard]:
-        """The shards, in the order of their zones."""
-        return self._shards
-
-    def each(self, phase: Callable[[Shard], None]) -> None:
-        """Run `phase` on every shard, in order."""
+    def each(self, phase: Phase, *arguments: Any) -> None:
+        """Call the method `phase` of every shard, in order."""
         for shard in self._shards:
-            phase(shard)
+            getattr(shard, phase)(*arguments)

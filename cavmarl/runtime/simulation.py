@@ -153,25 +153,25 @@ class Simulation:
             worlds.ticks[w] = 0
         self._episodes[chosen] += 1
         self._traffic.populate(self._gate, worlds, chosen)
-        self._executor.each(Shard.switch_signals)
-        self._executor.each(lambda shard: shard.sense(chosen))
+        self._executor.each("switch_signals")
+        self._executor.each("sense", chosen)
 
     def step(self, commands: Commands) -> None:
         """One agent step: its ticks, then what the agents sense."""
-        self._executor.each(lambda shard: shard.begin_step(commands))
+        self._executor.each("begin_step", commands)
         for _ in range(self.config.clock.ticks_per_step):
             self._tick(commands)
-        self._executor.each(lambda shard: shard.sense(self._everywhere))
+        self._executor.each("sense", self._everywhere)
 
     def _tick(self, commands: Commands) -> None:
         """Advance → (exchange) → resolve → departures → (migrate) → commit → signals."""
-        self._executor.each(lambda shard: shard.advance(commands))
-        self._executor.each(Shard.resolve)
+        self._executor.each("advance", commands)
+        self._executor.each("resolve")
         self._traffic.arrive_and_depart(
             self._gate, self._shard.worlds, self._shard.scratch, self.config.clock.sim_dt_s
         )
-        self._executor.each(Shard.commit)
-        self._executor.each(Shard.switch_signals)
+        self._executor.each("commit")
+        self._executor.each("switch_signals")
 
     def retire_agents(self) -> None:
         """Take out the agents whose trip ended in the last step; to be called after it is read."""
@@ -188,7 +188,7 @@ class Simulation:
 
     def suggest(self, out: NDArray[np.float64]) -> None:
         """Write what the built-in driver would do in the agents' place into `out` (W, A, 2)."""
-        self._executor.each(lambda shard: shard.suggest(out))
+        self._executor.each("suggest", out)
 
     def state_hash(self, world: int = 0) -> str:
         """Hex digest of a world's state.
