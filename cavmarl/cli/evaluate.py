@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
+from rich import box
 from rich.console import Console
 from rich.markup import escape
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
@@ -84,7 +85,14 @@ def report_table(reports: dict[str, EvaluationReport]) -> Table:
     """Reports side by side, one column a driver."""
     first = next(iter(reports.values()))
     title = f"{first.manifest.environment}, {first.episodes} episodes of seed {first.manifest.seed}"
-    table = Table("rate [95 % interval], mean ± half of it", title=escape(title))
+    # Narrow enough for three drivers on eighty columns.
+    table = Table(
+        "",
+        title=escape(title),
+        caption="rates with their 95 % interval, means ± half of theirs",
+        box=box.SIMPLE_HEAD,
+        pad_edge=False,
+    )
     for name in reports:
         table.add_column(escape(name), justify="right")
     columns = [_cells(report) for report in reports.values()]
@@ -97,35 +105,37 @@ def _cells(report: EvaluationReport) -> dict[str, str]:
     speed = report.speed
     return {
         "trips": str(report.trips),
-        "success": _rate(report.success),
-        "collision": _rate(report.collision),
-        "off road": _rate(report.off_road),
-        "unfinished": _rate(report.unfinished),
-        "red light": _rate(report.red_light),
-        "wrong way": _rate(report.wrong_way),
+        "success, %": _rate(report.success),
+        "collision, %": _rate(report.collision),
+        "off road, %": _rate(report.off_road),
+        "unfinished, %": _rate(report.unfinished),
+        "red light, %": _rate(report.red_light),
+        "wrong way, %": _rate(report.wrong_way),
         "episode return": _interval(report.episode_return),
-        "least time to collision, s": _interval(report.mean_least_ttc_s),
+        "least TTC, s": _interval(report.mean_least_ttc_s),
         "jerk, m/s³": _interval(report.mean_jerk_mps3),
-        "speed above the limit": _interval(report.mean_speeding, unit="%"),
-        "delay of an arrival, s": _interval(report.mean_delay_s),
+        "speeding, %": _interval(report.mean_speeding, scale=100.0),
+        "delay, s": _interval(report.mean_delay_s),
         "speed, m/s": number(report.mean_speed_mps),
-        "step of a world, ms": f"{speed.step_ms:.3f}",
-        "policy for a world, ms": f"{speed.policy_ms:.3f}",
+        "world step, ms": f"{speed.step_ms:.3f}",
+        "policy, ms": f"{speed.policy_ms:.3f}",
         "agent-steps/s": f"{speed.agent_steps_per_s:,.0f}",
     }
 
 
 def _rate(interval: Interval) -> str:
-    """A share and the ends of its interval, which reaches farther to one side."""
-    share = number(interval.mean, unit="%")
+    """A share in % and the ends of its interval, which reaches farther to one side."""
+    if interval.mean is None:
+        return number(None)
+    share = f"{100.0 * interval.mean:.1f}"
     if interval.low is None or interval.high is None:
         return share
     return f"{share} [{100.0 * interval.low:.1f}, {100.0 * interval.high:.1f}]"
 
 
-def _interval(interval: Interval, unit: str = "") -> str:
+def _interval(interval: Interval, scale: float = 1.0) -> str:
     """The mean and half the width of its interval."""
-    if interval.low is None or interval.high is None:
-        return number(interval.mean, unit=unit)
-    half = number((interval.high - interval.low) / 2.0, unit=unit)
-    return f"{number(interval.mean, unit=unit).removesuffix(' %')} ± {half}"
+    if interval.mean is None or interval.low is None or interval.high is None:
+        return number(interval.mean, scale)
+    half = number((interval.high - interval.low) / 2.0, scale)
+    return f"{number(interval.mean, scale)} ± {half}"

@@ -123,11 +123,9 @@ def write_json(path: Path | None, document: dict[str, Any]) -> None:
         raise _unwritable(path, error) from error
 
 
-def number(value: float | None, digits: int = 2, unit: str = "") -> str:
-    """A number for a table; a dash where there is none."""
-    if value is None:
-        return "-"
-    return f"{100.0 * value:.1f} %" if unit == "%" else f"{value:.{digits}f}{unit and f' {unit}'}"
+def number(value: float | None, scale: float = 1.0) -> str:
+    """A number for a table, times `scale`; a dash where there is none."""
+    return "-" if value is None else f"{scale * value:.2f}"
 
 
 def print_error(message: str) -> None:

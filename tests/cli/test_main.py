@@ -71,7 +71,7 @@ def test_evaluate_shows_a_table_and_writes_json(
     report = json.loads(path.read_text())
     rate = report["success"]
     ends = f"{100.0 * rate['low']:.1f}, {100.0 * rate['high']:.1f}"
-    assert f"{100.0 * rate['mean']:.1f} % [{ends}]" in shown
+    assert f"{100.0 * rate['mean']:.1f} [{ends}]" in shown
     assert report["episodes"] == 2
     assert report["manifest"]["seed"] == 3
 
