@@ -12,7 +12,17 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["Demand", "Gate", "LaneGrid", "Outputs", "RoadArrays", "Scratch", "Sensors", "Worlds"]
+__all__ = [
+    "Demand",
+    "Gate",
+    "LaneGrid",
+    "Outputs",
+    "RoadArrays",
+    "Scratch",
+    "Sensors",
+    "Travel",
+    "Worlds",
+]
 
 
 class RoadArrays(NamedTuple):
@@ -41,6 +51,13 @@ class LaneGrid(NamedTuple):
     cell_lanes: NDArray[np.int32]
 
 
+class Travel(NamedTuple):
+    """What vehicles are and which ways there are; the same for all worlds of an environment."""
+
+    types: NDArray[np.void]  # VTYPE (num_types,), by VEHICLE["vtype"]
+    steps: NDArray[np.void]  # PLAN (num_steps,), see `kernels.ways`
+
+
 class Worlds(NamedTuple):
     """A shard's part of W worlds: the vehicles and signals that a tick reads and writes.
 
@@ -60,7 +77,10 @@ class Worlds(NamedTuple):
 class Gate(NamedTuple):
     """What one place keeps of each world, however it is divided: ids, the queue, the counts."""
 
-    queue: NDArray[np.void]  # DEPARTURE (W, C) vehicles that wait to enter, in id order
+    orders: NDArray[np.void]  # DEPARTURE (W, D) what a demand file orders, in order of `due`
+    num_orders: NDArray[np.int64]  # (W,)
+    next_order: NDArray[np.int64]  # (W,) the first one that is not due yet
+    queue: NDArray[np.void]  # DEPARTURE (W, C + D) vehicles that wait to enter, in id order
     num_queue: NDArray[np.int64]  # (W,)
     next_id: NDArray[np.int64]  # (W,) the next vehicle's id
     num_entered: NDArray[np.int64]  # (W,) agents that have been ordered so far
@@ -87,15 +107,15 @@ class Demand(NamedTuple):
 class Scratch(NamedTuple):
     """Room that a tick works in; holds nothing between calls."""
 
-    lane_start: NDArray[np.int32]  # (L + 2,) entries of lane l: [lane_start[l], lane_start[l + 1])
-    entry_row: NDArray[np.int32]  # (2 C,) vehicle rows by (lane, s, id), side lanes included
-    entry_s: NDArray[np.float64]  # (2 C,)
-    link_start: NDArray[np.int32]  # (K + 2,) entries of link k, as above
-    link_row: NDArray[np.int32]  # (3 C,) vehicles that approach or are on link k
-    link_dist: NDArray[np.float64]  # (3 C,) centre to stop line, m; negative: inside
-    pair_link: NDArray[np.int32]  # (3 C,) the same before sorting
-    pair_row: NDArray[np.int32]
-    pair_dist: NDArray[np.float64]
+    lane_start: NDArray[np.int32]  # (L + 1,) entries of lane l: [lane_start[l], lane_start[l + 1])
+    lane_end: NDArray[np.int32]  # (L,) lane_start[l + 1] again
+    entries: NDArray[np.void]  # ENTRY (2 C,) vehicles by (lane, s, id), side lanes included
+    lane_taken: NDArray[np.bool_]  # (L,) somebody has tried to enter there in this tick
+    link_start: NDArray[np.int32]  # (K + 2,) approach of link k: [link_start[k], link_start[k + 1])
+    approach: NDArray[np.void]  # APPROACH (3 C,) vehicles on or before links, by link
+    pairs: NDArray[np.void]  # APPROACH (3 C,) the same before sorting
+    line_link: NDArray[np.int32]  # (C,) the next link of each row, or -1
+    line_m: NDArray[np.float64]  # (C,) the way of its centre to that link's stop line
     accel: NDArray[np.float64]  # (C,) decided accelerations
     link_ahead: NDArray[np.int32]  # (C,) the link whose stop line each row is next to
     lane_change: NDArray[np.int32]  # (C,) decided lane changes: 1 left, -1 right

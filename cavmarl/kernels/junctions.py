@@ -1,9 +1,9 @@
-"""Right of way: who approaches which link, and whether a driver may enter one.
+"""Right of way: whether a driver may enter a link, or go on from a waiting position inside.
 
-Every vehicle announces itself to the links ahead on its way and to the one it is on. A driver
-enters a link if no foe is in the shared area when it would be, if it gives way to those it must
-give way to, and if there is room behind the junction. All questions are minima and any-ofs over the
-foes: the order of rows plays no part.
+A driver enters a link if no foe is in the shared area when it would be, if it gives way to those it
+must give way to, and if there is room behind the junction. Where the map lets drivers wait inside
+the junction (for oncoming traffic before a left turn), what lies beyond that place is asked there.
+All questions are minima and any-ofs over the foes: the order of rows plays no part.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cavmarl.kernels import kernel
-from cavmarl.kernels.arrays import RoadArrays, Scratch
+from cavmarl.kernels.arrays import RoadArrays, Scratch, Travel
 from cavmarl.kernels.codes import (
     DRIVER_AGENT,
     HOLD_EXIT_BLOCKED,
@@ -30,19 +30,16 @@ from cavmarl.kernels.codes import (
     SIGNAL_YELLOW_MAJOR,
     SIGNAL_YELLOW_MINOR,
 )
-from cavmarl.kernels.lanes import last_on_lane
+from cavmarl.kernels.following import before_line, behind, no_press
+from cavmarl.kernels.lanes import last_on
 
 __all__ = [
-    "APPROACH_M",
     "STOP_SIGN_S",
-    "conflict_inside",
     "link_signal",
     "may_enter",
-    "register_links",
+    "press_inside",
 ]
 
-APPROACH_M = 150.0  # how far ahead a vehicle announces itself to links
-MAX_LINKS_AHEAD = 2
 ENTRY_ACCEL = 2.5  # m/s², how a driver thinks others and itself speed up over a junction
 COMFORT_STOP = 3.0  # m/s², a driver stops for yellow where this braking is enough
 HARD_STOP = 5.0  # m/s², a vehicle that needs more to stop before the line will not stop
@@ -53,6 +50,7 @@ LAST_CHANCE_M = 3.0  # with the front this near to the line
 ROOM_M = 3.0  # free way left behind a vehicle that clears a junction
 IMPATIENT_S = 3.0  # a vehicle that stands this long without reason is not waited for
 STOP_SIGN_S = 0.5  # how long one stands at a stop sign, and before a tie is broken
+WAIT_SLACK_M = 0.5  # a front this far beyond a waiting position still waits there
 STATE_STOP = ord("s")
 STATE_ALLWAY_STOP = ord("w")
 
@@ -65,84 +63,6 @@ def link_signal(roads: RoadArrays, link: int, phase: NDArray[np.int32]) -> int:
         return SIGNAL_NONE
     first = roads.phases[phase[signal]]["first_state"]
     return int(roads.phase_states[first + roads.links[link]["signal_index"]])
-
-
-@kernel
-def register_links(
-    roads: RoadArrays,
-    plans: NDArray[np.void],
-    rows: NDArray[np.void],
-    num: int,
-    scratch: Scratch,
-) -> None:
-    """List for every link the vehicles that are on it or will reach it, into `scratch.link_*`.
-
-    Args:
-        roads: the road arrays.
-        plans: PLAN (G, L).
-        rows: VEHICLE (C,), of which `num` live.
-        num: live rows.
-        scratch: link_start, link_row, link_dist are written. The distance is that of the vehicle's
-            centre to the stop line, negative beyond it.
-    """
-    pairs = 0
-    for i in range(num):
-        pairs = _announce(roads, plans, rows[i], i, pairs, scratch)
-    start = scratch.link_start
-    num_links = roads.links.shape[0]
-    start[: num_links + 2] = 0
-    for k in range(pairs):
-        start[scratch.pair_link[k] + 2] += 1
-    for link in range(num_links):
-        start[link + 2] += start[link + 1]
-    for k in range(pairs):
-        link = scratch.pair_link[k]
-        place = start[link + 1]
-        scratch.link_row[place] = scratch.pair_row[k]
-        scratch.link_dist[place] = scratch.pair_dist[k]
-        start[link + 1] = place + 1
-
-
-@kernel
-def _announce(
-    roads: RoadArrays,
-    plans: NDArray[np.void],
-    row: np.void,
-    i: int,
-    pairs: int,
-    scratch: Scratch,
-) -> int:
-    """Append row i's (link, distance) pairs; returns the new number of pairs."""
-    lane = row["lane"]
-    here = roads.lanes[lane]
-    if here["internal"]:
-        scratch.pair_link[pairs] = here["link"]
-        scratch.pair_row[pairs] = i
-        scratch.pair_dist[pairs] = -(here["link_offset_m"] + row["s"])
-        pairs += 1
-    elif row["link"] >= 0 and row["s"] < 0.5 * row["length"]:
-        # Its centre has left the junction, its rear has not.
-        left = row["link"]
-        if roads.links[left]["to_lane"] == lane:
-            scratch.pair_link[pairs] = left
-            scratch.pair_row[pairs] = i
-            scratch.pair_dist[pairs] = -(roads.links[left]["length_m"] + row["s"])
-            pairs += 1
-    distance = here["length_m"] - row["s"]
-    found = 0
-    while distance < APPROACH_M and found < MAX_LINKS_AHEAD:
-        step = plans[row["goal"], lane]
-        if step["next"] < 0:
-            break
-        if step["link"] >= 0:
-            scratch.pair_link[pairs] = step["link"]
-            scratch.pair_row[pairs] = i
-            scratch.pair_dist[pairs] = max(distance, 0.0)
-            pairs += 1
-            found += 1
-        lane = step["next"]
-        distance += roads.lanes[lane]["length_m"]
-    return pairs
 
 
 @kernel
@@ -184,17 +104,61 @@ def _ignores(row: np.void, foe: np.void, link: int, signal: int) -> bool:
 
 
 @kernel
+def _foe_blocks(
+    roads: RoadArrays,
+    rows: NDArray[np.void],
+    row: np.void,
+    link: int,
+    conflict: np.void,
+    foe: np.void,
+    gives_way: bool,
+    foe_signal: int,
+    time_in: float,
+    time_out: float,
+) -> bool:
+    """Whether one APPROACH is, or will be, in the shared area while `row` is, or goes first."""
+    to_clear = foe["dist"] + conflict["foe_leave_m"] + foe["half"]
+    if to_clear <= 0.0:
+        return False
+    cleared = to_clear / max(foe["speed"], 0.1)
+    # Its front before the line that it can still stop at: the stop line, or, where the shared
+    # area lies beyond that, its waiting position inside.
+    front = foe["dist"] - foe["half"]
+    wait_m = roads.links[foe["link"]]["wait_m"]
+    if front <= 0.0 and conflict["foe_enter_m"] >= wait_m:
+        front += wait_m + WAIT_SLACK_M
+    if front <= 0.0:
+        return cleared + 0.5 * GAP_S > time_in
+    committed = foe["speed"] * foe["speed"] > 2.0 * HARD_STOP * max(front, 0.01)
+    if not committed:
+        if not (gives_way and conflict["must_yield"]):
+            return False
+        if _ignores(row, rows[foe["row"]], link, foe_signal):
+            return False
+    if cleared + GAP_S < time_in:
+        return False
+    foe_limit = roads.lanes[roads.links[foe["link"]]["from_lane"]]["speed_mps"]
+    arrives = _earliest(foe["dist"] + conflict["foe_enter_m"] - foe["half"], foe["speed"], foe_limit)
+    return arrives < time_out + GAP_S
+
+
+@kernel
 def _blocked_by_foes(
     roads: RoadArrays,
     rows: NDArray[np.void],
     i: int,
     link: int,
     distance: float,
+    wait_m: float,
+    inside: bool,
     gives_way: bool,
     phase: NDArray[np.int32],
     scratch: Scratch,
 ) -> bool:
-    """Whether a foe is, or will be, where row i would be on `link`, `distance` m from its line."""
+    """Whether a foe is, or will be, where row i would be on `link`, `distance` m from its line.
+
+    Asks about the shared areas before `wait_m`, or, from `inside`, about those beyond.
+    """
     row = rows[i]
     half = 0.5 * row["length"]
     limit = roads.lanes[roads.links[link]["next_lane"]]["speed_mps"]
@@ -203,65 +167,38 @@ def _blocked_by_foes(
     first = roads.links[link]["first_conflict"]
     for c in range(first, first + roads.links[link]["num_conflicts"]):
         conflict = roads.conflicts[c]
-        foe_link = conflict["foe"]
-        begin = scratch.link_start[foe_link]
-        end = scratch.link_start[foe_link + 1]
-        if begin == end:
+        begin = scratch.link_start[conflict["foe"]]
+        end = scratch.link_start[conflict["foe"] + 1]
+        if begin == end or (conflict["enter_m"] >= wait_m) != inside:
             continue
         time_in = _earliest(distance + conflict["enter_m"] - half, row["speed"], limit)
         time_out = _earliest(distance + conflict["leave_m"] + half, row["speed"], limit)
-        foe_signal = link_signal(roads, foe_link, phase)
+        foe_signal = link_signal(roads, conflict["foe"], phase)
         for k in range(begin, end):
-            j = scratch.link_row[k]
-            if j == i:
-                continue
-            foe = rows[j]
-            foe_half = 0.5 * foe["length"]
-            foe_distance = scratch.link_dist[k]
-            to_clear = foe_distance + conflict["foe_leave_m"] + foe_half
-            if to_clear <= 0.0:
-                continue
-            cleared = to_clear / max(foe["speed"], 0.1)
-            if foe_distance - foe_half <= 0.0 and foe_distance <= 0.0:
-                if cleared + 0.5 * GAP_S > time_in:
-                    return True
-                continue
-            front = max(foe_distance - foe_half, 0.01)
-            committed = foe["speed"] * foe["speed"] > 2.0 * HARD_STOP * front
-            if not committed:
-                if not (gives_way and conflict["must_yield"]) or _ignores(
-                    row, foe, link, foe_signal
-                ):
-                    continue
-            if cleared + GAP_S < time_in:
-                continue
-            foe_limit = roads.lanes[roads.links[foe_link]["from_lane"]]["speed_mps"]
-            arrives = _earliest(
-                foe_distance + conflict["foe_enter_m"] - foe_half, foe["speed"], foe_limit
-            )
-            if arrives < time_out + GAP_S:
+            foe = scratch.approach[k]
+            if foe["row"] != i and _foe_blocks(
+                roads, rows, row, link, conflict, foe, gives_way, foe_signal, time_in, time_out
+            ):
                 return True
     return False
 
 
 @kernel
-def _exit_blocked(
-    roads: RoadArrays, rows: NDArray[np.void], i: int, link: int, scratch: Scratch
-) -> bool:
-    """Whether there is no room for row i between the junction and the last vehicle behind it."""
+def _exit_blocked(roads: RoadArrays, row: np.void, link: int, scratch: Scratch) -> bool:
+    """Whether there is no room for a row between the junction and the last vehicle behind it."""
     target = roads.links[link]
-    j, s = last_on_lane(i, target["to_lane"], scratch)
-    if j < 0 or rows[j]["speed"] > 2.0:
+    k = last_on(scratch, target["to_lane"], row["id"])
+    if k < 0 or scratch.entries[k]["speed"] > 2.0:
         return False
-    room = s - 0.5 * rows[j]["length"]
+    room = scratch.entries[k]["s"] - scratch.entries[k]["half"]
     lane = target["next_lane"]
     while roads.lanes[lane]["internal"]:
-        for k in range(scratch.lane_start[lane], scratch.lane_start[lane + 1]):
-            other = scratch.entry_row[k]
-            if other != i:
-                room -= rows[other]["length"] + ROOM_M
+        for n in range(scratch.lane_start[lane], scratch.lane_start[lane + 1]):
+            other = scratch.entries[n]
+            if other["id"] != row["id"]:
+                room -= 2.0 * other["half"] + ROOM_M
         lane = roads.lanes[lane]["successor"]
-    blocked: bool = room < rows[i]["length"] + ROOM_M
+    blocked: bool = room < row["length"] + ROOM_M
     return blocked
 
 
@@ -306,40 +243,71 @@ def may_enter(
     if must_stop and row["stopped_at"] != link:
         return HOLD_YIELD
     gives_way = signal != SIGNAL_GREEN_MAJOR and signal != SIGNAL_OFF
-    if _blocked_by_foes(roads, rows, i, link, distance, gives_way, phase, scratch):
+    if _blocked_by_foes(
+        roads, rows, i, link, distance, target["wait_m"], False, gives_way, phase, scratch
+    ):
         return HOLD_YIELD
-    if _exit_blocked(roads, rows, i, link, scratch):
+    if _exit_blocked(roads, row, link, scratch):
         return HOLD_EXIT_BLOCKED
     return HOLD_NONE
 
 
 @kernel
-def conflict_inside(
-    roads: RoadArrays, rows: NDArray[np.void], i: int, link: int, place: float, scratch: Scratch
-) -> float:
-    """Way in m from row i's front to where it has to stop for a foe on the same junction, or inf.
+def press_inside(
+    roads: RoadArrays,
+    travel: Travel,
+    rows: NDArray[np.void],
+    i: int,
+    place: float,
+    phase: NDArray[np.int32],
+    dt: float,
+    scratch: Scratch,
+) -> tuple[float, int]:
+    """How foes on the same junction press row i, whose centre is `place` m beyond its stop line.
 
-    `place` is row i's centre on the link, m from its stop line. Of two vehicles in conflict the one
-    that is nearer to the shared area goes first; at equal distance the smaller id.
+    Of two vehicles in conflict the one that is nearer to the shared area goes first; at equal
+    distance the smaller id. Where both lead into one lane, the other follows it there. At a
+    waiting position inside, row i waits until it may go on.
+
+    Returns:
+        press, and why it holds at the waiting position (HOLD_*).
     """
     row = rows[i]
-    front = place + 0.5 * row["length"]
-    nearest = math.inf
-    first = roads.links[link]["first_conflict"]
-    for c in range(first, first + roads.links[link]["num_conflicts"]):
+    kind = travel.types[row["vtype"]]
+    link = roads.lanes[row["lane"]]["link"]
+    half = 0.5 * row["length"]
+    front = place + half
+    press = no_press(kind)
+    target = roads.links[link]
+    wait_m = target["wait_m"]
+    if front <= wait_m + WAIT_SLACK_M:
+        signal = link_signal(roads, link, phase)
+        gives_way = signal != SIGNAL_GREEN_MAJOR and signal != SIGNAL_OFF
+        hold = HOLD_NONE
+        if _blocked_by_foes(
+            roads, rows, i, link, -place, wait_m, True, gives_way, phase, scratch
+        ):
+            hold = HOLD_YIELD
+        elif _exit_blocked(roads, row, link, scratch):
+            hold = HOLD_EXIT_BLOCKED
+        if hold != HOLD_NONE:
+            return before_line(kind, row["speed"], wait_m - front, dt), hold
+    first = target["first_conflict"]
+    for c in range(first, first + target["num_conflicts"]):
         conflict = roads.conflicts[c]
         to_area = conflict["enter_m"] - front
-        if to_area < 0.0 or to_area >= nearest:
+        if to_area < 0.0:
             continue
-        foe_link = conflict["foe"]
-        for k in range(scratch.link_start[foe_link], scratch.link_start[foe_link + 1]):
-            foe = rows[scratch.link_row[k]]
-            foe_place = -scratch.link_dist[k]
-            foe_half = 0.5 * foe["length"]
-            if foe_place < 0.0 or foe_place - foe_half > conflict["foe_leave_m"]:
+        foe_link = roads.links[conflict["foe"]]
+        for k in range(scratch.link_start[conflict["foe"]], scratch.link_start[conflict["foe"] + 1]):
+            foe = scratch.approach[k]
+            foe_place = -foe["dist"]
+            if foe_place < 0.0 or foe_place - foe["half"] > conflict["foe_leave_m"]:
                 continue
-            foe_to_area = conflict["foe_enter_m"] - foe_place - foe_half
+            foe_to_area = conflict["foe_enter_m"] - foe_place - foe["half"]
+            if foe_to_area > 0.0 and foe_place + foe["half"] <= foe_link["wait_m"] + WAIT_SLACK_M:
+                if conflict["foe_enter_m"] >= foe_link["wait_m"] and foe["speed"] < STANDING_MPS:
+                    continue  # it waits
             if foe_to_area < to_area or (foe_to_area == to_area and foe["id"] < row["id"]):
-                nearest = to_area
-                break
-    return nearest
+                press = max(press, before_line(kind, row["speed"], to_area, dt))
+    return press, HOLD_NONE

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cavmarl.kernels import kernel
-from cavmarl.kernels.arrays import LaneGrid, RoadArrays
+from cavmarl.kernels.arrays import LaneGrid, RoadArrays, Travel
 from cavmarl.kernels.codes import (
     EVENT_ARRIVED,
     EVENT_RED_LIGHT,
@@ -25,6 +25,7 @@ from cavmarl.kernels.junctions import link_signal
 from cavmarl.kernels.kinematics import bicycle_step
 from cavmarl.kernels.scalars import clamp
 from cavmarl.kernels.tracking import locate, side_lane
+from cavmarl.kernels.ways import next_step, way_left
 
 __all__ = ["ARRIVE_M", "MAX_SPEED_MPS", "move_agent", "move_background", "place_on_lane"]
 
@@ -69,21 +70,22 @@ def _account(row: np.void, old: np.void, roads: RoadArrays, dt: float) -> None:
 
 
 @kernel
-def _cross_borders(roads: RoadArrays, plans: NDArray[np.void], row: np.void) -> bool:
-    """Carry s beyond lane ends over to the lanes that the plan names; False where the way ends."""
+def _cross_borders(roads: RoadArrays, travel: Travel, row: np.void) -> bool:
+    """Carry s beyond lane ends over to the lanes of the way; False where the way ends."""
     for _ in range(CROSSINGS_PER_TICK):
         length = roads.lanes[row["lane"]]["length_m"]
         if row["s"] < length:
             return True
-        step = plans[row["goal"], row["lane"]]
-        if step["next"] < 0:
+        lane, way, link = next_step(roads, travel, row["lane"], row["way"])
+        if lane < 0:
             row["s"] = length
             return False
         row["s"] -= length
-        row["lane"] = step["next"]
-        row["target_lane"] = step["next"]
-        if step["link"] >= 0:
-            row["link"] = step["link"]
+        row["lane"] = lane
+        row["way"] = way
+        row["target_lane"] = lane
+        if link >= 0:
+            row["link"] = link
             row["stopped_at"] = -1
     return True
 
@@ -91,7 +93,7 @@ def _cross_borders(roads: RoadArrays, plans: NDArray[np.void], row: np.void) -> 
 @kernel
 def move_background(
     roads: RoadArrays,
-    plans: NDArray[np.void],
+    travel: Travel,
     old: np.void,
     row: np.void,
     accel: float,
@@ -100,18 +102,21 @@ def move_background(
 ) -> None:
     """Advance a background vehicle by one tick.
 
+    The new speed drives the whole tick (semi-implicit Euler), as the safe speed of Krauss's model
+    takes it.
+
     Args:
         roads: the road arrays.
-        plans: PLAN (G, L).
+        travel: the ways.
         old: VEHICLE, the committed record.
         row: VEHICLE, a copy of it that becomes the next one.
         accel: decided acceleration in m/s².
         lane_change: 1 to the left, -1 to the right, 0 none.
         dt: seconds of the tick.
     """
-    speed = old["speed"]
+    speed = clamp(old["speed"] + accel * dt, 0.0, MAX_SPEED_MPS)
     row["throttle"] = accel
-    row["speed"] = clamp(speed + accel * dt, 0.0, MAX_SPEED_MPS)
+    row["speed"] = speed
     row["s"] = old["s"] + speed * dt
     if lane_change != 0:
         lane = roads.lanes[old["lane"]]
@@ -122,7 +127,7 @@ def move_background(
         row["lane"] = target
         row["target_lane"] = target
         row["last_change"] = old["tick"]
-    if not _cross_borders(roads, plans, row):
+    if not _cross_borders(roads, travel, row):
         row["speed"] = 0.0
     sideways = min(LATERAL_MPS, max(LATERAL_RATIO * speed, LATERAL_MIN_MPS)) * dt
     before = row["d"]
@@ -138,8 +143,7 @@ def move_background(
         error = 0.0
     row["heading"] = wrap_angle(old["heading"] + error * min(1.0, speed * dt / TRAIL_M))
     row["steering"] = clamp(math.atan2(row["length"] * error, 2.0 * TRAIL_M), -0.8, 0.8)
-    step = plans[row["goal"], row["lane"]]
-    row["to_go"] = step["to_go"] - row["s"]
+    row["to_go"] = way_left(roads, travel, row)
     if row["to_go"] <= ARRIVE_M:
         row["events"] |= EVENT_ARRIVED
     _account(row, old, roads, dt)

@@ -9,7 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cavmarl.kernels import kernel
-from cavmarl.kernels.arrays import LaneGrid, RoadArrays, Scratch, Worlds
+from cavmarl.kernels.approach import register_links
+from cavmarl.kernels.arrays import LaneGrid, RoadArrays, Scratch, Travel, Worlds
 from cavmarl.kernels.codes import (
     ACTION_FASTER,
     ACTION_IDLE,
@@ -24,7 +25,7 @@ from cavmarl.kernels.codes import (
 from cavmarl.kernels.contacts import find_contacts
 from cavmarl.kernels.control import speed_control
 from cavmarl.kernels.drivers import decide
-from cavmarl.kernels.junctions import STOP_SIGN_S, register_links
+from cavmarl.kernels.junctions import STOP_SIGN_S
 from cavmarl.kernels.lane_choice import needed_change
 from cavmarl.kernels.lanes import index_lanes
 from cavmarl.kernels.motion import move_agent, move_background
@@ -91,6 +92,7 @@ def _any_driver(rows: NDArray[np.void], num: int, driver: int) -> bool:
 def advance(
     roads: RoadArrays,
     plans: NDArray[np.void],
+    travel: Travel,
     lane_grid: LaneGrid,
     worlds: Worlds,
     scratch: Scratch,
@@ -106,6 +108,7 @@ def advance(
     Args:
         roads: the road arrays.
         plans: PLAN (G, L).
+        travel: types and ways.
         lane_grid: which lanes lie near a place.
         worlds: next_rows is written.
         scratch: room.
@@ -121,10 +124,10 @@ def advance(
         owned = worlds.num_owned[w]
         phase = worlds.signal_phase[w]
         if _any_driver(rows, owned, DRIVER_BACKGROUND):
-            index_lanes(roads.lanes, rows, worlds.num_rows[w], scratch)
-            register_links(roads, plans, rows, worlds.num_rows[w], scratch)
+            index_lanes(roads, travel, rows, worlds.num_rows[w], scratch)
+            register_links(roads, travel, rows, worlds.num_rows[w], scratch)
             decide(
-                roads, plans, rows, owned, DRIVER_BACKGROUND, worlds.ticks[w], dt, phase, scratch
+                roads, travel, rows, owned, DRIVER_BACKGROUND, worlds.ticks[w], dt, phase, scratch
             )
         for i in range(owned):
             old = rows[i]
@@ -136,7 +139,8 @@ def advance(
                 if scratch.link_ahead[i] >= 0 and old["wait_s"] >= STOP_SIGN_S:
                     row["stopped_at"] = scratch.link_ahead[i]
                 move_background(
-                    roads, plans, old, row, scratch.accel[i], scratch.lane_change[i], dt
+                    roads,
+                    travel, old, row, scratch.accel[i], scratch.lane_change[i], dt
                 )
                 continue
             if old["events"] & EVENTS_THAT_END:
@@ -162,7 +166,7 @@ def advance(
                 dt,
             )
             # The indicator is automatic: drivers behind make room for who has to change lanes.
-            row["blinker"] = needed_change(roads, plans, row)
+            row["blinker"] = needed_change(roads, travel, row)
 
 
 @kernel
@@ -193,6 +197,7 @@ def resolve(worlds: Worlds, scratch: Scratch, grid: Grid) -> None:
 def suggest(
     roads: RoadArrays,
     plans: NDArray[np.void],
+    travel: Travel,
     worlds: Worlds,
     scratch: Scratch,
     discrete: bool,
@@ -206,6 +211,7 @@ def suggest(
     Args:
         roads: the road arrays.
         plans: PLAN (G, L).
+        travel: types and ways.
         worlds: not written.
         scratch: room.
         discrete: whether to answer with meta-actions.
@@ -219,9 +225,9 @@ def suggest(
         rows = worlds.rows[w]
         owned = worlds.num_owned[w]
         phase = worlds.signal_phase[w]
-        index_lanes(roads.lanes, rows, worlds.num_rows[w], scratch)
-        register_links(roads, plans, rows, worlds.num_rows[w], scratch)
-        decide(roads, plans, rows, owned, DRIVER_AGENT, worlds.ticks[w], dt, phase, scratch)
+        index_lanes(roads, travel, rows, worlds.num_rows[w], scratch)
+        register_links(roads, travel, rows, worlds.num_rows[w], scratch)
+        decide(roads, travel, rows, owned, DRIVER_AGENT, worlds.ticks[w], dt, phase, scratch)
         for i in range(owned):
             row = rows[i]
             if row["driver"] != DRIVER_AGENT:

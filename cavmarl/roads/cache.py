@@ -31,7 +31,7 @@ from cavmarl.roads.reader import map_name, read_network, source_hash
 __all__ = ["load_network"]
 
 # Raise this when the reader gives other rows for the same file; record types count by themselves.
-FORMAT = 8
+FORMAT = 9
 
 _DTYPES = {
     "points": POINT,

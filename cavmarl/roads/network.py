@@ -134,6 +134,7 @@ LINK = np.dtype(
             np.int32,
         ),  # where a vehicle is after the end of from_lane: first_internal, or to_lane
         ("length_m", np.float64),  # of the chain of internal lanes
+        ("wait_m", np.float64),  # from the stop line to the waiting position inside; inf: none
         ("junction", np.int32),
         ("index", np.int32),  # the link's bit in its junction's request, response and foes
         ("signal", np.int32),  # SIGNAL row

@@ -209,6 +209,8 @@ def _link_rows(
         link["first_internal"] = chain[0] if chain else -1
         link["next_lane"] = chain[0] if chain else link["to_lane"]
         link["length_m"] = lanes["length_m"][chain].sum()
+        # netconvert cuts a path in two where drivers wait inside the junction.
+        link["wait_m"] = lanes["length_m"][chain[0]] if len(chain) > 1 else np.inf
         link["junction"] = node_row[id(movement.node)]
         link["index"] = movement.index
         link["signal"], link["signal_index"] = signals.find(connection, movement.node.getType())

@@ -80,9 +80,13 @@ class Simulation:
         with first_compilation() as is_first:
             blank = blank_vehicle()
             self._traffic = NativeTraffic(network, config.traffic, config.population, blank)
+            traffic = self._traffic
             population = config.population
-            self._gate = make_gate(num_worlds, population.agents + population.background)
-            self._shard = Shard(config, network, self._traffic.plans, num_worlds)
+            capacity = population.agents + population.background
+            self._gate = make_gate(num_worlds, capacity)
+            self._shard = Shard(
+                config, network, traffic.plans, traffic.travel, num_worlds, capacity
+            )
             self._executor: Executor = SerialExecutor([self._shard])
             if is_first:
                 self._call_every_kernel()
@@ -211,6 +215,7 @@ class Simulation:
             worlds.ticks[world],
             worlds.keys[world],
             self._gate.next_id[world],
+            self._gate.next_order[world],
             self._gate.num_entered[world],
         ):
             digest.update(array.tobytes())

@@ -12,7 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cavmarl.config import TERMS, EnvConfig
-from cavmarl.kernels.arrays import LaneGrid, Outputs, RoadArrays, Scratch, Worlds
+from cavmarl.kernels.approach import APPROACH
+from cavmarl.kernels.arrays import LaneGrid, Outputs, RoadArrays, Scratch, Travel, Worlds
+from cavmarl.kernels.lanes import ENTRY
 from cavmarl.kernels.neighbors import make_grid
 from cavmarl.kernels.sense import sense
 from cavmarl.kernels.tick import advance, begin_step, resolve, suggest, switch_signals
@@ -46,18 +48,26 @@ class Shard:
     Args:
         config: the environment.
         network: the roads.
-        plans: PLAN (G, L).
+        plans: PLAN (G, L), the ways of agents.
+        travel: types and ways.
         num_worlds: W.
+        capacity: rows a world can hold.
     """
 
     def __init__(
-        self, config: EnvConfig, network: RoadNetwork, plans: NDArray[np.void], num_worlds: int
+        self,
+        config: EnvConfig,
+        network: RoadNetwork,
+        plans: NDArray[np.void],
+        travel: Travel,
+        num_worlds: int,
+        capacity: int,
     ) -> None:
         self._config = config
         self._roads: RoadArrays = network.arrays
         self._plans = plans
+        self._travel = travel
         self._lane_grid: LaneGrid = lane_grid(network)
-        capacity = config.population.agents + config.population.background
         self._sensors = sensor_arrays(config.sensors)
         self._grid = make_grid(network.extent_m, CELL_M, capacity)
         self.scratch = _make_scratch(len(network.lanes), len(network.links), capacity)
@@ -83,6 +93,7 @@ class Shard:
         advance(
             self._roads,
             self._plans,
+            self._travel,
             self._lane_grid,
             self.worlds,
             self.scratch,
@@ -125,6 +136,7 @@ class Shard:
         suggest(
             self._roads,
             self._plans,
+            self._travel,
             self.worlds,
             self.scratch,
             self._discrete,
@@ -157,15 +169,15 @@ def _make_scratch(num_lanes: int, num_links: int, capacity: int) -> Scratch:
         return np.zeros(size, dtype=np.float64)
 
     return Scratch(
-        lane_start=integers(num_lanes + 2),
-        entry_row=integers(2 * capacity),
-        entry_s=floats(2 * capacity),
+        lane_start=integers(num_lanes + 1),
+        lane_end=integers(num_lanes),
+        entries=np.zeros(2 * capacity, dtype=ENTRY),
+        lane_taken=np.zeros(num_lanes, dtype=np.bool_),
         link_start=integers(num_links + 2),
-        link_row=integers(3 * capacity),
-        link_dist=floats(3 * capacity),
-        pair_link=integers(3 * capacity),
-        pair_row=integers(3 * capacity),
-        pair_dist=floats(3 * capacity),
+        approach=np.zeros(3 * capacity, dtype=APPROACH),
+        pairs=np.zeros(3 * capacity, dtype=APPROACH),
+        line_link=integers(capacity),
+        line_m=floats(capacity),
         accel=floats(capacity),
         link_ahead=integers(capacity),
         lane_change=integers(capacity),

@@ -58,11 +58,15 @@ VEHICLE = np.dtype(
         ("side_lane", np.int32),  # neighbour lane that the body also covers
         ("s", np.float64),
         ("d", np.float64),
-        ("goal", np.int32),  # where it drives to: row of the plans' table
+        ("goal", np.int32),  # where it drives to: row of the plans' table; -1: a route's end
+        ("way", np.int64),  # where the step of its lane stands, see kernels.ways
         ("leg", np.int32),  # how many goals it has had before
+        ("order", np.int32),  # DEPARTURE row of the demand file's orders; -1: of the generator
+        ("stop", np.int32),  # STOP row that it makes next; -1 or stops_end: none
+        ("stops_end", np.int32),
         ("to_go", np.float64),  # m left to the goal, along the plan
         # configuration
-        ("vtype", np.int32),  # row of a table of types; reserved: all are passenger cars
+        ("vtype", np.int32),  # VTYPE row: how it drives
         ("driver", np.int32),  # DRIVER_*
         ("length", np.float64),
         ("width", np.float64),
@@ -101,16 +105,31 @@ PLACEMENT_FIELDS = ("owner", "source_zone", "target_zone", "epoch", "transfer")
 STATE_FIELDS = tuple(name for name in VEHICLE.names or () if name not in PLACEMENT_FIELDS)
 
 
+# Fields of a new vehicle that point at nothing.
+_NOTHING = (
+    "agent",
+    "source_zone",
+    "target_zone",
+    "side_lane",
+    "link",
+    "stopped_at",
+    "hit",
+    "last_change",
+    "memory",
+    "order",
+    "stop",
+    "stops_end",
+)
+
+
 def blank_vehicle() -> NDArray[np.void]:
     """VEHICLE (1,): the record that a new vehicle starts from, a passenger car.
 
     The size is highway-env's (5 m × 2 m).
     """
     blank = np.zeros(1, dtype=VEHICLE)
-    for name in ("agent", "source_zone", "target_zone", "side_lane", "link", "stopped_at", "hit"):
+    for name in _NOTHING:
         blank[name] = -1
-    blank["last_change"] = -1
-    blank["memory"] = -1
     blank["length"] = 5.0
     blank["width"] = 2.0
     blank["height"] = 1.6

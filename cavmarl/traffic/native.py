@@ -10,11 +10,12 @@ from numpy.typing import NDArray
 
 from cavmarl.config import PopulationConfig, TrafficConfig
 from cavmarl.errors import CapacityError, ConfigError, RouteError
-from cavmarl.kernels.arrays import Demand, Gate, Scratch, Worlds
+from cavmarl.kernels.arrays import Demand, Gate, Scratch, Travel, Worlds
 from cavmarl.kernels.codes import DRIVER_AGENT, DRIVER_BACKGROUND
-from cavmarl.kernels.departures import choose_goals, let_in, populate, take_out
+from cavmarl.kernels.departures import call_orders, choose_goals, let_in, populate, take_out
 from cavmarl.roads.network import VEHICLE_CLASSES, RoadNetwork
 from cavmarl.roads.routing import make_plans
+from cavmarl.traffic.vtypes import generated_types
 
 __all__ = ["NativeTraffic"]
 
@@ -69,6 +70,11 @@ class NativeTraffic:
         return make_plans(self.network, [int(edge) for edge in self.goal_edges])
 
     @cached_property
+    def travel(self) -> Travel:
+        """Types and ways of all vehicles."""
+        return Travel(types=generated_types(), steps=self.plans.reshape(-1))
+
+    @cached_property
     def demand(self) -> Demand:
         """The tables that departures are drawn from.
 
@@ -104,14 +110,15 @@ class NativeTraffic:
 
     def populate(self, gate: Gate, worlds: Worlds, chosen: NDArray[np.bool_]) -> None:
         """Fill the chosen worlds (W,) for a new episode."""
-        populate(self.demand, self.network.arrays, self.plans, gate, worlds, chosen)
+        populate(self.demand, self.network.arrays, self.travel, gate, worlds, chosen)
 
     def arrive_and_depart(self, gate: Gate, worlds: Worlds, scratch: Scratch, dt: float) -> None:
         """Who has arrived leaves `next_rows`, wanderers pick new goals, and who waits may enter."""
         roads = self.network.arrays
-        choose_goals(self.demand, roads, self.plans, worlds)
+        choose_goals(self.demand, roads, self.travel, len(self.plans), worlds)
         take_out(self.demand, roads, gate, worlds, worlds.next_rows, DRIVER_BACKGROUND, dt, 1)
-        let_in(self.demand, roads, self.plans, gate, worlds, scratch)
+        call_orders(gate, worlds)
+        let_in(self.demand, roads, self.travel, gate, worlds, scratch)
 
     def retire_agents(self, gate: Gate, worlds: Worlds, dt: float, ticks_per_step: int) -> None:
         """Take agents whose trip has ended out of the committed rows; order those that follow."""
