@@ -141,7 +141,9 @@ class ActionDecoder:
             return shares
         return raw[..., 0].astype(np.int64)
 
-    def _rows_of(self, agents: Sequence[str]) -> NDArray[np.intp]:
+    def _rows_of(self, agents: Sequence[str]) -> NDArray[np.intp] | slice:
+        if tuple(agents) == self._agents:
+            return slice(None)
         return np.array([self._index[agent] for agent in agents], dtype=np.intp)
 
     def _check_ids(self, actions: Mapping[str, Any], live: Sequence[str]) -> int:

@@ -31,7 +31,8 @@ __all__ = ["CavEnv", "parallel_env"]
 RENDER_MODES = ("human", "rgb_array")
 
 # What an agent's info holds, in this order.
-_NO_INFO = dict.fromkeys((*TERMS, "active", "vehicle_done", "vehicle_id"), 0.0)
+_ABSENT = dict.fromkeys((*TERMS, "active", "vehicle_done", "vehicle_id"), 0.0)
+_ACTIVE = _ABSENT | {"active": 1.0}
 
 Observation = NDArray[np.float32] | dict[str, NDArray[np.float32]]
 
@@ -119,7 +120,9 @@ class CavEnv(ParallelEnv[str, Any, Any]):  # type: ignore[misc] # PettingZoo is 
             "render_fps": max(1, round(1.0 / config.clock.ctrl_dt_s)),
         }
         self.possible_agents = [f"car_{k}" for k in range(config.population.num_ids)]
-        self._seat(np.zeros(0, dtype=np.intp))
+        self._rows: NDArray[np.intp]
+        self._listed: NDArray[np.intp] | slice  # the same
+        self._list(np.zeros(0, dtype=np.intp))
         self.max_cycles = config.max_steps
         self.state_space = state_space(config)
         one_observation, one_action = observation_space(config), action_space(config.action)
@@ -166,10 +169,10 @@ class CavEnv(ParallelEnv[str, Any, Any]):  # type: ignore[misc] # PettingZoo is 
         self._decoder.forget(np.ones(1, dtype=np.bool_))
         self._steps = 0
         present = self._simulation.outputs.present[0]
-        self._seat(np.flatnonzero(present | self._seats))
+        self._list(np.flatnonzero(present | self._seats))
         if not self.agents:
             self._wait_for_agents()
-        return self._observations(self.agents, self._rows), self._infos(self.agents, self._rows)
+        return self._observations(), self._infos()
 
     def step(
         self, actions: Mapping[str, Any]
@@ -197,7 +200,7 @@ class CavEnv(ParallelEnv[str, Any, Any]):  # type: ignore[misc] # PettingZoo is 
                 raise EpisodeEndedError("the episode is over: call env.reset()")
             return {}, {}, {}, {}, {}
         outputs = self._simulation.outputs
-        active = (outputs.present[0] & ~outputs.terminated[0])[self._rows]
+        active = (outputs.present[0] & ~outputs.terminated[0])[self._listed]
         needed = self.agents if active.all() else list(compress(self.agents, active.tolist()))
         commands = self._decoder.from_dict(actions, self.agents, needed)
         self._simulation.step(commands)
@@ -218,25 +221,26 @@ class CavEnv(ParallelEnv[str, Any, Any]):  # type: ignore[misc] # PettingZoo is 
         truncated = self._steps >= self.max_cycles
         if not truncated:
             entered = outputs.present[0].copy()
-            entered[self._rows] = False
+            entered[self._listed] = False
             if entered.any():
-                self._seat(np.concatenate([self._rows, np.flatnonzero(entered)]))
-        shown, rows = self.agents, self._rows
-        ended = outputs.terminated[0, rows] & (not self._seats)
-        observations = self._observations(shown, rows)
-        infos = self._infos(shown, rows)
-        rewards = dict(zip(shown, outputs.rewards[0, rows].tolist(), strict=True))
+                self._list(np.concatenate([self._rows, np.flatnonzero(entered)]))
+        shown = self.agents
+        ended = outputs.terminated[0, self._listed] & (not self._seats)
+        observations, infos = self._observations(), self._infos()
+        rewards = dict(zip(shown, outputs.rewards[0, self._listed].tolist(), strict=True))
         terminations = dict(zip(shown, ended.tolist(), strict=True))
-        truncations = dict(zip(shown, (~ended & truncated).tolist(), strict=True))
+        truncations = dict.fromkeys(shown, False)
+        if truncated:
+            truncations = dict(zip(shown, (~ended).tolist(), strict=True))
         self._simulation.retire_agents()
         if truncated:
-            self._seat(rows[:0])
+            self._list(self._rows[:0])
         elif ended.any():
-            self._seat(rows[~ended])
+            self._list(self._rows[~ended])
         if not self.agents and not truncated:
             self._wait_for_agents()
-            observations |= self._observations(self.agents, self._rows)
-            infos |= self._infos(self.agents, self._rows)
+            observations |= self._observations()
+            infos |= self._infos()
             rewards |= dict.fromkeys(self.agents, 0.0)
             terminations |= dict.fromkeys(self.agents, False)
             truncations |= dict.fromkeys(self.agents, False)
@@ -244,10 +248,13 @@ class CavEnv(ParallelEnv[str, Any, Any]):  # type: ignore[misc] # PettingZoo is 
             self.render()
         return observations, rewards, terminations, truncations, infos
 
-    def _seat(self, rows: NDArray[np.intp]) -> None:
+    def _list(self, rows: NDArray[np.intp]) -> None:
         """Make these agents, by their index, the ones in the episode."""
         self._rows = rows
         self.agents = [self.possible_agents[k] for k in rows.tolist()]
+        # The first ones in their order, which is the usual case, can be taken without a copy.
+        in_order = bool((rows == np.arange(rows.size)).all())
+        self._listed = slice(rows.size) if in_order else rows
 
     def _wait_for_agents(self) -> None:
         """Let an empty world go on until an agent enters; ends without one at the horizon."""
@@ -256,35 +263,36 @@ class CavEnv(ParallelEnv[str, Any, Any]):  # type: ignore[misc] # PettingZoo is 
             self._steps += 1
             present = self._simulation.outputs.present[0]
             if present.any() and self._steps < self.max_cycles:
-                self._seat(np.flatnonzero(present))
+                self._list(np.flatnonzero(present))
                 break
 
-    def _observations(self, agents: list[str], rows: NDArray[np.intp]) -> dict[str, Observation]:
-        found = self._simulation.outputs.observations[0, rows]
+    def _observations(self) -> dict[str, Observation]:
+        found = self._simulation.outputs.observations[0].copy()[self._listed]
         if self._places is None:
-            return dict(zip(agents, found, strict=True))
+            return dict(zip(self.agents, found, strict=True))
         return {
             agent: {name: row[place] for name, place in self._places.items()}
-            for agent, row in zip(agents, found, strict=True)
+            for agent, row in zip(self.agents, found, strict=True)
         }
 
-    def _infos(self, agents: list[str], rows: NDArray[np.intp]) -> dict[str, dict[str, float]]:
-        outputs = self._simulation.outputs
-        done = outputs.events[0, rows] & EVENTS_THAT_END != 0
-        numbers = np.column_stack(
-            [outputs.terms[0, rows], outputs.present[0, rows] & ~done, done]
-        ).T.astype(np.float64)
+    def _infos(self) -> dict[str, dict[str, float]]:
+        outputs, listed = self._simulation.outputs, self._listed
+        done = outputs.events[0, listed] & EVENTS_THAT_END != 0
+        active = outputs.present[0, listed] & ~done
+        terms = outputs.terms[0, listed].T
         # Most are 0 for everybody: no accident, no red light.
-        used = np.asarray(numbers.any(axis=1))
-        infos = [_NO_INFO.copy() for _ in agents]
-        for name, column in zip(
-            compress(_NO_INFO, used.tolist()), numbers[used].tolist(), strict=True
-        ):
-            for info, number in zip(infos, column, strict=True):
+        columns = [(TERMS[k], terms[k]) for k in np.flatnonzero(terms.any(axis=1)).tolist()]
+        columns.append(("vehicle_id", outputs.vehicle_ids[0, listed]))
+        usual = _ACTIVE
+        if not active.all():
+            usual = _ABSENT
+            columns.append(("active", active.astype(np.float64)))
+            columns.append(("vehicle_done", done.astype(np.float64)))
+        infos = [usual.copy() for _ in self.agents]
+        for name, column in columns:
+            for info, number in zip(infos, column.tolist(), strict=True):
                 info[name] = number
-        for info, vehicle in zip(infos, outputs.vehicle_ids[0, rows].tolist(), strict=True):
-            info["vehicle_id"] = vehicle
-        return dict(zip(agents, infos, strict=True))
+        return dict(zip(self.agents, infos, strict=True))
 
     def check_action(self, agent: str, action: Any) -> None:
         """Refuse an action that `step` would refuse, before anything is kept of it.
