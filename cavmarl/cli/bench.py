@@ -9,6 +9,7 @@ import typer
 from rich.console import Console
 from rich.table import Table
 
+from cavmarl.cli.bench_traffic import traffic
 from cavmarl.cli.output import JsonPath, write_json
 from cavmarl.errors import ConfigError
 
@@ -18,11 +19,7 @@ if TYPE_CHECKING:
 __all__ = ["app"]
 
 app = typer.Typer(help="How fast it is, measured side by side.", no_args_is_help=True)
-
-
-@app.callback()
-def _group() -> None:
-    """Keep `step` a command of its own while there is no other."""
+app.command()(traffic)
 
 
 @app.command()

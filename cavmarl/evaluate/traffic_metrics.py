@@ -34,6 +34,7 @@ EDGE_MINUTE = np.dtype(
     [
         ("edge", np.int32),  # EDGE row, none inside junctions
         ("minute", np.int32),  # since the beginning
+        ("length_m", np.float64),  # of the edge
         ("density_per_km", np.float64),  # vehicles on a kilometre of one lane
         ("flow_per_h", np.float64),  # vehicles an hour on one lane
         ("speed_mps", np.float64),  # flow over density
@@ -193,6 +194,7 @@ class TrafficMeter:
             part = np.zeros(len(chosen), EDGE_MINUTE)
             part["edge"] = chosen
             part["minute"] = minute
+            part["length_m"] = edges["length_m"][chosen]
             part["density_per_km"] = seconds[chosen] / samples / lane_km[chosen]
             part["speed_mps"] = metres[chosen] / seconds[chosen]
             part["flow_per_h"] = 3.6 * part["speed_mps"] * part["density_per_km"]
