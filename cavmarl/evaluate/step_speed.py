@@ -22,7 +22,7 @@ import numpy as np
 from cavmarl.errors import ConfigError, require
 from cavmarl.vector_env import CavVectorEnv, make_vec
 
-__all__ = ["Rates", "StepSpeed", "measure_step_speed"]
+__all__ = ["Rates", "StepSpeed", "measure_step_speed", "one_core"]
 
 RAYS = 64
 RANGE_M = 60.0
@@ -103,7 +103,7 @@ def measure_step_speed(
         if not 1 <= value <= most:
             raise ConfigError(f"{name} = {value}: must be from 1 to {most}")
     require("highway_env", "highway")
-    with _one_core(), tempfile.TemporaryDirectory() as folder:
+    with one_core(), tempfile.TemporaryDirectory() as folder:
         progress("making highway-env's road")
         theirs = _highway_env(agents)
         along = [vehicle.position[0] for vehicle in theirs.controlled_vehicles]
@@ -133,7 +133,7 @@ def measure_step_speed(
 
 
 @contextmanager
-def _one_core() -> Iterator[None]:
+def one_core() -> Iterator[None]:
     """Keep this process on one core, where the system can."""
     if not hasattr(os, "sched_setaffinity"):
         yield

@@ -12,10 +12,9 @@ from cavmarl.evaluate.native_traffic import run_native
 from cavmarl.evaluate.sumo_input import read_input
 from cavmarl.evaluate.sumo_traffic import SumoJob, run_sumo
 from cavmarl.evaluate.traffic_metrics import TrafficRun
-from cavmarl.maps.netconvert import map_file
-from cavmarl.registry import load_config, resolve_map
+from cavmarl.worlds import find_map
 
-__all__ = ["TrafficComparison", "compare_traffic", "find_map"]
+__all__ = ["TrafficComparison", "compare_traffic"]
 
 MAX_SECONDS = 100_000
 RATIOS = ("departed", "waiting", "arrived", "mean_speed_mps", "mean_delay_s", "queue")
@@ -101,13 +100,3 @@ def compare_traffic(
     ours = run_native(path, demand, seconds, dt_s, seed)
     name = path.name.removesuffix(".gz").removesuffix(".net.xml")
     return TrafficComparison(name, seconds, dt_s, seed, ours, sumo)
-
-
-def find_map(map_name: str | Path) -> Path:
-    """The SUMO network of an environment or a map file.
-
-    Raises:
-        UnknownEnvironmentError: nothing of that name.
-        MapError: the map cannot be read.
-    """
-    return map_file(resolve_map(*load_config(map_name))).resolve()
