@@ -36,7 +36,5 @@ def random(
     from cavmarl.worlds import find_map
 
     network = load_network(find_map(map_name))
-    write_random_demand(
-        network, out, vehicles=vehicles, within_s=within, route_m=route, seed=seed
-    )
+    write_random_demand(network, out, vehicles=vehicles, within_s=within, route_m=route, seed=seed)
     typer.echo(f"{out}: {vehicles} vehicles on {network.name}")

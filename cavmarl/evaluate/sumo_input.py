@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import gzip
 import re
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field
+from io import BytesIO
 from pathlib import Path
 from xml.etree.ElementTree import Element, ParseError
 
@@ -70,7 +72,7 @@ def read_input(demand: Sequence[Path]) -> SumoInput:
         return _read_config(demand[0])
     routes, additional = [], []
     for path in demand:
-        root = _root(path).tag
+        root = _root_tag(path)
         if root == "routes":
             routes.append(path.resolve())
         elif root in ("additional", "add", "tlLogics"):
@@ -121,17 +123,32 @@ def _read_config(path: Path) -> SumoInput:
 
 
 def _root(path: Path) -> Element:
-    try:
+    with _readable(path):
         root: Element = defusedxml.ElementTree.fromstring(read_bytes(path), forbid_dtd=True)
+    return root
+
+
+def _root_tag(path: Path) -> str:
+    """Only that: demand of a day is too long to read it twice."""
+    with _readable(path):
+        content = BytesIO(read_bytes(path))
+        _, root = next(defusedxml.ElementTree.iterparse(content, ("start",), forbid_dtd=True))
+    return str(root.tag)
+
+
+@contextmanager
+def _readable(path: Path) -> Iterator[None]:
+    """Turn what goes wrong with a file into a ConfigError that names it."""
+    try:
+        yield
     except ParseError as error:
         raise ConfigError(f"{path}, line {error.position[0]}: broken XML ({error})") from error
     except DefusedXmlException as error:
         raise ConfigError(f"{path}: declares a document type or entities: remove them") from error
     except (gzip.BadGzipFile, EOFError) as error:
-        raise ConfigError(f"{path}: broken gzip ({error})") from error
+        raise ConfigError(f"{path}: broken gzip ({error}): make the file again") from error
     except OSError as error:
         raise ConfigError(f"{path}: cannot be read ({error.strerror or error})") from error
-    return root
 
 
 def _seconds(text: str, path: Path) -> float:

@@ -8,13 +8,14 @@ from __future__ import annotations
 
 import math
 import tempfile
-from collections.abc import Callable
+from collections.abc import Iterator
 from concurrent.futures import ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
+from contextlib import contextmanager
 from dataclasses import dataclass
 from multiprocessing import get_context
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 import defusedxml.ElementTree
 import numpy as np
@@ -28,11 +29,9 @@ from cavmarl.roads.cache import load_network
 from cavmarl.roads.network import SIGNAL_STATES, RoadNetwork
 from cavmarl.shard.vehicles import VEHICLE, blank_vehicle
 
-__all__ = ["SumoJob", "in_own_process", "run_sumo", "start_sumo"]
+__all__ = ["SumoJob", "run_sumo", "start_sumo", "sumo_process"]
 
 MAX_VEHICLES = 1 << 16
-
-Result = TypeVar("Result")
 
 
 @dataclass(frozen=True)
@@ -64,25 +63,28 @@ def run_sumo(job: SumoJob) -> TrafficRun:
         ConfigError: SUMO refuses the demand on this map; the message is SUMO's.
         MissingExtraError: SUMO is not installed.
     """
-    require("libsumo", "sumo")
-    return in_own_process(_measure, job)
+    with sumo_process(job) as process:
+        return process.submit(_measure, job).result()
 
 
-def in_own_process(work: Callable[[SumoJob], Result], job: SumoJob) -> Result:
-    """`work(job)` in a fresh process.
+@contextmanager
+def sumo_process(job: SumoJob) -> Iterator[ProcessPoolExecutor]:
+    """A fresh process for one simulation of SUMO's; what is submitted runs there.
 
     Raises:
-        ConfigError: the process died.
+        ConfigError: SUMO ended the process.
+        MissingExtraError: SUMO is not installed.
     """
-    with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as pool:
+    require("libsumo", "sumo")
+    with ProcessPoolExecutor(1, get_context("spawn")) as process:
         try:
-            return pool.submit(work, job).result()
+            yield process
         except BrokenProcessPool as error:
             raise ConfigError(f"{job.map_file}: SUMO ended its process on this demand") from error
 
 
 def start_sumo(job: SumoJob, folder: Path, *more: str) -> Any:
-    """libsumo with the job loaded, in this process.
+    """Load the job into this process's libsumo and return it.
 
     Args:
         job: what to run.
@@ -156,8 +158,8 @@ def _measure(job: SumoJob) -> TrafficRun:
         waiting = len(libsumo.simulation.getPendingVehicles())
         libsumo.close()
         delays = [
-            float(trip.get("timeLoss")) for trip in defusedxml.ElementTree.parse(trips).getroot()
-            if trip.tag == "tripinfo"
+            float(trip.attrib["timeLoss"])
+            for trip in defusedxml.ElementTree.parse(trips).iter("tripinfo")
         ]
     delay = math.fsum(delays) / len(delays) if delays else None
     return meter.result(TrafficCounts(departed, waiting, arrived, delay, teleports))
@@ -185,7 +187,7 @@ class _VehicleReader:
             return rows
         places = np.empty((len(self._names), 4))
         for i, name in enumerate(self._names):
-            rows[i] = self._blank(name)
+            rows[i] = self._blank(name)[0]
             places[i, :3] = vehicle.getPosition3D(name)
             places[i, 3] = vehicle.getAngle(name)
         heading = 0.5 * math.pi - np.radians(places[:, 3])
@@ -215,7 +217,7 @@ class _VehicleReader:
         return codes
 
     def _blank(self, name: str) -> NDArray[np.void]:
-        """The record that this vehicle starts from, with a number for its name."""
+        """VEHICLE (1,) that this vehicle starts from, with a number for its name."""
         if name not in self._known:
             vehicle = self._libsumo.vehicle
             row = blank_vehicle()
@@ -224,4 +226,4 @@ class _VehicleReader:
             row["width"] = vehicle.getWidth(name)
             row["height"] = vehicle.getHeight(name)
             self._known[name] = row
-        return self._known[name][0]
+        return self._known[name]

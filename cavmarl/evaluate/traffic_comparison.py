@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from cavmarl.errors import ConfigError, require
+from cavmarl.errors import ConfigError
 from cavmarl.evaluate.native_traffic import run_native
 from cavmarl.evaluate.sumo_input import read_input
 from cavmarl.evaluate.sumo_traffic import SumoJob, run_sumo
-from cavmarl.evaluate.traffic_metrics import TrafficRun
+from cavmarl.evaluate.traffic_metrics import EDGE_MINUTE, TrafficRun
 from cavmarl.worlds import find_map
 
 __all__ = ["TrafficComparison", "compare_traffic"]
@@ -52,7 +52,7 @@ class TrafficComparison:
                 "figures": run.figures.to_dict(),
                 "locks_s": run.locks_s,
                 "edge_minutes": {
-                    key: run.edge_minutes[key].tolist() for key in run.edge_minutes.dtype.names
+                    key: run.edge_minutes[key].tolist() for key in EDGE_MINUTE.names or ()
                 },
             }
             for name, run in (("ours", self.ours), ("sumo", self.sumo))
@@ -91,7 +91,6 @@ def compare_traffic(
         raise ConfigError(f"seconds = {seconds}: must be from 1 to {MAX_SECONDS}")
     if not 0.0 < dt_s <= 1.0 or abs(1.0 / dt_s - round(1.0 / dt_s)) > 1e-6:
         raise ConfigError(f"dt = {dt_s:g}: a second must be a whole number of steps; try 0.1")
-    require("libsumo", "sumo")
     given = read_input(demand)
     path = find_map(map_name)
     progress("SUMO's run")

@@ -47,9 +47,8 @@ def plot_fundamental_diagram(found: TrafficComparison, path: Path) -> None:
         axes.set_xlim(left=0.0)
         axes.set_ylim(bottom=0.0)
         axes.legend(frameon=False)
-    figure.suptitle(
-        f"{found.map_name}, {found.seconds} s, step {found.dt_s:g} s: each edge of {LEAST_EDGE_M:g} m or more, each minute"
-    )
+    edges = f"each edge of {LEAST_EDGE_M:g} m or more, each minute"
+    figure.suptitle(f"{found.map_name}, {found.seconds} s, step {found.dt_s:g} s: {edges}")
     try:
         figure.savefig(path, dpi=150)
     except (OSError, ValueError) as error:

@@ -9,9 +9,7 @@ from __future__ import annotations
 import tempfile
 import time
 from collections.abc import Callable, Sequence
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import asdict, dataclass
-from multiprocessing import get_context
 from pathlib import Path
 from statistics import median
 from typing import Any
@@ -20,7 +18,7 @@ from cavmarl.errors import ConfigError, require
 from cavmarl.evaluate.native_traffic import advance, idle_commands, make_world
 from cavmarl.evaluate.step_speed import Rates, one_core
 from cavmarl.evaluate.sumo_input import read_input
-from cavmarl.evaluate.sumo_traffic import SumoJob, start_sumo
+from cavmarl.evaluate.sumo_traffic import SumoJob, start_sumo, sumo_process
 from cavmarl.runtime.simulation import Simulation
 from cavmarl.worlds import find_map
 
@@ -91,7 +89,6 @@ def measure_traffic_speed(
     for name, value, most in (("after", after_s, MAX_AFTER_S), ("repeats", repeats, MAX_REPEATS)):
         if not 1 <= value <= most:
             raise ConfigError(f"{name} = {value}: must be from 1 to {most}")
-    require("libsumo", "sumo")
     path = find_map(map_name)
     job = SumoJob(path, read_input(demand), after_s, dt_s, seed)
     warm, steps = round(after_s / dt_s), round(TURN_S / dt_s)
@@ -99,7 +96,7 @@ def measure_traffic_speed(
     with (
         one_core(),
         tempfile.TemporaryDirectory() as folder,
-        ProcessPoolExecutor(1, get_context("spawn")) as sumo,
+        sumo_process(job) as sumo,
     ):
         progress(f"SUMO's first {after_s} s")
         sumo.submit(_load_sumo, job, folder).result()

@@ -137,9 +137,7 @@ def _largest_part(network: RoadNetwork) -> tuple[list[list[int]], NDArray[np.int
     lanes, links = network.lanes, network.links
     usable = lanes["permissions"] & _PASSENGER != 0
     good = (
-        usable[links["from_lane"]]
-        & usable[links["to_lane"]]
-        & (links["direction"] != _TURNAROUND)
+        usable[links["from_lane"]] & usable[links["to_lane"]] & (links["direction"] != _TURNAROUND)
     )
     ends = np.stack([links["from_lane"][good], links["to_lane"][good]], axis=1)
     arcs = np.unique(lanes["edge"][ends], axis=0)
@@ -149,8 +147,8 @@ def _largest_part(network: RoadNetwork) -> tuple[list[list[int]], NDArray[np.int
     in_part[sizes < 2] = 0.0
     if not in_part.any():
         raise RouteError(
-            f"map '{network.name}': no edge can be reached again without turning round, so no route "
-            "of any length exists; write demand with origins and destinations by hand"
+            f"map '{network.name}': no edge can be reached again without turning round, so routes "
+            "of any length do not exist; write demand with origins and destinations by hand"
         )
     chosen = part == np.argmax(in_part)
     into: list[list[int]] = [[] for _ in range(len(network.edges))]

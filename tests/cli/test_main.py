@@ -11,7 +11,7 @@ import pytest
 
 from cavmarl.cli import main
 
-COMMANDS = ("evaluate", "view", "demo", "list", "map", "bench")
+COMMANDS = ("evaluate", "view", "demo", "list", "map", "demand", "bench")
 QUICK = ("--set", "horizon_s=1", "--agents", "2", "--background", "2")
 
 
