@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from cavmarl.cli.output import Seed
+from cavmarl.cli.output import JsonPath, Seed, write_json
 
 __all__ = ["app"]
 
@@ -29,6 +29,7 @@ def random(
     within: Annotated[float, typer.Option(help="Seconds in which they depart, evenly.")] = 60.0,
     route: Annotated[float, typer.Option(help="Shortest route, in metres.")] = 10_000.0,
     seed: Seed = 0,
+    json_path: JsonPath = None,
 ) -> None:
     """Cars with explicit random routes, from edges drawn by the length of their lanes."""
     from cavmarl.roads.cache import load_network
@@ -38,3 +39,5 @@ def random(
     network = load_network(find_map(map_name))
     write_random_demand(network, out, vehicles=vehicles, within_s=within, route_m=route, seed=seed)
     typer.echo(f"{out}: {vehicles} vehicles on {network.name}")
+    asked = {"vehicles": vehicles, "within_s": within, "route_m": route, "seed": seed}
+    write_json(json_path, {"file": str(out), "map": network.name, **asked})

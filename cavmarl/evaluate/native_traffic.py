@@ -14,9 +14,7 @@ from cavmarl.runtime.simulation import Simulation
 from cavmarl.shard.shard import Commands
 from cavmarl.worlds import load_world
 
-__all__ = ["MAX_VEHICLES", "advance", "make_world", "run_native"]
-
-MAX_VEHICLES = 1 << 16
+__all__ = ["advance", "idle_commands", "make_world", "run_native"]
 
 
 def make_world(map_file: Path, demand: Sequence[Path], seed: int, dt_s: float) -> Simulation:
@@ -79,7 +77,7 @@ def run_native(
         MapError: see `make_world`.
     """
     simulation = make_world(map_file, demand, seed, dt_s)
-    meter = TrafficMeter(simulation.network, MAX_VEHICLES)
+    meter = TrafficMeter(simulation.network)
     commands = idle_commands(simulation)
     ticks_per_s = round(1.0 / dt_s)
     for tick in range(1, seconds * ticks_per_s + 1):

@@ -30,7 +30,7 @@ _INPUTS = {
     "additional": "additional-files",
     "a": "additional-files",
 }
-_DROPPED_SECTIONS = ("input", "output", "report", "gui_only", "time")
+_DROPPED_SECTIONS = ("input", "output", "report", "gui_only", "time", "traci_server")
 _OUTPUT = re.compile(
     rb"<(?:e[123]Detector|inductionLoop|instantInductionLoop|laneAreaDetector|entryExitDetector|"
     rb"edgeData|laneData|routeProbe|vTypeProbe|timedEvent)\b[^>]*>"

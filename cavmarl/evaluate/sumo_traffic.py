@@ -31,8 +31,6 @@ from cavmarl.shard.vehicles import VEHICLE, blank_vehicle
 
 __all__ = ["SumoJob", "run_sumo", "start_sumo", "sumo_process"]
 
-MAX_VEHICLES = 1 << 16
-
 
 @dataclass(frozen=True)
 class SumoJob:
@@ -126,9 +124,10 @@ def _refusal(job: SumoJob, log: Path, error: Exception) -> ConfigError:
     """What SUMO complained about, in its words."""
     said = log.read_text(encoding="utf-8", errors="replace") if log.exists() else ""
     lines = [line.removeprefix("Error: ") for line in said.splitlines() if line.strip()]
+    own = f", {job.demand.net_file}" if job.demand.net_file else ""
     return ConfigError(
         f"{job.map_file}: SUMO refuses this demand: {' '.join(lines) or error}\n"
-        "Cure: give demand that was made for this map"
+        f"Cure: give demand that was made for this map, or the map that it was made for{own}"
     )
 
 
@@ -138,7 +137,7 @@ def _measure(job: SumoJob) -> TrafficRun:
         folder = Path(name)
         trips = folder / "trips.xml"
         libsumo = start_sumo(job, folder, f"--tripinfo-output={trips}")
-        meter = TrafficMeter(network, MAX_VEHICLES)
+        meter = TrafficMeter(network)
         reader = _VehicleReader(libsumo, network)
         departed = arrived = teleports = 0
         ticks_per_s = round(1.0 / job.dt_s)

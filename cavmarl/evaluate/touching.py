@@ -20,16 +20,15 @@ class TouchCounter:
 
     Args:
         bounds: min_x, min_y, max_x, max_y of the map in m.
-        capacity: most vehicles that it can be shown.
 
     Attributes:
         count: pairs so far; one that parts and touches again counts again.
     """
 
-    def __init__(self, bounds: tuple[float, float, float, float], capacity: int) -> None:
+    def __init__(self, bounds: tuple[float, float, float, float]) -> None:
         self.count = 0
-        self._grid = make_grid(bounds, CELL_M, capacity)
-        self._hit = np.zeros(capacity, dtype=np.int64)
+        self._bounds = bounds
+        self._make_room(0)
         self._touching: set[tuple[int, int]] = set()
 
     def see(self, rows: NDArray[np.void]) -> None:
@@ -38,6 +37,8 @@ class TouchCounter:
         Args:
             rows: VEHICLE (num_vehicles,).
         """
+        if len(rows) > len(self._hit):
+            self._make_room(2 * len(rows))
         fill_grid(rows, len(rows), self._grid)
         find_contacts(len(rows), self._grid, self._hit)
         hitting = np.flatnonzero(self._hit[: len(rows)] >= 0)
@@ -45,3 +46,7 @@ class TouchCounter:
         touching = {(min(pair), max(pair)) for pair in zip(ids, others, strict=True)}
         self.count += len(touching - self._touching)
         self._touching = touching
+
+    def _make_room(self, capacity: int) -> None:
+        self._grid = make_grid(self._bounds, CELL_M, capacity)
+        self._hit = np.zeros(capacity, dtype=np.int64)

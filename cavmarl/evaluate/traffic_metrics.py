@@ -117,12 +117,11 @@ class TrafficMeter:
 
     Args:
         network: the map that the vehicles' `lane` speaks of.
-        capacity: most vehicles in the world at any one time.
     """
 
-    def __init__(self, network: RoadNetwork, capacity: int) -> None:
+    def __init__(self, network: RoadNetwork) -> None:
         self._network = network
-        self._touches = TouchCounter(network.extent_m, capacity)
+        self._touches = TouchCounter(network.extent_m)
         self._locks = JunctionLocks(network)
         signalled = network.links["from_lane"][network.links["signal"] >= 0]
         self._ends_at_signal = np.zeros(len(network.lanes), dtype=np.bool_)

@@ -89,6 +89,11 @@ def test_demand_of_another_map_is_refused_in_sumos_words() -> None:
         run_sumo(job(read_input([ROUTES]), GAME / "cross" / "cross.net.xml"))
 
 
+def test_a_refusal_names_the_map_of_a_configuration() -> None:
+    with pytest.raises(ConfigError, match=r"the map that it was made for, .*cross\.net\.xml"):
+        run_sumo(job(read_input([GAME / "cross_demo.sumocfg"])))
+
+
 def test_without_sumo_it_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
     demand = read_input([ROUTES])
 

@@ -55,7 +55,7 @@ def codes(network: RoadNetwork, letter: int) -> NDArray[np.uint8]:
 def measure(
     network: RoadNetwork, samples: list[NDArray[np.void]], letter: int = SIGNAL_GREEN_MAJOR
 ) -> TrafficRun:
-    meter = TrafficMeter(network, capacity=8)
+    meter = TrafficMeter(network)
     for sample in samples:
         meter.see(sample)
         meter.sample(sample, codes(network, letter))
@@ -129,7 +129,7 @@ def test_who_stands_inside_locks_and_who_vanishes_there_passes(
 
 def test_time_at_red_neither_counts_nor_ends_a_lock(network: RoadNetwork, link: int) -> None:
     way = rows(car(network, 0, int(network.links["from_lane"][link])))
-    meter = TrafficMeter(network, capacity=8)
+    meter = TrafficMeter(network)
     for letter, seconds in ((SIGNAL_GREEN_MAJOR, 3), (SIGNAL_RED, 20), (SIGNAL_GREEN_MAJOR, 4)):
         for _ in range(seconds):
             meter.sample(way, codes(network, letter))
