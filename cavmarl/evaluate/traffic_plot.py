@@ -39,7 +39,7 @@ def plot_fundamental_diagram(found: TrafficComparison, path: Path) -> None:
             (speed, points["speed_mps"]),
         ):
             color = COLORS[name]
-            axes.scatter(density, values, s=3.0, alpha=0.25, linewidths=0.0, color=color)
+            axes.scatter(density, values, s=7.0, alpha=0.45, linewidths=0.0, color=color)
             axes.plot(*binned_means(density, values), color=color, linewidth=2.0, label=name)
     for axes, label in ((flow, "flow, vehicles/h and lane"), (speed, "speed, m/s")):
         axes.set_xlabel("density, vehicles/km and lane")
