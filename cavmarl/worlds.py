@@ -13,7 +13,7 @@ from cavmarl.registry import load_config, resolve_map
 from cavmarl.roads.cache import load_network
 from cavmarl.roads.network import RoadNetwork
 
-__all__ = ["check_placement", "load_world"]
+__all__ = ["check_placement", "find_map", "load_world"]
 
 
 def load_world(
@@ -40,6 +40,16 @@ def load_world(
         overrides=overrides,
     )
     return config, load_network(map_file(resolve_map(config, base_dir)))
+
+
+def find_map(env: str | Path) -> Path:
+    """The SUMO network of an entry, a folder or a map file.
+
+    Raises:
+        UnknownEnvironmentError: nothing of that name.
+        MapError: the map cannot be read.
+    """
+    return map_file(resolve_map(*load_config(env))).resolve()
 
 
 def check_placement(workers: int | None) -> None:

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 
 import typer
 
-from cavmarl.cli import bench, demo, evaluate, listing, map, view
+from cavmarl.cli import bench, demand, demo, evaluate, listing, map, view
 from cavmarl.cli.output import print_error
 from cavmarl.errors import CavmarlError
 
@@ -23,6 +23,7 @@ app.command()(view.view)
 app.command()(demo.demo)
 app.command("list")(listing.list_entries)
 app.add_typer(map.app, name="map")
+app.add_typer(demand.app, name="demand")
 app.add_typer(bench.app, name="bench")
 
 

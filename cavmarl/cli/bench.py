@@ -9,6 +9,7 @@ import typer
 from rich.console import Console
 from rich.table import Table
 
+from cavmarl.cli.bench_traffic import traffic
 from cavmarl.cli.output import (
     Agents,
     Background,
@@ -29,6 +30,7 @@ if TYPE_CHECKING:
 __all__ = ["app"]
 
 app = typer.Typer(help="How fast it is, measured side by side.", no_args_is_help=True)
+app.command()(traffic)
 
 _SENSORS = {"lidar": "64 rays", "kinematics": "no rays"}
 _WHO = {

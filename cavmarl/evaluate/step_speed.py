@@ -36,7 +36,7 @@ from cavmarl.evaluate.highway_worlds import (
 )
 from cavmarl.vector_env import CavVectorEnv, make_vec
 
-__all__ = ["MORE", "Row", "StepSpeed", "measure_step_speed"]
+__all__ = ["MORE", "Row", "StepSpeed", "measure_step_speed", "one_core"]
 
 OUR_STEPS = 100  # from a fresh reset: nobody reaches the end of the road
 THEIR_STEPS = 10
@@ -137,7 +137,7 @@ def measure_step_speed(
         if not 1 <= value <= most:
             raise ConfigError(f"{name} = {value}: must be from 1 to {most}")
     require("highway_env", "highway")
-    with _one_core(), tempfile.TemporaryDirectory() as folder:
+    with one_core(), tempfile.TemporaryDirectory() as folder:
         progress("making highway-env's worlds")
         theirs, road_m = _their_runners(agents)
         progress("making our worlds on that road")
@@ -185,7 +185,7 @@ def _compare(road_m: float, repeats: int, rows: list[Row]) -> StepSpeed:
 
 
 @contextmanager
-def _one_core() -> Iterator[None]:
+def one_core() -> Iterator[None]:
     """Keep this process on one core, where the system can."""
     if not hasattr(os, "sched_setaffinity"):
         yield

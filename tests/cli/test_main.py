@@ -11,7 +11,7 @@ import pytest
 
 from cavmarl.cli import main
 
-COMMANDS = ("evaluate", "view", "demo", "list", "map", "bench")
+COMMANDS = ("evaluate", "view", "demo", "list", "map", "demand", "bench")
 QUICK = ("--set", "horizon_s=1", "--agents", "2", "--background", "2")
 
 
@@ -136,6 +136,7 @@ def test_a_json_path_is_tried_before_any_work(
         "view": ("view", "nowhere"),
         "map": ("map", "check", str(network)),
         "bench": ("bench", "step", "--agents", "0"),
+        "demand": ("demand", "random", "nowhere", "--out", "x.rou.xml"),
     }.get(command, (command,))
     missing = tmp_path / "missing" / "x.json"
     assert "there is no folder" in refusal(capsys, *words, "--json", str(missing))

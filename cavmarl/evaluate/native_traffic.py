@@ -1,0 +1,91 @@
+"""Our run of a demand, measured by the meter that measures SUMO's."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from cavmarl.evaluate.traffic_metrics import TrafficCounts, TrafficMeter, TrafficRun
+from cavmarl.kernels.codes import ACTION_IDLE
+from cavmarl.render.ground import signal_codes
+from cavmarl.runtime.simulation import Simulation
+from cavmarl.shard.shard import Commands
+from cavmarl.worlds import load_world
+
+__all__ = ["advance", "idle_commands", "make_world", "run_native"]
+
+
+def make_world(map_file: Path, demand: Sequence[Path], seed: int, dt_s: float) -> Simulation:
+    """One world with background traffic and nobody to train, at the start of an episode.
+
+    Args:
+        map_file: a SUMO network.
+        demand: what drives on it.
+        seed: root of all random numbers.
+        dt_s: seconds a tick.
+
+    Raises:
+        ConfigError: a demand or a tick that cannot work.
+        MapError: the map cannot be driven.
+    """
+    config, network = load_world(
+        map_file,
+        agents=1,
+        background=100,
+        overrides={
+            "clock.sim_dt_s": dt_s,
+            "clock.ctrl_dt_s": dt_s,
+            "population.mode": "seats",
+            "sensors.lidar.rays": 0,
+        },
+    )
+    simulation = Simulation(config, network)
+    simulation.seed(seed)
+    simulation.reset()
+    return simulation
+
+
+def advance(simulation: Simulation, commands: Commands) -> None:
+    """One tick, the built-in driver in every seat."""
+    simulation.suggest(commands.controls)
+    simulation.step(commands)
+    simulation.retire_agents()
+
+
+def idle_commands(simulation: Simulation) -> Commands:
+    """Room for the commands of `advance`."""
+    shape = simulation.outputs.present.shape
+    return Commands(np.zeros((*shape, 2)), np.full(shape, ACTION_IDLE, dtype=np.int64))
+
+
+def run_native(
+    map_file: Path, demand: Sequence[Path], seconds: int, dt_s: float, seed: int
+) -> TrafficRun:
+    """Run and measure it.
+
+    Args:
+        map_file: a SUMO network.
+        demand: what drives on it.
+        seconds: how long.
+        dt_s: seconds a tick; a whole number of ticks is a second.
+        seed: root of all random numbers.
+
+    Raises:
+        ConfigError: see `make_world`.
+        MapError: see `make_world`.
+    """
+    simulation = make_world(map_file, demand, seed, dt_s)
+    meter = TrafficMeter(simulation.network)
+    commands = idle_commands(simulation)
+    ticks_per_s = round(1.0 / dt_s)
+    for tick in range(1, seconds * ticks_per_s + 1):
+        advance(simulation, commands)
+        rows = simulation.vehicles()
+        meter.see(rows)
+        if tick % ticks_per_s == 0:
+            meter.sample(rows, signal_codes(simulation.network, simulation.signal_phases()))
+    stats = simulation.traffic_stats()
+    delay = stats.mean_delay_s if stats.arrived else None
+    return meter.result(TrafficCounts(stats.departed, stats.waiting, stats.arrived, delay))
