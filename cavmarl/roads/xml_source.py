@@ -7,7 +7,6 @@ import io
 import re
 import zlib
 from pathlib import Path
-from typing import IO
 from xml.sax import SAXParseException
 from xml.sax.handler import ContentHandler
 
@@ -86,7 +85,7 @@ def read_xml(path: Path, handler: ContentHandler, failure: type[CavmarlError] = 
         raise failure(f"{path}: cannot be read ({error.strerror or error})") from error
 
 
-def _check_encoding(path: Path, stream: IO[bytes], failure: type[CavmarlError]) -> None:
+def _check_encoding(path: Path, stream: io.BufferedIOBase, failure: type[CavmarlError]) -> None:
     """Refuse encodings for which the parser would raise errors of other kinds."""
     declared = _DECLARED.match(stream.read(_DECLARATION_BYTES))
     stream.seek(0)

@@ -107,9 +107,11 @@ class DemandFile:
         rows, numbers, times = departures_ms(self.elements, key, self.begin_ms, end_ms)
         order = np.lexsort((numbers, rows, times))
         rows, numbers, times = rows[order], numbers[order], times[order]
-        element = self.elements[rows]
-        types = self.type_choices.pick(element["types"], chances(key, rows, numbers, DRAW_TYPE))
-        routes = self.route_choices.pick(element["routes"], chances(key, rows, numbers, DRAW_ROUTE))
+        types = self._pick(self.type_choices, "types", rows, numbers, key, DRAW_TYPE)
+        routes = self._pick(self.route_choices, "routes", rows, numbers, key, DRAW_ROUTE)
+        driven = ~np.isin(types.astype(np.int64) * len(self.routes) + routes, self.bad_pairs)
+        rows, numbers, times = rows[driven], numbers[driven], times[driven]
+        types, routes, element = types[driven], routes[driven], self.elements[rows]
         orders = np.zeros(len(rows), dtype=ORDER)
         orders["depart"] = times / 1000.0
         orders["element"], orders["number"] = rows, numbers
@@ -122,8 +124,19 @@ class DemandFile:
         for name in _COPIED:
             orders[name] = element[name]
         self._place(orders, element)
-        driven = ~np.isin(types.astype(np.int64) * len(self.routes) + routes, self.bad_pairs)
-        return orders[driven]
+        return orders
+
+    def _pick(
+        self,
+        choices: Choices,
+        field: str,
+        rows: NDArray[np.int64],
+        numbers: NDArray[np.int64],
+        key: int,
+        stream: int,
+    ) -> NDArray[np.int32]:
+        """What each vehicle (n,) gets of what its element has to choose from."""
+        return choices.pick(self.elements[field][rows], chances(key, rows, numbers, stream))
 
     def vehicle_id(self, order: np.void) -> str:
         """SUMO's name of the vehicle of one ORDER ()."""

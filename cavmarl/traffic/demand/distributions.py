@@ -28,9 +28,9 @@ def listed(source: Element, key: str) -> list[tuple[str, float | None]]:
         raise source.error(
             f"has {len(texts)} probabilities for {len(names)} {key}", "give one for each"
         )
-    values = [Element(source.name, {"p": text}, source.path, source.line) for text in texts]
     weights: list[float | None] = [
-        value.number("p", 1.0, least=0.0, most=MAX_WEIGHT) for value in values
+        source.saying(probabilities=text).number("probabilities", 1.0, least=0.0, most=MAX_WEIGHT)
+        for text in texts
     ]
     return list(zip(names, weights or [None] * len(names), strict=True))
 

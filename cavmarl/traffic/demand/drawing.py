@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 from numpy.typing import NDArray
 
 from cavmarl.kernels.rng import STREAM_DEMAND, fill_uniform
 from cavmarl.traffic.demand.records import (
-    FLOW_EXPONENTIAL,
     FLOW_PROBABILITY,
     FLOW_REGULAR,
 )
@@ -43,12 +44,7 @@ def departures_ms(
     parts = [regular]
     for row in np.flatnonzero(elements["pattern"] != FLOW_REGULAR):
         flow = elements[row]
-        last = min(int(flow["end_ms"]), end_ms)
-        times = (
-            _exponential(flow, key, int(row), last)
-            if flow["pattern"] == FLOW_EXPONENTIAL
-            else _each_second(flow, key, int(row), last)
-        )[: int(flow["number"])]
+        times = _random(flow, key, int(row), min(int(flow["end_ms"]), end_ms))
         number = np.arange(len(times))
         kept = times >= begin_ms
         parts.append((np.full(kept.sum(), row), number[kept], times[kept]))
@@ -74,24 +70,25 @@ def _regular(
     return rows, numbers, start[rows] + numbers * elements["period_ms"][rows]
 
 
-def _exponential(flow: np.void, key: int, row: int, end_ms: int) -> NDArray[np.int64]:
-    """A Poisson process: sums of gaps -ln(1 - u) / rate after the begin."""
-    times: list[NDArray[np.float64]] = []
-    at, drawn, wanted = float(flow["begin_ms"]), 0, int(flow["number"])
+def _random(flow: np.void, key: int, row: int, end_ms: int) -> NDArray[np.int64]:
+    """Sums of random gaps after the begin, one number for each vehicle.
+
+    Gaps are exponential, -ln(1 - u) / rate, or count trials: with a chance p each full second the
+    next success comes after 1 + floor(ln(1 - u) / ln(1 - p)) of them, whatever a step's length is.
+    """
+    trials = flow["pattern"] == FLOW_PROBABILITY
+    rate, wanted = float(flow["rate"]), int(flow["number"])
+    begin = int(flow["begin_ms"])
+    at = float((-(-begin // 1000) - 1) * 1000 if trials else begin)
+    decay = (-math.inf if rate == 1.0 else math.log1p(-rate)) if trials else -rate
+    times: list[NDArray[np.float64]] = [np.empty(0)]
+    drawn = 0
     while at < end_ms and drawn < wanted:
         numbers = np.arange(drawn, drawn + _CHUNK)
-        gaps = -np.log1p(-chances(key, np.full(_CHUNK, row), numbers, DRAW_TIME))
-        times.append(at + np.cumsum(gaps * (1000.0 / float(flow["rate"]))))
+        gaps = np.log1p(-chances(key, np.full(_CHUNK, row), numbers, DRAW_TIME)) / decay
+        gaps = np.floor(gaps) + 1.0 if trials else gaps
+        times.append(at + np.cumsum(gaps * 1000.0))
         at = float(times[-1][-1])
         drawn += _CHUNK
-    found = np.floor(np.concatenate([*times, np.empty(0)]) + 0.5)
+    found = np.floor(np.concatenate(times)[:wanted] + 0.5)
     return found[found < end_ms].astype(np.int64)
-
-
-def _each_second(flow: np.void, key: int, row: int, end_ms: int) -> NDArray[np.int64]:
-    """One trial at each full second: the same traffic whatever the length of a step is."""
-    times = np.arange(-(-int(flow["begin_ms"]) // 1000), -(-end_ms // 1000))
-    drawn = chances(key, np.full(len(times), row), times, DRAW_TIME)
-    assert flow["pattern"] == FLOW_PROBABILITY
-    found: NDArray[np.int64] = times[drawn < flow["rate"]].astype(np.int64) * 1000
-    return found

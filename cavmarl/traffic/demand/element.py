@@ -70,6 +70,11 @@ class Element:
         known = f' id="{self.attrs["id"]}"' if "id" in self.attrs else ""
         return failure(f"{self.place}: <{self.name}{known}> {problem}: {cure}")
 
+    def saying(self, **attrs: str) -> Element:
+        """This element with other attributes: parts of a composed one, checked on their own."""
+        kept = {key: self.attrs[key] for key in ("id",) if key in self.attrs}
+        return Element(self.name, {**kept, **attrs}, self.path, self.line)
+
     def text(self, key: str) -> str:
         """An attribute that must be there and hold something."""
         value = self.attrs.get(key, "").strip()

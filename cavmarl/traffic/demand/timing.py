@@ -11,6 +11,7 @@ from cavmarl.traffic.demand.records import FLOW_EXPONENTIAL, FLOW_PROBABILITY, F
 __all__ = ["DAY_MS", "Timing", "flow_timing", "single_timing"]
 
 DAY_MS = 86_400_000  # SUMO lets flows without an end last so long
+MIN_RATE = 1e-12  # 1/s: less is never
 MAX_NUMBER = 1 << 40  # of a flow without a number: beyond every cap
 
 _EXPONENTIAL = re.compile(r"exp\(([^()]*)\)")
@@ -80,11 +81,10 @@ def _rate(
 ) -> tuple[int, int, int, int, int, float]:
     exponential = _EXPONENTIAL.fullmatch(element.attrs[key].strip()) if key == "period" else None
     if exponential:
-        values = Element("flow", {"period": exponential[1]}, element.path, element.line)
-        rate = values.number("period", 0.0, above=0.0)
+        rate = element.saying(period=exponential[1]).number("period", 0.0, above=MIN_RATE)
         return FLOW_EXPONENTIAL, begin, end, 0, number, rate
     if key == "probability":
-        chance = element.number(key, 0.0, above=0.0, most=1.0)
+        chance = element.number(key, 0.0, above=MIN_RATE, most=1.0)
         return FLOW_PROBABILITY, begin, end, 0, number, chance
     if key == "period":
         period = element.time_ms(key)

@@ -52,7 +52,7 @@ def reroute_chance(element: Element) -> float:
     params = element.params()
     chance = params.get("device.rerouting.probability", "0")
     device = params.get("has.rerouting.device", "false")
-    values = Element("param", {"device": device, "chance": chance}, element.path, element.line)
+    values = element.saying(device=device, chance=chance)
     return (
         1.0 if values.flag("device", False) else values.number("chance", 0.0, least=0.0, most=1.0)
     )
@@ -139,7 +139,7 @@ def _set_speed_factor(record: NDArray[np.void], element: Element, deviation: flo
     if "speedDev" in element.attrs and len(parts) > 1:
         parts[1] = numbers["speedDev"]
     numbers.update(zip(("speedFactor", "speedDev", "least", "most"), parts, strict=False))
-    values = Element(element.name, numbers, element.path, element.line)
+    values = element.saying(**numbers)
     record["speed_factor"] = mean = values.number("speedFactor", 1.0, above=0.0)
     record["speed_dev"] = values.number("speedDev", deviation, least=0.0)
     record["min_speed_factor"] = least = values.number("least", MIN_SPEED_FACTOR, least=0.0)
