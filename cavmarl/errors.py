@@ -5,6 +5,7 @@
     │   └── UnknownEnvironmentError   no entry, path or map of that name
     ├── MapError               a map that cannot be read, built or driven
     │   └── RouteError         no way from here to there
+    ├── DemandError            a file of traffic that cannot be read or does not fit its map
     ├── ActionError            refused before any state has changed
     │   ├── InvalidActionError    wrong shape, dtype or value
     │   ├── MissingActionError    a live agent without an action
@@ -29,6 +30,7 @@ __all__ = [
     "CapacityError",
     "CavmarlError",
     "ConfigError",
+    "DemandError",
     "EpisodeEndedError",
     "EpisodeError",
     "InvalidActionError",
@@ -62,6 +64,10 @@ class MapError(CavmarlError):
 
 class RouteError(MapError):
     """The lane graph has no way between two places."""
+
+
+class DemandError(CavmarlError):
+    """A file of traffic demand that cannot be read, contradicts itself or does not fit its map."""
 
 
 class ActionError(CavmarlError):

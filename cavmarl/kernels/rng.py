@@ -19,11 +19,13 @@ are uint64: Numba turns a mix with int64 into float64.
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
 
 from cavmarl.kernels import kernel
 
 __all__ = [
     "DRAWS_PER_STREAM",
+    "STREAM_DEMAND",
     "STREAM_DEPARTURE",
     "STREAM_DRIVER",
     "STREAM_ORIGIN",
@@ -37,6 +39,7 @@ __all__ = [
     "STREAM_VTYPE",
     "STREAM_WORLD",
     "below",
+    "fill_uniform",
     "philox4x32",
     "quick_uniform",
     "uniform",
@@ -57,6 +60,7 @@ STREAM_POLICY = 8 * DRAWS_PER_STREAM  # actions of scripted random drivers
 STREAM_DRIVER = 9 * DRAWS_PER_STREAM  # decisions of background drivers
 STREAM_SENSOR = 10 * DRAWS_PER_STREAM  # noise and dropouts of sensors
 STREAM_V2X = 11 * DRAWS_PER_STREAM  # losses and delays of messages
+STREAM_DEMAND = 12 * DRAWS_PER_STREAM  # times, types and routes of a demand file
 
 _MASK_16 = np.uint64(0xFFFF)
 _MASK_32 = np.uint64(0xFFFFFFFF)
@@ -157,6 +161,19 @@ def uniform(key: int | np.uint64, vehicle: int, tick: int, stream: int) -> float
     """
     word_0, word_1 = _block(key, vehicle, tick, stream)
     return float(((word_0 >> _SHIFT_5) << _SHIFT_26) | (word_1 >> _SHIFT_6)) * _ULP
+
+
+@kernel
+def fill_uniform(
+    key: int | np.uint64,
+    vehicles: NDArray[np.int64],
+    ticks: NDArray[np.int64],
+    stream: int,
+    numbers: NDArray[np.float64],
+) -> None:
+    """`uniform` for each pair of `vehicles` (n,) and `ticks` (n,), written to `numbers` (n,)."""
+    for i in range(len(numbers)):
+        numbers[i] = uniform(key, vehicles[i], ticks[i], stream)
 
 
 @kernel

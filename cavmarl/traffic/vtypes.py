@@ -26,8 +26,6 @@ __all__ = [
     "ALL_PERMISSIONS",
     "CLASS_DEFAULTS",
     "DEFAULT_TYPES",
-    "MODEL_IDM",
-    "MODEL_KRAUSS",
     "NEAREST_CLASS",
     "NEAREST_MODEL",
     "NO_ROAD_CLASSES",
