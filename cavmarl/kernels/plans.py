@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from cavmarl.kernels import kernel, setup_kernel
 from cavmarl.kernels.arrays import RoadArrays
 
-__all__ = ["LANE_CHANGE_COST_S", "plan_goal"]
+__all__ = ["LANE_CHANGE_COST_S", "change_cost", "plan_goal"]
 
 LANE_CHANGE_COST_S = 5.0  # what a lane change is worth in travel time, s,
 SHORT_LANE_M = 50.0  # and one second more for every metre that the lane is shorter than this
@@ -50,7 +50,7 @@ def _leads_to(roads: RoadArrays, before: int, lane: int) -> bool:
 
 
 @kernel
-def _change_cost(roads: RoadArrays, lane: int) -> float:
+def change_cost(roads: RoadArrays, lane: int) -> float:
     """Cost in s of leaving a lane sideways: plans change lanes where there is room to.
 
     Inside junctions nobody changes lanes.
@@ -100,7 +100,7 @@ def _settle(
     best = through
     change = 0
     beside = -1
-    sideways = _change_cost(roads, lane)
+    sideways = change_cost(roads, lane)
     if row["left"] >= 0 and cost[row["left"]] + sideways < best:
         best = cost[row["left"]] + sideways
         change = 1
@@ -176,7 +176,7 @@ def plan_goal(roads: RoadArrays, goal_edge: int, permission: int, plan: NDArray[
                 continue
             if not roads.lanes[beside]["permissions"] & permission:
                 continue
-            reached = here + _change_cost(roads, beside)
+            reached = here + change_cost(roads, beside)
             if reached < cost[beside]:
                 cost[beside] = reached
                 heapq.heappush(heap, (reached, np.int64(beside)))
