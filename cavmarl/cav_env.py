@@ -24,7 +24,8 @@ from cavmarl.seeds import check_seed, first_seed
 from cavmarl.shard.sensors import layout
 from cavmarl.spaces import action_space, observation_space, state_space
 from cavmarl.state import global_state
-from cavmarl.worlds import check_placement, load_world
+from cavmarl.traffic.demand import DemandFile
+from cavmarl.worlds import check_agents, check_placement, load_world
 
 __all__ = ["CavEnv", "parallel_env"]
 
@@ -67,7 +68,7 @@ def parallel_env(
         MapError: the map cannot be read or driven.
     """
     check_placement(workers)
-    config, network = load_world(
+    config, network, demand = load_world(
         env,
         zones=zones,
         agents=agents,
@@ -75,7 +76,7 @@ def parallel_env(
         max_cycles=max_cycles,
         overrides=overrides,
     )
-    return CavEnv(config, network, seed=seed, render_mode=render_mode)
+    return CavEnv(config, network, demand, seed=seed, render_mode=render_mode)
 
 
 class CavEnv(ParallelEnv[str, Any, Any]):  # type: ignore[misc] # PettingZoo is not typed
@@ -88,6 +89,7 @@ class CavEnv(ParallelEnv[str, Any, Any]):  # type: ignore[misc] # PettingZoo is 
     Args:
         config: the environment.
         network: its roads.
+        demand: whose vehicles drive beside the generator's.
         seed: of the first reset, if that is given none.
         render_mode: `human`, `rgb_array` or None.
     """
@@ -103,6 +105,7 @@ class CavEnv(ParallelEnv[str, Any, Any]):  # type: ignore[misc] # PettingZoo is 
         self,
         config: EnvConfig,
         network: RoadNetwork,
+        demand: DemandFile | None = None,
         *,
         seed: int | None = None,
         render_mode: str | None = None,
@@ -111,6 +114,7 @@ class CavEnv(ParallelEnv[str, Any, Any]):  # type: ignore[misc] # PettingZoo is 
             raise ConfigError(
                 f"render_mode = {render_mode!r}: must be {' or '.join(RENDER_MODES)}, or None"
             )
+        check_agents(config)
         self.config = config
         self.network = network
         self.render_mode = render_mode
@@ -130,7 +134,7 @@ class CavEnv(ParallelEnv[str, Any, Any]):  # type: ignore[misc] # PettingZoo is 
         self.action_spaces = dict.fromkeys(self.possible_agents, one_action)
         self._seats = config.population.mode == "seats"
         self._places = layout(config.sensors) if config.observation.kind == "dict" else None
-        self._simulation = Simulation(config, network)
+        self._simulation = Simulation(config, network, demand=demand)
         self._decoder = ActionDecoder(config.action, 1, self.possible_agents)
         self._first_seed = None if seed is None else check_seed(seed)
         self._steps = -1

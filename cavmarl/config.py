@@ -153,10 +153,10 @@ class PopulationConfig:
 
     def __post_init__(self) -> None:
         _check(
-            1 <= self.agents <= 100_000,
+            0 <= self.agents <= 100_000,
             "population.agents",
             self.agents,
-            "must be a whole number from 1 to 100000",
+            "must be a whole number from 0 (a world to watch) to 100000",
         )
         _check(
             0 <= self.background <= 1_000_000,
@@ -185,7 +185,9 @@ class TrafficConfig:
     """Where departures come from.
 
     Attributes:
-        source: `native`: the seeded generator.
+        source: `native`: the seeded generator, and the demand files.
+        demand: SUMO files of vehicles, flows, routes and types (`.rou.xml`, `.add.xml`, `.sumocfg`):
+            named as `map.source`; their vehicles drive beside the generator's.
         goals: how many destination edges the generator uses; lane-level plans are made for each.
         origins: edges that agents start on, by id; empty: all that lead somewhere.
         destinations: edges that agents drive to, by id; empty: the generator's goals.
@@ -195,6 +197,7 @@ class TrafficConfig:
     """
 
     source: Literal["native"] = "native"
+    demand: tuple[str, ...] = ()
     goals: int = 32
     origins: tuple[str, ...] = ()
     destinations: tuple[str, ...] = ()

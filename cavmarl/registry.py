@@ -15,7 +15,14 @@ from typing import Any
 import numpy as np
 
 from cavmarl.config import EnvConfig, MapConfig
-from cavmarl.errors import ConfigError, MapError, UnknownEnvironmentError, require
+from cavmarl.errors import (
+    CavmarlError,
+    ConfigError,
+    DemandError,
+    MapError,
+    UnknownEnvironmentError,
+    require,
+)
 
 __all__ = [
     "MAP_SUFFIXES",
@@ -24,6 +31,7 @@ __all__ = [
     "find_entry",
     "load_config",
     "places",
+    "resolve_demand",
     "resolve_map",
 ]
 
@@ -148,16 +156,32 @@ def resolve_map(config: EnvConfig, base_dir: Path) -> Path:
         MapError: no such file.
         MissingExtraError: the source lies in the eclipse-sumo wheel, which is not installed.
     """
-    source = config.map.source
+    return _resolve("map.source", config.map.source, base_dir, MapError)
+
+
+def resolve_demand(config: EnvConfig, base_dir: Path) -> list[Path]:
+    """The files that `traffic.demand` means; as `resolve_map`.
+
+    Raises:
+        DemandError: no such file.
+        MissingExtraError: a file lies in the eclipse-sumo wheel, which is not installed.
+    """
+    return [
+        _resolve("traffic.demand", source, base_dir, DemandError)
+        for source in config.traffic.demand
+    ]
+
+
+def _resolve(key: str, source: str, base_dir: Path, failure: type[CavmarlError]) -> Path:
     if source.startswith(_SUMO_PREFIX):
         home = Path(require("sumo", "sumo").SUMO_HOME).resolve()
         path = (home / source.removeprefix(_SUMO_PREFIX)).resolve()
         if not path.is_relative_to(home):
-            raise MapError(f"map.source = {source!r}: leads out of the eclipse-sumo wheel")
+            raise failure(f"{key} = {source!r}: leads out of the eclipse-sumo wheel")
     else:
         path = base_dir / source
     if not path.is_file():
-        raise MapError(f"map.source = {source!r}: no file {path}")
+        raise failure(f"{key} = {source!r}: no file {path}")
     return path
 
 

@@ -25,7 +25,8 @@ from cavmarl.roads.network import RoadNetwork
 from cavmarl.runtime.simulation import Simulation
 from cavmarl.seeds import check_seed, first_seed
 from cavmarl.spaces import action_space, flat_observation_space
-from cavmarl.worlds import check_placement, load_world
+from cavmarl.traffic.demand import DemandFile
+from cavmarl.worlds import check_agents, check_placement, load_world
 
 __all__ = ["CavVectorEnv", "make_vec"]
 
@@ -74,7 +75,7 @@ def make_vec(
         raise ConfigError(f"num_envs = {num_envs!r}: must be a whole number")
     if not 1 <= num_envs <= MAX_WORLDS:
         raise ConfigError(f"num_envs = {num_envs}: must be from 1 to {MAX_WORLDS}")
-    config, network = load_world(
+    config, network, demand = load_world(
         env,
         zones=zones,
         agents=agents,
@@ -103,8 +104,15 @@ class CavVectorEnv:
     """
 
     def __init__(
-        self, config: EnvConfig, network: RoadNetwork, num_envs: int, *, seed: int | None = None
+        self,
+        config: EnvConfig,
+        network: RoadNetwork,
+        num_envs: int,
+        demand: DemandFile | None = None,
+        *,
+        seed: int | None = None,
     ) -> None:
+        check_agents(config)
         self.config = config
         self.network = network
         self.num_envs = num_envs
@@ -123,7 +131,7 @@ class CavVectorEnv:
             "name": f"cavmarl/{config.name}-v{config.version}",
             "autoreset_mode": AutoresetMode.SAME_STEP,
         }
-        self._simulation = Simulation(config, network, num_envs)
+        self._simulation = Simulation(config, network, num_envs, demand)
         self._decoder = ActionDecoder(config.action, num_envs, self.possible_agents)
         self._steps = np.zeros(num_envs, dtype=np.int64)
         self._mask = np.zeros((num_envs, self.num_agents), dtype=np.bool_)

@@ -63,7 +63,7 @@ def evaluate(
         raise ConfigError(f"episodes = {episodes!r}: must be a whole number")
     if not 1 <= episodes <= MAX_EPISODES:
         raise ConfigError(f"episodes = {episodes}: must be from 1 to {MAX_EPISODES}")
-    config, network = load_world(
+    config, network, demand = load_world(
         env,
         agents=agents,
         background=background,
@@ -76,7 +76,7 @@ def evaluate(
             f"episodes = {episodes}: with {vehicles} vehicles each, {episodes * vehicles} in all; "
             f"at most {MAX_VEHICLES}: take at most {MAX_VEHICLES // vehicles} episodes"
         )
-    vec = CavVectorEnv(config, network, episodes)
+    vec = CavVectorEnv(config, network, episodes, demand)
     driver = load_policy(policy, vec)
     trips, returns, speed = _drive(vec, driver, seed, progress)
     manifest = make_manifest(

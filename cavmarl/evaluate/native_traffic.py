@@ -17,12 +17,15 @@ from cavmarl.worlds import load_world
 __all__ = ["advance", "idle_commands", "make_world", "run_native"]
 
 
-def make_world(map_file: Path, demand: Sequence[Path], seed: int, dt_s: float) -> Simulation:
+def make_world(
+    map_file: Path, demand: Sequence[Path], seconds: int, seed: int, dt_s: float
+) -> Simulation:
     """One world with background traffic and nobody to train, at the start of an episode.
 
     Args:
         map_file: a SUMO network.
         demand: what drives on it.
+        seconds: how long.
         seed: root of all random numbers.
         dt_s: seconds a tick.
 
@@ -30,28 +33,26 @@ def make_world(map_file: Path, demand: Sequence[Path], seed: int, dt_s: float) -
         ConfigError: a demand or a tick that cannot work.
         MapError: the map cannot be driven.
     """
-    config, network = load_world(
+    config, network, file = load_world(
         map_file,
-        agents=1,
-        background=100,
+        agents=0,
+        background=0,
         overrides={
             "clock.sim_dt_s": dt_s,
             "clock.ctrl_dt_s": dt_s,
-            "population.mode": "seats",
-            "sensors.lidar.rays": 0,
+            "horizon_s": float(seconds),
+            "traffic.demand": [str(path.resolve()) for path in demand],
         },
     )
-    simulation = Simulation(config, network)
+    simulation = Simulation(config, network, demand=file)
     simulation.seed(seed)
     simulation.reset()
     return simulation
 
 
 def advance(simulation: Simulation, commands: Commands) -> None:
-    """One tick, the built-in driver in every seat."""
-    simulation.suggest(commands.controls)
+    """One tick."""
     simulation.step(commands)
-    simulation.retire_agents()
 
 
 def idle_commands(simulation: Simulation) -> Commands:
@@ -76,7 +77,7 @@ def run_native(
         ConfigError: see `make_world`.
         MapError: see `make_world`.
     """
-    simulation = make_world(map_file, demand, seed, dt_s)
+    simulation = make_world(map_file, demand, seconds, seed, dt_s)
     meter = TrafficMeter(simulation.network)
     commands = idle_commands(simulation)
     ticks_per_s = round(1.0 / dt_s)

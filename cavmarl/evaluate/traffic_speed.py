@@ -16,7 +16,7 @@ from typing import Any
 
 from cavmarl.errors import ConfigError, require
 from cavmarl.evaluate.native_traffic import advance, idle_commands, make_world
-from cavmarl.evaluate.step_speed import Rates, one_core
+from cavmarl.evaluate.step_speed import one_core
 from cavmarl.evaluate.sumo_input import read_input
 from cavmarl.evaluate.sumo_traffic import SumoJob, start_sumo, sumo_process
 from cavmarl.runtime.simulation import Simulation
@@ -102,7 +102,7 @@ def measure_traffic_speed(
         sumo.submit(_load_sumo, job, folder).result()
         sumo.submit(_turn_of_sumo, warm).result()
         progress(f"our first {after_s} s")
-        simulation = make_world(path, demand, seed, dt_s)
+        simulation = make_world(path, demand, MOST_S, seed, dt_s)
         _our_turn(simulation, warm)
         for repeat in range(repeats):
             progress(f"measuring, {repeat + 1} of {repeats}")

@@ -56,6 +56,8 @@ class Travel(NamedTuple):
 
     types: NDArray[np.void]  # VTYPE (num_types,), by VEHICLE["vtype"]
     steps: NDArray[np.void]  # PLAN (num_steps,), see `kernels.ways`
+    stops: NDArray[np.void]  # STOP (num_stops,), by VEHICLE["stop"]
+    begin_s: float  # the clock of the demand at tick 0
 
 
 class Worlds(NamedTuple):

@@ -35,6 +35,11 @@ SPEED_LIMIT = 4
 SPEED_LAST = 5  # of the last vehicle on the lane
 SPEED_AVERAGE = 6
 
+# STOP["until_from"]: what the time of leaving is counted from
+UNTIL_ABSOLUTE = 0
+UNTIL_FLOW = 1
+UNTIL_DEPARTURE = 2
+
 # VEHICLE["hold"]: why a driver stands or will stop
 HOLD_NONE = 0
 HOLD_SIGNAL = 1  # red or yellow

@@ -29,6 +29,7 @@ from cavmarl.kernels.junctions import may_enter, press_inside
 from cavmarl.kernels.lane_choice import LOOK_BACK_M, SIDE_GAP_M, choose_lane, needed_change
 from cavmarl.kernels.lanes import ahead_on, behind_on, last_on
 from cavmarl.kernels.rng import STREAM_DRIVER, quick_uniform
+from cavmarl.kernels.stopping import way_to_stop
 from cavmarl.kernels.ways import next_step
 
 __all__ = ["LOOK_AHEAD_M", "decide"]
@@ -308,6 +309,9 @@ def decide(
         press, allowed, hold, link_ahead = _road_ahead(
             roads, travel, rows, k, phase, MERGE_ROOM_M, dt, scratch
         )
+        to_stop = way_to_stop(roads, travel, row)
+        if to_stop < math.inf:
+            press = max(press, before_line(kind, speed, to_stop + LINE_MARGIN_M, dt))
         if row["side_lane"] >= 0:
             press = max(press, _beside(roads, kind, row, row["side_lane"], scratch))
         needed = needed_change(roads, travel, row)

@@ -16,6 +16,7 @@ from cavmarl.kernels.codes import DRIVER_AGENT
 from cavmarl.kernels.following import accel_behind, no_press, wish
 from cavmarl.kernels.lane_change import LANE_CHANGE_DELAY_S, mobil_accepts
 from cavmarl.kernels.lanes import ahead_on, last_on, neighbor_behind
+from cavmarl.kernels.stopping import STAY, lane_to_stop
 from cavmarl.kernels.ways import next_step
 
 __all__ = ["LOOK_BACK_M", "SIDE_GAP_M", "choose_lane", "needed_change"]
@@ -35,6 +36,9 @@ def needed_change(roads: RoadArrays, travel: Travel, row: np.void) -> int:
     lane = row["lane"]
     if roads.lanes[lane]["internal"]:
         return 0
+    to_stop = lane_to_stop(roads, travel, row)
+    if to_stop != 0:
+        return to_stop if to_stop != STAY else 0
     step = travel.steps[row["way"] + lane]
     if step["change"] == 0:
         return 0
@@ -126,6 +130,8 @@ def _may_change(
     if lane["length_m"] - row["s"] < 0.5 * row["length"] + SIDEWAYS_S * row["speed"]:
         return False
     if needed == 0:
+        if lane_to_stop(roads, travel, row) == STAY:
+            return False
         beyond = travel.steps[row["way"] + target]
         if beyond["to_go"] == math.inf or row["speed"] < 1.0:
             return False

@@ -24,6 +24,7 @@ from cavmarl.kernels.geometry import lane_pose, wrap_angle
 from cavmarl.kernels.junctions import link_signal
 from cavmarl.kernels.kinematics import bicycle_step
 from cavmarl.kernels.scalars import clamp
+from cavmarl.kernels.stopping import make_stop
 from cavmarl.kernels.tracking import locate, side_lane
 from cavmarl.kernels.ways import next_step, way_left
 
@@ -147,6 +148,7 @@ def move_background(
     if row["to_go"] <= ARRIVE_M:
         row["events"] |= EVENT_ARRIVED
     _account(row, old, roads, dt)
+    make_stop(roads, travel, old, row, travel.begin_s, dt)
 
 
 @kernel

@@ -28,6 +28,7 @@ from cavmarl.runtime.compilation import first_compilation
 from cavmarl.runtime.executor import Executor, SerialExecutor
 from cavmarl.shard.shard import Commands, Shard
 from cavmarl.shard.vehicles import STATE_FIELDS, blank_vehicle
+from cavmarl.traffic.demand import DemandFile
 from cavmarl.traffic.departures import make_gate
 from cavmarl.traffic.native import NativeTraffic
 
@@ -70,9 +71,16 @@ class Simulation:
         config: the environment.
         network: its roads.
         num_worlds: W.
+        demand: whose vehicles drive beside the generator's.
     """
 
-    def __init__(self, config: EnvConfig, network: RoadNetwork, num_worlds: int = 1) -> None:
+    def __init__(
+        self,
+        config: EnvConfig,
+        network: RoadNetwork,
+        num_worlds: int = 1,
+        demand: DemandFile | None = None,
+    ) -> None:
         self.config = config
         self.network = network
         self.num_worlds = num_worlds
@@ -81,10 +89,17 @@ class Simulation:
         self._everywhere = np.ones(num_worlds, dtype=np.bool_)
         with first_compilation() as is_first:
             blank = blank_vehicle()
-            self._traffic = NativeTraffic(network, config.traffic, config.population, blank)
-            traffic = self._traffic
-            population = config.population
-            capacity = population.agents + population.background
+            traffic = NativeTraffic(
+                network,
+                config.traffic,
+                config.population,
+                blank,
+                config.clock.sim_dt_s,
+                config.horizon_s,
+                demand,
+            )
+            capacity = traffic.capacity
+            self._traffic = traffic
             self._gate = make_gate(num_worlds, capacity)
             self._shard = Shard(
                 config, network, traffic.plans, traffic.travel, num_worlds, capacity
@@ -158,6 +173,7 @@ class Simulation:
             worlds.keys[w] = world_key(self._seed, int(w), int(self._episodes[w]))
             worlds.ticks[w] = 0
         self._episodes[chosen] += 1
+        self._gate = self._traffic.draw_orders(self._gate, worlds, chosen)
         self._traffic.populate(self._gate, worlds, chosen)
         self._executor.each("switch_signals")
         self._executor.each("sense", chosen)

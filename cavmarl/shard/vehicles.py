@@ -64,6 +64,7 @@ VEHICLE = np.dtype(
         ("order", np.int32),  # DEPARTURE row of the demand file's orders; -1: of the generator
         ("stop", np.int32),  # STOP row that it makes next; -1 or stops_end: none
         ("stops_end", np.int32),
+        ("stopped_s", np.float64),  # how long it has stood there
         ("to_go", np.float64),  # m left to the goal, along the plan
         # configuration
         ("vtype", np.int32),  # VTYPE row: how it drives

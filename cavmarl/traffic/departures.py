@@ -7,7 +7,7 @@ import numpy as np
 from cavmarl.kernels.arrays import Gate
 from cavmarl.kernels.codes import NUM_COUNTS, NUM_SUMS
 
-__all__ = ["DEPARTURE", "make_gate"]
+__all__ = ["DEPARTURE", "make_gate", "with_room"]
 
 DEPARTURE = np.dtype(
     [
@@ -32,22 +32,29 @@ DEPARTURE = np.dtype(
 )
 
 
-def make_gate(num_worlds: int, capacity: int, num_orders: int = 0) -> Gate:
-    """The empty gates of `num_worlds` worlds.
-
-    Args:
-        num_worlds: W.
-        capacity: vehicles that the generator keeps in each.
-        num_orders: most departures that a demand file orders in each.
-    """
+def make_gate(num_worlds: int, capacity: int) -> Gate:
+    """The empty gates of `num_worlds` worlds that hold `capacity` vehicles each."""
     return Gate(
-        orders=np.zeros((num_worlds, num_orders), dtype=DEPARTURE),
+        orders=np.zeros((num_worlds, 0), dtype=DEPARTURE),
         num_orders=np.zeros(num_worlds, dtype=np.int64),
         next_order=np.zeros(num_worlds, dtype=np.int64),
-        queue=np.zeros((num_worlds, capacity + num_orders), dtype=DEPARTURE),
+        queue=np.zeros((num_worlds, capacity), dtype=DEPARTURE),
         num_queue=np.zeros(num_worlds, dtype=np.int64),
         next_id=np.zeros(num_worlds, dtype=np.int64),
         num_entered=np.zeros(num_worlds, dtype=np.int64),
         counts=np.zeros((num_worlds, NUM_COUNTS), dtype=np.int64),
         sums=np.zeros((num_worlds, NUM_SUMS), dtype=np.float64),
+    )
+
+
+def with_room(gate: Gate, num_orders: int) -> Gate:
+    """The gate with room for at least so many orders, all of which may wait at once."""
+    num_worlds, present = gate.orders.shape
+    more = num_orders - present
+    if more <= 0:
+        return gate
+    room = np.zeros((num_worlds, more), dtype=DEPARTURE)
+    return gate._replace(
+        orders=np.concatenate([gate.orders, room], axis=1),
+        queue=np.concatenate([gate.queue, room], axis=1),
     )

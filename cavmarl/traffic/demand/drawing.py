@@ -13,12 +13,15 @@ from cavmarl.traffic.demand.records import (
     FLOW_REGULAR,
 )
 
-__all__ = ["DRAW_REROUTE", "DRAW_ROUTE", "DRAW_TYPE", "chances", "departures_ms"]
+__all__ = ["DRAW_REROUTE", "DRAW_ROUTE", "DRAW_TYPE", "chances", "departures_ms", "speed_factors"]
 
 DRAW_TIME = STREAM_DEMAND
 DRAW_TYPE = STREAM_DEMAND + 1
 DRAW_ROUTE = STREAM_DEMAND + 2
 DRAW_REROUTE = STREAM_DEMAND + 3
+DRAW_SPEED_FACTOR = STREAM_DEMAND + 4
+
+SPEED_FACTOR_TRIES = 8
 
 _CHUNK = 4096
 
@@ -92,3 +95,27 @@ def _random(flow: np.void, key: int, row: int, end_ms: int) -> NDArray[np.int64]
         drawn += _CHUNK
     found = np.floor(np.concatenate(times)[:wanted] + 0.5)
     return found[found < end_ms].astype(np.int64)
+
+
+def speed_factors(
+    types: NDArray[np.void], orders: NDArray[np.void], key: int
+) -> NDArray[np.float64]:
+    """The speed factors (n,) of ORDER (n,): their own, or drawn from the normal law of their type.
+
+    As in SUMO a number beyond the type's bounds is drawn again; after `SPEED_FACTOR_TRIES` it is
+    cut.
+    """
+    kind = types[orders["vtype"]]
+    low, high = kind["min_speed_factor"], kind["max_speed_factor"]
+    drawn = np.full(len(orders), np.nan)
+    for attempt in range(SPEED_FACTOR_TRIES):
+        # Box, Muller: "A note on the generation of random normal deviates", 1958.
+        stream = DRAW_SPEED_FACTOR + 2 * attempt
+        radius = chances(key, orders["element"], orders["number"], stream)
+        angle = chances(key, orders["element"], orders["number"], stream + 1)
+        normal = np.sqrt(-2.0 * np.log1p(-radius)) * np.cos(2.0 * np.pi * angle)
+        value = kind["speed_factor"] + kind["speed_dev"] * normal
+        last = attempt == SPEED_FACTOR_TRIES - 1
+        fits = np.isnan(drawn) & (last | ((value >= low) & (value <= high)))
+        drawn[fits] = np.clip(value, low, high)[fits]
+    return np.where(np.isnan(orders["speed_factor"]), drawn, orders["speed_factor"])
