@@ -220,8 +220,9 @@ def _lanes_never_green(network: RoadNetwork) -> tuple[str, ...]:
     shut: set[int] = set()
     for link in network.links[network.links["signal"] >= 0]:
         signal = network.signals[link["signal"]]
-        first = signal["first_phase"]
-        phases = network.phases[first : first + signal["num_phases"]]
+        program = network.programs[signal["program"]]
+        first = program["first_phase"]
+        phases = network.phases[first : first + program["num_phases"]]
         letters = network.phase_states[phases["first_state"] + link["signal_index"]]
         if not np.isin(letters, _GREEN).any():
             shut.add(int(link["from_lane"]))
