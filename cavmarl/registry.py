@@ -25,6 +25,7 @@ __all__ = [
     "load_config",
     "places",
     "resolve_map",
+    "resolve_programs",
 ]
 
 MAP_SUFFIXES = (".net.xml", ".net.xml.gz", ".osm", ".osm.gz", ".osm.xml", ".xodr")
@@ -148,16 +149,24 @@ def resolve_map(config: EnvConfig, base_dir: Path) -> Path:
         MapError: no such file.
         MissingExtraError: the source lies in the eclipse-sumo wheel, which is not installed.
     """
-    source = config.map.source
+    return _resolve("map.source", config.map.source, base_dir)
+
+
+def resolve_programs(config: EnvConfig, base_dir: Path) -> list[Path]:
+    """The files that `map.programs` means; arguments and errors as for `resolve_map`."""
+    return [_resolve("map.programs", source, base_dir) for source in config.map.programs]
+
+
+def _resolve(key: str, source: str, base_dir: Path) -> Path:
     if source.startswith(_SUMO_PREFIX):
         home = Path(require("sumo", "sumo").SUMO_HOME).resolve()
         path = (home / source.removeprefix(_SUMO_PREFIX)).resolve()
         if not path.is_relative_to(home):
-            raise MapError(f"map.source = {source!r}: leads out of the eclipse-sumo wheel")
+            raise MapError(f"{key} = {source!r}: leads out of the eclipse-sumo wheel")
     else:
         path = base_dir / source
     if not path.is_file():
-        raise MapError(f"map.source = {source!r}: no file {path}")
+        raise MapError(f"{key} = {source!r}: no file {path}")
     return path
 
 

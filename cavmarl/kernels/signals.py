@@ -159,9 +159,7 @@ def _look(
 
 
 @kernel
-def _gap(
-    roads: RoadArrays, phase: np.void, detected_s: NDArray[np.float64], now_ms: int
-) -> float:
+def _gap(roads: RoadArrays, phase: np.void, detected_s: NDArray[np.float64], now_ms: int) -> float:
     """Seconds since a vehicle was on the phase's detectors; inf if longer than each one's gap."""
     gap = math.inf
     for k in range(phase["first_detector"], phase["first_detector"] + phase["num_detectors"]):
@@ -174,4 +172,4 @@ def _gap(
 
 @kernel
 def _milliseconds(seconds: float) -> int:
-    return int(math.floor(seconds * 1e3 + 0.5))
+    return math.floor(seconds * 1e3 + 0.5)

@@ -83,7 +83,9 @@ class _Approaches:
         self.links = links
         self.lanes: list[int] = [
             int(lane)
-            for lane in dict.fromkeys(links["from_lane"][np.argsort(links["signal_index"])].tolist())
+            for lane in dict.fromkeys(
+                links["from_lane"][np.argsort(links["signal_index"])].tolist()
+            )
             if program.params.get(roads.lane_ids[lane]) != NO_DETECTOR
         ]
         self.indices = {
@@ -157,7 +159,9 @@ class _Approaches:
         if stated.min_s == stated.max_s:
             return []
         state = stated.state
-        major = {lane for i, letter in enumerate(state) if letter == "G" for lane in self.lanes_at[i]}
+        major = {
+            lane for i, letter in enumerate(state) if letter == "G" for lane in self.lanes_at[i]
+        }
         open_links = {
             index
             for index, letter in enumerate(state)

@@ -181,9 +181,7 @@ def _phase(attrs: Mapping[str, str], place: str) -> Phase:
     )
 
 
-def _seconds(
-    attrs: Mapping[str, str], key: str, place: str, default: float | None = None
-) -> float:
+def _seconds(attrs: Mapping[str, str], key: str, place: str, default: float | None = None) -> float:
     if key not in attrs and default is not None:
         return default
     text = attrs[key]

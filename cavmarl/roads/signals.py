@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cavmarl.errors import MapError
-from cavmarl.roads.network import PHASE, PROGRAM, SIGNAL, SIGNAL_STATES, SWITCH
+from cavmarl.roads.network import PHASE, PROGRAM, SIGNAL, SIGNAL_STATES, SWITCH, RoadNetwork
 from cavmarl.roads.programs import Phase, Program
 
 __all__ = ["SignalArrays", "SignalRows", "parameter", "read_signals"]
@@ -56,6 +56,28 @@ class SignalRows:
         self.num_controllers = 0
         self.phase_detectors: list[int] = []
         self.specs: dict[int, Program] = {}  # by row; of actuated programs that need detectors
+
+    @classmethod
+    def of(cls, network: RoadNetwork) -> SignalRows:
+        """The rows of a network, to append more."""
+        rows = cls()
+        rows.ids = list(network.signal_ids)
+        rows.row = {name: row for row, name in enumerate(rows.ids)}
+        rows.signals = [[int(s["program"]), int(s["num_links"])] for s in network.signals]
+        rows.programs = network.programs.tolist()
+        rows.program_ids = list(network.program_ids)
+        rows.program_row = {
+            (rows.ids[program["signal"]], name): row
+            for row, (program, name) in enumerate(
+                zip(network.programs, network.program_ids, strict=True)
+            )
+        }
+        rows.phases = network.phases.tolist()
+        rows.letters = network.phase_states.tolist()
+        rows.switches = network.switches.tolist()
+        rows.num_controllers = network.num_controllers
+        rows.phase_detectors = network.phase_detectors.tolist()
+        return rows
 
     def add(self, program: Program) -> None:
         """Append a program; of several the last is on, as in SUMO.
