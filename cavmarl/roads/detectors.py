@@ -37,6 +37,7 @@ class DetectorRoads(NamedTuple):
     lanes: NDArray[np.void]
     edges: NDArray[np.void]
     links: NDArray[np.void]
+    conflicts: NDArray[np.void]
     into: NDArray[np.int32]
     lane_ids: tuple[str, ...]
 
@@ -144,7 +145,11 @@ class _Approaches:
         )
         s = float(lanes["length_m"][lane]) - distance
         while s < 0.0 and lanes["num_into"][lane] == 1:
-            lane = int(self.roads.into[lanes["first_into"][lane]])
+            before = int(self.roads.into[lanes["first_into"][lane]])
+            link = lanes["link"][before]
+            if link >= 0 and self.roads.links["signal"][link] >= 0:
+                break
+            lane = before
             s += float(lanes["length_m"][lane])
         return lane, max(s, 0.0)
 
@@ -165,7 +170,7 @@ class _Approaches:
         open_links = {
             index
             for index, letter in enumerate(state)
-            if letter == "G" or (letter == "g" and self._counts(index, major))
+            if letter == "G" or (letter == "g" and self._counts(index, state, major))
         }
         shut = {lane for lane in detected if not open_links.issuperset(self.indices[lane])}
         return [
@@ -174,10 +179,28 @@ class _Approaches:
             if lane not in shut and not shut.intersection(self._next_lanes(lane))
         ]
 
-    def _counts(self, index: int, major: set[int]) -> bool:
+    def _counts(self, index: int, state: str, major: set[int]) -> bool:
         """Whether a green that gives way is as good as one that does not."""
         unimportant = index in self.never_major or index in self.turnaround
-        return (unimportant and bool(major & self.lanes_at[index])) or index in self.one_lane
+        if index in self.one_lane or (unimportant and major & self.lanes_at[index]):
+            return True
+        return not any(
+            self._gives_way(link, state) for link in self.links[self.links["signal_index"] == index]
+        )
+
+    def _gives_way(self, link: np.void, state: str) -> bool:
+        """Whether motor vehicles of another road may cross the way of a link in this state."""
+        first = link["first_conflict"]
+        foes = self.roads.conflicts["foe"][first : first + link["num_conflicts"]]
+        for foe in self.roads.links[foes]:
+            if foe["signal"] == link["signal"] and state[foe["signal_index"]] in "gG":
+                source, target, own = self.roads.lanes[
+                    [foe["from_lane"], foe["to_lane"], link["from_lane"]]
+                ]
+                open_to = source["permissions"] & target["permissions"] & _MOTORIZED
+                if open_to and source["edge"] != own["edge"]:
+                    return True
+        return False
 
     def _next_lanes(self, lane: int) -> list[int]:
         """Lanes behind the junction, where a second line of the same signal may be shut."""

@@ -97,7 +97,7 @@ def _assemble(net: Any, programs: list[Program], name: str, digest: str) -> Road
     links["num_conflicts"] = np.diff(first_conflict)
     junctions, kinds = _junction_rows(nodes, links)
     detectors, phase_detectors = place_detectors(
-        signal_rows, DetectorRoads(lanes, edges, links, into, lane_ids)
+        signal_rows, DetectorRoads(lanes, edges, links, conflicts, into, lane_ids)
     )
     return RoadNetwork(
         name=name,

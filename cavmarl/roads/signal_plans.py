@@ -59,7 +59,12 @@ def with_programs(
         rows.signals[row][0] = _program(network, rows, signal_id, program_id, "map.program")
         rows.switches = [switch for switch in rows.switches if switch[0] != row]
     roads = DetectorRoads(
-        network.lanes, network.edges, network.links, network.into, network.lane_ids
+        network.lanes,
+        network.edges,
+        network.links,
+        network.conflicts,
+        network.into,
+        network.lane_ids,
     )
     detectors, phase_detectors = place_detectors(rows, roads, len(network.detectors))
     return replace(

@@ -23,7 +23,7 @@ from cavmarl.shard.controllers import CONTROLLER
 from cavmarl.shard.sensors import layout, sensor_arrays
 from cavmarl.shard.vehicles import VEHICLE
 
-__all__ = ["Commands", "Shard"]
+__all__ = ["Commands", "Shard", "make_worlds"]
 
 CELL_M = 25.0  # of the spatial index over vehicles
 SUGGESTED_HORIZON_S = 1.0  # in which a suggested target speed is to be reached
@@ -63,7 +63,7 @@ class Shard:
         self._sensors = sensor_arrays(config.sensors)
         self._grid = make_grid(network.extent_m, CELL_M, capacity)
         self.scratch = _make_scratch(len(network.lanes), len(network.links), capacity)
-        self.worlds = _make_worlds(num_worlds, capacity, network)
+        self.worlds = make_worlds(num_worlds, capacity, network)
         self.outputs = _make_outputs(config, num_worlds)
         self._weights = np.array([config.terms.weights.get(name, 0.0) for name in TERMS])
         self._target_speeds = np.array(config.action.target_speeds_mps)
@@ -137,7 +137,8 @@ class Shard:
         )
 
 
-def _make_worlds(num_worlds: int, capacity: int, network: RoadNetwork) -> Worlds:
+def make_worlds(num_worlds: int, capacity: int, network: RoadNetwork) -> Worlds:
+    """Arrays of W worlds that hold `capacity` vehicles each, all of them empty."""
     shape = (num_worlds, capacity)
     return Worlds(
         rows=np.zeros(shape, dtype=VEHICLE),
