@@ -18,7 +18,10 @@ from numpy.typing import NDArray
 from cavmarl.kernels import kernel
 from cavmarl.kernels.arrays import RoadArrays, Worlds
 
-__all__ = ["switch_signals"]
+__all__ = ["DETECTOR_REACH_M", "switch_signals"]
+
+# From a detector to the centre of any vehicle that is over it or has left it in this tick.
+DETECTOR_REACH_M = 30.0
 
 SECOND_MS = 1000  # SUMO prolongs phases to whole seconds, and looks no sooner after a switch
 
@@ -108,13 +111,26 @@ def _detect(
         while place >= 0:
             at = roads.places[place]
             ahead = row["s"] - at["s_m"]
-            rear = ahead - 0.5 * row["length"]
-            if ahead + 0.5 * row["length"] >= 0.0 and rear <= row["speed"] * dt:
-                # The tick was driven at the speed at its end (semi-implicit Euler).
-                since = rear / row["speed"] if rear > 0.0 else 0.0
-                detector = at["detector"]
-                detected_s[detector] = max(detected_s[detector], time - since)
+            if abs(ahead) < DETECTOR_REACH_M:
+                _note(row, ahead, time, dt, at["detector"], detected_s)
             place = at["next"]
+
+
+@kernel
+def _note(
+    row: np.void,
+    ahead: float,
+    time: float,
+    dt: float,
+    detector: int,
+    detected_s: NDArray[np.float64],
+) -> None:
+    """Note when a body was over a detector that its centre is `ahead` m of."""
+    rear = ahead - 0.5 * row["length"]
+    if ahead + 0.5 * row["length"] >= 0.0 and rear <= row["speed"] * dt:
+        # The tick was driven at the speed at its end (semi-implicit Euler).
+        since = rear / row["speed"] if rear > 0.0 else 0.0
+        detected_s[detector] = max(detected_s[detector], time - since)
 
 
 @kernel

@@ -21,6 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cavmarl.kernels.arrays import RoadArrays
+from cavmarl.kernels.signals import DETECTOR_REACH_M
 
 __all__ = [
     "CONFLICT",
@@ -321,15 +322,17 @@ class RoadNetwork:
             lane = self.lanes[detector["lane"]]
             s = float(detector["s_m"])
             found.append((int(detector["lane"]), number, s))
-            for before in self.into[lane["first_into"] : lane["first_into"] + lane["num_into"]]:
-                if self.lanes["internal"][before]:
-                    found.append((int(before), number, s + self.lanes["length_m"][before]))
-            links = self.links[lane["first_link"] : lane["first_link"] + lane["num_links"]]
-            found += [
-                (int(behind), number, s - lane["length_m"])
-                for behind in links["first_internal"]
-                if behind >= 0
-            ]
+            if s < DETECTOR_REACH_M:
+                into = self.into[lane["first_into"] : lane["first_into"] + lane["num_into"]]
+                found += [
+                    (int(before), number, s + float(self.lanes["length_m"][before]))
+                    for before in into[self.lanes["internal"][into]]
+                ]
+            beyond = s - float(lane["length_m"])
+            if beyond > -DETECTOR_REACH_M:
+                links = self.links[lane["first_link"] : lane["first_link"] + lane["num_links"]]
+                behind = links["first_internal"]
+                found += [(int(row), number, beyond) for row in behind[behind >= 0]]
         first = np.full(len(self.lanes), -1, dtype=np.int32)
         places = np.zeros(len(found), PLACE)
         for row, (at, number, s) in enumerate(found):
