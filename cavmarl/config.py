@@ -69,12 +69,18 @@ class MapConfig:
     Attributes:
         source: a map file: relative to the entry's folder, absolute, or `sumo:PATH` for a file of
             the eclipse-sumo wheel.
+        programs: additional files with more signal programs, named as the source is; of several
+            programs of a signal the last is on.
+        program: the program of each signal named here, whatever was loaded; `off` is one, too.
     """
 
     source: str
+    programs: tuple[str, ...] = ()
+    program: dict[str, str] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         _check(bool(self.source), "map.source", self.source, "must name a map file")
+        _check(all(self.programs), "map.programs", self.programs, "must name files")
 
 
 @dataclass(frozen=True)

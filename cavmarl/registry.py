@@ -33,6 +33,7 @@ __all__ = [
     "places",
     "resolve_demand",
     "resolve_map",
+    "resolve_programs",
 ]
 
 MAP_SUFFIXES = (".net.xml", ".net.xml.gz", ".osm", ".osm.gz", ".osm.xml", ".xodr")
@@ -169,6 +170,13 @@ def resolve_demand(config: EnvConfig, base_dir: Path) -> list[Path]:
     return [
         _resolve("traffic.demand", source, base_dir, DemandError)
         for source in config.traffic.demand
+    ]
+
+
+def resolve_programs(config: EnvConfig, base_dir: Path) -> list[Path]:
+    """The files that `map.programs` means; arguments and errors as for `resolve_map`."""
+    return [
+        _resolve("map.programs", source, base_dir, MapError) for source in config.map.programs
     ]
 
 

@@ -9,12 +9,13 @@ from typing import Any
 from cavmarl.config import EnvConfig
 from cavmarl.errors import ConfigError
 from cavmarl.maps.netconvert import map_file
-from cavmarl.registry import load_config, resolve_demand, resolve_map
+from cavmarl.registry import load_config, resolve_demand, resolve_map, resolve_programs
 from cavmarl.roads.cache import load_network
 from cavmarl.roads.network import RoadNetwork
+from cavmarl.roads.signal_plans import with_programs
 from cavmarl.traffic.demand import DemandFile, read_demand
 
-__all__ = ["check_agents", "check_placement", "find_map", "load_world"]
+__all__ = ["check_agents", "check_placement", "find_map", "load_roads", "load_world"]
 
 
 def load_world(
@@ -42,9 +43,23 @@ def load_world(
         max_cycles=max_cycles,
         overrides=overrides,
     )
-    network = load_network(map_file(resolve_map(config, base_dir)))
+    network = load_roads(config, base_dir)
     files = resolve_demand(config, base_dir)
     return config, network, read_demand(files, network) if files else None
+
+
+def load_roads(config: EnvConfig, base_dir: Path) -> RoadNetwork:
+    """The roads of a configuration, with the signal programs that it names.
+
+    Args:
+        config: of the environment.
+        base_dir: the folder that relative files start from.
+
+    Raises:
+        MapError: the map or a file of programs cannot be read, or they do not fit.
+    """
+    network = load_network(map_file(resolve_map(config, base_dir)))
+    return with_programs(network, resolve_programs(config, base_dir), config.map.program)
 
 
 def find_map(env: str | Path) -> Path:

@@ -9,8 +9,8 @@ import pytest
 
 from cavmarl.config import EnvConfig
 from cavmarl.config_io import MAX_BYTES, MAX_DEPTH, dotted_keys, read_yaml
-from cavmarl.errors import ConfigError
-from cavmarl.registry import load_config
+from cavmarl.errors import ConfigError, MapError
+from cavmarl.registry import load_config, resolve_programs
 
 MINIMAL = "name: mine\nmap: {source: m.net.xml}\n"
 
@@ -205,3 +205,12 @@ def test_overrides_are_checked_like_the_file() -> None:
         load_config("ring", agents=True)
     with pytest.raises(ConfigError, match=r"zones\.count = 0: this version runs one zone"):
         load_config("ring", zones=0)
+
+
+def test_signal_programs_are_files_beside_the_map_and_choices(tmp_path: Path) -> None:
+    config = load(
+        tmp_path, "name: a\nmap: {source: m.net.xml, programs: [p.add.xml], program: {j: night}}"
+    )
+    assert (config.map.programs, config.map.program) == (("p.add.xml",), {"j": "night"})
+    with pytest.raises(MapError, match=r"map\.programs = 'p\.add\.xml': no file"):
+        resolve_programs(config, tmp_path)

@@ -22,11 +22,20 @@ from cavmarl.evaluate.sumo_traffic import SumoJob, start_sumo, sumo_process
 from cavmarl.runtime.simulation import Simulation
 from cavmarl.worlds import find_map
 
-__all__ = ["TrafficSpeed", "measure_traffic_speed"]
+__all__ = ["Rates", "TrafficSpeed", "measure_traffic_speed"]
 
 TURN_S = 10
 MAX_AFTER_S = 3600
 MAX_REPEATS = 100
+
+
+@dataclass(frozen=True)
+class Rates:
+    """Vehicle-steps a second: slowest turn, median, fastest turn."""
+
+    low: float
+    median: float
+    high: float
 
 
 @dataclass(frozen=True)
@@ -102,7 +111,7 @@ def measure_traffic_speed(
         sumo.submit(_load_sumo, job, folder).result()
         sumo.submit(_turn_of_sumo, warm).result()
         progress(f"our first {after_s} s")
-        simulation = make_world(path, demand, MOST_S, seed, dt_s)
+        simulation = make_world(path, demand, after_s + repeats * TURN_S, seed, dt_s)
         _our_turn(simulation, warm)
         for repeat in range(repeats):
             progress(f"measuring, {repeat + 1} of {repeats}")

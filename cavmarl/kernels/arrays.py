@@ -35,8 +35,14 @@ class RoadArrays(NamedTuple):
     conflicts: NDArray[np.void]  # CONFLICT (num_conflicts,)
     into: NDArray[np.int32]  # (num_into,) see LANE["first_into"]
     signals: NDArray[np.void]  # SIGNAL (num_signals,)
+    programs: NDArray[np.void]  # PROGRAM (num_programs,)
     phases: NDArray[np.void]  # PHASE (num_phases,)
     phase_states: NDArray[np.uint8]  # (num_letters,) codes: positions in SIGNAL_STATES
+    switches: NDArray[np.void]  # SWITCH (num_switches,)
+    detectors: NDArray[np.void]  # DETECTOR (D,)
+    phase_detectors: NDArray[np.int32]  # see PHASE["first_detector"]
+    lane_place: NDArray[np.int32]  # (L,) the first PLACE of each lane, or -1
+    places: NDArray[np.void]  # PLACE (num_places,) detectors that bodies on a lane can cover
 
 
 class LaneGrid(NamedTuple):
@@ -73,6 +79,8 @@ class Worlds(NamedTuple):
     ticks: NDArray[np.int64]  # (W,) since reset
     keys: NDArray[np.uint64]  # (W,) the root of all random numbers of the episode
     signal_phase: NDArray[np.int32]  # (W, num_signals) PHASE row that is on
+    controllers: NDArray[np.void]  # CONTROLLER (W, num_controllers) of the actuated programs
+    detected_s: NDArray[np.float64]  # (W, D) when a body was last over each detector
     num_contacts: NDArray[np.int64]  # (W,) vehicles that began to touch another, since reset
 
 

@@ -33,24 +33,7 @@ from cavmarl.kernels.neighbors import Grid, fill_grid
 from cavmarl.kernels.scalars import clamp
 from cavmarl.kernels.steering import nearest_speed, steer_to_lane, take_meta_action
 
-__all__ = ["advance", "begin_step", "resolve", "suggest", "switch_signals"]
-
-
-@kernel
-def switch_signals(roads: RoadArrays, worlds: Worlds, dt: float) -> None:
-    """Set every signal to the phase of its fixed-time program at the worlds' ticks."""
-    for w in range(worlds.ticks.shape[0]):
-        time = worlds.ticks[w] * dt
-        for k in range(roads.signals.shape[0]):
-            signal = roads.signals[k]
-            left = (time - signal["offset_s"]) % signal["cycle_s"]
-            phase = signal["first_phase"]
-            last = phase + signal["num_phases"] - 1
-            # Half a tick of slack: sums of ticks are not exact.
-            while phase < last and left + 0.5 * dt >= roads.phases[phase]["duration_s"]:
-                left -= roads.phases[phase]["duration_s"]
-                phase += 1
-            worlds.signal_phase[w, k] = phase
+__all__ = ["advance", "begin_step", "resolve", "suggest"]
 
 
 @kernel

@@ -17,13 +17,16 @@ from numpy.typing import NDArray
 from cavmarl.kernels import cache_dir
 from cavmarl.roads.network import (
     CONFLICT,
+    DETECTOR,
     EDGE,
     JUNCTION,
     LANE,
     LINK,
     PHASE,
     POINT,
+    PROGRAM,
     SIGNAL,
+    SWITCH,
     RoadNetwork,
 )
 from cavmarl.roads.reader import map_name, read_network, source_hash
@@ -31,7 +34,7 @@ from cavmarl.roads.reader import map_name, read_network, source_hash
 __all__ = ["load_network"]
 
 # Raise this when the reader gives other rows for the same file; record types count by themselves.
-FORMAT = 9
+FORMAT = 10
 
 _DTYPES = {
     "points": POINT,
@@ -42,10 +45,14 @@ _DTYPES = {
     "junctions": JUNCTION,
     "into": np.dtype(np.int32),
     "signals": SIGNAL,
+    "programs": PROGRAM,
     "phases": PHASE,
     "phase_states": np.dtype(np.uint8),
+    "switches": SWITCH,
+    "detectors": DETECTOR,
+    "phase_detectors": np.dtype(np.int32),
 }
-_IDS = ("lane_ids", "edge_ids", "junction_ids", "signal_ids", "junction_kinds")
+_IDS = ("lane_ids", "edge_ids", "junction_ids", "signal_ids", "program_ids", "junction_kinds")
 
 
 def load_network(path: str | Path) -> RoadNetwork:

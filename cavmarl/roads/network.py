@@ -21,17 +21,22 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cavmarl.kernels.arrays import RoadArrays
+from cavmarl.kernels.signals import DETECTOR_REACH_M
 
 __all__ = [
     "CONFLICT",
+    "DETECTOR",
     "EDGE",
     "JUNCTION",
     "LANE",
     "LINK",
     "PHASE",
+    "PLACE",
     "POINT",
+    "PROGRAM",
     "SIGNAL",
     "SIGNAL_STATES",
+    "SWITCH",
     "VEHICLE_CLASSES",
     "RoadNetwork",
 ]
@@ -172,11 +177,24 @@ JUNCTION = np.dtype(
 
 SIGNAL = np.dtype(
     [
-        ("first_phase", np.int32),  # PHASE rows of the first program
-        ("num_phases", np.int32),
+        ("program", np.int32),  # PROGRAM that is on at the beginning
         ("num_links", np.int32),  # letters in a state
+        ("first_switch", np.int32),  # SWITCH rows, by rising time
+        ("num_switches", np.int32),
+    ],
+    align=True,
+)
+
+PROGRAM = np.dtype(
+    [
+        ("signal", np.int32),
+        ("first_phase", np.int32),  # PHASE rows [first_phase, first_phase + num_phases)
+        ("num_phases", np.int32),
         ("offset_s", np.float64),  # by which all phases are late
         ("cycle_s", np.float64),  # sum of the phases' durations
+        ("controller", np.int32),  # actuated: its place in a world's controllers
+        ("detector_gap_s", np.float64),  # actuated: from a detector to the stop line, at the limit
+        ("simplified", np.bool_),  # SUMO has rules for it that are not run here
     ],
     align=True,
 )
@@ -184,7 +202,40 @@ SIGNAL = np.dtype(
 PHASE = np.dtype(
     [
         ("duration_s", np.float64),
+        ("min_ms", np.int64),  # actuated: bounds of the duration, in SUMO's unit of time
+        ("max_ms", np.int64),
+        ("following", np.int32),  # actuated: PHASE that comes next
+        ("green", np.bool_),  # some letter is green and none is yellow: it may be prolonged
         ("first_state", np.int32),  # phase_states[first_state : first_state + num_links]
+        ("first_detector", np.int32),  # phase_detectors that prolong it
+        ("num_detectors", np.int32),
+    ],
+    align=True,
+)
+
+SWITCH = np.dtype(
+    [
+        ("signal", np.int32),
+        ("at_s", np.float64),  # since the beginning
+        ("program", np.int32),  # PROGRAM that is on from then
+    ],
+    align=True,
+)
+
+DETECTOR = np.dtype(
+    [
+        ("lane", np.int32),  # LANE on which it lies; its signal may be one lane farther on
+        ("s_m", np.float64),  # where on that lane
+        ("max_gap_s", np.float64),  # between two vehicles of which the second prolongs the green
+    ],
+    align=True,
+)
+
+PLACE = np.dtype(
+    [
+        ("next", np.int32),  # the next PLACE of the same lane
+        ("detector", np.int32),
+        ("s_m", np.float64),  # of the detector in the lane's s; beyond its ends on lanes beside it
     ],
     align=True,
 )
@@ -196,11 +247,13 @@ class RoadNetwork:
 
     Attributes:
         name: the source file's name without its endings.
-        source_hash: SHA-256 of the source, hex; part of every manifest and cache key. points,
-        lanes, edges, links, conflicts, junctions, signals, phases: record arrays, read-only.
+        source_hash: SHA-256 of the source, hex; part of every manifest and cache key.
+        points, lanes, edges, links, conflicts, junctions: record arrays, read-only.
+        signals, programs, phases, switches, detectors: record arrays, read-only.
         into: LANE rows, see LANE["first_into"].
         phase_states: signal letters as codes, see PHASE.
-        lane_ids, edge_ids, junction_ids, signal_ids: the source's names, by row.
+        phase_detectors: DETECTOR rows, see PHASE["first_detector"].
+        lane_ids, edge_ids, junction_ids, signal_ids, program_ids: the source's names, by row.
         junction_kinds: SUMO's junction types that occur, by `JUNCTION["kind"]`.
     """
 
@@ -214,12 +267,17 @@ class RoadNetwork:
     junctions: NDArray[np.void]
     into: NDArray[np.int32]
     signals: NDArray[np.void]
+    programs: NDArray[np.void]
     phases: NDArray[np.void]
     phase_states: NDArray[np.uint8]
+    switches: NDArray[np.void]
+    detectors: NDArray[np.void]
+    phase_detectors: NDArray[np.int32]
     lane_ids: tuple[str, ...]
     edge_ids: tuple[str, ...]
     junction_ids: tuple[str, ...]
     signal_ids: tuple[str, ...]
+    program_ids: tuple[str, ...]
     junction_kinds: tuple[str, ...]
 
     def __post_init__(self) -> None:
@@ -239,9 +297,49 @@ class RoadNetwork:
             self.conflicts,
             self.into,
             self.signals,
+            self.programs,
             self.phases,
             self.phase_states,
+            self.switches,
+            self.detectors,
+            self.phase_detectors,
+            *self._places,
         )
+
+    @property
+    def num_controllers(self) -> int:
+        """Actuated programs: each keeps a state in every world."""
+        return int((self.programs["controller"] >= 0).sum())
+
+    @cached_property
+    def _places(self) -> tuple[NDArray[np.int32], NDArray[np.void]]:
+        """The first PLACE of every lane, (num_lanes,), and the PLACE rows.
+
+        A vehicle belongs to the lane of its centre while its ends reach onto others: so a detector
+        is listed with the internal lanes before and behind its own, too.
+        """
+        found: list[tuple[int, int, float]] = []
+        for number, detector in enumerate(self.detectors):
+            lane = self.lanes[detector["lane"]]
+            s = float(detector["s_m"])
+            found.append((int(detector["lane"]), number, s))
+            if s < DETECTOR_REACH_M:
+                into = self.into[lane["first_into"] : lane["first_into"] + lane["num_into"]]
+                found += [
+                    (int(before), number, s + float(self.lanes["length_m"][before]))
+                    for before in into[self.lanes["internal"][into]]
+                ]
+            beyond = s - float(lane["length_m"])
+            if beyond > -DETECTOR_REACH_M:
+                links = self.links[lane["first_link"] : lane["first_link"] + lane["num_links"]]
+                behind = links["first_internal"]
+                found += [(int(row), number, beyond) for row in behind[behind >= 0]]
+        first = np.full(len(self.lanes), -1, dtype=np.int32)
+        places = np.zeros(len(found), PLACE)
+        for row, (at, number, s) in enumerate(found):
+            places[row] = (first[at], number, s)
+            first[at] = row
+        return first, places
 
     @cached_property
     def extent_m(self) -> tuple[float, float, float, float]:

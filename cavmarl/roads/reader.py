@@ -12,8 +12,10 @@ from numpy.typing import NDArray
 
 from cavmarl.errors import MapError
 from cavmarl.roads.conflicts import LinkPath, sample_path
+from cavmarl.roads.detectors import DetectorRoads, place_detectors
 from cavmarl.roads.network import EDGE, JUNCTION, LANE, LINK, RoadNetwork
 from cavmarl.roads.polylines import clean_shape, extend_stubs, point_rows
+from cavmarl.roads.programs import Program
 from cavmarl.roads.right_of_way import conflict_rows
 from cavmarl.roads.selection import Movement, Selection, permission_bits, select
 from cavmarl.roads.signals import SignalRows, read_signals
@@ -58,14 +60,14 @@ def read_network(path: str | Path) -> RoadNetwork:
     path = Path(path)
     digest = source_hash(path)
     try:
-        return _assemble(parse_net(path), map_name(path), digest)
+        return _assemble(*parse_net(path), map_name(path), digest)
     except MapError as error:
         if str(error).startswith(str(path)):
             raise
         raise MapError(f"{path}: {error}") from error
 
 
-def _assemble(net: Any, name: str, digest: str) -> RoadNetwork:
+def _assemble(net: Any, programs: list[Program], name: str, digest: str) -> RoadNetwork:
     chosen = select(net)
     if not chosen.edges:
         raise MapError(
@@ -73,7 +75,7 @@ def _assemble(net: Any, name: str, digest: str) -> RoadNetwork:
             "netconvert kept (--keep-edges.by-vclass)"
         )
     lane_row = {id(lane): row for row, lane in enumerate(chosen.lanes)}
-    signal_rows = read_signals(net)
+    signal_rows = read_signals(programs)
     nodes = net.getNodes()
     node_row = {id(node): row for row, node in enumerate(nodes)}
 
@@ -94,7 +96,9 @@ def _assemble(net: Any, name: str, digest: str) -> RoadNetwork:
     links["first_conflict"] = first_conflict[:-1]
     links["num_conflicts"] = np.diff(first_conflict)
     junctions, kinds = _junction_rows(nodes, links)
-    signals, phases, phase_states = signal_rows.arrays()
+    detectors, phase_detectors = place_detectors(
+        signal_rows, DetectorRoads(lanes, edges, links, conflicts, into, lane_ids)
+    )
     return RoadNetwork(
         name=name,
         source_hash=digest,
@@ -105,9 +109,9 @@ def _assemble(net: Any, name: str, digest: str) -> RoadNetwork:
         conflicts=conflicts,
         junctions=junctions,
         into=into,
-        signals=signals,
-        phases=phases,
-        phase_states=phase_states,
+        **signal_rows.arrays()._asdict(),
+        detectors=detectors,
+        phase_detectors=phase_detectors,
         lane_ids=lane_ids,
         edge_ids=tuple(edge.getID() for edge in chosen.edges),
         junction_ids=tuple(node.getID() for node in nodes),

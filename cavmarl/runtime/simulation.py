@@ -237,6 +237,8 @@ class Simulation:
             digest.update(np.ascontiguousarray(queue[name]).tobytes())
         for array in (
             worlds.signal_phase[world],
+            worlds.controllers[world],
+            worlds.detected_s[world],
             worlds.ticks[world],
             worlds.keys[world],
             self._gate.next_id[world],

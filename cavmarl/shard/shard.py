@@ -17,13 +17,15 @@ from cavmarl.kernels.arrays import LaneGrid, Outputs, RoadArrays, Scratch, Trave
 from cavmarl.kernels.lanes import ENTRY
 from cavmarl.kernels.neighbors import make_grid
 from cavmarl.kernels.sense import sense
-from cavmarl.kernels.tick import advance, begin_step, resolve, suggest, switch_signals
+from cavmarl.kernels.signals import switch_signals
+from cavmarl.kernels.tick import advance, begin_step, resolve, suggest
 from cavmarl.roads.network import RoadNetwork
 from cavmarl.roads.routing import lane_grid
+from cavmarl.shard.controllers import CONTROLLER
 from cavmarl.shard.sensors import layout, sensor_arrays
 from cavmarl.shard.vehicles import VEHICLE
 
-__all__ = ["Commands", "Shard"]
+__all__ = ["Commands", "Shard", "make_worlds"]
 
 CELL_M = 25.0  # of the spatial index over vehicles
 SUGGESTED_HORIZON_S = 1.0  # in which a suggested target speed is to be reached
@@ -71,7 +73,7 @@ class Shard:
         self._sensors = sensor_arrays(config.sensors)
         self._grid = make_grid(network.extent_m, CELL_M, capacity)
         self.scratch = _make_scratch(len(network.lanes), len(network.links), capacity)
-        self.worlds = _make_worlds(num_worlds, capacity, len(network.signals))
+        self.worlds = make_worlds(num_worlds, capacity, network)
         self.outputs = _make_outputs(config, num_worlds)
         self._weights = np.array([config.terms.weights.get(name, 0.0) for name in TERMS])
         self._target_speeds = np.array(config.action.target_speeds_mps)
@@ -147,7 +149,8 @@ class Shard:
         )
 
 
-def _make_worlds(num_worlds: int, capacity: int, num_signals: int) -> Worlds:
+def make_worlds(num_worlds: int, capacity: int, network: RoadNetwork) -> Worlds:
+    """Arrays of W worlds that hold `capacity` vehicles each, all of them empty."""
     shape = (num_worlds, capacity)
     return Worlds(
         rows=np.zeros(shape, dtype=VEHICLE),
@@ -156,7 +159,9 @@ def _make_worlds(num_worlds: int, capacity: int, num_signals: int) -> Worlds:
         num_rows=np.zeros(num_worlds, dtype=np.int64),
         ticks=np.zeros(num_worlds, dtype=np.int64),
         keys=np.zeros(num_worlds, dtype=np.uint64),
-        signal_phase=np.zeros((num_worlds, num_signals), dtype=np.int32),
+        signal_phase=np.zeros((num_worlds, len(network.signals)), dtype=np.int32),
+        controllers=np.zeros((num_worlds, network.num_controllers), dtype=CONTROLLER),
+        detected_s=np.zeros((num_worlds, len(network.detectors)), dtype=np.float64),
         num_contacts=np.zeros(num_worlds, dtype=np.int64),
     )
 

@@ -132,8 +132,9 @@ def test_signals_keep_their_program(crossing: Crossing) -> None:
 
     assert network.signal_ids == ("c",)
     signal = network.signals[0]
-    assert (signal["num_phases"], signal["num_links"]) == (3, 3)
-    assert (signal["offset_s"], signal["cycle_s"]) == (3.0, 60.0)
+    program = network.programs[signal["program"]]
+    assert (program["num_phases"], signal["num_links"]) == (3, 3)
+    assert (program["offset_s"], program["cycle_s"]) == (3.0, 60.0)
     letters = "".join(SIGNAL_STATES[code] for code in network.phase_states)
     assert letters == "GrryrrrGg"
     assert network.phases["first_state"].tolist() == [0, 3, 6]
