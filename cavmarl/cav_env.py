@@ -20,8 +20,13 @@ from cavmarl.render.view import WorldView
 from cavmarl.roads.network import RoadNetwork
 from cavmarl.runtime.simulation import Simulation
 from cavmarl.seeds import check_seed, first_seed
-from cavmarl.shard.sensors import layout
-from cavmarl.spaces import action_space, observation_space, state_space
+from cavmarl.spaces import (
+    action_space,
+    named_observation,
+    observation_parts,
+    observation_space,
+    state_space,
+)
 from cavmarl.state import global_state
 from cavmarl.worlds import check_placement, load_world
 
@@ -29,7 +34,7 @@ __all__ = ["CavEnv", "parallel_env"]
 
 RENDER_MODES = ("human", "rgb_array")
 
-Observation = NDArray[np.float32] | dict[str, NDArray[np.float32]]
+Observation = NDArray[np.float32] | dict[str, NDArray[Any]]
 
 
 def parallel_env(
@@ -122,7 +127,10 @@ class CavEnv(ParallelEnv[str, Any, Any]):  # type: ignore[misc] # PettingZoo is 
         self.observation_spaces = dict.fromkeys(self.possible_agents, one_observation)
         self.action_spaces = dict.fromkeys(self.possible_agents, one_action)
         self._seats = config.population.mode == "seats"
-        self._places = layout(config.sensors) if config.observation.kind == "dict" else None
+        self._stack = config.sensors.stack
+        self._parts = (
+            observation_parts(config.sensors) if config.observation.kind == "dict" else None
+        )
         self._index = {agent: k for k, agent in enumerate(self.possible_agents)}
         self._simulation = Simulation(config, network)
         self._decoder = ActionDecoder(config.action, 1, self.possible_agents)
@@ -257,12 +265,10 @@ class CavEnv(ParallelEnv[str, Any, Any]):  # type: ignore[misc] # PettingZoo is 
     def _observations(self, agents: list[str]) -> dict[str, Observation]:
         rows = self._simulation.outputs.observations[0].copy()
         index = self._index
-        if self._places is None:
+        if self._parts is None:
             return {agent: rows[index[agent]] for agent in agents}
-        return {
-            agent: {name: rows[index[agent], place] for name, place in self._places.items()}
-            for agent in agents
-        }
+        frames = rows.reshape(len(rows), self._stack, -1)
+        return {agent: named_observation(self._parts, frames[index[agent]]) for agent in agents}
 
     def _infos(self, agents: list[str]) -> dict[str, dict[str, float]]:
         outputs = self._simulation.outputs

@@ -6,8 +6,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cavmarl.kernels import kernel
-from cavmarl.kernels.arrays import Outputs, RoadArrays, Sensors, Worlds
+from cavmarl.kernels.arrays import LaneGrid, Outputs, RoadArrays, Sensors, Worlds
 from cavmarl.kernels.codes import DRIVER_AGENT, EVENTS_THAT_END
+from cavmarl.kernels.kinematics_observation import observe_kinematics
+from cavmarl.kernels.lidar_cells import observe_lidar_cells
 from cavmarl.kernels.neighbors import Grid, fill_grid
 from cavmarl.kernels.observing import (
     observe_ego,
@@ -16,6 +18,9 @@ from cavmarl.kernels.observing import (
     observe_route,
     observe_signal,
 )
+from cavmarl.kernels.occupancy import observe_occupancy
+from cavmarl.kernels.roadgraph import observe_roadgraph
+from cavmarl.kernels.stacking import newest_frame, repeat_frame, shift_frames
 from cavmarl.kernels.terms import NUM_TERMS, write_terms
 
 __all__ = ["sense"]
@@ -25,6 +30,7 @@ __all__ = ["sense"]
 def sense(
     roads: RoadArrays,
     plans: NDArray[np.void],
+    lane_grid: LaneGrid,
     worlds: Worlds,
     grid: Grid,
     sensors: Sensors,
@@ -43,6 +49,7 @@ def sense(
     Args:
         roads: the road arrays.
         plans: PLAN (G, L).
+        lane_grid: which lanes lie near a place.
         worlds: committed rows at the end of the step; episode_return of agents' rows is written.
         grid: room for the spatial index of one world.
         sensors: settings and room.
@@ -58,7 +65,6 @@ def sense(
         if not chosen[w]:
             continue
         rows = worlds.rows[w]
-        outputs.observations[w] = 0.0
         outputs.terms[w] = 0.0
         outputs.rewards[w] = 0.0
         outputs.terminated[w] = False
@@ -72,21 +78,61 @@ def sense(
             if row["driver"] != DRIVER_AGENT:
                 continue
             agent = row["agent"]
-            out = outputs.observations[w, agent]
-            observe_ego(roads, plans, row, out)
-            observe_route(roads, plans, row, sensors, out)
-            observe_neighbors(rows, i, grid, sensors, out)
-            observe_signal(roads, plans, row, worlds.signal_phase[w], sensors, out)
-            observe_lidar(rows, i, grid, sensors, out)
+            entered = row["departed"] > row["tick"] - ticks_per_step
+            seen = outputs.observations[w, agent]
+            shift_frames(seen, sensors.stack)
+            _observe(
+                roads,
+                plans,
+                lane_grid,
+                rows,
+                i,
+                grid,
+                worlds.signal_phase[w],
+                sensors,
+                newest_frame(seen, sensors.stack),
+            )
+            if entered:
+                repeat_frame(seen, sensors.stack)
             outputs.present[w, agent] = True
             outputs.vehicle_ids[w, agent] = row["id"]
-            if row["departed"] > row["tick"] - ticks_per_step:
+            if entered:
                 continue
             write_terms(roads, rows, i, grid, step_s, outputs.terms[w, agent])
             outputs.acted[w, agent] = True
             outputs.terminated[w, agent] = row["events"] & EVENTS_THAT_END != 0
             outputs.events[w, agent] = row["events"]
+        for agent in range(outputs.present.shape[1]):
+            if not outputs.present[w, agent]:
+                outputs.observations[w, agent] = 0.0
         _reward(worlds, w, weights, team_share, outputs)
+
+
+@kernel
+def _observe(
+    roads: RoadArrays,
+    plans: NDArray[np.void],
+    lane_grid: LaneGrid,
+    rows: NDArray[np.void],
+    i: int,
+    grid: Grid,
+    phase: NDArray[np.int32],
+    sensors: Sensors,
+    out: NDArray[np.float32],
+) -> None:
+    """Write one frame, which is 0 before; sensors that are off write nothing."""
+    row = rows[i]
+    if sensors.ego:
+        observe_ego(roads, plans, row, out)
+    observe_route(roads, plans, row, sensors, out)
+    observe_neighbors(rows, i, grid, sensors, out)
+    if sensors.signal:
+        observe_signal(roads, plans, row, phase, sensors, out)
+    observe_lidar(rows, i, grid, sensors, out)
+    observe_kinematics(roads, rows, i, grid, sensors.kinematics, out)
+    observe_occupancy(roads, lane_grid, rows, i, grid, sensors.occupancy, out)
+    observe_lidar_cells(rows, i, grid, sensors.lidar_cells, out)
+    observe_roadgraph(row, sensors.roadgraph, out)
 
 
 @kernel

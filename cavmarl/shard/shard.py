@@ -18,7 +18,7 @@ from cavmarl.kernels.sense import sense
 from cavmarl.kernels.tick import advance, begin_step, resolve, suggest, switch_signals
 from cavmarl.roads.network import RoadNetwork
 from cavmarl.roads.routing import lane_grid
-from cavmarl.shard.sensors import layout, sensor_arrays
+from cavmarl.shard.sensors import frame_size, sensor_arrays
 from cavmarl.shard.vehicles import VEHICLE
 
 __all__ = ["Commands", "Shard"]
@@ -58,7 +58,7 @@ class Shard:
         self._plans = plans
         self._lane_grid: LaneGrid = lane_grid(network)
         capacity = config.population.agents + config.population.background
-        self._sensors = sensor_arrays(config.sensors)
+        self._sensors = sensor_arrays(config.sensors, network, plans)
         self._grid = make_grid(network.extent_m, CELL_M, capacity)
         self.scratch = _make_scratch(len(network.lanes), len(network.links), capacity)
         self.worlds = _make_worlds(num_worlds, capacity, len(network.signals))
@@ -109,6 +109,7 @@ class Shard:
         sense(
             self._roads,
             self._plans,
+            self._lane_grid,
             self.worlds,
             self._grid,
             self._sensors,
@@ -177,7 +178,7 @@ def _make_scratch(num_lanes: int, num_links: int, capacity: int) -> Scratch:
 
 def _make_outputs(config: EnvConfig, num_worlds: int) -> Outputs:
     agents = (num_worlds, config.population.num_ids)
-    size = max(place.stop for place in layout(config.sensors).values())
+    size = config.sensors.stack * frame_size(config.sensors)
     return Outputs(
         observations=np.zeros((*agents, size), dtype=np.float32),
         terms=np.zeros((*agents, len(TERMS)), dtype=np.float32),
