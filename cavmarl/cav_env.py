@@ -267,8 +267,10 @@ class CavEnv(ParallelEnv[str, Any, Any]):  # type: ignore[misc] # PettingZoo is 
         index = self._index
         if self._parts is None:
             return {agent: rows[index[agent]] for agent in agents}
-        frames = rows.reshape(len(rows), self._stack, -1)
-        return {agent: named_observation(self._parts, frames[index[agent]]) for agent in agents}
+        named = named_observation(self._parts, rows.reshape(len(rows), self._stack, -1))
+        return {
+            agent: {name: part[index[agent]] for name, part in named.items()} for agent in agents
+        }
 
     def _infos(self, agents: list[str]) -> dict[str, dict[str, float]]:
         outputs = self._simulation.outputs

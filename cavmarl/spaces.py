@@ -109,14 +109,18 @@ def observation_parts(config: SensorsConfig) -> dict[str, ObservationPart]:
 def named_observation(
     parts: Mapping[str, ObservationPart], frames: NDArray[np.float32]
 ) -> dict[str, NDArray[Any]]:
-    """A flat observation by sensor: views of it, but for images, which become bytes.
+    """Flat observations by sensor: views of them, but for images, which become bytes.
 
     Args:
         parts: of `observation_parts`.
-        frames: (stack, frame size): a flat observation, reshaped.
+        frames: (…, stack, frame size): flat observations, reshaped.
+
+    Returns:
+        an array (…, *shape) a sensor.
     """
+    before = frames.shape[:-2]
     return {
-        name: frames[:, part.place].reshape(part.shape).astype(part.dtype, copy=False)
+        name: frames[..., part.place].reshape(*before, *part.shape).astype(part.dtype, copy=False)
         for name, part in parts.items()
     }
 

@@ -19,6 +19,7 @@ from cavmarl.kernels.scalars import clamp
 from cavmarl.kernels.sensor_arrays import RoadgraphSensor, RoadPoints
 
 __all__ = [
+    "NUM_RINGS",
     "NUM_ROAD_TYPES",
     "ROADGRAPH_FEATURES",
     "ROAD_POINT",

@@ -10,9 +10,10 @@ from numpy.typing import NDArray
 
 from cavmarl.config_sensors import OccupancyGridConfig, SensorsConfig
 from cavmarl.kernels.occupancy import observe_occupancy
+from cavmarl.roads import routing
 from cavmarl.shard.sensors import occupancy_grid
 from tests.kernels import highway
-from tests.kernels.traffic import network
+from tests.kernels.traffic import network, on_lane
 
 FEATURES = ("presence", "vx", "vy", "on_road")  # highway-env's default
 
@@ -84,3 +85,20 @@ def test_a_cell_shows_the_smallest_id_and_no_other_level() -> None:
     seen = layers(env, rows, 0, features=("vx",), features_range={"vx": (-10.0, 10.0)})
     assert seen[0, 5, 5] == pytest.approx(np.cos(rows["heading"][0]), abs=1e-6)
     assert np.count_nonzero(seen) == 1
+
+
+@pytest.mark.parametrize("name", ["ring", "grid4x4", "merge"])
+def test_near_lanes_draw_what_all_lanes_draw(name: str) -> None:
+    roads = network(name)
+    settings = SensorsConfig(occupancy_grid=OccupancyGridConfig(features=("on_road",)))
+    rng = np.random.default_rng(0)
+    for lane in rng.integers(0, len(roads.lanes), 20):
+        rows = on_lane(roads, int(lane), 0.3 * float(roads.lanes["length_m"][lane]))
+        drawn = []
+        for lane_grid in (routing.lane_grid(roads), highway.everywhere(roads.arrays)):
+            sensor = occupancy_grid.settings(settings, 0, roads, np.zeros((1, 2)))
+            out = np.zeros(121, np.float32)
+            observe_occupancy(roads.arrays, lane_grid, rows, 0, highway.grid_of(rows), sensor, out)
+            drawn.append(out)
+        np.testing.assert_array_equal(*drawn)
+        assert drawn[0].reshape(11, 11)[4:7, 4:7].any(), "the own lane is on the road"

@@ -26,6 +26,8 @@ _DEFAULT_RANGES = {
     "x": (-200.0, 200.0), "y": (-4.0, 4.0), "vx": (-80.0, 80.0), "vy": (-80.0, 80.0)
 }  # fmt: skip
 
+_RELATIVE = ("x", "y", "vx", "vy")
+
 
 def features(config: SensorsConfig) -> list[Feature]:
     """Row by row; rows without a vehicle are 0."""
@@ -35,8 +37,10 @@ def features(config: SensorsConfig) -> list[Feature]:
         ranges = {}
     found = []
     for row in range(kinematics.vehicles_count):
-        subject = f"vehicle {row}, 0 is the own one"
         for name in kinematics.features:
+            subject = f"vehicle {row}"
+            if name in _RELATIVE and not kinematics.absolute:
+                subject += " (0 itself, others less its own)"
             feature = vehicle_feature(name, f"{name}_{row}", subject, ranges, kinematics.clip)
             if name == "y" and ranges is _DEFAULT_RANGES:
                 feature = replace(feature, scale="4 m · lanes of the widest road")
