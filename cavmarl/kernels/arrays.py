@@ -12,13 +12,6 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from cavmarl.kernels.sensor_arrays import (
-    KinematicsSensor,
-    LidarCells,
-    OccupancyGrid,
-    RoadgraphSensor,
-)
-
 __all__ = ["Demand", "Gate", "LaneGrid", "Outputs", "RoadArrays", "Scratch", "Sensors", "Worlds"]
 
 
@@ -133,10 +126,6 @@ class Sensors(NamedTuple):
     near_row: NDArray[np.int32]  # (neighbors,) room
     near_squared: NDArray[np.float64]
     echoes: NDArray[np.void]  # ECHO (lidar_rays,) room
-    kinematics: KinematicsSensor
-    occupancy: OccupancyGrid
-    lidar_cells: LidarCells
-    roadgraph: RoadgraphSensor
 
 
 class Outputs(NamedTuple):

@@ -125,16 +125,19 @@ def observe_kinematics(
         sensor: settings and room; ranges in the frame of `vehicle_features`.
         out: an observation, zeros from `sensor.at` on.
     """
-    if sensor.vehicles == 0:
-        return
     ego = rows[i]
-    vehicle_features(roads, ego, sensor.destinations, True, sensor.values)
+    vehicle_features(roads.lanes, roads.points, ego, sensor.destinations, True, sensor.values)
     _write(sensor, 0, out)
     found = _find_near(roads, rows, i, grid, sensor)
     for k in range(found):
         other = rows[grid.bodies[sensor.near_body[k]]["row"]]
         vehicle_features(
-            roads, other, sensor.destinations, sensor.observe_intentions, sensor.values
+            roads.lanes,
+            roads.points,
+            other,
+            sensor.destinations,
+            sensor.observe_intentions,
+            sensor.values,
         )
         if not sensor.absolute:
             make_relative(sensor.values, ego)

@@ -150,8 +150,6 @@ def observe_lidar_cells(
         sensor: settings and room.
         out: an observation; 2 · cells numbers from `sensor.at` on are written.
     """
-    if sensor.cells == 0:
-        return
     ego = rows[i]
     ego_cos = math.cos(ego["heading"])
     ego_sin = -math.sin(ego["heading"])

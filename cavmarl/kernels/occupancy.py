@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from cavmarl.kernels import kernel
 from cavmarl.kernels.arrays import LaneGrid, RoadArrays
-from cavmarl.kernels.geometry import lane_pose, project
+from cavmarl.kernels.geometry import project
 from cavmarl.kernels.neighbors import LEVEL_HEIGHT_M, Grid, cell_columns, cell_rows
 from cavmarl.kernels.scalars import clamp
 from cavmarl.kernels.sensor_arrays import OccupancyGrid
@@ -87,21 +87,38 @@ def _draw_lane(
 ) -> None:
     """Mark the cells with waypoints of one lane, as far apart as a cell is wide."""
     row = roads.lanes[lane]
+    reach = sensor.radius_m
+    if (
+        row["min_x"] > ego["x"] + reach
+        or row["max_x"] < ego["x"] - reach
+        or row["min_y"] > ego["y"] + reach
+        or row["max_y"] < ego["y"] - reach
+    ):
+        return
     first, num = row["first_point"], row["num_points"]
     beside, _, _, _ = project(roads.points, first, num, ego["x"], ego["y"])
     spacing = min(sensor.step_x, sensor.step_y)
+    shown = _level(sensor, 1.0)
+    segment = first
     before = -1.0
     for k in range(math.ceil(2.0 * LANE_REACH_M / spacing)):
         s = clamp(beside - LANE_REACH_M + k * spacing, 0.0, row["length_m"])
         if s == before:
             continue
         before = s
-        x, y, z, _, _, _ = lane_pose(roads.points, first, num, s)
-        if abs(z - ego["z"]) > LEVEL_HEIGHT_M:
+        while segment < first + num - 2 and roads.points[segment + 1]["s"] <= s:
+            segment += 1
+        point = roads.points[segment]
+        along = s - point["s"]
+        x = point["x"] + along * point["cos"]
+        y = point["y"] + along * point["sin"]
+        if abs(x - ego["x"]) > reach or abs(y - ego["y"]) > reach:
+            continue
+        if abs(point["z"] + along * point["slope"] - ego["z"]) > LEVEL_HEIGHT_M:
             continue
         cell = _cell(sensor, ego, x, y)
         if cell >= 0:
-            out[at + cell] = _level(sensor, 1.0)
+            out[at + cell] = shown
 
 
 @kernel
@@ -153,8 +170,6 @@ def observe_occupancy(
         sensor: settings and room; cells and ranges in the frame of `vehicle_features`.
         out: an observation, zeros from `sensor.at` on.
     """
-    if sensor.features.size == 0:
-        return
     ego = rows[i]
     num_cells = sensor.num_x * sensor.num_y
     _find_bodies(ego, grid, sensor)
@@ -162,7 +177,7 @@ def observe_occupancy(
         if sensor.cell_body[cell] < 0:
             continue
         shown = rows[grid.bodies[sensor.cell_body[cell]]["row"]]
-        vehicle_features(roads, shown, sensor.destinations, True, sensor.values)
+        vehicle_features(roads.lanes, roads.points, shown, sensor.destinations, True, sensor.values)
         make_relative(sensor.values, ego)
         for layer in range(sensor.features.size):
             feature = sensor.features[layer]

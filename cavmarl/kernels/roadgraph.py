@@ -171,8 +171,6 @@ def observe_roadgraph(row: np.void, sensor: RoadgraphSensor, out: NDArray[np.flo
         sensor: settings, points and room.
         out: an observation, zeros from `sensor.at` on.
     """
-    if sensor.num_points == 0:
-        return
     cos = math.cos(row["heading"])
     sin = math.sin(row["heading"])
     found = nearest_points(row["x"], row["y"], row["z"], sensor)

@@ -6,10 +6,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cavmarl.kernels import kernel
-from cavmarl.kernels.arrays import LaneGrid, Outputs, RoadArrays, Sensors, Worlds
+from cavmarl.kernels.arrays import Outputs, RoadArrays, Sensors, Worlds
 from cavmarl.kernels.codes import DRIVER_AGENT, EVENTS_THAT_END
-from cavmarl.kernels.kinematics_observation import observe_kinematics
-from cavmarl.kernels.lidar_cells import observe_lidar_cells
 from cavmarl.kernels.neighbors import Grid, fill_grid
 from cavmarl.kernels.observing import (
     observe_ego,
@@ -18,9 +16,7 @@ from cavmarl.kernels.observing import (
     observe_route,
     observe_signal,
 )
-from cavmarl.kernels.occupancy import observe_occupancy
-from cavmarl.kernels.roadgraph import observe_roadgraph
-from cavmarl.kernels.stacking import newest_frame, repeat_frame, shift_frames
+from cavmarl.kernels.stacking import has_entered, newest_frame, shift_frames
 from cavmarl.kernels.terms import NUM_TERMS, write_terms
 
 __all__ = ["sense"]
@@ -30,7 +26,6 @@ __all__ = ["sense"]
 def sense(
     roads: RoadArrays,
     plans: NDArray[np.void],
-    lane_grid: LaneGrid,
     worlds: Worlds,
     grid: Grid,
     sensors: Sensors,
@@ -44,12 +39,11 @@ def sense(
     """Write what every agent of the chosen worlds gets, at its own index.
 
     A vehicle that entered during the step has not acted: it is observed, its terms and reward are
-    0, and it does not end.
+    0, and it does not end. `observe_further` and `fill_stacks` complete the observations.
 
     Args:
         roads: the road arrays.
         plans: PLAN (G, L).
-        lane_grid: which lanes lie near a place.
         worlds: committed rows at the end of the step; episode_return of agents' rows is written.
         grid: room for the spatial index of one world.
         sensors: settings and room.
@@ -78,25 +72,19 @@ def sense(
             if row["driver"] != DRIVER_AGENT:
                 continue
             agent = row["agent"]
-            entered = row["departed"] > row["tick"] - ticks_per_step
             seen = outputs.observations[w, agent]
             shift_frames(seen, sensors.stack)
-            _observe(
-                roads,
-                plans,
-                lane_grid,
-                rows,
-                i,
-                grid,
-                worlds.signal_phase[w],
-                sensors,
-                newest_frame(seen, sensors.stack),
-            )
-            if entered:
-                repeat_frame(seen, sensors.stack)
+            out = seen[newest_frame(seen, sensors.stack) :]
+            if sensors.ego:
+                observe_ego(roads, plans, row, out)
+            observe_route(roads, plans, row, sensors, out)
+            observe_neighbors(rows, i, grid, sensors, out)
+            if sensors.signal:
+                observe_signal(roads, plans, row, worlds.signal_phase[w], sensors, out)
+            observe_lidar(rows, i, grid, sensors, out)
             outputs.present[w, agent] = True
             outputs.vehicle_ids[w, agent] = row["id"]
-            if entered:
+            if has_entered(row, ticks_per_step):
                 continue
             write_terms(roads, rows, i, grid, step_s, outputs.terms[w, agent])
             outputs.acted[w, agent] = True
@@ -106,33 +94,6 @@ def sense(
             if not outputs.present[w, agent]:
                 outputs.observations[w, agent] = 0.0
         _reward(worlds, w, weights, team_share, outputs)
-
-
-@kernel
-def _observe(
-    roads: RoadArrays,
-    plans: NDArray[np.void],
-    lane_grid: LaneGrid,
-    rows: NDArray[np.void],
-    i: int,
-    grid: Grid,
-    phase: NDArray[np.int32],
-    sensors: Sensors,
-    out: NDArray[np.float32],
-) -> None:
-    """Write one frame, which is 0 before; sensors that are off write nothing."""
-    row = rows[i]
-    if sensors.ego:
-        observe_ego(roads, plans, row, out)
-    observe_route(roads, plans, row, sensors, out)
-    observe_neighbors(rows, i, grid, sensors, out)
-    if sensors.signal:
-        observe_signal(roads, plans, row, phase, sensors, out)
-    observe_lidar(rows, i, grid, sensors, out)
-    observe_kinematics(roads, rows, i, grid, sensors.kinematics, out)
-    observe_occupancy(roads, lane_grid, rows, i, grid, sensors.occupancy, out)
-    observe_lidar_cells(rows, i, grid, sensors.lidar_cells, out)
-    observe_roadgraph(row, sensors.roadgraph, out)
 
 
 @kernel

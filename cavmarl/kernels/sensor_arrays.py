@@ -1,6 +1,6 @@
-"""Settings, room and tables of the sensors that have more of them than a few numbers.
+"""Settings, room and tables of the sensors that environments switch on for those who ask.
 
-Each one's kernel says what the fields mean; `at` is where the sensor writes in an observation.
+Each one's kernel says what the fields mean; `at` is where the sensor writes in a frame.
 """
 
 from __future__ import annotations
@@ -10,7 +10,14 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["KinematicsSensor", "LidarCells", "OccupancyGrid", "RoadPoints", "RoadgraphSensor"]
+__all__ = [
+    "FurtherSensors",
+    "KinematicsSensor",
+    "LidarCells",
+    "OccupancyGrid",
+    "RoadPoints",
+    "RoadgraphSensor",
+]
 
 
 class KinematicsSensor(NamedTuple):
@@ -88,3 +95,12 @@ class RoadgraphSensor(NamedTuple):
     sorted_point: NDArray[np.int64]  # (N,) room; the answer
     sorted_squared: NDArray[np.float64]
     ring_start: NDArray[np.int64]  # (NUM_RINGS + 1,) room
+
+
+class FurtherSensors(NamedTuple):
+    """All of them; apart from `arrays.Sensors`, as many arrays slow every call that takes them."""
+
+    kinematics: KinematicsSensor
+    occupancy: OccupancyGrid
+    lidar_cells: LidarCells
+    roadgraph: RoadgraphSensor

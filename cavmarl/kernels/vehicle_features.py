@@ -13,7 +13,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cavmarl.kernels import kernel
-from cavmarl.kernels.arrays import RoadArrays
 from cavmarl.kernels.geometry import lane_pose, wrap_angle
 
 __all__ = [
@@ -45,7 +44,8 @@ FEATURE_ON_ROAD = 13
 
 @kernel
 def vehicle_features(
-    roads: RoadArrays,
+    lanes: NDArray[np.void],
+    points: NDArray[np.void],
     row: np.void,
     destinations: NDArray[np.float64],
     intentions: bool,
@@ -54,7 +54,8 @@ def vehicle_features(
     """All features of a vehicle in the world's frame.
 
     Args:
-        roads: the road arrays.
+        lanes: LANE (L,).
+        points: POINT (num_points,).
         row: the vehicle.
         destinations: (G, 2) x and y of each goal in m, our frame.
         intentions: whether the direction to the vehicle's goal is shown; else it is 0.
@@ -79,9 +80,9 @@ def vehicle_features(
         if distance > 0.0:
             out[FEATURE_COS_D] = dx / distance
             out[FEATURE_SIN_D] = -dy / distance
-    lane = roads.lanes[row["lane"]]
+    lane = lanes[row["lane"]]
     _, _, _, lane_cos, lane_sin, _ = lane_pose(
-        roads.points, lane["first_point"], lane["num_points"], row["s"]
+        points, lane["first_point"], lane["num_points"], row["s"]
     )
     out[FEATURE_LONG_OFF] = row["s"]
     out[FEATURE_LAT_OFF] = -row["d"]

@@ -14,11 +14,13 @@ from numpy.typing import NDArray
 from cavmarl.config import TERMS, EnvConfig
 from cavmarl.kernels.arrays import LaneGrid, Outputs, RoadArrays, Scratch, Worlds
 from cavmarl.kernels.neighbors import make_grid
+from cavmarl.kernels.observe_further import observe_further
 from cavmarl.kernels.sense import sense
+from cavmarl.kernels.stacking import fill_stacks
 from cavmarl.kernels.tick import advance, begin_step, resolve, suggest, switch_signals
 from cavmarl.roads.network import RoadNetwork
 from cavmarl.roads.routing import lane_grid
-from cavmarl.shard.sensors import frame_size, sensor_arrays
+from cavmarl.shard.sensors import frame_size, further_arrays, sensor_arrays
 from cavmarl.shard.vehicles import VEHICLE
 
 __all__ = ["Commands", "Shard"]
@@ -58,7 +60,8 @@ class Shard:
         self._plans = plans
         self._lane_grid: LaneGrid = lane_grid(network)
         capacity = config.population.agents + config.population.background
-        self._sensors = sensor_arrays(config.sensors, network, plans)
+        self._sensors = sensor_arrays(config.sensors)
+        self._further = further_arrays(config.sensors, network, plans)
         self._grid = make_grid(network.extent_m, CELL_M, capacity)
         self.scratch = _make_scratch(len(network.lanes), len(network.links), capacity)
         self.worlds = _make_worlds(num_worlds, capacity, len(network.signals))
@@ -109,7 +112,6 @@ class Shard:
         sense(
             self._roads,
             self._plans,
-            self._lane_grid,
             self.worlds,
             self._grid,
             self._sensors,
@@ -120,6 +122,21 @@ class Shard:
             chosen,
             self.outputs,
         )
+        observations, stack = self.outputs.observations, self._config.sensors.stack
+        if self._further is not None:
+            observe_further(
+                self._roads,
+                self._lane_grid,
+                self.worlds,
+                self._grid,
+                self._further,
+                stack,
+                chosen,
+                observations,
+            )
+        if stack > 1:
+            ticks_per_step = self._config.clock.ticks_per_step
+            fill_stacks(self.worlds, ticks_per_step, stack, chosen, observations)
 
     def suggest(self, out: NDArray[np.float64]) -> None:
         """Write what the built-in driver would do in the agents' place into `out` (W, A, 2)."""

@@ -56,6 +56,8 @@ def roads(env: Any) -> RoadArrays:
         row["first_point"], row["num_points"] = first, len(s)
         row["length_m"] = parts[-1]["s"][-1]
         row["width_m"] = lane.width_at(0.0)
+        row["min_x"], row["min_y"] = corners[:, :2].min(axis=0)
+        row["max_x"], row["max_y"] = corners[:, :2].max(axis=0)
         first += len(s)
     empty: Any = np.zeros(0, np.int32)
     return RoadArrays(np.concatenate(parts), rows, *([empty] * 7))

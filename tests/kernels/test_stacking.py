@@ -12,8 +12,8 @@ def test_frames_move_up_and_the_newest_is_last(stack: int) -> None:
     frames = [np.full(3, k, np.float32) for k in range(1, 8)]
     for k, frame in enumerate(frames):
         shift_frames(observation, stack)
-        assert not newest_frame(observation, stack).any()
-        newest_frame(observation, stack)[:] = frame
+        assert not observation[newest_frame(observation, stack) :].any()
+        observation[newest_frame(observation, stack) :] = frame
         if k == 0:
             repeat_frame(observation, stack)
         past = [frames[max(k - back, 0)] for back in range(stack - 1, -1, -1)]

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from cavmarl.config import SensorsConfig
 from cavmarl.kernels.arrays import Sensors
+from cavmarl.kernels.sensor_arrays import FurtherSensors
 from cavmarl.roads.network import RoadNetwork
 from cavmarl.shard.sensors import (
     ego,
@@ -26,7 +27,16 @@ from cavmarl.shard.sensors import (
 from cavmarl.shard.sensors.feature import Feature, Sensor
 from cavmarl.shard.sensors.highway import goal_places
 
-__all__ = ["SENSORS", "Feature", "Sensor", "frame_size", "layout", "reach_m", "sensor_arrays"]
+__all__ = [
+    "SENSORS",
+    "Feature",
+    "Sensor",
+    "frame_size",
+    "further_arrays",
+    "layout",
+    "reach_m",
+    "sensor_arrays",
+]
 
 # In the order of their features in a frame.
 SENSORS: tuple[Sensor, ...] = (
@@ -52,6 +62,9 @@ SENSORS: tuple[Sensor, ...] = (
     Sensor("roadgraph", roadgraph.features, roadgraph.reach_m, roadgraph.shape),
 )
 
+# Those that `observe_further` writes.
+FURTHER = frozenset(("kinematics", "occupancy_grid", "lidar_observation", "roadgraph"))
+
 
 def layout(config: SensorsConfig) -> dict[str, slice]:
     """Where each sensor's features lie in a frame; sensors that are off are left out."""
@@ -75,19 +88,18 @@ def reach_m(config: SensorsConfig) -> float:
     return max(sensor.reach_m(config) for sensor in SENSORS)
 
 
-def sensor_arrays(config: SensorsConfig, network: RoadNetwork, plans: NDArray[np.void]) -> Sensors:
-    """The settings, the tables and the room that the sensing kernels take.
-
-    Args:
-        config: the sensors.
-        network: the roads.
-        plans: PLAN (G, L).
-    """
+def _starts(config: SensorsConfig) -> dict[str, int]:
+    """Where each sensor begins in a frame; 0 for those that are off."""
     places = layout(config)
-    unused = slice(0, 0)
-    starts = {sensor.name: places.get(sensor.name, unused).start for sensor in SENSORS}
-    shows_goals = bool(config.kinematics.vehicles_count or config.occupancy_grid.features)
-    goals = goal_places(network, plans if shows_goals else plans[:0])
+    return {
+        sensor.name: places[sensor.name].start if sensor.name in places else 0 for sensor in SENSORS
+    }
+
+
+def sensor_arrays(config: SensorsConfig) -> Sensors:
+    """The settings and the room that `sense` takes."""
+    places = layout(config)
+    starts = _starts(config)
     return Sensors(
         stack=config.stack,
         ego="ego" in places,
@@ -106,9 +118,27 @@ def sensor_arrays(config: SensorsConfig, network: RoadNetwork, plans: NDArray[np
         lidar_speeds=config.lidar.speeds,
         rays=lidar.directions(config),
         echoes=lidar.room(config),
+        **neighbors.room(config),
+    )
+
+
+def further_arrays(
+    config: SensorsConfig, network: RoadNetwork, plans: NDArray[np.void]
+) -> FurtherSensors | None:
+    """What `observe_further` takes; None if all of its sensors are off.
+
+    Args:
+        config: the sensors.
+        network: the roads.
+        plans: PLAN (G, L).
+    """
+    if FURTHER.isdisjoint(layout(config)):
+        return None
+    starts = _starts(config)
+    goals = goal_places(network, plans)
+    return FurtherSensors(
         kinematics=kinematics.settings(config, starts["kinematics"], network, goals),
         occupancy=occupancy_grid.settings(config, starts["occupancy_grid"], network, goals),
         lidar_cells=lidar_observation.settings(config, starts["lidar_observation"]),
         roadgraph=roadgraph.settings(config, starts["roadgraph"], network),
-        **neighbors.room(config),
     )
