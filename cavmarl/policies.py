@@ -21,7 +21,6 @@ from pettingzoo import ParallelEnv
 
 from cavmarl.cav_env import CavEnv
 from cavmarl.config import EnvConfig, SensorsConfig
-from cavmarl.config_io import dotted_keys
 from cavmarl.errors import PolicyError, require
 from cavmarl.registry import agent_entries
 from cavmarl.spaces import flat_observation, flat_observation_space, observation_parts
@@ -213,6 +212,8 @@ def _load_network_policy(folder: Path, env: Environment) -> NetworkPolicy:
 
 def _differences(config: NetworkConfig, here: EnvConfig) -> dict[str, tuple[Any, Any]]:
     """Keys that make observations or actions mean something else: (in training, here)."""
+    from cavmarl.config_io import dotted_keys  # pydantic is slow to import
+
     kind = config.action.kind
     scales = {
         "continuous": ("acceleration_mps2", "steering_rad"),

@@ -1,7 +1,7 @@
 """The sensors: what each adds to an observation, and how far it looks.
 
-One file a sensor; a new one is a file here, a function in `kernels/observing.py` that writes its
-numbers, and its line in `SENSORS`.
+One file a sensor; a new one is a file here, a kernel that writes its numbers, which `kernels/sense`
+or, if most environments leave it off, `kernels/observe_further` calls, and its line in `SENSORS`.
 """
 
 from __future__ import annotations
