@@ -98,7 +98,7 @@ class RoadgraphSensor(NamedTuple):
 
 
 class FurtherSensors(NamedTuple):
-    """All of them; apart from `arrays.Sensors`, as many arrays slow every call that takes them."""
+    """All of them; apart from `arrays.Sensors`, so that `sense` need not unpack what is off."""
 
     kinematics: KinematicsSensor
     occupancy: OccupancyGrid
