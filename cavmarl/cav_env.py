@@ -21,8 +21,13 @@ from cavmarl.render.view import WorldView
 from cavmarl.roads.network import RoadNetwork
 from cavmarl.runtime.simulation import Simulation
 from cavmarl.seeds import check_seed, first_seed
-from cavmarl.shard.sensors import layout
-from cavmarl.spaces import action_space, observation_space, state_space
+from cavmarl.spaces import (
+    action_space,
+    named_observation,
+    observation_parts,
+    observation_space,
+    state_space,
+)
 from cavmarl.state import global_state
 from cavmarl.traffic.demand import DemandFile
 from cavmarl.worlds import check_agents, check_placement, load_world
@@ -35,7 +40,7 @@ RENDER_MODES = ("human", "rgb_array")
 _ABSENT = dict.fromkeys((*TERMS, "active", "vehicle_done", "vehicle_id"), 0.0)
 _ACTIVE = _ABSENT | {"active": 1.0}
 
-Observation = NDArray[np.float32] | dict[str, NDArray[np.float32]]
+Observation = NDArray[np.float32] | dict[str, NDArray[Any]]
 
 
 def parallel_env(
@@ -133,7 +138,10 @@ class CavEnv(ParallelEnv[str, Any, Any]):  # type: ignore[misc] # PettingZoo is 
         self.observation_spaces = dict.fromkeys(self.possible_agents, one_observation)
         self.action_spaces = dict.fromkeys(self.possible_agents, one_action)
         self._seats = config.population.mode == "seats"
-        self._places = layout(config.sensors) if config.observation.kind == "dict" else None
+        self._stack = config.sensors.stack
+        self._parts = (
+            observation_parts(config.sensors) if config.observation.kind == "dict" else None
+        )
         self._simulation = Simulation(config, network, demand=demand)
         self._decoder = ActionDecoder(config.action, 1, self.possible_agents)
         self._first_seed = None if seed is None else check_seed(seed)
@@ -272,11 +280,12 @@ class CavEnv(ParallelEnv[str, Any, Any]):  # type: ignore[misc] # PettingZoo is 
 
     def _observations(self) -> dict[str, Observation]:
         found = self._simulation.outputs.observations[0].copy()[self._listed]
-        if self._places is None:
+        if self._parts is None:
             return dict(zip(self.agents, found, strict=True))
+        named = named_observation(self._parts, found.reshape(len(found), self._stack, -1))
         return {
-            agent: {name: row[place] for name, place in self._places.items()}
-            for agent, row in zip(self.agents, found, strict=True)
+            agent: {name: part[k] for name, part in named.items()}
+            for k, agent in enumerate(self.agents)
         }
 
     def _infos(self) -> dict[str, dict[str, float]]:

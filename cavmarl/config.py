@@ -12,21 +12,19 @@ from dataclasses import dataclass, field
 from itertools import pairwise
 from typing import Literal
 
-from cavmarl.errors import ConfigError
+from cavmarl.config_checks import check as _check
+from cavmarl.config_checks import check_finite as _check_finite
+from cavmarl.config_sensors import SensorsConfig
 
 __all__ = [
     "TERMS",
     "ActionConfig",
     "ClockConfig",
     "EnvConfig",
-    "LidarConfig",
     "MapConfig",
-    "NeighborsConfig",
     "ObservationConfig",
     "PopulationConfig",
-    "RouteAheadConfig",
     "SensorsConfig",
-    "SignalAheadConfig",
     "TermsConfig",
     "TrafficConfig",
     "ZonesConfig",
@@ -45,21 +43,6 @@ TERMS = (
     "arrival",
     "delay",
 )
-
-
-def _check(holds: bool, key: str, value: object, expected: str) -> None:
-    """Raise a ConfigError that names key, value and expectation unless `holds`."""
-    if not holds:
-        raise ConfigError(f"{key} = {value!r}: {expected}")
-
-
-def _check_finite(key: str, value: float, low: float, high: float) -> None:
-    _check(
-        math.isfinite(value) and low <= value <= high,
-        key,
-        value,
-        f"must be a number from {low:g} to {high:g}",
-    )
 
 
 @dataclass(frozen=True)
@@ -259,83 +242,6 @@ class ActionConfig:
             speeds,
             "must be at least two rising speeds from 0 to 60",
         )
-
-
-@dataclass(frozen=True)
-class RouteAheadConfig:
-    """Points of the route ahead, in the ego frame.
-
-    Attributes:
-        points: how many; 0 switches the sensor off.
-        spacing_m: way between one and the next.
-    """
-
-    points: int = 8
-    spacing_m: float = 6.0
-
-    def __post_init__(self) -> None:
-        _check(0 <= self.points <= 64, "sensors.route.points", self.points, "must be from 0 to 64")
-        _check_finite("sensors.route.spacing_m", self.spacing_m, 0.5, 100.0)
-
-
-@dataclass(frozen=True)
-class NeighborsConfig:
-    """The nearest vehicles, in the ego frame.
-
-    Attributes:
-        count: how many at most; 0 switches the sensor off.
-        range_m: distance up to which a vehicle is seen.
-    """
-
-    count: int = 8
-    range_m: float = 60.0
-
-    def __post_init__(self) -> None:
-        _check(0 <= self.count <= 64, "sensors.neighbors.count", self.count, "must be from 0 to 64")
-        _check_finite("sensors.neighbors.range_m", self.range_m, 1.0, 300.0)
-
-
-@dataclass(frozen=True)
-class SignalAheadConfig:
-    """The next signal or duty to give way on the route.
-
-    Attributes:
-        range_m: how far ahead it is seen.
-    """
-
-    range_m: float = 80.0
-
-    def __post_init__(self) -> None:
-        _check_finite("sensors.signal.range_m", self.range_m, 1.0, 300.0)
-
-
-@dataclass(frozen=True)
-class LidarConfig:
-    """Distances around the vehicle.
-
-    Attributes:
-        rays: how many, equally spaced; 0 switches the sensor off.
-        range_m: how far a ray reaches.
-        speeds: adds the relative speed of what each ray hits.
-    """
-
-    rays: int = 64
-    range_m: float = 60.0
-    speeds: bool = False
-
-    def __post_init__(self) -> None:
-        _check(0 <= self.rays <= 1024, "sensors.lidar.rays", self.rays, "must be from 0 to 1024")
-        _check_finite("sensors.lidar.range_m", self.range_m, 1.0, 300.0)
-
-
-@dataclass(frozen=True)
-class SensorsConfig:
-    """The sensors of every agent; 0 points, neighbours or rays switch one off."""
-
-    route: RouteAheadConfig = field(default_factory=RouteAheadConfig)
-    neighbors: NeighborsConfig = field(default_factory=NeighborsConfig)
-    signal: SignalAheadConfig = field(default_factory=SignalAheadConfig)
-    lidar: LidarConfig = field(default_factory=LidarConfig)
 
 
 @dataclass(frozen=True)

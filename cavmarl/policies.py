@@ -11,7 +11,7 @@ import importlib.util
 import inspect
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
-from dataclasses import asdict
+from operator import attrgetter
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -20,10 +20,10 @@ from numpy.typing import NDArray
 from pettingzoo import ParallelEnv
 
 from cavmarl.cav_env import CavEnv
-from cavmarl.config import EnvConfig
+from cavmarl.config import EnvConfig, SensorsConfig
 from cavmarl.errors import PolicyError, require
 from cavmarl.registry import agent_entries
-from cavmarl.spaces import flat_observation_space
+from cavmarl.spaces import flat_observation, flat_observation_space, observation_parts
 from cavmarl.vector_env import CavVectorEnv
 
 if TYPE_CHECKING:
@@ -73,13 +73,15 @@ class Policy(ABC):
         index = {agent: k for k, agent in enumerate(env.possible_agents)}
         live = [agent for agent in env.agents if agent in observations]
         size = flat_observation_space(env.config).shape[0]
+        parts = observation_parts(env.config.sensors)
         batch = np.zeros((1, len(index), size), dtype=np.float32)
         mask = np.zeros((1, len(index)), dtype=np.bool_)
         for agent in live:
             seen = observations[agent]
-            # The parts of a Dict observation stand in the order of their places in the flat one.
             batch[0, index[agent]] = (
-                np.concatenate(list(seen.values())) if isinstance(seen, Mapping) else seen
+                flat_observation(parts, seen, env.config.sensors.stack)
+                if isinstance(seen, Mapping)
+                else seen
             )
             mask[0, index[agent]] = True
         actions = self.act_batch(batch, mask)[0]
@@ -210,6 +212,8 @@ def _load_network_policy(folder: Path, env: Environment) -> NetworkPolicy:
 
 def _differences(config: NetworkConfig, here: EnvConfig) -> dict[str, tuple[Any, Any]]:
     """Keys that make observations or actions mean something else: (in training, here)."""
+    from cavmarl.config_io import dotted_keys  # pydantic is slow to import
+
     kind = config.action.kind
     scales = {
         "continuous": ("acceleration_mps2", "steering_rad"),
@@ -220,9 +224,9 @@ def _differences(config: NetworkConfig, here: EnvConfig) -> dict[str, tuple[Any,
         there, ours = getattr(config.action, key), getattr(here.action, key)
         if there != ours:
             found[f"action.{key}"] = (there, ours)
-    sensors_there, sensors_here = asdict(config.sensors), asdict(here.sensors)
-    for sensor, settings in sensors_there.items():
-        for key, value in settings.items():
-            if sensors_here[sensor][key] != value:
-                found[f"sensors.{sensor}.{key}"] = (value, sensors_here[sensor][key])
+    for key in dotted_keys(SensorsConfig):
+        value = attrgetter(key)
+        there, ours = value(config.sensors), value(here.sensors)
+        if there != ours:
+            found[f"sensors.{key}"] = (there, ours)
     return found

@@ -175,9 +175,7 @@ def resolve_demand(config: EnvConfig, base_dir: Path) -> list[Path]:
 
 def resolve_programs(config: EnvConfig, base_dir: Path) -> list[Path]:
     """The files that `map.programs` means; arguments and errors as for `resolve_map`."""
-    return [
-        _resolve("map.programs", source, base_dir, MapError) for source in config.map.programs
-    ]
+    return [_resolve("map.programs", source, base_dir, MapError) for source in config.map.programs]
 
 
 def _resolve(key: str, source: str, base_dir: Path, failure: type[CavmarlError]) -> Path:

@@ -83,7 +83,7 @@ def make_vec(
         max_cycles=max_cycles,
         overrides=overrides,
     )
-    return CavVectorEnv(config, network, int(num_envs), seed=seed)
+    return CavVectorEnv(config, network, int(num_envs), demand, seed=seed)
 
 
 class CavVectorEnv:

@@ -135,14 +135,17 @@ class Scratch(NamedTuple):
 
 
 class Sensors(NamedTuple):
-    """What the agents' sensors are set to, and where each writes in an observation."""
+    """What the agents' sensors are set to, and where each writes in a frame."""
 
+    stack: int  # frames in an observation
+    ego: bool  # whether it is on; it writes at 0
     route_at: int
     route_points: int
     route_spacing_m: float
     neighbors_at: int
     neighbors: int
     neighbors_range_m: float
+    signal: bool
     signal_at: int
     signal_range_m: float
     lidar_at: int
@@ -158,10 +161,11 @@ class Sensors(NamedTuple):
 class Outputs(NamedTuple):
     """What agents get at the end of a step, at their own index; absent agents have zeros.
 
-    T is the number of terms, D the size of a flat observation.
+    T is the number of terms, D the size of a flat observation. What an agent saw before is kept
+    here and nowhere else: the frames of a stack move up within `observations`.
     """
 
-    observations: NDArray[np.float32]  # (W, A, D)
+    observations: NDArray[np.float32]  # (W, A, D) the stacked frames, oldest first
     terms: NDArray[np.float32]  # (W, A, T)
     rewards: NDArray[np.float32]  # (W, A)
     terminated: NDArray[np.bool_]  # (W, A) the vehicle ended in this step

@@ -56,7 +56,7 @@ def _look_ahead_m(kind: np.void, speed: float) -> float:
         way = 15.0 + speed * (1.0 + kind["tau"]) + 0.5 * speed * speed / kind["decel"]
     else:
         way = 30.0 + 2.0 * speed + 0.2 * speed * speed
-    return min(way, LOOK_AHEAD_M)
+    return float(min(way, LOOK_AHEAD_M))
 
 
 @kernel
@@ -195,7 +195,10 @@ def _road_ahead(
     # any more once the leader has passed it.
     if k + 1 < scratch.lane_end[lane]:
         leader = scratch.entries[k + 1]
-        press = max(press, _behind_entry(kind, speed, leader["s"] - row["s"] - half - leader["half"], leader))
+        press = max(
+            press,
+            _behind_entry(kind, speed, leader["s"] - row["s"] - half - leader["half"], leader),
+        )
         look = min(look, half + 5.0 + speed + 0.5 * speed * speed / kind["decel"])
     way = row["way"]
     while distance < look:
@@ -233,9 +236,7 @@ def _road_ahead(
 
 
 @kernel
-def _beside(
-    roads: RoadArrays, kind: np.void, row: np.void, lane: int, scratch: Scratch
-) -> float:
+def _beside(roads: RoadArrays, kind: np.void, row: np.void, lane: int, scratch: Scratch) -> float:
     """How the leader on a neighbour lane presses that the body covers, or is about to."""
     s = row["s"] * roads.lanes[lane]["length_m"] / roads.lanes[row["lane"]]["length_m"]
     j = ahead_on(scratch, lane, s, row["id"])

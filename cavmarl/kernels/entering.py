@@ -102,7 +102,7 @@ def entry_place(
     tick: int,
     scratch: Scratch,
 ) -> float:
-    """Where on its lane the centre of a departure enters, in m: with its whole body on the lane."""
+    """Where on its lane the centre of a departure enters, in m: its whole body is on the lane."""
     length = roads.lanes[lane]["length_m"]
     half = 0.5 * kind["length"]
     most = max(length - half, half)
@@ -120,14 +120,14 @@ def entry_place(
             s = last["s"] - last["half"] - kind["min_gap"] - half
     else:
         s = half + (most - half) * uniform(key, departure["id"], tick, STREAM_PLACE)
-    return min(max(s, half), most, length)
+    return float(min(max(s, half), most, length))
 
 
 @kernel
 def speed_at(roads: RoadArrays, kind: np.void, lane: int, s: float, wanted: float) -> float:
     """At most `wanted`, at most the machine's, and slow before the end of the lane."""
     rest = max(roads.lanes[lane]["length_m"] - s - 0.5 * kind["length"] - 2.0, 0.0)
-    return min(wanted, kind["max_speed"], math.sqrt(2.0 * ENTER_DECEL * rest))
+    return float(min(wanted, kind["max_speed"], math.sqrt(2.0 * ENTER_DECEL * rest)))
 
 
 @kernel

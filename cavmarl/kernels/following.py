@@ -109,7 +109,8 @@ def speed_behind(kind: np.void, gap: float, front_speed: float, front_decel: flo
     room = gap - kind["min_gap"]
     if room <= 0.0:
         return 0.0
-    return max(0.5 * scale * (math.sqrt(linear * linear + 4.0 * room / scale) - linear), 0.0)
+    root = math.sqrt(linear * linear + 4.0 * room / scale)
+    return float(max(0.5 * scale * (root - linear), 0.0))
 
 
 @kernel
@@ -129,6 +130,6 @@ def response(
     if kind["model"] == MODEL_KRAUSS:
         wanted = min(-press, allowed, speed + kind["accel"] * dt)
         wanted = dawdle(max(wanted, 0.0), kind["accel"], kind["sigma"], share, dt)
-        return max((wanted - speed) / dt, -kind["emergency_decel"])
+        return float(max((wanted - speed) / dt, -kind["emergency_decel"]))
     accel = idm_free(speed, allowed, kind["accel"]) - press
     return clamp(accel, -ACCEL_LIMIT, ACCEL_LIMIT)

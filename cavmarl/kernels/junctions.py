@@ -30,7 +30,7 @@ from cavmarl.kernels.codes import (
     SIGNAL_YELLOW_MAJOR,
     SIGNAL_YELLOW_MINOR,
 )
-from cavmarl.kernels.following import before_line, behind, no_press
+from cavmarl.kernels.following import before_line, no_press
 from cavmarl.kernels.lanes import last_on
 
 __all__ = [
@@ -128,7 +128,8 @@ def _foe_blocks(
     if front <= 0.0 and conflict["foe_enter_m"] >= wait_m:
         front += wait_m + WAIT_SLACK_M
     if front <= 0.0:
-        return cleared + 0.5 * GAP_S > time_in
+        inside: bool = cleared + 0.5 * GAP_S > time_in
+        return inside
     committed = foe["speed"] * foe["speed"] > 2.0 * HARD_STOP * max(front, 0.01)
     if not committed:
         if not (gives_way and conflict["must_yield"]):
@@ -138,7 +139,9 @@ def _foe_blocks(
     if cleared + GAP_S < time_in:
         return False
     foe_limit = roads.lanes[roads.links[foe["link"]]["from_lane"]]["speed_mps"]
-    arrives = _earliest(foe["dist"] + conflict["foe_enter_m"] - foe["half"], foe["speed"], foe_limit)
+    arrives = _earliest(
+        foe["dist"] + conflict["foe_enter_m"] - foe["half"], foe["speed"], foe_limit
+    )
     return arrives < time_out + GAP_S
 
 
@@ -284,9 +287,7 @@ def press_inside(
         signal = link_signal(roads, link, phase)
         gives_way = signal != SIGNAL_GREEN_MAJOR and signal != SIGNAL_OFF
         hold = HOLD_NONE
-        if _blocked_by_foes(
-            roads, rows, i, link, -place, wait_m, True, gives_way, phase, scratch
-        ):
+        if _blocked_by_foes(roads, rows, i, link, -place, wait_m, True, gives_way, phase, scratch):
             hold = HOLD_YIELD
         elif _exit_blocked(roads, row, link, scratch):
             hold = HOLD_EXIT_BLOCKED
@@ -299,7 +300,9 @@ def press_inside(
         if to_area < 0.0:
             continue
         foe_link = roads.links[conflict["foe"]]
-        for k in range(scratch.link_start[conflict["foe"]], scratch.link_start[conflict["foe"] + 1]):
+        for k in range(
+            scratch.link_start[conflict["foe"]], scratch.link_start[conflict["foe"] + 1]
+        ):
             foe = scratch.approach[k]
             foe_place = -foe["dist"]
             if foe_place < 0.0 or foe_place - foe["half"] > conflict["foe_leave_m"]:

@@ -16,6 +16,7 @@ from cavmarl.kernels.observing import (
     observe_route,
     observe_signal,
 )
+from cavmarl.kernels.stacking import has_entered, newest_frame, shift_frames
 from cavmarl.kernels.terms import NUM_TERMS, write_terms
 
 __all__ = ["sense"]
@@ -38,7 +39,7 @@ def sense(
     """Write what every agent of the chosen worlds gets, at its own index.
 
     A vehicle that entered during the step has not acted: it is observed, its terms and reward are
-    0, and it does not end.
+    0, and it does not end. `observe_further` and `fill_stacks` complete the observations.
 
     Args:
         roads: the road arrays.
@@ -58,7 +59,6 @@ def sense(
         if not chosen[w]:
             continue
         rows = worlds.rows[w]
-        outputs.observations[w] = 0.0
         outputs.terms[w] = 0.0
         outputs.rewards[w] = 0.0
         outputs.terminated[w] = False
@@ -72,20 +72,27 @@ def sense(
             if row["driver"] != DRIVER_AGENT:
                 continue
             agent = row["agent"]
-            out = outputs.observations[w, agent]
-            observe_ego(roads, plans, row, out)
+            seen = outputs.observations[w, agent]
+            shift_frames(seen, sensors.stack)
+            out = seen[newest_frame(seen, sensors.stack) :]
+            if sensors.ego:
+                observe_ego(roads, plans, row, out)
             observe_route(roads, plans, row, sensors, out)
             observe_neighbors(rows, i, grid, sensors, out)
-            observe_signal(roads, plans, row, worlds.signal_phase[w], sensors, out)
+            if sensors.signal:
+                observe_signal(roads, plans, row, worlds.signal_phase[w], sensors, out)
             observe_lidar(rows, i, grid, sensors, out)
             outputs.present[w, agent] = True
             outputs.vehicle_ids[w, agent] = row["id"]
-            if row["departed"] > row["tick"] - ticks_per_step:
+            if has_entered(row, ticks_per_step):
                 continue
             write_terms(roads, rows, i, grid, step_s, outputs.terms[w, agent])
             outputs.acted[w, agent] = True
             outputs.terminated[w, agent] = row["events"] & EVENTS_THAT_END != 0
             outputs.events[w, agent] = row["events"]
+        for agent in range(outputs.present.shape[1]):
+            if not outputs.present[w, agent]:
+                outputs.observations[w, agent] = 0.0
         _reward(worlds, w, weights, team_share, outputs)
 
 

@@ -27,7 +27,9 @@ def way_to_stop(roads: RoadArrays, travel: Travel, row: np.void) -> float:
     place = roads.lanes[stop["lane"]]
     if place["edge"] != lane["edge"]:
         return np.inf
-    left = float(stop["end"] * lane["length_m"] / place["length_m"] - row["s"] - 0.5 * row["length"])
+    left = float(
+        stop["end"] * lane["length_m"] / place["length_m"] - row["s"] - 0.5 * row["length"]
+    )
     return left if left > -PASSED_M else np.inf
 
 

@@ -122,8 +122,7 @@ def advance(
                 if scratch.link_ahead[i] >= 0 and old["wait_s"] >= STOP_SIGN_S:
                     row["stopped_at"] = scratch.link_ahead[i]
                 move_background(
-                    roads,
-                    travel, old, row, scratch.accel[i], scratch.lane_change[i], dt
+                    roads, travel, old, row, scratch.accel[i], scratch.lane_change[i], dt
                 )
                 continue
             if old["events"] & EVENTS_THAT_END:

@@ -16,13 +16,15 @@ from cavmarl.kernels.approach import APPROACH
 from cavmarl.kernels.arrays import LaneGrid, Outputs, RoadArrays, Scratch, Travel, Worlds
 from cavmarl.kernels.lanes import ENTRY
 from cavmarl.kernels.neighbors import make_grid
+from cavmarl.kernels.observe_further import observe_further
 from cavmarl.kernels.sense import sense
 from cavmarl.kernels.signals import switch_signals
+from cavmarl.kernels.stacking import fill_stacks
 from cavmarl.kernels.tick import advance, begin_step, resolve, suggest
 from cavmarl.roads.network import RoadNetwork
 from cavmarl.roads.routing import lane_grid
 from cavmarl.shard.controllers import CONTROLLER
-from cavmarl.shard.sensors import layout, sensor_arrays
+from cavmarl.shard.sensors import frame_size, further_arrays, sensor_arrays
 from cavmarl.shard.vehicles import VEHICLE
 
 __all__ = ["Commands", "Shard", "make_worlds"]
@@ -71,6 +73,7 @@ class Shard:
         self._travel = travel
         self._lane_grid: LaneGrid = lane_grid(network)
         self._sensors = sensor_arrays(config.sensors)
+        self._further = further_arrays(config.sensors, network, plans)
         self._grid = make_grid(network.extent_m, CELL_M, capacity)
         self.scratch = _make_scratch(len(network.lanes), len(network.links), capacity)
         self.worlds = make_worlds(num_worlds, capacity, network)
@@ -132,6 +135,21 @@ class Shard:
             chosen,
             self.outputs,
         )
+        observations, stack = self.outputs.observations, self._config.sensors.stack
+        if self._further is not None:
+            observe_further(
+                self._roads,
+                self._lane_grid,
+                self.worlds,
+                self._grid,
+                self._further,
+                stack,
+                chosen,
+                observations,
+            )
+        if stack > 1:
+            ticks_per_step = self._config.clock.ticks_per_step
+            fill_stacks(self.worlds, ticks_per_step, stack, chosen, observations)
 
     def suggest(self, out: NDArray[np.float64]) -> None:
         """Write what the built-in driver would do in the agents' place into `out` (W, A, 2)."""
@@ -194,7 +212,7 @@ def _make_scratch(num_lanes: int, num_links: int, capacity: int) -> Scratch:
 
 def _make_outputs(config: EnvConfig, num_worlds: int) -> Outputs:
     agents = (num_worlds, config.population.num_ids)
-    size = max(place.stop for place in layout(config.sensors).values())
+    size = config.sensors.stack * frame_size(config.sensors)
     return Outputs(
         observations=np.zeros((*agents, size), dtype=np.float32),
         terms=np.zeros((*agents, len(TERMS)), dtype=np.float32),

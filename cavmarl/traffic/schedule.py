@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,14 +22,6 @@ __all__ = ["Schedule"]
 
 MAX_STEPS = 50_000_000
 MAX_EDGES = 100_000  # of one way
-
-
-@dataclass(frozen=True)
-class _Way:
-    """A route as one class of vehicles drives it."""
-
-    edges: tuple[int, ...]
-    first_step: int
 
 
 class Schedule:
@@ -95,7 +87,7 @@ class Schedule:
             return named
         found = [np.array([named[0]], dtype=np.int32)]
         room = np.zeros(MAX_EDGES, dtype=np.int32)
-        for start, goal in zip(named[:-1], named[1:], strict=True):
+        for start, goal in pairwise(named):
             number = trace_edges(self._network.arrays, self._plan(int(goal), mask), start, room)
             if number <= 0:
                 names = self._network.edge_ids

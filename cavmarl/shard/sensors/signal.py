@@ -10,6 +10,8 @@ __all__ = ["features", "reach_m"]
 
 def features(config: SensorsConfig) -> list[Feature]:
     """All 0 where no such line is within range."""
+    if not config.signal.enabled:
+        return []
     return [
         Feature("present", "1 if there is a line with a signal or a duty to give way"),
         Feature("distance", "way to the line", f"{config.signal.range_m:g} m"),

@@ -7,13 +7,13 @@ import re
 import numpy as np
 from numpy.typing import NDArray
 
+from cavmarl.kernels.codes import MODEL_IDM
 from cavmarl.roads.network import VEHICLE_CLASSES
 from cavmarl.traffic.demand.element import Element, near
 from cavmarl.traffic.demand.report import DemandReport
 from cavmarl.traffic.vtypes import (
     ALL_PERMISSIONS,
     CLASS_DEFAULTS,
-    MODEL_IDM,
     NEAREST_CLASS,
     NEAREST_MODEL,
     NO_ROAD_CLASSES,
