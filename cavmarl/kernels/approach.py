@@ -87,10 +87,11 @@ def _announce(
     s = row["s"]
     if here["internal"]:
         pairs = _note(scratch, pairs, here["link"], row, i, -(here["link_offset_m"] + s))
-    elif row["link"] >= 0 and s < 0.5 * row["length"]:
-        # Its centre has left the junction, its rear has not.
+    elif row["link"] >= 0:
+        # Its centre has left the junction, its rear has not, or not the fork before it.
         left = roads.links[row["link"]]
-        if left["to_lane"] == lane:
+        rear = s - 0.5 * row["length"]
+        if left["to_lane"] == lane and (rear < 0.0 or left["length_m"] + rear < left["fork_m"]):
             pairs = _note(scratch, pairs, row["link"], row, i, -(left["length_m"] + s))
     scratch.line_link[i] = -1
     reach = min(APPROACH_STANDING_M + APPROACH_S * row["speed"], APPROACH_M)

@@ -35,8 +35,10 @@ from cavmarl.kernels.entering import (
     follower_brakes,
     speed_at,
 )
+from cavmarl.kernels.geometry import boxes_overlap
 from cavmarl.kernels.lanes import index_lanes
 from cavmarl.kernels.motion import place_on_lane
+from cavmarl.kernels.neighbors import LEVEL_HEIGHT_M
 from cavmarl.kernels.rng import (
     STREAM_ORIGIN,
     STREAM_PLACE,
@@ -53,6 +55,7 @@ PLACE_TRIES = 24  # places tried for a vehicle at reset before it has to queue
 PLACE_GAP_M = 10.0  # m between bumpers of vehicles placed at reset
 END_ROOM_M = 12.0  # nobody starts nearer than this to the end of a lane, unless it is shorter
 PLACE_SHARE = 0.7  # of the speed limit, with which vehicles drive that are placed at reset
+ENTER_ROOM_M = 0.3  # free on all sides of a vehicle that enters
 WANDER_M = 150.0  # nearer to its goal than this a vehicle of a closed world picks another
 GOAL_TRIES = 8
 GIVE_UP_S = 10.0  # a driver that waits longer than this to change lanes takes another way
@@ -108,7 +111,6 @@ def _send(roads: RoadArrays, departure: np.void, lane: int, goal: int) -> None:
 def _enter(
     roads: RoadArrays,
     travel: Travel,
-    gate: Gate,
     worlds: Worlds,
     w: int,
     departure: np.void,
@@ -140,11 +142,9 @@ def _enter(
     row["rng_key"] = worlds.keys[w]
     row["departed"] = worlds.ticks[w]
     row["tick"] = worlds.ticks[w]
-    cos, sin = place_on_lane(roads, row)
-    row["heading"] = math.atan2(sin, cos)
+    row["heading"] = place_on_lane(roads, travel, row)
     row["to_go"] = way_left(roads, travel, row)
     row["step_to_go"] = row["to_go"]
-    gate.counts[w, COUNT_DEPARTED] += 1
 
 
 @kernel
@@ -211,7 +211,8 @@ def populate(
                     limit = PLACE_SHARE * roads.lanes[lane]["speed_mps"]
                     speed = speed_at(roads, kind, lane, s, limit)
                     row = worlds.rows[w, num]
-                    _enter(roads, travel, gate, worlds, w, departure, lane, s, speed, row)
+                    _enter(roads, travel, worlds, w, departure, lane, s, speed, row)
+                    gate.counts[w, COUNT_DEPARTED] += 1
                     worlds.num_rows[w] = num + 1
                     worlds.num_owned[w] = num + 1
                     gate.num_queue[w] -= 1
@@ -355,6 +356,39 @@ def call_orders(gate: Gate, worlds: Worlds) -> None:
 
 
 @kernel
+def _touches(rows: NDArray[np.void], i: int) -> bool:
+    """Whether row i, with some room around it, touches one of the rows before it."""
+    own = rows[i]
+    cos = math.cos(own["heading"])
+    sin = math.sin(own["heading"])
+    half_length = 0.5 * own["length"] + ENTER_ROOM_M
+    half_width = 0.5 * own["width"] + ENTER_ROOM_M
+    for j in range(i):
+        other = rows[j]
+        dx = other["x"] - own["x"]
+        dy = other["y"] - own["y"]
+        reach = half_length + half_width + 0.5 * (other["length"] + other["width"])
+        if dx * dx + dy * dy > reach * reach or abs(other["z"] - own["z"]) > LEVEL_HEIGHT_M:
+            continue
+        if boxes_overlap(
+            own["x"],
+            own["y"],
+            cos,
+            sin,
+            half_length,
+            half_width,
+            other["x"],
+            other["y"],
+            math.cos(other["heading"]),
+            math.sin(other["heading"]),
+            0.5 * other["length"],
+            0.5 * other["width"],
+        ):
+            return True
+    return False
+
+
+@kernel
 def _try_to_enter(
     demand: Demand,
     roads: RoadArrays,
@@ -380,10 +414,13 @@ def _try_to_enter(
         return False
     if follower_brakes(roads, travel, rows, departure, kind, lane, s, speed, scratch):
         return False
-    i = worlds.num_owned[w]
+    i = worlds.num_rows[w]
     rows[i] = demand.blank[0]
-    _enter(roads, travel, gate, worlds, w, departure, lane, s, speed, rows[i])
-    worlds.num_owned[w] = i + 1
+    _enter(roads, travel, worlds, w, departure, lane, s, speed, rows[i])
+    if _touches(rows, i):
+        return False
+    gate.counts[w, COUNT_DEPARTED] += 1
+    worlds.num_owned[w] += 1
     worlds.num_rows[w] += 1
     return True
 

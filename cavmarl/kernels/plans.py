@@ -1,7 +1,8 @@
 """Lane-level plans: for one goal, what to do next from every lane of the map.
 
 Dijkstra's algorithm backwards from the goal's lanes over the lane graph. Driving along a lane costs
-the time it takes at the speed limit; a lane change costs a fixed time, and more on a short lane.
+the time it takes at the speed limit; a lane change costs the more time the shorter the lane is, so that it
+is made early and where there is room.
 """
 
 from __future__ import annotations
@@ -18,8 +19,8 @@ from cavmarl.kernels.arrays import RoadArrays
 
 __all__ = ["LANE_CHANGE_COST_S", "change_cost", "plan_goal"]
 
-LANE_CHANGE_COST_S = 5.0  # what a lane change is worth in travel time, s,
-SHORT_LANE_M = 50.0  # and one second more for every metre that the lane is shorter than this
+LANE_CHANGE_COST_S = 5.0  # what a lane change is worth in travel time on a long lane, s;
+LANE_CHANGE_M = 250.0  # twice as much on a lane of this length, which is hardly enough for one
 TURNAROUND = ord("t")
 
 
@@ -57,7 +58,7 @@ def change_cost(roads: RoadArrays, lane: int) -> float:
     """
     if roads.lanes[lane]["internal"]:
         return math.inf
-    return LANE_CHANGE_COST_S + max(SHORT_LANE_M - float(roads.lanes[lane]["length_m"]), 0.0)
+    return LANE_CHANGE_COST_S * (1.0 + LANE_CHANGE_M / float(roads.lanes[lane]["length_m"]))
 
 
 @kernel

@@ -83,12 +83,17 @@ LANE = np.dtype(
             np.float64,
         ),  # arc length of the polyline in the plane: the `s` of its last point
         ("width_m", np.float64),
+        ("stop_back_m", np.float64),  # from the stop line to the end, where paths of others sweep
         ("speed_mps", np.float64),  # speed limit
         ("permissions", np.uint32),  # bit k set: VEHICLE_CLASSES[k] may drive here
         ("first_point", np.int32),  # POINT rows [first_point, first_point + num_points)
         ("num_points", np.int32),  # at least 2
         ("left", np.int32),  # LANE row of the neighbour to the left in the same direction
         ("right", np.int32),
+        ("left_start_m", np.float64),  # where on the left neighbour this lane's start and end lie:
+        ("left_end_m", np.float64),  # places between them are mapped in proportion
+        ("right_start_m", np.float64),
+        ("right_end_m", np.float64),
         (
             "first_link",
             np.int32,
@@ -139,6 +144,7 @@ LINK = np.dtype(
             np.int32,
         ),  # where a vehicle is after the end of from_lane: first_internal, or to_lane
         ("length_m", np.float64),  # of the chain of internal lanes
+        ("fork_m", np.float64),  # of its path that others from the same lane come near
         ("wait_m", np.float64),  # from the stop line to the waiting position inside; inf: none
         ("junction", np.int32),
         ("index", np.int32),  # the link's bit in its junction's request, response and foes
@@ -155,6 +161,7 @@ LINK = np.dtype(
 CONFLICT = np.dtype(
     [
         ("foe", np.int32),  # LINK whose path crosses or merges with this link's path (a `foes` bit)
+        ("merging", np.bool_),  # both lead into one lane
         ("must_yield", np.bool_),  # this link has to give way to the foe (a `response` bit)
         ("enter_m", np.float64),  # where on this link's path the shared area begins and ends,
         ("leave_m", np.float64),  # from the stop line; leave = the whole length where both merge
