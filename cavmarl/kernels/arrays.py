@@ -63,6 +63,7 @@ class Travel(NamedTuple):
     types: NDArray[np.void]  # VTYPE (num_types,), by VEHICLE["vtype"]
     steps: NDArray[np.void]  # PLAN (num_steps,), see `kernels.ways`
     stops: NDArray[np.void]  # STOP (num_stops,), by VEHICLE["stop"]
+    first_detour: int  # PLAN row of the first goal of demand vehicles that take another way
     begin_s: float  # the clock of the demand at tick 0
 
 

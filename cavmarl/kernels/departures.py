@@ -17,6 +17,7 @@ from cavmarl.kernels.codes import (
     COUNT_ARRIVED,
     COUNT_DEPARTED,
     COUNT_REMOVED,
+    COUNT_REROUTED,
     DRIVER_AGENT,
     DRIVER_BACKGROUND,
     EVENT_ARRIVED,
@@ -58,6 +59,7 @@ PLACE_SHARE = 0.7  # of the speed limit, with which vehicles drive that are plac
 ENTER_ROOM_M = 0.3  # free on all sides of a vehicle that enters
 WANDER_M = 150.0  # nearer to its goal than this a vehicle of a closed world picks another
 GOAL_TRIES = 8
+REROUTE_S = 45.0  # one on a route so long
 GIVE_UP_S = 10.0  # a driver that waits longer than this to change lanes takes another way
 
 
@@ -225,11 +227,18 @@ def _needs_goal(demand: Demand, roads: RoadArrays, travel: Travel, row: np.void)
 
     Stuck is who has stood for `GIVE_UP_S` at the end of a lane that its way does not follow.
     """
-    if row["driver"] != DRIVER_BACKGROUND or row["order"] >= 0:
+    if row["driver"] != DRIVER_BACKGROUND:
         return False
+    if row["order"] >= 0:
+        return row["goal"] >= 0 and _is_stuck(roads, travel, row, REROUTE_S)
     if not demand.reenter and row["to_go"] <= WANDER_M:
         return True
-    if row["wait_s"] <= GIVE_UP_S or roads.lanes[row["lane"]]["internal"]:
+    return _is_stuck(roads, travel, row, GIVE_UP_S)
+
+
+@kernel
+def _is_stuck(roads: RoadArrays, travel: Travel, row: np.void, patience_s: float) -> bool:
+    if row["wait_s"] <= patience_s or roads.lanes[row["lane"]]["internal"]:
         return False
     step = travel.steps[row["way"] + row["lane"]]
     stuck: bool = step["next"] < 0 and step["change"] != 0
@@ -237,8 +246,26 @@ def _needs_goal(demand: Demand, roads: RoadArrays, travel: Travel, row: np.void)
 
 
 @kernel
+def _take_detour(roads: RoadArrays, travel: Travel, row: np.void) -> bool:
+    """Send a vehicle of the demand file on to its goal without the lane change it waits for."""
+    way = travel.first_detour + row["goal"] * roads.lanes.shape[0]
+    step = travel.steps[way + row["lane"]]
+    if step["next"] < 0 or way == row["way"]:
+        return False
+    row["way"] = way
+    row["leg"] += 1
+    row["to_go"] = step["to_go"] - row["s"]
+    return True
+
+
+@kernel
 def choose_goals(
-    demand: Demand, roads: RoadArrays, travel: Travel, num_goals: int, worlds: Worlds
+    demand: Demand,
+    roads: RoadArrays,
+    travel: Travel,
+    num_goals: int,
+    gate: Gate,
+    worlds: Worlds,
 ) -> None:
     """Give the background vehicles of `next_rows` that need it another goal, if one is in reach."""
     for w in range(worlds.ticks.shape[0]):
@@ -247,6 +274,9 @@ def choose_goals(
             if not _needs_goal(demand, roads, travel, row):
                 continue
             lane = row["lane"]
+            if row["order"] >= 0:
+                gate.counts[w, COUNT_REROUTED] += _take_detour(roads, travel, row)
+                continue
             if roads.lanes[lane]["internal"]:
                 continue
             for attempt in range(GOAL_TRIES):

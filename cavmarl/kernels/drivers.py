@@ -25,7 +25,7 @@ from cavmarl.kernels.following import (
     response,
     wish,
 )
-from cavmarl.kernels.junctions import may_enter, press_inside
+from cavmarl.kernels.junctions import may_enter, press_inside, waits_inside
 from cavmarl.kernels.lane_choice import LOOK_BACK_M, SIDE_GAP_M, choose_lane, needed_change
 from cavmarl.kernels.lanes import ahead_on, behind_on, beside_s, last_on
 from cavmarl.kernels.rng import STREAM_DRIVER, quick_uniform
@@ -159,6 +159,41 @@ def _lane_end(
 
 
 @kernel
+def _at_line(
+    roads: RoadArrays,
+    travel: Travel,
+    rows: NDArray[np.void],
+    i: int,
+    kind: np.void,
+    link: int,
+    distance: float,
+    way: int,
+    phase: NDArray[np.int32],
+    dt: float,
+    scratch: Scratch,
+) -> tuple[float, int, bool]:
+    """How a stop line presses row i, `distance` m ahead of its centre: (press, HOLD_*, it stops)."""
+    row = rows[i]
+    speed = row["speed"]
+    front = distance - 0.5 * row["length"]
+    to_line = front - roads.lanes[roads.links[link]["from_lane"]]["stop_back_m"]
+    if to_line <= 0.0:
+        # Its front is over the line: it does not wait there any more.
+        press, hold = press_inside(
+            roads, travel, rows, i, link, -distance, way, phase, dt, scratch
+        )
+        return press, hold, False
+    hold = may_enter(roads, travel, rows, i, link, distance, way, phase, scratch)
+    if hold != HOLD_NONE:
+        return before_line(kind, speed, to_line, dt), hold, True
+    waits = waits_inside(roads, travel, rows, i, link, distance, way, phase, scratch)
+    if waits != HOLD_NONE:
+        to_wait = front + roads.links[link]["wait_m"]
+        return before_line(kind, speed, to_wait, dt), HOLD_NONE, False
+    return no_press(kind), HOLD_NONE, False
+
+
+@kernel
 def _road_ahead(
     roads: RoadArrays,
     travel: Travel,
@@ -218,24 +253,16 @@ def _road_ahead(
             )
             press = max(press, end)
             break
+        stops = False
         if link >= 0:
-            to_line = distance - half - roads.lanes[before]["stop_back_m"]
-            if to_line < STOP_LINE_M and link_ahead < 0:
-                link_ahead = link
-            if to_line <= 0.0:
-                # Its front is over the line: it does not wait there any more.
-                inside, hold = press_inside(
-                    roads, travel, rows, i, link, -distance, way, phase, dt, scratch
-                )
-                press = max(press, inside)
-                held = HOLD_NONE
-            else:
-                held = may_enter(roads, travel, rows, i, link, distance, way, phase, scratch)
-            if held != HOLD_NONE:
-                hold = held
-                press = max(press, before_line(kind, speed, to_line, dt))
-                break
-            press = max(press, _shared_start(roads, kind, row, before, link, distance, scratch))
+            if distance - half - roads.lanes[before]["stop_back_m"] < STOP_LINE_M:
+                link_ahead = link if link_ahead < 0 else link_ahead
+            fork = _shared_start(roads, kind, row, before, link, distance, scratch)
+            at_line, found, stops = _at_line(
+                roads, travel, rows, i, kind, link, distance, way, phase, dt, scratch
+            )
+            press = max(press, fork, at_line)
+            hold = found if found != HOLD_NONE else hold
         ahead = roads.lanes[lane]
         limit = ahead["speed_mps"] * row["speed_factor"]
         if steered:
@@ -246,6 +273,7 @@ def _road_ahead(
             leader = scratch.entries[j]
             gap = distance + leader["s"] - half - leader["half"]
             press = max(press, _behind_entry(kind, speed, gap, leader))
+        if j >= 0 or stops:
             break
         distance += ahead["length_m"]
     return press, allowed, hold, link_ahead
@@ -264,10 +292,16 @@ def _beside(roads: RoadArrays, kind: np.void, row: np.void, lane: int, scratch: 
     # Beyond the end of that lane, whichever way others have gone there.
     press = no_press(kind)
     for link in range(beside["first_link"], beside["first_link"] + beside["num_links"]):
-        j = last_on(scratch, roads.links[link]["next_lane"], row["id"])
+        distance = beside["length_m"] - s
+        beyond = roads.links[link]["next_lane"]
+        j = last_on(scratch, beyond, row["id"])
+        while j < 0 and roads.lanes[beyond]["internal"]:
+            distance += roads.lanes[beyond]["length_m"]
+            beyond = roads.lanes[beyond]["successor"]
+            j = last_on(scratch, beyond, row["id"])
         if j >= 0:
             leader = scratch.entries[j]
-            gap = beside["length_m"] - s + leader["s"] - half - leader["half"]
+            gap = distance + leader["s"] - half - leader["half"]
             press = max(press, _behind_entry(kind, row["speed"], gap, leader))
     return press
 

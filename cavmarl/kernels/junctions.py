@@ -38,6 +38,7 @@ __all__ = [
     "link_signal",
     "may_enter",
     "press_inside",
+    "waits_inside",
 ]
 
 ENTRY_ACCEL = 2.5  # m/s², how a driver thinks others and itself speed up over a junction
@@ -283,6 +284,34 @@ def may_enter(
 
 
 @kernel
+def waits_inside(
+    roads: RoadArrays,
+    travel: Travel,
+    rows: NDArray[np.void],
+    i: int,
+    link: int,
+    distance: float,
+    way: int,
+    phase: NDArray[np.int32],
+    scratch: Scratch,
+) -> int:
+    """Whether row i has to stop at the waiting position of `link`, if there is one: HOLD_*.
+
+    Arguments as in `may_enter`; the distance is negative inside.
+    """
+    wait_m = roads.links[link]["wait_m"]
+    if wait_m == math.inf:
+        return HOLD_NONE
+    signal = link_signal(roads, link, phase)
+    gives_way = signal != SIGNAL_GREEN_MAJOR and signal != SIGNAL_OFF
+    if _blocked_by_foes(roads, rows, i, link, distance, wait_m, True, gives_way, phase, scratch):
+        return HOLD_YIELD
+    if _exit_blocked(roads, travel, rows[i], link, way, scratch):
+        return HOLD_EXIT_BLOCKED
+    return HOLD_NONE
+
+
+@kernel
 def press_inside(
     roads: RoadArrays,
     travel: Travel,
@@ -323,14 +352,8 @@ def press_inside(
     press = no_press(kind)
     target = roads.links[link]
     wait_m = target["wait_m"]
-    if wait_m < math.inf and front <= wait_m + WAIT_SLACK_M:
-        signal = link_signal(roads, link, phase)
-        gives_way = signal != SIGNAL_GREEN_MAJOR and signal != SIGNAL_OFF
-        hold = HOLD_NONE
-        if _blocked_by_foes(roads, rows, i, link, -place, wait_m, True, gives_way, phase, scratch):
-            hold = HOLD_YIELD
-        elif _exit_blocked(roads, travel, row, link, way, scratch):
-            hold = HOLD_EXIT_BLOCKED
+    if front <= wait_m + WAIT_SLACK_M:
+        hold = waits_inside(roads, travel, rows, i, link, -place, way, phase, scratch)
         if hold != HOLD_NONE:
             return before_line(kind, row["speed"], wait_m - front, dt), hold
     first = target["first_conflict"]

@@ -51,14 +51,14 @@ def _leads_to(roads: RoadArrays, before: int, lane: int) -> bool:
 
 
 @kernel
-def change_cost(roads: RoadArrays, lane: int) -> float:
+def change_cost(roads: RoadArrays, lane: int, weight: float) -> float:
     """Cost in s of leaving a lane sideways: plans change lanes where there is room to.
 
     Inside junctions nobody changes lanes.
     """
     if roads.lanes[lane]["internal"]:
         return math.inf
-    return LANE_CHANGE_COST_S * (1.0 + LANE_CHANGE_M / float(roads.lanes[lane]["length_m"]))
+    return weight * LANE_CHANGE_COST_S * (1.0 + LANE_CHANGE_M / float(roads.lanes[lane]["length_m"]))
 
 
 @kernel
@@ -85,7 +85,12 @@ def _lane_cost(roads: RoadArrays, lane: int, cost: NDArray[np.float64]) -> tuple
 
 @kernel
 def _settle(
-    roads: RoadArrays, lane: int, goal_edge: int, cost: NDArray[np.float64], plan: NDArray[np.void]
+    roads: RoadArrays,
+    lane: int,
+    goal_edge: int,
+    change_weight: float,
+    cost: NDArray[np.float64],
+    plan: NDArray[np.void],
 ) -> None:
     """Write the plan of a lane whose cost, and that of all cheaper lanes, is final."""
     row = roads.lanes[lane]
@@ -101,7 +106,7 @@ def _settle(
     best = through
     change = 0
     beside = -1
-    sideways = change_cost(roads, lane)
+    sideways = change_cost(roads, lane, change_weight)
     if row["left"] >= 0 and cost[row["left"]] + sideways < best:
         best = cost[row["left"]] + sideways
         change = 1
@@ -124,12 +129,19 @@ def _settle(
 
 
 @setup_kernel
-def plan_goal(roads: RoadArrays, goal_edge: int, permission: int, plan: NDArray[np.void]) -> None:
+def plan_goal(
+    roads: RoadArrays,
+    goal_edge: int,
+    permission: int,
+    change_weight: float,
+    plan: NDArray[np.void],
+) -> None:
     """Fill the plan of one goal.
 
     Args:
         roads: the road arrays.
         goal_edge: EDGE row to reach.
+        change_weight: what lane changes cost, over the usual; large: only where nothing else leads.
         permission: bit of LANE["permissions"] that a lane needs.
         plan: PLAN records (L,), written whole. Lanes from which the goal cannot be reached get
             to_go = inf and next = -1.
@@ -159,7 +171,7 @@ def plan_goal(roads: RoadArrays, goal_edge: int, permission: int, plan: NDArray[
         if lane < 0 or settled[lane]:
             continue
         settled[lane] = True
-        _settle(roads, lane, goal_edge, cost, plan)
+        _settle(roads, lane, goal_edge, change_weight, cost, plan)
         row = roads.lanes[lane]
         for k in range(row["first_into"], row["first_into"] + row["num_into"]):
             before = roads.into[k]
@@ -177,7 +189,7 @@ def plan_goal(roads: RoadArrays, goal_edge: int, permission: int, plan: NDArray[
                 continue
             if not roads.lanes[beside]["permissions"] & permission:
                 continue
-            reached = here + change_cost(roads, beside)
+            reached = here + change_cost(roads, beside, change_weight)
             if reached < cost[beside]:
                 cost[beside] = reached
                 heapq.heappush(heap, (reached, np.int64(beside)))
