@@ -7,7 +7,7 @@ import pytest
 from numba.core import config
 from numba.core.errors import NumbaError
 
-from cavmarl.kernels import kernel, setup_kernel
+from cavmarl.kernels import allocating_kernel, kernel
 
 
 def _sum_of_room(size: int) -> float:
@@ -24,5 +24,5 @@ def test_a_kernel_cannot_allocate() -> None:
         kernel(_sum_of_room)(3)
 
 
-def test_a_setup_kernel_can_allocate() -> None:
-    assert setup_kernel(_sum_of_room)(3) == 3.0
+def test_an_allocating_kernel_can_allocate() -> None:
+    assert allocating_kernel(_sum_of_room)(3) == 3.0
