@@ -154,7 +154,7 @@ class Sensors(NamedTuple):
     lidar_range_m: float
     lidar_speeds: bool
     rays: NDArray[np.float64]  # (lidar_rays, 2) directions in the ego frame
-    near_row: NDArray[np.int32]  # (neighbors,) room
+    near_body: NDArray[np.int32]  # (neighbors,) room
     near_squared: NDArray[np.float64]
     echoes: NDArray[np.void]  # ECHO (lidar_rays,) room
 

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from cavmarl.kernels import kernel, setup_kernel
+from cavmarl.kernels import allocating_kernel, kernel
 from cavmarl.kernels.arrays import RoadArrays
 
 __all__ = ["LANE_CHANGE_COST_S", "change_cost", "plan_goal"]
@@ -128,7 +128,7 @@ def _settle(
         step["to_go"] = plan[beside]["to_go"]
 
 
-@setup_kernel
+@allocating_kernel
 def plan_goal(
     roads: RoadArrays,
     goal_edge: int,
