@@ -176,8 +176,8 @@ class CavVectorEnv:
             observations (W, A, D), rewards (W, A), terminations (W, A): the agent's vehicle ended;
             truncations (W, A): the episode was cut at the horizon; and infos: `mask` (W, A) who
             acts next; `acted` (W, A) who acted in this step, so whose reward counts; `terms` (W, A,
-            T) in the order of `config.TERMS`; `arrivals` (W,) vehicles that reached their goal since
-            the reset, agents included; `episode_over` (W,) which worlds were reset;
+            T) in the order of `config.TERMS`; `arrivals` (W,) vehicles that reached their goal
+            since the reset, agents included; `episode_over` (W,) which worlds were reset;
             `final_observations` (W, A, D) before that reset.
 
         Raises:

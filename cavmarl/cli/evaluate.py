@@ -254,7 +254,9 @@ def _change(metric: Metric, found: Difference) -> str:
 
 
 def _figure(value: float) -> str:
-    return f"{value:.2f}" if abs(value) < 100.0 else f"{value:.0f}"
+    """Three digits or so."""
+    decimals = 2 if abs(value) < 10.0 else 1 if abs(value) < 100.0 else 0
+    return f"{value:.{decimals}f}"
 
 
 def _least(driver: PolicyReport, field: str) -> str:

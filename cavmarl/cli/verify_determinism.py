@@ -36,7 +36,7 @@ def verify_determinism(
     settings: Settings = None,
     json_path: JsonPath = None,
 ) -> None:
-    """Drive one world in three fresh processes; exit code 1 and the first difference if there is one."""
+    """Drive one world in three fresh processes; exit code 1 and where they first differ."""
     from cavmarl.evaluate.determinism import verify_determinism as verify
 
     overrides = parse_settings(settings)

@@ -220,14 +220,16 @@ def _first_difference(
     """The smallest id, and of its record the first field; else the first other array and place."""
     one, other = states
 
-    def found(what: str, vehicle: int | None, field: str, values: tuple[Any, Any]) -> Any:
+    def found(
+        what: str, vehicle: int | None, field: str, values: tuple[Any, Any]
+    ) -> FirstDifference:
         return FirstDifference(step, tick, processes, what, vehicle, field, values)
 
     mine, theirs = ({int(row["id"]): row for row in state["vehicles"]} for state in states)
     for vehicle in sorted(mine.keys() | theirs.keys()):
         if vehicle not in mine or vehicle not in theirs:
-            ids = tuple(vehicle if vehicle in rows else None for rows in (mine, theirs))
-            return found("vehicle", vehicle, "id", ids)  # type: ignore[arg-type]
+            one_id, other_id = (vehicle if vehicle in rows else None for rows in (mine, theirs))
+            return found("vehicle", vehicle, "id", (one_id, other_id))
         for name in STATE_FIELDS:
             a, b = mine[vehicle][name], theirs[vehicle][name]
             if a.tobytes() != b.tobytes():

@@ -53,9 +53,7 @@ class Watch:
         worlds = self._vec.simulation.worlds
         locate_agents(worlds.rows, worlds.num_owned, self._recorder.places_m)
 
-    def encounters(
-        self, now_s: float, running: NDArray[np.bool_], mask: NDArray[np.bool_]
-    ) -> None:
+    def encounters(self, now_s: float, running: NDArray[np.bool_], mask: NDArray[np.bool_]) -> None:
         """Take in the traffic after a step, in the `running` worlds (W,); `mask` (W, A) drives."""
         if not self._mirror.size:
             return

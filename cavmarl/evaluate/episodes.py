@@ -210,9 +210,7 @@ class _Part:
             acted = infos["acted"] & running[:, None]
             over = infos["episode_over"] & running
             done = infos["vehicle_done"] & acted
-            self._recorder.add(
-                steps, acted, rewards, infos["terms"], done, over, infos["arrivals"]
-            )
+            self._recorder.add(steps, acted, rewards, infos["terms"], done, over, infos["arrivals"])
             running &= ~over
             steps += 1
             self._watch.encounters(steps * vec.step_s, running, infos["mask"])

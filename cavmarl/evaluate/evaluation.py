@@ -10,6 +10,7 @@ from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from cavmarl.errors import ConfigError, PolicyError
 from cavmarl.evaluate.episodes import Job, Progress, RunData, Speed, drive_run, worlds_at_once
@@ -30,7 +31,9 @@ from cavmarl.seeds import check_seed
 from cavmarl.vector_env import CavVectorEnv
 from cavmarl.worlds import load_world
 
-__all__ = ["evaluate", "load_report", "run_seeds"]
+__all__ = ["evaluate", "load_map", "load_report", "load_tables", "load_tracks", "run_seeds"]
+
+Rows = NDArray[np.void]
 
 MAX_EPISODES = 1_000_000
 MAX_REPEATS = 1000
@@ -107,13 +110,31 @@ def load_report(folder: Path) -> EvaluationReport:
         ManifestError: no closed manifest, or results that it does not know.
     """
     manifest = read_closed(folder)
+    speeds = json.loads((folder / SPEED_FILE).read_text(encoding="utf-8"))
+    timed = {name: tuple(Speed(**run) for run in speeds[name]) for name in manifest["policies"]}
+    return make_report(load_tables(folder), timed, manifest)
+
+
+def load_tables(folder: Path) -> dict[str, tuple[Rows, Rows]]:
+    """TRIP and EPISODE records by policy; raises as `load_report`."""
+    names = read_closed(folder)["policies"]
     trips = read_table(folder / TRIPS_FILE, TRIP)
     episodes = read_table(folder / EPISODES_FILE, EPISODE)
-    speeds = json.loads((folder / SPEED_FILE).read_text(encoding="utf-8"))
-    names = manifest["policies"]
-    tables = {name: (trips.get(name, np.zeros(0, TRIP)), episodes[name]) for name in names}
-    timed = {name: tuple(Speed(**run) for run in speeds[name]) for name in names}
-    return make_report(tables, timed, manifest)
+    return {name: (trips.get(name, np.zeros(0, TRIP)), episodes[name]) for name in names}
+
+
+def load_tracks(folder: Path) -> dict[str, Rows]:
+    """TRACK records of the first episode by policy; raises as `load_report`."""
+    names = read_closed(folder)["policies"]
+    tracks = read_table(folder / TRACKS_FILE, TRACK)
+    return {name: tracks.get(name, np.zeros(0, TRACK)) for name in names}
+
+
+def load_map(folder: Path) -> dict[str, Any]:
+    """What `map_outline` made; raises as `load_report`."""
+    read_closed(folder)
+    outline: dict[str, Any] = json.loads((folder / MAP_FILE).read_text(encoding="utf-8"))
+    return outline
 
 
 def run_seeds(seed: int, repeats: int) -> list[int]:

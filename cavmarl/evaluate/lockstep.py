@@ -39,7 +39,7 @@ def _steps(job: dict[str, Any]) -> Iterator[dict[str, Any]]:
     driver = load_policy(job["policy"], vec)
     observations, infos = vec.reset(seed=job["seed"])
     driver.reset(job["seed"])
-    results = [observations]
+    results: list[NDArray[Any]] = [observations]
     for step in range(job["steps"] + 1):
         yield {
             "step": step,
@@ -67,12 +67,12 @@ def _dump(path: str, vec: CavVectorEnv, results: list[NDArray[Any]]) -> None:
     """Leave everything that the hashes are made of."""
     vehicles = vec.simulation.vehicles()
     names = ("observations", "rewards", "terminations", "truncations", "terms", "actions")
-    np.savez(
-        path,
-        vehicles=vehicles[np.argsort(vehicles["id"])],
-        signals=vec.simulation.signal_phases(),
-        **dict(zip(names, results, strict=False)),
-    )
+    arrays: dict[str, Any] = {
+        "vehicles": vehicles[np.argsort(vehicles["id"])],
+        "signals": vec.simulation.signal_phases(),
+        **dict(zip(names, results, strict=False)),  # after a reset there are observations alone
+    }
+    np.savez(path, **arrays)
     print(json.dumps({"dumped": path}), flush=True)
 
 

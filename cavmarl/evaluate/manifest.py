@@ -160,7 +160,9 @@ def _read(path: Path) -> Document:
     try:
         document = json.loads(path.read_text(encoding="utf-8"))
     except (OSError, ValueError) as error:
-        raise ManifestError(f"{path}: cannot be read ({error}); run the evaluation again") from error
+        raise ManifestError(
+            f"{path}: cannot be read ({error}); run the evaluation again"
+        ) from error
     needed = {"schema", "status", "started", "command", "results_sha256"}
     if not isinstance(document, dict) or not needed <= document.keys():
         raise ManifestError(f"{path}: not a manifest of an evaluation; run it again")

@@ -163,9 +163,7 @@ def make_report(
     return EvaluationReport(policies, len(seeds), manifest["episodes"], seeds, manifest)
 
 
-def _find(
-    metric: Metric, trips: NDArray[np.void], episodes: NDArray[np.void], runs: int
-) -> Found:
+def _find(metric: Metric, trips: NDArray[np.void], episodes: NDArray[np.void], runs: int) -> Found:
     within = tuple(
         within_run(
             metric_values(metric, trips[trips["run"] == r], episodes[episodes["run"] == r]),

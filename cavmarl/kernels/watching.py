@@ -1,4 +1,4 @@
-"""What evaluation reads from the traffic after each step: where agents are, and who just missed whom.
+"""What evaluation reads from the traffic after each step: where agents are, who just missed whom.
 
 A conflict area is the stretch that the paths of two movements over a junction share (a CONFLICT
 row). Post-encroachment time is what passes between the moment at which the first vehicle's rear
@@ -42,7 +42,7 @@ def locate_agents(
 
 @kernel
 def _place_on_link(roads: RoadArrays, row: np.void) -> tuple[int, float]:
-    """The link whose path a vehicle is on, or has just left, and its centre's way from the stop line.
+    """The link that a vehicle is on, or has just left, and its centre's way from the stop line.
 
     (-1, 0) before the stop line and one length behind the junction.
     """
@@ -91,9 +91,9 @@ def watch_encroachments(
 ) -> None:
     """Take in one step: lower the agents' least post-encroachment times where somebody passed.
 
-    First all vehicles leave their mark on the areas that they cover, then each looks at the marks of
-    the other paths: so the order of rows does not matter. Vehicles that are in an area together have
-    a time of 0.
+    First all vehicles leave their mark on the areas that they cover, then each looks at the marks
+    of the other paths: so the order of rows does not matter. Vehicles that are in an area together
+    have a time of 0.
 
     Args:
         roads: the road arrays.
