@@ -35,7 +35,7 @@ __all__ = ["evaluate", "load_map", "load_report", "load_tables", "load_tracks", 
 
 Rows = NDArray[np.void]
 
-MAX_EPISODES = 1_000_000
+MAX_EPISODES = 100_000
 MAX_REPEATS = 1000
 
 TRIPS_FILE = "trips.csv"
