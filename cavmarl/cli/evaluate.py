@@ -220,7 +220,7 @@ def _check_page(html: Path | None) -> None:
 
 def _caption(repeats: int) -> str:
     if repeats > 1:
-        return "mean of the runs ± 95 % interval between runs (SD within a run)"
+        return "mean of the runs, ± or [95 % interval between runs], (SD within a run)"
     return "shares [Wilson's 95 %], means (SD within the run); one run: no interval of means"
 
 
@@ -233,11 +233,11 @@ def _cell(metric: Metric, found: Found) -> str:
     if found.mean is None:
         return number(None)
     parts = [_figure(metric.scale * found.mean)]
-    if found.between_run_ci95 is not None:
-        parts.append(f"±{_figure(metric.scale * (found.between_run_ci95.high - found.mean))}")
-    elif found.interval is not None:
+    if found.interval is not None and metric.share:
         low, high = metric.scale * found.interval.low, metric.scale * found.interval.high
         parts.append(f"[{low:.1f}, {high:.1f}]")
+    elif found.between_run_ci95 is not None:
+        parts.append(f"±{_figure(metric.scale * (found.between_run_ci95.high - found.mean))}")
     if not metric.share and found.within_sd is not None:
         parts.append(f"({_figure(metric.scale * found.within_sd)})")
     return " ".join(parts)

@@ -121,7 +121,8 @@ def _plot_metric(axes: Axes, metric: Metric, report: EvaluationReport) -> None:
             continue
         runs = [metric.scale * run.mean for run in found.within_run if run.mean is not None]
         if report.repeats > 1:
-            axes.plot(runs, [row] * len(runs), "o", color=color, alpha=0.3, markersize=4.0, mew=0)
+            below = [row + 0.25] * len(runs)
+            axes.plot(runs, below, "o", color=color, alpha=0.45, markersize=3.5, mew=0)
         if found.interval is not None:
             ends = [metric.scale * found.interval.low, metric.scale * found.interval.high]
             axes.plot(ends, [row, row], color=color, linewidth=2.2, solid_capstyle="butt")

@@ -174,7 +174,11 @@ def _find(metric: Metric, trips: NDArray[np.void], episodes: NDArray[np.void], r
     means = np.array([run.mean for run in within if run.mean is not None])
     if not means.size:
         return Found(None, None, within)
-    return Found(float(means.mean()), mean_interval(means), within)
+    interval = mean_interval(means)
+    if interval is not None and metric.share:
+        # The t distribution does not know that a share ends at 0 and 1; the mean of shares does.
+        interval = Interval(max(interval.low, 0.0), min(interval.high, 1.0))
+    return Found(float(means.mean()), interval, within)
 
 
 def _difference(mine: Found, first: Found) -> Difference:

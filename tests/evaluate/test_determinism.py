@@ -60,9 +60,7 @@ def test_bad_input_is_refused(tmp_path: Path) -> None:
         verify_determinism("merge", "idn", steps=1)
 
 
-def test_a_process_that_dies_is_reported(
-    tmp_path: Path, capfd: pytest.CaptureFixture[str]
-) -> None:
+def test_a_process_that_dies_is_reported(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
     script = tmp_path / "dying.py"
     script.write_text("import os\n\ndef make_policy(env):\n    os._exit(3)\n")
     with pytest.raises(EvaluationError, match="exit code 3"):

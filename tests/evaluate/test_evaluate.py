@@ -139,6 +139,14 @@ def test_the_interval_between_runs_is_that_of_the_run_means(compared: Path) -> N
     assert found.between_run_ci95.high == pytest.approx(means.mean() + half)
 
 
+def test_an_interval_of_shares_stays_a_share(compared: Path) -> None:
+    for policy in load_report(compared).policies.values():
+        for metric in METRICS:
+            interval = policy[metric.name].between_run_ci95
+            if metric.share and interval is not None:
+                assert 0.0 <= interval.low <= interval.high <= 1.0
+
+
 def test_policies_are_compared_run_by_run(compared: Path) -> None:
     report = load_report(compared)
     assert report["driver"].minus_first == {}
