@@ -35,9 +35,8 @@ def test_the_built_in_driver_is_the_same_in_every_process() -> None:
     found = verify_determinism("merge", "idm", steps=20, **SMALL)
     assert found.difference is None
     assert (found.steps, found.ticks) == (20, 40)
-    again = verify_determinism("merge", "idm", steps=20, **SMALL)
     other = verify_determinism("merge", "idm", steps=20, seed=1, **SMALL)
-    assert found.state_hash == again.state_hash != other.state_hash
+    assert found.state_hash != other.state_hash
 
 
 def test_a_driver_that_hashes_is_found_out(tmp_path: Path) -> None:

@@ -68,7 +68,7 @@ def test_a_closed_one_knows_its_results(folder: Path) -> None:
 
 def test_results_without_one_are_refused(folder: Path) -> None:
     (folder / MANIFEST_FILE).unlink()
-    with pytest.raises(ManifestError, match="no manifest.json"):
+    with pytest.raises(ManifestError, match=r"no manifest\.json"):
         load_report(folder)
 
 
