@@ -7,7 +7,7 @@ from collections.abc import Sequence
 
 import typer
 
-from cavmarl.cli import bench, demo, evaluate, listing, map, verify_determinism, view
+from cavmarl.cli import bench, demo, evaluate, listing, map, suite, verify_determinism, view
 from cavmarl.cli.output import print_error
 from cavmarl.errors import CavmarlError
 
@@ -20,6 +20,7 @@ app = typer.Typer(
 )
 app.command()(evaluate.evaluate)
 app.command()(evaluate.report)
+app.command()(suite.suite)
 app.command()(verify_determinism.verify_determinism)
 app.command()(view.view)
 app.command()(demo.demo)

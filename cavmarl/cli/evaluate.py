@@ -38,6 +38,7 @@ __all__ = [
     "evaluate_showing",
     "progress_bar",
     "report",
+    "report_cell",
     "report_table",
 ]
 
@@ -150,7 +151,7 @@ def report_table(found: EvaluationReport) -> Table:
     drivers = found.policies.values()
     table.add_row("trips", *(str(driver.trips) for driver in drivers))
     for metric in METRICS:
-        cells = [_cell(metric, driver[metric.name]) for driver in drivers]
+        cells = [report_cell(metric, driver[metric.name]) for driver in drivers]
         if not metric.name.startswith("reward_") and set(cells) != {number(None)}:
             table.add_row(_title(metric), *cells)
     table.add_row("world step, ms", *(_least(driver, "step_ms") for driver in drivers))
@@ -228,7 +229,7 @@ def _title(metric: Metric) -> str:
     return f"{metric.label}, {metric.unit}" if metric.unit else metric.label
 
 
-def _cell(metric: Metric, found: Found) -> str:
+def report_cell(metric: Metric, found: Found) -> str:
     """Mean, then its interval between runs or Wilson's, then the SD within a run."""
     if found.mean is None:
         return number(None)

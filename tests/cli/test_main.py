@@ -11,7 +11,17 @@ import pytest
 
 from cavmarl.cli import main
 
-COMMANDS = ("evaluate", "report", "verify-determinism", "view", "demo", "list", "map", "bench")
+COMMANDS = (
+    "evaluate",
+    "report",
+    "suite",
+    "verify-determinism",
+    "view",
+    "demo",
+    "list",
+    "map",
+    "bench",
+)
 QUICK = ("--set", "horizon_s=1", "--agents", "2", "--background", "2")
 
 
@@ -144,6 +154,8 @@ def test_verify_determinism_fails_and_names_the_first_difference(
         (("evaluate", "merge", "--repeats", "0"), "repeats = 0: must be from 1"),
         (("evaluate", "merge", "-p", "idm", "-p", "idm"), "one stands there twice"),
         (("evaluate", "merge", "--html", "/dev/null/x.html"), "/dev/null: cannot be written"),
+        (("suite", "nothing"), "no suite or file 'nothing'"),
+        (("suite", "--maps", "no-folder"), "is no environment and no file in no-folder"),
         (("report", "no-folder"), "no-folder: no manifest.json"),
         (("verify-determinism", "merge", "--steps", "0"), "steps = 0: must be"),
         (("verify-determinism", "merg"), "did you mean merge"),
@@ -198,6 +210,7 @@ def test_a_json_path_is_tried_before_any_work(
     words = {
         "evaluate": ("evaluate", "nowhere"),
         "report": ("report", "nowhere"),
+        "suite": ("suite", "nowhere"),
         "verify-determinism": ("verify-determinism", "nowhere"),
         "view": ("view", "nowhere"),
         "map": ("map", "check", str(network)),
