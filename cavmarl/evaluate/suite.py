@@ -81,11 +81,14 @@ def worlds_of(suite: Suite, maps: Path) -> list[World]:
     """Every map with every number of agents.
 
     Raises:
-        ConfigError: a map is neither an environment nor a file below `maps`.
+        ConfigError: a map is neither an environment nor a file below `maps`, or two have one name.
     """
+    found = {Path(name).name.split(".")[0]: env for name, env in _found(suite, maps)}
+    if len(found) < len(suite.maps):
+        raise ConfigError(f"maps = {suite.maps!r}: two have one name; rename a file")
     return [
-        World(f"{Path(name).name.split('.')[0]}-{agents}", env, agents)
-        for name, env in _found(suite, maps)
+        World(f"{name}-{agents}", env, agents)
+        for name, env in found.items()
         for agents in suite.agents
     ]
 

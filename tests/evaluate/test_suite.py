@@ -50,6 +50,13 @@ def test_every_map_is_driven_with_every_number_of_agents(tmp_path: Path) -> None
         assert load_report(tmp_path / "out" / world.label) == reports[world.label]
 
 
+def test_two_maps_of_one_name_are_refused(tmp_path: Path) -> None:
+    file = tmp_path / "mine.yaml"
+    file.write_text("maps: [merge/map/map.net.xml, ring/map/map.net.xml]\nagents: [1]\n")
+    with pytest.raises(ConfigError, match="two have one name"):
+        worlds_of(load_suite(file), ROOT / "envs")
+
+
 @pytest.mark.parametrize(
     ("text", "message"),
     [
