@@ -111,7 +111,6 @@ def evaluate_showing(
     """`cavmarl.evaluate.evaluate` into a folder, with a progress bar."""
     from cavmarl.evaluate import evaluate as run
 
-    make_folder(out)
     with progress_bar(console) as bar:
         task = bar.add_task(env)
 

@@ -80,7 +80,7 @@ def evaluate(
             done in this run, and the most there can be.
 
     Raises:
-        ConfigError: a number or a key that cannot work.
+        ConfigError: a number or a key that cannot work, or `out` cannot be made.
         PolicyError: a policy cannot be loaded or does not fit, or two have one name.
         ManifestError: `out` holds results already.
     """
@@ -182,7 +182,10 @@ def _prepare(folder: Path, job: Job, repeats: int) -> None:
     one_world = CavVectorEnv(config, network, 1)
     for policy in job.policies.values():
         load_policy(policy, one_world)
-    folder.mkdir(parents=True, exist_ok=True)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise ConfigError(f"{folder}: cannot be made ({error.strerror or error})") from error
     vehicles = config.population.agents + config.population.background
     plan = {
         "processes": "this one" if repeats == 1 else "a fresh one for each run, one at a time",

@@ -114,6 +114,14 @@ def test_evaluate_keeps_its_results_in_a_new_folder(
     assert all((folder / "manifest.json").is_file() for folder in folders)
 
 
+def test_a_refused_evaluation_leaves_no_folder(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    refusal(capsys, "evaluate", "merge", "--policy", "nobody")
+    assert not list(tmp_path.iterdir())
+
+
 def test_verify_determinism_says_equal_and_gives_the_hash(
     capsys: pytest.CaptureFixture[str], tmp_path: Path
 ) -> None:
@@ -154,6 +162,7 @@ def test_verify_determinism_fails_and_names_the_first_difference(
         (("evaluate", "merge", "--repeats", "0"), "repeats = 0: must be from 1"),
         (("evaluate", "merge", "-p", "idm", "-p", "idm"), "one stands there twice"),
         (("evaluate", "merge", "--html", "/dev/null/x.html"), "/dev/null: cannot be written"),
+        (("evaluate", "merge", "--out", "/dev/null/x", *QUICK), "/dev/null/x: cannot be made"),
         (("suite", "nothing"), "no suite or file 'nothing'"),
         (("suite", "--maps", "no-folder"), "is no environment and no file in no-folder"),
         (("report", "no-folder"), "no-folder: no manifest.json"),
