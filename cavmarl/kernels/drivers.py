@@ -179,9 +179,7 @@ def _at_line(
     to_line = front - roads.lanes[roads.links[link]["from_lane"]]["stop_back_m"]
     if to_line <= 0.0:
         # Its front is over the line: it does not wait there any more.
-        press, hold = press_inside(
-            roads, travel, rows, i, link, -distance, way, phase, dt, scratch
-        )
+        press, hold = press_inside(roads, travel, rows, i, link, -distance, way, phase, dt, scratch)
         return press, hold, False
     hold = may_enter(roads, travel, rows, i, link, distance, way, phase, scratch)
     if hold != HOLD_NONE:

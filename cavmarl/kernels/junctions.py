@@ -361,7 +361,9 @@ def press_inside(
         conflict = roads.conflicts[c]
         if place - half > conflict["leave_m"]:
             continue
-        for k in range(scratch.link_start[conflict["foe"]], scratch.link_start[conflict["foe"] + 1]):
+        for k in range(
+            scratch.link_start[conflict["foe"]], scratch.link_start[conflict["foe"] + 1]
+        ):
             foe = scratch.approach[k]
             if foe["row"] != i:
                 press = max(press, _press_of(roads, kind, row, conflict, foe, place, dt))

@@ -15,7 +15,15 @@ from numpy.typing import NDArray
 from cavmarl.kernels import kernel
 from cavmarl.kernels.arrays import RoadArrays, Scratch, Travel
 
-__all__ = ["ENTRY", "ahead_on", "behind_on", "beside_s", "index_lanes", "last_on", "neighbor_behind"]
+__all__ = [
+    "ENTRY",
+    "ahead_on",
+    "behind_on",
+    "beside_s",
+    "index_lanes",
+    "last_on",
+    "neighbor_behind",
+]
 
 MAX_LOOK_BACK_LANES = 4
 
@@ -39,8 +47,8 @@ def beside_s(lanes: NDArray[np.void], lane: int, neighbor: int, s: float) -> flo
     row = lanes[lane]
     share = s / row["length_m"]
     if neighbor == row["left"]:
-        return row["left_start_m"] + share * (row["left_end_m"] - row["left_start_m"])
-    return row["right_start_m"] + share * (row["right_end_m"] - row["right_start_m"])
+        return float(row["left_start_m"] + share * (row["left_end_m"] - row["left_start_m"]))
+    return float(row["right_start_m"] + share * (row["right_end_m"] - row["right_start_m"]))
 
 
 @kernel

@@ -58,7 +58,9 @@ def change_cost(roads: RoadArrays, lane: int, weight: float) -> float:
     """
     if roads.lanes[lane]["internal"]:
         return math.inf
-    return weight * LANE_CHANGE_COST_S * (1.0 + LANE_CHANGE_M / float(roads.lanes[lane]["length_m"]))
+    return (
+        weight * LANE_CHANGE_COST_S * (1.0 + LANE_CHANGE_M / float(roads.lanes[lane]["length_m"]))
+    )
 
 
 @kernel

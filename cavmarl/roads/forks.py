@@ -15,9 +15,7 @@ __all__ = ["fork_lengths"]
 BEYOND_M = 3.0  # paths that end near each other part soon after the junction
 
 
-def fork_lengths(
-    from_lane: Sequence[int], paths: Sequence[LinkPath | None]
-) -> NDArray[np.float64]:
+def fork_lengths(from_lane: Sequence[int], paths: Sequence[LinkPath | None]) -> NDArray[np.float64]:
     """The length of each link's path that lies near another one's from the same lane, in m.
 
     Args:

@@ -20,8 +20,8 @@ from cavmarl.roads.polylines import clean_shape, extend_stubs, point_rows
 from cavmarl.roads.programs import Program
 from cavmarl.roads.right_of_way import conflict_rows
 from cavmarl.roads.selection import Movement, Selection, permission_bits, select
-from cavmarl.roads.stop_lines import stop_back
 from cavmarl.roads.signals import SignalRows, read_signals
+from cavmarl.roads.stop_lines import stop_back
 
 __all__ = ["map_name", "read_network", "source_hash"]
 
