@@ -83,6 +83,7 @@ class Simulation:
     ) -> None:
         self.config = config
         self.network = network
+        self.demand = demand
         self.num_worlds = num_worlds
         self._seed = 0
         self._episodes = np.zeros(num_worlds, dtype=np.int64)
