@@ -45,6 +45,9 @@ TERMS = (
 )
 
 
+MAX_IDS = 1_000_000  # of agents in one episode: each has its space and its rows in every output
+
+
 @dataclass(frozen=True)
 class MapConfig:
     """Where the roads come from.
@@ -155,10 +158,10 @@ class PopulationConfig:
         )
         if self.budget is not None and self.mode == "entering":
             _check(
-                self.budget >= self.agents,
+                self.agents <= self.budget <= MAX_IDS,
                 "population.budget",
                 self.budget,
-                f"must be at least population.agents = {self.agents}",
+                f"must be from population.agents = {self.agents} to {MAX_IDS}",
             )
 
     @property

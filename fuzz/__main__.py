@@ -12,15 +12,20 @@ from pathlib import Path
 
 import atheris
 
+HERE = Path(__file__).resolve().parent
+KERNELS = (HERE.parent / "cavmarl" / "kernels").glob("*.py")
+
 # Kernels are left out: Numba compiles the bytecode of their functions as it is.
 with atheris.instrument_imports(
-    include=["cavmarl", "sumolib.net", "yaml"], exclude=["cavmarl.kernels"]
+    include=["cavmarl", "sumolib", "yaml"],
+    exclude=[f"cavmarl.kernels.{path.stem}" for path in KERNELS],
 ):
+    import cavmarl.roads.sumo_xml  # noqa: F401 - the reader imports it late
+
     from fuzz.targets import TARGETS
 
 from fuzz.mutations import mutated
 
-HERE = Path(__file__).resolve().parent
 MAX_BYTES = 1 << 15
 INPUT_S = 30
 MEMORY_MB = 3000

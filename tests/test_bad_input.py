@@ -334,6 +334,10 @@ def test_a_number_of_worlds_that_cannot_be_is_refused(num_envs: Any) -> None:
             {"overrides": {"population.mode": "entering", "population.budget": 1}, "agents": 2},
             ("population.budget", "1", "2"),
         ),
+        (
+            {"overrides": {"population.mode": "entering", "population.budget": 2**40}},
+            ("population.budget", "1000000"),
+        ),
         ({"overrides": {"terms.weights": {"speeed": 1.0}}}, ("terms.weights", "speeed", "speed")),
         ({"overrides": {"terms.weights": {"speed": float("inf")}}}, ("terms.weights",)),
         ({"overrides": {"traffic.min_trip_m": 1e5}}, ("traffic.min_trip_m", "longest way")),
