@@ -44,7 +44,6 @@ TERMS = (
     "delay",
 )
 
-
 MAX_IDS = 1_000_000  # of agents in one episode: each has its space and its rows in every output
 
 
@@ -161,7 +160,7 @@ class PopulationConfig:
                 self.agents <= self.budget <= MAX_IDS,
                 "population.budget",
                 self.budget,
-                f"must be from population.agents = {self.agents} to {MAX_IDS}",
+                f"must be at least population.agents = {self.agents}, and at most {MAX_IDS}",
             )
 
     @property

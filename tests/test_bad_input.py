@@ -530,6 +530,7 @@ def test_times_out_of_order_are_put_in_order(write: Write) -> None:
         for _ in range(50):
             env.step(env.suggest_actions())
         assert env.traffic_stats()["departed"] == 3
+        assert env.state_space.contains(env.state())
         hashes.append(sorted(env.simulation.vehicles()["x"].tolist()))
     assert hashes[0] == hashes[1]
 

@@ -120,6 +120,11 @@ class Simulation:
         self._episodes[:] = 0
 
     @property
+    def capacity(self) -> int:
+        """How many vehicles a world can hold."""
+        return int(self._shard.worlds.rows.shape[1])
+
+    @property
     def outputs(self) -> Outputs:
         """What the agents got at the end of the last step; arrays that the next step overwrites."""
         return self._shard.outputs
