@@ -282,7 +282,9 @@ class CavEnv(ParallelEnv[str, Any, Any]):  # type: ignore[misc] # PettingZoo is 
         found = self._simulation.outputs.observations[0].copy()[self._listed]
         if self._parts is None:
             return dict(zip(self.agents, found, strict=True))
-        named = named_observation(self._parts, found.reshape(len(found), self._stack, -1))
+        named = named_observation(
+            self._parts, found.reshape(len(found), self._stack, found.shape[1] // self._stack)
+        )
         return {
             agent: {name: part[k] for name, part in named.items()}
             for k, agent in enumerate(self.agents)

@@ -177,8 +177,8 @@ class TrafficConfig:
 
     Attributes:
         source: `native`: the seeded generator, and the demand files.
-        demand: SUMO files of vehicles, flows, routes and types (`.rou.xml`, `.add.xml`, `.sumocfg`):
-            named as `map.source`; their vehicles drive beside the generator's.
+        demand: SUMO files of vehicles, flows, routes and types (`.rou.xml`, `.add.xml`,
+            `.sumocfg`): named as `map.source`; their vehicles drive beside the generator's.
         goals: how many destination edges the generator uses; lane-level plans are made for each.
         origins: edges that agents start on, by id; empty: all that lead somewhere.
         destinations: edges that agents drive to, by id; empty: the generator's goals.

@@ -21,10 +21,9 @@ with atheris.instrument_imports(
     exclude=[f"cavmarl.kernels.{path.stem}" for path in KERNELS],
 ):
     import cavmarl.roads.sumo_xml  # noqa: F401 - the reader imports it late
-
     from fuzz.targets import TARGETS
 
-from fuzz.mutations import mutated
+from fuzz.mutations import mutated  # noqa: E402
 
 MAX_BYTES = 1 << 15
 INPUT_S = 30

@@ -56,7 +56,7 @@ def _drivers() -> tuple[bytes, ...]:
             environment="ring",
             observation_size=3,
             sensors=SensorsConfig(),
-            action=ActionConfig(kind=kind),  # type: ignore[arg-type]
+            action=ActionConfig(kind=kind),
             hidden=(2,),
         )
         with tempfile.TemporaryDirectory() as name:

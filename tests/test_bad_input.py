@@ -19,10 +19,12 @@ from cavmarl import (
     InvalidActionError,
     MapError,
     MissingActionError,
+    PolicyError,
     ResetNeededError,
     RouteError,
     UnknownAgentError,
     UnknownEnvironmentError,
+    load_policy,
     make_vec,
     parallel_env,
 )
@@ -371,6 +373,18 @@ def test_more_agents_than_the_map_can_take_are_refused() -> None:
 def test_an_unknown_environment_is_refused_with_what_there_is() -> None:
     with pytest.raises(UnknownEnvironmentError, match=r"mreg.*did you mean merge"):
         parallel_env("mreg")
+
+
+@pytest.mark.parametrize("name", ["x" * 5000, "a\0b", "", "\ud800"])
+def test_names_that_no_file_can_have_are_refused(name: str) -> None:
+    with pytest.raises(UnknownEnvironmentError):
+        parallel_env(name)
+    with pytest.raises(PolicyError):
+        load_policy(name, parallel_env("ring"))
+    with pytest.raises((MapError, ConfigError), match=r"map\.source|Unicode"):
+        parallel_env("ring", overrides={"map.source": f"{name}.net.xml"})
+    with pytest.raises((DemandError, ConfigError), match=r"traffic\.demand|Unicode"):
+        parallel_env("ring", overrides={"traffic.demand": [f"{name}.rou.xml"]})
 
 
 # Maps: what the reader and netconvert refuse is tested beside them; here, what a user sees.

@@ -92,9 +92,9 @@ class Schedule:
             if number <= 0:
                 names = self._network.edge_ids
                 raise RouteError(
-                    f"{self._place(route)}: no way from edge '{names[start]}' to edge '{names[goal]}' of the map "
-                    f"'{self._network.name}' for the class of a trip between them: change the trip "
-                    "or drop it (duarouter --ignore-errors)"
+                    f"{self._place(route)}: no way from edge '{names[start]}' to edge "
+                    f"'{names[goal]}' of the map '{self._network.name}' for the class of a trip "
+                    "between them: change the trip or drop it (duarouter --ignore-errors)"
                 )
             found.append(room[1:number].copy())
         return np.concatenate(found)
