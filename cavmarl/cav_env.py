@@ -140,7 +140,6 @@ class CavEnv(ParallelEnv[str, Any, Any]):  # type: ignore[misc] # PettingZoo is 
         self._listed: NDArray[np.intp] | slice  # the same
         self._list(np.zeros(0, dtype=np.intp))
         self.max_cycles = config.max_steps
-        self.state_space = state_space(config)
         one_observation, one_action = observation_space(config), action_space(config.action)
         self.observation_spaces = dict.fromkeys(self.possible_agents, one_observation)
         self.action_spaces = dict.fromkeys(self.possible_agents, one_action)
@@ -150,6 +149,7 @@ class CavEnv(ParallelEnv[str, Any, Any]):  # type: ignore[misc] # PettingZoo is 
             observation_parts(config.sensors) if config.observation.kind == "dict" else None
         )
         self._simulation = Simulation(config, network, demand=demand)
+        self.state_space = state_space(self._simulation.capacity)
         self._decoder = ActionDecoder(config.action, 1, self.possible_agents)
         self._first_seed = None if seed is None else check_seed(seed)
         self._steps = -1
@@ -287,7 +287,9 @@ class CavEnv(ParallelEnv[str, Any, Any]):  # type: ignore[misc] # PettingZoo is 
         found = self._simulation.outputs.observations[0].copy()[self._listed]
         if self._parts is None:
             return dict(zip(self.agents, found, strict=True))
-        named = named_observation(self._parts, found.reshape(len(found), self._stack, -1))
+        named = named_observation(
+            self._parts, found.reshape(len(found), self._stack, found.shape[1] // self._stack)
+        )
         return {
             agent: {name: part[k] for name, part in named.items()}
             for k, agent in enumerate(self.agents)

@@ -44,6 +44,8 @@ TERMS = (
     "delay",
 )
 
+MAX_IDS = 1_000_000  # of agents in one episode: each has its space and its rows in every output
+
 
 @dataclass(frozen=True)
 class MapConfig:
@@ -155,10 +157,10 @@ class PopulationConfig:
         )
         if self.budget is not None and self.mode == "entering":
             _check(
-                self.budget >= self.agents,
+                self.agents <= self.budget <= MAX_IDS,
                 "population.budget",
                 self.budget,
-                f"must be at least population.agents = {self.agents}",
+                f"must be at least population.agents = {self.agents}, and at most {MAX_IDS}",
             )
 
     @property

@@ -178,6 +178,8 @@ def _explain(kind: type[Any], details: ErrorDetails) -> str:
             return f"{path}: missing; it has no default"
         case "dataclass_type":
             return f"{path} = {details['input']!r}: must be a mapping of keys"
+        case "json_invalid":
+            return "some text is no Unicode (half of a surrogate pair): write it anew"
         case "tuple_type":
             return f"{path} = {details['input']!r}: must be a list"
     return f"{path} = {details['input']!r}: {details['msg'].replace('Input should', 'must')}"

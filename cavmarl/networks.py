@@ -81,6 +81,18 @@ class NetworkConfig:
                 f"{MAX_WIDTH}"
             )
 
+    @property
+    def num_weights(self) -> int:
+        """How many numbers an `ActorCritic` learns."""
+        continuous = self.action.kind == "continuous"
+        actions = CONTINUOUS_ACTIONS if continuous else META_ACTIONS
+        deviations = actions if continuous else 0
+        return deviations + sum(
+            (inputs + 1) * outputs
+            for last in (actions, 1)
+            for inputs, outputs in pairwise((self.observation_size, *self.hidden, last))
+        )
+
 
 class ActorCritic(nn.Module):
     """A policy and a value function, each a small tanh network of its own.
@@ -177,11 +189,16 @@ def load_network(folder: Path) -> tuple[ActorCritic, NetworkConfig]:
             raise PolicyError(f"no {name} in {folder}: is this the folder of a trained driver?")
     config = _read_config(folder / CONFIG_FILE)
     path = folder / WEIGHTS_FILE
-    network = ActorCritic(config)
     try:
         weights = load_file(path)
     except (OSError, SafetensorError) as error:
         raise _unreadable(path, error) from error
+    held = sum(tensor.numel() for tensor in weights.values())
+    if held != config.num_weights:  # before a network is made that may be far larger than the file
+        raise PolicyError(
+            f"{path}: does not fit {CONFIG_FILE}: {held} weights, not {config.num_weights}"
+        )
+    network = ActorCritic(config)
     try:
         network.load_state_dict(weights)
     except RuntimeError as error:

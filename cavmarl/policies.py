@@ -12,6 +12,7 @@ import inspect
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from operator import attrgetter
+from os.path import isdir, isfile
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -170,11 +171,11 @@ def _find(policy: str | Path) -> Path:
     if isinstance(policy, str) and policy in known:
         return known[policy]
     path = Path(policy)
-    if path.is_dir():
+    if isdir(path):  # unlike Path's, it takes names that no folder can have
         return path
-    if path.is_file() and path.suffix == ".py":
+    if isfile(path) and path.suffix == ".py":
         return path
-    if path.exists():
+    if isfile(path):
         raise PolicyError(
             f"{path}: no policy; give a folder with model.safetensors, or a .py with make_policy"
         )

@@ -9,6 +9,7 @@ from __future__ import annotations
 import dataclasses
 import difflib
 from collections.abc import Callable, Mapping
+from os.path import isdir, isfile
 from pathlib import Path
 from typing import Any
 
@@ -76,15 +77,15 @@ def find_entry(env: str | Path) -> Path:
     if isinstance(env, str) and env in known:
         return known[env]
     path = Path(env)
-    if (path / "env.yaml").is_file():
+    if isfile(path / "env.yaml"):  # unlike Path's, it takes names that no file can have
         return path
-    if path.is_file():
+    if isfile(path):
         if not path.name.endswith(MAP_SUFFIXES):
             raise UnknownEnvironmentError(
                 f"{path}: not a map file; their names end in {', '.join(MAP_SUFFIXES)}"
             )
         return path
-    if path.is_dir():
+    if isdir(path):
         raise UnknownEnvironmentError(f"{path}: a folder without an env.yaml")
     raise UnknownEnvironmentError(
         f"no environment, folder or map file '{env}'; {_advice(env, known)}"
@@ -186,7 +187,7 @@ def _resolve(key: str, source: str, base_dir: Path, failure: type[CavmarlError])
             raise failure(f"{key} = {source!r}: leads out of the eclipse-sumo wheel")
     else:
         path = base_dir / source
-    if not path.is_file():
+    if not isfile(path):
         raise failure(f"{key} = {source!r}: no file {path}")
     return path
 

@@ -146,9 +146,8 @@ def action_space(config: ActionConfig) -> spaces.Box | spaces.Discrete:
     return spaces.Discrete(NUM_META_ACTIONS)
 
 
-def state_space(config: EnvConfig) -> spaces.Box:
+def state_space(capacity: int) -> spaces.Box:
     """The global state: `STATE_FEATURES` numbers for each vehicle that the world can hold."""
-    capacity = config.population.agents + config.population.background
     return _box(capacity * STATE_FEATURES)
 
 

@@ -104,7 +104,7 @@ def test_a_wrong_type_is_named(tmp_path: Path, text: str, expected: str) -> None
 @pytest.mark.parametrize(
     ("text", "expected"),
     [
-        ("population: {agents: -4}", r"population\.agents = -4: .*from 1"),
+        ("population: {agents: -4}", r"population\.agents = -4: .*from 0"),
         ("population: {background: -1}", r"population\.background = -1: .*from 0"),
         ("horizon_s: .nan", r"horizon_s = nan: must be a number from"),
         ("horizon_s: .inf", r"horizon_s = inf: must be a number from"),

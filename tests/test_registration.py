@@ -19,6 +19,8 @@ ALL = sorted(entries())
 def test_every_entry_has_its_ids(name: str) -> None:
     assert f"cavmarl/{name}-v0" in gymnasium.registry
     assert f"cavmarl/{name}Agents-v0" in gymnasium.registry
+    if not hasattr(pettingzoo, "make"):
+        pytest.skip("this PettingZoo has no registry")
     for kind in ("parallel", "aec"):
         world = pettingzoo.make(kind, f"cavmarl/{name}-v0", max_cycles=3)
         world.reset(seed=0)

@@ -67,6 +67,7 @@ def traffic(
     console = Console()
     with console.status("") as status:
         found: TrafficComparison | TrafficSpeed
+        tolerated: tuple[str, ...] = ()
         if speed:
             found = measure_traffic_speed(
                 map_name,
@@ -88,10 +89,12 @@ def traffic(
                 teleports=teleports,
                 progress=status.update,
             )
-            table = _figures(found)
+            table, tolerated = _figures(found), found.tolerated
             if plot is not None:
                 _draw(found, plot)
     console.print(table)
+    if tolerated:
+        console.print("tolerated in our reading of the demand:", *tolerated, sep="\n")
     write_json(json_path, found.to_dict())
 
 

@@ -31,6 +31,7 @@ def make_world(
 
     Raises:
         ConfigError: a demand or a tick that cannot work.
+        DemandError: a demand that cannot be, or not on this map.
         MapError: the map cannot be driven.
     """
     config, network, file = load_world(
@@ -61,26 +62,16 @@ def idle_commands(simulation: Simulation) -> Commands:
     return Commands(np.zeros((*shape, 2)), np.full(shape, ACTION_IDLE, dtype=np.int64))
 
 
-def run_native(
-    map_file: Path, demand: Sequence[Path], seconds: int, dt_s: float, seed: int
-) -> TrafficRun:
+def run_native(simulation: Simulation, seconds: int) -> TrafficRun:
     """Run and measure it.
 
     Args:
-        map_file: a SUMO network.
-        demand: what drives on it.
+        simulation: of `make_world`; a whole number of its ticks is a second.
         seconds: how long.
-        dt_s: seconds a tick; a whole number of ticks is a second.
-        seed: root of all random numbers.
-
-    Raises:
-        ConfigError: see `make_world`.
-        MapError: see `make_world`.
     """
-    simulation = make_world(map_file, demand, seconds, seed, dt_s)
     meter = TrafficMeter(simulation.network)
     commands = idle_commands(simulation)
-    ticks_per_s = round(1.0 / dt_s)
+    ticks_per_s = round(1.0 / simulation.config.clock.sim_dt_s)
     for tick in range(1, seconds * ticks_per_s + 1):
         advance(simulation, commands)
         rows = simulation.vehicles()

@@ -8,6 +8,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from io import BytesIO
+from os.path import isfile
 from pathlib import Path
 from xml.etree.ElementTree import Element, ParseError
 
@@ -110,7 +111,7 @@ def _read_config(path: Path) -> SumoInput:
                 begin = value
             elif section.tag not in _DROPPED_SECTIONS:
                 options[option.tag] = value
-    missing = [name for group in files.values() for name in group if not name.is_file()]
+    missing = [name for group in files.values() for name in group if not isfile(name)]
     if missing:
         raise ConfigError(f"{path}: names {missing[0]}, which is not there")
     return SumoInput(

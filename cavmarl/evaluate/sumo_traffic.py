@@ -116,7 +116,7 @@ def start_sumo(job: SumoJob, folder: Path, *more: str) -> Any:
     try:
         libsumo.start(["sumo", *words, *more])
     except libsumo.TraCIException as error:
-        raise _refusal(job, log, error) from error
+        raise _refusal(job, log, error) from None  # SUMO's own cannot leave this process
     return libsumo
 
 
@@ -153,7 +153,7 @@ def _measure(job: SumoJob) -> TrafficRun:
                     reader.fill_lanes(rows)
                     meter.sample(rows, reader.signal_codes())
         except libsumo.TraCIException as error:
-            raise _refusal(job, folder / "errors.log", error) from error
+            raise _refusal(job, folder / "errors.log", error) from None
         waiting = len(libsumo.simulation.getPendingVehicles())
         libsumo.close()
         delays = [

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from cavmarl.errors import ConfigError
-from cavmarl.evaluate.native_traffic import run_native
+from cavmarl.evaluate.native_traffic import make_world, run_native
 from cavmarl.evaluate.sumo_input import read_input
 from cavmarl.evaluate.sumo_traffic import SumoJob, run_sumo
 from cavmarl.evaluate.traffic_metrics import EDGE_MINUTE, TrafficRun
@@ -31,6 +31,7 @@ class TrafficComparison:
         seed: of both.
         ours: our run.
         sumo: SUMO's.
+        tolerated: what ours left out of the demand or took for something near, with counts.
     """
 
     map_name: str
@@ -39,6 +40,7 @@ class TrafficComparison:
     seed: int
     ours: TrafficRun
     sumo: TrafficRun
+    tolerated: tuple[str, ...] = ()
 
     def ratio(self, figure: str) -> float | None:
         """Ours over SUMO's; None where that says nothing: SUMO's is zero or one has none."""
@@ -58,7 +60,8 @@ class TrafficComparison:
             for name, run in (("ours", self.ours), ("sumo", self.sumo))
         }
         run = {"map": self.map_name, "seconds": self.seconds, "dt_s": self.dt_s, "seed": self.seed}
-        return run | sides | {"ratios": {name: self.ratio(name) for name in RATIOS}}
+        ratios = {name: self.ratio(name) for name in RATIOS}
+        return run | sides | {"ratios": ratios, "tolerated": list(self.tolerated)}
 
 
 def compare_traffic(
@@ -83,7 +86,8 @@ def compare_traffic(
         progress: told what is going on.
 
     Raises:
-        ConfigError: a number, a demand, or a demand on this map that cannot work.
+        ConfigError: a number that cannot work, or a demand that SUMO refuses.
+        DemandError: a demand that cannot be, or not on this map.
         MapError: the map cannot be read or driven.
         MissingExtraError: SUMO is not installed.
     """
@@ -93,9 +97,13 @@ def compare_traffic(
         raise ConfigError(f"dt = {dt_s:g}: a second must be a whole number of steps; try 0.1")
     given = read_input(demand)
     path = find_map(map_name)
+    progress("the demand")
+    # Ours first: it names file and line of what neither can drive.
+    world = make_world(path, demand, seconds, seed, dt_s)
     progress("SUMO's run")
     sumo = run_sumo(SumoJob(path, given, seconds, dt_s, seed, teleports))
     progress("our run")
-    ours = run_native(path, demand, seconds, dt_s, seed)
+    ours = run_native(world, seconds)
     name = path.name.removesuffix(".gz").removesuffix(".net.xml")
-    return TrafficComparison(name, seconds, dt_s, seed, ours, sumo)
+    tolerated = world.demand.report.lines() if world.demand else []
+    return TrafficComparison(name, seconds, dt_s, seed, ours, sumo, tuple(tolerated))

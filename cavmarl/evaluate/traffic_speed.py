@@ -107,11 +107,12 @@ def measure_traffic_speed(
         tempfile.TemporaryDirectory() as folder,
         sumo_process(job) as sumo,
     ):
+        # Ours first: it names file and line of what neither can drive.
+        simulation = make_world(path, demand, after_s + repeats * TURN_S, seed, dt_s)
         progress(f"SUMO's first {after_s} s")
         sumo.submit(_load_sumo, job, folder).result()
         sumo.submit(_turn_of_sumo, warm).result()
         progress(f"our first {after_s} s")
-        simulation = make_world(path, demand, after_s + repeats * TURN_S, seed, dt_s)
         _our_turn(simulation, warm)
         for repeat in range(repeats):
             progress(f"measuring, {repeat + 1} of {repeats}")

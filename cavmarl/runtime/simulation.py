@@ -83,6 +83,7 @@ class Simulation:
     ) -> None:
         self.config = config
         self.network = network
+        self.demand = demand
         self.num_worlds = num_worlds
         self._seed = 0
         self._first_world = 0
@@ -118,6 +119,11 @@ class Simulation:
         self.step(Commands(controls, np.full(shape, ACTION_IDLE, dtype=np.int64)))
         self.retire_agents()
         self._episodes[:] = 0
+
+    @property
+    def capacity(self) -> int:
+        """How many vehicles a world can hold."""
+        return int(self._shard.worlds.rows.shape[1])
 
     @property
     def outputs(self) -> Outputs:

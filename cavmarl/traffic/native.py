@@ -101,7 +101,7 @@ class NativeTraffic:
     def capacity(self) -> int:
         """Rows that one world needs: no more vehicles than are ordered, or fit on the map."""
         own = self.population.agents + self.population.background
-        if self.file is None or self.schedule is None:
+        if self.file is None or self.schedule is None or not len(self.file.types):
             return own
         shortest = float(self.file.types["length"].min())
         metres = float(self.network.lanes["length_m"].sum())

@@ -119,12 +119,19 @@ class Schedule:
             if number <= 0:
                 names = self._network.edge_ids
                 raise RouteError(
-                    f"no way from edge '{names[start]}' to edge '{names[goal]}' of the map "
-                    f"'{self._network.name}' for the class of a trip between them: change the trip "
-                    "or drop it (duarouter --ignore-errors)"
+                    f"{self._place(route)}: no way from edge '{names[start]}' to edge "
+                    f"'{names[goal]}' of the map '{self._network.name}' for the class of a trip "
+                    "between them: change the trip or drop it (duarouter --ignore-errors)"
                 )
             found.append(room[1:number].copy())
         return np.concatenate(found)
+
+    def _place(self, route: int) -> str:
+        """File and line of the first element that may have a route."""
+        demand = self.demand
+        choices = range(len(demand.route_choices))
+        having = [c for c in choices if route in demand.route_choices.options(c)]
+        return demand.place(int(np.isin(demand.elements["routes"], having).argmax()))
 
     def _plan(self, goal: int, mask: int) -> NDArray[np.void]:
         key = (goal, mask)

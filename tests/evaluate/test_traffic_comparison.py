@@ -93,7 +93,7 @@ def test_numbers_out_of_range_are_refused(wrong: dict[str, float], says: str) ->
         (("bench", "traffic", str(MAP), "-d", "none.rou.xml"), "none.rou.xml: cannot be read"),
         (
             ("bench", "traffic", str(GAME / "cross" / "cross.net.xml"), "-d", str(ROUTES)),
-            "SUMO refuses this demand",
+            "is the file of another map",
         ),
         ((*WORDS, "--speed", "--plot", "x.png"), "--plot"),
         ((*WORDS, "--speed", "--after", "0"), "after = 0"),

@@ -144,6 +144,11 @@ class DemandFile:
         name = self.element_ids[row]
         return f"{name}.{order['number']}" if self.elements[row]["flow"] else name
 
+    def place(self, row: int) -> str:
+        """File and line of an ELEMENT row."""
+        element = self.elements[row]
+        return f"{self.report.files[int(element['file'])]}, line {element['line']}"
+
     def to_report(self) -> str:
         """Lines for a terminal: what was read and what was tolerated."""
         return self.report.to_report()

@@ -38,14 +38,18 @@ class DemandReport:
         tally = self.tolerated.setdefault(what, Tally(0, place))
         tally.count += count
 
+    def lines(self) -> list[str]:
+        """What was tolerated: how often, what, and where first."""
+        return [
+            f"{tally.count:>8} {what} (first: {tally.first})"
+            for what, tally in sorted(self.tolerated.items())
+        ]
+
     def to_report(self) -> str:
         """Lines for a terminal: what was read, then what was tolerated and where first."""
         lines = [f"read {path}" for path in self.files]
         lines += [f"  {count:>8} {kind}" for kind, count in sorted(self.read.items())]
         if self.tolerated:
             lines.append("tolerated")
-        lines += [
-            f"  {tally.count:>8} {what} (first: {tally.first})"
-            for what, tally in sorted(self.tolerated.items())
-        ]
+        lines += [f"  {line}" for line in self.lines()]
         return "\n".join(lines)

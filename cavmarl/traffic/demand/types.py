@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from cavmarl.kernels.codes import MODEL_IDM
 from cavmarl.roads.network import VEHICLE_CLASSES
+from cavmarl.traffic.demand.distributions import MAX_WEIGHT
 from cavmarl.traffic.demand.element import Element, near
 from cavmarl.traffic.demand.report import DemandReport
 from cavmarl.traffic.vtypes import (
@@ -24,6 +25,22 @@ __all__ = ["reroute_chance", "vehicle_class", "vtype_record"]
 
 MIN_SPEED_FACTOR = 0.2  # SUMO's cuts of the distribution of speed factors
 MAX_SPEED_FACTOR = 2.0
+
+# (least, most) of what a road vehicle can have, in SI units; with room for what studies try out.
+_LIMITS = {
+    "length": (0.1, 100.0),
+    "width": (0.1, 10.0),
+    "height": (0.0, 20.0),
+    "minGap": (0.0, 100.0),
+    "accel": (0.01, 1000.0),
+    "decel": (0.01, 1000.0),
+    "emergencyDecel": (0.01, 1000.0),
+    "maxSpeed": (0.01, 1e5),
+    "desiredMaxSpeed": (0.01, 1e5),
+    "tau": (0.001, 1000.0),
+    "sigma": (0.0, 1.0),
+    "probability": (0.0, MAX_WEIGHT),
+}
 
 _SPEED_FACTOR = re.compile(r"normc?\(([^()]*)\)")
 _MODEL_PREFIX = "carFollowing-"
@@ -79,20 +96,18 @@ def vtype_record(element: Element, report: DemandReport) -> NDArray[np.void] | N
     record["vclass"] = VEHICLE_CLASSES.index(NEAREST_CLASS[name])
     record["permissions"] = ALL_PERMISSIONS if name == "ignoring" else 1 << int(record["vclass"])
     record["model"] = model = _model(element, report)
-    for key in ("length", "width", "accel", "decel"):
-        record[key] = element.number(key, getattr(default, key), above=0.0)
-    record["height"] = element.number("height", default.height, least=0.0)
-    record["min_gap"] = element.number("minGap", default.min_gap, least=0.0)
-    record["max_speed"] = element.number("maxSpeed", default.max_speed, above=0.0)
-    record["desired_max_speed"] = element.number(
-        "desiredMaxSpeed", default.desired_max_speed, above=0.0
-    )
-    record["tau"] = element.number("tau", 1.0, above=0.0)
-    sigma = element.number("sigma", default.sigma, least=0.0, most=1.0)
+    for key in ("length", "width", "height", "accel", "decel"):
+        record[key] = _number(element, key, getattr(default, key))
+    record["min_gap"] = _number(element, "minGap", default.min_gap)
+    record["max_speed"] = _number(element, "maxSpeed", default.max_speed)
+    record["desired_max_speed"] = _number(element, "desiredMaxSpeed", default.desired_max_speed)
+    record["tau"] = _number(element, "tau", 1.0)
+    sigma = _number(element, "sigma", default.sigma)
     record["sigma"] = 0.0 if model == MODEL_IDM else sigma
+    _number(element, "probability", 1.0)
     decel = float(record["decel"])
-    record["emergency_decel"] = element.number(
-        "emergencyDecel", max(default.emergency_decel, decel), above=0.0
+    record["emergency_decel"] = _number(
+        element, "emergencyDecel", max(default.emergency_decel, decel)
     )
     if record["emergency_decel"] < decel:
         report.tolerate("emergencyDecel below decel is raised to it", element.place)
@@ -100,6 +115,11 @@ def vtype_record(element: Element, report: DemandReport) -> NDArray[np.void] | N
     _set_speed_factor(record, element, default.speed_dev)
     record["reroute"] = reroute_chance(element)
     return record
+
+
+def _number(element: Element, key: str, default: float) -> float:
+    least, most = _LIMITS[key]
+    return element.number(key, default, least=least, most=most)
 
 
 def _model(element: Element, report: DemandReport) -> int:
