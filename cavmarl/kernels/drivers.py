@@ -41,7 +41,7 @@ LIMIT_LEAD_S = 1.0  # to be down this time before it, as the model lags behind w
 FALL_IN_M = 100.0  # before the place where a lane change must be made
 COURTESY_DECEL = 2.0  # m/s², the hardest braking to let somebody merge
 # A driver that has to leave a lane waits this far before its end to change right, and a vehicle's
-# length further back to change left: two that want to swap lanes do not stand side by side for ever.
+# length further back to change left: two that want to swap do not stand side by side for ever.
 MERGE_ROOM_M = 2.0
 SWAP_ROOM_M = 3.0
 MERGE_ROOM_SHARE = 0.25  # to the right at most this share of the lane's length
@@ -172,7 +172,7 @@ def _at_line(
     dt: float,
     scratch: Scratch,
 ) -> tuple[float, int, bool]:
-    """How a stop line presses row i, `distance` m ahead of its centre: (press, HOLD_*, it stops)."""
+    """How the end of a lane presses, `distance` m ahead of row i: (press, HOLD_*, it stops)."""
     row = rows[i]
     speed = row["speed"]
     front = distance - 0.5 * row["length"]

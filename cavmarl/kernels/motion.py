@@ -44,7 +44,7 @@ CROSSINGS_PER_TICK = 16  # lane borders that one tick can cross
 
 @kernel
 def _way_point(roads: RoadArrays, travel: Travel, row: np.void, s: float) -> tuple[float, float]:
-    """X and y of a place on a vehicle's way, `s` m from the start of its lane: behind it as well."""
+    """X and y of a place on a vehicle's way, `s` m from the start of its lane, or behind it."""
     lane = row["lane"]
     way = row["way"]
     for _ in range(MAX_BODY_LANES):

@@ -1,8 +1,8 @@
 """Lane-level plans: for one goal, what to do next from every lane of the map.
 
 Dijkstra's algorithm backwards from the goal's lanes over the lane graph. Driving along a lane costs
-the time it takes at the speed limit; a lane change costs the more time the shorter the lane is, so that it
-is made early and where there is room.
+the time it takes at the speed limit; a lane change costs the more time the shorter the lane is, so
+that it is made early and where there is room.
 """
 
 from __future__ import annotations
