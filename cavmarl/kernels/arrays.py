@@ -82,6 +82,7 @@ class Worlds(NamedTuple):
     signal_phase: NDArray[np.int32]  # (W, num_signals) PHASE row that is on
     controllers: NDArray[np.void]  # CONTROLLER (W, num_controllers) of the actuated programs
     detected_s: NDArray[np.float64]  # (W, D) when a body was last over each detector
+    num_through: NDArray[np.int64]  # (W,) background vehicles that have arrived in this tick
     num_contacts: NDArray[np.int64]  # (W,) vehicles that began to touch another, since reset
 
 
@@ -125,8 +126,7 @@ class Scratch(NamedTuple):
     link_start: NDArray[np.int32]  # (K + 2,) approach of link k: [link_start[k], link_start[k + 1])
     approach: NDArray[np.void]  # APPROACH (3 C,) vehicles on or before links, by link
     pairs: NDArray[np.void]  # APPROACH (3 C,) the same before sorting
-    line_link: NDArray[np.int32]  # (C,) the next link of each row, or -1
-    line_m: NDArray[np.float64]  # (C,) the way of its centre to that link's stop line
+    order: NDArray[np.int32]  # (C,) the owned rows as they lie along the lanes
     accel: NDArray[np.float64]  # (C,) decided accelerations
     link_ahead: NDArray[np.int32]  # (C,) the link whose stop line each row is next to
     lane_change: NDArray[np.int32]  # (C,) decided lane changes: 1 left, -1 right

@@ -266,9 +266,16 @@ def choose_goals(
     num_goals: int,
     gate: Gate,
     worlds: Worlds,
+    dt: float,
 ) -> None:
-    """Give the background vehicles of `next_rows` that need it another goal, if one is in reach."""
+    """Give the background vehicles of `next_rows` that need it another goal, if one is in reach.
+
+    Asked about once a second.
+    """
+    turns = max(1, round(1.0 / dt))
     for w in range(worlds.ticks.shape[0]):
+        if worlds.ticks[w] % turns != 0:
+            continue
         for i in range(worlds.num_owned[w]):
             row = worlds.next_rows[w, i]
             if not _needs_goal(demand, roads, travel, row):
@@ -339,6 +346,8 @@ def take_out(
         ticks_per_step: ticks a step; agents that entered within the last of them have not acted.
     """
     for w in range(worlds.ticks.shape[0]):
+        if driver == DRIVER_BACKGROUND and worlds.num_through[w] == 0:
+            continue
         while True:
             i = _next_through(rows[w], worlds.num_owned[w], driver, ticks_per_step)
             if i < 0:

@@ -400,6 +400,6 @@ def decide(
         scratch.hold[i] = hold
         scratch.link_ahead[i] = link_ahead
     for k in range(total):
-        row = rows[scratch.entries[k]["row"]]
-        if row["blinker"] != 0 and not scratch.entries[k]["side"]:
-            _let_merge(roads, travel, rows, row, scratch)
+        entry = scratch.entries[k]
+        if entry["blinker"] != 0 and not entry["side"]:
+            _let_merge(roads, travel, rows, rows[entry["row"]], scratch)

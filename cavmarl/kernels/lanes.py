@@ -35,6 +35,7 @@ ENTRY = np.dtype(
         ("decel", np.float64),  # with which it brakes in comfort, m/s²
         ("id", np.int64),
         ("row", np.int32),  # VEHICLE row
+        ("blinker", np.int32),  # lane change wanted: 1 left, -1 right
         ("side", np.bool_),  # its body covers this lane, its centre is on a neighbour
     ],
     align=True,
@@ -61,6 +62,7 @@ def _fill(
     entry["decel"] = types[row["vtype"]]["decel"]
     entry["id"] = row["id"]
     entry["row"] = i
+    entry["blinker"] = row["blinker"]
     entry["side"] = side
 
 

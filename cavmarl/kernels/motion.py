@@ -20,7 +20,7 @@ from cavmarl.kernels.codes import (
     SIGNAL_RED,
     SIGNAL_RED_YELLOW,
 )
-from cavmarl.kernels.geometry import lane_pose, wrap_angle
+from cavmarl.kernels.geometry import lane_pose, segment_at, wrap_angle
 from cavmarl.kernels.junctions import link_signal
 from cavmarl.kernels.kinematics import bicycle_step
 from cavmarl.kernels.lanes import beside_s
@@ -90,9 +90,15 @@ def place_on_lane(roads: RoadArrays, travel: Travel, row: np.void) -> float:
     Both bumpers are on the way: in a bend the body is its chord.
     """
     lane = roads.lanes[row["lane"]]
-    x, y, z, cos, sin, slope = lane_pose(
-        roads.points, lane["first_point"], lane["num_points"], row["s"]
-    )
+    point = roads.points[
+        segment_at(roads.points, lane["first_point"], lane["num_points"], row["s"])
+    ]
+    along = row["s"] - point["s"]
+    cos = point["cos"]
+    sin = point["sin"]
+    x = point["x"] + along * cos
+    y = point["y"] + along * sin
+    heading = point["heading"]
     half = 0.5 * row["length"]
     if lane["num_points"] > 2 or row["s"] < half or row["s"] + half > lane["length_m"]:
         front_x, front_y = _way_point(roads, travel, row, row["s"] + half)
@@ -105,11 +111,12 @@ def place_on_lane(roads: RoadArrays, travel: Travel, row: np.void) -> float:
             y = 0.5 * (front_y + rear_y)
             cos = along_x / chord
             sin = along_y / chord
+            heading = math.atan2(sin, cos)
     row["x"] = x - row["d"] * sin
     row["y"] = y + row["d"] * cos
-    row["z"] = z
-    row["pitch"] = math.atan(slope) if slope != 0.0 else 0.0
-    return math.atan2(sin, cos)
+    row["z"] = point["z"] + along * point["slope"]
+    row["pitch"] = math.atan(point["slope"]) if point["slope"] != 0.0 else 0.0
+    return float(heading)
 
 
 @kernel

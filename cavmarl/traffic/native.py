@@ -165,7 +165,7 @@ class NativeTraffic:
     def arrive_and_depart(self, gate: Gate, worlds: Worlds, scratch: Scratch, dt: float) -> None:
         """Who has arrived leaves `next_rows`, wanderers pick new goals, and who waits may enter."""
         roads = self.network.arrays
-        choose_goals(self.demand, roads, self.travel, len(self.plans), gate, worlds)
+        choose_goals(self.demand, roads, self.travel, len(self.plans), gate, worlds, dt)
         take_out(self.demand, roads, gate, worlds, worlds.next_rows, DRIVER_BACKGROUND, dt, 1)
         call_orders(gate, worlds)
         let_in(self.demand, roads, self.travel, gate, worlds, scratch)
