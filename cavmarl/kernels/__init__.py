@@ -21,7 +21,7 @@ from typing import Any, ParamSpec, TypeVar
 import numba
 import numba.core.config
 
-__all__ = ["allocating_kernel", "cache_dir", "kernel", "kernel_cache_dir"]
+__all__ = ["allocating_kernel", "cache_dir", "inlined_kernel", "kernel", "kernel_cache_dir"]
 
 P = ParamSpec("P")
 R = TypeVar("R")
@@ -65,6 +65,14 @@ def kernel(function: Callable[P, R]) -> Callable[P, R]:
     (decision 002). So it can neither make an array nor return one.
     """
     return _compile(function, _nrt=False)
+
+
+def inlined_kernel(function: Callable[P, R]) -> Callable[P, R]:
+    """As `kernel`, but always compiled into its callers.
+
+    For what is called for every vehicle: a call hands over each array of a bundle as seven numbers.
+    """
+    return _compile(function, _nrt=False, forceinline=True)
 
 
 def allocating_kernel(function: Callable[P, R]) -> Callable[P, R]:

@@ -8,7 +8,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from cavmarl.kernels import kernel
+from cavmarl.kernels import inlined_kernel, kernel
 from cavmarl.kernels.arrays import RoadArrays, Scratch, Travel
 from cavmarl.kernels.ways import next_step
 
@@ -64,7 +64,7 @@ def register_links(
         start[link + 1] = place + 1
 
 
-@kernel
+@inlined_kernel
 def _note(scratch: Scratch, pairs: int, link: int, row: np.void, i: int, dist: float) -> int:
     pair = scratch.pairs[pairs]
     pair["link"] = link
@@ -76,7 +76,7 @@ def _note(scratch: Scratch, pairs: int, link: int, row: np.void, i: int, dist: f
     return pairs + 1
 
 
-@kernel
+@inlined_kernel
 def _announce(
     roads: RoadArrays, travel: Travel, row: np.void, i: int, pairs: int, scratch: Scratch
 ) -> int:

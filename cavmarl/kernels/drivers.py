@@ -13,7 +13,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from cavmarl.kernels import kernel
+from cavmarl.kernels import inlined_kernel, kernel
 from cavmarl.kernels.arrays import RoadArrays, Scratch, Travel
 from cavmarl.kernels.codes import DRIVER_AGENT, DRIVER_BACKGROUND, HOLD_NONE, MODEL_KRAUSS
 from cavmarl.kernels.following import (
@@ -26,7 +26,13 @@ from cavmarl.kernels.following import (
     wish,
 )
 from cavmarl.kernels.junctions import may_enter, press_inside, waits_inside
-from cavmarl.kernels.lane_choice import LOOK_BACK_M, SIDE_GAP_M, choose_lane, needed_change
+from cavmarl.kernels.lane_choice import (
+    LOOK_BACK_M,
+    SIDE_GAP_M,
+    choose_lane,
+    needed_change,
+    thinks_of_lanes,
+)
 from cavmarl.kernels.lanes import ahead_on, behind_on, beside_s, last_on
 from cavmarl.kernels.rng import STREAM_DRIVER, quick_uniform
 from cavmarl.kernels.stopping import way_to_stop
@@ -34,6 +40,7 @@ from cavmarl.kernels.ways import next_step
 
 __all__ = ["LOOK_AHEAD_M", "decide"]
 
+SEE_LINE_M = 8.0
 LOOK_AHEAD_M = 250.0  # no driver looks further
 STOP_LINE_M = 5.0  # standing with the front nearer than this counts as standing at the line
 LIMIT_DECEL = 2.0  # m/s², how a driver slows for a lower limit ahead,
@@ -50,7 +57,7 @@ MIN_BEND_RAD = 0.2  # by more than this
 BEND_M = 6.0  # within this length
 
 
-@kernel
+@inlined_kernel
 def _look_ahead_m(kind: np.void, speed: float) -> float:
     """How far ahead of its centre a driver looks, in m: IDM reacts earlier and more softly."""
     if kind["model"] == MODEL_KRAUSS:
@@ -60,7 +67,19 @@ def _look_ahead_m(kind: np.void, speed: float) -> float:
     return float(min(way, LOOK_AHEAD_M))
 
 
-@kernel
+@inlined_kernel
+def _see_line_m(kind: np.void, speed: float) -> float:
+    """How far before its front a driver asks whether it may pass a line, in m.
+
+    IDM asks as soon as it sees the line; Krauss's driver when it may soon have to brake.
+    """
+    if kind["model"] == MODEL_KRAUSS:
+        braking = 0.6 * speed * speed / kind["decel"]
+        return float(SEE_LINE_M + speed * (1.0 + kind["tau"]) + braking)
+    return LOOK_AHEAD_M
+
+
+@inlined_kernel
 def _slowing_to(kind: np.void, limit: float, distance: float, speed: float, dt: float) -> float:
     """The speed in m/s from which a driver gets down to a limit `distance` m ahead."""
     decel = LIMIT_DECEL
@@ -127,7 +146,7 @@ def _shared_start(
     return press
 
 
-@kernel
+@inlined_kernel
 def _behind_entry(kind: np.void, speed: float, gap: float, leader: np.void) -> float:
     return behind(kind, speed, gap, leader["speed"], leader["decel"])
 
@@ -191,7 +210,7 @@ def _at_line(
     return no_press(kind), HOLD_NONE, False
 
 
-@kernel
+@inlined_kernel
 def _road_ahead(
     roads: RoadArrays,
     travel: Travel,
@@ -215,7 +234,8 @@ def _road_ahead(
     steered = row["driver"] == DRIVER_AGENT
     lane = row["lane"]
     here = roads.lanes[lane]
-    allowed = min(here["speed_mps"] * row["speed_factor"], kind["max_speed"])
+    limit = min(here["speed_mps"], kind["desired_max_speed"])
+    allowed = min(limit * row["speed_factor"], kind["max_speed"])
     if steered:
         allowed = min(allowed, _bend_speed(roads, lane, -row["s"]))
     press = no_press(kind)
@@ -230,6 +250,7 @@ def _road_ahead(
         )
         press = max(press, fork)
     look = _look_ahead_m(kind, speed)
+    see = _see_line_m(kind, speed) + half
     distance = here["length_m"] - row["s"]
     # Behind a leader on its own lane a driver minds the next line only where it could not stop
     # any more once the leader has passed it.
@@ -252,7 +273,7 @@ def _road_ahead(
             press = max(press, end)
             break
         stops = False
-        if link >= 0:
+        if link >= 0 and distance < see:
             if distance - half - roads.lanes[before]["stop_back_m"] < STOP_LINE_M:
                 link_ahead = link if link_ahead < 0 else link_ahead
             fork = _shared_start(roads, kind, row, before, link, distance, scratch)
@@ -374,7 +395,9 @@ def decide(
             press = max(press, _beside(roads, kind, row, row["side_lane"], scratch))
         needed = needed_change(roads, travel, row)
         own_wish = wish(kind, speed, allowed, press)
-        change = choose_lane(roads, travel, rows, i, tick, dt, needed, own_wish, scratch)
+        change = 0
+        if needed != 0 or thinks_of_lanes(row, tick, dt):
+            change = choose_lane(roads, travel, rows, i, tick, needed, own_wish, scratch)
         if change != 0 and driver == DRIVER_AGENT:
             # A steered vehicle on its way into a neighbour lane still minds its own lane, to the
             # very end, and already the leader in the other one.

@@ -10,16 +10,16 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from cavmarl.kernels import kernel
+from cavmarl.kernels import inlined_kernel, kernel
 from cavmarl.kernels.arrays import RoadArrays, Scratch, Travel
 from cavmarl.kernels.codes import DRIVER_AGENT
 from cavmarl.kernels.following import accel_behind, no_press, wish
-from cavmarl.kernels.lane_change import LANE_CHANGE_DELAY_S, mobil_accepts
+from cavmarl.kernels.lane_change import LANE_CHANGE_DELAY_S, MIN_ACCEL_GAIN, mobil_accepts
 from cavmarl.kernels.lanes import ahead_on, beside_s, last_on, neighbor_behind
 from cavmarl.kernels.stopping import STAY, lane_to_stop
 from cavmarl.kernels.ways import next_step
 
-__all__ = ["LOOK_BACK_M", "SIDE_GAP_M", "choose_lane", "needed_change"]
+__all__ = ["LOOK_BACK_M", "SIDE_GAP_M", "choose_lane", "needed_change", "thinks_of_lanes"]
 
 LOOK_BACK_M = 60.0  # how far back a lane change looks for followers
 CHANGE_EARLY_M = 80.0  # a change that the route needs is made this far before it must be,
@@ -31,7 +31,7 @@ BRAKE_TIME_S = 0.5  # a braking that ends within this time is not felt
 SIDE_GAP_M = 1.0  # m between bumpers, the least with which a lane change starts
 
 
-@kernel
+@inlined_kernel
 def needed_change(roads: RoadArrays, travel: Travel, row: np.void) -> int:
     """The side that a vehicle's way needs it to change to by now: 1 left, -1 right, 0 none."""
     lane = row["lane"]
@@ -45,6 +45,13 @@ def needed_change(roads: RoadArrays, travel: Travel, row: np.void) -> int:
         return 0
     early = (CHANGE_EARLY_M + CHANGE_EARLY_S * row["speed"]) * step["changes"]
     return int(step["change"]) if step["room"] - row["s"] <= early else 0
+
+
+@kernel
+def _desired(roads: RoadArrays, kind: np.void, row: np.void, lane: int) -> float:
+    """The speed in m/s that a driver wants on a lane."""
+    limit = min(roads.lanes[lane]["speed_mps"], kind["desired_max_speed"])
+    return float(min(limit * row["speed_factor"], kind["max_speed"]))
 
 
 @kernel
@@ -65,7 +72,7 @@ def _change_is_safe(
     half = 0.5 * row["length"]
     lane = roads.lanes[target]
     s = beside_s(roads.lanes, row["lane"], target, row["s"])
-    desired = min(lane["speed_mps"] * row["speed_factor"], kind["max_speed"])
+    desired = _desired(roads, kind, row, target)
     ahead = 0.0
     j = ahead_on(scratch, target, s, row["id"])
     if j >= 0:
@@ -93,7 +100,7 @@ def _change_is_safe(
             return False
         theirs = travel.types[other["vtype"]]
         pace = follower["speed"]
-        limit = min(lane["speed_mps"] * other["speed_factor"], theirs["max_speed"])
+        limit = _desired(roads, theirs, other, target)
         follower_before = wish(theirs, pace, limit, no_press(theirs))
         if j >= 0:
             leader = scratch.entries[j]
@@ -132,15 +139,34 @@ def _may_change(
     if rest < (0.5 * row["length"] if needed == 0 or row["speed"] > CREEP_MPS else 0.0):
         return False
     if needed == 0:
-        if lane_to_stop(roads, travel, row) == STAY:
+        if row["speed"] < 1.0 or lane_to_stop(roads, travel, row) == STAY:
+            return False
+        # Not even an empty lane would be worth it.
+        kind = travel.types[row["vtype"]]
+        desired = _desired(roads, kind, row, target)
+        if wish(kind, row["speed"], desired, no_press(kind)) - own_wish < MIN_ACCEL_GAIN:
             return False
         beyond = travel.steps[row["way"] + target]
-        if beyond["to_go"] == math.inf or row["speed"] < 1.0:
+        if beyond["to_go"] == math.inf:
             return False
         early = (CHANGE_EARLY_M + CHANGE_EARLY_S * row["speed"]) * beyond["changes"]
         if beyond["change"] != 0 and beyond["room"] - row["s"] < 2.0 * early:
             return False
     return _change_is_safe(roads, travel, rows, i, target, own_wish, needed != 0, scratch)
+
+
+@inlined_kernel
+def thinks_of_lanes(row: np.void, tick: int, dt: float) -> bool:
+    """Whether a driver whose way needs no change thinks of one in this tick.
+
+    Each does so once in LANE_CHANGE_DELAY_S for either side, not all in the same ticks. A
+    suggestion for an agent is made anew at each step.
+    """
+    if row["driver"] == DRIVER_AGENT:
+        return True
+    turns = max(1, round(0.5 * LANE_CHANGE_DELAY_S / dt))
+    turn: bool = (tick // 2 + row["id"]) % turns == 0
+    return turn
 
 
 @kernel
@@ -150,7 +176,6 @@ def choose_lane(
     rows: NDArray[np.void],
     i: int,
     tick: int,
-    dt: float,
     needed: int,
     own_wish: float,
     scratch: Scratch,
@@ -159,7 +184,7 @@ def choose_lane(
 
     In even ticks background drivers may only change to the left, in odd ones to the right: two of
     them never take the same gap from both sides in one tick, whoever is asked first. A suggestion
-    for an agent is made anew at each step and binds nobody, so it has no such rule.
+    for an agent binds nobody, so it has no such rule.
     """
     row = rows[i]
     if row["driver"] == DRIVER_AGENT:
@@ -167,12 +192,9 @@ def choose_lane(
             if _may_change(roads, travel, rows, i, side, needed, own_wish, scratch):
                 return side
         return 0
-    # Who has to change looks for a gap all the time. Else every driver thinks of either side once
-    # in LANE_CHANGE_DELAY_S, not all in the same ticks.
-    turns = max(1, round(0.5 * LANE_CHANGE_DELAY_S / dt))
-    if row["side_lane"] >= 0 or (needed == 0 and (tick // 2 + row["id"]) % turns != 0):
-        return 0
     side = 1 if tick % 2 == 0 else -1
-    if _may_change(roads, travel, rows, i, side, needed, own_wish, scratch):
+    if row["side_lane"] < 0 and _may_change(
+        roads, travel, rows, i, side, needed, own_wish, scratch
+    ):
         return side
     return 0

@@ -12,7 +12,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from cavmarl.kernels import kernel
+from cavmarl.kernels import inlined_kernel, kernel
 from cavmarl.kernels.arrays import RoadArrays, Scratch, Travel
 
 __all__ = [
@@ -52,7 +52,7 @@ def beside_s(lanes: NDArray[np.void], lane: int, neighbor: int, s: float) -> flo
     return float(row["right_start_m"] + share * (row["right_end_m"] - row["right_start_m"]))
 
 
-@kernel
+@inlined_kernel
 def _fill(
     entry: np.void, types: NDArray[np.void], row: np.void, i: int, s: float, side: bool
 ) -> None:
@@ -104,7 +104,7 @@ def index_lanes(
             _insert(scratch, travel.types, side, row, i, s, True)
 
 
-@kernel
+@inlined_kernel
 def _insert(
     scratch: Scratch,
     types: NDArray[np.void],
@@ -156,7 +156,7 @@ def ahead_on(scratch: Scratch, lane: int, s: float, own_id: int) -> int:
     return k if k < end else -1
 
 
-@kernel
+@inlined_kernel
 def last_on(scratch: Scratch, lane: int, own_id: int) -> int:
     """Position in the index of the rearmost other vehicle on `lane`, or -1."""
     k = int(scratch.lane_start[lane])

@@ -12,7 +12,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from cavmarl.kernels import kernel
+from cavmarl.kernels import inlined_kernel, kernel
 from cavmarl.kernels.arrays import LaneGrid, RoadArrays, Travel
 from cavmarl.kernels.codes import (
     EVENT_ARRIVED,
@@ -83,7 +83,7 @@ def _lane_before(roads: RoadArrays, lane: int, link: int) -> int:
     return int(before)
 
 
-@kernel
+@inlined_kernel
 def place_on_lane(roads: RoadArrays, travel: Travel, row: np.void) -> float:
     """Set x, y, z and pitch from lane, s and d; returns the direction of the body in rad.
 
@@ -119,7 +119,7 @@ def place_on_lane(roads: RoadArrays, travel: Travel, row: np.void) -> float:
     return float(heading)
 
 
-@kernel
+@inlined_kernel
 def _account(row: np.void, old: np.void, roads: RoadArrays, dt: float) -> None:
     """What motion of both kinds leaves in the record: rates, ways, waiting time."""
     row["accel"] = (row["speed"] - old["speed"]) / dt
@@ -154,7 +154,20 @@ def _cross_borders(roads: RoadArrays, travel: Travel, row: np.void) -> bool:
     return True
 
 
-@kernel
+@inlined_kernel
+def _stand(old: np.void, row: np.void, throttle: float, dt: float) -> None:
+    """What changes in the record of a background vehicle that stands."""
+    row["throttle"] = throttle
+    row["accel"] = 0.0
+    row["jerk"] = -old["accel"] / dt
+    row["yaw_rate"] = 0.0
+    row["steering"] = 0.0
+    row["wait_s"] = old["wait_s"] + dt
+    row["step_jerk"] = old["step_jerk"] + abs(row["jerk"]) * dt
+    row["tick"] = old["tick"] + 1
+
+
+@inlined_kernel
 def move_background(
     roads: RoadArrays,
     travel: Travel,
@@ -179,6 +192,10 @@ def move_background(
         dt: seconds of the tick.
     """
     speed = clamp(old["speed"] + accel * dt, 0.0, MAX_SPEED_MPS)
+    if speed == 0.0 and old["speed"] == 0.0 and lane_change == 0 and old["d"] == 0.0:
+        _stand(old, row, accel, dt)
+        make_stop(roads, travel, old, row, travel.begin_s, dt)
+        return
     row["throttle"] = accel
     row["speed"] = speed
     row["s"] = old["s"] + speed * dt

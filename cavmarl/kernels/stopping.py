@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from cavmarl.kernels import kernel
+from cavmarl.kernels import inlined_kernel
 from cavmarl.kernels.arrays import RoadArrays, Travel
 from cavmarl.kernels.codes import UNTIL_DEPARTURE
 
@@ -17,7 +17,7 @@ STAY = 2  # answer of `lane_to_stop`
 LANE_EARLY_M = 100.0  # this far before it the driver wants its lane
 
 
-@kernel
+@inlined_kernel
 def way_to_stop(roads: RoadArrays, travel: Travel, row: np.void) -> float:
     """Metres from a vehicle's front to its next stop if that is on this edge ahead, or inf."""
     if row["stop"] < 0 or row["stop"] == row["stops_end"]:
@@ -33,7 +33,7 @@ def way_to_stop(roads: RoadArrays, travel: Travel, row: np.void) -> float:
     return left if left > -PASSED_M else np.inf
 
 
-@kernel
+@inlined_kernel
 def lane_to_stop(roads: RoadArrays, travel: Travel, row: np.void) -> int:
     """The side to which a vehicle has to change for its next stop: 1 left, -1 right, 0 none.
 
@@ -47,7 +47,7 @@ def lane_to_stop(roads: RoadArrays, travel: Travel, row: np.void) -> int:
     return 1 if stop["lane"] > row["lane"] else -1
 
 
-@kernel
+@inlined_kernel
 def make_stop(
     roads: RoadArrays, travel: Travel, old: np.void, row: np.void, begin_s: float, dt: float
 ) -> None:

@@ -135,6 +135,7 @@ def advance(
             worlds.next_rows[w, k] = old
             row = worlds.next_rows[w, k]
             if old["driver"] == DRIVER_BACKGROUND:
+                row["events"] = 0
                 row["hold"] = scratch.hold[i]
                 row["blinker"] = scratch.blinker[i]
                 if scratch.link_ahead[i] >= 0 and old["wait_s"] >= STOP_SIGN_S:

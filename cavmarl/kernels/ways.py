@@ -10,13 +10,13 @@ from __future__ import annotations
 
 import numpy as np
 
-from cavmarl.kernels import kernel
+from cavmarl.kernels import inlined_kernel
 from cavmarl.kernels.arrays import RoadArrays, Travel
 
 __all__ = ["next_step", "way_left"]
 
 
-@kernel
+@inlined_kernel
 def next_step(roads: RoadArrays, travel: Travel, lane: int, way: int) -> tuple[int, int, int]:
     """What follows the end of a lane: (lane, way there, link that is entered).
 
@@ -28,7 +28,7 @@ def next_step(roads: RoadArrays, travel: Travel, lane: int, way: int) -> tuple[i
     return step["next"], way + step["shift"], step["link"]
 
 
-@kernel
+@inlined_kernel
 def way_left(roads: RoadArrays, travel: Travel, row: np.void) -> float:
     """Metres from a vehicle's centre to the end of its way; inf where it has none."""
     lane = row["lane"]
