@@ -485,11 +485,10 @@ AROUND = "A0B0 B0B1 B1A1 A1A0"
 LOST = '<vehicle id="v" depart="0"><route edges="A0B0 lost"/></vehicle>'
 
 
-def demanding(write: Write, body: str) -> CavEnv:
+def demanding(write: Write, body: str, **more: str) -> CavEnv:
     path = write(f"<routes>\n{body}\n</routes>", "x.rou.xml")
-    return parallel_env(
-        "grid4x4", agents=1, background=0, seed=0, overrides={"traffic.demand": [str(path)]}
-    )
+    overrides = {"traffic.demand": [str(path)], **more}
+    return parallel_env("grid4x4", agents=1, background=0, seed=0, overrides=overrides)
 
 
 @pytest.mark.parametrize(
@@ -524,6 +523,15 @@ def test_demand_that_cannot_be_is_refused_with_its_line(
         demanding(write, body)
     for word in ("x.rou.xml, line 2", *words):
         assert word in str(caught.value)
+
+
+def test_vehicles_without_a_way_can_be_skipped_and_are_counted(write: Write) -> None:
+    body = '<vehicle id="v" depart="0"><route edges="A0B0 A1B1"/></vehicle>'
+    env = demanding(write, body, **{"traffic.on_bad_route": "skip"})
+    assert env.simulation.demand is not None
+    (line,) = env.simulation.demand.report.lines()
+    assert "1 vehicle or flow that cannot drive its route is left out" in line
+    assert "x.rou.xml, line 2" in line
 
 
 @pytest.mark.parametrize("body", ["", '<vType id="t"/>', '<vType id="t" vClass="rail"/>'])
