@@ -179,6 +179,8 @@ class TrafficConfig:
         source: `native`: the seeded generator, and the demand files.
         demand: SUMO files of vehicles, flows, routes and types (`.rou.xml`, `.add.xml`,
             `.sumocfg`): named as `map.source`; their vehicles drive beside the generator's.
+        on_bad_route: what to do with vehicles of the demand that cannot drive their route, and with
+            stops off it: `error`, or `skip` them (counted).
         goals: how many destination edges the generator uses; lane-level plans are made for each.
         origins: edges that agents start on, by id; empty: all that lead somewhere.
         destinations: edges that agents drive to, by id; empty: the generator's goals.
@@ -189,6 +191,7 @@ class TrafficConfig:
 
     source: Literal["native"] = "native"
     demand: tuple[str, ...] = ()
+    on_bad_route: Literal["error", "skip"] = "error"
     goals: int = 32
     origins: tuple[str, ...] = ()
     destinations: tuple[str, ...] = ()

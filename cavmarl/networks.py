@@ -213,7 +213,7 @@ def load_network(folder: Path) -> tuple[ActorCritic, NetworkConfig]:
 def _read_config(path: Path) -> NetworkConfig:
     try:
         raw: Any = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, UnicodeDecodeError, json.JSONDecodeError) as error:
+    except (OSError, ValueError, RecursionError) as error:  # not all of JSON's are its own
         raise _unreadable(path, error) from error
     try:
         return validate(NetworkConfig, raw, str(path))

@@ -131,6 +131,8 @@ def load_config(
         "horizon_s": max_cycles,
     }
     given = {key: value for key, value in keywords.items() if value is not None}
+    if not isinstance(overrides, Mapping | None):
+        raise ConfigError(f"overrides = {overrides!r}: must be a mapping of dotted keys")
     shadows = dict(overrides or {})
     if strange := [key for key in shadows if not isinstance(key, str)]:
         raise ConfigError(f"overrides: {strange[0]!r} is no key; keys are text, dotted")

@@ -45,7 +45,9 @@ def load_world(
     )
     network = load_roads(config, base_dir)
     files = resolve_demand(config, base_dir)
-    return config, network, read_demand(files, network) if files else None
+    if not files:
+        return config, network, None
+    return config, network, read_demand(files, network, on_bad_route=config.traffic.on_bad_route)
 
 
 def load_roads(config: EnvConfig, base_dir: Path) -> RoadNetwork:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import types
 from collections.abc import Mapping
 from dataclasses import fields, is_dataclass
@@ -21,6 +22,16 @@ from cavmarl.errors import ActionError, CavmarlError, EpisodeEndedError
 
 NONSENSE: list[Any] = [None, "", "x", "\x00", "4", [], {}, [[]], b"4", True, -1, 0, 1, 10**30]
 NONSENSE += [float("nan"), float("inf"), -0.0, 1e308, 5e-324, np.float32(3), np.int8(-1), object()]
+CIRCLE: list[Any] = []
+CIRCLE.append(CIRCLE)
+NONSENSE += [
+    CIRCLE,
+    {("a", 1): 2},
+    {1: 2},
+    {"a": b"b"},
+    json.loads("[" * 900 + "]" * 900),
+    "\ud800",
+]
 WHOLE = [0, 1, 2, 3, 16, 17, 64, 65, 256, 257, 1024, 1025, 2048, 65_536, 2**31, 2**63, 2**64]
 NUMBERS = [0.0, 1e-9, 0.001, 0.05, 0.1, 0.2, 0.5, 1.0, 2.0, 10.0, 60.0, 300.0, 300.1, 1e6, 1e7]
 

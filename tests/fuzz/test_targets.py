@@ -35,6 +35,12 @@ def test_mutations_are_taken_or_refused_on_purpose(name: str) -> None:
         assert not all(taken)
 
 
+@pytest.mark.parametrize("content", [b"[" * 100_000, b'{"seed": ' + b"9" * 5000 + b"}", b"\xff"])
+@pytest.mark.parametrize("name", TARGETS)
+def test_what_stumbles_parsers_is_refused(name: str, content: bytes) -> None:
+    TARGETS[name].accepts(content)
+
+
 @pytest.mark.parametrize("name", TARGETS)
 def test_no_file_is_too_short(name: str) -> None:
     target = TARGETS[name]

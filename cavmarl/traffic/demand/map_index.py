@@ -145,7 +145,7 @@ class MapIndex:
         """The error for a route that cannot be followed."""
         return element.error(
             f"cannot be driven: {gap}",
-            "mend the route (duarouter --repair), or skip such vehicles with on_bad_route='skip'",
+            "mend the route (duarouter --repair), or skip such (traffic.on_bad_route = skip)",
             RouteError,
         )
 

@@ -187,7 +187,7 @@ class Resolver:
             if problem and not self._tolerates(vtype, user):
                 raise user.error(
                     f"has departLane='{lane}', {problem}",
-                    "write departLane='best', or skip such vehicles with on_bad_route='skip'",
+                    "write departLane='best', or skip such (traffic.on_bad_route = skip)",
                 )
         return not problem
 

@@ -88,7 +88,7 @@ class StopReader:
             name = self._index.network.edge_ids[edge]
             raise element.error(
                 f"on edge '{name}' lies off the route, or before the stop above it",
-                "put stops in the order of the route, or skip such with on_bad_route='skip'",
+                "put stops in the order of the route, or skip it (traffic.on_bad_route = skip)",
             )
         self._report.tolerate("stop off its route is left out", element.place)
 

@@ -147,6 +147,8 @@ GAMES = ("A10KW", "bs3d", "corridor", "cross", "DRT", "fkk_in", "fokr_bs_demo", 
 @pytest.mark.parametrize("game", [*GAMES, "square"])
 def test_scenarios_of_the_wheel_are_read(game: str) -> None:
     config = Path(sumo_binary("sumo")).parents[1] / f"tools/game/{game}.sumocfg"
+    if not config.exists():
+        pytest.skip(f"this version of SUMO has no {game}")
     net_file = read_sumo_config(config).net_file
     assert net_file is not None
     file = read_demand([config], read_network(net_file))
