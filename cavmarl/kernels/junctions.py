@@ -41,7 +41,8 @@ __all__ = [
     "waits_inside",
 ]
 
-ENTRY_ACCEL = 2.5  # m/s², how a driver thinks others and itself speed up over a junction
+FOE_ACCEL = 2.5  # m/s², how a driver thinks that others speed up over a junction,
+OWN_ACCEL = 1.8  # and, to be safe, itself
 COMFORT_STOP = 3.0  # m/s², a driver stops for yellow where this braking is enough
 HARD_STOP = 5.0  # m/s², a vehicle that needs more to stop before the line will not stop
 GAP_S = 1.0  # s between the last of one and the first of the other in a shared area
@@ -68,15 +69,15 @@ def link_signal(roads: RoadArrays, link: int, phase: NDArray[np.int32]) -> int:
 
 
 @kernel
-def _earliest(distance: float, speed: float, limit: float) -> float:
-    """Time in s to drive `distance` m when speeding up with ENTRY_ACCEL to `limit` m/s."""
+def _earliest(distance: float, speed: float, limit: float, accel: float) -> float:
+    """Time in s to drive `distance` m when speeding up with `accel` m/s² to `limit` m/s."""
     if distance <= 0.0:
         return 0.0
     limit = max(limit, speed, 0.1)
-    ramp = (limit * limit - speed * speed) / (2.0 * ENTRY_ACCEL)
+    ramp = (limit * limit - speed * speed) / (2.0 * accel)
     if distance < ramp:
-        return (math.sqrt(speed * speed + 2.0 * ENTRY_ACCEL * distance) - speed) / ENTRY_ACCEL
-    return (limit - speed) / ENTRY_ACCEL + (distance - ramp) / limit
+        return (math.sqrt(speed * speed + 2.0 * accel * distance) - speed) / accel
+    return (limit - speed) / accel + (distance - ramp) / limit
 
 
 @kernel
@@ -146,9 +147,8 @@ def _foe_blocks(
     if cleared + GAP_S < time_in:
         return False
     foe_limit = roads.lanes[foe_lane]["speed_mps"]
-    arrives = _earliest(
-        foe["dist"] + conflict["foe_enter_m"] - foe["half"], foe["speed"], foe_limit
-    )
+    to_area = foe["dist"] + conflict["foe_enter_m"] - foe["half"]
+    arrives = _earliest(to_area, foe["speed"], foe_limit, FOE_ACCEL)
     return arrives < time_out + GAP_S
 
 
@@ -170,6 +170,7 @@ def _blocked_by_foes(
     Asks about the shared areas before `wait_m`, or, from `inside`, about those beyond.
     """
     row = rows[i]
+    speed = row["speed"]
     half = 0.5 * row["length"]
     limit = roads.lanes[roads.links[link]["next_lane"]]["speed_mps"]
     if row["driver"] == DRIVER_AGENT:
@@ -181,8 +182,8 @@ def _blocked_by_foes(
         end = scratch.link_start[conflict["foe"] + 1]
         if begin == end or (conflict["enter_m"] >= wait_m) != inside:
             continue
-        time_in = _earliest(distance + conflict["enter_m"] - half, row["speed"], limit)
-        time_out = _earliest(distance + conflict["leave_m"] + half, row["speed"], limit)
+        time_in = _earliest(distance + conflict["enter_m"] - half, speed, limit, FOE_ACCEL)
+        time_out = _earliest(distance + conflict["leave_m"] + half, speed, limit, OWN_ACCEL)
         foe_signal = link_signal(roads, conflict["foe"], phase)
         for k in range(begin, end):
             foe = scratch.approach[k]

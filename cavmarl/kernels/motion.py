@@ -120,14 +120,19 @@ def place_on_lane(roads: RoadArrays, travel: Travel, row: np.void) -> float:
 
 
 @inlined_kernel
-def _account(row: np.void, old: np.void, roads: RoadArrays, dt: float) -> None:
-    """What motion of both kinds leaves in the record: rates, ways, waiting time."""
+def _account(
+    row: np.void, old: np.void, roads: RoadArrays, pace: float, dt: float
+) -> None:
+    """What motion of both kinds leaves in the record: rates, ways, waiting time.
+
+    `pace` is the speed over the limit with which the way would have been driven freely.
+    """
     row["accel"] = (row["speed"] - old["speed"]) / dt
     row["jerk"] = (row["accel"] - old["accel"]) / dt
     row["yaw_rate"] = wrap_angle(row["heading"] - old["heading"]) / dt
     driven = abs(old["speed"]) * dt
     row["distance_m"] = old["distance_m"] + driven
-    row["free_s"] = old["free_s"] + driven / roads.lanes[old["lane"]]["speed_mps"]
+    row["free_s"] = old["free_s"] + driven / (pace * roads.lanes[old["lane"]]["speed_mps"])
     row["wait_s"] = old["wait_s"] + dt if abs(row["speed"]) < STANDING_MPS else 0.0
     row["step_jerk"] = old["step_jerk"] + abs(row["jerk"]) * dt
     row["tick"] = old["tick"] + 1
@@ -226,7 +231,7 @@ def move_background(
     row["to_go"] = way_left(roads, travel, row)
     if row["to_go"] <= ARRIVE_M:
         row["events"] |= EVENT_ARRIVED
-    _account(row, old, roads, dt)
+    _account(row, old, roads, old["speed_factor"], dt)
     make_stop(roads, travel, old, row, travel.begin_s, dt)
 
 
@@ -295,4 +300,4 @@ def move_agent(
     row["to_go"] = step["to_go"] - row["s"]
     if row["to_go"] <= ARRIVE_M:
         row["events"] |= EVENT_ARRIVED
-    _account(row, old, roads, dt)
+    _account(row, old, roads, 1.0, dt)

@@ -74,7 +74,8 @@ VEHICLE = np.dtype(
         ("tick", np.int64),  # the world's tick that this state belongs to
         ("to_go", np.float64),  # m left to the goal, along the plan
         ("distance_m", np.float64),  # driven since departure
-        ("free_s", np.float64),  # time the driven way would have taken at the limit, s
+        ("free_s", np.float64),  # s that the driven way would take at the limit; of a background
+        # vehicle, times its speed factor
         ("step_to_go", np.float64),  # to_go when the current step began
         ("step_jerk", np.float64),  # integral of |jerk| over the current step, m/s²
         ("hit", np.int64),  # id of the vehicle it collided with
