@@ -84,6 +84,13 @@ def parallel_env(
     return CavEnv(config, network, demand, seed=seed, render_mode=render_mode)
 
 
+def _flags(agents: list[str], flags: NDArray[np.bool_]) -> dict[str, bool]:
+    """One flag an agent; in most steps nobody's is set."""
+    if not flags.any():
+        return dict.fromkeys(agents, False)
+    return dict(zip(agents, flags.tolist(), strict=True))
+
+
 class CavEnv(ParallelEnv[str, Any, Any]):  # type: ignore[misc] # PettingZoo is not typed
     """One world.
 
@@ -240,10 +247,8 @@ class CavEnv(ParallelEnv[str, Any, Any]):  # type: ignore[misc] # PettingZoo is 
         ended = outputs.terminated[0, self._listed] & (not self._seats)
         observations, infos = self._observations(), self._infos()
         rewards = dict(zip(shown, outputs.rewards[0, self._listed].tolist(), strict=True))
-        terminations = dict(zip(shown, ended.tolist(), strict=True))
-        truncations = dict.fromkeys(shown, False)
-        if truncated:
-            truncations = dict(zip(shown, (~ended).tolist(), strict=True))
+        terminations = _flags(shown, ended)
+        truncations = _flags(shown, ~ended & truncated)
         self._simulation.retire_agents()
         if truncated:
             self._list(self._rows[:0])

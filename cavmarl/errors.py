@@ -14,6 +14,8 @@
     │   ├── ResetNeededError      step before reset
     │   └── EpisodeEndedError     step after the end
     ├── CapacityError          more vehicles or seats than the world can take
+    ├── EvaluationError        an evaluation that could not be brought to its end
+    │   └── ManifestError         results whose origin is not on record
     ├── PolicyError            a policy that cannot be loaded or does not fit
     └── MissingExtraError      an optional dependency is not installed
 
@@ -33,7 +35,9 @@ __all__ = [
     "DemandError",
     "EpisodeEndedError",
     "EpisodeError",
+    "EvaluationError",
     "InvalidActionError",
+    "ManifestError",
     "MapError",
     "MissingActionError",
     "MissingExtraError",
@@ -100,6 +104,14 @@ class EpisodeEndedError(EpisodeError):
 
 class CapacityError(CavmarlError):
     """More vehicles, agents or points than this world can take."""
+
+
+class EvaluationError(CavmarlError):
+    """A process of an evaluation died, or did something else than it was asked to."""
+
+
+class ManifestError(EvaluationError):
+    """Results without a manifest, with one that was never closed, or with one of other results."""
 
 
 class PolicyError(CavmarlError):

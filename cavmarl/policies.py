@@ -30,7 +30,7 @@ from cavmarl.vector_env import CavVectorEnv
 if TYPE_CHECKING:
     from cavmarl.networks import ActorCritic, NetworkConfig
 
-__all__ = ["NetworkPolicy", "Policy", "load_policy"]
+__all__ = ["NetworkPolicy", "Policy", "load_policy", "policy_files"]
 
 Environment = CavEnv | CavVectorEnv
 
@@ -95,13 +95,11 @@ class NetworkPolicy(Policy):
     Args:
         env: where it drives.
         network: maps flat observations to actions.
-        weights_file: where the network was read from.
     """
 
-    def __init__(self, env: Environment, network: ActorCritic, weights_file: Path) -> None:
+    def __init__(self, env: Environment, network: ActorCritic) -> None:
         super().__init__(env)
         self.network = network
-        self.weights_file = weights_file
 
     def act_batch(self, observations: NDArray[np.float32], mask: NDArray[np.bool_]) -> NDArray[Any]:
         """The network's most likely actions where `mask`, 0 elsewhere."""
@@ -142,6 +140,27 @@ def load_policy(policy: str | Path, env: Environment) -> Policy:
     if path.is_dir():
         return _load_network_policy(path, env)
     return _load_script(path, env)
+
+
+def policy_files(policy: str | Path) -> tuple[Path, ...]:
+    """The files that make a policy what it is: its script, or its weights and their description.
+
+    Raises:
+        PolicyError: nothing of that name, or a folder without them.
+        MissingExtraError: a network, without torch.
+    """
+    path = _find(policy)
+    if not path.is_dir():
+        return (path,)
+    require("torch", "torch")
+    require("safetensors", "torch")
+    from cavmarl.networks import CONFIG_FILE, WEIGHTS_FILE
+
+    files = (path / WEIGHTS_FILE, path / CONFIG_FILE)
+    for file in files:
+        if not file.is_file():
+            raise PolicyError(f"no {file.name} in {path}: not the folder of a trained driver")
+    return files
 
 
 def _find(policy: str | Path) -> Path:
@@ -191,7 +210,7 @@ def _load_script(path: Path, env: Environment) -> Policy:
 def _load_network_policy(folder: Path, env: Environment) -> NetworkPolicy:
     require("torch", "torch")
     require("safetensors", "torch")
-    from cavmarl.networks import WEIGHTS_FILE, load_network
+    from cavmarl.networks import load_network
 
     network, config = load_network(folder)
     name, here = folder.name, env.config
@@ -208,7 +227,7 @@ def _load_network_policy(folder: Path, env: Environment) -> NetworkPolicy:
             f"{name}: observes {config.observation_size} numbers, but its sensors give {size} in "
             "this version: train it again"
         )
-    return NetworkPolicy(env, network, folder / WEIGHTS_FILE)
+    return NetworkPolicy(env, network)
 
 
 def _differences(config: NetworkConfig, here: EnvConfig) -> dict[str, tuple[Any, Any]]:

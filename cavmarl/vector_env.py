@@ -156,13 +156,15 @@ class CavVectorEnv:
         Args:
             seed: root of all random numbers; world w's episodes depend on (seed, w) alone. None
                 goes on with the next episodes of the last seed.
-            options: not used; accepted because the API has it.
+            options: `first_world`, with a seed: these are the worlds from that number on, so that
+                many worlds can be run a part at a time. Others are not used.
 
         Returns:
             observations (W, A, D) and infos.
         """
         if seed is not None or not self._ready:
-            self._simulation.seed(first_seed(seed, self._first_seed))
+            first_world = int((options or {}).get("first_world", 0))
+            self._simulation.seed(first_seed(seed, self._first_seed), first_world)
         everywhere = np.ones(self.num_envs, dtype=np.bool_)
         self._simulation.reset()
         self._decoder.forget(everywhere)
@@ -182,7 +184,8 @@ class CavVectorEnv:
             observations (W, A, D), rewards (W, A), terminations (W, A): the agent's vehicle ended;
             truncations (W, A): the episode was cut at the horizon; and infos: `mask` (W, A) who
             acts next; `acted` (W, A) who acted in this step, so whose reward counts; `terms` (W, A,
-            T) in the order of `config.TERMS`; `episode_over` (W,) which worlds were reset;
+            T) in the order of `config.TERMS`; `arrivals` (W,) vehicles that reached their goal
+            since the reset, agents included; `episode_over` (W,) which worlds were reset;
             `final_observations` (W, A, D) before that reset and with the last ones of those who
             left: the same array as the observations in a step where nobody did.
 
@@ -210,6 +213,7 @@ class CavVectorEnv:
             "final_observations": final_observations,
         }
         simulation.retire_agents()
+        infos["arrivals"] = simulation.arrivals()
         staying = outputs.present & ~terminations
         over = horizon | ~(staying.any(axis=1) | simulation.agents_to_come())
         observations = final_observations

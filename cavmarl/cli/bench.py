@@ -105,7 +105,7 @@ def profile(
     env: Environment,
     agents: Agents = None,
     background: Background = None,
-    worlds: Annotated[int, typer.Option(help="Stepped together.")] = 1,
+    worlds: Annotated[int, typer.Option(help="Stepped together.")] = 16,
     steps: Annotated[int, typer.Option(help="Steps a turn.")] = 200,
     repeats: Annotated[int, typer.Option(help="Turns; the fastest counts.")] = 5,
     seed: Seed = 0,

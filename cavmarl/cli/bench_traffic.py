@@ -63,7 +63,7 @@ def traffic(
     if speed and plot is not None:
         raise ConfigError("--plot: draws what both do, and --speed does not look; use one")
     if plot is not None:
-        require("matplotlib", "plot")
+        require("matplotlib", "report")
     console = Console()
     with console.status("") as status:
         found: TrafficComparison | TrafficSpeed

@@ -29,7 +29,9 @@ def plot_fundamental_diagram(found: TrafficComparison, path: Path) -> None:
         ConfigError: the picture cannot be written.
         MissingExtraError: matplotlib is not installed.
     """
-    figure = require("matplotlib.figure", "plot").Figure(figsize=(10.0, 4.2), layout="constrained")
+    figure = require("matplotlib.figure", "report").Figure(
+        figsize=(10.0, 4.2), layout="constrained"
+    )
     flow, speed = figure.subplots(1, 2)
     for name, run in (("SUMO", found.sumo), ("cavmarl", found.ours)):
         points = run.edge_minutes[run.edge_minutes["length_m"] >= LEAST_EDGE_M]

@@ -45,8 +45,7 @@ def register_links(
         travel: the ways.
         rows: VEHICLE (C,), of which `num` live.
         num: live rows.
-        scratch: link_start and approach are written, and line_link and line_m: the next link of
-            each row and the way of its centre to that link's stop line, -1 if none is near.
+        scratch: link_start and approach are written.
     """
     pairs = 0
     for i in range(num):
@@ -87,12 +86,12 @@ def _announce(
     s = row["s"]
     if here["internal"]:
         pairs = _note(scratch, pairs, here["link"], row, i, -(here["link_offset_m"] + s))
-    elif row["link"] >= 0 and s < 0.5 * row["length"]:
-        # Its centre has left the junction, its rear has not.
+    elif row["link"] >= 0:
+        # Its centre has left the junction, its rear has not, or not the fork before it.
         left = roads.links[row["link"]]
-        if left["to_lane"] == lane:
+        rear = s - 0.5 * row["length"]
+        if left["to_lane"] == lane and (rear < 0.0 or left["length_m"] + rear < left["fork_m"]):
             pairs = _note(scratch, pairs, row["link"], row, i, -(left["length_m"] + s))
-    scratch.line_link[i] = -1
     reach = min(APPROACH_STANDING_M + APPROACH_S * row["speed"], APPROACH_M)
     distance = here["length_m"] - s
     way = row["way"]
@@ -102,9 +101,6 @@ def _announce(
         if lane < 0:
             break
         if link >= 0:
-            if found == 0:
-                scratch.line_link[i] = link
-                scratch.line_m[i] = distance
             if roads.links[link]["num_conflicts"] > 0:
                 pairs = _note(scratch, pairs, link, row, i, max(distance, 0.0))
             found += 1

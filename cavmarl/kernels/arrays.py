@@ -63,6 +63,7 @@ class Travel(NamedTuple):
     types: NDArray[np.void]  # VTYPE (num_types,), by VEHICLE["vtype"]
     steps: NDArray[np.void]  # PLAN (num_steps,), see `kernels.ways`
     stops: NDArray[np.void]  # STOP (num_stops,), by VEHICLE["stop"]
+    first_detour: int  # PLAN row of the first goal of demand vehicles that take another way
     begin_s: float  # the clock of the demand at tick 0
 
 
@@ -81,6 +82,7 @@ class Worlds(NamedTuple):
     signal_phase: NDArray[np.int32]  # (W, num_signals) PHASE row that is on
     controllers: NDArray[np.void]  # CONTROLLER (W, num_controllers) of the actuated programs
     detected_s: NDArray[np.float64]  # (W, D) when a body was last over each detector
+    num_through: NDArray[np.int64]  # (W,) background vehicles that have arrived in this tick
     num_contacts: NDArray[np.int64]  # (W,) vehicles that began to touch another, since reset
 
 
@@ -124,8 +126,7 @@ class Scratch(NamedTuple):
     link_start: NDArray[np.int32]  # (K + 2,) approach of link k: [link_start[k], link_start[k + 1])
     approach: NDArray[np.void]  # APPROACH (3 C,) vehicles on or before links, by link
     pairs: NDArray[np.void]  # APPROACH (3 C,) the same before sorting
-    line_link: NDArray[np.int32]  # (C,) the next link of each row, or -1
-    line_m: NDArray[np.float64]  # (C,) the way of its centre to that link's stop line
+    order: NDArray[np.int32]  # (C,) the owned rows as they lie along the lanes
     accel: NDArray[np.float64]  # (C,) decided accelerations
     link_ahead: NDArray[np.int32]  # (C,) the link whose stop line each row is next to
     lane_change: NDArray[np.int32]  # (C,) decided lane changes: 1 left, -1 right
@@ -153,7 +154,7 @@ class Sensors(NamedTuple):
     lidar_range_m: float
     lidar_speeds: bool
     rays: NDArray[np.float64]  # (lidar_rays, 2) directions in the ego frame
-    near_row: NDArray[np.int32]  # (neighbors,) room
+    near_body: NDArray[np.int32]  # (neighbors,) room
     near_squared: NDArray[np.float64]
     echoes: NDArray[np.void]  # ECHO (lidar_rays,) room
 

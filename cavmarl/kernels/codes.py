@@ -80,7 +80,8 @@ ACTION_SLOWER = 4
 COUNT_DEPARTED = 0  # vehicles that have entered
 COUNT_ARRIVED = 1  # vehicles that reached their goal
 COUNT_REMOVED = 2  # agents taken out after a collision or off the road
-NUM_COUNTS = 3
+COUNT_REROUTED = 3  # vehicles that left their route for another way
+NUM_COUNTS = 4
 
 # Gate.sums, over vehicles that arrived
 SUM_DISTANCE_M = 0

@@ -17,6 +17,7 @@ from cavmarl.kernels.codes import (
     COUNT_ARRIVED,
     COUNT_DEPARTED,
     COUNT_REMOVED,
+    COUNT_REROUTED,
     DRIVER_AGENT,
     DRIVER_BACKGROUND,
     EVENT_ARRIVED,
@@ -35,8 +36,10 @@ from cavmarl.kernels.entering import (
     follower_brakes,
     speed_at,
 )
+from cavmarl.kernels.geometry import boxes_overlap
 from cavmarl.kernels.lanes import index_lanes
 from cavmarl.kernels.motion import place_on_lane
+from cavmarl.kernels.neighbors import LEVEL_HEIGHT_M
 from cavmarl.kernels.rng import (
     STREAM_ORIGIN,
     STREAM_PLACE,
@@ -53,8 +56,10 @@ PLACE_TRIES = 24  # places tried for a vehicle at reset before it has to queue
 PLACE_GAP_M = 10.0  # m between bumpers of vehicles placed at reset
 END_ROOM_M = 12.0  # nobody starts nearer than this to the end of a lane, unless it is shorter
 PLACE_SHARE = 0.7  # of the speed limit, with which vehicles drive that are placed at reset
+ENTER_ROOM_M = 0.3  # free on all sides of a vehicle that enters
 WANDER_M = 150.0  # nearer to its goal than this a vehicle of a closed world picks another
 GOAL_TRIES = 8
+REROUTE_S = 45.0  # one on a route so long
 GIVE_UP_S = 10.0  # a driver that waits longer than this to change lanes takes another way
 
 
@@ -108,7 +113,6 @@ def _send(roads: RoadArrays, departure: np.void, lane: int, goal: int) -> None:
 def _enter(
     roads: RoadArrays,
     travel: Travel,
-    gate: Gate,
     worlds: Worlds,
     w: int,
     departure: np.void,
@@ -140,11 +144,9 @@ def _enter(
     row["rng_key"] = worlds.keys[w]
     row["departed"] = worlds.ticks[w]
     row["tick"] = worlds.ticks[w]
-    cos, sin = place_on_lane(roads, row)
-    row["heading"] = math.atan2(sin, cos)
+    row["heading"] = place_on_lane(roads, travel, row)
     row["to_go"] = way_left(roads, travel, row)
     row["step_to_go"] = row["to_go"]
-    gate.counts[w, COUNT_DEPARTED] += 1
 
 
 @kernel
@@ -211,7 +213,8 @@ def populate(
                     limit = PLACE_SHARE * roads.lanes[lane]["speed_mps"]
                     speed = speed_at(roads, kind, lane, s, limit)
                     row = worlds.rows[w, num]
-                    _enter(roads, travel, gate, worlds, w, departure, lane, s, speed, row)
+                    _enter(roads, travel, worlds, w, departure, lane, s, speed, row)
+                    gate.counts[w, COUNT_DEPARTED] += 1
                     worlds.num_rows[w] = num + 1
                     worlds.num_owned[w] = num + 1
                     gate.num_queue[w] -= 1
@@ -224,11 +227,18 @@ def _needs_goal(demand: Demand, roads: RoadArrays, travel: Travel, row: np.void)
 
     Stuck is who has stood for `GIVE_UP_S` at the end of a lane that its way does not follow.
     """
-    if row["driver"] != DRIVER_BACKGROUND or row["order"] >= 0:
+    if row["driver"] != DRIVER_BACKGROUND:
         return False
+    if row["order"] >= 0:
+        return row["goal"] >= 0 and _is_stuck(roads, travel, row, REROUTE_S)
     if not demand.reenter and row["to_go"] <= WANDER_M:
         return True
-    if row["wait_s"] <= GIVE_UP_S or roads.lanes[row["lane"]]["internal"]:
+    return _is_stuck(roads, travel, row, GIVE_UP_S)
+
+
+@kernel
+def _is_stuck(roads: RoadArrays, travel: Travel, row: np.void, patience_s: float) -> bool:
+    if row["wait_s"] <= patience_s or roads.lanes[row["lane"]]["internal"]:
         return False
     step = travel.steps[row["way"] + row["lane"]]
     stuck: bool = step["next"] < 0 and step["change"] != 0
@@ -236,16 +246,44 @@ def _needs_goal(demand: Demand, roads: RoadArrays, travel: Travel, row: np.void)
 
 
 @kernel
+def _take_detour(roads: RoadArrays, travel: Travel, row: np.void) -> bool:
+    """Send a vehicle of the demand file on to its goal without the lane change it waits for."""
+    way = travel.first_detour + row["goal"] * roads.lanes.shape[0]
+    step = travel.steps[way + row["lane"]]
+    if step["next"] < 0 or way == row["way"]:
+        return False
+    row["way"] = way
+    row["leg"] += 1
+    row["to_go"] = step["to_go"] - row["s"]
+    return True
+
+
+@kernel
 def choose_goals(
-    demand: Demand, roads: RoadArrays, travel: Travel, num_goals: int, worlds: Worlds
+    demand: Demand,
+    roads: RoadArrays,
+    travel: Travel,
+    num_goals: int,
+    gate: Gate,
+    worlds: Worlds,
+    dt: float,
 ) -> None:
-    """Give the background vehicles of `next_rows` that need it another goal, if one is in reach."""
+    """Give the background vehicles of `next_rows` that need it another goal, if one is in reach.
+
+    Asked about once a second.
+    """
+    turns = max(1, round(1.0 / dt))
     for w in range(worlds.ticks.shape[0]):
+        if worlds.ticks[w] % turns != 0:
+            continue
         for i in range(worlds.num_owned[w]):
             row = worlds.next_rows[w, i]
             if not _needs_goal(demand, roads, travel, row):
                 continue
             lane = row["lane"]
+            if row["order"] >= 0:
+                gate.counts[w, COUNT_REROUTED] += _take_detour(roads, travel, row)
+                continue
             if roads.lanes[lane]["internal"]:
                 continue
             for attempt in range(GOAL_TRIES):
@@ -308,6 +346,8 @@ def take_out(
         ticks_per_step: ticks a step; agents that entered within the last of them have not acted.
     """
     for w in range(worlds.ticks.shape[0]):
+        if driver == DRIVER_BACKGROUND and worlds.num_through[w] == 0:
+            continue
         while True:
             i = _next_through(rows[w], worlds.num_owned[w], driver, ticks_per_step)
             if i < 0:
@@ -355,6 +395,39 @@ def call_orders(gate: Gate, worlds: Worlds) -> None:
 
 
 @kernel
+def _touches(rows: NDArray[np.void], i: int) -> bool:
+    """Whether row i, with some room around it, touches one of the rows before it."""
+    own = rows[i]
+    cos = math.cos(own["heading"])
+    sin = math.sin(own["heading"])
+    half_length = 0.5 * own["length"] + ENTER_ROOM_M
+    half_width = 0.5 * own["width"] + ENTER_ROOM_M
+    for j in range(i):
+        other = rows[j]
+        dx = other["x"] - own["x"]
+        dy = other["y"] - own["y"]
+        reach = half_length + half_width + 0.5 * (other["length"] + other["width"])
+        if dx * dx + dy * dy > reach * reach or abs(other["z"] - own["z"]) > LEVEL_HEIGHT_M:
+            continue
+        if boxes_overlap(
+            own["x"],
+            own["y"],
+            cos,
+            sin,
+            half_length,
+            half_width,
+            other["x"],
+            other["y"],
+            math.cos(other["heading"]),
+            math.sin(other["heading"]),
+            0.5 * other["length"],
+            0.5 * other["width"],
+        ):
+            return True
+    return False
+
+
+@kernel
 def _try_to_enter(
     demand: Demand,
     roads: RoadArrays,
@@ -380,10 +453,13 @@ def _try_to_enter(
         return False
     if follower_brakes(roads, travel, rows, departure, kind, lane, s, speed, scratch):
         return False
-    i = worlds.num_owned[w]
+    i = worlds.num_rows[w]
     rows[i] = demand.blank[0]
-    _enter(roads, travel, gate, worlds, w, departure, lane, s, speed, rows[i])
-    worlds.num_owned[w] = i + 1
+    _enter(roads, travel, worlds, w, departure, lane, s, speed, rows[i])
+    if _touches(rows, i):
+        return False
+    gate.counts[w, COUNT_DEPARTED] += 1
+    worlds.num_owned[w] += 1
     worlds.num_rows[w] += 1
     return True
 

@@ -1,9 +1,9 @@
 """Background drivers: what each wants to do in this tick, from the committed state alone.
 
 Car following is IDM or Krauss's model, as the vehicle's type says, lane changing MOBIL; this file
-finds what they are applied to: the leader across lane and junction borders, the lower speed limit ahead, the stop line
-of a signal or of a right of way, the end of a lane, the vehicle that wants to merge, the lane that
-the route needs.
+finds what they are applied to: the leader across lane and junction borders, the lower speed limit
+ahead, the stop line of a signal or of a right of way, the end of a lane, the vehicle that wants to
+merge, the lane that the route needs.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from cavmarl.kernels import kernel
 from cavmarl.kernels.arrays import RoadArrays, Scratch, Travel
-from cavmarl.kernels.codes import DRIVER_AGENT, HOLD_NONE, MODEL_KRAUSS
+from cavmarl.kernels.codes import DRIVER_AGENT, DRIVER_BACKGROUND, HOLD_NONE, MODEL_KRAUSS
 from cavmarl.kernels.following import (
     LINE_MARGIN_M,
     accel_behind,
@@ -25,9 +25,9 @@ from cavmarl.kernels.following import (
     response,
     wish,
 )
-from cavmarl.kernels.junctions import may_enter, press_inside
+from cavmarl.kernels.junctions import may_enter, press_inside, waits_inside
 from cavmarl.kernels.lane_choice import LOOK_BACK_M, SIDE_GAP_M, choose_lane, needed_change
-from cavmarl.kernels.lanes import ahead_on, behind_on, last_on
+from cavmarl.kernels.lanes import ahead_on, behind_on, beside_s, last_on
 from cavmarl.kernels.rng import STREAM_DRIVER, quick_uniform
 from cavmarl.kernels.stopping import way_to_stop
 from cavmarl.kernels.ways import next_step
@@ -38,12 +38,13 @@ LOOK_AHEAD_M = 250.0  # no driver looks further
 STOP_LINE_M = 5.0  # standing with the front nearer than this counts as standing at the line
 LIMIT_DECEL = 2.0  # m/s², how a driver slows for a lower limit ahead,
 LIMIT_LEAD_S = 1.0  # to be down this time before it, as the model lags behind what is allowed
-SHARED_START_M = 7.0  # two links from one lane share about this much of their way
+FALL_IN_M = 100.0  # before the place where a lane change must be made
 COURTESY_DECEL = 2.0  # m/s², the hardest braking to let somebody merge
-# A driver that has to leave a lane waits this far before its end to change right, twice as far to
-# change left: two that want to swap lanes do not stand side by side for ever.
-MERGE_ROOM_M = 10.0
-MERGE_ROOM_SHARE = 0.25  # at most this share of the lane's length
+# A driver that has to leave a lane waits this far before its end to change right, and a vehicle's
+# length further back to change left: two that want to swap do not stand side by side for ever.
+MERGE_ROOM_M = 2.0
+SWAP_ROOM_M = 3.0
+MERGE_ROOM_SHARE = 0.25  # to the right at most this share of the lane's length
 LATERAL_ACCEL = 2.5  # m/s², with which a steered car takes a bend: where a lane turns
 MIN_BEND_RAD = 0.2  # by more than this
 BEND_M = 6.0  # within this length
@@ -53,7 +54,7 @@ BEND_M = 6.0  # within this length
 def _look_ahead_m(kind: np.void, speed: float) -> float:
     """How far ahead of its centre a driver looks, in m: IDM reacts earlier and more softly."""
     if kind["model"] == MODEL_KRAUSS:
-        way = 15.0 + speed * (1.0 + kind["tau"]) + 0.5 * speed * speed / kind["decel"]
+        way = 45.0 + speed * (1.0 + kind["tau"]) + 0.5 * speed * speed / kind["decel"]
     else:
         way = 30.0 + 2.0 * speed + 0.2 * speed * speed
     return float(min(way, LOOK_AHEAD_M))
@@ -61,7 +62,7 @@ def _look_ahead_m(kind: np.void, speed: float) -> float:
 
 @kernel
 def _slowing_to(kind: np.void, limit: float, distance: float, speed: float, dt: float) -> float:
-    """The speed in m/s now, from which a driver is down to a limit that begins `distance` m ahead."""
+    """The speed in m/s from which a driver gets down to a limit `distance` m ahead."""
     decel = LIMIT_DECEL
     lead_s = LIMIT_LEAD_S
     if kind["model"] == MODEL_KRAUSS:
@@ -120,7 +121,7 @@ def _shared_start(
         for k in range(scratch.link_start[link], scratch.link_start[link + 1]):
             other = scratch.approach[k]
             place = -other["dist"]
-            if place > 0.0 and place - other["half"] < SHARED_START_M:
+            if place > max(-distance, 0.0) and place - other["half"] < roads.links[link]["fork_m"]:
                 gap = distance + place - 0.5 * row["length"] - other["half"]
                 press = max(press, behind(kind, row["speed"], gap, other["speed"], kind["decel"]))
     return press
@@ -150,10 +151,44 @@ def _lane_end(
     # Stop with room enough to swing out, but on this lane and not before it.
     length = roads.lanes[lane]["length_m"]
     half = 0.5 * row["length"]
-    room = merge_room_m if step["change"] < 0 else 2.0 * merge_room_m
-    room = min(room, MERGE_ROOM_SHARE * length)
+    room = min(merge_room_m, MERGE_ROOM_SHARE * length)
+    if step["change"] > 0 and merge_room_m > 0.0:
+        room += row["length"] + SWAP_ROOM_M
     place = max(length - half - room, min(2.0 * LINE_MARGIN_M, 0.5 * length))
     return before_line(kind, row["speed"], distance - length + place, dt)
+
+
+@kernel
+def _at_line(
+    roads: RoadArrays,
+    travel: Travel,
+    rows: NDArray[np.void],
+    i: int,
+    kind: np.void,
+    link: int,
+    distance: float,
+    way: int,
+    phase: NDArray[np.int32],
+    dt: float,
+    scratch: Scratch,
+) -> tuple[float, int, bool]:
+    """How the end of a lane presses, `distance` m ahead of row i: (press, HOLD_*, it stops)."""
+    row = rows[i]
+    speed = row["speed"]
+    front = distance - 0.5 * row["length"]
+    to_line = front - roads.lanes[roads.links[link]["from_lane"]]["stop_back_m"]
+    if to_line <= 0.0:
+        # Its front is over the line: it does not wait there any more.
+        press, hold = press_inside(roads, travel, rows, i, link, -distance, way, phase, dt, scratch)
+        return press, hold, False
+    hold = may_enter(roads, travel, rows, i, link, distance, way, phase, scratch)
+    if hold != HOLD_NONE:
+        return before_line(kind, speed, to_line, dt), hold, True
+    waits = waits_inside(roads, travel, rows, i, link, distance, way, phase, scratch)
+    if waits != HOLD_NONE:
+        to_wait = front + roads.links[link]["wait_m"]
+        return before_line(kind, speed, to_wait, dt), HOLD_NONE, False
+    return no_press(kind), HOLD_NONE, False
 
 
 @kernel
@@ -188,7 +223,12 @@ def _road_ahead(
     link_ahead = -1
     if here["internal"]:
         place = here["link_offset_m"] + row["s"]
-        press, hold = press_inside(roads, travel, rows, i, place, phase, dt, scratch)
+        before = roads.links[here["link"]]["from_lane"]
+        fork = _shared_start(roads, kind, row, before, here["link"], -place, scratch)
+        press, hold = press_inside(
+            roads, travel, rows, i, here["link"], place, row["way"], phase, dt, scratch
+        )
+        press = max(press, fork)
     look = _look_ahead_m(kind, speed)
     distance = here["length_m"] - row["s"]
     # Behind a leader on its own lane a driver minds the next line only where it could not stop
@@ -211,15 +251,16 @@ def _road_ahead(
             )
             press = max(press, end)
             break
+        stops = False
         if link >= 0:
-            if distance - half < STOP_LINE_M and link_ahead < 0:
-                link_ahead = link
-            held = may_enter(roads, rows, i, link, distance, phase, scratch)
-            if held != HOLD_NONE:
-                hold = held
-                press = max(press, before_line(kind, speed, distance - half, dt))
-                break
-            press = max(press, _shared_start(roads, kind, row, before, link, distance, scratch))
+            if distance - half - roads.lanes[before]["stop_back_m"] < STOP_LINE_M:
+                link_ahead = link if link_ahead < 0 else link_ahead
+            fork = _shared_start(roads, kind, row, before, link, distance, scratch)
+            at_line, found, stops = _at_line(
+                roads, travel, rows, i, kind, link, distance, way, phase, dt, scratch
+            )
+            press = max(press, fork, at_line)
+            hold = found if found != HOLD_NONE else hold
         ahead = roads.lanes[lane]
         limit = ahead["speed_mps"] * row["speed_factor"]
         if steered:
@@ -230,6 +271,7 @@ def _road_ahead(
             leader = scratch.entries[j]
             gap = distance + leader["s"] - half - leader["half"]
             press = max(press, _behind_entry(kind, speed, gap, leader))
+        if j >= 0 or stops:
             break
         distance += ahead["length_m"]
     return press, allowed, hold, link_ahead
@@ -238,13 +280,28 @@ def _road_ahead(
 @kernel
 def _beside(roads: RoadArrays, kind: np.void, row: np.void, lane: int, scratch: Scratch) -> float:
     """How the leader on a neighbour lane presses that the body covers, or is about to."""
-    s = row["s"] * roads.lanes[lane]["length_m"] / roads.lanes[row["lane"]]["length_m"]
+    beside = roads.lanes[lane]
+    s = beside_s(roads.lanes, row["lane"], lane, row["s"])
+    half = 0.5 * row["length"]
     j = ahead_on(scratch, lane, s, row["id"])
-    if j < 0:
-        return no_press(kind)
-    leader = scratch.entries[j]
-    gap = leader["s"] - s - 0.5 * row["length"] - leader["half"]
-    return _behind_entry(kind, row["speed"], gap, leader)
+    if j >= 0:
+        leader = scratch.entries[j]
+        return _behind_entry(kind, row["speed"], leader["s"] - s - half - leader["half"], leader)
+    # Beyond the end of that lane, whichever way others have gone there.
+    press = no_press(kind)
+    for link in range(beside["first_link"], beside["first_link"] + beside["num_links"]):
+        distance = beside["length_m"] - s
+        beyond = roads.links[link]["next_lane"]
+        j = last_on(scratch, beyond, row["id"])
+        while j < 0 and roads.lanes[beyond]["internal"]:
+            distance += roads.lanes[beyond]["length_m"]
+            beyond = roads.lanes[beyond]["successor"]
+            j = last_on(scratch, beyond, row["id"])
+        if j >= 0:
+            leader = scratch.entries[j]
+            gap = distance + leader["s"] - half - leader["half"]
+            press = max(press, _behind_entry(kind, row["speed"], gap, leader))
+    return press
 
 
 @kernel
@@ -256,7 +313,7 @@ def _let_merge(
     target = lane["left"] if row["blinker"] > 0 else lane["right"]
     if target < 0:
         return
-    s = row["s"] * roads.lanes[target]["length_m"] / lane["length_m"]
+    s = beside_s(roads.lanes, row["lane"], target, row["s"])
     k = behind_on(scratch, target, s, row["id"])
     if k < 0 or scratch.entries[k]["side"]:
         return
@@ -328,12 +385,21 @@ def decide(
         share = 0.0
         if kind["sigma"] > 0.0:
             share = quick_uniform(row["rng_key"], row["id"], tick, STREAM_DRIVER)
-        scratch.accel[i] = response(kind, speed, allowed, press, share, dt)
+        accel = response(kind, speed, allowed, press, share, dt)
+        if needed != 0 and change == 0 and driver == DRIVER_BACKGROUND:
+            lane = roads.lanes[row["lane"]]
+            target = lane["left"] if needed > 0 else lane["right"]
+            room = travel.steps[row["way"] + row["lane"]]["room"] - row["s"]
+            if target >= 0 and room < FALL_IN_M:
+                # Fall in behind whom it wants to follow on the other lane.
+                fall_in = wish(kind, speed, allowed, _beside(roads, kind, row, target, scratch))
+                accel = min(accel, max(fall_in, -COURTESY_DECEL))
+        scratch.accel[i] = accel
         scratch.lane_change[i] = change
         scratch.blinker[i] = needed
         scratch.hold[i] = hold
         scratch.link_ahead[i] = link_ahead
     for k in range(total):
-        row = rows[scratch.entries[k]["row"]]
-        if row["blinker"] != 0 and not scratch.entries[k]["side"]:
-            _let_merge(roads, travel, rows, row, scratch)
+        entry = scratch.entries[k]
+        if entry["blinker"] != 0 and not entry["side"]:
+            _let_merge(roads, travel, rows, rows[entry["row"]], scratch)

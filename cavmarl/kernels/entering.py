@@ -141,7 +141,7 @@ def entry_speed(
     s: float,
     scratch: Scratch,
 ) -> float:
-    """The speed in m/s with which a departure enters at a place, or -1 if the leader is too near."""
+    """The speed in m/s with which a departure enters somewhere, -1 if the leader is too near."""
     here = roads.lanes[lane]
     code = departure["speed_code"]
     wanted = here["speed_mps"] * departure["speed_factor"]

@@ -30,14 +30,15 @@ from cavmarl.kernels.codes import (
     SIGNAL_YELLOW_MAJOR,
     SIGNAL_YELLOW_MINOR,
 )
-from cavmarl.kernels.following import before_line, no_press
-from cavmarl.kernels.lanes import last_on
+from cavmarl.kernels.following import before_line, behind, no_press
+from cavmarl.kernels.ways import next_step
 
 __all__ = [
     "STOP_SIGN_S",
     "link_signal",
     "may_enter",
     "press_inside",
+    "waits_inside",
 ]
 
 ENTRY_ACCEL = 2.5  # m/s², how a driver thinks others and itself speed up over a junction
@@ -49,6 +50,7 @@ STANDING_MPS = 0.5
 LAST_CHANCE_M = 3.0  # with the front this near to the line
 ROOM_M = 3.0  # free way left behind a vehicle that clears a junction
 IMPATIENT_S = 3.0  # a vehicle that stands this long without reason is not waited for
+EXIT_LANES = 4  # looked along for room
 STOP_SIGN_S = 0.5  # how long one stands at a stop sign, and before a tie is broken
 WAIT_SLACK_M = 0.5  # a front this far beyond a waiting position still waits there
 STATE_STOP = ord("s")
@@ -121,13 +123,18 @@ def _foe_blocks(
     if to_clear <= 0.0:
         return False
     cleared = to_clear / max(foe["speed"], 0.1)
+    foe_lane = roads.links[foe["link"]]["from_lane"]
     # Its front before the line that it can still stop at: the stop line, or, where the shared
     # area lies beyond that, its waiting position inside.
-    front = foe["dist"] - foe["half"]
+    front = foe["dist"] - foe["half"] - roads.lanes[foe_lane]["stop_back_m"]
     wait_m = roads.links[foe["link"]]["wait_m"]
     if front <= 0.0 and conflict["foe_enter_m"] >= wait_m:
         front += wait_m + WAIT_SLACK_M
     if front <= 0.0:
+        # Who stands on the junction before the shared area is kept from it by somebody else.
+        before_area = foe["dist"] + conflict["foe_enter_m"] - foe["half"] > 0.0
+        if before_area and foe["speed"] < STANDING_MPS and rows[foe["row"]]["wait_s"] > IMPATIENT_S:
+            return False
         inside: bool = cleared + 0.5 * GAP_S > time_in
         return inside
     committed = foe["speed"] * foe["speed"] > 2.0 * HARD_STOP * max(front, 0.01)
@@ -138,7 +145,7 @@ def _foe_blocks(
             return False
     if cleared + GAP_S < time_in:
         return False
-    foe_limit = roads.lanes[roads.links[foe["link"]]["from_lane"]]["speed_mps"]
+    foe_limit = roads.lanes[foe_lane]["speed_mps"]
     arrives = _earliest(
         foe["dist"] + conflict["foe_enter_m"] - foe["half"], foe["speed"], foe_limit
     )
@@ -187,31 +194,49 @@ def _blocked_by_foes(
 
 
 @kernel
-def _exit_blocked(roads: RoadArrays, row: np.void, link: int, scratch: Scratch) -> bool:
-    """Whether there is no room for a row between the junction and the last vehicle behind it."""
+def _exit_blocked(
+    roads: RoadArrays, travel: Travel, row: np.void, link: int, way: int, scratch: Scratch
+) -> bool:
+    """Whether a row could not clear the junction behind the last standing vehicle on its way.
+
+    Who still moves in between will need room as well.
+    """
     target = roads.links[link]
-    k = last_on(scratch, target["to_lane"], row["id"])
-    if k < 0 or scratch.entries[k]["speed"] > 2.0:
-        return False
-    room = scratch.entries[k]["s"] - scratch.entries[k]["half"]
+    room = 0.0
     lane = target["next_lane"]
     while roads.lanes[lane]["internal"]:
-        for n in range(scratch.lane_start[lane], scratch.lane_start[lane + 1]):
-            other = scratch.entries[n]
+        for k in range(scratch.lane_start[lane], scratch.lane_end[lane]):
+            other = scratch.entries[k]
             if other["id"] != row["id"]:
                 room -= 2.0 * other["half"] + ROOM_M
         lane = roads.lanes[lane]["successor"]
-    blocked: bool = room < row["length"] + ROOM_M
-    return blocked
+    needed = row["length"] + ROOM_M
+    for _ in range(EXIT_LANES):
+        for k in range(scratch.lane_start[lane], scratch.lane_end[lane]):
+            other = scratch.entries[k]
+            if other["speed"] < STANDING_MPS:
+                room += other["s"] - other["half"]
+                blocked: bool = room < needed
+                return blocked
+            room -= 2.0 * other["half"] + ROOM_M
+        room += roads.lanes[lane]["length_m"]
+        if room >= needed:
+            return False
+        lane, way, _ = next_step(roads, travel, lane, way)
+        if lane < 0:
+            return False
+    return False
 
 
 @kernel
 def may_enter(
     roads: RoadArrays,
+    travel: Travel,
     rows: NDArray[np.void],
     i: int,
     link: int,
     distance: float,
+    way: int,
     phase: NDArray[np.int32],
     scratch: Scratch,
 ) -> int:
@@ -219,16 +244,19 @@ def may_enter(
 
     Args:
         roads: the road arrays.
+        travel: the ways.
         rows: VEHICLE (C,).
         i: the row that asks.
         link: LINK row.
-        distance: of its centre to the stop line in m.
+        distance: of its centre to the end of its lane in m.
+        way: of the row beyond the junction.
         phase: (num_signals,) PHASE rows that are on.
         scratch: with the lane and link indices of this tick.
     """
     row = rows[i]
     signal = link_signal(roads, link, phase)
-    front = max(distance - 0.5 * row["length"], 0.01)
+    back = roads.lanes[roads.links[link]["from_lane"]]["stop_back_m"]
+    front = max(distance - 0.5 * row["length"] - back, 0.01)
     needed = row["speed"] * row["speed"] / (2.0 * front)
     if signal == SIGNAL_RED or signal == SIGNAL_RED_YELLOW:
         return HOLD_SIGNAL
@@ -250,7 +278,35 @@ def may_enter(
         roads, rows, i, link, distance, target["wait_m"], False, gives_way, phase, scratch
     ):
         return HOLD_YIELD
-    if _exit_blocked(roads, row, link, scratch):
+    if _exit_blocked(roads, travel, row, link, way, scratch):
+        return HOLD_EXIT_BLOCKED
+    return HOLD_NONE
+
+
+@kernel
+def waits_inside(
+    roads: RoadArrays,
+    travel: Travel,
+    rows: NDArray[np.void],
+    i: int,
+    link: int,
+    distance: float,
+    way: int,
+    phase: NDArray[np.int32],
+    scratch: Scratch,
+) -> int:
+    """Whether row i has to stop at the waiting position of `link`, if there is one: HOLD_*.
+
+    Arguments as in `may_enter`; the distance is negative inside.
+    """
+    wait_m = roads.links[link]["wait_m"]
+    if wait_m == math.inf:
+        return HOLD_NONE
+    signal = link_signal(roads, link, phase)
+    gives_way = signal != SIGNAL_GREEN_MAJOR and signal != SIGNAL_OFF
+    if _blocked_by_foes(roads, rows, i, link, distance, wait_m, True, gives_way, phase, scratch):
+        return HOLD_YIELD
+    if _exit_blocked(roads, travel, rows[i], link, way, scratch):
         return HOLD_EXIT_BLOCKED
     return HOLD_NONE
 
@@ -261,56 +317,97 @@ def press_inside(
     travel: Travel,
     rows: NDArray[np.void],
     i: int,
+    link: int,
     place: float,
+    way: int,
     phase: NDArray[np.int32],
     dt: float,
     scratch: Scratch,
 ) -> tuple[float, int]:
-    """How foes on the same junction press row i, whose centre is `place` m beyond its stop line.
+    """How foes on the same junction press row i, whose front is beyond its stop line.
 
     Of two vehicles in conflict the one that is nearer to the shared area goes first; at equal
     distance the smaller id. Where both lead into one lane, the other follows it there. At a
     waiting position inside, row i waits until it may go on.
+
+    Args:
+        roads: the road arrays.
+        travel: types and ways.
+        rows: VEHICLE (C,).
+        i: the row that asks.
+        link: that it drives on.
+        place: of its centre, m beyond the end of the lane that it comes from.
+        way: of the row beyond the junction.
+        phase: (num_signals,) PHASE rows that are on.
+        dt: seconds a tick.
+        scratch: with the lane and link indices of this tick.
 
     Returns:
         press, and why it holds at the waiting position (HOLD_*).
     """
     row = rows[i]
     kind = travel.types[row["vtype"]]
-    link = roads.lanes[row["lane"]]["link"]
     half = 0.5 * row["length"]
     front = place + half
     press = no_press(kind)
     target = roads.links[link]
     wait_m = target["wait_m"]
     if front <= wait_m + WAIT_SLACK_M:
-        signal = link_signal(roads, link, phase)
-        gives_way = signal != SIGNAL_GREEN_MAJOR and signal != SIGNAL_OFF
-        hold = HOLD_NONE
-        if _blocked_by_foes(roads, rows, i, link, -place, wait_m, True, gives_way, phase, scratch):
-            hold = HOLD_YIELD
-        elif _exit_blocked(roads, row, link, scratch):
-            hold = HOLD_EXIT_BLOCKED
+        hold = waits_inside(roads, travel, rows, i, link, -place, way, phase, scratch)
         if hold != HOLD_NONE:
             return before_line(kind, row["speed"], wait_m - front, dt), hold
     first = target["first_conflict"]
     for c in range(first, first + target["num_conflicts"]):
         conflict = roads.conflicts[c]
-        to_area = conflict["enter_m"] - front
-        if to_area < 0.0:
+        if place - half > conflict["leave_m"]:
             continue
-        foe_link = roads.links[conflict["foe"]]
         for k in range(
             scratch.link_start[conflict["foe"]], scratch.link_start[conflict["foe"] + 1]
         ):
             foe = scratch.approach[k]
-            foe_place = -foe["dist"]
-            if foe_place < 0.0 or foe_place - foe["half"] > conflict["foe_leave_m"]:
-                continue
-            foe_to_area = conflict["foe_enter_m"] - foe_place - foe["half"]
-            if foe_to_area > 0.0 and foe_place + foe["half"] <= foe_link["wait_m"] + WAIT_SLACK_M:
-                if conflict["foe_enter_m"] >= foe_link["wait_m"] and foe["speed"] < STANDING_MPS:
-                    continue  # it waits
-            if foe_to_area < to_area or (foe_to_area == to_area and foe["id"] < row["id"]):
-                press = max(press, before_line(kind, row["speed"], to_area, dt))
+            if foe["row"] != i:
+                press = max(press, _press_of(roads, kind, row, conflict, foe, place, dt))
     return press, HOLD_NONE
+
+
+@kernel
+def _press_of(
+    roads: RoadArrays,
+    kind: np.void,
+    row: np.void,
+    conflict: np.void,
+    foe: np.void,
+    place: float,
+    dt: float,
+) -> float:
+    """How one APPROACH presses a row on the same junction, `place` m beyond its stop line."""
+    half = 0.5 * row["length"]
+    front = place + half
+    foe_front = foe["half"] - foe["dist"]
+    foe_rear = -foe["half"] - foe["dist"]
+    wait_m = roads.links[foe["link"]]["wait_m"]
+    waits = (
+        foe_front <= wait_m + WAIT_SLACK_M
+        and conflict["foe_enter_m"] >= wait_m
+        and foe["speed"] < STANDING_MPS
+    )
+    if foe_front <= 0.0 or foe_rear > conflict["foe_leave_m"] or waits:
+        return no_press(kind)
+    to_area = conflict["enter_m"] - front
+    foe_to_area = conflict["foe_enter_m"] - foe_front
+    # How much further the one has to go to be out of the shared area than the other's rear.
+    gap = (conflict["leave_m"] - front) - (conflict["foe_leave_m"] - foe_rear)
+    if to_area >= 0.0:
+        if foe_to_area > to_area or (foe_to_area == to_area and foe["id"] > row["id"]):
+            return no_press(kind)
+        if conflict["merging"] and gap > to_area:
+            return behind(kind, row["speed"], gap, foe["speed"], kind["decel"])
+        return before_line(kind, row["speed"], to_area, dt)
+    # Both are in it side by side: who is nearer to its end goes on, the other stays behind.
+    if foe_to_area > 0.0:
+        return no_press(kind)
+    rest = conflict["leave_m"] - front
+    foe_rest = conflict["foe_leave_m"] - foe_front
+    if foe_rest > rest or (foe_rest == rest and foe["id"] > row["id"]):
+        return no_press(kind)
+    return behind(kind, row["speed"], gap, foe["speed"], kind["decel"])

@@ -15,7 +15,7 @@ from cavmarl.kernels.arrays import RoadArrays, Scratch, Travel
 from cavmarl.kernels.codes import DRIVER_AGENT
 from cavmarl.kernels.following import accel_behind, no_press, wish
 from cavmarl.kernels.lane_change import LANE_CHANGE_DELAY_S, mobil_accepts
-from cavmarl.kernels.lanes import ahead_on, last_on, neighbor_behind
+from cavmarl.kernels.lanes import ahead_on, beside_s, last_on, neighbor_behind
 from cavmarl.kernels.stopping import STAY, lane_to_stop
 from cavmarl.kernels.ways import next_step
 
@@ -25,6 +25,7 @@ LOOK_BACK_M = 60.0  # how far back a lane change looks for followers
 CHANGE_EARLY_M = 80.0  # a change that the route needs is made this far before it must be,
 CHANGE_EARLY_S = 12.0  # plus the way of this time
 MAX_BRAKING_ACCEPTED = 4.0  # m/s², harder braking behind the new leader is never worth it
+CREEP_MPS = 1.0  # so slow, a driver that has to change does so to the very end of its lane
 SIDEWAYS_S = 2.5  # a lane change takes about this long, and has to end before the lane does
 BRAKE_TIME_S = 0.5  # a braking that ends within this time is not felt
 SIDE_GAP_M = 1.0  # m between bumpers, the least with which a lane change starts
@@ -63,7 +64,7 @@ def _change_is_safe(
     speed = row["speed"]
     half = 0.5 * row["length"]
     lane = roads.lanes[target]
-    s = row["s"] * lane["length_m"] / roads.lanes[row["lane"]]["length_m"]
+    s = beside_s(roads.lanes, row["lane"], target, row["s"])
     desired = min(lane["speed_mps"] * row["speed_factor"], kind["max_speed"])
     ahead = 0.0
     j = ahead_on(scratch, target, s, row["id"])
@@ -127,7 +128,8 @@ def _may_change(
     target = lane["left"] if side > 0 else lane["right"]
     if lane["internal"] or target < 0 or (needed != 0 and needed != side):
         return False
-    if lane["length_m"] - row["s"] < 0.5 * row["length"] + SIDEWAYS_S * row["speed"]:
+    rest = lane["length_m"] - row["s"] - SIDEWAYS_S * row["speed"]
+    if rest < (0.5 * row["length"] if needed == 0 or row["speed"] > CREEP_MPS else 0.0):
         return False
     if needed == 0:
         if lane_to_stop(roads, travel, row) == STAY:
@@ -165,9 +167,10 @@ def choose_lane(
             if _may_change(roads, travel, rows, i, side, needed, own_wish, scratch):
                 return side
         return 0
-    # Every driver thinks of either side once in LANE_CHANGE_DELAY_S, not all in the same ticks.
+    # Who has to change looks for a gap all the time. Else every driver thinks of either side once
+    # in LANE_CHANGE_DELAY_S, not all in the same ticks.
     turns = max(1, round(0.5 * LANE_CHANGE_DELAY_S / dt))
-    if row["side_lane"] >= 0 or (tick // 2 + row["id"]) % turns != 0:
+    if row["side_lane"] >= 0 or (needed == 0 and (tick // 2 + row["id"]) % turns != 0):
         return 0
     side = 1 if tick % 2 == 0 else -1
     if _may_change(roads, travel, rows, i, side, needed, own_wish, scratch):

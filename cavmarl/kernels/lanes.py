@@ -15,7 +15,15 @@ from numpy.typing import NDArray
 from cavmarl.kernels import kernel
 from cavmarl.kernels.arrays import RoadArrays, Scratch, Travel
 
-__all__ = ["ENTRY", "ahead_on", "behind_on", "index_lanes", "last_on", "neighbor_behind"]
+__all__ = [
+    "ENTRY",
+    "ahead_on",
+    "behind_on",
+    "beside_s",
+    "index_lanes",
+    "last_on",
+    "neighbor_behind",
+]
 
 MAX_LOOK_BACK_LANES = 4
 
@@ -27,10 +35,21 @@ ENTRY = np.dtype(
         ("decel", np.float64),  # with which it brakes in comfort, m/s²
         ("id", np.int64),
         ("row", np.int32),  # VEHICLE row
+        ("blinker", np.int32),  # lane change wanted: 1 left, -1 right
         ("side", np.bool_),  # its body covers this lane, its centre is on a neighbour
     ],
     align=True,
 )
+
+
+@kernel
+def beside_s(lanes: NDArray[np.void], lane: int, neighbor: int, s: float) -> float:
+    """Where on a neighbour lane a place on a lane lies, in m."""
+    row = lanes[lane]
+    share = s / row["length_m"]
+    if neighbor == row["left"]:
+        return float(row["left_start_m"] + share * (row["left_end_m"] - row["left_start_m"]))
+    return float(row["right_start_m"] + share * (row["right_end_m"] - row["right_start_m"]))
 
 
 @kernel
@@ -43,6 +62,7 @@ def _fill(
     entry["decel"] = types[row["vtype"]]["decel"]
     entry["id"] = row["id"]
     entry["row"] = i
+    entry["blinker"] = row["blinker"]
     entry["side"] = side
 
 
@@ -80,7 +100,7 @@ def index_lanes(
         _insert(scratch, travel.types, lane, row, i, row["s"], False)
         side = row["side_lane"]
         if side >= 0:
-            s = row["s"] * lanes[side]["length_m"] / lanes[lane]["length_m"]
+            s = beside_s(lanes, lane, side, row["s"])
             _insert(scratch, travel.types, side, row, i, s, True)
 
 

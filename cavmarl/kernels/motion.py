@@ -1,7 +1,7 @@
 """Motion of one vehicle over one tick, from the committed record to the next one.
 
 Background vehicles move along their lanes: arc length by the decided acceleration, lateral offset
-towards the lane's centre, heading trailing the lane's direction. Agents' vehicles are kinematic
+towards the lane's centre, the body a chord of the way. Agents' vehicles are kinematic
 bicycles that go where they are steered; `tracking.locate` then finds their place on the lanes.
 """
 
@@ -20,9 +20,10 @@ from cavmarl.kernels.codes import (
     SIGNAL_RED,
     SIGNAL_RED_YELLOW,
 )
-from cavmarl.kernels.geometry import lane_pose, wrap_angle
+from cavmarl.kernels.geometry import lane_pose, segment_at, wrap_angle
 from cavmarl.kernels.junctions import link_signal
 from cavmarl.kernels.kinematics import bicycle_step
+from cavmarl.kernels.lanes import beside_s
 from cavmarl.kernels.scalars import clamp
 from cavmarl.kernels.stopping import make_stop
 from cavmarl.kernels.tracking import locate, side_lane
@@ -34,8 +35,7 @@ LATERAL_MPS = 1.4  # fastest sideways motion of a lane change
 LATERAL_RATIO = 0.35  # and no faster than this share of the speed,
 LATERAL_MIN_MPS = 0.2  # but never stuck between two lanes
 MAX_DRIFT_RAD = 0.12  # largest angle between a car that changes lanes and its lane
-STUB_M = 1.0  # lanes shorter than this, of which real maps have many, have no direction
-TRAIL_M = 2.0  # how quickly the heading follows the lane's direction
+MAX_BODY_LANES = 8  # that a body may lie on, before and behind its centre
 STANDING_MPS = 0.1
 ARRIVE_M = 5.0  # a trip ends this far before the end of its goal edge
 MAX_SPEED_MPS = 60.0
@@ -43,17 +43,80 @@ CROSSINGS_PER_TICK = 16  # lane borders that one tick can cross
 
 
 @kernel
-def place_on_lane(roads: RoadArrays, row: np.void) -> tuple[float, float]:
-    """Set x, y, z and pitch from lane, s and d; returns cos and sin of the lane's direction."""
+def _way_point(roads: RoadArrays, travel: Travel, row: np.void, s: float) -> tuple[float, float]:
+    """X and y of a place on a vehicle's way, `s` m from the start of its lane, or behind it."""
+    lane = row["lane"]
+    way = row["way"]
+    for _ in range(MAX_BODY_LANES):
+        length = roads.lanes[lane]["length_m"]
+        if s <= length:
+            break
+        following, way, _ = next_step(roads, travel, lane, way)
+        if following < 0:
+            break
+        s -= length
+        lane = following
+    for _ in range(MAX_BODY_LANES):
+        if s >= 0.0:
+            break
+        before = _lane_before(roads, lane, row["link"])
+        if before < 0:
+            break
+        lane = before
+        s += roads.lanes[lane]["length_m"]
+    here = roads.lanes[lane]
+    x, y, _, _, _, _ = lane_pose(roads.points, here["first_point"], here["num_points"], s)
+    return x, y
+
+
+@kernel
+def _lane_before(roads: RoadArrays, lane: int, link: int) -> int:
+    """The lane that a vehicle has come from which has entered `link` last, or -1."""
+    here = roads.lanes[lane]
+    if here["internal"]:
+        return int(roads.into[here["first_into"]])
+    if link < 0 or roads.links[link]["to_lane"] != lane or roads.links[link]["first_internal"] < 0:
+        return -1
+    before = roads.links[link]["first_internal"]
+    while roads.lanes[before]["successor"] != lane:
+        before = roads.lanes[before]["successor"]
+    return int(before)
+
+
+@kernel
+def place_on_lane(roads: RoadArrays, travel: Travel, row: np.void) -> float:
+    """Set x, y, z and pitch from lane, s and d; returns the direction of the body in rad.
+
+    Both bumpers are on the way: in a bend the body is its chord.
+    """
     lane = roads.lanes[row["lane"]]
-    x, y, z, cos, sin, slope = lane_pose(
-        roads.points, lane["first_point"], lane["num_points"], row["s"]
-    )
+    point = roads.points[
+        segment_at(roads.points, lane["first_point"], lane["num_points"], row["s"])
+    ]
+    along = row["s"] - point["s"]
+    cos = point["cos"]
+    sin = point["sin"]
+    x = point["x"] + along * cos
+    y = point["y"] + along * sin
+    heading = point["heading"]
+    half = 0.5 * row["length"]
+    if lane["num_points"] > 2 or row["s"] < half or row["s"] + half > lane["length_m"]:
+        front_x, front_y = _way_point(roads, travel, row, row["s"] + half)
+        rear_x, rear_y = _way_point(roads, travel, row, row["s"] - half)
+        along_x = front_x - rear_x
+        along_y = front_y - rear_y
+        chord = math.sqrt(along_x * along_x + along_y * along_y)
+        if chord > 0.5 * half:
+            x = 0.5 * (front_x + rear_x)
+            y = 0.5 * (front_y + rear_y)
+            cos = along_x / chord
+            sin = along_y / chord
+            heading = math.atan2(sin, cos)
     row["x"] = x - row["d"] * sin
     row["y"] = y + row["d"] * cos
-    row["z"] = z
-    row["pitch"] = math.atan(slope)
-    return cos, sin
+    row["z"] = point["z"] + along * point["slope"]
+    row["pitch"] = math.atan(point["slope"]) if point["slope"] != 0.0 else 0.0
+    return float(heading)
 
 
 @kernel
@@ -122,7 +185,7 @@ def move_background(
     if lane_change != 0:
         lane = roads.lanes[old["lane"]]
         target = lane["left"] if lane_change > 0 else lane["right"]
-        row["s"] *= roads.lanes[target]["length_m"] / lane["length_m"]
+        row["s"] = beside_s(roads.lanes, old["lane"], target, row["s"])
         apart = 0.5 * (lane["width_m"] + roads.lanes[target]["width_m"])
         row["d"] = old["d"] - lane_change * apart
         row["lane"] = target
@@ -134,16 +197,15 @@ def move_background(
     before = row["d"]
     row["d"] = before - clamp(before, -sideways, sideways)
     row["side_lane"] = side_lane(roads.lanes, row["lane"], row["d"], row["width"])
-    cos, sin = place_on_lane(roads, row)
-    direction = math.atan2(sin, cos)
-    if speed > STANDING_MPS:
+    heading = place_on_lane(roads, travel, row)
+    if row["d"] != before and speed > STANDING_MPS:
         drift = math.atan2((row["d"] - before) / dt, speed)
-        direction += clamp(drift, -MAX_DRIFT_RAD, MAX_DRIFT_RAD)
-    error = wrap_angle(direction - old["heading"])
-    if roads.lanes[row["lane"]]["length_m"] < STUB_M:
-        error = 0.0
-    row["heading"] = wrap_angle(old["heading"] + error * min(1.0, speed * dt / TRAIL_M))
-    row["steering"] = clamp(math.atan2(row["length"] * error, 2.0 * TRAIL_M), -0.8, 0.8)
+        heading = wrap_angle(heading + clamp(drift, -MAX_DRIFT_RAD, MAX_DRIFT_RAD))
+    row["heading"] = heading
+    turned = wrap_angle(heading - old["heading"])
+    row["steering"] = 0.0
+    if turned != 0.0 and speed > STANDING_MPS:
+        row["steering"] = clamp(math.atan(row["length"] * turned / (speed * dt)), -0.8, 0.8)
     row["to_go"] = way_left(roads, travel, row)
     if row["to_go"] <= ARRIVE_M:
         row["events"] |= EVENT_ARRIVED

@@ -26,7 +26,7 @@ from cavmarl.kernels.codes import (
 )
 from cavmarl.kernels.geometry import lane_pose, wrap_angle
 from cavmarl.kernels.junctions import link_signal
-from cavmarl.kernels.neighbors import Grid, k_nearest
+from cavmarl.kernels.neighbors import Grid, nearest_bodies
 from cavmarl.kernels.scalars import clamp
 from cavmarl.kernels.sensing import lidar
 
@@ -128,7 +128,7 @@ def observe_neighbors(
     if sensors.neighbors == 0:
         return
     row = rows[i]
-    found = k_nearest(
+    found = nearest_bodies(
         grid,
         i,
         row["x"],
@@ -136,17 +136,17 @@ def observe_neighbors(
         row["z"],
         sensors.neighbors_range_m,
         sensors.neighbors,
-        sensors.near_row,
+        sensors.near_body,
         sensors.near_squared,
     )
     cos_heading = math.cos(row["heading"])
     sin_heading = math.sin(row["heading"])
     for k in range(found):
-        other = rows[sensors.near_row[k]]
+        other = grid.bodies[sensors.near_body[k]]
         dx = other["x"] - row["x"]
         dy = other["y"] - row["y"]
-        cos_other = math.cos(other["heading"])
-        sin_other = math.sin(other["heading"])
+        cos_other = other["cos"]
+        sin_other = other["sin"]
         dvx = other["speed"] * cos_other - row["speed"] * cos_heading
         dvy = other["speed"] * sin_other - row["speed"] * sin_heading
         at = sensors.neighbors_at + NEIGHBOR_FEATURES * k
@@ -217,7 +217,11 @@ def observe_lidar(
     lidar(rows, i, grid, sensors.rays, sensors.lidar_range_m, sensors.echoes)
     at = sensors.lidar_at
     for k in range(rays):
-        out[at + k] = sensors.echoes[k]["distance"] / sensors.lidar_range_m
-    if sensors.lidar_speeds:
-        for k in range(rays):
-            out[at + rays + k] = _unit(sensors.echoes[k]["speed"] / SPEED_SCALE)
+        echo = sensors.echoes[k]
+        # Most rays meet nothing: no division for these.
+        if echo["id"] < 0:
+            out[at + k] = 1.0
+            continue
+        out[at + k] = echo["distance"] / sensors.lidar_range_m
+        if sensors.lidar_speeds:
+            out[at + rays + k] = _unit(echo["speed"] / SPEED_SCALE)

@@ -127,7 +127,7 @@ def _go_sideways(
     beside = row["left"] if side > 0 else row["right"]
     if beside < 0 or not row["permissions"] & permission:
         return
-    reached = cost[way + beside] + change_cost(roads, lane)
+    reached = cost[way + beside] + change_cost(roads, lane, 1.0)
     if reached < cost[way + lane]:
         step = steps[way + lane]
         better = steps[way + beside]

@@ -19,6 +19,7 @@ from cavmarl.kernels.codes import (
     ACTION_SLOWER,
     DRIVER_AGENT,
     DRIVER_BACKGROUND,
+    EVENT_ARRIVED,
     EVENT_COLLIDED,
     EVENTS_THAT_END,
 )
@@ -72,6 +73,17 @@ def _any_driver(rows: NDArray[np.void], num: int, driver: int) -> bool:
 
 
 @kernel
+def _order_by_lane(roads: RoadArrays, owned: int, scratch: Scratch) -> None:
+    """The owned rows in the order of the index: neighbours on the road become so in memory."""
+    found = 0
+    for k in range(scratch.lane_start[roads.lanes.shape[0]]):
+        entry = scratch.entries[k]
+        if not entry["side"] and entry["row"] < owned:
+            scratch.order[found] = entry["row"]
+            found += 1
+
+
+@kernel
 def advance(
     roads: RoadArrays,
     plans: NDArray[np.void],
@@ -112,10 +124,16 @@ def advance(
             decide(
                 roads, travel, rows, owned, DRIVER_BACKGROUND, worlds.ticks[w], dt, phase, scratch
             )
-        for i in range(owned):
+            _order_by_lane(roads, owned, scratch)
+        else:
+            for i in range(owned):
+                scratch.order[i] = i
+        through = 0
+        for k in range(owned):
+            i = scratch.order[k]
             old = rows[i]
-            worlds.next_rows[w, i] = old
-            row = worlds.next_rows[w, i]
+            worlds.next_rows[w, k] = old
+            row = worlds.next_rows[w, k]
             if old["driver"] == DRIVER_BACKGROUND:
                 row["hold"] = scratch.hold[i]
                 row["blinker"] = scratch.blinker[i]
@@ -124,6 +142,7 @@ def advance(
                 move_background(
                     roads, travel, old, row, scratch.accel[i], scratch.lane_change[i], dt
                 )
+                through += row["events"] & EVENT_ARRIVED
                 continue
             if old["events"] & EVENTS_THAT_END:
                 row["tick"] = old["tick"] + 1
@@ -149,6 +168,7 @@ def advance(
             )
             # The indicator is automatic: drivers behind make room for who has to change lanes.
             row["blinker"] = needed_change(roads, travel, row)
+        worlds.num_through[w] = through
 
 
 @kernel

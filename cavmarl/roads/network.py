@@ -69,42 +69,49 @@ POINT = np.dtype(
         ),  # direction of the segment that starts here (the last point repeats the one before)
         ("sin", np.float64),
         ("slope", np.float64),  # dz/ds of that segment
+        ("heading", np.float64),  # of that segment, rad
     ],
     align=True,
 )
 
+# What drivers ask all the time comes first and shares a cache line.
 LANE = np.dtype(
     [
-        ("edge", np.int32),  # EDGE row; internal lanes too
-        ("index", np.int32),  # position on its edge, 0 = rightmost
-        ("internal", np.bool_),  # lies inside a junction
         (
             "length_m",
             np.float64,
         ),  # arc length of the polyline in the plane: the `s` of its last point
-        ("width_m", np.float64),
         ("speed_mps", np.float64),  # speed limit
-        ("permissions", np.uint32),  # bit k set: VEHICLE_CLASSES[k] may drive here
-        ("first_point", np.int32),  # POINT rows [first_point, first_point + num_points)
-        ("num_points", np.int32),  # at least 2
+        ("width_m", np.float64),
+        ("internal", np.bool_),  # lies inside a junction
         ("left", np.int32),  # LANE row of the neighbour to the left in the same direction
         ("right", np.int32),
+        ("successor", np.int32),  # internal lanes: the one LANE that follows (internal or normal)
+        ("link", np.int32),  # internal lanes: the LINK that this lane is part of
         (
             "first_link",
             np.int32,
         ),  # LINK rows of the movements that leave this lane's end, sorted by
         ("num_links", np.int32),  # from-lane; 0 for internal lanes (see `successor`)
-        ("successor", np.int32),  # internal lanes: the one LANE that follows (internal or normal)
-        ("link", np.int32),  # internal lanes: the LINK that this lane is part of
+        ("first_point", np.int32),  # POINT rows [first_point, first_point + num_points)
+        ("num_points", np.int32),  # at least 2
+        ("edge", np.int32),  # EDGE row; internal lanes too
         (
             "link_offset_m",
             np.float64,
         ),  # internal lanes: path length of the link before this lane starts
+        ("stop_back_m", np.float64),  # from the stop line to the end, where paths of others sweep
+        ("left_start_m", np.float64),  # where on the left neighbour this lane's start and end lie:
+        ("left_end_m", np.float64),  # places between them are mapped in proportion
+        ("right_start_m", np.float64),
+        ("right_end_m", np.float64),
         (
             "first_into",
             np.int32,
         ),  # into[first_into : first_into + num_into]: LANE rows whose ends lead here
         ("num_into", np.int32),  # (internal lanes where the map has them)
+        ("permissions", np.uint32),  # bit k set: VEHICLE_CLASSES[k] may drive here
+        ("index", np.int32),  # position on its edge, 0 = rightmost
         ("min_x", np.float64),  # bounding box of the polyline, m
         ("min_y", np.float64),
         ("max_x", np.float64),
@@ -139,6 +146,7 @@ LINK = np.dtype(
             np.int32,
         ),  # where a vehicle is after the end of from_lane: first_internal, or to_lane
         ("length_m", np.float64),  # of the chain of internal lanes
+        ("fork_m", np.float64),  # of its path that others from the same lane come near
         ("wait_m", np.float64),  # from the stop line to the waiting position inside; inf: none
         ("junction", np.int32),
         ("index", np.int32),  # the link's bit in its junction's request, response and foes
@@ -155,6 +163,7 @@ LINK = np.dtype(
 CONFLICT = np.dtype(
     [
         ("foe", np.int32),  # LINK whose path crosses or merges with this link's path (a `foes` bit)
+        ("merging", np.bool_),  # both lead into one lane
         ("must_yield", np.bool_),  # this link has to give way to the foe (a `response` bit)
         ("enter_m", np.float64),  # where on this link's path the shared area begins and ends,
         ("leave_m", np.float64),  # from the stop line; leave = the whole length where both merge

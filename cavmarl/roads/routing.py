@@ -53,7 +53,7 @@ def make_plans(
     plans = np.zeros((len(goal_edges), len(network.lanes)), dtype=PLAN)
     permission = 1 << VEHICLE_CLASSES.index(vehicle_class)
     for goal, edge in enumerate(goal_edges):
-        plan_goal(network.arrays, int(edge), permission, plans[goal])
+        plan_goal(network.arrays, int(edge), permission, 1.0, plans[goal])
     plans.setflags(write=False)
     return plans
 

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from cavmarl.config import EnvConfig
 from cavmarl.errors import CapacityError
-from cavmarl.kernels.arrays import Outputs
+from cavmarl.kernels.arrays import Outputs, Worlds
 from cavmarl.kernels.codes import (
     ACTION_IDLE,
     COUNT_ARRIVED,
@@ -86,6 +86,7 @@ class Simulation:
         self.demand = demand
         self.num_worlds = num_worlds
         self._seed = 0
+        self._first_world = 0
         self._episodes = np.zeros(num_worlds, dtype=np.int64)
         self._everywhere = np.ones(num_worlds, dtype=np.bool_)
         with first_compilation() as is_first:
@@ -139,6 +140,11 @@ class Simulation:
         worlds = self._shard.worlds
         return worlds.rows[world, : worlds.num_owned[world]]
 
+    @property
+    def worlds(self) -> Worlds:
+        """The vehicles and signals of all worlds, for tools that measure; each tick swaps them."""
+        return self._shard.worlds
+
     def signal_phases(self, world: int = 0) -> NDArray[np.int32]:
         """PHASE rows that are on, (num_signals,)."""
         phases: NDArray[np.int32] = self._shard.worlds.signal_phase[world]
@@ -148,15 +154,21 @@ class Simulation:
         """(W,) ticks since each world's reset."""
         return self._shard.worlds.ticks
 
-    def seed(self, seed: int) -> None:
-        """Set the root of all random numbers; the next reset of each world is its first episode."""
+    def seed(self, seed: int, first_world: int = 0) -> None:
+        """Set the root of all random numbers; the next reset of each world is its first episode.
+
+        Args:
+            seed: the root.
+            first_world: number of the first of these worlds among all worlds of the seed.
+        """
         self._seed = seed
+        self._first_world = first_world
         self._episodes[:] = 0
 
     def reset(self, chosen: NDArray[np.bool_] | None = None) -> None:
         """Begin a new episode in the chosen worlds (W,), all by default, and sense.
 
-        World w's episode is a function of (seed, w, the number of its resets since `seed`).
+        World w's episode is a function of (seed, first_world + w, its resets since `seed`).
 
         Raises:
             CapacityError: the map has no room for that many agents of a closed world.
@@ -176,7 +188,8 @@ class Simulation:
     def _populate(self, chosen: NDArray[np.bool_]) -> None:
         worlds = self._shard.worlds
         for w in np.flatnonzero(chosen):
-            worlds.keys[w] = world_key(self._seed, int(w), int(self._episodes[w]))
+            number = self._first_world + int(w)
+            worlds.keys[w] = world_key(self._seed, number, int(self._episodes[w]))
             worlds.ticks[w] = 0
         self._episodes[chosen] += 1
         self._gate = self._traffic.draw_orders(self._gate, worlds, chosen)
@@ -220,6 +233,10 @@ class Simulation:
         waiting = np.arange(self._gate.queue.shape[1]) < self._gate.num_queue[:, None]
         found = np.any(waiting & (self._gate.queue["agent"] >= 0), axis=1)
         return np.asarray(found, dtype=np.bool_)
+
+    def arrivals(self) -> NDArray[np.int64]:
+        """(W,) vehicles that reached their goal since each world's reset, agents included."""
+        return self._gate.counts[:, COUNT_ARRIVED].copy()
 
     def suggest(self, out: NDArray[np.float64]) -> None:
         """Write what the built-in driver would do in the agents' place into `out` (W, A, 2)."""

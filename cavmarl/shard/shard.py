@@ -88,6 +88,8 @@ class Shard:
 
     def begin_step(self, commands: Commands) -> None:
         """Open the accounts of a step and take its meta-actions."""
+        if self._config.population.agents == 0:
+            return
         begin_step(
             self._roads, self.worlds, self._discrete, commands.meta_actions, self._target_speeds
         )
@@ -122,6 +124,8 @@ class Shard:
 
     def sense(self, chosen: NDArray[np.bool_]) -> None:
         """Write observations, terms and rewards of the chosen worlds' agents into `outputs`."""
+        if self._config.population.agents == 0:
+            return
         sense(
             self._roads,
             self._plans,
@@ -180,6 +184,7 @@ def make_worlds(num_worlds: int, capacity: int, network: RoadNetwork) -> Worlds:
         signal_phase=np.zeros((num_worlds, len(network.signals)), dtype=np.int32),
         controllers=np.zeros((num_worlds, network.num_controllers), dtype=CONTROLLER),
         detected_s=np.zeros((num_worlds, len(network.detectors)), dtype=np.float64),
+        num_through=np.zeros(num_worlds, dtype=np.int64),
         num_contacts=np.zeros(num_worlds, dtype=np.int64),
     )
 
@@ -199,8 +204,7 @@ def _make_scratch(num_lanes: int, num_links: int, capacity: int) -> Scratch:
         link_start=integers(num_links + 2),
         approach=np.zeros(3 * capacity, dtype=APPROACH),
         pairs=np.zeros(3 * capacity, dtype=APPROACH),
-        line_link=integers(capacity),
-        line_m=floats(capacity),
+        order=integers(capacity),
         accel=floats(capacity),
         link_ahead=integers(capacity),
         lane_change=integers(capacity),

@@ -90,12 +90,12 @@ class NativeTraffic:
     def travel(self) -> Travel:
         """Types and ways of all vehicles: the generator's first, then the demand file's."""
         types, steps = generated_types(), self.plans.reshape(-1)
-        if self.file is not None and self.schedule is not None:
-            types = np.concatenate([types, self.file.types])
-            steps = np.concatenate([steps, self.schedule.steps])
-        if self.file is None:
-            return Travel(types, steps, stops=np.zeros(0, dtype=STOP), begin_s=0.0)
-        return Travel(types, steps, self.file.stops, self.file.begin_ms / 1000.0)
+        if self.file is None or self.schedule is None:
+            return Travel(types, steps, np.zeros(0, dtype=STOP), first_detour=0, begin_s=0.0)
+        types = np.concatenate([types, self.file.types])
+        steps = np.concatenate([steps, self.schedule.steps])
+        first_detour = self.plans.size + self.schedule.first_detour
+        return Travel(types, steps, self.file.stops, first_detour, self.file.begin_ms / 1000.0)
 
     @cached_property
     def capacity(self) -> int:
@@ -165,7 +165,7 @@ class NativeTraffic:
     def arrive_and_depart(self, gate: Gate, worlds: Worlds, scratch: Scratch, dt: float) -> None:
         """Who has arrived leaves `next_rows`, wanderers pick new goals, and who waits may enter."""
         roads = self.network.arrays
-        choose_goals(self.demand, roads, self.travel, len(self.plans), worlds)
+        choose_goals(self.demand, roads, self.travel, len(self.plans), gate, worlds, dt)
         take_out(self.demand, roads, gate, worlds, worlds.next_rows, DRIVER_BACKGROUND, dt, 1)
         call_orders(gate, worlds)
         let_in(self.demand, roads, self.travel, gate, worlds, scratch)

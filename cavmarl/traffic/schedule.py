@@ -22,6 +22,8 @@ __all__ = ["Schedule"]
 
 MAX_STEPS = 50_000_000
 MAX_EDGES = 100_000  # of one way
+MAX_DETOUR_STEPS = 8_000_000
+DETOUR_CHANGE_WEIGHT = 100.0
 
 
 class Schedule:
@@ -63,8 +65,33 @@ class Schedule:
                 raise CapacityError(
                     f"the routes of the demand have over {MAX_STEPS} steps: fewer or shorter ones"
                 )
-        self.steps = np.concatenate(parts) if parts else np.zeros(0, dtype=PLAN)
+        self.first_detour = begin - first_step
+        parts.append(self._detours(masks))
+        self.steps = np.concatenate(parts)
         self._plans.clear()
+
+    def _detours(self, masks: NDArray[np.int64]) -> NDArray[np.void]:
+        """Steps from everywhere to the last edges of the routes, with as few changes as can be.
+
+        Who cannot make a lane change that its route needs goes on by them. Where they would take
+        more than `MAX_DETOUR_STEPS` there are none: such vehicles wait.
+        """
+        routes = self.demand.routes
+        last = self.demand.route_edges[routes["first_edge"] + routes["num_edges"] - 1]
+        goals = {
+            (int(last[route]), int(mask_row))
+            for route, mask_row in zip(*np.nonzero(self._way >= 0), strict=True)
+        }
+        num_lanes = len(self._network.lanes)
+        self._goal = np.full(self._way.shape, -1, dtype=np.int32)
+        if len(goals) * num_lanes > MAX_DETOUR_STEPS:
+            return np.zeros(0, dtype=PLAN)
+        plans = np.zeros((len(goals), num_lanes), dtype=PLAN)
+        for row, (edge, mask_row) in enumerate(sorted(goals)):
+            mask = int(masks[mask_row])
+            plan_goal(self._network.arrays, edge, mask, DETOUR_CHANGE_WEIGHT, plans[row])
+            self._goal[last == edge, mask_row] = row
+        return plans.reshape(-1)
 
     def _driven(self) -> Iterable[tuple[int, int]]:
         """Pairs of ROUTE row and class that some vehicle of the files may have."""
@@ -110,7 +137,7 @@ class Schedule:
         key = (goal, mask)
         if key not in self._plans:
             plan = np.zeros(len(self._network.lanes), dtype=PLAN)
-            plan_goal(self._network.arrays, goal, mask, plan)
+            plan_goal(self._network.arrays, goal, mask, 1.0, plan)
             self._plans[key] = plan
         return self._plans[key]
 
@@ -134,7 +161,7 @@ class Schedule:
         begin_s = demand.begin_ms / 1000.0
         departures["due"] = np.ceil((orders["depart"] - begin_s) / dt - 1e-6)
         departures["agent"] = -1
-        departures["goal"] = -1
+        departures["goal"] = self._goal[orders["route"], self._class_of_type[orders["vtype"]]]
         departures["order"] = np.arange(len(orders))
         departures["vtype"] = self._first_type + orders["vtype"]
         departures["way"] = self._way[orders["route"], self._class_of_type[orders["vtype"]]]
