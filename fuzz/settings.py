@@ -1,4 +1,4 @@
-"""Targets that read settings: env.yaml, overrides, and the folders of trained drivers."""
+"""Targets that read settings and records: env.yaml, overrides, drivers' folders, manifests."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ from pathlib import Path
 from cavmarl.cli.output import parse_settings
 from cavmarl.config import ActionConfig, EnvConfig, SensorsConfig
 from cavmarl.config_io import read_yaml, validate
+from cavmarl.evaluate.manifest import MANIFEST_FILE, close_manifest, open_manifest, read_closed
 from cavmarl.networks import (
     CONFIG_FILE,
     WEIGHTS_FILE,
@@ -20,7 +21,7 @@ from cavmarl.networks import (
 from cavmarl.registry import load_config
 from fuzz.files import ROOT, Target, scratch, seed
 
-__all__ = ["DRIVERS", "ENTRIES", "OVERRIDES"]
+__all__ = ["DRIVERS", "ENTRIES", "MANIFESTS", "OVERRIDES"]
 
 # Between the two files of a driver, in one input.
 _BORDER = b"\n----\n"
@@ -48,6 +49,17 @@ def _driver(content: bytes) -> object:
     return load_network(folder)
 
 
+def _manifest(content: bytes) -> object:
+    return read_closed(scratch(f"results/{MANIFEST_FILE}", content).parent)
+
+
+def _manifests() -> tuple[bytes, ...]:
+    with tempfile.TemporaryDirectory() as name:
+        open_manifest(Path(name), {"seed": 0})
+        close_manifest(Path(name), [])
+        return ((Path(name) / MANIFEST_FILE).read_bytes(),)
+
+
 @cache
 def _drivers() -> tuple[bytes, ...]:
     found = []
@@ -68,4 +80,5 @@ def _drivers() -> tuple[bytes, ...]:
 
 ENTRIES = Target(_entry, _entries)
 OVERRIDES = Target(_overrides, lambda: (seed("overrides.txt"),))
+MANIFESTS = Target(_manifest, _manifests)
 DRIVERS = Target(_driver, _drivers)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from fuzz.roads import CACHED, MAPS, NETWORKS, PROGRAMS
-from fuzz.settings import DRIVERS, ENTRIES, OVERRIDES
+from fuzz.settings import DRIVERS, ENTRIES, MANIFESTS, OVERRIDES
 from fuzz.traffic import DEMAND, SUMO_CONFIGS
 
 __all__ = ["TARGETS"]
@@ -18,4 +18,5 @@ TARGETS = {
     "entry": ENTRIES,
     "overrides": OVERRIDES,
     "driver": DRIVERS,
+    "manifest": MANIFESTS,
 }

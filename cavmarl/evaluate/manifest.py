@@ -14,6 +14,7 @@ import sys
 from collections.abc import Mapping
 from dataclasses import asdict
 from datetime import UTC, datetime
+from os.path import isfile
 from pathlib import Path
 from typing import Any
 
@@ -131,7 +132,7 @@ def read_closed(folder: Path) -> Document:
         )
     for name, known in document["results_sha256"].items():
         file = folder / name
-        if not file.is_file():
+        if not isfile(file):  # unlike Path's, it takes names that no file can have
             raise ManifestError(f"{file}: is missing, though {path} lists it; run it again")
         if hash_of_file(file) != known:
             raise ManifestError(
@@ -156,15 +157,26 @@ def write_text(path: Path, text: str) -> None:
     rough.replace(path)
 
 
+def _is_typed(document: Document) -> bool:
+    """Whether the keys that are read again hold what they are written with."""
+    command, known = document["command"], document["results_sha256"]
+    return (
+        isinstance(command, list)
+        and all(isinstance(word, str) for word in command)
+        and isinstance(known, dict)
+        and all(isinstance(digest, str) for digest in known.values())
+    )
+
+
 def _read(path: Path) -> Document:
     try:
         document = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError) as error:
+    except (OSError, ValueError, RecursionError) as error:
         raise ManifestError(
             f"{path}: cannot be read ({error}); run the evaluation again"
         ) from error
     needed = {"schema", "status", "started", "command", "results_sha256"}
-    if not isinstance(document, dict) or not needed <= document.keys():
+    if not isinstance(document, dict) or not needed <= document.keys() or not _is_typed(document):
         raise ManifestError(f"{path}: not a manifest of an evaluation; run it again")
     if document["schema"] != SCHEMA:
         raise ManifestError(

@@ -30,7 +30,7 @@ from cavmarl.kernels.codes import (
     SIGNAL_YELLOW_MAJOR,
     SIGNAL_YELLOW_MINOR,
 )
-from cavmarl.kernels.following import before_line, behind, no_press
+from cavmarl.kernels.following import LINE_MARGIN_M, before_line, behind, no_press
 from cavmarl.kernels.ways import next_step
 
 __all__ = [
@@ -129,7 +129,7 @@ def _foe_blocks(
     # area lies beyond that, its waiting position inside.
     front = foe["dist"] - foe["half"] - roads.lanes[foe_lane]["stop_back_m"]
     wait_m = roads.links[foe["link"]]["wait_m"]
-    if front <= 0.0 and conflict["foe_enter_m"] >= wait_m:
+    if front <= 0.0 and conflict["foe_enter_m"] >= wait_m - LINE_MARGIN_M:
         front += wait_m + WAIT_SLACK_M
     if front <= 0.0:
         # Who stands on the junction before the shared area is kept from it by somebody else.
@@ -180,7 +180,7 @@ def _blocked_by_foes(
         conflict = roads.conflicts[c]
         begin = scratch.link_start[conflict["foe"]]
         end = scratch.link_start[conflict["foe"] + 1]
-        if begin == end or (conflict["enter_m"] >= wait_m) != inside:
+        if begin == end or (conflict["enter_m"] >= wait_m - LINE_MARGIN_M) != inside:
             continue
         time_in = _earliest(distance + conflict["enter_m"] - half, speed, limit, FOE_ACCEL)
         time_out = _earliest(distance + conflict["leave_m"] + half, speed, limit, OWN_ACCEL)
@@ -389,7 +389,7 @@ def _press_of(
     wait_m = roads.links[foe["link"]]["wait_m"]
     waits = (
         foe_front <= wait_m + WAIT_SLACK_M
-        and conflict["foe_enter_m"] >= wait_m
+        and conflict["foe_enter_m"] >= wait_m - LINE_MARGIN_M
         and foe["speed"] < STANDING_MPS
     )
     if foe_front <= 0.0 or foe_rear > conflict["foe_leave_m"] or waits:
