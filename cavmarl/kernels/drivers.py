@@ -25,6 +25,7 @@ from cavmarl.kernels.following import (
     response,
     wish,
 )
+from cavmarl.kernels.geometry import wrap_angle
 from cavmarl.kernels.junctions import may_enter, press_inside, waits_inside
 from cavmarl.kernels.lane_choice import (
     LOOK_BACK_M,
@@ -42,6 +43,9 @@ __all__ = ["LOOK_AHEAD_M", "decide"]
 
 SEE_LINE_M = 8.0
 LOOK_AHEAD_M = 250.0  # no driver looks further
+NEAR_M = 6.0  # to a leader so near the corner between matters,
+ASKEW_RAD = 0.7  # if it turns by so much,
+ASKEW_M = 1.5  # which takes this off the gap
 STOP_LINE_M = 5.0  # standing with the front nearer than this counts as standing at the line
 LIMIT_DECEL = 2.0  # m/s², how a driver slows for a lower limit ahead,
 LIMIT_LEAD_S = 1.0  # to be down this time before it, as the model lags behind what is allowed
@@ -149,6 +153,13 @@ def _shared_start(
 @inlined_kernel
 def _behind_entry(kind: np.void, speed: float, gap: float, leader: np.void) -> float:
     return behind(kind, speed, gap, leader["speed"], leader["decel"])
+
+
+@kernel
+def _is_askew(row: np.void, leader: np.void) -> bool:
+    """Whether a leader around a corner stands so that its flank is nearer than its rear."""
+    askew: bool = abs(wrap_angle(leader["heading"] - row["heading"])) > ASKEW_RAD
+    return askew
 
 
 @kernel
@@ -291,6 +302,8 @@ def _road_ahead(
         if j >= 0:
             leader = scratch.entries[j]
             gap = distance + leader["s"] - half - leader["half"]
+            if gap < NEAR_M and _is_askew(row, rows[leader["row"]]):
+                gap -= ASKEW_M
             press = max(press, _behind_entry(kind, speed, gap, leader))
         if j >= 0 or stops:
             break
