@@ -43,9 +43,9 @@ __all__ = ["LOOK_AHEAD_M", "decide"]
 
 SEE_LINE_M = 8.0
 LOOK_AHEAD_M = 250.0  # no driver looks further
-NEAR_M = 6.0  # to a leader so near the corner between matters,
+NEAR_M = 8.0  # to a leader so near the corner between matters,
 ASKEW_RAD = 0.7  # if it turns by so much,
-ASKEW_M = 1.5  # which takes this off the gap
+ASKEW_M = 2.5  # which takes this off the gap
 STOP_LINE_M = 5.0  # standing with the front nearer than this counts as standing at the line
 LIMIT_DECEL = 2.0  # m/s², how a driver slows for a lower limit ahead,
 LIMIT_LEAD_S = 1.0  # to be down this time before it, as the model lags behind what is allowed
@@ -315,7 +315,7 @@ def _road_ahead(
 def _beside(roads: RoadArrays, kind: np.void, row: np.void, lane: int, scratch: Scratch) -> float:
     """How the leader on a neighbour lane presses that the body covers, or is about to."""
     beside = roads.lanes[lane]
-    s = beside_s(roads.lanes, row["lane"], lane, row["s"])
+    s = beside_s(roads, row["lane"], lane, row["s"])
     half = 0.5 * row["length"]
     j = ahead_on(scratch, lane, s, row["id"])
     if j >= 0:
@@ -347,7 +347,7 @@ def _let_merge(
     target = lane["left"] if row["blinker"] > 0 else lane["right"]
     if target < 0:
         return
-    s = beside_s(roads.lanes, row["lane"], target, row["s"])
+    s = beside_s(roads, row["lane"], target, row["s"])
     k = behind_on(scratch, target, s, row["id"])
     if k < 0 or scratch.entries[k]["side"]:
         return

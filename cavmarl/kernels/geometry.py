@@ -14,7 +14,6 @@ from numpy.typing import NDArray
 
 from cavmarl.kernels import kernel
 
-
 PI = math.pi
 TWO_PI = 2.0 * math.pi
 

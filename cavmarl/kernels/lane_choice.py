@@ -71,7 +71,7 @@ def _change_is_safe(
     speed = row["speed"]
     half = 0.5 * row["length"]
     lane = roads.lanes[target]
-    s = beside_s(roads.lanes, row["lane"], target, row["s"])
+    s = beside_s(roads, row["lane"], target, row["s"])
     desired = _desired(roads, kind, row, target)
     ahead = 0.0
     j = ahead_on(scratch, target, s, row["id"])

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from cavmarl.kernels import inlined_kernel, kernel
 from cavmarl.kernels.arrays import RoadArrays, Scratch, Travel
+from cavmarl.kernels.geometry import segment_at
 
 __all__ = [
     "ENTRY",
@@ -43,13 +44,16 @@ ENTRY = np.dtype(
 
 
 @kernel
-def beside_s(lanes: NDArray[np.void], lane: int, neighbor: int, s: float) -> float:
+def beside_s(roads: RoadArrays, lane: int, neighbor: int, s: float) -> float:
     """Where on a neighbour lane a place on a lane lies, in m."""
-    row = lanes[lane]
-    share = s / row["length_m"]
+    row = roads.lanes[lane]
+    k = segment_at(roads.points, row["first_point"], row["num_points"], s)
+    point = roads.points[k]
+    after = roads.points[k + 1]
+    share = min(max((s - point["s"]) / (after["s"] - point["s"]), 0.0), 1.0)
     if neighbor == row["left"]:
-        return float(row["left_start_m"] + share * (row["left_end_m"] - row["left_start_m"]))
-    return float(row["right_start_m"] + share * (row["right_end_m"] - row["right_start_m"]))
+        return float(point["left_s"] + share * (after["left_s"] - point["left_s"]))
+    return float(point["right_s"] + share * (after["right_s"] - point["right_s"]))
 
 
 @inlined_kernel
@@ -100,7 +104,7 @@ def index_lanes(
         _insert(scratch, travel.types, lane, row, i, row["s"], False)
         side = row["side_lane"]
         if side >= 0:
-            s = beside_s(lanes, lane, side, row["s"])
+            s = beside_s(roads, lane, side, row["s"])
             _insert(scratch, travel.types, side, row, i, s, True)
 
 

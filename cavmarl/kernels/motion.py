@@ -207,7 +207,7 @@ def move_background(
     if lane_change != 0:
         lane = roads.lanes[old["lane"]]
         target = lane["left"] if lane_change > 0 else lane["right"]
-        row["s"] = beside_s(roads.lanes, old["lane"], target, row["s"])
+        row["s"] = beside_s(roads, old["lane"], target, row["s"])
         apart = 0.5 * (lane["width_m"] + roads.lanes[target]["width_m"])
         row["d"] = old["d"] - lane_change * apart
         row["lane"] = target

@@ -34,7 +34,7 @@ from cavmarl.roads.reader import map_name, read_network, source_hash
 __all__ = ["load_network"]
 
 # Raise this when the reader gives other rows for the same file; record types count by themselves.
-FORMAT = 11
+FORMAT = 15
 
 _DIGEST_BYTES = 32  # SHA-256 of the rest begins an entry: NumPy would stumble over a broken one
 

@@ -70,6 +70,8 @@ POINT = np.dtype(
         ("sin", np.float64),
         ("slope", np.float64),  # dz/ds of that segment
         ("heading", np.float64),  # of that segment, rad
+        ("left_s", np.float64),  # where on the left neighbour of its lane the point lies, m
+        ("right_s", np.float64),
     ],
     align=True,
 )
@@ -101,10 +103,6 @@ LANE = np.dtype(
             np.float64,
         ),  # internal lanes: path length of the link before this lane starts
         ("stop_back_m", np.float64),  # from the stop line to the end, where paths of others sweep
-        ("left_start_m", np.float64),  # where on the left neighbour this lane's start and end lie:
-        ("left_end_m", np.float64),  # places between them are mapped in proportion
-        ("right_start_m", np.float64),
-        ("right_end_m", np.float64),
         (
             "first_into",
             np.int32,

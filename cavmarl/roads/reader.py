@@ -237,7 +237,7 @@ def _link_rows(
 
 
 def _map_neighbors(lanes: NDArray[np.void], points: NDArray[np.void]) -> None:
-    """Fill where the ends of each lane lie on its neighbours."""
+    """Fill where the points of each lane lie on its neighbours, in driving order."""
     for row in lanes:
         own = points[row["first_point"] : row["first_point"] + row["num_points"]]
         for side in ("left", "right"):
@@ -245,9 +245,11 @@ def _map_neighbors(lanes: NDArray[np.void], points: NDArray[np.void]) -> None:
                 continue
             other = lanes[row[side]]
             first, number = int(other["first_point"]), int(other["num_points"])
-            for end, point in (("start", own[0]), ("end", own[-1])):
+            reached = 0.0
+            for point in own:
                 s, _, _, _ = project(points, first, number, point["x"], point["y"])
-                row[f"{side}_{end}_m"] = min(max(s, 0.0), other["length_m"])
+                reached = max(reached, min(float(s), float(other["length_m"])))
+                point[f"{side}_s"] = reached
 
 
 def _lane_ends(lanes: NDArray[np.void], points: NDArray[np.void]) -> NDArray[np.float64]:
