@@ -19,10 +19,17 @@ def on_lane(roads: RoadNetwork, rows: NDArray[np.void], lane: int) -> list[Entry
         if row["lane"] == lane:
             found.append((float(row["s"]), int(row["id"]), i))
         if row["side_lane"] == lane:
-            # s · length / length, in this order: ties must stay ties.
-            s = row["s"] * roads.lanes[lane]["length_m"] / roads.lanes[row["lane"]]["length_m"]
-            found.append((float(s), int(row["id"]), i))
+            found.append((beside_s(roads, int(row["lane"]), lane, row["s"]), int(row["id"]), i))
     return sorted(found)
+
+
+def beside_s(roads: RoadNetwork, lane: int, neighbour: int, s: float) -> float:
+    """Where a place lies on the lane to one side: in proportion between its ends' images."""
+    row = roads.lanes[lane]
+    side = "left" if row["left"] == neighbour else "right"
+    start, end = float(row[f"{side}_start_m"]), float(row[f"{side}_end_m"])
+    # The share first, then the stretch, as the kernel does: ties must stay ties.
+    return float(start + s / row["length_m"] * (end - start))
 
 
 def ahead(
