@@ -58,17 +58,16 @@ def test_agents_are_rows_that_end_singly() -> None:
     rows.action_space.seed(0)
     observations, infos = rows.reset(seed=0)
     assert observations.shape == rows.observation_space.shape
-    ends = 0
+    single = 0
     for _ in range(60):
         observations, rewards, ended, cut, infos = rows.step(rows.action_space.sample())
         assert rewards.shape == ended.shape == cut.shape == (5,)
-        ends += int(ended.sum())
+        single += int(ended.any() and not ended.all())
         if ended.any():
             assert infos["_final_obs"][ended].all()
             assert np.abs(infos["final_obs"][ended]).sum() > 0
         assert not observations[~infos["active"]].any()
-    assert ends > 0
-    assert cut.all() or ended.any()
+    assert single > 0
 
 
 def test_the_aec_form_refuses_a_wrong_action_and_goes_on() -> None:

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
+from cavmarl.evaluate.sumo_input import read_input
 from cavmarl.evaluate.traffic_metrics import TrafficCounts, TrafficMeter, TrafficRun
 from cavmarl.kernels.codes import ACTION_IDLE
 from cavmarl.render.ground import signal_codes
@@ -24,7 +25,7 @@ def make_world(
 
     Args:
         map_file: a SUMO network.
-        demand: what drives on it.
+        demand: what drives on it, and the signal programs that its additional files have.
         seconds: how long.
         seed: root of all random numbers.
         dt_s: seconds a tick.
@@ -43,6 +44,7 @@ def make_world(
             "clock.ctrl_dt_s": dt_s,
             "horizon_s": float(seconds),
             "traffic.demand": [str(path.resolve()) for path in demand],
+            "map.programs": [str(path) for path in read_input(demand).additional_files],
         },
     )
     simulation = Simulation(config, network, demand=file)

@@ -60,8 +60,8 @@ def roads(env: Any) -> RoadArrays:
         row["max_x"], row["max_y"] = corners[:, :2].max(axis=0)
         first += len(s)
     empty: Any = np.zeros(0, np.int32)
-    rest = [empty] * (len(RoadArrays._fields) - 2)
-    return RoadArrays(np.concatenate(parts), rows, *rest)
+    others = len(RoadArrays._fields) - 2
+    return RoadArrays(np.concatenate(parts), rows, *([empty] * others))
 
 
 def everywhere(road: RoadArrays) -> LaneGrid:

@@ -66,7 +66,8 @@ class Scene:
         row = network.lane_ids.index(lane)
         s = float(network.lanes[row]["length_m"]) - to_line_m - 2.5
         goals = [network.edge_ids[edge] for edge in self.simulation.goal_edges]
-        car = on_lane(network, row, s, goal=goals.index(goal), **fields)
+        travel = self.simulation._traffic.travel
+        car = on_lane(network, row, s, travel, goal=goals.index(goal), **fields)
         plan = self.simulation._traffic.plans[car[0]["goal"], row]
         car["to_go"] = plan["to_go"] - s
         car["id"] = self.simulation._gate.next_id[0]
