@@ -15,7 +15,9 @@ def shuffle_rows(simulation: Simulation, rng: np.random.Generator) -> None:
     """Put the committed rows of each world in another order."""
     worlds = simulation._shard.worlds
     for w, num in enumerate(worlds.num_owned):
-        worlds.rows[w, :num] = worlds.rows[w, rng.permutation(num)]
+        order = rng.permutation(num)
+        assert num < 8 or (order != np.arange(num)).any()
+        worlds.rows[w, :num] = worlds.rows[w, order]
 
 
 SENSORS = {
@@ -63,5 +65,4 @@ def test_shuffled_rows_give_the_same_bytes(
         assert shuffled.traffic_stats() == tidy.traffic_stats()
         for mine, other in zip(shuffled.outputs, tidy.outputs, strict=True):
             np.testing.assert_array_equal(mine, other)
-    assert not np.array_equal(shuffled.vehicles()["id"], tidy.vehicles()["id"]), "nothing shuffled"
     assert agents == 1 or tidy.traffic_stats().removed > 0
