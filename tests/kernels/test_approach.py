@@ -46,7 +46,7 @@ def test_every_link_lists_who_is_on_it_and_who_comes(world: Simulation) -> None:
         rows = world.vehicles()
         room = listed(world, rows)
         expected: dict[int, list[tuple[int, float, float, float]]] = {}
-        for i, row in enumerate(rows):
+        for row in rows:
             found, _ = naive.announcements(roads, travel, row)
             for link, name, dist in found:
                 entry = (name, dist, row["speed"], 0.5 * row["length"])
