@@ -138,9 +138,7 @@ def test_random_places_are_anywhere_and_others_in_another_tick(code: int) -> Non
     assert (found <= LENGTH - 2.5).all()
     counts, _ = np.histogram(found, bins=4, range=(0.0, LENGTH))
     assert counts.min() > 70
-    np.testing.assert_array_equal(
-        found, [place(room, tick, pos_code=code) for tick in range(400)]
-    )
+    np.testing.assert_array_equal(found, [place(room, tick, pos_code=code) for tick in range(400)])
 
 
 def speed(room: Scratch, s: float = 20.0, vehicle: int = 50, **fields: Any) -> float:

@@ -348,7 +348,9 @@ def test_who_still_moves_on_the_junction_will_need_room_beyond_it(scene: Make) -
     assert lanes[here["first"]["lane"]] == "E_out_0", "for the first one there was room"
 
 
-def test_links_from_one_lane_share_their_way_up_to_the_fork(crossing: Callable[[str], Path]) -> None:
+def test_links_from_one_lane_share_their_way_up_to_the_fork(
+    crossing: Callable[[str], Path],
+) -> None:
     network = read_network(crossing("priority"))
     for lane in np.flatnonzero(network.lanes["num_links"] > 1).tolist():
         row = network.lanes[lane]

@@ -82,7 +82,9 @@ def test_neighbours_equal_twin(case: tuple[str, NDArray[np.void]], reach_m: floa
         assert distance == pytest.approx(true_distance)
         others = [(j, at) for at, _, j in naive.on_lane(roads, rows, lane) if j != i]
         assert seen(room, last_on(room, lane, own_id)) == (others[0] if others else (-1, np.inf))
-        before = [j for at, k, j in naive.on_lane(roads, rows, lane) if j != i and (at, k) <= (s, own_id)]
+        before = [
+            j for at, k, j in naive.on_lane(roads, rows, lane) if j != i and (at, k) <= (s, own_id)
+        ]
         assert seen(room, behind_on(room, lane, s, own_id))[0] == (before[-1] if before else -1)
 
 

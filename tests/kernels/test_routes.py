@@ -108,7 +108,7 @@ def test_lanes_that_the_class_may_not_use_are_no_part_of_a_route(
     forbidden = np.flatnonzero(
         ~roads.lanes["internal"] & (roads.lanes["permissions"] & PASSENGER == 0)
     )
-    edges = [e for e in np.unique(roads.lanes["edge"][forbidden]).tolist()]
+    edges = np.unique(roads.lanes["edge"][forbidden]).tolist()
     assert edges
     for edge in edges:
         route = [edge, *following(roads, edge)[:1]]

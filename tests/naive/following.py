@@ -19,9 +19,7 @@ def idm_response(
     wanted = [car_following.idm_acceleration(speed, allowed, None, 0.0, *own)]
     for gap, front_speed in leaders:
         distance = max(gap, 0.1) + CAR_M
-        wanted.append(
-            car_following.idm_acceleration(speed, allowed, distance, front_speed, *own)
-        )
+        wanted.append(car_following.idm_acceleration(speed, allowed, distance, front_speed, *own))
     return min(max(min(wanted), -6.0), 6.0)
 
 

@@ -32,7 +32,9 @@ def costs(
             if n == len(edges) - 1:
                 options.append(drive)
             for link in range(int(row["first_link"]), int(row["first_link"] + row["num_links"])):
-                options.append(drive + before.get((n + 1, int(roads.links[link]["to_lane"])), math.inf))
+                options.append(
+                    drive + before.get((n + 1, int(roads.links[link]["to_lane"])), math.inf)
+                )
             for beside in (int(row["left"]), int(row["right"])):
                 options.append(change_cost(roads, lane) + before.get((n, beside), math.inf))
             cost[n, lane] = min(options)
