@@ -150,7 +150,7 @@ def test_verify_determinism_fails_and_names_the_first_difference(
     )
     words = ("verify-determinism", "merge", "--policy", str(script), "--steps", "3", *QUICK)
     assert run(*words) == 1
-    assert "different: step 1 (tick 2), vehicle 0, x: " in capsys.readouterr().out
+    assert "different: step 1 (tick 2), vehicle 0, s: " in capsys.readouterr().out
 
 
 @pytest.mark.parametrize(
