@@ -47,7 +47,7 @@ def test_a_driver_that_hashes_is_found_out(tmp_path: Path) -> None:
     assert difference is not None
     assert (difference.step, difference.tick) == (7, 14)
     assert (difference.what, difference.vehicle) == ("vehicle", 1)
-    assert difference.field == "x"
+    assert difference.field == "s"
     assert difference.values[0] != difference.values[1]
     assert difference.processes[0] == 0
 

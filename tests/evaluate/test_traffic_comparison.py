@@ -10,10 +10,12 @@ import pytest
 
 from cavmarl.cli import main
 from cavmarl.errors import ConfigError
+from cavmarl.evaluate.native_traffic import make_world
 from cavmarl.evaluate.traffic_comparison import RATIOS, TrafficComparison, compare_traffic
 from cavmarl.evaluate.traffic_metrics import EDGE_MINUTE, TrafficFigures, TrafficRun
 from cavmarl.evaluate.traffic_plot import binned_means, plot_fundamental_diagram
 from cavmarl.evaluate.traffic_speed import measure_traffic_speed
+from cavmarl.roads.reader import read_network
 
 sumo = pytest.importorskip("sumo", reason="needs the extra 'sumo'")
 pytest.importorskip("libsumo", reason="needs the extra 'sumo'")
@@ -67,6 +69,15 @@ def test_the_command_prints_the_table_and_writes_both_files(
     written = json.loads(document.read_text())
     assert written["sumo"]["figures"]["departed"] > 0
     assert set(written["ratios"]) == set(RATIOS)
+
+
+def test_our_world_has_the_signal_programs_of_the_demand() -> None:
+    roads = GAME / "cross" / "cross.net.xml"
+    plain = read_network(roads)
+    world = make_world(roads, [GAME / "cross_demo.sumocfg"], 10, 0, 0.1)
+    assert set(world.network.program_ids) > set(plain.program_ids)
+    on = world.network.signals["program"][0]
+    assert world.network.program_ids[on] not in plain.program_ids
 
 
 def test_both_speeds_are_measured() -> None:

@@ -47,8 +47,7 @@ def test_every_link_lists_who_is_on_it_and_who_comes(world: Simulation) -> None:
         room = listed(world, rows)
         expected: dict[int, list[tuple[int, float, float, float]]] = {}
         for row in rows:
-            found, _ = naive.announcements(roads, travel, row)
-            for link, name, dist in found:
+            for link, name, dist in naive.announcements(roads, travel, row):
                 entry = (name, dist, row["speed"], 0.5 * row["length"])
                 expected.setdefault(link, []).append(entry)
         for link in range(len(roads.links)):

@@ -10,10 +10,8 @@ from cavmarl.roads.network import RoadNetwork
 Entry = tuple[int, int, float]  # link, vehicle's id, m of its centre to the stop line
 
 
-def announcements(
-    roads: RoadNetwork, travel: Travel, row: np.void
-) -> tuple[list[Entry], tuple[int, float] | None]:
-    """What one vehicle announces, and its next link with the way to that one's line."""
+def announcements(roads: RoadNetwork, travel: Travel, row: np.void) -> list[Entry]:
+    """What one vehicle announces."""
     lane, way, name = int(row["lane"]), int(row["way"]), int(row["id"])
     here = roads.lanes[lane]
     found: list[Entry] = []
@@ -42,4 +40,4 @@ def announcements(
     for link, distance in ahead:
         if roads.links[link]["num_conflicts"]:
             found.append((link, name, max(distance, 0.0)))
-    return found, ahead[0] if ahead else None
+    return found

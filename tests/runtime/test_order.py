@@ -15,9 +15,7 @@ def shuffle_rows(simulation: Simulation, rng: np.random.Generator) -> None:
     """Put the committed rows of each world in another order."""
     worlds = simulation._shard.worlds
     for w, num in enumerate(worlds.num_owned):
-        order = rng.permutation(num)
-        assert num < 8 or (order != np.arange(num)).any()
-        worlds.rows[w, :num] = worlds.rows[w, order]
+        worlds.rows[w, :num] = worlds.rows[w, rng.permutation(num)]
 
 
 SENSORS = {
@@ -65,4 +63,7 @@ def test_shuffled_rows_give_the_same_bytes(
         assert shuffled.traffic_stats() == tidy.traffic_stats()
         for mine, other in zip(shuffled.outputs, tidy.outputs, strict=True):
             np.testing.assert_array_equal(mine, other)
+    # A tick may put the rows in an order of its own: what was shuffled is what it read.
+    shuffle_rows(shuffled, rng)
+    assert not np.array_equal(shuffled.vehicles()["id"], tidy.vehicles()["id"]), "nothing shuffled"
     assert agents == 1 or tidy.traffic_stats().removed > 0

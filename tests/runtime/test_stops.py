@@ -130,7 +130,8 @@ def test_who_cannot_change_lanes_for_long_goes_on_another_way(world: World) -> N
         "grid4x4",
     )
     network, travel = simulation.network, simulation._traffic.travel
-    while not len(simulation.vehicles()):
+    # Drivers ask themselves once a second.
+    while not len(simulation.vehicles()) or simulation.ticks()[0] % round(1.0 / DT):
         drive(simulation)
     row = simulation.vehicles()[0]
     edge = network.edges[network.lanes[row["lane"]]["edge"]]
