@@ -309,7 +309,9 @@ class PufferDriveConfig:
     def __post_init__(self) -> None:
         key = "sensors.puffer_drive"
         check(0 <= self.partners <= 256, f"{key}.partners", self.partners, "must be from 0 to 256")
-        check(0 <= self.segments <= 2048, f"{key}.segments", self.segments, "must be from 0 to 2048")
+        check(
+            0 <= self.segments <= 2048, f"{key}.segments", self.segments, "must be from 0 to 2048"
+        )
         check_finite(f"{key}.spacing_m", self.spacing_m, 0.25, 50.0)
 
 

@@ -224,16 +224,19 @@ class CavVectorEnv:
         over = horizon | ~(staying.any(axis=1) | simulation.agents_to_come())
         observations = final_observations
         if terminations.any() or over.any():
-            if not self._copy:  # a reset writes into what the view shows
-                final_observations = infos["final_observations"] = final_observations.copy()
-            observations = final_observations.copy()
-            observations[terminations] = 0.0
+            if self._copy:
+                observations = final_observations.copy()
+                observations[terminations] = 0.0
+            else:  # what is written from here on, a reset's too, is what the view shows
+                infos["final_observations"] = final_observations.copy()
+                outputs.observations[terminations] = 0.0
         if over.any():
             simulation.reset(over)
             self._decoder.forget(over)
             self._steps[over] = 0
             staying[over] = simulation.outputs.present[over]
-            observations[over] = simulation.outputs.observations[over]
+            if self._copy:
+                observations[over] = simulation.outputs.observations[over]
         self._mask = staying
         infos["mask"] = staying.copy()
         infos["episode_over"] = over

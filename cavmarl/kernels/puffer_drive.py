@@ -1,8 +1,8 @@
 """The observation of pufferlib's `drive`: the vehicle, others by id, road segments cell by cell.
 
 Suarez: "PufferLib", ocean environment `drive`, version 3.0: `OWN_FEATURES` numbers of the vehicle,
-`PARTNER_FEATURES` for each other one within 50 m and `SEGMENT_FEATURES` for each road segment. A
-cell of 5 m holds at most ten segments; a vehicle sees the first ones of the 21 x 21 cells around its
+`PARTNER_FEATURES` for each other one within 50 m and `SEGMENT_FEATURES` for each road segment.
+A cell of 5 m holds at most ten segments; a vehicle sees the first ones of the 21 x 21 cells around its
 own, in a spiral. What a cell's vehicles see never changes and is listed once, by
 `roads.road_segments`. All is float32, as there.
 """
@@ -139,7 +139,7 @@ def _partners(row: np.void, i: int, grid: Grid, near_body: NDArray[np.int64]) ->
 
 
 @kernel
-def _seen_from(roads: RoadSegments, x: float, y: float) -> tuple[int, int]:
+def _seen_from(roads: RoadSegments, x: np.float32, y: np.float32) -> tuple[int, int]:
     """Begin and end in `roads.lists` of what is seen from a place, in m from the map's corner."""
     if not (x >= 0.0 and y >= 0.0):
         return 0, 0
@@ -152,8 +152,18 @@ def _seen_from(roads: RoadSegments, x: float, y: float) -> tuple[int, int]:
 
 
 @kernel
+def _unit(value: np.float32) -> np.float32:
+    return min(max(value, -ONE), ONE)
+
+
+@kernel
 def _observe_segments(
-    roads: RoadSegments, x: float, y: float, cos: float, sin: float, out: NDArray[np.float32]
+    roads: RoadSegments,
+    x: np.float32,
+    y: np.float32,
+    cos: np.float32,
+    sin: np.float32,
+    out: NDArray[np.float32],
 ) -> None:
     """Write what is seen from a place and, where it is less than there is room for, zeros."""
     begin, end = _seen_from(roads, x, y)
@@ -172,8 +182,8 @@ def _observe_segments(
         out[at + 1] = dy * near_cos - dx * near_sin
         out[at + 2] = segment["half"]
         out[at + 3] = SEGMENT_WIDTH
-        out[at + 4] = clamp(ahead * cos + left * sin, -ONE, ONE)
-        out[at + 5] = clamp(left * cos - ahead * sin, -ONE, ONE)
+        out[at + 4] = _unit(ahead * cos + left * sin)
+        out[at + 5] = _unit(left * cos - ahead * sin)
         out[at + 6] = segment["type"]
     out[SEGMENT_FEATURES * seen.size :] = 0.0
 

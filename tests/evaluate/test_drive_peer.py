@@ -44,7 +44,9 @@ def test_the_peer_sees_the_same_on_the_bench_road(flags: tuple[str, ...], tmp_pa
 @needs_compiler
 @pytest.mark.parametrize("env", ["merge", "grid4x4"])
 def test_the_peer_sees_the_same_among_junctions(env: str, tmp_path: Path) -> None:
-    vec = make_vec(env, agents=8, background=0, overrides={**PUFFER_DRIVE, "population.mode": "closed"})
+    vec = make_vec(
+        env, agents=8, background=0, overrides={**PUFFER_DRIVE, "population.mode": "closed"}
+    )
     ours, _ = vec.reset(seed=1)
     peer = DrivePeer(compile_peer(tmp_path, ("-O2",)), vec)
     peer.reset()

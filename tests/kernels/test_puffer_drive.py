@@ -51,9 +51,7 @@ def test_the_observation_equals_twin(
 
 
 @given(crowds(), st.integers(0, 11), st.randoms(use_true_random=False))
-def test_the_order_of_rows_does_not_matter(
-    rows: NDArray[np.void], i: int, random: object
-) -> None:
+def test_the_order_of_rows_does_not_matter(rows: NDArray[np.void], i: int, random: object) -> None:
     i %= len(rows)
     order = list(range(len(rows)))
     random.shuffle(order)  # type: ignore[attr-defined]
@@ -82,7 +80,10 @@ def test_every_segment_is_within_its_bounds(name: str) -> None:
     low, high = (np.array([getattr(f, end) for f in features]) for end in ("low", "high"))
     for x, y, heading in np.random.default_rng(0).uniform(-1.0, 1.0, (50, 3)):
         min_x, min_y, max_x, max_y = network(name).extent_m
-        place = ((min_x + max_x + x * (max_x - min_x)) / 2, (min_y + max_y + y * (max_y - min_y)) / 2)
+        place = (
+            (min_x + max_x + x * (max_x - min_x)) / 2,
+            (min_y + max_y + y * (max_y - min_y)) / 2,
+        )
         seen = frame(name, vehicles([(*place, 3.0 * heading)]), 0)
         assert np.all((low <= seen) & (seen <= high))
 

@@ -13,7 +13,7 @@ Line = tuple[NDArray[np.float32], int]
 
 
 def around(side: int) -> list[tuple[int, int]]:
-    """The cells of a square, ring by ring; each from the right of its lower right corner, upwards."""
+    """The cells of a square, ring by ring, each from its lower right corner upwards."""
     cells = [(0, 0)]
     for r in range(1, side // 2 + 1):
         cells += [(r, j) for j in range(1 - r, r + 1)]
@@ -38,9 +38,7 @@ def segments_seen(lines: Sequence[Line], x: float, y: float, most: int) -> list[
     own = (math.floor(np.float32(x) / np.float32(5.0)), math.floor(np.float32(y) / np.float32(5.0)))
     if not (0 <= own[0] < math.ceil(far_x / 5.0) and 0 <= own[1] < math.ceil(far_y / 5.0)):
         return []
-    seen = [
-        segment for i, j in around(21) for segment in cells.get((own[0] + i, own[1] + j), ())
-    ]
+    seen = [segment for i, j in around(21) for segment in cells.get((own[0] + i, own[1] + j), ())]
     return seen[:most]
 
 
