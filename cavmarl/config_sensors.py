@@ -23,6 +23,7 @@ __all__ = [
     "LidarObservationConfig",
     "NeighborsConfig",
     "OccupancyGridConfig",
+    "PufferDriveConfig",
     "RoadgraphConfig",
     "RouteAheadConfig",
     "SensorsConfig",
@@ -289,6 +290,32 @@ class RoadgraphConfig:
 
 
 @dataclass(frozen=True)
+class PufferDriveConfig:
+    """The observation of pufferlib's `drive`: 1,847 numbers with its own settings.
+
+    Attributes:
+        enabled: true switches the sensor on.
+        partners: others within 50 m that are shown, by id.
+        segments: road segments that are shown, of the cells around the vehicle from its own one
+            outwards.
+        spacing_m: longest segment that a line of the road is cut into.
+    """
+
+    enabled: bool = False
+    partners: int = 63
+    segments: int = 200
+    spacing_m: float = 2.0
+
+    def __post_init__(self) -> None:
+        key = "sensors.puffer_drive"
+        check(0 <= self.partners <= 256, f"{key}.partners", self.partners, "must be from 0 to 256")
+        check(
+            0 <= self.segments <= 2048, f"{key}.segments", self.segments, "must be from 0 to 2048"
+        )
+        check_finite(f"{key}.spacing_m", self.spacing_m, 0.25, 50.0)
+
+
+@dataclass(frozen=True)
 class SensorsConfig:
     """The sensors of every agent; 0 points, neighbours or rays switch one off.
 
@@ -306,6 +333,7 @@ class SensorsConfig:
     occupancy_grid: OccupancyGridConfig = field(default_factory=OccupancyGridConfig)
     lidar_observation: LidarObservationConfig = field(default_factory=LidarObservationConfig)
     roadgraph: RoadgraphConfig = field(default_factory=RoadgraphConfig)
+    puffer_drive: PufferDriveConfig = field(default_factory=PufferDriveConfig)
 
     def __post_init__(self) -> None:
         check(1 <= self.stack <= 64, "sensors.stack", self.stack, "must be from 1 to 64")
@@ -319,6 +347,7 @@ class SensorsConfig:
             len(self.occupancy_grid.features),
             self.lidar_observation.cells,
             self.roadgraph.points,
+            self.puffer_drive.enabled,
         )
         check(any(counts), "sensors", "all off", "an agent must observe something; switch one on")
 

@@ -51,6 +51,7 @@ def make_vec(
     background: int | None = None,
     seed: int | None = None,
     max_cycles: int | None = None,
+    copy: bool = True,
     overrides: Mapping[str, Any] | None = None,
 ) -> CavVectorEnv:
     """Make `num_envs` worlds of one environment that are stepped together.
@@ -64,6 +65,7 @@ def make_vec(
         background: shadows population.background.
         seed: of the first reset, if that is given none.
         max_cycles: steps until truncation; shadows horizon_s.
+        copy: False returns observations without a copy; see `CavVectorEnv`.
         overrides: values for any other key.
 
     Raises:
@@ -83,7 +85,7 @@ def make_vec(
         max_cycles=max_cycles,
         overrides=overrides,
     )
-    return CavVectorEnv(config, network, int(num_envs), demand, seed=seed)
+    return CavVectorEnv(config, network, int(num_envs), demand, seed=seed, copy=copy)
 
 
 class CavVectorEnv:
@@ -101,6 +103,8 @@ class CavVectorEnv:
         network: its roads.
         num_envs: W.
         seed: of the first reset, if that is given none.
+        copy: False returns observations as a read-only view that the next step or reset overwrites;
+            large ones are copied for longer than they are made.
     """
 
     def __init__(
@@ -111,6 +115,7 @@ class CavVectorEnv:
         demand: DemandFile | None = None,
         *,
         seed: int | None = None,
+        copy: bool = True,
     ) -> None:
         check_agents(config)
         self.config = config
@@ -136,6 +141,7 @@ class CavVectorEnv:
         self._steps = np.zeros(num_envs, dtype=np.int64)
         self._mask = np.zeros((num_envs, self.num_agents), dtype=np.bool_)
         self._first_seed = None if seed is None else check_seed(seed)
+        self._copy = copy
         self._ready = False
 
     @property
@@ -171,7 +177,7 @@ class CavVectorEnv:
         self._steps[:] = 0
         self._mask = self._simulation.outputs.present.copy()
         self._ready = True
-        return self._simulation.outputs.observations.copy(), {"mask": self._mask.copy()}
+        return self._observations(), {"mask": self._mask.copy()}
 
     def step(self, actions: NDArray[Any]) -> StepResult:
         """Let every agent of every world act.
@@ -205,7 +211,7 @@ class CavVectorEnv:
         acted = outputs.acted.copy()
         terminations = outputs.terminated.copy()
         truncations = acted & horizon[:, None] & ~terminations
-        final_observations = outputs.observations.copy()
+        final_observations = self._observations()
         infos: dict[str, NDArray[Any]] = {
             "acted": acted,
             "terms": outputs.terms.copy(),
@@ -218,18 +224,31 @@ class CavVectorEnv:
         over = horizon | ~(staying.any(axis=1) | simulation.agents_to_come())
         observations = final_observations
         if terminations.any() or over.any():
-            observations = final_observations.copy()
-            observations[terminations] = 0.0
+            if self._copy:
+                observations = final_observations.copy()
+                observations[terminations] = 0.0
+            else:  # what is written from here on, a reset's too, is what the view shows
+                infos["final_observations"] = final_observations.copy()
+                outputs.observations[terminations] = 0.0
         if over.any():
             simulation.reset(over)
             self._decoder.forget(over)
             self._steps[over] = 0
             staying[over] = simulation.outputs.present[over]
-            observations[over] = simulation.outputs.observations[over]
+            if self._copy:
+                observations[over] = simulation.outputs.observations[over]
         self._mask = staying
         infos["mask"] = staying.copy()
         infos["episode_over"] = over
         return observations, rewards, terminations, truncations, infos
+
+    def _observations(self) -> NDArray[np.float32]:
+        observations = self._simulation.outputs.observations
+        if self._copy:
+            return observations.copy()
+        view = observations.view()
+        view.flags.writeable = False
+        return view
 
     def suggest_actions(self) -> NDArray[Any]:
         """What the built-in driver (IDM, MOBIL, lane controller) would do in each agent's place."""

@@ -12,6 +12,7 @@ from cavmarl.config_sensors import (
     LidarObservationConfig,
     NeighborsConfig,
     OccupancyGridConfig,
+    PufferDriveConfig,
     RoadgraphConfig,
     RouteAheadConfig,
     SensorsConfig,
@@ -43,6 +44,7 @@ FURTHER = (
     ),
     replace(OFF, kinematics=KinematicsConfig(), lidar_observation=LidarObservationConfig(cells=16)),
     replace(OFF, kinematics=KinematicsConfig(), roadgraph=RoadgraphConfig(points=200)),
+    replace(OFF, kinematics=KinematicsConfig(), puffer_drive=PufferDriveConfig(enabled=True)),
 )
 
 

@@ -36,6 +36,7 @@ EVERYTHING = {
     "sensors.occupancy_grid.features": ["presence", "vx", "long_off", "heading", "on_road"],
     "sensors.lidar_observation.cells": 16,
     "sensors.roadgraph.points": 50,
+    "sensors.puffer_drive.enabled": True,
     "sensors.stack": 3,
 }
 IMAGE = {**EVERYTHING, "sensors.occupancy_grid.as_image": True}

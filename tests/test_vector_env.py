@@ -202,6 +202,27 @@ def test_the_arrays_have_the_shapes_and_dtypes_of_the_spaces() -> None:
     vec.close()
 
 
+@pytest.mark.parametrize("mode", MODES)
+def test_without_copies_the_results_are_the_same(mode: str) -> None:
+    stack = {"sensors.stack": 2}
+    kept, shown = (make(3, mode, overrides=stack, copy=copy) for copy in (True, False))
+    rng = np.random.default_rng(1)
+    np.testing.assert_array_equal(shown.reset(seed=5)[0], kept.reset(seed=5)[0])
+    ended = over = 0
+    for _ in range(90):
+        actions = wild(rng, kept)
+        one, other = kept.step(actions), shown.step(actions)
+        np.testing.assert_array_equal(other[0], one[0])
+        np.testing.assert_array_equal(other[4]["final_observations"], one[4]["final_observations"])
+        ended += int(one[2].sum())
+        over += int(one[4]["episode_over"].sum())
+    assert ended
+    assert over
+    with pytest.raises(ValueError, match="read-only"):
+        other[0][:] = 0.0
+    assert np.shares_memory(other[0], shown.simulation.outputs.observations)
+
+
 def test_results_are_the_callers_to_keep() -> None:
     vec = make(2)
     vec.reset(seed=0)

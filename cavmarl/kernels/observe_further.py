@@ -1,4 +1,4 @@
-"""The sensors that most environments leave off: highway-env's, and road points."""
+"""The sensors that most environments leave off: highway-env's, pufferlib's, and road points."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ from cavmarl.kernels.kinematics_observation import observe_kinematics
 from cavmarl.kernels.lidar_cells import observe_lidar_cells
 from cavmarl.kernels.neighbors import Grid, fill_grid
 from cavmarl.kernels.occupancy import observe_occupancy
+from cavmarl.kernels.puffer_drive import observe_puffer_drive
 from cavmarl.kernels.roadgraph import observe_roadgraph
 from cavmarl.kernels.sensor_arrays import FurtherSensors
 from cavmarl.kernels.stacking import newest_frame
@@ -42,7 +43,7 @@ def observe_further(
         chosen: (W,) which worlds.
         observations: (W, A, D), the parts 0 before.
     """
-    kinematics, occupancy, lidar_cells, roadgraph = further
+    kinematics, occupancy, lidar_cells, roadgraph, puffer_drive = further
     for w in range(chosen.size):
         if not chosen[w]:
             continue
@@ -62,3 +63,5 @@ def observe_further(
                 observe_lidar_cells(rows, i, grid, lidar_cells, out)
             if roadgraph.num_points > 0:
                 observe_roadgraph(row, roadgraph, out)
+            if puffer_drive.on:
+                observe_puffer_drive(rows, i, grid, puffer_drive, out)

@@ -73,7 +73,7 @@ def sense(
                 continue
             agent = row["agent"]
             seen = outputs.observations[w, agent]
-            shift_frames(seen, sensors.stack)
+            shift_frames(seen, sensors.stack, sensors.cleared)
             out = seen[newest_frame(seen, sensors.stack) :]
             if sensors.ego:
                 observe_ego(roads, plans, row, out)

@@ -18,7 +18,7 @@ from cavmarl.kernels.roadgraph import (
 from cavmarl.kernels.sensor_arrays import RoadPoints
 from cavmarl.roads.network import RoadNetwork
 
-__all__ = ["road_points"]
+__all__ = ["lines_along", "road_points"]
 
 CELL_M = 16.0
 
@@ -32,7 +32,9 @@ def road_points(network: RoadNetwork, spacing_m: float) -> RoadPoints:
         network: the roads.
         spacing_m: largest distance between one point of a line and the next.
     """
-    parts = [_along(network, lane, spacing_m) for lane in range(len(network.lanes))]
+    parts = [
+        line for lane in range(len(network.lanes)) for line in lines_along(network, lane, spacing_m)
+    ]
     points = np.concatenate([*parts, _stop_lines(network)])
     min_x, min_y = float(points["x"].min()), float(points["y"].min())
     columns = ((points["x"] - min_x) // CELL_M).astype(np.int64)
@@ -47,22 +49,27 @@ def road_points(network: RoadNetwork, spacing_m: float) -> RoadPoints:
     return RoadPoints(min_x, min_y, CELL_M, num_x, num_y, start, points)
 
 
-def _along(network: RoadNetwork, lane: int, spacing_m: float) -> NDArray[np.void]:
-    """Points of the middle of a lane and, outside junctions, of the lines that bound it.
+def lines_along(network: RoadNetwork, lane: int, spacing_m: float) -> list[NDArray[np.void]]:
+    """The middle of a lane and, outside junctions, the lines that bound it, each as its points.
 
     The line between two lanes belongs to the right one.
+
+    Args:
+        network: the roads.
+        lane: row of `network.lanes`.
+        spacing_m: largest distance between one point and the next.
     """
     row = network.lanes[lane]
     middle = _middle(network, lane, spacing_m)
     if row["internal"]:
         middle["type"] = TYPE_JUNCTION
-        return middle
+        return [middle]
     middle["type"] = TYPE_LANE
     half = 0.5 * float(row["width_m"])
-    parts = [middle, _beside(middle, half, TYPE_LINE if row["left"] >= 0 else TYPE_EDGE)]
+    lines = [middle, _beside(middle, half, TYPE_LINE if row["left"] >= 0 else TYPE_EDGE)]
     if row["right"] < 0:
-        parts.append(_beside(middle, -half, TYPE_EDGE))
-    return np.concatenate(parts)
+        lines.append(_beside(middle, -half, TYPE_EDGE))
+    return lines
 
 
 def _middle(network: RoadNetwork, lane: int, spacing_m: float) -> NDArray[np.void]:

@@ -135,6 +135,11 @@ class Simulation:
         """EDGE rows of the goals, by `VEHICLE["goal"]`."""
         return self._traffic.goal_edges
 
+    @property
+    def plans(self) -> NDArray[np.void]:
+        """PLAN (G, L): the ways of agents, by `VEHICLE["goal"]`."""
+        return self._traffic.plans
+
     def vehicles(self, world: int = 0) -> NDArray[np.void]:
         """The live vehicles of one world: a view of VEHICLE records, in no order."""
         worlds = self._shard.worlds

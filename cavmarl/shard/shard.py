@@ -218,7 +218,8 @@ def _make_outputs(config: EnvConfig, num_worlds: int) -> Outputs:
     agents = (num_worlds, config.population.num_ids)
     size = config.sensors.stack * frame_size(config.sensors)
     return Outputs(
-        observations=np.zeros((*agents, size), dtype=np.float32),
+        # Not `zeros`: NumPy asks for huge pages where it fills the array itself.
+        observations=np.full((*agents, size), 0.0, dtype=np.float32),
         terms=np.zeros((*agents, len(TERMS)), dtype=np.float32),
         rewards=np.zeros(agents, dtype=np.float32),
         terminated=np.zeros(agents, dtype=np.bool_),

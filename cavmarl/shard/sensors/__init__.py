@@ -20,6 +20,7 @@ from cavmarl.shard.sensors import (
     lidar_observation,
     neighbors,
     occupancy_grid,
+    puffer_drive,
     roadgraph,
     route,
     signal,
@@ -60,10 +61,16 @@ SENSORS: tuple[Sensor, ...] = (
         lidar_observation.shape,
     ),
     Sensor("roadgraph", roadgraph.features, roadgraph.reach_m, roadgraph.shape),
+    Sensor("puffer_drive", puffer_drive.features, puffer_drive.reach_m),
 )
 
 # Those that `observe_further` writes.
-FURTHER = frozenset(("kinematics", "occupancy_grid", "lidar_observation", "roadgraph"))
+FURTHER = frozenset(
+    ("kinematics", "occupancy_grid", "lidar_observation", "roadgraph", "puffer_drive")
+)
+
+# The last of them, and the one that writes its zeros itself: most of a large frame is written once.
+FILLS_ITS_PART = SENSORS[-1].name
 
 
 def layout(config: SensorsConfig) -> dict[str, slice]:
@@ -102,6 +109,7 @@ def sensor_arrays(config: SensorsConfig) -> Sensors:
     starts = _starts(config)
     return Sensors(
         stack=config.stack,
+        cleared=starts[FILLS_ITS_PART] if FILLS_ITS_PART in places else frame_size(config),
         ego="ego" in places,
         route_at=starts["route"],
         route_points=config.route.points,
@@ -141,4 +149,5 @@ def further_arrays(
         occupancy=occupancy_grid.settings(config, starts["occupancy_grid"], network, goals),
         lidar_cells=lidar_observation.settings(config, starts["lidar_observation"]),
         roadgraph=roadgraph.settings(config, starts["roadgraph"], network),
+        puffer_drive=puffer_drive.settings(config, starts["puffer_drive"], network, goals),
     )
