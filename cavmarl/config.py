@@ -19,6 +19,7 @@ __all__ = [
     "ActionConfig",
     "ClockConfig",
     "EnvConfig",
+    "LanesConfig",
     "LidarConfig",
     "MapConfig",
     "NeighborsConfig",
@@ -320,12 +321,27 @@ class LidarConfig:
 
 
 @dataclass(frozen=True)
+class LanesConfig:
+    """Vehicles by their place along the lanes around, and the one that crosses the own way first.
+
+    Attributes:
+        range_m: how far along lanes a vehicle is seen; 0 switches the sensor off.
+    """
+
+    range_m: float = 0.0
+
+    def __post_init__(self) -> None:
+        _check_finite("sensors.lanes.range_m", self.range_m, 0.0, 300.0)
+
+
+@dataclass(frozen=True)
 class SensorsConfig:
     """The sensors of every agent; 0 points, neighbours or rays switch one off."""
 
     route: RouteAheadConfig = field(default_factory=RouteAheadConfig)
     neighbors: NeighborsConfig = field(default_factory=NeighborsConfig)
     signal: SignalAheadConfig = field(default_factory=SignalAheadConfig)
+    lanes: LanesConfig = field(default_factory=LanesConfig)
     lidar: LidarConfig = field(default_factory=LidarConfig)
 
 

@@ -115,6 +115,8 @@ class Sensors(NamedTuple):
     neighbors_range_m: float
     signal_at: int
     signal_range_m: float
+    lanes_at: int
+    lanes_range_m: float
     lidar_at: int
     lidar_rays: int
     lidar_range_m: float

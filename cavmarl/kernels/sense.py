@@ -16,6 +16,7 @@ from cavmarl.kernels.observing import (
     observe_route,
     observe_signal,
 )
+from cavmarl.kernels.observing_lanes import observe_lanes
 from cavmarl.kernels.terms import NUM_TERMS, write_terms
 
 __all__ = ["sense"]
@@ -77,6 +78,9 @@ def sense(
             observe_route(roads, plans, row, sensors, out)
             observe_neighbors(rows, i, grid, sensors, out)
             observe_signal(roads, plans, row, worlds.signal_phase[w], sensors, out)
+            observe_lanes(
+                roads, plans, rows, i, grid, worlds.signal_phase[w], sensors, out
+            )
             observe_lidar(rows, i, grid, sensors, out)
             outputs.present[w, agent] = True
             outputs.vehicle_ids[w, agent] = row["id"]

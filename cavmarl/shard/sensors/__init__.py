@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from cavmarl.config import SensorsConfig
 from cavmarl.kernels.arrays import Sensors
-from cavmarl.shard.sensors import ego, lidar, neighbors, route, signal
+from cavmarl.shard.sensors import ego, lanes, lidar, neighbors, route, signal
 from cavmarl.shard.sensors.feature import Feature, Sensor
 
 __all__ = ["SENSORS", "Feature", "Sensor", "layout", "reach_m", "sensor_arrays"]
@@ -19,6 +19,7 @@ SENSORS: tuple[Sensor, ...] = (
     Sensor("route", route.features, route.reach_m),
     Sensor("neighbors", neighbors.features, neighbors.reach_m),
     Sensor("signal", signal.features, signal.reach_m),
+    Sensor("lanes", lanes.features, lanes.reach_m),
     Sensor("lidar", lidar.features, lidar.reach_m),
 )
 
@@ -53,6 +54,8 @@ def sensor_arrays(config: SensorsConfig) -> Sensors:
         neighbors_range_m=config.neighbors.range_m,
         signal_at=places["signal"].start,
         signal_range_m=config.signal.range_m,
+        lanes_at=places.get("lanes", unused).start,
+        lanes_range_m=config.lanes.range_m,
         lidar_at=places.get("lidar", unused).start,
         lidar_rays=config.lidar.rays,
         lidar_range_m=config.lidar.range_m,
