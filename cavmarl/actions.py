@@ -101,14 +101,14 @@ class ActionDecoder:
                 f"no action for {', '.join(missing)}: pass one for each id in env.agents, or set "
                 "action.missing_action = hold"
             )
-        given = [agent for agent in needed if agent in actions]
+        given = [agent for agent in needed if agent in actions] if missing else needed
         batch = self._idle.copy()
-        held = [self._index[agent] for agent in missing]
-        batch[0, held] = self._last[0, held]
-        rows = [self._index[agent] for agent in given]
+        if missing:
+            held = self._rows_of(missing)
+            batch[0, held] = self._last[0, held]
         if given:
             stacked = self._stack([actions[agent] for agent in given], given)
-            batch[0, rows] = stacked
+            batch[0, self._rows_of(given)] = stacked
         checked, clipped = self._check_values(batch)
         self.ignored += ignored
         self.held += len(missing)
@@ -141,14 +141,21 @@ class ActionDecoder:
             return shares
         return raw[..., 0].astype(np.int64)
 
+    def _rows_of(self, agents: Sequence[str]) -> NDArray[np.intp] | slice:
+        if tuple(agents) == self._agents:
+            return slice(None)
+        return np.array([self._index[agent] for agent in agents], dtype=np.intp)
+
     def _check_ids(self, actions: Mapping[str, Any], live: Sequence[str]) -> int:
         """How many actions are for agents that are not there; refuses those that never could be."""
+        alive = set(live)
+        if actions.keys() <= alive:
+            return 0
         strangers = [agent for agent in actions if agent not in self._index]
         if strangers:
             raise UnknownAgentError(
                 f"no agent {strangers[0]!r}: the ids are {self._agents[0]} … {self._agents[-1]}"
             )
-        alive = set(live)
         late = [agent for agent in actions if agent not in alive]
         if late and self._config.late_actions == "error":
             raise UnknownAgentError(
@@ -157,8 +164,11 @@ class ActionDecoder:
             )
         return len(late)
 
-    def _stack(self, values: list[Any], agents: list[str]) -> NDArray[Any]:
+    def _stack(self, values: list[Any], agents: Sequence[str]) -> NDArray[Any]:
         """The actions as one array; refuses the first that has another shape or is no number."""
+        alike = self._stack_alike(values)
+        if alike is not None:
+            return alike
         shape = self._last.shape[2:]
         arrays = []
         for agent, value in zip(agents, values, strict=True):
@@ -169,6 +179,23 @@ class ActionDecoder:
                 )
             arrays.append(array)
         return np.stack(arrays)
+
+    def _stack_alike(self, values: list[Any]) -> NDArray[Any] | None:
+        """The actions as one array where all are of one kind that needs no look at each; or None.
+
+        That is what policies give, and it takes a fifth of the time.
+        """
+        kinds = set(map(type, values))
+        if self._continuous:
+            if kinds != {np.ndarray} or {value.shape for value in values} != {(2,)}:
+                return None
+            if {value.dtype.kind for value in values} <= {"f", "i"}:
+                pairs: NDArray[Any] = np.concatenate(values).reshape(-1, 2)
+                return pairs
+        elif kinds == {int} or kinds == {np.int64}:
+            array = np.array(values)
+            return array if array.dtype == np.int64 else None
+        return None
 
     def _as_numbers(self, value: Any, who: str) -> NDArray[Any]:
         """An array of a dtype that loses nothing when it is cast; refuses what is none."""
@@ -191,11 +218,11 @@ class ActionDecoder:
             if wrong.any():
                 self._refuse(batch, wrong, f"must be from 0 to {ACTION_SLOWER}")
             return batch, 0
-        if not np.isfinite(batch).all():
-            self._refuse(batch, ~np.isfinite(batch), "must be finite")
-        beyond = np.abs(batch) > 1.0
+        beyond = ~(np.abs(batch) <= 1.0)
         if not beyond.any():
             return batch, 0
+        if not np.isfinite(batch).all():
+            self._refuse(batch, ~np.isfinite(batch), "must be finite")
         if self._config.out_of_range == "error":
             self._refuse(
                 batch, beyond, "must be within [-1, 1]; action.out_of_range = clip cuts it off"

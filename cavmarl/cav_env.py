@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import asdict
+from itertools import compress
 from pathlib import Path
 from typing import Any
 
@@ -28,6 +29,10 @@ from cavmarl.worlds import check_placement, load_world
 __all__ = ["CavEnv", "parallel_env"]
 
 RENDER_MODES = ("human", "rgb_array")
+
+# What an agent's info holds, in this order.
+_ABSENT = dict.fromkeys((*TERMS, "active", "vehicle_done", "vehicle_id"), 0.0)
+_ACTIVE = _ABSENT | {"active": 1.0}
 
 Observation = NDArray[np.float32] | dict[str, NDArray[np.float32]]
 
@@ -115,7 +120,9 @@ class CavEnv(ParallelEnv[str, Any, Any]):  # type: ignore[misc] # PettingZoo is 
             "render_fps": max(1, round(1.0 / config.clock.ctrl_dt_s)),
         }
         self.possible_agents = [f"car_{k}" for k in range(config.population.num_ids)]
-        self.agents: list[str] = []
+        self._rows: NDArray[np.intp]
+        self._listed: NDArray[np.intp] | slice  # the same
+        self._list(np.zeros(0, dtype=np.intp))
         self.max_cycles = config.max_steps
         self.state_space = state_space(config)
         one_observation, one_action = observation_space(config), action_space(config.action)
@@ -123,7 +130,6 @@ class CavEnv(ParallelEnv[str, Any, Any]):  # type: ignore[misc] # PettingZoo is 
         self.action_spaces = dict.fromkeys(self.possible_agents, one_action)
         self._seats = config.population.mode == "seats"
         self._places = layout(config.sensors) if config.observation.kind == "dict" else None
-        self._index = {agent: k for k, agent in enumerate(self.possible_agents)}
         self._simulation = Simulation(config, network)
         self._decoder = ActionDecoder(config.action, 1, self.possible_agents)
         self._first_seed = None if seed is None else check_seed(seed)
@@ -163,12 +169,10 @@ class CavEnv(ParallelEnv[str, Any, Any]):  # type: ignore[misc] # PettingZoo is 
         self._decoder.forget(np.ones(1, dtype=np.bool_))
         self._steps = 0
         present = self._simulation.outputs.present[0]
-        self.agents = [
-            agent for k, agent in enumerate(self.possible_agents) if self._seats or present[k]
-        ]
+        self._list(np.flatnonzero(present | self._seats))
         if not self.agents:
             self._wait_for_agents()
-        return self._observations(self.agents), self._infos(self.agents)
+        return self._observations(), self._infos()
 
     def step(
         self, actions: Mapping[str, Any]
@@ -196,8 +200,8 @@ class CavEnv(ParallelEnv[str, Any, Any]):  # type: ignore[misc] # PettingZoo is 
                 raise EpisodeEndedError("the episode is over: call env.reset()")
             return {}, {}, {}, {}, {}
         outputs = self._simulation.outputs
-        active = outputs.present[0] & ~outputs.terminated[0]
-        needed = [agent for agent in self.agents if active[self._index[agent]]]
+        active = (outputs.present[0] & ~outputs.terminated[0])[self._listed]
+        needed = self.agents if active.all() else list(compress(self.agents, active.tolist()))
         commands = self._decoder.from_dict(actions, self.agents, needed)
         self._simulation.step(commands)
         self._steps += 1
@@ -215,70 +219,80 @@ class CavEnv(ParallelEnv[str, Any, Any]):  # type: ignore[misc] # PettingZoo is 
         """What the agents get after a step; decides who stays."""
         outputs = self._simulation.outputs
         truncated = self._steps >= self.max_cycles
-        present = outputs.present[0]
-        known = set(self.agents)
-        entered = [
-            agent
-            for k, agent in enumerate(self.possible_agents)
-            if present[k] and agent not in known and not truncated
-        ]
-        shown = self.agents + entered
-        ended = outputs.terminated[0].tolist() if not self._seats else [False] * present.size
-        rewards = outputs.rewards[0].tolist()
-        index = self._index
-        observations = self._observations(shown)
-        infos = self._infos(shown)
-        reward_by_agent = {agent: rewards[index[agent]] for agent in shown}
-        terminations = {agent: ended[index[agent]] for agent in shown}
-        truncations = {agent: truncated and not ended[index[agent]] for agent in shown}
+        if not truncated:
+            entered = outputs.present[0].copy()
+            entered[self._listed] = False
+            if entered.any():
+                self._list(np.concatenate([self._rows, np.flatnonzero(entered)]))
+        shown = self.agents
+        ended = outputs.terminated[0, self._listed] & (not self._seats)
+        observations, infos = self._observations(), self._infos()
+        rewards = dict(zip(shown, outputs.rewards[0, self._listed].tolist(), strict=True))
+        terminations = dict(zip(shown, ended.tolist(), strict=True))
+        truncations = dict.fromkeys(shown, False)
+        if truncated:
+            truncations = dict(zip(shown, (~ended).tolist(), strict=True))
         self._simulation.retire_agents()
-        self.agents = [] if truncated else [agent for agent in shown if not terminations[agent]]
+        if truncated:
+            self._list(self._rows[:0])
+        elif ended.any():
+            self._list(self._rows[~ended])
         if not self.agents and not truncated:
-            for agent in self._wait_for_agents():
-                observations.update(self._observations([agent]))
-                infos.update(self._infos([agent]))
-                reward_by_agent[agent] = 0.0
-                terminations[agent] = truncations[agent] = False
+            self._wait_for_agents()
+            observations |= self._observations()
+            infos |= self._infos()
+            rewards |= dict.fromkeys(self.agents, 0.0)
+            terminations |= dict.fromkeys(self.agents, False)
+            truncations |= dict.fromkeys(self.agents, False)
         if self.render_mode == "human":
             self.render()
-        return observations, reward_by_agent, terminations, truncations, infos
+        return observations, rewards, terminations, truncations, infos
 
-    def _wait_for_agents(self) -> list[str]:
+    def _list(self, rows: NDArray[np.intp]) -> None:
+        """Make these agents, by their index, the ones in the episode."""
+        self._rows = rows
+        self.agents = [self.possible_agents[k] for k in rows.tolist()]
+        # The first ones in their order, which is the usual case, can be taken without a copy.
+        in_order = bool((rows == np.arange(rows.size)).all())
+        self._listed = slice(rows.size) if in_order else rows
+
+    def _wait_for_agents(self) -> None:
         """Let an empty world go on until an agent enters; ends without one at the horizon."""
         while self._steps < self.max_cycles and self._simulation.agents_to_come()[0]:
             self._simulation.step(self._decoder.idle())
             self._steps += 1
             present = self._simulation.outputs.present[0]
             if present.any() and self._steps < self.max_cycles:
-                self.agents = [self.possible_agents[k] for k in np.flatnonzero(present)]
+                self._list(np.flatnonzero(present))
                 break
-        return self.agents
 
-    def _observations(self, agents: list[str]) -> dict[str, Observation]:
-        rows = self._simulation.outputs.observations[0].copy()
-        index = self._index
+    def _observations(self) -> dict[str, Observation]:
+        found = self._simulation.outputs.observations[0].copy()[self._listed]
         if self._places is None:
-            return {agent: rows[index[agent]] for agent in agents}
+            return dict(zip(self.agents, found, strict=True))
         return {
-            agent: {name: rows[index[agent], place] for name, place in self._places.items()}
-            for agent in agents
+            agent: {name: row[place] for name, place in self._places.items()}
+            for agent, row in zip(self.agents, found, strict=True)
         }
 
-    def _infos(self, agents: list[str]) -> dict[str, dict[str, float]]:
-        outputs = self._simulation.outputs
-        terms = outputs.terms[0].tolist()
-        present = outputs.present[0].tolist()
-        done = (outputs.events[0] & EVENTS_THAT_END != 0).tolist()
-        ids = outputs.vehicle_ids[0].tolist()
-        infos = {}
-        for agent in agents:
-            k = self._index[agent]
-            info: dict[str, float] = dict(zip(TERMS, terms[k], strict=True))
-            info["active"] = float(present[k] and not done[k])
-            info["vehicle_done"] = float(done[k])
-            info["vehicle_id"] = ids[k]
-            infos[agent] = info
-        return infos
+    def _infos(self) -> dict[str, dict[str, float]]:
+        outputs, listed = self._simulation.outputs, self._listed
+        done = outputs.events[0, listed] & EVENTS_THAT_END != 0
+        active = outputs.present[0, listed] & ~done
+        terms = outputs.terms[0, listed].T
+        # Most are 0 for everybody: no accident, no red light.
+        columns = [(TERMS[k], terms[k]) for k in np.flatnonzero(terms.any(axis=1)).tolist()]
+        columns.append(("vehicle_id", outputs.vehicle_ids[0, listed]))
+        usual = _ACTIVE
+        if not active.all():
+            usual = _ABSENT
+            columns.append(("active", active.astype(np.float64)))
+            columns.append(("vehicle_done", done.astype(np.float64)))
+        infos = [usual.copy() for _ in self.agents]
+        for name, column in columns:
+            for info, number in zip(infos, column.tolist(), strict=True):
+                info[name] = number
+        return dict(zip(self.agents, infos, strict=True))
 
     def check_action(self, agent: str, action: Any) -> None:
         """Refuse an action that `step` would refuse, before anything is kept of it.
@@ -309,7 +323,7 @@ class CavEnv(ParallelEnv[str, Any, Any]):  # type: ignore[misc] # PettingZoo is 
         raw = np.zeros((1, len(self.possible_agents), 2))
         self._simulation.suggest(raw)
         batch = self._decoder.encode(raw)[0]
-        return {agent: batch[self._index[agent]] for agent in self.agents}
+        return dict(zip(self.agents, batch[self._rows], strict=True))
 
     def render(self) -> NDArray[np.uint8] | None:
         """A frame (height, width, 3) for `rgb_array`; None and a window for `human`."""

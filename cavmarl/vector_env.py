@@ -175,7 +175,8 @@ class CavVectorEnv:
             truncations (W, A): the episode was cut at the horizon; and infos: `mask` (W, A) who
             acts next; `acted` (W, A) who acted in this step, so whose reward counts; `terms` (W, A,
             T) in the order of `config.TERMS`; `episode_over` (W,) which worlds were reset;
-            `final_observations` (W, A, D) before that reset.
+            `final_observations` (W, A, D) before that reset and with the last ones of those who
+            left: the same array as the observations in a step where nobody did.
 
         Raises:
             ResetNeededError: before the first reset.
@@ -204,15 +205,15 @@ class CavVectorEnv:
         staying = outputs.present & ~terminations
         over = horizon | ~(staying.any(axis=1) | simulation.agents_to_come())
         observations = final_observations
+        if terminations.any() or over.any():
+            observations = final_observations.copy()
+            observations[terminations] = 0.0
         if over.any():
             simulation.reset(over)
             self._decoder.forget(over)
             self._steps[over] = 0
             staying[over] = simulation.outputs.present[over]
-            observations = np.where(
-                over[:, None, None], simulation.outputs.observations, final_observations
-            )
-        observations = np.where(staying[..., None], observations, np.float32(0.0))
+            observations[over] = simulation.outputs.observations[over]
         self._mask = staying
         infos["mask"] = staying.copy()
         infos["episode_over"] = over

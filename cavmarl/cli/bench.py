@@ -9,20 +9,33 @@ import typer
 from rich.console import Console
 from rich.table import Table
 
-from cavmarl.cli.output import JsonPath, write_json
+from cavmarl.cli.output import (
+    Agents,
+    Background,
+    Environment,
+    JsonPath,
+    Seed,
+    Settings,
+    parse_settings,
+    write_json,
+)
 from cavmarl.errors import ConfigError
 
 if TYPE_CHECKING:
-    from cavmarl.evaluate.step_speed import Rates, StepSpeed
+    from cavmarl.evaluate.step_profile import StepProfile
+    from cavmarl.evaluate.step_speed import Row, StepSpeed
+    from cavmarl.vector_env import CavVectorEnv
 
 __all__ = ["app"]
 
 app = typer.Typer(help="How fast it is, measured side by side.", no_args_is_help=True)
 
-
-@app.callback()
-def _group() -> None:
-    """Keep `step` a command of its own while there is no other."""
+_SENSORS = {"lidar": "64 rays", "kinematics": "no rays"}
+_WHO = {
+    "dicts": "cavmarl, dicts",
+    "highway_env": "highway-env",
+    "highway_env_raw": "highway-env, raw",
+}
 
 
 @app.command()
@@ -31,11 +44,11 @@ def step(
     worlds: Annotated[int, typer.Option(help="Of ours, stepped together.")] = 16,
     repeats: Annotated[int, typer.Option(help="Measurements of each, by turns.")] = 5,
     at_least: Annotated[
-        float | None, typer.Option(help="Exit with 1 if the ratio is below this.")
+        float | None, typer.Option(help="Exit with 1 if the ratio with a lidar is below this.")
     ] = None,
     json_path: JsonPath = None,
 ) -> None:
-    """Agent-steps a second next to highway-env's: same road, vehicles, sensor, rates; one core."""
+    """Agent-steps a second next to highway-env's: same road, vehicles and rates; one core."""
     from cavmarl.evaluate.step_speed import measure_step_speed
 
     if at_least is not None and not 0.0 < at_least < math.inf:
@@ -43,34 +56,94 @@ def step(
     console = Console()
     with console.status("") as status:
         found = measure_step_speed(agents, worlds, repeats, status.update)
-    console.print(_table(found))
+    console.print(_speed_table(found))
     console.print(
-        f"ratio: [bold]{found.ratio:,.0f}[/] batched, {found.ratio_single:,.0f} with one world"
+        f"batched over highway-env: [bold]{found.ratio:,.0f}[/] with a lidar, "
+        f"[bold]{found.ratio_kinematics:,.0f}[/] without "
+        f"({found.ratio_kinematics_raw:,.0f} over its raw observation)\n"
+        f"an agent among ten times as many costs [bold]{found.cost_of_more:.2f}[/] times as much; "
+        f"dicts add [bold]{found.dict_us:.2f} µs[/] an agent and step"
     )
     write_json(json_path, found.to_dict())
     if at_least is not None and found.ratio < at_least:
         raise typer.Exit(1)
 
 
-def _table(found: StepSpeed) -> Table:
+def _speed_table(found: StepSpeed) -> Table:
+    agents = found.rows[0].agents
     table = Table(
-        "agent-steps/s",
+        "observation",
+        "",
         title=(
-            f"{found.agents} controlled vehicles on {found.road_m / 1000.0:.1f} km of four lanes, "
-            f"64-ray lidar, one core, {found.repeats} repeats by turns"
+            f"agent-steps/s of one core: {agents} controlled vehicles on "
+            f"{found.road_m / 1000.0:.1f} km of four lanes,\n"
+            f"two ticks a step; ours with 16 neighbours too; {found.repeats} turns"
         ),
     )
-    for column in ("min", "median", "max"):
+    for column in ("agents", "min", "median", "max"):
         table.add_column(column, justify="right")
-    rows = {
-        f"cavmarl, {found.worlds} worlds": found.batched,
-        "cavmarl, 1 world": found.single,
-        "highway-env": found.highway_env,
-    }
-    for name, rates in rows.items():
-        table.add_row(name, *_cells(rates))
+    shown = ""
+    for row in sorted(found.rows, key=lambda row: row.sensors, reverse=True):
+        table.add_row(
+            "" if row.sensors == shown else _SENSORS[row.sensors],
+            _who(row),
+            f"{row.agents:,}",
+            *(f"{rate:,.0f}" for rate in (row.low, row.median, row.high)),
+        )
+        shown = row.sensors
     return table
 
 
-def _cells(rates: Rates) -> tuple[str, str, str]:
-    return f"{rates.low:,.0f}", f"{rates.median:,.0f}", f"{rates.high:,.0f}"
+def _who(row: Row) -> str:
+    return _WHO.get(row.who, f"cavmarl, {row.worlds} world{'' if row.worlds == 1 else 's'}")
+
+
+@app.command()
+def profile(
+    env: Environment,
+    agents: Agents = None,
+    background: Background = None,
+    worlds: Annotated[int, typer.Option(help="Stepped together.")] = 1,
+    steps: Annotated[int, typer.Option(help="Steps a turn.")] = 200,
+    repeats: Annotated[int, typer.Option(help="Turns; the fastest counts.")] = 5,
+    seed: Seed = 0,
+    settings: Settings = None,
+    json_path: JsonPath = None,
+) -> None:
+    """Where the time of a step goes: the processor's nanoseconds a vehicle, phase by phase."""
+    from cavmarl.evaluate.step_profile import profile_step
+    from cavmarl.vector_env import make_vec
+
+    overrides = parse_settings(settings)
+
+    def make() -> CavVectorEnv:
+        return make_vec(
+            env, num_envs=worlds, agents=agents, background=background, overrides=overrides
+        )
+
+    console = Console()
+    with console.status("measuring"):
+        found = profile_step(make, steps, seed, repeats)
+    console.print(_profile_table(found))
+    console.print(
+        f"a step without stopwatches: [bold]{found.plain_ns:,.0f}[/] ns a vehicle; the phases sum "
+        f"to {found.timed_ns / found.plain_ns - 1.0:+.1%} of that"
+    )
+    write_json(json_path, found.to_dict())
+
+
+def _profile_table(found: StepProfile) -> Table:
+    table = Table(
+        "phase",
+        title=(
+            f"{found.vehicles:,.0f} vehicles, {found.agents:,.0f} of them agents; "
+            f"{found.ticks_per_step} ticks a step"
+        ),
+    )
+    table.add_column("ns a vehicle and step", justify="right")
+    table.add_column("share", justify="right")
+    for name, ns in found.phases.items():
+        table.add_row(name, f"{ns:,.0f}", f"{ns / found.timed_ns:.1%}")
+    table.add_section()
+    table.add_row("sum", f"{found.timed_ns:,.0f}", "100 %")
+    return table

@@ -1,8 +1,8 @@
 """How fast a step is, next to highway-env's, on the same road with the same number of vehicles.
 
-Both sides drive N controlled vehicles by the meta-action IDLE on a straight road of four lanes, as
-densely as highway-env sets them out, at 20 Hz with 10 decisions a second. They observe by a lidar
-of 64 rays, distances and relative speeds over 60 m; nobody else is on the road.
+Every row of the comparison is measured once a turn, all rows one after the other, and the ratios
+are those of the medians over the turns: what else the machine does falls on all of them. Times are
+those of the processor that this process had, on one core, without what others took of it.
 """
 
 from __future__ import annotations
@@ -13,40 +13,65 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
+from functools import partial
 from pathlib import Path
 from statistics import median
 from typing import Any
 
 import numpy as np
 
+from cavmarl.cav_env import CavEnv, parallel_env
 from cavmarl.errors import ConfigError, require
+from cavmarl.evaluate.highway_worlds import (
+    IDLE,
+    KINEMATICS,
+    LIDAR,
+    THEIR_KINEMATICS,
+    THEIR_LIDAR,
+    THEIR_RAW_KINEMATICS,
+    highway_env,
+    length_m,
+    overrides,
+    straight_road,
+)
 from cavmarl.vector_env import CavVectorEnv, make_vec
 
-__all__ = ["Rates", "StepSpeed", "measure_step_speed"]
+__all__ = ["MORE", "Row", "StepSpeed", "measure_step_speed"]
 
-RAYS = 64
-RANGE_M = 60.0
-SIM_HZ = 20
-CONTROL_HZ = 10
-LANES = 4
-LANE_WIDTH_M = 3.2
-SPEED_MPS = 30.0
-RUN_OUT_M = 1500.0
-IDLE = 1
-OUR_STEPS = 100
+OUR_STEPS = 100  # from a fresh reset: nobody reaches the end of the road
 THEIR_STEPS = 10
+MORE = 10  # times as many agents, on a road as many times as long
 MAX_AGENTS = 1000
 
 _ONE = np.int64(IDLE)
 
 
 @dataclass(frozen=True)
-class Rates:
-    """Agent-steps a second over the repeats."""
+class Row:
+    """One way to step one kind of world.
 
+    Attributes:
+        sensors: `lidar` (and neighbours) or `kinematics`.
+        who: `batched`, `single`, `dicts`, `more`, `highway_env` or `highway_env_raw`.
+        agents: controlled vehicles a world.
+        worlds: stepped together.
+        low: agent-steps a second, the slowest turn.
+        median: over the turns.
+        high: the fastest turn.
+    """
+
+    sensors: str
+    who: str
+    agents: int
+    worlds: int
     low: float
     median: float
     high: float
+
+    @property
+    def agent_step_s(self) -> float:
+        """Seconds an agent-step takes, by the median."""
+        return 1.0 / self.median
 
 
 @dataclass(frozen=True)
@@ -54,30 +79,39 @@ class StepSpeed:
     """Result of the comparison.
 
     Attributes:
-        agents: controlled vehicles a world, on both sides.
-        worlds: how many of ours were stepped together in `batched`.
-        road_m: length of the road that the vehicles were set out on, on both sides.
-        repeats: measurements of each kind, by turns.
-        batched: ours, `worlds` worlds.
-        single: ours, one world.
-        highway_env: highway-env, one world.
-        ratio: of the medians, `batched` over `highway_env`.
-        ratio_single: of the medians, `single` over `highway_env`.
+        road_m: length of the road that `agents` vehicles were set out on, on both sides.
+        repeats: turns.
+        rows: what was measured.
+        ratio: with a lidar, `batched` over `highway_env`.
+        ratio_kinematics: without, `batched` over `highway_env`'s default observation.
+        ratio_kinematics_raw: the same over its observation without normalisation.
+        cost_of_more: what an agent costs among `MORE` times as many, over what it costs `batched`.
+        dict_us: what the dict API adds for each agent and step to `single`, in µs.
     """
 
-    agents: int
-    worlds: int
     road_m: float
     repeats: int
-    batched: Rates
-    single: Rates
-    highway_env: Rates
+    rows: tuple[Row, ...]
     ratio: float
-    ratio_single: float
+    ratio_kinematics: float
+    ratio_kinematics_raw: float
+    cost_of_more: float
+    dict_us: float
 
     def to_dict(self) -> dict[str, Any]:
         """Plain values, for JSON."""
         return asdict(self)
+
+
+@dataclass(frozen=True)
+class _Runner:
+    """A row to be measured: `rate` steps its world and returns agent-steps a second."""
+
+    sensors: str
+    who: str
+    agents: int
+    worlds: int
+    rate: Callable[[], float]
 
 
 def measure_step_speed(
@@ -86,12 +120,12 @@ def measure_step_speed(
     repeats: int = 5,
     progress: Callable[[str], None] = lambda text: None,
 ) -> StepSpeed:
-    """Measure by turns on one core: ours batched, ours alone, highway-env.
+    """Measure by turns on one core, kernels warm.
 
     Args:
         agents: controlled vehicles a world.
-        worlds: of ours, stepped together.
-        repeats: measurements of each.
+        worlds: of ours, stepped together where they are batched.
+        repeats: turns.
         progress: told what is going on.
 
     Raises:
@@ -104,31 +138,49 @@ def measure_step_speed(
             raise ConfigError(f"{name} = {value}: must be from 1 to {most}")
     require("highway_env", "highway")
     with _one_core(), tempfile.TemporaryDirectory() as folder:
-        progress("making highway-env's road")
-        theirs = _highway_env(agents)
-        along = [vehicle.position[0] for vehicle in theirs.controlled_vehicles]
-        road_m = float(max(along) - min(along)) + LANES * 10.0
-        map_file = Path(folder) / "highway.net.xml"
-        map_file.write_text(_straight_road(road_m), encoding="utf-8")
+        progress("making highway-env's worlds")
+        theirs, road_m = _their_runners(agents)
         progress("making our worlds on that road")
-        batched, single = (_ours(map_file, agents, count) for count in (worlds, 1))
-        rates: dict[str, list[float]] = {"batched": [], "single": [], "highway_env": []}
+        runners = _our_runners(Path(folder), road_m, agents, worlds) + theirs
+        turns = []
         for repeat in range(repeats):
             progress(f"measuring, {repeat + 1} of {repeats}")
-            rates["batched"].append(_our_rate(batched, OUR_STEPS))
-            rates["single"].append(_our_rate(single, OUR_STEPS))
-            rates["highway_env"].append(_their_rate(theirs, agents))
-    found = {
-        name: Rates(min(values), median(values), max(values)) for name, values in rates.items()
-    }
+            turns.append([runner.rate() for runner in runners])
+    return _compare(
+        road_m,
+        repeats,
+        [
+            Row(
+                runner.sensors,
+                runner.who,
+                runner.agents,
+                runner.worlds,
+                min(rates),
+                median(rates),
+                max(rates),
+            )
+            for runner, rates in zip(runners, zip(*turns, strict=True), strict=True)
+        ],
+    )
+
+
+def _compare(road_m: float, repeats: int, rows: list[Row]) -> StepSpeed:
+    """The ratios of what was measured."""
+    found = {(row.sensors, row.who): row for row in rows}
+
+    def ratio(sensors: str, one: str, other: str) -> float:
+        return found[sensors, one].median / found[sensors, other].median
+
+    added_s = found["kinematics", "dicts"].agent_step_s - found["kinematics", "single"].agent_step_s
     return StepSpeed(
-        agents=agents,
-        worlds=worlds,
         road_m=road_m,
         repeats=repeats,
-        **found,
-        ratio=found["batched"].median / found["highway_env"].median,
-        ratio_single=found["single"].median / found["highway_env"].median,
+        rows=tuple(rows),
+        ratio=ratio("lidar", "batched", "highway_env"),
+        ratio_kinematics=ratio("kinematics", "batched", "highway_env"),
+        ratio_kinematics_raw=ratio("kinematics", "batched", "highway_env_raw"),
+        cost_of_more=ratio("kinematics", "batched", "more"),
+        dict_us=added_s * 1e6,
     )
 
 
@@ -146,112 +198,73 @@ def _one_core() -> Iterator[None]:
         os.sched_setaffinity(0, before)
 
 
-def _ours(map_file: Path, agents: int, worlds: int) -> CavVectorEnv:
-    """Our worlds on that road, kernels warm."""
-    vec = make_vec(
-        map_file,
-        num_envs=worlds,
-        agents=agents,
-        background=0,
-        overrides={
-            "clock.sim_dt_s": 1.0 / SIM_HZ,
-            "clock.ctrl_dt_s": 1.0 / CONTROL_HZ,
-            "action.kind": "discrete",
-            "traffic.origins": ["road"],
-            "traffic.destinations": ["end"],
-            "sensors.route.points": 0,
-            "sensors.neighbors.count": 0,
-            "sensors.lidar.rays": RAYS,
-            "sensors.lidar.range_m": RANGE_M,
-            "sensors.lidar.speeds": True,
-        },
-    )
-    vec.reset(seed=0)
-    _our_rate(vec, 2)
-    return vec
+def _our_runners(folder: Path, road_m: float, agents: int, worlds: int) -> list[_Runner]:
+    """Ours, each stepped twice before anything is measured."""
+    road = straight_road(folder, road_m)
+    long_road = straight_road(folder, road_m * MORE)
+    runners = []
+    for sensors, who, count, together in (
+        ("lidar", "batched", agents, worlds),
+        ("lidar", "single", agents, 1),
+        ("kinematics", "batched", agents, worlds),
+        ("kinematics", "single", agents, 1),
+        ("kinematics", "more", agents * MORE, worlds),
+    ):
+        vec = make_vec(
+            long_road if who == "more" else road,
+            num_envs=together,
+            agents=count,
+            background=0,
+            overrides=overrides(LIDAR if sensors == "lidar" else KINEMATICS, count),
+        )
+        _batched_rate(vec, 2)
+        runners.append(_Runner(sensors, who, count, together, partial(_batched_rate, vec)))
+    env = parallel_env(road, agents=agents, background=0, overrides=overrides(KINEMATICS, agents))
+    _dicts_rate(env, 2)
+    runners.append(_Runner("kinematics", "dicts", agents, 1, partial(_dicts_rate, env)))
+    return runners
 
 
-def _our_rate(vec: CavVectorEnv, steps: int) -> float:
+def _their_runners(agents: int) -> tuple[list[_Runner], float]:
+    """highway-env's, and the length of their road in m."""
+    runners = []
+    road_m = 0.0
+    for sensors, who, observation in (
+        ("lidar", "highway_env", THEIR_LIDAR),
+        ("kinematics", "highway_env", THEIR_KINEMATICS),
+        ("kinematics", "highway_env_raw", THEIR_RAW_KINEMATICS),
+    ):
+        env = highway_env(agents, observation)
+        road_m = length_m(env)
+        runners.append(_Runner(sensors, who, agents, 1, partial(_their_rate, env, agents)))
+    return runners, road_m
+
+
+def _batched_rate(vec: CavVectorEnv, steps: int = OUR_STEPS) -> float:
     """Agent-steps a second from a fresh reset, which is not timed."""
     vec.reset(seed=0)
     actions = np.full((vec.num_envs, vec.num_agents), _ONE)
     decisions = 0
-    began = time.perf_counter()
+    began = time.process_time()
     for _ in range(steps):
-        infos = vec.step(actions)[4]
-        decisions += int(infos["acted"].sum())
-    return decisions / (time.perf_counter() - began)
+        decisions += int(vec.step(actions)[4]["acted"].sum())
+    return decisions / (time.process_time() - began)
 
 
-def _highway_env(agents: int) -> Any:
-    """highway-env's own highway with that many controlled vehicles."""
-    gymnasium = require("gymnasium", "highway")
-    config = {
-        "controlled_vehicles": agents,
-        "vehicles_count": 0,
-        "lanes_count": LANES,
-        "duration": 1e9,
-        "simulation_frequency": SIM_HZ,
-        "policy_frequency": CONTROL_HZ,
-        "offscreen_rendering": True,
-        "action": {
-            "type": "MultiAgentAction",
-            "action_config": {"type": "DiscreteMetaAction"},
-        },
-        "observation": {
-            "type": "MultiAgentObservation",
-            "observation_config": {
-                "type": "LidarObservation",
-                "cells": RAYS,
-                "maximum_range": RANGE_M,
-            },
-        },
-    }
-    env = gymnasium.make("highway-v0", config=config).unwrapped
+def _dicts_rate(env: CavEnv, steps: int = OUR_STEPS) -> float:
+    """The same through PettingZoo's dicts."""
     env.reset(seed=0)
-    env.step((IDLE,) * agents)
-    return env
+    decisions = 0
+    began = time.process_time()
+    for _ in range(steps):
+        decisions += len(env.step(dict.fromkeys(env.agents, IDLE))[1])
+    return decisions / (time.process_time() - began)
 
 
 def _their_rate(env: Any, agents: int) -> float:
     env.reset(seed=0)
     actions = (IDLE,) * agents
-    began = time.perf_counter()
+    began = time.process_time()
     for _ in range(THEIR_STEPS):
         env.step(actions)
-    return agents * THEIR_STEPS / (time.perf_counter() - began)
-
-
-def _straight_road(road_m: float) -> str:
-    """A SUMO network: a straight `road`, and an `end` that nobody reaches while it is measured."""
-    whole_m = road_m + RUN_OUT_M
-
-    def lanes(edge: str, begin_m: float, end_m: float) -> str:
-        return "".join(
-            f'<lane id="{edge}_{k}" index="{k}" speed="{SPEED_MPS}" length="{end_m - begin_m:.2f}" '
-            f'shape="{begin_m:.2f},{_lane_y(k):.2f} {end_m:.2f},{_lane_y(k):.2f}"/>'
-            for k in range(LANES)
-        )
-
-    incoming = {edge: " ".join(f"{edge}_{k}" for k in range(LANES)) for edge in ("road", "end")}
-    joins = "".join(
-        f'<connection from="road" to="end" fromLane="{k}" toLane="{k}" dir="s" state="M"/>'
-        for k in range(LANES)
-    )
-    nowhere = 'incLanes="" intLanes="" shape=""'
-    return f"""<net version="1.20">
-        <edge id="road" from="west" to="middle">{lanes("road", 0.0, road_m)}</edge>
-        <edge id="end" from="middle" to="east">{lanes("end", road_m, whole_m)}</edge>
-        <junction id="west" type="dead_end" x="0" y="0" {nowhere}/>
-        <junction id="middle" type="priority" x="{road_m:.2f}" y="0"
-            incLanes="{incoming["road"]}" intLanes="" shape=""/>
-        <junction id="east" type="dead_end" x="{whole_m:.2f}" y="0"
-            incLanes="{incoming["end"]}" intLanes="" shape=""/>
-        {joins}
-        </net>
-        """
-
-
-def _lane_y(index: int) -> float:
-    """Of a lane's centre; lane 0 is the rightmost, driving to the east."""
-    return (index - LANES) * LANE_WIDTH_M
+    return agents * THEIR_STEPS / (time.process_time() - began)

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from cavmarl.kernels import allocating_kernel, kernel
+from cavmarl.kernels import kernel, setup_kernel
 from cavmarl.kernels.arrays import RoadArrays
 
 __all__ = ["LANE_CHANGE_COST_S", "plan_goal"]
@@ -122,7 +122,7 @@ def _settle(
         step["to_go"] = plan[beside]["to_go"]
 
 
-@allocating_kernel
+@setup_kernel
 def plan_goal(roads: RoadArrays, goal_edge: int, permission: int, plan: NDArray[np.void]) -> None:
     """Fill the plan of one goal.
 

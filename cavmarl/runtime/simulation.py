@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import hashlib
+from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -163,6 +165,11 @@ class Simulation:
             self._tick(commands)
         self._executor.each("sense", self._everywhere)
 
+    def instrument(self, wrap: Callable[[Any], Any]) -> None:
+        """Put `wrap(part)` in the place of the executor and of the traffic, to time their calls."""
+        self._executor = wrap(self._executor)
+        self._traffic = wrap(self._traffic)
+
     def _tick(self, commands: Commands) -> None:
         """Advance → (exchange) → resolve → departures → (migrate) → commit → signals."""
         self._executor.each("advance", commands)
@@ -182,6 +189,8 @@ class Simulation:
 
     def agents_to_come(self) -> NDArray[np.bool_]:
         """(W,) whether an agent waits to enter."""
+        if not self._gate.num_queue.any():
+            return np.zeros(self.num_worlds, dtype=np.bool_)
         waiting = np.arange(self._gate.queue.shape[1]) < self._gate.num_queue[:, None]
         found = np.any(waiting & (self._gate.queue["agent"] >= 0), axis=1)
         return np.asarray(found, dtype=np.bool_)

@@ -212,6 +212,14 @@ def test_bench_compares_and_says_whether_it_held(
     assert json.loads(path.read_text())["ratio"] > 0.0
 
 
+def test_bench_says_where_the_time_goes(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    path = tmp_path / "profile.json"
+    words = ("bench", "profile", "ring", "--agents", "2", "--steps", "3", "--repeats", "1")
+    assert run(*words, "--json", str(path)) == 0
+    assert "ns a vehicle" in capsys.readouterr().out
+    assert json.loads(path.read_text())["phases"]["sense"] > 0.0
+
+
 def test_the_demo_of_a_wheel_says_what_is_missing(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:

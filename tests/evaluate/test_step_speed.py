@@ -9,17 +9,26 @@ import pytest
 
 from cavmarl.errors import ConfigError, MissingExtraError
 from cavmarl.evaluate import step_speed
-from cavmarl.evaluate.step_speed import measure_step_speed
+from cavmarl.evaluate.highway_worlds import RUN_OUT_M, straight_road
+from cavmarl.evaluate.step_speed import MORE, measure_step_speed
 from cavmarl.maps.check import check_map
 
 
-def test_both_sides_are_measured() -> None:
+def test_every_row_is_measured_each_turn() -> None:
     pytest.importorskip("highway_env")
     told: list[str] = []
     found = measure_step_speed(agents=3, worlds=2, repeats=2, progress=told.append)
-    for rates in (found.batched, found.single, found.highway_env):
-        assert 0.0 < rates.low <= rates.median <= rates.high
-    assert found.ratio == found.batched.median / found.highway_env.median
+    rows = {(row.sensors, row.who): row for row in found.rows}
+    assert len(rows) == len(found.rows) == 9
+    for row in found.rows:
+        assert 0.0 < row.low <= row.median <= row.high
+    assert rows["kinematics", "more"].agents == MORE * 3
+    batched, theirs = rows["lidar", "batched"], rows["lidar", "highway_env"]
+    assert (batched.worlds, theirs.worlds) == (2, 1)
+    assert found.ratio == batched.median / theirs.median
+    assert found.cost_of_more == pytest.approx(
+        rows["kinematics", "more"].agent_step_s / rows["kinematics", "batched"].agent_step_s
+    )
     assert [text for text in told if text.startswith("measuring")] == [
         "measuring, 1 of 2",
         "measuring, 2 of 2",
@@ -27,11 +36,9 @@ def test_both_sides_are_measured() -> None:
 
 
 def test_the_road_can_be_driven(tmp_path: Path) -> None:
-    path = tmp_path / "road.net.xml"
-    path.write_text(step_speed._straight_road(500.0))
-    report = check_map(path)
+    report = check_map(straight_road(tmp_path, 500.0))
     assert report.drivable
-    assert report.road_km == pytest.approx((500.0 + step_speed.RUN_OUT_M) / 1000.0)
+    assert report.road_km == pytest.approx((500.0 + RUN_OUT_M) / 1000.0)
 
 
 @pytest.mark.skipif(not hasattr(os, "sched_getaffinity"), reason="no affinity on this system")
