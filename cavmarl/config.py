@@ -293,9 +293,11 @@ class SignalAheadConfig:
 
     Attributes:
         range_m: how far ahead it is seen.
+        timing: adds the time until the signal changes, as roadside units broadcast it.
     """
 
     range_m: float = 80.0
+    timing: bool = False
 
     def __post_init__(self) -> None:
         _check_finite("sensors.signal.range_m", self.range_m, 1.0, 300.0)

@@ -95,13 +95,15 @@ class ActorCritic(nn.Module):
 
     Args:
         config: sizes and kind of action.
-        initial_std: standard deviation of continuous actions before learning.
+        initial_std: standard deviations of continuous actions before learning: throttle, steering.
     """
 
     mean: Tensor
     deviation: Tensor
 
-    def __init__(self, config: NetworkConfig, initial_std: float = 0.5) -> None:
+    def __init__(
+        self, config: NetworkConfig, initial_std: tuple[float, float] = (0.5, 0.5)
+    ) -> None:
         super().__init__()
         self.continuous = config.action.kind == "continuous"
         actions = CONTINUOUS_ACTIONS if self.continuous else META_ACTIONS
@@ -113,7 +115,7 @@ class ActorCritic(nn.Module):
         self.actor = _perceptron((*sizes, actions), last_gain=0.01)
         self.critic = _perceptron((*sizes, 1), last_gain=1.0)
         if self.continuous:
-            self.log_std = nn.Parameter(torch.full((actions,), math.log(initial_std)))
+            self.log_std = nn.Parameter(torch.tensor(initial_std).log())
 
     def value(self, observations: Tensor) -> Tensor:
         """Expected return (N,) of observations (N, D)."""

@@ -76,7 +76,8 @@ class Args:
     imitation_weight: Annotated[float, "of the distance to the built-in driver, at the start"] = 0.0
     imitation_share: Annotated[float, "share of the run in which that weight falls to 0"] = 0.1
     max_gradient_norm: Annotated[float, "longer gradients are shortened"] = 0.5
-    initial_std: Annotated[float, "standard deviation of continuous actions at the start"] = 0.5
+    throttle_std: Annotated[float, "standard deviation of the throttle at the start"] = 0.3
+    steering_std: Annotated[float, "standard deviation of the steering at the start"] = 0.1
     hidden: Annotated[int, "width of the two hidden layers"] = 128
     threads: Annotated[int, "of torch; more cost small networks more than they bring"] = 1
     checkpoint_updates: Annotated[int, "updates between two checkpoints"] = 20
@@ -97,7 +98,7 @@ class Args:
             value = getattr(self, name)
             if not least <= value < float("inf"):
                 raise ConfigError(f"--{name.replace('_', '-')} {value}: must be at least {least}")
-        for name in ("learning_rate", "clip", "max_gradient_norm", "initial_std", "imitation_share"):
+        for name in ("learning_rate", "clip", "max_gradient_norm", "throttle_std", "steering_std", "imitation_share"):
             if not 0.0 < getattr(self, name) < float("inf"):
                 value = getattr(self, name)
                 raise ConfigError(f"--{name.replace('_', '-')} {value}: must be above 0")
@@ -382,7 +383,8 @@ class Learner:
                     loss = loss + imitation_weight * distance.mean()
                 self.optimizer.zero_grad()
                 loss.backward()  # type: ignore[no-untyped-call]
-                nn.utils.clip_grad_norm_(network.parameters(), args.max_gradient_norm)
+                for part in (network.actor, network.critic):
+                    nn.utils.clip_grad_norm_(part.parameters(), args.max_gradient_norm)
                 self.optimizer.step()
                 with torch.no_grad():
                     parts += 1
@@ -507,7 +509,7 @@ class Run:
             hidden=(args.hidden, args.hidden),
             seed=args.seed,
         )
-        self.network = ActorCritic(self.config, args.initial_std)
+        self.network = ActorCritic(self.config, (args.throttle_std, args.steering_std))
         self.learner = Learner(self.network, args)
         if args.resume:
             load_checkpoint(args.folder, self.learner, self.config)

@@ -115,6 +115,7 @@ class Sensors(NamedTuple):
     neighbors_range_m: float
     signal_at: int
     signal_range_m: float
+    signal_timing: bool
     lanes_at: int
     lanes_range_m: float
     lidar_at: int

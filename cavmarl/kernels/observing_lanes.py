@@ -1,7 +1,8 @@
 """What the `lanes` sensor writes: who drives ahead and behind on the lanes around, and who crosses.
 
 The nearest vehicles in the plane (`neighbors`) leave it to the policy to find out which of them are
-in its way; here places are told along lanes, as car-following models take them.
+in its way; here places are told along lanes, as car-following models take them. Of two that are
+equally near, the slower one is told: the order of rows plays no part.
 """
 
 from __future__ import annotations
@@ -18,15 +19,28 @@ from cavmarl.kernels.junctions import link_signal
 from cavmarl.kernels.neighbors import LEVEL_HEIGHT_M, Grid, cell_columns, cell_rows
 from cavmarl.kernels.scalars import clamp
 
-__all__ = ["GAPS", "LANES_FEATURES", "observe_lanes"]
+__all__ = ["HALF_M", "LANES_AHEAD", "LANES_FEATURES", "SLOWEST_MPS", "observe_lanes"]
 
-GAPS = 5  # own lane ahead; left ahead, behind; right ahead, behind
-CROSSING = 2 * GAPS  # where the features of the crossing vehicle begin
-LANES_FEATURES = CROSSING + 4
+OWN = 0  # slots of two features each: a gap and a speed
+LEFT = 1  # ahead; behind in the slot after it
+RIGHT = 3
+CROSSING = 10  # where the features of the crossing vehicle begin
+LANES_FEATURES = 14
 SPEED_SCALE = 40.0  # m/s
+HALF_M = 10.0  # a way of this length is a closeness of 0.5
 LANES_AHEAD = 8  # that a way is followed over, at most
-HALF_M = 10.0
 SLOWEST_MPS = 1.0  # that a vehicle is taken to cross with
+
+
+@kernel
+def _closeness(way: float) -> np.float32:
+    """1 where two touch, 0.5 at `HALF_M`, 0 far away: metres count where they are few."""
+    return np.float32(HALF_M / (HALF_M + max(way, 0.0)))
+
+
+@kernel
+def _scaled_speed(speed: float) -> np.float32:
+    return np.float32(clamp(speed / SPEED_SCALE, -1.0, 1.0))
 
 
 @kernel
@@ -38,7 +52,6 @@ def _way_between(
     s: float,
     target: int,
     target_s: float,
-    range_m: float,
 ) -> float:
     """Way in m along the plan from `s` of `lane` to `target_s` of lane `target`; inf: not on it."""
     way = -s
@@ -47,28 +60,24 @@ def _way_between(
             return way + target_s
         way += roads.lanes[lane]["length_m"]
         lane = plans[goal, lane]["next"]
-        if lane < 0 or way > range_m:
-            return math.inf
+        if lane < 0:
+            break
     return math.inf
-
-
-@kernel
-def _closeness(way: float) -> float:
-    """1 where two touch, 0.5 at `HALF_M`, 0 far away: metres count where they are few."""
-    return HALF_M / (HALF_M + max(way, 0.0))
 
 
 @kernel
 def _note_gap(out: NDArray[np.float32], slot: int, gap: float, speed: float) -> None:
     """Keep the nearest vehicle of a slot."""
+    at = 2 * slot
     closeness = _closeness(gap)
-    if closeness > out[2 * slot]:
-        out[2 * slot] = closeness
-        out[2 * slot + 1] = clamp(speed / SPEED_SCALE, -1.0, 1.0)
+    scaled = _scaled_speed(speed)
+    if closeness > out[at] or (closeness == out[at] and scaled < out[at + 1]):
+        out[at] = closeness
+        out[at + 1] = scaled
 
 
 @kernel
-def _observe_gaps(
+def _observe_gap(
     roads: RoadArrays,
     plans: NDArray[np.void],
     row: np.void,
@@ -78,28 +87,22 @@ def _observe_gaps(
     range_m: float,
     out: NDArray[np.float32],
 ) -> None:
-    """Note `other` in `slot`, if it is ahead on the way from `lane`, or behind in `slot` + 1."""
+    """Note `other` in `slot` if it is ahead on the way from `lane`, in the next one if behind."""
     s = row["s"] * roads.lanes[lane]["length_m"] / roads.lanes[row["lane"]]["length_m"]
     half = 0.5 * (row["length"] + other["length"])
     faster = other["speed"] - row["speed"]
     ahead = math.inf
-    for k in range(2):
-        on = other["lane"] if k == 0 else other["side_lane"]
+    for on in (other["lane"], other["side_lane"]):
         if on >= 0:
-            way = _way_between(
-                roads, plans, row["goal"], lane, s, on, other["s"], range_m + half
-            )
-            ahead = min(ahead, way)
-    if ahead >= 0.0 and ahead < range_m + half:
+            way = _way_between(roads, plans, row["goal"], lane, s, on, other["s"])
+            if way >= 0.0:
+                ahead = min(ahead, way)
+    if ahead - half < range_m:
         _note_gap(out, slot, ahead - half, faster)
-        return
-    if slot == 0:
-        return
-    behind = _way_between(
-        roads, plans, other["goal"], other["lane"], other["s"], lane, s, range_m + half
-    )
-    if behind >= 0.0 and behind < range_m + half:
-        _note_gap(out, slot + 1, behind - half, faster)
+    elif slot != OWN:
+        behind = _way_between(roads, plans, other["goal"], other["lane"], other["s"], lane, s)
+        if behind > 0.0 and behind - half < range_m:
+            _note_gap(out, slot + 1, behind - half, faster)
 
 
 @kernel
@@ -126,44 +129,53 @@ def _next_link(
 @kernel
 def _observe_crossing(
     roads: RoadArrays,
-    plans: NDArray[np.void],
     row: np.void,
     other: np.void,
     link: int,
     distance: float,
-    phase: NDArray[np.int32],
-    range_m: float,
+    foe_link: int,
+    foe_distance: float,
+    foe_held: bool,
     soonest: float,
     out: NDArray[np.float32],
 ) -> float:
-    """Note `other` if it reaches a place that `link` shares sooner than all before, `soonest` s."""
-    foe_link, foe_distance = _next_link(roads, plans, other, range_m)
-    if foe_link < 0:
-        return soonest
+    """Note `other` if it comes to a place that both links share before all others so far.
+
+    Those inside count, and those that have the right of way and are not held by a red signal.
+    Returns the time in s in which the soonest does, `soonest` or less.
+    """
     first = roads.links[link]["first_conflict"]
     for c in range(first, first + roads.links[link]["num_conflicts"]):
         conflict = roads.conflicts[c]
         if conflict["foe"] != foe_link:
             continue
-        if foe_distance > 0.0:
-            signal = link_signal(roads, foe_link, phase)
-            if signal == SIGNAL_RED or signal == SIGNAL_RED_YELLOW or not conflict["must_yield"]:
-                continue
-        half = 0.5 * other["length"]
-        if foe_distance + conflict["foe_leave_m"] + half < 0.0:
+        if foe_distance > 0.0 and (foe_held or not conflict["must_yield"]):
             continue
-        own = distance + conflict["enter_m"] - 0.5 * row["length"]
-        if distance + conflict["leave_m"] + 0.5 * row["length"] < 0.0:
+        half = 0.5 * row["length"]
+        foe_half = 0.5 * other["length"]
+        if foe_distance + conflict["foe_leave_m"] + foe_half < 0.0:
             continue
-        way = foe_distance + conflict["foe_enter_m"] - half
+        if distance + conflict["leave_m"] + half < 0.0:
+            continue
+        way = foe_distance + conflict["foe_enter_m"] - foe_half
         time = way / max(other["speed"], SLOWEST_MPS)
-        if time < soonest:
+        found = (
+            _closeness(distance + conflict["enter_m"] - half),
+            _closeness(way),
+            _scaled_speed(other["speed"]),
+        )
+        noted = (out[CROSSING + 1], out[CROSSING + 2], out[CROSSING + 3])
+        if time < soonest or (time == soonest and found < noted):
             soonest = time
             out[CROSSING] = 1.0
-            out[CROSSING + 1] = _closeness(own)
-            out[CROSSING + 2] = _closeness(way)
-            out[CROSSING + 3] = clamp(other["speed"] / SPEED_SCALE, -1.0, 1.0)
+            out[CROSSING + 1], out[CROSSING + 2], out[CROSSING + 3] = found
     return soonest
+
+
+@kernel
+def _held(roads: RoadArrays, link: int, phase: NDArray[np.int32]) -> bool:
+    signal = link_signal(roads, link, phase)
+    return signal == SIGNAL_RED or signal == SIGNAL_RED_YELLOW
 
 
 @kernel
@@ -186,8 +198,8 @@ def observe_lanes(
         i: row of the agent's vehicle.
         grid: filled from these rows.
         phase: (num_signals,) PHASE rows that are on.
-        sensors: where to write.
-        observation: (D,) `LANES_FEATURES` numbers are written.
+        sensors: range and place of the sensor; a range of 0 switches it off.
+        observation: (D,), of which `LANES_FEATURES` numbers are written; 0 before.
     """
     range_m = sensors.lanes_range_m
     if range_m == 0.0:
@@ -204,15 +216,22 @@ def observe_lanes(
         end = grid.start[j * grid.num_x + last_column + 1]
         for b in range(begin, end):
             body = grid.bodies[b]
-            if body["row"] == i or abs(body["z"] - row["z"]) > LEVEL_HEIGHT_M:
+            dx = body["x"] - row["x"]
+            dy = body["y"] - row["y"]
+            if body["row"] == i or dx * dx + dy * dy > range_m * range_m:
+                continue
+            if abs(body["z"] - row["z"]) > LEVEL_HEIGHT_M:
                 continue
             other = rows[body["row"]]
-            _observe_gaps(roads, plans, row, other, row["lane"], 0, range_m, out)
+            _observe_gap(roads, plans, row, other, row["lane"], OWN, range_m, out)
             if here["left"] >= 0:
-                _observe_gaps(roads, plans, row, other, here["left"], 1, range_m, out)
+                _observe_gap(roads, plans, row, other, here["left"], LEFT, range_m, out)
             if here["right"] >= 0:
-                _observe_gaps(roads, plans, row, other, here["right"], 3, range_m, out)
+                _observe_gap(roads, plans, row, other, here["right"], RIGHT, range_m, out)
             if link >= 0:
-                soonest = _observe_crossing(
-                    roads, plans, row, other, link, distance, phase, range_m, soonest, out
-                )
+                foe_link, foe_distance = _next_link(roads, plans, other, range_m)
+                if foe_link >= 0:
+                    held = _held(roads, foe_link, phase)
+                    soonest = _observe_crossing(
+                        roads, row, other, link, distance, foe_link, foe_distance, held, soonest, out
+                    )

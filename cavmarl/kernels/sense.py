@@ -77,7 +77,9 @@ def sense(
             observe_ego(roads, plans, row, out)
             observe_route(roads, plans, row, sensors, out)
             observe_neighbors(rows, i, grid, sensors, out)
-            observe_signal(roads, plans, row, worlds.signal_phase[w], sensors, out)
+            observe_signal(
+                roads, plans, row, worlds.signal_phase[w], worlds.ticks[w] * tick_s, sensors, out
+            )
             observe_lanes(
                 roads, plans, rows, i, grid, worlds.signal_phase[w], sensors, out
             )

@@ -54,6 +54,7 @@ def sensor_arrays(config: SensorsConfig) -> Sensors:
         neighbors_range_m=config.neighbors.range_m,
         signal_at=places["signal"].start,
         signal_range_m=config.signal.range_m,
+        signal_timing=config.signal.timing,
         lanes_at=places.get("lanes", unused).start,
         lanes_range_m=config.lanes.range_m,
         lidar_at=places.get("lidar", unused).start,
