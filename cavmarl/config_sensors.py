@@ -19,6 +19,7 @@ __all__ = [
     "VEHICLE_FEATURES",
     "EgoConfig",
     "KinematicsConfig",
+    "LanesConfig",
     "LidarConfig",
     "LidarObservationConfig",
     "NeighborsConfig",
@@ -106,13 +107,29 @@ class SignalAheadConfig:
     Attributes:
         enabled: false switches the sensor off.
         range_m: how far ahead it is seen.
+        timing: adds the time until the signal changes, as roadside units broadcast it.
     """
 
     enabled: bool = True
     range_m: float = 80.0
+    timing: bool = False
 
     def __post_init__(self) -> None:
         check_finite("sensors.signal.range_m", self.range_m, 1.0, 300.0)
+
+
+@dataclass(frozen=True)
+class LanesConfig:
+    """Vehicles by their place along the lanes around, and the one that crosses the own way first.
+
+    Attributes:
+        range_m: how far along lanes a vehicle is seen; 0 switches the sensor off.
+    """
+
+    range_m: float = 0.0
+
+    def __post_init__(self) -> None:
+        check_finite("sensors.lanes.range_m", self.range_m, 0.0, 300.0)
 
 
 @dataclass(frozen=True)
@@ -328,6 +345,7 @@ class SensorsConfig:
     route: RouteAheadConfig = field(default_factory=RouteAheadConfig)
     neighbors: NeighborsConfig = field(default_factory=NeighborsConfig)
     signal: SignalAheadConfig = field(default_factory=SignalAheadConfig)
+    lanes: LanesConfig = field(default_factory=LanesConfig)
     lidar: LidarConfig = field(default_factory=LidarConfig)
     kinematics: KinematicsConfig = field(default_factory=KinematicsConfig)
     occupancy_grid: OccupancyGridConfig = field(default_factory=OccupancyGridConfig)

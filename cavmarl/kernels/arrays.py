@@ -150,6 +150,9 @@ class Sensors(NamedTuple):
     signal: bool
     signal_at: int
     signal_range_m: float
+    signal_timing: bool
+    lanes_at: int
+    lanes_range_m: float
     lidar_at: int
     lidar_rays: int
     lidar_range_m: float

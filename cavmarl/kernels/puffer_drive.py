@@ -2,8 +2,8 @@
 
 Suarez: "PufferLib", ocean environment `drive`, version 3.0: `OWN_FEATURES` numbers of the vehicle,
 `PARTNER_FEATURES` for each other one within 50 m and `SEGMENT_FEATURES` for each road segment.
-A cell of 5 m holds at most ten segments; a vehicle sees the first ones of the 21 x 21 cells around its
-own, in a spiral. What a cell's vehicles see never changes and is listed once, by
+A cell of 5 m holds at most ten segments; a vehicle sees the first ones of the 21 x 21 cells around
+its own, in a spiral. What a cell's vehicles see never changes and is listed once, by
 `roads.road_segments`. All is float32, as there.
 """
 

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cavmarl.kernels import kernel
-from cavmarl.kernels.arrays import Outputs, RoadArrays, Sensors, Worlds
+from cavmarl.kernels.arrays import Outputs, RoadArrays, Sensors, Travel, Worlds
 from cavmarl.kernels.codes import DRIVER_AGENT, EVENTS_THAT_END
 from cavmarl.kernels.neighbors import Grid, fill_grid
 from cavmarl.kernels.observing import (
@@ -16,6 +16,7 @@ from cavmarl.kernels.observing import (
     observe_route,
     observe_signal,
 )
+from cavmarl.kernels.observing_lanes import observe_lanes
 from cavmarl.kernels.stacking import has_entered, newest_frame, shift_frames
 from cavmarl.kernels.terms import NUM_TERMS, write_terms
 
@@ -26,6 +27,7 @@ __all__ = ["sense"]
 def sense(
     roads: RoadArrays,
     plans: NDArray[np.void],
+    travel: Travel,
     worlds: Worlds,
     grid: Grid,
     sensors: Sensors,
@@ -43,7 +45,8 @@ def sense(
 
     Args:
         roads: the road arrays.
-        plans: PLAN (G, L).
+        plans: PLAN (G, L), the ways of agents.
+        travel: the ways of all.
         worlds: committed rows at the end of the step; episode_return of agents' rows is written.
         grid: room for the spatial index of one world.
         sensors: settings and room.
@@ -79,8 +82,12 @@ def sense(
                 observe_ego(roads, plans, row, out)
             observe_route(roads, plans, row, sensors, out)
             observe_neighbors(rows, i, grid, sensors, out)
+            phase = worlds.signal_phase[w]
             if sensors.signal:
-                observe_signal(roads, plans, row, worlds.signal_phase[w], sensors, out)
+                time = worlds.ticks[w] * tick_s
+                controllers = worlds.controllers[w]
+                observe_signal(roads, plans, controllers, row, phase, time, tick_s, sensors, out)
+            observe_lanes(roads, travel, rows, i, grid, phase, sensors, out)
             observe_lidar(rows, i, grid, sensors, out)
             outputs.present[w, agent] = True
             outputs.vehicle_ids[w, agent] = row["id"]

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from cavmarl.kernels import kernel
 from cavmarl.kernels.arrays import RoadArrays, Worlds
 
-__all__ = ["DETECTOR_REACH_M", "switch_signals"]
+__all__ = ["DETECTOR_REACH_M", "program_at", "switch_signals"]
 
 # From a detector to the centre of any vehicle that is over it or has left it in this tick.
 DETECTOR_REACH_M = 30.0
@@ -44,7 +44,7 @@ def switch_signals(roads: RoadArrays, worlds: Worlds, dt: float) -> None:
             _detect(roads, worlds.rows[w], worlds.num_owned[w], time, dt, worlds.detected_s[w])
             _control(roads, worlds, w, dt)
         for k in range(roads.signals.shape[0]):
-            program = _program_at(roads, k, time, dt)
+            program = program_at(roads, k, time, dt)
             controller = roads.programs[program]["controller"]
             if controller >= 0:
                 worlds.signal_phase[w, k] = worlds.controllers[w, controller]["phase"]
@@ -53,7 +53,7 @@ def switch_signals(roads: RoadArrays, worlds: Worlds, dt: float) -> None:
 
 
 @kernel
-def _program_at(roads: RoadArrays, k: int, time: float, dt: float) -> int:
+def program_at(roads: RoadArrays, k: int, time: float, dt: float) -> int:
     """The program of a signal that is on at `time`."""
     signal = roads.signals[k]
     program = signal["program"]

@@ -129,6 +129,7 @@ class Shard:
         sense(
             self._roads,
             self._plans,
+            self._travel,
             self.worlds,
             self._grid,
             self._sensors,

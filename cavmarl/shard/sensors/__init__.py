@@ -16,6 +16,7 @@ from cavmarl.roads.network import RoadNetwork
 from cavmarl.shard.sensors import (
     ego,
     kinematics,
+    lanes,
     lidar,
     lidar_observation,
     neighbors,
@@ -45,6 +46,7 @@ SENSORS: tuple[Sensor, ...] = (
     Sensor("route", route.features, route.reach_m),
     Sensor("neighbors", neighbors.features, neighbors.reach_m),
     Sensor("signal", signal.features, signal.reach_m),
+    Sensor("lanes", lanes.features, lanes.reach_m),
     Sensor("lidar", lidar.features, lidar.reach_m),
     Sensor("kinematics", kinematics.features, kinematics.reach_m, kinematics.shape),
     Sensor(
@@ -120,6 +122,9 @@ def sensor_arrays(config: SensorsConfig) -> Sensors:
         signal="signal" in places,
         signal_at=starts["signal"],
         signal_range_m=config.signal.range_m,
+        signal_timing=config.signal.timing,
+        lanes_at=starts["lanes"],
+        lanes_range_m=config.lanes.range_m,
         lidar_at=starts["lidar"],
         lidar_rays=config.lidar.rays,
         lidar_range_m=config.lidar.range_m,
