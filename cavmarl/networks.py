@@ -84,14 +84,19 @@ class NetworkConfig:
 
     @property
     def num_weights(self) -> int:
-        """How many numbers an `ActorCritic` learns."""
+        """How many numbers an `ActorCritic` learns, with the scaling of its observations."""
         continuous = self.action.kind == "continuous"
         actions = CONTINUOUS_ACTIONS if continuous else META_ACTIONS
         deviations = actions if continuous else 0
-        return deviations + sum(
-            (inputs + 1) * outputs
-            for last in (actions, 1)
-            for inputs, outputs in pairwise((self.observation_size, *self.hidden, last))
+        scaling = 2 * self.observation_size
+        return (
+            scaling
+            + deviations
+            + sum(
+                (inputs + 1) * outputs
+                for last in (actions, 1)
+                for inputs, outputs in pairwise((self.observation_size, *self.hidden, last))
+            )
         )
 
 

@@ -33,8 +33,8 @@ def observe(name: str, rows: NDArray[np.void], i: int, phase: NDArray[np.int32])
 
 def phases(name: str, random: object) -> NDArray[np.int32]:
     """A phase for every signal."""
-    signals = network(name).signals
-    found = [s["first_phase"] + random.randrange(s["num_phases"]) for s in signals]  # type: ignore[attr-defined]
+    programs = network(name).programs[network(name).signals["program"]]
+    found = [p["first_phase"] + random.randrange(p["num_phases"]) for p in programs]  # type: ignore[attr-defined]
     return np.array(found, dtype=np.int32)
 
 
