@@ -9,7 +9,7 @@ import pytest
 from gymnasium.utils.env_checker import check_env
 
 import cavmarl
-from cavmarl.registry import entries
+from cavmarl.registry import entries, load_config
 from cavmarl.seeds import check_seed, first_seed
 
 ALL = sorted(entries())
@@ -30,7 +30,10 @@ def test_every_entry_has_its_ids(name: str) -> None:
 def test_one_vehicle_of_a_world_passes_gymnasiums_checker() -> None:
     world = gymnasium.make("cavmarl/merge-v0", disable_env_checker=True).unwrapped
     check_env(world, skip_render_check=True)
-    assert world._env.config.population.background == 19
+    entry, _ = load_config("merge")
+    population = world._env.config.population
+    everybody = entry.population.agents + entry.population.background
+    assert (population.agents, population.background) == (1, everybody - 1)
 
 
 @pytest.mark.parametrize(

@@ -115,8 +115,9 @@ def test_a_run_goes_on_where_it_stopped_and_drives(ippo: ModuleType, here: Path,
 
 def test_the_clock_ends_a_run(ippo: ModuleType, here: Path) -> None:
     words = [*TINY, "--minutes", "0.0001", "--name", "short"]
-    assert ippo.main(words) == 0
-    assert len(log(here / "runs" / "short")) == 1
+    assert ippo.main([*words, "--total-agent-steps", "1000000000"]) == 0
+    rows = log(here / "runs" / "short")
+    assert 1 <= len(rows) < 1000  # 6 ms are some updates, however fast the machine
 
 
 def test_tensorboard_gets_the_same_numbers(ippo: ModuleType, here: Path) -> None:
@@ -234,9 +235,10 @@ def test_what_is_collected_is_cut_at_ends_and_at_the_horizon(ippo: ModuleType) -
 
     torch.manual_seed(0)
     vec = make_vec("merge", num_envs=3, agents=3, background=0, max_cycles=25)
-    config = NetworkConfig("merge", 155, vec.config.sensors, vec.config.action, (8,))
+    size = vec.single_observation_space.shape[0]
+    config = NetworkConfig("merge", size, vec.config.sensors, vec.config.action, (8,))
     args = ippo.Args(num_steps=60)
-    batch = ippo.Collector(vec, ActorCritic(config, 2.0), args, 0).collect()
+    batch = ippo.Collector(vec, ActorCritic(config, 2.0), args, 0).collect(with_suggested=False)
     boundary = batch.acted & ~batch.goes_on
     bootstrapped = boundary & (batch.next_values != 0.0)
     assert bootstrapped[24].any()
