@@ -360,6 +360,7 @@ class SensorsConfig:
             self.route.points,
             self.neighbors.count,
             self.signal.enabled,
+            self.lanes.range_m,
             self.lidar.rays,
             self.kinematics.vehicles_count,
             len(self.occupancy_grid.features),

@@ -42,15 +42,15 @@ EVERYTHING = {
     "sensors.stack": 3,
 }
 IMAGE = {**EVERYTHING, "sensors.occupancy_grid.as_image": True}
-ONLY_HIGHWAY = {
+NOTHING = {
     "sensors.ego.enabled": False,
     "sensors.route.points": 0,
     "sensors.neighbors.count": 0,
     "sensors.signal.enabled": False,
     "sensors.lanes.range_m": 0,
     "sensors.lidar.rays": 0,
-    "sensors.kinematics.vehicles_count": 5,
 }
+ONLY_HIGHWAY = {**NOTHING, "sensors.kinematics.vehicles_count": 5}
 
 
 def make(env: str = "merge", mode: str = "seats", **overrides: Any) -> Any:
@@ -64,6 +64,29 @@ def make(env: str = "merge", mode: str = "seats", **overrides: Any) -> Any:
 def wild(env: Any, rng: np.random.Generator) -> dict[str, Any]:
     """Full throttle and any steering: most leave the road or hit somebody soon."""
     return {agent: np.array([1.0, rng.uniform(-1.0, 1.0)]) for agent in env.agents}
+
+
+@pytest.mark.parametrize(
+    ("key", "value"),
+    [
+        ("ego.enabled", True),
+        ("route.points", 2),
+        ("neighbors.count", 2),
+        ("signal.enabled", True),
+        ("lanes.range_m", 50.0),
+        ("lidar.rays", 8),
+        ("kinematics.vehicles_count", 2),
+        ("occupancy_grid.features", ["presence"]),
+        ("lidar_observation.cells", 8),
+        ("roadgraph.points", 8),
+        ("puffer_drive.enabled", True),
+    ],
+)
+def test_any_one_sensor_is_enough(key: str, value: object) -> None:
+    env = make(**{**NOTHING, f"sensors.{key}": value})
+    assert list(observation_parts(env.config.sensors)) == [key.partition(".")[0]]
+    observations, _ = env.reset()
+    assert all(env.observation_space(agent).contains(observations[agent]) for agent in env.agents)
 
 
 @pytest.mark.parametrize("kind", ["flat", "dict"])

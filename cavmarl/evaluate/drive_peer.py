@@ -35,6 +35,7 @@ PUFFER_DRIVE: dict[str, object] = {
     "sensors.signal.enabled": False,
     "sensors.route.points": 0,
     "sensors.neighbors.count": 0,
+    "sensors.lanes.range_m": 0.0,
     "sensors.lidar.rays": 0,
 }
 

@@ -23,7 +23,9 @@ COMMANDS = (
     "demand",
     "bench",
 )
-QUICK = ("--set", "horizon_s=1", "--agents", "2", "--background", "2")
+QUICK = (
+    "--set", "horizon_s=1", "--set", "clock.ctrl_dt_s=0.1", "--agents", "2", "--background", "2",
+)  # fmt: skip
 
 
 def run(*words: str) -> int:

@@ -41,7 +41,9 @@ def test_it_says_what_a_result_depends_on() -> None:
     assert fewer["map_content_sha256"] == first["world"]["map_content_sha256"]
     other = manifest("ring")["world"]
     assert other["map_content_sha256"] != first["world"]["map_content_sha256"]
-    assert first["world"]["config"]["sensors"]["lidar"]["rays"] > 0
+    watching = manifest(overrides={"sensors.lidar.rays": 8})["world"]
+    assert watching["config"]["sensors"]["lidar"]["rays"] == 8
+    assert watching["config_sha256"] != first["world"]["config_sha256"]
     assert manifest(seed=3)["seeds"] == [3]
 
 

@@ -38,8 +38,9 @@ def test_shuffled_rows_give_the_same_bytes(make: Make) -> None:
     for simulation in (tidy, shuffled):
         start(simulation, seed=5)
     rng = np.random.default_rng(0)
+    moved = 0
     for step in range(steps(tidy, 120.0)):
-        shuffle_rows(shuffled, rng)
+        moved += shuffle_rows(shuffled, rng)
         drive(tidy)
         drive(shuffled)
         if step % 5 == 0:
@@ -47,9 +48,7 @@ def test_shuffled_rows_give_the_same_bytes(make: Make) -> None:
     assert shuffled.traffic_stats() == tidy.traffic_stats()
     assert shuffled.state_hash() == tidy.state_hash()
     assert tidy.traffic_stats().departed > 30
-    # A tick may put the rows in an order of its own: what was shuffled is what it read.
-    shuffle_rows(shuffled, rng)
-    assert not np.array_equal(shuffled.vehicles()["id"], tidy.vehicles()["id"]), "nothing shuffled"
+    assert moved > 10 * step, "hardly anything shuffled"
 
 
 def test_worlds_together_are_the_worlds_alone_and_differ(make: Make) -> None:
