@@ -26,6 +26,9 @@ __all__ = ["DRIVERS", "ENTRIES", "MANIFESTS", "OVERRIDES"]
 # Between the two files of a driver, in one input.
 _BORDER = b"\n----\n"
 
+# What lies beside the manifest.
+RESULT, RESULT_CONTENT = "trips.csv", b"policy,run\n"
+
 
 def _entry(content: bytes) -> EnvConfig:
     path = scratch("mine/env.yaml", content)
@@ -50,14 +53,20 @@ def _driver(content: bytes) -> object:
 
 
 def _manifest(content: bytes) -> object:
+    scratch(f"results/{RESULT}", RESULT_CONTENT)
     return read_closed(scratch(f"results/{MANIFEST_FILE}", content).parent)
 
 
 def _manifests() -> tuple[bytes, ...]:
-    with tempfile.TemporaryDirectory() as name:
-        open_manifest(Path(name), {"seed": 0})
-        close_manifest(Path(name), [])
-        return ((Path(name) / MANIFEST_FILE).read_bytes(),)
+    found = []
+    for results in ([], [RESULT]):
+        with tempfile.TemporaryDirectory() as name:
+            folder = Path(name)
+            (folder / RESULT).write_bytes(RESULT_CONTENT)
+            open_manifest(folder, {"seed": 0})
+            close_manifest(folder, results)
+            found.append((folder / MANIFEST_FILE).read_bytes())
+    return tuple(found)
 
 
 @cache
