@@ -34,7 +34,7 @@ from cavmarl.kernels.lane_choice import (
     needed_change,
     thinks_of_lanes,
 )
-from cavmarl.kernels.lanes import ahead_on, behind_on, beside_s, last_on
+from cavmarl.kernels.lanes import ahead_on, beside_s, last_on, neighbor_behind
 from cavmarl.kernels.rng import STREAM_DRIVER, quick_uniform
 from cavmarl.kernels.stopping import way_to_stop
 from cavmarl.kernels.ways import next_step
@@ -348,12 +348,12 @@ def _let_merge(
     if target < 0:
         return
     s = beside_s(roads, row["lane"], target, row["s"])
-    k = behind_on(scratch, target, s, row["id"])
+    k, apart = neighbor_behind(roads, scratch, target, s, row["id"], LOOK_BACK_M)
     if k < 0 or scratch.entries[k]["side"]:
         return
     follower = scratch.entries[k]
-    gap = s - follower["s"] - 0.5 * row["length"] - follower["half"]
-    if gap < SIDE_GAP_M or s - follower["s"] > LOOK_BACK_M:
+    gap = apart - 0.5 * row["length"] - follower["half"]
+    if gap < SIDE_GAP_M or apart > LOOK_BACK_M:
         return
     other = rows[follower["row"]]
     kind = travel.types[other["vtype"]]
