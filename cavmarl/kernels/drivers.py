@@ -50,7 +50,7 @@ STOP_LINE_M = 5.0  # standing with the front nearer than this counts as standing
 LIMIT_DECEL = 2.0  # m/s², how a driver slows for a lower limit ahead,
 LIMIT_LEAD_S = 1.0  # to be down this time before it, as the model lags behind what is allowed
 FALL_IN_M = 100.0  # before the place where a lane change must be made
-COURTESY_DECEL = 2.0  # m/s², the hardest braking to let somebody merge
+COURTESY_DECEL = 3.0  # m/s², the hardest braking to let somebody merge
 # A driver that has to leave a lane waits this far before its end to change right, and a vehicle's
 # length further back to change left: two that want to swap do not stand side by side for ever.
 MERGE_ROOM_M = 2.0
