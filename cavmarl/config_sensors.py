@@ -334,7 +334,7 @@ class PufferDriveConfig:
 
 @dataclass(frozen=True)
 class SensorsConfig:
-    """The sensors of every agent; 0 points, neighbours or rays switch one off.
+    """The sensors of every agent; counts and ranges of 0 switch one off.
 
     Attributes:
         stack: observations in one: the last ones, oldest first. At first all are the first.
@@ -360,6 +360,7 @@ class SensorsConfig:
             self.route.points,
             self.neighbors.count,
             self.signal.enabled,
+            self.lanes.range_m,
             self.lidar.rays,
             self.kinematics.vehicles_count,
             len(self.occupancy_grid.features),
