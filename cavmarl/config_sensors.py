@@ -334,7 +334,7 @@ class PufferDriveConfig:
 
 @dataclass(frozen=True)
 class SensorsConfig:
-    """The sensors of every agent; 0 points, neighbours or rays switch one off.
+    """The sensors of every agent; counts and ranges of 0 switch one off.
 
     Attributes:
         stack: observations in one: the last ones, oldest first. At first all are the first.

@@ -1,7 +1,7 @@
 """PPO with one network shared by all agents (IPPO), on batched worlds.
 
     python train/ippo_torch.py --env merge --minutes 2
-    python train/ippo_torch.py --config configs/train/merge_ippo.yaml
+    python train/ippo_torch.py --config configs/train/merge.yaml
     python train/ippo_torch.py --resume runs/merge_ippo_1 --total-agent-steps 8000000
 
 Every agent learns from its own observations and rewards; all of them share the weights (Schulman et

@@ -199,7 +199,7 @@ def _prepare(folder: Path, job: Job, repeats: int) -> None:
             "seeds": run_seeds(job.seed, repeats),
             "job": job.to_dict(),
             "plan": plan,
-            "world": describe_world(config, network),
+            "world": describe_world(config, network, demand),
         },
     )
     write_text(folder / MAP_FILE, json.dumps(map_outline(network)))

@@ -24,6 +24,7 @@ from cavmarl.evaluate.machine import describe_code, describe_hardware, describe_
 from cavmarl.kernels import kernel_cache_dir
 from cavmarl.policies import policy_files
 from cavmarl.roads.network import RoadNetwork
+from cavmarl.traffic.demand import DemandFile
 
 __all__ = [
     "MANIFEST_FILE",
@@ -42,8 +43,8 @@ SCHEMA = 1
 Document = dict[str, Any]
 
 
-def describe_world(config: EnvConfig, network: RoadNetwork) -> Document:
-    """The environment whole, its roads and the kernels by their hashes."""
+def describe_world(config: EnvConfig, network: RoadNetwork, demand: DemandFile | None) -> Document:
+    """The environment whole; its roads, its demand and the kernels by their hashes."""
     resolved = asdict(config)
     text = json.dumps(resolved, sort_keys=True)
     return {
@@ -53,6 +54,7 @@ def describe_world(config: EnvConfig, network: RoadNetwork) -> Document:
         "map": network.name,
         "map_source_sha256": network.source_hash,
         "map_content_sha256": network.content_hash,
+        "demand_content_sha256": None if demand is None else demand.content_hash,
         "kernels": kernel_cache_dir().name,
         "zones": config.zones.count,
         "channel": "none: there are no messages between vehicles",

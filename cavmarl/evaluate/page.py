@@ -155,6 +155,7 @@ def _facts(manifest: Mapping[str, Any]) -> dict[str, str]:
         "commit": f"{code['commit']}{dirty}",
         "configuration": f"{world['environment']}, SHA-256 {world['config_sha256']}",
         "map": f"{world['map']}, SHA-256 of its content {world['map_content_sha256']}",
+        "demand": f"SHA-256 of its content {world.get('demand_content_sha256') or '- (generated)'}",
         "kernels": str(world["kernels"]),
         "seeds of the runs": ", ".join(map(str, manifest["seeds"])),
         "processes": str(manifest["plan"]["processes"]),

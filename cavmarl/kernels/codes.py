@@ -86,5 +86,5 @@ NUM_COUNTS = 4
 # Gate.sums, over vehicles that arrived
 SUM_DISTANCE_M = 0
 SUM_TIME_S = 1
-SUM_DELAY_S = 2  # time above what the way takes at the limit
+SUM_DELAY_S = 2  # time above what the way takes at the speed that limit and driver allow
 NUM_SUMS = 3

@@ -34,7 +34,7 @@ from cavmarl.kernels.lane_choice import (
     needed_change,
     thinks_of_lanes,
 )
-from cavmarl.kernels.lanes import ahead_on, behind_on, beside_s, last_on
+from cavmarl.kernels.lanes import ahead_on, beside_s, last_on, neighbor_behind
 from cavmarl.kernels.rng import STREAM_DRIVER, quick_uniform
 from cavmarl.kernels.stopping import way_to_stop
 from cavmarl.kernels.ways import next_step
@@ -50,7 +50,7 @@ STOP_LINE_M = 5.0  # standing with the front nearer than this counts as standing
 LIMIT_DECEL = 2.0  # m/s², how a driver slows for a lower limit ahead,
 LIMIT_LEAD_S = 1.0  # to be down this time before it, as the model lags behind what is allowed
 FALL_IN_M = 100.0  # before the place where a lane change must be made
-COURTESY_DECEL = 2.0  # m/s², the hardest braking to let somebody merge
+COURTESY_DECEL = 3.0  # m/s², the hardest braking to let somebody merge
 # A driver that has to leave a lane waits this far before its end to change right, and a vehicle's
 # length further back to change left: two that want to swap do not stand side by side for ever.
 MERGE_ROOM_M = 2.0
@@ -348,12 +348,12 @@ def _let_merge(
     if target < 0:
         return
     s = beside_s(roads, row["lane"], target, row["s"])
-    k = behind_on(scratch, target, s, row["id"])
+    k, apart = neighbor_behind(roads, scratch, target, s, row["id"], LOOK_BACK_M)
     if k < 0 or scratch.entries[k]["side"]:
         return
     follower = scratch.entries[k]
-    gap = s - follower["s"] - 0.5 * row["length"] - follower["half"]
-    if gap < SIDE_GAP_M or s - follower["s"] > LOOK_BACK_M:
+    gap = apart - 0.5 * row["length"] - follower["half"]
+    if gap < SIDE_GAP_M or apart > LOOK_BACK_M:
         return
     other = rows[follower["row"]]
     kind = travel.types[other["vtype"]]

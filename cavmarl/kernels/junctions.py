@@ -52,6 +52,8 @@ LAST_CHANCE_M = 3.0  # with the front this near to the line
 ROOM_M = 3.0  # free way left behind a vehicle that clears a junction
 IMPATIENT_S = 3.0  # a vehicle that stands this long without reason is not waited for
 EXIT_LANES = 4  # looked along for room
+IMPATIENCE_S = 180.0  # after which one who gives way makes others brake
+FORCED_STOP = 4.5  # m/s², and how hard; less in proportion after less time
 STOP_SIGN_S = 0.5  # how long one stands at a stop sign, and before a tie is broken
 WAIT_SLACK_M = 0.5  # a front this far beyond a waiting position still waits there
 STATE_STOP = ord("s")
@@ -116,6 +118,7 @@ def _foe_blocks(
     foe: np.void,
     gives_way: bool,
     foe_signal: int,
+    to_leave: float,
     time_in: float,
     time_out: float,
 ) -> bool:
@@ -136,6 +139,10 @@ def _foe_blocks(
         before_area = foe["dist"] + conflict["foe_enter_m"] - foe["half"] > 0.0
         if before_area and foe["speed"] < STANDING_MPS and rows[foe["row"]]["wait_s"] > IMPATIENT_S:
             return False
+        # Behind one that is faster and leads into the same lane, one can follow.
+        apart = to_leave - to_clear
+        if conflict["merging"] and apart > ROOM_M and row["speed"] <= foe["speed"]:
+            return False
         inside: bool = cleared + 0.5 * GAP_S > time_in
         return inside
     committed = foe["speed"] * foe["speed"] > 2.0 * HARD_STOP * max(front, 0.01)
@@ -143,6 +150,9 @@ def _foe_blocks(
         if not (gives_way and conflict["must_yield"]):
             return False
         if _ignores(row, rows[foe["row"]], link, foe_signal):
+            return False
+        patience = min(row["wait_s"] / IMPATIENCE_S, 1.0)
+        if foe["speed"] * foe["speed"] < 2.0 * FORCED_STOP * patience * front:
             return False
     if cleared + GAP_S < time_in:
         return False
@@ -185,10 +195,21 @@ def _blocked_by_foes(
         time_in = _earliest(distance + conflict["enter_m"] - half, speed, limit, FOE_ACCEL)
         time_out = _earliest(distance + conflict["leave_m"] + half, speed, limit, OWN_ACCEL)
         foe_signal = link_signal(roads, conflict["foe"], phase)
+        to_leave = distance + conflict["leave_m"] - half
         for k in range(begin, end):
             foe = scratch.approach[k]
             if foe["row"] != i and _foe_blocks(
-                roads, rows, row, link, conflict, foe, gives_way, foe_signal, time_in, time_out
+                roads,
+                rows,
+                row,
+                link,
+                conflict,
+                foe,
+                gives_way,
+                foe_signal,
+                to_leave,
+                time_in,
+                time_out,
             ):
                 return True
     return False

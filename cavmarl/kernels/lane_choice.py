@@ -14,7 +14,12 @@ from cavmarl.kernels import inlined_kernel, kernel
 from cavmarl.kernels.arrays import RoadArrays, Scratch, Travel
 from cavmarl.kernels.codes import DRIVER_AGENT
 from cavmarl.kernels.following import accel_behind, no_press, wish
-from cavmarl.kernels.lane_change import LANE_CHANGE_DELAY_S, MIN_ACCEL_GAIN, mobil_accepts
+from cavmarl.kernels.lane_change import (
+    LANE_CHANGE_DELAY_S,
+    MAX_BRAKING_IMPOSED,
+    MIN_ACCEL_GAIN,
+    mobil_accepts,
+)
 from cavmarl.kernels.lanes import ahead_on, beside_s, last_on, neighbor_behind
 from cavmarl.kernels.stopping import STAY, lane_to_stop
 from cavmarl.kernels.ways import next_step
@@ -25,6 +30,7 @@ LOOK_BACK_M = 60.0  # how far back a lane change looks for followers
 CHANGE_EARLY_M = 80.0  # a change that the route needs is made this far before it must be,
 CHANGE_EARLY_S = 12.0  # plus the way of this time
 MAX_BRAKING_ACCEPTED = 4.0  # m/s², harder braking behind the new leader is never worth it
+MAX_BRAKING_NEEDED = 4.0  # m/s², what a change that the way needs may ask of the one behind
 CREEP_MPS = 1.0  # so slow, a driver that has to change does so to the very end of its lane
 SIDEWAYS_S = 2.5  # a lane change takes about this long, and has to end before the lane does
 BRAKE_TIME_S = 0.5  # a braking that ends within this time is not felt
@@ -78,11 +84,16 @@ def _change_is_safe(
     if j >= 0:
         ahead = scratch.entries[j]["s"] - s
     else:
-        beyond, _, _ = next_step(roads, travel, target, row["way"])
-        if beyond >= 0:
+        ahead = lane["length_m"] - s
+        beyond, way, _ = next_step(roads, travel, target, row["way"])
+        while beyond >= 0:
             j = last_on(scratch, beyond, row["id"])
-        if j >= 0:
-            ahead = scratch.entries[j]["s"] + lane["length_m"] - s
+            if j >= 0:
+                ahead += scratch.entries[j]["s"]
+            if j >= 0 or not roads.lanes[beyond]["internal"]:
+                break
+            ahead += roads.lanes[beyond]["length_m"]
+            beyond, way, _ = next_step(roads, travel, beyond, way)
     after = wish(kind, speed, desired, no_press(kind))
     if j >= 0:
         leader = scratch.entries[j]
@@ -115,7 +126,16 @@ def _change_is_safe(
     after = max(after, -speed / BRAKE_TIME_S)
     if after < -MAX_BRAKING_ACCEPTED:
         return False
-    return mobil_accepts(own_wish, after, follower_before, follower_after, 0.0, 0.0, mandatory)
+    return mobil_accepts(
+        own_wish,
+        after,
+        follower_before,
+        follower_after,
+        0.0,
+        0.0,
+        mandatory,
+        MAX_BRAKING_NEEDED if mandatory else MAX_BRAKING_IMPOSED,
+    )
 
 
 @kernel

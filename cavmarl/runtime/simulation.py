@@ -49,7 +49,8 @@ class TrafficStats:
         mean_speed_mps: over the vehicles in the world now.
         mean_trip_m: over the arrived ones.
         mean_trip_s: over the arrived ones.
-        mean_delay_s: over the arrived ones, time above what the way takes at the limit.
+        mean_delay_s: over the arrived ones, time above what the way takes at the speed that
+            limit and driver allow.
     """
 
     departed: int

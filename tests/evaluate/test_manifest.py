@@ -47,6 +47,20 @@ def test_it_says_what_a_result_depends_on() -> None:
     assert manifest(seed=3)["seeds"] == [3]
 
 
+def test_demand_is_told_by_its_content(tmp_path: Path) -> None:
+    found = []
+    for period in (5, 5, 4):
+        path = tmp_path / f"{len(found)}.rou.xml"
+        path.write_text(
+            "<routes><route id='r' edges='main_in weave main_out'/>"
+            f"<flow id='f' route='r' begin='0' end='60' period='{period}'/></routes>"
+        )
+        world = manifest(overrides={"traffic.demand": [str(path)]}, background=0)["world"]
+        found.append(world["demand_content_sha256"])
+    assert found[0] == found[1] != found[2]
+    assert manifest()["world"]["demand_content_sha256"] is None
+
+
 def test_hardware_and_versions_are_never_empty() -> None:
     found = manifest()
     hardware = found["hardware"]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
@@ -91,6 +92,23 @@ class DemandFile:
             value = getattr(self, field.name)
             if isinstance(value, np.ndarray):
                 value.setflags(write=False)
+
+    @property
+    def content_hash(self) -> str:
+        """SHA-256 of all that episodes are drawn from, hex."""
+        digest = hashlib.sha256()
+        for field in fields(self):
+            value = getattr(self, field.name)
+            if isinstance(value, Choices):
+                for part in (value.start, value.rows, value.upper):
+                    digest.update(part.tobytes())
+            elif isinstance(value, np.ndarray):
+                digest.update(value.tobytes())
+            elif isinstance(value, tuple):
+                digest.update("\0".join(value).encode())
+            elif isinstance(value, int):
+                digest.update(f"{field.name}={value}".encode())
+        return digest.hexdigest()
 
     def draw(self, key: int, until_s: float | None = None) -> NDArray[np.void]:
         """The orders of one episode: a pure function of the key.
