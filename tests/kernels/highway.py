@@ -20,6 +20,8 @@ from cavmarl.shard.vehicles import VEHICLE
 from tests.kernels.builders import points_of
 
 SAMPLES = 64  # points of a lane that is not straight
+# What its intersection writes to the class of all drivers, for the rest of the process.
+OVERWRITTEN = ("DISTANCE_WANTED", "COMFORT_ACC_MAX", "COMFORT_ACC_MIN")
 
 
 def make(name: str, seed: int, **config: Any) -> Any:
@@ -27,9 +29,12 @@ def make(name: str, seed: int, **config: Any) -> Any:
     pytest.importorskip("highway_env", reason="needs cavmarl[highway]")
     import gymnasium
     import highway_env
+    from highway_env.vehicle.behavior import IDMVehicle
 
-    with warnings.catch_warnings():
+    with warnings.catch_warnings(), pytest.MonkeyPatch.context() as restored:
         warnings.simplefilter("ignore")
+        for word in OVERWRITTEN:
+            restored.setattr(IDMVehicle, word, getattr(IDMVehicle, word))
         gymnasium.register_envs(highway_env)
         env = gymnasium.make(name, config=config).unwrapped
         env.reset(seed=seed)
