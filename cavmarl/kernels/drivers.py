@@ -46,6 +46,7 @@ LOOK_AHEAD_M = 250.0  # no driver looks further
 NEAR_M = 8.0  # to a leader so near the corner between matters,
 ASKEW_RAD = 0.7  # if it turns by so much,
 ASKEW_M = 2.5  # which takes this off the gap
+NEXT_LINE_M = 5.0  # and braking way: so near a line is minded by who has a leader on its own lane
 STOP_LINE_M = 5.0  # standing with the front nearer than this counts as standing at the line
 LIMIT_DECEL = 2.0  # m/s², how a driver slows for a lower limit ahead,
 LIMIT_LEAD_S = 1.0  # to be down this time before it, as the model lags behind what is allowed
@@ -234,7 +235,8 @@ def _road_ahead(
 ) -> tuple[float, float, int, int]:
     """Walk the way of entry k: (press, allowed speed, why it holds, link near its line).
 
-    Before the end of a lane that its way does not follow it stops `merge_room_m` early.
+    Who stands close behind its leader, too far from the line to look at it, need not: nothing that
+    lies further ahead could make it stay more. Before the end of a lane that its way does not follow it stops `merge_room_m` early.
     """
     own = scratch.entries[k]
     i = own["row"]
@@ -245,6 +247,14 @@ def _road_ahead(
     steered = row["driver"] == DRIVER_AGENT
     lane = row["lane"]
     here = roads.lanes[lane]
+    distance = here["length_m"] - row["s"]
+    queues = speed == 0.0 and kind["model"] == MODEL_KRAUSS and not here["internal"]
+    if queues and k + 1 < scratch.lane_end[lane] and distance >= half + NEXT_LINE_M:
+        leader = scratch.entries[k + 1]
+        gap = leader["s"] - row["s"] - half - leader["half"]
+        press = _behind_entry(kind, speed, gap, leader)
+        if press == 0.0:
+            return press, 0.0, HOLD_NONE, -1
     limit = min(here["speed_mps"], kind["desired_max_speed"])
     allowed = min(limit * row["speed_factor"], kind["max_speed"])
     if steered:
@@ -262,7 +272,6 @@ def _road_ahead(
         press = max(press, fork)
     look = _look_ahead_m(kind, speed)
     see = _see_line_m(kind, speed) + half
-    distance = here["length_m"] - row["s"]
     # Behind a leader on its own lane a driver minds the next line only where it could not stop
     # any more once the leader has passed it.
     if k + 1 < scratch.lane_end[lane]:
@@ -271,7 +280,7 @@ def _road_ahead(
             press,
             _behind_entry(kind, speed, leader["s"] - row["s"] - half - leader["half"], leader),
         )
-        look = min(look, half + 5.0 + speed + 0.5 * speed * speed / kind["decel"])
+        look = min(look, half + NEXT_LINE_M + speed + 0.5 * speed * speed / kind["decel"])
     way = row["way"]
     while distance < look:
         before = lane
@@ -409,7 +418,7 @@ def decide(
         needed = needed_change(roads, travel, row)
         own_wish = wish(kind, speed, allowed, press)
         change = 0
-        if needed != 0 or thinks_of_lanes(row, tick, dt):
+        if thinks_of_lanes(row, needed, tick, dt):
             change = choose_lane(roads, travel, rows, i, tick, needed, own_wish, scratch)
         if change != 0 and driver == DRIVER_AGENT:
             # A steered vehicle on its way into a neighbour lane still minds its own lane, to the

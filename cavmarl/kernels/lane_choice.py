@@ -53,7 +53,7 @@ def needed_change(roads: RoadArrays, travel: Travel, row: np.void) -> int:
     return int(step["change"]) if step["room"] - row["s"] <= early else 0
 
 
-@kernel
+@inlined_kernel
 def _desired(roads: RoadArrays, kind: np.void, row: np.void, lane: int) -> float:
     """The speed in m/s that a driver wants on a lane."""
     limit = min(roads.lanes[lane]["speed_mps"], kind["desired_max_speed"])
@@ -138,7 +138,7 @@ def _change_is_safe(
     )
 
 
-@kernel
+@inlined_kernel
 def _may_change(
     roads: RoadArrays,
     travel: Travel,
@@ -176,20 +176,21 @@ def _may_change(
 
 
 @inlined_kernel
-def thinks_of_lanes(row: np.void, tick: int, dt: float) -> bool:
-    """Whether a driver whose way needs no change thinks of one in this tick.
+def thinks_of_lanes(row: np.void, needed: int, tick: int, dt: float) -> bool:
+    """Whether a driver thinks of a lane change in this tick.
 
-    Each does so once in LANE_CHANGE_DELAY_S for either side, not all in the same ticks. A
-    suggestion for an agent is made anew at each step.
+    Each does so once in LANE_CHANGE_DELAY_S for either side, not all in the same ticks; always, if
+    its way needs the change and it does not stand. A suggestion for an agent is made anew at each
+    step.
     """
-    if row["driver"] == DRIVER_AGENT:
+    if row["driver"] == DRIVER_AGENT or (needed != 0 and row["speed"] > 0.0):
         return True
     turns = max(1, round(0.5 * LANE_CHANGE_DELAY_S / dt))
     turn: bool = (tick // 2 + row["id"]) % turns == 0
     return turn
 
 
-@kernel
+@inlined_kernel
 def choose_lane(
     roads: RoadArrays,
     travel: Travel,
