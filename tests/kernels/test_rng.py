@@ -75,7 +75,7 @@ def test_streams_do_not_share_draws() -> None:
 
 
 def test_numbers_are_spread_evenly() -> None:
-    key = rng.world_key(1, 2, 3)
+    key = np.uint64(rng.world_key(1, 2, 3))
     numbers = [rng.uniform(key, vehicle, 9, rng.STREAM_PLACE) for vehicle in range(4000)]
     counts, _ = np.histogram(numbers, bins=16, range=(0.0, 1.0))
     chi_squared = float(np.sum((counts - 250.0) ** 2) / 250.0)
@@ -91,7 +91,7 @@ def test_quick_uniform_equals_twin(key: int, vehicle: int, tick: int, stream: in
 
 
 def quick_numbers(vehicles: range, ticks: range) -> list[float]:
-    key = rng.world_key(1, 2, 3)
+    key = np.uint64(rng.world_key(1, 2, 3))
     return [rng.quick_uniform(key, v, t, rng.STREAM_DRIVER) for v in vehicles for t in ticks]
 
 
@@ -112,10 +112,13 @@ def test_quick_numbers_are_spread_evenly_and_neighbours_know_nothing_of_each_oth
 @wraps_around
 def test_quick_numbers_are_a_function_of_each_argument_and_of_nothing_else() -> None:
     asked = [(v, t) for v in range(30) for t in range(30)]
-    key = rng.world_key(1, 2, 3)
+    key = np.uint64(rng.world_key(1, 2, 3))
     forward = {a: rng.quick_uniform(key, *a, rng.STREAM_DRIVER) for a in asked}
     backward = {a: rng.quick_uniform(key, *a, rng.STREAM_DRIVER) for a in reversed(asked)}
     assert forward == backward
     assert len(set(forward.values())) == len(asked)
     assert rng.quick_uniform(key, 1, 1, rng.STREAM_ROUTE) not in forward.values()
-    assert rng.quick_uniform(rng.world_key(1, 2, 4), 1, 1, rng.STREAM_DRIVER) != forward[1, 1]
+    assert (
+        rng.quick_uniform(np.uint64(rng.world_key(1, 2, 4)), 1, 1, rng.STREAM_DRIVER)
+        != forward[1, 1]
+    )
