@@ -35,6 +35,10 @@ _SKIPPED = frozenset(
 )
 
 
+# `roads.signal_plans` reads them.
+_PROGRAMS = frozenset(("tlLogic", "WAUT", "wautJunction"))
+
+
 class _Handler(ContentHandler):
     """Builds each definition's small tree and hands it on when it ends."""
 
@@ -110,6 +114,8 @@ class _Handler(ContentHandler):
     def _skip(self, element: Element) -> None:
         known = element.name in _SKIPPED
         what = f"<{element.name}> is not read" if known else f"unknown element <{element.name}>"
+        if element.name in _PROGRAMS:
+            what += " as demand (signal programs: `map.programs`)"
         self._report.tolerate(what, element.place)
         self._skipping = self._depth
 
