@@ -152,6 +152,8 @@ def _foe_blocks(
         if _ignores(row, rows[foe["row"]], link, foe_signal):
             return False
         patience = min(row["wait_s"] / IMPATIENCE_S, 1.0)
+        if row["hold"] == HOLD_NONE and row["stopped_at"] == link:
+            patience = 1.0  # it has been let in and goes on
         if foe["speed"] * foe["speed"] < 2.0 * FORCED_STOP * patience * front:
             return False
     if cleared + GAP_S < time_in:
