@@ -133,7 +133,6 @@ class Scratch(NamedTuple):
     blinker: NDArray[np.int32]  # (C,)
     hold: NDArray[np.int32]  # (C,)
     hit: NDArray[np.int64]  # (C,) id of the vehicle each row touches
-    was_hit: NDArray[np.int64]  # (C,) the same before the tick
 
 
 class Sensors(NamedTuple):

@@ -236,7 +236,8 @@ def _road_ahead(
     """Walk the way of entry k: (press, allowed speed, why it holds, link near its line).
 
     Who stands close behind its leader, too far from the line to look at it, need not: nothing that
-    lies further ahead could make it stay more. Before the end of a lane that its way does not follow it stops `merge_room_m` early.
+    lies further ahead could make it stay more. Before the end of a lane that its way does not
+    follow it stops `merge_room_m` early.
     """
     own = scratch.entries[k]
     i = own["row"]

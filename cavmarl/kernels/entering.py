@@ -85,7 +85,7 @@ def entry_lane(
             continue
         rank = scratch.lane_end[lane] - scratch.lane_start[lane]
         if code == LANE_BEST:
-            rank += travel.steps[departure["way"] + lane]["changes"] * (1 << 20)
+            rank += int(travel.steps[departure["way"] + lane]["changes"]) * (1 << 20)
         if rank < best_rank:
             best = lane
             best_rank = rank

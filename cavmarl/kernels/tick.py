@@ -133,7 +133,6 @@ def advance(
             i = scratch.order[k]
             old = rows[i]
             worlds.next_rows[w, k] = old
-            scratch.was_hit[k] = old["hit"]
             row = worlds.next_rows[w, k]
             if old["driver"] == DRIVER_BACKGROUND:
                 row["events"] = 0
@@ -180,7 +179,7 @@ def resolve(worlds: Worlds, scratch: Scratch, grid: Grid) -> None:
     Args:
         worlds: events and hit of the owned next_rows are written; num_contacts rises by one for
             each vehicle when it begins to touch another.
-        scratch: room; was_hit as `advance` has left it.
+        scratch: room.
         grid: spatial index over the vehicles of one world, filled here.
     """
     for w in range(worlds.ticks.shape[0]):
@@ -188,14 +187,13 @@ def resolve(worlds: Worlds, scratch: Scratch, grid: Grid) -> None:
         fill_grid(rows, worlds.num_rows[w], grid)
         find_contacts(worlds.num_rows[w], grid, scratch.hit)
         for i in range(worlds.num_owned[w]):
+            row = rows[i]
             other = scratch.hit[i]
-            if other < 0 and scratch.was_hit[i] < 0:
-                continue
             if other >= 0:
-                if scratch.was_hit[i] < 0:
+                if row["hit"] < 0:
                     worlds.num_contacts[w] += 1
-                rows[i]["events"] |= EVENT_COLLIDED
-            rows[i]["hit"] = other
+                row["events"] |= EVENT_COLLIDED
+            row["hit"] = other
 
 
 @kernel

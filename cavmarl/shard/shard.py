@@ -212,7 +212,6 @@ def _make_scratch(num_lanes: int, num_links: int, capacity: int) -> Scratch:
         blinker=integers(capacity),
         hold=integers(capacity),
         hit=np.zeros(capacity, dtype=np.int64),
-        was_hit=np.zeros(capacity, dtype=np.int64),
     )
 
 
