@@ -29,6 +29,7 @@ from cavmarl.config_io import read_yaml
 from cavmarl.errors import CavmarlError, ConfigError, require
 from cavmarl.evaluate import EvaluationReport, evaluate
 from cavmarl.evaluate.statistics import Interval, mean_interval
+from cavmarl.evaluate.training_record import is_trained
 
 PROGRAM = Path(__file__).with_name("ippo_torch.py")
 SCRIPTED = ("idm", "random_actions")
@@ -88,7 +89,7 @@ class Row:
 def train(args: Args) -> dict[int, Path]:
     """The folder of each seed's run, trained unless it is there and complete."""
     folders = {seed: args.out / f"seed_{seed}" for seed in args.seeds}
-    missing = [seed for seed in args.seeds if not (folders[seed] / "manifest.json").is_file()]
+    missing = [seed for seed in args.seeds if not is_trained(folders[seed])]
 
     def run(seed: int) -> None:
         words = ["--config", str(args.config), "--seed", str(seed), "--runs", str(args.out)]

@@ -6,9 +6,10 @@
 
 Every agent learns from its own observations and rewards; all of them share the weights (Schulman et
 al. 2017; de Witt et al. 2020). A run's folder holds the driver (`model.safetensors` and
-`config.json`, which `cavmarl evaluate --policy FOLDER` takes), `progress.csv`, TensorBoard's files,
-and what `--resume` needs. With the same seed, threads and machine a run repeats itself, unless the
-clock ends it (`--minutes`). A resumed run begins new episodes.
+`config.json`, which `cavmarl evaluate --policy FOLDER` takes), `manifest.json` (what it was trained
+with), `progress.csv`, TensorBoard's files, and what `--resume` needs. With the same seed, threads
+and machine a run repeats itself, unless the clock ends it (`--minutes`). A resumed run begins new
+episodes.
 """
 
 from __future__ import annotations
@@ -36,7 +37,15 @@ from torch import Tensor, nn
 from cavmarl.config import TERMS
 from cavmarl.config_io import read_yaml, validate
 from cavmarl.errors import CavmarlError, ConfigError, PolicyError, require
-from cavmarl.networks import ActorCritic, NetworkConfig, load_network, save_network
+from cavmarl.evaluate.training_record import begin_training, end_training
+from cavmarl.networks import (
+    CONFIG_FILE,
+    WEIGHTS_FILE,
+    ActorCritic,
+    NetworkConfig,
+    load_network,
+    save_network,
+)
 from cavmarl.vector_env import CavVectorEnv, make_vec
 
 ARRIVAL, COLLISION, OFF_ROAD = (TERMS.index(t) for t in ("arrival", "collision", "off_road"))
@@ -525,6 +534,7 @@ class Run:
         self.collector = Collector(vec, self.network, args, args.seed + self.updates)
         try:
             args.folder.mkdir(parents=True, exist_ok=True)
+            begin_training(args.folder, "ippo_torch.py", asdict(args), vec.simulation)
             self.log = Log(args)
         except OSError as error:
             reason = error.strerror or error
@@ -588,6 +598,7 @@ def train(args: Args, console: Console) -> Path:
                 run.save(row)
             bar.update(task, completed=done, description=describe(row))
     run.log.close()
+    end_training(args.folder, (WEIGHTS_FILE, CONFIG_FILE, CSV_FILE))
     return args.folder
 
 

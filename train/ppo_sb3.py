@@ -5,7 +5,8 @@
 The library's own PPO, learning rate, batches and network; what is ours is the view of the worlds
 (`cavmarl.adapters.sb3_vec_env`). The run's folder holds stable-baselines3's `model.zip`,
 `progress.csv` with the columns of `ippo_torch.py`, and the same network as `model.safetensors` and
-`config.json`, which `cavmarl evaluate --policy FOLDER` takes.
+`config.json`, which `cavmarl evaluate --policy FOLDER` takes; `manifest.json` says what it was
+trained with.
 """
 
 from __future__ import annotations
@@ -16,7 +17,7 @@ import sys
 import time
 from collections import deque
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import Annotated, Any, get_args, get_type_hints
 
@@ -29,10 +30,20 @@ from stable_baselines3.common.vec_env import VecMonitor, VecNormalize
 
 from cavmarl.adapters.sb3_vec_env import CavSb3VecEnv
 from cavmarl.errors import CavmarlError, ConfigError
-from cavmarl.networks import MAX_DEVIATIONS, ActorCritic, NetworkConfig, save_network
+from cavmarl.evaluate.training_record import begin_training, end_training
+from cavmarl.networks import (
+    CONFIG_FILE,
+    MAX_DEVIATIONS,
+    WEIGHTS_FILE,
+    ActorCritic,
+    NetworkConfig,
+    save_network,
+)
 from cavmarl.registry import load_config
 
 WINDOW = 400  # trips
+CURVE_FILE = "progress.csv"
+MODEL_FILE = "model.zip"
 
 
 @dataclass(frozen=True)
@@ -184,9 +195,11 @@ def train(args: Args) -> Path:
     torch.set_num_threads(1)  # more cost small networks more than they bring
     model, worlds = make_model(args)
     args.folder.mkdir(parents=True, exist_ok=True)
-    model.learn(args.total_agent_steps, Curve(args.folder / "progress.csv", args.minutes))
-    model.save(args.folder / "model.zip")
+    begin_training(args.folder, "ppo_sb3.py", asdict(args), worlds.get_attr("simulation")[0])
+    model.learn(args.total_agent_steps, Curve(args.folder / CURVE_FILE, args.minutes))
+    model.save(args.folder / MODEL_FILE)
     save_driver(args, model, worlds)
+    end_training(args.folder, (WEIGHTS_FILE, CONFIG_FILE, CURVE_FILE, MODEL_FILE))
     return args.folder
 
 

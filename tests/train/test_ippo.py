@@ -14,6 +14,7 @@ import pytest
 import yaml
 
 from cavmarl.errors import ConfigError
+from cavmarl.evaluate.manifest import read_closed
 from cavmarl.registry import entries
 
 torch = pytest.importorskip("torch")
@@ -80,6 +81,10 @@ def test_two_updates_by_command_line(tmp_path: Path) -> None:
     assert len(rows) >= 2
     assert int(rows[-1]["agent_steps"]) >= 60
     assert (tmp_path / "one" / "model.safetensors").stat().st_size < 1_000_000
+    manifest = read_closed(tmp_path / "one")
+    assert manifest["settings"]["total_agent_steps"] == 60
+    assert manifest["world"]["map"]
+    assert "model.safetensors" in manifest["results_sha256"]
 
 
 def test_the_same_seed_learns_the_same(ippo: ModuleType, here: Path) -> None:
