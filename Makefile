@@ -5,9 +5,17 @@ BIN := .venv/bin
 READY := .venv/.ready
 # Debian keeps Python's venv in a package of its own; root can fetch it.
 VENV_PACKAGE := { test "$$(id -u)" = 0 && apt-get update && apt-get install --yes python3-venv; }
+OLDEST := .venv-oldest
+# What old versions of others will no longer do is no news; the rest stays an error.
+OLDEST_WARNINGS := -W default::DeprecationWarning -W default::PendingDeprecationWarning
+OLDEST_TESTS := tests/kernels tests/roads tests/runtime tests/traffic tests/test_config.py \
+    tests/test_registry.py tests/test_registration.py tests/test_env.py tests/test_vector_env.py \
+    tests/test_bad_input.py tests/test_public_api.py
+FUZZ_SECONDS ?= 60
+FUZZ_TARGETS ?= network programs map cached demand sumocfg entry overrides driver manifest
 MAPS := envs/ring/map/map.net.xml envs/merge/map/map.net.xml envs/grid4x4/map/map.net.xml
 
-.PHONY: help demo test check bench soak maps pictures clean
+.PHONY: help demo test check bench soak fuzz oldest maps pictures clean
 .DEFAULT_GOAL := help
 
 help: ## say what there is
@@ -29,8 +37,15 @@ check: $(READY) ## style, types, and the direction of imports
 bench: $(READY) ## agent-steps a second, next to highway-env
 	$(BIN)/cavmarl bench step
 
-soak: $(READY) ## the slow tests: long episodes, the wheel
+soak: $(READY) ## the slow tests: long episodes, memory, the wheel
 	$(BIN)/pytest -m slow
+
+fuzz: $(READY) ## each file parser, FUZZ_SECONDS long; what crashes one stays in fuzz/crashes
+	$(BIN)/python -m pip install --quiet --editable '.[fuzz]' --constraint constraints.txt
+	for target in $(FUZZ_TARGETS); do $(BIN)/python -m fuzz $$target $(FUZZ_SECONDS) || exit 1; done
+
+oldest: $(OLDEST)/.ready ## the heart of the tests with the oldest versions that are allowed
+	$(OLDEST)/bin/pytest $(OLDEST_WARNINGS) $(OLDEST_TESTS)
 
 # Without the comment that netconvert and netgenerate begin with (date, version, options), the same
 # options give the same bytes.
@@ -44,7 +59,7 @@ pictures: $(READY) ## draw the pictures of the README and the cards anew
 	$(BIN)/python -m cavmarl.render.pictures docs/images
 
 clean: ## remove .venv, builds and caches; runs/ stays
-	rm -rf .venv build dist .mypy_cache .ruff_cache .pytest_cache .hypothesis .import_linter_cache
+	rm -rf .venv .venv-oldest fuzz/corpus build dist .mypy_cache .ruff_cache .pytest_cache .hypothesis .import_linter_cache
 	find cavmarl agents train tests -name __pycache__ -prune -exec rm -rf {} +
 
 # torch comes first and alone, so that a CPU build that pip is told of (PIP_EXTRA_INDEX_URL,
@@ -57,4 +72,10 @@ $(READY): pyproject.toml constraints.txt
 	test -x $(BIN)/pip || "$(PYTHON)" -m venv --clear .venv
 	$(BIN)/python -m pip install $$(grep '^torch==' constraints.txt) --constraint constraints.txt
 	$(BIN)/python -m pip install --editable '.[dev]' --constraint constraints.txt
+	@touch $@
+
+$(OLDEST)/.ready: pyproject.toml constraints-oldest.txt
+	"$(PYTHON)" -m venv --clear $(OLDEST)
+	$(OLDEST)/bin/python -m pip install --editable '.[sumo]' pytest hypothesis \
+	    --constraint constraints-oldest.txt
 	@touch $@

@@ -107,7 +107,7 @@ class ActionDecoder:
             held = self._rows_of(missing)
             batch[0, held] = self._last[0, held]
         if given:
-            stacked = self._stack([actions[agent] for agent in given], given)
+            stacked = self._stack(list(map(actions.__getitem__, given)), given)
             batch[0, self._rows_of(given)] = stacked
         checked, clipped = self._check_values(batch)
         self.ignored += ignored

@@ -21,10 +21,16 @@ from cavmarl.render.view import WorldView
 from cavmarl.roads.network import RoadNetwork
 from cavmarl.runtime.simulation import Simulation
 from cavmarl.seeds import check_seed, first_seed
-from cavmarl.shard.sensors import layout
-from cavmarl.spaces import action_space, observation_space, state_space
+from cavmarl.spaces import (
+    action_space,
+    named_observation,
+    observation_parts,
+    observation_space,
+    state_space,
+)
 from cavmarl.state import global_state
-from cavmarl.worlds import check_placement, load_world
+from cavmarl.traffic.demand import DemandFile
+from cavmarl.worlds import check_agents, check_placement, load_world
 
 __all__ = ["CavEnv", "parallel_env"]
 
@@ -34,7 +40,7 @@ RENDER_MODES = ("human", "rgb_array")
 _ABSENT = dict.fromkeys((*TERMS, "active", "vehicle_done", "vehicle_id"), 0.0)
 _ACTIVE = _ABSENT | {"active": 1.0}
 
-Observation = NDArray[np.float32] | dict[str, NDArray[np.float32]]
+Observation = NDArray[np.float32] | dict[str, NDArray[Any]]
 
 
 def parallel_env(
@@ -67,7 +73,7 @@ def parallel_env(
         MapError: the map cannot be read or driven.
     """
     check_placement(workers)
-    config, network = load_world(
+    config, network, demand = load_world(
         env,
         zones=zones,
         agents=agents,
@@ -75,7 +81,14 @@ def parallel_env(
         max_cycles=max_cycles,
         overrides=overrides,
     )
-    return CavEnv(config, network, seed=seed, render_mode=render_mode)
+    return CavEnv(config, network, demand, seed=seed, render_mode=render_mode)
+
+
+def _flags(agents: list[str], flags: NDArray[np.bool_]) -> dict[str, bool]:
+    """One flag an agent; in most steps nobody's is set."""
+    if not flags.any():
+        return dict.fromkeys(agents, False)
+    return dict(zip(agents, flags.tolist(), strict=True))
 
 
 class CavEnv(ParallelEnv[str, Any, Any]):  # type: ignore[misc] # PettingZoo is not typed
@@ -88,6 +101,7 @@ class CavEnv(ParallelEnv[str, Any, Any]):  # type: ignore[misc] # PettingZoo is 
     Args:
         config: the environment.
         network: its roads.
+        demand: whose vehicles drive beside the generator's.
         seed: of the first reset, if that is given none.
         render_mode: `human`, `rgb_array` or None.
     """
@@ -103,6 +117,7 @@ class CavEnv(ParallelEnv[str, Any, Any]):  # type: ignore[misc] # PettingZoo is 
         self,
         config: EnvConfig,
         network: RoadNetwork,
+        demand: DemandFile | None = None,
         *,
         seed: int | None = None,
         render_mode: str | None = None,
@@ -111,6 +126,7 @@ class CavEnv(ParallelEnv[str, Any, Any]):  # type: ignore[misc] # PettingZoo is 
             raise ConfigError(
                 f"render_mode = {render_mode!r}: must be {' or '.join(RENDER_MODES)}, or None"
             )
+        check_agents(config)
         self.config = config
         self.network = network
         self.render_mode = render_mode
@@ -124,13 +140,16 @@ class CavEnv(ParallelEnv[str, Any, Any]):  # type: ignore[misc] # PettingZoo is 
         self._listed: NDArray[np.intp] | slice  # the same
         self._list(np.zeros(0, dtype=np.intp))
         self.max_cycles = config.max_steps
-        self.state_space = state_space(config)
         one_observation, one_action = observation_space(config), action_space(config.action)
         self.observation_spaces = dict.fromkeys(self.possible_agents, one_observation)
         self.action_spaces = dict.fromkeys(self.possible_agents, one_action)
         self._seats = config.population.mode == "seats"
-        self._places = layout(config.sensors) if config.observation.kind == "dict" else None
-        self._simulation = Simulation(config, network)
+        self._stack = config.sensors.stack
+        self._parts = (
+            observation_parts(config.sensors) if config.observation.kind == "dict" else None
+        )
+        self._simulation = Simulation(config, network, demand=demand)
+        self.state_space = state_space(self._simulation.capacity)
         self._decoder = ActionDecoder(config.action, 1, self.possible_agents)
         self._first_seed = None if seed is None else check_seed(seed)
         self._steps = -1
@@ -228,10 +247,8 @@ class CavEnv(ParallelEnv[str, Any, Any]):  # type: ignore[misc] # PettingZoo is 
         ended = outputs.terminated[0, self._listed] & (not self._seats)
         observations, infos = self._observations(), self._infos()
         rewards = dict(zip(shown, outputs.rewards[0, self._listed].tolist(), strict=True))
-        terminations = dict(zip(shown, ended.tolist(), strict=True))
-        truncations = dict.fromkeys(shown, False)
-        if truncated:
-            truncations = dict(zip(shown, (~ended).tolist(), strict=True))
+        terminations = _flags(shown, ended)
+        truncations = _flags(shown, ~ended & truncated)
         self._simulation.retire_agents()
         if truncated:
             self._list(self._rows[:0])
@@ -268,11 +285,14 @@ class CavEnv(ParallelEnv[str, Any, Any]):  # type: ignore[misc] # PettingZoo is 
 
     def _observations(self) -> dict[str, Observation]:
         found = self._simulation.outputs.observations[0].copy()[self._listed]
-        if self._places is None:
+        if self._parts is None:
             return dict(zip(self.agents, found, strict=True))
+        named = named_observation(
+            self._parts, found.reshape(len(found), self._stack, found.shape[1] // self._stack)
+        )
         return {
-            agent: {name: row[place] for name, place in self._places.items()}
-            for agent, row in zip(self.agents, found, strict=True)
+            agent: {name: part[k] for name, part in named.items()}
+            for k, agent in enumerate(self.agents)
         }
 
     def _infos(self) -> dict[str, dict[str, float]]:

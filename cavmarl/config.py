@@ -12,21 +12,19 @@ from dataclasses import dataclass, field
 from itertools import pairwise
 from typing import Literal
 
-from cavmarl.errors import ConfigError
+from cavmarl.config_checks import check as _check
+from cavmarl.config_checks import check_finite as _check_finite
+from cavmarl.config_sensors import SensorsConfig
 
 __all__ = [
     "TERMS",
     "ActionConfig",
     "ClockConfig",
     "EnvConfig",
-    "LidarConfig",
     "MapConfig",
-    "NeighborsConfig",
     "ObservationConfig",
     "PopulationConfig",
-    "RouteAheadConfig",
     "SensorsConfig",
-    "SignalAheadConfig",
     "TermsConfig",
     "TrafficConfig",
     "ZonesConfig",
@@ -46,20 +44,7 @@ TERMS = (
     "delay",
 )
 
-
-def _check(holds: bool, key: str, value: object, expected: str) -> None:
-    """Raise a ConfigError that names key, value and expectation unless `holds`."""
-    if not holds:
-        raise ConfigError(f"{key} = {value!r}: {expected}")
-
-
-def _check_finite(key: str, value: float, low: float, high: float) -> None:
-    _check(
-        math.isfinite(value) and low <= value <= high,
-        key,
-        value,
-        f"must be a number from {low:g} to {high:g}",
-    )
+MAX_IDS = 1_000_000  # of agents in one episode: each has its space and its rows in every output
 
 
 @dataclass(frozen=True)
@@ -69,12 +54,18 @@ class MapConfig:
     Attributes:
         source: a map file: relative to the entry's folder, absolute, or `sumo:PATH` for a file of
             the eclipse-sumo wheel.
+        programs: additional files with more signal programs, named as the source is; of several
+            programs of a signal the last is on.
+        program: the program of each signal named here, whatever was loaded; `off` is one, too.
     """
 
     source: str
+    programs: tuple[str, ...] = ()
+    program: dict[str, str] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         _check(bool(self.source), "map.source", self.source, "must name a map file")
+        _check(all(self.programs), "map.programs", self.programs, "must name files")
 
 
 @dataclass(frozen=True)
@@ -153,10 +144,10 @@ class PopulationConfig:
 
     def __post_init__(self) -> None:
         _check(
-            1 <= self.agents <= 100_000,
+            0 <= self.agents <= 100_000,
             "population.agents",
             self.agents,
-            "must be a whole number from 1 to 100000",
+            "must be a whole number from 0 (a world to watch) to 100000",
         )
         _check(
             0 <= self.background <= 1_000_000,
@@ -166,10 +157,10 @@ class PopulationConfig:
         )
         if self.budget is not None and self.mode == "entering":
             _check(
-                self.budget >= self.agents,
+                self.agents <= self.budget <= MAX_IDS,
                 "population.budget",
                 self.budget,
-                f"must be at least population.agents = {self.agents}",
+                f"must be at least population.agents = {self.agents}, and at most {MAX_IDS}",
             )
 
     @property
@@ -185,7 +176,11 @@ class TrafficConfig:
     """Where departures come from.
 
     Attributes:
-        source: `native`: the seeded generator.
+        source: `native`: the seeded generator, and the demand files.
+        demand: SUMO files of vehicles, flows, routes and types (`.rou.xml`, `.add.xml`,
+            `.sumocfg`): named as `map.source`; their vehicles drive beside the generator's.
+        on_bad_route: what to do with vehicles of the demand that cannot drive their route, and with
+            stops off it: `error`, or `skip` them (counted).
         goals: how many destination edges the generator uses; lane-level plans are made for each.
         origins: edges that agents start on, by id; empty: all that lead somewhere.
         destinations: edges that agents drive to, by id; empty: the generator's goals.
@@ -195,6 +190,8 @@ class TrafficConfig:
     """
 
     source: Literal["native"] = "native"
+    demand: tuple[str, ...] = ()
+    on_bad_route: Literal["error", "skip"] = "error"
     goals: int = 32
     origins: tuple[str, ...] = ()
     destinations: tuple[str, ...] = ()
@@ -250,83 +247,6 @@ class ActionConfig:
             speeds,
             "must be at least two rising speeds from 0 to 60",
         )
-
-
-@dataclass(frozen=True)
-class RouteAheadConfig:
-    """Points of the route ahead, in the ego frame.
-
-    Attributes:
-        points: how many; 0 switches the sensor off.
-        spacing_m: way between one and the next.
-    """
-
-    points: int = 8
-    spacing_m: float = 6.0
-
-    def __post_init__(self) -> None:
-        _check(0 <= self.points <= 64, "sensors.route.points", self.points, "must be from 0 to 64")
-        _check_finite("sensors.route.spacing_m", self.spacing_m, 0.5, 100.0)
-
-
-@dataclass(frozen=True)
-class NeighborsConfig:
-    """The nearest vehicles, in the ego frame.
-
-    Attributes:
-        count: how many at most; 0 switches the sensor off.
-        range_m: distance up to which a vehicle is seen.
-    """
-
-    count: int = 8
-    range_m: float = 60.0
-
-    def __post_init__(self) -> None:
-        _check(0 <= self.count <= 64, "sensors.neighbors.count", self.count, "must be from 0 to 64")
-        _check_finite("sensors.neighbors.range_m", self.range_m, 1.0, 300.0)
-
-
-@dataclass(frozen=True)
-class SignalAheadConfig:
-    """The next signal or duty to give way on the route.
-
-    Attributes:
-        range_m: how far ahead it is seen.
-    """
-
-    range_m: float = 80.0
-
-    def __post_init__(self) -> None:
-        _check_finite("sensors.signal.range_m", self.range_m, 1.0, 300.0)
-
-
-@dataclass(frozen=True)
-class LidarConfig:
-    """Distances around the vehicle.
-
-    Attributes:
-        rays: how many, equally spaced; 0 switches the sensor off.
-        range_m: how far a ray reaches.
-        speeds: adds the relative speed of what each ray hits.
-    """
-
-    rays: int = 64
-    range_m: float = 60.0
-    speeds: bool = False
-
-    def __post_init__(self) -> None:
-        _check(0 <= self.rays <= 1024, "sensors.lidar.rays", self.rays, "must be from 0 to 1024")
-        _check_finite("sensors.lidar.range_m", self.range_m, 1.0, 300.0)
-
-
-@dataclass(frozen=True)
-class SensorsConfig:
-    """The sensors of every agent; 0 points, neighbours or rays switch one off."""
-
-    route: RouteAheadConfig = field(default_factory=RouteAheadConfig)
-    neighbors: NeighborsConfig = field(default_factory=NeighborsConfig)
-    signal: SignalAheadConfig = field(default_factory=SignalAheadConfig)
-    lidar: LidarConfig = field(default_factory=LidarConfig)
 
 
 @dataclass(frozen=True)

@@ -127,7 +127,11 @@ def validate(kind: type[T], raw: object, where: str) -> T:
         # By way of JSON: its strict mode knows no difference between list and tuple, or mapping and
         # dataclass. NumPy's numbers count as Python's; what else JSON cannot carry becomes text,
         # which no number accepts.
-        checked: T = _adapter(kind).validate_json(json.dumps(raw, default=_plain))
+        text = json.dumps(raw, default=_plain)
+    except (TypeError, ValueError, RecursionError) as error:
+        raise ConfigError(f"{where}: holds what no configuration can hold ({error})") from error
+    try:
+        checked: T = _adapter(kind).validate_json(text)
     except ValidationError as error:
         lines = [_explain(kind, details) for details in error.errors(include_url=False)]
         raise ConfigError("\n".join(f"{where}: {line}" for line in lines)) from error
@@ -178,6 +182,8 @@ def _explain(kind: type[Any], details: ErrorDetails) -> str:
             return f"{path}: missing; it has no default"
         case "dataclass_type":
             return f"{path} = {details['input']!r}: must be a mapping of keys"
+        case "json_invalid":
+            return f"holds what no configuration can hold ({details['msg']})"
         case "tuple_type":
             return f"{path} = {details['input']!r}: must be a list"
     return f"{path} = {details['input']!r}: {details['msg'].replace('Input should', 'must')}"

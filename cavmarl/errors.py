@@ -5,6 +5,7 @@
     │   └── UnknownEnvironmentError   no entry, path or map of that name
     ├── MapError               a map that cannot be read, built or driven
     │   └── RouteError         no way from here to there
+    ├── DemandError            a file of traffic that cannot be read or does not fit its map
     ├── ActionError            refused before any state has changed
     │   ├── InvalidActionError    wrong shape, dtype or value
     │   ├── MissingActionError    a live agent without an action
@@ -13,6 +14,8 @@
     │   ├── ResetNeededError      step before reset
     │   └── EpisodeEndedError     step after the end
     ├── CapacityError          more vehicles or seats than the world can take
+    ├── EvaluationError        an evaluation that could not be brought to its end
+    │   └── ManifestError         results whose origin is not on record
     ├── PolicyError            a policy that cannot be loaded or does not fit
     └── MissingExtraError      an optional dependency is not installed
 
@@ -29,9 +32,12 @@ __all__ = [
     "CapacityError",
     "CavmarlError",
     "ConfigError",
+    "DemandError",
     "EpisodeEndedError",
     "EpisodeError",
+    "EvaluationError",
     "InvalidActionError",
+    "ManifestError",
     "MapError",
     "MissingActionError",
     "MissingExtraError",
@@ -64,6 +70,10 @@ class RouteError(MapError):
     """The lane graph has no way between two places."""
 
 
+class DemandError(CavmarlError):
+    """A file of traffic demand that cannot be read, contradicts itself or does not fit its map."""
+
+
 class ActionError(CavmarlError):
     """An action that was refused; no state has changed and the step can be repeated."""
 
@@ -94,6 +104,14 @@ class EpisodeEndedError(EpisodeError):
 
 class CapacityError(CavmarlError):
     """More vehicles, agents or points than this world can take."""
+
+
+class EvaluationError(CavmarlError):
+    """A process of an evaluation died, or did something else than it was asked to."""
+
+
+class ManifestError(EvaluationError):
+    """Results without a manifest, with one that was never closed, or with one of other results."""
 
 
 class PolicyError(CavmarlError):

@@ -42,6 +42,7 @@ META_ACTIONS = 5
 MAX_LAYERS = 8
 MAX_WIDTH = 4096
 MAX_OBSERVATION_SIZE = 65_536
+MAX_DEVIATIONS = 5.0  # observations further from the mean are cut
 LOG_2_PI = math.log(2.0 * math.pi)
 
 
@@ -81,9 +82,29 @@ class NetworkConfig:
                 f"{MAX_WIDTH}"
             )
 
+    @property
+    def num_weights(self) -> int:
+        """How many numbers an `ActorCritic` learns, with the scaling of its observations."""
+        continuous = self.action.kind == "continuous"
+        actions = CONTINUOUS_ACTIONS if continuous else META_ACTIONS
+        deviations = actions if continuous else 0
+        scaling = 2 * self.observation_size
+        return (
+            scaling
+            + deviations
+            + sum(
+                (inputs + 1) * outputs
+                for last in (actions, 1)
+                for inputs, outputs in pairwise((self.observation_size, *self.hidden, last))
+            )
+        )
+
 
 class ActorCritic(nn.Module):
     """A policy and a value function, each a small tanh network of its own.
+
+    Both see observations less their `mean`, over their `deviation`: buffers that training fills and
+    a checkpoint keeps.
 
     Continuous actions are normal around the actor's output, with one learned deviation an action:
     the environment gets them clipped to [-1, 1], learning the raw ones. Discrete actions are
@@ -91,49 +112,69 @@ class ActorCritic(nn.Module):
 
     Args:
         config: sizes and kind of action.
-        initial_std: standard deviation of continuous actions before learning.
+        initial_std: standard deviations of continuous actions before learning: throttle, steering.
     """
 
-    def __init__(self, config: NetworkConfig, initial_std: float = 0.5) -> None:
+    mean: Tensor
+    deviation: Tensor
+
+    def __init__(
+        self, config: NetworkConfig, initial_std: tuple[float, float] = (0.5, 0.5)
+    ) -> None:
         super().__init__()
         self.continuous = config.action.kind == "continuous"
         actions = CONTINUOUS_ACTIONS if self.continuous else META_ACTIONS
         sizes = (config.observation_size, *config.hidden)
+        self.register_buffer("mean", torch.zeros(config.observation_size))
+        self.register_buffer("deviation", torch.ones(config.observation_size))
         # Small last weights: the first policy does nothing in particular (Andrychowicz et al.
         # 2021).
         self.actor = _perceptron((*sizes, actions), last_gain=0.01)
         self.critic = _perceptron((*sizes, 1), last_gain=1.0)
         if self.continuous:
-            self.log_std = nn.Parameter(torch.full((actions,), math.log(initial_std)))
+            self.log_std = nn.Parameter(torch.tensor(initial_std).log())
 
     def value(self, observations: Tensor) -> Tensor:
         """Expected return (N,) of observations (N, D)."""
-        values: Tensor = self.critic(observations).squeeze(-1)
+        values: Tensor = self.critic(self._normal(observations)).squeeze(-1)
         return values
 
     def best(self, observations: Tensor) -> Tensor:
         """The most likely actions: (N, 2) within [-1, 1], or (N,) meta-actions."""
-        output: Tensor = self.actor(observations)
+        output: Tensor = self.actor(self._normal(observations))
         return output.clamp(-1.0, 1.0) if self.continuous else output.argmax(-1)
 
     def sample(self, observations: Tensor) -> tuple[Tensor, Tensor]:
         """Random actions, continuous ones not clipped, and their log probabilities (N,)."""
-        output: Tensor = self.actor(observations)
+        output: Tensor = self.actor(self._normal(observations))
         if self.continuous:
             actions = output + torch.randn_like(output) * self.log_std.exp()
         else:
-            actions = torch.multinomial(output.softmax(-1), 1).squeeze(-1)
+            # The largest of log-weights plus Gumbel noise is a draw by these weights.
+            noise = torch.empty_like(output).exponential_().log()
+            actions = (output - noise).argmax(-1)
         return actions, self._log_prob(output, actions)
 
     def evaluate(self, observations: Tensor, actions: Tensor) -> tuple[Tensor, Tensor]:
         """Log probabilities (N,) of what `sample` gave, and entropies (N,)."""
-        output: Tensor = self.actor(observations)
+        output: Tensor = self.actor(self._normal(observations))
         if self.continuous:
             entropy = (0.5 + 0.5 * LOG_2_PI + self.log_std).sum().expand(output.shape[0])
         else:
             log_probs = output.log_softmax(-1)
             entropy = -(log_probs.exp() * log_probs).sum(-1)
         return self._log_prob(output, actions), entropy
+
+    def distance(self, observations: Tensor, actions: Tensor) -> Tensor:
+        """How far (N,) the policy is from given actions: squares, or surprise at meta-actions."""
+        output: Tensor = self.actor(self._normal(observations))
+        if self.continuous:
+            return (output - actions).square().sum(-1)
+        return nn.functional.cross_entropy(output, actions, reduction="none")
+
+    def _normal(self, observations: Tensor) -> Tensor:
+        normal: Tensor = (observations - self.mean) / self.deviation
+        return normal.clamp(-MAX_DEVIATIONS, MAX_DEVIATIONS)
 
     def _log_prob(self, output: Tensor, actions: Tensor) -> Tensor:
         if self.continuous:
@@ -177,11 +218,16 @@ def load_network(folder: Path) -> tuple[ActorCritic, NetworkConfig]:
             raise PolicyError(f"no {name} in {folder}: is this the folder of a trained driver?")
     config = _read_config(folder / CONFIG_FILE)
     path = folder / WEIGHTS_FILE
-    network = ActorCritic(config)
     try:
         weights = load_file(path)
     except (OSError, SafetensorError) as error:
         raise _unreadable(path, error) from error
+    held = sum(tensor.numel() for tensor in weights.values())
+    if held != config.num_weights:  # before a network is made that may be far larger than the file
+        raise PolicyError(
+            f"{path}: does not fit {CONFIG_FILE}: {held} weights, not {config.num_weights}"
+        )
+    network = ActorCritic(config)
     try:
         network.load_state_dict(weights)
     except RuntimeError as error:
@@ -196,7 +242,7 @@ def load_network(folder: Path) -> tuple[ActorCritic, NetworkConfig]:
 def _read_config(path: Path) -> NetworkConfig:
     try:
         raw: Any = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, UnicodeDecodeError, json.JSONDecodeError) as error:
+    except (OSError, ValueError, RecursionError) as error:  # not all of JSON's are its own
         raise _unreadable(path, error) from error
     try:
         return validate(NetworkConfig, raw, str(path))

@@ -11,7 +11,8 @@ import importlib.util
 import inspect
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
-from dataclasses import asdict
+from operator import attrgetter
+from os.path import isdir, isfile
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -20,16 +21,16 @@ from numpy.typing import NDArray
 from pettingzoo import ParallelEnv
 
 from cavmarl.cav_env import CavEnv
-from cavmarl.config import EnvConfig
+from cavmarl.config import EnvConfig, SensorsConfig
 from cavmarl.errors import PolicyError, require
 from cavmarl.registry import agent_entries
-from cavmarl.spaces import flat_observation_space
+from cavmarl.spaces import flat_observation, flat_observation_space, observation_parts
 from cavmarl.vector_env import CavVectorEnv
 
 if TYPE_CHECKING:
     from cavmarl.networks import ActorCritic, NetworkConfig
 
-__all__ = ["NetworkPolicy", "Policy", "load_policy"]
+__all__ = ["NetworkPolicy", "Policy", "load_policy", "policy_files"]
 
 Environment = CavEnv | CavVectorEnv
 
@@ -73,13 +74,15 @@ class Policy(ABC):
         index = {agent: k for k, agent in enumerate(env.possible_agents)}
         live = [agent for agent in env.agents if agent in observations]
         size = flat_observation_space(env.config).shape[0]
+        parts = observation_parts(env.config.sensors)
         batch = np.zeros((1, len(index), size), dtype=np.float32)
         mask = np.zeros((1, len(index)), dtype=np.bool_)
         for agent in live:
             seen = observations[agent]
-            # The parts of a Dict observation stand in the order of their places in the flat one.
             batch[0, index[agent]] = (
-                np.concatenate(list(seen.values())) if isinstance(seen, Mapping) else seen
+                flat_observation(parts, seen, env.config.sensors.stack)
+                if isinstance(seen, Mapping)
+                else seen
             )
             mask[0, index[agent]] = True
         actions = self.act_batch(batch, mask)[0]
@@ -92,13 +95,11 @@ class NetworkPolicy(Policy):
     Args:
         env: where it drives.
         network: maps flat observations to actions.
-        weights_file: where the network was read from.
     """
 
-    def __init__(self, env: Environment, network: ActorCritic, weights_file: Path) -> None:
+    def __init__(self, env: Environment, network: ActorCritic) -> None:
         super().__init__(env)
         self.network = network
-        self.weights_file = weights_file
 
     def act_batch(self, observations: NDArray[np.float32], mask: NDArray[np.bool_]) -> NDArray[Any]:
         """The network's most likely actions where `mask`, 0 elsewhere."""
@@ -141,6 +142,27 @@ def load_policy(policy: str | Path, env: Environment) -> Policy:
     return _load_script(path, env)
 
 
+def policy_files(policy: str | Path) -> tuple[Path, ...]:
+    """The files that make a policy what it is: its script, or its weights and their description.
+
+    Raises:
+        PolicyError: nothing of that name, or a folder without them.
+        MissingExtraError: a network, without torch.
+    """
+    path = _find(policy)
+    if not path.is_dir():
+        return (path,)
+    require("torch", "torch")
+    require("safetensors", "torch")
+    from cavmarl.networks import CONFIG_FILE, WEIGHTS_FILE
+
+    files = (path / WEIGHTS_FILE, path / CONFIG_FILE)
+    for file in files:
+        if not file.is_file():
+            raise PolicyError(f"no {file.name} in {path}: not the folder of a trained driver")
+    return files
+
+
 def _find(policy: str | Path) -> Path:
     """The file or folder that `policy` means."""
     if not isinstance(policy, str | Path):
@@ -149,11 +171,11 @@ def _find(policy: str | Path) -> Path:
     if isinstance(policy, str) and policy in known:
         return known[policy]
     path = Path(policy)
-    if path.is_dir():
+    if isdir(path):  # unlike Path's, it takes names that no folder can have
         return path
-    if path.is_file() and path.suffix == ".py":
+    if isfile(path) and path.suffix == ".py":
         return path
-    if path.exists():
+    if isfile(path):
         raise PolicyError(
             f"{path}: no policy; give a folder with model.safetensors, or a .py with make_policy"
         )
@@ -188,7 +210,7 @@ def _load_script(path: Path, env: Environment) -> Policy:
 def _load_network_policy(folder: Path, env: Environment) -> NetworkPolicy:
     require("torch", "torch")
     require("safetensors", "torch")
-    from cavmarl.networks import WEIGHTS_FILE, load_network
+    from cavmarl.networks import load_network
 
     network, config = load_network(folder)
     name, here = folder.name, env.config
@@ -205,11 +227,13 @@ def _load_network_policy(folder: Path, env: Environment) -> NetworkPolicy:
             f"{name}: observes {config.observation_size} numbers, but its sensors give {size} in "
             "this version: train it again"
         )
-    return NetworkPolicy(env, network, folder / WEIGHTS_FILE)
+    return NetworkPolicy(env, network)
 
 
 def _differences(config: NetworkConfig, here: EnvConfig) -> dict[str, tuple[Any, Any]]:
     """Keys that make observations or actions mean something else: (in training, here)."""
+    from cavmarl.config_io import dotted_keys  # pydantic is slow to import
+
     kind = config.action.kind
     scales = {
         "continuous": ("acceleration_mps2", "steering_rad"),
@@ -220,9 +244,9 @@ def _differences(config: NetworkConfig, here: EnvConfig) -> dict[str, tuple[Any,
         there, ours = getattr(config.action, key), getattr(here.action, key)
         if there != ours:
             found[f"action.{key}"] = (there, ours)
-    sensors_there, sensors_here = asdict(config.sensors), asdict(here.sensors)
-    for sensor, settings in sensors_there.items():
-        for key, value in settings.items():
-            if sensors_here[sensor][key] != value:
-                found[f"sensors.{sensor}.{key}"] = (value, sensors_here[sensor][key])
+    for key in dotted_keys(SensorsConfig):
+        value = attrgetter(key)
+        there, ours = value(config.sensors), value(here.sensors)
+        if there != ours:
+            found[f"sensors.{key}"] = (there, ours)
     return found

@@ -9,13 +9,21 @@ from __future__ import annotations
 import dataclasses
 import difflib
 from collections.abc import Callable, Mapping
+from os.path import isdir, isfile
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from cavmarl.config import EnvConfig, MapConfig
-from cavmarl.errors import ConfigError, MapError, UnknownEnvironmentError, require
+from cavmarl.errors import (
+    CavmarlError,
+    ConfigError,
+    DemandError,
+    MapError,
+    UnknownEnvironmentError,
+    require,
+)
 
 __all__ = [
     "MAP_SUFFIXES",
@@ -24,7 +32,9 @@ __all__ = [
     "find_entry",
     "load_config",
     "places",
+    "resolve_demand",
     "resolve_map",
+    "resolve_programs",
 ]
 
 MAP_SUFFIXES = (".net.xml", ".net.xml.gz", ".osm", ".osm.gz", ".osm.xml", ".xodr")
@@ -67,15 +77,15 @@ def find_entry(env: str | Path) -> Path:
     if isinstance(env, str) and env in known:
         return known[env]
     path = Path(env)
-    if (path / "env.yaml").is_file():
+    if isfile(path / "env.yaml"):  # unlike Path's, it takes names that no file can have
         return path
-    if path.is_file():
+    if isfile(path):
         if not path.name.endswith(MAP_SUFFIXES):
             raise UnknownEnvironmentError(
                 f"{path}: not a map file; their names end in {', '.join(MAP_SUFFIXES)}"
             )
         return path
-    if path.is_dir():
+    if isdir(path):
         raise UnknownEnvironmentError(f"{path}: a folder without an env.yaml")
     raise UnknownEnvironmentError(
         f"no environment, folder or map file '{env}'; {_advice(env, known)}"
@@ -121,6 +131,8 @@ def load_config(
         "horizon_s": max_cycles,
     }
     given = {key: value for key, value in keywords.items() if value is not None}
+    if not isinstance(overrides, Mapping | None):
+        raise ConfigError(f"overrides = {overrides!r}: must be a mapping of dotted keys")
     shadows = dict(overrides or {})
     if strange := [key for key in shadows if not isinstance(key, str)]:
         raise ConfigError(f"overrides: {strange[0]!r} is no key; keys are text, dotted")
@@ -148,16 +160,37 @@ def resolve_map(config: EnvConfig, base_dir: Path) -> Path:
         MapError: no such file.
         MissingExtraError: the source lies in the eclipse-sumo wheel, which is not installed.
     """
-    source = config.map.source
+    return _resolve("map.source", config.map.source, base_dir, MapError)
+
+
+def resolve_demand(config: EnvConfig, base_dir: Path) -> list[Path]:
+    """The files that `traffic.demand` means; as `resolve_map`.
+
+    Raises:
+        DemandError: no such file.
+        MissingExtraError: a file lies in the eclipse-sumo wheel, which is not installed.
+    """
+    return [
+        _resolve("traffic.demand", source, base_dir, DemandError)
+        for source in config.traffic.demand
+    ]
+
+
+def resolve_programs(config: EnvConfig, base_dir: Path) -> list[Path]:
+    """The files that `map.programs` means; arguments and errors as for `resolve_map`."""
+    return [_resolve("map.programs", source, base_dir, MapError) for source in config.map.programs]
+
+
+def _resolve(key: str, source: str, base_dir: Path, failure: type[CavmarlError]) -> Path:
     if source.startswith(_SUMO_PREFIX):
         home = Path(require("sumo", "sumo").SUMO_HOME).resolve()
         path = (home / source.removeprefix(_SUMO_PREFIX)).resolve()
         if not path.is_relative_to(home):
-            raise MapError(f"map.source = {source!r}: leads out of the eclipse-sumo wheel")
+            raise failure(f"{key} = {source!r}: leads out of the eclipse-sumo wheel")
     else:
         path = base_dir / source
-    if not path.is_file():
-        raise MapError(f"map.source = {source!r}: no file {path}")
+    if not isfile(path):
+        raise failure(f"{key} = {source!r}: no file {path}")
     return path
 
 

@@ -2,16 +2,26 @@
 
 from __future__ import annotations
 
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
 import numpy as np
 from gymnasium import spaces
+from numpy.typing import DTypeLike, NDArray
 
 from cavmarl.config import ActionConfig, EnvConfig, SensorsConfig
 from cavmarl.shard.sensors import SENSORS, Feature, layout
 
 __all__ = [
     "STATE_FEATURES",
+    "ObservationPart",
     "action_space",
+    "flat_observation",
     "flat_observation_space",
+    "named_observation",
+    "observation_parts",
     "observation_space",
     "observation_table",
     "state_space",
@@ -27,16 +37,106 @@ def _box(size: int) -> spaces.Box:
 
 
 def flat_observation_space(config: EnvConfig) -> spaces.Box:
-    """All features of all sensors in one Box within [-1, 1], whatever `observation.kind` says."""
-    return _box(max(place.stop for place in layout(config.sensors).values()))
+    """All features of all sensors in one Box, whatever `observation.kind` says.
+
+    Within [-1, 1], but for features that are left unscaled. With `sensors.stack` the frames follow
+    one another, oldest first.
+    """
+    features = [feature for sensor in SENSORS for feature in sensor.features(config.sensors)]
+    stack = config.sensors.stack
+    return _feature_box(features * stack, (stack * len(features),), np.float32)
 
 
 def observation_space(config: EnvConfig) -> spaces.Box | spaces.Dict:
-    """What one agent observes: a flat Box, or a Dict with one Box a sensor."""
+    """What one agent observes: a flat Box, or a Dict with one Box a sensor.
+
+    With `sensors.stack` the Boxes of a Dict have the frames as their first axis.
+    """
     if config.observation.kind == "flat":
         return flat_observation_space(config)
-    places = layout(config.sensors)
-    return spaces.Dict({name: _box(place.stop - place.start) for name, place in places.items()})
+    sensors = {sensor.name: sensor for sensor in SENSORS}
+    return spaces.Dict(
+        {
+            name: _feature_box(
+                sensors[name].features(config.sensors) * config.sensors.stack,
+                part.shape,
+                part.dtype,
+            )
+            for name, part in observation_parts(config.sensors).items()
+        }
+    )
+
+
+def _feature_box(
+    features: Sequence[Feature], shape: tuple[int, ...], dtype: DTypeLike
+) -> spaces.Box:
+    low = np.array([feature.low for feature in features], dtype=dtype)
+    high = np.array([feature.high for feature in features], dtype=dtype)
+    return spaces.Box(low.reshape(shape), high.reshape(shape), dtype=low.dtype.type)
+
+
+@dataclass(frozen=True)
+class ObservationPart:
+    """One sensor's part of an observation.
+
+    Attributes:
+        place: where its features lie in each frame of a flat observation.
+        shape: in a Dict observation; the frames of a stack are its first axis.
+        dtype: in a Dict observation.
+    """
+
+    place: slice
+    shape: tuple[int, ...]
+    dtype: DTypeLike
+
+
+def observation_parts(config: SensorsConfig) -> dict[str, ObservationPart]:
+    """The sensors that are on, in the order of their features."""
+    places = layout(config)
+    parts = {}
+    for sensor in SENSORS:
+        if sensor.name in places:
+            place = places[sensor.name]
+            shape = sensor.shape(config)
+            if shape == (-1,):
+                shape = (place.stop - place.start,)
+            if config.stack > 1:
+                shape = (config.stack, *shape)
+            parts[sensor.name] = ObservationPart(place, shape, sensor.dtype(config))
+    return parts
+
+
+def named_observation(
+    parts: Mapping[str, ObservationPart], frames: NDArray[np.float32]
+) -> dict[str, NDArray[Any]]:
+    """Flat observations by sensor: views of them, but for images, which become bytes.
+
+    Args:
+        parts: of `observation_parts`.
+        frames: (…, stack, frame size): flat observations, reshaped.
+
+    Returns:
+        an array (…, *shape) a sensor.
+    """
+    before = frames.shape[:-2]
+    return {
+        name: frames[..., part.place].reshape(*before, *part.shape).astype(part.dtype, copy=False)
+        for name, part in parts.items()
+    }
+
+
+def flat_observation(
+    parts: Mapping[str, ObservationPart], named: Mapping[str, NDArray[Any]], stack: int
+) -> NDArray[np.float32]:
+    """The flat observation (stack · frame size,) of one that is named by sensor.
+
+    Args:
+        parts: of `observation_parts`.
+        named: an array a sensor, in any order.
+        stack: frames in an observation.
+    """
+    frames = [np.asarray(named[name], np.float32).reshape(stack, -1) for name in parts]
+    return np.concatenate(frames, axis=1).ravel()
 
 
 def action_space(config: ActionConfig) -> spaces.Box | spaces.Discrete:
@@ -46,16 +146,16 @@ def action_space(config: ActionConfig) -> spaces.Box | spaces.Discrete:
     return spaces.Discrete(NUM_META_ACTIONS)
 
 
-def state_space(config: EnvConfig) -> spaces.Box:
+def state_space(capacity: int) -> spaces.Box:
     """The global state: `STATE_FEATURES` numbers for each vehicle that the world can hold."""
-    capacity = config.population.agents + config.population.background
     return _box(capacity * STATE_FEATURES)
 
 
 def observation_table(config: SensorsConfig) -> str:
-    """A Markdown table of the flat observation, index by index, for the cards of `envs/`.
+    """A Markdown table of a frame, index by index, for the cards of `envs/`.
 
-    Features that repeat (points, neighbours, rays) are folded into one line.
+    Features that repeat (points, neighbours, rays, cells) are folded into one line. Frame `k` of a
+    stack, 0 the oldest, begins at `k` times the size of a frame.
     """
     lines = ["| index | sensor | feature | meaning | 1.0 is |", "|---|---|---|---|---|"]
     places = layout(config)
@@ -67,10 +167,10 @@ def observation_table(config: SensorsConfig) -> str:
 
 
 def _lines(sensor: str, start: int, features: list[Feature]) -> list[str]:
-    """One line for each name without its number; the first of its features says what it means."""
+    """One line for each name without its numbers; the first of its features says what it means."""
     groups: dict[str, list[int]] = {}
     for k, feature in enumerate(features):
-        groups.setdefault(feature.name.rstrip("0123456789").rstrip("_"), []).append(k)
+        groups.setdefault(re.sub(r"(_\d+)+$", "", feature.name), []).append(k)
     lines = []
     for name, members in groups.items():
         index = ", ".join(str(start + k) for k in members[:2])

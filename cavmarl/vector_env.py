@@ -25,7 +25,8 @@ from cavmarl.roads.network import RoadNetwork
 from cavmarl.runtime.simulation import Simulation
 from cavmarl.seeds import check_seed, first_seed
 from cavmarl.spaces import action_space, flat_observation_space
-from cavmarl.worlds import check_placement, load_world
+from cavmarl.traffic.demand import DemandFile
+from cavmarl.worlds import check_agents, check_placement, load_world
 
 __all__ = ["CavVectorEnv", "make_vec"]
 
@@ -50,6 +51,7 @@ def make_vec(
     background: int | None = None,
     seed: int | None = None,
     max_cycles: int | None = None,
+    copy: bool = True,
     overrides: Mapping[str, Any] | None = None,
 ) -> CavVectorEnv:
     """Make `num_envs` worlds of one environment that are stepped together.
@@ -63,6 +65,7 @@ def make_vec(
         background: shadows population.background.
         seed: of the first reset, if that is given none.
         max_cycles: steps until truncation; shadows horizon_s.
+        copy: False returns observations without a copy; see `CavVectorEnv`.
         overrides: values for any other key.
 
     Raises:
@@ -74,7 +77,7 @@ def make_vec(
         raise ConfigError(f"num_envs = {num_envs!r}: must be a whole number")
     if not 1 <= num_envs <= MAX_WORLDS:
         raise ConfigError(f"num_envs = {num_envs}: must be from 1 to {MAX_WORLDS}")
-    config, network = load_world(
+    config, network, demand = load_world(
         env,
         zones=zones,
         agents=agents,
@@ -82,7 +85,7 @@ def make_vec(
         max_cycles=max_cycles,
         overrides=overrides,
     )
-    return CavVectorEnv(config, network, int(num_envs), seed=seed)
+    return CavVectorEnv(config, network, int(num_envs), demand, seed=seed, copy=copy)
 
 
 class CavVectorEnv:
@@ -100,11 +103,21 @@ class CavVectorEnv:
         network: its roads.
         num_envs: W.
         seed: of the first reset, if that is given none.
+        copy: False returns observations as a read-only view that the next step or reset overwrites;
+            large ones are copied for longer than they are made.
     """
 
     def __init__(
-        self, config: EnvConfig, network: RoadNetwork, num_envs: int, *, seed: int | None = None
+        self,
+        config: EnvConfig,
+        network: RoadNetwork,
+        num_envs: int,
+        demand: DemandFile | None = None,
+        *,
+        seed: int | None = None,
+        copy: bool = True,
     ) -> None:
+        check_agents(config)
         self.config = config
         self.network = network
         self.num_envs = num_envs
@@ -123,11 +136,12 @@ class CavVectorEnv:
             "name": f"cavmarl/{config.name}-v{config.version}",
             "autoreset_mode": AutoresetMode.SAME_STEP,
         }
-        self._simulation = Simulation(config, network, num_envs)
+        self._simulation = Simulation(config, network, num_envs, demand)
         self._decoder = ActionDecoder(config.action, num_envs, self.possible_agents)
         self._steps = np.zeros(num_envs, dtype=np.int64)
         self._mask = np.zeros((num_envs, self.num_agents), dtype=np.bool_)
         self._first_seed = None if seed is None else check_seed(seed)
+        self._copy = copy
         self._ready = False
 
     @property
@@ -148,20 +162,22 @@ class CavVectorEnv:
         Args:
             seed: root of all random numbers; world w's episodes depend on (seed, w) alone. None
                 goes on with the next episodes of the last seed.
-            options: not used; accepted because the API has it.
+            options: `first_world`, with a seed: these are the worlds from that number on, so that
+                many worlds can be run a part at a time. Others are not used.
 
         Returns:
             observations (W, A, D) and infos.
         """
         if seed is not None or not self._ready:
-            self._simulation.seed(first_seed(seed, self._first_seed))
+            first_world = int((options or {}).get("first_world", 0))
+            self._simulation.seed(first_seed(seed, self._first_seed), first_world)
         everywhere = np.ones(self.num_envs, dtype=np.bool_)
         self._simulation.reset()
         self._decoder.forget(everywhere)
         self._steps[:] = 0
         self._mask = self._simulation.outputs.present.copy()
         self._ready = True
-        return self._simulation.outputs.observations.copy(), {"mask": self._mask.copy()}
+        return self._observations(), {"mask": self._mask.copy()}
 
     def step(self, actions: NDArray[Any]) -> StepResult:
         """Let every agent of every world act.
@@ -174,7 +190,8 @@ class CavVectorEnv:
             observations (W, A, D), rewards (W, A), terminations (W, A): the agent's vehicle ended;
             truncations (W, A): the episode was cut at the horizon; and infos: `mask` (W, A) who
             acts next; `acted` (W, A) who acted in this step, so whose reward counts; `terms` (W, A,
-            T) in the order of `config.TERMS`; `episode_over` (W,) which worlds were reset;
+            T) in the order of `config.TERMS`; `arrivals` (W,) vehicles that reached their goal
+            since the reset, agents included; `episode_over` (W,) which worlds were reset;
             `final_observations` (W, A, D) before that reset and with the last ones of those who
             left: the same array as the observations in a step where nobody did.
 
@@ -194,7 +211,7 @@ class CavVectorEnv:
         acted = outputs.acted.copy()
         terminations = outputs.terminated.copy()
         truncations = acted & horizon[:, None] & ~terminations
-        final_observations = outputs.observations.copy()
+        final_observations = self._observations()
         infos: dict[str, NDArray[Any]] = {
             "acted": acted,
             "terms": outputs.terms.copy(),
@@ -202,22 +219,36 @@ class CavVectorEnv:
             "final_observations": final_observations,
         }
         simulation.retire_agents()
+        infos["arrivals"] = simulation.arrivals()
         staying = outputs.present & ~terminations
         over = horizon | ~(staying.any(axis=1) | simulation.agents_to_come())
         observations = final_observations
         if terminations.any() or over.any():
-            observations = final_observations.copy()
-            observations[terminations] = 0.0
+            if self._copy:
+                observations = final_observations.copy()
+                observations[terminations] = 0.0
+            else:  # what is written from here on, a reset's too, is what the view shows
+                infos["final_observations"] = final_observations.copy()
+                outputs.observations[terminations] = 0.0
         if over.any():
             simulation.reset(over)
             self._decoder.forget(over)
             self._steps[over] = 0
             staying[over] = simulation.outputs.present[over]
-            observations[over] = simulation.outputs.observations[over]
+            if self._copy:
+                observations[over] = simulation.outputs.observations[over]
         self._mask = staying
         infos["mask"] = staying.copy()
         infos["episode_over"] = over
         return observations, rewards, terminations, truncations, infos
+
+    def _observations(self) -> NDArray[np.float32]:
+        observations = self._simulation.outputs.observations
+        if self._copy:
+            return observations.copy()
+        view = observations.view()
+        view.flags.writeable = False
+        return view
 
     def suggest_actions(self) -> NDArray[Any]:
         """What the built-in driver (IDM, MOBIL, lane controller) would do in each agent's place."""

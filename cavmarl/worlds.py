@@ -9,11 +9,13 @@ from typing import Any
 from cavmarl.config import EnvConfig
 from cavmarl.errors import ConfigError
 from cavmarl.maps.netconvert import map_file
-from cavmarl.registry import load_config, resolve_map
+from cavmarl.registry import load_config, resolve_demand, resolve_map, resolve_programs
 from cavmarl.roads.cache import load_network
 from cavmarl.roads.network import RoadNetwork
+from cavmarl.roads.signal_plans import with_programs
+from cavmarl.traffic.demand import DemandFile, read_demand
 
-__all__ = ["check_placement", "load_world"]
+__all__ = ["check_agents", "check_placement", "find_map", "load_roads", "load_world"]
 
 
 def load_world(
@@ -24,12 +26,14 @@ def load_world(
     background: int | None = None,
     max_cycles: int | None = None,
     overrides: Mapping[str, Any] | None = None,
-) -> tuple[EnvConfig, RoadNetwork]:
-    """Config and roads of an entry, a folder or a map file; keywords as in `parallel_env`.
+) -> tuple[EnvConfig, RoadNetwork, DemandFile | None]:
+    """Config, roads and demand of an entry, a folder or a map file; keywords as in `parallel_env`.
 
     Raises:
         ConfigError: a key, value or combination that cannot work.
         MapError: the map cannot be read or driven.
+        DemandError: a demand file is missing, broken or another map's.
+        RouteError: its routes do not connect.
     """
     config, base_dir = load_config(
         env,
@@ -39,7 +43,35 @@ def load_world(
         max_cycles=max_cycles,
         overrides=overrides,
     )
-    return config, load_network(map_file(resolve_map(config, base_dir)))
+    network = load_roads(config, base_dir)
+    files = resolve_demand(config, base_dir)
+    if not files:
+        return config, network, None
+    return config, network, read_demand(files, network, on_bad_route=config.traffic.on_bad_route)
+
+
+def load_roads(config: EnvConfig, base_dir: Path) -> RoadNetwork:
+    """The roads of a configuration, with the signal programs that it names.
+
+    Args:
+        config: of the environment.
+        base_dir: the folder that relative files start from.
+
+    Raises:
+        MapError: the map or a file of programs cannot be read, or they do not fit.
+    """
+    network = load_network(map_file(resolve_map(config, base_dir)))
+    return with_programs(network, resolve_programs(config, base_dir), config.map.program)
+
+
+def find_map(env: str | Path) -> Path:
+    """The SUMO network of an entry, a folder or a map file.
+
+    Raises:
+        UnknownEnvironmentError: nothing of that name.
+        MapError: the map cannot be read.
+    """
+    return map_file(resolve_map(*load_config(env))).resolve()
 
 
 def check_placement(workers: int | None) -> None:
@@ -52,3 +84,13 @@ def check_placement(workers: int | None) -> None:
         raise ConfigError(
             f"workers = {workers!r}: this version runs all shards in the caller's process; use 0"
         )
+
+
+def check_agents(config: EnvConfig) -> None:
+    """Refuse a world without agents where somebody wants to drive one.
+
+    Raises:
+        ConfigError: `population.agents` is 0.
+    """
+    if config.population.agents == 0:
+        raise ConfigError("population.agents = 0: an environment needs at least one agent")

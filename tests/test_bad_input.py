@@ -14,14 +14,18 @@ from cavmarl import (
     CapacityError,
     CavEnv,
     ConfigError,
+    DemandError,
     EpisodeEndedError,
     InvalidActionError,
     MapError,
     MissingActionError,
+    MissingExtraError,
+    PolicyError,
     ResetNeededError,
     RouteError,
     UnknownAgentError,
     UnknownEnvironmentError,
+    load_policy,
     make_vec,
     parallel_env,
 )
@@ -303,7 +307,7 @@ def test_a_number_of_worlds_that_cannot_be_is_refused(num_envs: Any) -> None:
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
-        ({"agents": 0}, ("population.agents", "0", "from 1")),
+        ({"agents": 0}, ("population.agents", "0", "at least one agent")),
         ({"agents": -3}, ("population.agents", "-3")),
         ({"agents": 2.5}, ("population.agents", "2.5")),
         ({"agents": True}, ("population.agents", "True")),
@@ -332,6 +336,10 @@ def test_a_number_of_worlds_that_cannot_be_is_refused(num_envs: Any) -> None:
         (
             {"overrides": {"population.mode": "entering", "population.budget": 1}, "agents": 2},
             ("population.budget", "1", "2"),
+        ),
+        (
+            {"overrides": {"population.mode": "entering", "population.budget": 2**40}},
+            ("population.budget", "1000000"),
         ),
         ({"overrides": {"terms.weights": {"speeed": 1.0}}}, ("terms.weights", "speeed", "speed")),
         ({"overrides": {"terms.weights": {"speed": float("inf")}}}, ("terms.weights",)),
@@ -366,6 +374,18 @@ def test_more_agents_than_the_map_can_take_are_refused() -> None:
 def test_an_unknown_environment_is_refused_with_what_there_is() -> None:
     with pytest.raises(UnknownEnvironmentError, match=r"mreg.*did you mean merge"):
         parallel_env("mreg")
+
+
+@pytest.mark.parametrize("name", ["x" * 5000, "a\0b", "", "\ud800"])
+def test_names_that_no_file_can_have_are_refused(name: str) -> None:
+    with pytest.raises(UnknownEnvironmentError):
+        parallel_env(name)
+    with pytest.raises((PolicyError, MissingExtraError)):  # "" is the folder that one works in
+        load_policy(name, parallel_env("ring"))
+    with pytest.raises((MapError, ConfigError), match=r"map\.source|can hold"):
+        parallel_env("ring", overrides={"map.source": f"{name}.net.xml"})
+    with pytest.raises((DemandError, ConfigError), match=r"traffic\.demand|can hold"):
+        parallel_env("ring", overrides={"traffic.demand": [f"{name}.rou.xml"]})
 
 
 # Maps: what the reader and netconvert refuse is tested beside them; here, what a user sees.
@@ -458,3 +478,94 @@ def test_a_map_that_is_not_there_is_refused(tmp_path: Path) -> None:
     (folder / "env.yaml").write_text("name: mine\nmap: {source: lost.net.xml}\n")
     with pytest.raises(MapError, match=r"map\.source.*lost\.net\.xml"):
         parallel_env(folder)
+
+
+# Demand: what its reader refuses is tested beside it; here, what a user sees.
+
+AROUND = "A0B0 B0B1 B1A1 A1A0"
+LOST = '<vehicle id="v" depart="0"><route edges="A0B0 lost"/></vehicle>'
+
+
+def demanding(write: Write, body: str, **more: str) -> CavEnv:
+    path = write(f"<routes>\n{body}\n</routes>", "x.rou.xml")
+    overrides = {"traffic.demand": [str(path)], **more}
+    return parallel_env("grid4x4", agents=1, background=0, seed=0, overrides=overrides)
+
+
+@pytest.mark.parametrize(
+    ("body", "error", "words"),
+    [
+        (LOST, DemandError, ("lost", "another map")),
+        (LOST.replace("A0B0 lost", "a b c"), DemandError, ("3 edges", "another map")),
+        (
+            '<vehicle id="v" depart="0"><route edges="A0B0 A1B1"/></vehicle>',
+            RouteError,
+            ("A0B0", "A1B1", "duarouter"),
+        ),
+        (
+            '<trip id="t" depart="0" from="A0bottom0" to="bottom0A0"/>',
+            RouteError,
+            ("A0bottom0", "bottom0A0", "duarouter"),
+        ),
+        ('<vType id="t" length="1e9"/>', DemandError, ("length", "at most 100")),
+        ('<flow id="f" begin="9" end="3" number="2"/>', DemandError, ("f", "ends before")),
+        (
+            f'<flow id="f" begin="0" end="9" number="100000000"><route edges="{AROUND}"/></flow>',
+            CapacityError,
+            ("f", "2000000"),
+        ),
+    ],
+    ids=["edge", "map", "route", "trip", "type", "times", "many"],
+)
+def test_demand_that_cannot_be_is_refused_with_its_line(
+    write: Write, body: str, error: type[Exception], words: tuple[str, ...]
+) -> None:
+    with pytest.raises(error) as caught:
+        demanding(write, body)
+    for word in ("x.rou.xml, line 2", *words):
+        assert word in str(caught.value)
+
+
+def test_vehicles_without_a_way_can_be_skipped_and_are_counted(write: Write) -> None:
+    body = '<vehicle id="v" depart="0"><route edges="A0B0 A1B1"/></vehicle>'
+    env = demanding(write, body, **{"traffic.on_bad_route": "skip"})
+    assert env.simulation.demand is not None
+    (line,) = env.simulation.demand.report.lines()
+    assert "1 vehicle or flow that cannot drive its route is left out" in line
+    assert "x.rou.xml, line 2" in line
+
+
+@pytest.mark.parametrize("body", ["", '<vType id="t"/>', '<vType id="t" vClass="rail"/>'])
+def test_demand_without_vehicles_is_a_world_without_them(write: Write, body: str) -> None:
+    env = demanding(write, body)
+    env.reset()
+    env.step(env.suggest_actions())
+    assert env.traffic_stats()["departed"] == 1
+
+
+def test_times_out_of_order_are_put_in_order(write: Write) -> None:
+    # Draws go by the place in the file: here nothing is drawn.
+    alike = '<vType id="alike" speedDev="0"/>'
+    vehicle = f'<vehicle id="{{}}" type="alike" depart="{{}}"><route edges="{AROUND}"/></vehicle>'
+    one, other = vehicle.format("a", 3), vehicle.format("b", 1)
+    hashes = []
+    for body in (one + other, other + one):
+        env = demanding(write, alike + body)
+        env.reset()
+        for _ in range(50):
+            env.step(env.suggest_actions())
+        assert env.traffic_stats()["departed"] == 3
+        assert env.state_space.contains(env.state())
+        hashes.append(sorted(env.simulation.vehicles()["x"].tolist()))
+    assert hashes[0] == hashes[1]
+
+
+def test_more_demand_than_the_map_can_take_waits_and_is_counted(write: Write) -> None:
+    flow = f'<flow id="f" begin="0" end="9" number="20000"><route edges="{AROUND}"/></flow>'
+    env = demanding(write, flow)
+    env.reset()
+    for _ in range(100):
+        env.step(env.suggest_actions())
+    stats = env.traffic_stats()
+    assert stats["waiting"] + stats["departed"] == 20_001
+    assert 1 < stats["departed"] < 100

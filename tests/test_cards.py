@@ -1,15 +1,66 @@
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
+from cavmarl.config_sensors import (
+    EgoConfig,
+    KinematicsConfig,
+    LidarConfig,
+    LidarObservationConfig,
+    NeighborsConfig,
+    OccupancyGridConfig,
+    PufferDriveConfig,
+    RoadgraphConfig,
+    RouteAheadConfig,
+    SensorsConfig,
+    SignalAheadConfig,
+)
 from cavmarl.registry import entries, load_config
 from cavmarl.shard.sensors import SENSORS, layout
 from cavmarl.spaces import flat_observation_space, observation_table
 from tests.generated import check_block
 
 ROOT = Path(__file__).parent.parent
+
+OFF = SensorsConfig(
+    ego=EgoConfig(enabled=False),
+    route=RouteAheadConfig(points=0),
+    neighbors=NeighborsConfig(count=0),
+    signal=SignalAheadConfig(enabled=False),
+    lidar=LidarConfig(rays=0),
+    kinematics=KinematicsConfig(vehicles_count=1),  # something has to be on
+)
+
+# The sensors that entries leave off, with the settings that those who made them have as defaults.
+FURTHER = (
+    replace(OFF, kinematics=KinematicsConfig(vehicles_count=5)),
+    replace(
+        OFF,
+        kinematics=KinematicsConfig(),
+        occupancy_grid=OccupancyGridConfig(features=("presence", "vx", "vy", "on_road")),
+    ),
+    replace(OFF, kinematics=KinematicsConfig(), lidar_observation=LidarObservationConfig(cells=16)),
+    replace(OFF, kinematics=KinematicsConfig(), roadgraph=RoadgraphConfig(points=200)),
+    replace(OFF, kinematics=KinematicsConfig(), puffer_drive=PufferDriveConfig(enabled=True)),
+)
+
+
+def further_table() -> str:
+    """The tables of `FURTHER` as one; each sensor's indices begin at 0."""
+    head, *rows = observation_table(FURTHER[0]).split("\n", 1)
+    for config in FURTHER[1:]:
+        rows.append(observation_table(config).split("\n", 2)[2])
+    return "\n".join([head, *rows])
+
+
+@pytest.mark.parametrize(
+    "page", ["docs/environments.md", *(f"envs/{name}/README.md" for name in sorted(entries()))]
+)
+def test_a_page_has_the_sensors_that_can_be_switched_on(page: str) -> None:
+    check_block(ROOT / page, "further sensors", further_table())
 
 
 @pytest.mark.parametrize("name", sorted(entries()))

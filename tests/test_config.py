@@ -9,8 +9,8 @@ import pytest
 
 from cavmarl.config import EnvConfig
 from cavmarl.config_io import MAX_BYTES, MAX_DEPTH, dotted_keys, read_yaml
-from cavmarl.errors import ConfigError
-from cavmarl.registry import load_config
+from cavmarl.errors import ConfigError, MapError
+from cavmarl.registry import load_config, resolve_programs
 
 MINIMAL = "name: mine\nmap: {source: m.net.xml}\n"
 
@@ -104,7 +104,7 @@ def test_a_wrong_type_is_named(tmp_path: Path, text: str, expected: str) -> None
 @pytest.mark.parametrize(
     ("text", "expected"),
     [
-        ("population: {agents: -4}", r"population\.agents = -4: .*from 1"),
+        ("population: {agents: -4}", r"population\.agents = -4: .*from 0"),
         ("population: {background: -1}", r"population\.background = -1: .*from 0"),
         ("horizon_s: .nan", r"horizon_s = nan: must be a number from"),
         ("horizon_s: .inf", r"horizon_s = inf: must be a number from"),
@@ -119,6 +119,12 @@ def test_a_wrong_type_is_named(tmp_path: Path, text: str, expected: str) -> None
         ("sensors: {lidar: {range_m: -1}}", r"sensors\.lidar\.range_m = -1\.0: must be"),
         ("action: {target_speeds_mps: [3, 2]}", r"target_speeds_mps = .*rising speeds"),
         ("terms: {weights: {collision: .nan}}", r"terms\.weights\.collision = nan: must be"),
+        ("sensors: {stack: 0}", r"sensors\.stack = 0: must be from 1 to 64"),
+        ("sensors: {kinematics: {vehicles_count: -1}}", r"vehicles_count = -1: must be from 0"),
+        ("sensors: {lidar_observation: {cells: 5000}}", r"cells = 5000: must be from 0 to 1024"),
+        ("sensors: {lidar_observation: {maximum_range_m: 0}}", r"maximum_range_m = 0\.0: must be"),
+        ("sensors: {roadgraph: {points: 9999}}", r"roadgraph\.points = 9999: must be from 0"),
+        ("sensors: {roadgraph: {spacing_m: 0}}", r"roadgraph\.spacing_m = 0\.0: must be"),
     ],
 )
 def test_a_value_out_of_range_is_told_the_range(tmp_path: Path, text: str, expected: str) -> None:
@@ -140,6 +146,56 @@ def test_an_impossible_combination_is_told_the_cure(
     tmp_path: Path, text: str, expected: str
 ) -> None:
     assert re.search(expected, refusal(tmp_path, MINIMAL + text))
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        (
+            "kinematics: {features: [presence, speed]}",
+            r"kinematics\.features = 'speed': no such feature; there are presence, x, y",
+        ),
+        ("kinematics: {features: []}", r"kinematics\.features = \(\): must name at least one"),
+        ("kinematics: {features: [x, x]}", r"kinematics\.features = .*must name each feature once"),
+        (
+            "kinematics: {features: [on_road]}",
+            r"kinematics\.features = 'on_road': no such feature",
+        ),
+        (
+            "kinematics: {features_range: {vz: [0, 1]}}",
+            r"kinematics\.features_range = 'vz': no such feature",
+        ),
+        (
+            "kinematics: {features_range: {x: [1, 1]}}",
+            r"kinematics\.features_range\.x = \(1\.0, 1\.0\): must be \[min, max\], rising",
+        ),
+        ("kinematics: {order: nearest}", r"kinematics\.order = 'nearest': must be 'sorted' or"),
+        ("occupancy_grid: {features: [road]}", r"occupancy_grid\.features = 'road': no such"),
+        (
+            "occupancy_grid: {grid_size_m: [[-5, 5]]}",
+            r"grid_size_m = \(\(-5\.0, 5\.0\),\): must be \[\[min x, max x\], \[min y, max y\]\]",
+        ),
+        ("occupancy_grid: {grid_size_m: [[5, -5], [-5, 5]]}", r"grid_size_m = .*both rising"),
+        ("occupancy_grid: {grid_step_m: [5]}", r"grid_step_m = \(5\.0,\): must be \[x, y\]"),
+        (
+            "occupancy_grid: {grid_step_m: [0, 5]}",
+            r"grid_step_m = 0\.0: must be a number from 0\.1",
+        ),
+        ("occupancy_grid: {grid_step_m: [99, 5]}", r"grid_step_m = .*must fit into grid_size_m"),
+        (
+            "occupancy_grid: {features: [x, y], grid_step_m: [0.1, 0.1]}",
+            r"2 layers of 550 by 550 cells are 605000 numbers, more than 65536; use larger",
+        ),
+        (
+            "{ego: {enabled: false}, signal: {enabled: false}, route: {points: 0}, "
+            "neighbors: {count: 0}, lidar: {rays: 0}}",
+            r"sensors = 'all off': an agent must observe something",
+        ),
+    ],
+)
+def test_a_sensor_that_cannot_be_is_told_why(tmp_path: Path, text: str, expected: str) -> None:
+    text = text if text.startswith("{") else f"{{{text}}}"
+    assert re.search(expected, refusal(tmp_path, f"{MINIMAL}sensors: {text}"))
 
 
 def test_a_missing_key_is_named(tmp_path: Path) -> None:
@@ -205,3 +261,12 @@ def test_overrides_are_checked_like_the_file() -> None:
         load_config("ring", agents=True)
     with pytest.raises(ConfigError, match=r"zones\.count = 0: this version runs one zone"):
         load_config("ring", zones=0)
+
+
+def test_signal_programs_are_files_beside_the_map_and_choices(tmp_path: Path) -> None:
+    config = load(
+        tmp_path, "name: a\nmap: {source: m.net.xml, programs: [p.add.xml], program: {j: night}}"
+    )
+    assert (config.map.programs, config.map.program) == (("p.add.xml",), {"j": "night"})
+    with pytest.raises(MapError, match=r"map\.programs = 'p\.add\.xml': no file"):
+        resolve_programs(config, tmp_path)

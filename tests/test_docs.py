@@ -70,6 +70,19 @@ def type_text(hint: Any) -> str:
     return {tuple: "list of ", dict: "mapping of "}.get(get_origin(hint), "") + " to ".join(inner)
 
 
+def list_text(items: tuple[Any, ...]) -> str:
+    """A list as YAML writes it on one line."""
+    texts = (
+        list_text(item)
+        if isinstance(item, tuple)
+        else item
+        if isinstance(item, str)
+        else f"{item:g}"
+        for item in items
+    )
+    return f"[{', '.join(texts)}]"
+
+
 def default_text(value: object) -> str:
     match value:
         case _ if value is MISSING:
@@ -79,7 +92,7 @@ def default_text(value: object) -> str:
         case bool():
             return f"`{str(value).lower()}`"
         case tuple():
-            return f"`[{', '.join(f'{item:g}' for item in value)}]`"
+            return f"`{list_text(value)}`"
         case dict():
             return ", ".join(f"`{key}` {item:g}" for key, item in value.items())
         case float():

@@ -260,10 +260,12 @@ def test_the_dict_form_holds_the_slices_of_the_flat_one() -> None:
         ("sensors.route.points", "route"),
         ("sensors.neighbors.count", "neighbors"),
         ("sensors.lidar.rays", "lidar"),
+        ("sensors.lanes.range_m", "lanes"),
     ],
 )
 def test_a_sensor_can_be_switched_off_and_leaves_the_others_alone(key: str, sensor: str) -> None:
-    full, reduced = make("merge"), make("merge", overrides={key: 0})
+    on = {"sensors.lidar.rays": 16}
+    full, reduced = make("merge", overrides=on), make("merge", overrides={**on, key: 0})
     places = layout(full.config.sensors)
     assert sensor not in layout(reduced.config.sensors)
     whole, _ = full.reset()

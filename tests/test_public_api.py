@@ -27,6 +27,8 @@ LATE = (
     "pydantic",
     "pygame",
     "imageio",
+    "matplotlib",
+    "jinja2",
     "typer",
     "rich",
     "fastapi",

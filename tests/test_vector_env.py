@@ -146,7 +146,11 @@ def test_a_world_that_is_over_begins_anew_in_the_same_step(mode: str) -> None:
             shown = np.where(infos["mask"][world][:, None], first, 0.0)
             np.testing.assert_array_equal(observations[world], shown)
             assert vec.simulation.ticks()[world] == 0
-            assert infos["final_observations"][world].any()
+            # In entering mode the last step may find nobody who acts: the others wait to enter.
+            shows = infos["final_observations"][world].any(axis=1)
+            # Who entered in it is seen, has not acted, and was not asked to.
+            assert shows[infos["acted"][world]].all()
+            assert not (shows & ~infos["acted"][world] & acting[world]).any()
             assert not np.array_equal(observations[world], infos["final_observations"][world])
         for world in np.flatnonzero(~over):
             going_on = infos["mask"][world] & ~terminations[world]
@@ -198,6 +202,27 @@ def test_the_arrays_have_the_shapes_and_dtypes_of_the_spaces() -> None:
     assert infos["episode_over"].shape == (3,)
     assert vec.step_s == vec.config.clock.ctrl_dt_s
     vec.close()
+
+
+@pytest.mark.parametrize("mode", MODES)
+def test_without_copies_the_results_are_the_same(mode: str) -> None:
+    stack = {"sensors.stack": 2}
+    kept, shown = (make(3, mode, overrides=stack, copy=copy) for copy in (True, False))
+    rng = np.random.default_rng(1)
+    np.testing.assert_array_equal(shown.reset(seed=5)[0], kept.reset(seed=5)[0])
+    ended = over = 0
+    for _ in range(90):
+        actions = wild(rng, kept)
+        one, other = kept.step(actions), shown.step(actions)
+        np.testing.assert_array_equal(other[0], one[0])
+        np.testing.assert_array_equal(other[4]["final_observations"], one[4]["final_observations"])
+        ended += int(one[2].sum())
+        over += int(one[4]["episode_over"].sum())
+    assert ended
+    assert over
+    with pytest.raises(ValueError, match="read-only"):
+        other[0][:] = 0.0
+    assert np.shares_memory(other[0], shown.simulation.outputs.observations)
 
 
 def test_results_are_the_callers_to_keep() -> None:

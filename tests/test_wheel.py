@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import json
+import os
 import subprocess
 import sys
+import sysconfig
 import zipfile
 from pathlib import Path
 
@@ -16,14 +18,77 @@ ROOT = Path(__file__).resolve().parents[1]
 
 
 @pytest.fixture(scope="module")
-def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder with the content of a fresh wheel."""
+def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A fresh wheel."""
     folder = tmp_path_factory.mktemp("wheel")
     build = [sys.executable, "-m", "build", "--wheel", "--no-isolation", "--outdir", str(folder)]
     subprocess.run(build, cwd=ROOT, check=True, capture_output=True)
-    (wheel,) = folder.glob("*.whl")
-    zipfile.ZipFile(wheel).extractall(folder / "site")
-    return folder / "site"
+    (found,) = folder.glob("*.whl")
+    return found
+
+
+@pytest.fixture(scope="module")
+def site(wheel: Path) -> Path:
+    """A folder with the content of the wheel."""
+    zipfile.ZipFile(wheel).extractall(wheel.parent / "site")
+    return wheel.parent / "site"
+
+
+@pytest.fixture(scope="module")
+def elsewhere(wheel: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The `bin` of an environment of its own that the wheel is installed in.
+
+    What the wheel depends on is borrowed from here: a test must not need a network.
+    """
+    folder = tmp_path_factory.mktemp("elsewhere")
+    subprocess.run([sys.executable, "-m", "venv", str(folder)], check=True)
+    install = [str(folder / "bin" / "python"), "-m", "pip", "install", "--no-deps", "--no-index"]
+    subprocess.run([*install, str(wheel)], check=True, capture_output=True)
+    (packages,) = folder.glob("lib/python*/site-packages")
+    borrowed = sysconfig.get_path("purelib")
+    (packages / "borrowed.pth").write_text(f"{borrowed}\n", encoding="utf-8")
+    return folder / "bin"
+
+
+def run(command: list[str], cwd: Path) -> str:
+    """What a command says that knows nothing of the checkout."""
+    clean = {name: value for name, value in os.environ.items() if name != "PYTHONPATH"}
+    done = subprocess.run(command, cwd=cwd, env=clean, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    return done.stdout
+
+
+DRIVE = """
+import json, cavmarl
+steps = {}
+for name in cavmarl.entries():
+    env = cavmarl.parallel_env(name, seed=0)
+    policy = cavmarl.load_policy("idm", env)
+    observations, _ = env.reset()
+    for _ in range(20):
+        observations, *_ = env.step(policy.act(observations))
+    vec = cavmarl.make_vec(name, num_envs=2, seed=0)
+    vec.reset()
+    vec.step(vec.suggest_actions())
+    steps[name] = env.traffic_stats()["departed"]
+print(json.dumps([cavmarl.__file__, steps]))
+"""
+
+
+@pytest.mark.slow
+def test_every_environment_drives_from_an_installed_wheel(elsewhere: Path, tmp_path: Path) -> None:
+    out = run([str(elsewhere / "python"), "-c", DRIVE], tmp_path)
+    place, departed = json.loads(out)
+    assert place.startswith(str(elsewhere.parent))
+    assert list(departed) == list(entries())
+    assert min(departed.values()) > 1
+
+
+@pytest.mark.slow
+def test_the_installed_command_runs(elsewhere: Path, tmp_path: Path) -> None:
+    out = run([str(elsewhere / "cavmarl"), "list"], tmp_path)
+    for name in [*entries(), *agent_entries()]:
+        assert name in out
 
 
 @pytest.mark.slow

@@ -1,14 +1,15 @@
 """PPO with one network shared by all agents (IPPO), on batched worlds.
 
     python train/ippo_torch.py --env merge --minutes 2
-    python train/ippo_torch.py --config configs/train/merge_ippo.yaml
+    python train/ippo_torch.py --config configs/train/merge.yaml
     python train/ippo_torch.py --resume runs/merge_ippo_1 --total-agent-steps 8000000
 
 Every agent learns from its own observations and rewards; all of them share the weights (Schulman et
 al. 2017; de Witt et al. 2020). A run's folder holds the driver (`model.safetensors` and
-`config.json`, which `cavmarl evaluate --policy FOLDER` takes), `progress.csv`, TensorBoard's files,
-and what `--resume` needs. With the same seed, threads and machine a run repeats itself, unless the
-clock ends it (`--minutes`). A resumed run begins new episodes.
+`config.json`, which `cavmarl evaluate --policy FOLDER` takes), `manifest.json` (what it was trained
+with), `progress.csv`, TensorBoard's files, and what `--resume` needs. With the same seed, threads
+and machine a run repeats itself, unless the clock ends it (`--minutes`). A resumed run begins new
+episodes.
 """
 
 from __future__ import annotations
@@ -36,11 +37,20 @@ from torch import Tensor, nn
 from cavmarl.config import TERMS
 from cavmarl.config_io import read_yaml, validate
 from cavmarl.errors import CavmarlError, ConfigError, PolicyError, require
-from cavmarl.networks import ActorCritic, NetworkConfig, load_network, save_network
+from cavmarl.evaluate.training_record import begin_training, end_training
+from cavmarl.networks import (
+    CONFIG_FILE,
+    WEIGHTS_FILE,
+    ActorCritic,
+    NetworkConfig,
+    load_network,
+    save_network,
+)
 from cavmarl.vector_env import CavVectorEnv, make_vec
 
 ARRIVAL, COLLISION, OFF_ROAD = (TERMS.index(t) for t in ("arrival", "collision", "off_road"))
 WINDOW = 400  # trips
+LEAST_DEVIATION = 0.02  # of an observation; those that hardly change are not blown up
 OPTIMIZER_FILE = "optimizer.pt"
 STATE_FILE = "training.json"
 CSV_FILE = "progress.csv"
@@ -72,8 +82,11 @@ class Args:
     clip: Annotated[float, "how far the ratio of probabilities may leave 1"] = 0.2
     entropy_weight: Annotated[float, "of the entropy in the loss"] = 0.0
     value_weight: Annotated[float, "of the value loss"] = 0.5
+    imitation_weight: Annotated[float, "of the distance to the built-in driver, at the start"] = 0.0
+    imitation_share: Annotated[float, "share of the run in which that weight falls to 0"] = 0.1
     max_gradient_norm: Annotated[float, "longer gradients are shortened"] = 0.5
-    initial_std: Annotated[float, "standard deviation of continuous actions at the start"] = 0.5
+    throttle_std: Annotated[float, "standard deviation of the throttle at the start"] = 0.3
+    steering_std: Annotated[float, "standard deviation of the steering at the start"] = 0.1
     hidden: Annotated[int, "width of the two hidden layers"] = 128
     threads: Annotated[int, "of torch; more cost small networks more than they bring"] = 1
     checkpoint_updates: Annotated[int, "updates between two checkpoints"] = 20
@@ -88,13 +101,21 @@ class Args:
         at_least = {
             "agents": 0, "background": -1, "num_envs": 1, "seed": 0, "total_agent_steps": 1,
             "minutes": 0.0, "num_steps": 1, "epochs": 1, "minibatches": 1, "entropy_weight": 0.0,
-            "value_weight": 0.0, "hidden": 1, "threads": 1, "checkpoint_updates": 1,
+            "value_weight": 0.0, "imitation_weight": 0.0, "hidden": 1, "threads": 1,
+            "checkpoint_updates": 1,
         }  # fmt: skip
         for name, least in at_least.items():
             value = getattr(self, name)
             if not least <= value < float("inf"):
                 raise ConfigError(f"--{name.replace('_', '-')} {value}: must be at least {least}")
-        for name in ("learning_rate", "clip", "max_gradient_norm", "initial_std"):
+        for name in (
+            "learning_rate",
+            "clip",
+            "max_gradient_norm",
+            "throttle_std",
+            "steering_std",
+            "imitation_share",
+        ):
             if not 0.0 < getattr(self, name) < float("inf"):
                 value = getattr(self, name)
                 raise ConfigError(f"--{name.replace('_', '-')} {value}: must be above 0")
@@ -187,6 +208,7 @@ class Batch:
         acted: (T, W, A) which entries are decisions.
         next_values: (T, W, A) what was to be expected after the step; 0 where a vehicle ended.
         goes_on: (T, W, A) whether entry t + 1 is of the same vehicle and episode.
+        suggested: (T, W, A, …) what the built-in driver would have done, while it is imitated.
     """
 
     observations: Tensor
@@ -197,6 +219,7 @@ class Batch:
     acted: Tensor
     next_values: Tensor
     goes_on: Tensor
+    suggested: Tensor | None = None
 
     def advantages(self, gamma: float, gae_lambda: float) -> Tensor:
         """(T, W, A) generalised advantage estimates; 0 where nobody acted."""
@@ -208,6 +231,34 @@ class Batch:
             following = following * self.acted[t]
             advantages[t] = following
         return advantages
+
+
+class Scales:
+    """Keeps the network's mean and deviation of observations: of all decisions of a run so far.
+
+    Args:
+        network: whose `mean` and `deviation` are kept.
+        count: decisions that they are of already.
+    """
+
+    def __init__(self, network: ActorCritic, count: int) -> None:
+        self._network = network
+        self._count = count
+        self._squares = network.deviation.square() * count
+
+    def add(self, observations: Tensor) -> None:
+        """Take in the observations (N, D) of new decisions (Chan et al. 1979)."""
+        network, new = self._network, observations.shape[0]
+        if new == 0:
+            return
+        mean = observations.mean(0)
+        apart = mean - network.mean
+        total = self._count + new
+        self._squares += (observations - mean).square().sum(0)
+        self._squares += apart.square() * (self._count * new / total)
+        network.mean += apart * (new / total)
+        network.deviation.copy_((self._squares / total).sqrt().clamp(min=LEAST_DEVIATION))
+        self._count = total
 
 
 class Trips:
@@ -247,20 +298,23 @@ class Collector:
         self._mask: NDArray[np.bool_] = infos["mask"]
 
     @torch.inference_mode()
-    def collect(self) -> Batch:
-        """`num_steps` steps of all worlds."""
+    def collect(self, with_suggested: bool) -> Batch:
+        """`num_steps` steps of all worlds, on request with what the built-in driver would do."""
         shape = (self._num_steps, *self._mask.shape)
         network, continuous = self.network, self.network.continuous
         observations = torch.zeros((*shape, self._observations.shape[-1]))
         actions = torch.zeros((*shape, 2)) if continuous else torch.zeros(shape, dtype=torch.int64)
         log_probs, rewards, next_values = (torch.zeros(shape) for _ in range(3))
         acted, goes_on, cut = (torch.zeros(shape, dtype=torch.bool) for _ in range(3))
+        suggested = torch.zeros_like(actions) if with_suggested else None
         for t in range(self._num_steps):
+            if suggested is not None:
+                suggested[t] = torch.from_numpy(self.vec.suggest_actions())
+            mask = torch.from_numpy(self._mask)
             observations[t] = torch.from_numpy(self._observations)
-            flat = observations[t].flatten(0, 1)
-            sampled, log_prob = network.sample(flat)
-            actions[t] = sampled.view_as(actions[t])
-            log_probs[t] = log_prob.view_as(log_probs[t])
+            sampled, log_prob = network.sample(observations[t, mask])
+            actions[t, mask] = sampled
+            log_probs[t, mask] = log_prob
             given = actions[t].clamp(-1.0, 1.0) if continuous else actions[t]
             self._observations, reward, ended, cut_off, infos = self.vec.step(given.numpy())
             self._mask = infos["mask"]
@@ -272,11 +326,23 @@ class Collector:
                 last = torch.from_numpy(infos["final_observations"][cut_off])
                 next_values[t, cut[t]] = network.value(last)
             self.trips.add(reward, infos["vehicle_done"], cut_off, infos["terms"])
-        values = network.value(observations.flatten(0, 2)).view(shape)
-        after = network.value(torch.from_numpy(self._observations).flatten(0, 1))
-        following = torch.cat([values[1:], after.view_as(values[0])[None]])
-        next_values = torch.where(goes_on, following, next_values)
-        return Batch(observations, actions, log_probs, values, rewards, acted, next_values, goes_on)
+        values = torch.zeros(shape)
+        values[acted] = network.value(observations[acted])
+        after = torch.zeros(shape[1:])
+        going = goes_on[-1]
+        after[going] = network.value(torch.from_numpy(self._observations)[going])
+        next_values = torch.where(goes_on, torch.cat([values[1:], after[None]]), next_values)
+        return Batch(
+            observations,
+            actions,
+            log_probs,
+            values,
+            rewards,
+            acted,
+            next_values,
+            goes_on,
+            suggested,
+        )
 
 
 class Learner:
@@ -287,10 +353,16 @@ class Learner:
         self.optimizer = torch.optim.Adam(network.parameters(), lr=args.learning_rate, eps=1e-5)
         self._args = args
 
+    def imitation_weight(self, left: float) -> float:
+        """How much the built-in driver's example counts with `left` of the run to go."""
+        args = self._args
+        return args.imitation_weight * max(1.0 - (1.0 - left) / args.imitation_share, 0.0)
+
     def update(self, batch: Batch, left: float) -> dict[str, float]:
         """Learn from the decisions of a batch; `left` is the share of the run that is left."""
         args, network = self._args, self.network
-        rate = args.learning_rate * (left if args.anneal else 1.0)
+        share = left if args.anneal else 1.0
+        rate, entropy_weight = args.learning_rate * share, args.entropy_weight * share
         for group in self.optimizer.param_groups:
             group["lr"] = rate
         acted = batch.acted
@@ -300,6 +372,8 @@ class Learner:
         b_observations = batch.observations[acted]
         b_actions, b_log_probs = batch.actions[acted], batch.log_probs[acted]
         size = b_returns.shape[0]
+        imitation_weight = self.imitation_weight(left)
+        b_suggested = None if batch.suggested is None else batch.suggested[acted]
         sums = dict.fromkeys(("policy_loss", "value_loss", "entropy", "kl", "clipped"), 0.0)
         parts = 0
         for _ in range(args.epochs):
@@ -319,11 +393,15 @@ class Learner:
                 loss = (
                     policy_loss
                     + 0.5 * args.value_weight * value_loss
-                    - args.entropy_weight * entropy.mean()
+                    - entropy_weight * entropy.mean()
                 )
+                if b_suggested is not None:
+                    distance = network.distance(b_observations[mb], b_suggested[mb])
+                    loss = loss + imitation_weight * distance.mean()
                 self.optimizer.zero_grad()
                 loss.backward()  # type: ignore[no-untyped-call]
-                nn.utils.clip_grad_norm_(network.parameters(), args.max_gradient_norm)
+                for part in (network.actor, network.critic):
+                    nn.utils.clip_grad_norm_(part.parameters(), args.max_gradient_norm)
                 self.optimizer.step()
                 with torch.no_grad():
                     parts += 1
@@ -448,13 +526,15 @@ class Run:
             hidden=(args.hidden, args.hidden),
             seed=args.seed,
         )
-        self.network = ActorCritic(self.config, args.initial_std)
+        self.network = ActorCritic(self.config, (args.throttle_std, args.steering_std))
         self.learner = Learner(self.network, args)
         if args.resume:
             load_checkpoint(args.folder, self.learner, self.config)
+        self.scales = Scales(self.network, self.agent_steps)
         self.collector = Collector(vec, self.network, args, args.seed + self.updates)
         try:
             args.folder.mkdir(parents=True, exist_ok=True)
+            begin_training(args.folder, "ippo_torch.py", asdict(args), vec.simulation)
             self.log = Log(args)
         except OSError as error:
             reason = error.strerror or error
@@ -473,8 +553,10 @@ class Run:
     def update(self) -> dict[str, float]:
         """Collect, learn, and log the numbers, which are returned."""
         started = time.perf_counter()
-        batch = self.collector.collect()
-        numbers = self.learner.update(batch, 1.0 - self.done())
+        left = 1.0 - self.done()
+        batch = self.collector.collect(self.learner.imitation_weight(left) > 0.0)
+        numbers = self.learner.update(batch, left)
+        self.scales.add(batch.observations[batch.acted])
         new = int(batch.acted.sum())
         self.agent_steps += new
         self.updates += 1
@@ -516,6 +598,7 @@ def train(args: Args, console: Console) -> Path:
                 run.save(row)
             bar.update(task, completed=done, description=describe(row))
     run.log.close()
+    end_training(args.folder, (WEIGHTS_FILE, CONFIG_FILE, CSV_FILE))
     return args.folder
 
 

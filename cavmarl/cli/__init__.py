@@ -7,7 +7,17 @@ from collections.abc import Sequence
 
 import typer
 
-from cavmarl.cli import bench, demo, evaluate, listing, map, view
+from cavmarl.cli import (
+    bench,
+    demand,
+    demo,
+    evaluate,
+    listing,
+    map,
+    suite,
+    verify_determinism,
+    view,
+)
 from cavmarl.cli.output import print_error
 from cavmarl.errors import CavmarlError
 
@@ -19,10 +29,14 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
 )
 app.command()(evaluate.evaluate)
+app.command()(evaluate.report)
+app.command()(suite.suite)
+app.command()(verify_determinism.verify_determinism)
 app.command()(view.view)
 app.command()(demo.demo)
 app.command("list")(listing.list_entries)
 app.add_typer(map.app, name="map")
+app.add_typer(demand.app, name="demand")
 app.add_typer(bench.app, name="bench")
 
 

@@ -9,6 +9,7 @@ import typer
 from rich.console import Console
 from rich.table import Table
 
+from cavmarl.cli.bench_traffic import traffic
 from cavmarl.cli.output import (
     Agents,
     Background,
@@ -29,12 +30,16 @@ if TYPE_CHECKING:
 __all__ = ["app"]
 
 app = typer.Typer(help="How fast it is, measured side by side.", no_args_is_help=True)
+app.command()(traffic)
 
-_SENSORS = {"lidar": "64 rays", "kinematics": "no rays"}
+_SENSORS = {"lidar": "64 rays", "kinematics": "no rays", "puffer_drive": "pufferlib's"}
 _WHO = {
     "dicts": "cavmarl, dicts",
     "highway_env": "highway-env",
     "highway_env_raw": "highway-env, raw",
+    "copied": "cavmarl, copied",
+    "c": "peer in C, -O2",
+    "c_native": "peer in C, -O3, native",
 }
 
 
@@ -43,6 +48,9 @@ def step(
     agents: Annotated[int, typer.Option(help="Controlled vehicles a world.")] = 100,
     worlds: Annotated[int, typer.Option(help="Of ours, stepped together.")] = 16,
     repeats: Annotated[int, typer.Option(help="Measurements of each, by turns.")] = 5,
+    peer: Annotated[
+        bool, typer.Option("--peer", help="With pufferlib's observation beside a peer in C, too.")
+    ] = False,
     at_least: Annotated[
         float | None, typer.Option(help="Exit with 1 if the ratio with a lidar is below this.")
     ] = None,
@@ -55,7 +63,7 @@ def step(
         raise ConfigError(f"--at-least {at_least:g}: must be a number above 0")
     console = Console()
     with console.status("") as status:
-        found = measure_step_speed(agents, worlds, repeats, status.update)
+        found = measure_step_speed(agents, worlds, repeats, peer, status.update)
     console.print(_speed_table(found))
     console.print(
         f"batched over highway-env: [bold]{found.ratio:,.0f}[/] with a lidar, "
@@ -64,6 +72,11 @@ def step(
         f"an agent among ten times as many costs [bold]{found.cost_of_more:.2f}[/] times as much; "
         f"dicts add [bold]{found.dict_us:.2f} µs[/] an agent and step"
     )
+    if found.ratio_peer is not None:
+        console.print(
+            f"with pufferlib's observation, batched over the peer in C: "
+            f"[bold]{found.ratio_peer:.2f}[/] ({found.ratio_peer_native:.2f} over its native build)"
+        )
     write_json(json_path, found.to_dict())
     if at_least is not None and found.ratio < at_least:
         raise typer.Exit(1)
@@ -77,13 +90,14 @@ def _speed_table(found: StepSpeed) -> Table:
         title=(
             f"agent-steps/s of one core: {agents} controlled vehicles on "
             f"{found.road_m / 1000.0:.1f} km of four lanes,\n"
-            f"two ticks a step; ours with 16 neighbours too; {found.repeats} turns"
+            "two ticks a step (pufferlib's: one); ours with 16 neighbours too; "
+            f"{found.repeats} turns"
         ),
     )
     for column in ("agents", "min", "median", "max"):
         table.add_column(column, justify="right")
     shown = ""
-    for row in sorted(found.rows, key=lambda row: row.sensors, reverse=True):
+    for row in sorted(found.rows, key=lambda row: list(_SENSORS).index(row.sensors)):
         table.add_row(
             "" if row.sensors == shown else _SENSORS[row.sensors],
             _who(row),
@@ -103,7 +117,7 @@ def profile(
     env: Environment,
     agents: Agents = None,
     background: Background = None,
-    worlds: Annotated[int, typer.Option(help="Stepped together.")] = 1,
+    worlds: Annotated[int, typer.Option(help="Stepped together.")] = 16,
     steps: Annotated[int, typer.Option(help="Steps a turn.")] = 200,
     repeats: Annotated[int, typer.Option(help="Turns; the fastest counts.")] = 5,
     seed: Seed = 0,

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import subprocess
 import sys
+from datetime import datetime
 from pathlib import Path
 from typing import Annotated
 
@@ -54,11 +55,15 @@ def demo(
 
     console.print("[bold]2. evaluate[/] on merge, on other seeds")
     drivers = {"trained": str(trained), "idm": "idm", "random_actions": "random_actions"}
-    reports = {
-        name: evaluate_showing(console, "merge", policy, episodes=EPISODES, seed=EVALUATION_SEED)
-        for name, policy in drivers.items()
-    }
-    console.print(report_table(reports))
+    found = evaluate_showing(
+        console,
+        "merge",
+        drivers,
+        episodes=EPISODES,
+        seed=EVALUATION_SEED,
+        out=out / f"evaluation-{datetime.now():%Y%m%d-%H%M%S-%f}",
+    )
+    console.print(report_table(found))
 
     console.print(f"[bold]3. drive[/] {seconds:g} s")
     videos = {"merge": str(trained), "town": "idm"}
@@ -75,7 +80,7 @@ def demo(
         json_path,
         {
             "driver": str(trained),
-            "reports": {name: report.to_dict() for name, report in reports.items()},
+            "report": found.to_dict(),
             "traffic": stats,
             "videos": [str(out / f"{env}.mp4") for env in videos],
         },

@@ -1,7 +1,9 @@
-"""`cavmarl evaluate`: seeded episodes of a driver, and what they say about it."""
+"""`cavmarl evaluate`: seeded runs of some drivers, and what they say about them."""
 
 from __future__ import annotations
 
+from datetime import datetime
+from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
@@ -16,58 +18,106 @@ from cavmarl.cli.output import (
     Background,
     Environment,
     JsonPath,
-    PolicyName,
     Seed,
     Settings,
+    make_folder,
     number,
     parse_settings,
     write_json,
 )
+from cavmarl.errors import require
 
 if TYPE_CHECKING:
     from cavmarl.evaluate import EvaluationReport
-    from cavmarl.evaluate.statistics import Interval
+    from cavmarl.evaluate.metrics import Metric
+    from cavmarl.evaluate.report import Difference, Found, PolicyReport
 
-__all__ = ["evaluate", "evaluate_showing", "progress_bar", "report_table"]
+__all__ = [
+    "difference_table",
+    "evaluate",
+    "evaluate_showing",
+    "progress_bar",
+    "report",
+    "report_cell",
+    "report_table",
+]
+
+HtmlPath = Annotated[
+    Path | None, typer.Option("--html", help="Write a page with tables, plots and the map here.")
+]
 
 
 def evaluate(
     env: Environment,
-    policy: PolicyName = "idm",
-    episodes: Annotated[int, typer.Option("--episodes", "-n", help="How many.")] = 32,
+    policy: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--policy",
+            "-p",
+            help="A name of `cavmarl list`, or a path; repeat it to compare with the first. "
+            "Default: idm.",
+        ),
+    ] = None,
+    episodes: Annotated[int, typer.Option("--episodes", "-n", help="Of each run.")] = 32,
+    repeats: Annotated[
+        int, typer.Option("--repeats", "-r", help="Independent runs, each in a fresh process.")
+    ] = 1,
     seed: Seed = 0,
     agents: Agents = None,
     background: Background = None,
     settings: Settings = None,
+    out: Annotated[
+        Path | None,
+        typer.Option(help="Folder of manifest and raw results; default: a new one in runs/."),
+    ] = None,
+    html: HtmlPath = None,
     json_path: JsonPath = None,
 ) -> None:
-    """Drive seeded episodes and show success, collisions, comfort, delay and speed."""
+    """Drive seeded episodes and show success, safety, comfort, delay, throughput and fairness."""
+    overrides = parse_settings(settings)
+    _check_page(html)
     console = Console()
-    report = evaluate_showing(
+    folder = out or _new_folder(env)
+    found = evaluate_showing(
         console,
         env,
-        policy,
+        policy or ["idm"],
         episodes=episodes,
+        repeats=repeats,
         seed=seed,
+        out=folder,
         agents=agents,
         background=background,
-        overrides=parse_settings(settings),
+        overrides=overrides,
     )
-    console.print(report_table({policy: report}))
-    write_json(json_path, report.to_dict())
+    _show(console, found, folder, html, json_path)
 
 
-def evaluate_showing(console: Console, env: str, policy: str, **settings: Any) -> EvaluationReport:
-    """`cavmarl.evaluate.evaluate` with a progress bar."""
+def report(
+    folder: Annotated[Path, typer.Argument(help="That `cavmarl evaluate` left.")],
+    html: HtmlPath = None,
+    json_path: JsonPath = None,
+) -> None:
+    """Show the results in a folder again; refused without their closed manifest."""
+    from cavmarl.evaluate import load_report
+
+    _check_page(html)
+    _show(Console(), load_report(folder), folder, html, json_path)
+
+
+def evaluate_showing(
+    console: Console, env: str, policies: Any, *, out: Path, **settings: Any
+) -> EvaluationReport:
+    """`cavmarl.evaluate.evaluate` into a folder, with a progress bar."""
     from cavmarl.evaluate import evaluate as run
 
     with progress_bar(console) as bar:
-        task = bar.add_task(f"{policy} drives {env}")
+        task = bar.add_task(env)
 
-        def progress(steps: int, most: int) -> None:
-            bar.update(task, completed=steps, total=most)
+        def progress(policy: str, steps: int, most: int) -> None:
+            bar.update(task, description=f"{policy} drives {env}", completed=steps, total=most)
 
-        return run(env, policy, progress=progress, **settings)
+        return run(env, policies, out=out, progress=progress, **settings)
 
 
 def progress_bar(console: Console) -> Progress:
@@ -81,61 +131,133 @@ def progress_bar(console: Console) -> Progress:
     )
 
 
-def report_table(reports: dict[str, EvaluationReport]) -> Table:
-    """Reports side by side, one column a driver."""
-    first = next(iter(reports.values()))
-    title = f"{first.manifest.environment}, {first.episodes} episodes of seed {first.manifest.seed}"
+def report_table(found: EvaluationReport) -> Table:
+    """Drivers side by side."""
+    from cavmarl.evaluate.metrics import METRICS
+
+    world = found.manifest["world"]["environment"]
+    runs = f"{found.repeats} runs of " if found.repeats > 1 else ""
     # Narrow enough for three drivers on eighty columns.
     table = Table(
         "",
-        title=escape(title),
-        caption="rates with their 95 % interval, means ± half of theirs",
+        title=escape(f"{world}, {runs}{found.episodes} episodes, seed {found.seeds[0]}"),
+        caption=_caption(found.repeats),
         box=box.SIMPLE_HEAD,
         pad_edge=False,
     )
-    for name in reports:
-        table.add_column(escape(name), justify="right")
-    columns = [_cells(report) for report in reports.values()]
-    for row in columns[0]:
-        table.add_row(row, *(column[row] for column in columns))
+    for name in found.policies:
+        table.add_column(escape(Path(name).name), justify="right")
+    drivers = found.policies.values()
+    table.add_row("trips", *(str(driver.trips) for driver in drivers))
+    for metric in METRICS:
+        cells = [report_cell(metric, driver[metric.name]) for driver in drivers]
+        if not metric.name.startswith("reward_") and set(cells) != {number(None)}:
+            table.add_row(_title(metric), *cells)
+    table.add_row("world step, ms", *(_least(driver, "step_ms") for driver in drivers))
+    table.add_row("policy, ms", *(_least(driver, "policy_ms") for driver in drivers))
     return table
 
 
-def _cells(report: EvaluationReport) -> dict[str, str]:
-    speed = report.speed
-    return {
-        "trips": str(report.trips),
-        "success, %": _rate(report.success),
-        "collision, %": _rate(report.collision),
-        "off road, %": _rate(report.off_road),
-        "unfinished, %": _rate(report.unfinished),
-        "red light, %": _rate(report.red_light),
-        "wrong way, %": _rate(report.wrong_way),
-        "episode return": _interval(report.episode_return),
-        "least TTC, s": _interval(report.mean_least_ttc_s),
-        "jerk, m/s³": _interval(report.mean_jerk_mps3),
-        "speeding, %": _interval(report.mean_speeding, scale=100.0),
-        "delay, s": _interval(report.mean_delay_s),
-        "speed, m/s": number(report.mean_speed_mps),
-        "world step, ms": f"{speed.step_ms:.3f}",
-        "policy, ms": f"{speed.policy_ms:.3f}",
-        "agent-steps/s": f"{speed.agent_steps_per_s:,.0f}",
-    }
+def difference_table(found: EvaluationReport) -> Table:
+    """Each further driver minus the first one, on the same episodes."""
+    from cavmarl.evaluate.metrics import METRICS
+
+    first, *others = found.policies
+    table = Table(
+        "",
+        title=escape(f"minus {Path(first).name}, paired by seed"),
+        caption="mean of the runs ± 95 % interval between runs; *: 0 lies outside",
+        box=box.SIMPLE_HEAD,
+        pad_edge=False,
+    )
+    for name in others:
+        table.add_column(escape(Path(name).name), justify="right")
+    for metric in METRICS:
+        cells = [_change(metric, found[name].minus_first[metric.name]) for name in others]
+        if not metric.name.startswith("reward_") and set(cells) != {number(None)}:
+            table.add_row(_title(metric), *cells)
+    return table
 
 
-def _rate(interval: Interval) -> str:
-    """A share in % and the ends of its interval, which reaches farther to one side."""
-    if interval.mean is None:
+def _show(
+    console: Console,
+    found: EvaluationReport,
+    folder: Path,
+    html: Path | None,
+    json_path: Path | None,
+) -> None:
+    console.print(report_table(found))
+    if len(found.policies) > 1:
+        console.print(difference_table(found))
+    write_json(json_path, found.to_dict())
+    if html is not None:
+        from cavmarl.evaluate.page import write_page
+
+        write_page(folder, html)
+        console.print(f"page: {html}", markup=False, highlight=False, soft_wrap=True)
+    console.print(
+        f"results: {folder} (`cavmarl report` shows them again)",
+        markup=False,
+        highlight=False,
+        soft_wrap=True,
+    )
+
+
+def _new_folder(env: str) -> Path:
+    """A folder in runs/ that nobody has used."""
+    stamp = datetime.now().strftime("%Y%m%d-%H%M%S-%f")
+    return Path("runs/evaluate") / f"{Path(env).name}-{stamp}"
+
+
+def _check_page(html: Path | None) -> None:
+    """Refuse a page that cannot be written before any work is done for it."""
+    if html is None:
+        return
+    require("matplotlib", "report")
+    require("jinja2", "report")
+    make_folder(html.parent)
+
+
+def _caption(repeats: int) -> str:
+    if repeats > 1:
+        return "mean of the runs, ± or [95 % interval between runs], (SD within a run)"
+    return "shares [Wilson's 95 %], means (SD within the run); one run: no interval of means"
+
+
+def _title(metric: Metric) -> str:
+    return f"{metric.label}, {metric.unit}" if metric.unit else metric.label
+
+
+def report_cell(metric: Metric, found: Found) -> str:
+    """Mean, then its interval between runs or Wilson's, then the SD within a run."""
+    if found.mean is None:
         return number(None)
-    share = f"{100.0 * interval.mean:.1f}"
-    if interval.low is None or interval.high is None:
-        return share
-    return f"{share} [{100.0 * interval.low:.1f}, {100.0 * interval.high:.1f}]"
+    parts = [_figure(metric.scale * found.mean)]
+    if found.interval is not None and metric.share:
+        low, high = metric.scale * found.interval.low, metric.scale * found.interval.high
+        parts.append(f"[{low:.1f}, {high:.1f}]")
+    elif found.between_run_ci95 is not None:
+        parts.append(f"±{_figure(metric.scale * (found.between_run_ci95.high - found.mean))}")
+    if not metric.share and found.within_sd is not None:
+        parts.append(f"({_figure(metric.scale * found.within_sd)})")
+    return " ".join(parts)
 
 
-def _interval(interval: Interval, scale: float = 1.0) -> str:
-    """The mean and half the width of its interval."""
-    if interval.mean is None or interval.low is None or interval.high is None:
-        return number(interval.mean, scale)
-    half = number((interval.high - interval.low) / 2.0, scale)
-    return f"{number(interval.mean, scale)} ± {half}"
+def _change(metric: Metric, found: Difference) -> str:
+    if found.mean is None:
+        return number(None)
+    text = f"{metric.scale * found.mean:+.2f}"
+    if found.between_run_ci95 is None:
+        return text
+    half = metric.scale * (found.between_run_ci95.high - found.mean)
+    return f"{text} ±{_figure(half)}{' *' if found.distinct else '  '}"
+
+
+def _figure(value: float) -> str:
+    """Three digits or so."""
+    decimals = 2 if abs(value) < 10.0 else 1 if abs(value) < 100.0 else 0
+    return f"{value:.{decimals}f}"
+
+
+def _least(driver: PolicyReport, field: str) -> str:
+    return f"{min(getattr(run, field) for run in driver.speed):.3f}"

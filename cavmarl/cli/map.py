@@ -117,7 +117,8 @@ def _print_report(console: Console, report: MapReport) -> None:
         "road / lane length": f"{report.road_km:.2f} km / {report.lane_km:.2f} km",
         "edges / lanes": f"{report.edges} / {report.lanes}",
         "junctions": f"{report.junctions} (nodes: {kinds})",
-        "traffic lights": str(report.signals),
+        "traffic lights": f"{report.signals} ({report.actuated_signals} actuated), "
+        f"{report.programs} programs",
         "extent": f"{max_x - min_x:.0f} m x {max_y - min_y:.0f} m",
         "elevation": f"{report.elevation_m[0]:.1f} to {report.elevation_m[1]:.1f} m",
         "steepest grade": f"{report.max_grade:.1%}",

@@ -88,7 +88,7 @@ def parse_settings(settings: Sequence[str] | None) -> dict[str, Any]:
             raise ConfigError(f"--set {key}: given twice")
         try:
             overrides[key] = json.loads(text)
-        except json.JSONDecodeError:
+        except (ValueError, RecursionError):  # not all of JSON's are its own
             overrides[key] = text
         if overrides[key] == "":
             raise ConfigError(f"--set {key}=: has no value")

@@ -1,9 +1,8 @@
-"""Evaluation: seeded episodes, what they say about a driver, and what they were made with."""
+"""Evaluation: seeded runs, what they say about policies, and what they were made with."""
 
 from __future__ import annotations
 
-from cavmarl.evaluate.episodes import evaluate
-from cavmarl.evaluate.manifest import Manifest
+from cavmarl.evaluate.evaluation import evaluate, load_report
 from cavmarl.evaluate.report import EvaluationReport
 
-__all__ = ["EvaluationReport", "Manifest", "evaluate"]
+__all__ = ["EvaluationReport", "evaluate", "load_report"]

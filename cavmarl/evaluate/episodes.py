@@ -1,130 +1,241 @@
-"""Running the episodes of an evaluation: one world each, stepped together."""
+"""Running the episodes of one run: worlds that are stepped together, a part of them at a time."""
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Callable, Mapping
-from pathlib import Path
+from dataclasses import asdict, dataclass, field
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from cavmarl.errors import ConfigError
-from cavmarl.evaluate.manifest import make_manifest
-from cavmarl.evaluate.report import EvaluationReport, Speed, make_report
-from cavmarl.evaluate.statistics import TripRecorder, Trips
-from cavmarl.policies import NetworkPolicy, Policy, load_policy
+from cavmarl.config import TERMS
+from cavmarl.evaluate.encounters import Watch
+from cavmarl.evaluate.recorder import Recorder
+from cavmarl.evaluate.tables import EPISODE, TRACK, TRIP
+from cavmarl.policies import Policy, load_policy
 from cavmarl.vector_env import CavVectorEnv
 from cavmarl.worlds import load_world
 
-__all__ = ["evaluate"]
+__all__ = ["Job", "RunData", "Speed", "drive_run", "worlds_at_once"]
 
-MAX_EPISODES = 10_000
-MAX_VEHICLES = 2_000_000  # all worlds are in memory at once
+MAX_VEHICLES = 100_000  # of the worlds that are stepped together
+MAX_WORLDS = 128
+TRACK_S = 0.5  # between the points of a track
+_HALF = np.uint64(1)  # a seed has 63 bits
 
-Progress = Callable[[int, int], None]
+Progress = Callable[[str, int, int], None]  # policy, steps done, most steps there can be
 
 
-def evaluate(
-    env: str | Path,
-    policy: str | Path,
-    *,
-    episodes: int = 32,
-    seed: int = 0,
-    agents: int | None = None,
-    background: int | None = None,
-    max_cycles: int | None = None,
-    overrides: Mapping[str, Any] | None = None,
-    progress: Progress | None = None,
-) -> EvaluationReport:
-    """Let a policy drive `episodes` seeded episodes of an environment, each counted once.
+@dataclass(frozen=True)
+class Job:
+    """One run: some policies, each over the same episodes.
 
-    Episode e is the first episode of world e of `seed`, whichever policy drives: policies that are
-    evaluated with equal arguments meet equal traffic.
+    Attributes:
+        env, agents, background, max_cycles, overrides: as in `make_vec`.
+        policies: as in `load_policy`, by the name that results have.
+        episodes: how many; episode e is the first one of world e of `seed`.
+        seed: root of all random numbers, also the policies'.
+        run: its number.
+    """
 
-    Args:
-        env: as in `make_vec`, like the other keywords that are not explained here.
-        policy: as in `load_policy`.
-        episodes: how many.
-        seed: root of all random numbers, also the policy's.
-        agents: shadows population.agents.
-        background: shadows population.background.
-        max_cycles: shadows horizon_s.
-        overrides: values for any other key.
-        progress: called after every step with its number and with the most there can be.
+    env: str
+    policies: Mapping[str, str]
+    episodes: int
+    seed: int
+    run: int = 0
+    agents: int | None = None
+    background: int | None = None
+    max_cycles: int | None = None
+    overrides: Mapping[str, Any] = field(default_factory=dict)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain values, for JSON; `Job(**…)` is the way back."""
+        return asdict(self)
+
+
+@dataclass(frozen=True)
+class Speed:
+    """How fast a run went; not repeatable.
+
+    Attributes:
+        step_ms: milliseconds of simulation for one step of one world.
+        policy_ms: milliseconds of the policy for one step of one world.
+        agent_steps_per_s: decisions a second, simulation and policy.
+        worlds: how many were stepped together.
+    """
+
+    step_ms: float
+    policy_ms: float
+    agent_steps_per_s: float
+    worlds: int
+
+
+@dataclass(frozen=True)
+class RunData:
+    """What a policy did in one run.
+
+    Attributes:
+        trips: TRIP records of all trips.
+        episodes: EPISODE records.
+        tracks: TRACK records of the agents of the first episode.
+        speed: how fast it ran.
+    """
+
+    trips: NDArray[np.void]
+    episodes: NDArray[np.void]
+    tracks: NDArray[np.void]
+    speed: Speed
+
+
+def worlds_at_once(episodes: int, vehicles: int) -> int:
+    """How many worlds are stepped together: few enough for flat memory, and even parts."""
+    most = max(1, min(MAX_WORLDS, MAX_VEHICLES // max(vehicles, 1)))
+    return math.ceil(episodes / math.ceil(episodes / most))
+
+
+def drive_run(job: Job, progress: Progress | None = None) -> dict[str, RunData]:
+    """Drive every policy of a job through its episodes.
 
     Raises:
-        ConfigError: a number or a key that cannot work, or more than `MAX_VEHICLES` agents and
-            background vehicles in all episodes together.
-        PolicyError: the policy cannot be loaded or does not fit.
+        ConfigError: a key or a value that cannot work.
+        PolicyError: a policy cannot be loaded or does not fit.
     """
-    if isinstance(episodes, bool) or not isinstance(episodes, int):
-        raise ConfigError(f"episodes = {episodes!r}: must be a whole number")
-    if not 1 <= episodes <= MAX_EPISODES:
-        raise ConfigError(f"episodes = {episodes}: must be from 1 to {MAX_EPISODES}")
-    config, network = load_world(
-        env,
-        agents=agents,
-        background=background,
-        max_cycles=max_cycles,
-        overrides=overrides,
+    config, network, demand = load_world(
+        job.env,
+        agents=job.agents,
+        background=job.background,
+        max_cycles=job.max_cycles,
+        overrides=job.overrides,
     )
     vehicles = config.population.agents + config.population.background
-    if episodes * vehicles > MAX_VEHICLES:
-        raise ConfigError(
-            f"episodes = {episodes}: with {vehicles} vehicles each, {episodes * vehicles} in all; "
-            f"at most {MAX_VEHICLES}: take at most {MAX_VEHICLES // vehicles} episodes"
-        )
-    vec = CavVectorEnv(config, network, episodes)
-    driver = load_policy(policy, vec)
-    trips, returns, speed = _drive(vec, driver, seed, progress)
-    manifest = make_manifest(
-        vec.config,
-        vec.network,
-        policy=str(policy),
-        weights=driver.weights_file if isinstance(driver, NetworkPolicy) else None,
-        seed=seed,
-        episodes=episodes,
-    )
-    return make_report(trips, returns, speed, manifest)
+    vec = CavVectorEnv(config, network, worlds_at_once(job.episodes, vehicles), demand)
+    drivers = {name: load_policy(policy, vec) for name, policy in job.policies.items()}
+    return {name: _drive(vec, driver, name, job, progress) for name, driver in drivers.items()}
 
 
 def _drive(
-    vec: CavVectorEnv, driver: Policy, seed: int, progress: Progress | None
-) -> tuple[Trips, NDArray[np.float64], Speed]:
-    """The first episode of every world: its trips, returns (W,) as means over agents, and speed."""
-    worlds = vec.num_envs
-    observations, infos = vec.reset(seed=seed)
-    driver.reset(seed)
-    recorder = TripRecorder(worlds, vec.num_agents, vec.max_cycles, vec.step_s)
-    returns = np.zeros(worlds)
-    running = np.ones(worlds, dtype=np.bool_)
-    policy_s = simulation_s = 0.0
-    decisions = steps = 0
-    while running.any():
-        before = time.perf_counter()
-        actions = driver.act_batch(observations, infos["mask"])
-        between = time.perf_counter()
-        observations, rewards, _, _, infos = vec.step(actions)
-        after = time.perf_counter()
-        if steps:  # the first step loads or compiles what the others use
-            policy_s += between - before
-            simulation_s += after - between
-            decisions += int(infos["acted"].sum())
-        acted = infos["acted"] & running[:, None]
-        over = infos["episode_over"] & running
-        returns += np.where(acted, rewards, 0.0).sum(axis=1)
-        recorder.add(steps, acted, infos["terms"], infos["vehicle_done"] & acted, over)
-        running &= ~over
-        steps += 1
-        if progress is not None:
-            progress(steps, vec.max_cycles)
-    timed = max((steps - 1) * worlds, 1)
-    speed = Speed(
+    vec: CavVectorEnv, driver: Policy, name: str, job: Job, progress: Progress | None
+) -> RunData:
+    """All episodes of one policy, part after part."""
+    parts: list[_Part] = []
+    count = math.ceil(job.episodes / vec.num_envs)
+    for k in range(count):
+        first = k * vec.num_envs
+
+        def step_done(steps: int, most: int, before: int = k) -> None:
+            if progress is not None:
+                progress(name, before * most + steps, count * most)
+
+        part = _Part(vec, min(vec.num_envs, job.episodes - first), tracked=k == 0)
+        part.drive(driver, job.seed, first, _policy_seed(job.seed, k), step_done)
+        parts.append(part)
+    trips = np.concatenate([np.zeros(0, TRIP), *(part.trips for part in parts)])
+    episodes = np.concatenate([np.zeros(0, EPISODE), *(part.episodes for part in parts)])
+    trips["run"], episodes["run"] = job.run, job.run
+    return RunData(trips, episodes, parts[0].tracks, _speed(parts, vec.num_envs))
+
+
+def _policy_seed(seed: int, part: int) -> int:
+    """The seed of a policy's own random numbers in one part; that of the first is the run's."""
+    if part == 0:
+        return seed
+    return int(np.random.SeedSequence((seed, part)).generate_state(1, np.uint64)[0] >> _HALF)
+
+
+class _Part:
+    """The episodes of the worlds that are stepped together.
+
+    Args:
+        vec: the worlds.
+        count: how many of them count, from the first.
+        tracked: whether to keep where the agents of the first world drive.
+    """
+
+    def __init__(self, vec: CavVectorEnv, count: int, *, tracked: bool) -> None:
+        self._vec = vec
+        self._count = count
+        weights = vec.config.terms.weights
+        self._recorder = Recorder(
+            vec.num_envs,
+            vec.num_agents,
+            vec.max_cycles,
+            vec.step_s,
+            np.array([weights.get(term, 0.0) for term in TERMS]),
+        )
+        self._watch = Watch(vec, self._recorder)
+        self._tracked = tracked
+        self._tracks: list[NDArray[np.void]] = [np.zeros(0, TRACK)]
+        self.policy_s = self.simulation_s = 0.0
+        self.decisions = self.timed_steps = 0
+        self.trips = np.zeros(0, TRIP)
+        self.episodes = np.zeros(0, EPISODE)
+
+    @property
+    def tracks(self) -> NDArray[np.void]:
+        """TRACK records of the first world's agents."""
+        return np.concatenate(self._tracks)
+
+    def drive(
+        self,
+        driver: Policy,
+        seed: int,
+        first: int,
+        policy_seed: int,
+        step_done: Callable[[int, int], None],
+    ) -> None:
+        """Drive until every world that counts has been through its episode."""
+        vec = self._vec
+        observations, infos = vec.reset(seed=seed, options={"first_world": first})
+        driver.reset(policy_seed)
+        running = np.arange(vec.num_envs) < self._count
+        every = max(1, round(TRACK_S / vec.step_s))
+        steps = 0
+        while running.any():
+            self._watch.locate()
+            if self._tracked and running[0] and steps % every == 0:
+                self._note_track(steps, infos["mask"][0])
+            before = time.perf_counter()
+            actions = driver.act_batch(observations, infos["mask"])
+            between = time.perf_counter()
+            observations, rewards, _, _, infos = vec.step(actions)
+            after = time.perf_counter()
+            if steps:  # the first step loads or compiles what the others use
+                self.policy_s += between - before
+                self.simulation_s += after - between
+                self.decisions += int(infos["acted"].sum())
+                self.timed_steps += 1
+            acted = infos["acted"] & running[:, None]
+            over = infos["episode_over"] & running
+            done = infos["vehicle_done"] & acted
+            self._recorder.add(steps, acted, rewards, infos["terms"], done, over, infos["arrivals"])
+            running &= ~over
+            steps += 1
+            self._watch.encounters(steps * vec.step_s, running, infos["mask"])
+            step_done(steps, vec.max_cycles)
+        self.trips = self._recorder.trips()
+        self.episodes = self._recorder.episodes()[: self._count]
+        self.trips["episode"] += first
+        self.episodes["episode"] += first
+
+    def _note_track(self, steps: int, mask: NDArray[np.bool_]) -> None:
+        agents = np.flatnonzero(mask)
+        rows = np.zeros(agents.size, TRACK)
+        rows["agent"] = agents
+        rows["time_s"] = steps * self._vec.step_s
+        rows["x_m"], rows["y_m"] = self._recorder.places_m[0, agents].T
+        self._tracks.append(rows)
+
+
+def _speed(parts: list[_Part], worlds: int) -> Speed:
+    timed = max(sum(part.timed_steps for part in parts) * worlds, 1)
+    policy_s = sum(part.policy_s for part in parts)
+    simulation_s = sum(part.simulation_s for part in parts)
+    return Speed(
         step_ms=1e3 * simulation_s / timed,
         policy_ms=1e3 * policy_s / timed,
-        agent_steps_per_s=decisions / max(policy_s + simulation_s, 1e-9),
+        agent_steps_per_s=sum(p.decisions for p in parts) / max(policy_s + simulation_s, 1e-9),
         worlds=worlds,
     )
-    return recorder.trips(), returns / vec.num_agents, speed

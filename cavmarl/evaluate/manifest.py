@@ -1,116 +1,192 @@
-"""What a result was made with: enough to make it again, and to see why it differs."""
+"""The manifest of an evaluation: what a result is made with, on record before there is one.
+
+`open_manifest` writes it before the first step, `close_manifest` when all results lie beside it,
+with their hashes. A process that dies in between leaves an open one. `read_closed` is the door
+through which every report goes: results without a closed manifest that knows them are refused.
+"""
 
 from __future__ import annotations
 
 import hashlib
 import json
-import platform
-import shutil
-import subprocess
-from dataclasses import asdict, dataclass
-from importlib.metadata import PackageNotFoundError, version
+import os
+import sys
+from collections.abc import Mapping
+from dataclasses import asdict
+from datetime import UTC, datetime
+from os.path import isfile
 from pathlib import Path
+from typing import Any
 
 from cavmarl.config import EnvConfig
+from cavmarl.errors import ManifestError
+from cavmarl.evaluate.machine import describe_code, describe_hardware, describe_software
+from cavmarl.kernels import kernel_cache_dir
+from cavmarl.policies import policy_files
 from cavmarl.roads.network import RoadNetwork
+from cavmarl.traffic.demand import DemandFile
 
-__all__ = ["Manifest", "make_manifest"]
+__all__ = [
+    "MANIFEST_FILE",
+    "close_manifest",
+    "describe_policies",
+    "describe_world",
+    "hash_of_file",
+    "open_manifest",
+    "read_closed",
+    "write_text",
+]
 
-_ROOT = Path(__file__).resolve().parents[2]
+MANIFEST_FILE = "manifest.json"
+SCHEMA = 1
 
-
-@dataclass(frozen=True)
-class Manifest:
-    """Origin of a result.
-
-    Attributes:
-        cavmarl: version; None in a checkout that is not installed.
-        git: commit of the checkout, with `+` where files differ from it; None outside of one.
-        environment: name and version of the entry.
-        config_hash: of the whole configuration, keywords and overrides included.
-        map_hash: SHA-256 of the map's source.
-        policy: name or path, as it was given.
-        weights_hash: SHA-256 of a trained policy's weights.
-        seed: world w of this seed ran episode w.
-        episodes: how many.
-        python, numpy, numba: versions.
-        machine: processor and system.
-    """
-
-    cavmarl: str | None
-    git: str | None
-    environment: str
-    config_hash: str
-    map_hash: str
-    policy: str
-    weights_hash: str | None
-    seed: int
-    episodes: int
-    python: str
-    numpy: str
-    numba: str
-    machine: str
+Document = dict[str, Any]
 
 
-def make_manifest(
-    config: EnvConfig,
-    network: RoadNetwork,
-    *,
-    policy: str,
-    weights: Path | None,
-    seed: int,
-    episodes: int,
-) -> Manifest:
-    """Note everything that a result depends on.
+def describe_world(config: EnvConfig, network: RoadNetwork, demand: DemandFile | None) -> Document:
+    """The environment whole; its roads, its demand and the kernels by their hashes."""
+    resolved = asdict(config)
+    text = json.dumps(resolved, sort_keys=True)
+    return {
+        "environment": f"{config.name}-v{config.version}",
+        "config": resolved,
+        "config_sha256": hashlib.sha256(text.encode()).hexdigest(),
+        "map": network.name,
+        "map_source_sha256": network.source_hash,
+        "map_content_sha256": network.content_hash,
+        "demand_content_sha256": None if demand is None else demand.content_hash,
+        "kernels": kernel_cache_dir().name,
+        "zones": config.zones.count,
+        "channel": "none: there are no messages between vehicles",
+    }
+
+
+def describe_policies(policies: Mapping[str, str]) -> Document:
+    """Each policy's name or path as given, and the hashes of its files."""
+    return {
+        name: {
+            "given": given,
+            "sha256": {file.name: hash_of_file(file) for file in policy_files(given)},
+        }
+        for name, given in policies.items()
+    }
+
+
+def open_manifest(folder: Path, document: Mapping[str, Any]) -> Document:
+    """Write the manifest of results that are about to be made into `folder`.
 
     Args:
-        config: the environment.
-        network: its roads.
-        policy: name or path.
-        weights: file of a trained policy.
-        seed: of all episodes.
-        episodes: how many.
+        folder: of the results; it exists and holds no manifest.
+        document: what this evaluation is; machine, versions, commit and time are added.
+
+    Raises:
+        ManifestError: there is a manifest already.
     """
-    text = json.dumps(asdict(config), sort_keys=True)
-    return Manifest(
-        cavmarl=_own_version(),
-        git=_git_commit(),
-        environment=f"{config.name}-v{config.version}",
-        config_hash=hashlib.sha256(text.encode()).hexdigest()[:16],
-        map_hash=network.source_hash,
-        policy=policy,
-        weights_hash=hashlib.sha256(weights.read_bytes()).hexdigest() if weights else None,
-        seed=seed,
-        episodes=episodes,
-        python=platform.python_version(),
-        numpy=version("numpy"),
-        numba=version("numba"),
-        machine=f"{_processor()}, {platform.system()} {platform.release()}",
+    path = folder / MANIFEST_FILE
+    if path.exists():
+        raise ManifestError(f"{path}: there are results of another run here; give a new folder")
+    opened = {
+        "schema": SCHEMA,
+        "status": "open",
+        "started": _now(),
+        "ended": None,
+        "command": [Path(sys.argv[0]).name, *sys.argv[1:]],
+        **document,
+        "hardware": describe_hardware(),
+        "software": describe_software(),
+        "code": describe_code(),
+        "results_sha256": {},
+    }
+    write_text(path, json.dumps(opened, indent=2) + "\n")
+    return opened
+
+
+def close_manifest(folder: Path, files: list[str]) -> Document:
+    """Mark the manifest as closed, with the hashes of the result `files` that lie beside it."""
+    path = folder / MANIFEST_FILE
+    closed: Document = {
+        **_read(path),
+        "status": "closed",
+        "ended": _now(),
+        "results_sha256": {name: hash_of_file(folder / name) for name in files},
+    }
+    write_text(path, json.dumps(closed, indent=2) + "\n")
+    return closed
+
+
+def read_closed(folder: Path) -> Document:
+    """The manifest of a folder of results that can be trusted to belong to it.
+
+    Raises:
+        ManifestError: no manifest, an open one, or results that it does not know.
+    """
+    path = folder / MANIFEST_FILE
+    if not path.is_file():
+        raise ManifestError(
+            f"{folder}: no {MANIFEST_FILE}: nobody can say what these results were made with; "
+            "make them with `cavmarl evaluate … --out FOLDER`"
+        )
+    document = _read(path)
+    if document["status"] != "closed":
+        raise ManifestError(
+            f"{path}: open since {document['started']}: that evaluation has not ended, or it died; "
+            f"run it again into a new folder: {' '.join(document['command'])}"
+        )
+    for name, known in document["results_sha256"].items():
+        file = folder / name
+        if not isfile(file):  # unlike Path's, it takes names that no file can have
+            raise ManifestError(f"{file}: is missing, though {path} lists it; run it again")
+        if hash_of_file(file) != known:
+            raise ManifestError(
+                f"{file}: is not the file that {path} was closed with; restore it, or run it again"
+            )
+    return document
+
+
+def hash_of_file(path: Path) -> str:
+    """SHA-256 of a file, hex."""
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+def write_text(path: Path, text: str) -> None:
+    """Write a file that is there whole or not at all."""
+    rough = path.with_name(f".{path.name}.{os.getpid()}")
+    with rough.open("w", encoding="utf-8") as file:
+        file.write(text)
+        file.flush()
+        os.fsync(file.fileno())
+    rough.replace(path)
+
+
+def _is_typed(document: Document) -> bool:
+    """Whether the keys that are read again hold what they are written with."""
+    command, known = document["command"], document["results_sha256"]
+    return (
+        isinstance(command, list)
+        and all(isinstance(word, str) for word in command)
+        and isinstance(known, dict)
+        and all(isinstance(digest, str) for digest in known.values())
     )
 
 
-def _own_version() -> str | None:
+def _read(path: Path) -> Document:
     try:
-        return version("cavmarl")
-    except PackageNotFoundError:
-        return None
+        document = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError, RecursionError) as error:
+        raise ManifestError(
+            f"{path}: cannot be read ({error}); run the evaluation again"
+        ) from error
+    needed = {"schema", "status", "started", "command", "results_sha256"}
+    if not isinstance(document, dict) or not needed <= document.keys() or not _is_typed(document):
+        raise ManifestError(f"{path}: not a manifest of an evaluation; run it again")
+    if document["schema"] != SCHEMA:
+        raise ManifestError(
+            f"{path}: schema {document['schema']}, but this version reads {SCHEMA}; use the "
+            "version of cavmarl that wrote it"
+        )
+    return document
 
 
-def _git_commit() -> str | None:
-    """The commit of the checkout that this file lies in."""
-    git = shutil.which("git")
-    if git is None or not (_ROOT / ".git").exists():
-        return None
-    command = [git, "-C", str(_ROOT), "describe", "--always", "--abbrev=40", "--dirty=+"]
-    done = subprocess.run(command, capture_output=True, text=True, check=False)
-    return done.stdout.strip() or None
-
-
-def _processor() -> str:
-    """The processor's name, where the system tells it."""
-    info = Path("/proc/cpuinfo")
-    if info.is_file():
-        for line in info.read_text(encoding="utf-8", errors="replace").splitlines():
-            if line.startswith("model name"):
-                return line.partition(":")[2].strip()
-    return platform.processor() or platform.machine()
+def _now() -> str:
+    return datetime.now(UTC).isoformat(timespec="seconds")

@@ -1,118 +1,192 @@
-"""`EvaluationReport`: what an evaluation found, as plain frozen values."""
+"""`EvaluationReport`: what an evaluation found, as plain frozen values.
+
+Two things are kept apart. *Between runs*: each run has its own seed and gives one mean; the
+interval says where the mean of all such runs lies. *Within a run*: how trips or episodes of one run
+differ among themselves; it says nothing about another run.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from cavmarl.evaluate.manifest import Manifest
-from cavmarl.evaluate.statistics import Interval, Trips, mean_interval, share_interval
+from cavmarl.evaluate.episodes import Speed
+from cavmarl.evaluate.metrics import METRICS, Metric, metric_values
+from cavmarl.evaluate.statistics import Interval, Within, mean_interval, within_run
 
-__all__ = ["EvaluationReport", "Speed", "make_report"]
+__all__ = ["Difference", "EvaluationReport", "Found", "PolicyReport", "make_report"]
+
+NO_INTERVAL = "not available: one run says nothing about the next; use --repeats 2 or more"
 
 
 @dataclass(frozen=True)
-class Speed:
-    """How fast it ran.
+class Found:
+    """One metric of one policy.
 
     Attributes:
-        step_ms: milliseconds of simulation for one step of one world.
-        policy_ms: milliseconds of the policy for one step of one world.
-        agent_steps_per_s: decisions a second, simulation and policy.
-        worlds: how many were stepped together.
+        mean: of the run means; None without data.
+        between_run_ci95: interval of that mean over independent runs, by Student's t; None with
+            fewer than two runs that have the metric.
+        within_run: each run's own mean and spread, in the order of the runs.
     """
 
-    step_ms: float
-    policy_ms: float
-    agent_steps_per_s: float
-    worlds: int
+    mean: float | None
+    between_run_ci95: Interval | None
+    within_run: tuple[Within, ...]
+
+    @property
+    def interval(self) -> Interval | None:
+        """Between runs if there are several, else Wilson's of the one run (shares only)."""
+        if self.between_run_ci95 is not None or len(self.within_run) != 1:
+            return self.between_run_ci95
+        return self.within_run[0].wilson95
+
+    @property
+    def within_sd(self) -> float | None:
+        """Spread within a run: root of the mean variance of the runs."""
+        variances = [run.sd * run.sd for run in self.within_run if run.sd is not None]
+        return float(np.sqrt(np.mean(variances))) if variances else None
+
+
+@dataclass(frozen=True)
+class Difference:
+    """A policy minus the first one, run by run on the same seeds.
+
+    Attributes:
+        mean: of the differences of run means; None without data.
+        between_run_ci95: interval of that mean by Student's t for paired samples; None with fewer
+            than two runs.
+        runs: the differences; None where one of the two has no value.
+    """
+
+    mean: float | None
+    between_run_ci95: Interval | None
+    runs: tuple[float | None, ...]
+
+    @property
+    def distinct(self) -> bool:
+        """Whether the interval leaves 0 out."""
+        found = self.between_run_ci95
+        return found is not None and not found.low <= 0.0 <= found.high
+
+
+@dataclass(frozen=True)
+class PolicyReport:
+    """Everything about one policy.
+
+    Attributes:
+        trips: that count, in all runs.
+        metrics: by the names of `metrics.METRICS`.
+        minus_first: by metric, paired differences from the first policy; empty for itself.
+        speed: of each run; not repeatable.
+    """
+
+    trips: int
+    metrics: Mapping[str, Found]
+    minus_first: Mapping[str, Difference]
+    speed: tuple[Speed, ...]
+
+    def __getitem__(self, metric: str) -> Found:
+        return self.metrics[metric]
 
 
 @dataclass(frozen=True)
 class EvaluationReport:
-    """A driver's results over seeded episodes.
-
-    Rates are shares of the trips that count: those that began in the first half of an episode.
-    `success`, `collision`, `off_road` and `unfinished` add up to 1; `red_light` and `wrong_way` are
-    of trips in which that happened at all.
+    """The results of some policies over the same episodes.
 
     Attributes:
-        episodes: each counted once.
-        trips: that count.
-        episode_return: sum of rewards of an agent id over an episode, mean over the ids.
-        success: arrived.
-        collision: ended by touching a vehicle.
-        off_road: ended off the road.
-        unfinished: cut by the horizon.
-        red_light: passed a red light.
-        wrong_way: drove against a lane.
-        least_ttc_s: least time to collision of all trips, 4 at most.
-        mean_least_ttc_s: mean over the trips of each one's least.
-        mean_jerk_mps3: mean over the trips of their mean |jerk|.
-        mean_speeding: mean over the trips of their mean speed above the limit, as a share of it.
-        mean_delay_s: mean over the arrived trips.
-        mean_speed_mps: way made towards goals over time on the way, all trips.
-        mean_trip_s: mean duration of the arrived trips.
-        speed: how fast it ran; not repeatable.
-        manifest: what it was made with.
+        policies: by name, in the order in which they were given.
+        repeats: independent runs.
+        episodes: of each run.
+        seeds: of the runs.
+        manifest: the closed manifest of the results.
     """
 
+    policies: Mapping[str, PolicyReport]
+    repeats: int
     episodes: int
-    trips: int
-    episode_return: Interval
-    success: Interval
-    collision: Interval
-    off_road: Interval
-    unfinished: Interval
-    red_light: Interval
-    wrong_way: Interval
-    least_ttc_s: float | None
-    mean_least_ttc_s: Interval
-    mean_jerk_mps3: Interval
-    mean_speeding: Interval
-    mean_delay_s: Interval
-    mean_speed_mps: float | None
-    mean_trip_s: Interval
-    speed: Speed
-    manifest: Manifest
+    seeds: tuple[int, ...]
+    manifest: Mapping[str, Any]
+
+    def __getitem__(self, policy: str) -> PolicyReport:
+        return self.policies[policy]
 
     def to_dict(self) -> dict[str, Any]:
         """Plain values, for JSON."""
-        return asdict(self)
+        document = {**asdict(self), "seeds": list(self.seeds)}
+        document["metrics"] = {
+            metric.name: {
+                "unit": "" if metric.share else metric.unit,
+                "per": metric.per,
+                "meaning": metric.meaning,
+            }
+            for metric in METRICS
+        }
+        if self.repeats < 2:
+            document["between_run_ci95"] = NO_INTERVAL
+        return document
 
 
 def make_report(
-    trips: Trips, returns: NDArray[np.float64], speed: Speed, manifest: Manifest
+    tables: Mapping[str, tuple[NDArray[np.void], NDArray[np.void]]],
+    speeds: Mapping[str, tuple[Speed, ...]],
+    manifest: Mapping[str, Any],
 ) -> EvaluationReport:
-    """Reduce trips and episode returns (E,) to a report."""
-    total = trips.count
-    off_road = trips.off_road & ~trips.collided
-    arrived = trips.arrived & ~trips.collided & ~off_road
-    cut = ~(arrived | trips.collided | off_road)
+    """Reduce raw tables to a report.
 
-    def share(which: NDArray[np.bool_]) -> Interval:
-        return share_interval(int(which.sum()), total)
+    Args:
+        tables: by policy, TRIP and EPISODE records of all runs.
+        speeds: by policy, of each run.
+        manifest: of the same results.
+    """
+    seeds = tuple(manifest["seeds"])
+    found = {
+        name: {metric.name: _find(metric, trips, episodes, len(seeds)) for metric in METRICS}
+        for name, (trips, episodes) in tables.items()
+    }
+    first = next(iter(found))
+    policies = {
+        name: PolicyReport(
+            trips=int(tables[name][0]["counted"].sum()),
+            metrics=metrics,
+            minus_first={}
+            if name == first
+            else {key: _difference(metrics[key], found[first][key]) for key in metrics},
+            speed=speeds[name],
+        )
+        for name, metrics in found.items()
+    }
+    return EvaluationReport(policies, len(seeds), manifest["episodes"], seeds, manifest)
 
-    return EvaluationReport(
-        episodes=returns.size,
-        trips=total,
-        episode_return=mean_interval(returns),
-        success=share(arrived),
-        collision=share(trips.collided),
-        off_road=share(off_road),
-        unfinished=share(cut),
-        red_light=share(trips.red_light),
-        wrong_way=share(trips.wrong_way),
-        least_ttc_s=float(trips.least_ttc_s.min()) if total else None,
-        mean_least_ttc_s=mean_interval(trips.least_ttc_s),
-        mean_jerk_mps3=mean_interval(trips.mean_jerk_mps3),
-        mean_speeding=mean_interval(trips.mean_speeding),
-        mean_delay_s=mean_interval(trips.delay_s[arrived]),
-        mean_speed_mps=float(trips.distance_m.sum() / trips.duration_s.sum()) if total else None,
-        mean_trip_s=mean_interval(trips.duration_s[arrived]),
-        speed=speed,
-        manifest=manifest,
+
+def _find(metric: Metric, trips: NDArray[np.void], episodes: NDArray[np.void], runs: int) -> Found:
+    within = tuple(
+        within_run(
+            metric_values(metric, trips[trips["run"] == r], episodes[episodes["run"] == r]),
+            share=metric.share,
+        )
+        for r in range(runs)
     )
+    means = np.array([run.mean for run in within if run.mean is not None])
+    if not means.size:
+        return Found(None, None, within)
+    interval = mean_interval(means)
+    if interval is not None and metric.share:
+        # The t distribution does not know that a share ends at 0 and 1; the mean of shares does.
+        interval = Interval(max(interval.low, 0.0), min(interval.high, 1.0))
+    return Found(float(means.mean()), interval, within)
+
+
+def _difference(mine: Found, first: Found) -> Difference:
+    runs = tuple(
+        None if a.mean is None or b.mean is None else a.mean - b.mean
+        for a, b in zip(mine.within_run, first.within_run, strict=True)
+    )
+    known = np.array([run for run in runs if run is not None])
+    if not known.size:
+        return Difference(None, None, runs)
+    return Difference(float(known.mean()), mean_interval(known), runs)

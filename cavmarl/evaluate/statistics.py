@@ -1,158 +1,135 @@
-"""What trips and episodes add up to: means with intervals, and the record of trips under way."""
+"""What numbers add up to: intervals between runs, spread within one, shares, evenness."""
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import cache
 
 import numpy as np
 from numpy.typing import NDArray
 
-from cavmarl.config import TERMS
-from cavmarl.kernels.terms import TTC_HORIZON_S
-
-__all__ = ["Interval", "TripRecorder", "Trips", "mean_interval", "share_interval"]
+__all__ = [
+    "Interval",
+    "Within",
+    "gini_coefficient",
+    "jain_index",
+    "mean_interval",
+    "share_interval",
+    "student_quantile",
+    "within_run",
+]
 
 Z_95 = 1.959963984540054
-RESAMPLES = 2000
+TWO_SIDED = 0.975  # of the distribution lies below the upper end of a 95 % interval
 
-_TERM = {name: k for k, name in enumerate(TERMS)}
+Values = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
 class Interval:
-    """An estimate with its 95 % confidence interval; all None without data."""
+    """The ends of a 95 % confidence interval."""
 
+    low: float
+    high: float
+
+
+@dataclass(frozen=True)
+class Within:
+    """The values of one run: what they are in the mean and how they differ among themselves.
+
+    Attributes:
+        n: how many trips or episodes.
+        mean: None without any.
+        sd: sample standard deviation; None with fewer than two. It is the spread of trips or
+            episodes and says nothing about how another run would come out.
+        wilson95: shares only, of independent trips of one run (Wilson 1927).
+    """
+
+    n: int
     mean: float | None
-    low: float | None
-    high: float | None
+    sd: float | None
+    wilson95: Interval | None
 
 
-def mean_interval(values: NDArray[np.float64]) -> Interval:
-    """Mean of `values` (N,), interval by the percentile bootstrap, seeded (Efron 1979)."""
+def within_run(values: Values, *, share: bool) -> Within:
+    """Mean and spread of the values (N,) of one run; NaN is no value."""
+    values = values[~np.isnan(values)]
     if not values.size:
-        return Interval(None, None, None)
+        return Within(0, None, None, None)
     mean = float(values.mean())
-    if values.size == 1:
-        return Interval(mean, None, None)
-    draws = np.random.Generator(np.random.Philox(0)).integers(
-        0, values.size, (RESAMPLES, values.size)
-    )
-    low, high = np.quantile(values[draws].mean(axis=1), (0.025, 0.975)).tolist()
-    return Interval(mean, low, high)
+    sd = float(values.std(ddof=1)) if values.size > 1 else None
+    wilson = share_interval(round(float(values.sum())), values.size) if share else None
+    return Within(values.size, mean, sd, wilson)
 
 
-def share_interval(hits: int, total: int) -> Interval:
-    """Share of `hits` in `total`, interval by Wilson's score (1927)."""
+def mean_interval(means: Values) -> Interval | None:
+    """Interval of the mean of independent runs (R,) by Student's t; None for fewer than two.
+
+    mean ± t(0.975, R - 1) · sd / √R, where sd is that of the run means.
+    """
+    if means.size < 2:
+        return None
+    mean = float(means.mean())
+    error = float(means.std(ddof=1)) / math.sqrt(means.size)
+    half = student_quantile(means.size - 1) * error
+    return Interval(mean - half, mean + half)
+
+
+def share_interval(hits: int, total: int) -> Interval | None:
+    """Interval of a share by Wilson's score (1927); None without a total."""
     if total == 0:
-        return Interval(None, None, None)
+        return None
     share = hits / total
     weight = Z_95 * Z_95 / total
     centre = (share + weight / 2.0) / (1.0 + weight)
     half = math.sqrt(weight * (share * (1.0 - share) + weight / 4.0)) / (1.0 + weight)
-    return Interval(share, max(centre - half, 0.0), min(centre + half, 1.0))
+    return Interval(max(centre - half, 0.0), min(centre + half, 1.0))
 
 
-@dataclass(frozen=True)
-class Trips:
-    """N finished or cut trips of agents, one entry each.
+@cache
+def student_quantile(freedom: int) -> float:
+    """The 0.975 quantile of Student's t with a whole number of degrees of freedom, by bisection."""
+    low, high = 0.0, 16.0
+    while high - low > 1e-12 * high:
+        middle = 0.5 * (low + high)
+        if 0.5 + 0.5 * _student_within(middle, freedom) < TWO_SIDED:
+            low = middle
+        else:
+            high = middle
+    return 0.5 * (low + high)
 
-    Attributes:
-        arrived, collided, off_road: how the trip ended; none of them: the horizon cut it.
-        red_light, wrong_way: whether it ever passed a red light, or drove against its lane.
-        duration_s: from its first decision to its end.
-        distance_m: way made towards the goal.
-        delay_s: time lost against driving at the limit.
-        mean_jerk_mps3: mean |jerk|.
-        mean_speeding: mean speed above the limit, as a share of it.
-        least_ttc_s: least time to collision; TTC_HORIZON_S stands for that and above.
+
+def _student_within(t: float, freedom: int) -> float:
+    """P(|T| < t): Abramowitz and Stegun 1964, 26.7.3 and 26.7.4."""
+    theta = math.atan(t / math.sqrt(freedom))
+    square = math.cos(theta) ** 2
+    odd = freedom % 2 == 1
+    term = math.cos(theta) if odd else 1.0
+    total = term if freedom > 1 else 0.0
+    for k in range(2 if odd else 1, freedom - 2, 2):
+        term *= square * k / (k + 1)
+        total += term
+    return 2.0 / math.pi * (theta + math.sin(theta) * total) if odd else math.sin(theta) * total
+
+
+def jain_index(values: Values) -> float:
+    """Jain's fairness index (Jain, Chiu and Hawe 1984): (Σx)² / (n · Σx²).
+
+    1 where all have the same, 1/n where one has all; NaN without values or where all are 0.
     """
-
-    arrived: NDArray[np.bool_]
-    collided: NDArray[np.bool_]
-    off_road: NDArray[np.bool_]
-    red_light: NDArray[np.bool_]
-    wrong_way: NDArray[np.bool_]
-    duration_s: NDArray[np.float64]
-    distance_m: NDArray[np.float64]
-    delay_s: NDArray[np.float64]
-    mean_jerk_mps3: NDArray[np.float64]
-    mean_speeding: NDArray[np.float64]
-    least_ttc_s: NDArray[np.float64]
-
-    @property
-    def count(self) -> int:
-        """N."""
-        return self.arrived.size
+    squares = values.size * float(values @ values)
+    return float(values.sum()) ** 2 / squares if squares > 0.0 else math.nan
 
 
-class TripRecorder:
-    """Follows the trips of W worlds with A agents through one episode each.
+def gini_coefficient(values: Values) -> float:
+    """Gini's coefficient (1912) of values ≥ 0: Σᵢ Σⱼ |xᵢ - xⱼ| / (2 n² · mean).
 
-    A trip counts if it began in the first half of its episode: so each had at least half an episode
-    to end, and which trips count does not depend on how they end.
-
-    Args:
-        num_worlds: W.
-        num_agents: A.
-        max_steps: steps of an episode.
-        step_s: seconds a step.
+    0 where all have the same, towards 1 where one has all; NaN without values or where all are 0.
     """
-
-    def __init__(self, num_worlds: int, num_agents: int, max_steps: int, step_s: float) -> None:
-        shape = (num_worlds, num_agents)
-        self._half = max_steps / 2.0
-        self._step_s = step_s
-        self._sums = np.zeros((*shape, len(TERMS)))
-        self._worst_ttc = np.zeros(shape)
-        self._steps = np.zeros(shape, dtype=np.int64)
-        self._began = np.zeros(shape, dtype=np.int64)
-        self._rows: list[NDArray[np.float64]] = []
-
-    def add(
-        self,
-        step: int,
-        acted: NDArray[np.bool_],
-        terms: NDArray[np.float32],
-        done: NDArray[np.bool_],
-        over: NDArray[np.bool_],
-    ) -> None:
-        """Take in one step.
-
-        Args:
-            step: its number in the episode, from 0.
-            acted: (W, A) whose trip this step belongs to.
-            terms: (W, A, T).
-            done: (W, A) whose trip ended in it.
-            over: (W,) whose episode ended in it, which cuts the trips still under way.
-        """
-        self._began[acted & (self._steps == 0)] = step
-        self._steps += acted
-        self._sums += np.where(acted[..., None], terms, 0.0)
-        ttc = np.where(acted, terms[..., _TERM["time_to_collision"]], 0.0)
-        np.maximum(self._worst_ttc, ttc, out=self._worst_ttc)
-        ended = (self._steps > 0) & (done | over[:, None])
-        counted = ended & (self._began < self._half)
-        columns = (self._sums[counted], self._steps[counted, None], self._worst_ttc[counted, None])
-        self._rows.append(np.concatenate(columns, axis=1))
-        self._sums[ended] = 0.0
-        self._steps[ended] = 0
-        self._worst_ttc[ended] = 0.0
-
-    def trips(self) -> Trips:
-        """All trips that count and have ended."""
-        rows = np.concatenate(self._rows) if self._rows else np.zeros((0, len(TERMS) + 2))
-        steps, worst_ttc = rows[:, -2], rows[:, -1]
-        return Trips(
-            arrived=rows[:, _TERM["arrival"]] > 0.0,
-            collided=rows[:, _TERM["collision"]] > 0.0,
-            off_road=rows[:, _TERM["off_road"]] > 0.0,
-            red_light=rows[:, _TERM["red_light"]] > 0.0,
-            wrong_way=rows[:, _TERM["wrong_way"]] > 0.0,
-            duration_s=steps * self._step_s,
-            distance_m=rows[:, _TERM["progress"]],
-            delay_s=rows[:, _TERM["delay"]],
-            mean_jerk_mps3=10.0 * rows[:, _TERM["comfort"]] / np.maximum(steps, 1.0),
-            mean_speeding=rows[:, _TERM["speed"]] / np.maximum(steps, 1.0),
-            least_ttc_s=TTC_HORIZON_S * (1.0 - worst_ttc),
-        )
+    total = float(values.sum())
+    if total <= 0.0:
+        return math.nan
+    ranks = np.arange(1, values.size + 1)
+    weighted = float((2.0 * ranks - values.size - 1.0) @ np.sort(values))
+    return weighted / (values.size * total)

@@ -1,4 +1,4 @@
-"""How fast a step is, next to highway-env's, on the same road with the same number of vehicles.
+"""How fast a step is, next to others', on the same road with the same number of vehicles.
 
 Every row of the comparison is measured once a turn, all rows one after the other, and the ratios
 are those of the medians over the turns: what else the machine does falls on all of them. Times are
@@ -34,9 +34,11 @@ from cavmarl.evaluate.highway_worlds import (
     overrides,
     straight_road,
 )
+from cavmarl.evaluate.peer_speed import check_compiler, peer_runners
+from cavmarl.evaluate.speed_rows import Row, Runner
 from cavmarl.vector_env import CavVectorEnv, make_vec
 
-__all__ = ["MORE", "Row", "StepSpeed", "measure_step_speed"]
+__all__ = ["MORE", "Row", "StepSpeed", "measure_step_speed", "one_core"]
 
 OUR_STEPS = 100  # from a fresh reset: nobody reaches the end of the road
 THEIR_STEPS = 10
@@ -44,34 +46,6 @@ MORE = 10  # times as many agents, on a road as many times as long
 MAX_AGENTS = 1000
 
 _ONE = np.int64(IDLE)
-
-
-@dataclass(frozen=True)
-class Row:
-    """One way to step one kind of world.
-
-    Attributes:
-        sensors: `lidar` (and neighbours) or `kinematics`.
-        who: `batched`, `single`, `dicts`, `more`, `highway_env` or `highway_env_raw`.
-        agents: controlled vehicles a world.
-        worlds: stepped together.
-        low: agent-steps a second, the slowest turn.
-        median: over the turns.
-        high: the fastest turn.
-    """
-
-    sensors: str
-    who: str
-    agents: int
-    worlds: int
-    low: float
-    median: float
-    high: float
-
-    @property
-    def agent_step_s(self) -> float:
-        """Seconds an agent-step takes, by the median."""
-        return 1.0 / self.median
 
 
 @dataclass(frozen=True)
@@ -87,6 +61,8 @@ class StepSpeed:
         ratio_kinematics_raw: the same over its observation without normalisation.
         cost_of_more: what an agent costs among `MORE` times as many, over what it costs `batched`.
         dict_us: what the dict API adds for each agent and step to `single`, in µs.
+        ratio_peer: with pufferlib's observation, `batched` over `c`; None where it is not measured.
+        ratio_peer_native: the same over `c_native`.
     """
 
     road_m: float
@@ -97,27 +73,19 @@ class StepSpeed:
     ratio_kinematics_raw: float
     cost_of_more: float
     dict_us: float
+    ratio_peer: float | None
+    ratio_peer_native: float | None
 
     def to_dict(self) -> dict[str, Any]:
         """Plain values, for JSON."""
         return asdict(self)
 
 
-@dataclass(frozen=True)
-class _Runner:
-    """A row to be measured: `rate` steps its world and returns agent-steps a second."""
-
-    sensors: str
-    who: str
-    agents: int
-    worlds: int
-    rate: Callable[[], float]
-
-
 def measure_step_speed(
     agents: int = 100,
     worlds: int = 16,
     repeats: int = 5,
+    peer: bool = False,
     progress: Callable[[str], None] = lambda text: None,
 ) -> StepSpeed:
     """Measure by turns on one core, kernels warm.
@@ -126,22 +94,29 @@ def measure_step_speed(
         agents: controlled vehicles a world.
         worlds: of ours, stepped together where they are batched.
         repeats: turns.
+        peer: whether the peer in C is measured, too.
         progress: told what is going on.
 
     Raises:
         ConfigError: a number out of range.
         MissingExtraError: highway-env is not installed.
+        EvaluationError: there is no C compiler for the peer.
     """
     limits = {"agents": (agents, MAX_AGENTS), "worlds": (worlds, 1024), "repeats": (repeats, 100)}
     for name, (value, most) in limits.items():
         if not 1 <= value <= most:
             raise ConfigError(f"{name} = {value}: must be from 1 to {most}")
     require("highway_env", "highway")
-    with _one_core(), tempfile.TemporaryDirectory() as folder:
+    if peer:
+        check_compiler()
+    with one_core(), tempfile.TemporaryDirectory() as folder:
         progress("making highway-env's worlds")
         theirs, road_m = _their_runners(agents)
         progress("making our worlds on that road")
         runners = _our_runners(Path(folder), road_m, agents, worlds) + theirs
+        if peer:
+            progress("making the peer's worlds on that road")
+            runners += peer_runners(Path(folder), road_m, agents, worlds)
         turns = []
         for repeat in range(repeats):
             progress(f"measuring, {repeat + 1} of {repeats}")
@@ -171,6 +146,9 @@ def _compare(road_m: float, repeats: int, rows: list[Row]) -> StepSpeed:
     def ratio(sensors: str, one: str, other: str) -> float:
         return found[sensors, one].median / found[sensors, other].median
 
+    def peer_ratio(who: str) -> float | None:
+        return ratio("puffer_drive", "batched", who) if ("puffer_drive", who) in found else None
+
     added_s = found["kinematics", "dicts"].agent_step_s - found["kinematics", "single"].agent_step_s
     return StepSpeed(
         road_m=road_m,
@@ -181,11 +159,13 @@ def _compare(road_m: float, repeats: int, rows: list[Row]) -> StepSpeed:
         ratio_kinematics_raw=ratio("kinematics", "batched", "highway_env_raw"),
         cost_of_more=ratio("kinematics", "batched", "more"),
         dict_us=added_s * 1e6,
+        ratio_peer=peer_ratio("c"),
+        ratio_peer_native=peer_ratio("c_native"),
     )
 
 
 @contextmanager
-def _one_core() -> Iterator[None]:
+def one_core() -> Iterator[None]:
     """Keep this process on one core, where the system can."""
     if not hasattr(os, "sched_setaffinity"):
         yield
@@ -198,7 +178,7 @@ def _one_core() -> Iterator[None]:
         os.sched_setaffinity(0, before)
 
 
-def _our_runners(folder: Path, road_m: float, agents: int, worlds: int) -> list[_Runner]:
+def _our_runners(folder: Path, road_m: float, agents: int, worlds: int) -> list[Runner]:
     """Ours, each stepped twice before anything is measured."""
     road = straight_road(folder, road_m)
     long_road = straight_road(folder, road_m * MORE)
@@ -218,14 +198,14 @@ def _our_runners(folder: Path, road_m: float, agents: int, worlds: int) -> list[
             overrides=overrides(LIDAR if sensors == "lidar" else KINEMATICS, count),
         )
         _batched_rate(vec, 2)
-        runners.append(_Runner(sensors, who, count, together, partial(_batched_rate, vec)))
+        runners.append(Runner(sensors, who, count, together, partial(_batched_rate, vec)))
     env = parallel_env(road, agents=agents, background=0, overrides=overrides(KINEMATICS, agents))
     _dicts_rate(env, 2)
-    runners.append(_Runner("kinematics", "dicts", agents, 1, partial(_dicts_rate, env)))
+    runners.append(Runner("kinematics", "dicts", agents, 1, partial(_dicts_rate, env)))
     return runners
 
 
-def _their_runners(agents: int) -> tuple[list[_Runner], float]:
+def _their_runners(agents: int) -> tuple[list[Runner], float]:
     """highway-env's, and the length of their road in m."""
     runners = []
     road_m = 0.0
@@ -236,7 +216,7 @@ def _their_runners(agents: int) -> tuple[list[_Runner], float]:
     ):
         env = highway_env(agents, observation)
         road_m = length_m(env)
-        runners.append(_Runner(sensors, who, agents, 1, partial(_their_rate, env, agents)))
+        runners.append(Runner(sensors, who, agents, 1, partial(_their_rate, env, agents)))
     return runners, road_m
 
 
@@ -252,12 +232,13 @@ def _batched_rate(vec: CavVectorEnv, steps: int = OUR_STEPS) -> float:
 
 
 def _dicts_rate(env: CavEnv, steps: int = OUR_STEPS) -> float:
-    """The same through PettingZoo's dicts."""
+    """The same through PettingZoo's dicts; nobody leaves, so the actions are ready as well."""
     env.reset(seed=0)
+    actions = dict.fromkeys(env.agents, IDLE)
     decisions = 0
     began = time.process_time()
     for _ in range(steps):
-        decisions += len(env.step(dict.fromkeys(env.agents, IDLE))[1])
+        decisions += len(env.step(actions)[1])
     return decisions / (time.process_time() - began)
 
 

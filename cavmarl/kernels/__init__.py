@@ -1,10 +1,7 @@
 """Compiled kernels: arrays and scalars in, arrays out. They know no object and no setting.
 
 `kernel` is the one place for compiler flags: no fastmath (results must not depend on how a world is
-divided), serial (processes give the parallelism), GIL released, cached on disk. And no runtime that
-counts references to arrays: a kernel allocates nothing and returns no array, so there is nothing to
-count, and counting took two thirds of a step (docs/decisions/008). One that needs room of its own
-is a `setup_kernel`, for work that is done once.
+divided), serial (processes give the parallelism), GIL released, cached on disk.
 
 The cache lives in a folder named after the content of all kernel sources: Numba itself only watches
 the file that defines a function, not the functions which that one calls, and would hand out stale
@@ -24,7 +21,7 @@ from typing import Any, ParamSpec, TypeVar
 import numba
 import numba.core.config
 
-__all__ = ["cache_dir", "kernel", "kernel_cache_dir", "setup_kernel"]
+__all__ = ["allocating_kernel", "cache_dir", "inlined_kernel", "kernel", "kernel_cache_dir"]
 
 P = ParamSpec("P")
 R = TypeVar("R")
@@ -46,30 +43,38 @@ def kernel_cache_dir() -> Path:
     return cache_dir() / "kernels" / digest.hexdigest()[:16]
 
 
-def kernel(function: Callable[P, R]) -> Callable[P, R]:
-    """Compile `function` with the flags that all kernels share; it cannot allocate."""
-    return _compiled(function, counts_references=False)
-
-
-def setup_kernel(function: Callable[P, R]) -> Callable[P, R]:
-    """Compile a `function` that allocates, with the flags of `kernel` but for that."""
-    return _compiled(function, counts_references=True)
-
-
-def _compiled(function: Callable[P, R], counts_references: bool) -> Callable[P, R]:
+def _compile(function: Callable[P, R], **options: bool) -> Callable[P, R]:
     settings: Any = numba.core.config
     before = settings.CACHE_DIR
     settings.CACHE_DIR = str(kernel_cache_dir())
     try:
-        decorate: Any = numba.njit  # the stubs do not know `_nrt`
-        compiled: Callable[P, R] = decorate(
-            cache=True,
-            fastmath=False,
-            parallel=False,
-            nogil=True,
-            error_model="numpy",
-            _nrt=counts_references,
+        njit: Any = numba.njit
+        compiled: Callable[P, R] = njit(
+            cache=True, fastmath=False, parallel=False, nogil=True, error_model="numpy", **options
         )(function)
     finally:
         settings.CACHE_DIR = before
     return compiled
+
+
+def kernel(function: Callable[P, R]) -> Callable[P, R]:
+    """Compile `function` with the flags that all kernels share.
+
+    Its arrays are borrowed from the caller and never counted: with Numba's reference counts, an
+    atomic addition for every look into a bundle of arrays, a tick takes ten times as long
+    (decision 002). So it can neither make an array nor return one.
+    """
+    return _compile(function, _nrt=False)
+
+
+def inlined_kernel(function: Callable[P, R]) -> Callable[P, R]:
+    """As `kernel`, but always compiled into its callers.
+
+    For what is called for every vehicle: a call hands over each array of a bundle as seven numbers.
+    """
+    return _compile(function, _nrt=False, forceinline=True)
+
+
+def allocating_kernel(function: Callable[P, R]) -> Callable[P, R]:
+    """As `kernel`, for those that make arrays or lists; none of them is part of a tick."""
+    return _compile(function)

@@ -12,7 +12,17 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["Demand", "Gate", "LaneGrid", "Outputs", "RoadArrays", "Scratch", "Sensors", "Worlds"]
+__all__ = [
+    "Demand",
+    "Gate",
+    "LaneGrid",
+    "Outputs",
+    "RoadArrays",
+    "Scratch",
+    "Sensors",
+    "Travel",
+    "Worlds",
+]
 
 
 class RoadArrays(NamedTuple):
@@ -25,8 +35,14 @@ class RoadArrays(NamedTuple):
     conflicts: NDArray[np.void]  # CONFLICT (num_conflicts,)
     into: NDArray[np.int32]  # (num_into,) see LANE["first_into"]
     signals: NDArray[np.void]  # SIGNAL (num_signals,)
+    programs: NDArray[np.void]  # PROGRAM (num_programs,)
     phases: NDArray[np.void]  # PHASE (num_phases,)
     phase_states: NDArray[np.uint8]  # (num_letters,) codes: positions in SIGNAL_STATES
+    switches: NDArray[np.void]  # SWITCH (num_switches,)
+    detectors: NDArray[np.void]  # DETECTOR (D,)
+    phase_detectors: NDArray[np.int32]  # see PHASE["first_detector"]
+    lane_place: NDArray[np.int32]  # (L,) the first PLACE of each lane, or -1
+    places: NDArray[np.void]  # PLACE (num_places,) detectors that bodies on a lane can cover
 
 
 class LaneGrid(NamedTuple):
@@ -39,6 +55,16 @@ class LaneGrid(NamedTuple):
     num_y: int
     cell_start: NDArray[np.int32]  # (num_x * num_y + 1,)
     cell_lanes: NDArray[np.int32]
+
+
+class Travel(NamedTuple):
+    """What vehicles are and which ways there are; the same for all worlds of an environment."""
+
+    types: NDArray[np.void]  # VTYPE (num_types,), by VEHICLE["vtype"]
+    steps: NDArray[np.void]  # PLAN (num_steps,), see `kernels.ways`
+    stops: NDArray[np.void]  # STOP (num_stops,), by VEHICLE["stop"]
+    first_detour: int  # PLAN row of the first goal of demand vehicles that take another way
+    begin_s: float  # the clock of the demand at tick 0
 
 
 class Worlds(NamedTuple):
@@ -54,13 +80,19 @@ class Worlds(NamedTuple):
     ticks: NDArray[np.int64]  # (W,) since reset
     keys: NDArray[np.uint64]  # (W,) the root of all random numbers of the episode
     signal_phase: NDArray[np.int32]  # (W, num_signals) PHASE row that is on
+    controllers: NDArray[np.void]  # CONTROLLER (W, num_controllers) of the actuated programs
+    detected_s: NDArray[np.float64]  # (W, D) when a body was last over each detector
+    num_through: NDArray[np.int64]  # (W,) background vehicles that have arrived in this tick
     num_contacts: NDArray[np.int64]  # (W,) vehicles that began to touch another, since reset
 
 
 class Gate(NamedTuple):
     """What one place keeps of each world, however it is divided: ids, the queue, the counts."""
 
-    queue: NDArray[np.void]  # DEPARTURE (W, C) vehicles that wait to enter, in id order
+    orders: NDArray[np.void]  # DEPARTURE (W, D) what a demand file orders, in order of `due`
+    num_orders: NDArray[np.int64]  # (W,)
+    next_order: NDArray[np.int64]  # (W,) the first one that is not due yet
+    queue: NDArray[np.void]  # DEPARTURE (W, C + D) vehicles that wait to enter, in id order
     num_queue: NDArray[np.int64]  # (W,)
     next_id: NDArray[np.int64]  # (W,) the next vehicle's id
     num_entered: NDArray[np.int64]  # (W,) agents that have been ordered so far
@@ -87,15 +119,14 @@ class Demand(NamedTuple):
 class Scratch(NamedTuple):
     """Room that a tick works in; holds nothing between calls."""
 
-    lane_start: NDArray[np.int32]  # (L + 2,) entries of lane l: [lane_start[l], lane_start[l + 1])
-    entry_row: NDArray[np.int32]  # (2 C,) vehicle rows by (lane, s, id), side lanes included
-    entry_s: NDArray[np.float64]  # (2 C,)
-    link_start: NDArray[np.int32]  # (K + 2,) entries of link k, as above
-    link_row: NDArray[np.int32]  # (3 C,) vehicles that approach or are on link k
-    link_dist: NDArray[np.float64]  # (3 C,) centre to stop line, m; negative: inside
-    pair_link: NDArray[np.int32]  # (3 C,) the same before sorting
-    pair_row: NDArray[np.int32]
-    pair_dist: NDArray[np.float64]
+    lane_start: NDArray[np.int32]  # (L + 1,) entries of lane l: [lane_start[l], lane_start[l + 1])
+    lane_end: NDArray[np.int32]  # (L,) lane_start[l + 1] again
+    entries: NDArray[np.void]  # ENTRY (2 C,) vehicles by (lane, s, id), side lanes included
+    lane_taken: NDArray[np.bool_]  # (L,) somebody has tried to enter there in this tick
+    link_start: NDArray[np.int32]  # (K + 2,) approach of link k: [link_start[k], link_start[k + 1])
+    approach: NDArray[np.void]  # APPROACH (3 C,) vehicles on or before links, by link
+    pairs: NDArray[np.void]  # APPROACH (3 C,) the same before sorting
+    order: NDArray[np.int32]  # (C,) the owned rows as they lie along the lanes
     accel: NDArray[np.float64]  # (C,) decided accelerations
     link_ahead: NDArray[np.int32]  # (C,) the link whose stop line each row is next to
     lane_change: NDArray[np.int32]  # (C,) decided lane changes: 1 left, -1 right
@@ -105,22 +136,29 @@ class Scratch(NamedTuple):
 
 
 class Sensors(NamedTuple):
-    """What the agents' sensors are set to, and where each writes in an observation."""
+    """What the agents' sensors are set to, and where each writes in a frame."""
 
+    stack: int  # frames in an observation
+    cleared: int  # numbers of a frame that are 0 before the sensors write
+    ego: bool  # whether it is on; it writes at 0
     route_at: int
     route_points: int
     route_spacing_m: float
     neighbors_at: int
     neighbors: int
     neighbors_range_m: float
+    signal: bool
     signal_at: int
     signal_range_m: float
+    signal_timing: bool
+    lanes_at: int
+    lanes_range_m: float
     lidar_at: int
     lidar_rays: int
     lidar_range_m: float
     lidar_speeds: bool
     rays: NDArray[np.float64]  # (lidar_rays, 2) directions in the ego frame
-    near_row: NDArray[np.int32]  # (neighbors,) room
+    near_body: NDArray[np.int32]  # (neighbors,) room
     near_squared: NDArray[np.float64]
     echoes: NDArray[np.void]  # ECHO (lidar_rays,) room
 
@@ -128,10 +166,11 @@ class Sensors(NamedTuple):
 class Outputs(NamedTuple):
     """What agents get at the end of a step, at their own index; absent agents have zeros.
 
-    T is the number of terms, D the size of a flat observation.
+    T is the number of terms, D the size of a flat observation. What an agent saw before is kept
+    here and nowhere else: the frames of a stack move up within `observations`.
     """
 
-    observations: NDArray[np.float32]  # (W, A, D)
+    observations: NDArray[np.float32]  # (W, A, D) the stacked frames, oldest first
     terms: NDArray[np.float32]  # (W, A, T)
     rewards: NDArray[np.float32]  # (W, A)
     terminated: NDArray[np.bool_]  # (W, A) the vehicle ended in this step

@@ -6,6 +6,40 @@ from __future__ import annotations
 DRIVER_BACKGROUND = 0  # moves along lanes, driven by the models of kernels/drivers.py
 DRIVER_AGENT = 1  # kinematic bicycle, driven by actions
 
+# VTYPE["model"]: how a background driver follows its leader
+MODEL_KRAUSS = 0
+MODEL_IDM = 1
+
+# DEPARTURE["lane_code"]: on which lane of its edge a vehicle enters
+LANE_GIVEN = 0
+LANE_FIRST = -1  # the rightmost one of those that it may use
+LANE_RANDOM = -2
+LANE_FREE = -3  # the least occupied one
+LANE_ALLOWED = -4
+LANE_BEST = -5  # one from which its way goes on without a lane change
+
+# DEPARTURE["pos_code"]: where on the lane
+POS_GIVEN = 0
+POS_BASE = 1  # the rear bumper at the start of the lane
+POS_RANDOM = 2
+POS_FREE = 3
+POS_RANDOM_FREE = 4
+POS_LAST = 5  # behind the last vehicle
+
+# DEPARTURE["speed_code"]: how fast
+SPEED_GIVEN = 0
+SPEED_RANDOM = 1
+SPEED_MAX = 2  # the most that is safe there
+SPEED_DESIRED = 3
+SPEED_LIMIT = 4
+SPEED_LAST = 5  # of the last vehicle on the lane
+SPEED_AVERAGE = 6
+
+# STOP["until_from"]: what the time of leaving is counted from
+UNTIL_ABSOLUTE = 0
+UNTIL_FLOW = 1
+UNTIL_DEPARTURE = 2
+
 # VEHICLE["hold"]: why a driver stands or will stop
 HOLD_NONE = 0
 HOLD_SIGNAL = 1  # red or yellow
@@ -46,10 +80,11 @@ ACTION_SLOWER = 4
 COUNT_DEPARTED = 0  # vehicles that have entered
 COUNT_ARRIVED = 1  # vehicles that reached their goal
 COUNT_REMOVED = 2  # agents taken out after a collision or off the road
-NUM_COUNTS = 3
+COUNT_REROUTED = 3  # vehicles that left their route for another way
+NUM_COUNTS = 4
 
 # Gate.sums, over vehicles that arrived
 SUM_DISTANCE_M = 0
 SUM_TIME_S = 1
-SUM_DELAY_S = 2  # time above what the way takes at the limit
+SUM_DELAY_S = 2  # time above what the way takes at the speed that limit and driver allow
 NUM_SUMS = 3

@@ -12,28 +12,34 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cavmarl.kernels import kernel
-from cavmarl.kernels.arrays import Demand, Gate, RoadArrays, Scratch, Worlds
-from cavmarl.kernels.car_following import (
-    ACCEL_MAX,
-    DECEL_COMFORT,
-    JAM_DISTANCE_M,
-    TIME_HEADWAY_S,
-)
+from cavmarl.kernels.arrays import Demand, Gate, RoadArrays, Scratch, Travel, Worlds
 from cavmarl.kernels.codes import (
     COUNT_ARRIVED,
     COUNT_DEPARTED,
     COUNT_REMOVED,
+    COUNT_REROUTED,
     DRIVER_AGENT,
     DRIVER_BACKGROUND,
     EVENT_ARRIVED,
     EVENTS_THAT_END,
+    LANE_GIVEN,
+    POS_GIVEN,
+    SPEED_MAX,
     SUM_DELAY_S,
     SUM_DISTANCE_M,
     SUM_TIME_S,
 )
-from cavmarl.kernels.following import REFERENCE_LENGTH_M
-from cavmarl.kernels.lanes import index_lanes, neighbor_ahead, neighbor_behind
+from cavmarl.kernels.entering import (
+    entry_lane,
+    entry_place,
+    entry_speed,
+    follower_brakes,
+    speed_at,
+)
+from cavmarl.kernels.geometry import boxes_overlap
+from cavmarl.kernels.lanes import index_lanes
 from cavmarl.kernels.motion import place_on_lane
+from cavmarl.kernels.neighbors import LEVEL_HEIGHT_M
 from cavmarl.kernels.rng import (
     STREAM_ORIGIN,
     STREAM_PLACE,
@@ -42,19 +48,18 @@ from cavmarl.kernels.rng import (
     below,
     uniform,
 )
+from cavmarl.kernels.ways import way_left
 
-__all__ = ["choose_goals", "let_in", "populate", "take_out"]
+__all__ = ["call_orders", "choose_goals", "let_in", "populate", "take_out"]
 
 PLACE_TRIES = 24  # places tried for a vehicle at reset before it has to queue
 PLACE_GAP_M = 10.0  # m between bumpers of vehicles placed at reset
 END_ROOM_M = 12.0  # nobody starts nearer than this to the end of a lane, unless it is shorter
-ENTER_GAP_M = 3.0  # m between bumpers, the least with which a vehicle enters
-ENTER_HEADWAY_S = 1.0  # and this time before the one behind
-ENTER_DECEL = 2.0  # m/s², braking that an entering vehicle may impose, or need at the lane's end
-ENTER_SHARE = 0.7  # of the speed limit
-ENTER_REACH_M = 80.0
+PLACE_SHARE = 0.7  # of the speed limit, with which vehicles drive that are placed at reset
+ENTER_ROOM_M = 0.3  # free on all sides of a vehicle that enters
 WANDER_M = 150.0  # nearer to its goal than this a vehicle of a closed world picks another
 GOAL_TRIES = 8
+REROUTE_S = 45.0  # one on a route so long
 GIVE_UP_S = 10.0  # a driver that waits longer than this to change lanes takes another way
 
 
@@ -77,58 +82,71 @@ def _order(
     gate.num_queue[w] += 1
     departure["id"] = vehicle
     departure["agent"] = agent
-    departure["lane"] = trips[trip, 0]
-    departure["goal"] = trips[trip, 1]
-    departure["ordered"] = worlds.ticks[w]
+    departure["order"] = -1
+    departure["vtype"] = demand.blank[0]["vtype"]
+    departure["stop"] = -1
+    departure["stops_end"] = -1
+    departure["lane_code"] = LANE_GIVEN
+    departure["pos_code"] = POS_GIVEN
+    departure["speed_code"] = SPEED_MAX
+    departure["due"] = worlds.ticks[w]
+    _send(roads, departure, trips[trip, 0], trips[trip, 1])
     spread = 2.0 * uniform(key, vehicle, 0, STREAM_SPEED_FACTOR) - 1.0
     departure["speed_factor"] = 1.0 + demand.speed_factor_spread * spread
     length = roads.lanes[departure["lane"]]["length_m"]
-    half = 0.5 * demand.blank[0]["length"]
-    free = max(length - 2.0 * half - END_ROOM_M, 0.0)
-    departure["s"] = half + 1.0
+    body = demand.blank[0]["length"]
+    departure["pos"] = body + 1.0
     if agent >= 0 or not demand.enter_at_start:
-        departure["s"] += free * uniform(key, vehicle, 0, STREAM_PLACE)
+        free = max(length - body - END_ROOM_M, 0.0)
+        departure["pos"] += free * uniform(key, vehicle, 0, STREAM_PLACE)
+
+
+@kernel
+def _send(roads: RoadArrays, departure: np.void, lane: int, goal: int) -> None:
+    """Set where a departure of the generator starts and where it goes."""
+    departure["lane"] = lane
+    departure["goal"] = goal
+    departure["way"] = goal * roads.lanes.shape[0]
 
 
 @kernel
 def _enter(
-    demand: Demand,
     roads: RoadArrays,
-    plans: NDArray[np.void],
-    gate: Gate,
+    travel: Travel,
     worlds: Worlds,
     w: int,
     departure: np.void,
+    lane: int,
+    s: float,
     speed: float,
     row: np.void,
 ) -> None:
     """Write the record of a vehicle that enters; `row` already holds the blank."""
+    kind = travel.types[departure["vtype"]]
     row["id"] = departure["id"]
     row["agent"] = departure["agent"]
     row["driver"] = DRIVER_AGENT if departure["agent"] >= 0 else DRIVER_BACKGROUND
+    row["order"] = departure["order"]
+    row["vtype"] = departure["vtype"]
+    row["length"] = kind["length"]
+    row["width"] = kind["width"]
+    row["height"] = kind["height"]
     row["goal"] = departure["goal"]
-    row["lane"] = departure["lane"]
-    row["target_lane"] = departure["lane"]
-    row["s"] = departure["s"]
+    row["way"] = departure["way"]
+    row["stop"] = departure["stop"]
+    row["stops_end"] = departure["stops_end"]
+    row["lane"] = lane
+    row["target_lane"] = lane
+    row["s"] = s
     row["speed"] = speed
     row["target_speed"] = speed
     row["speed_factor"] = departure["speed_factor"]
     row["rng_key"] = worlds.keys[w]
     row["departed"] = worlds.ticks[w]
     row["tick"] = worlds.ticks[w]
-    cos, sin = place_on_lane(roads, row)
-    row["heading"] = math.atan2(sin, cos)
-    row["to_go"] = plans[row["goal"], row["lane"]]["to_go"] - row["s"]
+    row["heading"] = place_on_lane(roads, travel, row)
+    row["to_go"] = way_left(roads, travel, row)
     row["step_to_go"] = row["to_go"]
-    gate.counts[w, COUNT_DEPARTED] += 1
-
-
-@kernel
-def _speed_at(roads: RoadArrays, lane: int, s: float, half: float) -> float:
-    """A speed to start with at a place: below the limit, and slow before the end of the lane."""
-    row = roads.lanes[lane]
-    rest = max(row["length_m"] - s - half - 2.0, 0.0)
-    return min(ENTER_SHARE * float(row["speed_mps"]), math.sqrt(2.0 * ENTER_DECEL * rest))
 
 
 @kernel
@@ -144,7 +162,7 @@ def _is_free(rows: NDArray[np.void], num: int, lane: int, s: float, half: float)
 def populate(
     demand: Demand,
     roads: RoadArrays,
-    plans: NDArray[np.void],
+    travel: Travel,
     gate: Gate,
     worlds: Worlds,
     chosen: NDArray[np.bool_],
@@ -156,7 +174,7 @@ def populate(
     Args:
         demand: the generator's tables.
         roads: the road arrays.
-        plans: PLAN (G, L).
+        travel: types and ways.
         gate: written where chosen.
         worlds: written where chosen; ticks and keys are already those of the new episode.
         chosen: (W,) which worlds.
@@ -169,6 +187,7 @@ def populate(
         worlds.num_rows[w] = 0
         worlds.num_contacts[w] = 0
         gate.num_queue[w] = 0
+        gate.next_order[w] = 0
         gate.next_id[w] = 0
         gate.counts[w, :] = 0
         gate.sums[w, :] = 0.0
@@ -179,19 +198,23 @@ def populate(
             _order(demand, roads, gate, worlds, w, agent, trips)
             departure = gate.queue[w, gate.num_queue[w] - 1]
             vehicle = departure["id"]
+            kind = travel.types[departure["vtype"]]
             for attempt in range(PLACE_TRIES):
                 trip = below(worlds.keys[w], vehicle, 0, STREAM_ORIGIN + attempt, trips.shape[0])
-                departure["lane"] = trips[trip, 0]
-                departure["goal"] = trips[trip, 1]
-                length = roads.lanes[departure["lane"]]["length_m"]
+                lane = trips[trip, 0]
+                _send(roads, departure, lane, trips[trip, 1])
+                length = roads.lanes[lane]["length_m"]
                 share = uniform(worlds.keys[w], vehicle, 0, STREAM_PLACE + attempt)
-                departure["s"] = half + 1.0 + share * max(length - 2.0 * half - END_ROOM_M, 0.0)
+                s = half + 1.0 + share * max(length - 2.0 * half - END_ROOM_M, 0.0)
+                departure["pos"] = s + half
                 num = worlds.num_rows[w]
-                if _is_free(worlds.rows[w], num, departure["lane"], departure["s"], half):
+                if _is_free(worlds.rows[w], num, lane, s, half):
                     worlds.rows[w, num] = demand.blank[0]
-                    speed = _speed_at(roads, departure["lane"], departure["s"], half)
+                    limit = PLACE_SHARE * roads.lanes[lane]["speed_mps"]
+                    speed = speed_at(roads, kind, lane, s, limit)
                     row = worlds.rows[w, num]
-                    _enter(demand, roads, plans, gate, worlds, w, departure, speed, row)
+                    _enter(roads, travel, worlds, w, departure, lane, s, speed, row)
+                    gate.counts[w, COUNT_DEPARTED] += 1
                     worlds.num_rows[w] = num + 1
                     worlds.num_owned[w] = num + 1
                     gate.num_queue[w] -= 1
@@ -199,36 +222,80 @@ def populate(
 
 
 @kernel
-def _needs_goal(demand: Demand, plans: NDArray[np.void], row: np.void) -> bool:
+def _needs_goal(demand: Demand, roads: RoadArrays, travel: Travel, row: np.void) -> bool:
     """Whether a background vehicle picks another goal: near it in a closed world, or stuck.
 
     Stuck is who has stood for `GIVE_UP_S` at the end of a lane that its way does not follow.
     """
+    if row["driver"] != DRIVER_BACKGROUND:
+        return False
+    if row["order"] >= 0:
+        return row["goal"] >= 0 and _is_stuck(roads, travel, row, REROUTE_S)
     if not demand.reenter and row["to_go"] <= WANDER_M:
         return True
-    step = plans[row["goal"], row["lane"]]
-    stuck: bool = row["wait_s"] > GIVE_UP_S and step["next"] < 0 and step["change"] != 0
+    return _is_stuck(roads, travel, row, GIVE_UP_S)
+
+
+@kernel
+def _is_stuck(roads: RoadArrays, travel: Travel, row: np.void, patience_s: float) -> bool:
+    if row["wait_s"] <= patience_s or roads.lanes[row["lane"]]["internal"]:
+        return False
+    step = travel.steps[row["way"] + row["lane"]]
+    stuck: bool = step["next"] < 0 and step["change"] != 0
     return stuck
 
 
 @kernel
+def _take_detour(roads: RoadArrays, travel: Travel, row: np.void) -> bool:
+    """Send a vehicle of the demand file on to its goal without the lane change it waits for."""
+    way = travel.first_detour + row["goal"] * roads.lanes.shape[0]
+    step = travel.steps[way + row["lane"]]
+    if step["next"] < 0 or way == row["way"]:
+        return False
+    row["way"] = way
+    row["leg"] += 1
+    row["to_go"] = step["to_go"] - row["s"]
+    return True
+
+
+@kernel
 def choose_goals(
-    demand: Demand, roads: RoadArrays, plans: NDArray[np.void], worlds: Worlds
+    demand: Demand,
+    roads: RoadArrays,
+    travel: Travel,
+    num_goals: int,
+    gate: Gate,
+    worlds: Worlds,
+    dt: float,
 ) -> None:
-    """Give the background vehicles of `next_rows` that need it another goal, if one is in reach."""
+    """Give the background vehicles of `next_rows` that need it another goal, if one is in reach.
+
+    Asked about once a second.
+    """
+    turns = max(1, round(1.0 / dt))
     for w in range(worlds.ticks.shape[0]):
+        if worlds.ticks[w] % turns != 0:
+            continue
         for i in range(worlds.num_owned[w]):
             row = worlds.next_rows[w, i]
-            if row["driver"] != DRIVER_BACKGROUND or not _needs_goal(demand, plans, row):
+            if not _needs_goal(demand, roads, travel, row):
+                continue
+            lane = row["lane"]
+            if row["order"] >= 0:
+                gate.counts[w, COUNT_REROUTED] += _take_detour(roads, travel, row)
+                continue
+            if roads.lanes[lane]["internal"]:
                 continue
             for attempt in range(GOAL_TRIES):
                 goal = below(
-                    row["rng_key"], row["id"], row["tick"], STREAM_ROUTE + attempt, plans.shape[0]
+                    row["rng_key"], row["id"], row["tick"], STREAM_ROUTE + attempt, num_goals
                 )
-                step = plans[goal, row["lane"]]
+                way = goal * roads.lanes.shape[0]
+                step = travel.steps[way + lane]
                 to_go = step["to_go"] - row["s"]
                 if to_go < math.inf and to_go > WANDER_M and step["change"] == 0:
                     row["goal"] = goal
+                    row["way"] = way
                     row["leg"] += 1
                     row["to_go"] = to_go
                     row["events"] &= ~EVENT_ARRIVED
@@ -279,12 +346,15 @@ def take_out(
         ticks_per_step: ticks a step; agents that entered within the last of them have not acted.
     """
     for w in range(worlds.ticks.shape[0]):
+        if driver == DRIVER_BACKGROUND and worlds.num_through[w] == 0:
+            continue
         while True:
             i = _next_through(rows[w], worlds.num_owned[w], driver, ticks_per_step)
             if i < 0:
                 break
             row = rows[w, i]
             agent = row["agent"]
+            ordered = row["order"] >= 0
             if row["events"] & EVENT_ARRIVED:
                 time = (row["tick"] - row["departed"]) * dt
                 gate.counts[w, COUNT_ARRIVED] += 1
@@ -297,7 +367,7 @@ def take_out(
             rows[w, i] = rows[w, last]
             worlds.num_owned[w] = last
             worlds.num_rows[w] -= 1
-            if not demand.reenter:
+            if not demand.reenter or ordered:
                 continue
             if agent < 0:
                 _order(demand, roads, gate, worlds, w, -1, demand.enter_trips)
@@ -310,80 +380,115 @@ def take_out(
 
 
 @kernel
-def _speed_behind(gap: float, leader_speed: float) -> float:
-    """The speed at which `gap` m between bumpers is just what IDM wants behind a leader.
-
-    The positive root of jam + v·T + v·(v - leader) / (2·sqrt(a·b)) = gap, or 0.
-    """
-    scale = 2.0 * math.sqrt(ACCEL_MAX * DECEL_COMFORT)
-    linear = TIME_HEADWAY_S - leader_speed / scale
-    room = gap + REFERENCE_LENGTH_M - JAM_DISTANCE_M
-    root = linear * linear + 4.0 * room / scale
-    return max(0.5 * scale * (math.sqrt(max(root, 0.0)) - linear), 0.0) if room > 0.0 else 0.0
+def call_orders(gate: Gate, worlds: Worlds) -> None:
+    """Put the ordered departures that are due by the coming tick at the end of the queue."""
+    for w in range(worlds.ticks.shape[0]):
+        n = gate.next_order[w]
+        while n < gate.num_orders[w] and gate.orders[w, n]["due"] <= worlds.ticks[w] + 1:
+            departure = gate.queue[w, gate.num_queue[w]]
+            gate.queue[w, gate.num_queue[w]] = gate.orders[w, n]
+            departure["id"] = gate.next_id[w]
+            gate.next_id[w] += 1
+            gate.num_queue[w] += 1
+            n += 1
+        gate.next_order[w] = n
 
 
 @kernel
-def _gap_speed(
+def _touches(rows: NDArray[np.void], i: int) -> bool:
+    """Whether row i, with some room around it, touches one of the rows before it."""
+    own = rows[i]
+    cos = math.cos(own["heading"])
+    sin = math.sin(own["heading"])
+    half_length = 0.5 * own["length"] + ENTER_ROOM_M
+    half_width = 0.5 * own["width"] + ENTER_ROOM_M
+    for j in range(i):
+        other = rows[j]
+        dx = other["x"] - own["x"]
+        dy = other["y"] - own["y"]
+        reach = half_length + half_width + 0.5 * (other["length"] + other["width"])
+        if dx * dx + dy * dy > reach * reach or abs(other["z"] - own["z"]) > LEVEL_HEIGHT_M:
+            continue
+        if boxes_overlap(
+            own["x"],
+            own["y"],
+            cos,
+            sin,
+            half_length,
+            half_width,
+            other["x"],
+            other["y"],
+            math.cos(other["heading"]),
+            math.sin(other["heading"]),
+            0.5 * other["length"],
+            0.5 * other["width"],
+        ):
+            return True
+    return False
+
+
+@kernel
+def _try_to_enter(
+    demand: Demand,
     roads: RoadArrays,
-    rows: NDArray[np.void],
-    i: int,
-    lane: int,
-    s: float,
-    speed: float,
+    travel: Travel,
+    gate: Gate,
+    worlds: Worlds,
+    w: int,
+    departure: np.void,
     scratch: Scratch,
-) -> float:
-    """The speed, at most `speed`, at which row i can enter safely; negative if it can not."""
-    half = 0.5 * rows[i]["length"]
-    j, ahead_s = neighbor_ahead(rows, i, lane, s, scratch)
-    if j >= 0:
-        gap = ahead_s - s - half - 0.5 * rows[j]["length"]
-        if gap < ENTER_GAP_M:
-            return -1.0
-        speed = min(speed, _speed_behind(gap, rows[j]["speed"]))
-    k, behind = neighbor_behind(roads, rows, i, lane, s, ENTER_REACH_M, scratch)
-    if k >= 0:
-        follower = rows[k]["speed"]
-        braking = max(follower * follower - speed * speed, 0.0) / (2.0 * ENTER_DECEL)
-        needed = ENTER_GAP_M + follower * ENTER_HEADWAY_S + braking
-        if behind - half - 0.5 * rows[k]["length"] < needed:
-            return -1.0
-    return speed
+) -> bool:
+    """Let one departure enter `next_rows` if it finds a safe gap on its lane."""
+    key = worlds.keys[w]
+    lane = entry_lane(roads, travel, key, departure, scratch)
+    if lane < 0:
+        return False
+    # The lane is taken whether or not there is room: who waits longer goes first.
+    scratch.lane_taken[lane] = True
+    rows = worlds.next_rows[w]
+    kind = travel.types[departure["vtype"]]
+    s = entry_place(roads, key, departure, kind, lane, worlds.ticks[w], scratch)
+    speed = entry_speed(roads, travel, key, departure, kind, lane, s, scratch)
+    if speed < 0.0:
+        return False
+    if follower_brakes(roads, travel, rows, departure, kind, lane, s, speed, scratch):
+        return False
+    i = worlds.num_rows[w]
+    rows[i] = demand.blank[0]
+    _enter(roads, travel, worlds, w, departure, lane, s, speed, rows[i])
+    if _touches(rows, i):
+        return False
+    gate.counts[w, COUNT_DEPARTED] += 1
+    worlds.num_owned[w] += 1
+    worlds.num_rows[w] += 1
+    return True
 
 
 @kernel
 def let_in(
     demand: Demand,
     roads: RoadArrays,
-    plans: NDArray[np.void],
+    travel: Travel,
     gate: Gate,
     worlds: Worlds,
     scratch: Scratch,
 ) -> None:
-    """Let the first waiting departure of each world that finds a safe gap enter `next_rows`.
-
-    One a tick: the next one sees it among the rows.
-    """
+    """Let the waiting departures that find a safe gap enter `next_rows`, at most one a lane."""
     for w in range(worlds.ticks.shape[0]):
         waiting = gate.num_queue[w]
         if waiting == 0:
             continue
-        rows = worlds.next_rows[w]
-        i = worlds.num_owned[w]
-        rows[i] = demand.blank[0]
-        index_lanes(roads.lanes, rows, worlds.num_rows[w], scratch)
+        index_lanes(roads, travel, worlds.next_rows[w], worlds.num_rows[w], scratch)
+        scratch.lane_taken[:] = False
+        kept = 0
         for q in range(waiting):
             departure = gate.queue[w, q]
-            row = rows[i]
-            row["id"] = departure["id"]
-            lane = departure["lane"]
-            free = _speed_at(roads, lane, departure["s"], 0.5 * row["length"])
-            speed = _gap_speed(roads, rows, i, lane, departure["s"], free, scratch)
-            if speed < 0.0:
+            full = worlds.num_rows[w] == worlds.rows.shape[1]
+            if not full and _try_to_enter(
+                demand, roads, travel, gate, worlds, w, departure, scratch
+            ):
                 continue
-            _enter(demand, roads, plans, gate, worlds, w, departure, speed, row)
-            worlds.num_owned[w] = i + 1
-            worlds.num_rows[w] += 1
-            for rest in range(q + 1, waiting):
-                gate.queue[w, rest - 1] = gate.queue[w, rest]
-            gate.num_queue[w] = waiting - 1
-            break
+            if kept < q:
+                gate.queue[w, kept] = departure
+            kept += 1
+        gate.num_queue[w] = kept

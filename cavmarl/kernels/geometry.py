@@ -14,8 +14,6 @@ from numpy.typing import NDArray
 
 from cavmarl.kernels import kernel
 
-__all__ = ["boxes_overlap", "lane_pose", "project", "project_near", "wrap_angle"]
-
 PI = math.pi
 TWO_PI = 2.0 * math.pi
 
@@ -30,7 +28,7 @@ def wrap_angle(angle: float) -> float:
 
 
 @kernel
-def _segment_at(points: NDArray[np.void], first: int, num: int, s: float) -> int:
+def segment_at(points: NDArray[np.void], first: int, num: int, s: float) -> int:
     """The last segment that starts at or before `s`, as a POINT row; the first one for s < 0."""
     low = first
     high = first + num - 2
@@ -58,7 +56,7 @@ def lane_pose(
     Returns:
         x, y, z in metres, cos and sin of the direction, slope dz/ds.
     """
-    point = points[_segment_at(points, first, num, s)]
+    point = points[segment_at(points, first, num, s)]
     along = s - point["s"]
     return (
         point["x"] + along * point["cos"],
@@ -157,8 +155,8 @@ def project_near(
 
     Faster on long lanes, and it keeps a vehicle on its branch of a lane that returns to itself.
     """
-    start = _segment_at(points, first, num, s_hint - window_m)
-    stop = _segment_at(points, first, num, s_hint + window_m) + 1
+    start = segment_at(points, first, num, s_hint - window_m)
+    stop = segment_at(points, first, num, s_hint + window_m) + 1
     return _project_between(points, first, num, start, stop, x, y)
 
 

@@ -1,9 +1,9 @@
-"""Right of way: who approaches which link, and whether a driver may enter one.
+"""Right of way: whether a driver may enter a link, or go on from a waiting position inside.
 
-Every vehicle announces itself to the links ahead on its way and to the one it is on. A driver
-enters a link if no foe is in the shared area when it would be, if it gives way to those it must
-give way to, and if there is room behind the junction. All questions are minima and any-ofs over the
-foes: the order of rows plays no part.
+A driver enters a link if no foe is in the shared area when it would be, if it gives way to those it
+must give way to, and if there is room behind the junction. Where the map lets drivers wait inside
+the junction (for oncoming traffic before a left turn), what lies beyond that place is asked there.
+All questions are minima and any-ofs over the foes: the order of rows plays no part.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cavmarl.kernels import kernel
-from cavmarl.kernels.arrays import RoadArrays, Scratch
+from cavmarl.kernels.arrays import RoadArrays, Scratch, Travel
 from cavmarl.kernels.codes import (
     DRIVER_AGENT,
     HOLD_EXIT_BLOCKED,
@@ -30,20 +30,19 @@ from cavmarl.kernels.codes import (
     SIGNAL_YELLOW_MAJOR,
     SIGNAL_YELLOW_MINOR,
 )
-from cavmarl.kernels.lanes import last_on_lane
+from cavmarl.kernels.following import LINE_MARGIN_M, before_line, behind, no_press
+from cavmarl.kernels.ways import next_step
 
 __all__ = [
-    "APPROACH_M",
     "STOP_SIGN_S",
-    "conflict_inside",
     "link_signal",
     "may_enter",
-    "register_links",
+    "press_inside",
+    "waits_inside",
 ]
 
-APPROACH_M = 150.0  # how far ahead a vehicle announces itself to links
-MAX_LINKS_AHEAD = 2
-ENTRY_ACCEL = 2.5  # m/s², how a driver thinks others and itself speed up over a junction
+FOE_ACCEL = 2.5  # m/s², how a driver thinks that others speed up over a junction,
+OWN_ACCEL = 1.8  # and, to be safe, itself
 COMFORT_STOP = 3.0  # m/s², a driver stops for yellow where this braking is enough
 HARD_STOP = 5.0  # m/s², a vehicle that needs more to stop before the line will not stop
 GAP_S = 1.0  # s between the last of one and the first of the other in a shared area
@@ -52,7 +51,11 @@ STANDING_MPS = 0.5
 LAST_CHANCE_M = 3.0  # with the front this near to the line
 ROOM_M = 3.0  # free way left behind a vehicle that clears a junction
 IMPATIENT_S = 3.0  # a vehicle that stands this long without reason is not waited for
+EXIT_LANES = 4  # looked along for room
+IMPATIENCE_S = 180.0  # after which one who gives way makes others brake
+FORCED_STOP = 4.5  # m/s², and how hard; less in proportion after less time
 STOP_SIGN_S = 0.5  # how long one stands at a stop sign, and before a tie is broken
+WAIT_SLACK_M = 0.5  # a front this far beyond a waiting position still waits there
 STATE_STOP = ord("s")
 STATE_ALLWAY_STOP = ord("w")
 
@@ -68,93 +71,15 @@ def link_signal(roads: RoadArrays, link: int, phase: NDArray[np.int32]) -> int:
 
 
 @kernel
-def register_links(
-    roads: RoadArrays,
-    plans: NDArray[np.void],
-    rows: NDArray[np.void],
-    num: int,
-    scratch: Scratch,
-) -> None:
-    """List for every link the vehicles that are on it or will reach it, into `scratch.link_*`.
-
-    Args:
-        roads: the road arrays.
-        plans: PLAN (G, L).
-        rows: VEHICLE (C,), of which `num` live.
-        num: live rows.
-        scratch: link_start, link_row, link_dist are written. The distance is that of the vehicle's
-            centre to the stop line, negative beyond it.
-    """
-    pairs = 0
-    for i in range(num):
-        pairs = _announce(roads, plans, rows[i], i, pairs, scratch)
-    start = scratch.link_start
-    num_links = roads.links.shape[0]
-    start[: num_links + 2] = 0
-    for k in range(pairs):
-        start[scratch.pair_link[k] + 2] += 1
-    for link in range(num_links):
-        start[link + 2] += start[link + 1]
-    for k in range(pairs):
-        link = scratch.pair_link[k]
-        place = start[link + 1]
-        scratch.link_row[place] = scratch.pair_row[k]
-        scratch.link_dist[place] = scratch.pair_dist[k]
-        start[link + 1] = place + 1
-
-
-@kernel
-def _announce(
-    roads: RoadArrays,
-    plans: NDArray[np.void],
-    row: np.void,
-    i: int,
-    pairs: int,
-    scratch: Scratch,
-) -> int:
-    """Append row i's (link, distance) pairs; returns the new number of pairs."""
-    lane = row["lane"]
-    here = roads.lanes[lane]
-    if here["internal"]:
-        scratch.pair_link[pairs] = here["link"]
-        scratch.pair_row[pairs] = i
-        scratch.pair_dist[pairs] = -(here["link_offset_m"] + row["s"])
-        pairs += 1
-    elif row["link"] >= 0 and row["s"] < 0.5 * row["length"]:
-        # Its centre has left the junction, its rear has not.
-        left = row["link"]
-        if roads.links[left]["to_lane"] == lane:
-            scratch.pair_link[pairs] = left
-            scratch.pair_row[pairs] = i
-            scratch.pair_dist[pairs] = -(roads.links[left]["length_m"] + row["s"])
-            pairs += 1
-    distance = here["length_m"] - row["s"]
-    found = 0
-    while distance < APPROACH_M and found < MAX_LINKS_AHEAD:
-        step = plans[row["goal"], lane]
-        if step["next"] < 0:
-            break
-        if step["link"] >= 0:
-            scratch.pair_link[pairs] = step["link"]
-            scratch.pair_row[pairs] = i
-            scratch.pair_dist[pairs] = max(distance, 0.0)
-            pairs += 1
-            found += 1
-        lane = step["next"]
-        distance += roads.lanes[lane]["length_m"]
-    return pairs
-
-
-@kernel
-def _earliest(distance: float, speed: float, limit: float) -> float:
-    """Time in s to drive `distance` m when speeding up with ENTRY_ACCEL to `limit` m/s."""
+def _earliest(distance: float, speed: float, limit: float, accel: float) -> float:
+    """Time in s to drive `distance` m when speeding up with `accel` m/s² to `limit` m/s."""
     if distance <= 0.0:
         return 0.0
     limit = max(limit, speed, 0.1)
-    ramp = (limit * limit - speed * speed) / (2.0 * ENTRY_ACCEL)
+    ramp = (limit * limit - speed * speed) / (2.0 * accel)
     if distance < ramp:
-        return (math.sqrt(speed * speed + 2.0 * ENTRY_ACCEL * distance) - speed) / ENTRY_ACCEL
-    return (limit - speed) / ENTRY_ACCEL + (distance - ramp) / limit
+        return (math.sqrt(speed * speed + 2.0 * accel * distance) - speed) / accel
+    return (limit - speed) / accel + (distance - ramp) / limit
 
 
 @kernel
@@ -184,18 +109,80 @@ def _ignores(row: np.void, foe: np.void, link: int, signal: int) -> bool:
 
 
 @kernel
+def _foe_blocks(
+    roads: RoadArrays,
+    rows: NDArray[np.void],
+    row: np.void,
+    link: int,
+    conflict: np.void,
+    foe: np.void,
+    gives_way: bool,
+    foe_signal: int,
+    to_leave: float,
+    time_in: float,
+    time_out: float,
+) -> bool:
+    """Whether one APPROACH is, or will be, in the shared area while `row` is, or goes first."""
+    to_clear = foe["dist"] + conflict["foe_leave_m"] + foe["half"]
+    if to_clear <= 0.0:
+        return False
+    cleared = to_clear / max(foe["speed"], 0.1)
+    foe_lane = roads.links[foe["link"]]["from_lane"]
+    # Its front before the line that it can still stop at: the stop line, or, where the shared
+    # area lies beyond that, its waiting position inside.
+    front = foe["dist"] - foe["half"] - roads.lanes[foe_lane]["stop_back_m"]
+    wait_m = roads.links[foe["link"]]["wait_m"]
+    if front <= 0.0 and conflict["foe_enter_m"] >= wait_m - LINE_MARGIN_M:
+        front += wait_m + WAIT_SLACK_M
+    if front <= 0.0:
+        # Who stands on the junction before the shared area is kept from it by somebody else.
+        before_area = foe["dist"] + conflict["foe_enter_m"] - foe["half"] > 0.0
+        if before_area and foe["speed"] < STANDING_MPS and rows[foe["row"]]["wait_s"] > IMPATIENT_S:
+            return False
+        # Behind one that is faster and leads into the same lane, one can follow.
+        apart = to_leave - to_clear
+        if conflict["merging"] and apart > ROOM_M and row["speed"] <= foe["speed"]:
+            return False
+        inside: bool = cleared + 0.5 * GAP_S > time_in
+        return inside
+    committed = foe["speed"] * foe["speed"] > 2.0 * HARD_STOP * max(front, 0.01)
+    if not committed:
+        if not (gives_way and conflict["must_yield"]):
+            return False
+        if _ignores(row, rows[foe["row"]], link, foe_signal):
+            return False
+        patience = min(row["wait_s"] / IMPATIENCE_S, 1.0)
+        if row["hold"] == HOLD_NONE and row["stopped_at"] == link:
+            patience = 1.0  # it has been let in and goes on
+        if foe["speed"] * foe["speed"] < 2.0 * FORCED_STOP * patience * front:
+            return False
+    if cleared + GAP_S < time_in:
+        return False
+    foe_limit = roads.lanes[foe_lane]["speed_mps"]
+    to_area = foe["dist"] + conflict["foe_enter_m"] - foe["half"]
+    arrives = _earliest(to_area, foe["speed"], foe_limit, FOE_ACCEL)
+    return arrives < time_out + GAP_S
+
+
+@kernel
 def _blocked_by_foes(
     roads: RoadArrays,
     rows: NDArray[np.void],
     i: int,
     link: int,
     distance: float,
+    wait_m: float,
+    inside: bool,
     gives_way: bool,
     phase: NDArray[np.int32],
     scratch: Scratch,
 ) -> bool:
-    """Whether a foe is, or will be, where row i would be on `link`, `distance` m from its line."""
+    """Whether a foe is, or will be, where row i would be on `link`, `distance` m from its line.
+
+    Asks about the shared areas before `wait_m`, or, from `inside`, about those beyond.
+    """
     row = rows[i]
+    speed = row["speed"]
     half = 0.5 * row["length"]
     limit = roads.lanes[roads.links[link]["next_lane"]]["speed_mps"]
     if row["driver"] == DRIVER_AGENT:
@@ -203,75 +190,77 @@ def _blocked_by_foes(
     first = roads.links[link]["first_conflict"]
     for c in range(first, first + roads.links[link]["num_conflicts"]):
         conflict = roads.conflicts[c]
-        foe_link = conflict["foe"]
-        begin = scratch.link_start[foe_link]
-        end = scratch.link_start[foe_link + 1]
-        if begin == end:
+        begin = scratch.link_start[conflict["foe"]]
+        end = scratch.link_start[conflict["foe"] + 1]
+        if begin == end or (conflict["enter_m"] >= wait_m - LINE_MARGIN_M) != inside:
             continue
-        time_in = _earliest(distance + conflict["enter_m"] - half, row["speed"], limit)
-        time_out = _earliest(distance + conflict["leave_m"] + half, row["speed"], limit)
-        foe_signal = link_signal(roads, foe_link, phase)
+        time_in = _earliest(distance + conflict["enter_m"] - half, speed, limit, FOE_ACCEL)
+        time_out = _earliest(distance + conflict["leave_m"] + half, speed, limit, OWN_ACCEL)
+        foe_signal = link_signal(roads, conflict["foe"], phase)
+        to_leave = distance + conflict["leave_m"] - half
         for k in range(begin, end):
-            j = scratch.link_row[k]
-            if j == i:
-                continue
-            foe = rows[j]
-            foe_half = 0.5 * foe["length"]
-            foe_distance = scratch.link_dist[k]
-            to_clear = foe_distance + conflict["foe_leave_m"] + foe_half
-            if to_clear <= 0.0:
-                continue
-            cleared = to_clear / max(foe["speed"], 0.1)
-            if foe_distance - foe_half <= 0.0 and foe_distance <= 0.0:
-                if cleared + 0.5 * GAP_S > time_in:
-                    return True
-                continue
-            front = max(foe_distance - foe_half, 0.01)
-            committed = foe["speed"] * foe["speed"] > 2.0 * HARD_STOP * front
-            if not committed:
-                if not (gives_way and conflict["must_yield"]) or _ignores(
-                    row, foe, link, foe_signal
-                ):
-                    continue
-            if cleared + GAP_S < time_in:
-                continue
-            foe_limit = roads.lanes[roads.links[foe_link]["from_lane"]]["speed_mps"]
-            arrives = _earliest(
-                foe_distance + conflict["foe_enter_m"] - foe_half, foe["speed"], foe_limit
-            )
-            if arrives < time_out + GAP_S:
+            foe = scratch.approach[k]
+            if foe["row"] != i and _foe_blocks(
+                roads,
+                rows,
+                row,
+                link,
+                conflict,
+                foe,
+                gives_way,
+                foe_signal,
+                to_leave,
+                time_in,
+                time_out,
+            ):
                 return True
     return False
 
 
 @kernel
 def _exit_blocked(
-    roads: RoadArrays, rows: NDArray[np.void], i: int, link: int, scratch: Scratch
+    roads: RoadArrays, travel: Travel, row: np.void, link: int, way: int, scratch: Scratch
 ) -> bool:
-    """Whether there is no room for row i between the junction and the last vehicle behind it."""
+    """Whether a row could not clear the junction behind the last standing vehicle on its way.
+
+    Who still moves in between will need room as well.
+    """
     target = roads.links[link]
-    j, s = last_on_lane(i, target["to_lane"], scratch)
-    if j < 0 or rows[j]["speed"] > 2.0:
-        return False
-    room = s - 0.5 * rows[j]["length"]
+    room = 0.0
     lane = target["next_lane"]
     while roads.lanes[lane]["internal"]:
-        for k in range(scratch.lane_start[lane], scratch.lane_start[lane + 1]):
-            other = scratch.entry_row[k]
-            if other != i:
-                room -= rows[other]["length"] + ROOM_M
+        for k in range(scratch.lane_start[lane], scratch.lane_end[lane]):
+            other = scratch.entries[k]
+            if other["id"] != row["id"]:
+                room -= 2.0 * other["half"] + ROOM_M
         lane = roads.lanes[lane]["successor"]
-    blocked: bool = room < rows[i]["length"] + ROOM_M
-    return blocked
+    needed = row["length"] + ROOM_M
+    for _ in range(EXIT_LANES):
+        for k in range(scratch.lane_start[lane], scratch.lane_end[lane]):
+            other = scratch.entries[k]
+            if other["speed"] < STANDING_MPS:
+                room += other["s"] - other["half"]
+                blocked: bool = room < needed
+                return blocked
+            room -= 2.0 * other["half"] + ROOM_M
+        room += roads.lanes[lane]["length_m"]
+        if room >= needed:
+            return False
+        lane, way, _ = next_step(roads, travel, lane, way)
+        if lane < 0:
+            return False
+    return False
 
 
 @kernel
 def may_enter(
     roads: RoadArrays,
+    travel: Travel,
     rows: NDArray[np.void],
     i: int,
     link: int,
     distance: float,
+    way: int,
     phase: NDArray[np.int32],
     scratch: Scratch,
 ) -> int:
@@ -279,16 +268,19 @@ def may_enter(
 
     Args:
         roads: the road arrays.
+        travel: the ways.
         rows: VEHICLE (C,).
         i: the row that asks.
         link: LINK row.
-        distance: of its centre to the stop line in m.
+        distance: of its centre to the end of its lane in m.
+        way: of the row beyond the junction.
         phase: (num_signals,) PHASE rows that are on.
         scratch: with the lane and link indices of this tick.
     """
     row = rows[i]
     signal = link_signal(roads, link, phase)
-    front = max(distance - 0.5 * row["length"], 0.01)
+    back = roads.lanes[roads.links[link]["from_lane"]]["stop_back_m"]
+    front = max(distance - 0.5 * row["length"] - back, 0.01)
     needed = row["speed"] * row["speed"] / (2.0 * front)
     if signal == SIGNAL_RED or signal == SIGNAL_RED_YELLOW:
         return HOLD_SIGNAL
@@ -306,40 +298,140 @@ def may_enter(
     if must_stop and row["stopped_at"] != link:
         return HOLD_YIELD
     gives_way = signal != SIGNAL_GREEN_MAJOR and signal != SIGNAL_OFF
-    if _blocked_by_foes(roads, rows, i, link, distance, gives_way, phase, scratch):
+    if _blocked_by_foes(
+        roads, rows, i, link, distance, target["wait_m"], False, gives_way, phase, scratch
+    ):
         return HOLD_YIELD
-    if _exit_blocked(roads, rows, i, link, scratch):
+    if _exit_blocked(roads, travel, row, link, way, scratch):
         return HOLD_EXIT_BLOCKED
     return HOLD_NONE
 
 
 @kernel
-def conflict_inside(
-    roads: RoadArrays, rows: NDArray[np.void], i: int, link: int, place: float, scratch: Scratch
-) -> float:
-    """Way in m from row i's front to where it has to stop for a foe on the same junction, or inf.
+def waits_inside(
+    roads: RoadArrays,
+    travel: Travel,
+    rows: NDArray[np.void],
+    i: int,
+    link: int,
+    distance: float,
+    way: int,
+    phase: NDArray[np.int32],
+    scratch: Scratch,
+) -> int:
+    """Whether row i has to stop at the waiting position of `link`, if there is one: HOLD_*.
 
-    `place` is row i's centre on the link, m from its stop line. Of two vehicles in conflict the one
-    that is nearer to the shared area goes first; at equal distance the smaller id.
+    Arguments as in `may_enter`; the distance is negative inside.
+    """
+    wait_m = roads.links[link]["wait_m"]
+    if wait_m == math.inf:
+        return HOLD_NONE
+    signal = link_signal(roads, link, phase)
+    gives_way = signal != SIGNAL_GREEN_MAJOR and signal != SIGNAL_OFF
+    if _blocked_by_foes(roads, rows, i, link, distance, wait_m, True, gives_way, phase, scratch):
+        return HOLD_YIELD
+    if _exit_blocked(roads, travel, rows[i], link, way, scratch):
+        return HOLD_EXIT_BLOCKED
+    return HOLD_NONE
+
+
+@kernel
+def press_inside(
+    roads: RoadArrays,
+    travel: Travel,
+    rows: NDArray[np.void],
+    i: int,
+    link: int,
+    place: float,
+    way: int,
+    phase: NDArray[np.int32],
+    dt: float,
+    scratch: Scratch,
+) -> tuple[float, int]:
+    """How foes on the same junction press row i, whose front is beyond its stop line.
+
+    Of two vehicles in conflict the one that is nearer to the shared area goes first; at equal
+    distance the smaller id. Where both lead into one lane, the other follows it there. At a
+    waiting position inside, row i waits until it may go on.
+
+    Args:
+        roads: the road arrays.
+        travel: types and ways.
+        rows: VEHICLE (C,).
+        i: the row that asks.
+        link: that it drives on.
+        place: of its centre, m beyond the end of the lane that it comes from.
+        way: of the row beyond the junction.
+        phase: (num_signals,) PHASE rows that are on.
+        dt: seconds a tick.
+        scratch: with the lane and link indices of this tick.
+
+    Returns:
+        press, and why it holds at the waiting position (HOLD_*).
     """
     row = rows[i]
-    front = place + 0.5 * row["length"]
-    nearest = math.inf
-    first = roads.links[link]["first_conflict"]
-    for c in range(first, first + roads.links[link]["num_conflicts"]):
+    kind = travel.types[row["vtype"]]
+    half = 0.5 * row["length"]
+    front = place + half
+    press = no_press(kind)
+    target = roads.links[link]
+    wait_m = target["wait_m"]
+    if front <= wait_m + WAIT_SLACK_M:
+        hold = waits_inside(roads, travel, rows, i, link, -place, way, phase, scratch)
+        if hold != HOLD_NONE:
+            return before_line(kind, row["speed"], wait_m - front, dt), hold
+    first = target["first_conflict"]
+    for c in range(first, first + target["num_conflicts"]):
         conflict = roads.conflicts[c]
-        to_area = conflict["enter_m"] - front
-        if to_area < 0.0 or to_area >= nearest:
+        if place - half > conflict["leave_m"]:
             continue
-        foe_link = conflict["foe"]
-        for k in range(scratch.link_start[foe_link], scratch.link_start[foe_link + 1]):
-            foe = rows[scratch.link_row[k]]
-            foe_place = -scratch.link_dist[k]
-            foe_half = 0.5 * foe["length"]
-            if foe_place < 0.0 or foe_place - foe_half > conflict["foe_leave_m"]:
-                continue
-            foe_to_area = conflict["foe_enter_m"] - foe_place - foe_half
-            if foe_to_area < to_area or (foe_to_area == to_area and foe["id"] < row["id"]):
-                nearest = to_area
-                break
-    return nearest
+        for k in range(
+            scratch.link_start[conflict["foe"]], scratch.link_start[conflict["foe"] + 1]
+        ):
+            foe = scratch.approach[k]
+            if foe["row"] != i:
+                press = max(press, _press_of(roads, kind, row, conflict, foe, place, dt))
+    return press, HOLD_NONE
+
+
+@kernel
+def _press_of(
+    roads: RoadArrays,
+    kind: np.void,
+    row: np.void,
+    conflict: np.void,
+    foe: np.void,
+    place: float,
+    dt: float,
+) -> float:
+    """How one APPROACH presses a row on the same junction, `place` m beyond its stop line."""
+    half = 0.5 * row["length"]
+    front = place + half
+    foe_front = foe["half"] - foe["dist"]
+    foe_rear = -foe["half"] - foe["dist"]
+    wait_m = roads.links[foe["link"]]["wait_m"]
+    waits = (
+        foe_front <= wait_m + WAIT_SLACK_M
+        and conflict["foe_enter_m"] >= wait_m - LINE_MARGIN_M
+        and foe["speed"] < STANDING_MPS
+    )
+    if foe_front <= 0.0 or foe_rear > conflict["foe_leave_m"] or waits:
+        return no_press(kind)
+    to_area = conflict["enter_m"] - front
+    foe_to_area = conflict["foe_enter_m"] - foe_front
+    # How much further the one has to go to be out of the shared area than the other's rear.
+    gap = (conflict["leave_m"] - front) - (conflict["foe_leave_m"] - foe_rear)
+    if to_area >= 0.0:
+        if foe_to_area > to_area or (foe_to_area == to_area and foe["id"] > row["id"]):
+            return no_press(kind)
+        if conflict["merging"] and gap > to_area:
+            return behind(kind, row["speed"], gap, foe["speed"], kind["decel"])
+        return before_line(kind, row["speed"], to_area, dt)
+    # Both are in it side by side: who is nearer to its end goes on, the other stays behind.
+    if foe_to_area > 0.0:
+        return no_press(kind)
+    rest = conflict["leave_m"] - front
+    foe_rest = conflict["foe_leave_m"] - foe_front
+    if foe_rest > rest or (foe_rest == rest and foe["id"] > row["id"]):
+        return no_press(kind)
+    return behind(kind, row["speed"], gap, foe["speed"], kind["decel"])

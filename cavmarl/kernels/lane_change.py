@@ -33,6 +33,7 @@ def mobil_accepts(
     old_follower_accel: float,
     old_follower_accel_after: float,
     mandatory: bool,
+    max_braking: float = MAX_BRAKING_IMPOSED,
 ) -> bool:
     """Whether to change into a lane; all accelerations from the car-following model, in m/s².
 
@@ -45,11 +46,12 @@ def mobil_accepts(
         old_follower_accel_after: of that car after the change; 0 if there is none.
         mandatory: the route needs the change, so it only has to be safe for both. The caller sees
             to it that the lane lies on the route's side.
+        max_braking: m/s², harder braking makes the change unsafe.
     """
-    if new_follower_accel_after < -MAX_BRAKING_IMPOSED:
+    if new_follower_accel_after < -max_braking:
         return False
     if mandatory:
-        return own_accel_after >= -MAX_BRAKING_IMPOSED
+        return own_accel_after >= -max_braking
     gain = (
         own_accel_after
         - own_accel

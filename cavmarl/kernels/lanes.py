@@ -1,7 +1,8 @@
 """Who is where on which lane: an index over the vehicles of one world, and searches along it.
 
 The index lists, lane by lane, the vehicles on it by rising (s, id). A vehicle whose body also
-covers a neighbour lane stands in both lists. Nothing here depends on the order of rows.
+covers a neighbour lane stands in both lists. What others look at is copied into the entries, which
+lie together in memory. Nothing here depends on the order of rows.
 """
 
 from __future__ import annotations
@@ -11,87 +12,135 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from cavmarl.kernels import kernel
-from cavmarl.kernels.arrays import RoadArrays, Scratch
+from cavmarl.kernels import inlined_kernel, kernel
+from cavmarl.kernels.arrays import RoadArrays, Scratch, Travel
+from cavmarl.kernels.geometry import segment_at
 
-__all__ = ["index_lanes", "last_on_lane", "neighbor_ahead", "neighbor_behind"]
+__all__ = [
+    "ENTRY",
+    "ahead_on",
+    "behind_on",
+    "beside_s",
+    "index_lanes",
+    "last_on",
+    "neighbor_behind",
+]
 
 MAX_LOOK_BACK_LANES = 4
+
+ENTRY = np.dtype(
+    [
+        ("s", np.float64),  # of the centre on this lane, m
+        ("speed", np.float64),  # m/s
+        ("half", np.float64),  # half its length, m
+        ("decel", np.float64),  # with which it brakes in comfort, m/s²
+        ("id", np.int64),
+        ("row", np.int32),  # VEHICLE row
+        ("blinker", np.int32),  # lane change wanted: 1 left, -1 right
+        ("side", np.bool_),  # its body covers this lane, its centre is on a neighbour
+    ],
+    align=True,
+)
+
+
+@kernel
+def beside_s(roads: RoadArrays, lane: int, neighbor: int, s: float) -> float:
+    """Where on a neighbour lane a place on a lane lies, in m."""
+    row = roads.lanes[lane]
+    k = segment_at(roads.points, row["first_point"], row["num_points"], s)
+    point = roads.points[k]
+    after = roads.points[k + 1]
+    share = min(max((s - point["s"]) / (after["s"] - point["s"]), 0.0), 1.0)
+    if neighbor == row["left"]:
+        return float(point["left_s"] + share * (after["left_s"] - point["left_s"]))
+    return float(point["right_s"] + share * (after["right_s"] - point["right_s"]))
+
+
+@inlined_kernel
+def _fill(
+    entry: np.void, types: NDArray[np.void], row: np.void, i: int, s: float, side: bool
+) -> None:
+    entry["s"] = s
+    entry["speed"] = row["speed"]
+    entry["half"] = 0.5 * row["length"]
+    entry["decel"] = types[row["vtype"]]["decel"]
+    entry["id"] = row["id"]
+    entry["row"] = i
+    entry["blinker"] = row["blinker"]
+    entry["side"] = side
 
 
 @kernel
 def index_lanes(
-    lanes: NDArray[np.void], rows: NDArray[np.void], num: int, scratch: Scratch
+    roads: RoadArrays, travel: Travel, rows: NDArray[np.void], num: int, scratch: Scratch
 ) -> None:
-    """Sort the vehicles of one world by (lane, s, id) into `scratch.entry_*`.
+    """Sort the vehicles of one world by (lane, s, id) into `scratch.entries`.
 
     Args:
-        lanes: LANE (L,).
+        roads: the road arrays.
+        travel: the vehicles' types.
         rows: VEHICLE (C,), of which `num` live.
         num: live rows.
-        scratch: lane_start, entry_row and entry_s are written.
+        scratch: lane_start, lane_end and entries are written.
     """
+    lanes = roads.lanes
     start = scratch.lane_start
+    end = scratch.lane_end
     num_lanes = lanes.shape[0]
-    start[: num_lanes + 2] = 0
+    end[:num_lanes] = 0
     for i in range(num):
-        start[rows[i]["lane"] + 2] += 1
+        end[rows[i]["lane"]] += 1
         if rows[i]["side_lane"] >= 0:
-            start[rows[i]["side_lane"] + 2] += 1
+            end[rows[i]["side_lane"]] += 1
+    begin = 0
     for lane in range(num_lanes):
-        start[lane + 2] += start[lane + 1]
-    # start[l + 1] is now where lane l's list begins; filling moves it to where the list ends.
+        start[lane] = begin
+        begin += end[lane]
+        end[lane] = start[lane]
+    start[num_lanes] = begin
     for i in range(num):
-        lane = rows[i]["lane"]
-        k = start[lane + 1]
-        scratch.entry_row[k] = i
-        scratch.entry_s[k] = rows[i]["s"]
-        start[lane + 1] = k + 1
-        side = rows[i]["side_lane"]
+        row = rows[i]
+        lane = row["lane"]
+        _insert(scratch, travel.types, lane, row, i, row["s"], False)
+        side = row["side_lane"]
         if side >= 0:
-            k = start[side + 1]
-            scratch.entry_row[k] = i
-            scratch.entry_s[k] = rows[i]["s"] * lanes[side]["length_m"] / lanes[lane]["length_m"]
-            start[side + 1] = k + 1
-    for lane in range(num_lanes):
-        if start[lane + 1] - start[lane] > 1:
-            _sort(rows, start[lane], start[lane + 1], scratch.entry_row, scratch.entry_s)
+            s = beside_s(roads, lane, side, row["s"])
+            _insert(scratch, travel.types, side, row, i, s, True)
 
 
-@kernel
-def _sort(
-    rows: NDArray[np.void],
-    first: int,
-    end: int,
-    entry_row: NDArray[np.int32],
-    entry_s: NDArray[np.float64],
+@inlined_kernel
+def _insert(
+    scratch: Scratch,
+    types: NDArray[np.void],
+    lane: int,
+    row: np.void,
+    i: int,
+    s: float,
+    side: bool,
 ) -> None:
-    """Insertion sort of one lane's list by (s, id)."""
-    for k in range(first + 1, end):
-        i = entry_row[k]
-        s = entry_s[k]
-        own_id = rows[i]["id"]
-        j = k
-        while j > first:
-            before = entry_s[j - 1]
-            if before < s or (before == s and rows[entry_row[j - 1]]["id"] < own_id):
-                break
-            entry_row[j] = entry_row[j - 1]
-            entry_s[j] = before
-            j -= 1
-        entry_row[j] = i
-        entry_s[j] = s
+    """Put an entry among those of its lane that are there already, by (s, id)."""
+    first = scratch.lane_start[lane]
+    k = scratch.lane_end[lane]
+    scratch.lane_end[lane] = k + 1
+    entries = scratch.entries
+    while k > first:
+        before = entries[k - 1]
+        if before["s"] < s or (before["s"] == s and before["id"] < row["id"]):
+            break
+        entries[k] = before
+        k -= 1
+    _fill(entries[k], types, row, i, s, side)
 
 
 @kernel
-def _first_after(rows: NDArray[np.void], own_id: int, lane: int, s: float, scratch: Scratch) -> int:
-    """Position in the index of the first entry on `lane` beyond (s, own_id)."""
+def _first_after(scratch: Scratch, lane: int, s: float, own_id: int) -> int:
+    """Position of the first entry on `lane` beyond (s, own_id)."""
     low = int(scratch.lane_start[lane])
     high = int(scratch.lane_start[lane + 1])
     while low < high:
         middle = (low + high) // 2
-        other_s = scratch.entry_s[middle]
-        if other_s < s or (other_s == s and rows[scratch.entry_row[middle]]["id"] <= own_id):
+        other = scratch.entries[middle]
+        if other["s"] < s or (other["s"] == s and other["id"] <= own_id):
             low = middle + 1
         else:
             high = middle
@@ -99,65 +148,50 @@ def _first_after(rows: NDArray[np.void], own_id: int, lane: int, s: float, scrat
 
 
 @kernel
-def neighbor_ahead(
-    rows: NDArray[np.void], i: int, lane: int, s: float, scratch: Scratch
-) -> tuple[int, float]:
-    """The next vehicle on `lane` ahead of place `s`: (row, its s) or (-1, inf).
+def ahead_on(scratch: Scratch, lane: int, s: float, own_id: int) -> int:
+    """Position in the index of the next other vehicle on `lane` ahead of place `s`, or -1.
 
     At equal s the larger id counts as ahead, so that of two vehicles one is always the leader.
     """
-    k = _first_after(rows, rows[i]["id"], lane, s, scratch)
+    k = _first_after(scratch, lane, s, own_id)
     end = scratch.lane_start[lane + 1]
-    while k < end and scratch.entry_row[k] == i:
+    while k < end and scratch.entries[k]["id"] == own_id:
         k += 1
-    if k == end:
-        return -1, math.inf
-    return scratch.entry_row[k], scratch.entry_s[k]
+    return k if k < end else -1
+
+
+@inlined_kernel
+def last_on(scratch: Scratch, lane: int, own_id: int) -> int:
+    """Position in the index of the rearmost other vehicle on `lane`, or -1."""
+    k = int(scratch.lane_start[lane])
+    end = scratch.lane_start[lane + 1]
+    while k < end and scratch.entries[k]["id"] == own_id:
+        k += 1
+    return k if k < end else -1
 
 
 @kernel
-def last_on_lane(i: int, lane: int, scratch: Scratch) -> tuple[int, float]:
-    """The rearmost vehicle on `lane` other than row i: (row, its s) or (-1, inf)."""
-    k = scratch.lane_start[lane]
-    end = scratch.lane_start[lane + 1]
-    while k < end and scratch.entry_row[k] == i:
-        k += 1
-    if k == end:
-        return -1, math.inf
-    return scratch.entry_row[k], scratch.entry_s[k]
-
-
-@kernel
-def _first_behind(
-    rows: NDArray[np.void], i: int, lane: int, s: float, scratch: Scratch
-) -> tuple[int, float]:
-    """The nearest vehicle behind place `s` of the same lane: (row, its s) or (-1, -inf)."""
-    k = _first_after(rows, rows[i]["id"], lane, s, scratch) - 1
-    while k >= scratch.lane_start[lane] and scratch.entry_row[k] == i:
+def behind_on(scratch: Scratch, lane: int, s: float, own_id: int) -> int:
+    """Position in the index of the nearest other vehicle on `lane` behind place `s`, or -1."""
+    k = _first_after(scratch, lane, s, own_id) - 1
+    first = scratch.lane_start[lane]
+    while k >= first and scratch.entries[k]["id"] == own_id:
         k -= 1
-    if k < scratch.lane_start[lane]:
-        return -1, -math.inf
-    return scratch.entry_row[k], scratch.entry_s[k]
+    return k if k >= first else -1
 
 
 @kernel
 def neighbor_behind(
-    roads: RoadArrays,
-    rows: NDArray[np.void],
-    i: int,
-    lane: int,
-    s: float,
-    reach_m: float,
-    scratch: Scratch,
+    roads: RoadArrays, scratch: Scratch, lane: int, s: float, own_id: int, reach_m: float
 ) -> tuple[int, float]:
-    """The nearest vehicle behind place `s` of `lane`: (row, distance in m) or (-1, inf).
+    """The nearest vehicle behind place `s` of `lane`: (position in the index, distance in m).
 
     Looks back over lane borders, up to `reach_m` and along every lane that leads here; of several
-    the nearest counts, at equal distances the smallest id.
+    the nearest counts, at equal distances the smallest id. (-1, inf) where there is none.
     """
-    best, best_s = _first_behind(rows, i, lane, s, scratch)
+    best = behind_on(scratch, lane, s, own_id)
     if best >= 0:
-        return best, s - best_s
+        return best, s - scratch.entries[best]["s"]
     best_distance = math.inf
     row = roads.lanes[lane]
     for k in range(row["first_into"], row["first_into"] + row["num_into"]):
@@ -167,11 +201,13 @@ def neighbor_behind(
             if distance > reach_m:
                 break
             length = roads.lanes[before]["length_m"]
-            other, other_s = _first_behind(rows, i, before, math.inf, scratch)
+            other = behind_on(scratch, before, math.inf, own_id)
             if other >= 0:
-                gap = distance + length - other_s
+                gap = distance + length - scratch.entries[other]["s"]
                 nearer = gap < best_distance
-                tie = gap == best_distance and best >= 0 and rows[other]["id"] < rows[best]["id"]
+                tie = gap == best_distance and best >= 0
+                if tie:
+                    tie = scratch.entries[other]["id"] < scratch.entries[best]["id"]
                 if nearer or tie:
                     best = other
                     best_distance = gap

@@ -1,7 +1,7 @@
 """Motion of one vehicle over one tick, from the committed record to the next one.
 
 Background vehicles move along their lanes: arc length by the decided acceleration, lateral offset
-towards the lane's centre, heading trailing the lane's direction. Agents' vehicles are kinematic
+towards the lane's centre, the body a chord of the way. Agents' vehicles are kinematic
 bicycles that go where they are steered; `tracking.locate` then finds their place on the lanes.
 """
 
@@ -12,19 +12,22 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from cavmarl.kernels import kernel
-from cavmarl.kernels.arrays import LaneGrid, RoadArrays
+from cavmarl.kernels import inlined_kernel, kernel
+from cavmarl.kernels.arrays import LaneGrid, RoadArrays, Travel
 from cavmarl.kernels.codes import (
     EVENT_ARRIVED,
     EVENT_RED_LIGHT,
     SIGNAL_RED,
     SIGNAL_RED_YELLOW,
 )
-from cavmarl.kernels.geometry import lane_pose, wrap_angle
+from cavmarl.kernels.geometry import lane_pose, segment_at, wrap_angle
 from cavmarl.kernels.junctions import link_signal
 from cavmarl.kernels.kinematics import bicycle_step
+from cavmarl.kernels.lanes import beside_s
 from cavmarl.kernels.scalars import clamp
+from cavmarl.kernels.stopping import make_stop
 from cavmarl.kernels.tracking import locate, side_lane
+from cavmarl.kernels.ways import next_step, way_left
 
 __all__ = ["ARRIVE_M", "MAX_SPEED_MPS", "move_agent", "move_background", "place_on_lane"]
 
@@ -32,8 +35,7 @@ LATERAL_MPS = 1.4  # fastest sideways motion of a lane change
 LATERAL_RATIO = 0.35  # and no faster than this share of the speed,
 LATERAL_MIN_MPS = 0.2  # but never stuck between two lanes
 MAX_DRIFT_RAD = 0.12  # largest angle between a car that changes lanes and its lane
-STUB_M = 1.0  # lanes shorter than this, of which real maps have many, have no direction
-TRAIL_M = 2.0  # how quickly the heading follows the lane's direction
+MAX_BODY_LANES = 8  # that a body may lie on, before and behind its centre
 STANDING_MPS = 0.1
 ARRIVE_M = 5.0  # a trip ends this far before the end of its goal edge
 MAX_SPEED_MPS = 60.0
@@ -41,57 +43,137 @@ CROSSINGS_PER_TICK = 16  # lane borders that one tick can cross
 
 
 @kernel
-def place_on_lane(roads: RoadArrays, row: np.void) -> tuple[float, float]:
-    """Set x, y, z and pitch from lane, s and d; returns cos and sin of the lane's direction."""
-    lane = roads.lanes[row["lane"]]
-    x, y, z, cos, sin, slope = lane_pose(
-        roads.points, lane["first_point"], lane["num_points"], row["s"]
-    )
-    row["x"] = x - row["d"] * sin
-    row["y"] = y + row["d"] * cos
-    row["z"] = z
-    row["pitch"] = math.atan(slope)
-    return cos, sin
+def _way_point(roads: RoadArrays, travel: Travel, row: np.void, s: float) -> tuple[float, float]:
+    """X and y of a place on a vehicle's way, `s` m from the start of its lane, or behind it."""
+    lane = row["lane"]
+    way = row["way"]
+    for _ in range(MAX_BODY_LANES):
+        length = roads.lanes[lane]["length_m"]
+        if s <= length:
+            break
+        following, way, _ = next_step(roads, travel, lane, way)
+        if following < 0:
+            break
+        s -= length
+        lane = following
+    for _ in range(MAX_BODY_LANES):
+        if s >= 0.0:
+            break
+        before = _lane_before(roads, lane, row["link"])
+        if before < 0:
+            break
+        lane = before
+        s += roads.lanes[lane]["length_m"]
+    here = roads.lanes[lane]
+    x, y, _, _, _, _ = lane_pose(roads.points, here["first_point"], here["num_points"], s)
+    return x, y
 
 
 @kernel
-def _account(row: np.void, old: np.void, roads: RoadArrays, dt: float) -> None:
-    """What motion of both kinds leaves in the record: rates, ways, waiting time."""
+def _lane_before(roads: RoadArrays, lane: int, link: int) -> int:
+    """The lane that a vehicle has come from which has entered `link` last, or -1."""
+    here = roads.lanes[lane]
+    if here["internal"]:
+        return int(roads.into[here["first_into"]])
+    if link < 0 or roads.links[link]["to_lane"] != lane or roads.links[link]["first_internal"] < 0:
+        return -1
+    before = roads.links[link]["first_internal"]
+    while roads.lanes[before]["successor"] != lane:
+        before = roads.lanes[before]["successor"]
+    return int(before)
+
+
+@inlined_kernel
+def place_on_lane(roads: RoadArrays, travel: Travel, row: np.void) -> float:
+    """Set x, y, z and pitch from lane, s and d; returns the direction of the body in rad.
+
+    Both bumpers are on the way: in a bend the body is its chord.
+    """
+    lane = roads.lanes[row["lane"]]
+    point = roads.points[
+        segment_at(roads.points, lane["first_point"], lane["num_points"], row["s"])
+    ]
+    along = row["s"] - point["s"]
+    cos = point["cos"]
+    sin = point["sin"]
+    x = point["x"] + along * cos
+    y = point["y"] + along * sin
+    heading = point["heading"]
+    half = 0.5 * row["length"]
+    if lane["num_points"] > 2 or row["s"] < half or row["s"] + half > lane["length_m"]:
+        front_x, front_y = _way_point(roads, travel, row, row["s"] + half)
+        rear_x, rear_y = _way_point(roads, travel, row, row["s"] - half)
+        along_x = front_x - rear_x
+        along_y = front_y - rear_y
+        chord = math.sqrt(along_x * along_x + along_y * along_y)
+        if chord > 0.5 * half:
+            x = 0.5 * (front_x + rear_x)
+            y = 0.5 * (front_y + rear_y)
+            cos = along_x / chord
+            sin = along_y / chord
+            heading = math.atan2(sin, cos)
+    row["x"] = x - row["d"] * sin
+    row["y"] = y + row["d"] * cos
+    row["z"] = point["z"] + along * point["slope"]
+    row["pitch"] = math.atan(point["slope"]) if point["slope"] != 0.0 else 0.0
+    return float(heading)
+
+
+@inlined_kernel
+def _account(row: np.void, old: np.void, roads: RoadArrays, pace: float, dt: float) -> None:
+    """What motion of both kinds leaves in the record: rates, ways, waiting time.
+
+    `pace` is the speed over the limit with which the way would have been driven freely.
+    """
     row["accel"] = (row["speed"] - old["speed"]) / dt
     row["jerk"] = (row["accel"] - old["accel"]) / dt
     row["yaw_rate"] = wrap_angle(row["heading"] - old["heading"]) / dt
     driven = abs(old["speed"]) * dt
     row["distance_m"] = old["distance_m"] + driven
-    row["free_s"] = old["free_s"] + driven / roads.lanes[old["lane"]]["speed_mps"]
+    row["free_s"] = old["free_s"] + driven / (pace * roads.lanes[old["lane"]]["speed_mps"])
     row["wait_s"] = old["wait_s"] + dt if abs(row["speed"]) < STANDING_MPS else 0.0
     row["step_jerk"] = old["step_jerk"] + abs(row["jerk"]) * dt
     row["tick"] = old["tick"] + 1
 
 
 @kernel
-def _cross_borders(roads: RoadArrays, plans: NDArray[np.void], row: np.void) -> bool:
-    """Carry s beyond lane ends over to the lanes that the plan names; False where the way ends."""
+def _cross_borders(roads: RoadArrays, travel: Travel, row: np.void) -> bool:
+    """Carry s beyond lane ends over to the lanes of the way; False where the way ends."""
     for _ in range(CROSSINGS_PER_TICK):
         length = roads.lanes[row["lane"]]["length_m"]
         if row["s"] < length:
             return True
-        step = plans[row["goal"], row["lane"]]
-        if step["next"] < 0:
+        lane, way, link = next_step(roads, travel, row["lane"], row["way"])
+        if lane < 0:
             row["s"] = length
             return False
         row["s"] -= length
-        row["lane"] = step["next"]
-        row["target_lane"] = step["next"]
-        if step["link"] >= 0:
-            row["link"] = step["link"]
+        row["lane"] = lane
+        row["way"] = way
+        row["target_lane"] = lane
+        if link >= 0:
+            row["link"] = link
             row["stopped_at"] = -1
     return True
 
 
-@kernel
+@inlined_kernel
+def _stand(old: np.void, row: np.void, throttle: float, dt: float) -> None:
+    """What changes in the record of a background vehicle that stands."""
+    row["throttle"] = throttle
+    row["accel"] = 0.0
+    row["jerk"] = -old["accel"] / dt
+    row["yaw_rate"] = 0.0
+    row["steering"] = 0.0
+    row["wait_s"] = old["wait_s"] + dt
+    row["step_jerk"] = old["step_jerk"] + abs(row["jerk"]) * dt
+    row["tick"] = old["tick"] + 1
+
+
+@inlined_kernel
 def move_background(
     roads: RoadArrays,
-    plans: NDArray[np.void],
+    travel: Travel,
     old: np.void,
     row: np.void,
     accel: float,
@@ -100,49 +182,55 @@ def move_background(
 ) -> None:
     """Advance a background vehicle by one tick.
 
+    The new speed drives the whole tick (semi-implicit Euler), as the safe speed of Krauss's model
+    takes it.
+
     Args:
         roads: the road arrays.
-        plans: PLAN (G, L).
+        travel: the ways.
         old: VEHICLE, the committed record.
         row: VEHICLE, a copy of it that becomes the next one.
         accel: decided acceleration in m/s².
         lane_change: 1 to the left, -1 to the right, 0 none.
         dt: seconds of the tick.
     """
-    speed = old["speed"]
+    speed = clamp(old["speed"] + accel * dt, 0.0, MAX_SPEED_MPS)
+    if speed == 0.0 and old["speed"] == 0.0 and lane_change == 0 and old["d"] == 0.0:
+        _stand(old, row, accel, dt)
+        make_stop(roads, travel, old, row, travel.begin_s, dt)
+        return
     row["throttle"] = accel
-    row["speed"] = clamp(speed + accel * dt, 0.0, MAX_SPEED_MPS)
+    row["speed"] = speed
     row["s"] = old["s"] + speed * dt
     if lane_change != 0:
         lane = roads.lanes[old["lane"]]
         target = lane["left"] if lane_change > 0 else lane["right"]
-        row["s"] *= roads.lanes[target]["length_m"] / lane["length_m"]
+        row["s"] = beside_s(roads, old["lane"], target, row["s"])
         apart = 0.5 * (lane["width_m"] + roads.lanes[target]["width_m"])
         row["d"] = old["d"] - lane_change * apart
         row["lane"] = target
         row["target_lane"] = target
         row["last_change"] = old["tick"]
-    if not _cross_borders(roads, plans, row):
+    if not _cross_borders(roads, travel, row):
         row["speed"] = 0.0
     sideways = min(LATERAL_MPS, max(LATERAL_RATIO * speed, LATERAL_MIN_MPS)) * dt
     before = row["d"]
     row["d"] = before - clamp(before, -sideways, sideways)
     row["side_lane"] = side_lane(roads.lanes, row["lane"], row["d"], row["width"])
-    cos, sin = place_on_lane(roads, row)
-    direction = math.atan2(sin, cos)
-    if speed > STANDING_MPS:
+    heading = place_on_lane(roads, travel, row)
+    if row["d"] != before and speed > STANDING_MPS:
         drift = math.atan2((row["d"] - before) / dt, speed)
-        direction += clamp(drift, -MAX_DRIFT_RAD, MAX_DRIFT_RAD)
-    error = wrap_angle(direction - old["heading"])
-    if roads.lanes[row["lane"]]["length_m"] < STUB_M:
-        error = 0.0
-    row["heading"] = wrap_angle(old["heading"] + error * min(1.0, speed * dt / TRAIL_M))
-    row["steering"] = clamp(math.atan2(row["length"] * error, 2.0 * TRAIL_M), -0.8, 0.8)
-    step = plans[row["goal"], row["lane"]]
-    row["to_go"] = step["to_go"] - row["s"]
+        heading = wrap_angle(heading + clamp(drift, -MAX_DRIFT_RAD, MAX_DRIFT_RAD))
+    row["heading"] = heading
+    turned = wrap_angle(heading - old["heading"])
+    row["steering"] = 0.0
+    if turned != 0.0 and speed > STANDING_MPS:
+        row["steering"] = clamp(math.atan(row["length"] * turned / (speed * dt)), -0.8, 0.8)
+    row["to_go"] = way_left(roads, travel, row)
     if row["to_go"] <= ARRIVE_M:
         row["events"] |= EVENT_ARRIVED
-    _account(row, old, roads, dt)
+    _account(row, old, roads, old["speed_factor"], dt)
+    make_stop(roads, travel, old, row, travel.begin_s, dt)
 
 
 @kernel
@@ -210,4 +298,4 @@ def move_agent(
     row["to_go"] = step["to_go"] - row["s"]
     if row["to_go"] <= ARRIVE_M:
         row["events"] |= EVENT_ARRIVED
-    _account(row, old, roads, dt)
+    _account(row, old, roads, 1.0, dt)

@@ -26,6 +26,7 @@ __all__ = [
     "fill_grid",
     "k_nearest",
     "make_grid",
+    "nearest_bodies",
 ]
 
 LEVEL_HEIGHT_M = (
@@ -198,6 +199,25 @@ def k_nearest(
     Returns:
         how many were found.
     """
+    found = nearest_bodies(grid, row, x, y, z, radius_m, k, out_row, out_squared)
+    for m in range(found):
+        out_row[m] = grid.bodies[out_row[m]]["row"]
+    return found
+
+
+@kernel
+def nearest_bodies(
+    grid: Grid,
+    row: int,
+    x: float,
+    y: float,
+    z: float,
+    radius_m: float,
+    k: int,
+    out_body: NDArray[np.int32],
+    out_squared: NDArray[np.float64],
+) -> int:
+    """`k_nearest` as positions in `grid.bodies`, whose records hold what others see."""
     bodies = grid.bodies
     limit = radius_m * radius_m
     first_column, last_column = cell_columns(grid, x, radius_m)
@@ -213,13 +233,13 @@ def k_nearest(
             squared = dx * dx + dy * dy
             if not squared <= limit or body["row"] == row or abs(body["z"] - z) > LEVEL_HEIGHT_M:
                 continue
-            # Insertion from the end; `out_row` holds places in `bodies` until all are found.
+            # Insertion from the end.
             place = found
             while place > 0 and (
                 squared < out_squared[place - 1]
                 or (
                     squared == out_squared[place - 1]
-                    and body["id"] < bodies[out_row[place - 1]]["id"]
+                    and body["id"] < bodies[out_body[place - 1]]["id"]
                 )
             ):
                 place -= 1
@@ -228,10 +248,8 @@ def k_nearest(
             if found < k:
                 found += 1
             for m in range(found - 1, place, -1):
-                out_row[m] = out_row[m - 1]
+                out_body[m] = out_body[m - 1]
                 out_squared[m] = out_squared[m - 1]
-            out_row[place] = b
+            out_body[place] = b
             out_squared[place] = squared
-    for m in range(found):
-        out_row[m] = bodies[out_row[m]]["row"]
     return found

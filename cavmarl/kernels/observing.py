@@ -26,9 +26,10 @@ from cavmarl.kernels.codes import (
 )
 from cavmarl.kernels.geometry import lane_pose, wrap_angle
 from cavmarl.kernels.junctions import link_signal
-from cavmarl.kernels.neighbors import Grid, k_nearest
+from cavmarl.kernels.neighbors import Grid, nearest_bodies
 from cavmarl.kernels.scalars import clamp
 from cavmarl.kernels.sensing import lidar
+from cavmarl.kernels.signal_timing import time_to_change
 
 __all__ = [
     "EGO_FEATURES",
@@ -52,11 +53,19 @@ YAW_SCALE = 1.0  # rad/s
 OFFSET_SCALE = 4.0  # m
 ROOM_SCALE = 200.0  # m
 TO_GO_SCALE = 1000.0  # m
+HALF_S = 5.0  # a time of this length is a soonness of 0.5
+SLOWEST_MPS = 1.0  # who stands is taken to come on with
 
 
 @kernel
 def _unit(value: float) -> float:
     return clamp(value, -1.0, 1.0)
+
+
+@kernel
+def _soonness(time: float) -> float:
+    """1 now, 0.5 in `HALF_S`, 0 in a long time: seconds count where they are few."""
+    return HALF_S / (HALF_S + time)
 
 
 @kernel
@@ -128,7 +137,7 @@ def observe_neighbors(
     if sensors.neighbors == 0:
         return
     row = rows[i]
-    found = k_nearest(
+    found = nearest_bodies(
         grid,
         i,
         row["x"],
@@ -136,17 +145,17 @@ def observe_neighbors(
         row["z"],
         sensors.neighbors_range_m,
         sensors.neighbors,
-        sensors.near_row,
+        sensors.near_body,
         sensors.near_squared,
     )
     cos_heading = math.cos(row["heading"])
     sin_heading = math.sin(row["heading"])
     for k in range(found):
-        other = rows[sensors.near_row[k]]
+        other = grid.bodies[sensors.near_body[k]]
         dx = other["x"] - row["x"]
         dy = other["y"] - row["y"]
-        cos_other = math.cos(other["heading"])
-        sin_other = math.sin(other["heading"])
+        cos_other = other["cos"]
+        sin_other = other["sin"]
         dvx = other["speed"] * cos_other - row["speed"] * cos_heading
         dvy = other["speed"] * sin_other - row["speed"] * sin_heading
         at = sensors.neighbors_at + NEIGHBOR_FEATURES * k
@@ -175,12 +184,18 @@ def _gives_way(roads: RoadArrays, link: int, signal: int) -> bool:
 def observe_signal(
     roads: RoadArrays,
     plans: NDArray[np.void],
+    controllers: NDArray[np.void],
     row: np.void,
     phase: NDArray[np.int32],
+    time: float,
+    tick_s: float,
     sensors: Sensors,
     out: NDArray[np.float32],
 ) -> None:
-    """The next stop line on the way at which a signal stands or somebody has the right of way."""
+    """The next stop line on the way at which a signal stands or somebody has the right of way.
+
+    `time` is that of the tick, in s since the world's reset.
+    """
     at = sensors.signal_at
     lane = row["lane"]
     distance = -row["s"]
@@ -204,6 +219,10 @@ def observe_signal(
     elif signal == SIGNAL_GREEN_MAJOR or signal == SIGNAL_GREEN_MINOR:
         out[at + 4] = 1.0
     out[at + 5] = 1.0 if gives_way else 0.0
+    if sensors.signal_timing and signal != SIGNAL_NONE:
+        change = time_to_change(roads, controllers, step["link"], phase, time, tick_s)
+        out[at + 6] = _soonness(change)
+        out[at + 7] = _soonness(max(distance, 0.0) / max(row["speed"], SLOWEST_MPS))
 
 
 @kernel
@@ -217,7 +236,11 @@ def observe_lidar(
     lidar(rows, i, grid, sensors.rays, sensors.lidar_range_m, sensors.echoes)
     at = sensors.lidar_at
     for k in range(rays):
-        out[at + k] = sensors.echoes[k]["distance"] / sensors.lidar_range_m
-    if sensors.lidar_speeds:
-        for k in range(rays):
-            out[at + rays + k] = _unit(sensors.echoes[k]["speed"] / SPEED_SCALE)
+        echo = sensors.echoes[k]
+        # Most rays meet nothing: no division for these.
+        if echo["id"] < 0:
+            out[at + k] = 1.0
+            continue
+        out[at + k] = echo["distance"] / sensors.lidar_range_m
+        if sensors.lidar_speeds:
+            out[at + rays + k] = _unit(echo["speed"] / SPEED_SCALE)

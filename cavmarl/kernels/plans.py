@@ -1,7 +1,8 @@
 """Lane-level plans: for one goal, what to do next from every lane of the map.
 
 Dijkstra's algorithm backwards from the goal's lanes over the lane graph. Driving along a lane costs
-the time it takes at the speed limit; a lane change costs a fixed time, and more on a short lane.
+the time it takes at the speed limit; a lane change costs the more time the shorter the lane is, so
+that it is made early and where there is room.
 """
 
 from __future__ import annotations
@@ -13,13 +14,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from cavmarl.kernels import kernel, setup_kernel
+from cavmarl.kernels import allocating_kernel, kernel
 from cavmarl.kernels.arrays import RoadArrays
 
-__all__ = ["LANE_CHANGE_COST_S", "plan_goal"]
+__all__ = ["LANE_CHANGE_COST_S", "change_cost", "plan_goal"]
 
-LANE_CHANGE_COST_S = 5.0  # what a lane change is worth in travel time, s,
-SHORT_LANE_M = 50.0  # and one second more for every metre that the lane is shorter than this
+LANE_CHANGE_COST_S = 5.0  # what a lane change is worth in travel time on a long lane, s;
+LANE_CHANGE_M = 250.0  # twice as much on a lane of this length, which is hardly enough for one
 TURNAROUND = ord("t")
 
 
@@ -50,14 +51,16 @@ def _leads_to(roads: RoadArrays, before: int, lane: int) -> bool:
 
 
 @kernel
-def _change_cost(roads: RoadArrays, lane: int) -> float:
+def change_cost(roads: RoadArrays, lane: int, weight: float) -> float:
     """Cost in s of leaving a lane sideways: plans change lanes where there is room to.
 
     Inside junctions nobody changes lanes.
     """
     if roads.lanes[lane]["internal"]:
         return math.inf
-    return LANE_CHANGE_COST_S + max(SHORT_LANE_M - float(roads.lanes[lane]["length_m"]), 0.0)
+    return (
+        weight * LANE_CHANGE_COST_S * (1.0 + LANE_CHANGE_M / float(roads.lanes[lane]["length_m"]))
+    )
 
 
 @kernel
@@ -84,7 +87,12 @@ def _lane_cost(roads: RoadArrays, lane: int, cost: NDArray[np.float64]) -> tuple
 
 @kernel
 def _settle(
-    roads: RoadArrays, lane: int, goal_edge: int, cost: NDArray[np.float64], plan: NDArray[np.void]
+    roads: RoadArrays,
+    lane: int,
+    goal_edge: int,
+    change_weight: float,
+    cost: NDArray[np.float64],
+    plan: NDArray[np.void],
 ) -> None:
     """Write the plan of a lane whose cost, and that of all cheaper lanes, is final."""
     row = roads.lanes[lane]
@@ -100,7 +108,7 @@ def _settle(
     best = through
     change = 0
     beside = -1
-    sideways = _change_cost(roads, lane)
+    sideways = change_cost(roads, lane, change_weight)
     if row["left"] >= 0 and cost[row["left"]] + sideways < best:
         best = cost[row["left"]] + sideways
         change = 1
@@ -122,13 +130,20 @@ def _settle(
         step["to_go"] = plan[beside]["to_go"]
 
 
-@setup_kernel
-def plan_goal(roads: RoadArrays, goal_edge: int, permission: int, plan: NDArray[np.void]) -> None:
+@allocating_kernel
+def plan_goal(
+    roads: RoadArrays,
+    goal_edge: int,
+    permission: int,
+    change_weight: float,
+    plan: NDArray[np.void],
+) -> None:
     """Fill the plan of one goal.
 
     Args:
         roads: the road arrays.
         goal_edge: EDGE row to reach.
+        change_weight: what lane changes cost, over the usual; large: only where nothing else leads.
         permission: bit of LANE["permissions"] that a lane needs.
         plan: PLAN records (L,), written whole. Lanes from which the goal cannot be reached get
             to_go = inf and next = -1.
@@ -143,6 +158,7 @@ def plan_goal(roads: RoadArrays, goal_edge: int, permission: int, plan: NDArray[
         step["change"] = 0
         step["changes"] = 0
         step["turnarounds"] = 0
+        step["shift"] = 0
         step["room"] = 0.0
         step["to_go"] = math.inf
     heap: list[tuple[float, Any]] = [(0.0, -1)]  # tells the compiler the type; -1 is no lane
@@ -157,7 +173,7 @@ def plan_goal(roads: RoadArrays, goal_edge: int, permission: int, plan: NDArray[
         if lane < 0 or settled[lane]:
             continue
         settled[lane] = True
-        _settle(roads, lane, goal_edge, cost, plan)
+        _settle(roads, lane, goal_edge, change_weight, cost, plan)
         row = roads.lanes[lane]
         for k in range(row["first_into"], row["first_into"] + row["num_into"]):
             before = roads.into[k]
@@ -175,7 +191,7 @@ def plan_goal(roads: RoadArrays, goal_edge: int, permission: int, plan: NDArray[
                 continue
             if not roads.lanes[beside]["permissions"] & permission:
                 continue
-            reached = here + _change_cost(roads, beside)
+            reached = here + change_cost(roads, beside, change_weight)
             if reached < cost[beside]:
                 cost[beside] = reached
                 heapq.heappush(heap, (reached, np.int64(beside)))

@@ -19,11 +19,13 @@ are uint64: Numba turns a mix with int64 into float64.
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
 
 from cavmarl.kernels import kernel
 
 __all__ = [
     "DRAWS_PER_STREAM",
+    "STREAM_DEMAND",
     "STREAM_DEPARTURE",
     "STREAM_DRIVER",
     "STREAM_ORIGIN",
@@ -37,7 +39,9 @@ __all__ = [
     "STREAM_VTYPE",
     "STREAM_WORLD",
     "below",
+    "fill_uniform",
     "philox4x32",
+    "quick_uniform",
     "uniform",
     "world_key",
 ]
@@ -56,6 +60,7 @@ STREAM_POLICY = 8 * DRAWS_PER_STREAM  # actions of scripted random drivers
 STREAM_DRIVER = 9 * DRAWS_PER_STREAM  # decisions of background drivers
 STREAM_SENSOR = 10 * DRAWS_PER_STREAM  # noise and dropouts of sensors
 STREAM_V2X = 11 * DRAWS_PER_STREAM  # losses and delays of messages
+STREAM_DEMAND = 12 * DRAWS_PER_STREAM  # times, types and routes of a demand file
 
 _MASK_16 = np.uint64(0xFFFF)
 _MASK_32 = np.uint64(0xFFFFFFFF)
@@ -66,6 +71,15 @@ _MULTIPLIER_1 = np.uint64(0xCD9E8D57)
 _WEYL_0 = np.uint64(0x9E3779B9)  # golden ratio
 _WEYL_1 = np.uint64(0xBB67AE85)  # sqrt(3) - 1
 _ROUNDS = 10
+
+# SplitMix64's increment and multipliers.
+_GOLDEN = np.uint64(0x9E3779B97F4A7C15)
+_MIX_0 = np.uint64(0xBF58476D1CE4E5B9)
+_MIX_1 = np.uint64(0x94D049BB133111EB)
+_SHIFT_11 = np.uint64(11)
+_SHIFT_27 = np.uint64(27)
+_SHIFT_30 = np.uint64(30)
+_SHIFT_31 = np.uint64(31)
 
 # The upper 27 and 26 bits of two words make the 53 of a float64.
 _SHIFT_5 = np.uint64(5)
@@ -150,6 +164,19 @@ def uniform(key: int | np.uint64, vehicle: int, tick: int, stream: int) -> float
 
 
 @kernel
+def fill_uniform(
+    key: int | np.uint64,
+    vehicles: NDArray[np.int64],
+    ticks: NDArray[np.int64],
+    stream: int,
+    numbers: NDArray[np.float64],
+) -> None:
+    """`uniform` for each pair of `vehicles` (n,) and `ticks` (n,), written to `numbers` (n,)."""
+    for i in range(len(numbers)):
+        numbers[i] = uniform(key, vehicles[i], ticks[i], stream)
+
+
+@kernel
 def below(key: int | np.uint64, vehicle: int, tick: int, stream: int, n: int) -> int:
     """An integer uniform in [0, n); no value's chance is off by more than 2**-64.
 
@@ -164,3 +191,23 @@ def below(key: int | np.uint64, vehicle: int, tick: int, stream: int, n: int) ->
     count = np.uint64(n)
     # floor(n * (word_0 * 2**32 + word_1) / 2**64), carried out in two halves that fit.
     return int((word_0 * count + ((word_1 * count) >> _SHIFT_32)) >> _SHIFT_32)
+
+
+@kernel
+def _mix(word: np.uint64) -> np.uint64:
+    word = (word ^ (word >> _SHIFT_30)) * _MIX_0
+    word = (word ^ (word >> _SHIFT_27)) * _MIX_1
+    return word ^ (word >> _SHIFT_31)
+
+
+@kernel
+def quick_uniform(key: int | np.uint64, vehicle: int, tick: int, stream: int) -> float:
+    """As `uniform`, for what every vehicle draws in every tick: a fifth of the time.
+
+    The finaliser of SplitMix64 (Steele, Lea, Flood: "Fast splittable pseudorandom number
+    generators", OOPSLA 2014) over key, vehicle and (stream, tick) in turn.
+    """
+    word = _mix(np.uint64(key) + _GOLDEN)
+    word = _mix(word ^ (np.uint64(vehicle) * _GOLDEN))
+    word = _mix(word ^ ((np.uint64(stream) << _SHIFT_32) + np.uint64(tick)) * _GOLDEN)
+    return float(word >> _SHIFT_11) * _ULP

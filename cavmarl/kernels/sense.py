@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cavmarl.kernels import kernel
-from cavmarl.kernels.arrays import Outputs, RoadArrays, Sensors, Worlds
+from cavmarl.kernels.arrays import Outputs, RoadArrays, Sensors, Travel, Worlds
 from cavmarl.kernels.codes import DRIVER_AGENT, EVENTS_THAT_END
 from cavmarl.kernels.neighbors import Grid, fill_grid
 from cavmarl.kernels.observing import (
@@ -16,6 +16,8 @@ from cavmarl.kernels.observing import (
     observe_route,
     observe_signal,
 )
+from cavmarl.kernels.observing_lanes import observe_lanes
+from cavmarl.kernels.stacking import has_entered, newest_frame, shift_frames
 from cavmarl.kernels.terms import NUM_TERMS, write_terms
 
 __all__ = ["sense"]
@@ -25,6 +27,7 @@ __all__ = ["sense"]
 def sense(
     roads: RoadArrays,
     plans: NDArray[np.void],
+    travel: Travel,
     worlds: Worlds,
     grid: Grid,
     sensors: Sensors,
@@ -38,11 +41,12 @@ def sense(
     """Write what every agent of the chosen worlds gets, at its own index.
 
     A vehicle that entered during the step has not acted: it is observed, its terms and reward are
-    0, and it does not end.
+    0, and it does not end. `observe_further` and `fill_stacks` complete the observations.
 
     Args:
         roads: the road arrays.
-        plans: PLAN (G, L).
+        plans: PLAN (G, L), the ways of agents.
+        travel: the ways of all.
         worlds: committed rows at the end of the step; episode_return of agents' rows is written.
         grid: room for the spatial index of one world.
         sensors: settings and room.
@@ -58,7 +62,6 @@ def sense(
         if not chosen[w]:
             continue
         rows = worlds.rows[w]
-        outputs.observations[w] = 0.0
         outputs.terms[w] = 0.0
         outputs.rewards[w] = 0.0
         outputs.terminated[w] = False
@@ -72,20 +75,31 @@ def sense(
             if row["driver"] != DRIVER_AGENT:
                 continue
             agent = row["agent"]
-            out = outputs.observations[w, agent]
-            observe_ego(roads, plans, row, out)
+            seen = outputs.observations[w, agent]
+            shift_frames(seen, sensors.stack, sensors.cleared)
+            out = seen[newest_frame(seen, sensors.stack) :]
+            if sensors.ego:
+                observe_ego(roads, plans, row, out)
             observe_route(roads, plans, row, sensors, out)
             observe_neighbors(rows, i, grid, sensors, out)
-            observe_signal(roads, plans, row, worlds.signal_phase[w], sensors, out)
+            phase = worlds.signal_phase[w]
+            if sensors.signal:
+                time = worlds.ticks[w] * tick_s
+                controllers = worlds.controllers[w]
+                observe_signal(roads, plans, controllers, row, phase, time, tick_s, sensors, out)
+            observe_lanes(roads, travel, rows, i, grid, phase, sensors, out)
             observe_lidar(rows, i, grid, sensors, out)
             outputs.present[w, agent] = True
             outputs.vehicle_ids[w, agent] = row["id"]
-            if row["departed"] > row["tick"] - ticks_per_step:
+            if has_entered(row, ticks_per_step):
                 continue
             write_terms(roads, rows, i, grid, step_s, outputs.terms[w, agent])
             outputs.acted[w, agent] = True
             outputs.terminated[w, agent] = row["events"] & EVENTS_THAT_END != 0
             outputs.events[w, agent] = row["events"]
+        for agent in range(outputs.present.shape[1]):
+            if not outputs.present[w, agent]:
+                outputs.observations[w, agent] = 0.0
         _reward(worlds, w, weights, team_share, outputs)
 
 

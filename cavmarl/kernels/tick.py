@@ -9,7 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cavmarl.kernels import kernel
-from cavmarl.kernels.arrays import LaneGrid, RoadArrays, Scratch, Worlds
+from cavmarl.kernels.approach import register_links
+from cavmarl.kernels.arrays import LaneGrid, RoadArrays, Scratch, Travel, Worlds
 from cavmarl.kernels.codes import (
     ACTION_FASTER,
     ACTION_IDLE,
@@ -18,13 +19,14 @@ from cavmarl.kernels.codes import (
     ACTION_SLOWER,
     DRIVER_AGENT,
     DRIVER_BACKGROUND,
+    EVENT_ARRIVED,
     EVENT_COLLIDED,
     EVENTS_THAT_END,
 )
 from cavmarl.kernels.contacts import find_contacts
 from cavmarl.kernels.control import speed_control
 from cavmarl.kernels.drivers import decide
-from cavmarl.kernels.junctions import STOP_SIGN_S, register_links
+from cavmarl.kernels.junctions import STOP_SIGN_S
 from cavmarl.kernels.lane_choice import needed_change
 from cavmarl.kernels.lanes import index_lanes
 from cavmarl.kernels.motion import move_agent, move_background
@@ -32,24 +34,7 @@ from cavmarl.kernels.neighbors import Grid, fill_grid
 from cavmarl.kernels.scalars import clamp
 from cavmarl.kernels.steering import nearest_speed, steer_to_lane, take_meta_action
 
-__all__ = ["advance", "begin_step", "resolve", "suggest", "switch_signals"]
-
-
-@kernel
-def switch_signals(roads: RoadArrays, worlds: Worlds, dt: float) -> None:
-    """Set every signal to the phase of its fixed-time program at the worlds' ticks."""
-    for w in range(worlds.ticks.shape[0]):
-        time = worlds.ticks[w] * dt
-        for k in range(roads.signals.shape[0]):
-            signal = roads.signals[k]
-            left = (time - signal["offset_s"]) % signal["cycle_s"]
-            phase = signal["first_phase"]
-            last = phase + signal["num_phases"] - 1
-            # Half a tick of slack: sums of ticks are not exact.
-            while phase < last and left + 0.5 * dt >= roads.phases[phase]["duration_s"]:
-                left -= roads.phases[phase]["duration_s"]
-                phase += 1
-            worlds.signal_phase[w, k] = phase
+__all__ = ["advance", "begin_step", "resolve", "suggest"]
 
 
 @kernel
@@ -88,9 +73,21 @@ def _any_driver(rows: NDArray[np.void], num: int, driver: int) -> bool:
 
 
 @kernel
+def _order_by_lane(roads: RoadArrays, owned: int, scratch: Scratch) -> None:
+    """The owned rows in the order of the index: neighbours on the road become so in memory."""
+    found = 0
+    for k in range(scratch.lane_start[roads.lanes.shape[0]]):
+        entry = scratch.entries[k]
+        if not entry["side"] and entry["row"] < owned:
+            scratch.order[found] = entry["row"]
+            found += 1
+
+
+@kernel
 def advance(
     roads: RoadArrays,
     plans: NDArray[np.void],
+    travel: Travel,
     lane_grid: LaneGrid,
     worlds: Worlds,
     scratch: Scratch,
@@ -106,6 +103,7 @@ def advance(
     Args:
         roads: the road arrays.
         plans: PLAN (G, L).
+        travel: types and ways.
         lane_grid: which lanes lie near a place.
         worlds: next_rows is written.
         scratch: room.
@@ -121,23 +119,31 @@ def advance(
         owned = worlds.num_owned[w]
         phase = worlds.signal_phase[w]
         if _any_driver(rows, owned, DRIVER_BACKGROUND):
-            index_lanes(roads.lanes, rows, worlds.num_rows[w], scratch)
-            register_links(roads, plans, rows, worlds.num_rows[w], scratch)
+            index_lanes(roads, travel, rows, worlds.num_rows[w], scratch)
+            register_links(roads, travel, rows, worlds.num_rows[w], scratch)
             decide(
-                roads, plans, rows, owned, DRIVER_BACKGROUND, worlds.ticks[w], dt, phase, scratch
+                roads, travel, rows, owned, DRIVER_BACKGROUND, worlds.ticks[w], dt, phase, scratch
             )
-        for i in range(owned):
+            _order_by_lane(roads, owned, scratch)
+        else:
+            for i in range(owned):
+                scratch.order[i] = i
+        through = 0
+        for k in range(owned):
+            i = scratch.order[k]
             old = rows[i]
-            worlds.next_rows[w, i] = old
-            row = worlds.next_rows[w, i]
+            worlds.next_rows[w, k] = old
+            row = worlds.next_rows[w, k]
             if old["driver"] == DRIVER_BACKGROUND:
+                row["events"] = 0
                 row["hold"] = scratch.hold[i]
                 row["blinker"] = scratch.blinker[i]
                 if scratch.link_ahead[i] >= 0 and old["wait_s"] >= STOP_SIGN_S:
                     row["stopped_at"] = scratch.link_ahead[i]
                 move_background(
-                    roads, plans, old, row, scratch.accel[i], scratch.lane_change[i], dt
+                    roads, travel, old, row, scratch.accel[i], scratch.lane_change[i], dt
                 )
+                through += row["events"] & EVENT_ARRIVED
                 continue
             if old["events"] & EVENTS_THAT_END:
                 row["tick"] = old["tick"] + 1
@@ -162,7 +168,8 @@ def advance(
                 dt,
             )
             # The indicator is automatic: drivers behind make room for who has to change lanes.
-            row["blinker"] = needed_change(roads, plans, row)
+            row["blinker"] = needed_change(roads, travel, row)
+        worlds.num_through[w] = through
 
 
 @kernel
@@ -193,6 +200,7 @@ def resolve(worlds: Worlds, scratch: Scratch, grid: Grid) -> None:
 def suggest(
     roads: RoadArrays,
     plans: NDArray[np.void],
+    travel: Travel,
     worlds: Worlds,
     scratch: Scratch,
     discrete: bool,
@@ -206,6 +214,7 @@ def suggest(
     Args:
         roads: the road arrays.
         plans: PLAN (G, L).
+        travel: types and ways.
         worlds: not written.
         scratch: room.
         discrete: whether to answer with meta-actions.
@@ -219,9 +228,9 @@ def suggest(
         rows = worlds.rows[w]
         owned = worlds.num_owned[w]
         phase = worlds.signal_phase[w]
-        index_lanes(roads.lanes, rows, worlds.num_rows[w], scratch)
-        register_links(roads, plans, rows, worlds.num_rows[w], scratch)
-        decide(roads, plans, rows, owned, DRIVER_AGENT, worlds.ticks[w], dt, phase, scratch)
+        index_lanes(roads, travel, rows, worlds.num_rows[w], scratch)
+        register_links(roads, travel, rows, worlds.num_rows[w], scratch)
+        decide(roads, travel, rows, owned, DRIVER_AGENT, worlds.ticks[w], dt, phase, scratch)
         for i in range(owned):
             row = rows[i]
             if row["driver"] != DRIVER_AGENT:

@@ -38,6 +38,11 @@ class MapReport:
         junctions: where more than two edges meet.
         junctions_by_type: all nodes of the map by SUMO's type.
         signals: traffic lights.
+        programs: of all traffic lights together.
+        actuated_signals: traffic lights whose program follows the traffic.
+        programs_simplified: signal programs (signal/program) for which SUMO has rules that are not
+            run here: a choice among following phases, delay-based and NEMA control, which run for
+            their stated durations, and limits of single links.
         extent_m: min x, min y, max x, max y of the lanes.
         elevation_m: lowest and highest point of the lanes.
         max_grade: steepest slope of a lane, as a ratio.
@@ -63,6 +68,8 @@ class MapReport:
     junctions: int
     junctions_by_type: dict[str, int]
     signals: int
+    programs: int
+    actuated_signals: int
     extent_m: tuple[float, float, float, float]
     elevation_m: tuple[float, float]
     max_grade: float
@@ -73,6 +80,7 @@ class MapReport:
     junctions_without_right_of_way: tuple[str, ...]
     signals_without_lanes: tuple[str, ...]
     lanes_never_green: tuple[str, ...]
+    programs_simplified: tuple[str, ...]
     self_loops: tuple[str, ...]
     speed_outliers: tuple[str, ...]
     problems: tuple[str, ...]
@@ -102,6 +110,7 @@ def check_map(source: str | Path | RoadNetwork) -> MapReport:
         "junctions_without_right_of_way": _lawless_junctions(network),
         "signals_without_lanes": _idle_signals(network),
         "lanes_never_green": _lanes_never_green(network),
+        "programs_simplified": _simplified_programs(network),
         "self_loops": cars.self_loops(),
         "speed_outliers": cars.speed_outliers(),
     }
@@ -119,6 +128,10 @@ def check_map(source: str | Path | RoadNetwork) -> MapReport:
         junctions=_crossroads(network),
         junctions_by_type=_junctions_by_type(network),
         signals=len(network.signals),
+        programs=len(network.programs),
+        actuated_signals=int(
+            (network.programs["controller"][network.signals["program"]] >= 0).sum()
+        ),
         extent_m=network.extent_m,
         elevation_m=heights,
         max_grade=grade,
@@ -216,12 +229,20 @@ def _idle_signals(network: RoadNetwork) -> tuple[str, ...]:
     return tuple(network.signal_ids[row] for row in rows)
 
 
+def _simplified_programs(network: RoadNetwork) -> tuple[str, ...]:
+    return tuple(
+        f"{network.signal_ids[network.programs['signal'][row]]}/{network.program_ids[row]}"
+        for row in np.flatnonzero(network.programs["simplified"])
+    )
+
+
 def _lanes_never_green(network: RoadNetwork) -> tuple[str, ...]:
     shut: set[int] = set()
     for link in network.links[network.links["signal"] >= 0]:
         signal = network.signals[link["signal"]]
-        first = signal["first_phase"]
-        phases = network.phases[first : first + signal["num_phases"]]
+        program = network.programs[signal["program"]]
+        first = program["first_phase"]
+        phases = network.phases[first : first + program["num_phases"]]
         letters = network.phase_states[phases["first_state"] + link["signal_index"]]
         if not np.isin(letters, _GREEN).any():
             shut.add(int(link["from_lane"]))

@@ -13,6 +13,7 @@ import subprocess
 import tempfile
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
+from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
@@ -145,8 +146,9 @@ def map_file(path: str | Path) -> Path:
 
 
 def _cache_entry(source: Path, options: Sequence[str]) -> Path:
-    version = require("sumo", "sumo").__version__
-    digest = hashlib.sha256("\0".join([source_hash(source), version, *options]).encode())
+    require("sumo", "sumo")
+    release = version("eclipse-sumo")
+    digest = hashlib.sha256("\0".join([source_hash(source), release, *options]).encode())
     return cache_dir() / "maps" / digest.hexdigest()[:32] / f"{map_name(source)}.net.xml"
 
 

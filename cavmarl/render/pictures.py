@@ -13,13 +13,13 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from cavmarl.registry import load_config, resolve_map
+from cavmarl.registry import load_config
 from cavmarl.render.camera import Bounds
 from cavmarl.render.canvas import load_pygame
 from cavmarl.render.topdown import TopDownRenderer
-from cavmarl.roads.cache import load_network
 from cavmarl.runtime.simulation import Simulation
 from cavmarl.shard.shard import Commands
+from cavmarl.worlds import load_roads
 
 if TYPE_CHECKING:
     from pygame import Surface
@@ -64,7 +64,7 @@ PICTURES = {
 def draw_picture(picture: Picture) -> Surface:
     """Run the world up to the moment of the picture, and draw it."""
     config, folder = load_config(picture.env, agents=picture.agents, background=picture.background)
-    network = load_network(resolve_map(config, folder))
+    network = load_roads(config, folder)
     simulation = Simulation(config, network)
     simulation.seed(SEED)
     simulation.reset()

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import hashlib
+import io
 import json
 import os
 import tempfile
-import zipfile
 from dataclasses import fields
 from pathlib import Path
 from typing import Any
@@ -17,13 +17,16 @@ from numpy.typing import NDArray
 from cavmarl.kernels import cache_dir
 from cavmarl.roads.network import (
     CONFLICT,
+    DETECTOR,
     EDGE,
     JUNCTION,
     LANE,
     LINK,
     PHASE,
     POINT,
+    PROGRAM,
     SIGNAL,
+    SWITCH,
     RoadNetwork,
 )
 from cavmarl.roads.reader import map_name, read_network, source_hash
@@ -31,7 +34,9 @@ from cavmarl.roads.reader import map_name, read_network, source_hash
 __all__ = ["load_network"]
 
 # Raise this when the reader gives other rows for the same file; record types count by themselves.
-FORMAT = 8
+FORMAT = 15
+
+_DIGEST_BYTES = 32  # SHA-256 of the rest begins an entry: NumPy would stumble over a broken one
 
 _DTYPES = {
     "points": POINT,
@@ -42,10 +47,14 @@ _DTYPES = {
     "junctions": JUNCTION,
     "into": np.dtype(np.int32),
     "signals": SIGNAL,
+    "programs": PROGRAM,
     "phases": PHASE,
     "phase_states": np.dtype(np.uint8),
+    "switches": SWITCH,
+    "detectors": DETECTOR,
+    "phase_detectors": np.dtype(np.int32),
 }
-_IDS = ("lane_ids", "edge_ids", "junction_ids", "signal_ids", "junction_kinds")
+_IDS = ("lane_ids", "edge_ids", "junction_ids", "signal_ids", "program_ids", "junction_kinds")
 
 
 def load_network(path: str | Path) -> RoadNetwork:
@@ -66,19 +75,20 @@ def load_network(path: str | Path) -> RoadNetwork:
 
 def _entry(digest: str) -> Path:
     layout = hashlib.sha256(repr((FORMAT, [dtype.descr for dtype in _DTYPES.values()])).encode())
-    return cache_dir() / "maps" / f"{digest}-{layout.hexdigest()[:12]}.npz"
+    return cache_dir() / "maps" / f"{digest}-{layout.hexdigest()[:12]}.network"
 
 
 def _restore(entry: Path, name: str, digest: str) -> RoadNetwork | None:
     """The network of a cache entry, or None if there is no whole one."""
     try:
-        with entry.open("rb") as stream, np.load(stream, allow_pickle=False) as stored:
-            values: dict[str, Any] = {
-                key: _thaw(stored[key], kind) for key, kind in _DTYPES.items()
-            }
-            values |= {key: tuple(json.loads(stored[key].tobytes())) for key in _IDS}
-    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile):
+        content = entry.read_bytes()
+    except OSError:
         return None
+    if hashlib.sha256(content[_DIGEST_BYTES:]).digest() != content[:_DIGEST_BYTES]:
+        return None
+    with np.load(io.BytesIO(content[_DIGEST_BYTES:]), allow_pickle=False) as stored:
+        values: dict[str, Any] = {key: _thaw(stored[key], kind) for key, kind in _DTYPES.items()}
+        values |= {key: tuple(json.loads(stored[key].tobytes())) for key in _IDS}
     return RoadNetwork(name=name, source_hash=digest, **values)
 
 
@@ -91,9 +101,12 @@ def _store(entry: Path, network: RoadNetwork) -> None:
             stored[field.name] = np.frombuffer(value.tobytes(), dtype=np.uint8)
         elif field.name in _IDS:
             stored[field.name] = np.frombuffer(json.dumps(value).encode(), dtype=np.uint8)
+    buffer = io.BytesIO()
+    np.savez(buffer, allow_pickle=False, **stored)
+    content = buffer.getvalue()
     entry.parent.mkdir(parents=True, exist_ok=True)
     with tempfile.NamedTemporaryFile(dir=entry.parent, suffix=".tmp", delete=False) as target:
-        np.savez(target, allow_pickle=False, **stored)
+        target.write(hashlib.sha256(content).digest() + content)
     os.replace(target.name, entry)
 
 

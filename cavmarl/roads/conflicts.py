@@ -11,15 +11,25 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["LinkPath", "Overlap", "grazing", "overlap", "sample_path"]
+__all__ = [
+    "CLEARANCE_M",
+    "NEAR_M",
+    "LinkPath",
+    "Overlap",
+    "Poses",
+    "grazing",
+    "overlap",
+    "poses",
+    "sample_path",
+    "touching",
+]
 
 SAMPLE_M = 0.5
 # Half a car (2 m wide) on either path and a margin that covers corners cut in a turn.
 NEAR_M = 1.0 + 1.0 + 0.6
-# Half a car with a margin, and how quickly its heading follows the path (kernels.motion.TRAIL_M).
+# Half a car with a margin.
 HALF_LENGTH_M = 2.6
 HALF_WIDTH_M = 1.1
-TRAIL_M = 2.0
 # Paths further apart than this in height are a bridge and the road below it.
 CLEARANCE_M = 3.0
 # The half length of the stretch where foes never come near each other in the plane.
@@ -33,6 +43,13 @@ class LinkPath(NamedTuple):
     xyz: NDArray[np.float64]  # (n, 3) m
 
 
+class Poses(NamedTuple):
+    """Car boxes along a path."""
+
+    xyz: NDArray[np.float64]  # (n, 3) centres, m
+    heading: NDArray[np.float64]  # (n,) rad
+
+
 class Overlap(NamedTuple):
     """The shared area of two paths, in metres from each stop line."""
 
@@ -44,8 +61,8 @@ class Overlap(NamedTuple):
 
 def sample_path(s: NDArray[np.float64], xyz: NDArray[np.float64]) -> LinkPath:
     """Sample a polyline with arc lengths `s` (n,) and points `xyz` (n, 3), metres, evenly."""
-    count = int(np.ceil(s[-1] / SAMPLE_M)) + 1
-    at = np.linspace(0.0, s[-1], max(count, 2))
+    count = int(np.ceil((s[-1] - s[0]) / SAMPLE_M)) + 1
+    at = np.linspace(s[0], s[-1], max(count, 2))
     return LinkPath(at, np.stack([np.interp(at, s, xyz[:, axis]) for axis in range(3)], axis=1))
 
 
@@ -89,41 +106,58 @@ def overlap(path: LinkPath, foe: LinkPath, *, merging: bool) -> Overlap | None:
 def grazing(path: LinkPath, foe: LinkPath) -> Overlap | None:
     """Where cars on two paths would touch as they stand askew in their bends, or None.
 
-    Cars are boxes whose heading trails the path, as background vehicles drive. The answer is in
-    places of a front bumper that comes and a rear bumper that leaves, as in `overlap`.
+    The answer is in places of a front bumper that comes and a rear bumper that leaves, as in
+    `overlap`.
     """
-    plane = path.xyz[:, None, :2] - foe.xyz[None, :, :2]
-    square = plane[..., 0] * plane[..., 0] + plane[..., 1] * plane[..., 1]
-    level = np.abs(path.xyz[:, None, 2] - foe.xyz[None, :, 2]) <= CLEARANCE_M
+    mine, theirs = poses(path), poses(foe)
+    apart = mine.xyz[:, None, :] - theirs.xyz[None, :, :]
+    square = apart[..., 0] * apart[..., 0] + apart[..., 1] * apart[..., 1]
+    level = np.abs(apart[..., 2]) <= CLEARANCE_M
     reach = 2.0 * np.hypot(HALF_LENGTH_M, HALF_WIDTH_M)
     rows, columns = np.nonzero(level & (square < reach * reach))
     if not rows.size:
         return None
-    mine, theirs = _headings(path)[rows], _headings(foe)[columns]
-    touching = ~_apart(plane[rows, columns], mine, theirs)
-    if not touching.any():
+    meet = touching(apart[rows, columns, :2], mine.heading[rows], theirs.heading[columns])
+    if not meet.any():
         return None
-    here, there = path.s[rows[touching]], foe.s[columns[touching]]
+    here, there = path.s[rows[meet]], foe.s[columns[meet]]
     return Overlap(*map(float, (*_from_centres(path, here), *_from_centres(foe, there))))
 
 
-def _headings(path: LinkPath) -> NDArray[np.float64]:
-    """Heading at each sample of a car whose heading follows the path within `TRAIL_M`."""
-    steps = np.diff(path.xyz[:, :2], axis=0)
-    directions = np.arctan2(steps[:, 1], steps[:, 0])
-    headings = np.empty(len(path.s))
-    headings[0] = directions[0]
-    for k, direction in enumerate(directions):
-        error = (direction - headings[k] + np.pi) % (2.0 * np.pi) - np.pi
-        share = min(1.0, (path.s[k + 1] - path.s[k]) / TRAIL_M)
-        headings[k + 1] = headings[k] + error * share
-    return headings
+def poses(path: LinkPath) -> Poses:
+    """How a car stands along a path: as a chord of it, both bumpers on the path.
+
+    Before and behind its ends the path goes on straight.
+    """
+    ends = [path.s[0] - 2.0 * HALF_LENGTH_M, *path.s, path.s[-1] + 2.0 * HALF_LENGTH_M]
+    first, last = path.xyz[1] - path.xyz[0], path.xyz[-1] - path.xyz[-2]
+    reach = 2.0 * HALF_LENGTH_M
+    xyz = np.concatenate(
+        [
+            [path.xyz[0] - first * reach / max(float(np.hypot(*first[:2])), 1e-6)],
+            path.xyz,
+            [path.xyz[-1] + last * reach / max(float(np.hypot(*last[:2])), 1e-6)],
+        ]
+    )
+
+    def at(s: NDArray[np.float64]) -> NDArray[np.float64]:
+        return np.stack([np.interp(s, ends, xyz[:, axis]) for axis in range(3)], axis=1)
+
+    front, rear = at(path.s + HALF_LENGTH_M), at(path.s - HALF_LENGTH_M)
+    chord = front - rear
+    return Poses(0.5 * (front + rear), np.arctan2(chord[:, 1], chord[:, 0]))
 
 
-def _apart(
+def touching(
     apart: NDArray[np.float64], mine: NDArray[np.float64], theirs: NDArray[np.float64]
 ) -> NDArray[np.bool_]:
-    """Whether pairs of car boxes have a separating axis; centres `apart` (n, 2), headings (n,)."""
+    """Whether pairs of car boxes have no separating axis.
+
+    Args:
+        apart: (n, 2) between the centres, m.
+        mine: (n,) headings, rad.
+        theirs: (n,) headings, rad.
+    """
     across = np.abs(np.sin(mine - theirs))
     along = np.abs(np.cos(mine - theirs))
     separated = np.zeros(len(apart), dtype=np.bool_)
@@ -132,7 +166,7 @@ def _apart(
         sideways = np.abs(apart[:, 1] * np.cos(heading) - apart[:, 0] * np.sin(heading))
         separated |= forward > HALF_LENGTH_M * (1.0 + along) + HALF_WIDTH_M * across
         separated |= sideways > HALF_WIDTH_M * (1.0 + along) + HALF_LENGTH_M * across
-    return separated
+    return ~separated
 
 
 def _from_centres(path: LinkPath, centres: NDArray[np.float64]) -> tuple[float, float]:

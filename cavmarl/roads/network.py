@@ -21,17 +21,22 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cavmarl.kernels.arrays import RoadArrays
+from cavmarl.kernels.signals import DETECTOR_REACH_M
 
 __all__ = [
     "CONFLICT",
+    "DETECTOR",
     "EDGE",
     "JUNCTION",
     "LANE",
     "LINK",
     "PHASE",
+    "PLACE",
     "POINT",
+    "PROGRAM",
     "SIGNAL",
     "SIGNAL_STATES",
+    "SWITCH",
     "VEHICLE_CLASSES",
     "RoadNetwork",
 ]
@@ -64,42 +69,47 @@ POINT = np.dtype(
         ),  # direction of the segment that starts here (the last point repeats the one before)
         ("sin", np.float64),
         ("slope", np.float64),  # dz/ds of that segment
+        ("heading", np.float64),  # of that segment, rad
+        ("left_s", np.float64),  # where on the left neighbour of its lane the point lies, m
+        ("right_s", np.float64),
     ],
     align=True,
 )
 
+# What drivers ask all the time comes first and shares a cache line.
 LANE = np.dtype(
     [
-        ("edge", np.int32),  # EDGE row; internal lanes too
-        ("index", np.int32),  # position on its edge, 0 = rightmost
-        ("internal", np.bool_),  # lies inside a junction
         (
             "length_m",
             np.float64,
         ),  # arc length of the polyline in the plane: the `s` of its last point
-        ("width_m", np.float64),
         ("speed_mps", np.float64),  # speed limit
-        ("permissions", np.uint32),  # bit k set: VEHICLE_CLASSES[k] may drive here
-        ("first_point", np.int32),  # POINT rows [first_point, first_point + num_points)
-        ("num_points", np.int32),  # at least 2
+        ("width_m", np.float64),
+        ("internal", np.bool_),  # lies inside a junction
         ("left", np.int32),  # LANE row of the neighbour to the left in the same direction
         ("right", np.int32),
+        ("successor", np.int32),  # internal lanes: the one LANE that follows (internal or normal)
+        ("link", np.int32),  # internal lanes: the LINK that this lane is part of
         (
             "first_link",
             np.int32,
         ),  # LINK rows of the movements that leave this lane's end, sorted by
         ("num_links", np.int32),  # from-lane; 0 for internal lanes (see `successor`)
-        ("successor", np.int32),  # internal lanes: the one LANE that follows (internal or normal)
-        ("link", np.int32),  # internal lanes: the LINK that this lane is part of
+        ("first_point", np.int32),  # POINT rows [first_point, first_point + num_points)
+        ("num_points", np.int32),  # at least 2
+        ("edge", np.int32),  # EDGE row; internal lanes too
         (
             "link_offset_m",
             np.float64,
         ),  # internal lanes: path length of the link before this lane starts
+        ("stop_back_m", np.float64),  # from the stop line to the end, where paths of others sweep
         (
             "first_into",
             np.int32,
         ),  # into[first_into : first_into + num_into]: LANE rows whose ends lead here
         ("num_into", np.int32),  # (internal lanes where the map has them)
+        ("permissions", np.uint32),  # bit k set: VEHICLE_CLASSES[k] may drive here
+        ("index", np.int32),  # position on its edge, 0 = rightmost
         ("min_x", np.float64),  # bounding box of the polyline, m
         ("min_y", np.float64),
         ("max_x", np.float64),
@@ -134,6 +144,8 @@ LINK = np.dtype(
             np.int32,
         ),  # where a vehicle is after the end of from_lane: first_internal, or to_lane
         ("length_m", np.float64),  # of the chain of internal lanes
+        ("fork_m", np.float64),  # of its path that others from the same lane come near
+        ("wait_m", np.float64),  # from the stop line to the waiting position inside; inf: none
         ("junction", np.int32),
         ("index", np.int32),  # the link's bit in its junction's request, response and foes
         ("signal", np.int32),  # SIGNAL row
@@ -149,6 +161,7 @@ LINK = np.dtype(
 CONFLICT = np.dtype(
     [
         ("foe", np.int32),  # LINK whose path crosses or merges with this link's path (a `foes` bit)
+        ("merging", np.bool_),  # both lead into one lane
         ("must_yield", np.bool_),  # this link has to give way to the foe (a `response` bit)
         ("enter_m", np.float64),  # where on this link's path the shared area begins and ends,
         ("leave_m", np.float64),  # from the stop line; leave = the whole length where both merge
@@ -171,11 +184,24 @@ JUNCTION = np.dtype(
 
 SIGNAL = np.dtype(
     [
-        ("first_phase", np.int32),  # PHASE rows of the first program
-        ("num_phases", np.int32),
+        ("program", np.int32),  # PROGRAM that is on at the beginning
         ("num_links", np.int32),  # letters in a state
+        ("first_switch", np.int32),  # SWITCH rows, by rising time
+        ("num_switches", np.int32),
+    ],
+    align=True,
+)
+
+PROGRAM = np.dtype(
+    [
+        ("signal", np.int32),
+        ("first_phase", np.int32),  # PHASE rows [first_phase, first_phase + num_phases)
+        ("num_phases", np.int32),
         ("offset_s", np.float64),  # by which all phases are late
         ("cycle_s", np.float64),  # sum of the phases' durations
+        ("controller", np.int32),  # actuated: its place in a world's controllers
+        ("detector_gap_s", np.float64),  # actuated: from a detector to the stop line, at the limit
+        ("simplified", np.bool_),  # SUMO has rules for it that are not run here
     ],
     align=True,
 )
@@ -183,7 +209,40 @@ SIGNAL = np.dtype(
 PHASE = np.dtype(
     [
         ("duration_s", np.float64),
+        ("min_ms", np.int64),  # actuated: bounds of the duration, in SUMO's unit of time
+        ("max_ms", np.int64),
+        ("following", np.int32),  # actuated: PHASE that comes next
+        ("green", np.bool_),  # some letter is green and none is yellow: it may be prolonged
         ("first_state", np.int32),  # phase_states[first_state : first_state + num_links]
+        ("first_detector", np.int32),  # phase_detectors that prolong it
+        ("num_detectors", np.int32),
+    ],
+    align=True,
+)
+
+SWITCH = np.dtype(
+    [
+        ("signal", np.int32),
+        ("at_s", np.float64),  # since the beginning
+        ("program", np.int32),  # PROGRAM that is on from then
+    ],
+    align=True,
+)
+
+DETECTOR = np.dtype(
+    [
+        ("lane", np.int32),  # LANE on which it lies; its signal may be one lane farther on
+        ("s_m", np.float64),  # where on that lane
+        ("max_gap_s", np.float64),  # between two vehicles of which the second prolongs the green
+    ],
+    align=True,
+)
+
+PLACE = np.dtype(
+    [
+        ("next", np.int32),  # the next PLACE of the same lane
+        ("detector", np.int32),
+        ("s_m", np.float64),  # of the detector in the lane's s; beyond its ends on lanes beside it
     ],
     align=True,
 )
@@ -195,11 +254,13 @@ class RoadNetwork:
 
     Attributes:
         name: the source file's name without its endings.
-        source_hash: SHA-256 of the source, hex; part of every manifest and cache key. points,
-        lanes, edges, links, conflicts, junctions, signals, phases: record arrays, read-only.
+        source_hash: SHA-256 of the source, hex; part of every manifest and cache key.
+        points, lanes, edges, links, conflicts, junctions: record arrays, read-only.
+        signals, programs, phases, switches, detectors: record arrays, read-only.
         into: LANE rows, see LANE["first_into"].
         phase_states: signal letters as codes, see PHASE.
-        lane_ids, edge_ids, junction_ids, signal_ids: the source's names, by row.
+        phase_detectors: DETECTOR rows, see PHASE["first_detector"].
+        lane_ids, edge_ids, junction_ids, signal_ids, program_ids: the source's names, by row.
         junction_kinds: SUMO's junction types that occur, by `JUNCTION["kind"]`.
     """
 
@@ -213,12 +274,17 @@ class RoadNetwork:
     junctions: NDArray[np.void]
     into: NDArray[np.int32]
     signals: NDArray[np.void]
+    programs: NDArray[np.void]
     phases: NDArray[np.void]
     phase_states: NDArray[np.uint8]
+    switches: NDArray[np.void]
+    detectors: NDArray[np.void]
+    phase_detectors: NDArray[np.int32]
     lane_ids: tuple[str, ...]
     edge_ids: tuple[str, ...]
     junction_ids: tuple[str, ...]
     signal_ids: tuple[str, ...]
+    program_ids: tuple[str, ...]
     junction_kinds: tuple[str, ...]
 
     def __post_init__(self) -> None:
@@ -238,9 +304,49 @@ class RoadNetwork:
             self.conflicts,
             self.into,
             self.signals,
+            self.programs,
             self.phases,
             self.phase_states,
+            self.switches,
+            self.detectors,
+            self.phase_detectors,
+            *self._places,
         )
+
+    @property
+    def num_controllers(self) -> int:
+        """Actuated programs: each keeps a state in every world."""
+        return int((self.programs["controller"] >= 0).sum())
+
+    @cached_property
+    def _places(self) -> tuple[NDArray[np.int32], NDArray[np.void]]:
+        """The first PLACE of every lane, (num_lanes,), and the PLACE rows.
+
+        A vehicle belongs to the lane of its centre while its ends reach onto others: so a detector
+        is listed with the internal lanes before and behind its own, too.
+        """
+        found: list[tuple[int, int, float]] = []
+        for number, detector in enumerate(self.detectors):
+            lane = self.lanes[detector["lane"]]
+            s = float(detector["s_m"])
+            found.append((int(detector["lane"]), number, s))
+            if s < DETECTOR_REACH_M:
+                into = self.into[lane["first_into"] : lane["first_into"] + lane["num_into"]]
+                found += [
+                    (int(before), number, s + float(self.lanes["length_m"][before]))
+                    for before in into[self.lanes["internal"][into]]
+                ]
+            beyond = s - float(lane["length_m"])
+            if beyond > -DETECTOR_REACH_M:
+                links = self.links[lane["first_link"] : lane["first_link"] + lane["num_links"]]
+                behind = links["first_internal"]
+                found += [(int(row), number, beyond) for row in behind[behind >= 0]]
+        first = np.full(len(self.lanes), -1, dtype=np.int32)
+        places = np.zeros(len(found), PLACE)
+        for row, (at, number, s) in enumerate(found):
+            places[row] = (first[at], number, s)
+            first[at] = row
+        return first, places
 
     @cached_property
     def extent_m(self) -> tuple[float, float, float, float]:

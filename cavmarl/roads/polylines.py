@@ -80,6 +80,7 @@ def point_rows(shapes: Sequence[Shape]) -> tuple[NDArray[np.void], NDArray[np.in
         points["cos"] = delta[:, 0] / length
         points["sin"] = delta[:, 1] / length
         points["slope"] = delta[:, 2] / length
-    for name in ("cos", "sin", "slope"):
+    points["heading"] = np.arctan2(delta[:, 1], delta[:, 0])
+    for name in ("cos", "sin", "slope", "heading"):
         points[name][last] = points[name][last - 1]
     return points, first.astype(np.int32)

@@ -11,15 +11,21 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cavmarl.errors import MapError
+from cavmarl.kernels.geometry import project
 from cavmarl.roads.conflicts import LinkPath, sample_path
+from cavmarl.roads.detectors import DetectorRoads, place_detectors
+from cavmarl.roads.forks import fork_lengths
 from cavmarl.roads.network import EDGE, JUNCTION, LANE, LINK, RoadNetwork
 from cavmarl.roads.polylines import clean_shape, extend_stubs, point_rows
+from cavmarl.roads.programs import Program
 from cavmarl.roads.right_of_way import conflict_rows
 from cavmarl.roads.selection import Movement, Selection, permission_bits, select
 from cavmarl.roads.signals import SignalRows, read_signals
+from cavmarl.roads.stop_lines import stop_back
 
 __all__ = ["map_name", "read_network", "source_hash"]
 
+APPROACH_M = 12.0  # before a junction, where bodies still stand askew to those who wait
 _ENDINGS = (".gz", ".xml", ".net", ".osm", ".xodr")
 
 
@@ -58,14 +64,14 @@ def read_network(path: str | Path) -> RoadNetwork:
     path = Path(path)
     digest = source_hash(path)
     try:
-        return _assemble(parse_net(path), map_name(path), digest)
+        return _assemble(*parse_net(path), map_name(path), digest)
     except MapError as error:
         if str(error).startswith(str(path)):
             raise
         raise MapError(f"{path}: {error}") from error
 
 
-def _assemble(net: Any, name: str, digest: str) -> RoadNetwork:
+def _assemble(net: Any, programs: list[Program], name: str, digest: str) -> RoadNetwork:
     chosen = select(net)
     if not chosen.edges:
         raise MapError(
@@ -73,7 +79,7 @@ def _assemble(net: Any, name: str, digest: str) -> RoadNetwork:
             "netconvert kept (--keep-edges.by-vclass)"
         )
     lane_row = {id(lane): row for row, lane in enumerate(chosen.lanes)}
-    signal_rows = read_signals(net)
+    signal_rows = read_signals(programs)
     nodes = net.getNodes()
     node_row = {id(node): row for row, node in enumerate(nodes)}
 
@@ -88,13 +94,24 @@ def _assemble(net: Any, name: str, digest: str) -> RoadNetwork:
     lanes = _lane_rows(chosen, edges, points, first_point)
     links = _link_rows(chosen.movements, lane_row, lanes, node_row, signal_rows)
     into = _connect(lanes, links, chosen.movements, lane_row)
-    conflicts, first_conflict = conflict_rows(
-        chosen.movements, [_path(move, lane_row, lanes, points) for move in chosen.movements]
+    paths = [_path(move, lane_row, lanes, points) for move in chosen.movements]
+    conflicts, first_conflict = conflict_rows(chosen.movements, paths)
+    links["fork_m"] = fork_lengths(links["from_lane"].tolist(), paths)
+    _map_neighbors(lanes, points)
+    lanes["stop_back_m"] = stop_back(
+        _lane_ends(lanes, points),
+        lanes["edge"],
+        links["from_lane"].tolist(),
+        links["junction"].tolist(),
+        paths,
+        [_path(move, lane_row, lanes, points, APPROACH_M) for move in chosen.movements],
     )
     links["first_conflict"] = first_conflict[:-1]
     links["num_conflicts"] = np.diff(first_conflict)
     junctions, kinds = _junction_rows(nodes, links)
-    signals, phases, phase_states = signal_rows.arrays()
+    detectors, phase_detectors = place_detectors(
+        signal_rows, DetectorRoads(lanes, edges, links, conflicts, into, lane_ids)
+    )
     return RoadNetwork(
         name=name,
         source_hash=digest,
@@ -105,9 +122,9 @@ def _assemble(net: Any, name: str, digest: str) -> RoadNetwork:
         conflicts=conflicts,
         junctions=junctions,
         into=into,
-        signals=signals,
-        phases=phases,
-        phase_states=phase_states,
+        **signal_rows.arrays()._asdict(),
+        detectors=detectors,
+        phase_detectors=phase_detectors,
         lane_ids=lane_ids,
         edge_ids=tuple(edge.getID() for edge in chosen.edges),
         junction_ids=tuple(node.getID() for node in nodes),
@@ -209,12 +226,37 @@ def _link_rows(
         link["first_internal"] = chain[0] if chain else -1
         link["next_lane"] = chain[0] if chain else link["to_lane"]
         link["length_m"] = lanes["length_m"][chain].sum()
+        # netconvert cuts a path in two where drivers wait inside the junction.
+        link["wait_m"] = lanes["length_m"][chain[0]] if len(chain) > 1 else np.inf
         link["junction"] = node_row[id(movement.node)]
         link["index"] = movement.index
         link["signal"], link["signal_index"] = signals.find(connection, movement.node.getType())
         link["direction"] = ord(connection.getDirection()[0])
         link["state"] = ord(connection.getState()[0])
     return links
+
+
+def _map_neighbors(lanes: NDArray[np.void], points: NDArray[np.void]) -> None:
+    """Fill where the points of each lane lie on its neighbours, in driving order."""
+    for row in lanes:
+        own = points[row["first_point"] : row["first_point"] + row["num_points"]]
+        for side in ("left", "right"):
+            if row[side] < 0:
+                continue
+            other = lanes[row[side]]
+            first, number = int(other["first_point"]), int(other["num_points"])
+            reached = 0.0
+            for point in own:
+                s, _, _, _ = project(points, first, number, point["x"], point["y"])
+                reached = max(reached, min(float(s), float(other["length_m"])))
+                point[f"{side}_s"] = reached
+
+
+def _lane_ends(lanes: NDArray[np.void], points: NDArray[np.void]) -> NDArray[np.float64]:
+    """(L, 4) x, y, z of each lane's last point and its direction there."""
+    last = points[lanes["first_point"] + lanes["num_points"] - 1]
+    heading = np.arctan2(last["sin"], last["cos"])
+    return np.stack([last["x"], last["y"], last["z"], heading], axis=1)
 
 
 def _connect(
@@ -255,11 +297,22 @@ def _path(
     lane_row: dict[int, int],
     lanes: NDArray[np.void],
     points: NDArray[np.void],
+    approach_m: float = 0.0,
 ) -> LinkPath | None:
-    """The sampled path of a link along its chain of internal lanes."""
+    """The sampled path of a link along its chain of internal lanes.
+
+    It may begin `approach_m` before the junction, with places below zero.
+    """
     if not movement.chain:
         return None
     s, xyz = [], []
+    if approach_m > 0.0:
+        row = lanes[lane_row[id(movement.connection.getFromLane())]]
+        part = points[row["first_point"] : row["first_point"] + row["num_points"]]
+        begin = max(row["length_m"] - approach_m, 0.0)
+        at = np.append(begin, part["s"][part["s"] > begin])
+        s.append(at - row["length_m"])
+        xyz.append(np.stack([np.interp(at, part["s"], part[axis]) for axis in "xyz"], axis=1))
     for lane in movement.chain:
         row = lanes[lane_row[id(lane)]]
         part = points[row["first_point"] : row["first_point"] + row["num_points"]]

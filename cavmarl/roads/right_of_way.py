@@ -16,7 +16,7 @@ from cavmarl.roads.selection import Movement
 
 __all__ = ["conflict_rows"]
 
-Row = tuple[int, bool, float, float, float, float]
+Row = tuple[int, bool, bool, float, float, float, float]
 
 
 def conflict_rows(
@@ -55,8 +55,8 @@ def conflict_rows(
             if shared is None:
                 continue
             mine, theirs = shared[:2], shared[2:]
-            found[one].append((other, yields[0], *mine, *theirs))
-            found[other].append((one, yields[1], *theirs, *mine))
+            found[one].append((other, merging, yields[0], *mine, *theirs))
+            found[other].append((one, merging, yields[1], *theirs, *mine))
 
     counts = [len(rows) for rows in found]
     conflicts = np.zeros(sum(counts), CONFLICT)

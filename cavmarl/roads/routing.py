@@ -23,9 +23,10 @@ PLAN = np.dtype(
     [
         ("next", np.int32),  # LANE after this lane's end; -1: the goal's own lane, or no way
         ("link", np.int32),  # LINK that leads there; -1 inside junctions
-        ("change", np.int32),  # side of the better lane: 1 left, -1 right, 0 this one is best
-        ("changes", np.int32),  # lane changes to the best lane of this edge
-        ("turnarounds", np.int32),  # U-turns on the way: where a road ends, plans turn round
+        ("shift", np.int32),  # what to add to a vehicle's way there, see `kernels.ways`
+        ("change", np.int16),  # side of the better lane: 1 left, -1 right, 0 this one is best
+        ("changes", np.int16),  # lane changes to the best lane of this edge
+        ("turnarounds", np.int16),  # U-turns on the way: where a road ends, plans turn round
         (
             "room",
             np.float64,
@@ -52,7 +53,7 @@ def make_plans(
     plans = np.zeros((len(goal_edges), len(network.lanes)), dtype=PLAN)
     permission = 1 << VEHICLE_CLASSES.index(vehicle_class)
     for goal, edge in enumerate(goal_edges):
-        plan_goal(network.arrays, int(edge), permission, plans[goal])
+        plan_goal(network.arrays, int(edge), permission, 1.0, plans[goal])
     plans.setflags(write=False)
     return plans
 

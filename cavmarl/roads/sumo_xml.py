@@ -16,6 +16,7 @@ from xml.sax.handler import ContentHandler
 from sumolib.net import NetReader
 
 from cavmarl.errors import MapError
+from cavmarl.roads.programs import Program, ProgramReader
 from cavmarl.roads.xml_source import read_xml
 
 __all__ = ["parse_net"]
@@ -26,14 +27,10 @@ _REQUIRED = {
     "junction": ("id", "type", "x", "y", "incLanes", "intLanes"),
     "connection": ("from", "to", "fromLane", "toLane", "dir", "state"),
     "request": ("index", "response", "foes"),
-    "tlLogic": ("id", "type", "programID", "offset"),
-    "phase": ("duration", "state"),
 }
 _FINITE = {
     "lane": ("speed", "length", "width"),
     "junction": ("x", "y", "z"),
-    "tlLogic": ("offset",),
-    "phase": ("duration",),
 }
 _POSITIVE = {("lane", "speed"), ("lane", "length"), ("lane", "width")}
 _VERSION = re.compile(r"[0-9]+\.[0-9]+(\.[0-9]+)?")
@@ -45,9 +42,8 @@ class _CheckedReader(ContentHandler):
 
     def __init__(self, path: Path) -> None:
         super().__init__()
-        self.reader = NetReader(withInternal=True, withPrograms=True, withFoes=True)
-        # sumolib reads this at a <param> outside everything, and sets it at the first program only.
-        self.reader._currentProgram = None
+        self.reader = NetReader(withInternal=True, withFoes=True)
+        self.programs = ProgramReader(path)
         self._path = path
         self._seen: set[tuple[str, str]] = set()
         self._edge = ""
@@ -62,6 +58,7 @@ class _CheckedReader(ContentHandler):
                 raise self._error(name, attrs, "is not the root of a SUMO network, which is <net>")
             self._check_version(attrs)
         self._check(name, attrs)
+        self.programs.start(name, attrs, self._locator.getLineNumber())
         try:
             self.reader.startElement(name, attrs)
         except (KeyError, ValueError, IndexError, AttributeError, TypeError) as error:
@@ -69,6 +66,7 @@ class _CheckedReader(ContentHandler):
             raise self._error(name, attrs, problem) from error
 
     def endElement(self, name: str) -> None:
+        self.programs.end(name)
         try:
             self.reader.endElement(name)
         except KeyError as error:
@@ -134,8 +132,8 @@ class _CheckedReader(ContentHandler):
                 raise self._error("lane", attrs, f"has the point '{point}', not finite x,y[,z]")
 
 
-def parse_net(path: Path) -> Any:
-    """Read a SUMO network (`.net.xml`, `.net.xml.gz`) into a `sumolib.net.Net`.
+def parse_net(path: Path) -> tuple[Any, list[Program]]:
+    """Read a SUMO network (`.net.xml`, `.net.xml.gz`): a `sumolib.net.Net` and signal programs.
 
     Raises:
         MapError: hostile or broken XML, a root other than <net>, missing attributes, numbers that
@@ -144,4 +142,4 @@ def parse_net(path: Path) -> Any:
     """
     handler = _CheckedReader(path)
     read_xml(path, handler)
-    return handler.reader.getNet()
+    return handler.reader.getNet(), handler.programs.programs

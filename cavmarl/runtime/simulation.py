@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from cavmarl.config import EnvConfig
 from cavmarl.errors import CapacityError
-from cavmarl.kernels.arrays import Outputs
+from cavmarl.kernels.arrays import Outputs, Worlds
 from cavmarl.kernels.codes import (
     ACTION_IDLE,
     COUNT_ARRIVED,
@@ -28,6 +28,7 @@ from cavmarl.runtime.compilation import first_compilation
 from cavmarl.runtime.executor import Executor, SerialExecutor
 from cavmarl.shard.shard import Commands, Shard
 from cavmarl.shard.vehicles import STATE_FIELDS, blank_vehicle
+from cavmarl.traffic.demand import DemandFile
 from cavmarl.traffic.departures import make_gate
 from cavmarl.traffic.native import NativeTraffic
 
@@ -48,7 +49,8 @@ class TrafficStats:
         mean_speed_mps: over the vehicles in the world now.
         mean_trip_m: over the arrived ones.
         mean_trip_s: over the arrived ones.
-        mean_delay_s: over the arrived ones, time above what the way takes at the limit.
+        mean_delay_s: over the arrived ones, time above what the way takes at the speed that
+            limit and driver allow.
     """
 
     departed: int
@@ -70,21 +72,41 @@ class Simulation:
         config: the environment.
         network: its roads.
         num_worlds: W.
+        demand: whose vehicles drive beside the generator's.
     """
 
-    def __init__(self, config: EnvConfig, network: RoadNetwork, num_worlds: int = 1) -> None:
+    def __init__(
+        self,
+        config: EnvConfig,
+        network: RoadNetwork,
+        num_worlds: int = 1,
+        demand: DemandFile | None = None,
+    ) -> None:
         self.config = config
         self.network = network
+        self.demand = demand
         self.num_worlds = num_worlds
         self._seed = 0
+        self._first_world = 0
         self._episodes = np.zeros(num_worlds, dtype=np.int64)
         self._everywhere = np.ones(num_worlds, dtype=np.bool_)
         with first_compilation() as is_first:
             blank = blank_vehicle()
-            self._traffic = NativeTraffic(network, config.traffic, config.population, blank)
-            population = config.population
-            self._gate = make_gate(num_worlds, population.agents + population.background)
-            self._shard = Shard(config, network, self._traffic.plans, num_worlds)
+            traffic = NativeTraffic(
+                network,
+                config.traffic,
+                config.population,
+                blank,
+                config.clock.sim_dt_s,
+                config.horizon_s,
+                demand,
+            )
+            capacity = traffic.capacity
+            self._traffic = traffic
+            self._gate = make_gate(num_worlds, capacity)
+            self._shard = Shard(
+                config, network, traffic.plans, traffic.travel, num_worlds, capacity
+            )
             self._executor: Executor = SerialExecutor([self._shard])
             if is_first:
                 self._call_every_kernel()
@@ -100,6 +122,11 @@ class Simulation:
         self._episodes[:] = 0
 
     @property
+    def capacity(self) -> int:
+        """How many vehicles a world can hold."""
+        return int(self._shard.worlds.rows.shape[1])
+
+    @property
     def outputs(self) -> Outputs:
         """What the agents got at the end of the last step; arrays that the next step overwrites."""
         return self._shard.outputs
@@ -109,10 +136,20 @@ class Simulation:
         """EDGE rows of the goals, by `VEHICLE["goal"]`."""
         return self._traffic.goal_edges
 
+    @property
+    def plans(self) -> NDArray[np.void]:
+        """PLAN (G, L): the ways of agents, by `VEHICLE["goal"]`."""
+        return self._traffic.plans
+
     def vehicles(self, world: int = 0) -> NDArray[np.void]:
         """The live vehicles of one world: a view of VEHICLE records, in no order."""
         worlds = self._shard.worlds
         return worlds.rows[world, : worlds.num_owned[world]]
+
+    @property
+    def worlds(self) -> Worlds:
+        """The vehicles and signals of all worlds, for tools that measure; each tick swaps them."""
+        return self._shard.worlds
 
     def signal_phases(self, world: int = 0) -> NDArray[np.int32]:
         """PHASE rows that are on, (num_signals,)."""
@@ -123,15 +160,21 @@ class Simulation:
         """(W,) ticks since each world's reset."""
         return self._shard.worlds.ticks
 
-    def seed(self, seed: int) -> None:
-        """Set the root of all random numbers; the next reset of each world is its first episode."""
+    def seed(self, seed: int, first_world: int = 0) -> None:
+        """Set the root of all random numbers; the next reset of each world is its first episode.
+
+        Args:
+            seed: the root.
+            first_world: number of the first of these worlds among all worlds of the seed.
+        """
         self._seed = seed
+        self._first_world = first_world
         self._episodes[:] = 0
 
     def reset(self, chosen: NDArray[np.bool_] | None = None) -> None:
         """Begin a new episode in the chosen worlds (W,), all by default, and sense.
 
-        World w's episode is a function of (seed, w, the number of its resets since `seed`).
+        World w's episode is a function of (seed, first_world + w, its resets since `seed`).
 
         Raises:
             CapacityError: the map has no room for that many agents of a closed world.
@@ -151,9 +194,11 @@ class Simulation:
     def _populate(self, chosen: NDArray[np.bool_]) -> None:
         worlds = self._shard.worlds
         for w in np.flatnonzero(chosen):
-            worlds.keys[w] = world_key(self._seed, int(w), int(self._episodes[w]))
+            number = self._first_world + int(w)
+            worlds.keys[w] = world_key(self._seed, number, int(self._episodes[w]))
             worlds.ticks[w] = 0
         self._episodes[chosen] += 1
+        self._gate = self._traffic.draw_orders(self._gate, worlds, chosen)
         self._traffic.populate(self._gate, worlds, chosen)
         self._executor.each("switch_signals")
         self._executor.each("sense", chosen)
@@ -195,6 +240,10 @@ class Simulation:
         found = np.any(waiting & (self._gate.queue["agent"] >= 0), axis=1)
         return np.asarray(found, dtype=np.bool_)
 
+    def arrivals(self) -> NDArray[np.int64]:
+        """(W,) vehicles that reached their goal since each world's reset, agents included."""
+        return self._gate.counts[:, COUNT_ARRIVED].copy()
+
     def suggest(self, out: NDArray[np.float64]) -> None:
         """Write what the built-in driver would do in the agents' place into `out` (W, A, 2)."""
         self._executor.each("suggest", out)
@@ -217,9 +266,12 @@ class Simulation:
             digest.update(np.ascontiguousarray(queue[name]).tobytes())
         for array in (
             worlds.signal_phase[world],
+            worlds.controllers[world],
+            worlds.detected_s[world],
             worlds.ticks[world],
             worlds.keys[world],
             self._gate.next_id[world],
+            self._gate.next_order[world],
             self._gate.num_entered[world],
         ):
             digest.update(array.tobytes())

@@ -12,16 +12,22 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cavmarl.config import TERMS, EnvConfig
-from cavmarl.kernels.arrays import LaneGrid, Outputs, RoadArrays, Scratch, Worlds
+from cavmarl.kernels.approach import APPROACH
+from cavmarl.kernels.arrays import LaneGrid, Outputs, RoadArrays, Scratch, Travel, Worlds
+from cavmarl.kernels.lanes import ENTRY
 from cavmarl.kernels.neighbors import make_grid
+from cavmarl.kernels.observe_further import observe_further
 from cavmarl.kernels.sense import sense
-from cavmarl.kernels.tick import advance, begin_step, resolve, suggest, switch_signals
+from cavmarl.kernels.signals import switch_signals
+from cavmarl.kernels.stacking import fill_stacks
+from cavmarl.kernels.tick import advance, begin_step, resolve, suggest
 from cavmarl.roads.network import RoadNetwork
 from cavmarl.roads.routing import lane_grid
-from cavmarl.shard.sensors import layout, sensor_arrays
+from cavmarl.shard.controllers import CONTROLLER
+from cavmarl.shard.sensors import frame_size, further_arrays, sensor_arrays
 from cavmarl.shard.vehicles import VEHICLE
 
-__all__ = ["Commands", "Shard"]
+__all__ = ["Commands", "Shard", "make_worlds"]
 
 CELL_M = 25.0  # of the spatial index over vehicles
 SUGGESTED_HORIZON_S = 1.0  # in which a suggested target speed is to be reached
@@ -46,22 +52,31 @@ class Shard:
     Args:
         config: the environment.
         network: the roads.
-        plans: PLAN (G, L).
+        plans: PLAN (G, L), the ways of agents.
+        travel: types and ways.
         num_worlds: W.
+        capacity: rows a world can hold.
     """
 
     def __init__(
-        self, config: EnvConfig, network: RoadNetwork, plans: NDArray[np.void], num_worlds: int
+        self,
+        config: EnvConfig,
+        network: RoadNetwork,
+        plans: NDArray[np.void],
+        travel: Travel,
+        num_worlds: int,
+        capacity: int,
     ) -> None:
         self._config = config
         self._roads: RoadArrays = network.arrays
         self._plans = plans
+        self._travel = travel
         self._lane_grid: LaneGrid = lane_grid(network)
-        capacity = config.population.agents + config.population.background
         self._sensors = sensor_arrays(config.sensors)
+        self._further = further_arrays(config.sensors, network, plans)
         self._grid = make_grid(network.extent_m, CELL_M, capacity)
         self.scratch = _make_scratch(len(network.lanes), len(network.links), capacity)
-        self.worlds = _make_worlds(num_worlds, capacity, len(network.signals))
+        self.worlds = make_worlds(num_worlds, capacity, network)
         self.outputs = _make_outputs(config, num_worlds)
         self._weights = np.array([config.terms.weights.get(name, 0.0) for name in TERMS])
         self._target_speeds = np.array(config.action.target_speeds_mps)
@@ -73,6 +88,8 @@ class Shard:
 
     def begin_step(self, commands: Commands) -> None:
         """Open the accounts of a step and take its meta-actions."""
+        if self._config.population.agents == 0:
+            return
         begin_step(
             self._roads, self.worlds, self._discrete, commands.meta_actions, self._target_speeds
         )
@@ -83,6 +100,7 @@ class Shard:
         advance(
             self._roads,
             self._plans,
+            self._travel,
             self._lane_grid,
             self.worlds,
             self.scratch,
@@ -106,9 +124,12 @@ class Shard:
 
     def sense(self, chosen: NDArray[np.bool_]) -> None:
         """Write observations, terms and rewards of the chosen worlds' agents into `outputs`."""
+        if self._config.population.agents == 0:
+            return
         sense(
             self._roads,
             self._plans,
+            self._travel,
             self.worlds,
             self._grid,
             self._sensors,
@@ -119,12 +140,28 @@ class Shard:
             chosen,
             self.outputs,
         )
+        observations, stack = self.outputs.observations, self._config.sensors.stack
+        if self._further is not None:
+            observe_further(
+                self._roads,
+                self._lane_grid,
+                self.worlds,
+                self._grid,
+                self._further,
+                stack,
+                chosen,
+                observations,
+            )
+        if stack > 1:
+            ticks_per_step = self._config.clock.ticks_per_step
+            fill_stacks(self.worlds, ticks_per_step, stack, chosen, observations)
 
     def suggest(self, out: NDArray[np.float64]) -> None:
         """Write what the built-in driver would do in the agents' place into `out` (W, A, 2)."""
         suggest(
             self._roads,
             self._plans,
+            self._travel,
             self.worlds,
             self.scratch,
             self._discrete,
@@ -135,7 +172,8 @@ class Shard:
         )
 
 
-def _make_worlds(num_worlds: int, capacity: int, num_signals: int) -> Worlds:
+def make_worlds(num_worlds: int, capacity: int, network: RoadNetwork) -> Worlds:
+    """Arrays of W worlds that hold `capacity` vehicles each, all of them empty."""
     shape = (num_worlds, capacity)
     return Worlds(
         rows=np.zeros(shape, dtype=VEHICLE),
@@ -144,7 +182,10 @@ def _make_worlds(num_worlds: int, capacity: int, num_signals: int) -> Worlds:
         num_rows=np.zeros(num_worlds, dtype=np.int64),
         ticks=np.zeros(num_worlds, dtype=np.int64),
         keys=np.zeros(num_worlds, dtype=np.uint64),
-        signal_phase=np.zeros((num_worlds, num_signals), dtype=np.int32),
+        signal_phase=np.zeros((num_worlds, len(network.signals)), dtype=np.int32),
+        controllers=np.zeros((num_worlds, network.num_controllers), dtype=CONTROLLER),
+        detected_s=np.zeros((num_worlds, len(network.detectors)), dtype=np.float64),
+        num_through=np.zeros(num_worlds, dtype=np.int64),
         num_contacts=np.zeros(num_worlds, dtype=np.int64),
     )
 
@@ -157,15 +198,14 @@ def _make_scratch(num_lanes: int, num_links: int, capacity: int) -> Scratch:
         return np.zeros(size, dtype=np.float64)
 
     return Scratch(
-        lane_start=integers(num_lanes + 2),
-        entry_row=integers(2 * capacity),
-        entry_s=floats(2 * capacity),
+        lane_start=integers(num_lanes + 1),
+        lane_end=integers(num_lanes),
+        entries=np.zeros(2 * capacity, dtype=ENTRY),
+        lane_taken=np.zeros(num_lanes, dtype=np.bool_),
         link_start=integers(num_links + 2),
-        link_row=integers(3 * capacity),
-        link_dist=floats(3 * capacity),
-        pair_link=integers(3 * capacity),
-        pair_row=integers(3 * capacity),
-        pair_dist=floats(3 * capacity),
+        approach=np.zeros(3 * capacity, dtype=APPROACH),
+        pairs=np.zeros(3 * capacity, dtype=APPROACH),
+        order=integers(capacity),
         accel=floats(capacity),
         link_ahead=integers(capacity),
         lane_change=integers(capacity),
@@ -177,9 +217,10 @@ def _make_scratch(num_lanes: int, num_links: int, capacity: int) -> Scratch:
 
 def _make_outputs(config: EnvConfig, num_worlds: int) -> Outputs:
     agents = (num_worlds, config.population.num_ids)
-    size = max(place.stop for place in layout(config.sensors).values())
+    size = config.sensors.stack * frame_size(config.sensors)
     return Outputs(
-        observations=np.zeros((*agents, size), dtype=np.float32),
+        # Not `zeros`: NumPy asks for huge pages where it fills the array itself.
+        observations=np.full((*agents, size), 0.0, dtype=np.float32),
         terms=np.zeros((*agents, len(TERMS)), dtype=np.float32),
         rewards=np.zeros(agents, dtype=np.float32),
         terminated=np.zeros(agents, dtype=np.bool_),

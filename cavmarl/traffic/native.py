@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -10,11 +11,15 @@ from numpy.typing import NDArray
 
 from cavmarl.config import PopulationConfig, TrafficConfig
 from cavmarl.errors import CapacityError, ConfigError, RouteError
-from cavmarl.kernels.arrays import Demand, Gate, Scratch, Worlds
+from cavmarl.kernels.arrays import Demand, Gate, Scratch, Travel, Worlds
 from cavmarl.kernels.codes import DRIVER_AGENT, DRIVER_BACKGROUND
-from cavmarl.kernels.departures import choose_goals, let_in, populate, take_out
+from cavmarl.kernels.departures import call_orders, choose_goals, let_in, populate, take_out
 from cavmarl.roads.network import VEHICLE_CLASSES, RoadNetwork
 from cavmarl.roads.routing import make_plans
+from cavmarl.traffic.demand import STOP, DemandFile
+from cavmarl.traffic.departures import with_room
+from cavmarl.traffic.schedule import Schedule
+from cavmarl.traffic.vtypes import generated_types
 
 __all__ = ["NativeTraffic"]
 
@@ -35,12 +40,18 @@ class NativeTraffic:
         traffic: settings of the generator.
         population: who is in the world.
         blank: VEHICLE (1,), the record that every vehicle starts from.
+        dt: seconds a tick.
+        horizon_s: seconds an episode.
+        file: the demand whose vehicles drive beside the generator's.
     """
 
     network: RoadNetwork
     traffic: TrafficConfig
     population: PopulationConfig
     blank: NDArray[np.void]
+    dt: float
+    horizon_s: float
+    file: DemandFile | None = None
 
     def __post_init__(self) -> None:
         # Trips that do not exist are refused when the world is made, not at its first reset.
@@ -67,6 +78,36 @@ class NativeTraffic:
     def plans(self) -> NDArray[np.void]:
         """PLAN (G, L) of the goal edges."""
         return make_plans(self.network, [int(edge) for edge in self.goal_edges])
+
+    @cached_property
+    def schedule(self) -> Schedule | None:
+        """The demand file's departures and routes."""
+        if self.file is None:
+            return None
+        return Schedule(self.file, len(generated_types()), self.plans.size)
+
+    @cached_property
+    def travel(self) -> Travel:
+        """Types and ways of all vehicles: the generator's first, then the demand file's."""
+        types, steps = generated_types(), self.plans.reshape(-1)
+        if self.file is None or self.schedule is None:
+            return Travel(types, steps, np.zeros(0, dtype=STOP), first_detour=0, begin_s=0.0)
+        types = np.concatenate([types, self.file.types])
+        steps = np.concatenate([steps, self.schedule.steps])
+        first_detour = self.plans.size + self.schedule.first_detour
+        return Travel(types, steps, self.file.stops, first_detour, self.file.begin_ms / 1000.0)
+
+    @cached_property
+    def capacity(self) -> int:
+        """Rows that one world needs: no more vehicles than are ordered, or fit on the map."""
+        own = self.population.agents + self.population.background
+        if self.file is None or self.schedule is None or not len(self.file.types):
+            return own
+        shortest = float(self.file.types["length"].min())
+        metres = float(self.network.lanes["length_m"].sum())
+        ordered = len(self.schedule.draw(0, self.horizon_s, self.dt))
+        spread = 6 * math.isqrt(ordered) + 16
+        return own + min(ordered + spread, int(metres / (shortest + JAM_GAP_M)) + 1)
 
     @cached_property
     def demand(self) -> Demand:
@@ -102,16 +143,32 @@ class NativeTraffic:
             blank=self.blank,
         )
 
+    def draw_orders(self, gate: Gate, worlds: Worlds, chosen: NDArray[np.bool_]) -> Gate:
+        """Draw what the demand file orders in the chosen worlds' (W,) new episodes.
+
+        Returns:
+            the gate, or a larger one if there are more orders than ever before.
+        """
+        if self.schedule is None:
+            return gate
+        for w in np.flatnonzero(chosen):
+            orders = self.schedule.draw(int(worlds.keys[w]), self.horizon_s, self.dt)
+            gate = with_room(gate, len(orders))
+            gate.orders[w, : len(orders)] = orders
+            gate.num_orders[w] = len(orders)
+        return gate
+
     def populate(self, gate: Gate, worlds: Worlds, chosen: NDArray[np.bool_]) -> None:
         """Fill the chosen worlds (W,) for a new episode."""
-        populate(self.demand, self.network.arrays, self.plans, gate, worlds, chosen)
+        populate(self.demand, self.network.arrays, self.travel, gate, worlds, chosen)
 
     def arrive_and_depart(self, gate: Gate, worlds: Worlds, scratch: Scratch, dt: float) -> None:
         """Who has arrived leaves `next_rows`, wanderers pick new goals, and who waits may enter."""
         roads = self.network.arrays
-        choose_goals(self.demand, roads, self.plans, worlds)
+        choose_goals(self.demand, roads, self.travel, len(self.plans), gate, worlds, dt)
         take_out(self.demand, roads, gate, worlds, worlds.next_rows, DRIVER_BACKGROUND, dt, 1)
-        let_in(self.demand, roads, self.plans, gate, worlds, scratch)
+        call_orders(gate, worlds)
+        let_in(self.demand, roads, self.travel, gate, worlds, scratch)
 
     def retire_agents(self, gate: Gate, worlds: Worlds, dt: float, ticks_per_step: int) -> None:
         """Take agents whose trip has ended out of the committed rows; order those that follow."""

@@ -11,8 +11,21 @@ import pytest
 
 from cavmarl.cli import main
 
-COMMANDS = ("evaluate", "view", "demo", "list", "map", "bench")
-QUICK = ("--set", "horizon_s=1", "--agents", "2", "--background", "2")
+COMMANDS = (
+    "evaluate",
+    "report",
+    "suite",
+    "verify-determinism",
+    "view",
+    "demo",
+    "list",
+    "map",
+    "demand",
+    "bench",
+)
+QUICK = (
+    "--set", "horizon_s=1", "--set", "clock.ctrl_dt_s=0.1", "--agents", "2", "--background", "2",
+)  # fmt: skip
 
 
 def run(*words: str) -> int:
@@ -63,17 +76,83 @@ def test_list_shows_what_there_is(capsys: pytest.CaptureFixture[str], tmp_path: 
 def test_evaluate_shows_a_table_and_writes_json(
     capsys: pytest.CaptureFixture[str], tmp_path: Path
 ) -> None:
-    path = tmp_path / "report.json"
+    path, out = tmp_path / "report.json", tmp_path / "results"
     words = ("evaluate", "merge", "--policy", "idm", "--episodes", "2", "--seed", "3", *QUICK)
-    assert run(*words, "--json", str(path)) == 0
+    assert run(*words, "--json", str(path), "--out", str(out)) == 0
     shown = capsys.readouterr().out
-    assert all(word in shown for word in ("success", "collision", "red light", "jerk", "delay"))
+    assert all(word in shown for word in ("success", "collision", "red light", "jerk", "speed"))
+    assert "no interval of means" in shown
     report = json.loads(path.read_text())
-    rate = report["success"]
-    ends = f"{100.0 * rate['low']:.1f}, {100.0 * rate['high']:.1f}"
-    assert f"{100.0 * rate['mean']:.1f} [{ends}]" in shown
+    (rate,) = report["policies"]["idm"]["metrics"]["off_road"]["within_run"]
+    ends = f"{100.0 * rate['wilson95']['low']:.1f}, {100.0 * rate['wilson95']['high']:.1f}"
+    assert f"[{ends}]" in shown
     assert report["episodes"] == 2
-    assert report["manifest"]["seed"] == 3
+    assert report["manifest"]["seeds"] == [3]
+    assert run("report", str(out)) == 0
+    assert capsys.readouterr().out.strip() == shown.strip()
+
+
+def test_evaluate_compares_in_repeated_runs_and_writes_a_page(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    pytest.importorskip("matplotlib")
+    out, page = tmp_path / "results", tmp_path / "page.html"
+    words = ("evaluate", "merge", "-p", "idm", "-p", "random_actions", "-n", "1", *QUICK)
+    assert run(*words, "--repeats", "2", "--out", str(out), "--html", str(page)) == 0
+    shown = " ".join(capsys.readouterr().out.split())
+    assert "2 runs of 1 episodes" in shown
+    assert "[95 % interval between runs], (SD within a run)" in shown
+    assert "minus idm, paired by seed" in shown
+    assert "<svg" in page.read_text(encoding="utf-8")
+
+
+def test_evaluate_keeps_its_results_in_a_new_folder(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    for _ in range(2):
+        assert run("evaluate", "merge", "-n", "1", *QUICK) == 0
+    folders = list((tmp_path / "runs" / "evaluate").iterdir())
+    assert len(folders) == 2
+    assert all((folder / "manifest.json").is_file() for folder in folders)
+
+
+def test_a_refused_evaluation_leaves_no_folder(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    refusal(capsys, "evaluate", "merge", "--policy", "nobody")
+    assert not list(tmp_path.iterdir())
+
+
+def test_verify_determinism_says_equal_and_gives_the_hash(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    path = tmp_path / "found.json"
+    words = ("verify-determinism", "merge", "--steps", "3", *QUICK)
+    assert run(*words, "--json", str(path)) == 0
+    found = json.loads(path.read_text())
+    assert found["difference"] is None
+    shown = capsys.readouterr().out
+    assert "equal: 3 steps in 3 processes" in shown
+    assert found["state_hash"] in shown
+
+
+def test_verify_determinism_fails_and_names_the_first_difference(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    script = tmp_path / "hashing.py"
+    script.write_text(
+        "from cavmarl.policies import Policy\n"
+        "class Hashing(Policy):\n"
+        "    def act_batch(self, observations, mask):\n"
+        "        return self.env.suggest_actions() * 0.0 + hash('a') % 997 / 1000.0\n"
+        "def make_policy(env):\n"
+        "    return Hashing(env)\n"
+    )
+    words = ("verify-determinism", "merge", "--policy", str(script), "--steps", "3", *QUICK)
+    assert run(*words) == 1
+    assert "different: step 1 (tick 2), vehicle 0, s: " in capsys.readouterr().out
 
 
 @pytest.mark.parametrize(
@@ -83,6 +162,15 @@ def test_evaluate_shows_a_table_and_writes_json(
         (("evaluate", "merge", "--policy", "idn"), "did you mean idm"),
         (("evaluate", "merge", "--episodes", "0"), "episodes = 0: must be from 1"),
         (("evaluate", "merge", "--episodes", "many"), "valid integer"),
+        (("evaluate", "merge", "--repeats", "0"), "repeats = 0: must be from 1"),
+        (("evaluate", "merge", "-p", "idm", "-p", "idm"), "one stands there twice"),
+        (("evaluate", "merge", "--html", "/dev/null/x.html"), "/dev/null: cannot be written"),
+        (("evaluate", "merge", "--out", "/dev/null/x", *QUICK), "/dev/null/x: cannot be made"),
+        (("suite", "nothing"), "no suite or file 'nothing'"),
+        (("suite", "--maps", "no-folder"), "is no environment and no file in no-folder"),
+        (("report", "no-folder"), "no-folder: no manifest.json"),
+        (("verify-determinism", "merge", "--steps", "0"), "steps = 0: must be"),
+        (("verify-determinism", "merg"), "did you mean merge"),
         (("evaluate", "merge", "--agents", "-1"), "population.agents = -1"),
         (("evaluate", "merge", "--seed", "-1"), "seed = -1"),
         (("evaluate", "merge", "--set", "lidar"), "must be KEY=VALUE"),
@@ -133,9 +221,13 @@ def test_a_json_path_is_tried_before_any_work(
     network.write_text("no map")
     words = {
         "evaluate": ("evaluate", "nowhere"),
+        "report": ("report", "nowhere"),
+        "suite": ("suite", "nowhere"),
+        "verify-determinism": ("verify-determinism", "nowhere"),
         "view": ("view", "nowhere"),
         "map": ("map", "check", str(network)),
         "bench": ("bench", "step", "--agents", "0"),
+        "demand": ("demand", "random", "nowhere", "--out", "x.rou.xml"),
     }.get(command, (command,))
     missing = tmp_path / "missing" / "x.json"
     assert "there is no folder" in refusal(capsys, *words, "--json", str(missing))

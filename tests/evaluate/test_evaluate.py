@@ -2,21 +2,27 @@
 
 from __future__ import annotations
 
+import csv
 import json
-from dataclasses import asdict
+from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 from cavmarl.errors import ConfigError, PolicyError, UnknownEnvironmentError
-from cavmarl.evaluate import EvaluationReport, evaluate
-from cavmarl.evaluate.manifest import Manifest
+from cavmarl.evaluate import EvaluationReport, episodes, evaluate, load_report
+from cavmarl.evaluate.episodes import worlds_at_once
+from cavmarl.evaluate.evaluation import load_tables, run_seeds
+from cavmarl.evaluate.metrics import METRICS
+from cavmarl.evaluate.statistics import student_quantile
 
 SMALL: dict[str, Any] = {"episodes": 3, "agents": 3, "background": 3, "max_cycles": 60}
 
 
-def without_speed(report: EvaluationReport) -> dict[str, Any]:
-    return {name: value for name, value in report.to_dict().items() if name != "speed"}
+def results(report: EvaluationReport) -> list[Any]:
+    """All that is repeatable."""
+    return [(policy.trips, policy.metrics) for policy in report.policies.values()]
 
 
 @pytest.fixture(scope="module")
@@ -24,32 +30,58 @@ def by_chance() -> EvaluationReport:
     return evaluate("merge", "random_actions", seed=4, **SMALL)
 
 
+@pytest.fixture(scope="module")
+def compared(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The folder of two policies in three runs."""
+    folder = tmp_path_factory.mktemp("compared")
+    policies = {"driver": "idm", "chance": "random_actions"}
+    evaluate("merge", policies, seed=4, repeats=3, out=folder, **SMALL)
+    return folder
+
+
 def test_the_ends_of_trips_add_up(by_chance: EvaluationReport) -> None:
-    ends = (by_chance.success, by_chance.collision, by_chance.off_road, by_chance.unfinished)
-    assert sum(end.mean or 0.0 for end in ends) == pytest.approx(1.0)
-    assert by_chance.trips >= SMALL["episodes"] * SMALL["agents"]
-    assert (by_chance.off_road.mean or 0.0) > 0.5
+    found = by_chance["random_actions"]
+    ends = [found[name].mean for name in ("success", "collision", "off_road", "unfinished")]
+    assert sum(end or 0.0 for end in ends) == pytest.approx(1.0)
+    assert found.trips >= SMALL["episodes"] * SMALL["agents"]
+    assert (found["off_road"].mean or 0.0) > 0.5
+
+
+def test_the_parts_of_the_return_add_up(by_chance: EvaluationReport) -> None:
+    found = by_chance["random_actions"]
+    parts = [found[m.name].mean or 0.0 for m in METRICS if m.name.startswith("reward_")]
+    assert sum(parts) == pytest.approx(found["episode_return"].mean, rel=1e-4)
 
 
 def test_the_same_seed_gives_the_same_report(by_chance: EvaluationReport) -> None:
     again = evaluate("merge", "random_actions", seed=4, **SMALL)
     other = evaluate("merge", "random_actions", seed=5, **SMALL)
-    assert without_speed(again) == without_speed(by_chance)
-    assert without_speed(other) != without_speed(by_chance)
+    assert results(again) == results(by_chance)
+    assert results(other) != results(by_chance)
 
 
 def test_a_report_is_json(by_chance: EvaluationReport) -> None:
-    text = json.dumps(by_chance.to_dict(), allow_nan=False)
-    assert json.loads(text)["manifest"]["policy"] == "random_actions"
+    document = json.loads(json.dumps(by_chance.to_dict(), allow_nan=False))
+    assert list(document["manifest"]["policies"]) == ["random_actions"]
+    assert set(document["metrics"]) == {metric.name for metric in METRICS}
+
+
+def test_one_run_makes_no_interval_up(by_chance: EvaluationReport) -> None:
+    found = by_chance["random_actions"]
+    assert all(found[metric.name].between_run_ci95 is None for metric in METRICS)
+    assert found["off_road"].interval == found["off_road"].within_run[0].wilson95
+    assert found["episode_return"].interval is None
+    assert "not available" in by_chance.to_dict()["between_run_ci95"]
 
 
 def test_the_built_in_driver_arrives_where_chance_does_not(by_chance: EvaluationReport) -> None:
     report = evaluate("merge", "idm", episodes=2, agents=3, background=3, seed=4)
-    assert report.success.mean is not None
-    assert report.success.mean > 0.8
-    assert report.collision.mean == 0.0
-    assert by_chance.success.mean == 0.0
-    assert (report.episode_return.mean or 0.0) > (by_chance.episode_return.mean or 0.0)
+    driver, chance = report["idm"], by_chance["random_actions"]
+    assert (driver["success"].mean or 0.0) > 0.8
+    assert driver["collision"].mean == 0.0
+    assert chance["success"].mean == 0.0
+    assert (driver["episode_return"].mean or 0.0) > (chance["episode_return"].mean or 0.0)
+    assert (driver["background_arrivals_per_h"].mean or 0.0) > 0.0
 
 
 @pytest.mark.parametrize("mode", ["closed", "entering", "seats"])
@@ -57,38 +89,109 @@ def test_every_population_can_be_judged(mode: str) -> None:
     report = evaluate(
         "merge", "idm", overrides={"population.mode": mode}, **{**SMALL, "max_cycles": 600}
     )
-    assert report.episodes == SMALL["episodes"]
-    assert (report.success.mean or 0.0) > 0.5
+    assert (report["idm"]["success"].mean or 0.0) > 0.5
 
 
-def test_the_manifest_says_what_a_result_depends_on(by_chance: EvaluationReport) -> None:
-    def manifest(env: str = "merge", **changed: Any) -> Manifest:
-        settings = {**SMALL, "max_cycles": 1, **changed}
-        return evaluate(env, "random_actions", seed=4, **settings).manifest
-
-    first = manifest()
-    assert manifest() == first
-    assert manifest(agents=2).config_hash != first.config_hash
-    assert manifest("ring").map_hash != first.map_hash
-    assert asdict(first)["seed"] == by_chance.manifest.seed == 4
-
-
-@pytest.mark.parametrize("episodes", [0, -1, 10**9, 2.0, True, "3"])
-def test_episodes_must_be_a_count(episodes: Any) -> None:
-    with pytest.raises(ConfigError, match="episodes = "):
-        evaluate("merge", "idm", episodes=episodes)
+def test_episodes_do_not_depend_on_how_many_worlds_run_together(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    settings = {**SMALL, "episodes": 5}
+    together = evaluate("merge", "idm", seed=4, **settings)
+    monkeypatch.setattr(episodes, "MAX_VEHICLES", 2 * (SMALL["agents"] + SMALL["background"]))
+    apart = evaluate("merge", "idm", seed=4, **settings)
+    assert apart["idm"].speed[0].worlds == 2
+    assert results(apart) == results(together)
 
 
-def test_episodes_that_need_too_much_memory_are_refused() -> None:
-    with pytest.raises(ConfigError, match="take at most 1960 episodes"):
-        evaluate("merge", "idm", episodes=10_000, agents=20, background=1000)
+def test_memory_stays_flat_however_many_episodes() -> None:
+    most = max(worlds_at_once(count, 20) for count in range(1, 2000))
+    assert worlds_at_once(100_000, 20) <= most == episodes.MAX_WORLDS
+    assert worlds_at_once(100_000, 1_000_000) == 1
+    assert worlds_at_once(3, 20) == 3
 
 
-def test_unknown_names_are_refused() -> None:
+def test_each_run_has_its_own_seed_and_the_first_is_the_callers() -> None:
+    seeds = run_seeds(4, 5)
+    assert seeds[0] == 4
+    assert len(set(seeds)) == 5
+    assert run_seeds(4, 3) == seeds[:3]
+    assert not set(run_seeds(5, 5)) & set(seeds)
+
+
+def test_a_run_in_a_fresh_process_is_the_run_in_this_one(
+    compared: Path, by_chance: EvaluationReport
+) -> None:
+    found = load_report(compared)["chance"]["episode_return"].within_run[0]
+    assert found == by_chance["random_actions"]["episode_return"].within_run[0]
+    seed = run_seeds(4, 3)[2]
+    third = evaluate("merge", {"driver": "idm"}, seed=seed, **SMALL)
+    mine = third["driver"]["episode_return"].within_run[0]
+    assert load_report(compared)["driver"]["episode_return"].within_run[2] == mine
+
+
+def test_the_interval_between_runs_is_that_of_the_run_means(compared: Path) -> None:
+    found = load_report(compared)["driver"]["episode_return"]
+    means = np.array([run.mean for run in found.within_run])
+    half = student_quantile(2) * means.std(ddof=1) / np.sqrt(3.0)
+    assert found.mean == pytest.approx(means.mean())
+    assert found.between_run_ci95 is not None
+    assert found.between_run_ci95.low == pytest.approx(means.mean() - half)
+    assert found.between_run_ci95.high == pytest.approx(means.mean() + half)
+
+
+def test_an_interval_of_shares_stays_a_share(compared: Path) -> None:
+    for policy in load_report(compared).policies.values():
+        for metric in METRICS:
+            interval = policy[metric.name].between_run_ci95
+            if metric.share and interval is not None:
+                assert 0.0 <= interval.low <= interval.high <= 1.0
+
+
+def test_policies_are_compared_run_by_run(compared: Path) -> None:
+    report = load_report(compared)
+    assert report["driver"].minus_first == {}
+    found = report["chance"].minus_first["episode_return"]
+    pairs = zip(
+        report["chance"]["episode_return"].within_run,
+        report["driver"]["episode_return"].within_run,
+        strict=True,
+    )
+    expected = [(mine.mean or 0.0) - (first.mean or 0.0) for mine, first in pairs]
+    assert found.runs == pytest.approx(expected)
+    assert found.mean == pytest.approx(np.mean(expected))
+    assert found.distinct
+
+
+def test_raw_tables_hold_every_trip_and_episode(compared: Path) -> None:
+    tables = load_tables(compared)
+    for trips, rows in tables.values():
+        assert rows["run"].tolist() == [0] * 3 + [1] * 3 + [2] * 3
+        assert rows["episode"].tolist() == [0, 1, 2] * 3
+        assert trips.size == rows["trips"].sum()
+        assert np.isfinite(trips["end_x_m"]).all()
+    with (compared / "trips.csv").open(newline="") as file:
+        header, *lines = csv.reader(file)
+    assert header[:4] == ["policy", "run", "episode", "agent"]
+    assert len(lines) == sum(trips.size for trips, _ in tables.values())
+
+
+@pytest.mark.parametrize("key", ["episodes", "repeats"])
+@pytest.mark.parametrize("value", [0, -1, 10**9, 2.0, True, "3"])
+def test_counts_must_be_counts(key: str, value: Any) -> None:
+    with pytest.raises(ConfigError, match=f"{key} = "):
+        evaluate("merge", "idm", **{key: value})
+
+
+def test_unknown_names_are_refused(tmp_path: Path) -> None:
     with pytest.raises(UnknownEnvironmentError, match="merg"):
         evaluate("merg", "idm", episodes=1)
     with pytest.raises(PolicyError, match="idn"):
-        evaluate("merge", "idn", episodes=1)
+        evaluate("merge", "idn", episodes=1, out=tmp_path)
+    with pytest.raises(PolicyError, match="twice"):
+        evaluate("merge", ["idm", "idm"], episodes=1)
+    with pytest.raises(PolicyError, match="at least one"):
+        evaluate("merge", [], episodes=1)
+    assert not list(tmp_path.iterdir())
 
 
 @pytest.mark.parametrize("seed", [-1, 1.5, 2**63])
@@ -98,7 +201,7 @@ def test_a_seed_is_a_whole_number(seed: Any) -> None:
 
 
 def test_progress_is_told_after_every_step() -> None:
-    told: list[tuple[int, int]] = []
+    told: list[tuple[str, int, int]] = []
     settings = {**SMALL, "max_cycles": 7}
-    evaluate("ring", "idm", progress=lambda k, n: told.append((k, n)), **settings)
-    assert told == [(k, 7) for k in range(1, 8)]
+    evaluate("ring", "idm", progress=lambda *words: told.append(words), **settings)
+    assert told == [("idm", k, 7) for k in range(1, 8)]

@@ -44,7 +44,7 @@ def test_the_road_can_be_driven(tmp_path: Path) -> None:
 @pytest.mark.skipif(not hasattr(os, "sched_getaffinity"), reason="no affinity on this system")
 def test_the_cores_are_given_back() -> None:
     before = os.sched_getaffinity(0)
-    with step_speed._one_core():
+    with step_speed.one_core():
         assert len(os.sched_getaffinity(0)) == 1
     assert os.sched_getaffinity(0) == before
 

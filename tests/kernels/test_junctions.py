@@ -9,8 +9,12 @@ from typing import Any
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from cavmarl.kernels.codes import DRIVER_AGENT
+from cavmarl.kernels.geometry import boxes_overlap, lane_pose
+from cavmarl.roads.network import RoadNetwork
+from cavmarl.roads.reader import read_network
 from cavmarl.runtime.simulation import Simulation
 from tests.driving import drive, make_traffic, start
 from tests.kernels.traffic import on_lane
@@ -66,7 +70,8 @@ class Scene:
         row = network.lane_ids.index(lane)
         s = float(network.lanes[row]["length_m"]) - to_line_m - 2.5
         goals = [network.edge_ids[edge] for edge in self.simulation.goal_edges]
-        car = on_lane(network, row, s, goal=goals.index(goal), **fields)
+        travel = self.simulation._traffic.travel
+        car = on_lane(network, row, s, travel, goal=goals.index(goal), **fields)
         plan = self.simulation._traffic.plans[car[0]["goal"], row]
         car["to_go"] = plan["to_go"] - s
         car["id"] = self.simulation._gate.next_id[0]
@@ -287,3 +292,112 @@ def test_nobody_enters_where_there_is_no_room_beyond(scene: Make) -> None:
         crossing = vehicles[vehicles["id"] == here.names.index("cross")]
         seen_cross |= bool(len(crossing) and lanes[crossing[0]["lane"]] == "N_out_0")
     assert seen_cross, "so that others can cross"
+
+
+def test_a_left_turn_waits_inside_for_who_comes_and_goes_when_they_are_through(scene: Make) -> None:
+    here = scene("traffic_light")
+    network = here.simulation.network
+    here.put("probe", "W_in_0", 140.0, "N_out")
+    step = here.simulation._traffic.plans[here["probe"]["goal"], here["probe"]["lane"]]
+    link = int(step["link"])
+    wait_m = float(network.links[link]["wait_m"])
+    assert np.isfinite(wait_m), "this turn has a waiting position"
+    here.clear()
+    for _ in here.run(200.0):
+        if shown(here, link) == "g":
+            break
+    assert shown(here, link) == "g"
+    here.put("left", "W_in_0", 10.0, "N_out", speed=8.0)
+    for k in range(4):
+        here.put(f"straight{k}", "E_in_0", 8.0 + 22.0 * k, "W_out", speed=11.0)
+    waited, left_at, through_at = 0.0, np.inf, 0.0
+    for time in here.run(25.0):
+        for car in here.simulation.vehicles():
+            name = here.names[car["id"]]
+            lane = network.lanes[car["lane"]]
+            edge = network.edge_ids[lane["edge"]]
+            if name == "left":
+                if lane["internal"] and car["speed"] < 0.1:
+                    front = lane["link_offset_m"] + car["s"] + 2.5
+                    assert wait_m - 2.0 < front < wait_m + 0.5
+                    waited = max(waited, float(car["wait_s"]))
+                if edge == "N_out":
+                    left_at = min(left_at, time)
+            elif edge != "W_out":
+                through_at = time
+        if left_at < np.inf:
+            break
+    assert waited > 1.0, "it stands on the junction, not before it"
+    assert through_at < left_at < through_at + 8.0
+
+
+def test_who_still_moves_on_the_junction_will_need_room_beyond_it(scene: Make) -> None:
+    here = scene("priority")
+    network = here.simulation.network
+    length = float(network.lanes[network.lane_ids.index("E_out_0")]["length_m"])
+    # Room for one car behind the one that stands for ever.
+    here.put("block", "E_out_0", length - 16.0, "E_out", agent=0)
+    here.simulation.vehicles()["driver"] = DRIVER_AGENT
+    here.put("first", "W_in_0", 15.0, "E_out", speed=10.0)
+    here.put("second", "W_in_0", 30.0, "E_out", speed=10.0)
+    lanes = network.lane_ids
+    for _ in here.run(25.0):
+        vehicles = here.simulation.vehicles()
+        vehicles["speed"][vehicles["id"] == here.names.index("block")] = 0.0
+        assert lanes[here["second"]["lane"]] == "W_in_0"
+    assert lanes[here["first"]["lane"]] == "E_out_0", "for the first one there was room"
+
+
+def test_links_from_one_lane_share_their_way_up_to_the_fork(
+    crossing: Callable[[str], Path],
+) -> None:
+    network = read_network(crossing("priority"))
+    for lane in np.flatnonzero(network.lanes["num_links"] > 1).tolist():
+        row = network.lanes[lane]
+        links = range(int(row["first_link"]), int(row["first_link"] + row["num_links"]))
+        paths = {link: path_of(network, link) for link in links}
+        for link in links:
+            fork = float(network.links[link]["fork_m"])
+            assert 0.0 < fork < network.links[link]["length_m"]
+            others = np.concatenate([paths[k][:, 1:] for k in links if k != link])
+            s, xy = paths[link][:, 0], paths[link][:, 1:]
+            apart = np.hypot(*(xy[:, None] - others[None]).transpose(2, 0, 1)).min(axis=1)
+            assert (apart[s < fork - 0.6] < 2.7).all(), "as near as two cars side by side"
+            beyond = apart[s > fork + 0.6]
+            assert beyond[0] > 2.5
+
+
+def path_of(network: RoadNetwork, link: int) -> NDArray[np.float64]:
+    """(n, 3) s, x and y of a link's way over its junction, every 0.1 m."""
+    rows, lane = [], int(network.links[link]["first_internal"])
+    while network.lanes[lane]["internal"]:
+        here = network.lanes[lane]
+        for s in np.arange(0.0, here["length_m"], 0.1):
+            x, y, *_ = lane_pose(network.points, here["first_point"], here["num_points"], s)
+            rows.append((here["link_offset_m"] + s, x, y))
+        lane = int(here["successor"])
+    return np.array(rows)
+
+
+@pytest.mark.parametrize("kind", ["priority", "right_before_left", "traffic_light"])
+def test_who_stands_at_a_stop_line_is_touched_by_nobody_who_drives_over(
+    crossing: Callable[[str], Path], kind: str
+) -> None:
+    network = read_network(crossing(kind))
+    for lane in np.flatnonzero(network.lanes["num_links"] > 0).tolist():
+        row = network.lanes[lane]
+        back = float(row["stop_back_m"])
+        assert 0.0 <= back <= 8.0
+        s = float(row["length_m"]) - back - 1.0 - 2.5
+        x, y, _, cos, sin, _ = lane_pose(network.points, row["first_point"], row["num_points"], s)
+        for link in range(len(network.links)):
+            other = network.lanes[network.links[link]["from_lane"]]
+            if other["edge"] == row["edge"]:
+                continue
+            path = path_of(network, link)
+            for k in range(2, len(path) - 2, 5):
+                heading = np.arctan2(*(path[k + 2] - path[k - 2])[:0:-1])
+                assert not boxes_overlap(
+                    x, y, cos, sin, 2.5, 1.0,
+                    path[k, 1], path[k, 2], np.cos(heading), np.sin(heading), 2.5, 0.9,
+                )  # fmt: skip

@@ -7,10 +7,18 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from cavmarl.kernels.arrays import Scratch
-from cavmarl.kernels.lanes import index_lanes, last_on_lane, neighbor_ahead, neighbor_behind
+from cavmarl.kernels.geometry import lane_pose
+from cavmarl.kernels.lanes import (
+    ahead_on,
+    behind_on,
+    beside_s,
+    index_lanes,
+    last_on,
+    neighbor_behind,
+)
 from cavmarl.roads.network import RoadNetwork
 from cavmarl.shard.vehicles import VEHICLE
-from tests.kernels.traffic import NAMES, crowds_on_lanes, network, scratch
+from tests.kernels.traffic import NAMES, crowds_on_lanes, network, scratch, travel
 from tests.naive import lanes as naive
 
 maps_with_crowds = st.sampled_from(NAMES).flatmap(
@@ -18,9 +26,10 @@ maps_with_crowds = st.sampled_from(NAMES).flatmap(
 )
 
 
-def indexed(roads: RoadNetwork, rows: NDArray[np.void]) -> Scratch:
+def indexed(name: str, rows: NDArray[np.void]) -> Scratch:
+    roads = network(name)
     room = scratch(roads, len(rows))
-    index_lanes(roads.lanes, rows, len(rows), room)
+    index_lanes(roads.arrays, travel(name), rows, len(rows), room)
     return room
 
 
@@ -41,27 +50,42 @@ def test_the_index_lists_everybody_on_every_lane_he_covers(
 ) -> None:
     name, rows = case
     roads = network(name)
-    room = indexed(roads, rows)
+    room = indexed(name, rows)
+    decel = travel(name).types[0]["decel"]
     for lane in range(len(roads.lanes)):
-        begin, end = room.lane_start[lane], room.lane_start[lane + 1]
-        entries = [(room.entry_s[k], rows[room.entry_row[k]]["id"]) for k in range(begin, end)]
-        assert entries == [(s, i) for s, i, _ in naive.on_lane(roads, rows, lane)]
+        entries = room.entries[room.lane_start[lane] : room.lane_end[lane]]
+        assert room.lane_end[lane] == room.lane_start[lane + 1]
+        assert [(e["s"], e["id"], e["row"]) for e in entries] == naive.on_lane(roads, rows, lane)
+        for entry in entries:
+            row = rows[entry["row"]]
+            assert entry["side"] == (row["lane"] != lane)
+            copied = (entry["speed"], entry["half"], entry["decel"])
+            assert copied == (row["speed"], 0.5 * row["length"], decel)
+
+
+def seen(room: Scratch, k: int) -> tuple[int, float]:
+    """Row and place of an entry, as the twin answers."""
+    return (int(room.entries[k]["row"]), float(room.entries[k]["s"])) if k >= 0 else (-1, np.inf)
 
 
 @given(maps_with_crowds, st.sampled_from([5.0, 60.0, 400.0]))
 def test_neighbours_equal_twin(case: tuple[str, NDArray[np.void]], reach_m: float) -> None:
     name, rows = case
     roads = network(name)
-    room = indexed(roads, rows)
+    room = indexed(name, rows)
     for i, lane, s in looked_for(roads, rows):
-        assert neighbor_ahead(rows, i, lane, s, room) == naive.ahead(roads, rows, i, lane, s)
-        found, distance = neighbor_behind(roads.arrays, rows, i, lane, s, reach_m, room)
+        own_id = rows[i]["id"]
+        assert seen(room, ahead_on(room, lane, s, own_id)) == naive.ahead(roads, rows, i, lane, s)
+        found, distance = neighbor_behind(roads.arrays, room, lane, s, own_id, reach_m)
         expected, true_distance = naive.behind(roads, rows, i, lane, s, reach_m)
-        assert found == expected
+        assert seen(room, found)[0] == expected
         assert distance == pytest.approx(true_distance)
-        others = [(at, j) for at, _, j in naive.on_lane(roads, rows, lane) if j != i]
-        last, last_s = last_on_lane(i, lane, room)
-        assert (last_s, last) == (others[0] if others else (np.inf, -1))
+        others = [(j, at) for at, _, j in naive.on_lane(roads, rows, lane) if j != i]
+        assert seen(room, last_on(room, lane, own_id)) == (others[0] if others else (-1, np.inf))
+        before = [
+            j for at, k, j in naive.on_lane(roads, rows, lane) if j != i and (at, k) <= (s, own_id)
+        ]
+        assert seen(room, behind_on(room, lane, s, own_id))[0] == (before[-1] if before else -1)
 
 
 @given(maps_with_crowds, st.randoms(use_true_random=False))
@@ -73,29 +97,58 @@ def test_the_order_of_rows_does_not_matter(
     order = list(range(len(rows)))
     random.shuffle(order)  # type: ignore[attr-defined]
     shuffled = rows[order]
-    tidy_room, room = indexed(roads, rows), indexed(roads, shuffled)
+    tidy, room = indexed(name, rows), indexed(name, shuffled)
+    fields = [field for field in tidy.entries.dtype.names if field != "row"]
+    listed = tidy.lane_start[-1]
+    np.testing.assert_array_equal(tidy.lane_start, room.lane_start)
+    np.testing.assert_array_equal(tidy.entries[fields][:listed], room.entries[fields][:listed])
     for i, lane, s in looked_for(roads, rows):
-        j = order.index(i)
-        for found, other in (
-            (
-                neighbor_ahead(rows, i, lane, s, tidy_room),
-                neighbor_ahead(shuffled, j, lane, s, room),
-            ),
-            (
-                neighbor_behind(roads.arrays, rows, i, lane, s, 60.0, tidy_room),
-                neighbor_behind(roads.arrays, shuffled, j, lane, s, 60.0, room),
-            ),
-        ):
-            assert found[1] == other[1]
-            assert (found[0] < 0) == (other[0] < 0)
-            assert found[0] < 0 or rows[found[0]]["id"] == shuffled[other[0]]["id"]
+        own_id = rows[i]["id"]
+        assert ahead_on(tidy, lane, s, own_id) == ahead_on(room, lane, s, own_id)
+        assert neighbor_behind(roads.arrays, tidy, lane, s, own_id, 60.0) == neighbor_behind(
+            roads.arrays, room, lane, s, own_id, 60.0
+        )
 
 
 def test_of_two_at_one_place_the_larger_id_leads() -> None:
     roads = network("ring")
     rows = np.zeros(2, VEHICLE)
     rows["id"], rows["side_lane"], rows["s"] = [7, 3], -1, 10.0
-    room = indexed(roads, rows)
-    assert neighbor_ahead(rows, 1, 0, 10.0, room) == (0, 10.0)
-    assert neighbor_ahead(rows, 0, 0, 10.0, room) == (-1, np.inf)
-    assert neighbor_behind(roads.arrays, rows, 0, 0, 10.0, 60.0, room) == (1, 0.0)
+    room = indexed("ring", rows)
+    assert seen(room, ahead_on(room, 0, 10.0, 3)) == (0, 10.0)
+    assert ahead_on(room, 0, 10.0, 7) == -1
+    k, distance = neighbor_behind(roads.arrays, room, 0, 10.0, 7, 60.0)
+    assert (seen(room, k)[0], distance) == (1, 0.0)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_places_on_neighbour_lanes_equal_twin_and_lie_beside(name: str) -> None:
+    roads = network(name)
+    asked = 0
+    for lane in np.flatnonzero(~roads.lanes["internal"]).tolist():
+        here = roads.lanes[lane]
+        for beside in {int(here["left"]), int(here["right"])} - {-1}:
+            for share in (0.0, 0.3, 1.0):
+                s = share * float(here["length_m"])
+                there = beside_s(roads.arrays, lane, beside, s)
+                assert there == naive.beside_s(roads, lane, beside, s)
+                assert 0.0 <= there <= roads.lanes[beside]["length_m"]
+                x, y = place(roads, lane, s)
+                nearest = min(
+                    np.hypot(x - other_x, y - other_y)
+                    for other_x, other_y in (
+                        place(roads, beside, at)
+                        for at in np.arange(0.0, roads.lanes[beside]["length_m"], 0.25)
+                    )
+                )
+                other_x, other_y = place(roads, beside, there)
+                # No place of the neighbour lane is much nearer than the one it is mapped to.
+                assert np.hypot(x - other_x, y - other_y) < nearest + 1.0
+                asked += 1
+    assert asked > 0
+
+
+def place(roads: RoadNetwork, lane: int, s: float) -> tuple[float, float]:
+    row = roads.lanes[lane]
+    x, y, *_ = lane_pose(roads.points, row["first_point"], row["num_points"], s)
+    return x, y

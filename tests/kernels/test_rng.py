@@ -12,6 +12,9 @@ KEYS = st.integers(0, 2**64 - 1)
 NUMBERS = st.integers(0, 2**48 - 1)
 STREAMS = st.integers(0, 2**32 - 1)
 
+# SplitMix64 counts modulo 2**64: where nothing is compiled NumPy tells of it.
+wraps_around = pytest.mark.filterwarnings("ignore:overflow encountered in scalar:RuntimeWarning")
+
 
 # Random123's known answers, kat_vectors, "philox4x32 10".
 @pytest.mark.parametrize(
@@ -72,8 +75,50 @@ def test_streams_do_not_share_draws() -> None:
 
 
 def test_numbers_are_spread_evenly() -> None:
-    key = rng.world_key(1, 2, 3)
+    key = np.uint64(rng.world_key(1, 2, 3))
     numbers = [rng.uniform(key, vehicle, 9, rng.STREAM_PLACE) for vehicle in range(4000)]
     counts, _ = np.histogram(numbers, bins=16, range=(0.0, 1.0))
     chi_squared = float(np.sum((counts - 250.0) ** 2) / 250.0)
     assert chi_squared < 37.7  # the 99.9 % quantile for 15 degrees of freedom
+
+
+@wraps_around
+@given(KEYS, NUMBERS, st.integers(0, 2**32 - 1), STREAMS)
+def test_quick_uniform_equals_twin(key: int, vehicle: int, tick: int, stream: int) -> None:
+    number = rng.quick_uniform(np.uint64(key), vehicle, tick, stream)
+    assert number == naive.quick_uniform(key, vehicle, tick, stream)
+    assert 0.0 <= number < 1.0
+
+
+def quick_numbers(vehicles: range, ticks: range) -> list[float]:
+    key = np.uint64(rng.world_key(1, 2, 3))
+    return [rng.quick_uniform(key, v, t, rng.STREAM_DRIVER) for v in vehicles for t in ticks]
+
+
+@wraps_around
+@pytest.mark.parametrize(("vehicles", "ticks"), [(range(4000), range(1)), (range(1), range(4000))])
+def test_quick_numbers_are_spread_evenly_and_neighbours_know_nothing_of_each_other(
+    vehicles: range, ticks: range
+) -> None:
+    numbers = np.array(quick_numbers(vehicles, ticks))
+    counts, _ = np.histogram(numbers, bins=16, range=(0.0, 1.0))
+    assert float(np.sum((counts - 250.0) ** 2) / 250.0) < 37.7  # as above
+    pairs, _, _ = np.histogram2d(numbers[:-1], numbers[1:], bins=4, range=[(0, 1), (0, 1)])
+    assert float(np.sum((pairs - 3999 / 16) ** 2) / (3999 / 16)) < 37.7
+    for lag in (1, 2, 7):
+        assert abs(np.corrcoef(numbers[:-lag], numbers[lag:])[0, 1]) < 0.06
+
+
+@wraps_around
+def test_quick_numbers_are_a_function_of_each_argument_and_of_nothing_else() -> None:
+    asked = [(v, t) for v in range(30) for t in range(30)]
+    key = np.uint64(rng.world_key(1, 2, 3))
+    forward = {a: rng.quick_uniform(key, *a, rng.STREAM_DRIVER) for a in asked}
+    backward = {a: rng.quick_uniform(key, *a, rng.STREAM_DRIVER) for a in reversed(asked)}
+    assert forward == backward
+    assert len(set(forward.values())) == len(asked)
+    assert rng.quick_uniform(key, 1, 1, rng.STREAM_ROUTE) not in forward.values()
+    assert (
+        rng.quick_uniform(np.uint64(rng.world_key(1, 2, 4)), 1, 1, rng.STREAM_DRIVER)
+        != forward[1, 1]
+    )

@@ -8,14 +8,16 @@ import numpy as np
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from cavmarl.kernels.arrays import Scratch
+from cavmarl.kernels.arrays import Scratch, Travel
 from cavmarl.kernels.motion import place_on_lane
 from cavmarl.registry import load_config, resolve_map
 from cavmarl.roads.cache import load_network
 from cavmarl.roads.network import RoadNetwork
-from cavmarl.roads.routing import make_plans
+from cavmarl.roads.routing import PLAN, make_plans
 from cavmarl.shard.shard import _make_scratch
 from cavmarl.shard.vehicles import VEHICLE, blank_vehicle
+from cavmarl.traffic.demand import STOP
+from cavmarl.traffic.vtypes import generated_types
 
 NAMES = ("ring", "merge", "grid4x4")
 
@@ -35,20 +37,49 @@ def plans(name: str) -> NDArray[np.void]:
     return make_plans(roads, [int(edge) for edge in outside[picks]])
 
 
+def travel_by(
+    steps: NDArray[np.void],
+    types: NDArray[np.void] | None = None,
+    stops: NDArray[np.void] | None = None,
+) -> Travel:
+    """Ways (any shape of PLAN), with the generator's type and no stops unless others are given."""
+    return Travel(
+        generated_types() if types is None else types,
+        steps.reshape(-1),
+        np.zeros(0, STOP) if stops is None else stops,
+        first_detour=0,
+        begin_s=0.0,
+    )
+
+
+@cache
+def travel(name: str) -> Travel:
+    """The generator's type and the ways to the four goals of `plans`."""
+    return travel_by(plans(name))
+
+
 def scratch(roads: RoadNetwork, capacity: int) -> Scratch:
     """Room for the kernels."""
     return _make_scratch(len(roads.lanes), len(roads.links), capacity)
 
 
-def on_lane(roads: RoadNetwork, lane: int, s: float, **fields: object) -> NDArray[np.void]:
-    """VEHICLE (1,): a car on a lane, in its direction; `fields` override columns."""
+def on_lane(
+    roads: RoadNetwork, lane: int, s: float, travel: Travel | None = None, **fields: object
+) -> NDArray[np.void]:
+    """VEHICLE (1,): a car on a lane, on its way to its goal if it has one; `fields` override."""
     row = blank_vehicle()
     row["lane"], row["target_lane"], row["s"] = lane, lane, s
     for field, value in fields.items():
         row[field] = value
-    cos, sin = place_on_lane(roads.arrays, row[0])
+    if travel is None:
+        nowhere = np.zeros(len(roads.lanes), PLAN)
+        nowhere["next"] = -1
+        travel = travel_by(nowhere)
+    elif "way" not in fields:
+        row["way"] = row["goal"] * len(roads.lanes)
+    heading = place_on_lane(roads.arrays, travel, row[0])
     if "heading" not in fields:
-        row["heading"] = np.arctan2(sin, cos)
+        row["heading"] = heading
     return row
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,10 +20,20 @@ def on_lane(roads: RoadNetwork, rows: NDArray[np.void], lane: int) -> list[Entry
         if row["lane"] == lane:
             found.append((float(row["s"]), int(row["id"]), i))
         if row["side_lane"] == lane:
-            # s · length / length, in this order: ties must stay ties.
-            s = row["s"] * roads.lanes[lane]["length_m"] / roads.lanes[row["lane"]]["length_m"]
-            found.append((float(s), int(row["id"]), i))
+            found.append((beside_s(roads, int(row["lane"]), lane, row["s"]), int(row["id"]), i))
     return sorted(found)
+
+
+def beside_s(roads: RoadNetwork, lane: int, neighbour: int, s: float) -> float:
+    """Where a place lies on the lane to one side: in proportion between the points' images."""
+    row = roads.lanes[lane]
+    side = "left_s" if row["left"] == neighbour else "right_s"
+    points = roads.points[row["first_point"] : row["first_point"] + row["num_points"]]
+    for one, other in pairwise(points):
+        if s < other["s"] or other is points[-1] or other["s"] == points[-1]["s"]:
+            share = min(max((s - one["s"]) / (other["s"] - one["s"]), 0.0), 1.0)
+            return float(one[side] + share * (other[side] - one[side]))
+    raise AssertionError("a lane has segments")
 
 
 def ahead(

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from cavmarl.roads.network import RoadNetwork
 
 LANE_CHANGE_COST_S = 5.0
-SHORT_LANE_M = 50.0
+LANE_CHANGE_M = 250.0
 
 
 def followers(roads: RoadNetwork, lane: int) -> list[tuple[int, int]]:
@@ -51,7 +51,7 @@ def neighbours(roads: RoadNetwork, lane: int, permission: int) -> list[int]:
 
 def change_cost(roads: RoadNetwork, lane: int) -> float:
     """What it costs to leave a lane sideways, in s."""
-    return LANE_CHANGE_COST_S + max(SHORT_LANE_M - float(roads.lanes[lane]["length_m"]), 0.0)
+    return LANE_CHANGE_COST_S * (1.0 + LANE_CHANGE_M / float(roads.lanes[lane]["length_m"]))
 
 
 def costs(roads: RoadNetwork, goal_edge: int, permission: int) -> NDArray[np.float64]:

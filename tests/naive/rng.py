@@ -42,3 +42,22 @@ def world_key(seed: int, world: int, episode: int) -> int:
     """The words in the other order, as one number."""
     bits = random_bits(seed, world, episode, 0)
     return (bits & MASK_32) << 32 | bits >> 32
+
+
+MASK_64 = (1 << 64) - 1
+GOLDEN = 0x9E3779B97F4A7C15
+
+
+def _mix(word: int) -> int:
+    """The finaliser of SplitMix64."""
+    word = (word ^ word >> 30) * 0xBF58476D1CE4E5B9 & MASK_64
+    word = (word ^ word >> 27) * 0x94D049BB133111EB & MASK_64
+    return word ^ word >> 31
+
+
+def quick_uniform(key: int, vehicle: int, tick: int, stream: int) -> float:
+    """Key, vehicle and (stream, tick) mixed in turn; the upper 53 bits."""
+    word = _mix((key + GOLDEN) & MASK_64)
+    word = _mix(word ^ vehicle * GOLDEN & MASK_64)
+    word = _mix(word ^ ((stream << 32) + tick) * GOLDEN & MASK_64)
+    return (word >> 11) / 2**53

@@ -57,7 +57,7 @@ def test_size_suits_the_map(grid: RoadNetwork) -> None:
 
 def test_same_world_same_bytes(grid: RoadNetwork, car: Car) -> None:
     rows = np.concatenate([car(x=100.0 * k, y=300.0, id=k, agent=k - 1) for k in range(5)])
-    phases = grid.signals["first_phase"].astype(np.int32)
+    phases = grid.programs["first_phase"][grid.signals["program"]].astype(np.int32)
     one = TopDownRenderer(grid, SIZE).frame(rows, phases, clock_s=2.0)
     assert (TopDownRenderer(grid, SIZE).frame(rows[::-1], phases, clock_s=2.0) == one).all()
 
@@ -109,14 +109,14 @@ def test_left_blinker_is_at_the_left(ring: RoadNetwork, car: Car) -> None:
 
 
 def test_signal_letters_are_those_of_the_phase(grid: RoadNetwork) -> None:
-    phases = grid.signals["first_phase"].astype(np.int32)
+    phases = grid.programs["first_phase"][grid.signals["program"]].astype(np.int32)
     codes = signal_codes(grid, phases)
     signalled = grid.links["signal"] >= 0
     assert signalled.any()
     assert (codes[~signalled] == 255).all()
     for link in np.flatnonzero(signalled)[:20]:
         signal = grid.signals[grid.links[link]["signal"]]
-        phase = grid.phases[signal["first_phase"]]
+        phase = grid.phases[grid.programs["first_phase"][signal["program"]]]
         states = grid.phase_states[phase["first_state"] :][: signal["num_links"]]
         letter = SIGNAL_STATES[states[grid.links[link]["signal_index"]]]
         assert signal_letter(grid, int(link), phases) == letter
@@ -124,12 +124,12 @@ def test_signal_letters_are_those_of_the_phase(grid: RoadNetwork) -> None:
 
 def test_stop_lines_switch_with_their_signal(grid: RoadNetwork) -> None:
     signal = grid.signals[0]
-    first = grid.signals["first_phase"].astype(np.int32)
+    first = grid.programs["first_phase"][grid.signals["program"]].astype(np.int32)
     red, green = palette.SIGNALS[0], palette.SIGNALS[3]
     links = np.flatnonzero(grid.links["signal"] == 0)
     renderer = TopDownRenderer(grid, SIZE)
     seen = set()
-    for step in range(signal["num_phases"]):
+    for step in range(grid.programs["num_phases"][signal["program"]]):
         phases = first.copy()
         phases[0] += step
         link = int(links[0])

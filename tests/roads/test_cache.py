@@ -46,7 +46,7 @@ def test_a_second_load_restores_every_array(
             assert not other.flags.writeable
         else:
             assert one == other
-    assert [entry.suffix for entry in cache_folder.iterdir()] == [".npz"]
+    assert [entry.suffix for entry in cache_folder.iterdir()] == [".network"]
 
 
 def test_a_changed_source_is_read_again(crossing: Callable[..., Path], cache_folder: Path) -> None:

@@ -110,7 +110,10 @@ def test_crossing_paths_share_the_middle_and_merging_paths_the_end(crossing: Cro
     assert merge["leave_m"] == network.links["length_m"][0]
     assert merge["foe_leave_m"] == network.links["length_m"][2]
     assert 0.0 < merge["enter_m"] < 10.0
-    assert tuple(network.conflicts[2])[2:] == tuple(cross)[4:] + tuple(cross)[2:4]
+    mirrored = network.conflicts[2]
+    for end in ("enter_m", "leave_m"):
+        assert mirrored[end] == cross[f"foe_{end}"]
+        assert mirrored[f"foe_{end}"] == cross[end]
 
 
 def test_a_bridge_is_no_conflict(crossing: Crossing) -> None:
@@ -132,8 +135,9 @@ def test_signals_keep_their_program(crossing: Crossing) -> None:
 
     assert network.signal_ids == ("c",)
     signal = network.signals[0]
-    assert (signal["num_phases"], signal["num_links"]) == (3, 3)
-    assert (signal["offset_s"], signal["cycle_s"]) == (3.0, 60.0)
+    program = network.programs[signal["program"]]
+    assert (program["num_phases"], signal["num_links"]) == (3, 3)
+    assert (program["offset_s"], program["cycle_s"]) == (3.0, 60.0)
     letters = "".join(SIGNAL_STATES[code] for code in network.phase_states)
     assert letters == "GrryrrrGg"
     assert network.phases["first_state"].tolist() == [0, 3, 6]

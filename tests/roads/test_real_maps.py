@@ -147,8 +147,9 @@ def check_signals(network: RoadNetwork) -> None:
     ruled = network.links[network.links["signal"] >= 0]
     assert (ruled["signal_index"] < signals["num_links"][ruled["signal"]]).all()
     for signal in signals:
-        mine = phases[signal["first_phase"] : signal["first_phase"] + signal["num_phases"]]
-        assert mine["duration_s"].sum() == signal["cycle_s"] > 0.0
+        program = network.programs[signal["program"]]
+        mine = phases[program["first_phase"] : program["first_phase"] + program["num_phases"]]
+        assert mine["duration_s"].sum() == program["cycle_s"] > 0.0
         assert (np.diff(mine["first_state"]) == signal["num_links"]).all()
 
 

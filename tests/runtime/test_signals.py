@@ -51,10 +51,11 @@ def planned(program: Program, time: Fraction) -> str:
 @pytest.mark.parametrize("offset", [None, "10"])
 def test_signals_show_what_the_map_plans(env: str, offset: str | None, tmp_path: Path) -> None:
     source = resolve_map(*load_config(env))
+    text = source.read_text(encoding="utf-8").replace('type="actuated"', 'type="static"')
     if offset is not None:
-        text = source.read_text(encoding="utf-8").replace('offset="0"', f'offset="{offset}"')
-        source = tmp_path / "shifted.net.xml"
-        source.write_text(text, encoding="utf-8")
+        text = text.replace('offset="0"', f'offset="{offset}"')
+    source = tmp_path / "fixed.net.xml"
+    source.write_text(text, encoding="utf-8")
     simulation = make_traffic(source, background=0, overrides={"clock.ctrl_dt_s": 0.05})
     start(simulation, seed=0)
     plan = programs(source)

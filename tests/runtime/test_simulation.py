@@ -110,22 +110,25 @@ def test_speed_limits_hold_for_every_driver_in_his_own_measure(env: str) -> None
 def test_nobody_drives_through_red(env: str) -> None:
     simulation = make_traffic(env, background=60, num_worlds=2, overrides=PER_TICK)
     start(simulation, seed=2)
-    roads = simulation.network.arrays
+    roads, steps = simulation.network.arrays, simulation._traffic.travel.steps
     crossed = 0
-    before: list[dict[int, int]] = [{}, {}]
+    before: list[dict[int, tuple[int, float]]] = [{}, {}]
     for _ in minutes(simulation, 2.0):
         for world in range(2):
-            vehicles = simulation.vehicles(world)
-            now = dict(zip(vehicles["id"].tolist(), vehicles["link"].tolist(), strict=True))
-            entered = {
-                now[i] for i in now if now[i] >= 0 and before[world].get(i, now[i]) != now[i]
-            }
-            before[world] = now
             phases = simulation.signal_phases(world)
-            for link in entered:
-                shown = link_signal(roads, link, phases)
-                assert shown not in (SIGNAL_RED, SIGNAL_RED_YELLOW), f"link {link}"
-                crossed += int(roads.links[link]["signal"] >= 0)
+            now = {}
+            for row in simulation.vehicles(world):
+                lane = roads.lanes[row["lane"]]
+                link = -1 if lane["internal"] else int(steps[row["way"] + row["lane"]]["link"])
+                front = row["s"] + 0.5 * row["length"]
+                to_line = float(lane["length_m"] - lane["stop_back_m"] - front)
+                now[int(row["id"])] = link, to_line
+                earlier, earlier_m = before[world].get(int(row["id"]), (-1, 0.0))
+                if link >= 0 and link == earlier and to_line <= 0.0 < earlier_m:
+                    shown = link_signal(roads, link, phases)
+                    assert shown not in (SIGNAL_RED, SIGNAL_RED_YELLOW), f"link {link}"
+                    crossed += int(roads.links[link]["signal"] >= 0)
+            before[world] = now
     assert crossed > 50
 
 

@@ -10,6 +10,8 @@ __all__ = ["features", "reach_m"]
 
 def features(config: SensorsConfig) -> list[Feature]:
     """The features in order; the scales are those of `kernels/observing.py`."""
+    if not config.ego.enabled:
+        return []
     return [
         Feature("speed", "speed along the heading", "40 m/s"),
         Feature("accel", "acceleration of the last tick", "10 m/s²"),

@@ -39,6 +39,6 @@ def room(config: SensorsConfig) -> dict[str, Any]:
     """The arrays that the search works in."""
     count = config.neighbors.count
     return {
-        "near_row": np.zeros(count, dtype=np.int32),
+        "near_body": np.zeros(count, dtype=np.int32),
         "near_squared": np.zeros(count, dtype=np.float64),
     }

@@ -1,0 +1,131 @@
+"""stable-baselines3's `VecEnv`: every agent seat of every world is one of its environments.
+
+Importing this module loads stable-baselines3 and torch; nothing that `import cavmarl` loads imports
+it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from stable_baselines3.common.vec_env.base_vec_env import VecEnv
+
+from cavmarl.config import TERMS
+from cavmarl.errors import ConfigError
+from cavmarl.vector_env import make_vec
+
+__all__ = ["CavSb3VecEnv"]
+
+ARRIVAL = TERMS.index("arrival")
+MODE = "population.mode"
+
+Indices = int | Iterable[int] | None
+
+
+class CavSb3VecEnv(VecEnv):
+    """W worlds with A seats each as W · A environments that share one policy; row w · A + a.
+
+    Always in `seats`: a row whose vehicle ended gets a new one. A row that ended is `done` and
+    carries its last observation as `terminal_observation`, whether the horizon cut it as
+    `TimeLimit.truncated`, and whether it arrived as `is_success`. While a row waits for a vehicle
+    its observation and reward are 0, its actions are not read and its info says `inactive`.
+
+    Args:
+        env: as for `make_vec`.
+        num_worlds: W.
+        overrides: values for any key but `population.mode`.
+        arguments: other keywords of `make_vec`.
+
+    Raises:
+        ConfigError: a key, value or combination that cannot work.
+    """
+
+    def __init__(
+        self,
+        env: str | Path = "merge",
+        *,
+        num_worlds: int = 1,
+        overrides: Mapping[str, Any] | None = None,
+        **arguments: Any,
+    ) -> None:
+        if MODE in (overrides or {}):
+            raise ConfigError(f"{MODE}: rows need seats; cavmarl.make_vec leaves it to you")
+        self._vec = make_vec(
+            env, num_envs=num_worlds, overrides={**(overrides or {}), MODE: "seats"}, **arguments
+        )
+        self._shape = (num_worlds, self._vec.num_agents)
+        self._actions: NDArray[Any] = np.zeros(0)
+        super().__init__(
+            num_worlds * self._vec.num_agents,
+            self._vec.single_observation_space,
+            self._vec.single_action_space,
+        )
+
+    def reset(self) -> NDArray[np.float32]:
+        """Begin an episode in every world; the first row's seed is the root of all."""
+        observations, infos = self._vec.reset(seed=self._seeds[0])
+        self._reset_seeds()
+        self._reset_options()
+        self.reset_infos = [{} if active else {"inactive": True} for active in infos["mask"].flat]
+        return self._rows(observations)
+
+    def step_async(self, actions: NDArray[Any]) -> None:
+        """Take the actions of all rows."""
+        self._actions = actions.reshape(*self._shape, *actions.shape[1:])
+
+    def step_wait(
+        self,
+    ) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.bool_], list[dict[str, Any]]]:
+        """Let every row act."""
+        observations, rewards, ended, cut, infos = self._vec.step(self._actions)
+        done = self._rows(ended | cut)
+        shown: list[dict[str, Any]] = [
+            {} if acted else {"inactive": True} for acted in infos["acted"].flat
+        ]
+        last = self._rows(infos["final_observations"])
+        arrived = self._rows(infos["terms"])[:, ARRIVAL] > 0.0
+        truncated = self._rows(cut)
+        for row in np.flatnonzero(done):
+            shown[row] = {
+                "terminal_observation": last[row],
+                "TimeLimit.truncated": bool(truncated[row]),
+                "is_success": bool(arrived[row]),
+            }
+        return self._rows(observations), self._rows(rewards), done, shown
+
+    def close(self) -> None:
+        """As `CavVectorEnv.close`."""
+        self._vec.close()
+
+    def get_attr(self, attr_name: str, indices: Indices = None) -> list[Any]:
+        """An attribute of the worlds, the same for every row."""
+        # The worlds draw nothing themselves; SB3 asks every VecEnv.
+        value = None if attr_name == "render_mode" else getattr(self._vec, attr_name)
+        return [value for _ in self._get_indices(indices)]
+
+    def set_attr(self, attr_name: str, value: Any, indices: Indices = None) -> None:
+        """Refused: rows share their worlds.
+
+        Raises:
+            NotImplementedError: always.
+        """
+        raise NotImplementedError(f"{attr_name}: rows share their worlds, no row has its own")
+
+    def env_method(
+        self, method_name: str, *method_args: Any, indices: Indices = None, **method_kwargs: Any
+    ) -> list[Any]:
+        """Call a method of the worlds once; every row gets what it returns."""
+        found = getattr(self._vec, method_name)(*method_args, **method_kwargs)
+        return [found for _ in self._get_indices(indices)]
+
+    def env_is_wrapped(self, wrapper_class: Any, indices: Indices = None) -> list[bool]:
+        """No row is wrapped by itself."""
+        return [False for _ in self._get_indices(indices)]
+
+    def _rows(self, batch: NDArray[Any]) -> NDArray[Any]:
+        """(W, A, …) as (W · A, …)."""
+        return batch.reshape(-1, *batch.shape[2:])

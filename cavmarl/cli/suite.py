@@ -1,0 +1,79 @@
+"""`cavmarl suite`: the same drivers on several maps with several numbers of agents."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+from rich import box
+from rich.console import Console
+from rich.markup import escape
+from rich.table import Table
+
+from cavmarl.cli.evaluate import report_cell
+from cavmarl.cli.output import JsonPath, Seed, make_folder, write_json
+
+if TYPE_CHECKING:
+    from cavmarl.evaluate import EvaluationReport
+
+__all__ = ["suite"]
+
+SHOWN = ("success", "collision", "delay_s")  # as many as eighty columns hold
+
+
+def suite(
+    name: Annotated[
+        str, typer.Argument(metavar="SUITE", help="A name in configs/suites/, or a .yaml.")
+    ] = "standard",
+    maps: Annotated[Path, typer.Option(help="Folder of the map files.")] = Path("maps"),
+    policy: Annotated[
+        list[str] | None,
+        typer.Option("--policy", "-p", help="A driver; may be repeated. Default: idm."),
+    ] = None,
+    episodes: Annotated[int, typer.Option("--episodes", "-n", help="Of each run.")] = 4,
+    repeats: Annotated[int, typer.Option("--repeats", "-r", help="Independent runs.")] = 5,
+    seed: Seed = 0,
+    out: Annotated[Path, typer.Option(help="Folder of the results, one folder a world.")] = Path(
+        "runs/suite"
+    ),
+    json_path: JsonPath = None,
+) -> None:
+    """Evaluate drivers in every world of a suite; `cavmarl report` shows any of them whole."""
+    from cavmarl.evaluate.suite import find_suite, load_suite, run_suite, worlds_of
+
+    loaded = load_suite(find_suite(name))
+    worlds = worlds_of(loaded, maps)
+    make_folder(out)
+    console = Console()
+    with console.status("") as status:
+        reports = run_suite(
+            loaded,
+            worlds,
+            policy or ["idm"],
+            out,
+            episodes=episodes,
+            repeats=repeats,
+            seed=seed,
+            began=lambda world: status.update(escape(world.label)),
+        )
+    console.print(_table(reports))
+    write_json(json_path, {label: found.to_dict() for label, found in reports.items()})
+
+
+def _table(reports: dict[str, EvaluationReport]) -> Table:
+    """One row a world and driver."""
+    from cavmarl.evaluate.metrics import METRICS
+
+    metrics = [metric for metric in METRICS if metric.name in SHOWN]
+    heads = (f"{metric.label}, {metric.unit}" for metric in metrics)
+    table = Table(box=box.SIMPLE_HEAD, pad_edge=False)
+    table.add_column("map, agents", overflow="fold")
+    table.add_column("driver", overflow="fold")
+    for head in heads:
+        table.add_column(head, justify="right", no_wrap=True)
+    for label, found in reports.items():
+        for driver, results in found.policies.items():
+            cells = (report_cell(metric, results[metric.name]) for metric in metrics)
+            table.add_row(escape(label), escape(Path(driver).name), *cells)
+    return table

@@ -1,0 +1,74 @@
+"""`Watch`: between the steps of many worlds, where their agents are and whom they just missed."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cavmarl.evaluate.recorder import Recorder
+from cavmarl.kernels.watching import locate_agents, watch_encroachments
+from cavmarl.roads.network import RoadNetwork
+from cavmarl.vector_env import CavVectorEnv
+
+__all__ = ["Watch", "mirrored_conflicts"]
+
+
+def mirrored_conflicts(network: RoadNetwork) -> NDArray[np.int32]:
+    """(num_conflicts,) the row of the same area as seen from the foe's path, -1 where paths merge.
+
+    Who follows another out of a merge shares its lane from then on: that is following, which time
+    to collision measures, and no encroachment.
+    """
+    links, conflicts = network.links, network.conflicts
+    link = np.repeat(np.arange(len(links)), links["num_conflicts"])
+    foe = conflicts["foe"]
+    rows = {pair: c for c, pair in enumerate(zip(link.tolist(), foe.tolist(), strict=True))}
+    mirror = np.array(
+        [rows.get(pair, -1) for pair in zip(foe.tolist(), link.tolist(), strict=True)],
+        dtype=np.int32,
+    )
+    mirror[links["to_lane"][link] == links["to_lane"][foe]] = -1
+    return mirror
+
+
+class Watch:
+    """Writes places and least post-encroachment times of the agents into a recorder.
+
+    Args:
+        vec: the worlds, looked at between their steps.
+        recorder: of the same worlds.
+    """
+
+    def __init__(self, vec: CavVectorEnv, recorder: Recorder) -> None:
+        self._vec = vec
+        self._recorder = recorder
+        self._mirror = mirrored_conflicts(vec.network)
+        shape = (vec.num_envs, len(self._mirror))
+        self._seen_s = np.full(shape, -np.inf)
+        self._seen_id = np.full(shape, -1, dtype=np.int64)
+        self._seen_agent = np.full(shape, -1, dtype=np.int32)
+
+    def locate(self) -> None:
+        """Note where the agents are."""
+        worlds = self._vec.simulation.worlds
+        locate_agents(worlds.rows, worlds.num_owned, self._recorder.places_m)
+
+    def encounters(self, now_s: float, running: NDArray[np.bool_], mask: NDArray[np.bool_]) -> None:
+        """Take in the traffic after a step, in the `running` worlds (W,); `mask` (W, A) drives."""
+        if not self._mirror.size:
+            return
+        worlds = self._vec.simulation.worlds
+        watch_encroachments(
+            self._vec.network.arrays,
+            self._mirror,
+            worlds.rows,
+            worlds.num_owned,
+            running,
+            np.where(mask, self._vec.simulation.outputs.vehicle_ids, -1),
+            now_s,
+            self._vec.step_s,
+            self._seen_s,
+            self._seen_id,
+            self._seen_agent,
+            self._recorder.least_pet_s,
+        )

@@ -1,0 +1,226 @@
+"""`evaluate`: seeded runs of some policies, on record from before the first step."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cavmarl.errors import ConfigError, PolicyError
+from cavmarl.evaluate.episodes import Job, Progress, RunData, Speed, drive_run, worlds_at_once
+from cavmarl.evaluate.fresh import drive_in_fresh_process
+from cavmarl.evaluate.manifest import (
+    close_manifest,
+    describe_policies,
+    describe_world,
+    open_manifest,
+    read_closed,
+    write_text,
+)
+from cavmarl.evaluate.map_outline import map_outline
+from cavmarl.evaluate.report import EvaluationReport, make_report
+from cavmarl.evaluate.tables import EPISODE, TRACK, TRIP, read_table, write_table
+from cavmarl.policies import load_policy
+from cavmarl.seeds import check_seed
+from cavmarl.vector_env import CavVectorEnv
+from cavmarl.worlds import load_world
+
+__all__ = ["evaluate", "load_map", "load_report", "load_tables", "load_tracks", "run_seeds"]
+
+Rows = NDArray[np.void]
+
+MAX_EPISODES = 100_000
+MAX_REPEATS = 1000
+
+TRIPS_FILE = "trips.csv"
+EPISODES_FILE = "episodes.csv"
+TRACKS_FILE = "tracks.csv"
+MAP_FILE = "map.json"
+SPEED_FILE = "speed.json"
+RESULT_FILES = [TRIPS_FILE, EPISODES_FILE, TRACKS_FILE, MAP_FILE, SPEED_FILE]
+
+
+def evaluate(
+    env: str | Path,
+    policies: str | Path | Sequence[str | Path] | Mapping[str, str | Path],
+    *,
+    episodes: int = 32,
+    seed: int = 0,
+    repeats: int = 1,
+    out: Path | None = None,
+    agents: int | None = None,
+    background: int | None = None,
+    max_cycles: int | None = None,
+    overrides: Mapping[str, Any] | None = None,
+    progress: Progress | None = None,
+) -> EvaluationReport:
+    """Let policies drive `repeats` runs of `episodes` seeded episodes, each counted once.
+
+    All policies meet the same episodes: episode e of a run is the first one of world e of its seed.
+    Two or more runs are driven in fresh processes, one after the other.
+
+    Args:
+        env: as in `make_vec`, like the other keywords that are not explained here.
+        policies: as in `load_policy`: one, several, or names for them in the results.
+        episodes: of each run.
+        seed: of the first run; those of the others follow from it (`run_seeds`).
+        repeats: independent runs.
+        out: folder for manifest and raw results; None keeps nothing but the report.
+        agents: shadows population.agents.
+        background: shadows population.background.
+        max_cycles: shadows horizon_s.
+        overrides: values for any other key.
+        progress: called after every step of a run with the policy's name, the steps that it has
+            done in this run, and the most there can be.
+
+    Raises:
+        ConfigError: a number or a key that cannot work, or `out` cannot be made.
+        PolicyError: a policy cannot be loaded or does not fit, or two have one name.
+        ManifestError: `out` holds results already.
+    """
+    _check_count("episodes", episodes, MAX_EPISODES)
+    _check_count("repeats", repeats, MAX_REPEATS)
+    job = Job(
+        env=str(env),
+        policies=_named(policies),
+        episodes=episodes,
+        seed=check_seed(seed),
+        agents=agents,
+        background=background,
+        max_cycles=max_cycles,
+        overrides=dict(overrides or {}),
+    )
+    with TemporaryDirectory() as room:
+        folder = Path(room) if out is None else out
+        _prepare(folder, job, repeats)
+        _drive_all(folder, job, run_seeds(seed, repeats), progress)
+        return load_report(folder)
+
+
+def load_report(folder: Path) -> EvaluationReport:
+    """The report of the results in a folder, made anew from its raw tables.
+
+    Raises:
+        ManifestError: no closed manifest, or results that it does not know.
+    """
+    manifest = read_closed(folder)
+    speeds = json.loads((folder / SPEED_FILE).read_text(encoding="utf-8"))
+    timed = {name: tuple(Speed(**run) for run in speeds[name]) for name in manifest["policies"]}
+    return make_report(load_tables(folder), timed, manifest)
+
+
+def load_tables(folder: Path) -> dict[str, tuple[Rows, Rows]]:
+    """TRIP and EPISODE records by policy; raises as `load_report`."""
+    names = read_closed(folder)["policies"]
+    trips = read_table(folder / TRIPS_FILE, TRIP)
+    episodes = read_table(folder / EPISODES_FILE, EPISODE)
+    return {name: (trips.get(name, np.zeros(0, TRIP)), episodes[name]) for name in names}
+
+
+def load_tracks(folder: Path) -> dict[str, Rows]:
+    """TRACK records of the first episode by policy; raises as `load_report`."""
+    names = read_closed(folder)["policies"]
+    tracks = read_table(folder / TRACKS_FILE, TRACK)
+    return {name: tracks.get(name, np.zeros(0, TRACK)) for name in names}
+
+
+def load_map(folder: Path) -> dict[str, Any]:
+    """What `map_outline` made; raises as `load_report`."""
+    read_closed(folder)
+    outline: dict[str, Any] = json.loads((folder / MAP_FILE).read_text(encoding="utf-8"))
+    return outline
+
+
+def run_seeds(seed: int, repeats: int) -> list[int]:
+    """The seeds of the runs: the first is `seed`, the others are hashes of (seed, run)."""
+    hashes = [
+        int(np.random.SeedSequence((seed, run)).generate_state(1, np.uint64)[0]) >> 1
+        for run in range(1, repeats)
+    ]
+    return [seed, *hashes]
+
+
+def _check_count(name: str, value: Any, most: int) -> None:
+    if isinstance(value, bool) or not isinstance(value, int):
+        raise ConfigError(f"{name} = {value!r}: must be a whole number")
+    if not 1 <= value <= most:
+        raise ConfigError(f"{name} = {value}: must be from 1 to {most}")
+
+
+def _named(
+    policies: str | Path | Sequence[str | Path] | Mapping[str, str | Path],
+) -> dict[str, str]:
+    """Policies by the names that results have."""
+    if isinstance(policies, Mapping):
+        named = {name: str(policy) for name, policy in policies.items()}
+    else:
+        given = [policies] if isinstance(policies, str | Path) else list(policies)
+        named = {str(policy): str(policy) for policy in given}
+        if len(named) < len(given):
+            raise PolicyError(f"policies {', '.join(map(str, given))}: one stands there twice")
+    if not named:
+        raise PolicyError("no policy: give at least one")
+    return named
+
+
+def _prepare(folder: Path, job: Job, repeats: int) -> None:
+    """Refuse early what cannot work, then put everything on record."""
+    config, network, demand = load_world(
+        job.env,
+        agents=job.agents,
+        background=job.background,
+        max_cycles=job.max_cycles,
+        overrides=job.overrides,
+    )
+    policies = describe_policies(job.policies)
+    one_world = CavVectorEnv(config, network, 1, demand)
+    for policy in job.policies.values():
+        load_policy(policy, one_world)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise ConfigError(f"{folder}: cannot be made ({error.strerror or error})") from error
+    vehicles = config.population.agents + config.population.background
+    plan = {
+        "processes": "this one" if repeats == 1 else "a fresh one for each run, one at a time",
+        "worlds_at_once": worlds_at_once(job.episodes, vehicles),
+    }
+    open_manifest(
+        folder,
+        {
+            "policies": policies,
+            "episodes": job.episodes,
+            "seeds": run_seeds(job.seed, repeats),
+            "job": job.to_dict(),
+            "plan": plan,
+            "world": describe_world(config, network, demand),
+        },
+    )
+    write_text(folder / MAP_FILE, json.dumps(map_outline(network)))
+
+
+def _drive_all(folder: Path, job: Job, seeds: list[int], progress: Progress | None) -> None:
+    """Drive all runs, leave their tables, close the manifest."""
+    runs: list[dict[str, RunData]] = []
+    for run, seed in enumerate(seeds):
+        one = Job(**{**job.to_dict(), "seed": seed, "run": run})
+        if len(seeds) == 1:
+            runs.append(drive_run(one, progress))
+        else:
+            runs.append(drive_in_fresh_process(one, folder, progress))
+    names = list(job.policies)
+    trips = {name: np.concatenate([run[name].trips for run in runs]) for name in names}
+    episodes = {name: np.concatenate([run[name].episodes for run in runs]) for name in names}
+    tracks = {name: runs[0][name].tracks for name in names}
+    speeds = {name: [asdict(run[name].speed) for run in runs] for name in names}
+    write_table(folder / TRIPS_FILE, trips, TRIP)
+    write_table(folder / EPISODES_FILE, episodes, EPISODE)
+    write_table(folder / TRACKS_FILE, tracks, TRACK)
+    write_text(folder / SPEED_FILE, json.dumps(speeds, indent=2))
+    close_manifest(folder, RESULT_FILES)

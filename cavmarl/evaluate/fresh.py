@@ -1,0 +1,103 @@
+"""One run in a process of its own: the caller's side, and the program on the other.
+
+The program reads a job as JSON from standard input, tells its progress line by line on standard
+output, and leaves arrays in a file. A run shares nothing with another but the files on disk.
+"""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from cavmarl import errors
+from cavmarl.evaluate.episodes import Job, Progress, RunData, Speed, drive_run
+
+__all__ = ["drive_in_fresh_process", "main"]
+
+PROGRAM = "from cavmarl.evaluate.fresh import main; main()"
+
+
+def drive_in_fresh_process(
+    job: Job, folder: Path, progress: Progress | None = None
+) -> dict[str, RunData]:
+    """`drive_run` in a new interpreter.
+
+    Args:
+        job: what to drive.
+        folder: for its file, which is gone again afterwards.
+        progress: as in `drive_run`.
+
+    Raises:
+        CavmarlError: what `drive_run` raises there, and a process that died.
+    """
+    path = folder / f"run_{job.run}.npz"
+    program = subprocess.Popen(
+        [sys.executable, "-c", PROGRAM, str(path)],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        text=True,
+    )
+    assert program.stdin is not None
+    assert program.stdout is not None
+    with program:
+        program.stdin.write(json.dumps(job.to_dict()))
+        program.stdin.close()
+        for line in program.stdout:
+            told = json.loads(line)
+            if "error" in told:
+                raise getattr(errors, told["error"])(told["message"])
+            if progress is not None:
+                progress(told["policy"], told["steps"], told["most"])
+    if program.returncode:
+        raise errors.EvaluationError(
+            f"run {job.run} (seed {job.seed}) ended with exit code {program.returncode}; "
+            "its own message is above"
+        )
+    try:
+        return _read(path, list(job.policies))
+    finally:
+        path.unlink()
+
+
+def _read(path: Path, policies: list[str]) -> dict[str, RunData]:
+    with np.load(path) as arrays:
+        return {
+            name: RunData(
+                arrays[f"trips_{k}"],
+                arrays[f"episodes_{k}"],
+                arrays[f"tracks_{k}"],
+                Speed(**json.loads(str(arrays[f"speed_{k}"]))),
+            )
+            for k, name in enumerate(policies)
+        }
+
+
+def _write(path: Path, found: dict[str, RunData]) -> None:
+    arrays: dict[str, Any] = {}
+    for k, data in enumerate(found.values()):
+        arrays[f"trips_{k}"] = data.trips
+        arrays[f"episodes_{k}"] = data.episodes
+        arrays[f"tracks_{k}"] = data.tracks
+        arrays[f"speed_{k}"] = json.dumps(asdict(data.speed))
+    np.savez(path, **arrays)
+
+
+def _tell(**what: Any) -> None:
+    print(json.dumps(what), flush=True)
+
+
+def main() -> None:
+    """The program: a job from standard input."""
+    job = Job(**json.load(sys.stdin))
+    try:
+        found = drive_run(job, lambda name, k, n: _tell(policy=name, steps=k, most=n))
+    except errors.CavmarlError as error:
+        _tell(error=type(error).__name__, message=str(error))
+        return
+    _write(Path(sys.argv[1]), found)

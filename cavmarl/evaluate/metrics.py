@@ -1,0 +1,176 @@
+"""What is measured: the metrics of a report, each a column of trips or of episodes."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cavmarl.config import TERMS
+from cavmarl.evaluate.tables import reward_column
+
+__all__ = ["METRICS", "Metric", "metric_values"]
+
+
+@dataclass(frozen=True)
+class Metric:
+    """One number of interest.
+
+    Attributes:
+        name: its key in a report, and its column.
+        label: its name in tables.
+        unit: of the values times `scale`; empty for plain numbers.
+        per: a run has one value for each of these.
+        share: the values are yes or no, and their mean is a share.
+        arrived: only trips that arrived have a value.
+        scale: values are shown times this.
+        better: which way is better; None where neither is.
+        meaning: one line.
+    """
+
+    name: str
+    label: str
+    unit: str
+    per: Literal["trip", "episode"]
+    meaning: str
+    share: bool = False
+    arrived: bool = False
+    scale: float = 1.0
+    better: Literal["more", "less"] | None = None
+
+
+def _share(name: str, label: str, meaning: str, better: Literal["more", "less"]) -> Metric:
+    return Metric(name, label, "%", "trip", meaning, share=True, scale=100.0, better=better)
+
+
+METRICS = (
+    Metric(
+        "episode_return",
+        "return",
+        "",
+        "episode",
+        "sum of rewards of an agent id over an episode, mean over the ids",
+        better="more",
+    ),
+    _share("success", "success", "trips that arrived", "more"),
+    _share("collision", "collision", "trips that ended by touching a vehicle", "less"),
+    _share("off_road", "off road", "trips that ended off the road", "less"),
+    _share("unfinished", "unfinished", "trips that the horizon cut", "less"),
+    _share("red_light", "red light", "trips that passed a red light", "less"),
+    _share("wrong_way", "wrong way", "trips that drove against a lane", "less"),
+    Metric(
+        "agent_arrivals_per_h",
+        "agents arriving",
+        "1/h",
+        "episode",
+        "agents that arrived in an hour of simulated time",
+        better="more",
+    ),
+    Metric(
+        "background_arrivals_per_h",
+        "others arriving",
+        "1/h",
+        "episode",
+        "background vehicles that arrived in an hour of simulated time",
+        better="more",
+    ),
+    Metric(
+        "delay_s",
+        "delay",
+        "s",
+        "trip",
+        "time lost against driving at the limit, of trips that arrived",
+        arrived=True,
+        better="less",
+    ),
+    Metric(
+        "duration_s",
+        "duration",
+        "s",
+        "trip",
+        "from the first decision to the goal, of trips that arrived",
+        arrived=True,
+    ),
+    Metric("mean_speed_mps", "speed", "m/s", "trip", "way made towards the goal over time"),
+    Metric(
+        "mean_speeding",
+        "speeding",
+        "%",
+        "trip",
+        "mean speed above the limit, as a share of it",
+        scale=100.0,
+        better="less",
+    ),
+    Metric("mean_jerk_mps3", "jerk", "m/s³", "trip", "mean |jerk|", better="less"),
+    Metric(
+        "least_ttc_s",
+        "least TTC",
+        "s",
+        "trip",
+        "least time to collision of a trip; 4 stands for that and above",
+        better="more",
+    ),
+    Metric(
+        "short_ttc_share",
+        "TTC < 1.5 s",
+        "% time",
+        "trip",
+        "share of a trip with a time to collision below 1.5 s",
+        scale=100.0,
+        better="less",
+    ),
+    Metric(
+        "least_pet_s",
+        "least PET",
+        "s",
+        "trip",
+        "least post-encroachment time of a trip that met crossing traffic within 10 s",
+        better="more",
+    ),
+    Metric(
+        "jain_speed",
+        "speeds, Jain",
+        "",
+        "episode",
+        "Jain's index of the agents' mean speeds: 1 is even",
+        better="more",
+    ),
+    Metric(
+        "gini_delay",
+        "delays, Gini",
+        "",
+        "episode",
+        "Gini's coefficient of the agents' delays a kilometre: 0 is even",
+        better="less",
+    ),
+    *(
+        Metric(
+            reward_column(term),
+            f"return from {term.replace('_', ' ')}",
+            "",
+            "episode",
+            f"that part of the return: weight · sum of `{term}`",
+        )
+        for term in TERMS
+    ),
+)
+
+
+def metric_values(
+    metric: Metric, trips: NDArray[np.void], episodes: NDArray[np.void]
+) -> NDArray[np.float64]:
+    """The values (N,) of a metric; NaN is no value.
+
+    Args:
+        metric: which.
+        trips: TRIP records; only those that count are looked at.
+        episodes: EPISODE records.
+    """
+    if metric.per == "episode":
+        return np.asarray(episodes[metric.name], dtype=np.float64)
+    rows = trips[trips["counted"]]
+    if metric.arrived:
+        rows = rows[rows["success"]]
+    return np.asarray(rows[metric.name], dtype=np.float64)

@@ -1,0 +1,173 @@
+"""A report as one HTML file that needs nothing else: tables, plots, the map, the manifest."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from cavmarl.errors import require
+from cavmarl.evaluate.evaluation import load_map, load_report, load_tables, load_tracks
+from cavmarl.evaluate.manifest import write_text
+from cavmarl.evaluate.metrics import METRICS, Metric
+from cavmarl.evaluate.report import Difference, EvaluationReport, Found
+from cavmarl.evaluate.statistics import Interval
+
+__all__ = ["write_page"]
+
+TEMPLATE = Path(__file__).with_name("page.html.j2")
+NOTHING = "-"
+
+
+def write_page(folder: Path, path: Path) -> None:
+    """Write the page of the results in a folder.
+
+    Args:
+        folder: that `evaluate` left.
+        path: of the HTML file.
+
+    Raises:
+        ManifestError: no closed manifest, or results that it does not know.
+        MissingExtraError: matplotlib or Jinja2 is not installed.
+    """
+    require("matplotlib", "report")
+    jinja2 = require("jinja2", "report")
+    report = load_report(folder)
+    environment = jinja2.Environment(
+        autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True, lstrip_blocks=True
+    )
+    template = environment.from_string(TEMPLATE.read_text(encoding="utf-8"))
+    write_text(path, template.render(_content(folder, report)))
+
+
+def _content(folder: Path, report: EvaluationReport) -> dict[str, Any]:
+    from cavmarl.evaluate import plots
+
+    tables, tracks, outline = load_tables(folder), load_tracks(folder), load_map(folder)
+    first, *others = report.policies
+    return {
+        "report": report,
+        "manifest": report.manifest,
+        "facts": _facts(report.manifest),
+        "manifest_text": json.dumps(report.manifest, indent=2),
+        "policies": [(name, plots.color_of(k)) for k, name in enumerate(report.policies)],
+        "first": first,
+        "others": others,
+        "rows": _rows(report, rewards=False),
+        "reward_rows": _rows(report, rewards=True),
+        "differences": _differences(report, others),
+        "runs": _runs(report),
+        "outcomes": plots.plot_outcomes(report),
+        "metrics": plots.plot_metrics(report),
+        "distributions": plots.plot_distributions(tables),
+        "maps": {
+            name: plots.plot_map(outline, tracks[name], tables[name][0], plots.color_of(k))
+            for k, name in enumerate(report.policies)
+        },
+    }
+
+
+def _rows(report: EvaluationReport, *, rewards: bool) -> list[dict[str, Any]]:
+    """The metrics that any policy has a value of; parts of the return that are not all 0."""
+    rows = []
+    for metric in METRICS:
+        found = [policy[metric.name] for policy in report.policies.values()]
+        values = [one.mean for one in found]
+        if metric.name.startswith("reward_") != rewards or not any(
+            value is not None and (value != 0.0 or not rewards) for value in values
+        ):
+            continue
+        rows.append({"metric": metric, "cells": [_cell(metric, one) for one in found]})
+    return rows
+
+
+def _cell(metric: Metric, found: Found) -> dict[str, str]:
+    return {
+        "mean": _figure(found.mean, metric),
+        "interval": _ends(found.interval, metric),
+        "sd": NOTHING if metric.share else _figure(found.within_sd, metric),
+    }
+
+
+def _differences(report: EvaluationReport, others: list[str]) -> list[dict[str, Any]]:
+    rows = []
+    for metric in METRICS:
+        found = [report[name].minus_first[metric.name] for name in others]
+        if metric.name.startswith("reward_") or all(one.mean is None for one in found):
+            continue
+        rows.append({"metric": metric, "cells": [_change(metric, one) for one in found]})
+    return rows
+
+
+def _change(metric: Metric, found: Difference) -> dict[str, str]:
+    mean = NOTHING if found.mean is None else f"{metric.scale * found.mean:+.2f}"
+    return {
+        "mean": mean,
+        "interval": _ends(found.between_run_ci95, metric),
+        "verdict": _verdict(metric, found),
+    }
+
+
+def _verdict(metric: Metric, found: Difference) -> str:
+    """Better or worse where the interval leaves 0 out and one way is better; else nothing."""
+    if not found.distinct or metric.better is None or found.mean is None:
+        return ""
+    return "better" if (found.mean > 0.0) == (metric.better == "more") else "worse"
+
+
+def _runs(report: EvaluationReport) -> list[dict[str, Any]]:
+    """Every run's own figures: one line a policy, metric and run."""
+    return [
+        {
+            "policy": name,
+            "metric": metric,
+            "run": run,
+            "seed": report.seeds[run],
+            "n": within.n,
+            "mean": _figure(within.mean, metric),
+            "sd": _figure(within.sd, metric),
+            "wilson": _ends(within.wilson95, metric),
+        }
+        for name, policy in report.policies.items()
+        for metric in METRICS
+        for run, within in enumerate(policy[metric.name].within_run)
+        if within.n and not metric.name.startswith("reward_")
+    ]
+
+
+def _facts(manifest: Mapping[str, Any]) -> dict[str, str]:
+    """The manifest's main lines."""
+    hardware, software, code, world = (
+        manifest[key] for key in ("hardware", "software", "code", "world")
+    )
+    dirty = {True: ", with changed files", False: "", None: ""}[code["dirty"]]
+    packages = (f"{name} {found}" for name, found in software["packages"].items() if found)
+    return {
+        "command": " ".join(manifest["command"]),
+        "started, ended": f"{manifest['started']}, {manifest['ended']}",
+        "processor": f"{hardware['cpu']}, {hardware['usable_cores']} of "
+        f"{hardware['logical_cores']} cores",
+        "memory": f"{hardware['memory_gb']} GB",
+        "GPU": ", ".join(hardware["gpus"]) or "none",
+        "system": f"{software['os']}, {software['python']}",
+        "packages": ", ".join(packages),
+        "commit": f"{code['commit']}{dirty}",
+        "configuration": f"{world['environment']}, SHA-256 {world['config_sha256']}",
+        "map": f"{world['map']}, SHA-256 of its content {world['map_content_sha256']}",
+        "demand": f"SHA-256 of its content {world.get('demand_content_sha256') or '- (generated)'}",
+        "kernels": str(world["kernels"]),
+        "seeds of the runs": ", ".join(map(str, manifest["seeds"])),
+        "processes": str(manifest["plan"]["processes"]),
+        "channel": str(world["channel"]),
+    }
+
+
+def _figure(value: float | None, metric: Metric) -> str:
+    return NOTHING if value is None else f"{metric.scale * value:.2f}"
+
+
+def _ends(interval: Interval | None, metric: Metric) -> str:
+    if interval is None:
+        return NOTHING
+    return f"{metric.scale * interval.low:.2f} … {metric.scale * interval.high:.2f}"

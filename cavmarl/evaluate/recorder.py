@@ -1,0 +1,160 @@
+"""`Recorder`: follows the trips and episodes of worlds that are stepped together."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cavmarl.config import TERMS
+from cavmarl.evaluate.statistics import gini_coefficient, jain_index
+from cavmarl.evaluate.tables import EPISODE, TRIP, reward_column
+from cavmarl.kernels.terms import TTC_HORIZON_S
+
+__all__ = ["PET_HORIZON_S", "SHORT_TTC_S", "Recorder"]
+
+SHORT_TTC_S = 1.5  # below this a driver has no time left to react (Hayward 1972; SSAM)
+PET_HORIZON_S = 10.0  # who passes later than this after another has not met it
+MIN_DISTANCE_M = 1.0  # of a trip whose delay a kilometre is compared
+JERK_UNIT_MPS3 = 10.0  # of the term `comfort`
+
+_TERM = {name: k for k, name in enumerate(TERMS)}
+
+
+class Recorder:
+    """Follows W worlds with A agents through one episode each.
+
+    A trip counts if it began in the first half of its episode: so each had at least half an episode
+    to end, and which trips count does not depend on how they end.
+
+    Args:
+        num_worlds: W.
+        num_agents: A.
+        max_steps: steps of an episode.
+        step_s: seconds a step.
+        weights: (T,) of the terms in the reward.
+    """
+
+    def __init__(
+        self,
+        num_worlds: int,
+        num_agents: int,
+        max_steps: int,
+        step_s: float,
+        weights: NDArray[np.float64],
+    ) -> None:
+        shape = (num_worlds, num_agents)
+        self._half = max_steps / 2.0
+        self._step_s = step_s
+        self._weights = weights
+        self._sums = np.zeros((*shape, len(TERMS)))
+        self._rewards = np.zeros(shape)
+        self._worst_ttc = np.zeros(shape)
+        self._short_ttc = np.zeros(shape, dtype=np.int64)
+        self._steps = np.zeros(shape, dtype=np.int64)
+        self._began = np.zeros(shape, dtype=np.int64)
+        self._world_steps = np.zeros(num_worlds, dtype=np.int64)
+        self._background_arrivals = np.zeros(num_worlds, dtype=np.int64)
+        self._world_terms = np.zeros((num_worlds, len(TERMS)))
+        self._world_rewards = np.zeros(num_worlds)
+        self._trips: list[NDArray[np.void]] = []
+        self.least_pet_s = np.full(shape, np.inf)  # written by whoever watches the junctions
+        self.places_m = np.full((*shape, 2), np.nan)  # likewise: before the step
+
+    def add(
+        self,
+        step: int,
+        acted: NDArray[np.bool_],
+        rewards: NDArray[np.float32],
+        terms: NDArray[np.float32],
+        done: NDArray[np.bool_],
+        over: NDArray[np.bool_],
+        arrivals: NDArray[np.int64],
+    ) -> None:
+        """Take in one step.
+
+        Args:
+            step: its number in the episode, from 0.
+            acted: (W, A) whose trip this step belongs to; nobody's in worlds that are through.
+            rewards: (W, A).
+            terms: (W, A, T).
+            done: (W, A) whose trip ended in it.
+            over: (W,) whose episode ended in it, which cuts the trips still under way.
+            arrivals: (W,) vehicles that have arrived so far, agents included.
+        """
+        self._began[acted & (self._steps == 0)] = step
+        self._steps += acted
+        mine = np.where(acted[..., None], terms, 0.0)
+        paid = np.where(acted, rewards, 0.0)
+        self._sums += mine
+        self._rewards += paid
+        ttc = mine[..., _TERM["time_to_collision"]]
+        np.maximum(self._worst_ttc, ttc, out=self._worst_ttc)
+        self._short_ttc += ttc > 1.0 - SHORT_TTC_S / TTC_HORIZON_S
+        self._world_terms += mine.sum(axis=1)
+        self._world_rewards += paid.sum(axis=1)
+        self._world_steps[over] = step + 1
+        agents_arrived = self._world_terms[:, _TERM["arrival"]].astype(np.int64)
+        self._background_arrivals[over] = arrivals[over] - agents_arrived[over]
+        ended = (self._steps > 0) & (done | over[:, None])
+        if ended.any():
+            self._trips.append(self._close(ended))
+
+    def _close(self, ended: NDArray[np.bool_]) -> NDArray[np.void]:
+        """TRIP records of the trips that have ended, whose seats are free again."""
+        world, agent = np.nonzero(ended)
+        sums, steps = self._sums[ended], self._steps[ended]
+        began = self._began[ended]
+        pet = self.least_pet_s[ended]
+        rows = np.zeros(world.size, dtype=TRIP)
+        rows["episode"], rows["agent"] = world, agent
+        rows["began_s"] = began * self._step_s
+        rows["counted"] = began < self._half
+        rows["collision"] = sums[:, _TERM["collision"]] > 0.0
+        rows["off_road"] = (sums[:, _TERM["off_road"]] > 0.0) & ~rows["collision"]
+        out = rows["collision"] | rows["off_road"]
+        rows["success"] = (sums[:, _TERM["arrival"]] > 0.0) & ~out
+        rows["unfinished"] = ~(rows["success"] | out)
+        rows["red_light"] = sums[:, _TERM["red_light"]] > 0.0
+        rows["wrong_way"] = sums[:, _TERM["wrong_way"]] > 0.0
+        rows["reward"] = self._rewards[ended]
+        rows["duration_s"] = steps * self._step_s
+        rows["distance_m"] = sums[:, _TERM["progress"]]
+        rows["mean_speed_mps"] = rows["distance_m"] / rows["duration_s"]
+        rows["delay_s"] = sums[:, _TERM["delay"]]
+        rows["mean_jerk_mps3"] = JERK_UNIT_MPS3 * sums[:, _TERM["comfort"]] / steps
+        rows["mean_speeding"] = sums[:, _TERM["speed"]] / steps
+        rows["least_ttc_s"] = TTC_HORIZON_S * (1.0 - self._worst_ttc[ended])
+        rows["short_ttc_share"] = self._short_ttc[ended] / steps
+        rows["least_pet_s"] = np.where(pet <= PET_HORIZON_S, pet, np.nan)
+        rows["end_x_m"], rows["end_y_m"] = self.places_m[ended].T
+        for room in (self._sums, self._rewards, self._worst_ttc, self._short_ttc, self._steps):
+            room[ended] = 0
+        self.least_pet_s[ended] = np.inf
+        return rows
+
+    def trips(self) -> NDArray[np.void]:
+        """TRIP (N,) of all trips that have ended, by episode, agent and time."""
+        rows = np.concatenate([np.zeros(0, dtype=TRIP), *self._trips])
+        return rows[np.lexsort((rows["began_s"], rows["agent"], rows["episode"]))]
+
+    def episodes(self) -> NDArray[np.void]:
+        """EPISODE (W,) of all worlds; those that have not ended have a duration of 0."""
+        rows = np.zeros(self._world_steps.size, dtype=EPISODE)
+        num_agents = self._steps.shape[1]
+        trips = self.trips()
+        bounds = np.searchsorted(trips["episode"], np.arange(rows.size + 1))
+        hours = np.maximum(self._world_steps, 1) * self._step_s / 3600.0
+        rows["episode"] = np.arange(rows.size)
+        rows["duration_s"] = self._world_steps * self._step_s
+        rows["trips"] = np.diff(bounds)
+        rows["episode_return"] = self._world_rewards / num_agents
+        rows["agent_arrivals_per_h"] = self._world_terms[:, _TERM["arrival"]] / hours
+        rows["background_arrivals_per_h"] = self._background_arrivals / hours
+        for k, term in enumerate(TERMS):
+            rows[reward_column(term)] = self._weights[k] * self._world_terms[:, k] / num_agents
+        for row, begin, end in zip(rows, bounds[:-1], bounds[1:], strict=True):
+            counted = trips[begin:end][trips["counted"][begin:end]]
+            row["jain_speed"] = jain_index(np.maximum(counted["mean_speed_mps"], 0.0))
+            way = counted[counted["distance_m"] >= MIN_DISTANCE_M]
+            row["gini_delay"] = gini_coefficient(way["delay_s"] / way["distance_m"])
+        return rows

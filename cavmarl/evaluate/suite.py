@@ -1,0 +1,152 @@
+"""A suite: the same policies on several maps with several numbers of agents."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from cavmarl.config_io import read_yaml, validate
+from cavmarl.errors import ConfigError
+from cavmarl.evaluate.evaluation import evaluate
+from cavmarl.evaluate.report import EvaluationReport
+from cavmarl.registry import entries, places
+
+__all__ = ["Suite", "World", "find_suite", "load_suite", "run_suite", "worlds_of"]
+
+
+@dataclass(frozen=True)
+class Suite:
+    """What a suite drives: every map with every number of agents.
+
+    Attributes:
+        maps: names of environments, or map files below the folder of maps.
+        agents: numbers of agents.
+        background: background vehicles of every world.
+        horizon_s: of every episode.
+    """
+
+    maps: tuple[str, ...]
+    agents: tuple[int, ...]
+    background: int = 100
+    horizon_s: float = 300.0
+
+    def __post_init__(self) -> None:
+        for name in ("maps", "agents"):
+            values = getattr(self, name)
+            if not values or len(set(values)) < len(values):
+                raise ConfigError(f"{name} = {values!r}: must be at least one, and each once")
+
+
+@dataclass(frozen=True)
+class World:
+    """One world of a suite.
+
+    Attributes:
+        label: its name in results, and its folder.
+        env: as in `make_vec`.
+        agents: how many.
+    """
+
+    label: str
+    env: str
+    agents: int
+
+
+def find_suite(suite: str) -> Path:
+    """The file that `suite` means: a path, or a name in `configs/suites/`.
+
+    Raises:
+        ConfigError: there is none.
+    """
+    if Path(suite).is_file():
+        return Path(suite)
+    for place in places("configs"):
+        path = place / "suites" / f"{suite}.yaml"
+        if path.is_file():
+            return path
+    raise ConfigError(f"no suite or file '{suite}': give 'standard' or the path of a .yaml")
+
+
+def load_suite(path: Path) -> Suite:
+    """Read a suite.
+
+    Raises:
+        ConfigError: not YAML, an unknown key, or a value that cannot work.
+    """
+    return validate(Suite, read_yaml(path), str(path))
+
+
+def worlds_of(suite: Suite, maps: Path) -> list[World]:
+    """Every map with every number of agents.
+
+    Raises:
+        ConfigError: a map is neither an environment nor a file below `maps`, or two have one name.
+    """
+    found = {Path(name).name.split(".")[0]: env for name, env in _found(suite, maps)}
+    if len(found) < len(suite.maps):
+        raise ConfigError(f"maps = {suite.maps!r}: two have one name; rename a file")
+    return [
+        World(f"{name}-{agents}", env, agents)
+        for name, env in found.items()
+        for agents in suite.agents
+    ]
+
+
+def _found(suite: Suite, maps: Path) -> Iterator[tuple[str, str]]:
+    known = entries()
+    for name in suite.maps:
+        if name in known:
+            yield name, name
+        elif (maps / name).is_file():
+            yield name, str(maps / name)
+        else:
+            raise ConfigError(
+                f"maps: '{name}' is no environment and no file in {maps}: give the folder of the "
+                "maps with --maps, or a suite of your own"
+            )
+
+
+def run_suite(
+    suite: Suite,
+    worlds: Sequence[World],
+    policies: Sequence[str],
+    out: Path,
+    *,
+    episodes: int,
+    repeats: int,
+    seed: int,
+    began: Callable[[World], None],
+) -> dict[str, EvaluationReport]:
+    """Evaluate the policies in every world, each into its own folder of `out`.
+
+    Agents enter as long as the episode lasts (seats), so that their number holds.
+
+    Args:
+        suite: what holds for all worlds.
+        worlds: from `worlds_of`.
+        policies: as in `evaluate`, like episodes, repeats and seed.
+        out: folder of the folders.
+        episodes: of each run.
+        repeats: independent runs.
+        seed: of the first run.
+        began: called before each world.
+
+    Raises:
+        CavmarlError: as `evaluate`.
+    """
+    reports = {}
+    for world in worlds:
+        began(world)
+        reports[world.label] = evaluate(
+            world.env,
+            policies,
+            episodes=episodes,
+            repeats=repeats,
+            seed=seed,
+            out=out / world.label,
+            agents=world.agents,
+            background=suite.background,
+            overrides={"population.mode": "seats", "horizon_s": suite.horizon_s},
+        )
+    return reports

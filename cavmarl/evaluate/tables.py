@@ -1,0 +1,111 @@
+"""The raw values of an evaluation as records, and their CSV files."""
+
+from __future__ import annotations
+
+import csv
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cavmarl.config import TERMS
+
+__all__ = ["EPISODE", "TRACK", "TRIP", "read_table", "reward_column", "write_table"]
+
+Rows = NDArray[np.void]
+
+
+def reward_column(term: str) -> str:
+    """The column of EPISODE with a term's part of the return."""
+    return f"reward_{term}"
+
+
+TRIP = np.dtype(
+    [
+        ("run", np.int64),
+        ("episode", np.int64),
+        ("agent", np.int64),  # index of the agent that drove it
+        ("began_s", np.float64),  # time of the episode at its first decision
+        ("counted", np.bool_),  # began in the first half of its episode
+        ("success", np.bool_),  # how it ended: one of these four
+        ("collision", np.bool_),
+        ("off_road", np.bool_),
+        ("unfinished", np.bool_),  # the horizon cut it
+        ("red_light", np.bool_),  # whether it ever passed one
+        ("wrong_way", np.bool_),  # whether it ever drove against its lane
+        ("reward", np.float64),  # sum over the trip
+        ("duration_s", np.float64),  # from its first decision to its end
+        ("distance_m", np.float64),  # way made towards the goal
+        ("mean_speed_mps", np.float64),  # of these two
+        ("delay_s", np.float64),  # time lost against driving at the limit
+        ("mean_jerk_mps3", np.float64),  # mean |jerk|
+        ("mean_speeding", np.float64),  # mean speed above the limit, as a share of it
+        ("least_ttc_s", np.float64),  # least time to collision; TTC_HORIZON_S: that and above
+        ("short_ttc_share", np.float64),  # share of the trip with less than SHORT_TTC_S
+        ("least_pet_s", np.float64),  # least post-encroachment time; NaN: none up to PET_HORIZON_S
+        ("end_x_m", np.float64),  # its last place but one step
+        ("end_y_m", np.float64),
+    ]
+)
+
+EPISODE = np.dtype(
+    [
+        ("run", np.int64),
+        ("episode", np.int64),
+        ("duration_s", np.float64),
+        ("trips", np.int64),  # that ended or were cut in it
+        ("episode_return", np.float64),  # sum of rewards of an agent id, mean over the ids
+        ("agent_arrivals_per_h", np.float64),  # of simulated time
+        ("background_arrivals_per_h", np.float64),
+        ("jain_speed", np.float64),  # of the mean speeds of its trips that count
+        ("gini_delay", np.float64),  # of their delays a kilometre
+        *((reward_column(term), np.float64) for term in TERMS),  # that part of the return
+    ]
+)
+
+TRACK = np.dtype(
+    [("agent", np.int64), ("time_s", np.float64), ("x_m", np.float64), ("y_m", np.float64)]
+)
+
+
+def write_table(path: Path, tables: dict[str, Rows], dtype: np.dtype[np.void]) -> None:
+    """Write the records of several policies into one CSV file, the policy in the first column."""
+    with path.open("w", newline="", encoding="utf-8") as file:
+        writer = csv.writer(file)
+        writer.writerow(["policy", *_names(dtype)])
+        for policy, rows in tables.items():
+            columns = [_texts(rows[name]) for name in _names(dtype)]
+            writer.writerows([policy, *row] for row in zip(*columns, strict=True))
+
+
+def read_table(path: Path, dtype: np.dtype[np.void]) -> dict[str, Rows]:
+    """What `write_table` wrote, policies in the order of their first rows."""
+    with path.open(newline="", encoding="utf-8") as file:
+        reader = csv.reader(file)
+        next(reader)
+        by_policy: dict[str, list[list[str]]] = {}
+        for policy, *texts in reader:
+            by_policy.setdefault(policy, []).append(texts)
+    return {policy: _records(texts, dtype) for policy, texts in by_policy.items()}
+
+
+def _names(dtype: np.dtype[np.void]) -> tuple[str, ...]:
+    return dtype.names or ()
+
+
+def _texts(column: NDArray[np.generic]) -> list[str]:
+    """Shortest texts that give the same numbers again; NaN is an empty cell."""
+    if column.dtype == np.bool_:
+        return ["1" if value else "0" for value in column.tolist()]
+    return ["" if value != value else repr(value) for value in column.tolist()]
+
+
+def _records(lines: Sequence[Sequence[str]], dtype: np.dtype[np.void]) -> Rows:
+    rows = np.zeros(len(lines), dtype=dtype)
+    for name, texts in zip(_names(dtype), zip(*lines, strict=True), strict=True):
+        if dtype[name] == np.float64:
+            rows[name] = [float(text) if text else np.nan for text in texts]
+        else:
+            rows[name] = [int(text) for text in texts]
+    return rows

@@ -1,0 +1,110 @@
+"""Who approaches which link: every vehicle announces itself to the link it is on and to the next.
+
+The lists lie together in memory and carry what the right of way asks of a foe.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cavmarl.kernels import inlined_kernel, kernel
+from cavmarl.kernels.arrays import RoadArrays, Scratch, Travel
+from cavmarl.kernels.ways import next_step
+
+__all__ = ["APPROACH", "APPROACH_M", "register_links"]
+
+APPROACH_M = 150.0  # how far ahead a vehicle announces itself at most,
+APPROACH_S = 8.0  # which it does this time before it arrives,
+APPROACH_STANDING_M = 30.0  # and this far ahead in any case
+MAX_LINKS_AHEAD = 2
+
+APPROACH = np.dtype(
+    [
+        ("link", np.int32),
+        ("row", np.int32),  # VEHICLE row
+        ("dist", np.float64),  # of its centre to the stop line, m; negative beyond it
+        ("speed", np.float64),  # m/s
+        ("half", np.float64),  # half its length, m
+        ("id", np.int64),
+    ],
+    align=True,
+)
+
+
+@kernel
+def register_links(
+    roads: RoadArrays, travel: Travel, rows: NDArray[np.void], num: int, scratch: Scratch
+) -> None:
+    """List for every link the vehicles that are on it or will reach it, into `scratch.approach`.
+
+    Only links with conflicts list those that approach.
+
+    Args:
+        roads: the road arrays.
+        travel: the ways.
+        rows: VEHICLE (C,), of which `num` live.
+        num: live rows.
+        scratch: link_start and approach are written.
+    """
+    pairs = 0
+    for i in range(num):
+        pairs = _announce(roads, travel, rows[i], i, pairs, scratch)
+    start = scratch.link_start
+    num_links = roads.links.shape[0]
+    start[: num_links + 2] = 0
+    for k in range(pairs):
+        start[scratch.pairs[k]["link"] + 2] += 1
+    for link in range(num_links):
+        start[link + 2] += start[link + 1]
+    for k in range(pairs):
+        link = scratch.pairs[k]["link"]
+        place = start[link + 1]
+        scratch.approach[place] = scratch.pairs[k]
+        start[link + 1] = place + 1
+
+
+@inlined_kernel
+def _note(scratch: Scratch, pairs: int, link: int, row: np.void, i: int, dist: float) -> int:
+    pair = scratch.pairs[pairs]
+    pair["link"] = link
+    pair["row"] = i
+    pair["dist"] = dist
+    pair["speed"] = row["speed"]
+    pair["half"] = 0.5 * row["length"]
+    pair["id"] = row["id"]
+    return pairs + 1
+
+
+@inlined_kernel
+def _announce(
+    roads: RoadArrays, travel: Travel, row: np.void, i: int, pairs: int, scratch: Scratch
+) -> int:
+    """Append row i's entries; returns the new number of pairs."""
+    lane = row["lane"]
+    here = roads.lanes[lane]
+    s = row["s"]
+    if here["internal"]:
+        pairs = _note(scratch, pairs, here["link"], row, i, -(here["link_offset_m"] + s))
+    elif row["link"] >= 0:
+        # Its centre has left the junction, its rear has not, or not the fork before it.
+        left = roads.links[row["link"]]
+        rear = s - 0.5 * row["length"]
+        if left["to_lane"] == lane and (rear < 0.0 or left["length_m"] + rear < left["fork_m"]):
+            pairs = _note(scratch, pairs, row["link"], row, i, -(left["length_m"] + s))
+    reach = min(APPROACH_STANDING_M + APPROACH_S * row["speed"], APPROACH_M)
+    distance = here["length_m"] - s
+    way = row["way"]
+    found = 0
+    while distance < reach:
+        lane, way, link = next_step(roads, travel, lane, way)
+        if lane < 0:
+            break
+        if link >= 0:
+            if roads.links[link]["num_conflicts"] > 0:
+                pairs = _note(scratch, pairs, link, row, i, max(distance, 0.0))
+            found += 1
+            if found == MAX_LINKS_AHEAD:
+                break
+        distance += roads.lanes[lane]["length_m"]
+    return pairs

@@ -1,0 +1,131 @@
+"""Settings, room and tables of the sensors that environments switch on for those who ask.
+
+Each one's kernel says what the fields mean; `at` is where the sensor writes in a frame.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+__all__ = [
+    "FurtherSensors",
+    "KinematicsSensor",
+    "LidarCells",
+    "OccupancyGrid",
+    "PufferDrive",
+    "RoadPoints",
+    "RoadSegments",
+    "RoadgraphSensor",
+]
+
+
+class KinematicsSensor(NamedTuple):
+    """highway-env's `Kinematics`: see `kernels.kinematics_observation`."""
+
+    at: int
+    vehicles: int  # rows, the own one included; 0: off
+    features: NDArray[np.int64]  # (F,) FEATURE_* codes, the columns
+    ranges: NDArray[np.float64]  # (NUM_VEHICLE_FEATURES, 2) what becomes [-1, 1]; nan: left as is
+    absolute: bool
+    shuffled: bool
+    clip: bool
+    see_behind: bool
+    observe_intentions: bool
+    destinations: NDArray[np.float64]  # (G, 2) where each goal is, m
+    near_body: NDArray[np.int64]  # (vehicles,) room
+    near_key: NDArray[np.float64]
+    values: NDArray[np.float64]  # (NUM_VEHICLE_FEATURES,) room
+
+
+class OccupancyGrid(NamedTuple):
+    """highway-env's `OccupancyGrid`: see `kernels.occupancy`."""
+
+    at: int
+    features: NDArray[np.int64]  # (F,) FEATURE_* codes, the layers; none: off
+    ranges: NDArray[np.float64]  # (NUM_VEHICLE_FEATURES, 2) what becomes [-1, 1]; nan: left as is
+    min_x: float
+    min_y: float
+    step_x: float
+    step_y: float
+    num_x: int
+    num_y: int
+    radius_m: float  # of a circle around the vehicle that holds the grid
+    aligned: bool
+    clip: bool
+    as_image: bool
+    destinations: NDArray[np.float64]  # (G, 2) where each goal is, m
+    cell_body: NDArray[np.int64]  # (num_x * num_y,) room
+    lane_seen: NDArray[np.int64]  # (L + 1,) room: when each lane was drawn last, and the time
+    values: NDArray[np.float64]  # (NUM_VEHICLE_FEATURES,) room
+
+
+class LidarCells(NamedTuple):
+    """highway-env's `LidarObservation`: see `kernels.lidar_cells`."""
+
+    at: int
+    cells: int  # 0: off
+    range_m: float
+    scale: float  # what distances and speeds are divided by
+    directions: NDArray[np.float64]  # (cells, 2) cosine and sine of the middle of each cell
+    echoes: NDArray[np.void]  # ECHO (cells,) room
+
+
+class RoadPoints(NamedTuple):
+    """Points of a road map in square cells; see `kernels.roadgraph`."""
+
+    min_x: float  # m, corner of cell (0, 0)
+    min_y: float
+    cell_m: float
+    num_x: int
+    num_y: int
+    start: NDArray[np.int32]  # (num_x * num_y + 1,) points of cell c: [start[c], start[c + 1])
+    points: NDArray[np.void]  # ROAD_POINT (N,)
+
+
+class RoadgraphSensor(NamedTuple):
+    """The nearest points of the road network: see `kernels.roadgraph`."""
+
+    at: int
+    num_points: int  # 0: off
+    range_m: float
+    road_map: RoadPoints
+    near_point: NDArray[np.int64]  # (N,) room
+    near_squared: NDArray[np.float64]
+    sorted_point: NDArray[np.int64]  # (N,) room; the answer
+    sorted_squared: NDArray[np.float64]
+    ring_start: NDArray[np.int64]  # (NUM_RINGS + 1,) room
+
+
+class RoadSegments(NamedTuple):
+    """Road segments, and those seen from each cell of 5 m; see `kernels.puffer_drive`."""
+
+    min_x: float  # m, the map's corner
+    min_y: float
+    num_x: int
+    num_y: int
+    list_start: NDArray[np.int64]  # (num_x * num_y + 1,) of cell c: lists[start[c] : start[c + 1]]
+    lists: NDArray[np.uint32]  # rows of `segments`
+    segments: NDArray[np.void]  # ROAD_SEGMENT (N,)
+
+
+class PufferDrive(NamedTuple):
+    """pufferlib's `drive` observation: see `kernels.puffer_drive`."""
+
+    on: bool
+    at: int
+    destinations: NDArray[np.float64]  # (G, 2) where each goal is, m
+    roads: RoadSegments
+    near_body: NDArray[np.int64]  # (partners,) room
+
+
+class FurtherSensors(NamedTuple):
+    """All of them; apart from `arrays.Sensors`, so that `sense` need not unpack what is off."""
+
+    kinematics: KinematicsSensor
+    occupancy: OccupancyGrid
+    lidar_cells: LidarCells
+    roadgraph: RoadgraphSensor
+    puffer_drive: PufferDrive

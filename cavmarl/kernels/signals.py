@@ -1,0 +1,191 @@
+"""Signals: which phase is on, of fixed-time programs and of actuated ones.
+
+A fixed-time program is a function of the tick. An actuated one is SUMO's gap-based control: a green
+phase that may be prolonged is, while vehicles follow one another over its detectors, until its
+longest duration. Its times are whole milliseconds, as SUMO's, and its state is in the world: the
+phase, when it began, when to look next, and when each detector was last under a body.
+
+Source: SUMO's documentation, Simulation/Traffic Lights ("actuated"), and what libsumo 1.28 does.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cavmarl.kernels import kernel
+from cavmarl.kernels.arrays import RoadArrays, Worlds
+
+__all__ = ["DETECTOR_REACH_M", "program_at", "switch_signals"]
+
+# From a detector to the centre of any vehicle that is over it or has left it in this tick.
+DETECTOR_REACH_M = 30.0
+
+SECOND_MS = 1000  # SUMO prolongs phases to whole seconds, and looks no sooner after a switch
+
+
+@kernel
+def switch_signals(roads: RoadArrays, worlds: Worlds, dt: float) -> None:
+    """Bring every signal to the worlds' ticks; once more at the same tick changes nothing.
+
+    Args:
+        roads: the road arrays.
+        worlds: signal_phase, controllers and detected_s are written; the rows are the committed
+            ones of the tick.
+        dt: seconds of the tick.
+    """
+    for w in range(worlds.ticks.shape[0]):
+        time = worlds.ticks[w] * dt
+        if worlds.controllers.shape[1] > 0:
+            if worlds.ticks[w] == 0:
+                _start(roads, worlds, w, dt)
+            _detect(roads, worlds.rows[w], worlds.num_owned[w], time, dt, worlds.detected_s[w])
+            _control(roads, worlds, w, dt)
+        for k in range(roads.signals.shape[0]):
+            program = program_at(roads, k, time, dt)
+            controller = roads.programs[program]["controller"]
+            if controller >= 0:
+                worlds.signal_phase[w, k] = worlds.controllers[w, controller]["phase"]
+            else:
+                worlds.signal_phase[w, k] = _fixed_phase(roads, program, time, dt)
+
+
+@kernel
+def program_at(roads: RoadArrays, k: int, time: float, dt: float) -> int:
+    """The program of a signal that is on at `time`."""
+    signal = roads.signals[k]
+    program = signal["program"]
+    for row in range(signal["first_switch"], signal["first_switch"] + signal["num_switches"]):
+        if roads.switches[row]["at_s"] > time + 0.5 * dt:
+            break
+        program = roads.switches[row]["program"]
+    return int(program)
+
+
+@kernel
+def _fixed_phase(roads: RoadArrays, program: int, time: float, dt: float) -> int:
+    """The PHASE row of a fixed-time program at `time`."""
+    row = roads.programs[program]
+    left = (time - row["offset_s"]) % row["cycle_s"]
+    phase = row["first_phase"]
+    last = phase + row["num_phases"] - 1
+    # Half a tick of slack: sums of ticks are not exact.
+    while phase < last and left + 0.5 * dt >= roads.phases[phase]["duration_s"]:
+        left -= roads.phases[phase]["duration_s"]
+        phase += 1
+    return int(phase)
+
+
+@kernel
+def _start(roads: RoadArrays, worlds: Worlds, w: int, dt: float) -> None:
+    """Begin every actuated program with the phase that its offset names, afresh."""
+    for program in range(roads.programs.shape[0]):
+        controller = roads.programs[program]["controller"]
+        if controller >= 0:
+            state = worlds.controllers[w, controller]
+            state["phase"] = _fixed_phase(roads, program, 0.0, dt)
+            state["since_ms"] = 0
+            state["next_ms"] = roads.phases[state["phase"]]["min_ms"]
+    # As in SUMO, time since the beginning counts as time since a vehicle.
+    worlds.detected_s[w] = 0.0
+
+
+@kernel
+def _detect(
+    roads: RoadArrays,
+    rows: NDArray[np.void],
+    num: int,
+    time: float,
+    dt: float,
+    detected_s: NDArray[np.float64],
+) -> None:
+    """Note when bodies were over the detectors: now, or when their rear left in this tick.
+
+    The latest counts, so that neither the order of rows nor who owns them matters.
+    """
+    for i in range(num):
+        row = rows[i]
+        place = roads.lane_place[row["lane"]]
+        while place >= 0:
+            at = roads.places[place]
+            ahead = row["s"] - at["s_m"]
+            if abs(ahead) < DETECTOR_REACH_M:
+                _note(row, ahead, time, dt, at["detector"], detected_s)
+            place = at["next"]
+
+
+@kernel
+def _note(
+    row: np.void,
+    ahead: float,
+    time: float,
+    dt: float,
+    detector: int,
+    detected_s: NDArray[np.float64],
+) -> None:
+    """Note when a body was over a detector that its centre is `ahead` m of."""
+    rear = ahead - 0.5 * row["length"]
+    if ahead + 0.5 * row["length"] >= 0.0 and rear <= row["speed"] * dt:
+        # The tick was driven at the speed at its end (semi-implicit Euler).
+        since = rear / row["speed"] if rear > 0.0 else 0.0
+        detected_s[detector] = max(detected_s[detector], time - since)
+
+
+@kernel
+def _control(roads: RoadArrays, worlds: Worlds, w: int, dt: float) -> None:
+    """Let every actuated program of a world look, as often as is due before the next tick."""
+    now_ms = _milliseconds(worlds.ticks[w] * dt)
+    end_ms = _milliseconds((worlds.ticks[w] + 1) * dt)
+    for program in range(roads.programs.shape[0]):
+        controller = roads.programs[program]["controller"]
+        if controller >= 0:
+            state = worlds.controllers[w, controller]
+            gap_s = roads.programs[program]["detector_gap_s"]
+            while state["next_ms"] < end_ms:
+                state["next_ms"] += _look(roads, state, worlds.detected_s[w], gap_s, now_ms)
+
+
+@kernel
+def _look(
+    roads: RoadArrays,
+    state: np.void,
+    detected_s: NDArray[np.float64],
+    detector_gap_s: float,
+    now_ms: int,
+) -> int:
+    """Prolong the phase or go on to the next; ms until to look again."""
+    phase = roads.phases[state["phase"]]
+    lasted = now_ms - state["since_ms"]
+    gap = math.inf
+    if phase["green"] and lasted < phase["max_ms"]:
+        gap = _gap(roads, phase, detected_s, now_ms)
+    if gap < math.inf:
+        # Until the last vehicle has come from its detector to the stop line.
+        more = max(phase["min_ms"] - lasted, _milliseconds(detector_gap_s - gap), 1)
+        if more % SECOND_MS != 0:
+            more = ((more + lasted) // SECOND_MS + 1) * SECOND_MS - lasted
+        return int(min(more, phase["max_ms"] - lasted))
+    if phase["following"] != state["phase"]:
+        state["phase"] = phase["following"]
+        state["since_ms"] = now_ms
+        lasted = 0
+    return int(max(SECOND_MS, roads.phases[state["phase"]]["min_ms"] - lasted))
+
+
+@kernel
+def _gap(roads: RoadArrays, phase: np.void, detected_s: NDArray[np.float64], now_ms: int) -> float:
+    """Seconds since a vehicle was on the phase's detectors; inf if longer than each one's gap."""
+    gap = math.inf
+    for k in range(phase["first_detector"], phase["first_detector"] + phase["num_detectors"]):
+        detector = roads.phase_detectors[k]
+        since = now_ms / SECOND_MS - detected_s[detector]
+        if since < roads.detectors[detector]["max_gap_s"]:
+            gap = min(gap, since)
+    return gap
+
+
+@kernel
+def _milliseconds(seconds: float) -> int:
+    return math.floor(seconds * 1e3 + 0.5)

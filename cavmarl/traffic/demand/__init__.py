@@ -1,0 +1,18 @@
+"""Demand from SUMO's files: who wants to drive when, from where, to where, in what."""
+
+from __future__ import annotations
+
+from cavmarl.traffic.demand.demand_file import DemandFile, read_demand
+from cavmarl.traffic.demand.records import ELEMENT, ORDER, ROUTE, STOP, Choices
+from cavmarl.traffic.demand.report import DemandReport
+
+__all__ = [
+    "ELEMENT",
+    "ORDER",
+    "ROUTE",
+    "STOP",
+    "Choices",
+    "DemandFile",
+    "DemandReport",
+    "read_demand",
+]

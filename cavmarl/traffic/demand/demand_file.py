@@ -1,0 +1,258 @@
+"""`DemandFile`: the demand of SUMO's files on one map, immutable, from which episodes are drawn."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cavmarl.errors import DemandError
+from cavmarl.roads.network import RoadNetwork
+from cavmarl.traffic.demand.collector import Collector
+from cavmarl.traffic.demand.drawing import (
+    DRAW_REROUTE,
+    DRAW_ROUTE,
+    DRAW_TYPE,
+    chances,
+    departures_ms,
+)
+from cavmarl.traffic.demand.element import MAX_TIME_MS
+from cavmarl.traffic.demand.map_index import MapIndex
+from cavmarl.traffic.demand.records import ORDER, POS_GIVEN, Choices
+from cavmarl.traffic.demand.report import DemandReport
+from cavmarl.traffic.demand.resolver import Resolver
+from cavmarl.traffic.demand.sumo_config import read_sumo_config
+from cavmarl.traffic.demand.xml_files import read_elements
+
+__all__ = ["MAX_DEPARTURES", "DemandFile", "read_demand"]
+
+MAX_DEPARTURES = 2_000_000
+
+_COPIED = (
+    "depart_pos_code",
+    "depart_speed_code",
+    "depart_speed",
+    "arrival_pos_code",
+    "arrival_speed_code",
+    "arrival_speed",
+    "speed_factor",
+)
+
+
+@dataclass(frozen=True, eq=False)
+class DemandFile:
+    """Who wants to drive on a map; see `records` for the dtypes.
+
+    Attributes:
+        network: the roads that all rows point into.
+        types: VTYPE (num_types,).
+        type_ids: their names.
+        routes: ROUTE (num_routes,), equal routes once.
+        route_edges: EDGE rows that ROUTE points into.
+        route_ids: their names, "" for those inside vehicles.
+        stops: STOP (num_stops,) that ROUTE and ELEMENT point into.
+        elements: ELEMENT (num_elements,), in the order of the files.
+        element_ids: ids of vehicles, trips and flows.
+        type_choices: lists of VTYPE rows with probabilities.
+        route_choices: lists of ROUTE rows with probabilities.
+        bad_pairs: sorted keys type * num_routes + route of vehicles that cannot drive their route;
+            empty unless such were to be skipped.
+        lane_table: (num_edges, n) LANE row by SUMO's index on the edge, -1 where there is none.
+        begin_ms: start of the simulation that the files are meant for.
+        end_ms: its end; `MAX_TIME_MS` if they name none.
+        step_ms: its step.
+        report: what was read and what was tolerated.
+    """
+
+    network: RoadNetwork
+    types: NDArray[np.void]
+    type_ids: tuple[str, ...]
+    routes: NDArray[np.void]
+    route_edges: NDArray[np.int32]
+    route_ids: tuple[str, ...]
+    stops: NDArray[np.void]
+    elements: NDArray[np.void]
+    element_ids: tuple[str, ...]
+    type_choices: Choices
+    route_choices: Choices
+    bad_pairs: NDArray[np.int64]
+    lane_table: NDArray[np.int32]
+    begin_ms: int
+    end_ms: int
+    step_ms: int
+    report: DemandReport
+
+    def __post_init__(self) -> None:
+        for field in fields(self):
+            value = getattr(self, field.name)
+            if isinstance(value, np.ndarray):
+                value.setflags(write=False)
+
+    @property
+    def content_hash(self) -> str:
+        """SHA-256 of all that episodes are drawn from, hex."""
+        digest = hashlib.sha256()
+        for field in fields(self):
+            value = getattr(self, field.name)
+            if isinstance(value, Choices):
+                for part in (value.start, value.rows, value.upper):
+                    digest.update(part.tobytes())
+            elif isinstance(value, np.ndarray):
+                digest.update(value.tobytes())
+            elif isinstance(value, tuple):
+                digest.update("\0".join(value).encode())
+            elif isinstance(value, int):
+                digest.update(f"{field.name}={value}".encode())
+        return digest.hexdigest()
+
+    def draw(self, key: int, until_s: float | None = None) -> NDArray[np.void]:
+        """The orders of one episode: a pure function of the key.
+
+        Args:
+            key: of the world and episode, see `kernels.rng.world_key`.
+            until_s: no vehicle departs at or after this time; the end of the files' simulation if
+                None.
+
+        Returns:
+            ORDER (n,), sorted by departure, at one time in the order of the files.
+        """
+        end_ms = self.end_ms if until_s is None else min(self.end_ms, round(until_s * 1000.0))
+        rows, numbers, times = departures_ms(self.elements, key, self.begin_ms, end_ms)
+        order = np.lexsort((numbers, rows, times))
+        rows, numbers, times = rows[order], numbers[order], times[order]
+        types = self._pick(self.type_choices, "types", rows, numbers, key, DRAW_TYPE)
+        routes = self._pick(self.route_choices, "routes", rows, numbers, key, DRAW_ROUTE)
+        driven = ~np.isin(types.astype(np.int64) * len(self.routes) + routes, self.bad_pairs)
+        rows, numbers, times = rows[driven], numbers[driven], times[driven]
+        types, routes, element = types[driven], routes[driven], self.elements[rows]
+        orders = np.zeros(len(rows), dtype=ORDER)
+        orders["depart"] = times / 1000.0
+        orders["element"], orders["number"] = rows, numbers
+        orders["vtype"], orders["route"] = types, routes
+        own = element["first_stop"] >= 0
+        for name in ("first_stop", "num_stops"):
+            orders[name] = np.where(own, element[name], self.routes[name][routes])
+        chance = np.maximum(element["reroute"], self.types["reroute"][types])
+        orders["reroute"] = chances(key, rows, numbers, DRAW_REROUTE) < chance
+        for name in _COPIED:
+            orders[name] = element[name]
+        self._place(orders, element)
+        return orders
+
+    def _pick(
+        self,
+        choices: Choices,
+        field: str,
+        rows: NDArray[np.int64],
+        numbers: NDArray[np.int64],
+        key: int,
+        stream: int,
+    ) -> NDArray[np.int32]:
+        """What each vehicle (n,) gets of what its element has to choose from."""
+        return choices.pick(self.elements[field][rows], chances(key, rows, numbers, stream))
+
+    def vehicle_id(self, order: np.void) -> str:
+        """SUMO's name of the vehicle of one ORDER ()."""
+        row = int(order["element"])
+        name = self.element_ids[row]
+        return f"{name}.{order['number']}" if self.elements[row]["flow"] else name
+
+    def place(self, row: int) -> str:
+        """File and line of an ELEMENT row."""
+        element = self.elements[row]
+        return f"{self.report.files[int(element['file'])]}, line {element['line']}"
+
+    def to_report(self) -> str:
+        """Lines for a terminal: what was read and what was tolerated."""
+        return self.report.to_report()
+
+    def _place(self, orders: NDArray[np.void], element: NDArray[np.void]) -> None:
+        """Lanes as LANE rows, positions from the start of the edge and on it."""
+        route = self.routes[orders["route"]]
+        ends = {
+            "depart": self.route_edges[route["first_edge"]],
+            "arrival": self.route_edges[route["first_edge"] + route["num_edges"] - 1],
+        }
+        for end, edges in ends.items():
+            lane = element[f"{end}_lane"]
+            rows = self.lane_table[edges, np.clip(lane, 0, self.lane_table.shape[1] - 1)]
+            orders[f"{end}_lane"] = np.where(lane < 0, lane, rows)
+            length = self.network.edges["length_m"][edges]
+            place = element[f"{end}_pos"]
+            place = np.clip(np.where(place < 0.0, place + length, place), 0.0, length)
+            orders[f"{end}_pos"] = np.where(element[f"{end}_pos_code"] == POS_GIVEN, place, 0.0)
+
+
+def read_demand(
+    paths: Sequence[Path],
+    network: RoadNetwork,
+    *,
+    on_bad_route: Literal["error", "skip"] = "error",
+    max_departures: int = MAX_DEPARTURES,
+) -> DemandFile:
+    """Read SUMO's files of vehicles, routes, types and stopping places.
+
+    Args:
+        paths: `.rou.xml` and `.add.xml` files, plain or gzipped, in any order; a `.sumocfg` stands
+            for the files and the times that it names.
+        network: the map.
+        on_bad_route: what to do with vehicles whose class cannot drive their route, and with stops
+            off the route: refuse the file, or leave them out and count them in the report.
+        max_departures: the most vehicles that the files may make.
+
+    Raises:
+        DemandError: files are missing or broken, contradict themselves, or are another map's.
+        RouteError: a route does not connect for a class that drives it.
+        CapacityError: the files make more than `max_departures`.
+    """
+    if on_bad_route not in ("error", "skip"):
+        raise DemandError(f"on_bad_route='{on_bad_route}': choose 'error' or 'skip'")
+    report = DemandReport()
+    files, begin_ms, end_ms, step_ms = _files(paths)
+    collector = Collector(report, begin_ms, end_ms, max_departures)
+    for path in files:
+        read_elements(path, report, collector.take)
+    index = MapIndex(network)
+    resolver = Resolver(collector, index, skip=on_bad_route == "skip")
+    elements = resolver.elements()
+    routes, route_edges, stops = resolver.routes.arrays()
+    return DemandFile(
+        network=network,
+        types=resolver.types.records(),
+        type_ids=tuple(resolver.types.names),
+        routes=routes,
+        route_edges=route_edges,
+        route_ids=tuple(resolver.routes.names),
+        stops=stops,
+        elements=elements,
+        element_ids=tuple(resolver.ids),
+        type_choices=resolver.type_choices(),
+        route_choices=resolver.route_choices(),
+        bad_pairs=resolver.bad_pairs(),
+        lane_table=index.lane_table,
+        begin_ms=begin_ms,
+        end_ms=end_ms if end_ms >= 0 else MAX_TIME_MS,
+        step_ms=step_ms,
+        report=report,
+    )
+
+
+def _files(paths: Sequence[Path]) -> tuple[list[Path], int, int, int]:
+    """The files to read and the begin, end and step of their simulation, ms."""
+    files: list[Path] = []
+    begin_ms, end_ms, step_ms = 0, -1, 1000
+    for path in map(Path, paths):
+        if path.suffix == ".sumocfg":
+            config = read_sumo_config(path)
+            files.extend(config.files)
+            begin_ms, end_ms, step_ms = config.begin_ms, config.end_ms, config.step_ms
+        else:
+            files.append(path)
+    if not files:
+        raise DemandError("no file of demand was given: name a .rou.xml or a .sumocfg")
+    return files, begin_ms, end_ms, step_ms

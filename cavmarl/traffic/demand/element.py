@@ -1,0 +1,143 @@
+"""`Element`: one XML element with its place, and the checked values of its attributes."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Iterable
+from dataclasses import dataclass, field
+from difflib import get_close_matches
+
+from cavmarl.errors import CavmarlError, DemandError
+
+__all__ = ["MAX_TIME_MS", "Element", "near", "parse_time_ms"]
+
+# A century: later times are mistakes, and far from the end of the integers.
+MAX_TIME_MS = 100 * 366 * 86_400_000
+
+_NUMBER = re.compile(r"[+-]?([0-9]+\.?[0-9]*|\.[0-9]+)([eE][+-]?[0-9]+)?")
+_WHOLE = re.compile(r"[+-]?[0-9]{1,18}")
+_TRUE = frozenset(("true", "1", "yes", "y", "t", "on", "x"))
+_FALSE = frozenset(("false", "0", "no", "n", "f", "off", "-"))
+_UNIT_MS = (1000, 60_000, 3_600_000, 86_400_000)
+
+
+def parse_time_ms(text: str) -> int | None:
+    """Milliseconds of "12.5", "HH:MM:SS" or "D:HH:MM:SS", rounded as SUMO does; None: no time."""
+    parts = text.strip().split(":")
+    if len(parts) not in (1, 3, 4) or not all(map(_NUMBER.fullmatch, parts)):
+        return None
+    total = sum(float(part) * unit for part, unit in zip(reversed(parts), _UNIT_MS, strict=False))
+    if not abs(total) <= MAX_TIME_MS:
+        return None
+    return math.floor(abs(total) + 0.5) * (-1 if total < 0.0 else 1)
+
+
+def near(name: str, known: Iterable[str]) -> str:
+    """The names most like a misspelt one, for the end of a message."""
+    names = list(known)
+    matches = get_close_matches(name, names, n=3) or names[:3]
+    return f"near it: {', '.join(matches)}" if matches else "there is none"
+
+
+@dataclass(slots=True)
+class Element:
+    """An XML element.
+
+    Attributes:
+        name: of its tag.
+        attrs: its attributes as they stand.
+        path: of its file.
+        line: where it starts.
+        children: the elements inside, in order.
+    """
+
+    name: str
+    attrs: dict[str, str]
+    path: str
+    line: int
+    children: list[Element] = field(default_factory=list)
+
+    @property
+    def place(self) -> str:
+        """File and line."""
+        return f"{self.path}, line {self.line}"
+
+    def error(
+        self, problem: str, cure: str, failure: type[CavmarlError] = DemandError
+    ) -> CavmarlError:
+        """An error that names this element, its place and the cure."""
+        known = f' id="{self.attrs["id"]}"' if "id" in self.attrs else ""
+        return failure(f"{self.place}: <{self.name}{known}> {problem}: {cure}")
+
+    def saying(self, **attrs: str) -> Element:
+        """This element with other attributes: parts of a composed one, checked on their own."""
+        kept = {key: self.attrs[key] for key in ("id",) if key in self.attrs}
+        return Element(self.name, {**kept, **attrs}, self.path, self.line)
+
+    def text(self, key: str) -> str:
+        """An attribute that must be there and hold something."""
+        value = self.attrs.get(key, "").strip()
+        if not value:
+            raise self.error(f"has no {key}", f"give it the attribute '{key}'")
+        return value
+
+    def number(
+        self,
+        key: str,
+        default: float,
+        *,
+        least: float = -math.inf,
+        above: float = -math.inf,
+        most: float = math.inf,
+    ) -> float:
+        """A finite number in [least, most] and greater than `above`."""
+        if key not in self.attrs:
+            return default
+        text = self.attrs[key]
+        value = float(text) if _NUMBER.fullmatch(text.strip()) else math.nan
+        if not math.isfinite(value):
+            raise self.error(f"has {key}='{text}'", "write a finite number")
+        if value < least or value > most or value <= above:
+            low = f"above {above:g}" if above > least else f"at least {least:g}"
+            high = f" and at most {most:g}" if most < math.inf else ""
+            raise self.error(f"has {key}='{text}'", f"it must be {low}{high}")
+        return value
+
+    def whole(self, key: str, default: int, *, least: int) -> int:
+        """A whole number of at least `least`."""
+        if key not in self.attrs:
+            return default
+        text = self.attrs[key].strip()
+        if not _WHOLE.fullmatch(text) or int(text) < least:
+            raise self.error(f"has {key}='{text}'", f"write a whole number of at least {least}")
+        return int(text)
+
+    def flag(self, key: str, default: bool) -> bool:
+        """A truth value in one of SUMO's spellings."""
+        if key not in self.attrs:
+            return default
+        text = self.attrs[key].strip().lower()
+        if text not in _TRUE and text not in _FALSE:
+            raise self.error(f"has {key}='{self.attrs[key]}'", "write true or false")
+        return text in _TRUE
+
+    def time_ms(self, key: str, default: int | None = None) -> int:
+        """A time that is not negative, in milliseconds."""
+        if key not in self.attrs and default is not None:
+            return default
+        text = self.text(key)
+        value = parse_time_ms(text)
+        if value is None:
+            raise self.error(f"has {key}='{text}'", "write seconds, HH:MM:SS or D:HH:MM:SS")
+        if value < 0:
+            raise self.error(f"has the negative time {key}='{text}'", "start at 0 or later")
+        return value
+
+    def params(self) -> dict[str, str]:
+        """The <param> children as a dictionary."""
+        return {
+            child.attrs.get("key", ""): child.attrs.get("value", "")
+            for child in self.children
+            if child.name == "param"
+        }

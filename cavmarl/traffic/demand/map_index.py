@@ -1,0 +1,155 @@
+"""`MapIndex`: what demand asks of a road network, by the source's names."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cavmarl.errors import CavmarlError, RouteError
+from cavmarl.roads.network import VEHICLE_CLASSES, RoadNetwork
+from cavmarl.traffic.demand.element import Element, near
+
+__all__ = ["MapIndex"]
+
+
+class MapIndex:
+    """Edges, lanes and connections of one map.
+
+    Attributes:
+        network: the roads.
+        edge_row: EDGE row by id, junction-internal edges left out.
+        lane_row: LANE row by id.
+        lane_table: (num_edges, n) LANE row by SUMO's index on the edge, -1 where there is none:
+            SUMO counts pavements, too.
+        permissions: (num_edges,) classes that some lane of the edge is open to.
+    """
+
+    def __init__(self, network: RoadNetwork) -> None:
+        self.network = network
+        self.edge_row = {
+            name: row for row, name in enumerate(network.edge_ids) if not name.startswith(":")
+        }
+        self.lane_row = {name: row for row, name in enumerate(network.lane_ids)}
+        position = [int(name.rpartition("_")[2]) for name in network.lane_ids]
+        self.lane_table = np.full(
+            (len(network.edges), max(position, default=0) + 1), -1, dtype=np.int32
+        )
+        self.lane_table[network.lanes["edge"], position] = np.arange(len(position))
+        self.lane_table.setflags(write=False)
+        self.permissions = np.zeros(len(network.edges), dtype=np.uint32)
+        np.bitwise_or.at(self.permissions, network.lanes["edge"], network.lanes["permissions"])
+        self._movements = self._connections()
+
+    def _connections(self) -> dict[tuple[int, int], int]:
+        """The classes that may drive from one edge straight to another."""
+        lanes, links = self.network.lanes, self.network.links
+        allowed = lanes["permissions"][links["from_lane"]] & lanes["permissions"][links["to_lane"]]
+        pairs = zip(
+            lanes["edge"][links["from_lane"]].tolist(),
+            lanes["edge"][links["to_lane"]].tolist(),
+            allowed.tolist(),
+            strict=True,
+        )
+        found: dict[tuple[int, int], int] = {}
+        for source, target, classes in pairs:
+            found[source, target] = found.get((source, target), 0) | classes
+        return found
+
+    def edge(self, name: str, element: Element) -> int:
+        """The EDGE row of an id.
+
+        Raises:
+            DemandError: the map has no such edge.
+        """
+        row = self.edge_row.get(name, -1)
+        if row < 0:
+            raise element.error(
+                f"names the edge '{name}', which the map '{self.network.name}' does not have or "
+                "not for road vehicles",
+                f"is this the file of another map? {near(name, self.edge_row)}",
+            )
+        return row
+
+    def edges(self, text: str, element: Element) -> tuple[int, ...]:
+        """The EDGE rows of ids between blanks.
+
+        Raises:
+            DemandError: the map lacks one of them; when it lacks most, the file is another map's.
+        """
+        names = text.split()
+        unknown = [name for name in names if name not in self.edge_row]
+        if len(unknown) * 2 > len(names) > 1:
+            some = ", ".join(list(self.edge_row)[:5])
+            raise element.error(
+                f"names {len(names)} edges of which the map '{self.network.name}' has "
+                f"{len(names) - len(unknown)}",
+                f"this is the file of another map: the edges of this one are called {some} …",
+            )
+        return tuple(self.edge(name, element) for name in names)
+
+    def lane(self, name: str, element: Element) -> int:
+        """The LANE row of an id.
+
+        Raises:
+            DemandError: the map has no such lane.
+        """
+        row = self.lane_row.get(name, -1)
+        if row < 0 or name.startswith(":"):
+            raise element.error(
+                f"names the lane '{name}', which the map '{self.network.name}' does not have or "
+                "not for road vehicles",
+                near(name, [known for known in self.lane_row if not known.startswith(":")]),
+            )
+        return row
+
+    def open_lane(self, edge: int, permissions: int) -> int:
+        """The rightmost lane of an edge that a class may use; its first lane if there is none."""
+        row = self.network.edges[edge]
+        lanes = self.network.lanes[row["first_lane"] : row["first_lane"] + row["num_lanes"]]
+        return int(row["first_lane"]) + int(np.argmax(lanes["permissions"] & permissions != 0))
+
+    def scale(self, lane: int) -> float:
+        """Metres on our lane, measured along its polyline, for each metre on SUMO's."""
+        row = self.network.lanes[lane]
+        return float(row["length_m"]) / float(self.network.edges[row["edge"]]["length_m"])
+
+    def gap(
+        self, edges: NDArray[np.int32] | tuple[int, ...], exact: bool, permissions: int
+    ) -> str | None:
+        """Why a class cannot follow edges in a row: a clause, or None if it can.
+
+        Args:
+            edges: EDGE rows.
+            exact: whether each must lead straight to the next.
+            permissions: bits of the class.
+        """
+        names = self.network.edge_ids
+        rows = [int(edge) for edge in edges]
+        for row in dict.fromkeys(rows):
+            if not int(self.permissions[row]) & permissions:
+                return f"edge '{names[row]}' is forbidden for {_names(permissions)}"
+        if exact:
+            for source, target in pairwise(rows):
+                if not self._movements.get((source, target), 0) & permissions:
+                    way = (
+                        "no connection"
+                        if (source, target) not in self._movements
+                        else (f"no connection for {_names(permissions)}")
+                    )
+                    return f"there is {way} from edge '{names[source]}' to '{names[target]}'"
+        return None
+
+    def route_error(self, element: Element, gap: str) -> CavmarlError:
+        """The error for a route that cannot be followed."""
+        return element.error(
+            f"cannot be driven: {gap}",
+            "mend the route (duarouter --repair), or skip such (traffic.on_bad_route = skip)",
+            RouteError,
+        )
+
+
+def _names(permissions: int) -> str:
+    found = [name for bit, name in enumerate(VEHICLE_CLASSES) if permissions >> bit & 1]
+    return found[0] if len(found) == 1 else "every class"

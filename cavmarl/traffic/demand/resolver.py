@@ -1,0 +1,224 @@
+"""`Resolver`: gives the names in collected definitions their rows, and checks them on the map."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cavmarl.roads.network import VEHICLE_CLASSES
+from cavmarl.traffic.demand.collector import Collector
+from cavmarl.traffic.demand.element import Element
+from cavmarl.traffic.demand.map_index import MapIndex
+from cavmarl.traffic.demand.records import (
+    LANE_CURRENT,
+    UNTIL_ABSOLUTE,
+    UNTIL_FLOW,
+    Choices,
+    Options,
+)
+from cavmarl.traffic.demand.routes import RouteTable
+from cavmarl.traffic.demand.stops import StopReader
+from cavmarl.traffic.demand.type_table import TypeTable
+
+__all__ = ["Resolver"]
+
+# Classes with lanes of their own that road networks leave out: see `roads.selection`.
+_PARTLY_MAPPED = sum(1 << VEHICLE_CLASSES.index(name) for name in ("bicycle", "tram"))
+
+
+class Resolver:
+    """The second half of reading: all definitions are known.
+
+    Attributes:
+        types: all types.
+        routes: all routes and stops.
+        ids: of the elements that are kept, by row.
+    """
+
+    def __init__(self, collector: Collector, index: MapIndex, skip: bool) -> None:
+        self._index = index
+        self._skip = skip
+        self._report = collector.report
+        named = collector.named
+        self.types = TypeTable(named, self._report)
+        places = named.get("stopping place", {})
+        stop_reader = StopReader(index, places, self._report, skip)
+        self.routes = RouteTable(index, named, stop_reader, self._report)
+        self._type_options = [
+            self.types.options(name, user) for name, user in collector.types.items()
+        ]
+        elements, ids = self._on_roads(collector.elements(), collector.ids)
+        self._route_options = self._options_of(elements, list(collector.routes.values()))
+        self._bad: set[tuple[int, int]] = set()
+        keep = self._check(elements, ids)
+        self._elements = elements[keep]
+        self.ids = [ids[row] for row in np.flatnonzero(keep)]
+        self._check_ids()
+        self._place_stops(list(collector.stops.values()))
+
+    def elements(self) -> NDArray[np.void]:
+        """ELEMENT (num_elements,)."""
+        return self._elements
+
+    def type_choices(self) -> Choices:
+        """What `types` of the elements points into."""
+        return Choices([options or Options((), ()) for options in self._type_options])
+
+    def route_choices(self) -> Choices:
+        """What `routes` of the elements points into."""
+        return Choices([options or Options((), ()) for options in self._route_options])
+
+    def bad_pairs(self) -> NDArray[np.int64]:
+        """Keys type * num_routes + route that cannot be driven."""
+        num_routes = len(self.routes.names)
+        return np.array(sorted(t * num_routes + r for t, r in self._bad), dtype=np.int64)
+
+    def _stub(self, elements: NDArray[np.void], ids: Sequence[str], row: int) -> Element:
+        """An element to complain about, from what is left of it."""
+        element = elements[row]
+        name = "flow" if element["flow"] else "vehicle"
+        path = self._report.files[int(element["file"])]
+        return Element(name, {"id": ids[row]}, path, int(element["line"]))
+
+    def _on_roads(
+        self, elements: NDArray[np.void], ids: list[str]
+    ) -> tuple[NDArray[np.void], list[str]]:
+        """Leave out those whose types drive on no road."""
+        on_road = np.array([options is not None for options in self._type_options], dtype=bool)
+        keep = on_road[elements["types"]] if len(on_road) else np.zeros(0, dtype=bool)
+        for row in np.flatnonzero(~keep):
+            self._report.tolerate(
+                "vehicle of a class that drives on no road is left out",
+                self._stub(elements, ids, int(row)).place,
+            )
+        return elements[keep], [ids[row] for row in np.flatnonzero(keep)]
+
+    def _options_of(
+        self, elements: NDArray[np.void], sources: list[Element]
+    ) -> list[Options | None]:
+        """The routes of those sources that elements use."""
+        used = set(np.unique(elements["routes"]).tolist())
+        return [
+            self.routes.options(source) if number in used else None
+            for number, source in enumerate(sources)
+        ]
+
+    def _check(self, elements: NDArray[np.void], ids: list[str]) -> NDArray[np.bool_]:
+        """Which elements can drive; whoever cannot is refused or counted."""
+        fields = ["types", "routes", "depart_lane", "arrival_lane"]
+        seen, first, which = np.unique(
+            np.stack([elements[name] for name in fields], axis=1),
+            axis=0,
+            return_index=True,
+            return_inverse=True,
+        )
+        counts = np.bincount(which.ravel(), minlength=len(seen))
+        fits = np.ones(len(seen), dtype=bool)
+        # In the order of the files, so that the first mistake is the one that is named.
+        for case in np.argsort(first):
+            types, routes, depart_lane, arrival_lane = (int(value) for value in seen[case])
+            user = self._stub(elements, ids, int(first[case]))
+            fits[case] = self._drives(types, routes, user) and self._has_lane(
+                types, routes, depart_lane, user
+            )
+            if not fits[case]:
+                what = "vehicle or flow that cannot drive its route is left out"
+                self._report.tolerate(what, user.place, int(counts[case]))
+            elif arrival_lane >= 0 and self._missing_lane(routes, arrival_lane, -1):
+                what = "arrivalLane beyond the lanes of the edge is any lane"
+                self._report.tolerate(what, user.place)
+                elements["arrival_lane"][which.ravel() == case] = LANE_CURRENT
+        keep: NDArray[np.bool_] = fits[which.ravel()]
+        return keep
+
+    def _drives(self, types: int, routes: int, user: Element) -> bool:
+        """Whether any choice can be driven; in the strict mode, all have to."""
+        some = False
+        for vtype in self._options(self._type_options, types).rows:
+            permissions = self.types.permissions(vtype)
+            for route in self._options(self._route_options, routes).rows:
+                gap = self._index.gap(
+                    self.routes.edges(route), self.routes.exact(route), permissions
+                )
+                if gap is None:
+                    some = True
+                elif self._tolerates(vtype, user):
+                    self._bad.add((vtype, route))
+                else:
+                    raise self._index.route_error(user, gap)
+        return some
+
+    def _tolerates(self, vtype: int, user: Element) -> bool:
+        """Whether vehicles of a type that have no way are left out, not refused."""
+        if self.types.permissions(vtype) & ~_PARTLY_MAPPED == 0:
+            what = f"type '{self.types.names[vtype]}' without a way: maps leave out its own lanes"
+            self._report.tolerate(what, user.place)
+            return True
+        return self._skip
+
+    def _options(self, table: list[Options | None], choice: int) -> Options:
+        options = table[choice]
+        assert options is not None
+        return options
+
+    def _missing_lane(self, routes: int, lane: int, end: int) -> str:
+        """The first or last edge (end 0 or -1) of a route that has no such lane; "" if all do."""
+        table = self._index.lane_table
+        for route in self._options(self._route_options, routes).rows:
+            edge = self.routes.edges(route)[end]
+            if lane >= table.shape[1] or table[edge, lane] < 0:
+                return self._index.network.edge_ids[edge]
+        return ""
+
+    def _has_lane(self, types: int, routes: int, lane: int, user: Element) -> bool:
+        """Whether all that is chosen from can enter on a lane, by SUMO's index or a code."""
+        if lane < 0:
+            return True
+        name = self._missing_lane(routes, lane, 0)
+        problem = f"which edge '{name}' does not have or not for road vehicles" if name else ""
+        lanes = self._index.network.lanes
+        for vtype in self._options(self._type_options, types).rows:
+            for route in self._options(self._route_options, routes).rows if not name else ():
+                row = self._index.lane_table[self.routes.edges(route)[0], lane]
+                if not int(lanes[row]["permissions"]) & self.types.permissions(vtype):
+                    problem = f"which is closed to type '{self.types.names[vtype]}'"
+            if problem and not self._tolerates(vtype, user):
+                raise user.error(
+                    f"has departLane='{lane}', {problem}",
+                    "write departLane='best', or skip such (traffic.on_bad_route = skip)",
+                )
+        return not problem
+
+    def _check_ids(self) -> None:
+        """Vehicles must not have the names that a flow gives."""
+        flows = {name: row for row, name in enumerate(self.ids) if self._elements[row]["flow"]}
+        for row, name in enumerate(self.ids):
+            stem, _, number = name.rpartition(".")
+            if stem in flows and number.isascii() and number.isdigit():
+                if (
+                    int(number[:18]) < self._elements[flows[stem]]["number"]
+                    and not (self._elements[row]["flow"])
+                ):
+                    raise self._stub(self._elements, self.ids, row).error(
+                        f"has the name of a vehicle of the flow '{stem}'", "ids must be unique"
+                    )
+
+    def _place_stops(self, lists: list[list[Element]]) -> None:
+        """Replace the numbers of lists of stops by STOP rows, along each route that has them."""
+        placed: dict[tuple[int, int, bool], tuple[int, int]] = {}
+        for row in np.flatnonzero(self._elements["first_stop"] >= 0):
+            element = self._elements[row]
+            stops = lists[int(element["first_stop"])]
+            routes = self._options(self._route_options, int(element["routes"])).rows
+            if len(routes) > 1:
+                what = "stops of a vehicle with a choice of routes are left out"
+                self._report.tolerate(what, stops[0].place)
+                element["first_stop"] = -1
+                continue
+            key = (int(element["first_stop"]), routes[0], bool(element["flow"]))
+            if key not in placed:
+                until_from = UNTIL_FLOW if element["flow"] else UNTIL_ABSOLUTE
+                placed[key] = self.routes.stops_with(routes[0], stops, until_from)
+            element["first_stop"], element["num_stops"] = placed[key]

@@ -1,0 +1,98 @@
+"""SUMO's configuration files: which network, which demand, from when to when."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+from xml.sax.handler import ContentHandler
+
+from cavmarl.errors import DemandError
+from cavmarl.roads.xml_source import read_xml
+from cavmarl.traffic.demand.element import Element
+
+__all__ = ["SumoConfig", "read_sumo_config"]
+
+_ROOTS = ("configuration", "sumoConfiguration")
+_OPTIONS = {
+    "n": "net-file",
+    "net": "net-file",
+    "r": "route-files",
+    "a": "additional-files",
+    "b": "begin",
+    "e": "end",
+}
+
+
+@dataclass(frozen=True)
+class SumoConfig:
+    """What a `.sumocfg` says of network, demand and time.
+
+    Attributes:
+        net_file: the road network; None if the file names none.
+        files: additional files, then route files, in SUMO's order of reading.
+        begin_ms: start of the simulation.
+        end_ms: its end; -1: when the demand has ended.
+        step_ms: length of its step.
+    """
+
+    net_file: Path | None
+    files: tuple[Path, ...]
+    begin_ms: int
+    end_ms: int
+    step_ms: int
+
+
+class _Handler(ContentHandler):
+    def __init__(self, path: Path) -> None:
+        super().__init__()
+        self.options: dict[str, Element] = {}
+        self._path = path
+        self._root = ""
+        self._locator: Any = None
+
+    def startElement(self, name: str, attrs: Any) -> None:
+        element = Element(name, dict(attrs.items()), str(self._path), self._locator.getLineNumber())
+        if not self._root:
+            self._root = name
+            if name not in _ROOTS:
+                raise element.error(
+                    "is not the root of a SUMO configuration", "give a file with <configuration>"
+                )
+        elif "value" in element.attrs or "v" in element.attrs:
+            element.attrs = {"value": element.attrs.get("value", element.attrs.get("v", ""))}
+            self.options[_OPTIONS.get(name, name)] = element
+
+
+def read_sumo_config(path: Path) -> SumoConfig:
+    """Read a `.sumocfg`.
+
+    Raises:
+        DemandError: it is missing, is no SUMO configuration, or holds times that are none.
+    """
+    handler = _Handler(path)
+    read_xml(path, handler, DemandError)
+    options = handler.options
+
+    def paths(name: str) -> list[Path]:
+        text = options[name].attrs["value"] if name in options else ""
+        return [path.parent / part.strip() for part in text.split(",") if part.strip()]
+
+    def time_ms(name: str, default: int) -> int:
+        element = options.get(name)
+        # SUMO writes -1 for "no end".
+        if element is None or element.attrs["value"].strip().startswith("-1"):
+            return default
+        return element.time_ms("value")
+
+    net = paths("net-file")
+    step_ms = time_ms("step-length", 1000)
+    if step_ms <= 0:
+        raise options["step-length"].error("is no length of a step", "write seconds above 0")
+    return SumoConfig(
+        net_file=net[0] if net else None,
+        files=tuple(paths("additional-files") + paths("route-files")),
+        begin_ms=time_ms("begin", 0),
+        end_ms=time_ms("end", -1),
+        step_ms=step_ms,
+    )

@@ -1,0 +1,156 @@
+"""Reading demand files as streams: elements with their lines, one definition at a time."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+from xml.sax.handler import ContentHandler
+
+from cavmarl.errors import DemandError
+from cavmarl.roads.xml_source import read_xml
+from cavmarl.traffic.demand.element import Element, near
+from cavmarl.traffic.demand.report import DemandReport
+
+__all__ = ["STOPPING_PLACES", "read_elements"]
+
+MAX_INCLUDES = 16  # files inside files
+MAX_CHILDREN = 100_000  # of one definition
+
+_ROOTS = frozenset(("routes", "additional", "add", "trips", "flows", "vtypes", "vTypes"))
+STOPPING_PLACES = frozenset(
+    ("busStop", "trainStop", "containerStop", "chargingStation", "parkingArea")
+)
+_DEFINITIONS = STOPPING_PLACES | frozenset(
+    ("vType", "vTypeDistribution", "route", "routeDistribution", "vehicle", "trip", "flow")
+)
+
+# What SUMO's files may hold beside vehicles. Signal programs are read elsewhere.
+_SKIPPED = frozenset(
+    "person personFlow container containerFlow calibrator rerouter variableSpeedSign vTypeProbe "
+    "routeProbe e1Detector inductionLoop instantInductionLoop e2Detector laneAreaDetector "
+    "e3Detector entryExitDetector edgeData laneData timedEvent tlLogic tlLogics WAUT wautJunction "
+    "poly poi polys pois taz tazs location param access overheadWire overheadWireSegment "
+    "tractionSubstation parkingSpace calibrators closingReroute".split()
+)
+
+
+# `roads.signal_plans` reads them.
+_PROGRAMS = frozenset(("tlLogic", "WAUT", "wautJunction"))
+
+
+class _Handler(ContentHandler):
+    """Builds each definition's small tree and hands it on when it ends."""
+
+    def __init__(
+        self,
+        path: Path,
+        report: DemandReport,
+        take: Callable[[Element], None],
+        including: tuple[Path, ...],
+    ) -> None:
+        super().__init__()
+        self._path = path
+        self._name = str(path)
+        self._report = report
+        self._take = take
+        self._including = (*including, path.resolve())
+        self._depth = 0  # of the element around the next one
+        self._skipping = 0  # depth of the element whose inside is of no interest
+        self._tree: list[Element] = []  # from the definition to the innermost open element
+        self._interval: dict[str, str] = {}
+        self._locator: Any = None
+
+    def startElement(self, name: str, attrs: Any) -> None:
+        self._depth += 1
+        if self._skipping:
+            return
+        element = Element(name, dict(attrs.items()), self._name, self._locator.getLineNumber())
+        if self._tree:
+            self._add(element)
+        elif self._depth == 1:
+            self._open_root(element)
+        elif name == "interval":
+            self._interval = element.attrs
+        elif name == "include":
+            self._include(element)
+        elif name in _DEFINITIONS:
+            if name == "flow" and self._interval:
+                element.attrs = {**self._interval, **element.attrs}
+            self._tree.append(element)
+        else:
+            self._skip(element)
+
+    def endElement(self, name: str) -> None:
+        if self._skipping == self._depth:
+            self._skipping = 0
+        elif not self._skipping:
+            if self._tree:
+                element = self._tree.pop()
+                if not self._tree:
+                    self._report.count(element.name)
+                    self._take(element)
+            elif name == "interval":
+                self._interval = {}
+        self._depth -= 1
+
+    def _add(self, element: Element) -> None:
+        parent = self._tree[-1]
+        if len(parent.children) >= MAX_CHILDREN:
+            raise parent.error(f"holds more than {MAX_CHILDREN} elements", "split it")
+        parent.children.append(element)
+        self._tree.append(element)
+
+    def _open_root(self, element: Element) -> None:
+        if element.name in _SKIPPED:
+            self._skip(element)
+        elif element.name not in _ROOTS:
+            raise element.error(
+                "is not the root of a file of demand",
+                f"SUMO's begin with {', '.join(f'<{root}>' for root in sorted(_ROOTS))}; "
+                f"{near(element.name, _ROOTS)}",
+            )
+
+    def _skip(self, element: Element) -> None:
+        known = element.name in _SKIPPED
+        what = f"<{element.name}> is not read" if known else f"unknown element <{element.name}>"
+        if element.name in _PROGRAMS:
+            what += " as demand (signal programs: `map.programs`)"
+        self._report.tolerate(what, element.place)
+        self._skipping = self._depth
+
+    def _include(self, element: Element) -> None:
+        path = self._path.parent / element.text("href")
+        if path.resolve() in self._including or len(self._including) > MAX_INCLUDES:
+            raise element.error(
+                f"includes '{path}', which includes it", "files must not hold themselves"
+            )
+        _read(path, self._report, self._take, self._including)
+        self._skipping = self._depth
+
+
+def _read(
+    path: Path,
+    report: DemandReport,
+    take: Callable[[Element], None],
+    including: tuple[Path, ...],
+) -> None:
+    if str(path) not in report.files:
+        report.files.append(str(path))
+    read_xml(path, _Handler(path, report, take, including), DemandError)
+
+
+def read_elements(path: Path, report: DemandReport, take: Callable[[Element], None]) -> None:
+    """Hand the definitions of a file and of those it includes to `take`, in their order.
+
+    Flows inside an <interval> get its begin and end. What is no demand is counted in `report`.
+
+    Args:
+        path: of a plain or gzipped file.
+        report: where files, elements and what is skipped are counted.
+        take: gets each <vType>, <route>, <vehicle>, … with its children, when it has ended.
+
+    Raises:
+        DemandError: the file is missing, is no XML, or has another root.
+    """
+    _read(path, report, take, ())

@@ -1,0 +1,185 @@
+"""`Schedule`: a demand file made ready for the kernels: types, steps of all routes, departures."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from itertools import pairwise
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cavmarl.errors import CapacityError, RouteError
+from cavmarl.kernels.codes import LANE_GIVEN, SPEED_GIVEN
+from cavmarl.kernels.plans import plan_goal
+from cavmarl.kernels.routes import plan_route, trace_edges
+from cavmarl.roads.network import RoadNetwork
+from cavmarl.roads.routing import PLAN
+from cavmarl.traffic.demand import DemandFile
+from cavmarl.traffic.demand.drawing import speed_factors
+from cavmarl.traffic.departures import DEPARTURE
+
+__all__ = ["Schedule"]
+
+MAX_STEPS = 50_000_000
+MAX_EDGES = 100_000  # of one way
+MAX_DETOUR_STEPS = 8_000_000
+DETOUR_CHANGE_WEIGHT = 100.0
+
+
+class Schedule:
+    """The departures of a demand file as records, and the steps of their routes.
+
+    Ways of trips are found once, when the world is made: the fastest ones at the speed limits, over
+    the edges that the trip names.
+
+    Args:
+        demand: of the files.
+        first_type: VTYPE row of the file's first type in the world's table.
+        first_step: PLAN row of the first route's first step in the world's table.
+
+    Raises:
+        RouteError: a trip without a way.
+        CapacityError: the routes have too many steps.
+    """
+
+    def __init__(self, demand: DemandFile, first_type: int, first_step: int) -> None:
+        self.demand = demand
+        self._network: RoadNetwork = demand.network
+        self._first_type = first_type
+        self._plans: dict[tuple[int, int], NDArray[np.void]] = {}
+        permissions = demand.types["permissions"].astype(np.int64)
+        self._class_of_type = np.unique(permissions, return_inverse=True)[1]
+        masks = np.unique(permissions)
+        self._way = np.full((len(demand.routes), len(masks)), -1, dtype=np.int64)
+        self.first_edge = np.zeros(len(demand.routes), dtype=np.int32)
+        parts: list[NDArray[np.void]] = []
+        begin = first_step
+        for route, mask_row in sorted(self._driven()):
+            edges = self._edges(route, int(masks[mask_row]))
+            steps = self._steps(edges, int(masks[mask_row]))
+            first_lane = int(self._network.edges[edges[0]]["first_lane"])
+            self._way[route, mask_row] = begin - first_lane
+            parts.append(steps)
+            begin += len(steps)
+            if begin > MAX_STEPS:
+                raise CapacityError(
+                    f"the routes of the demand have over {MAX_STEPS} steps: fewer or shorter ones"
+                )
+        self.first_detour = begin - first_step
+        parts.append(self._detours(masks))
+        self.steps = np.concatenate(parts)
+        self._plans.clear()
+
+    def _detours(self, masks: NDArray[np.int64]) -> NDArray[np.void]:
+        """Steps from everywhere to the last edges of the routes, with as few changes as can be.
+
+        Who cannot make a lane change that its route needs goes on by them. Where they would take
+        more than `MAX_DETOUR_STEPS` there are none: such vehicles wait.
+        """
+        routes = self.demand.routes
+        last = self.demand.route_edges[routes["first_edge"] + routes["num_edges"] - 1]
+        goals = {
+            (int(last[route]), int(mask_row))
+            for route, mask_row in zip(*np.nonzero(self._way >= 0), strict=True)
+        }
+        num_lanes = len(self._network.lanes)
+        self._goal = np.full(self._way.shape, -1, dtype=np.int32)
+        if len(goals) * num_lanes > MAX_DETOUR_STEPS:
+            return np.zeros(0, dtype=PLAN)
+        plans = np.zeros((len(goals), num_lanes), dtype=PLAN)
+        for row, (edge, mask_row) in enumerate(sorted(goals)):
+            mask = int(masks[mask_row])
+            plan_goal(self._network.arrays, edge, mask, DETOUR_CHANGE_WEIGHT, plans[row])
+            self._goal[last == edge, mask_row] = row
+        return plans.reshape(-1)
+
+    def _driven(self) -> Iterable[tuple[int, int]]:
+        """Pairs of ROUTE row and class that some vehicle of the files may have."""
+        demand = self.demand
+        choices = np.unique(demand.elements[["types", "routes"]])
+        pairs = {
+            (int(route), int(self._class_of_type[vtype]))
+            for choice in choices
+            for route in demand.route_choices.options(choice["routes"])
+            for vtype in demand.type_choices.options(choice["types"])
+            if vtype * len(demand.routes) + route not in demand.bad_pairs
+        }
+        return pairs
+
+    def _edges(self, route: int, mask: int) -> NDArray[np.int32]:
+        """The EDGE rows of a route, found where the file leaves them open."""
+        row = self.demand.routes[route]
+        named = self.demand.route_edges[row["first_edge"] : row["first_edge"] + row["num_edges"]]
+        if row["exact"]:
+            return named
+        found = [np.array([named[0]], dtype=np.int32)]
+        room = np.zeros(MAX_EDGES, dtype=np.int32)
+        for start, goal in pairwise(named):
+            number = trace_edges(self._network.arrays, self._plan(int(goal), mask), start, room)
+            if number <= 0:
+                names = self._network.edge_ids
+                raise RouteError(
+                    f"{self._place(route)}: no way from edge '{names[start]}' to edge "
+                    f"'{names[goal]}' of the map '{self._network.name}' for the class of a trip "
+                    "between them: change the trip or drop it (duarouter --ignore-errors)"
+                )
+            found.append(room[1:number].copy())
+        return np.concatenate(found)
+
+    def _place(self, route: int) -> str:
+        """File and line of the first element that may have a route."""
+        demand = self.demand
+        choices = range(len(demand.route_choices))
+        having = [c for c in choices if route in demand.route_choices.options(c)]
+        return demand.place(int(np.isin(demand.elements["routes"], having).argmax()))
+
+    def _plan(self, goal: int, mask: int) -> NDArray[np.void]:
+        key = (goal, mask)
+        if key not in self._plans:
+            plan = np.zeros(len(self._network.lanes), dtype=PLAN)
+            plan_goal(self._network.arrays, goal, mask, 1.0, plan)
+            self._plans[key] = plan
+        return self._plans[key]
+
+    def _steps(self, edges: NDArray[np.int32], mask: int) -> NDArray[np.void]:
+        number = int(self._network.edges["num_lanes"][edges].sum())
+        steps = np.zeros(number, dtype=PLAN)
+        plan_route(self._network.arrays, edges, mask, 0, steps, np.zeros(number))
+        return steps
+
+    def draw(self, key: int, horizon_s: float, dt: float) -> NDArray[np.void]:
+        """The departures of one episode, DEPARTURE (n,) in order of `due`.
+
+        Args:
+            key: of the world and episode.
+            horizon_s: seconds an episode; who would depart later is not drawn.
+            dt: seconds a tick.
+        """
+        demand = self.demand
+        orders = demand.draw(key, demand.begin_ms / 1000.0 + horizon_s)
+        departures = np.zeros(len(orders), dtype=DEPARTURE)
+        begin_s = demand.begin_ms / 1000.0
+        departures["due"] = np.ceil((orders["depart"] - begin_s) / dt - 1e-6)
+        departures["agent"] = -1
+        departures["goal"] = self._goal[orders["route"], self._class_of_type[orders["vtype"]]]
+        departures["order"] = np.arange(len(orders))
+        departures["vtype"] = self._first_type + orders["vtype"]
+        departures["way"] = self._way[orders["route"], self._class_of_type[orders["vtype"]]]
+        routes = demand.routes[orders["route"]]
+        first_edge = demand.route_edges[routes["first_edge"]]
+        lanes, edges = self._network.lanes, self._network.edges
+        given = orders["depart_lane"] >= 0
+        departures["lane"] = np.where(given, orders["depart_lane"], edges["first_lane"][first_edge])
+        departures["lane_code"] = np.where(given, LANE_GIVEN, orders["depart_lane"])
+        departures["pos_code"] = orders["depart_pos_code"]
+        scale = lanes["length_m"][departures["lane"]] / edges["length_m"][first_edge]
+        departures["pos"] = orders["depart_pos"] * scale
+        departures["speed_code"] = orders["depart_speed_code"]
+        departures["speed"] = np.where(
+            orders["depart_speed_code"] == SPEED_GIVEN, orders["depart_speed"], 0.0
+        )
+        departures["speed_factor"] = speed_factors(demand.types, orders, key)
+        departures["stop"] = np.where(orders["num_stops"] > 0, orders["first_stop"], -1)
+        departures["stops_end"] = departures["stop"] + orders["num_stops"]
+        departures["stops_end"][orders["num_stops"] == 0] = -1
+        return departures

@@ -1,0 +1,68 @@
+"""`python -m fuzz TARGET SECONDS`: attack one parser, guided by which of its code is reached.
+
+Inputs that reach new code are kept in `fuzz/corpus/TARGET`; one that crashes, hangs or takes too
+much memory is left in `fuzz/crashes` and makes the exit code 1 or more.
+"""
+
+from __future__ import annotations
+
+import random
+import sys
+from pathlib import Path
+
+import atheris
+
+HERE = Path(__file__).resolve().parent
+KERNELS = (HERE.parent / "cavmarl" / "kernels").glob("*.py")
+
+# Kernels are left out: Numba compiles the bytecode of their functions as it is.
+with atheris.instrument_imports(
+    include=["cavmarl", "sumolib", "yaml"],
+    exclude=[f"cavmarl.kernels.{path.stem}" for path in KERNELS],
+):
+    import cavmarl.roads.sumo_xml  # noqa: F401 - the reader imports it late
+    from fuzz.targets import TARGETS
+
+from fuzz.mutations import mutated  # noqa: E402
+
+MAX_BYTES = 1 << 15
+INPUT_S = 30
+MEMORY_MB = 3000
+
+
+def _mutate(content: bytes, limit: int, seed: int) -> bytes:
+    """Half of the changes keep the file's pieces whole, the others are libFuzzer's own."""
+    rng = random.Random(seed)
+    if content and rng.random() < 0.5:
+        return mutated(content, rng)[:limit]
+    changed: bytes = atheris.Mutate(content, limit)
+    return changed
+
+
+def main(name: str, seconds: int) -> None:
+    """Fuzz the target `name` for so many seconds."""
+    target = TARGETS[name]
+    corpus, crashes = HERE / "corpus" / name, HERE / "crashes"
+    corpus.mkdir(parents=True, exist_ok=True)
+    crashes.mkdir(exist_ok=True)
+    for k, content in enumerate(target.seeds()):
+        (corpus / f"seed-{k}").write_bytes(content)
+    options = {
+        "max_total_time": seconds,
+        "max_len": MAX_BYTES,
+        "timeout": INPUT_S,
+        "rss_limit_mb": MEMORY_MB,
+        "artifact_prefix": f"{crashes}/{name}-",
+        "print_final_stats": 1,
+    }
+    words = [f"-{key}={value}" for key, value in options.items()]
+
+    def attack(content: bytes) -> None:
+        target.accepts(content)
+
+    atheris.Setup(["fuzz", *words, str(corpus)], attack, custom_mutator=_mutate)
+    atheris.Fuzz()
+
+
+if __name__ == "__main__":
+    main(sys.argv[1], int(sys.argv[2]))

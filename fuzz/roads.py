@@ -1,0 +1,69 @@
+"""Targets that read roads: SUMO networks, signal programs, other maps, and cached networks."""
+
+from __future__ import annotations
+
+import gzip
+from functools import cache
+from pathlib import Path
+
+from cavmarl.maps.netconvert import build_network
+from cavmarl.roads.cache import _entry, load_network
+from cavmarl.roads.network import RoadNetwork
+from cavmarl.roads.reader import read_network, source_hash
+from cavmarl.roads.signal_plans import with_programs
+from fuzz.files import ROOT, Target, scratch, seed
+
+__all__ = ["CACHED", "MAPS", "NETWORKS", "PROGRAMS", "grid"]
+
+NETCONVERT_S = 5.0  # longer is no crash, but nothing to wait for
+
+
+@cache
+def grid() -> RoadNetwork:
+    """The roads that programs and demand are read for."""
+    return load_network(ROOT / "envs" / "grid4x4" / "map" / "map.net.xml")
+
+
+def _network(content: bytes) -> RoadNetwork:
+    return read_network(scratch("small.net.xml", content))
+
+
+def _networks() -> tuple[bytes, ...]:
+    plain = seed("crossing.net.xml")
+    return plain, gzip.compress(plain, mtime=0)
+
+
+def _programs(content: bytes) -> RoadNetwork:
+    return with_programs(grid(), [scratch("programs.add.xml", content)])
+
+
+def _map(content: bytes) -> object:
+    source = scratch("some.map", content)
+    return build_network(source, source.with_name("made.net.xml"), timeout_s=NETCONVERT_S)
+
+
+def _cached(content: bytes) -> RoadNetwork:
+    source, entry = _source_and_entry()
+    entry.write_bytes(content)
+    return load_network(source)
+
+
+@cache
+def _source_and_entry() -> tuple[Path, Path]:
+    # The comment gives it an entry of its own, which no other process reads.
+    process = scratch("cached.net.xml", b"").parent.name
+    source = scratch("cached.net.xml", seed("crossing.net.xml") + f"<!--{process}-->".encode())
+    return source, _entry(source_hash(source))
+
+
+def _entries() -> tuple[bytes, ...]:
+    source, entry = _source_and_entry()
+    entry.unlink(missing_ok=True)
+    load_network(source)
+    return (entry.read_bytes(),)
+
+
+NETWORKS = Target(_network, _networks)
+PROGRAMS = Target(_programs, lambda: (seed("programs.add.xml"),))
+MAPS = Target(_map, lambda: (seed("small.osm"), seed("small.xodr")), slow=True)
+CACHED = Target(_cached, _entries)

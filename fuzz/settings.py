@@ -1,0 +1,93 @@
+"""Targets that read settings and records: env.yaml, overrides, drivers' folders, manifests."""
+
+from __future__ import annotations
+
+import tempfile
+from functools import cache
+from pathlib import Path
+
+from cavmarl.cli.output import parse_settings
+from cavmarl.config import ActionConfig, EnvConfig, SensorsConfig
+from cavmarl.config_io import read_yaml, validate
+from cavmarl.evaluate.manifest import MANIFEST_FILE, close_manifest, open_manifest, read_closed
+from cavmarl.networks import (
+    CONFIG_FILE,
+    WEIGHTS_FILE,
+    ActorCritic,
+    NetworkConfig,
+    load_network,
+    save_network,
+)
+from cavmarl.registry import load_config
+from fuzz.files import ROOT, Target, scratch, seed
+
+__all__ = ["DRIVERS", "ENTRIES", "MANIFESTS", "OVERRIDES"]
+
+# Between the two files of a driver, in one input.
+_BORDER = b"\n----\n"
+
+# What lies beside the manifest.
+RESULT, RESULT_CONTENT = "trips.csv", b"policy,run\n"
+
+
+def _entry(content: bytes) -> EnvConfig:
+    path = scratch("mine/env.yaml", content)
+    validate(EnvConfig, read_yaml(path), str(path))
+    return load_config(path.parent)[0]
+
+
+def _entries() -> tuple[bytes, ...]:
+    return tuple(path.read_bytes() for path in sorted((ROOT / "envs").glob("*/env.yaml")))
+
+
+def _overrides(content: bytes) -> EnvConfig:
+    settings = content.decode("utf-8", errors="replace").splitlines()
+    return load_config("ring", overrides=parse_settings(settings))[0]
+
+
+def _driver(content: bytes) -> object:
+    config, _, weights = content.partition(_BORDER)
+    folder = scratch(f"driver/{CONFIG_FILE}", config).parent
+    scratch(f"driver/{WEIGHTS_FILE}", weights)
+    return load_network(folder)
+
+
+def _manifest(content: bytes) -> object:
+    scratch(f"results/{RESULT}", RESULT_CONTENT)
+    return read_closed(scratch(f"results/{MANIFEST_FILE}", content).parent)
+
+
+def _manifests() -> tuple[bytes, ...]:
+    found = []
+    for results in ([], [RESULT]):
+        with tempfile.TemporaryDirectory() as name:
+            folder = Path(name)
+            (folder / RESULT).write_bytes(RESULT_CONTENT)
+            open_manifest(folder, {"seed": 0})
+            close_manifest(folder, results)
+            found.append((folder / MANIFEST_FILE).read_bytes())
+    return tuple(found)
+
+
+@cache
+def _drivers() -> tuple[bytes, ...]:
+    found = []
+    for kind in ("continuous", "discrete"):
+        config = NetworkConfig(
+            environment="ring",
+            observation_size=3,
+            sensors=SensorsConfig(),
+            action=ActionConfig(kind=kind),
+            hidden=(2,),
+        )
+        with tempfile.TemporaryDirectory() as name:
+            save_network(Path(name), ActorCritic(config), config)
+            parts = [(Path(name) / part).read_bytes() for part in (CONFIG_FILE, WEIGHTS_FILE)]
+        found.append(_BORDER.join(parts))
+    return tuple(found)
+
+
+ENTRIES = Target(_entry, _entries)
+OVERRIDES = Target(_overrides, lambda: (seed("overrides.txt"),))
+MANIFESTS = Target(_manifest, _manifests)
+DRIVERS = Target(_driver, _drivers)

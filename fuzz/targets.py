@@ -1,0 +1,22 @@
+"""All targets by name: one for every kind of file that cavmarl reads."""
+
+from __future__ import annotations
+
+from fuzz.roads import CACHED, MAPS, NETWORKS, PROGRAMS
+from fuzz.settings import DRIVERS, ENTRIES, MANIFESTS, OVERRIDES
+from fuzz.traffic import DEMAND, SUMO_CONFIGS
+
+__all__ = ["TARGETS"]
+
+TARGETS = {
+    "network": NETWORKS,
+    "programs": PROGRAMS,
+    "map": MAPS,
+    "cached": CACHED,
+    "demand": DEMAND,
+    "sumocfg": SUMO_CONFIGS,
+    "entry": ENTRIES,
+    "overrides": OVERRIDES,
+    "driver": DRIVERS,
+    "manifest": MANIFESTS,
+}

@@ -1,0 +1,36 @@
+"""Targets that read demand: routes and types, and SUMO's configurations."""
+
+from __future__ import annotations
+
+from contextlib import suppress
+
+from cavmarl.errors import CavmarlError
+from cavmarl.evaluate.sumo_input import read_input
+from cavmarl.traffic.demand import read_demand
+from cavmarl.traffic.demand.sumo_config import read_sumo_config
+from cavmarl.traffic.schedule import Schedule
+from fuzz.files import Target, scratch, seed
+from fuzz.roads import grid
+
+__all__ = ["DEMAND", "SUMO_CONFIGS"]
+
+MAX_DEPARTURES = 2000
+
+
+def _demand(content: bytes) -> None:
+    path = scratch("x.rou.xml", content)
+    with suppress(CavmarlError):
+        read_demand([path], grid(), on_bad_route="skip", max_departures=MAX_DEPARTURES)
+    demand = read_demand([path], grid(), max_departures=MAX_DEPARTURES)
+    Schedule(demand, 0, 0).draw(1, 60.0, 0.1)
+
+
+def _sumo_config(content: bytes) -> None:
+    path = scratch("x.sumocfg", content)
+    with suppress(CavmarlError):
+        read_input([path])
+    read_sumo_config(path)
+
+
+DEMAND = Target(_demand, lambda: (seed("demand.rou.xml"),))
+SUMO_CONFIGS = Target(_sumo_config, lambda: (seed("small.sumocfg"),))

@@ -1,0 +1,132 @@
+"""The rows for stable-baselines3, by its own checks, and against the worlds that they show."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from cavmarl.errors import ConfigError, InvalidActionError
+from cavmarl.vector_env import make_vec
+
+sb3 = pytest.importorskip("stable_baselines3")
+
+WORLDS, SEATS = 2, 3
+SMALL: dict[str, Any] = {"num_worlds": WORLDS, "agents": SEATS, "background": 2}
+
+
+@pytest.fixture
+def rows() -> Any:
+    from cavmarl.adapters.sb3_vec_env import CavSb3VecEnv
+
+    return CavSb3VecEnv("merge", **SMALL, max_cycles=40)
+
+
+def wild(rows: Any, seed: int) -> list[Any]:
+    """80 steps at full throttle, steered at random: vehicles leave the road, then the horizon."""
+    rows.seed(seed)
+    found = [rows.reset()]
+    random = np.random.default_rng(0)
+    for _ in range(80):
+        actions = random.uniform(-1.0, 1.0, (rows.num_envs, 2)).astype(np.float32)
+        actions[:, 0] = 1.0
+        found.append(rows.step(actions))
+    return found
+
+
+def test_sb3_finds_spaces_that_it_knows(rows: Any) -> None:
+    from stable_baselines3.common.utils import check_for_correct_spaces
+    from stable_baselines3.common.vec_env import VecCheckNan, VecMonitor
+
+    assert rows.num_envs == WORLDS * SEATS
+    watched = VecMonitor(VecCheckNan(rows, raise_exception=True))
+    watched.seed(0)
+    observations = watched.reset()
+    assert observations.dtype == rows.observation_space.dtype
+    ended = 0
+    for _ in range(60):
+        actions = np.stack([rows.action_space.sample() for _ in range(rows.num_envs)])
+        observations, rewards, done, infos = watched.step(actions)
+        assert all(rows.observation_space.contains(row) for row in observations)
+        assert rewards.shape == done.shape == (rows.num_envs,)
+        assert done.dtype == np.bool_
+        ended += sum("episode" in info for info in infos)
+    assert ended >= rows.num_envs
+    model = sb3.PPO("MlpPolicy", watched, n_steps=8, batch_size=24, n_epochs=1, device="cpu")
+    check_for_correct_spaces(watched, model.observation_space, model.action_space)
+
+
+def test_sb3_learns_saves_and_loads(rows: Any, tmp_path: Any) -> None:
+    from stable_baselines3.common.evaluation import evaluate_policy
+    from stable_baselines3.common.vec_env import VecMonitor
+
+    watched = VecMonitor(rows)
+    model = sb3.PPO("MlpPolicy", watched, n_steps=16, batch_size=32, seed=0, device="cpu")
+    model.learn(2 * 16 * rows.num_envs)
+    model.save(tmp_path / "model.zip")
+    loaded = sb3.PPO.load(tmp_path / "model.zip", env=watched, device="cpu")
+    mean, _ = evaluate_policy(loaded, watched, n_eval_episodes=4)
+    assert np.isfinite(mean)
+
+
+def test_rows_are_the_worlds_seats(rows: Any) -> None:
+    vec = make_vec(
+        "merge",
+        num_envs=WORLDS,
+        agents=SEATS,
+        background=2,
+        max_cycles=40,
+        overrides={"population.mode": "seats"},
+    )
+    observations, _ = vec.reset(seed=5)
+    random = np.random.default_rng(0)
+    found = wild(rows, 5)
+    assert np.array_equal(found[0], observations.reshape(rows.num_envs, -1))
+    kinds = {"ended": 0, "cut": 0, "inactive": 0}
+    for seen, rewards, done, infos in found[1:]:
+        actions = random.uniform(-1.0, 1.0, (rows.num_envs, 2)).astype(np.float32)
+        actions[:, 0] = 1.0
+        theirs = vec.step(actions.reshape(WORLDS, SEATS, 2))
+        assert np.array_equal(seen, theirs[0].reshape(rows.num_envs, -1))
+        assert np.array_equal(rewards, theirs[1].ravel())
+        assert np.array_equal(done, (theirs[2] | theirs[3]).ravel())
+        for row, info in enumerate(infos):
+            world, seat = divmod(row, SEATS)
+            assert ("terminal_observation" in info) == done[row]
+            assert ("inactive" in info) == (not theirs[4]["acted"][world, seat])
+            kinds["inactive"] += "inactive" in info
+            if done[row]:
+                last = theirs[4]["final_observations"][world, seat]
+                assert np.array_equal(info["terminal_observation"], last)
+                assert info["TimeLimit.truncated"] == theirs[3][world, seat]
+                kinds["cut" if theirs[3][world, seat] else "ended"] += 1
+    assert kinds["ended"] > 0
+    assert kinds["cut"] > 0
+
+
+def test_the_same_seed_gives_the_same_rows(rows: Any) -> None:
+    first, again, other = wild(rows, 1), wild(rows, 1), wild(rows, 2)
+    assert all(np.array_equal(a[0], b[0]) for a, b in zip(first[1:], again[1:], strict=True))
+    assert not np.array_equal(first[0], other[0])
+
+
+def test_attributes_and_methods_are_those_of_the_worlds(rows: Any) -> None:
+    rows.reset()
+    assert rows.get_attr("max_cycles") == [40] * rows.num_envs
+    assert rows.get_attr("max_cycles", 1) == [40]
+    assert not rows.has_attr("nonsense")
+    assert rows.env_method("state_hash", 1, indices=[0]) == [rows.env_method("state_hash", 1)[0]]
+    assert rows.env_is_wrapped(object) == [False] * rows.num_envs
+    with pytest.raises(NotImplementedError, match="max_cycles: rows share"):
+        rows.set_attr("max_cycles", 3)
+
+
+def test_wrong_use_is_refused(rows: Any) -> None:
+    from cavmarl.adapters.sb3_vec_env import CavSb3VecEnv
+
+    with pytest.raises(ConfigError, match=r"population\.mode: rows need seats"):
+        CavSb3VecEnv("merge", overrides={"population.mode": "closed"})
+    rows.reset()
+    with pytest.raises(InvalidActionError, match="must be finite"):
+        rows.step(np.full((rows.num_envs, 2), np.nan, dtype=np.float32))

@@ -1,0 +1,74 @@
+"""Suites: what they name, what they drive, what they refuse."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from cavmarl.errors import ConfigError
+from cavmarl.evaluate import load_report
+from cavmarl.evaluate.suite import find_suite, load_suite, run_suite, worlds_of
+
+ROOT = Path(__file__).resolve().parents[2]
+
+
+def test_the_standard_suite_has_the_maps_and_numbers_that_it_should() -> None:
+    suite = load_suite(find_suite("standard"))
+    assert len(suite.maps) >= 4
+    assert suite.agents == (1, 25, 50, 100)
+
+
+def test_its_maps_are_there_and_each_world_has_its_own_name(shared_maps: Path) -> None:
+    suite = load_suite(find_suite("standard"))
+    labels = [world.label for world in worlds_of(suite, shared_maps)]
+    assert len(set(labels)) == len(suite.maps) * len(suite.agents)
+
+
+def test_every_map_is_driven_with_every_number_of_agents(tmp_path: Path) -> None:
+    file = tmp_path / "mine.yaml"
+    file.write_text(
+        "maps: [ring, merge/map/map.net.xml]\nagents: [1, 2]\nbackground: 2\nhorizon_s: 2\n"
+    )
+    suite = load_suite(find_suite(str(file)))
+    worlds = worlds_of(suite, ROOT / "envs")
+    begun: list[str] = []
+    reports = run_suite(
+        suite,
+        worlds,
+        ["idm"],
+        tmp_path / "out",
+        episodes=1,
+        repeats=1,
+        seed=0,
+        began=lambda world: begun.append(world.label),
+    )
+    assert begun == list(reports) == ["ring-1", "ring-2", "map-1", "map-2"]
+    for world in worlds:
+        population = reports[world.label].manifest["world"]["config"]["population"]
+        assert population["agents"] == world.agents
+        assert load_report(tmp_path / "out" / world.label) == reports[world.label]
+
+
+def test_two_maps_of_one_name_are_refused(tmp_path: Path) -> None:
+    file = tmp_path / "mine.yaml"
+    file.write_text("maps: [merge/map/map.net.xml, ring/map/map.net.xml]\nagents: [1]\n")
+    with pytest.raises(ConfigError, match="two have one name"):
+        worlds_of(load_suite(file), ROOT / "envs")
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("maps: []\nagents: [1]", "maps = "),
+        ("maps: [ring, ring]\nagents: [1]", "each once"),
+        ("maps: [ring]\nagents: []", "agents = "),
+        ("maps: [ring]\nagents: [1]\nmap: x", "map: unknown key"),
+        ("maps: ring", "maps"),
+    ],
+)
+def test_a_suite_that_cannot_work_is_refused(tmp_path: Path, text: str, message: str) -> None:
+    file = tmp_path / "bad.yaml"
+    file.write_text(text)
+    with pytest.raises(ConfigError, match=message):
+        load_suite(file)

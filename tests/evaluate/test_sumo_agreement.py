@@ -1,0 +1,64 @@
+"""Whole runs of real demand beside SUMO's own: nobody touches, and the figures are near SUMO's."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import NamedTuple
+
+import pytest
+
+from cavmarl.evaluate.traffic_comparison import compare_traffic
+
+sumo = pytest.importorskip("sumo", reason="needs the extra 'sumo'")
+pytest.importorskip("libsumo", reason="needs the extra 'sumo'")
+
+GAME = Path(sumo.SUMO_HOME) / "tools" / "game"
+NEAR = 0.15  # of SUMO's figure
+
+
+class Case(NamedTuple):
+    """A map, its demand, and which figures are held to SUMO's."""
+
+    roads: str
+    demand: tuple[str, ...]
+    near: tuple[str, ...] = ("arrived", "mean_speed_mps")
+
+
+# On Town10HD some twenty vehicles arrive in the whole time: that number says little.
+REAL = {
+    "bologna": Case(
+        "net/bologna_acosta/acosta_buslanes.net.xml", ("net/bologna_acosta/run.sumocfg",)
+    ),
+    "mcity": Case(
+        "net/mcity/mcity.net.xml", ("net/mcity/mcity.rou.xml", "net/mcity/mcity.add.xml")
+    ),
+    "town25": Case("net/Town10HD.net.xml", ("demand/town10hd_25.rou.xml",), ("mean_speed_mps",)),
+    "town50": Case("net/Town10HD.net.xml", ("demand/town10hd_50.rou.xml",), ("mean_speed_mps",)),
+}
+WHEEL = {
+    "kuehne": Case("kuehne/kuehne.net.xml", ("kuehne/kuehne.rou.xml",)),
+    "cross_demo": Case("cross/cross.net.xml", ("cross_demo.sumocfg",)),
+}
+
+
+def compare(folder: Path, case: Case) -> None:
+    files = [folder / name for name in case.demand]
+    found = compare_traffic(folder / case.roads, files, seconds=900, dt_s=0.1, seed=1)
+    assert found.ours.figures.contacts == 0
+    assert found.ours.figures.departed > 0
+    for figure in case.near:
+        ratio = found.ratio(figure)
+        assert ratio is not None
+        assert abs(ratio - 1.0) < NEAR, f"{figure}: {ratio:.2f} of SUMO's"
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", REAL)
+def test_on_real_maps_traffic_is_as_sumos(shared_maps: Path, name: str) -> None:
+    compare(shared_maps, REAL[name])
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", WHEEL)
+def test_on_the_wheels_maps_traffic_is_as_sumos(name: str) -> None:
+    compare(GAME, WHEEL[name])

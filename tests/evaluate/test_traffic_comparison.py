@@ -1,0 +1,134 @@
+"""Both sides of the table in one run, its picture, and its speed."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from cavmarl.cli import main
+from cavmarl.errors import ConfigError
+from cavmarl.evaluate.native_traffic import make_world
+from cavmarl.evaluate.traffic_comparison import RATIOS, TrafficComparison, compare_traffic
+from cavmarl.evaluate.traffic_metrics import EDGE_MINUTE, TrafficFigures, TrafficRun
+from cavmarl.evaluate.traffic_plot import binned_means, plot_fundamental_diagram
+from cavmarl.evaluate.traffic_speed import measure_traffic_speed
+from cavmarl.roads.reader import read_network
+
+sumo = pytest.importorskip("sumo", reason="needs the extra 'sumo'")
+pytest.importorskip("libsumo", reason="needs the extra 'sumo'")
+
+GAME = Path(sumo.SUMO_HOME) / "tools" / "game"
+MAP = GAME / "kuehne" / "kuehne.net.xml"
+ROUTES = GAME / "kuehne" / "kuehne.rou.xml"
+WORDS = ("bench", "traffic", str(MAP), "--demand", str(ROUTES))
+
+
+def run(*words: str) -> int:
+    """The exit code of a command."""
+    with pytest.raises(SystemExit) as ended:
+        main(words)
+    return int(ended.value.code or 0)
+
+
+def side(arrived: int, mean_speed_mps: float | None) -> TrafficRun:
+    figures = TrafficFigures(9, 0, arrived, mean_speed_mps, None, 2.0, 0, 0.0, "", 0)
+    points = np.zeros(40, EDGE_MINUTE)
+    points["length_m"] = 80.0
+    points["density_per_km"] = np.linspace(1.0, 30.0, 40)
+    points["flow_per_h"] = 600.0
+    points["speed_mps"] = 9.0
+    return TrafficRun(figures, {}, points)
+
+
+def comparison(ours: TrafficRun, theirs: TrafficRun) -> TrafficComparison:
+    return TrafficComparison("town", 900, 0.1, 1, ours, theirs)
+
+
+def test_a_ratio_is_ours_over_sumos_where_that_says_something() -> None:
+    found = comparison(side(6, 3.0), side(8, None))
+    assert found.ratio("arrived") == 0.75
+    assert found.ratio("mean_speed_mps") is None
+    assert found.ratio("waiting") is None
+    assert found.ratio("contacts") is None
+
+
+def test_the_command_prints_the_table_and_writes_both_files(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    pytest.importorskip("matplotlib")
+    picture, document = tmp_path / "fd.png", tmp_path / "out.json"
+    words = ("--seconds", "20", "--dt", "0.2", "--plot", str(picture), "--json", str(document))
+    assert run(*WORDS, *words) == 0
+    shown = capsys.readouterr().out
+    for label in ("departed", "waiting", "arrived", "mean speed", "mean delay", "queue"):
+        assert label in shown
+    assert picture.read_bytes().startswith(b"\x89PNG")
+    written = json.loads(document.read_text())
+    assert written["sumo"]["figures"]["departed"] > 0
+    assert set(written["ratios"]) == set(RATIOS)
+
+
+def test_our_world_has_the_signal_programs_of_the_demand() -> None:
+    roads = GAME / "cross" / "cross.net.xml"
+    plain = read_network(roads)
+    world = make_world(roads, [GAME / "cross_demo.sumocfg"], 10, 0, 0.1)
+    assert set(world.network.program_ids) > set(plain.program_ids)
+    on = world.network.signals["program"][0]
+    assert world.network.program_ids[on] not in plain.program_ids
+
+
+def test_both_speeds_are_measured() -> None:
+    found = measure_traffic_speed(MAP, [ROUTES], dt_s=0.2, after_s=10, repeats=2)
+    for rates in (found.ours, found.sumo):
+        assert 0.0 < rates.low <= rates.median <= rates.high
+    assert found.sumo_vehicles > 1.0
+    assert found.ratio == found.ours.median / found.sumo.median
+
+
+@pytest.mark.parametrize(
+    ("wrong", "says"),
+    [({"seconds": 0}, "seconds = 0"), ({"dt_s": 0.3}, "dt = 0.3"), ({"dt_s": 0.0}, "dt = 0")],
+)
+def test_numbers_out_of_range_are_refused(wrong: dict[str, float], says: str) -> None:
+    with pytest.raises(ConfigError, match=says):
+        compare_traffic(MAP, [ROUTES], **wrong)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(
+    ("words", "says"),
+    [
+        (("bench", "traffic", "nowhere", "-d", str(ROUTES)), "nowhere"),
+        (("bench", "traffic", str(MAP), "-d", "none.rou.xml"), "none.rou.xml: cannot be read"),
+        (
+            ("bench", "traffic", str(GAME / "cross" / "cross.net.xml"), "-d", str(ROUTES)),
+            "is the file of another map",
+        ),
+        ((*WORDS, "--speed", "--plot", "x.png"), "--plot"),
+        ((*WORDS, "--speed", "--after", "0"), "after = 0"),
+    ],
+)
+def test_bad_input_is_one_line(
+    capsys: pytest.CaptureFixture[str], words: tuple[str, ...], says: str
+) -> None:
+    assert run(*words) == 2
+    said = " ".join(capsys.readouterr().err.split())
+    assert says in said
+    assert "Traceback" not in said
+
+
+def test_bins_join_what_lies_in_them() -> None:
+    density = np.array([1.0, 3.0, 2.0, 5.0, 4.0, 11.0])
+    means = binned_means(density, np.array([1.0, 1.0, 1.0, 1.0, 6.0, 100.0]))
+    assert means[0].tolist() == [3.0]
+    assert means[1].tolist() == [2.0]
+
+
+def test_a_picture_that_cannot_be_written_is_refused(tmp_path: Path) -> None:
+    pytest.importorskip("matplotlib")
+    found = comparison(side(6, 3.0), side(8, 3.0))
+    for name in ("gone/fd.png", "fd.xyz"):
+        with pytest.raises(ConfigError, match="cannot be written"):
+            plot_fundamental_diagram(found, tmp_path / name)

@@ -1,0 +1,43 @@
+"""Who is on which link or comes towards it, one vehicle at a time."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from cavmarl.kernels.arrays import Travel
+from cavmarl.roads.network import RoadNetwork
+
+Entry = tuple[int, int, float]  # link, vehicle's id, m of its centre to the stop line
+
+
+def announcements(roads: RoadNetwork, travel: Travel, row: np.void) -> list[Entry]:
+    """What one vehicle announces."""
+    lane, way, name = int(row["lane"]), int(row["way"]), int(row["id"])
+    here = roads.lanes[lane]
+    found: list[Entry] = []
+    if here["internal"]:
+        driven = float(here["link_offset_m"] + row["s"])
+        found.append((int(here["link"]), name, -driven))
+    elif row["link"] >= 0 and roads.links[row["link"]]["to_lane"] == lane:
+        link = roads.links[row["link"]]
+        rear = float(link["length_m"] + row["s"] - 0.5 * row["length"])
+        if rear < max(link["length_m"], link["fork_m"]):
+            found.append((int(row["link"]), name, -float(link["length_m"] + row["s"])))
+    sight = min(30.0 + 8.0 * float(row["speed"]), 150.0)
+    to_end = float(here["length_m"] - row["s"])
+    ahead: list[tuple[int, float]] = []
+    while to_end < sight and len(ahead) < 2:
+        if here["internal"]:
+            lane = int(here["successor"])
+        else:
+            step = travel.steps[way + lane]
+            if step["next"] < 0:
+                break
+            ahead.append((int(step["link"]), to_end))
+            lane, way = int(step["next"]), way + int(step["shift"])
+        here = roads.lanes[lane]
+        to_end += float(here["length_m"])
+    for link, distance in ahead:
+        if roads.links[link]["num_conflicts"]:
+            found.append((link, name, max(distance, 0.0)))
+    return found

@@ -1,0 +1,49 @@
+"""Post-encroachment times of vehicles that pass a junction at constant speeds, in closed form."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from itertools import combinations
+from typing import NamedTuple
+
+from cavmarl.roads.network import RoadNetwork
+
+
+class Passage(NamedTuple):
+    """A vehicle's way over a junction."""
+
+    link: int
+    start_m: float  # centre's way from the stop line at time 0; negative: before it
+    speed_mps: float
+    length_m: float
+
+
+def least_encroachments(network: RoadNetwork, passages: Sequence[Passage]) -> list[float]:
+    """Of each vehicle, the least time between its stay in a shared area and another's; inf: none.
+
+    Vehicles on crossing paths share the area of their conflict; on paths into one lane they do not.
+    """
+    least = [float("inf")] * len(passages)
+    for a, b in combinations(range(len(passages)), 2):
+        mine, other = passages[a], passages[b]
+        row = network.links[mine.link]
+        first, count = int(row["first_conflict"]), int(row["num_conflicts"])
+        for conflict in network.conflicts[first : first + count]:
+            if conflict["foe"] != other.link:
+                continue
+            if network.links[other.link]["to_lane"] == row["to_lane"]:
+                continue
+            enter, leave = _stay(mine, conflict["enter_m"], conflict["leave_m"])
+            foe_enter, foe_leave = _stay(other, conflict["foe_enter_m"], conflict["foe_leave_m"])
+            passed = max(foe_enter - leave, enter - foe_leave, 0.0)
+            least[a], least[b] = min(least[a], passed), min(least[b], passed)
+    return least
+
+
+def _stay(passage: Passage, enter_m: float, leave_m: float) -> tuple[float, float]:
+    """When the front bumper comes and when the rear bumper leaves."""
+    half = 0.5 * passage.length_m
+    return (
+        (float(enter_m) - half - passage.start_m) / passage.speed_mps,
+        (float(leave_m) + half - passage.start_m) / passage.speed_mps,
+    )

@@ -1,0 +1,43 @@
+"""Both models of car following, told from the acceleration that a driver takes in the end."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from tests.naive import car_following, krauss
+
+CAR_M = 5.0  # IDM measures between the centres of two such cars
+MARGIN_M = 1.0  # kept before lines
+
+
+def idm_response(
+    kind: np.void, speed: float, allowed: float, leaders: list[tuple[float, float]]
+) -> float:
+    """IDM behind the worst of several leaders, given as (gap between bumpers, speed)."""
+    jam = float(kind["min_gap"]) + CAR_M
+    own = (float(kind["accel"]), float(kind["decel"]), jam, float(kind["tau"]))
+    wanted = [car_following.idm_acceleration(speed, allowed, None, 0.0, *own)]
+    for gap, front_speed in leaders:
+        distance = max(gap, 0.1) + CAR_M
+        wanted.append(car_following.idm_acceleration(speed, allowed, distance, front_speed, *own))
+    return min(max(min(wanted), -6.0), 6.0)
+
+
+def krauss_response(
+    kind: np.void,
+    speed: float,
+    allowed: float,
+    leaders: list[tuple[float, float, float]],
+    share: float,
+    dt: float,
+) -> float:
+    """Krauss behind several leaders, given as (gap between bumpers, speed, deceleration)."""
+    accel, decel = float(kind["accel"]), float(kind["decel"])
+    wanted = min(allowed, speed + accel * dt)
+    for gap, front_speed, front_decel in leaders:
+        room = gap - float(kind["min_gap"])
+        wanted = min(
+            wanted, krauss.safe_speed(room, front_speed, decel, front_decel, float(kind["tau"]))
+        )
+    driven = krauss.dawdle(max(wanted, 0.0), accel, float(kind["sigma"]), share, dt)
+    return max((driven - speed) / dt, -float(kind["emergency_decel"]))

@@ -1,0 +1,158 @@
+"""Programs of additional files join those of the map; the last one loaded is on, as in SUMO."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from cavmarl.errors import MapError
+from cavmarl.kernels.signals import switch_signals
+from cavmarl.maps.check import check_map
+from cavmarl.roads.network import SIGNAL_STATES, RoadNetwork
+from cavmarl.roads.reader import read_network
+from cavmarl.roads.signal_plans import with_programs
+from cavmarl.shard.shard import make_worlds
+
+NIGHT = """<additional>
+  <inductionLoop id="passed over" lane="s_0" pos="1" period="60" file="x"/>
+  <tlLogic id="c" type="static" programID="night" offset="begin">
+    <phase duration="5" state="Grr"/>
+    <phase duration="5" state="rGG"/>
+  </tlLogic>
+  EXTRA
+</additional>
+"""
+WEEK = """
+  <WAUT id="week" refTime="0" startProg="0">
+    <wautSwitch time="00:00:40" to="night"/><wautSwitch time="60" to="off"/>
+  </WAUT>
+  <wautJunction wautID="week" junctionID="c"/>
+"""
+
+
+@pytest.fixture
+def additional(tmp_path: Path) -> Callable[..., Path]:
+    def write(extra: str = "", *changes: tuple[str, str]) -> Path:
+        text = NIGHT.replace("EXTRA", extra)
+        for old, new in changes:
+            assert old in text
+            text = text.replace(old, new)
+        path = tmp_path / "programs.add.xml"
+        path.write_text(text, encoding="utf-8")
+        return path
+
+    return write
+
+
+def states(network: RoadNetwork, times: list[int]) -> list[str]:
+    worlds = make_worlds(1, 1, network)
+    shown = []
+    for time in times:
+        worlds.ticks[0] = time
+        switch_signals(network.arrays, worlds, 1.0)
+        first = network.phases[worlds.signal_phase[0, 0]]["first_state"]
+        codes = network.phase_states[first : first + 3]
+        shown.append("".join(SIGNAL_STATES[code] for code in codes))
+    return shown
+
+
+def test_the_program_loaded_last_is_on(
+    crossing: Callable[..., Path], additional: Callable[..., Path]
+) -> None:
+    plain = read_network(crossing())
+    network = with_programs(plain, [additional()])
+
+    assert network.program_ids == ("0", "night")
+    assert states(network, [0, 4, 5, 9, 10]) == ["Grr", "Grr", "rGG", "rGG", "Grr"]
+    assert plain.program_ids == ("0",), "the network given is not changed"
+    assert network.content_hash != plain.content_hash
+    assert network.source_hash != plain.source_hash
+    assert with_programs(plain) is plain
+
+
+def test_of_several_programs_in_a_map_the_last_is_on(crossing: Callable[..., Path]) -> None:
+    second = (
+        '<tlLogic id="c" type="static" programID="1"><phase duration="9" state="ggg"/></tlLogic>'
+    )
+    network = read_network(crossing(("</tlLogic>", f"</tlLogic>{second}")))
+
+    assert network.program_ids == ("0", "1")
+    assert states(network, [0, 7]) == ["ggg", "ggg"]
+
+
+def test_a_choice_stands_above_all(
+    crossing: Callable[..., Path], additional: Callable[..., Path]
+) -> None:
+    plain = read_network(crossing())
+
+    assert states(with_programs(plain, [additional(WEEK)], {"c": "0"}), [3, 45, 70]) == [
+        "Grr",
+        "rGg",
+        "Grr",
+    ]
+    assert states(with_programs(plain, chosen={"c": "off"}), [0, 50]) == ["Ooo", "Ooo"]
+
+
+def test_a_timetable_switches_programs(
+    crossing: Callable[..., Path], additional: Callable[..., Path]
+) -> None:
+    network = with_programs(read_network(crossing()), [additional(WEEK)])
+
+    expected = ["rGg", "Grr", "rGg", "Grr", "rGG", "Ooo", "Ooo"]
+    assert states(network, [0, 3, 39, 40, 45, 60, 99]) == expected
+
+
+BROKEN = {
+    "other map": ("", ('id="c"', 'id="z"'), "line 3: .*no signal 'z'.*another map"),
+    "letters": ("", ('state="rGG"', 'state="rG"'), "different numbers of links"),
+    "name taken": ("", ('programID="night"', 'programID="0"'), "two programs '0'"),
+    "no duration": ("", ('<phase duration="5"', "<phase"), "line 4: <phase> has no attribute"),
+    "no number": ("", ('duration="5"', 'duration="inf"'), "duration='inf'"),
+    "no phase": ("", ('state="Grr"', 'state="Grr" next="7"'), "leads to phase 7"),
+    "unknown program": (WEEK, ('to="night"', 'to="day"'), "no program 'day'; there are 0, night"),
+    "unknown timetable": (WEEK, ('wautID="week"', 'wautID="year"'), "unknown WAUT 'year'"),
+}
+
+
+@pytest.mark.parametrize("case", BROKEN)
+def test_broken_programs_are_refused(
+    crossing: Callable[..., Path], additional: Callable[..., Path], case: str
+) -> None:
+    extra, change, message = BROKEN[case]
+    with pytest.raises(MapError, match=message):
+        with_programs(read_network(crossing()), [additional(extra, change)])
+
+
+def test_actuated_programs_get_detectors_where_the_green_empties(
+    crossing: Callable[..., Path],
+) -> None:
+    text = ('type="static" programID="0" offset="3"', 'type="actuated" programID="0" offset="3"')
+    green = ('duration="30"', 'duration="30" minDur="5" maxDur="50"')
+    network = read_network(crossing(text, green))
+
+    # 2 s at 10 m/s before the end of the 95 m lane: nearer than 5 s of queue.
+    assert network.detectors["s_m"].tolist() == [75.0]
+    assert [network.lane_ids[row] for row in network.detectors["lane"]] == ["w_1"]
+    assert network.phases["num_detectors"].tolist() == [1, 0, 0]
+    assert network.phases["green"].tolist() == [True, False, True]
+    assert check_map(network).actuated_signals == 1
+    assert network.phase_detectors.tolist() == [0]
+
+
+@pytest.mark.parametrize(
+    ("change", "simplified"),
+    [
+        (('type="static"', 'type="actuated"'), False),
+        (('type="static"', 'type="delay_based"'), True),
+        (('type="static"', 'type="NEMA"'), True),
+        (('state="Grr"', 'state="Grr" next="1 2"'), True),
+    ],
+)
+def test_rules_that_are_not_run_are_reported(
+    crossing: Callable[..., Path], change: tuple[str, str], simplified: bool
+) -> None:
+    report = check_map(read_network(crossing(change)))
+    assert report.programs_simplified == (("c/0",) if simplified else ())
+    assert any("programs simplified" in note for note in report.notes) == simplified

@@ -1,0 +1,87 @@
+"""Memory stays flat however long worlds are driven."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from cavmarl import make_vec, parallel_env
+
+STATM = Path("/proc/self/statm")
+GROWTH_MB = 5.0
+RESETS = 1000
+AGENT_STEPS = 1_000_000
+
+DEMAND = """<routes>
+  <flow id="f" begin="0" end="60" period="1"><route edges="bottom0A0 A0B0 B0C0 C0D0"/></flow>
+  <flow id="g" from="left0A0" to="A3top0" begin="0" end="60" probability="0.5"/>
+</routes>
+"""
+
+pytestmark = [
+    pytest.mark.slow,
+    pytest.mark.skipif(not STATM.exists(), reason="memory is read from /proc"),
+]
+
+
+@pytest.fixture(params=["closed", "entering", "seats", "demand"])
+def world(request: pytest.FixtureRequest, tmp_path: Path) -> dict[str, Any]:
+    """Arguments of a world of each population, and of one with demand."""
+    overrides: dict[str, Any] = {"population.mode": request.param}
+    if request.param == "demand":
+        path = tmp_path / "x.rou.xml"
+        path.write_text(DEMAND, encoding="utf-8")
+        overrides = {"population.mode": "entering", "traffic.demand": [str(path)]}
+    return {"env": "grid4x4", "agents": 8, "background": 20, "seed": 0, "overrides": overrides}
+
+
+def resident_mb() -> float:
+    return int(STATM.read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE") / 1e6
+
+
+def growth_mb(work: Callable[[], object], times: int) -> float:
+    """By how much `times` calls let the process grow, after a tenth of them as warm-up."""
+    for _ in range(times // 10):
+        work()
+    before = resident_mb()
+    for _ in range(times):
+        work()
+    return resident_mb() - before
+
+
+def test_a_thousand_resets(world: dict[str, Any]) -> None:
+    env = parallel_env(**world)
+
+    def episode() -> None:
+        env.reset()
+        for _ in range(5):
+            env.step(env.suggest_actions())
+            env.state()
+
+    assert growth_mb(episode, RESETS) < GROWTH_MB
+
+
+def test_a_million_agent_steps(world: dict[str, Any]) -> None:
+    vec = make_vec(**world, num_envs=8)
+    _, infos = vec.reset()
+    acted = int(infos["mask"].sum())
+
+    def step() -> None:
+        nonlocal acted
+        *_, infos = vec.step(vec.suggest_actions())
+        acted += int(infos["acted"].sum())
+
+    number = AGENT_STEPS // (vec.num_envs * world["agents"])
+    assert growth_mb(step, number) < GROWTH_MB
+    assert acted > AGENT_STEPS // 10, "too few agents drove for this to mean anything"
+
+
+def test_a_thousand_worlds_made() -> None:
+    def make() -> None:
+        parallel_env("ring", agents=2, background=2, seed=0).reset()
+
+    assert growth_mb(make, 1000) < GROWTH_MB

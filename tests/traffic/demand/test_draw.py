@@ -1,0 +1,140 @@
+"""What is drawn from a demand file: pure functions of the key, with the chances that it states."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from cavmarl.kernels.rng import world_key
+from cavmarl.traffic.demand import Choices
+from cavmarl.traffic.demand.records import (
+    LANE_BEST,
+    POS_GIVEN,
+    SPEED_MAX,
+    UNTIL_DEPARTURE,
+    UNTIL_FLOW,
+    Options,
+)
+from tests.traffic.demand.conftest import Reader
+
+KEY = int(world_key(7, 0, 0))
+
+
+def test_draws_depend_on_the_key_and_on_nothing_else(demand: Reader) -> None:
+    flows = '<flow id="f" end="900" period="exp(0.5)"><route edges="AB BC"/></flow>'
+    flows += '<flow id="g" end="900" probability="0.3"><route edges="AB BC"/></flow>'
+    file, again = demand(flows), demand(flows)
+    orders = file.draw(KEY)
+    assert orders.tobytes() == again.draw(KEY).tobytes()
+    assert orders.tobytes() != file.draw(KEY + 1).tobytes()
+    early = file.draw(KEY, until_s=300.0)
+    assert early.tobytes() == orders[: len(early)].tobytes()
+    assert len(early) == np.count_nonzero(orders["depart"] < 300.0)
+
+
+def test_another_element_behind_changes_nothing(demand: Reader) -> None:
+    flow = '<flow id="f" end="900" period="exp(0.5)"><route edges="AB BC"/></flow>'
+    alone = demand(flow).draw(KEY)
+    beside = demand(flow + flow.replace('"f"', '"g"')).draw(KEY)
+    assert alone["depart"].tolist() == beside["depart"][beside["element"] == 0].tolist()
+
+
+@pytest.mark.parametrize("rate", ['period="exp(0.5)"', 'probability="0.5"', 'vehsPerHour="1800"'])
+def test_flows_have_the_rate_that_they_state(demand: Reader, rate: str) -> None:
+    file = demand(f'<flow id="f" end="10000" {rate}><route edges="AB BC"/></flow>')
+    orders = file.draw(KEY)
+    assert len(orders) == pytest.approx(5000, abs=4 * 5000**0.5)
+    assert orders["number"].tolist() == list(range(len(orders)))
+    assert file.vehicle_id(orders[3]) == "f.3"
+
+
+def test_distributions_are_drawn_with_their_weights(demand: Reader) -> None:
+    file = demand(
+        '<vTypeDistribution id="d"><vType id="a" probability="3"/><vType id="b" probability="1"/>'
+        '<vType id="never" probability="0"/></vTypeDistribution>'
+        '<route id="x" edges="AB BC"/><route id="y" edges="CB BA"/>'
+        '<routeDistribution id="r" routes="x y" probabilities="1 4"/>'
+        '<flow id="f" type="d" route="r" end="10000" number="10000"/>'
+    )
+    orders = file.draw(KEY)
+    share = {
+        field: np.bincount(orders[field], minlength=2)[:2] / len(orders)
+        for field in ("vtype", "route")
+    }
+    np.testing.assert_allclose(share["vtype"], [0.75, 0.25], atol=0.02)
+    np.testing.assert_allclose(share["route"], [0.2, 0.8], atol=0.02)
+
+
+def test_choices_stay_in_their_list() -> None:
+    choices = Choices([Options((k,), (1.0,)) for k in range(5000)])
+    most = np.nextafter(1.0, 0.0)
+    picked = choices.pick(np.arange(5000, dtype=np.int32), np.full(5000, most))
+    assert picked.tolist() == list(range(5000))
+
+
+def test_equal_routes_are_stored_once_and_orders_are_sorted(demand: Reader) -> None:
+    file = demand(
+        '<vehicle id="b" depart="9"><route edges="AB BC" color="red"/></vehicle>'
+        '<vehicle id="a" depart="3"><route edges="AB  BC"/></vehicle>'
+        '<vehicle id="c" depart="3"><route edges="AB BC"/></vehicle>'
+    )
+    assert len(file.routes) == 1
+    assert [file.vehicle_id(order) for order in file.draw(0)] == ["a", "c", "b"]
+    assert sum(tally.count for tally in file.report.tolerated.values()) == 2
+
+
+def test_trips_name_the_edges_to_pass(demand: Reader) -> None:
+    file = demand('<trip id="t" depart="0" from="AB" via="BC" to="CB"/>')
+    (order,) = file.draw(0)
+    route = file.routes[order["route"]]
+    assert not route["exact"]
+    assert order["reroute"]
+    names = [file.network.edge_ids[edge] for edge in file.route_edges]
+    assert names == ["AB", "BC", "CB"]
+
+
+def test_how_a_vehicle_enters_and_leaves(demand: Reader) -> None:
+    file = demand(
+        '<vehicle id="a" depart="0" departLane="1" departPos="-20" departSpeed="max" '
+        'arrivalPos="30" speedFactor="1.1"><route edges="AB BC"/></vehicle>'
+        '<vehicle id="b" depart="0" departLane="best"><route edges="AB BC"/></vehicle>'
+    )
+    first, second = file.draw(0)
+    network = file.network
+    edge = network.edges[network.edge_ids.index("AB")]
+    assert network.lane_ids[first["depart_lane"]] == "AB_1"
+    assert first["depart_pos_code"] == POS_GIVEN
+    assert first["depart_pos"] == pytest.approx(float(edge["length_m"]) - 20.0)
+    assert first["depart_speed_code"] == SPEED_MAX
+    assert first["arrival_pos"] == 30.0
+    assert first["speed_factor"] == 1.1
+    assert second["depart_lane"] == LANE_BEST
+    assert np.isnan(second["speed_factor"])
+
+
+def test_stops_of_routes_and_vehicles(demand: Reader) -> None:
+    file = demand(
+        '<busStop id="s" lane="BC_0" startPos="10" endPos="30"/>'
+        '<route id="r" edges="AB BC"><stop busStop="s" duration="20" until="60"/></route>'
+        '<flow id="f" route="r" number="1" end="9">'
+        '<stop lane="AB_1" endPos="-50" until="40" parking="true"/></flow>'
+        '<vehicle id="a" route="r" depart="0"/>'
+    )
+    flow, single = file.draw(0)
+    stops = file.stops[flow["first_stop"] :][: flow["num_stops"]]
+    assert stops["at_edge"].tolist() == [0, 1]
+    assert stops["until_from"].tolist() == [UNTIL_FLOW, UNTIL_DEPARTURE]
+    assert stops["parking"].tolist() == [True, False]
+    assert stops["duration"].tolist() == [0.0, 20.0]
+    assert single["num_stops"] == 1
+    stop = file.stops[single["first_stop"]]
+    assert file.network.lane_ids[stop["lane"]] == "BC_0"
+    assert stop["end"] == pytest.approx(30.0)
+
+
+def test_reroute_chances_are_drawn(demand: Reader) -> None:
+    file = demand(
+        '<flow id="f" end="4000" number="4000"><route edges="AB BC"/>'
+        '<param key="device.rerouting.probability" value="0.25"/></flow>'
+    )
+    assert file.draw(KEY)["reroute"].mean() == pytest.approx(0.25, abs=0.03)

@@ -1,0 +1,83 @@
+"""The other training programs, as a user calls them, on a few decisions."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from cavmarl.evaluate.manifest import read_closed
+from cavmarl.evaluate.training_record import is_trained
+
+pytest.importorskip("torch", reason="needs the extra: torch")
+
+TRAIN = Path(__file__).resolve().parents[2] / "train"
+SMALL = """\
+env: merge
+agents: 2
+background: 0
+num_envs: 2
+num_steps: 8
+minibatches: 2
+hidden: 8
+total_agent_steps: 40
+"""
+
+
+def call(program: str, *words: object) -> subprocess.CompletedProcess[str]:
+    command = [sys.executable, str(TRAIN / program), *map(str, words)]
+    return subprocess.run(command, capture_output=True, text=True, check=False)
+
+
+def test_sb3_trains_a_driver_that_evaluate_takes(tmp_path: Path) -> None:
+    pytest.importorskip("stable_baselines3", reason="needs the extra: sb3")
+    sizes = ["--num-worlds", 2, "--num-steps", 8, "--minibatches", 2, "--hidden", 8]
+    done = call("ppo_sb3.py", *sizes, "--total-agent-steps", 300, "--runs", tmp_path, "--name", "a")
+    assert done.returncode == 0, done.stderr
+    manifest = read_closed(tmp_path / "a")
+    assert manifest["program"] == "ppo_sb3.py"
+    assert set(manifest["results_sha256"]) >= {"model.zip", "model.safetensors", "progress.csv"}
+    from cavmarl.policies import load_policy
+    from cavmarl.vector_env import make_vec
+
+    vec = make_vec("merge")
+    observations, infos = vec.reset(seed=0)
+    vec.step(load_policy(tmp_path / "a", vec).act_batch(observations, infos["mask"]))
+
+
+def test_five_seeds_trains_what_is_missing_and_writes_the_table(tmp_path: Path) -> None:
+    pytest.importorskip("matplotlib", reason="needs the extra: report")
+    config = tmp_path / "small.yaml"
+    config.write_text(SMALL)
+    words = ["--config", config, "--seeds", 0, 1, "--episodes", 1, "--repeats", 2]
+    done = call("five_seeds.py", *words, "--out", tmp_path / "out")
+    assert done.returncode == 0, done.stderr
+    assert "idm" in (tmp_path / "out" / "table.md").read_text()
+    assert (tmp_path / "out" / "curves.svg").stat().st_size > 1000
+    result = json.loads((tmp_path / "out" / "result.json").read_text())
+    assert len(result["trained"]["success"]["runs"]) == 2
+    assert read_closed(tmp_path / "out" / "evaluation")["policies"]["seed_1"]
+    assert is_trained(tmp_path / "out" / "seed_0")
+    (tmp_path / "out" / "seed_0" / "progress.csv").write_text("changed\n")
+    assert not is_trained(tmp_path / "out" / "seed_0")
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["--config", "nowhere.yaml"], "nowhere.yaml"),
+        (["--config", "{small}", "--seeds", "3"], "--seeds"),
+        (["--config", "{small}", "--jobs", "0"], "--jobs"),
+        (["--config", "{list}"], "mapping"),
+    ],
+)
+def test_wrong_use_of_five_seeds_is_refused(tmp_path: Path, words: list[str], message: str) -> None:
+    small, listed = tmp_path / "small.yaml", tmp_path / "list.yaml"
+    small.write_text(SMALL)
+    listed.write_text("- env\n")
+    done = call("five_seeds.py", *(word.format(small=small, list=listed) for word in words))
+    assert done.returncode == 2
+    assert message in done.stderr

@@ -1,0 +1,226 @@
+"""Training repeated with other seeds, and the drivers that came of it beside scripted ones.
+
+    python train/five_seeds.py --config configs/train/merge.yaml
+
+Trains with each seed (`ippo_torch.py`, one core each), lets all drivers and the scripted ones
+drive the same episodes, which no training has seen, and writes into the folder: `table.md`,
+`result.json`, `curves.svg`, `evaluation/` with its manifest and raw tables, and the runs, each with
+its own manifest. A seed that is trained already is not trained again.
+
+Of the trained drivers the interval is that of the mean over training seeds; of a scripted one, that
+of the mean over evaluation runs; both 95 %, by Student's t.
+"""
+
+from __future__ import annotations
+
+import argparse
+import csv
+import json
+import subprocess
+import sys
+from collections.abc import Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import numpy as np
+
+from cavmarl.config_io import read_yaml
+from cavmarl.errors import CavmarlError, ConfigError, require
+from cavmarl.evaluate import EvaluationReport, evaluate
+from cavmarl.evaluate.statistics import Interval, mean_interval
+from cavmarl.evaluate.training_record import is_trained
+
+PROGRAM = Path(__file__).with_name("ippo_torch.py")
+SCRIPTED = ("idm", "random_actions")
+METRICS = {
+    "success": "success, %",
+    "collision": "collision, %",
+    "off_road": "off road, %",
+    "red_light": "red light, %",
+    "episode_return": "episode return",
+    "delay_s": "delay of an arrival, s",
+}
+JUDGED = ("success", "episode_return")
+PERCENT = frozenset(("success", "collision", "off_road", "red_light"))
+
+
+@dataclass(frozen=True)
+class Args:
+    """The settings; see `parse_args`."""
+
+    config: Path
+    seeds: list[int]
+    jobs: int
+    episodes: int
+    repeats: int
+    evaluation_seed: int
+    out: Path
+    others: list[str]
+
+
+def parse_args(words: Sequence[str] | None = None) -> Args:
+    """The settings that the command line asks for."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("--config", type=Path, required=True, help="settings of ippo_torch.py")
+    parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2, 3, 4], help="of training")
+    parser.add_argument("--jobs", type=int, default=1, help="seeds that are trained side by side")
+    parser.add_argument("--episodes", type=int, default=64, help="of an evaluation run")
+    parser.add_argument("--repeats", type=int, default=5, help="evaluation runs")
+    parser.add_argument("--evaluation-seed", type=int, default=1000, help="of the first of them")
+    parser.add_argument("--out", type=Path, help="folder (default: runs/CONFIG_seeds)")
+    parser.add_argument("--others", nargs="*", default=[], help="more runs for the curves")
+    given = vars(parser.parse_args(words))
+    given["out"] = given["out"] or Path("runs") / f"{given['config'].stem}_seeds"
+    if len(set(given["seeds"])) < 2 or given["repeats"] < 2 or given["jobs"] < 1:
+        raise ConfigError("--seeds and --repeats: an interval needs two; --jobs: at least 1")
+    return Args(**given)
+
+
+@dataclass(frozen=True)
+class Row:
+    """A metric of a driver: mean of its runs and the interval of that mean."""
+
+    mean: float | None
+    interval: Interval | None
+    runs: list[float | None]
+
+
+def train(args: Args) -> dict[int, Path]:
+    """The folder of each seed's run, trained unless it is there and complete."""
+    folders = {seed: args.out / f"seed_{seed}" for seed in args.seeds}
+    missing = [seed for seed in args.seeds if not is_trained(folders[seed])]
+
+    def run(seed: int) -> None:
+        words = ["--config", str(args.config), "--seed", str(seed), "--runs", str(args.out)]
+        command = [sys.executable, str(PROGRAM), *words, "--name", f"seed_{seed}"]
+        print(f"training seed {seed}", flush=True)
+        done = subprocess.run(command, stdout=subprocess.DEVNULL, check=False)
+        if done.returncode != 0:
+            raise ConfigError(f"training with seed {seed} failed: {' '.join(command)}")
+
+    with ThreadPoolExecutor(args.jobs) as pool:
+        list(pool.map(run, missing))
+    return folders
+
+
+def summarise(report: EvaluationReport, args: Args) -> dict[str, dict[str, Row]]:
+    """Rows by driver and metric; the trained drivers are one."""
+    trained = [report[f"seed_{seed}"] for seed in args.seeds]
+    found: dict[str, dict[str, Row]] = {"trained": {}}
+    for metric in METRICS:
+        means = [driver[metric].mean for driver in trained]
+        known = np.array([mean for mean in means if mean is not None])
+        mean = float(known.mean()) if known.size else None
+        found["trained"][metric] = Row(mean, mean_interval(known), means)
+    for name in SCRIPTED:
+        found[name] = {
+            metric: Row(
+                report[name][metric].mean,
+                report[name][metric].between_run_ci95,
+                [run.mean for run in report[name][metric].within_run],
+            )
+            for metric in METRICS
+        }
+    return found
+
+
+def beats(rows: Mapping[str, Mapping[str, Row]], other: str, metric: str) -> bool:
+    """Whether the trained drivers' interval lies above another driver's."""
+    mine, theirs = rows["trained"][metric].interval, rows[other][metric].interval
+    return mine is not None and theirs is not None and mine.low > theirs.high
+
+
+def table(rows: Mapping[str, Mapping[str, Row]], args: Args, env: str) -> str:
+    """The result as Markdown."""
+    count = len(args.seeds)
+    lines = [
+        f"`{env}`: {count} training seeds; {args.repeats} runs of {args.episodes} episodes.",
+        "",
+        "| | " + " | ".join(rows) + " |",
+        "| --- |" + " ---: |" * len(rows),
+    ]
+    for metric, title in METRICS.items():
+        cells = [_cell(row[metric], 100.0 if metric in PERCENT else 1.0) for row in rows.values()]
+        lines.append(f"| {title} | " + " | ".join(cells) + " |")
+    lines.append("")
+    for other in SCRIPTED:
+        for metric in JUDGED:
+            word = "beats" if beats(rows, other, metric) else "does not beat"
+            lines.append(f"- trained {word} {other} in {METRICS[metric]}")
+    return "\n".join(lines) + "\n"
+
+
+def _cell(row: Row, scale: float) -> str:
+    if row.mean is None:
+        return "-"
+    if row.interval is None:
+        return f"{scale * row.mean:.2f}"
+    low, high = scale * row.interval.low, scale * row.interval.high
+    return f"{scale * row.mean:.2f} [{low:.2f}, {high:.2f}]"
+
+
+def read_curve(folder: Path) -> dict[str, list[float]]:
+    """The columns of a run's progress.csv."""
+    with (folder / "progress.csv").open(newline="", encoding="utf-8") as file:
+        rows = list(csv.DictReader(file))
+    return {name: [float(row[name]) for row in rows] for name in rows[0]}
+
+
+def draw_curves(path: Path, folders: Sequence[Path], others: Sequence[Path], title: str) -> None:
+    """Learning curves of all seeds, one line each, and of other runs."""
+    require("matplotlib", "report")
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(9.0, 3.2), layout="constrained")
+    axes = figure.subplots(1, 2)
+    shown = {"success": "trips that arrive", "trip_return": "return of a trip"}
+    for axis, (column, label) in zip(axes, shown.items(), strict=True):
+        for k, folder in enumerate((*folders, *others)):
+            curve = read_curve(folder)
+            millions = [steps / 1e6 for steps in curve["agent_steps"]]
+            name = folder.name if folder in others else "ippo_torch.py" if k == 0 else None
+            color = f"C{1 + others.index(folder)}" if folder in others else "C0"
+            axis.plot(millions, curve[column], color=color, label=name, linewidth=0.9)
+        axis.set(xlabel="decisions, million", ylabel=label)
+        axis.grid(color="0.9")
+    axes[0].legend(frameon=False)
+    figure.suptitle(title)
+    figure.savefig(path)
+
+
+def main(words: Sequence[str] | None = None) -> int:
+    """Train, evaluate, write; 0: done, 2: wrong use."""
+    try:
+        args = parse_args(words)
+        settings = read_yaml(args.config)
+        if not isinstance(settings, dict):
+            raise ConfigError(f"{args.config}: must be a mapping of settings")
+        env = str(settings.get("env", "merge"))
+        args.out.mkdir(parents=True, exist_ok=True)
+        folders = train(args)
+        drivers = {folder.name: folder for folder in folders.values()}
+        report = evaluate(
+            env,
+            {**drivers, **{name: name for name in SCRIPTED}},
+            episodes=args.episodes,
+            seed=args.evaluation_seed,
+            repeats=args.repeats,
+            out=args.out / "evaluation",
+        )
+        rows = summarise(report, args)
+        text = table(rows, args, env)
+        (args.out / "table.md").write_text(text, encoding="utf-8")
+        plain = {name: {key: asdict(row) for key, row in row.items()} for name, row in rows.items()}
+        (args.out / "result.json").write_text(json.dumps(plain, indent=2) + "\n", encoding="utf-8")
+        others = [Path(folder) for folder in args.others]
+        draw_curves(args.out / "curves.svg", list(folders.values()), others, env)
+    except CavmarlError as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 2
+    print(text)
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
