@@ -125,8 +125,11 @@ def verify_determinism(
     }
     with ExitStack() as stack:
         room = Path(stack.enter_context(TemporaryDirectory()))
+        programs = [stack.enter_context(_Program(job, HASH_SEEDS[0]))]
+        # If kernels have to be compiled, one process does it for all.
+        programs[0].wait_for_line()
         stack.enter_context(_load_beside())
-        programs = [stack.enter_context(_Program(job, key)) for key in HASH_SEEDS]
+        programs += [stack.enter_context(_Program(job, key)) for key in HASH_SEEDS[1:]]
         for step in range(steps + 1):
             told = [program.read() for program in programs]
             odd = next((k for k, line in enumerate(told) if line != told[0]), None)
@@ -153,6 +156,7 @@ class _Program:
 
     def __init__(self, job: dict[str, Any], hash_seed: str) -> None:
         self._hash_seed = hash_seed
+        self._line = ""
         self._process = subprocess.Popen(
             [sys.executable, "-m", "cavmarl.evaluate.lockstep"],
             stdin=subprocess.PIPE,
@@ -178,12 +182,18 @@ class _Program:
         except BrokenPipeError as error:
             raise self._died() from error
 
+    def wait_for_line(self) -> None:
+        """Wait until it has told something that `read` returns next."""
+        assert self._process.stdout is not None
+        self._line = self._process.stdout.readline()
+        if not self._line:
+            raise self._died()
+
     def read(self) -> dict[str, Any]:
         """The next line."""
-        assert self._process.stdout is not None
-        line = self._process.stdout.readline()
-        if not line:
-            raise self._died()
+        if not self._line:
+            self.wait_for_line()
+        line, self._line = self._line, ""
         told: dict[str, Any] = json.loads(line)
         if "error" in told:
             raise getattr(errors, told["error"])(told["message"])

@@ -18,6 +18,7 @@ from cavmarl.kernels.codes import (
     COUNT_ARRIVED,
     COUNT_DEPARTED,
     COUNT_REMOVED,
+    COUNT_REROUTED,
     SUM_DELAY_S,
     SUM_DISTANCE_M,
     SUM_TIME_S,
@@ -46,6 +47,7 @@ class TrafficStats:
         arrived: vehicles that reached their goal.
         contacts: vehicles that began to touch another one.
         removed: agents taken out after a collision or off the road.
+        rerouted: vehicles that took a detour; one that took two counts twice.
         mean_speed_mps: over the vehicles in the world now.
         mean_trip_m: over the arrived ones.
         mean_trip_s: over the arrived ones.
@@ -59,6 +61,7 @@ class TrafficStats:
     arrived: int
     contacts: int
     removed: int
+    rerouted: int
     mean_speed_mps: float
     mean_trip_m: float
     mean_trip_s: float
@@ -292,6 +295,7 @@ class Simulation:
             arrived=arrived,
             contacts=int(worlds.num_contacts[world]),
             removed=int(counts[COUNT_REMOVED]),
+            rerouted=int(counts[COUNT_REROUTED]),
             mean_speed_mps=float(np.sort(rows["speed"]).mean()) if len(rows) else 0.0,
             mean_trip_m=float(sums[SUM_DISTANCE_M]) / trips,
             mean_trip_s=float(sums[SUM_TIME_S]) / trips,

@@ -156,3 +156,16 @@ def test_a_follower_comes_to_stand_behind_who_brakes_hard(name: str) -> None:
         assert gap > 0.5 * kind["min_gap"]
     assert speed < 0.1
     assert gap < kind["min_gap"] + 1.5
+
+
+@given(allowed=SPEEDS, further=st.floats(-40.0, 40.0), gap=st.floats(-2.0, 2.4), share=SHARES)
+def test_who_stands_close_behind_a_standing_leader_stays_whatever_lies_ahead(
+    allowed: float, further: float, gap: float, share: float
+) -> None:
+    # `drivers` looks no further then.
+    car = krauss()
+    press = behind(car, 0.0, gap, 0.0, 4.5)
+    assert press == 0.0
+    for whole in (press, max(press, further)):
+        assert response(car, 0.0, allowed, whole, share, DT) == 0.0
+    assert wish(car, 0.0, allowed, press) == wish(car, 0.0, 0.0, press) == 0.0

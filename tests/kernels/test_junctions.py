@@ -156,6 +156,26 @@ def test_the_side_road_waits_for_a_whole_column_and_then_goes(scene: Make) -> No
     assert times["side"] > max(times[f"main{k}"] for k in range(5))
 
 
+@pytest.mark.parametrize(("waited_s", "first"), [(0.0, "main"), (170.0, "side")])
+def test_who_has_given_way_for_long_is_let_in_by_who_can_brake(
+    scene: Make, waited_s: float, first: str
+) -> None:
+    here = scene("priority")
+    here.put("side", "S_in_0", 1.0, "N_out", wait_s=waited_s)
+    here.put("main", "W_in_0", 40.0, "E_out", speed=11.0)
+    times = here.entries(25.0)
+    assert set(times) == {"side", "main"}
+    assert min(times, key=lambda name: times[name]) == first
+
+
+def test_patience_does_not_run_into_who_cannot_brake_any_more(scene: Make) -> None:
+    here = scene("priority")
+    here.put("side", "S_in_0", 1.0, "N_out", wait_s=10_000.0)
+    here.put("main", "W_in_0", 12.0, "E_out", speed=13.0)
+    times = here.entries(10.0)  # nobody touches
+    assert times["main"] < times["side"]
+
+
 def test_a_left_turn_gives_way_to_who_comes_straight(scene: Make) -> None:
     here = scene("priority")
     here.put("left", "W_in_0", 20.0, "N_out", speed=10.0)

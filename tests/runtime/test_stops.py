@@ -7,7 +7,6 @@ from pathlib import Path
 
 import pytest
 
-from cavmarl.kernels.codes import COUNT_REROUTED
 from cavmarl.runtime.simulation import Simulation
 from tests.demand_worlds import make
 from tests.driving import drive, start
@@ -137,7 +136,6 @@ def test_who_cannot_change_lanes_for_long_goes_on_another_way(world: World) -> N
     edge = network.edges[network.lanes[row["lane"]]["edge"]]
     lanes = range(int(edge["first_lane"]), int(edge["first_lane"] + edge["num_lanes"]))
     (wrong,) = (k for k in lanes if travel.steps[row["way"] + k]["change"] != 0)
-    rerouted = simulation._gate.counts[0, COUNT_REROUTED : COUNT_REROUTED + 1]
     for waited, times in ((44.0, 0), (46.0, 1)):
         row = simulation.vehicles()[0]
         row["lane"] = row["target_lane"] = wrong
@@ -148,7 +146,7 @@ def test_who_cannot_change_lanes_for_long_goes_on_another_way(world: World) -> N
         simulation._traffic.arrive_and_depart(
             simulation._gate, worlds, simulation._shard.scratch, DT
         )
-        assert rerouted[0] == times
+        assert simulation.traffic_stats().rerouted == times
         worlds.rows[0, 0] = worlds.next_rows[0, 0]
     row = simulation.vehicles()[0]
     assert row["way"] == travel.first_detour + row["goal"] * len(network.lanes)

@@ -41,7 +41,8 @@ def ippo() -> ModuleType:
 def learn(ippo: ModuleType, folder: Path, agents: int, agent_steps: int) -> Path:
     """Train from nothing: no example is imitated."""
     words = ["--env", str(CROSSING), "--agents", str(agents), "--num-envs", str(64 // agents)]
-    words += ["--total-agent-steps", str(agent_steps), "--initial-std", "0.4", "--hidden", "32"]
+    words += ["--total-agent-steps", str(agent_steps), "--hidden", "32"]
+    words += ["--throttle-std", "0.4"]
     words += ["--runs", str(folder), "--name", f"agents_{agents}", "--minibatches", "16"]
     assert ippo.main(words) == 0
     return folder / f"agents_{agents}"
@@ -68,7 +69,7 @@ def test_the_ladder(ippo: ModuleType, tmp_path: Path) -> None:
     assert ends(alone, agents=1)[0] > 0.98
     reckless = ends(alone, agents=2)[1]
     assert reckless > 0.05
-    together = learn(ippo, tmp_path, agents=2, agent_steps=1_500_000)
+    together = learn(ippo, tmp_path, agents=2, agent_steps=3_000_000)
     arrived, collided = ends(together, agents=2)
     assert arrived > 0.98
     assert collided < 0.2 * reckless
