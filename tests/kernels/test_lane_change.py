@@ -28,6 +28,12 @@ def test_a_mandatory_change_needs_no_gain_but_safety() -> None:
     assert not mobil_accepts(1.0, -1.5, 0.0, -2.1, 0.0, 0.0, True)
 
 
+def test_how_hard_a_change_may_make_one_brake_can_be_said() -> None:
+    assert mobil_accepts(1.0, -3.9, 0.0, -3.9, 0.0, 0.0, True, 4.0)
+    assert not mobil_accepts(1.0, -4.1, 0.0, -3.9, 0.0, 0.0, True, 4.0)
+    assert not mobil_accepts(1.0, -3.9, 0.0, -4.1, 0.0, 0.0, True, 4.0)
+
+
 def test_the_thresholds_themselves_are_accepted() -> None:
     assert mobil_accepts(0.0, 0.2, 0.0, -2.0, 0.0, 0.0, False)
     assert mobil_accepts(0.0, -2.0, 0.0, -2.0, 0.0, 0.0, True)
