@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from cavmarl.kernels import inlined_kernel, kernel
 from cavmarl.kernels.arrays import RoadArrays, Scratch, Travel
-from cavmarl.kernels.ways import next_step
+from cavmarl.kernels.ways import leave, next_step, own_step
 
 __all__ = ["APPROACH", "APPROACH_M", "register_links"]
 
@@ -45,8 +45,12 @@ def register_links(
         travel: the ways.
         rows: VEHICLE (C,), of which `num` live.
         num: live rows.
-        scratch: link_start and approach are written.
+        scratch: step, link_start and approach are written.
     """
+    # One look for all that follows: in a city the steps lie far apart, each a cache miss, and a loop
+    # that does nothing else has many of them under way at once.
+    for i in range(num):
+        scratch.step[i] = travel.steps[own_step(roads, rows[i])]
     pairs = 0
     for i in range(num):
         pairs = _announce(roads, travel, rows[i], i, pairs, scratch)
@@ -97,7 +101,10 @@ def _announce(
     way = row["way"]
     found = 0
     while distance < reach:
-        lane, way, link = next_step(roads, travel, lane, way)
+        if lane == row["lane"] and way == row["way"]:
+            lane, way, link = leave(roads, scratch.step[i], lane, way)
+        else:
+            lane, way, link = next_step(roads, travel, lane, way)
         if lane < 0:
             break
         if link >= 0:

@@ -83,6 +83,7 @@ class Worlds(NamedTuple):
     controllers: NDArray[np.void]  # CONTROLLER (W, num_controllers) of the actuated programs
     detected_s: NDArray[np.float64]  # (W, D) when a body was last over each detector
     num_through: NDArray[np.int64]  # (W,) background vehicles that have arrived in this tick
+    num_touching: NDArray[np.int64]  # (W,) owned vehicles that touched another before this tick
     num_contacts: NDArray[np.int64]  # (W,) vehicles that began to touch another, since reset
 
 
@@ -122,6 +123,7 @@ class Scratch(NamedTuple):
     lane_start: NDArray[np.int32]  # (L + 1,) entries of lane l: [lane_start[l], lane_start[l + 1])
     lane_end: NDArray[np.int32]  # (L,) lane_start[l + 1] again
     entries: NDArray[np.void]  # ENTRY (2 C,) vehicles by (lane, s, id), side lanes included
+    step: NDArray[np.void]  # PLAN (C,) of each row the step of its lane, see `ways.own_step`
     lane_taken: NDArray[np.bool_]  # (L,) somebody has tried to enter there in this tick
     link_start: NDArray[np.int32]  # (K + 2,) approach of link k: [link_start[k], link_start[k + 1])
     approach: NDArray[np.void]  # APPROACH (3 C,) vehicles on or before links, by link

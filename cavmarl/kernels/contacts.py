@@ -42,8 +42,8 @@ def bodies_touch(one: np.void, other: np.void) -> bool:
 
 
 @kernel
-def find_contacts(num: int, grid: Grid, hit: NDArray[np.int64]) -> None:
-    """For each vehicle the smallest id of those that it touches.
+def find_contacts(num: int, grid: Grid, hit: NDArray[np.int64]) -> bool:
+    """For each vehicle the smallest id of those that it touches; whether any two do.
 
     Args:
         num: live rows of the world.
@@ -51,6 +51,7 @@ def find_contacts(num: int, grid: Grid, hit: NDArray[np.int64]) -> None:
         hit: (C,) by VEHICLE row, overwritten up to `num`: an id, or -1.
     """
     hit[:num] = -1
+    found = False
     bodies = grid.bodies
     for a in range(num):
         body = bodies[a]
@@ -66,6 +67,8 @@ def find_contacts(num: int, grid: Grid, hit: NDArray[np.int64]) -> None:
                 if bodies_touch(body, other):
                     _note(hit, body["row"], other["id"])
                     _note(hit, other["row"], body["id"])
+                    found = True
+    return found
 
 
 @kernel

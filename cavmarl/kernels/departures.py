@@ -48,7 +48,7 @@ from cavmarl.kernels.rng import (
     below,
     uniform,
 )
-from cavmarl.kernels.ways import way_left
+from cavmarl.kernels.ways import own_step, way_left
 
 __all__ = ["call_orders", "choose_goals", "let_in", "populate", "take_out"]
 
@@ -145,7 +145,7 @@ def _enter(
     row["departed"] = worlds.ticks[w]
     row["tick"] = worlds.ticks[w]
     row["heading"] = place_on_lane(roads, travel, row)
-    row["to_go"] = way_left(roads, travel, row)
+    row["to_go"] = way_left(roads, row, travel.steps[own_step(roads, row)])
     row["step_to_go"] = row["to_go"]
 
 

@@ -37,7 +37,7 @@ from cavmarl.kernels.lane_choice import (
 from cavmarl.kernels.lanes import ahead_on, beside_s, last_on, neighbor_behind
 from cavmarl.kernels.rng import STREAM_DRIVER, quick_uniform
 from cavmarl.kernels.stopping import way_to_stop
-from cavmarl.kernels.ways import next_step
+from cavmarl.kernels.ways import leave, next_step
 
 __all__ = ["LOOK_AHEAD_M", "decide"]
 
@@ -286,7 +286,10 @@ def _road_ahead(
     while distance < look:
         before = lane
         before_way = way
-        lane, way, link = next_step(roads, travel, before, way)
+        if before == row["lane"] and before_way == row["way"]:
+            lane, way, link = leave(roads, scratch.step[i], before, way)
+        else:
+            lane, way, link = next_step(roads, travel, before, way)
         if lane < 0:
             end = _lane_end(
                 roads, travel, row, kind, before, before_way, distance, merge_room_m, dt
@@ -416,7 +419,7 @@ def decide(
             press = max(press, before_line(kind, speed, to_stop + LINE_MARGIN_M, dt))
         if row["side_lane"] >= 0:
             press = max(press, _beside(roads, kind, row, row["side_lane"], scratch))
-        needed = needed_change(roads, travel, row)
+        needed = needed_change(roads, travel, row, scratch.step[i])
         own_wish = wish(kind, speed, allowed, press)
         change = 0
         if thinks_of_lanes(row, needed, tick, dt):
@@ -435,7 +438,7 @@ def decide(
         if needed != 0 and change == 0 and driver == DRIVER_BACKGROUND:
             lane = roads.lanes[row["lane"]]
             target = lane["left"] if needed > 0 else lane["right"]
-            room = travel.steps[row["way"] + row["lane"]]["room"] - row["s"]
+            room = scratch.step[i]["room"] - row["s"]
             if target >= 0 and room < FALL_IN_M:
                 # Fall in behind whom it wants to follow on the other lane.
                 fall_in = wish(kind, speed, allowed, _beside(roads, kind, row, target, scratch))

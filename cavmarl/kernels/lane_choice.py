@@ -38,15 +38,17 @@ SIDE_GAP_M = 1.0  # m between bumpers, the least with which a lane change starts
 
 
 @inlined_kernel
-def needed_change(roads: RoadArrays, travel: Travel, row: np.void) -> int:
-    """The side that a vehicle's way needs it to change to by now: 1 left, -1 right, 0 none."""
+def needed_change(roads: RoadArrays, travel: Travel, row: np.void, step: np.void) -> int:
+    """The side that a vehicle's way needs it to change to by now: 1 left, -1 right, 0 none.
+
+    `step` is its own one.
+    """
     lane = row["lane"]
     if roads.lanes[lane]["internal"]:
         return 0
     to_stop = lane_to_stop(roads, travel, row)
     if to_stop != 0:
         return to_stop if to_stop != STAY else 0
-    step = travel.steps[row["way"] + lane]
     if step["change"] == 0:
         return 0
     early = (CHANGE_EARLY_M + CHANGE_EARLY_S * row["speed"]) * step["changes"]

@@ -89,9 +89,10 @@ def index_lanes(
     num_lanes = lanes.shape[0]
     end[:num_lanes] = 0
     for i in range(num):
-        end[rows[i]["lane"]] += 1
-        if rows[i]["side_lane"] >= 0:
-            end[rows[i]["side_lane"]] += 1
+        row = rows[i]
+        end[row["lane"]] += 1
+        if row["side_lane"] >= 0:
+            end[row["side_lane"]] += 1
     begin = 0
     for lane in range(num_lanes):
         start[lane] = begin

@@ -27,7 +27,7 @@ from cavmarl.kernels.lanes import beside_s
 from cavmarl.kernels.scalars import clamp
 from cavmarl.kernels.stopping import make_stop
 from cavmarl.kernels.tracking import locate, side_lane
-from cavmarl.kernels.ways import next_step, way_left
+from cavmarl.kernels.ways import next_step, own_step, way_left
 
 __all__ = ["ARRIVE_M", "MAX_SPEED_MPS", "move_agent", "move_background", "place_on_lane"]
 
@@ -176,6 +176,7 @@ def move_background(
     travel: Travel,
     old: np.void,
     row: np.void,
+    step: np.void,
     accel: float,
     lane_change: int,
     dt: float,
@@ -190,6 +191,7 @@ def move_background(
         travel: the ways.
         old: VEHICLE, the committed record.
         row: VEHICLE, a copy of it that becomes the next one.
+        step: PLAN, its own step before the tick.
         accel: decided acceleration in m/s².
         lane_change: 1 to the left, -1 to the right, 0 none.
         dt: seconds of the tick.
@@ -226,7 +228,10 @@ def move_background(
     row["steering"] = 0.0
     if turned != 0.0 and speed > STANDING_MPS:
         row["steering"] = clamp(math.atan(row["length"] * turned / (speed * dt)), -0.8, 0.8)
-    row["to_go"] = way_left(roads, travel, row)
+    if row["lane"] == old["lane"] and row["way"] == old["way"]:
+        row["to_go"] = way_left(roads, row, step)
+    else:
+        row["to_go"] = way_left(roads, row, travel.steps[own_step(roads, row)])
     if row["to_go"] <= ARRIVE_M:
         row["events"] |= EVENT_ARRIVED
     _account(row, old, roads, old["speed_factor"], dt)

@@ -33,6 +33,7 @@ from cavmarl.kernels.motion import move_agent, move_background
 from cavmarl.kernels.neighbors import Grid, fill_grid
 from cavmarl.kernels.scalars import clamp
 from cavmarl.kernels.steering import nearest_speed, steer_to_lane, take_meta_action
+from cavmarl.kernels.ways import own_step
 
 __all__ = ["advance", "begin_step", "resolve", "suggest"]
 
@@ -129,9 +130,11 @@ def advance(
             for i in range(owned):
                 scratch.order[i] = i
         through = 0
+        touching = 0
         for k in range(owned):
             i = scratch.order[k]
             old = rows[i]
+            touching += old["hit"] >= 0
             worlds.next_rows[w, k] = old
             row = worlds.next_rows[w, k]
             if old["driver"] == DRIVER_BACKGROUND:
@@ -141,7 +144,14 @@ def advance(
                 if scratch.link_ahead[i] >= 0 and old["wait_s"] >= STOP_SIGN_S:
                     row["stopped_at"] = scratch.link_ahead[i]
                 move_background(
-                    roads, travel, old, row, scratch.accel[i], scratch.lane_change[i], dt
+                    roads,
+                    travel,
+                    old,
+                    row,
+                    scratch.step[i],
+                    scratch.accel[i],
+                    scratch.lane_change[i],
+                    dt,
                 )
                 through += row["events"] & EVENT_ARRIVED
                 continue
@@ -168,8 +178,9 @@ def advance(
                 dt,
             )
             # The indicator is automatic: drivers behind make room for who has to change lanes.
-            row["blinker"] = needed_change(roads, travel, row)
+            row["blinker"] = needed_change(roads, travel, row, travel.steps[own_step(roads, row)])
         worlds.num_through[w] = through
+        worlds.num_touching[w] = touching
 
 
 @kernel
@@ -185,7 +196,9 @@ def resolve(worlds: Worlds, scratch: Scratch, grid: Grid) -> None:
     for w in range(worlds.ticks.shape[0]):
         rows = worlds.next_rows[w]
         fill_grid(rows, worlds.num_rows[w], grid)
-        find_contacts(worlds.num_rows[w], grid, scratch.hit)
+        touch = find_contacts(worlds.num_rows[w], grid, scratch.hit)
+        if not touch and worlds.num_touching[w] == 0:
+            continue
         for i in range(worlds.num_owned[w]):
             row = rows[i]
             other = scratch.hit[i]

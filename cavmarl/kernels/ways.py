@@ -13,7 +13,24 @@ import numpy as np
 from cavmarl.kernels import inlined_kernel
 from cavmarl.kernels.arrays import RoadArrays, Travel
 
-__all__ = ["next_step", "way_left"]
+__all__ = ["leave", "next_step", "own_step", "way_left"]
+
+
+@inlined_kernel
+def own_step(roads: RoadArrays, row: np.void) -> int:
+    """Where in `Travel.steps` a vehicle is: the step of its lane, or, inside a junction, of the next."""
+    lane = row["lane"]
+    if roads.lanes[lane]["internal"]:
+        lane = roads.links[roads.lanes[lane]["link"]]["to_lane"]
+    return int(row["way"] + lane)
+
+
+@inlined_kernel
+def leave(roads: RoadArrays, step: np.void, lane: int, way: int) -> tuple[int, int, int]:
+    """`next_step` from the lane that a vehicle is on, whose own step is known."""
+    if roads.lanes[lane]["internal"]:
+        return roads.lanes[lane]["successor"], way, -1
+    return step["next"], way + step["shift"], step["link"]
 
 
 @inlined_kernel
@@ -29,13 +46,13 @@ def next_step(roads: RoadArrays, travel: Travel, lane: int, way: int) -> tuple[i
 
 
 @inlined_kernel
-def way_left(roads: RoadArrays, travel: Travel, row: np.void) -> float:
-    """Metres from a vehicle's centre to the end of its way; inf where it has none."""
-    lane = row["lane"]
-    here = roads.lanes[lane]
+def way_left(roads: RoadArrays, row: np.void, step: np.void) -> float:
+    """Metres from a vehicle's centre to the end of its way; inf where it has none.
+
+    `step` is its own one.
+    """
+    here = roads.lanes[row["lane"]]
     left = -row["s"]
     if here["internal"]:
-        link = roads.links[here["link"]]
-        left += link["length_m"] - here["link_offset_m"]
-        lane = link["to_lane"]
-    return float(travel.steps[row["way"] + lane]["to_go"] + left)
+        left += roads.links[here["link"]]["length_m"] - here["link_offset_m"]
+    return float(step["to_go"] + left)

@@ -22,7 +22,7 @@ from cavmarl.kernels.signals import switch_signals
 from cavmarl.kernels.stacking import fill_stacks
 from cavmarl.kernels.tick import advance, begin_step, resolve, suggest
 from cavmarl.roads.network import RoadNetwork
-from cavmarl.roads.routing import lane_grid
+from cavmarl.roads.routing import PLAN, lane_grid
 from cavmarl.shard.controllers import CONTROLLER
 from cavmarl.shard.sensors import frame_size, further_arrays, sensor_arrays
 from cavmarl.shard.vehicles import VEHICLE
@@ -186,6 +186,7 @@ def make_worlds(num_worlds: int, capacity: int, network: RoadNetwork) -> Worlds:
         controllers=np.zeros((num_worlds, network.num_controllers), dtype=CONTROLLER),
         detected_s=np.zeros((num_worlds, len(network.detectors)), dtype=np.float64),
         num_through=np.zeros(num_worlds, dtype=np.int64),
+        num_touching=np.zeros(num_worlds, dtype=np.int64),
         num_contacts=np.zeros(num_worlds, dtype=np.int64),
     )
 
@@ -201,6 +202,7 @@ def _make_scratch(num_lanes: int, num_links: int, capacity: int) -> Scratch:
         lane_start=integers(num_lanes + 1),
         lane_end=integers(num_lanes),
         entries=np.zeros(2 * capacity, dtype=ENTRY),
+        step=np.zeros(capacity, dtype=PLAN),
         lane_taken=np.zeros(num_lanes, dtype=np.bool_),
         link_start=integers(num_links + 2),
         approach=np.zeros(3 * capacity, dtype=APPROACH),
