@@ -12,12 +12,13 @@ from cavmarl.kernels import inlined_kernel, kernel
 from cavmarl.kernels.arrays import RoadArrays, Scratch, Travel
 from cavmarl.kernels.ways import leave, next_step, own_step
 
-__all__ = ["APPROACH", "APPROACH_M", "register_links"]
+__all__ = ["APPROACH", "APPROACH_M", "FORK_BEYOND_M", "register_links"]
 
 APPROACH_M = 150.0  # how far ahead a vehicle announces itself at most,
 APPROACH_S = 8.0  # which it does this time before it arrives,
 APPROACH_STANDING_M = 30.0  # and this far ahead in any case
 MAX_LINKS_AHEAD = 2
+FORK_BEYOND_M = 3.0  # how far beyond a junction paths from one lane can still run together
 
 APPROACH = np.dtype(
     [
@@ -90,7 +91,7 @@ def _announce(
     s = row["s"]
     if here["internal"]:
         pairs = _note(scratch, pairs, here["link"], row, i, -(here["link_offset_m"] + s))
-    elif row["link"] >= 0:
+    elif row["link"] >= 0 and s - 0.5 * row["length"] < FORK_BEYOND_M:
         # Its centre has left the junction, its rear has not, or not the fork before it.
         left = roads.links[row["link"]]
         rear = s - 0.5 * row["length"]

@@ -83,6 +83,9 @@ class Worlds(NamedTuple):
     controllers: NDArray[np.void]  # CONTROLLER (W, num_controllers) of the actuated programs
     detected_s: NDArray[np.float64]  # (W, D) when a body was last over each detector
     num_through: NDArray[np.int64]  # (W,) background vehicles that have arrived in this tick
+    pending: NDArray[
+        np.float64
+    ]  # (W, A, D + 1, 2) agents' commands of the last D ticks of latency, by tick modulo D + 1
     num_touching: NDArray[np.int64]  # (W,) owned vehicles that touched another before this tick
     num_contacts: NDArray[np.int64]  # (W,) vehicles that began to touch another, since reset
 

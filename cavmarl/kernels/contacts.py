@@ -5,14 +5,14 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from cavmarl.kernels import kernel
+from cavmarl.kernels import inlined_kernel, kernel
 from cavmarl.kernels.geometry import boxes_overlap
 from cavmarl.kernels.neighbors import Grid, cell_columns, cell_rows
 
 __all__ = ["bodies_touch", "find_contacts"]
 
 
-@kernel
+@inlined_kernel
 def bodies_touch(one: np.void, other: np.void) -> bool:
     """Whether two BODY records overlap: their rectangles share area and their heights overlap.
 

@@ -125,7 +125,10 @@ def _enter(
     kind = travel.types[departure["vtype"]]
     row["id"] = departure["id"]
     row["agent"] = departure["agent"]
-    row["driver"] = DRIVER_AGENT if departure["agent"] >= 0 else DRIVER_BACKGROUND
+    row["driver"] = DRIVER_BACKGROUND
+    if departure["agent"] >= 0:
+        row["driver"] = DRIVER_AGENT
+        worlds.pending[w, departure["agent"]] = 0.0
     row["order"] = departure["order"]
     row["vtype"] = departure["vtype"]
     row["length"] = kind["length"]

@@ -247,7 +247,6 @@ def move_agent(
     row: np.void,
     throttle: float,
     steering: float,
-    latency_ticks: int,
     phase: NDArray[np.int32],
     dt: float,
 ) -> None:
@@ -261,21 +260,9 @@ def move_agent(
         row: VEHICLE, a copy of it that becomes the next one.
         throttle: commanded acceleration in m/s².
         steering: commanded angle of the front wheels in rad.
-        latency_ticks: ticks between command and effect.
         phase: (num_signals,) PHASE rows that are on.
         dt: seconds of the tick.
     """
-    if latency_ticks > 0:
-        last = latency_ticks - 1
-        delayed_throttle = old["pending"][0, 0]
-        delayed_steering = old["pending"][0, 1]
-        for k in range(last):
-            row["pending"][k, 0] = old["pending"][k + 1, 0]
-            row["pending"][k, 1] = old["pending"][k + 1, 1]
-        row["pending"][last, 0] = throttle
-        row["pending"][last, 1] = steering
-        throttle = delayed_throttle
-        steering = delayed_steering
     # No reverse gear: the brake ends at a standstill.
     throttle = max(throttle, -old["speed"] / dt)
     x, y, heading, speed, _ = bicycle_step(

@@ -60,7 +60,7 @@ class Grid(NamedTuple):
 
     min_x: float  # m, corner of cell (0, 0)
     min_y: float
-    cell_m: float
+    cells_per_m: float
     num_x: int
     num_y: int
     start: NDArray[
@@ -85,7 +85,7 @@ def make_grid(bounds: tuple[float, float, float, float], cell_m: float, capacity
     return Grid(
         min_x=float(min_x),
         min_y=float(min_y),
-        cell_m=float(cell_m),
+        cells_per_m=1.0 / float(cell_m),
         num_x=num_x,
         num_y=num_y,
         start=np.zeros(num_x * num_y + 1, np.int32),
@@ -96,9 +96,9 @@ def make_grid(bounds: tuple[float, float, float, float], cell_m: float, capacity
 
 
 @kernel
-def _slot(offset: float, cell_m: float, count: int) -> int:
+def _slot(offset: float, cells_per_m: float, count: int) -> int:
     """The cell along one axis; the first or last one outside of the area, the first one for NaN."""
-    cells = offset / cell_m
+    cells = offset * cells_per_m
     if not cells > 0.0:
         return 0
     return int(cells) if cells < count else count - 1
@@ -108,8 +108,8 @@ def _slot(offset: float, cell_m: float, count: int) -> int:
 def cell_columns(grid: Grid, x: float, distance_m: float) -> tuple[int, int]:
     """The first and last column of cells that can hold a body within `distance_m` of `x`."""
     return (
-        _slot(x - distance_m - _MARGIN_M - grid.min_x, grid.cell_m, grid.num_x),
-        _slot(x + distance_m + _MARGIN_M - grid.min_x, grid.cell_m, grid.num_x),
+        _slot(x - distance_m - _MARGIN_M - grid.min_x, grid.cells_per_m, grid.num_x),
+        _slot(x + distance_m + _MARGIN_M - grid.min_x, grid.cells_per_m, grid.num_x),
     )
 
 
@@ -117,8 +117,8 @@ def cell_columns(grid: Grid, x: float, distance_m: float) -> tuple[int, int]:
 def cell_rows(grid: Grid, y: float, distance_m: float) -> tuple[int, int]:
     """The first and last row of cells that can hold a body within `distance_m` of `y`."""
     return (
-        _slot(y - distance_m - _MARGIN_M - grid.min_y, grid.cell_m, grid.num_y),
-        _slot(y + distance_m + _MARGIN_M - grid.min_y, grid.cell_m, grid.num_y),
+        _slot(y - distance_m - _MARGIN_M - grid.min_y, grid.cells_per_m, grid.num_y),
+        _slot(y + distance_m + _MARGIN_M - grid.min_y, grid.cells_per_m, grid.num_y),
     )
 
 
@@ -154,8 +154,8 @@ def fill_grid(rows: NDArray[np.void], num: int, grid: Grid) -> None:
     cell = grid.cell
     start[:] = 0
     for i in range(num):
-        column = _slot(rows[i]["x"] - grid.min_x, grid.cell_m, grid.num_x)
-        c = _slot(rows[i]["y"] - grid.min_y, grid.cell_m, grid.num_y) * grid.num_x + column
+        column = _slot(rows[i]["x"] - grid.min_x, grid.cells_per_m, grid.num_x)
+        c = _slot(rows[i]["y"] - grid.min_y, grid.cells_per_m, grid.num_y) * grid.num_x + column
         cell[i] = c
         start[c] += 1
     for c in range(1, start.size):

@@ -8,7 +8,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from cavmarl.kernels import kernel
+from cavmarl.kernels import inlined_kernel, kernel
 from cavmarl.kernels.approach import register_links
 from cavmarl.kernels.arrays import LaneGrid, RoadArrays, Scratch, Travel, Worlds
 from cavmarl.kernels.codes import (
@@ -84,6 +84,19 @@ def _order_by_lane(roads: RoadArrays, owned: int, scratch: Scratch) -> None:
             found += 1
 
 
+@inlined_kernel
+def _delay(
+    pending: NDArray[np.float64], w: int, agent: int, tick: int, throttle: float, steering: float
+) -> tuple[float, float]:
+    """Put an agent's command behind those that wait, and take out the one that is due."""
+    slots = pending.shape[2]
+    last = (tick + slots - 1) % slots
+    pending[w, agent, last, 0] = throttle
+    pending[w, agent, last, 1] = steering
+    due = tick % slots
+    return pending[w, agent, due, 0], pending[w, agent, due, 1]
+
+
 @kernel
 def advance(
     roads: RoadArrays,
@@ -96,7 +109,6 @@ def advance(
     discrete: bool,
     accel_limit: float,
     steering_limit: float,
-    latency_ticks: int,
     dt: float,
 ) -> None:
     """Decide all controls from the committed rows, then move every owned row into `next_rows`.
@@ -112,7 +124,6 @@ def advance(
         discrete: whether agents are driven by the controllers instead.
         accel_limit: m/s², of the agents' throttle.
         steering_limit: rad, of the agents' front wheels.
-        latency_ticks: between an agent's command and its effect.
         dt: seconds of the tick.
     """
     for w in range(worlds.ticks.shape[0]):
@@ -165,6 +176,9 @@ def advance(
                 steering = steer_to_lane(roads, plans, old, old["target_lane"])
             throttle = clamp(throttle, -accel_limit, accel_limit)
             steering = clamp(steering, -steering_limit, steering_limit)
+            throttle, steering = _delay(
+                worlds.pending, w, old["agent"], worlds.ticks[w], throttle, steering
+            )
             move_agent(
                 roads,
                 plans,
@@ -173,7 +187,6 @@ def advance(
                 row,
                 throttle,
                 steering,
-                latency_ticks,
                 phase,
                 dt,
             )

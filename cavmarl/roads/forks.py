@@ -8,11 +8,10 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from cavmarl.kernels.approach import FORK_BEYOND_M
 from cavmarl.roads.conflicts import NEAR_M, LinkPath
 
 __all__ = ["fork_lengths"]
-
-BEYOND_M = 3.0  # paths that end near each other part soon after the junction
 
 
 def fork_lengths(from_lane: Sequence[int], paths: Sequence[LinkPath | None]) -> NDArray[np.float64]:
@@ -39,4 +38,4 @@ def _shared_m(path: LinkPath, other: LinkPath) -> float:
     apart = path.xyz[:, None, :2] - other.xyz[None, :, :2]
     nearest = (apart[..., 0] * apart[..., 0] + apart[..., 1] * apart[..., 1]).min(axis=1)
     parted = np.flatnonzero(nearest > NEAR_M * NEAR_M)
-    return float(path.s[parted[0]]) if parted.size else float(path.s[-1]) + BEYOND_M
+    return float(path.s[parted[0]]) if parted.size else float(path.s[-1]) + FORK_BEYOND_M

@@ -14,6 +14,7 @@ from cavmarl.errors import MapError
 from cavmarl.kernels.geometry import project
 from cavmarl.roads.conflicts import LinkPath, sample_path
 from cavmarl.roads.detectors import DetectorRoads, place_detectors
+from cavmarl.kernels.approach import FORK_BEYOND_M
 from cavmarl.roads.forks import fork_lengths
 from cavmarl.roads.network import EDGE, JUNCTION, LANE, LINK, RoadNetwork
 from cavmarl.roads.polylines import clean_shape, extend_stubs, point_rows
@@ -96,7 +97,8 @@ def _assemble(net: Any, programs: list[Program], name: str, digest: str) -> Road
     into = _connect(lanes, links, chosen.movements, lane_row)
     paths = [_path(move, lane_row, lanes, points) for move in chosen.movements]
     conflicts, first_conflict = conflict_rows(chosen.movements, paths)
-    links["fork_m"] = fork_lengths(links["from_lane"].tolist(), paths)
+    fork_m = fork_lengths(links["from_lane"].tolist(), paths)
+    links["fork_m"] = np.minimum(fork_m, links["length_m"] + FORK_BEYOND_M)
     _map_neighbors(lanes, points)
     lanes["stop_back_m"] = stop_back(
         _lane_ends(lanes, points),

@@ -264,6 +264,8 @@ class Simulation:
         digest = hashlib.blake2b(digest_size=16)
         for name in STATE_FIELDS:
             digest.update(np.ascontiguousarray(rows[name]).tobytes())
+        agents = rows["agent"][rows["agent"] >= 0]
+        digest.update(worlds.pending[world, agents].tobytes())
         queue = self._gate.queue[world, : self._gate.num_queue[world]]
         for name in queue.dtype.names or ():
             digest.update(np.ascontiguousarray(queue[name]).tobytes())

@@ -76,7 +76,13 @@ class Shard:
         self._further = further_arrays(config.sensors, network, plans)
         self._grid = make_grid(network.extent_m, CELL_M, capacity)
         self.scratch = _make_scratch(len(network.lanes), len(network.links), capacity)
-        self.worlds = make_worlds(num_worlds, capacity, network)
+        self.worlds = make_worlds(
+            num_worlds,
+            capacity,
+            network,
+            config.population.num_ids,
+            config.clock.control_latency_ticks,
+        )
         self.outputs = _make_outputs(config, num_worlds)
         self._weights = np.array([config.terms.weights.get(name, 0.0) for name in TERMS])
         self._target_speeds = np.array(config.action.target_speeds_mps)
@@ -108,7 +114,6 @@ class Shard:
             self._discrete,
             action.acceleration_mps2,
             action.steering_rad,
-            self._config.clock.control_latency_ticks,
             self._config.clock.sim_dt_s,
         )
 
@@ -172,8 +177,17 @@ class Shard:
         )
 
 
-def make_worlds(num_worlds: int, capacity: int, network: RoadNetwork) -> Worlds:
-    """Arrays of W worlds that hold `capacity` vehicles each, all of them empty."""
+def make_worlds(
+    num_worlds: int,
+    capacity: int,
+    network: RoadNetwork,
+    num_agents: int = 0,
+    latency_ticks: int = 0,
+) -> Worlds:
+    """Arrays of W worlds that hold `capacity` vehicles each, all of them empty.
+
+    Agents' commands take effect `latency_ticks` later.
+    """
     shape = (num_worlds, capacity)
     return Worlds(
         rows=np.zeros(shape, dtype=VEHICLE),
@@ -186,6 +200,7 @@ def make_worlds(num_worlds: int, capacity: int, network: RoadNetwork) -> Worlds:
         controllers=np.zeros((num_worlds, network.num_controllers), dtype=CONTROLLER),
         detected_s=np.zeros((num_worlds, len(network.detectors)), dtype=np.float64),
         num_through=np.zeros(num_worlds, dtype=np.int64),
+        pending=np.zeros((num_worlds, num_agents, latency_ticks + 1, 2)),
         num_touching=np.zeros(num_worlds, dtype=np.int64),
         num_contacts=np.zeros(num_worlds, dtype=np.int64),
     )

@@ -2,8 +2,8 @@
 
 A shard holds one array of these: owned rows first, ghosts after. Migration is a row assignment, a
 snapshot a copy, a halo a slice, the wire format the bytes. So the record carries more than the next
-tick needs: ownership, delayed actions, the random stream, sensor phase and returns travel with the
-row.
+tick needs: ownership, the random stream, sensor phase and returns travel with the row. An agent's
+delayed commands lie in `Worlds.pending`, apart: most vehicles have none, and every tick copies rows.
 
 Frames as in `roads.network`: x, y, z is the centre of the body; heading counter-clockwise from
 east; `s` and `d` are the centre's place on the lane, d positive to the left. Indices that point at
@@ -17,7 +17,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 __all__ = [
-    "MAX_LATENCY_TICKS",
     "PLACEMENT_FIELDS",
     "RECORD_VERSION",
     "STATE_FIELDS",
@@ -26,7 +25,6 @@ __all__ = [
 ]
 
 RECORD_VERSION = 1
-MAX_LATENCY_TICKS = 16
 
 # The order is that of use: what every driver asks of every other comes first and shares two cache
 # lines, what only some ask comes last.
@@ -97,7 +95,6 @@ VEHICLE = np.dtype(
         ("sensor_phase", np.int32),  # ticks until slow sensors fire; reserved: all fire each step
         ("episode_return", np.float64),  # sum of rewards since it was seated
         ("memory", np.int64),  # handle of a recurrent policy's state; reserved
-        ("pending", np.float64, (MAX_LATENCY_TICKS, 2)),  # delayed (throttle, steering), next first
     ],
     align=True,
 )
