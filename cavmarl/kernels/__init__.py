@@ -21,6 +21,8 @@ from typing import Any, ParamSpec, TypeVar
 import numba
 import numba.core.config
 
+from cavmarl.kernels.compiler import KernelCompiler
+
 __all__ = ["allocating_kernel", "cache_dir", "inlined_kernel", "kernel", "kernel_cache_dir"]
 
 P = ParamSpec("P")
@@ -43,7 +45,7 @@ def kernel_cache_dir() -> Path:
     return cache_dir() / "kernels" / digest.hexdigest()[:16]
 
 
-def _compile(function: Callable[P, R], **options: bool) -> Callable[P, R]:
+def _compile(function: Callable[P, R], **options: Any) -> Callable[P, R]:
     settings: Any = numba.core.config
     before = settings.CACHE_DIR
     settings.CACHE_DIR = str(kernel_cache_dir())
@@ -64,7 +66,7 @@ def kernel(function: Callable[P, R]) -> Callable[P, R]:
     atomic addition for every look into a bundle of arrays, a tick takes ten times as long
     (decision 002). So it can neither make an array nor return one.
     """
-    return _compile(function, _nrt=False)
+    return _compile(function, _nrt=False, pipeline_class=KernelCompiler)
 
 
 def inlined_kernel(function: Callable[P, R]) -> Callable[P, R]:
@@ -72,7 +74,7 @@ def inlined_kernel(function: Callable[P, R]) -> Callable[P, R]:
 
     For what is called for every vehicle: a call hands over each array of a bundle as seven numbers.
     """
-    return _compile(function, _nrt=False, forceinline=True)
+    return _compile(function, _nrt=False, pipeline_class=KernelCompiler, forceinline=True)
 
 
 def allocating_kernel(function: Callable[P, R]) -> Callable[P, R]:
