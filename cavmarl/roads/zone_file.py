@@ -73,15 +73,15 @@ def read_zones(path: str | Path) -> ZonePartition:
         raise ZoneError(f"{path}: {error}") from error
 
 
-def zones_for(network: RoadNetwork, path: str | Path, count: int) -> ZonePartition:
-    """The partition of a zone file, which has to be of this map and have so many zones.
+def zones_for(network: RoadNetwork, path: str | Path, count: int | None) -> ZonePartition:
+    """The partition of a zone file, which has to be of this map and have `count` zones, if given.
 
     Raises:
         ConfigError: see `read_zones`.
         ZoneError: see `read_zones`; another number of zones; roads beyond the bounds.
     """
     partition = read_zones(path)
-    if partition.count != count:
+    if count is not None and partition.count != count:
         raise ZoneError(
             f"zones.count = {count}: {path} has {partition.count} zones; use {partition.count}"
         )

@@ -24,6 +24,7 @@ __all__ = ["MIN_SIDE_M", "cut_map"]
 Floats = NDArray[np.float64]
 Rect = tuple[float, float, float, float]
 
+_WEIGHTS = ("lane_length", "uniform")
 MIN_SIDE_M = 5.0  # of a zone: about a car
 # Around the roads, which have a width; a straight road has an area by it.
 _RIM_M = 5.0
@@ -70,11 +71,13 @@ def cut_map(
         density: (n, 3) x and y in m, and a weight: shared out instead, such as expected vehicles.
 
     Raises:
-        ZoneError: no such layout, more zones than there can be, than the map can hold, or a density
-            that is none.
+        ZoneError: no such layout or weight, more zones than there can be or than the map can hold,
+            or a density that is none.
     """
     if layout not in ZONE_LAYOUTS:
         raise ZoneError(f"layout '{layout}': there are {', '.join(ZONE_LAYOUTS)}")
+    if weight not in _WEIGHTS:
+        raise ZoneError(f"weight '{weight}': there are {', '.join(_WEIGHTS)}")
     if not 1 <= count <= MAX_ZONES:
         raise ZoneError(f"{count} zones: must be a whole number from 1 to {MAX_ZONES}")
     min_x, min_y, max_x, max_y = network.extent_m

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import math
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -31,7 +32,7 @@ def ghosts(
     found = publish(partition.arrays, halo, rows, len(rows), zone, out)
     assert found == out.start[-1]
     assert out.start[0] == 0
-    return [out.rows[a:b].tolist() for a, b in zip(out.start[:-1], out.start[1:], strict=True)]
+    return [out.rows[a:b].tolist() for a, b in pairwise(out.start)]
 
 
 @given(st.data(), partitions())
