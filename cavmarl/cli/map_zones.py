@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated
 
@@ -14,6 +15,7 @@ from cavmarl.cli.output import JsonPath, write_json
 from cavmarl.config import ZONE_FILE_SUFFIXES, ZONE_LAYOUTS
 from cavmarl.errors import ConfigError
 from cavmarl.maps.netconvert import map_file
+from cavmarl.maps.zone_loops import zones_without_loop
 from cavmarl.roads.cache import load_network
 from cavmarl.roads.network import RoadNetwork
 from cavmarl.roads.zone_file import write_zones, zones_for
@@ -75,7 +77,10 @@ def zones(
     statistics = zone_statistics(partition, network, halo_m=halo)
     console = Console()
     _print_table(console, network, partition, statistics)
+    loopless = zones_without_loop(network, partition)
     _print_notes(console, partition, statistics, halo)
+    if loopless:
+        console.print(f"note: no loop to drive in: zones {_named(loopless)}", soft_wrap=True)
     if out is not None:
         write_zones(out, partition)
         console.print(f"zones: {out}", markup=False)
@@ -93,6 +98,7 @@ def zones(
             "rects_m": partition.rects.tolist(),
             "neighbors": [[other.zone for other in row] for row in partition.neighbors],
             "statistics": statistics.to_dict(),
+            "without_loop": list(loopless),
         },
     )
 
@@ -125,13 +131,16 @@ def _print_notes(
     )
     console.print(f"hash: {partition.content_hash}", soft_wrap=True)
     if statistics.narrow:
-        named = ", ".join(map(str, statistics.narrow))
         console.print(
-            f"note: narrower than the halo of {halo_m:g} m: zones {named}; results stay exact, but "
-            "such a zone works more on ghosts than on its own vehicles",
+            f"note: narrower than the halo of {halo_m:g} m: zones {_named(statistics.narrow)}; "
+            "results stay exact, but such a zone works more on ghosts than on its own vehicles",
             style="yellow",
             soft_wrap=True,
         )
+
+
+def _named(numbers: Sequence[int]) -> str:
+    return ", ".join(map(str, numbers))
 
 
 def _draw(network: RoadNetwork, partition: ZonePartition, halo_m: float, path: Path) -> None:

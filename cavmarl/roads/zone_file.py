@@ -19,7 +19,6 @@ from typing import Literal
 import numpy as np
 
 from cavmarl.config import MAX_ZONES
-from cavmarl.config_io import read_yaml, validate
 from cavmarl.errors import ZoneError
 from cavmarl.roads.network import RoadNetwork
 from cavmarl.roads.zones import Bounds, ZonePartition
@@ -52,6 +51,8 @@ def read_zones(path: str | Path) -> ZonePartition:
         ZoneError: a doubled or missing id, too many zones, or rectangles that overlap, leave a gap,
             leave the bounds or are not finite; names the file, the zones, the place and the cure.
     """
+    from cavmarl.config_io import read_yaml, validate
+
     path = Path(path)
     document = validate(_Document, read_yaml(path), str(path))
     ids = [zone.id for zone in document.zones]
