@@ -17,7 +17,10 @@ from cavmarl.config_checks import check_finite as _check_finite
 from cavmarl.config_sensors import SensorsConfig
 
 __all__ = [
+    "MAX_ZONES",
     "TERMS",
+    "ZONE_FILE_SUFFIXES",
+    "ZONE_LAYOUTS",
     "ActionConfig",
     "ClockConfig",
     "EnvConfig",
@@ -43,6 +46,10 @@ TERMS = (
     "arrival",
     "delay",
 )
+
+MAX_ZONES = 256  # of one map
+ZONE_LAYOUTS = ("grid", "strips", "bisection")
+ZONE_FILE_SUFFIXES = (".json", ".yaml", ".yml")
 
 MAX_IDS = 1_000_000  # of agents in one episode: each has its space and its rows in every output
 
@@ -108,18 +115,46 @@ class ClockConfig:
 
 @dataclass(frozen=True)
 class ZonesConfig:
-    """How the map is divided. This version runs one zone; the shard boundaries are in place.
+    """How the map is divided; see docs/zones.md. This version runs one zone.
 
     Attributes:
-        layout: how zones are cut.
-        count: number of zones.
+        layout: how zones are cut: `grid`, `strips`, `bisection`, or a zone file named as
+            `map.source` is.
+        count: number of zones; of a zone file, as many as it has.
+        avoid_junctions: move cuts aside where that keeps junctions whole.
+        weight: what `bisection` shares out evenly: length of lanes, or area.
+        hysteresis_m: how far behind a border a vehicle changes its zone.
+        max_deferred_ticks: ticks after which a change that was not acknowledged is forced.
     """
 
-    layout: Literal["grid"] = "grid"
+    layout: str = "bisection"
     count: int = 1
+    avoid_junctions: bool = False
+    weight: Literal["lane_length", "uniform"] = "lane_length"
+    hysteresis_m: float = 2.0
+    max_deferred_ticks: int = 2
 
     def __post_init__(self) -> None:
+        _check(
+            self.layout in ZONE_LAYOUTS or self.layout.endswith(ZONE_FILE_SUFFIXES),
+            "zones.layout",
+            self.layout,
+            f"must be {', '.join(ZONE_LAYOUTS)}, or a zone file ({', '.join(ZONE_FILE_SUFFIXES)})",
+        )
+        _check(
+            1 <= self.count <= MAX_ZONES,
+            "zones.count",
+            self.count,
+            f"must be a whole number from 1 to {MAX_ZONES}",
+        )
         _check(self.count == 1, "zones.count", self.count, "this version runs one zone; use 1")
+        _check_finite("zones.hysteresis_m", self.hysteresis_m, 0.0, 100.0)
+        _check(
+            0 <= self.max_deferred_ticks <= 1000,
+            "zones.max_deferred_ticks",
+            self.max_deferred_ticks,
+            "must be a whole number from 0 to 1000",
+        )
 
 
 @dataclass(frozen=True)

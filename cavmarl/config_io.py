@@ -13,7 +13,7 @@ import re
 from collections.abc import Hashable, Mapping
 from dataclasses import fields, is_dataclass
 from pathlib import Path
-from typing import Any, TypeVar, get_type_hints
+from typing import Any, TypeVar, get_args, get_type_hints
 
 import numpy as np
 import yaml
@@ -194,7 +194,7 @@ def _nearest(kind: type[Any], location: list[str]) -> str:
     *parents, key = location
     inner = kind
     for parent in parents:
-        inner = _fields(inner)[parent]
+        inner = get_args(inner)[0] if parent.isdecimal() else _fields(inner)[parent]
     known = list(_fields(inner))
     for name in known:
         if name != key and _stem(name) == _stem(key):

@@ -2,7 +2,8 @@
 
     CavmarlError
     ├── ConfigError            a key, a value or a combination that cannot work
-    │   └── UnknownEnvironmentError   no entry, path or map of that name
+    │   ├── UnknownEnvironmentError   no entry, path or map of that name
+    │   └── ZoneError                 zones that overlap, leak or do not fit the map
     ├── MapError               a map that cannot be read, built or driven
     │   └── RouteError         no way from here to there
     ├── DemandError            a file of traffic that cannot be read or does not fit its map
@@ -46,6 +47,7 @@ __all__ = [
     "RouteError",
     "UnknownAgentError",
     "UnknownEnvironmentError",
+    "ZoneError",
     "require",
 ]
 
@@ -60,6 +62,10 @@ class ConfigError(CavmarlError):
 
 class UnknownEnvironmentError(ConfigError):
     """No environment, folder or map file of that name."""
+
+
+class ZoneError(ConfigError):
+    """Zones that overlap, leave a gap, do not fit the map or see less far than exactness needs."""
 
 
 class MapError(CavmarlError):

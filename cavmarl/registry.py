@@ -15,13 +15,14 @@ from typing import Any
 
 import numpy as np
 
-from cavmarl.config import EnvConfig, MapConfig
+from cavmarl.config import ZONE_LAYOUTS, EnvConfig, MapConfig
 from cavmarl.errors import (
     CavmarlError,
     ConfigError,
     DemandError,
     MapError,
     UnknownEnvironmentError,
+    ZoneError,
     require,
 )
 
@@ -35,6 +36,7 @@ __all__ = [
     "resolve_demand",
     "resolve_map",
     "resolve_programs",
+    "resolve_zones",
 ]
 
 MAP_SUFFIXES = (".net.xml", ".net.xml.gz", ".osm", ".osm.gz", ".osm.xml", ".xodr")
@@ -179,6 +181,14 @@ def resolve_demand(config: EnvConfig, base_dir: Path) -> list[Path]:
 def resolve_programs(config: EnvConfig, base_dir: Path) -> list[Path]:
     """The files that `map.programs` means; arguments and errors as for `resolve_map`."""
     return [_resolve("map.programs", source, base_dir, MapError) for source in config.map.programs]
+
+
+def resolve_zones(config: EnvConfig, base_dir: Path) -> Path | None:
+    """The zone file that `zones.layout` means; None where it is no file. Else as `resolve_map`."""
+    layout = config.zones.layout
+    if layout in ZONE_LAYOUTS:
+        return None
+    return _resolve("zones.layout", layout, base_dir, ZoneError)
 
 
 def _resolve(key: str, source: str, base_dir: Path, failure: type[CavmarlError]) -> Path:

@@ -9,13 +9,22 @@ from typing import Any
 from cavmarl.config import EnvConfig
 from cavmarl.errors import ConfigError
 from cavmarl.maps.netconvert import map_file
-from cavmarl.registry import load_config, resolve_demand, resolve_map, resolve_programs
+from cavmarl.registry import (
+    load_config,
+    resolve_demand,
+    resolve_map,
+    resolve_programs,
+    resolve_zones,
+)
 from cavmarl.roads.cache import load_network
 from cavmarl.roads.network import RoadNetwork
 from cavmarl.roads.signal_plans import with_programs
+from cavmarl.roads.zone_file import zones_for
+from cavmarl.roads.zone_layouts import cut_map
+from cavmarl.roads.zones import ZonePartition
 from cavmarl.traffic.demand import DemandFile, read_demand
 
-__all__ = ["check_agents", "check_placement", "find_map", "load_roads", "load_world"]
+__all__ = ["check_agents", "check_placement", "find_map", "load_roads", "load_world", "load_zones"]
 
 
 def load_world(
@@ -62,6 +71,31 @@ def load_roads(config: EnvConfig, base_dir: Path) -> RoadNetwork:
     """
     network = load_network(map_file(resolve_map(config, base_dir)))
     return with_programs(network, resolve_programs(config, base_dir), config.map.program)
+
+
+def load_zones(config: EnvConfig, base_dir: Path, network: RoadNetwork) -> ZonePartition:
+    """The zones of a configuration.
+
+    Args:
+        config: of the environment.
+        base_dir: the folder that relative files start from.
+        network: its roads.
+
+    Raises:
+        ConfigError: a zone file that cannot be read, or more zones than the map can hold.
+        ZoneError: a zone file of another number of zones, or of another map.
+    """
+    settings = config.zones
+    path = resolve_zones(config, base_dir)
+    if path is not None:
+        return zones_for(network, path, settings.count)
+    return cut_map(
+        network,
+        settings.layout,
+        settings.count,
+        avoid_junctions=settings.avoid_junctions,
+        weight=settings.weight,
+    )
 
 
 def find_map(env: str | Path) -> Path:

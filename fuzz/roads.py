@@ -1,4 +1,4 @@
-"""Targets that read roads: SUMO networks, signal programs, other maps, and cached networks."""
+"""Targets that read roads: networks, signal programs, other maps, cached networks, zones."""
 
 from __future__ import annotations
 
@@ -11,9 +11,12 @@ from cavmarl.roads.cache import _entry, load_network
 from cavmarl.roads.network import RoadNetwork
 from cavmarl.roads.reader import read_network, source_hash
 from cavmarl.roads.signal_plans import with_programs
+from cavmarl.roads.zone_file import read_zones, write_zones
+from cavmarl.roads.zone_layouts import cut_map
+from cavmarl.roads.zones import ZonePartition
 from fuzz.files import ROOT, Target, scratch, seed
 
-__all__ = ["CACHED", "MAPS", "NETWORKS", "PROGRAMS", "grid"]
+__all__ = ["CACHED", "MAPS", "NETWORKS", "PROGRAMS", "ZONES", "grid"]
 
 NETCONVERT_S = 5.0  # longer is no crash, but nothing to wait for
 
@@ -56,6 +59,19 @@ def _source_and_entry() -> tuple[Path, Path]:
     return source, _entry(source_hash(source))
 
 
+def _zones(content: bytes) -> ZonePartition:
+    return read_zones(scratch("zones.json", content))
+
+
+def _zone_files() -> tuple[bytes, ...]:
+    path = scratch("seed.json", b"")
+    found = []
+    for layout in ("grid", "bisection"):
+        write_zones(path, cut_map(grid(), layout, 4))
+        found.append(path.read_bytes())
+    return tuple(found)
+
+
 def _entries() -> tuple[bytes, ...]:
     source, entry = _source_and_entry()
     entry.unlink(missing_ok=True)
@@ -67,3 +83,4 @@ NETWORKS = Target(_network, _networks)
 PROGRAMS = Target(_programs, lambda: (seed("programs.add.xml"),))
 MAPS = Target(_map, lambda: (seed("small.osm"), seed("small.xodr")), slow=True)
 CACHED = Target(_cached, _entries)
+ZONES = Target(_zones, _zone_files)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from fuzz.roads import CACHED, MAPS, NETWORKS, PROGRAMS
+from fuzz.roads import CACHED, MAPS, NETWORKS, PROGRAMS, ZONES
 from fuzz.settings import DRIVERS, ENTRIES, MANIFESTS, OVERRIDES
 from fuzz.traffic import DEMAND, SUMO_CONFIGS
 
@@ -13,6 +13,7 @@ TARGETS = {
     "programs": PROGRAMS,
     "map": MAPS,
     "cached": CACHED,
+    "zones": ZONES,
     "demand": DEMAND,
     "sumocfg": SUMO_CONFIGS,
     "entry": ENTRIES,

@@ -259,8 +259,34 @@ def test_overrides_are_checked_like_the_file() -> None:
         load_config("ring", overrides={"sensors.lidar.ray": 3})
     with pytest.raises(ConfigError, match=r"population\.agents = True"):
         load_config("ring", agents=True)
-    with pytest.raises(ConfigError, match=r"zones\.count = 0: this version runs one zone"):
+    with pytest.raises(ConfigError, match=r"zones\.count = 0: must be .* from 1 to 256"):
         load_config("ring", zones=0)
+    with pytest.raises(ConfigError, match=r"zones\.count = 2: this version runs one zone"):
+        load_config("ring", zones=2)
+
+
+@pytest.mark.parametrize("layout", ["grid", "strips", "bisection", "zones.json", "mine/zones.yaml"])
+def test_zones_are_laid_out_by_name_or_by_a_file(tmp_path: Path, layout: str) -> None:
+    config = load(tmp_path, f"name: a\nmap: {{source: m.net.xml}}\nzones: {{layout: {layout}}}")
+    assert config.zones.layout == layout
+
+
+@pytest.mark.parametrize(
+    ("key", "value"),
+    [
+        ("layout", "rings"),
+        ("count", 257),
+        ("weight", "speed"),
+        ("avoid_junctions", 1),
+        ("hysteresis_m", -1.0),
+        ("hysteresis_m", float("nan")),
+        ("max_deferred_ticks", -1),
+        ("max_deferred_ticks", 2.5),
+    ],
+)
+def test_settings_of_zones_are_checked(key: str, value: object) -> None:
+    with pytest.raises(ConfigError, match=rf"zones\.{key} = "):
+        load_config("ring", overrides={f"zones.{key}": value})
 
 
 def test_signal_programs_are_files_beside_the_map_and_choices(tmp_path: Path) -> None:

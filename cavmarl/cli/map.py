@@ -1,4 +1,4 @@
-"""`cavmarl map`: build road networks and check that they can be driven."""
+"""`cavmarl map`: build road networks, check that they can be driven, and divide them."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
+from cavmarl.cli import map_zones
 from cavmarl.cli.output import JsonPath, write_json
 from cavmarl.maps.check import MapReport, check_map
 from cavmarl.maps.netconvert import Box, BuildResult, build_network, map_file
@@ -18,7 +19,8 @@ from cavmarl.roads.reader import map_name
 __all__ = ["app"]
 
 app = typer.Typer(
-    help="Build road networks and check that they can be driven.", no_args_is_help=True
+    help="Build road networks, check that they can be driven, and divide them.",
+    no_args_is_help=True,
 )
 
 Source = Annotated[
@@ -27,6 +29,8 @@ Source = Annotated[
         help="A SUMO network, an OSM or an OpenDRIVE file.", exists=True, dir_okay=False
     ),
 ]
+
+app.command("zones")(map_zones.zones)
 
 _NETWORK_ENDINGS = (".net.xml", ".net.xml.gz")
 _SHOWN_WARNINGS = 12

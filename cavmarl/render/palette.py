@@ -20,8 +20,10 @@ __all__ = [
     "PANEL",
     "PATH",
     "SIGNALS",
+    "ZONES",
     "Color",
     "agent_color",
+    "zone_color",
 ]
 
 Color = tuple[int, int, int]
@@ -54,6 +56,17 @@ AGENTS: tuple[Color, ...] = (
     (205, 92, 190),
 )
 
+# Of zones, washed over the map; zones that touch seldom have the same.
+ZONES: tuple[Color, ...] = (
+    (38, 110, 196),
+    (214, 96, 40),
+    (46, 150, 84),
+    (150, 76, 178),
+    (196, 150, 22),
+    (18, 148, 160),
+    (204, 62, 104),
+)
+
 # By signal code, the positions in roads.network.SIGNAL_STATES = "rugGysoOY".
 SIGNALS: tuple[Color, ...] = (
     (232, 58, 52),
@@ -75,3 +88,8 @@ MUTED_INK: Color = (112, 120, 130)
 def agent_color(agent: int) -> Color:
     """The colour of an agent, by its index."""
     return AGENTS[agent % len(AGENTS)]
+
+
+def zone_color(zone: int) -> Color:
+    """The colour of a zone, by its number."""
+    return ZONES[zone % len(ZONES)]

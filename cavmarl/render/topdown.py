@@ -20,7 +20,7 @@ from cavmarl.roads.network import RoadNetwork
 if TYPE_CHECKING:
     from pygame import Surface
 
-__all__ = ["TopDownRenderer"]
+__all__ = ["TopDownRenderer", "suitable_size"]
 
 # Pixels of a picture whose size is not given, and how much wider than high it may be.
 PICTURE_PX = 960 * 720
@@ -57,7 +57,7 @@ class TopDownRenderer:
         load_pygame()
         self.network = network
         bounds = focus or network.extent_m
-        self.size = size or _suitable_size(bounds)
+        self.size = size or suitable_size(bounds)
         self._home = Camera.fit(bounds, self.size, MARGIN_PX)
         self._camera = self._home
         self._following = False
@@ -189,7 +189,7 @@ class TopDownRenderer:
         return self._scene[2]
 
 
-def _suitable_size(bounds: Bounds) -> tuple[int, int]:
+def suitable_size(bounds: Bounds) -> tuple[int, int]:
     """A size in the proportions of `bounds`, in steps of 16 pixels, which all video coders take."""
     min_x, min_y, max_x, max_y = bounds
     aspect = max(max_x - min_x, 1.0) / max(max_y - min_y, 1.0)

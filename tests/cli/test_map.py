@@ -7,7 +7,7 @@ import pytest
 from typer.testing import CliRunner
 
 from cavmarl.cli.map import app
-from cavmarl.errors import ConfigError, MapError
+from cavmarl.errors import ConfigError, MapError, ZoneError
 
 runner = CliRunner()
 
@@ -138,3 +138,59 @@ def test_an_unwritable_report_is_an_error(shared_maps: Path, tmp_path: Path) -> 
 
     result = runner.invoke(app, ["check", source, "--json", str(taken / "report.json")])
     assert isinstance(result.exception, ConfigError)
+
+
+def test_zones_are_cut_written_and_read_again(shared_maps: Path, tmp_path: Path) -> None:
+    source = str(shared_maps / "net" / "Town10HD.net.xml")
+    out, report, again = (tmp_path / name for name in ("zones.json", "a.json", "b.json"))
+
+    words = ["zones", source, "--count", "4", "--avoid-junctions"]
+    result = runner.invoke(app, [*words, "--out", str(out), "--json", str(report)])
+    assert result.exit_code == 0, result.output
+    assert "junctions cut: 0 of 9" in result.output
+    found = json.loads(report.read_text())
+    assert found["neighbors"] == [[1, 2], [0, 2, 3], [0, 1, 3], [1, 2]]
+    assert found["statistics"]["lane_imbalance"] < 1.3
+
+    read = runner.invoke(app, ["zones", source, "--layout", str(out), "--json", str(again)])
+    assert read.exit_code == 0, read.output
+    assert json.loads(again.read_text()) == found
+
+
+def test_zones_narrower_than_the_halo_are_noted(shared_maps: Path) -> None:
+    source = str(shared_maps / "net" / "Town10HD.net.xml")
+    words = ["zones", source, "--layout", "strips", "--count", "3", "--halo", "200"]
+    assert "narrower than the halo of 200 m: zones 1;" in runner.invoke(app, words).output
+
+
+def test_zones_are_drawn(shared_maps: Path, tmp_path: Path) -> None:
+    pytest.importorskip("pygame", reason="pictures need the extra 'render'")
+    source = str(shared_maps / "net" / "Town10HD.net.xml")
+    picture = tmp_path / "zones.png"
+    result = runner.invoke(app, ["zones", source, "--picture", str(picture)])
+    assert result.exit_code == 0, result.output
+    assert picture.read_bytes().startswith(b"\x89PNG")
+    result = runner.invoke(app, ["zones", source, "--picture", str(tmp_path / "no" / "z.png")])
+    assert isinstance(result.exception, ConfigError)
+
+
+@pytest.mark.parametrize(
+    ("words", "error"),
+    [
+        (["--layout", "rings"], "is none of grid, strips, bisection"),
+        (["--picture", "zones.jpg"], "must end in .png"),
+    ],
+)
+def test_wrong_options_of_zones_are_refused(
+    shared_maps: Path, words: list[str], error: str
+) -> None:
+    source = str(shared_maps / "net" / "Town10HD.net.xml")
+    result = runner.invoke(app, ["zones", source, *words])
+    assert result.exit_code == 2
+    assert error in " ".join(result.output.replace("│", " ").split())
+
+
+def test_more_zones_than_the_map_can_hold_are_refused(shared_maps: Path) -> None:
+    source = str(shared_maps / "net" / "Town10HD.net.xml")
+    result = runner.invoke(app, ["zones", source, "--count", "256", "--layout", "strips"])
+    assert isinstance(result.exception, ZoneError)

@@ -1,0 +1,154 @@
+"""`cavmarl map zones`: cut a map into zones and see what comes of it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from rich.console import Console
+from rich.table import Table
+from rich.text import Text
+
+from cavmarl.cli.output import JsonPath, write_json
+from cavmarl.config import ZONE_FILE_SUFFIXES, ZONE_LAYOUTS
+from cavmarl.errors import ConfigError
+from cavmarl.maps.netconvert import map_file
+from cavmarl.maps.zone_loops import zones_without_loop
+from cavmarl.roads.cache import load_network
+from cavmarl.roads.network import RoadNetwork
+from cavmarl.roads.zone_file import write_zones, zones_for
+from cavmarl.roads.zone_layouts import cut_map
+from cavmarl.roads.zone_statistics import ZoneStatistics, zone_statistics
+from cavmarl.roads.zones import ZonePartition
+
+__all__ = ["zones"]
+
+
+def zones(
+    source: Annotated[
+        Path,
+        typer.Argument(
+            metavar="MAP",
+            help="A SUMO network, an OSM or an OpenDRIVE file.",
+            exists=True,
+            dir_okay=False,
+        ),
+    ],
+    count: Annotated[
+        int | None, typer.Option(help="How many; default: 4, or as many as a zone file has.")
+    ] = None,
+    layout: Annotated[
+        str, typer.Option(help=f"{', '.join(ZONE_LAYOUTS)}, or a zone file.")
+    ] = "bisection",
+    avoid_junctions: Annotated[
+        bool, typer.Option("--avoid-junctions", help="Move cuts aside to keep junctions whole.")
+    ] = False,
+    weight: Annotated[
+        str, typer.Option(help="What bisection shares out: lane_length, or uniform for area.")
+    ] = "lane_length",
+    halo: Annotated[
+        float, typer.Option(min=0.0, help="How far zones see over their borders, m.")
+    ] = 100.0,
+    out: Annotated[Path | None, typer.Option("--out", "-o", help="Write a zone file here.")] = None,
+    picture: Annotated[
+        Path | None, typer.Option(help="Draw the map with its zones here, a .png.")
+    ] = None,
+    json_path: JsonPath = None,
+) -> None:
+    """Divide a map into zones; print what is in each, and how evenly lanes are shared out."""
+    if picture is not None and picture.suffix != ".png":
+        raise typer.BadParameter(f"'{picture}' must end in .png", param_hint="--picture")
+    network = load_network(map_file(source))
+    if layout in ZONE_LAYOUTS:
+        partition = cut_map(
+            network, layout, 4 if count is None else count,
+            avoid_junctions=avoid_junctions, weight=weight,
+        )  # fmt: skip
+    elif layout.endswith(ZONE_FILE_SUFFIXES):
+        partition = zones_for(network, layout, count)
+    else:
+        raise typer.BadParameter(
+            f"'{layout}' is none of {', '.join(ZONE_LAYOUTS)}, and no zone file "
+            f"({', '.join(ZONE_FILE_SUFFIXES)})",
+            param_hint="--layout",
+        )
+    statistics = zone_statistics(partition, network, halo_m=halo)
+    console = Console()
+    _print_table(console, network, partition, statistics)
+    loopless = zones_without_loop(network, partition)
+    _print_notes(console, partition, statistics, halo)
+    if loopless:
+        console.print(f"note: no loop to drive in: zones {_named(loopless)}", soft_wrap=True)
+    if out is not None:
+        write_zones(out, partition)
+        console.print(f"zones: {out}", markup=False)
+    if picture is not None:
+        _draw(network, partition, halo, picture)
+        console.print(f"picture: {picture}", markup=False)
+    write_json(
+        json_path,
+        {
+            "map": network.name,
+            "map_content_sha256": network.content_hash,
+            "zones_sha256": partition.content_hash,
+            "halo_m": halo,
+            "bounds_m": list(partition.bounds),
+            "rects_m": partition.rects.tolist(),
+            "neighbors": [[other.zone for other in row] for row in partition.neighbors],
+            "statistics": statistics.to_dict(),
+            "without_loop": list(loopless),
+        },
+    )
+
+
+def _print_table(
+    console: Console, network: RoadNetwork, partition: ZonePartition, statistics: ZoneStatistics
+) -> None:
+    table = Table(title=Text(network.name), show_edge=False)
+    for heading in ("zone", "x, m", "y, m", "lanes, km", "cut"):
+        table.add_column(heading, justify="right", no_wrap=True)
+    table.add_column("neighbours, *: corner")
+    for zone, (min_x, min_y, max_x, max_y) in enumerate(partition.rects.tolist()):
+        table.add_row(
+            str(zone),
+            f"{min_x:.0f} … {max_x:.0f}",
+            f"{min_y:.0f} … {max_y:.0f}",
+            f"{statistics.lane_km[zone]:.2f}",
+            str(statistics.cut_junctions[zone]),
+            " ".join(f"{near.zone}{'*' * near.corner}" for near in partition.neighbors[zone]),
+        )
+    console.print(table)
+
+
+def _print_notes(
+    console: Console, partition: ZonePartition, statistics: ZoneStatistics, halo_m: float
+) -> None:
+    console.print(
+        f"imbalance of lanes (max / mean): {statistics.lane_imbalance:.3f}; "
+        f"junctions cut: {statistics.junctions_cut} of {statistics.junctions}"
+    )
+    console.print(f"hash: {partition.content_hash}", soft_wrap=True)
+    if statistics.narrow:
+        console.print(
+            f"note: narrower than the halo of {halo_m:g} m: zones {_named(statistics.narrow)}; "
+            "results stay exact, but such a zone works more on ghosts than on its own vehicles",
+            style="yellow",
+            soft_wrap=True,
+        )
+
+
+def _named(numbers: Sequence[int]) -> str:
+    return ", ".join(map(str, numbers))
+
+
+def _draw(network: RoadNetwork, partition: ZonePartition, halo_m: float, path: Path) -> None:
+    from cavmarl.render.canvas import load_pygame
+    from cavmarl.render.zones import zone_picture
+
+    surface = zone_picture(network, partition, halo_m, network.name)
+    try:
+        load_pygame().image.save(surface, str(path))
+    except (OSError, load_pygame().error) as error:
+        raise ConfigError(f"{path}: cannot be written ({error})") from error

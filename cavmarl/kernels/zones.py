@@ -1,0 +1,182 @@
+"""Whose is this place, and who else has to see what is there.
+
+A zone is a rectangle [min_x, max_x) by [min_y, max_y); those at the rim reach to infinity. The cuts
+of all zones together span a table of cells, each of one zone: a place belongs to the cell that two
+searches among the cuts find. Both only compare the coordinate with stored numbers, so every process
+gives the same answer, on a border as well.
+
+A vehicle is published by its position: each zone within the halo of it gets it as a ghost, whether
+or not that zone touches the vehicle's own (decision 012).
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cavmarl.kernels import kernel
+
+__all__ = [
+    "Halo",
+    "Publication",
+    "ZoneArrays",
+    "make_publication",
+    "publish",
+    "squared_distance",
+    "zone_of",
+    "zones_of",
+]
+
+
+class ZoneArrays(NamedTuple):
+    """What kernels take of a `ZonePartition`; k zones."""
+
+    cuts_x: NDArray[np.float64]  # (columns - 1,) rising, m
+    cuts_y: NDArray[np.float64]  # (rows - 1,) rising, m
+    cells: NDArray[np.int32]  # (rows, columns) the zone of each cell
+    rects: NDArray[np.float64]  # (k, 4) min_x, min_y, max_x, max_y; infinite at the rim
+
+
+class Halo(NamedTuple):
+    """How far zones see over their borders."""
+
+    halo_m: float
+    inner: NDArray[np.float64]  # (k, 4) the part of a zone that no other zone's halo reaches
+    near_start: NDArray[np.int32]  # (k + 1,)
+    near: NDArray[np.int32]  # near[near_start[z] : near_start[z + 1]]: zones within the halo of
+    # zone z, z itself among them
+
+
+class Publication(NamedTuple):
+    """Which rows of a shard which zones have to get; `publish` overwrites it."""
+
+    start: NDArray[np.int64]  # (k + 1,)
+    rows: NDArray[np.int32]  # rows[start[z] : start[z + 1]]: the rows that zone z needs, rising
+    pair_row: NDArray[np.int32]  # the same as they were found: row after row
+    pair_zone: NDArray[np.int32]
+
+
+def make_publication(capacity: int, num_zones: int) -> Publication:
+    """Room for the ghosts of a shard.
+
+    Args:
+        capacity: most vehicles that the shard can own.
+        num_zones: k of the partition.
+    """
+    pairs = capacity * (num_zones - 1)
+    # Memory that is never written is never taken: a vehicle seldom has more than one ghost.
+    return Publication(
+        start=np.zeros(num_zones + 1, np.int64),
+        rows=np.empty(pairs, np.int32),
+        pair_row=np.empty(pairs, np.int32),
+        pair_zone=np.empty(pairs, np.int32),
+    )
+
+
+@kernel
+def _slot(cuts: NDArray[np.float64], value: float) -> int:
+    """How many of the cuts are at or below `value`; none for NaN."""
+    low = 0
+    high = cuts.size
+    while low < high:
+        middle = (low + high) >> 1
+        if cuts[middle] <= value:
+            low = middle + 1
+        else:
+            high = middle
+    return low
+
+
+@kernel
+def zone_of(zones: ZoneArrays, x: float, y: float) -> int:
+    """The one zone of a place in metres; a place on a border belongs to the zone that begins there.
+
+    O(log k).
+    """
+    return int(zones.cells[_slot(zones.cuts_y, y), _slot(zones.cuts_x, x)])
+
+
+@kernel
+def zones_of(zones: ZoneArrays, rows: NDArray[np.void], num: int, out: NDArray[np.int32]) -> None:
+    """`zone_of` for many.
+
+    Args:
+        zones: of the partition.
+        rows: records with `x` and `y` in metres, such as VEHICLE.
+        num: how many of them, `rows[:num]`.
+        out: (num,) or longer, overwritten.
+    """
+    for i in range(num):
+        out[i] = zone_of(zones, rows[i]["x"], rows[i]["y"])
+
+
+@kernel
+def squared_distance(rects: NDArray[np.float64], zone: int, x: float, y: float) -> float:
+    """From a place to the nearest point of a zone, squared, in m²; 0 inside.
+
+    Rounding grows with what is rounded. So the squared distance from (x, y) to a vehicle inside the
+    zone, taken by the same operations, is never the smaller of the two: not by one bit.
+    """
+    dx = 0.0
+    if x < rects[zone, 0]:
+        dx = rects[zone, 0] - x
+    elif x > rects[zone, 2]:
+        dx = x - rects[zone, 2]
+    dy = 0.0
+    if y < rects[zone, 1]:
+        dy = rects[zone, 1] - y
+    elif y > rects[zone, 3]:
+        dy = y - rects[zone, 3]
+    return dx * dx + dy * dy
+
+
+@kernel
+def publish(
+    zones: ZoneArrays, halo: Halo, rows: NDArray[np.void], num: int, zone: int, out: Publication
+) -> int:
+    """Decide which of a shard's vehicles which other zones need as ghosts.
+
+    Zone z needs a vehicle if and only if it lies within `halo_m` of z's rectangle. A vehicle that
+    has left its own zone's rectangle, because its transfer is late, is published like any other,
+    to the zone that it is in as well.
+
+    Args:
+        zones: of the partition.
+        halo: from `roads.zone_coverage.zone_halo`, for the same partition.
+        rows: VEHICLE (C,).
+        num: the vehicles that the shard owns, `rows[:num]`; at most the capacity of `out`.
+        zone: the shard's own.
+        out: from `make_publication`, overwritten.
+
+    Returns:
+        how many ghosts there are in all zones together, `out.start[-1]`.
+    """
+    start = out.start
+    start[:] = 0
+    limit = halo.halo_m * halo.halo_m
+    min_x, min_y = halo.inner[zone, 0], halo.inner[zone, 1]
+    max_x, max_y = halo.inner[zone, 2], halo.inner[zone, 3]
+    found = 0
+    for i in range(num):
+        x = rows[i]["x"]
+        y = rows[i]["y"]
+        if min_x < x and x < max_x and min_y < y and y < max_y:
+            continue
+        here = zone_of(zones, x, y)
+        for n in range(halo.near_start[here], halo.near_start[here + 1]):
+            other = halo.near[n]
+            if other != zone and squared_distance(zones.rects, other, x, y) <= limit:
+                out.pair_row[found] = i
+                out.pair_zone[found] = other
+                start[other] += 1
+                found += 1
+    for z in range(1, start.size):
+        start[z] += start[z - 1]
+    # From the ends of the zones' parts to their beginnings, hence from the last pair to the first.
+    for pair in range(found - 1, -1, -1):
+        z = out.pair_zone[pair]
+        start[z] -= 1
+        out.rows[start[z]] = out.pair_row[pair]
+    return found

@@ -1,0 +1,40 @@
+"""Zones by looking at every rectangle."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+
+def owners(rects: NDArray[np.float64], x: float, y: float) -> list[int]:
+    """All zones whose half-open rectangle holds the place; it should be one."""
+    return [
+        zone
+        for zone, (min_x, min_y, max_x, max_y) in enumerate(rects.tolist())
+        if min_x <= x < max_x and min_y <= y < max_y
+    ]
+
+
+def distance(rect: NDArray[np.float64], x: float, y: float) -> float:
+    """From a place to the nearest point of a rectangle."""
+    min_x, min_y, max_x, max_y = rect.tolist()
+    return math.hypot(x - min(max(x, min_x), max_x), y - min(max(y, min_y), max_y))
+
+
+def published(
+    rects: NDArray[np.float64], halo_m: float, xy: NDArray[np.float64], zone: int
+) -> list[list[int]]:
+    """For each zone the rows of `xy`, all owned by `zone`, that lie within its halo."""
+    needed: list[list[int]] = []
+    for other, rect in enumerate(rects.tolist()):
+        rows = []
+        for row, (x, y) in enumerate(xy.tolist()):
+            dx = max(rect[0] - x, x - rect[2], 0.0)
+            dy = max(rect[1] - y, y - rect[3], 0.0)
+            # Squares, as the kernel: a root would round once more.
+            if other != zone and dx * dx + dy * dy <= halo_m * halo_m:
+                rows.append(row)
+        needed.append(rows)
+    return needed
