@@ -15,7 +15,7 @@ FUZZ_SECONDS ?= 60
 FUZZ_TARGETS ?= network programs map cached zones demand sumocfg entry overrides driver manifest
 MAPS := envs/ring/map/map.net.xml envs/merge/map/map.net.xml envs/grid4x4/map/map.net.xml
 
-.PHONY: help demo test check bench soak fuzz oldest maps pictures clean
+.PHONY: help demo test check bench bounds soak fuzz oldest maps pictures clean
 .DEFAULT_GOAL := help
 
 help: ## say what there is
@@ -36,6 +36,9 @@ check: $(READY) ## style, types, and the direction of imports
 
 bench: $(READY) ## agent-steps a second, next to highway-env
 	$(BIN)/cavmarl bench step
+
+bounds: $(READY) ## the tests with every index of the kernels checked
+	NUMBA_BOUNDSCHECK=1 $(BIN)/pytest -m "not slow"
 
 soak: $(READY) ## the slow tests: long episodes, memory, the wheel
 	$(BIN)/pytest -m slow

@@ -37,8 +37,12 @@ def cache_dir() -> Path:
 
 @cache
 def kernel_cache_dir() -> Path:
-    """The folder of this version's compiled kernels: one per content of the kernel sources."""
-    digest = hashlib.sha256(numba.__version__.encode())
+    """The folder of this version's compiled kernels: one per content of the kernel sources.
+
+    And one for those that check their indices (`NUMBA_BOUNDSCHECK=1`).
+    """
+    settings: Any = numba.core.config
+    digest = hashlib.sha256(f"{numba.__version__} {settings.BOUNDSCHECK}".encode())
     package = Path(__file__).parent
     for source in sorted(package.glob("*.py")):
         digest.update(source.name.encode() + b"\0" + source.read_bytes())
