@@ -141,11 +141,11 @@ def measure_traffic_speed(
 @dataclass(frozen=True)
 class _Turn:
     vehicle_steps: int
-    wall_s: float
+    cpu_s: float
 
 
 def _rates(turns: list[_Turn]) -> Rates:
-    rates = [turn.vehicle_steps / turn.wall_s for turn in turns]
+    rates = [turn.vehicle_steps / turn.cpu_s for turn in turns]
     return Rates(min(rates), median(rates), max(rates))
 
 

@@ -421,3 +421,14 @@ def test_who_stands_at_a_stop_line_is_touched_by_nobody_who_drives_over(
                     x, y, cos, sin, 2.5, 1.0,
                     path[k, 1], path[k, 2], np.cos(heading), np.sin(heading), 2.5, 0.9,
                 )  # fmt: skip
+
+
+@pytest.mark.parametrize(("pace", "brakes"), [(9.0, False), (3.0, True)])
+def test_who_gives_way_follows_a_faster_one_into_the_same_lane_and_waits_for_a_slower_one(
+    scene: Make, pace: float, brakes: bool
+) -> None:
+    here = scene("priority")
+    here.put("main", "W_in_0", -3.0, "E_out", speed=pace)
+    here.put("side", "N_in_0", 8.0, "E_out", speed=6.0)
+    slowest = min(float(here["side"]["speed"]) for _ in here.run(3.0))
+    assert (slowest < 5.9) == brakes
