@@ -48,8 +48,8 @@ def register_links(
         num: live rows.
         scratch: step, link_start and approach are written.
     """
-    # One look for all that follows: in a city the steps lie far apart, each a cache miss, and a loop
-    # that does nothing else has many of them under way at once.
+    # One look for all that follows: in a city the steps lie far apart, each is a cache miss, and a
+    # loop that does nothing else has many of them under way at once.
     for i in range(num):
         scratch.step[i] = travel.steps[own_step(roads, rows[i])]
     pairs = 0

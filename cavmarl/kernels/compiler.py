@@ -2,9 +2,9 @@
 
 In Python `a[-1]` is the last item, so Numba compares every signed index with zero before it reads.
 In kernels -1 means nothing and is asked about before; leaving that comparison out makes a tick of
-traffic a tenth faster (decision 008). A negative index that is written out, as in `a[-1]`, keeps its
-meaning. With `NUMBA_BOUNDSCHECK=1` every index outside of its array, negative ones included, is an
-`IndexError`: `make bounds` runs the tests so.
+traffic a tenth faster (decision 008). A negative index that is written out, as in `a[-1]`, keeps
+its meaning. With `NUMBA_BOUNDSCHECK=1` every index outside of its array, negative ones included,
+is an `IndexError`: `make bounds` runs the tests so.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ def _from_the_front() -> Iterator[None]:
 
     Numba compiles under one lock, so no other function is being lowered meanwhile.
     """
-    usual = arrayobj.fix_integer_index
+    usual: Any = arrayobj.fix_integer_index
 
     def fix(context: Any, builder: Any, index_type: Any, index: Any, size: Any) -> Any:
         if index_type.signed and not isinstance(index, ir.Constant):
@@ -43,13 +43,17 @@ def _from_the_front() -> Iterator[None]:
         arrayobj.fix_integer_index = usual
 
 
-@register_pass(mutates_CFG=True, analysis_only=False)
+_register: Any = register_pass
+
+
+@_register(mutates_CFG=True, analysis_only=False)
 class _KernelLowering(NativeLowering):
     _name = "kernel_lowering"
 
     def run_pass(self, state: Any) -> bool:
+        lower: Any = super().run_pass
         with _from_the_front():
-            return bool(super().run_pass(state))
+            return bool(lower(state))
 
 
 class KernelCompiler(CompilerBase):
@@ -57,7 +61,8 @@ class KernelCompiler(CompilerBase):
 
     def define_pipelines(self) -> list[Any]:
         """The one pipeline."""
-        manager = DefaultPassBuilder.define_nopython_pipeline(self.state)
+        builder: Any = DefaultPassBuilder
+        manager = builder.define_nopython_pipeline(self.state)
         manager.passes[:] = [
             (_KernelLowering if step is NativeLowering else step, about)
             for step, about in manager.passes

@@ -18,7 +18,7 @@ __all__ = ["leave", "next_step", "own_step", "way_left"]
 
 @inlined_kernel
 def own_step(roads: RoadArrays, row: np.void) -> int:
-    """Where in `Travel.steps` a vehicle is: the step of its lane, or, inside a junction, of the next."""
+    """Where in `Travel.steps` a vehicle is: at its lane's step, in a junction at the next one's."""
     lane = row["lane"]
     if roads.lanes[lane]["internal"]:
         lane = roads.links[roads.lanes[lane]["link"]]["to_lane"]

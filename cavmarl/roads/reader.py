@@ -11,10 +11,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cavmarl.errors import MapError
+from cavmarl.kernels.approach import FORK_BEYOND_M
 from cavmarl.kernels.geometry import project
 from cavmarl.roads.conflicts import LinkPath, sample_path
 from cavmarl.roads.detectors import DetectorRoads, place_detectors
-from cavmarl.kernels.approach import FORK_BEYOND_M
 from cavmarl.roads.forks import fork_lengths
 from cavmarl.roads.network import EDGE, JUNCTION, LANE, LINK, RoadNetwork
 from cavmarl.roads.polylines import clean_shape, extend_stubs, point_rows

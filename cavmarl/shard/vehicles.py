@@ -3,7 +3,8 @@
 A shard holds one array of these: owned rows first, ghosts after. Migration is a row assignment, a
 snapshot a copy, a halo a slice, the wire format the bytes. So the record carries more than the next
 tick needs: ownership, the random stream, sensor phase and returns travel with the row. An agent's
-delayed commands lie in `Worlds.pending`, apart: most vehicles have none, and every tick copies rows.
+delayed commands lie apart, in `Worlds.pending`: most vehicles have none, and every tick copies the
+rows.
 
 Frames as in `roads.network`: x, y, z is the centre of the body; heading counter-clockwise from
 east; `s` and `d` are the centre's place on the lane, d positive to the left. Indices that point at
