@@ -34,15 +34,14 @@ from cavmarl.kernels.lane_choice import (
     needed_change,
     thinks_of_lanes,
 )
-from cavmarl.kernels.lanes import ahead_on, beside_s, last_on, neighbor_behind
+from cavmarl.kernels.lanes import VIEW_M, ahead_on, beside_s, last_on, neighbor_behind
 from cavmarl.kernels.rng import STREAM_DRIVER, quick_uniform
 from cavmarl.kernels.stopping import way_to_stop
 from cavmarl.kernels.ways import leave, next_step
 
-__all__ = ["LOOK_AHEAD_M", "decide"]
+__all__ = ["decide"]
 
 SEE_LINE_M = 8.0
-LOOK_AHEAD_M = 250.0  # no driver looks further
 NEAR_M = 8.0  # to a leader so near the corner between matters,
 ASKEW_RAD = 0.7  # if it turns by so much,
 ASKEW_M = 2.5  # which takes this off the gap
@@ -69,7 +68,7 @@ def _look_ahead_m(kind: np.void, speed: float) -> float:
         way = 45.0 + speed * (1.0 + kind["tau"]) + 0.5 * speed * speed / kind["decel"]
     else:
         way = 30.0 + 2.0 * speed + 0.2 * speed * speed
-    return float(min(way, LOOK_AHEAD_M))
+    return float(min(way, VIEW_M))
 
 
 @inlined_kernel
@@ -81,7 +80,7 @@ def _see_line_m(kind: np.void, speed: float) -> float:
     if kind["model"] == MODEL_KRAUSS:
         braking = 0.6 * speed * speed / kind["decel"]
         return float(SEE_LINE_M + speed * (1.0 + kind["tau"]) + braking)
-    return LOOK_AHEAD_M
+    return VIEW_M
 
 
 @inlined_kernel
@@ -275,7 +274,7 @@ def _road_ahead(
     see = _see_line_m(kind, speed) + half
     # Behind a leader on its own lane a driver minds the next line only where it could not stop
     # any more once the leader has passed it.
-    if k + 1 < scratch.lane_end[lane]:
+    if k + 1 < scratch.lane_end[lane] and scratch.entries[k + 1]["s"] - row["s"] <= VIEW_M:
         leader = scratch.entries[k + 1]
         press = max(
             press,
@@ -311,7 +310,7 @@ def _road_ahead(
         if steered:
             allowed = min(allowed, _bend_speed(roads, lane, distance))
         allowed = min(allowed, _slowing_to(kind, limit, distance, speed, dt))
-        j = last_on(scratch, lane, row["id"])
+        j = last_on(scratch, lane, row["id"], distance)
         if j >= 0:
             leader = scratch.entries[j]
             gap = distance + leader["s"] - half - leader["half"]
@@ -339,11 +338,11 @@ def _beside(roads: RoadArrays, kind: np.void, row: np.void, lane: int, scratch: 
     for link in range(beside["first_link"], beside["first_link"] + beside["num_links"]):
         distance = beside["length_m"] - s
         beyond = roads.links[link]["next_lane"]
-        j = last_on(scratch, beyond, row["id"])
+        j = last_on(scratch, beyond, row["id"], distance)
         while j < 0 and roads.lanes[beyond]["internal"]:
             distance += roads.lanes[beyond]["length_m"]
             beyond = roads.lanes[beyond]["successor"]
-            j = last_on(scratch, beyond, row["id"])
+            j = last_on(scratch, beyond, row["id"], distance)
         if j >= 0:
             leader = scratch.entries[j]
             gap = distance + leader["s"] - half - leader["half"]

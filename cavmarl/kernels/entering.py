@@ -28,7 +28,7 @@ from cavmarl.kernels.codes import (
     SPEED_RANDOM,
 )
 from cavmarl.kernels.following import accel_behind, speed_behind
-from cavmarl.kernels.lanes import ahead_on, last_on, neighbor_behind
+from cavmarl.kernels.lanes import VIEW_M, ahead_on, last_on, neighbor_behind
 from cavmarl.kernels.rng import STREAM_DEPARTURE, STREAM_PLACE, below, uniform
 from cavmarl.kernels.ways import next_step
 
@@ -45,6 +45,15 @@ DRAW_SPEED = 1
 def _may_use(travel: Travel, departure: np.void, lane: int) -> bool:
     usable: bool = travel.steps[departure["way"] + lane]["to_go"] < math.inf
     return usable
+
+
+@kernel
+def _crowd(scratch: Scratch, lane: int, s: float) -> int:
+    """How many vehicles are in view around a place on a lane."""
+    found = 0
+    for k in range(scratch.lane_start[lane], scratch.lane_end[lane]):
+        found += abs(scratch.entries[k]["s"] - s) <= VIEW_M
+    return found
 
 
 @kernel
@@ -83,7 +92,7 @@ def entry_lane(
             return -1 if scratch.lane_taken[lane] else lane
         if scratch.lane_taken[lane]:
             continue
-        rank = scratch.lane_end[lane] - scratch.lane_start[lane]
+        rank = _crowd(scratch, lane, max(departure["pos"], 0.0))
         if code == LANE_BEST:
             rank += int(travel.steps[departure["way"] + lane]["changes"]) * (1 << 20)
         if rank < best_rank:
@@ -113,7 +122,7 @@ def entry_place(
     elif code == POS_BASE:
         s = half
     elif code == POS_LAST:
-        k = last_on(scratch, lane, departure["id"])
+        k = last_on(scratch, lane, departure["id"], 0.0)
         s = most
         if k >= 0:
             last = scratch.entries[k]
@@ -151,8 +160,8 @@ def entry_speed(
     if j < 0:
         beyond, _, _ = next_step(roads, travel, lane, departure["way"])
         if beyond >= 0:
-            j = last_on(scratch, beyond, departure["id"])
             distance += here["length_m"]
+            j = last_on(scratch, beyond, departure["id"], distance)
     if code == SPEED_GIVEN:
         wanted = min(departure["speed"], wanted)
     elif code == SPEED_RANDOM:

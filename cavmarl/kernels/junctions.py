@@ -51,7 +51,8 @@ STANDING_MPS = 0.5
 LAST_CHANCE_M = 3.0  # with the front this near to the line
 ROOM_M = 3.0  # free way left behind a vehicle that clears a junction
 IMPATIENT_S = 3.0  # a vehicle that stands this long without reason is not waited for
-EXIT_LANES = 4  # looked along for room
+EXIT_LANES = 4  # looked along for room,
+EXIT_LOOK_M = 150.0  # and no further than this
 IMPATIENCE_S = 180.0  # after which one who gives way makes others brake
 FORCED_STOP = 4.5  # m/s², and how hard; less in proportion after less time
 STOP_SIGN_S = 0.5  # how long one stands at a stop sign, and before a tie is broken
@@ -223,7 +224,8 @@ def _exit_blocked(
 ) -> bool:
     """Whether a row could not clear the junction behind the last standing vehicle on its way.
 
-    Who still moves in between will need room as well.
+    Who still moves in between will need room as well. Nobody counts who is more than `EXIT_LOOK_M`
+    beyond the junction.
     """
     target = roads.links[link]
     room = 0.0
@@ -235,16 +237,20 @@ def _exit_blocked(
                 room -= 2.0 * other["half"] + ROOM_M
         lane = roads.lanes[lane]["successor"]
     needed = row["length"] + ROOM_M
+    beyond = 0.0
     for _ in range(EXIT_LANES):
         for k in range(scratch.lane_start[lane], scratch.lane_end[lane]):
             other = scratch.entries[k]
+            if beyond + other["s"] > EXIT_LOOK_M:
+                return False
             if other["speed"] < STANDING_MPS:
                 room += other["s"] - other["half"]
                 blocked: bool = room < needed
                 return blocked
             room -= 2.0 * other["half"] + ROOM_M
         room += roads.lanes[lane]["length_m"]
-        if room >= needed:
+        beyond += roads.lanes[lane]["length_m"]
+        if room >= needed or beyond > EXIT_LOOK_M:
             return False
         lane, way, _ = next_step(roads, travel, lane, way)
         if lane < 0:

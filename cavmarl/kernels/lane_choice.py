@@ -89,7 +89,7 @@ def _change_is_safe(
         ahead = lane["length_m"] - s
         beyond, way, _ = next_step(roads, travel, target, row["way"])
         while beyond >= 0:
-            j = last_on(scratch, beyond, row["id"])
+            j = last_on(scratch, beyond, row["id"], ahead)
             if j >= 0:
                 ahead += scratch.entries[j]["s"]
             if j >= 0 or not roads.lanes[beyond]["internal"]:

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from cavmarl.kernels.arrays import Scratch
 from cavmarl.kernels.geometry import lane_pose
 from cavmarl.kernels.lanes import (
+    VIEW_M,
     ahead_on,
     behind_on,
     beside_s,
@@ -81,7 +82,9 @@ def test_neighbours_equal_twin(case: tuple[str, NDArray[np.void]], reach_m: floa
         assert seen(room, found)[0] == expected
         assert distance == pytest.approx(true_distance)
         others = [(j, at) for at, _, j in naive.on_lane(roads, rows, lane) if j != i]
-        assert seen(room, last_on(room, lane, own_id)) == (others[0] if others else (-1, np.inf))
+        for way in (0.0, 120.0):
+            last = others[0] if others and way + others[0][1] <= VIEW_M else (-1, np.inf)
+            assert seen(room, last_on(room, lane, own_id, way)) == last
         before = [
             j for at, k, j in naive.on_lane(roads, rows, lane) if j != i and (at, k) <= (s, own_id)
         ]
@@ -108,6 +111,20 @@ def test_the_order_of_rows_does_not_matter(
         assert neighbor_behind(roads.arrays, tidy, lane, s, own_id, 60.0) == neighbor_behind(
             roads.arrays, room, lane, s, own_id, 60.0
         )
+
+
+def test_nobody_sees_further_than_the_view() -> None:
+    roads = network("ring")
+    lane = int(np.argmax(roads.lanes["length_m"]))
+    assert roads.lanes[lane]["length_m"] > VIEW_M + 1.0
+    rows = np.zeros(2, VEHICLE)
+    rows["id"], rows["side_lane"], rows["lane"] = [0, 1], -1, lane
+    for apart, sees in ((VIEW_M, True), (VIEW_M + 0.5, False)):
+        rows["s"] = [0.0, apart]
+        room = indexed("ring", rows)
+        assert (ahead_on(room, lane, 0.0, 0) >= 0) == sees
+        assert (neighbor_behind(roads.arrays, room, lane, apart, 1, 60.0)[0] >= 0) == sees
+        assert (last_on(room, lane, 9, VIEW_M - apart) >= 0) == (apart <= VIEW_M)
 
 
 def test_of_two_at_one_place_the_larger_id_leads() -> None:

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from cavmarl.roads.network import RoadNetwork
 
 Entry = tuple[float, int, int]  # s, id, row
+VIEW_M = 250.0
 
 
 def on_lane(roads: RoadNetwork, rows: NDArray[np.void], lane: int) -> list[Entry]:
@@ -42,7 +43,7 @@ def ahead(
     """The next one beyond (s, own id): (row, s) or (-1, inf)."""
     for other_s, other_id, j in on_lane(roads, rows, lane):
         if j != i and (other_s, other_id) > (s, rows[i]["id"]):
-            return j, other_s
+            return (j, other_s) if other_s - s <= VIEW_M else (-1, math.inf)
     return -1, math.inf
 
 
@@ -61,7 +62,7 @@ def behind(
     """The nearest one behind, over lane borders: (row, distance) or (-1, inf)."""
     j, other_s = _behind_here(roads, rows, i, lane, s)
     if j >= 0:
-        return j, s - other_s
+        return (j, s - other_s) if s - other_s <= VIEW_M else (-1, math.inf)
     found = []
     for before in _into(roads, lane):
         distance = s
@@ -78,7 +79,7 @@ def behind(
             if not following:
                 break
             before = following[0]
-    if not found:
+    if not found or min(found)[0] > VIEW_M:
         return -1, math.inf
     distance, _, j = min(found)
     return j, distance
