@@ -149,11 +149,12 @@ class Rerouting:
         """How many of those who ask take another way."""
         rows, num = worlds.next_rows[w], int(worlds.num_owned[w])
         looks = self._looks[w]
+        clock_s = self._travel.begin_s + tick * self._dt
+        self._forget_seen(looks, clock_s)
         asking = np.empty(num, dtype=np.int64)
         found = find_asking(self._roads, rows, num, tick, self._has_rules, looks, asking)
         if found == 0:
             return 0
-        clock_s = self._travel.begin_s + tick * self._dt
         traffic = Traffic(self._speed_sums[w], self._past.shape[1], self._closed(clock_s))
         search = WaySearch(self._roads, self._travel, self._slots, w, rows, num, traffic)
         legs = rows["leg"][:num].sum()
@@ -166,6 +167,13 @@ class Rerouting:
                 if answer is not Answer.LATER:
                     look["next"] = tick + look["period"] if look["period"] > 0 else NEVER
         return int(rows["leg"][:num].sum() - legs)
+
+    def _forget_seen(self, looks: NDArray[np.void], clock_s: float) -> None:
+        """Where a rule begins in this second, those who are on its edge ask once more."""
+        rules = self._schedule.demand.rerouters.rules
+        begun = (rules["begin_s"] <= clock_s) & (clock_s - 1.0 < rules["begin_s"])
+        if begun.any():
+            looks["seen"][np.isin(looks["seen"], rules["edge"][begun])] = -1
 
     def _closed(self, clock_s: float) -> NDArray[np.int64]:
         """(num_edges,) bits of the classes that an edge is closed to now."""
