@@ -284,7 +284,7 @@ class Simulation:
         ):
             digest.update(array.tobytes())
         if rerouting is not None:
-            for array in rerouting.state(world):
+            for array in rerouting.state(world, rows):
                 digest.update(array.tobytes())
         return digest.hexdigest()
 

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from cavmarl.kernels.arrays import Gate, RoadArrays, Travel, Worlds
 from cavmarl.kernels.codes import COUNT_REROUTED
 from cavmarl.kernels.edge_speeds import limit_speeds, sample_speeds
-from cavmarl.kernels.rerouting import find_asking
+from cavmarl.kernels.rerouting import find_asking, mark_slots
 from cavmarl.kernels.rng import STREAM_REROUTER, uniform
 from cavmarl.roads.routing import PLAN
 from cavmarl.traffic.demand import Choices
@@ -75,8 +75,10 @@ class Rerouting:
         self._speed_sums = np.zeros((slots.num_worlds, edges), dtype=np.int64)
         self._looks = np.zeros((slots.num_worlds, 0), dtype=LOOK)
         self._num_looks = np.zeros(slots.num_worlds, dtype=np.int64)
+        rules = demand.rerouters.rules
+        self._rules_at = {edge: rules[rules["edge"] == edge] for edge in np.unique(rules["edge"])}
         self._has_rules = np.zeros(edges, dtype=np.bool_)
-        self._has_rules[demand.rerouters.rules["edge"]] = True
+        self._has_rules[rules["edge"]] = True
         self._lane_counts = np.zeros(lanes, dtype=np.int64)
         self._lane_sums = np.zeros(lanes, dtype=np.int64)
 
@@ -119,14 +121,22 @@ class Rerouting:
         """VEHICLE["way"] (n,) of a world as it would be in the first one."""
         return self._slots.ways_of_first_world(ways, world)
 
-    def state(self, world: int) -> Iterator[NDArray[np.generic]]:
-        """What of a world's state is kept here, as arrays without padding."""
+    def state(self, world: int, rows: NDArray[np.void]) -> Iterator[NDArray[np.generic]]:
+        """What of a world's state is kept here, as arrays without padding.
+
+        Args:
+            world: number of the world.
+            rows: VEHICLE (n,), its vehicles: only the ways that they drive on count.
+        """
         yield self._speed_sums[world]
         yield self._past[world]
-        looks = self._looks[world, : self._num_looks[world]]
-        first = self._slots.first_of(world)
-        steps = self._travel.steps[first : first + self._slots.of_world]
-        for records in (looks, steps):
+        slots = self._slots
+        used = np.zeros(slots.number, dtype=np.bool_)
+        first = slots.first_of(world)
+        mark_slots(self._roads, rows, len(rows), first, slots.steps, used)
+        steps = self._travel.steps[first : first + slots.of_world]
+        ways = steps.reshape(slots.number, slots.steps)[used]
+        for records in (self._looks[world, : self._num_looks[world]], ways):
             for name in records.dtype.names or ():
                 yield np.ascontiguousarray(records[name])
 
@@ -190,9 +200,8 @@ class Rerouting:
         edge = self._roads.lanes[row["lane"]]["edge"]
         if look["seen"] == edge:
             return
-        rules = self._schedule.demand.rerouters.rules
-        here = (rules["edge"] == edge) & (rules["begin_s"] <= clock_s) & (clock_s < rules["end_s"])
-        for rule in rules[here]:
+        rules = self._rules_at[edge]
+        for rule in rules[(rules["begin_s"] <= clock_s) & (clock_s < rules["end_s"])]:
             if self._is_meant(rule, row):
                 answer = self._follow(search, i, row, look, rule)
                 if answer is Answer.LATER:

@@ -195,7 +195,7 @@ def test_the_hash_covers_what_is_known_of_traffic_and_ways(net: Path, tmp_path: 
         rerouting._speed_sums,
         rerouting._looks["next"],
         rerouting._looks["goal"],
-        simulation._traffic.travel.steps["to_go"][slots.first :],
+        simulation._traffic.travel.steps["to_go"][slots.first :],  # somebody drives there
     ):
         value = array.reshape(-1)[:1].copy()
         array[(0,) * array.ndim] -= 1

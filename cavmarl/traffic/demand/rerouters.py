@@ -18,9 +18,10 @@ from cavmarl.traffic.demand.report import DemandReport
 from cavmarl.traffic.demand.routes import RouteTable
 from cavmarl.traffic.vtypes import ALL_PERMISSIONS, NEAREST_CLASS, NO_ROAD_CLASSES
 
-__all__ = ["CLOSING", "KEEP_DESTINATION", "MAX_RULES", "RULE", "Rerouters", "read_rerouters"]
+__all__ = ["CLOSING", "KEEP_DESTINATION", "RULE", "Rerouters", "read_rerouters"]
 
-MAX_RULES = 30_000  # each has random numbers of its own
+MAX_INTERVALS = 30_000  # each has random numbers of its own
+MAX_RULES = 300_000  # intervals times edges
 KEEP_DESTINATION = -1  # in place of an EDGE row
 _ACTED_ON = ("closingReroute", "destProbReroute", "routeProbReroute")
 _NOT_MODELLED = ("timeThreshold", "radius", "file")
@@ -101,7 +102,7 @@ def read_rerouters(
 
     Raises:
         DemandError: edges, routes, types, times or chances that cannot be.
-        CapacityError: more than `MAX_RULES` intervals.
+        CapacityError: more than `MAX_INTERVALS` intervals, or `MAX_RULES` times edges.
     """
     reader = _Reader(index, routes, type_ids, known_types, report)
     for element in elements:
@@ -178,9 +179,11 @@ class _Reader:
         end_ms = interval.time_ms("end", MAX_TIME_MS)
         if end_ms < begin_ms:
             raise interval.error("ends before it begins", "let end be after begin")
-        if len(self._types) == MAX_RULES:
+        if len(self._types) == MAX_INTERVALS or len(self._rules) + len(edges) > MAX_RULES:
             raise interval.error(
-                f"is one of more than {MAX_RULES} of rerouters", "use fewer", CapacityError
+                f"is beyond {MAX_INTERVALS} intervals of rerouters, or {MAX_RULES} times edges",
+                "use fewer",
+                CapacityError,
             )
         span = begin_ms / 1000.0, end_ms / 1000.0
         parts: dict[str, list[Element]] = {name: [] for name in _ACTED_ON}
