@@ -179,9 +179,10 @@ class Rerouting:
         return int(rows["leg"][:num].sum() - legs)
 
     def _forget_seen(self, looks: NDArray[np.void], clock_s: float) -> None:
-        """Where a rule begins in this second, those who are on its edge ask once more."""
+        """Where a rule has begun within a second, those who are on its edge ask once more."""
         rules = self._schedule.demand.rerouters.rules
-        begun = (rules["begin_s"] <= clock_s) & (clock_s - 1.0 < rules["begin_s"])
+        before_s = clock_s - self._ticks_per_s * self._dt
+        begun = (rules["begin_s"] <= clock_s) & (before_s < rules["begin_s"])
         if begun.any():
             looks["seen"][np.isin(looks["seen"], rules["edge"][begun])] = -1
 
