@@ -262,13 +262,12 @@ class Simulation:
         worlds = self._shard.worlds
         rows = self.vehicles(world)
         rows = rows[np.argsort(rows["id"])]
-        digest = hashlib.blake2b(digest_size=16)
         rerouting = self._traffic.rerouting
+        if rerouting is not None:
+            rows["way"] = rerouting.ways_of_first_world(rows["way"], world)
+        digest = hashlib.blake2b(digest_size=16)
         for name in STATE_FIELDS:
-            values = rows[name]
-            if name == "way" and rerouting is not None:
-                values = rerouting.ways_of_first_world(values, world)
-            digest.update(np.ascontiguousarray(values).tobytes())
+            digest.update(np.ascontiguousarray(rows[name]).tobytes())
         queue = self._gate.queue[world, : self._gate.num_queue[world]]
         for name in queue.dtype.names or ():
             digest.update(np.ascontiguousarray(queue[name]).tobytes())
@@ -284,7 +283,7 @@ class Simulation:
         ):
             digest.update(array.tobytes())
         if rerouting is not None:
-            for array in rerouting.state(world, rows):
+            for array in rerouting.state(world, self.vehicles(world)):
                 digest.update(array.tobytes())
         return digest.hexdigest()
 
