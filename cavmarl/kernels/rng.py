@@ -31,6 +31,7 @@ __all__ = [
     "STREAM_ORIGIN",
     "STREAM_PLACE",
     "STREAM_POLICY",
+    "STREAM_REROUTER",
     "STREAM_ROUTE",
     "STREAM_SEAT",
     "STREAM_SENSOR",
@@ -61,6 +62,7 @@ STREAM_DRIVER = 9 * DRAWS_PER_STREAM  # decisions of background drivers
 STREAM_SENSOR = 10 * DRAWS_PER_STREAM  # noise and dropouts of sensors
 STREAM_V2X = 11 * DRAWS_PER_STREAM  # losses and delays of messages
 STREAM_DEMAND = 12 * DRAWS_PER_STREAM  # times, types and routes of a demand file
+STREAM_REROUTER = 13 * DRAWS_PER_STREAM  # who follows a rerouter, and where to
 
 _MASK_16 = np.uint64(0xFFFF)
 _MASK_32 = np.uint64(0xFFFFFFFF)

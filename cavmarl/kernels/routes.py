@@ -11,7 +11,7 @@ from cavmarl.kernels import kernel
 from cavmarl.kernels.arrays import RoadArrays
 from cavmarl.kernels.plans import change_cost
 
-__all__ = ["plan_route", "trace_edges"]
+__all__ = ["follow_plan", "plan_route", "trace_edges"]
 
 
 @kernel
@@ -164,7 +164,25 @@ def trace_edges(
                 lane = candidate
     if lane < 0:
         return 0
-    out[0] = first_edge
+    return follow_plan(roads, plan, lane, out)
+
+
+@kernel
+def follow_plan(
+    roads: RoadArrays, plan: NDArray[np.void], lane: int, out: NDArray[np.int32]
+) -> int:
+    """The edges that a plan leads along from a lane.
+
+    Args:
+        roads: the road arrays.
+        plan: PLAN (L,) of one goal, with a way from that lane.
+        lane: LANE row outside junctions.
+        out: room for the EDGE rows, that of the lane included.
+
+    Returns:
+        how many edges, -1 where `out` is too short.
+    """
+    out[0] = roads.lanes[lane]["edge"]
     found = 1
     while True:
         step = plan[lane]

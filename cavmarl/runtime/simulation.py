@@ -47,7 +47,7 @@ class TrafficStats:
         arrived: vehicles that reached their goal.
         contacts: vehicles that began to touch another one.
         removed: agents taken out after a collision or off the road.
-        rerouted: vehicles that took a detour; one that took two counts twice.
+        rerouted: vehicles that took another way; one that did so twice counts twice.
         mean_speed_mps: over the vehicles in the world now.
         mean_trip_m: over the arrived ones.
         mean_trip_s: over the arrived ones.
@@ -103,6 +103,7 @@ class Simulation:
                 config.clock.sim_dt_s,
                 config.horizon_s,
                 demand,
+                num_worlds,
             )
             capacity = traffic.capacity
             self._traffic = traffic
@@ -261,6 +262,9 @@ class Simulation:
         worlds = self._shard.worlds
         rows = self.vehicles(world)
         rows = rows[np.argsort(rows["id"])]
+        rerouting = self._traffic.rerouting
+        if rerouting is not None:
+            rows["way"] = rerouting.ways_of_first_world(rows["way"], world)
         digest = hashlib.blake2b(digest_size=16)
         for name in STATE_FIELDS:
             digest.update(np.ascontiguousarray(rows[name]).tobytes())
@@ -280,6 +284,9 @@ class Simulation:
             self._gate.num_entered[world],
         ):
             digest.update(array.tobytes())
+        if rerouting is not None:
+            for array in rerouting.state(world, self.vehicles(world)):
+                digest.update(array.tobytes())
         return digest.hexdigest()
 
     def traffic_stats(self, world: int = 0) -> TrafficStats:

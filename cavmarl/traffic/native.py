@@ -18,8 +18,10 @@ from cavmarl.roads.network import VEHICLE_CLASSES, RoadNetwork
 from cavmarl.roads.routing import make_plans
 from cavmarl.traffic.demand import STOP, DemandFile
 from cavmarl.traffic.departures import with_room
+from cavmarl.traffic.rerouting import Rerouting
 from cavmarl.traffic.schedule import Schedule
 from cavmarl.traffic.vtypes import generated_types
+from cavmarl.traffic.way_slots import WaySlots, way_slots
 
 __all__ = ["NativeTraffic"]
 
@@ -43,6 +45,7 @@ class NativeTraffic:
         dt: seconds a tick.
         horizon_s: seconds an episode.
         file: the demand whose vehicles drive beside the generator's.
+        num_worlds: how many worlds are stepped together.
     """
 
     network: RoadNetwork
@@ -52,6 +55,7 @@ class NativeTraffic:
     dt: float
     horizon_s: float
     file: DemandFile | None = None
+    num_worlds: int = 1
 
     def __post_init__(self) -> None:
         # Trips that do not exist are refused when the world is made, not at its first reset.
@@ -94,8 +98,29 @@ class NativeTraffic:
             return Travel(types, steps, np.zeros(0, dtype=STOP), first_detour=0, begin_s=0.0)
         types = np.concatenate([types, self.file.types])
         steps = np.concatenate([steps, self.schedule.steps])
+        if self._slots is not None:
+            steps = np.concatenate([steps, self._slots.table()])
         first_detour = self.plans.size + self.schedule.first_detour
         return Travel(types, steps, self.file.stops, first_detour, self.file.begin_ms / 1000.0)
+
+    @cached_property
+    def _slots(self) -> WaySlots | None:
+        """Room for the ways that vehicles find while the world runs, where some may."""
+        file, schedule = self.file, self.schedule
+        if file is None or schedule is None:
+            return None
+        if not file.may_look and not len(file.rerouters.rules):
+            return None
+        first_step = self.plans.size + len(schedule.steps)
+        return way_slots(schedule, first_step, self.num_worlds, self.capacity, self.horizon_s)
+
+    @cached_property
+    def rerouting(self) -> Rerouting | None:
+        """Those ways; None where nobody looks for one."""
+        if self.schedule is None or self._slots is None:
+            return None
+        first_type = len(generated_types())
+        return Rerouting(self.schedule, self.travel, self._slots, first_type, self.dt)
 
     @cached_property
     def capacity(self) -> int:
@@ -156,6 +181,8 @@ class NativeTraffic:
             gate = with_room(gate, len(orders))
             gate.orders[w, : len(orders)] = orders
             gate.num_orders[w] = len(orders)
+            if self.rerouting is not None:
+                self.rerouting.begin(int(w), int(worlds.keys[w]), self.horizon_s)
         return gate
 
     def populate(self, gate: Gate, worlds: Worlds, chosen: NDArray[np.bool_]) -> None:
@@ -163,10 +190,12 @@ class NativeTraffic:
         populate(self.demand, self.network.arrays, self.travel, gate, worlds, chosen)
 
     def arrive_and_depart(self, gate: Gate, worlds: Worlds, scratch: Scratch, dt: float) -> None:
-        """Who has arrived leaves `next_rows`, wanderers pick new goals, and who waits may enter."""
+        """Who has arrived leaves `next_rows`, who looks for a way finds it, who waits may enter."""
         roads = self.network.arrays
         choose_goals(self.demand, roads, self.travel, len(self.plans), gate, worlds, dt)
         take_out(self.demand, roads, gate, worlds, worlds.next_rows, DRIVER_BACKGROUND, dt, 1)
+        if self.rerouting is not None:
+            self.rerouting.act(gate, worlds)
         call_orders(gate, worlds)
         let_in(self.demand, roads, self.travel, gate, worlds, scratch)
 

@@ -54,12 +54,14 @@ class Schedule:
         self.first_edge = np.zeros(len(demand.routes), dtype=np.int32)
         parts: list[NDArray[np.void]] = []
         begin = first_step
+        self._longest = 0
         for route, mask_row in sorted(self._driven()):
             edges = self._edges(route, int(masks[mask_row]))
             steps = self._steps(edges, int(masks[mask_row]))
             first_lane = int(self._network.edges[edges[0]]["first_lane"])
             self._way[route, mask_row] = begin - first_lane
             parts.append(steps)
+            self._longest = max(self._longest, len(steps))
             begin += len(steps)
             if begin > MAX_STEPS:
                 raise CapacityError(
@@ -104,7 +106,49 @@ class Schedule:
             for vtype in demand.type_choices.options(choice["types"])
             if vtype * len(demand.routes) + route not in demand.bad_pairs
         }
-        return pairs
+        classes = range(self._way.shape[1])
+        return pairs | {(int(route), c) for route in demand.rerouters.routes.rows for c in classes}
+
+    @property
+    def longest(self) -> int:
+        """Steps of the longest way."""
+        return self._longest
+
+    def orders(self, key: int, horizon_s: float) -> NDArray[np.void]:
+        """ORDER (n,) of one episode, see `draw`."""
+        return self.demand.draw(key, self.demand.begin_ms / 1000.0 + horizon_s)
+
+    def last_edges(self, routes: NDArray[np.int32]) -> NDArray[np.int32]:
+        """The EDGE rows (n,) that ROUTE rows (n,) end on."""
+        rows = self.demand.routes[routes]
+        last: NDArray[np.int32] = self.demand.route_edges[
+            rows["first_edge"] + rows["num_edges"] - 1
+        ]
+        return last
+
+    def way_on(self, route: int, vtype: int, edge: int) -> int:
+        """The way of a <route>'s vehicle on one of its edges, or -1.
+
+        Args:
+            route: ROUTE row, with all edges.
+            vtype: VTYPE row of the file.
+            edge: EDGE row.
+        """
+        row = self.demand.routes[route]
+        begin = self._way[route, self._class_of_type[vtype]]
+        edges = self.demand.route_edges[row["first_edge"] : row["first_edge"] + row["num_edges"]]
+        if begin < 0 or edge not in edges:
+            return -1
+        before = edges[: int(np.argmax(edges == edge))]
+        network = self._network.edges
+        first_step = int(begin) + int(network["first_lane"][edges[0]])
+        return (
+            first_step + int(network["num_lanes"][before].sum()) - int(network["first_lane"][edge])
+        )
+
+    def detour_goal(self, route: int, vtype: int) -> int:
+        """VEHICLE["goal"] of who drives on a route, or -1."""
+        return int(self._goal[route, self._class_of_type[vtype]])
 
     def _edges(self, route: int, mask: int) -> NDArray[np.int32]:
         """The EDGE rows of a route, found where the file leaves them open."""
@@ -156,7 +200,7 @@ class Schedule:
             dt: seconds a tick.
         """
         demand = self.demand
-        orders = demand.draw(key, demand.begin_ms / 1000.0 + horizon_s)
+        orders = self.orders(key, horizon_s)
         departures = np.zeros(len(orders), dtype=DEPARTURE)
         begin_s = demand.begin_ms / 1000.0
         departures["due"] = np.ceil((orders["depart"] - begin_s) / dt - 1e-6)

@@ -57,7 +57,11 @@ VTYPE = np.dtype(
         ("speed_dev", np.float64),  # its standard deviation
         ("min_speed_factor", np.float64),  # the normal distribution is cut here
         ("max_speed_factor", np.float64),
-        ("reroute", np.float64),  # chance that such a vehicle looks for its way itself
+        (
+            "reroute",
+            np.float64,
+        ),  # chance that such a vehicle looks for its way itself; -1: not said
+        ("reroute_period_ms", np.int64),  # how often; 0: once, -1: not said
     ],
     align=True,
 )

@@ -178,7 +178,9 @@ def test_what_is_left_of_a_way_is_the_sum_of_what_lies_ahead(
                 if m + k == len(lanes) - 1 or not changes_lane(roads, lanes[m + k : m + k + 2])
             ]
             expected = roads.lanes["length_m"][ahead].sum() - s
-            assert way_left(roads.arrays, row[0], travel.steps[own_step(roads.arrays, row[0])]) == pytest.approx(expected)
+            assert way_left(
+                roads.arrays, row[0], travel.steps[own_step(roads.arrays, row[0])]
+            ) == pytest.approx(expected)
 
 
 def changes_lane(roads: RoadNetwork, pair: list[int]) -> bool:

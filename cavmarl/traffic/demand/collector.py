@@ -28,8 +28,8 @@ from cavmarl.traffic.demand.records import (
     SPEED_GIVEN,
 )
 from cavmarl.traffic.demand.report import DemandReport
+from cavmarl.traffic.demand.rerouting_device import device
 from cavmarl.traffic.demand.timing import Timing, flow_timing, single_timing
-from cavmarl.traffic.demand.types import reroute_chance
 from cavmarl.traffic.demand.xml_files import STOPPING_PLACES
 
 __all__ = ["Collector"]
@@ -48,7 +48,8 @@ class Collector:
     """Definitions by id, and one row for each vehicle, trip and flow.
 
     Attributes:
-        named: elements by kind and id: vType, route, their distributions, stopping places.
+        named: elements by kind and id: vType, route, their distributions, stopping places,
+            rerouters.
         routes: elements that say a route, one for each way of saying: a <route>, or a trip.
         types: the name of each type that is used, by first use.
         stops: lists of <stop> elements, equal lists once.
@@ -134,7 +135,6 @@ class Collector:
                 self.report.tolerate(what, element.place)
         timing = self._timing(element, flow, start)
         self._check_room(element, timing)
-        chance = 1.0 if element.name == "trip" else reroute_chance(element)
         row: Iterable[float] = (
             self.report.files.index(element.path),
             element.line,
@@ -144,7 +144,7 @@ class Collector:
             self._route(element),
             self._stops(element),
             0,
-            chance,
+            *device(element),
             *_how(element),
         )
         self.ids.append(name)

@@ -25,6 +25,8 @@ from cavmarl.traffic.demand.element import MAX_TIME_MS
 from cavmarl.traffic.demand.map_index import MapIndex
 from cavmarl.traffic.demand.records import ORDER, POS_GIVEN, Choices
 from cavmarl.traffic.demand.report import DemandReport
+from cavmarl.traffic.demand.rerouters import Rerouters
+from cavmarl.traffic.demand.rerouting_device import DeviceOptions
 from cavmarl.traffic.demand.resolver import Resolver
 from cavmarl.traffic.demand.sumo_config import read_sumo_config
 from cavmarl.traffic.demand.xml_files import read_elements
@@ -62,6 +64,8 @@ class DemandFile:
         route_choices: lists of ROUTE rows with probabilities.
         bad_pairs: sorted keys type * num_routes + route of vehicles that cannot drive their route;
             empty unless such were to be skipped.
+        rerouters: what sends vehicles another way on certain edges.
+        device: options of the rerouting device for all vehicles.
         lane_table: (num_edges, n) LANE row by SUMO's index on the edge, -1 where there is none.
         begin_ms: start of the simulation that the files are meant for.
         end_ms: its end; `MAX_TIME_MS` if they name none.
@@ -81,6 +85,8 @@ class DemandFile:
     type_choices: Choices
     route_choices: Choices
     bad_pairs: NDArray[np.int64]
+    rerouters: Rerouters
+    device: DeviceOptions
     lane_table: NDArray[np.int32]
     begin_ms: int
     end_ms: int
@@ -102,6 +108,10 @@ class DemandFile:
             if isinstance(value, Choices):
                 for part in (value.start, value.rows, value.upper):
                     digest.update(part.tobytes())
+            elif isinstance(value, Rerouters):
+                digest.update(value.content())
+            elif isinstance(value, DeviceOptions):
+                digest.update(repr(value).encode())
             elif isinstance(value, np.ndarray):
                 digest.update(value.tobytes())
             elif isinstance(value, tuple):
@@ -137,12 +147,35 @@ class DemandFile:
         own = element["first_stop"] >= 0
         for name in ("first_stop", "num_stops"):
             orders[name] = np.where(own, element[name], self.routes[name][routes])
-        chance = np.maximum(element["reroute"], self.types["reroute"][types])
+        chance = self._said("reroute", element, types, self.device.chance)
         orders["reroute"] = chances(key, rows, numbers, DRAW_REROUTE) < chance
+        orders["reroute_period_ms"] = self._said(
+            "reroute_period_ms", element, types, self.device.period_ms
+        )
         for name in _COPIED:
             orders[name] = element[name]
         self._place(orders, element)
         return orders
+
+    @property
+    def may_look(self) -> bool:
+        """Whether some vehicle may have a rerouting device."""
+        return any(
+            bool((chance > 0.0).any())
+            for chance in (self.elements["reroute"], self.types["reroute"])
+        ) or (self.device.chance > 0.0 and len(self.elements) > 0)
+
+    def _said(
+        self,
+        field: str,
+        element: NDArray[np.void],
+        types: NDArray[np.int32],
+        default: float,
+    ) -> NDArray[np.float64]:
+        """What vehicles (n,) say of their device, else their types, else the configuration."""
+        said: NDArray[np.float64] = self.types[field][types].astype(np.float64)
+        said = np.where(said < 0.0, default, said)
+        return np.where(element[field] < 0, said, element[field])
 
     def _pick(
         self,
@@ -213,13 +246,14 @@ def read_demand(
     if on_bad_route not in ("error", "skip"):
         raise DemandError(f"on_bad_route='{on_bad_route}': choose 'error' or 'skip'")
     report = DemandReport()
-    files, begin_ms, end_ms, step_ms = _files(paths)
+    files, begin_ms, end_ms, step_ms, device = _files(paths)
     collector = Collector(report, begin_ms, end_ms, max_departures)
     for path in files:
         read_elements(path, report, collector.take)
     index = MapIndex(network)
     resolver = Resolver(collector, index, skip=on_bad_route == "skip")
     elements = resolver.elements()
+    rerouters = resolver.rerouters()
     routes, route_edges, stops = resolver.routes.arrays()
     return DemandFile(
         network=network,
@@ -234,6 +268,8 @@ def read_demand(
         type_choices=resolver.type_choices(),
         route_choices=resolver.route_choices(),
         bad_pairs=resolver.bad_pairs(),
+        rerouters=rerouters,
+        device=device,
         lane_table=index.lane_table,
         begin_ms=begin_ms,
         end_ms=end_ms if end_ms >= 0 else MAX_TIME_MS,
@@ -242,17 +278,18 @@ def read_demand(
     )
 
 
-def _files(paths: Sequence[Path]) -> tuple[list[Path], int, int, int]:
-    """The files to read and the begin, end and step of their simulation, ms."""
+def _files(paths: Sequence[Path]) -> tuple[list[Path], int, int, int, DeviceOptions]:
+    """The files to read; begin, end and step of their simulation, ms; the rerouting device."""
     files: list[Path] = []
-    begin_ms, end_ms, step_ms = 0, -1, 1000
+    begin_ms, end_ms, step_ms, device = 0, -1, 1000, DeviceOptions()
     for path in map(Path, paths):
         if path.suffix == ".sumocfg":
             config = read_sumo_config(path)
             files.extend(config.files)
             begin_ms, end_ms, step_ms = config.begin_ms, config.end_ms, config.step_ms
+            device = config.rerouting
         else:
             files.append(path)
     if not files:
         raise DemandError("no file of demand was given: name a .rou.xml or a .sumocfg")
-    return files, begin_ms, end_ms, step_ms
+    return files, begin_ms, end_ms, step_ms, device

@@ -144,7 +144,8 @@ ELEMENT = np.dtype(
         ("routes", np.int32),  # choice among ROUTE rows
         ("first_stop", np.int32),  # STOP rows [first_stop, first_stop + num_stops)
         ("num_stops", np.int32),
-        ("reroute", np.float64),  # chance that the vehicle looks for its way itself
+        ("reroute", np.float64),  # chance that the vehicle looks for its way itself; -1: its type's
+        ("reroute_period_ms", np.int64),  # how often; 0: once, -1: as its type
         *_HOW,
     ],
     align=True,
@@ -159,7 +160,8 @@ ORDER = np.dtype(
         ("route", np.int32),  # ROUTE row
         ("first_stop", np.int32),  # STOP rows, in the order in which they are reached
         ("num_stops", np.int32),
-        ("reroute", np.bool_),  # looks for its way itself, now and then
+        ("reroute", np.bool_),  # looks for its way itself when it has entered, …
+        ("reroute_period_ms", np.int64),  # … and then so often; 0: not again
         *_HOW,
     ],
     align=True,

@@ -18,9 +18,11 @@ from cavmarl.traffic.demand.records import (
     Choices,
     Options,
 )
+from cavmarl.traffic.demand.rerouters import Rerouters, read_rerouters
 from cavmarl.traffic.demand.routes import RouteTable
 from cavmarl.traffic.demand.stops import StopReader
 from cavmarl.traffic.demand.type_table import TypeTable
+from cavmarl.traffic.vtypes import DEFAULT_TYPES
 
 __all__ = ["Resolver"]
 
@@ -41,7 +43,7 @@ class Resolver:
         self._index = index
         self._skip = skip
         self._report = collector.report
-        named = collector.named
+        self._named = named = collector.named
         self.types = TypeTable(named, self._report)
         places = named.get("stopping place", {})
         stop_reader = StopReader(index, places, self._report, skip)
@@ -69,6 +71,17 @@ class Resolver:
     def route_choices(self) -> Choices:
         """What `routes` of the elements points into."""
         return Choices([options or Options((), ()) for options in self._route_options])
+
+    def rerouters(self) -> Rerouters:
+        """All <rerouter>s; the routes that they name join the others."""
+        return read_rerouters(
+            list(self._named.get("rerouter", {}).values()),
+            self._index,
+            self.routes,
+            self.types.names,
+            {*self._named.get("vType", {}), *DEFAULT_TYPES},
+            self._report,
+        )
 
     def bad_pairs(self) -> NDArray[np.int64]:
         """Keys type * num_routes + route that cannot be driven."""

@@ -10,6 +10,7 @@ from xml.sax.handler import ContentHandler
 from cavmarl.errors import DemandError
 from cavmarl.roads.xml_source import read_xml
 from cavmarl.traffic.demand.element import Element
+from cavmarl.traffic.demand.rerouting_device import DeviceOptions
 
 __all__ = ["SumoConfig", "read_sumo_config"]
 
@@ -34,6 +35,7 @@ class SumoConfig:
         begin_ms: start of the simulation.
         end_ms: its end; -1: when the demand has ended.
         step_ms: length of its step.
+        rerouting: options of the rerouting device.
     """
 
     net_file: Path | None
@@ -41,6 +43,7 @@ class SumoConfig:
     begin_ms: int
     end_ms: int
     step_ms: int
+    rerouting: DeviceOptions
 
 
 class _Handler(ContentHandler):
@@ -95,4 +98,5 @@ def read_sumo_config(path: Path) -> SumoConfig:
         begin_ms=time_ms("begin", 0),
         end_ms=time_ms("end", -1),
         step_ms=step_ms,
+        rerouting=DeviceOptions.of(options),
     )

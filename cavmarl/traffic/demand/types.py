@@ -12,6 +12,7 @@ from cavmarl.roads.network import VEHICLE_CLASSES
 from cavmarl.traffic.demand.distributions import MAX_WEIGHT
 from cavmarl.traffic.demand.element import Element, near
 from cavmarl.traffic.demand.report import DemandReport
+from cavmarl.traffic.demand.rerouting_device import device
 from cavmarl.traffic.vtypes import (
     ALL_PERMISSIONS,
     CLASS_DEFAULTS,
@@ -21,7 +22,7 @@ from cavmarl.traffic.vtypes import (
     VTYPE,
 )
 
-__all__ = ["reroute_chance", "vehicle_class", "vtype_record"]
+__all__ = ["vehicle_class", "vtype_record"]
 
 MIN_SPEED_FACTOR = 0.2  # SUMO's cuts of the distribution of speed factors
 MAX_SPEED_FACTOR = 2.0
@@ -64,17 +65,6 @@ def vehicle_class(element: Element) -> str:
     return name
 
 
-def reroute_chance(element: Element) -> float:
-    """The chance that a vehicle looks for its way itself, from the parameters of SUMO's device."""
-    params = element.params()
-    chance = params.get("device.rerouting.probability", "0")
-    device = params.get("has.rerouting.device", "false")
-    values = element.saying(device=device, chance=chance)
-    return (
-        1.0 if values.flag("device", False) else values.number("chance", 0.0, least=0.0, most=1.0)
-    )
-
-
 def vtype_record(element: Element, report: DemandReport) -> NDArray[np.void] | None:
     """One VTYPE () from a <vType>; None for a class that drives on no road.
 
@@ -113,7 +103,7 @@ def vtype_record(element: Element, report: DemandReport) -> NDArray[np.void] | N
         report.tolerate("emergencyDecel below decel is raised to it", element.place)
         record["emergency_decel"] = decel
     _set_speed_factor(record, element, default.speed_dev)
-    record["reroute"] = reroute_chance(element)
+    record["reroute"], record["reroute_period_ms"] = device(element)
     return record
 
 

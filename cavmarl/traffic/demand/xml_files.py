@@ -22,16 +22,16 @@ STOPPING_PLACES = frozenset(
     ("busStop", "trainStop", "containerStop", "chargingStation", "parkingArea")
 )
 _DEFINITIONS = STOPPING_PLACES | frozenset(
-    ("vType", "vTypeDistribution", "route", "routeDistribution", "vehicle", "trip", "flow")
+    "vType vTypeDistribution route routeDistribution vehicle trip flow rerouter".split()
 )
 
 # What SUMO's files may hold beside vehicles. Signal programs are read elsewhere.
 _SKIPPED = frozenset(
-    "person personFlow container containerFlow calibrator rerouter variableSpeedSign vTypeProbe "
+    "person personFlow container containerFlow calibrator variableSpeedSign vTypeProbe "
     "routeProbe e1Detector inductionLoop instantInductionLoop e2Detector laneAreaDetector "
     "e3Detector entryExitDetector edgeData laneData timedEvent tlLogic tlLogics WAUT wautJunction "
     "poly poi polys pois taz tazs location param access overheadWire overheadWireSegment "
-    "tractionSubstation parkingSpace calibrators closingReroute".split()
+    "tractionSubstation parkingSpace calibrators".split()
 )
 
 

@@ -88,7 +88,6 @@ def test_trips_name_the_edges_to_pass(demand: Reader) -> None:
     (order,) = file.draw(0)
     route = file.routes[order["route"]]
     assert not route["exact"]
-    assert order["reroute"]
     names = [file.network.edge_ids[edge] for edge in file.route_edges]
     assert names == ["AB", "BC", "CB"]
 

@@ -1,0 +1,263 @@
+"""`Rerouting`: vehicles of the demand that look for another way while the world runs.
+
+Two things make them: SUMO's rerouting device, which looks for the fastest way by the speeds of the
+last minutes, and <rerouter>s, which stand on edges. Both act once a second at the gate, in one
+place however the world is divided. Decision 011 says why it is done like this.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cavmarl.kernels.arrays import Gate, RoadArrays, Travel, Worlds
+from cavmarl.kernels.codes import COUNT_REROUTED
+from cavmarl.kernels.edge_speeds import limit_speeds, sample_speeds
+from cavmarl.kernels.rerouting import find_asking, mark_slots
+from cavmarl.kernels.rng import STREAM_REROUTER, uniform
+from cavmarl.roads.routing import PLAN
+from cavmarl.traffic.demand import Choices
+from cavmarl.traffic.demand.rerouters import KEEP_DESTINATION
+from cavmarl.traffic.schedule import Schedule
+from cavmarl.traffic.way_search import Answer, Traffic, WaySearch
+from cavmarl.traffic.way_slots import WaySlots
+
+__all__ = ["LOOK", "Rerouting"]
+
+NEVER = np.iinfo(np.int64).max
+
+# What an ordered vehicle knows of its looking for ways, by VEHICLE["order"].
+LOOK = np.dtype(
+    [
+        ("next", np.int64),  # tick from which on it looks again
+        ("period", np.int64),  # ticks until it does so once more; 0: it does not
+        ("goal", np.int32),  # EDGE row that it drives to
+        ("seen", np.int32),  # EDGE row on which it has asked the rerouters last
+        ("may_leave", np.bool_),  # no edge between first and last is one that it has to pass
+        ("equipped", np.bool_),  # it has a rerouting device: knows the speeds
+    ],
+    align=True,
+)
+
+
+class Rerouting:
+    """Who looks for a way, what is known of the traffic, and the ways that were found; W worlds.
+
+    Args:
+        schedule: of the demand file.
+        travel: types and ways, with room behind them.
+        slots: that room.
+        first_type: VTYPE row of the file's first type.
+        dt: seconds a tick.
+    """
+
+    def __init__(
+        self,
+        schedule: Schedule,
+        travel: Travel,
+        slots: WaySlots,
+        first_type: int,
+        dt: float,
+    ) -> None:
+        self._schedule = schedule
+        self._travel = travel
+        self._slots = slots
+        self._first_type = first_type
+        self._dt = dt
+        self._ticks_per_s = max(1, round(1.0 / dt))
+        self._roads: RoadArrays = schedule.demand.network.arrays
+        demand, edges, lanes = schedule.demand, len(self._roads.edges), len(self._roads.lanes)
+        self._measures = demand.may_look
+        steps = demand.device.adaptation_steps if self._measures else 0
+        self._past = np.zeros((slots.num_worlds, steps, edges), dtype=np.int32)
+        self._speed_sums = np.zeros((slots.num_worlds, edges), dtype=np.int64)
+        self._looks = np.zeros((slots.num_worlds, 0), dtype=LOOK)
+        self._num_looks = np.zeros(slots.num_worlds, dtype=np.int64)
+        rules = demand.rerouters.rules
+        self._rules_at = {edge: rules[rules["edge"] == edge] for edge in np.unique(rules["edge"])}
+        self._has_rules = np.zeros(edges, dtype=np.bool_)
+        self._has_rules[rules["edge"]] = True
+        self._lane_counts = np.zeros(lanes, dtype=np.int64)
+        self._lane_sums = np.zeros(lanes, dtype=np.int64)
+
+    def begin(self, world: int, key: int, horizon_s: float) -> None:
+        """Forget an episode of a world and take up the next.
+
+        Args:
+            world: which one.
+            key: of the world and the new episode.
+            horizon_s: seconds an episode.
+        """
+        orders = self._schedule.orders(key, horizon_s)
+        more = len(orders) - self._looks.shape[1]
+        if more > 0:
+            room = np.zeros((len(self._looks), more), dtype=LOOK)
+            self._looks = np.concatenate([self._looks, room], axis=1)
+        looks = self._looks[world, : len(orders)]
+        self._num_looks[world] = len(orders)
+        routes = self._schedule.demand.routes[orders["route"]]
+        period = np.round(orders["reroute_period_ms"] / 1000.0 / self._dt).astype(np.int64)
+        looks["period"] = np.where(period > 0, np.maximum(period, self._ticks_per_s), 0)
+        looks["equipped"] = orders["reroute"]
+        looks["next"] = np.where(orders["reroute"], 0, NEVER)
+        looks["goal"] = self._schedule.last_edges(orders["route"])
+        looks["seen"] = -1
+        looks["may_leave"] = routes["exact"] | (routes["num_edges"] <= 2)
+        if self._measures:
+            limit_speeds(self._roads, self._past[world], self._speed_sums[world])
+        first = self._slots.first_of(world)
+        self._travel.steps[first : first + self._slots.of_world] = np.zeros((), dtype=PLAN)
+
+    def act(self, gate: Gate, worlds: Worlds) -> None:
+        """Sample the speeds, and let those ask who may, once a second; writes `next_rows`."""
+        for w, tick in enumerate(worlds.ticks):
+            if tick % self._ticks_per_s == 0:
+                self._sample(worlds, w, int(tick))
+                gate.counts[w, COUNT_REROUTED] += self._let_ask(worlds, w, int(tick))
+
+    def ways_of_first_world(self, ways: NDArray[np.int64], world: int) -> NDArray[np.int64]:
+        """VEHICLE["way"] (n,) of a world as it would be in the first one."""
+        return self._slots.ways_of_first_world(ways, world)
+
+    def state(self, world: int, rows: NDArray[np.void]) -> Iterator[NDArray[np.generic]]:
+        """What of a world's state is kept here, as arrays without padding.
+
+        Args:
+            world: number of the world.
+            rows: VEHICLE (n,), its vehicles: only the ways that they drive on count.
+        """
+        yield self._speed_sums[world]
+        yield self._past[world]
+        slots = self._slots
+        used = np.zeros(slots.number, dtype=np.bool_)
+        first = slots.first_of(world)
+        mark_slots(self._roads, rows, len(rows), first, slots.steps, used)
+        steps = self._travel.steps[first : first + slots.of_world]
+        ways = steps.reshape(slots.number, slots.steps)[used]
+        for records in (self._looks[world, : self._num_looks[world]], ways):
+            for name in records.dtype.names or ():
+                yield np.ascontiguousarray(records[name])
+
+    def _sample(self, worlds: Worlds, w: int, tick: int) -> None:
+        interval_ms = self._schedule.demand.device.adaptation_interval_ms
+        ticks = self._ticks_per_s * (interval_ms // 1000)
+        if self._measures and tick % ticks == 0:
+            sample_speeds(
+                self._roads,
+                worlds.next_rows[w],
+                worlds.num_owned[w],
+                tick // ticks,
+                self._past[w],
+                self._speed_sums[w],
+                self._lane_counts,
+                self._lane_sums,
+            )
+
+    def _let_ask(self, worlds: Worlds, w: int, tick: int) -> int:
+        """How many of those who ask take another way."""
+        rows, num = worlds.next_rows[w], int(worlds.num_owned[w])
+        looks = self._looks[w]
+        clock_s = self._travel.begin_s + tick * self._dt
+        self._forget_seen(looks, clock_s)
+        asking = np.empty(num, dtype=np.int64)
+        found = find_asking(self._roads, rows, num, tick, self._has_rules, looks, asking)
+        if found == 0:
+            return 0
+        traffic = Traffic(self._speed_sums[w], self._past.shape[1], self._closed(clock_s))
+        search = WaySearch(self._roads, self._travel, self._slots, w, rows, num, traffic)
+        legs = rows["leg"][:num].sum()
+        for i in asking[:found]:
+            row = rows[i]
+            look = looks[row["order"]]
+            self._ask_rerouters(search, int(i), row, look, clock_s)
+            if tick >= look["next"]:
+                answer = search.send(int(i), int(look["goal"]), True, False)
+                if answer is not Answer.LATER:
+                    look["next"] = tick + look["period"] if look["period"] > 0 else NEVER
+        return int(rows["leg"][:num].sum() - legs)
+
+    def _forget_seen(self, looks: NDArray[np.void], clock_s: float) -> None:
+        """Where a rule has begun within a second, those who are on its edge ask once more."""
+        rules = self._schedule.demand.rerouters.rules
+        before_s = clock_s - self._ticks_per_s * self._dt
+        begun = (rules["begin_s"] <= clock_s) & (before_s < rules["begin_s"])
+        if begun.any():
+            looks["seen"][np.isin(looks["seen"], rules["edge"][begun])] = -1
+
+    def _closed(self, clock_s: float) -> NDArray[np.int64]:
+        """(num_edges,) bits of the classes that an edge is closed to now."""
+        closed = np.zeros(len(self._roads.edges), dtype=np.int64)
+        closings = self._schedule.demand.rerouters.closings
+        now = closings[(closings["begin_s"] <= clock_s) & (clock_s < closings["end_s"])]
+        np.bitwise_or.at(closed, now["edge"], now["classes"])
+        return closed
+
+    def _ask_rerouters(
+        self, search: WaySearch, i: int, row: np.void, look: np.void, clock_s: float
+    ) -> None:
+        """Follow the first rerouter on a vehicle's edge that has another way for it."""
+        edge = self._roads.lanes[row["lane"]]["edge"]
+        if look["seen"] == edge:
+            return
+        rules = self._rules_at[edge]
+        for rule in rules[(rules["begin_s"] <= clock_s) & (clock_s < rules["end_s"])]:
+            if self._is_meant(rule, row):
+                answer = self._follow(search, i, row, look, rule)
+                if answer is Answer.LATER:
+                    return
+                if answer is Answer.TAKEN:
+                    break
+        look["seen"] = edge
+
+    def _is_meant(self, rule: np.void, row: np.void) -> bool:
+        """Whether a rule is about a vehicle's type, and the vehicle follows it."""
+        types = self._schedule.demand.rerouters.types[rule["interval"]]
+        if not types[row["vtype"] - self._first_type]:
+            return False
+        return self._drawn(rule, row, 0) < float(rule["chance"])
+
+    def _drawn(self, rule: np.void, row: np.void, number: int) -> float:
+        """A number in [0, 1): the same however often a vehicle asks until it takes a way."""
+        stream = STREAM_REROUTER + 2 * int(rule["interval"]) + number
+        return uniform(row["rng_key"], row["id"], row["leg"], stream)
+
+    def _follow(
+        self, search: WaySearch, i: int, row: np.void, look: np.void, rule: np.void
+    ) -> Answer:
+        if rule["routes"] >= 0:
+            return self._take_route(search, i, row, look, rule)
+        knows = bool(look["equipped"])
+        if rule["closes"]:
+            if not search.meets_closing(i):
+                return Answer.KEPT
+            answer = search.send(i, int(look["goal"]), knows, True)
+            if answer is not Answer.NO_WAY or rule["goals"] < 0:
+                return answer
+        goal = self._pick(self._schedule.demand.rerouters.goals, rule["goals"], rule, row)
+        if goal in (KEEP_DESTINATION, look["goal"]):
+            return Answer.KEPT
+        answer = search.send(i, goal, knows, True)
+        if answer is Answer.TAKEN:
+            look["goal"] = goal
+            # No plan of detours leads there.
+            row["goal"] = -1
+        return answer
+
+    def _take_route(
+        self, search: WaySearch, i: int, row: np.void, look: np.void, rule: np.void
+    ) -> Answer:
+        schedule = self._schedule
+        route = self._pick(schedule.demand.rerouters.routes, rule["routes"], rule, row)
+        vtype = int(row["vtype"]) - self._first_type
+        way = schedule.way_on(route, vtype, int(self._roads.lanes[row["lane"]]["edge"]))
+        answer = search.send_along(i, way) if way >= 0 else Answer.NO_WAY
+        if answer is Answer.TAKEN:
+            look["goal"] = schedule.last_edges(np.array([route]))[0]
+            row["goal"] = schedule.detour_goal(route, vtype)
+        return answer
+
+    def _pick(self, choices: Choices, number: int, rule: np.void, row: np.void) -> int:
+        drawn = np.array([self._drawn(rule, row, 1)])
+        return int(choices.pick(np.array([number], dtype=np.int32), drawn)[0])
