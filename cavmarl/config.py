@@ -147,7 +147,6 @@ class ZonesConfig:
             self.count,
             f"must be a whole number from 1 to {MAX_ZONES}",
         )
-        _check(self.count == 1, "zones.count", self.count, "this version runs one zone; use 1")
         _check_finite("zones.hysteresis_m", self.hysteresis_m, 0.0, 100.0)
         _check(
             0 <= self.max_deferred_ticks <= 1000,

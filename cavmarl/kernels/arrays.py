@@ -102,6 +102,13 @@ class Gate(NamedTuple):
     num_entered: NDArray[np.int64]  # (W,) agents that have been ordered so far
     counts: NDArray[np.int64]  # (W, NUM_COUNTS) departed, arrived, removed since reset
     sums: NDArray[np.float64]  # (W, NUM_SUMS) sums over arrived vehicles
+    passing: NDArray[np.void]  # VEHICLE (W, C + D) who leaves, or is about to enter, in this tick
+    num_passing: NDArray[np.int64]  # (W,)
+    places: NDArray[np.int64]  # (W, C + D) where in the queue those stand that are about to enter
+    tries: NDArray[np.int32]  # (W, C + D) LANE on which each of the queue tries to enter, or -1
+    ranks: NDArray[np.int64]  # (W, C + D, E) how crowded the lanes of its edge are, at most E
+    lane_taken: NDArray[np.bool_]  # (L,) somebody tries to enter there in this tick
+    spare: NDArray[np.void]  # VEHICLE (1,) room
 
 
 class Demand(NamedTuple):
@@ -127,7 +134,6 @@ class Scratch(NamedTuple):
     lane_end: NDArray[np.int32]  # (L,) lane_start[l + 1] again
     entries: NDArray[np.void]  # ENTRY (2 C,) vehicles by (lane, s, id), side lanes included
     step: NDArray[np.void]  # PLAN (C,) of each row the step of its lane, see `ways.own_step`
-    lane_taken: NDArray[np.bool_]  # (L,) somebody has tried to enter there in this tick
     link_start: NDArray[np.int32]  # (K + 2,) approach of link k: [link_start[k], link_start[k + 1])
     approach: NDArray[np.void]  # APPROACH (3 C,) vehicles on or before links, by link
     pairs: NDArray[np.void]  # APPROACH (3 C,) the same before sorting

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cavmarl.kernels import kernel
-from cavmarl.kernels.arrays import Demand, Gate, RoadArrays, Scratch, Travel, Worlds
+from cavmarl.kernels.arrays import Demand, Gate, RoadArrays, Travel, Worlds
 from cavmarl.kernels.codes import (
     COUNT_ARRIVED,
     COUNT_DEPARTED,
@@ -21,7 +21,6 @@ from cavmarl.kernels.codes import (
     DRIVER_AGENT,
     DRIVER_BACKGROUND,
     EVENT_ARRIVED,
-    EVENTS_THAT_END,
     LANE_GIVEN,
     POS_GIVEN,
     SPEED_MAX,
@@ -30,16 +29,9 @@ from cavmarl.kernels.codes import (
     SUM_TIME_S,
 )
 from cavmarl.kernels.entering import (
-    entry_lane,
-    entry_place,
-    entry_speed,
-    follower_brakes,
     speed_at,
 )
-from cavmarl.kernels.geometry import boxes_overlap
-from cavmarl.kernels.lanes import index_lanes
 from cavmarl.kernels.motion import place_on_lane
-from cavmarl.kernels.neighbors import LEVEL_HEIGHT_M
 from cavmarl.kernels.rng import (
     STREAM_ORIGIN,
     STREAM_PLACE,
@@ -50,13 +42,12 @@ from cavmarl.kernels.rng import (
 )
 from cavmarl.kernels.ways import own_step, way_left
 
-__all__ = ["call_orders", "choose_goals", "let_in", "populate", "take_out"]
+__all__ = ["call_orders", "choose_goals", "enter", "populate", "settle"]
 
 PLACE_TRIES = 24  # places tried for a vehicle at reset before it has to queue
 PLACE_GAP_M = 10.0  # m between bumpers of vehicles placed at reset
 END_ROOM_M = 12.0  # nobody starts nearer than this to the end of a lane, unless it is shorter
 PLACE_SHARE = 0.7  # of the speed limit, with which vehicles drive that are placed at reset
-ENTER_ROOM_M = 0.3  # free on all sides of a vehicle that enters
 WANDER_M = 150.0  # nearer to its goal than this a vehicle of a closed world picks another
 GOAL_TRIES = 8
 REROUTE_S = 45.0  # one on a route so long
@@ -110,7 +101,7 @@ def _send(roads: RoadArrays, departure: np.void, lane: int, goal: int) -> None:
 
 
 @kernel
-def _enter(
+def enter(
     roads: RoadArrays,
     travel: Travel,
     worlds: Worlds,
@@ -216,7 +207,7 @@ def populate(
                     limit = PLACE_SHARE * roads.lanes[lane]["speed_mps"]
                     speed = speed_at(roads, kind, lane, s, limit)
                     row = worlds.rows[w, num]
-                    _enter(roads, travel, worlds, w, departure, lane, s, speed, row)
+                    enter(roads, travel, worlds, w, departure, lane, s, speed, row)
                     gate.counts[w, COUNT_DEPARTED] += 1
                     worlds.num_rows[w] = num + 1
                     worlds.num_owned[w] = num + 1
@@ -306,56 +297,34 @@ def choose_goals(
 
 
 @kernel
-def _next_through(rows: NDArray[np.void], num: int, driver: int, ticks_per_step: int) -> int:
-    """Row of the smallest id among the vehicles of one kind of driver that are through, or -1."""
-    ending = EVENTS_THAT_END if driver == DRIVER_AGENT else EVENT_ARRIVED
-    first = -1
-    for i in range(num):
-        row = rows[i]
-        if row["driver"] != driver or not row["events"] & ending:
-            continue
-        if driver == DRIVER_AGENT and row["departed"] > row["tick"] - ticks_per_step:
-            continue
-        if first < 0 or row["id"] < rows[first]["id"]:
-            first = i
-    return first
+def _next_leaving(gate: Gate, w: int, first: int) -> int:
+    """Where in `gate.passing` the smallest id stands of those from `first` on."""
+    found = first
+    for n in range(first + 1, gate.num_passing[w]):
+        if gate.passing[w, n]["id"] < gate.passing[w, found]["id"]:
+            found = n
+    return found
 
 
 @kernel
-def take_out(
-    demand: Demand,
-    roads: RoadArrays,
-    gate: Gate,
-    worlds: Worlds,
-    rows: NDArray[np.void],
-    driver: int,
-    dt: float,
-    ticks_per_step: int,
-) -> None:
-    """Take out the vehicles of one kind of driver that are through, and order those that follow.
+def settle(demand: Demand, roads: RoadArrays, gate: Gate, worlds: Worlds, dt: float) -> None:
+    """Count the vehicles that have left, and order those that follow.
 
     They go in the order of their ids, so that who follows gets the same number wherever the rows
-    lie. Background vehicles are through when they have arrived; agents that have acted also after a
-    collision or off the road.
+    lay.
 
     Args:
         demand: the generator's tables.
         roads: the road arrays.
-        gate: counts, sums and queue are written.
-        worlds: how many rows there are is written.
-        rows: VEHICLE (W, C), the rows to take from.
-        driver: DRIVER_*.
+        gate: counts, sums and queue are written; `passing` holds those that left, and is emptied.
+        worlds: keys and ticks.
         dt: seconds of a tick.
-        ticks_per_step: ticks a step; agents that entered within the last of them have not acted.
     """
     for w in range(worlds.ticks.shape[0]):
-        if driver == DRIVER_BACKGROUND and worlds.num_through[w] == 0:
-            continue
-        while True:
-            i = _next_through(rows[w], worlds.num_owned[w], driver, ticks_per_step)
-            if i < 0:
-                break
-            row = rows[w, i]
+        for n in range(gate.num_passing[w]):
+            # Nobody looks at those before n any more.
+            found = _next_leaving(gate, w, n)
+            row = gate.passing[w, found]
             agent = row["agent"]
             ordered = row["order"] >= 0
             if row["events"] & EVENT_ARRIVED:
@@ -366,10 +335,7 @@ def take_out(
                 gate.sums[w, SUM_DELAY_S] += max(time - row["free_s"], 0.0)
             else:
                 gate.counts[w, COUNT_REMOVED] += 1
-            last = worlds.num_owned[w] - 1
-            rows[w, i] = rows[w, last]
-            worlds.num_owned[w] = last
-            worlds.num_rows[w] -= 1
+            gate.passing[w, found] = gate.passing[w, n]
             if not demand.reenter or ordered:
                 continue
             if agent < 0:
@@ -380,6 +346,7 @@ def take_out(
                 follower = gate.num_entered[w]
                 gate.num_entered[w] = follower + 1
                 _order(demand, roads, gate, worlds, w, follower, demand.agent_trips)
+        gate.num_passing[w] = 0
 
 
 @kernel
@@ -395,103 +362,3 @@ def call_orders(gate: Gate, worlds: Worlds) -> None:
             gate.num_queue[w] += 1
             n += 1
         gate.next_order[w] = n
-
-
-@kernel
-def _touches(rows: NDArray[np.void], i: int) -> bool:
-    """Whether row i, with some room around it, touches one of the rows before it."""
-    own = rows[i]
-    cos = math.cos(own["heading"])
-    sin = math.sin(own["heading"])
-    half_length = 0.5 * own["length"] + ENTER_ROOM_M
-    half_width = 0.5 * own["width"] + ENTER_ROOM_M
-    for j in range(i):
-        other = rows[j]
-        dx = other["x"] - own["x"]
-        dy = other["y"] - own["y"]
-        reach = half_length + half_width + 0.5 * (other["length"] + other["width"])
-        if dx * dx + dy * dy > reach * reach or abs(other["z"] - own["z"]) > LEVEL_HEIGHT_M:
-            continue
-        if boxes_overlap(
-            own["x"],
-            own["y"],
-            cos,
-            sin,
-            half_length,
-            half_width,
-            other["x"],
-            other["y"],
-            math.cos(other["heading"]),
-            math.sin(other["heading"]),
-            0.5 * other["length"],
-            0.5 * other["width"],
-        ):
-            return True
-    return False
-
-
-@kernel
-def _try_to_enter(
-    demand: Demand,
-    roads: RoadArrays,
-    travel: Travel,
-    gate: Gate,
-    worlds: Worlds,
-    w: int,
-    departure: np.void,
-    scratch: Scratch,
-) -> bool:
-    """Let one departure enter `next_rows` if it finds a safe gap on its lane."""
-    key = worlds.keys[w]
-    lane = entry_lane(roads, travel, key, departure, scratch)
-    if lane < 0:
-        return False
-    # The lane is taken whether or not there is room: who waits longer goes first.
-    scratch.lane_taken[lane] = True
-    rows = worlds.next_rows[w]
-    kind = travel.types[departure["vtype"]]
-    s = entry_place(roads, key, departure, kind, lane, worlds.ticks[w], scratch)
-    speed = entry_speed(roads, travel, key, departure, kind, lane, s, scratch)
-    if speed < 0.0:
-        return False
-    if follower_brakes(roads, travel, rows, departure, kind, lane, s, speed, scratch):
-        return False
-    i = worlds.num_rows[w]
-    rows[i] = demand.blank[0]
-    _enter(roads, travel, worlds, w, departure, lane, s, speed, rows[i])
-    if _touches(rows, i):
-        return False
-    gate.counts[w, COUNT_DEPARTED] += 1
-    worlds.num_owned[w] += 1
-    worlds.num_rows[w] += 1
-    return True
-
-
-@kernel
-def let_in(
-    demand: Demand,
-    roads: RoadArrays,
-    travel: Travel,
-    gate: Gate,
-    worlds: Worlds,
-    scratch: Scratch,
-) -> None:
-    """Let the waiting departures that find a safe gap enter `next_rows`, at most one a lane."""
-    for w in range(worlds.ticks.shape[0]):
-        waiting = gate.num_queue[w]
-        if waiting == 0:
-            continue
-        index_lanes(roads, travel, worlds.next_rows[w], worlds.num_rows[w], scratch)
-        scratch.lane_taken[:] = False
-        kept = 0
-        for q in range(waiting):
-            departure = gate.queue[w, q]
-            full = worlds.num_rows[w] == worlds.rows.shape[1]
-            if not full and _try_to_enter(
-                demand, roads, travel, gate, worlds, w, departure, scratch
-            ):
-                continue
-            if kept < q:
-                gate.queue[w, kept] = departure
-            kept += 1
-        gate.num_queue[w] = kept

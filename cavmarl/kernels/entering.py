@@ -32,7 +32,7 @@ from cavmarl.kernels.lanes import VIEW_M, ahead_on, last_on, neighbor_behind
 from cavmarl.kernels.rng import STREAM_DEPARTURE, STREAM_PLACE, below, uniform
 from cavmarl.kernels.ways import next_step
 
-__all__ = ["entry_lane", "entry_place", "entry_speed", "follower_brakes", "speed_at"]
+__all__ = ["crowd", "entry_lane", "entry_place", "entry_speed", "follower_brakes", "speed_at"]
 
 ENTER_GAP_M = 1.0  # m between bumpers, the least with which a vehicle enters
 ENTER_DECEL = 2.0  # m/s², braking that an entering vehicle may impose, or need at the lane's end
@@ -48,7 +48,7 @@ def _may_use(travel: Travel, departure: np.void, lane: int) -> bool:
 
 
 @kernel
-def _crowd(scratch: Scratch, lane: int, s: float) -> int:
+def crowd(scratch: Scratch, lane: int, s: float) -> int:
     """How many vehicles are in view around a place on a lane."""
     found = 0
     for k in range(scratch.lane_start[lane], scratch.lane_end[lane]):
@@ -58,17 +58,30 @@ def _crowd(scratch: Scratch, lane: int, s: float) -> int:
 
 @kernel
 def entry_lane(
-    roads: RoadArrays, travel: Travel, key: np.uint64, departure: np.void, scratch: Scratch
+    roads: RoadArrays,
+    travel: Travel,
+    key: np.uint64,
+    departure: np.void,
+    ranks: NDArray[np.int64],
+    taken: NDArray[np.bool_],
 ) -> int:
-    """The LANE where a departure enters in this tick, or -1 if another one has just entered there.
+    """The LANE where a departure enters in this tick, or -1 if another one tries there.
 
     Whose lane is chosen by traffic takes the one with the fewest vehicles of those that it may use
     (`best`: from which its way goes on without a lane change, or with the fewest), the right one of
     two.
+
+    Args:
+        roads: the road arrays.
+        travel: types and ways.
+        key: of the world.
+        departure: who enters.
+        ranks: how crowded each lane of its edge is; read where traffic chooses.
+        taken: (L,) lanes on which another one tries in this tick.
     """
     code = departure["lane_code"]
     if code == LANE_GIVEN:
-        return -1 if scratch.lane_taken[departure["lane"]] else departure["lane"]
+        return -1 if taken[departure["lane"]] else departure["lane"]
     edge = roads.edges[roads.lanes[departure["lane"]]["edge"]]
     first = edge["first_lane"]
     end = first + edge["num_lanes"]
@@ -85,14 +98,14 @@ def entry_lane(
             continue
         if code == LANE_RANDOM:
             if pick == 0:
-                return -1 if scratch.lane_taken[lane] else lane
+                return -1 if taken[lane] else lane
             pick -= 1
             continue
         if code == LANE_FIRST:
-            return -1 if scratch.lane_taken[lane] else lane
-        if scratch.lane_taken[lane]:
+            return -1 if taken[lane] else lane
+        if taken[lane]:
             continue
-        rank = _crowd(scratch, lane, max(departure["pos"], 0.0))
+        rank = ranks[lane - first]
         if code == LANE_BEST:
             rank += int(travel.steps[departure["way"] + lane]["changes"]) * (1 << 20)
         if rank < best_rank:

@@ -154,7 +154,8 @@ def _first_after(scratch: Scratch, lane: int, s: float, own_id: int) -> int:
 def ahead_on(scratch: Scratch, lane: int, s: float, own_id: int) -> int:
     """Position in the index of the next other vehicle on `lane` ahead of place `s`, or -1.
 
-    Beyond `VIEW_M` nobody is found. At equal s the larger id counts as ahead, so that of two vehicles one is always the leader.
+    Beyond `VIEW_M` nobody is found. At equal s the larger id counts as ahead, so that of two
+    vehicles one is always the leader.
     """
     k = _first_after(scratch, lane, s, own_id)
     end = scratch.lane_start[lane + 1]

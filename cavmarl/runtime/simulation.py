@@ -23,10 +23,16 @@ from cavmarl.kernels.codes import (
     SUM_DISTANCE_M,
     SUM_TIME_S,
 )
+from cavmarl.kernels.motion import MAX_SPEED_MPS
 from cavmarl.kernels.rng import world_key
 from cavmarl.roads.network import RoadNetwork
+from cavmarl.roads.zone_coverage import Coverage, zone_halo
+from cavmarl.roads.zone_layouts import cut_map
+from cavmarl.roads.zones import ZonePartition
 from cavmarl.runtime.compilation import first_compilation
+from cavmarl.runtime.division import Division
 from cavmarl.runtime.executor import Executor, SerialExecutor
+from cavmarl.shard.reach import driving_reach_m
 from cavmarl.shard.shard import Commands, Shard
 from cavmarl.shard.vehicles import STATE_FIELDS, blank_vehicle
 from cavmarl.traffic.demand import DemandFile
@@ -76,6 +82,7 @@ class Simulation:
         network: its roads.
         num_worlds: W.
         demand: whose vehicles drive beside the generator's.
+        partition: the zones, if `config.zones` names a file.
     """
 
     def __init__(
@@ -84,6 +91,7 @@ class Simulation:
         network: RoadNetwork,
         num_worlds: int = 1,
         demand: DemandFile | None = None,
+        partition: ZonePartition | None = None,
     ) -> None:
         self.config = config
         self.network = network
@@ -107,13 +115,42 @@ class Simulation:
             )
             capacity = traffic.capacity
             self._traffic = traffic
-            self._gate = make_gate(num_worlds, capacity)
-            self._shard = Shard(
-                config, network, traffic.plans, traffic.travel, num_worlds, capacity
-            )
-            self._executor: Executor = SerialExecutor([self._shard])
+            self._gate = make_gate(num_worlds, capacity, network.arrays, blank.dtype)
+            self._shards = self._make_shards(partition or _cut(config, network))
+            self._shard = self._shards[0]
+            self._executor: Executor = SerialExecutor(self._shards)
             if is_first:
                 self._call_every_kernel()
+
+    def _make_shards(self, partition: ZonePartition) -> list[Shard]:
+        """One shard a zone, and the division that knows them all."""
+        config, traffic = self.config, self._traffic
+        zones, settings = partition.arrays, config.zones
+        coverage = Coverage.of(
+            (driving_reach_m(self.network, traffic.travel.types),),
+            hysteresis_m=settings.hysteresis_m,
+            max_deferred_ticks=settings.max_deferred_ticks,
+            max_speed_mps=MAX_SPEED_MPS,
+            sim_dt_s=config.clock.sim_dt_s,
+        )
+        halo = zone_halo(partition, coverage.halo_m)
+        shards: list[Shard] = []
+        for zone in range(partition.count):
+            shard = Shard(
+                config,
+                self.network,
+                traffic.plans,
+                traffic.travel,
+                self.num_worlds,
+                traffic.capacity,
+                zone,
+                zones,
+                halo,
+                shards[0] if shards else None,
+            )
+            shards.append(shard)
+        self._division = Division(shards, zones, halo, settings.hysteresis_m)
+        return shards
 
     def _call_every_kernel(self) -> None:
         """Run one step of a world that the first reset forgets."""
@@ -146,14 +183,19 @@ class Simulation:
         return self._traffic.plans
 
     def vehicles(self, world: int = 0) -> NDArray[np.void]:
-        """The live vehicles of one world: a view of VEHICLE records, in no order."""
-        worlds = self._shard.worlds
-        return worlds.rows[world, : worlds.num_owned[world]]
+        """The live vehicles of one world, VEHICLE records in no order.
+
+        A view, or, where the world is divided, a copy.
+        """
+        return self._division.vehicles(world)
 
     @property
     def worlds(self) -> Worlds:
-        """The vehicles and signals of all worlds, for tools that measure; each tick swaps them."""
-        return self._shard.worlds
+        """The vehicles and signals of all worlds, for tools that measure; each tick swaps them.
+
+        A copy where worlds are divided.
+        """
+        return self._division.whole()
 
     def signal_phases(self, world: int = 0) -> NDArray[np.int32]:
         """PHASE rows that are on, (num_signals,)."""
@@ -204,6 +246,7 @@ class Simulation:
         self._episodes[chosen] += 1
         self._gate = self._traffic.draw_orders(self._gate, worlds, chosen)
         self._traffic.populate(self._gate, worlds, chosen)
+        self._division.distribute(chosen)
         self._executor.each("switch_signals")
         self._executor.each("sense", chosen)
 
@@ -220,21 +263,48 @@ class Simulation:
         self._traffic = wrap(self._traffic)
 
     def _tick(self, commands: Commands) -> None:
-        """Advance → (exchange) → resolve → departures → (migrate) → commit → signals."""
+        """Advance → leave → exchange → resolve → enter → migrate → commit → signals."""
         self._executor.each("advance", commands)
+        self._leave()
+        self._division.exchange()
         self._executor.each("resolve")
-        self._traffic.arrive_and_depart(
-            self._gate, self._shard.worlds, self._shard.scratch, self.config.clock.sim_dt_s
-        )
+        self._enter()
+        self._division.migrate()
         self._executor.each("commit")
+        self._shard.worlds.ticks[:] += 1
         self._executor.each("switch_signals")
+
+    def _leave(self) -> None:
+        """Who needs it picks another goal, who has arrived leaves, who looks for a way finds it."""
+        traffic, gate, worlds = self._traffic, self._gate, self._shard.worlds
+        if (worlds.ticks % traffic.ticks_per_s == 0).any():
+            self._executor.each("choose_goals", traffic.demand, len(traffic.plans), gate)
+        self._executor.each("leave", gate)
+        if gate.num_passing.any():
+            traffic.settle(gate, worlds)
+        if traffic.rerouting is not None:
+            traffic.rerouting.act(gate, worlds)
+
+    def _enter(self) -> None:
+        """Those who wait and find a gap enter `next_rows`."""
+        traffic, gate, worlds = self._traffic, self._gate, self._shard.worlds
+        traffic.call_orders(gate, worlds)
+        if not gate.num_queue.any():
+            return
+        self._executor.each("rank_lanes", gate)
+        traffic.assign_lanes(gate, worlds)
+        self._executor.each("propose", traffic.demand, gate)
+        traffic.accept(gate, self._division.running())
+        self._executor.each("admit", gate)
+        gate.num_passing[:] = 0
 
     def retire_agents(self) -> None:
         """Take out the agents whose trip ended in the last step; to be called after it is read."""
-        clock = self.config.clock
-        self._traffic.retire_agents(
-            self._gate, self._shard.worlds, clock.sim_dt_s, clock.ticks_per_step
-        )
+        gate = self._gate
+        self._executor.each("retire", gate)
+        if gate.num_passing.any():
+            self._executor.each("forget", gate)
+            self._traffic.settle(gate, self._shard.worlds)
 
     def agents_to_come(self) -> NDArray[np.bool_]:
         """(W,) whether an agent waits to enter."""
@@ -291,7 +361,7 @@ class Simulation:
 
     def traffic_stats(self, world: int = 0) -> TrafficStats:
         """Counts and means since the world's reset."""
-        worlds = self._shard.worlds
+        contacts = sum(int(shard.worlds.num_contacts[world]) for shard in self._shards)
         counts = self._gate.counts[world]
         sums = self._gate.sums[world]
         rows = self.vehicles(world)
@@ -302,7 +372,7 @@ class Simulation:
             waiting=int(self._gate.num_queue[world]),
             running=len(rows),
             arrived=arrived,
-            contacts=int(worlds.num_contacts[world]),
+            contacts=contacts,
             removed=int(counts[COUNT_REMOVED]),
             rerouted=int(counts[COUNT_REROUTED]),
             mean_speed_mps=float(np.sort(rows["speed"]).mean()) if len(rows) else 0.0,
@@ -310,3 +380,14 @@ class Simulation:
             mean_trip_s=float(sums[SUM_TIME_S]) / trips,
             mean_delay_s=float(sums[SUM_DELAY_S]) / trips,
         )
+
+
+def _cut(config: EnvConfig, network: RoadNetwork) -> ZonePartition:
+    settings = config.zones
+    return cut_map(
+        network,
+        settings.layout,
+        settings.count,
+        avoid_junctions=settings.avoid_junctions,
+        weight=settings.weight,
+    )

@@ -12,15 +12,29 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cavmarl.config import TERMS, EnvConfig
+from cavmarl.kernels.admission import admit, propose, rank_lanes
 from cavmarl.kernels.approach import APPROACH
-from cavmarl.kernels.arrays import LaneGrid, Outputs, RoadArrays, Scratch, Travel, Worlds
+from cavmarl.kernels.arrays import (
+    Demand,
+    Gate,
+    LaneGrid,
+    Outputs,
+    RoadArrays,
+    Scratch,
+    Travel,
+    Worlds,
+)
+from cavmarl.kernels.codes import DRIVER_AGENT, DRIVER_BACKGROUND
+from cavmarl.kernels.departures import choose_goals
 from cavmarl.kernels.lanes import ENTRY
+from cavmarl.kernels.leaving import drop_ghosts, leave
 from cavmarl.kernels.neighbors import make_grid
 from cavmarl.kernels.observe_further import observe_further
 from cavmarl.kernels.sense import sense
 from cavmarl.kernels.signals import switch_signals
 from cavmarl.kernels.stacking import fill_stacks
 from cavmarl.kernels.tick import advance, begin_step, resolve, suggest
+from cavmarl.kernels.zones import Halo, ZoneArrays
 from cavmarl.roads.network import RoadNetwork
 from cavmarl.roads.routing import PLAN, lane_grid
 from cavmarl.shard.controllers import CONTROLLER
@@ -29,6 +43,8 @@ from cavmarl.shard.vehicles import VEHICLE
 
 __all__ = ["Commands", "Shard", "make_worlds"]
 
+# What is the world's and not a zone's: shards in one process have the same arrays.
+SHARED = ("ticks", "keys", "signal_phase", "controllers", "detected_s", "pending")
 CELL_M = 25.0  # of the spatial index over vehicles
 SUGGESTED_HORIZON_S = 1.0  # in which a suggested target speed is to be reached
 
@@ -56,6 +72,10 @@ class Shard:
         travel: types and ways.
         num_worlds: W.
         capacity: rows a world can hold.
+        zone: which one.
+        zones: of the partition.
+        halo: how far it sees over its borders.
+        of: another shard of the same worlds, with which it shares clock, keys and signals.
     """
 
     def __init__(
@@ -66,7 +86,14 @@ class Shard:
         travel: Travel,
         num_worlds: int,
         capacity: int,
+        zone: int,
+        zones: ZoneArrays,
+        halo: Halo,
+        of: Shard | None = None,
     ) -> None:
+        self.zone = zone
+        self._zones = zones
+        self._halo = halo
         self._config = config
         self._roads: RoadArrays = network.arrays
         self._plans = plans
@@ -84,6 +111,11 @@ class Shard:
             config.clock.control_latency_ticks,
         )
         self.outputs = _make_outputs(config, num_worlds)
+        if of is not None:
+            self.outputs = of.outputs
+            self.worlds = self.worlds._replace(
+                **{name: getattr(of.worlds, name) for name in SHARED}
+            )
         self._weights = np.array([config.terms.weights.get(name, 0.0) for name in TERMS])
         self._target_speeds = np.array(config.action.target_speeds_mps)
         self._discrete = config.action.kind == "discrete"
@@ -121,11 +153,51 @@ class Shard:
         """Find who touches whom in `next_rows`."""
         resolve(self.worlds, self.scratch, self._grid)
 
+    def choose_goals(self, demand: Demand, num_goals: int, gate: Gate) -> None:
+        """Give the vehicles of `next_rows` that need it another goal."""
+        dt = self._config.clock.sim_dt_s
+        choose_goals(demand, self._roads, self._travel, num_goals, gate, self.worlds, dt)
+
+    def leave(self, gate: Gate) -> None:
+        """Hand the background vehicles of `next_rows` that have arrived to the gate."""
+        leave(gate, self.worlds, self.worlds.next_rows, DRIVER_BACKGROUND, 1)
+
+    def retire(self, gate: Gate) -> None:
+        """Hand the agents' vehicles of the committed rows whose trip has ended to the gate."""
+        ticks = self._config.clock.ticks_per_step
+        leave(gate, self.worlds, self.worlds.rows, DRIVER_AGENT, ticks)
+
+    def forget(self, gate: Gate) -> None:
+        """Drop the ghosts of those who have been retired."""
+        drop_ghosts(gate, self.worlds, self.worlds.rows)
+
+    def rank_lanes(self, gate: Gate) -> None:
+        """Count who is around the places of this zone where departures may enter."""
+        rank_lanes(
+            self._roads, self._travel, self._zones, self.zone, gate, self.worlds, self.scratch
+        )
+
+    def propose(self, demand: Demand, gate: Gate) -> None:
+        """Tell the gate which departures find a safe gap in this zone."""
+        propose(
+            demand,
+            self._roads,
+            self._travel,
+            self._zones,
+            self.zone,
+            gate,
+            self.worlds,
+            self.scratch,
+        )
+
+    def admit(self, gate: Gate) -> None:
+        """Take in those whom the gate has accepted, as owned or as ghosts."""
+        admit(self._zones, self._halo, self.zone, gate, self.worlds)
+
     def commit(self) -> None:
-        """Make `next_rows` the committed state of the next tick."""
+        """Make `next_rows` the committed state."""
         worlds = self.worlds
         self.worlds = worlds._replace(rows=worlds.next_rows, next_rows=worlds.rows)
-        worlds.ticks[:] += 1
 
     def sense(self, chosen: NDArray[np.bool_]) -> None:
         """Write observations, terms and rewards of the chosen worlds' agents into `outputs`."""
@@ -218,7 +290,6 @@ def _make_scratch(num_lanes: int, num_links: int, capacity: int) -> Scratch:
         lane_end=integers(num_lanes),
         entries=np.zeros(2 * capacity, dtype=ENTRY),
         step=np.zeros(capacity, dtype=PLAN),
-        lane_taken=np.zeros(num_lanes, dtype=np.bool_),
         link_start=integers(num_links + 2),
         approach=np.zeros(3 * capacity, dtype=APPROACH),
         pairs=np.zeros(3 * capacity, dtype=APPROACH),

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 
-from cavmarl.kernels.arrays import Gate
+from cavmarl.kernels.arrays import Gate, RoadArrays
 from cavmarl.kernels.codes import NUM_COUNTS, NUM_SUMS
 
 __all__ = ["DEPARTURE", "make_gate", "with_room"]
@@ -32,8 +34,10 @@ DEPARTURE = np.dtype(
 )
 
 
-def make_gate(num_worlds: int, capacity: int) -> Gate:
-    """The empty gates of `num_worlds` worlds that hold `capacity` vehicles each."""
+def make_gate(
+    num_worlds: int, capacity: int, roads: RoadArrays, vehicle: np.dtype[np.void]
+) -> Gate:
+    """The empty gates of `num_worlds` worlds that hold `capacity` records of vehicles each."""
     return Gate(
         orders=np.zeros((num_worlds, 0), dtype=DEPARTURE),
         num_orders=np.zeros(num_worlds, dtype=np.int64),
@@ -44,7 +48,23 @@ def make_gate(num_worlds: int, capacity: int) -> Gate:
         num_entered=np.zeros(num_worlds, dtype=np.int64),
         counts=np.zeros((num_worlds, NUM_COUNTS), dtype=np.int64),
         sums=np.zeros((num_worlds, NUM_SUMS), dtype=np.float64),
+        num_passing=np.zeros(num_worlds, dtype=np.int64),
+        lane_taken=np.zeros(len(roads.lanes), dtype=np.bool_),
+        spare=np.zeros(1, dtype=vehicle),
+        **_room(num_worlds, capacity, int(roads.edges["num_lanes"].max()), vehicle),
     )
+
+
+def _room(
+    num_worlds: int, waiting: int, num_lanes: int, vehicle: np.dtype[np.void]
+) -> dict[str, Any]:
+    """What the gate needs for each that may wait."""
+    return {
+        "passing": np.zeros((num_worlds, waiting), dtype=vehicle),
+        "places": np.zeros((num_worlds, waiting), dtype=np.int64),
+        "tries": np.zeros((num_worlds, waiting), dtype=np.int32),
+        "ranks": np.zeros((num_worlds, waiting, num_lanes), dtype=np.int64),
+    }
 
 
 def with_room(gate: Gate, num_orders: int) -> Gate:
@@ -54,7 +74,9 @@ def with_room(gate: Gate, num_orders: int) -> Gate:
     if more <= 0:
         return gate
     room = np.zeros((num_worlds, more), dtype=DEPARTURE)
+    queue = np.concatenate([gate.queue, room], axis=1)
     return gate._replace(
         orders=np.concatenate([gate.orders, room], axis=1),
-        queue=np.concatenate([gate.queue, room], axis=1),
+        queue=queue,
+        **_room(num_worlds, queue.shape[1], gate.ranks.shape[2], gate.passing.dtype),
     )

@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 
 from cavmarl.config import PopulationConfig, TrafficConfig
 from cavmarl.errors import CapacityError, ConfigError, RouteError
-from cavmarl.kernels.arrays import Demand, Gate, Scratch, Travel, Worlds
-from cavmarl.kernels.codes import DRIVER_AGENT, DRIVER_BACKGROUND
-from cavmarl.kernels.departures import call_orders, choose_goals, let_in, populate, take_out
+from cavmarl.kernels.admission import accept, assign_lanes
+from cavmarl.kernels.arrays import Demand, Gate, Travel, Worlds
+from cavmarl.kernels.departures import call_orders, populate, settle
 from cavmarl.roads.network import VEHICLE_CLASSES, RoadNetwork
 from cavmarl.roads.routing import make_plans
 from cavmarl.traffic.demand import STOP, DemandFile
@@ -114,6 +114,11 @@ class NativeTraffic:
         first_step = self.plans.size + len(schedule.steps)
         return way_slots(schedule, first_step, self.num_worlds, self.capacity, self.horizon_s)
 
+    @property
+    def ticks_per_s(self) -> int:
+        """How many ticks a second has; at least 1."""
+        return max(1, round(1.0 / self.dt))
+
     @cached_property
     def rerouting(self) -> Rerouting | None:
         """Those ways; None where nobody looks for one."""
@@ -189,20 +194,21 @@ class NativeTraffic:
         """Fill the chosen worlds (W,) for a new episode."""
         populate(self.demand, self.network.arrays, self.travel, gate, worlds, chosen)
 
-    def arrive_and_depart(self, gate: Gate, worlds: Worlds, scratch: Scratch, dt: float) -> None:
-        """Who has arrived leaves `next_rows`, who looks for a way finds it, who waits may enter."""
-        roads = self.network.arrays
-        choose_goals(self.demand, roads, self.travel, len(self.plans), gate, worlds, dt)
-        take_out(self.demand, roads, gate, worlds, worlds.next_rows, DRIVER_BACKGROUND, dt, 1)
-        if self.rerouting is not None:
-            self.rerouting.act(gate, worlds)
-        call_orders(gate, worlds)
-        let_in(self.demand, roads, self.travel, gate, worlds, scratch)
+    def settle(self, gate: Gate, worlds: Worlds) -> None:
+        """Count who has left, and order those that follow."""
+        settle(self.demand, self.network.arrays, gate, worlds, self.dt)
 
-    def retire_agents(self, gate: Gate, worlds: Worlds, dt: float, ticks_per_step: int) -> None:
-        """Take agents whose trip has ended out of the committed rows; order those that follow."""
-        roads = self.network.arrays
-        take_out(self.demand, roads, gate, worlds, worlds.rows, DRIVER_AGENT, dt, ticks_per_step)
+    def assign_lanes(self, gate: Gate, worlds: Worlds) -> None:
+        """Say who of the queue tries to enter on which lane."""
+        assign_lanes(self.network.arrays, self.travel, gate, worlds)
+
+    def call_orders(self, gate: Gate, worlds: Worlds) -> None:
+        """Put the orders that are due by the coming tick into the queue."""
+        call_orders(gate, worlds)
+
+    def accept(self, gate: Gate, running: NDArray[np.int64]) -> None:
+        """Choose among those who could enter; `running` (W,) are in the worlds already."""
+        accept(gate, running, self.capacity)
 
     def _check_room(self) -> None:
         """Refuse a population that cannot stand on the map, bumper to bumper.
