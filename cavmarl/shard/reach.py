@@ -22,7 +22,8 @@ def driving_reach_m(network: RoadNetwork, types: NDArray[np.void]) -> float:
     """The farthest vehicle that a driver's decision can depend on.
 
     A driver looks `VIEW_M` ahead and asks at a line in view who comes to the junction beyond it,
-    within `APPROACH_M` of the lines there, and who stands behind it, within `EXIT_LOOK_M`.
+    within `APPROACH_M` of the lines there, and who stands behind it, within `EXIT_LOOK_M`. Own path
+    and foe's meet somewhere on the junction: between the lines may lie the lengths of both.
 
     Args:
         network: the roads.
@@ -33,4 +34,4 @@ def driving_reach_m(network: RoadNetwork, types: NDArray[np.void]) -> float:
     back_m = float(network.lanes["stop_back_m"].max())
     bodies_m = 2.0 * float(types["length"].max())
     beyond_m = max(APPROACH_M, EXIT_LOOK_M)
-    return VIEW_M + back_m + crossing_m + beyond_m + bodies_m + ASIDE_M
+    return VIEW_M + back_m + 2.0 * crossing_m + beyond_m + bodies_m + ASIDE_M
