@@ -85,11 +85,18 @@ def rank_lanes(
             for lane in range(first, first + edge["num_lanes"]):
                 on_lane = min(s, roads.lanes[lane]["length_m"])
                 if chooses and _zone_on(roads, zones, lane, on_lane) == zone:
-                    gate.ranks[w, q, lane - first] = crowd(scratch, lane, s)
+                    gate.ranks[w, q, lane - first] = crowd(scratch, lane, s, travel.view_m)
                 if last and _zone_on(roads, zones, lane, 0.0) == zone:
                     kind = travel.types[departure["vtype"]]
                     gate.last_s[w, q, lane - first] = entry_place(
-                        roads, worlds.keys[w], departure, kind, lane, worlds.ticks[w], scratch
+                        roads,
+                        worlds.keys[w],
+                        departure,
+                        kind,
+                        lane,
+                        worlds.ticks[w],
+                        scratch,
+                        travel.view_m,
                     )
 
 
@@ -193,7 +200,9 @@ def propose(
                 edge = roads.edges[roads.lanes[lane]["edge"]]
                 s = gate.last_s[w, q, lane - edge["first_lane"]]
             else:
-                s = entry_place(roads, key, departure, kind, lane, worlds.ticks[w], scratch)
+                s = entry_place(
+                    roads, key, departure, kind, lane, worlds.ticks[w], scratch, travel.view_m
+                )
             if _zone_on(roads, zones, lane, s) != zone:
                 continue
             speed = entry_speed(roads, travel, key, departure, kind, lane, s, scratch)

@@ -127,7 +127,7 @@ class Simulation:
         config, traffic = self.config, self._traffic
         zones, settings = partition.arrays, config.zones
         coverage = Coverage.of(
-            (driving_reach_m(self.network, traffic.travel.types),),
+            (driving_reach_m(self.network, traffic.travel),),
             hysteresis_m=settings.hysteresis_m,
             max_deferred_ticks=settings.max_deferred_ticks,
             max_speed_mps=MAX_SPEED_MPS,
