@@ -35,7 +35,7 @@ def make_world(
         DemandError: a demand that cannot be, or not on this map.
         MapError: the map cannot be driven.
     """
-    config, network, file = load_world(
+    config, network, file, _ = load_world(
         map_file,
         agents=0,
         background=0,
