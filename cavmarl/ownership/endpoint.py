@@ -139,11 +139,16 @@ class Endpoint:
         return tuple(self._prepare(target, offers[target]) for target in offers)
 
     def refuse(self, message: Prepare) -> Reaction:
-        """Answer a PREPARE with a NACK, without looking at it: the host has no room."""
+        """Answer a PREPARE with a NACK: the host has no room."""
         if self._misfit(message) is not None:
             return self.on_message(message)
         refused = tuple(
-            Refused(entry.vehicle, entry.epoch, Refusal.LOAD) for entry in message.entries
+            Refused(
+                offer.vehicle,
+                offer.epoch,
+                self.replicas.refuse(offer, message.tick, Refusal.LOAD),
+            )
+            for offer in message.entries
         )
         return Reaction((Nack(*self._answer_header(message), refused),))
 
@@ -221,8 +226,9 @@ class Endpoint:
         self.lease, self._answer = step.tick, None
         self.replicas.expire(self.tick)
         return Advance(
-            step.tick, release, leave, overwrites + tuple(enter), step.spawn, step.payload
-        )
+            self.episode, step.tick, release, leave, overwrites + tuple(enter), step.spawn,
+            step.payload,
+        )  # fmt: skip
 
     def _own(self, vehicle: int, epoch: int, event: Event) -> None:
         after(Party.ROW, self.row_state(vehicle), event)

@@ -29,6 +29,7 @@ class Advance:
     """The shard's work for one tick: change the rows that are owned, then advance all of them.
 
     Attributes:
+        episode: when it changes, all earlier rows are void.
         tick: the tick to reach.
         release: rows kept from earlier switches, which may go or become ghosts now.
         leave: rows that are frozen as they are and kept.
@@ -37,6 +38,7 @@ class Advance:
         payload: the STEP's own, for the runtime.
     """
 
+    episode: int
     tick: int
     release: tuple[int, ...]
     leave: tuple[int, ...]

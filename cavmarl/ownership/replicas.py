@@ -50,16 +50,21 @@ class Replicas:
         held = self.held.get(offer.vehicle)
         if not self._newer(offer.vehicle, offer.epoch, tick):
             return held is not None and held[:3] == (offer.epoch, tick, offer.digest)
-        if self._safeguards.state_schema and schema != self._limits.schema:
-            return Refusal.SCHEMA
         if self._safeguards.state_digest and state_digest(offer.state) != offer.digest:
-            return Refusal.DIGEST
+            return Refusal.DIGEST  # damaged on its way: not heard, so it may be sent again
+        if self._safeguards.state_schema and schema != self._limits.schema:
+            return self.refuse(offer, tick, Refusal.SCHEMA)
         if held is None and len(self.held) >= self._limits.capacity:
-            return Refusal.LOAD
+            return self.refuse(offer, tick, Refusal.LOAD)
         after(Party.REPLICA, self.state(offer.vehicle), Event.PREPARE)
         self.held[offer.vehicle] = Replica(offer.epoch, tick, offer.digest, offer.state)
         self._raise_fence(offer.vehicle, offer.epoch, tick)
         return True
+
+    def refuse(self, offer: Offer, tick: int, reason: Refusal) -> Refusal:
+        """Hear a state, but do not take it in."""
+        self._raise_fence(offer.vehicle, offer.epoch, tick)
+        return reason
 
     def abort(self, vehicle: int, epoch: int, tick: int) -> bool:
         """Drop a replica; False if the message is older than what has been heard."""

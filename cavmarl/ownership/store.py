@@ -7,7 +7,7 @@ promises the same of NumPy rows; tests of the protocol use this one.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 
 from cavmarl.ownership.ledger import row_hash, world_digest
 from cavmarl.ownership.safeguards import ALL_ON, Safeguards
@@ -17,11 +17,13 @@ class MemoryStore:
     """States as bytes, by vehicle.
 
     Attributes:
-        committed: vehicle → state at the committed tick.
+        tick: the committed tick.
+        committed: vehicle → state at that tick.
         segments: (zone, incarnation) → what that process has written for the next tick.
     """
 
     def __init__(self, safeguards: Safeguards = ALL_ON) -> None:
+        self.tick = 0
         self.committed: dict[int, bytes] = {}
         self.segments: dict[tuple[int, int], dict[int, bytes]] = {}
         self._safeguards = safeguards
@@ -45,15 +47,27 @@ class MemoryStore:
         rows = self.segments.get(self._segment(zone, incarnation), {})
         return world_digest(row_hash(vehicle, state) for vehicle, state in rows.items())
 
-    def commit(self, incarnations: Mapping[int, int], removed: Iterable[int]) -> None:
-        """Make the segments of the living hosts the truth, less the vehicles that left."""
+    def commit(self, tick: int, incarnations: Mapping[int, int]) -> None:
+        """Make the segments of the living hosts the truth of `tick`.
+
+        After a COMMIT that was logged but not carried out, a coordinator that starts again calls
+        it once more: the segments are still there.
+
+        Args:
+            tick: as the COMMIT record has it.
+            incarnations: zone → incarnation, from the same record.
+        """
         self.committed = {
             vehicle: state
             for zone, incarnation in sorted(incarnations.items())
             for vehicle, state in self.segments.get(self._segment(zone, incarnation), {}).items()
         }
-        for vehicle in removed:
-            self.committed.pop(vehicle, None)
+        self.tick = tick
+        self.segments.clear()
+
+    def reset(self, tick: int) -> None:
+        """Begin an episode without vehicles."""
+        self.tick, self.committed = tick, {}
         self.segments.clear()
 
     def world(self) -> int:

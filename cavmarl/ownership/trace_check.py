@@ -11,7 +11,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 
 from cavmarl.errors import InvariantError
-from cavmarl.ownership.ledger import tally
+from cavmarl.ownership.ledger import state_digest, tally
 from cavmarl.ownership.messages import (
     COORDINATOR,
     Abort,
@@ -173,8 +173,10 @@ class TraceChecker:
 
     def _prepare(self, message: Prepare) -> None:
         process = (message.target, self._incarnations.get(message.target, 0))
-        for vehicle, epoch, digest, _ in message.entries:
-            if self._hear(message.target, vehicle, epoch, message.tick):
+        for vehicle, epoch, digest, state in message.entries:
+            if state_digest(state) == digest and self._hear(
+                message.target, vehicle, epoch, message.tick
+            ):
                 self._holdings.add((*process, vehicle, epoch, message.tick, digest))
 
     def _hear(self, zone: int, vehicle: int, epoch: int, tick: int) -> bool:
@@ -184,6 +186,8 @@ class TraceChecker:
 
     def _ack(self, message: Ack) -> None:
         process = (message.zone, message.incarnation)
+        if self._incarnations.get(message.zone) != message.incarnation:
+            return  # a zombie's: what it still hears is not in the trace
         for vehicle, epoch, digest in message.entries:
             holding = (*process, vehicle, epoch, message.tick, digest)
             known = holding in self._holdings or message.tick < self._tick - self._lifetime
