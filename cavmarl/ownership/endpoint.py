@@ -239,6 +239,7 @@ class Endpoint:
         after(Party.ROW, self.row_state(vehicle), Event.OUT)
         epoch = self.owned.pop(vehicle)
         self.tally = self.tally.minus(self.run, vehicle, epoch)
+        self.offers.forget(vehicle)
         if self._safeguards.copy_until_commit:
             self.retained[vehicle] = epoch
 

@@ -70,6 +70,12 @@ class Offers:
         withdrawn = {target: tuple(sorted(entries)) for target, entries in sorted(ended.items())}
         return self._by_target(), withdrawn
 
+    def forget(self, vehicle: int) -> None:
+        """The vehicle has been handed over. An ABORT now could reach its target before the STEP."""
+        for pair in [pair for pair in self.open if pair[0] == vehicle]:
+            del self.open[pair]
+            self.owed.pop(pair, None)
+
     def again(self) -> dict[int, tuple[Offer, ...]]:
         """Offers without an answer, target → offers; none after the last attempt."""
         if self.attempts >= self._limits.attempts:

@@ -56,7 +56,11 @@ Place = tuple[int, bool]
 
 @dataclass(frozen=True)
 class Small:
-    """A small world. `window`: ticks after which a message in the soup is forgotten."""
+    """A small world.
+
+    A message in the soup is forgotten after `window` ticks. Hosts die from the tick on in which
+    the first switch may be. Zones are interchangeable, and the next new one is always the same.
+    """
 
     zones: int = 2
     vehicles: int = 1
@@ -78,6 +82,7 @@ class Node(NamedTuple):
     soup: frozenset[tuple[int, int]]
     places: tuple[Place, ...]
     writers: tuple[int, ...]  # the zone that advanced each vehicle in the tick in progress
+    visited: int  # zones in which a vehicle has been
     budget: tuple[int, int, int]  # crashes, false alarms, crashes of the coordinator
 
 
@@ -147,7 +152,7 @@ class Explorer:
         endpoints = tuple(self._endpoint(directory, zone) for zone in range(small.zones))
         budget = (small.crashes, small.false_alarms, small.coordinator_crashes)
         number = self._keep_directory(fork(directory), tuple(log))
-        return Node(number, endpoints, frozenset(), (), (-1,) * small.vehicles, budget)
+        return Node(number, endpoints, frozenset(), (), (-1,) * small.vehicles, 1, budget)
 
     def _next(self, node: Node) -> Iterator[Node]:
         directory: Directory = self._parties[node.directory]
@@ -161,6 +166,8 @@ class Explorer:
             elif node.endpoints[destination] != DEAD:
                 yield self._react(node, destination, number)
         crashes, alarms, restarts = node.budget
+        if directory.table.tick == 0:
+            return
         for zone, endpoint in enumerate(node.endpoints):
             if endpoint == DEAD:
                 yield self._rehost(node, zone)
@@ -178,8 +185,12 @@ class Explorer:
         small, nears = self.small, (True, False) if self.small.turns_away else (True,)
         number, sent = self._begun(node.directory, node.places)
         soup, writers = node.soup | sent, (-1,) * small.vehicles
-        for places in product(product(range(small.zones), nears), repeat=small.vehicles):
-            yield node._replace(directory=number, places=places, writers=writers, soup=soup)
+        zones = range(min(small.zones, node.visited + 1))
+        for places in product(product(zones, nears), repeat=small.vehicles):
+            visited = max(node.visited, *(zone + 1 for zone, _ in places))
+            yield node._replace(
+                directory=number, places=places, writers=writers, soup=soup, visited=visited
+            )
 
     def _begun(self, number: int, places: tuple[Place, ...]) -> tuple[int, frozenset[Any]]:
         def decide(directory: Directory) -> Output:
@@ -230,6 +241,8 @@ class Explorer:
         tick = endpoint.tick
         reaction = endpoint.on_message(self._messages[message])
         sent, advanced = list(reaction.messages), ()
+        if any(isinstance(answer, Need) for answer in sent):
+            raise InvariantError(f"I4: zone {zone} is to promote a state that it does not hold")
         if reaction.advance is not None:
             if reaction.advance.tick <= tick:
                 raise InvariantError(f"I1: zone {zone} executes tick {tick} again")
@@ -242,7 +255,7 @@ class Explorer:
             sent.append(endpoint.complete(digest))
             sent += endpoint.offer(
                 Approach(vehicle, target, rows[vehicle])
-                for vehicle in advanced
+                for vehicle in sorted(endpoint.owned)
                 for target in range(self.small.zones)
                 if target != zone and places[vehicle][1]
             )
