@@ -207,6 +207,8 @@ class TraceChecker:
         owners = dict(self._owners)
         owners.update((s.vehicle, (s.target, s.epoch)) for s in begun.switches)
         owners.update((b.vehicle, (b.zone, 0)) for b in begun.births)
+        told = [ledger.zone for ledger in record.zones]
+        _require(told == sorted(self._incarnations), f"tells of zones {told}")
         removed = []
         for zone in sorted(self._incarnations):
             done = self._dones.get(zone)

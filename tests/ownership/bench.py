@@ -56,9 +56,7 @@ class Bench:
 
     def host(self, zone: int) -> Output:
         output = self.note(self.directory.host(zone, worker=zone))
-        self.endpoints[zone] = Endpoint(
-            self.directory.hosting(zone), self.limits, self.safeguards
-        )
+        self.endpoints[zone] = Endpoint(self.directory.hosting(zone), self.limits, self.safeguards)
         return output
 
     def crash(self, zone: int) -> Output:

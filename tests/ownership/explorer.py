@@ -50,6 +50,7 @@ CHANGING = (
 )  # fmt: skip
 APART = ("dropped", "refusals", "_store")  # counts are no part of the state
 DEAD = -1
+ONE_TICK = Limits(deferral=1)
 Place = tuple[int, bool]
 """Where a vehicle is after the tick in progress: its zone, and whether others are near."""
 
@@ -70,7 +71,7 @@ class Small:
     coordinator_crashes: int = 0
     window: int = 0
     turns_away: bool = True
-    limits: Limits = Limits(deferral=1)
+    limits: Limits = ONE_TICK
     safeguards: Safeguards = ALL_ON
 
 
@@ -362,7 +363,9 @@ class Explorer:
         if isinstance(message, Step | Done | Need):
             return message.tick > tick or not (guards.step_tick and guards.done_tick)
         oldest = tick - self.small.window
-        return message.tick >= oldest if isinstance(message, Prepare | Abort) else message.tick >= tick
+        return (
+            message.tick >= oldest if isinstance(message, Prepare | Abort) else message.tick >= tick
+        )
 
 
 def version(vehicle: int, tick: int) -> bytes:

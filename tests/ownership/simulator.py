@@ -1,4 +1,4 @@
-"""The whole protocol in one thread: real directory and endpoints, a network and crashes from a seed.
+"""The whole protocol in one thread: the real parties, a network and crashes from a seed.
 
 `Simulator.run` drives the toy world tick by tick. `crashes` says who dies at which point of which
 tick. Everything that happens is in `trace`; the coordinator's log is `log`, as text.
@@ -262,9 +262,7 @@ class Simulator:
             self.deaths["zone"] += 1
             del self.hosts[zone]
 
-    def _react(
-        self, host: ZoneHost, message: Message, refused: bool, zombie: bool = False
-    ) -> None:
+    def _react(self, host: ZoneHost, message: Message, refused: bool, zombie: bool = False) -> None:
         endpoint = host.endpoint
         if isinstance(message, Step):
             self._may_die("before STEP", host, zombie)
@@ -299,9 +297,8 @@ class Simulator:
         host.rows.update(work.spawn)
         if not zombie:
             self.monitor.advanced(zone, incarnation, work.tick, endpoint.owned)
-        born = dict(
-            (entry.vehicle, entry.state) for entry in self.directory.table.planned.record.births
-        )
+        births = self.directory.table.planned.record.births
+        born = {entry.vehicle: entry.state for entry in births}
         near = store.committed | born | host.rows
         after = {v: self.world.advance(v, row, near, work.tick) for v, row in host.rows.items()}
         store.clear(zone, incarnation)

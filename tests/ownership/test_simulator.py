@@ -1,4 +1,4 @@
-"""AT7: whole runs of the real parties under seeded faults equal the undivided world, bit for bit."""
+"""AT7: whole runs of the real parties under seeded faults equal the undivided world."""
 
 from __future__ import annotations
 

@@ -1,0 +1,121 @@
+"""The log as JSON lines: replayed, it is the table; damaged, it is refused by name."""
+
+from __future__ import annotations
+
+import json
+
+import pytest
+
+from cavmarl.errors import CorruptJournalError, JournalError, TornJournalError
+from cavmarl.ownership.records import (
+    SCHEMA,
+    record_from_dict,
+    record_to_dict,
+    record_to_line,
+    records_from_lines,
+    replay,
+    whole_lines,
+)
+from tests.ownership.test_simulator import campaign
+
+
+@pytest.fixture(scope="module")
+def log() -> str:
+    simulator = campaign(4, "corner")
+    simulator.run(15)
+    owners = simulator.directory.table.owners
+    assert replay(records_from_lines(simulator.log)).owners == owners
+    return simulator.log
+
+
+def test_a_line_says_what_it_is(log: str) -> None:
+    for sequence, line in enumerate(log.splitlines()):
+        content = json.loads(line)
+        assert (content["schema"], content["sequence"]) == (SCHEMA, sequence)
+        assert {"kind", "episode", "tick", "checksum"} <= set(content)
+
+
+def test_records_come_back_equal(log: str) -> None:
+    records = records_from_lines(log)
+    assert "".join(record_to_line(record, k) for k, record in enumerate(records)) == log
+    assert [record_from_dict(record_to_dict(r, k), k) for k, r in enumerate(records)] == list(
+        records
+    )
+
+
+def test_every_prefix_can_be_replayed(log: str) -> None:
+    records = records_from_lines(log)
+    ticks = [replay(records[:length]).tick for length in range(1, len(records) + 1)]
+    assert ticks == sorted(ticks)
+    assert ticks[-1] == 15
+
+
+def test_a_torn_last_line_is_named_and_what_precedes_it_is_whole(log: str) -> None:
+    torn = log[:-7]
+    with pytest.raises(TornJournalError, match=f"line {len(log.splitlines())} "):
+        records_from_lines(torn)
+    assert records_from_lines(whole_lines(torn)) == records_from_lines(log)[:-1]
+
+
+def test_every_changed_letter_of_a_line_is_noticed(log: str) -> None:
+    line = log.splitlines(keepends=True)[8]
+    for at in range(len(line) - 1):
+        for letter in ("0", "1", "f", '"', "x"):
+            damaged = line[:at] + letter + line[at + 1 :]
+            if damaged != line:
+                with pytest.raises(CorruptJournalError):
+                    records_from_lines("".join(log.splitlines(keepends=True)[:8]) + damaged)
+
+
+def test_a_missing_doubled_or_swapped_line_is_noticed(log: str) -> None:
+    lines = log.splitlines(keepends=True)
+    for wrong in (lines[:5] + lines[6:], lines[:5] + lines[4:], [*lines[:5], lines[6], lines[5]]):
+        with pytest.raises(CorruptJournalError, match="lines are missing"):
+            records_from_lines("".join(wrong))
+
+
+def sealed(**change: object) -> dict[str, object]:
+    from cavmarl.ownership.messages import Host
+    from cavmarl.ownership.records import _checksum
+
+    line = record_to_dict(Host(0, 0, 1, 1, 1), 0)
+    line.update(change)
+    del line["checksum"]
+    return line | {"checksum": _checksum(line)}
+
+
+@pytest.mark.parametrize(
+    ("change", "why"),
+    [
+        ({"schema": "cavmarl.ownership/9"}, "schema"),
+        ({"kind": "BLESS"}, "'BLESS', which is none"),
+        ({"zone": "one"}, "zone is 'one'"),
+        ({"zone": True}, "zone is True"),
+    ],
+)
+def test_a_line_of_another_kind_is_refused(change: dict[str, object], why: str) -> None:
+    with pytest.raises(CorruptJournalError, match=why):
+        record_from_dict(sealed(**change), 0)
+
+
+def test_lines_that_are_no_objects_are_refused() -> None:
+    for text in ("[1]\n", "nonsense\n", "\n"):
+        with pytest.raises(CorruptJournalError, match="line 1"):
+            records_from_lines(text)
+
+
+def test_a_log_that_no_coordinator_writes_cannot_be_replayed(log: str) -> None:
+    records = records_from_lines(log)
+    with pytest.raises(JournalError, match="begins with a RESET"):
+        replay(records[1:])
+    with pytest.raises(JournalError, match="begins with a RESET"):
+        replay(())
+    kinds = [type(record).__name__ for record in records]
+    begin, commit = kinds.index("Begin"), kinds.index("Commit")
+    with pytest.raises(JournalError, match="BEGIN of tick 1"):
+        replay([*records[: begin + 1], records[begin]])
+    second = kinds.index("Begin", begin + 1)
+    with pytest.raises(JournalError, match="BEGIN of tick 2"):
+        replay([*records[:begin], records[second]])
+    with pytest.raises(JournalError, match="COMMIT of tick 1"):
+        replay([*records[: second + 1], records[commit]])
