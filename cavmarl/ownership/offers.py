@@ -11,6 +11,7 @@ from collections import defaultdict
 from collections.abc import Iterable, Mapping
 from typing import NamedTuple
 
+from cavmarl.errors import ProtocolError
 from cavmarl.ownership.ledger import state_digest
 from cavmarl.ownership.limits import Limits
 from cavmarl.ownership.messages import Ack, Nack, Offer, Refusal, Withdrawn
@@ -52,10 +53,15 @@ class Offers:
 
         Returns:
             Target → offers, and target → withdrawals.
+
+        Raises:
+            ProtocolError: a vehicle is not owned.
         """
         self.barred = {pair: until for pair, until in self.barred.items() if until > tick}
         before, self.open, self.owed, self.attempts = self.open, {}, {}, 1
         for vehicle, target, state in approaches:
+            if vehicle not in epochs:
+                raise ProtocolError(f"a zone offers vehicle {vehicle}, which it does not own")
             pair, epoch = (vehicle, target), epochs[vehicle]
             if pair in self.barred:
                 if pair in before:

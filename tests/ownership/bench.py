@@ -73,8 +73,11 @@ class Bench:
         return tuple(message for message in output.messages if isinstance(message, Step))
 
     def give(self, message: Message, removed: Sequence[int] = ()) -> tuple[Message, ...]:
-        """Deliver a message to its first destination; what that sends, with DONE after a STEP."""
-        destination = destinations(message)[0]
+        """Deliver a message; what its receiver sends, with DONE after a STEP."""
+        destination, *copies = destinations(message)
+        for zone in copies:
+            self.trace.delivered(zone, message)
+            self.endpoints[zone].on_message(message)
         self.trace.delivered(destination, message)
         if destination == COORDINATOR:
             return self.note(self.directory.on_message(message)).messages
