@@ -15,7 +15,7 @@ FUZZ_SECONDS ?= 60
 FUZZ_TARGETS ?= network programs map cached demand sumocfg entry overrides driver manifest
 MAPS := envs/ring/map/map.net.xml envs/merge/map/map.net.xml envs/grid4x4/map/map.net.xml
 
-.PHONY: help demo test check bench soak fuzz oldest maps pictures clean
+.PHONY: help demo test check bench soak model fuzz oldest maps pictures clean
 .DEFAULT_GOAL := help
 
 help: ## say what there is
@@ -39,6 +39,11 @@ bench: $(READY) ## agent-steps a second, next to highway-env
 
 soak: $(READY) ## the slow tests: long episodes, memory, the wheel
 	$(BIN)/pytest -m slow
+
+model: ## verify the model of the hand-off protocol, and that each of its mutations is caught
+	@command -v spin >/dev/null || { echo "make model needs spin; on Debian: apt-get install spin" >&2; exit 1; }
+	@command -v cc >/dev/null || { echo "make model needs a C compiler; on Debian: apt-get install gcc libc6-dev" >&2; exit 1; }
+	sh docs/model/check_model.sh
 
 fuzz: $(READY) ## each file parser, FUZZ_SECONDS long; what crashes one stays in fuzz/crashes
 	$(BIN)/python -m pip install --quiet --editable '.[fuzz]' --constraint constraints.txt
