@@ -132,7 +132,9 @@ class Directory:
         return Output(output.records, self.resend((zone,)).messages)
 
     def fence(self, zone: int) -> Output:
-        """The zone's process is dead to us; whatever it still says is dropped."""
+        """The zone's process is dead to us; whatever it still says is dropped. Once is enough."""
+        if self.table.states[zone] is State.FENCED:
+            return SILENCE
         self.dones.pop(zone, None)
         incarnation = self.table.hosts[zone][1]
         return self._logged(Fence(self.table.episode, self.table.tick, zone, incarnation))
@@ -274,11 +276,11 @@ class Directory:
         if isinstance(message, Ack | Nack):
             fresh = current or message.tick == table.tick or not guards.ack_freshness
             return None if fresh else "tick"
-        if isinstance(message, Done) and message.zone in self.dones:
-            return "answered"
-        if not current and (guards.done_tick or table.plan is None):
-            return "tick"
-        return None
+        if isinstance(message, Done):
+            if message.zone in self.dones:
+                return "answered"
+            current = current or not guards.done_tick
+        return None if current else "tick"
 
     def _on_ack(self, ack: Ack) -> None:
         births = {} if self.table.plan is None else self.table.plan.births

@@ -12,7 +12,6 @@ from dataclasses import dataclass, field
 from cavmarl.errors import LedgerError
 from cavmarl.ownership.ledger import Tally
 from cavmarl.ownership.messages import Begin, Confirmed, Done, Out, Removed, Spawn, Switch
-from cavmarl.ownership.transitions import Event, Party, State, after
 
 
 @dataclass(slots=True)
@@ -48,10 +47,6 @@ class Plan:
             return self.births[vehicle], 0
         return committed.get(vehicle, (-1, -1))
 
-    def state(self, vehicle: int) -> State:
-        """SWITCHING or OWNED."""
-        return State.SWITCHING if vehicle in self.switches else State.OWNED
-
 
 def make_plan(run: bytes, record: Begin, committed: Mapping[int, Tally]) -> Plan:
     """The plan of a BEGIN record, given what the zones owned when the last tick was committed."""
@@ -59,7 +54,6 @@ def make_plan(run: bytes, record: Begin, committed: Mapping[int, Tally]) -> Plan
     expected = plan.expected
     for switch in record.switches:
         vehicle, source, target, epoch, forced = switch
-        after(Party.VEHICLE, State.OWNED, Event.SWITCH)
         expected[source] = expected[source].minus(run, vehicle, epoch - 1)
         expected[target] = expected[target].plus(run, vehicle, epoch)
         plan.switches[vehicle] = switch
@@ -68,7 +62,6 @@ def make_plan(run: bytes, record: Begin, committed: Mapping[int, Tally]) -> Plan
         if forced:
             plan.attach.add(vehicle)
     for vehicle, zone, state in record.births:
-        after(Party.VEHICLE, State.UNKNOWN, Event.SPAWN)
         expected[zone] = expected[zone].plus(run, vehicle, 0)
         plan.births[vehicle] = zone
         plan.spawn[zone].append(Spawn(vehicle, state))
@@ -88,7 +81,6 @@ def check_done(run: bytes, plan: Plan, done: Done, owners: Mapping[int, tuple[in
         zone, epoch = plan.owner(vehicle, owners)
         if zone != done.zone:
             raise LedgerError(f"{where} removed vehicle {vehicle}, which zone {zone} owns")
-        after(Party.VEHICLE, plan.state(vehicle), Event.REMOVE)
         expected = expected.minus(run, vehicle, epoch)
     planned = tuple(Confirmed(entry.vehicle, entry.epoch) for entry in plan.enter[done.zone])
     if done.confirmed != planned:

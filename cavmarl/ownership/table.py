@@ -57,6 +57,13 @@ class Table:
             raise ProtocolError("no tick is in progress")
         return self.plan
 
+    def state(self, vehicle: int) -> State:
+        """UNKNOWN, OWNED, SWITCHING or REMOVED."""
+        if vehicle not in self.owners:
+            return State.REMOVED if vehicle in self.seen else State.UNKNOWN
+        switching = self.plan is not None and vehicle in self.plan.switches
+        return State.SWITCHING if switching else State.OWNED
+
     def alive(self, zone: int, incarnation: int) -> bool:
         """Whether that process hosts the zone now."""
         return self.states[zone] is State.HOSTED and self.hosts[zone][1] == incarnation
@@ -90,20 +97,27 @@ class Table:
     def _begin(self, record: Begin) -> None:
         if self.plan is not None or record.tick != self.tick + 1:
             raise JournalError(f"BEGIN of tick {record.tick} after tick {self.tick}, or once more")
-        self.plan = make_plan(self.run, record, self.tallies)
+        for vehicle, source, _, epoch, _ in record.switches:
+            after(Party.VEHICLE, self.state(vehicle), Event.SWITCH)
+            if self.owners[vehicle] != (source, epoch - 1):
+                raise JournalError(f"BEGIN of tick {record.tick} takes {vehicle} from {source}")
         for vehicle, _, _ in record.births:
+            after(Party.VEHICLE, self.state(vehicle), Event.SPAWN)
             self.seen.add(vehicle)
+        self.plan = make_plan(self.run, record, self.tallies)
 
     def _commit(self, record: Commit) -> None:
         plan = self.planned
         if record.tick != plan.record.tick:
             raise JournalError(f"COMMIT of tick {record.tick}, but {plan.record.tick} was begun")
-        for switch in plan.record.switches:
-            after(Party.VEHICLE, State.SWITCHING, Event.COMMIT)
-            self.owners[switch.vehicle] = (switch.target, switch.epoch)
         self.owners.update((vehicle, (zone, 0)) for vehicle, zone in plan.births.items())
         for vehicle, _ in record.removed:
-            self.owners.pop(vehicle, None)
+            after(Party.VEHICLE, self.state(vehicle), Event.REMOVE)
+            del self.owners[vehicle]
+        for vehicle, switch in plan.switches.items():
+            if vehicle in self.owners:
+                after(Party.VEHICLE, self.state(vehicle), Event.COMMIT)
+                self.owners[vehicle] = (switch.target, switch.epoch)
         self.deferred = {
             vehicle: ticks for vehicle, ticks in plan.record.deferred if vehicle in self.owners
         }

@@ -187,7 +187,10 @@ class Explorer:
         number, sent = self._begun(node.directory, node.places)
         soup, writers = node.soup | sent, (-1,) * small.vehicles
         zones = range(min(small.zones, node.visited + 1))
-        for places in product(product(zones, nears), repeat=small.vehicles):
+        paths = product(product(zones, nears), repeat=small.vehicles)
+        if self._tick(node) == small.ticks - 1:  # where they are at the end moves nobody
+            paths = iter([tuple((0, True) for _ in range(small.vehicles))])
+        for places in paths:
             visited = max(node.visited, *(zone + 1 for zone, _ in places))
             yield node._replace(
                 directory=number, places=places, writers=writers, soup=soup, visited=visited
@@ -254,12 +257,13 @@ class Explorer:
             rows = {vehicle: version(vehicle, tick + 1) for vehicle in advanced}
             digest = world_digest(row_hash(vehicle, row) for vehicle, row in rows.items())
             sent.append(endpoint.complete(digest))
-            sent += endpoint.offer(
-                Approach(vehicle, target, rows[vehicle])
-                for vehicle in sorted(endpoint.owned)
-                for target in range(self.small.zones)
-                if target != zone and places[vehicle][1]
-            )
+            if tick + 1 < self.small.ticks:
+                sent += endpoint.offer(
+                    Approach(vehicle, target, rows[vehicle])
+                    for vehicle in sorted(endpoint.owned)
+                    for target in range(self.small.zones)
+                    if target != zone and places[vehicle][1]
+                )
         return self._keep(endpoint), self._stirred(sent), advanced
 
     def _rehost(self, node: Node, zone: int) -> Node:

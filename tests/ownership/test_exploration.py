@@ -14,27 +14,39 @@ from tests.ownership.explorer import Explorer, Small
 PATIENT = Limits(deferral=1, policy=DeadlinePolicy.EXTEND, grace=1)
 
 QUICK = {
-    "1 vehicle, 3 zones": Small(zones=3),
-    "1 vehicle, 3 zones, the coordinator dies": Small(zones=3, coordinator_crashes=1),
-    "1 vehicle, 2 zones, 3 ticks, old offers": Small(ticks=3, window=1),
-    "1 vehicle, 2 zones, 4 ticks": Small(ticks=4, turns_away=False),
-    "1 vehicle, 2 zones, a host dies": Small(ticks=3, crashes=1, turns_away=False),
-    "1 vehicle, 2 zones, a zombie": Small(ticks=2, false_alarms=1),
-    "1 vehicle, 2 zones, two hosts die": Small(ticks=2, crashes=2),
-    "1 vehicle, 2 zones, no waiting": Small(ticks=3, limits=Limits(deferral=0)),
-    "1 vehicle, 2 zones, a policy": Small(ticks=4, turns_away=False, limits=PATIENT),
-    "2 vehicles, 2 zones": Small(vehicles=2),
-    "2 vehicles, 2 zones, a host dies": Small(vehicles=2, crashes=1, turns_away=False),
-    "2 vehicles, 2 zones, the coordinator dies": Small(vehicles=2, coordinator_crashes=1),
-}
-SLOW = {
+    "1 vehicle, 3 zones, 3 ticks": Small(zones=3, ticks=3),
+    "1 vehicle, 3 zones, the coordinator dies": Small(
+        zones=3, ticks=3, coordinator_crashes=1, turns_away=False
+    ),
     "1 vehicle, 3 zones, a host dies": Small(zones=3, crashes=1),
     "1 vehicle, 3 zones, a zombie": Small(zones=3, false_alarms=1),
+    "1 vehicle, 2 zones, 4 ticks, old offers": Small(ticks=4, window=1),
+    "1 vehicle, 2 zones, a host dies, 3 ticks": Small(ticks=3, crashes=1, turns_away=False),
+    "1 vehicle, 2 zones, a zombie, 3 ticks": Small(ticks=3, false_alarms=1),
     "1 vehicle, 2 zones, everybody dies": Small(
         crashes=1, false_alarms=1, coordinator_crashes=1, turns_away=False
     ),
-    "2 vehicles, 2 zones, a zombie": Small(vehicles=2, false_alarms=1, turns_away=False),
-    "1 vehicle, 3 zones, 3 ticks": Small(zones=3, ticks=3, turns_away=False),
+    "1 vehicle, 2 zones, two hosts die": Small(crashes=2),
+    "1 vehicle, 2 zones, no waiting": Small(ticks=3, limits=Limits(deferral=0)),
+    "1 vehicle, 2 zones, a policy": Small(ticks=4, turns_away=False, limits=PATIENT),
+    "2 vehicles, 2 zones, 3 ticks": Small(vehicles=2, ticks=3),
+    "2 vehicles, 2 zones, the coordinator dies": Small(
+        vehicles=2, ticks=3, coordinator_crashes=1, turns_away=False
+    ),
+    "2 vehicles, 2 zones, a host dies": Small(vehicles=2, crashes=1),
+    "2 vehicles, 2 zones, a zombie": Small(vehicles=2, false_alarms=1),
+}
+SLOW = {
+    "1 vehicle, 3 zones, a host dies, 3 ticks": Small(
+        zones=3, ticks=3, crashes=1, turns_away=False
+    ),
+    "1 vehicle, 2 zones, host and coordinator die": Small(
+        ticks=3, crashes=1, coordinator_crashes=1
+    ),
+    "1 vehicle, 2 zones, 5 ticks": Small(ticks=5),
+    "2 vehicles, 2 zones, a host dies, 3 ticks": Small(
+        vehicles=2, ticks=3, crashes=1, turns_away=False
+    ),
 }
 
 

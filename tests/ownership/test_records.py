@@ -3,10 +3,18 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 
 import pytest
 
-from cavmarl.errors import CorruptJournalError, JournalError, TornJournalError
+from cavmarl.errors import (
+    CorruptJournalError,
+    JournalError,
+    ProtocolError,
+    TornJournalError,
+    TransitionError,
+)
+from cavmarl.ownership.messages import Begin, Birth, Commit, Removed
 from cavmarl.ownership.records import (
     SCHEMA,
     record_from_dict,
@@ -16,6 +24,7 @@ from cavmarl.ownership.records import (
     replay,
     whole_lines,
 )
+from tests.ownership.bench import Bench
 from tests.ownership.test_simulator import campaign
 
 
@@ -119,3 +128,25 @@ def test_a_log_that_no_coordinator_writes_cannot_be_replayed(log: str) -> None:
         replay([*records[:begin], records[second]])
     with pytest.raises(JournalError, match="COMMIT of tick 1"):
         replay([*records[: second + 1], records[commit]])
+
+
+def test_a_log_whose_vehicles_do_what_they_cannot_is_refused() -> None:
+    bench = Bench()
+    bench.tick(births=[(7, 0), (8, 0)], offers=[(7, 1)])
+    bench.tick(movers=[(7, 1)], removed=[8])
+    kinds = [type(record).__name__ for record in bench.log]
+    k = [at for at, kind in enumerate(kinds) if kind == "Begin"][1]
+    begin, commit = bench.log[k], bench.log[k + 1]
+    assert isinstance(begin, Begin)
+    assert isinstance(commit, Commit)
+    switch = begin.switches[0]
+    for wrong in (
+        replace(begin, switches=(switch._replace(source=1),)),
+        replace(begin, switches=(switch._replace(epoch=5),)),
+        replace(begin, switches=(switch._replace(vehicle=9),)),
+        replace(begin, births=(Birth(7, 0, b""),)),
+    ):
+        with pytest.raises(ProtocolError):
+            replay([*bench.log[:k], wrong])
+    with pytest.raises(TransitionError):
+        replay([*bench.log[: k + 1], replace(commit, removed=(Removed(9, 0),))])

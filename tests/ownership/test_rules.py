@@ -164,6 +164,9 @@ def test_r11_every_living_host_has_said_done() -> None:
     bench.directory.on_message(late)
     bench.directory.on_message(replace(late, incarnation=2))
     assert bench.directory.waiting_for() == (1,)
+    bench.directory = Directory.restore(bench.log, range(2), bench)
+    assert bench.directory.table.states[1] is State.FENCED
+    assert not bench.directory.fence(1).records
 
 
 def test_r12_the_ledger_is_exact_or_the_tick_is_not_committed() -> None:
@@ -212,10 +215,12 @@ def test_r15_only_what_is_newer_than_the_fence_counts() -> None:
 def test_r16_what_is_older_than_the_lifetime_is_gone_and_not_heard() -> None:
     bench, prepare = prepared(ALL_ON)
     bench.commit()
-    for _ in range(bench.limits.lifetime + 2):
+    for _ in range(bench.limits.lifetime):
         bench.tick()
     assert not bench.give(prepare)
     assert bench.endpoints[1].dropped["Prepare", "tick"] == 1
+    for _ in range(2):
+        bench.tick()
     assert not bench.endpoints[1].replicas.fences
 
 
@@ -235,6 +240,9 @@ def test_r18_a_target_gets_one_prepare_or_abort_a_tick_and_some_more_tries() -> 
     sent = bench.offer(0)
     assert [type(message) for message in sent] == [Abort]
     assert not bench.offer(0)
+    (prepare,) = bench.offer(0, (7, 1))
+    bench.pass_on(bench.give(prepare))
+    assert not endpoint.offer_again(), "it has been answered"
 
 
 def test_r19_a_refusal_has_a_reason_and_is_followed_by_silence() -> None:
@@ -288,6 +296,9 @@ def test_r23_a_tick_that_no_host_survives_ends_in_an_error() -> None:
     with pytest.raises(ZoneStepError) as error:
         bench.crash(0)
     assert (error.value.zone, error.value.tick) == (0, 1)
+    bench.note(bench.directory.reset())
+    bench.begin()
+    bench.crash(0)
 
 
 def test_r24_a_living_zone_moves_between_ticks_only() -> None:
@@ -313,6 +324,7 @@ def test_r25_a_removed_vehicle_is_gone_for_the_episode() -> None:
             bench.begin(births=births)
     with pytest.raises(ProtocolError, match="does not exist"):
         bench.begin(movers=[(7, 1)])
+    assert [bench.directory.table.state(vehicle) for vehicle in (7, 8)] == ["REMOVED", "UNKNOWN"]
 
 
 def test_r26_a_reset_begins_an_episode_and_the_ticks_go_on() -> None:
@@ -372,6 +384,7 @@ def test_r29_a_policy_grants_more_ticks_and_names_who_is_overdue(policy: Deadlin
         overdue.append(bench.directory.overdue())
         bench.pass_on(steps)
         bench.commit()
+    assert not bench.directory.overdue()
     acts = policy is not DeadlinePolicy.EXTEND
     assert overdue == [(), (7,), (7,), ()] if acts else [()] * 4
     assert bench.owner(7) == 1
