@@ -12,7 +12,8 @@ OLDEST_TESTS := tests/kernels tests/roads tests/runtime tests/traffic tests/test
     tests/test_registry.py tests/test_registration.py tests/test_env.py tests/test_vector_env.py \
     tests/test_bad_input.py tests/test_public_api.py
 FUZZ_SECONDS ?= 60
-FUZZ_TARGETS ?= network programs map cached demand sumocfg entry overrides driver manifest
+FUZZ_TARGETS ?= network programs map cached demand sumocfg entry overrides driver manifest \
+    message log
 MAPS := envs/ring/map/map.net.xml envs/merge/map/map.net.xml envs/grid4x4/map/map.net.xml
 
 .PHONY: help demo test check bench soak model fuzz oldest maps pictures clean

@@ -14,7 +14,8 @@ from collections.abc import Iterable, Mapping, Sequence
 
 from cavmarl.errors import JournalError, ProtocolError, StoreError, ZoneStepError
 from cavmarl.ownership.decisions import CommittedStates, Decisions
-from cavmarl.ownership.ledger import state_digest, world_digest
+from cavmarl.ownership.leases import make_step
+from cavmarl.ownership.ledger import world_digest
 from cavmarl.ownership.limits import DeadlinePolicy, Limits
 from cavmarl.ownership.messages import (
     Ack,
@@ -24,7 +25,6 @@ from cavmarl.ownership.messages import (
     Done,
     Fence,
     Host,
-    In,
     Message,
     Nack,
     Need,
@@ -33,7 +33,6 @@ from cavmarl.ownership.messages import (
     Refusal,
     Reset,
     Step,
-    Switch,
     ZoneLedger,
 )
 from cavmarl.ownership.planning import all_removed, check_done
@@ -314,20 +313,7 @@ class Directory:
                 check_done(self.run, self.table.planned, done, self.table.owners)
 
     def _step(self, zone: int) -> Step:
-        table, plan = self.table, self.table.planned
-        enter = tuple(
-            self._entry(switch, switch.vehicle in plan.attach) for switch in plan.enter[zone]
-        )
-        return Step(
-            self.run, table.episode, plan.record.tick, zone, table.hosts[zone][1], table.tick,
-            enter, tuple(plan.leave[zone]), tuple(plan.spawn[zone]), plan.expected[zone],
-            self._payloads.get(zone, b""),
-        )  # fmt: skip
-
-    def _entry(self, switch: Switch, attached: bool) -> In:
-        state = self._store.state(switch.vehicle)
-        digest = state_digest(state)
-        return In(switch.vehicle, switch.epoch, attached, digest, state if attached else b"")
+        return make_step(self.table, zone, self._store, self._payloads.get(zone, b""))
 
     def _logged(self, record: Record) -> Output:
         self.table.apply(record)

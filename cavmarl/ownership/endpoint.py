@@ -68,7 +68,6 @@ class Endpoint:
         self._answer: Done | None = None
         self._entering: tuple[Confirmed, ...] = ()
         self._overwrites: dict[int, bytes] = {}
-        self._leaving: tuple[int, ...] = ()
         self._limits = limits
         self._safeguards = safeguards
 
@@ -114,9 +113,7 @@ class Endpoint:
         for vehicle, _ in removed:
             after(Party.ROW, self.row_state(vehicle), Event.REMOVE)
             self.tally = self.tally.minus(self.run, vehicle, self.owned.pop(vehicle))
-        for vehicle in self._leaving:
-            self._leave(vehicle)
-        self.tick, self.lease, self._leaving = self.lease, None, ()
+        self.tick, self.lease = self.lease, None
         self._answer = Done(
             self.run, self.episode, self.tick, self.zone, self.incarnation,
             confirmed=self._entering, removed=tuple(sorted(removed)),
@@ -210,8 +207,6 @@ class Endpoint:
         if self._safeguards.one_step_lease:
             for vehicle in leave:
                 self._leave(vehicle)
-        else:
-            self._leaving = leave
         overwrites, self._overwrites = tuple(self._overwrites.items()), {}
         enter = []
         for vehicle, epoch, forced, _, state in step.enter:

@@ -27,6 +27,7 @@ KINDS: dict[str, type[Record]] = {
     "HOST": Host,
 }
 _NAMES = {kind: name for name, kind in KINDS.items()}
+_LARGEST = 1 << 63
 _WIDE = frozenset({"world", "rows", "digest"})
 
 
@@ -35,7 +36,13 @@ def record_to_dict(record: Record, sequence: int) -> dict[str, Any]:
     line: dict[str, Any] = {"schema": SCHEMA, "sequence": sequence, "kind": _NAMES[type(record)]}
     for field in fields(record):
         line[field.name] = _plain(field.name, getattr(record, field.name))
-    return line | {"checksum": _checksum(line)}
+    return sealed(line)
+
+
+def sealed(line: dict[str, Any]) -> dict[str, Any]:
+    """A line with the checksum of what stands in it."""
+    content = {key: value for key, value in line.items() if key != "checksum"}
+    return content | {"checksum": _checksum(content)}
 
 
 def record_from_dict(line: dict[str, Any], sequence: int) -> Record:
@@ -47,12 +54,11 @@ def record_from_dict(line: dict[str, Any], sequence: int) -> Record:
     where = f"line {sequence + 1} of the log"
     if line.get("schema") != SCHEMA:
         raise CorruptJournalError(f"{where} has schema {line.get('schema')!r}, not {SCHEMA!r}")
-    content = {key: value for key, value in line.items() if key != "checksum"}
-    if line.get("checksum") != _checksum(content):
+    if line.get("checksum") != sealed(line)["checksum"]:
         raise CorruptJournalError(f"{where} does not match its checksum")
     if line.get("sequence") != sequence:
         raise CorruptJournalError(f"{where} has number {line.get('sequence')}: lines are missing")
-    kind = KINDS.get(line.get("kind", ""))
+    kind = KINDS.get(str(line.get("kind")))
     if kind is None:
         raise CorruptJournalError(f"{where} is of kind {line.get('kind')!r}, which is none")
     hints = get_type_hints(kind)
@@ -84,7 +90,7 @@ def records_from_lines(text: str) -> tuple[Record, ...]:
             raise TornJournalError(f"line {sequence + 1} of the log is cut short: {line[:40]!r}")
         try:
             content = json.loads(line)
-        except ValueError as error:
+        except (ValueError, RecursionError) as error:
             raise CorruptJournalError(f"line {sequence + 1} of the log: {error}") from error
         if not isinstance(content, dict):
             raise CorruptJournalError(f"line {sequence + 1} of the log is no JSON object")
@@ -129,7 +135,7 @@ def _value(name: str, hint: Any, value: Any) -> Any:
     if hint is int and name in _WIDE:
         return int(value, 16)
     if hint in (int, bool):
-        if type(value) is not hint:
+        if type(value) is not hint or abs(value) >= _LARGEST:
             raise TypeError(f"{name} is {value!r}")
         return value
     inner = get_type_hints(hint)

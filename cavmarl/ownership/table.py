@@ -11,7 +11,7 @@ from collections.abc import Iterable
 
 from cavmarl.errors import JournalError, ProtocolError
 from cavmarl.ownership.ledger import SeenIds, Tally
-from cavmarl.ownership.messages import Begin, Commit, Fence, Host, Record, Reset
+from cavmarl.ownership.messages import RUN_BYTES, Begin, Commit, Fence, Host, Record, Reset
 from cavmarl.ownership.planning import Plan, make_plan
 from cavmarl.ownership.safeguards import ALL_ON, Safeguards
 from cavmarl.ownership.transitions import Event, Party, State, after
@@ -88,6 +88,8 @@ class Table:
                 self._host(record)
 
     def _reset(self, record: Reset) -> None:
+        if len(record.run) != RUN_BYTES:
+            raise JournalError(f"a run has {RUN_BYTES} bytes, not {len(record.run)}")
         self.run, self.tick, self.episode = record.run, record.tick, record.episode
         self.owners, self.deferred, self.plan = {}, {}, None
         self.tallies = dict.fromkeys(self.hosts, Tally())
@@ -97,6 +99,8 @@ class Table:
     def _begin(self, record: Begin) -> None:
         if self.plan is not None or record.tick != self.tick + 1:
             raise JournalError(f"BEGIN of tick {record.tick} after tick {self.tick}, or once more")
+        self._check_zones(switch.target for switch in record.switches)
+        self._check_zones(birth.zone for birth in record.births)
         for vehicle, source, _, epoch, _ in record.switches:
             after(Party.VEHICLE, self.state(vehicle), Event.SWITCH)
             if self.owners[vehicle] != (source, epoch - 1):
@@ -110,6 +114,9 @@ class Table:
         plan = self.planned
         if record.tick != plan.record.tick:
             raise JournalError(f"COMMIT of tick {record.tick}, but {plan.record.tick} was begun")
+        told = [entry.zone for entry in record.zones]
+        if told != list(self.hosts):
+            raise JournalError(f"COMMIT of tick {record.tick} tells of zones {told}")
         self.owners.update((vehicle, (zone, 0)) for vehicle, zone in plan.births.items())
         for vehicle, _ in record.removed:
             after(Party.VEHICLE, self.state(vehicle), Event.REMOVE)
@@ -133,5 +140,11 @@ class Table:
             if self._safeguards.reattach:
                 self.plan.attach.update(entry.vehicle for entry in self.plan.enter[record.zone])
 
+    def _check_zones(self, zones: Iterable[int]) -> None:
+        unknown = sorted(set(zones) - self.hosts.keys())
+        if unknown:
+            raise JournalError(f"zones {unknown} do not exist")
+
     def _move(self, record: Fence | Host, event: Event) -> None:
+        self._check_zones((record.zone,))
         self.states[record.zone] = after(Party.ZONE, self.states[record.zone], event)

@@ -14,7 +14,7 @@ from cavmarl.errors import (
     TornJournalError,
     TransitionError,
 )
-from cavmarl.ownership.messages import Begin, Birth, Commit, Removed
+from cavmarl.ownership.messages import Begin, Birth, Commit, Host, Removed, Reset
 from cavmarl.ownership.records import (
     SCHEMA,
     record_from_dict,
@@ -22,6 +22,7 @@ from cavmarl.ownership.records import (
     record_to_line,
     records_from_lines,
     replay,
+    sealed,
     whole_lines,
 )
 from tests.ownership.bench import Bench
@@ -83,14 +84,8 @@ def test_a_missing_doubled_or_swapped_line_is_noticed(log: str) -> None:
             records_from_lines("".join(wrong))
 
 
-def sealed(**change: object) -> dict[str, object]:
-    from cavmarl.ownership.messages import Host
-    from cavmarl.ownership.records import _checksum
-
-    line = record_to_dict(Host(0, 0, 1, 1, 1), 0)
-    line.update(change)
-    del line["checksum"]
-    return line | {"checksum": _checksum(line)}
+def changed(**change: object) -> dict[str, object]:
+    return sealed(record_to_dict(Host(0, 0, 1, 1, 1), 0) | change)
 
 
 @pytest.mark.parametrize(
@@ -100,11 +95,13 @@ def sealed(**change: object) -> dict[str, object]:
         ({"kind": "BLESS"}, "'BLESS', which is none"),
         ({"zone": "one"}, "zone is 'one'"),
         ({"zone": True}, "zone is True"),
+        ({"zone": 1 << 70}, "zone is"),
+        ({"kind": ["HOST"]}, "which is none"),
     ],
 )
 def test_a_line_of_another_kind_is_refused(change: dict[str, object], why: str) -> None:
     with pytest.raises(CorruptJournalError, match=why):
-        record_from_dict(sealed(**change), 0)
+        record_from_dict(changed(**change), 0)
 
 
 def test_lines_that_are_no_objects_are_refused() -> None:
@@ -145,8 +142,13 @@ def test_a_log_whose_vehicles_do_what_they_cannot_is_refused() -> None:
         replace(begin, switches=(switch._replace(epoch=5),)),
         replace(begin, switches=(switch._replace(vehicle=9),)),
         replace(begin, births=(Birth(7, 0, b""),)),
+        replace(begin, births=(Birth(9, 5, b""),)),
     ):
         with pytest.raises(ProtocolError):
             replay([*bench.log[:k], wrong])
+    with pytest.raises(JournalError, match="zones \\[0\\]"):
+        replay([*bench.log[: k + 1], replace(commit, zones=commit.zones[:1])])
+    with pytest.raises(JournalError, match="16 bytes"):
+        replay([Reset(0, 0, b"short")])
     with pytest.raises(TransitionError):
         replay([*bench.log[: k + 1], replace(commit, removed=(Removed(9, 0),))])

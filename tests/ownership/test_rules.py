@@ -254,6 +254,13 @@ def test_r19_a_refusal_has_a_reason_and_is_followed_by_silence() -> None:
         offered.append(sum(isinstance(message, Prepare) for message in sent))
     assert offered == [1, 0, 0, 0, 1, 0, 0, 0]
     assert bench.directory.refusals == {Refusal.LOAD: 2}
+    other, prepare = prepared(ALL_ON)
+    target = other.endpoints[1]
+    (nack,) = target.refuse(prepare).messages
+    assert isinstance(nack, Nack)
+    assert [entry.reason for entry in nack.entries] == [Refusal.LOAD]
+    assert not target.refuse(replace(prepare, target=0)).messages
+    assert target.dropped["Prepare", "zone"] == 1
 
 
 def test_r20_a_repeated_step_is_answered_from_memory() -> None:
