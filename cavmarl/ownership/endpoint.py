@@ -114,6 +114,7 @@ class Endpoint:
             after(Party.ROW, self.row_state(vehicle), Event.REMOVE)
             self.tally = self.tally.minus(self.run, vehicle, self.owned.pop(vehicle))
         self.tick, self.lease = self.lease, None
+        self.offers.owed.clear()  # what is not answered by now is of the tick before
         self._answer = Done(
             self.run, self.episode, self.tick, self.zone, self.incarnation,
             confirmed=self._entering, removed=tuple(sorted(removed)),

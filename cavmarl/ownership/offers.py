@@ -80,7 +80,6 @@ class Offers:
         """The vehicle has been handed over. An ABORT now could reach its target before the STEP."""
         for pair in [pair for pair in self.open if pair[0] == vehicle]:
             del self.open[pair]
-            self.owed.pop(pair, None)
 
     def again(self) -> dict[int, tuple[Offer, ...]]:
         """Offers without an answer, target → offers; none after the last attempt."""

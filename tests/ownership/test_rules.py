@@ -72,6 +72,18 @@ def test_r03_records_come_before_messages() -> None:
     assert not bench.directory.resend().records
 
 
+def test_r03_what_rides_with_a_step_is_sent_again_with_it() -> None:
+    bench = Bench()
+    bench.directory.begin([], payloads={1: b"ghosts"})
+    for output in (bench.directory.resend(), bench.crash(0), bench.crash(1)):
+        for step in output.messages:
+            assert isinstance(step, Step)
+            assert step.payload == (b"ghosts" if step.zone == 1 else b"")
+    bench.pass_on(bench.directory.resend().messages)
+    bench.commit()
+    assert [step.payload for step in bench.begin()] == [b"", b""]
+
+
 def test_r04_a_logged_decision_is_not_taken_anew() -> None:
     bench = approached(Bench())
     sent = bench.begin([(7, 1)])
@@ -137,6 +149,9 @@ def test_r09_a_target_promotes_the_exact_state_or_asks_for_it() -> None:
     (need,) = bench.give(step)
     assert isinstance(need, Need)
     assert bench.endpoints[1].lease is None
+    bench.give(replace(need, vehicles=(99,)))
+    bench.give(replace(need, zone=0))
+    assert bench.directory.dropped["Need", "unknown"] == 2
     (again,) = bench.give(need)
     bench.pass_on([again])
     assert bench.entered[7] == version(7, 1)
@@ -243,6 +258,10 @@ def test_r18_a_target_gets_one_prepare_or_abort_a_tick_and_some_more_tries() -> 
     (prepare,) = bench.offer(0, (7, 1))
     bench.pass_on(bench.give(prepare))
     assert not endpoint.offer_again(), "it has been answered"
+    bench.offer(0, (7, 1))
+    bench.commit()
+    bench.give(bench.begin()[0])
+    assert not endpoint.offer_again(), "it was of the tick before"
 
 
 def test_r19_a_refusal_has_a_reason_and_is_followed_by_silence() -> None:
