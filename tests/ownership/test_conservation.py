@@ -81,3 +81,18 @@ def test_a_hundred_thousand_hand_offs_lose_nobody() -> None:
 @pytest.mark.slow
 def test_a_million_hand_offs_lose_nobody() -> None:
     drive(1_000_000)
+
+
+def test_nothing_grows_with_the_ticks() -> None:
+    traffic = Traffic()
+    sizes = []
+    for tick in range(90):
+        traffic.tick()
+        directory, endpoints = traffic.bench.directory, traffic.bench.endpoints.values()
+        assert set(directory.readiness.held) <= {tick + 1}
+        kept = [directory.table.deferred, directory.table.seen.above, directory.dones]
+        for end in endpoints:
+            kept += [end.replicas.held, end.replicas.fences, end.replicas._heard, end.retained]
+            kept += [end.offers.open, end.offers.owed, end.offers.barred]
+        sizes.append(sum(len(container) for container in kept))
+    assert max(sizes[60:]) <= 1.1 * max(sizes[20:50])
