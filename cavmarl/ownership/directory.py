@@ -105,9 +105,7 @@ class Directory:
         tick = table.tick if table.plan is None else table.plan.record.tick
         episode = table.episode + 1
         self.dones = {}
-        if self._safeguards.tick_never_resets:
-            self.readiness.clear()
-        else:
+        if not self._safeguards.tick_never_resets:
             tick, episode = 0, 0
         return self._logged(Reset(episode, tick, self.run))
 

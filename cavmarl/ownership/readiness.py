@@ -46,7 +46,3 @@ class Readiness:
         if self._safeguards.ack_freshness:
             for tick in [tick for tick in self.held if tick < before]:
                 del self.held[tick]
-
-    def clear(self) -> None:
-        """Drop everything."""
-        self.held.clear()

@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from itertools import product
 
 import pytest
 
-from cavmarl.errors import TransitionError
+from cavmarl.errors import LedgerError, TransitionError
+from cavmarl.ownership.endpoint import Endpoint
+from cavmarl.ownership.messages import In, Out, Removed, Spawn
 from cavmarl.ownership.transitions import TABLE, Event, Party, State, after, mermaid
+from tests.ownership.bench import Bench
 
 BEGINNINGS = {
     Party.VEHICLE: State.UNKNOWN,
@@ -24,6 +28,27 @@ def test_what_is_not_listed_does_not_happen() -> None:
             continue
         with pytest.raises(TransitionError, match=f"{event} of {party}, which is {state}"):
             after(party, state, event)
+
+
+def test_a_host_is_not_given_what_it_owns_and_gives_nothing_that_it_does_not_own() -> None:
+    bench = Bench()
+    bench.tick(births=[(7, 0), (8, 1)])
+    step = bench.begin()[0]
+    again = In(7, 1, True, bytes(16), b"state")
+    for wrong in (
+        replace(step, enter=(again,)),
+        replace(step, leave=(Out(8, 0),)),
+        replace(step, spawn=(Spawn(7, b"state"),)),
+    ):
+        host = Endpoint(bench.directory.hosting(0), bench.limits)
+        with pytest.raises(TransitionError, match="a vehicle's row"):
+            host.on_message(wrong)
+    host = Endpoint(bench.directory.hosting(0), bench.limits)
+    host.on_message(step)
+    with pytest.raises(TransitionError, match="REMOVE of a vehicle's row"):
+        host.complete(0, [Removed(8, 0)])
+    with pytest.raises(LedgerError, match="zone 0 on its way to tick 2"):
+        Endpoint(replace(bench.directory.hosting(0), owned={}), bench.limits).on_message(step)
 
 
 @pytest.mark.parametrize("party", Party)
