@@ -50,6 +50,11 @@ def test_the_page_lists_every_safeguard() -> None:
     check_block(PAGE, "safeguards", table(("hole", "remedy", "switch"), rows))
 
 
+def test_the_program_of_the_page_runs() -> None:
+    (program,) = re.findall(r"```python\n(.*?)```", PAGE.read_text(encoding="utf-8"), re.DOTALL)
+    exec(compile(program, str(PAGE), "exec"), {})
+
+
 def test_the_page_and_the_tests_have_the_same_rules() -> None:
     text = PAGE.read_text(encoding="utf-8")
     listed = re.findall(r"^\| R(\d+) \|.*\| `(\w+)` \|$", text, re.MULTILINE)

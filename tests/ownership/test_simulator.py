@@ -79,14 +79,15 @@ def test_a_crash_at_any_point_is_invisible(point: str, party: int) -> None:
     assert sum(simulator.deaths.values()) + len(simulator.zombies) >= 3 or point == "false alarm"
 
 
-def campaign(seed: int, layout: str, **options: object) -> Simulator:
-    """A run in which everything happens now and then."""
+def campaign(seed: int, layout: str) -> Simulator:
+    """A run in which everything happens now and then, also several times in a tick."""
 
     def crashes(tick: int, point: str, party: int) -> bool:
         return number(seed, "crash", tick, point, party) % 100 < 2
 
     plan = FaultPlan(seed=seed, otherwise=FAULTS["everything"])
-    return Simulator(world(layout, seed), plan=plan, crashes=crashes, **options)  # type: ignore[arg-type]
+    limits = Limits(repeats=len(ZONE_POINTS))
+    return Simulator(world(layout, seed), plan=plan, crashes=crashes, limits=limits)
 
 
 @pytest.mark.parametrize("seed", range(12))
