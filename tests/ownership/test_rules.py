@@ -9,6 +9,7 @@ import pytest
 
 from cavmarl.errors import (
     CoverageError,
+    JournalError,
     LedgerError,
     ProtocolError,
     SpawnError,
@@ -91,6 +92,9 @@ def test_r04_a_logged_decision_is_not_taken_anew() -> None:
     assert again.resend().messages == sent
     with pytest.raises(ProtocolError, match="not committed"):
         again.begin([])
+    for log in ([], bench.log[1:]):
+        with pytest.raises(JournalError, match="begins with a RESET"):
+            Directory.restore(log, range(2), bench)
 
 
 def test_r05_a_tick_is_begun_when_the_one_before_is_committed() -> None:
