@@ -57,8 +57,6 @@ class Endpoint:
         self.zone, self.incarnation = hosting.zone, hosting.incarnation
         self.tick = hosting.tick
         self.lease: int | None = None
-        for _ in hosting.owned:
-            after(Party.ROW, State.NONE, Event.LOAD)
         self.owned = dict(hosting.owned)
         self.tally = tally(self.run, self.owned)
         self.retained: dict[int, int] = {}

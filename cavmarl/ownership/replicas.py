@@ -91,12 +91,11 @@ class Replicas:
         held = self.held.pop(vehicle, None)
         return b"" if held is None else held.state
 
-    def expire(self, now: int) -> tuple[int, ...]:
-        """Drop what has not been refreshed for the lifetime; the vehicles whose replica went."""
+    def expire(self, now: int) -> None:
+        """Drop what has not been refreshed for the lifetime, with its fence."""
         if not self._safeguards.replica_lifetime:
-            return ()
+            return
         last = now - self._limits.lifetime
-        gone = []
         for tick in sorted(tick for tick in self._heard if tick <= last):
             for vehicle in self._heard.pop(tick):
                 if self.fences.get(vehicle, (0, now))[1] <= last:
@@ -104,8 +103,6 @@ class Replicas:
                     if vehicle in self.held:
                         after(Party.REPLICA, State.PREPARED, Event.EXPIRE)
                         del self.held[vehicle]
-                        gone.append(vehicle)
-        return tuple(gone)
 
     def _newer(self, vehicle: int, epoch: int, tick: int) -> bool:
         return (epoch, tick) > self.fences.get(vehicle, (-1, -1))
