@@ -18,7 +18,13 @@ from numpy.typing import NDArray
 from cavmarl.kernels import kernel
 from cavmarl.kernels.arrays import RoadArrays, Worlds
 
-__all__ = ["DETECTOR_REACH_M", "program_at", "switch_signals"]
+__all__ = [
+    "DETECTOR_REACH_M",
+    "detect",
+    "merge_detections",
+    "program_at",
+    "switch_signals",
+]
 
 # From a detector to the centre of any vehicle that is over it or has left it in this tick.
 DETECTOR_REACH_M = 30.0
@@ -27,13 +33,57 @@ SECOND_MS = 1000  # SUMO prolongs phases to whole seconds, and looks no sooner a
 
 
 @kernel
+def detect(
+    lane_place: NDArray[np.int32],
+    places: NDArray[np.void],
+    rows: NDArray[np.void],
+    num_owned: NDArray[np.int64],
+    ticks: NDArray[np.int64],
+    dt: float,
+    detected_s: NDArray[np.float64],
+) -> None:
+    """Note when bodies were over the detectors: now, or when their rear left in this tick.
+
+    The latest counts, so that neither the order of rows nor who owns them matters.
+
+    Args:
+        lane_place: (L,) see `RoadArrays`.
+        places: PLACE (num_places,).
+        rows: VEHICLE (W, C), the committed ones of the tick.
+        num_owned: (W,) rows to look at.
+        ticks: (W,) since reset.
+        dt: seconds of the tick.
+        detected_s: (W, D), written; begun afresh at a reset.
+    """
+    for w in range(ticks.size):
+        if ticks[w] == 0:
+            # As in SUMO, time since the beginning counts as time since a vehicle.
+            detected_s[w] = 0.0
+        for i in range(num_owned[w]):
+            row = rows[w, i]
+            place = lane_place[row["lane"]]
+            while place >= 0:
+                at = places[place]
+                ahead = row["s"] - at["s_m"]
+                if abs(ahead) < DETECTOR_REACH_M:
+                    _note(row, ahead, ticks[w] * dt, dt, at["detector"], detected_s[w])
+                place = at["next"]
+
+
+@kernel
+def merge_detections(into: NDArray[np.float64], others: NDArray[np.float64]) -> None:
+    """Keep the latest of what two shards have noted, `detected_s` (W, D) of each."""
+    np.maximum(into, others, into)
+
+
+@kernel
 def switch_signals(roads: RoadArrays, worlds: Worlds, dt: float) -> None:
     """Bring every signal to the worlds' ticks; once more at the same tick changes nothing.
 
     Args:
         roads: the road arrays.
-        worlds: signal_phase, controllers and detected_s are written; the rows are the committed
-            ones of the tick.
+        worlds: signal_phase and controllers are written; detected_s is what bodies of all shards
+            did up to this tick. Rows are not looked at.
         dt: seconds of the tick.
     """
     for w in range(worlds.ticks.shape[0]):
@@ -41,7 +91,6 @@ def switch_signals(roads: RoadArrays, worlds: Worlds, dt: float) -> None:
         if worlds.controllers.shape[1] > 0:
             if worlds.ticks[w] == 0:
                 _start(roads, worlds, w, dt)
-            _detect(roads, worlds.rows[w], worlds.num_owned[w], time, dt, worlds.detected_s[w])
             _control(roads, worlds, w, dt)
         for k in range(roads.signals.shape[0]):
             program = program_at(roads, k, time, dt)
@@ -88,32 +137,6 @@ def _start(roads: RoadArrays, worlds: Worlds, w: int, dt: float) -> None:
             state["phase"] = _fixed_phase(roads, program, 0.0, dt)
             state["since_ms"] = 0
             state["next_ms"] = roads.phases[state["phase"]]["min_ms"]
-    # As in SUMO, time since the beginning counts as time since a vehicle.
-    worlds.detected_s[w] = 0.0
-
-
-@kernel
-def _detect(
-    roads: RoadArrays,
-    rows: NDArray[np.void],
-    num: int,
-    time: float,
-    dt: float,
-    detected_s: NDArray[np.float64],
-) -> None:
-    """Note when bodies were over the detectors: now, or when their rear left in this tick.
-
-    The latest counts, so that neither the order of rows nor who owns them matters.
-    """
-    for i in range(num):
-        row = rows[i]
-        place = roads.lane_place[row["lane"]]
-        while place >= 0:
-            at = roads.places[place]
-            ahead = row["s"] - at["s_m"]
-            if abs(ahead) < DETECTOR_REACH_M:
-                _note(row, ahead, time, dt, at["detector"], detected_s)
-            place = at["next"]
 
 
 @kernel

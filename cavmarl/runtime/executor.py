@@ -10,7 +10,9 @@ from cavmarl.shard.shard import Shard
 __all__ = ["Executor", "Phase", "SerialExecutor"]
 
 # The methods of a shard that a tick is made of: a name and its arguments can be sent anywhere.
-Phase = Literal["begin_step", "advance", "resolve", "commit", "switch_signals", "sense", "suggest"]
+Phase = Literal[
+    "begin_step", "advance", "resolve", "commit", "detect", "sense", "credit", "suggest"
+]
 
 
 class Executor(Protocol):

@@ -25,6 +25,7 @@ from cavmarl.kernels.codes import (
 )
 from cavmarl.kernels.rng import world_key
 from cavmarl.roads.network import RoadNetwork
+from cavmarl.runtime.commons import Commons
 from cavmarl.runtime.compilation import first_compilation
 from cavmarl.runtime.executor import Executor, SerialExecutor
 from cavmarl.shard.shard import Commands, Shard
@@ -108,8 +109,15 @@ class Simulation:
             capacity = traffic.capacity
             self._traffic = traffic
             self._gate = make_gate(num_worlds, capacity)
+            self._commons = Commons(config, network, num_worlds)
             self._shard = Shard(
-                config, network, traffic.plans, traffic.travel, num_worlds, capacity
+                config,
+                network,
+                traffic.plans,
+                traffic.travel,
+                num_worlds,
+                capacity,
+                self._commons.outputs,
             )
             self._executor: Executor = SerialExecutor([self._shard])
             if is_first:
@@ -133,7 +141,7 @@ class Simulation:
     @property
     def outputs(self) -> Outputs:
         """What the agents got at the end of the last step; arrays that the next step overwrites."""
-        return self._shard.outputs
+        return self._commons.outputs
 
     @property
     def goal_edges(self) -> NDArray[np.int32]:
@@ -204,20 +212,21 @@ class Simulation:
         self._episodes[chosen] += 1
         self._gate = self._traffic.draw_orders(self._gate, worlds, chosen)
         self._traffic.populate(self._gate, worlds, chosen)
-        self._executor.each("switch_signals")
-        self._executor.each("sense", chosen)
+        self._switch_signals()
+        self._sense(chosen)
 
     def step(self, commands: Commands) -> None:
         """One agent step: its ticks, then what the agents sense."""
         self._executor.each("begin_step", commands)
         for _ in range(self.config.clock.ticks_per_step):
             self._tick(commands)
-        self._executor.each("sense", self._everywhere)
+        self._sense(self._everywhere)
 
     def instrument(self, wrap: Callable[[Any], Any]) -> None:
-        """Put `wrap(part)` in the place of the executor and of the traffic, to time their calls."""
+        """Put `wrap(part)` in the place of each part that phases are calls of, to time them."""
         self._executor = wrap(self._executor)
         self._traffic = wrap(self._traffic)
+        self._commons = wrap(self._commons)
 
     def _tick(self, commands: Commands) -> None:
         """Advance → (exchange) → resolve → departures → (migrate) → commit → signals."""
@@ -227,7 +236,21 @@ class Simulation:
             self._gate, self._shard.worlds, self._shard.scratch, self.config.clock.sim_dt_s
         )
         self._executor.each("commit")
-        self._executor.each("switch_signals")
+        self._switch_signals()
+
+    def _switch_signals(self) -> None:
+        """Detect → switch."""
+        self._executor.each("detect")
+        self._commons.switch_signals(self._shard.worlds)
+
+    def _sense(self, chosen: NDArray[np.bool_]) -> None:
+        """Clear → sense → settle → credit."""
+        if self.config.population.agents == 0:
+            return
+        self._commons.clear_outputs(chosen)
+        self._executor.each("sense", chosen)
+        self._commons.settle_outputs(chosen)
+        self._executor.each("credit", chosen)
 
     def retire_agents(self) -> None:
         """Take out the agents whose trip ended in the last step; to be called after it is read."""

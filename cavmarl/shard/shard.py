@@ -11,25 +11,28 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from cavmarl.config import TERMS, EnvConfig
+from cavmarl.config import EnvConfig
 from cavmarl.kernels.approach import APPROACH
 from cavmarl.kernels.arrays import LaneGrid, Outputs, RoadArrays, Scratch, Travel, Worlds
 from cavmarl.kernels.lanes import ENTRY
 from cavmarl.kernels.neighbors import make_grid
 from cavmarl.kernels.observe_further import observe_further
+from cavmarl.kernels.outputs import credit
 from cavmarl.kernels.sense import sense
-from cavmarl.kernels.signals import switch_signals
+from cavmarl.kernels.signals import detect
 from cavmarl.kernels.stacking import fill_stacks
 from cavmarl.kernels.tick import advance, begin_step, resolve, suggest
 from cavmarl.roads.network import RoadNetwork
 from cavmarl.roads.routing import PLAN, lane_grid
 from cavmarl.shard.controllers import CONTROLLER
-from cavmarl.shard.sensors import frame_size, further_arrays, sensor_arrays
+from cavmarl.shard.sensors import further_arrays, sensor_arrays
 from cavmarl.shard.vehicles import VEHICLE
 
 __all__ = ["Commands", "Shard", "make_worlds"]
 
 CELL_M = 25.0  # of the spatial index over vehicles
+# Fields of `Worlds` that the shards of one world have in common.
+COMMON = ("ticks", "keys", "signal_phase", "controllers", "detected_s")
 SUGGESTED_HORIZON_S = 1.0  # in which a suggested target speed is to be reached
 
 
@@ -56,6 +59,8 @@ class Shard:
         travel: types and ways.
         num_worlds: W.
         capacity: rows a world can hold.
+        outputs: where the agents of all shards get what they sense, each at its own index.
+        first: the shard whose clock, keys and signals this one shares; None: it has its own.
     """
 
     def __init__(
@@ -66,6 +71,8 @@ class Shard:
         travel: Travel,
         num_worlds: int,
         capacity: int,
+        outputs: Outputs,
+        first: Shard | None = None,
     ) -> None:
         self._config = config
         self._roads: RoadArrays = network.arrays
@@ -76,21 +83,33 @@ class Shard:
         self._further = further_arrays(config.sensors, network, plans)
         self._grid = make_grid(network.extent_m, CELL_M, capacity)
         self.scratch = _make_scratch(len(network.lanes), len(network.links), capacity)
-        self.worlds = make_worlds(
+        self.worlds: Worlds = make_worlds(
             num_worlds,
             capacity,
             network,
             config.population.num_ids,
             config.clock.control_latency_ticks,
+            None if first is None else first.worlds,
         )
-        self.outputs = _make_outputs(config, num_worlds)
-        self._weights = np.array([config.terms.weights.get(name, 0.0) for name in TERMS])
+        self._keeps_clock = first is None
+        self.outputs = outputs
         self._target_speeds = np.array(config.action.target_speeds_mps)
         self._discrete = config.action.kind == "discrete"
 
-    def switch_signals(self) -> None:
-        """Bring the signals to the present tick."""
-        switch_signals(self._roads, self.worlds, self._config.clock.sim_dt_s)
+    def detect(self) -> None:
+        """Note when owned bodies were over the detectors of actuated signals."""
+        worlds = self.worlds
+        if worlds.controllers.shape[1] == 0:
+            return
+        detect(
+            self._roads.lane_place,
+            self._roads.places,
+            worlds.rows,
+            worlds.num_owned,
+            worlds.ticks,
+            self._config.clock.sim_dt_s,
+            worlds.detected_s,
+        )
 
     def begin_step(self, commands: Commands) -> None:
         """Open the accounts of a step and take its meta-actions."""
@@ -122,15 +141,14 @@ class Shard:
         resolve(self.worlds, self.scratch, self._grid)
 
     def commit(self) -> None:
-        """Make `next_rows` the committed state of the next tick."""
+        """Make `next_rows` the committed state of the next tick; who keeps the clock counts it."""
         worlds = self.worlds
         self.worlds = worlds._replace(rows=worlds.next_rows, next_rows=worlds.rows)
-        worlds.ticks[:] += 1
+        if self._keeps_clock:
+            worlds.ticks[:] += 1
 
     def sense(self, chosen: NDArray[np.bool_]) -> None:
-        """Write observations, terms and rewards of the chosen worlds' agents into `outputs`."""
-        if self._config.population.agents == 0:
-            return
+        """Write observations and terms of the chosen worlds' owned agents into `outputs`."""
         sense(
             self._roads,
             self._plans,
@@ -138,8 +156,6 @@ class Shard:
             self.worlds,
             self._grid,
             self._sensors,
-            self._weights,
-            self._config.terms.team_share,
             self._config.clock.sim_dt_s,
             self._config.clock.ticks_per_step,
             chosen,
@@ -160,6 +176,10 @@ class Shard:
         if stack > 1:
             ticks_per_step = self._config.clock.ticks_per_step
             fill_stacks(self.worlds, ticks_per_step, stack, chosen, observations)
+
+    def credit(self, chosen: NDArray[np.bool_]) -> None:
+        """Add the step's rewards to the episode's of the chosen worlds' owned agents."""
+        credit(self.worlds.rows, self.worlds.num_owned, self.outputs.rewards, chosen)
 
     def suggest(self, out: NDArray[np.float64]) -> None:
         """Write what the built-in driver would do in the agents' place into `out` (W, A, 2)."""
@@ -183,13 +203,15 @@ def make_worlds(
     network: RoadNetwork,
     num_agents: int = 0,
     latency_ticks: int = 0,
+    first: Worlds | None = None,
 ) -> Worlds:
     """Arrays of W worlds that hold `capacity` vehicles each, all of them empty.
 
-    Agents' commands take effect `latency_ticks` later.
+    Agents' commands take effect `latency_ticks` later. What is the same in all zones of a world
+    (ticks, keys, signals and what detectors saw) is `first`'s own arrays, if it is given.
     """
     shape = (num_worlds, capacity)
-    return Worlds(
+    worlds = Worlds(
         rows=np.zeros(shape, dtype=VEHICLE),
         next_rows=np.zeros(shape, dtype=VEHICLE),
         num_owned=np.zeros(num_worlds, dtype=np.int64),
@@ -204,6 +226,9 @@ def make_worlds(
         num_touching=np.zeros(num_worlds, dtype=np.int64),
         num_contacts=np.zeros(num_worlds, dtype=np.int64),
     )
+    if first is None:
+        return worlds
+    return worlds._replace(**{name: getattr(first, name) for name in COMMON})
 
 
 def _make_scratch(num_lanes: int, num_links: int, capacity: int) -> Scratch:
@@ -229,20 +254,4 @@ def _make_scratch(num_lanes: int, num_links: int, capacity: int) -> Scratch:
         blinker=integers(capacity),
         hold=integers(capacity),
         hit=np.zeros(capacity, dtype=np.int64),
-    )
-
-
-def _make_outputs(config: EnvConfig, num_worlds: int) -> Outputs:
-    agents = (num_worlds, config.population.num_ids)
-    size = config.sensors.stack * frame_size(config.sensors)
-    return Outputs(
-        # Not `zeros`: NumPy asks for huge pages where it fills the array itself.
-        observations=np.full((*agents, size), 0.0, dtype=np.float32),
-        terms=np.zeros((*agents, len(TERMS)), dtype=np.float32),
-        rewards=np.zeros(agents, dtype=np.float32),
-        terminated=np.zeros(agents, dtype=np.bool_),
-        present=np.zeros(agents, dtype=np.bool_),
-        acted=np.zeros(agents, dtype=np.bool_),
-        events=np.zeros(agents, dtype=np.int32),
-        vehicle_ids=np.full(agents, -1, dtype=np.int64),
     )

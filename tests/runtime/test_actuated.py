@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from cavmarl.kernels.arrays import Worlds
-from cavmarl.kernels.signals import switch_signals
+from cavmarl.kernels.signals import detect, switch_signals
 from cavmarl.roads.network import RoadNetwork
 from cavmarl.roads.reader import read_network
 from cavmarl.shard.shard import make_worlds
@@ -96,6 +96,13 @@ def place(
     worlds.num_owned[0] = len(vehicles)
 
 
+def look_and_switch(network: RoadNetwork, worlds: Worlds, step_s: float) -> None:
+    """Look at the detectors, then switch."""
+    places = network.arrays.lane_place, network.arrays.places
+    detect(*places, worlds.rows, worlds.num_owned, worlds.ticks, step_s, worlds.detected_s)
+    switch_signals(network.arrays, worlds, step_s)
+
+
 def shown(network: RoadNetwork, worlds: Worlds, world: int = 0) -> dict[str, str]:
     states = {}
     for name, signal, phase in zip(
@@ -118,7 +125,7 @@ def test_same_vehicles_make_the_signals_switch_at_sumos_ticks(
     seen = set()
     for tick, sumo_tick in enumerate(theirs["ticks"]):
         worlds.ticks[0] = tick
-        switch_signals(network.arrays, worlds, step_s)
+        look_and_switch(network, worlds, step_s)
         # What SUMO shows after a step is what ruled in it.
         assert shown(network, worlds) == sumo_tick["states"], f"at {tick * step_s} s"
         seen.add(tuple(sumo_tick["states"].values()))
@@ -148,9 +155,9 @@ def test_order_of_rows_and_other_worlds_change_nothing(grid: Path) -> None:
         many.rows[1] = rows[rng.permutation(40)]
         one.num_owned[:], many.num_owned[1] = 40, 40
         one.ticks[:], many.ticks[:] = tick, tick
-        switch_signals(network.arrays, one, 0.5)
-        switch_signals(network.arrays, many, 0.5)
-        switch_signals(network.arrays, many, 0.5)
+        look_and_switch(network, one, 0.5)
+        look_and_switch(network, many, 0.5)
+        look_and_switch(network, many, 0.5)
         for name in ("signal_phase", "controllers", "detected_s"):
             assert getattr(one, name)[0].tobytes() == getattr(many, name)[1].tobytes()
     assert shown(network, many, 0) != shown(network, many, 1), "the empty world switches otherwise"
