@@ -60,7 +60,8 @@ class Shard:
         num_worlds: W.
         capacity: rows a world can hold.
         outputs: where the agents of all shards get what they sense, each at its own index.
-        first: the shard whose clock, keys and signals this one shares; None: it has its own.
+        common: whose clock, keys and signals these worlds share, those of the first shard; None:
+            this is the first one.
     """
 
     def __init__(
@@ -72,7 +73,7 @@ class Shard:
         num_worlds: int,
         capacity: int,
         outputs: Outputs,
-        first: Shard | None = None,
+        common: Worlds | None = None,
     ) -> None:
         self._config = config
         self._roads: RoadArrays = network.arrays
@@ -89,9 +90,9 @@ class Shard:
             network,
             config.population.num_ids,
             config.clock.control_latency_ticks,
-            None if first is None else first.worlds,
+            common,
         )
-        self._keeps_clock = first is None
+        self._keeps_clock = common is None
         self.outputs = outputs
         self._target_speeds = np.array(config.action.target_speeds_mps)
         self._discrete = config.action.kind == "discrete"
@@ -203,12 +204,12 @@ def make_worlds(
     network: RoadNetwork,
     num_agents: int = 0,
     latency_ticks: int = 0,
-    first: Worlds | None = None,
+    common: Worlds | None = None,
 ) -> Worlds:
     """Arrays of W worlds that hold `capacity` vehicles each, all of them empty.
 
-    Agents' commands take effect `latency_ticks` later. What is the same in all zones of a world
-    (ticks, keys, signals and what detectors saw) is `first`'s own arrays, if it is given.
+    Agents' commands take effect `latency_ticks` later. What all zones of a world have in
+    common (ticks, keys, signals and what detectors saw) are the arrays of `common`, if it is given.
     """
     shape = (num_worlds, capacity)
     worlds = Worlds(
@@ -226,9 +227,9 @@ def make_worlds(
         num_touching=np.zeros(num_worlds, dtype=np.int64),
         num_contacts=np.zeros(num_worlds, dtype=np.int64),
     )
-    if first is None:
+    if common is None:
         return worlds
-    return worlds._replace(**{name: getattr(first, name) for name in COMMON})
+    return worlds._replace(**{name: getattr(common, name) for name in COMMON})
 
 
 def _make_scratch(num_lanes: int, num_links: int, capacity: int) -> Scratch:
