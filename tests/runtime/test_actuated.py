@@ -16,6 +16,7 @@ from cavmarl.kernels.signals import detect, switch_signals
 from cavmarl.roads.network import RoadNetwork
 from cavmarl.roads.reader import read_network
 from cavmarl.shard.shard import make_worlds
+from tests.actuated import actuated_grid
 from tests.driving import idle, make_traffic, start
 
 # Runs in a child process: a process holds one libsumo at most.
@@ -43,25 +44,10 @@ print(json.dumps({
 """
 
 
-def sumo_tool(*arguments: object) -> None:
-    import sumo
-
-    name, *rest = map(str, arguments)
-    subprocess.run([Path(sumo.SUMO_HOME) / "bin" / name, *rest], check=True, capture_output=True)
-
-
 @pytest.fixture(scope="module")
 def grid(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Four crossings with actuated signals and short roads, each of two lanes."""
     pytest.importorskip("libsumo")
-    path = tmp_path_factory.mktemp("grid") / "grid.net.xml"
-    sumo_tool(
-        *("netgenerate", "--grid", "--grid.number", 2, "--grid.length", 120),
-        *("--grid.attach-length", 100, "--default-junction-type", "traffic_light"),
-        *("--tls.default-type", "actuated", "--default.lanenumber", 2, "--no-turnarounds"),
-        *("--xml-validation", "never", "-o", path),
-    )
-    return path
+    return actuated_grid(tmp_path_factory.mktemp("grid"))
 
 
 def demand(path: Path, headway_s: float) -> Path:

@@ -63,9 +63,7 @@ BLIND = {"route", "signal", "roadgraph"}  # look at no vehicle
 def world(env: str, sensor: str) -> Simulation:
     """A world whose agents have one sensor beside `ego`, one step old."""
     overrides = {**OFF, **ON[sensor]}
-    simulation = make_simulation(
-        env, mode="closed", agents=1, background=MOST, overrides=overrides
-    )
+    simulation = make_simulation(env, mode="closed", agents=1, background=MOST, overrides=overrides)
     start(simulation, seed=4)
     drive(simulation)
     return simulation
