@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cavmarl.kernels import kernel
-from cavmarl.kernels.arrays import RoadArrays, Worlds
+from cavmarl.kernels.arrays import RoadArrays
 
 __all__ = [
     "DETECTOR_REACH_M",
@@ -77,28 +77,37 @@ def merge_detections(into: NDArray[np.float64], others: NDArray[np.float64]) -> 
 
 
 @kernel
-def switch_signals(roads: RoadArrays, worlds: Worlds, dt: float) -> None:
+def switch_signals(
+    roads: RoadArrays,
+    ticks: NDArray[np.int64],
+    detected_s: NDArray[np.float64],
+    dt: float,
+    controllers: NDArray[np.void],
+    signal_phase: NDArray[np.int32],
+) -> None:
     """Bring every signal to the worlds' ticks; once more at the same tick changes nothing.
 
     Args:
         roads: the road arrays.
-        worlds: signal_phase and controllers are written; detected_s is what bodies of all shards
-            did up to this tick. Rows are not looked at.
+        ticks: (W,) since reset.
+        detected_s: (W, D) what bodies of all shards did up to these ticks.
         dt: seconds of the tick.
+        controllers: CONTROLLER (W, num_controllers), written.
+        signal_phase: (W, num_signals), written.
     """
-    for w in range(worlds.ticks.shape[0]):
-        time = worlds.ticks[w] * dt
-        if worlds.controllers.shape[1] > 0:
-            if worlds.ticks[w] == 0:
-                _start(roads, worlds, w, dt)
-            _control(roads, worlds, w, dt)
+    for w in range(ticks.size):
+        time = ticks[w] * dt
+        if controllers.shape[1] > 0:
+            if ticks[w] == 0:
+                _start(roads, controllers[w], dt)
+            _control(roads, ticks[w], detected_s[w], dt, controllers[w])
         for k in range(roads.signals.shape[0]):
             program = program_at(roads, k, time, dt)
             controller = roads.programs[program]["controller"]
             if controller >= 0:
-                worlds.signal_phase[w, k] = worlds.controllers[w, controller]["phase"]
+                signal_phase[w, k] = controllers[w, controller]["phase"]
             else:
-                worlds.signal_phase[w, k] = _fixed_phase(roads, program, time, dt)
+                signal_phase[w, k] = _fixed_phase(roads, program, time, dt)
 
 
 @kernel
@@ -128,12 +137,12 @@ def _fixed_phase(roads: RoadArrays, program: int, time: float, dt: float) -> int
 
 
 @kernel
-def _start(roads: RoadArrays, worlds: Worlds, w: int, dt: float) -> None:
+def _start(roads: RoadArrays, controllers: NDArray[np.void], dt: float) -> None:
     """Begin every actuated program with the phase that its offset names, afresh."""
     for program in range(roads.programs.shape[0]):
         controller = roads.programs[program]["controller"]
         if controller >= 0:
-            state = worlds.controllers[w, controller]
+            state = controllers[controller]
             state["phase"] = _fixed_phase(roads, program, 0.0, dt)
             state["since_ms"] = 0
             state["next_ms"] = roads.phases[state["phase"]]["min_ms"]
@@ -157,17 +166,23 @@ def _note(
 
 
 @kernel
-def _control(roads: RoadArrays, worlds: Worlds, w: int, dt: float) -> None:
+def _control(
+    roads: RoadArrays,
+    tick: int,
+    detected_s: NDArray[np.float64],
+    dt: float,
+    controllers: NDArray[np.void],
+) -> None:
     """Let every actuated program of a world look, as often as is due before the next tick."""
-    now_ms = _milliseconds(worlds.ticks[w] * dt)
-    end_ms = _milliseconds((worlds.ticks[w] + 1) * dt)
+    now_ms = _milliseconds(tick * dt)
+    end_ms = _milliseconds((tick + 1) * dt)
     for program in range(roads.programs.shape[0]):
         controller = roads.programs[program]["controller"]
         if controller >= 0:
-            state = worlds.controllers[w, controller]
+            state = controllers[controller]
             gap_s = roads.programs[program]["detector_gap_s"]
             while state["next_ms"] < end_ms:
-                state["next_ms"] += _look(roads, state, worlds.detected_s[w], gap_s, now_ms)
+                state["next_ms"] += _look(roads, state, detected_s, gap_s, now_ms)
 
 
 @kernel

@@ -41,7 +41,14 @@ class Commons:
             worlds: of any shard; the arrays of signals are those of all.
         """
         if self._roads.signals.size > 0:
-            switch_signals(self._roads, worlds, self._sim_dt_s)
+            switch_signals(
+                self._roads,
+                worlds.ticks,
+                worlds.detected_s,
+                self._sim_dt_s,
+                worlds.controllers,
+                worlds.signal_phase,
+            )
 
     def clear_outputs(self, chosen: NDArray[np.bool_]) -> None:
         """Make all agents of the chosen worlds (W,) absent, before `sense` of all shards."""

@@ -86,7 +86,14 @@ def look_and_switch(network: RoadNetwork, worlds: Worlds, step_s: float) -> None
     """Look at the detectors, then switch."""
     places = network.arrays.lane_place, network.arrays.places
     detect(*places, worlds.rows, worlds.num_owned, worlds.ticks, step_s, worlds.detected_s)
-    switch_signals(network.arrays, worlds, step_s)
+    switch_signals(
+        network.arrays,
+        worlds.ticks,
+        worlds.detected_s,
+        step_s,
+        worlds.controllers,
+        worlds.signal_phase,
+    )
 
 
 def shown(network: RoadNetwork, worlds: Worlds, world: int = 0) -> dict[str, str]:
