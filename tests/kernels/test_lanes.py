@@ -110,23 +110,28 @@ def test_the_order_of_rows_does_not_matter(
     for i, lane, s in looked_for(roads, rows):
         own_id = rows[i]["id"]
         assert ahead_on(tidy, lane, s, own_id, VIEW_M) == ahead_on(room, lane, s, own_id, VIEW_M)
-        assert neighbor_behind(
-            roads.arrays, tidy, lane, s, own_id, 60.0, VIEW_M
-        ) == neighbor_behind(roads.arrays, room, lane, s, own_id, 60.0, VIEW_M)
+        one, other = (
+            neighbor_behind(roads.arrays, index, lane, s, own_id, 60.0, VIEW_M)
+            for index in (tidy, room)
+        )
+        assert one == other
 
 
 def test_nobody_sees_further_than_the_view() -> None:
     roads = network("ring")
     lane = int(np.argmax(roads.lanes["length_m"]))
-    assert roads.lanes[lane]["length_m"] > VIEW_M + 1.0
+    view_m = 40.0
     rows = np.zeros(2, VEHICLE)
     rows["id"], rows["side_lane"], rows["lane"] = [0, 1], -1, lane
-    for apart, sees in ((VIEW_M, True), (VIEW_M + 0.5, False)):
+    for apart, sees in ((view_m, True), (view_m + 0.5, False)):
         rows["s"] = [0.0, apart]
         room = indexed("ring", rows)
-        assert (ahead_on(room, lane, 0.0, 0, VIEW_M) >= 0) == sees
-        assert (neighbor_behind(roads.arrays, room, lane, apart, 1, 60.0, VIEW_M)[0] >= 0) == sees
-        assert (last_on(room, lane, 9, VIEW_M - apart, VIEW_M) >= 0) == (apart <= VIEW_M)
+        assert (ahead_on(room, lane, 0.0, 0, view_m) >= 0) == sees
+        behind, _ = neighbor_behind(roads.arrays, room, lane, apart, 1, 60.0, view_m)
+        assert (behind >= 0) == sees
+        rows["s"] = [apart - 15.0, 50.0]
+        room = indexed("ring", rows)
+        assert (last_on(room, lane, 9, 15.0, view_m) >= 0) == sees
 
 
 def test_of_two_at_one_place_the_larger_id_leads() -> None:
