@@ -34,6 +34,7 @@ from cavmarl.runtime.compilation import first_compilation
 from cavmarl.runtime.division import Division
 from cavmarl.runtime.executor import Executor, SerialExecutor
 from cavmarl.shard.reach import driving_reach_m
+from cavmarl.shard.sensors import largest_radius_m, sensing_reach_m
 from cavmarl.shard.shard import Commands, Shard
 from cavmarl.shard.vehicles import STATE_FIELDS, blank_vehicle
 from cavmarl.traffic.demand import DemandFile
@@ -130,7 +131,10 @@ class Simulation:
         config, traffic = self.config, self._traffic
         zones, settings = partition.arrays, config.zones
         coverage = Coverage.of(
-            (driving_reach_m(self.network, traffic.travel),),
+            (
+                driving_reach_m(self.network, traffic.travel),
+                sensing_reach_m(config.sensors, largest_radius_m(traffic.travel.types)),
+            ),
             hysteresis_m=settings.hysteresis_m,
             max_deferred_ticks=settings.max_deferred_ticks,
             max_speed_mps=MAX_SPEED_MPS,
