@@ -169,16 +169,14 @@ def test_one_world_begins_anew_while_others_go_on() -> None:
         "overrides": {"population.mode": "closed"} | FAST,
     }
     whole, divided = (make_vec("grid4x4", zones=zones, **settings) for zones in (1, 4))
-    pull = np.zeros((4, 1, 2), dtype=np.float32)
-    pull[:, 0, 1] = 0.0, 0.1, 0.3, 0.6
     for vec in (whole, divided):
         vec.reset(seed=2)
     alone = 0
-    for _ in range(60):
+    for step in range(60):
         actions = whole.suggest_actions()
         np.testing.assert_array_equal(actions, divided.suggest_actions())
-        pulled = np.clip(actions + pull, -1.0, 1.0)
-        results = [vec.step(pulled) for vec in (whole, divided)]
+        actions[step % 15 // 4 :, 0] = 1.0  # full throttle, full lock
+        results = [vec.step(actions) for vec in (whole, divided)]
         same(*results)
         over = results[0][4]["episode_over"]
         alone += over.any() and not over.all()
