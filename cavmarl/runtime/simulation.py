@@ -84,7 +84,7 @@ class Simulation:
         network: its roads.
         num_worlds: W.
         demand: whose vehicles drive beside the generator's.
-        partition: the zones, if `config.zones` names a file.
+        partition: the zones; None: cut as `config.zones` says.
     """
 
     def __init__(
