@@ -60,7 +60,7 @@ def parallel_env(
 
     Args:
         env: name of an entry of `envs/`, a folder with an env.yaml, or a map file.
-        zones: shadows zones.count.
+        zones: shadows zones.count, how many shards run the world; results do not depend on it.
         workers: processes that run the shards; this version runs them in the caller's (0).
         agents: shadows population.agents.
         background: shadows population.background.
@@ -103,7 +103,7 @@ class CavEnv(ParallelEnv[str, Any, Any]):  # type: ignore[misc] # PettingZoo is 
         config: the environment.
         network: its roads.
         demand: whose vehicles drive beside the generator's.
-        partition: its zones, as in `Simulation`.
+        partition: the zones; None: cut as `config.zones` says.
         seed: of the first reset, if that is given none.
         render_mode: `human`, `rgb_array` or None.
     """

@@ -60,7 +60,7 @@ def make_vec(
     Args:
         env: name of an entry of `envs/`, a folder with an env.yaml, or a map file.
         num_envs: number of worlds.
-        zones: shadows zones.count.
+        zones: shadows zones.count, how many shards run the world; results do not depend on it.
         workers: processes that run the shards; this version runs them in the caller's (0).
         agents: shadows population.agents.
         background: shadows population.background.
@@ -104,7 +104,7 @@ class CavVectorEnv:
         network: its roads.
         num_envs: W.
         demand: whose vehicles drive beside the generator's.
-        partition: its zones, as in `Simulation`.
+        partition: the zones; None: cut as `config.zones` says.
         seed: of the first reset, if that is given none.
         copy: False returns observations as a read-only view that the next step or reset overwrites;
             large ones are copied for longer than they are made.

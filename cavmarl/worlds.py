@@ -25,7 +25,7 @@ from cavmarl.roads.zones import ZonePartition
 from cavmarl.traffic.demand import DemandFile, read_demand
 
 __all__ = [
-    "LoadedWorld",
+    "World",
     "check_agents",
     "check_placement",
     "find_map",
@@ -35,13 +35,20 @@ __all__ = [
 ]
 
 
-class LoadedWorld(NamedTuple):
-    """What a world is made of."""
+class World(NamedTuple):
+    """What a world is made of.
+
+    Attributes:
+        config: the environment.
+        network: its roads.
+        demand: whose vehicles drive beside the generator's.
+        partition: its zones.
+    """
 
     config: EnvConfig
     network: RoadNetwork
-    demand: DemandFile | None  # whose vehicles drive beside the generator's
-    zones: ZonePartition
+    demand: DemandFile | None
+    partition: ZonePartition
 
 
 def load_world(
@@ -52,8 +59,8 @@ def load_world(
     background: int | None = None,
     max_cycles: int | None = None,
     overrides: Mapping[str, Any] | None = None,
-) -> LoadedWorld:
-    """What the world of an entry, a folder or a map file is made of; keywords as in `parallel_env`.
+) -> World:
+    """What an entry, a folder or a map file describes; keywords as in `parallel_env`.
 
     Raises:
         ConfigError: a key, value or combination that cannot work.
@@ -61,6 +68,7 @@ def load_world(
         MapError: the map cannot be read or driven.
         DemandError: a demand file is missing, broken or another map's.
         RouteError: its routes do not connect.
+        ZoneError: the zones do not fit the map.
     """
     config, base_dir = load_config(
         env,
@@ -75,7 +83,7 @@ def load_world(
     demand = None
     if files:
         demand = read_demand(files, network, on_bad_route=config.traffic.on_bad_route)
-    return LoadedWorld(config, network, demand, load_zones(config, base_dir, network))
+    return World(config, network, demand, load_zones(config, base_dir, network))
 
 
 def load_roads(config: EnvConfig, base_dir: Path) -> RoadNetwork:

@@ -111,8 +111,8 @@ def drive_run(job: Job, progress: Progress | None = None) -> dict[str, RunData]:
         overrides=job.overrides,
     )
     vehicles = config.population.agents + config.population.background
-    at_once = worlds_at_once(job.episodes, vehicles)
-    vec = CavVectorEnv(config, network, at_once, demand, partition)
+    num_envs = worlds_at_once(job.episodes, vehicles)
+    vec = CavVectorEnv(config, network, num_envs, demand, partition)
     drivers = {name: load_policy(policy, vec) for name, policy in job.policies.items()}
     return {name: _drive(vec, driver, name, job, progress) for name, driver in drivers.items()}
 

@@ -35,7 +35,7 @@ def make_world(
         DemandError: a demand that cannot be, or not on this map.
         MapError: the map cannot be driven.
     """
-    config, network, file, _ = load_world(
+    config, network, file, partition = load_world(
         map_file,
         agents=0,
         background=0,
@@ -47,7 +47,7 @@ def make_world(
             "map.programs": [str(path) for path in read_input(demand).additional_files],
         },
     )
-    simulation = Simulation(config, network, demand=file)
+    simulation = Simulation(config, network, demand=file, partition=partition)
     simulation.seed(seed)
     simulation.reset()
     return simulation
