@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
@@ -102,7 +103,7 @@ def _counts(text: str) -> list[int]:
 def _table(found: Equivalence, seed: int) -> Table:
     many = "a world" if found.worlds == 1 else f"{found.worlds} worlds"
     table = Table(
-        title=escape(f"{found.env}, {many}, seed {seed}: beside the undivided"),
+        title=escape(f"{Path(found.env).name}, {many}, seed {seed}: beside the undivided"),
         box=box.SIMPLE_HEAD,
         pad_edge=False,
     )

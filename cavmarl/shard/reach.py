@@ -1,9 +1,13 @@
 """How far a shard has to see over its borders: the farthest look of drivers and of sensors.
 
-Distances are between centres, in the plane. What is measured along a road is at least as long.
+Distances are between centres, in the plane. What is measured along a road is at least as long,
+except over junctions without lanes inside, where vehicles jump.
 """
 
 from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
 
 from cavmarl.kernels.approach import APPROACH_M
 from cavmarl.kernels.arrays import Travel
@@ -18,17 +22,47 @@ ASIDE_M = 10.0  # between the centres of neighbour lanes, and of vehicles beside
 def driving_reach_m(network: RoadNetwork, travel: Travel) -> float:
     """The farthest vehicle that a driver's decision can depend on.
 
-    A driver looks `view_m` ahead and asks at a line in view who comes to the junction beyond it,
-    within `APPROACH_M` of the lines there, and who stands behind it, within `EXIT_LOOK_M`. Own path
-    and foe's meet somewhere on the junction: between the lines may lie the lengths of both.
+    A driver looks `view_m` ahead, or is on a junction, and asks there who comes to that junction,
+    within `APPROACH_M` of the ends of the lanes that lead to it or on it, and who stands behind it,
+    within `EXIT_LOOK_M`.
 
     Args:
         network: the roads.
         travel: the types of vehicles, and how far they look.
     """
-    links = network.links
-    crossing_m = float((links["length_m"]).max()) if len(links) else 0.0
-    back_m = float(network.lanes["stop_back_m"].max())
+    longest_m = float(network.links["length_m"].max(initial=0.0))
+    ahead_m = max(travel.view_m, longest_m)
+    beyond_m = max(APPROACH_M, EXIT_LOOK_M, longest_m)
+    stretch, jump_m = _jumps(network)
     bodies_m = 2.0 * float(travel.types["length"].max())
-    beyond_m = max(APPROACH_M, EXIT_LOOK_M)
-    return travel.view_m + back_m + 2.0 * crossing_m + beyond_m + bodies_m + ASIDE_M
+    roads_m = stretch * (ahead_m + beyond_m) + 2.0 * jump_m
+    return roads_m + _across_m(network) + bodies_m + ASIDE_M
+
+
+def _ends(network: RoadNetwork) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """(L, 2) places where each lane starts and where it ends."""
+    first = network.lanes["first_point"]
+    points = np.stack([network.points["x"], network.points["y"]], axis=1)
+    return points[first], points[first + network.lanes["num_points"] - 1]
+
+
+def _across_m(network: RoadNetwork) -> float:
+    """The farthest from the end of a lane at a junction: a foe's lane, or where a way leads out."""
+    links = network.links
+    starts, ends = _ends(network)
+    leaves = ends[links["from_lane"]]
+    through = leaves - starts[links["to_lane"]]
+    own = np.repeat(np.arange(len(links)), links["num_conflicts"])
+    between = leaves[own] - leaves[network.conflicts["foe"]]
+    apart = np.concatenate([through, between])
+    return float(np.hypot(apart[:, 0], apart[:, 1]).max(initial=0.0))
+
+
+def _jumps(network: RoadNetwork) -> tuple[float, float]:
+    """How many times the way along a road the way in the plane can be, and the longest jump."""
+    links = network.links[network.links["first_internal"] < 0]
+    starts, ends = _ends(network)
+    jump = ends[links["from_lane"]] - starts[links["to_lane"]]
+    jump_m = np.hypot(jump[:, 0], jump[:, 1])
+    stretch = 1.0 + jump_m / network.lanes["length_m"][links["from_lane"]]
+    return float(stretch.max(initial=1.0)), float(jump_m.max(initial=0.0))
