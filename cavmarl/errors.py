@@ -16,7 +16,8 @@
     │   └── EpisodeEndedError     step after the end
     ├── CapacityError          more vehicles or seats than the world can take
     ├── EvaluationError        an evaluation that could not be brought to its end
-    │   └── ManifestError         results whose origin is not on record
+    │   ├── ManifestError         results whose origin is not on record
+    │   └── UnequalWorldsError    divided and undivided worlds that are not the same
     ├── PolicyError            a policy that cannot be loaded or does not fit
     └── MissingExtraError      an optional dependency is not installed
 
@@ -45,6 +46,7 @@ __all__ = [
     "PolicyError",
     "ResetNeededError",
     "RouteError",
+    "UnequalWorldsError",
     "UnknownAgentError",
     "UnknownEnvironmentError",
     "ZoneError",
@@ -118,6 +120,10 @@ class EvaluationError(CavmarlError):
 
 class ManifestError(EvaluationError):
     """Results without a manifest, with one that was never closed, or with one of other results."""
+
+
+class UnequalWorldsError(EvaluationError):
+    """Worlds of different division that should be the same bit for bit and are not."""
 
 
 class PolicyError(CavmarlError):

@@ -30,7 +30,7 @@ from cavmarl.roads.zone_coverage import Coverage, zone_halo
 from cavmarl.roads.zone_layouts import cut_map
 from cavmarl.roads.zones import ZonePartition
 from cavmarl.runtime.compilation import first_compilation
-from cavmarl.runtime.division import Division
+from cavmarl.runtime.division import Division, ZoneLoads
 from cavmarl.runtime.executor import Executor, SerialExecutor
 from cavmarl.shard.reach import driving_reach_m
 from cavmarl.shard.shard import Commands, Shard
@@ -189,6 +189,10 @@ class Simulation:
         """
         return self._division.vehicles(world)
 
+    def zone_loads(self) -> ZoneLoads:
+        """What each zone holds now, and how many vehicles have changed their zone."""
+        return self._division.loads()
+
     @property
     def worlds(self) -> Worlds:
         """The vehicles and signals of all worlds, for tools that measure; each tick swaps them.
@@ -258,8 +262,9 @@ class Simulation:
         self._executor.each("sense", self._everywhere)
 
     def instrument(self, wrap: Callable[[Any], Any]) -> None:
-        """Put `wrap(part)` in the place of the executor and of the traffic, to time their calls."""
+        """Put `wrap(part)` in the place of executor, division and traffic, to time their calls."""
         self._executor = wrap(self._executor)
+        self._division = wrap(self._division)
         self._traffic = wrap(self._traffic)
 
     def _tick(self, commands: Commands) -> None:
