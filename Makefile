@@ -12,10 +12,11 @@ OLDEST_TESTS := tests/kernels tests/roads tests/runtime tests/traffic tests/test
     tests/test_registry.py tests/test_registration.py tests/test_env.py tests/test_vector_env.py \
     tests/test_bad_input.py tests/test_public_api.py
 FUZZ_SECONDS ?= 60
-FUZZ_TARGETS ?= network programs map cached zones demand sumocfg entry overrides driver manifest
+FUZZ_TARGETS ?= network programs map cached zones demand sumocfg entry overrides driver manifest \
+    message log
 MAPS := envs/ring/map/map.net.xml envs/merge/map/map.net.xml envs/grid4x4/map/map.net.xml
 
-.PHONY: help demo test check bench bounds soak fuzz oldest maps pictures clean
+.PHONY: help demo test check bench bounds soak model fuzz oldest maps pictures clean
 .DEFAULT_GOAL := help
 
 help: ## say what there is
@@ -42,6 +43,11 @@ bounds: $(READY) ## the tests with every index of the kernels checked
 
 soak: $(READY) ## the slow tests: long episodes, memory, the wheel
 	$(BIN)/pytest -m slow
+
+model: ## verify the model of the hand-off protocol, and that each of its mutations is caught
+	@command -v spin >/dev/null || { echo "make model needs spin; on Debian: apt-get install spin" >&2; exit 1; }
+	@command -v cc >/dev/null || { echo "make model needs a C compiler; on Debian: apt-get install gcc libc6-dev" >&2; exit 1; }
+	sh docs/model/check_model.sh
 
 fuzz: $(READY) ## each file parser, FUZZ_SECONDS long; what crashes one stays in fuzz/crashes
 	$(BIN)/python -m pip install --quiet --editable '.[fuzz]' --constraint constraints.txt

@@ -3,7 +3,8 @@
     CavmarlError
     ├── ConfigError            a key, a value or a combination that cannot work
     │   ├── UnknownEnvironmentError   no entry, path or map of that name
-    │   └── ZoneError                 zones that overlap, leak or do not fit the map
+    │   ├── ZoneError                 zones that overlap, leak or do not fit the map
+    │   └── CoverageError         a zone sees less than its vehicles may need
     ├── MapError               a map that cannot be read, built or driven
     │   └── RouteError         no way from here to there
     ├── DemandError            a file of traffic that cannot be read or does not fit its map
@@ -18,6 +19,21 @@
     ├── EvaluationError        an evaluation that could not be brought to its end
     │   ├── ManifestError         results whose origin is not on record
     │   └── UnequalWorldsError    divided and undivided worlds that are not the same
+    ├── ProtocolError          the hand-off protocol was broken, or cannot go on
+    │   ├── TransitionError       an event that its state does not know
+    │   ├── SpawnError            a vehicle id that has been used, or a zone that is none
+    │   ├── LedgerError           a vehicle lost, doubled, or at another epoch
+    │   ├── StoreError            what is stored is not what the zones say they stored
+    │   ├── ZoneStepError         a tick that every host of a zone died of
+    │   ├── InvariantError        what always holds did not hold
+    │   ├── MessageError          bytes that are no message of this run
+    │   │   ├── TruncatedMessageError
+    │   │   ├── CorruptMessageError
+    │   │   ├── UnknownVersionError
+    │   │   └── ForeignRunError
+    │   └── JournalError          a log that cannot be replayed
+    │       ├── TornJournalError     only its last line is cut short
+    │       └── CorruptJournalError  a line is damaged, missing or out of order
     ├── PolicyError            a policy that cannot be loaded or does not fit
     └── MissingExtraError      an optional dependency is not installed
 
@@ -34,22 +50,38 @@ __all__ = [
     "CapacityError",
     "CavmarlError",
     "ConfigError",
+    "CorruptJournalError",
+    "CorruptMessageError",
+    "CoverageError",
     "DemandError",
     "EpisodeEndedError",
     "EpisodeError",
     "EvaluationError",
+    "ForeignRunError",
     "InvalidActionError",
+    "InvariantError",
+    "JournalError",
+    "LedgerError",
     "ManifestError",
     "MapError",
+    "MessageError",
     "MissingActionError",
     "MissingExtraError",
     "PolicyError",
+    "ProtocolError",
     "ResetNeededError",
     "RouteError",
+    "SpawnError",
+    "StoreError",
+    "TornJournalError",
+    "TransitionError",
+    "TruncatedMessageError",
     "UnequalWorldsError",
     "UnknownAgentError",
     "UnknownEnvironmentError",
+    "UnknownVersionError",
     "ZoneError",
+    "ZoneStepError",
     "require",
 ]
 
@@ -68,6 +100,10 @@ class UnknownEnvironmentError(ConfigError):
 
 class ZoneError(ConfigError):
     """Zones that overlap, leave a gap, do not fit the map or see less far than exactness needs."""
+
+
+class CoverageError(ConfigError):
+    """A zone would see less than a vehicle may need before it is handed over."""
 
 
 class MapError(CavmarlError):
@@ -124,6 +160,83 @@ class ManifestError(EvaluationError):
 
 class UnequalWorldsError(EvaluationError):
     """Worlds of different division that should be the same bit for bit and are not."""
+
+
+class ProtocolError(CavmarlError):
+    """The hand-off protocol was broken, or cannot go on."""
+
+
+class TransitionError(ProtocolError):
+    """An event that the state does not know."""
+
+
+class SpawnError(ProtocolError):
+    """A vehicle whose id has been in the episode before, or whose zone does not exist."""
+
+
+class LedgerError(ProtocolError):
+    """A vehicle was lost, doubled, or is at another epoch than planned."""
+
+
+class StoreError(ProtocolError):
+    """What is stored is not what the zones say they stored.
+
+    Attributes:
+        zones: those that have to be hosted anew and step again.
+    """
+
+    def __init__(self, zones: tuple[int, ...]) -> None:
+        super().__init__(f"zones {list(zones)} stored other rows than they told: host them anew")
+        self.zones = zones
+
+
+class ZoneStepError(ProtocolError):
+    """A tick that every host of a zone died of: it is not tried for ever.
+
+    Attributes:
+        zone: the zone.
+        tick: the tick that could not be computed.
+    """
+
+    def __init__(self, zone: int, tick: int, hosts: int) -> None:
+        super().__init__(f"zone {zone} could not reach tick {tick}: {hosts} hosts in a row died")
+        self.zone, self.tick = zone, tick
+
+
+class InvariantError(ProtocolError):
+    """What always holds did not hold."""
+
+
+class MessageError(ProtocolError):
+    """Bytes that are no message of this run."""
+
+
+class TruncatedMessageError(MessageError):
+    """A message that ends too early, or goes on after its end."""
+
+
+class CorruptMessageError(MessageError):
+    """A message whose checksum or content is wrong."""
+
+
+class UnknownVersionError(MessageError):
+    """A message of another version of the wire form."""
+
+
+class ForeignRunError(MessageError):
+    """A message of another run."""
+
+
+class JournalError(ProtocolError):
+    """A log that cannot be replayed."""
+
+
+class TornJournalError(JournalError):
+    """Only the last line of the log is cut short: what precedes it is whole."""
+
+
+class CorruptJournalError(JournalError):
+    """A line of the log is damaged, missing or out of order."""
 
 
 class PolicyError(CavmarlError):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from fuzz.protocol import LOGS, MESSAGES
 from fuzz.roads import CACHED, MAPS, NETWORKS, PROGRAMS, ZONES
 from fuzz.settings import DRIVERS, ENTRIES, MANIFESTS, OVERRIDES
 from fuzz.traffic import DEMAND, SUMO_CONFIGS
@@ -20,4 +21,6 @@ TARGETS = {
     "overrides": OVERRIDES,
     "driver": DRIVERS,
     "manifest": MANIFESTS,
+    "message": MESSAGES,
+    "log": LOGS,
 }

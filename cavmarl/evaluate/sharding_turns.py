@@ -16,12 +16,18 @@ from cavmarl.runtime.simulation import Simulation
 __all__ = ["PHASES", "Pair", "Turn", "TwinWorlds"]
 
 PHASES = ("traffic", "advance", "exchange", "resolve", "migrate", "sense", "other")
-# What is neither traffic nor another phase's name is `other`.
-TRAFFIC = (
-    "choose_goals", "leave", "settle",
-    "call_orders", "rank_lanes", "assign_lanes", "propose", "running", "accept", "admit",
-    "retire", "forget",
-)  # fmt: skip
+# Calls of the runtime that belong to a phase of another name; what is left is `other`.
+_MEMBERS = {
+    "traffic": (
+        "choose_goals", "leave", "settle",
+        "call_orders", "rank_lanes", "assign_lanes", "propose", "running", "accept", "admit",
+        "retire", "forget",
+    ),
+    "sense": ("clear_outputs", "settle_outputs", "credit"),
+}  # fmt: skip
+_PHASE_OF = {phase: phase for phase in PHASES} | {
+    name: phase for phase, names in _MEMBERS.items() for name in names
+}
 
 
 @dataclass(frozen=True)
@@ -110,15 +116,9 @@ class TwinWorlds:
         calls = {name: ns * share for name, ns in sorted(watch.phases().items())}
         phases = dict.fromkeys(PHASES, 0.0)
         for name, ns in calls.items():
-            phases[_phase_of(name)] += ns
+            phases[_PHASE_OF.get(name, "other")] += ns
         phases["other"] += timed_ns - sum(phases.values())
         return Pair(plain, timed, plain.ns * share, timed_ns, phases, calls)
-
-
-def _phase_of(name: str) -> str:
-    if name in TRAFFIC:
-        return "traffic"
-    return name if name in PHASES else "other"
 
 
 def _run(world: DrivenWorld, steps: int, watch: Stopwatch) -> Turn:

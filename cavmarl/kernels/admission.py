@@ -79,7 +79,7 @@ def rank_lanes(
             s = max(departure["pos"], 0.0)
             for lane in range(first, first + edge["num_lanes"]):
                 if _zone_on(roads, zones, lane, min(s, roads.lanes[lane]["length_m"])) == zone:
-                    gate.ranks[w, q, lane - first] = crowd(scratch, lane, s)
+                    gate.ranks[w, q, lane - first] = crowd(scratch, lane, s, travel.view_m)
 
 
 @kernel
@@ -178,7 +178,9 @@ def propose(
                 continue
             departure = gate.queue[w, q]
             kind = travel.types[departure["vtype"]]
-            s = entry_place(roads, key, departure, kind, lane, worlds.ticks[w], scratch)
+            s = entry_place(
+                roads, key, departure, kind, lane, worlds.ticks[w], scratch, travel.view_m
+            )
             if _zone_on(roads, zones, lane, s) != zone:
                 continue
             speed = entry_speed(roads, travel, key, departure, kind, lane, s, scratch)

@@ -65,6 +65,7 @@ class Travel(NamedTuple):
     stops: NDArray[np.void]  # STOP (num_stops,), by VEHICLE["stop"]
     first_detour: int  # PLAN row of the first goal of demand vehicles that take another way
     begin_s: float  # the clock of the demand at tick 0
+    view_m: float  # how far anybody looks for others along the road, at most VIEW_M
 
 
 class Worlds(NamedTuple):

@@ -39,7 +39,7 @@ from cavmarl.kernels.rng import STREAM_DRIVER, quick_uniform
 from cavmarl.kernels.stopping import way_to_stop
 from cavmarl.kernels.ways import leave, next_step
 
-__all__ = ["decide"]
+__all__ = ["decide", "look_ahead_m"]
 
 SEE_LINE_M = 8.0
 NEAR_M = 8.0  # to a leader so near the corner between matters,
@@ -62,7 +62,7 @@ BEND_M = 6.0  # within this length
 
 
 @inlined_kernel
-def _look_ahead_m(kind: np.void, speed: float) -> float:
+def look_ahead_m(kind: np.void, speed: float) -> float:
     """How far ahead of its centre a driver looks, in m: IDM reacts earlier and more softly."""
     if kind["model"] == MODEL_KRAUSS:
         way = 45.0 + speed * (1.0 + kind["tau"]) + 0.5 * speed * speed / kind["decel"]
@@ -270,11 +270,11 @@ def _road_ahead(
             roads, travel, rows, i, here["link"], place, row["way"], phase, dt, scratch
         )
         press = max(press, fork)
-    look = _look_ahead_m(kind, speed)
+    look = min(look_ahead_m(kind, speed), travel.view_m)
     see = _see_line_m(kind, speed) + half
     # Behind a leader on its own lane a driver minds the next line only where it could not stop
     # any more once the leader has passed it.
-    if k + 1 < scratch.lane_end[lane] and scratch.entries[k + 1]["s"] - row["s"] <= VIEW_M:
+    if k + 1 < scratch.lane_end[lane] and (scratch.entries[k + 1]["s"] - row["s"] <= travel.view_m):
         leader = scratch.entries[k + 1]
         press = max(
             press,
@@ -310,7 +310,7 @@ def _road_ahead(
         if steered:
             allowed = min(allowed, _bend_speed(roads, lane, distance))
         allowed = min(allowed, _slowing_to(kind, limit, distance, speed, dt))
-        j = last_on(scratch, lane, row["id"], distance)
+        j = last_on(scratch, lane, row["id"], distance, travel.view_m)
         if j >= 0:
             leader = scratch.entries[j]
             gap = distance + leader["s"] - half - leader["half"]
@@ -324,12 +324,14 @@ def _road_ahead(
 
 
 @kernel
-def _beside(roads: RoadArrays, kind: np.void, row: np.void, lane: int, scratch: Scratch) -> float:
+def _beside(
+    roads: RoadArrays, travel: Travel, kind: np.void, row: np.void, lane: int, scratch: Scratch
+) -> float:
     """How the leader on a neighbour lane presses that the body covers, or is about to."""
     beside = roads.lanes[lane]
     s = beside_s(roads, row["lane"], lane, row["s"])
     half = 0.5 * row["length"]
-    j = ahead_on(scratch, lane, s, row["id"])
+    j = ahead_on(scratch, lane, s, row["id"], travel.view_m)
     if j >= 0:
         leader = scratch.entries[j]
         return _behind_entry(kind, row["speed"], leader["s"] - s - half - leader["half"], leader)
@@ -338,11 +340,11 @@ def _beside(roads: RoadArrays, kind: np.void, row: np.void, lane: int, scratch: 
     for link in range(beside["first_link"], beside["first_link"] + beside["num_links"]):
         distance = beside["length_m"] - s
         beyond = roads.links[link]["next_lane"]
-        j = last_on(scratch, beyond, row["id"], distance)
+        j = last_on(scratch, beyond, row["id"], distance, travel.view_m)
         while j < 0 and roads.lanes[beyond]["internal"]:
             distance += roads.lanes[beyond]["length_m"]
             beyond = roads.lanes[beyond]["successor"]
-            j = last_on(scratch, beyond, row["id"], distance)
+            j = last_on(scratch, beyond, row["id"], distance, travel.view_m)
         if j >= 0:
             leader = scratch.entries[j]
             gap = distance + leader["s"] - half - leader["half"]
@@ -360,7 +362,7 @@ def _let_merge(
     if target < 0:
         return
     s = beside_s(roads, row["lane"], target, row["s"])
-    k, apart = neighbor_behind(roads, scratch, target, s, row["id"], LOOK_BACK_M)
+    k, apart = neighbor_behind(roads, scratch, target, s, row["id"], LOOK_BACK_M, travel.view_m)
     if k < 0 or scratch.entries[k]["side"]:
         return
     follower = scratch.entries[k]
@@ -417,7 +419,7 @@ def decide(
         if to_stop < math.inf:
             press = max(press, before_line(kind, speed, to_stop + LINE_MARGIN_M, dt))
         if row["side_lane"] >= 0:
-            press = max(press, _beside(roads, kind, row, row["side_lane"], scratch))
+            press = max(press, _beside(roads, travel, kind, row, row["side_lane"], scratch))
         needed = needed_change(roads, travel, row, scratch.step[i])
         own_wish = wish(kind, speed, allowed, press)
         change = 0
@@ -429,7 +431,7 @@ def decide(
             lane = roads.lanes[row["lane"]]
             press, allowed, _, _ = _road_ahead(roads, travel, rows, k, phase, 0.0, dt, scratch)
             target = lane["left"] if change > 0 else lane["right"]
-            press = max(press, _beside(roads, kind, row, target, scratch))
+            press = max(press, _beside(roads, travel, kind, row, target, scratch))
         share = 0.0
         if kind["sigma"] > 0.0:
             share = quick_uniform(row["rng_key"], row["id"], tick, STREAM_DRIVER)
@@ -440,7 +442,9 @@ def decide(
             room = scratch.step[i]["room"] - row["s"]
             if target >= 0 and room < FALL_IN_M:
                 # Fall in behind whom it wants to follow on the other lane.
-                fall_in = wish(kind, speed, allowed, _beside(roads, kind, row, target, scratch))
+                fall_in = wish(
+                    kind, speed, allowed, _beside(roads, travel, kind, row, target, scratch)
+                )
                 accel = min(accel, max(fall_in, -COURTESY_DECEL))
         scratch.accel[i] = accel
         scratch.lane_change[i] = change

@@ -28,7 +28,7 @@ from cavmarl.kernels.codes import (
     SPEED_RANDOM,
 )
 from cavmarl.kernels.following import accel_behind, speed_behind
-from cavmarl.kernels.lanes import VIEW_M, ahead_on, last_on, neighbor_behind
+from cavmarl.kernels.lanes import ahead_on, last_on, neighbor_behind
 from cavmarl.kernels.rng import STREAM_DEPARTURE, STREAM_PLACE, below, uniform
 from cavmarl.kernels.ways import next_step
 
@@ -48,11 +48,11 @@ def _may_use(travel: Travel, departure: np.void, lane: int) -> bool:
 
 
 @kernel
-def crowd(scratch: Scratch, lane: int, s: float) -> int:
+def crowd(scratch: Scratch, lane: int, s: float, view_m: float) -> int:
     """How many vehicles are in view around a place on a lane."""
     found = 0
     for k in range(scratch.lane_start[lane], scratch.lane_end[lane]):
-        found += abs(scratch.entries[k]["s"] - s) <= VIEW_M
+        found += abs(scratch.entries[k]["s"] - s) <= view_m
     return found
 
 
@@ -123,6 +123,7 @@ def entry_place(
     lane: int,
     tick: int,
     scratch: Scratch,
+    view_m: float,
 ) -> float:
     """Where on its lane the centre of a departure enters, in m: its whole body is on the lane."""
     length = roads.lanes[lane]["length_m"]
@@ -135,7 +136,7 @@ def entry_place(
     elif code == POS_BASE:
         s = half
     elif code == POS_LAST:
-        k = last_on(scratch, lane, departure["id"], 0.0)
+        k = last_on(scratch, lane, departure["id"], 0.0, view_m)
         s = most
         if k >= 0:
             last = scratch.entries[k]
@@ -168,13 +169,13 @@ def entry_speed(
     code = departure["speed_code"]
     wanted = here["speed_mps"] * departure["speed_factor"]
     half = 0.5 * kind["length"]
-    j = ahead_on(scratch, lane, s, departure["id"])
+    j = ahead_on(scratch, lane, s, departure["id"], travel.view_m)
     distance = -s
     if j < 0:
         beyond, _, _ = next_step(roads, travel, lane, departure["way"])
         if beyond >= 0:
             distance += here["length_m"]
-            j = last_on(scratch, beyond, departure["id"], distance)
+            j = last_on(scratch, beyond, departure["id"], distance, travel.view_m)
     if code == SPEED_GIVEN:
         wanted = min(departure["speed"], wanted)
     elif code == SPEED_RANDOM:
@@ -209,7 +210,9 @@ def follower_brakes(
     scratch: Scratch,
 ) -> bool:
     """Whether who follows would have to brake hard for a vehicle that enters."""
-    k, distance = neighbor_behind(roads, scratch, lane, s, departure["id"], ENTER_REACH_M)
+    k, distance = neighbor_behind(
+        roads, scratch, lane, s, departure["id"], ENTER_REACH_M, travel.view_m
+    )
     if k < 0:
         return False
     follower = scratch.entries[k]

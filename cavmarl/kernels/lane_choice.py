@@ -82,14 +82,14 @@ def _change_is_safe(
     s = beside_s(roads, row["lane"], target, row["s"])
     desired = _desired(roads, kind, row, target)
     ahead = 0.0
-    j = ahead_on(scratch, target, s, row["id"])
+    j = ahead_on(scratch, target, s, row["id"], travel.view_m)
     if j >= 0:
         ahead = scratch.entries[j]["s"] - s
     else:
         ahead = lane["length_m"] - s
         beyond, way, _ = next_step(roads, travel, target, row["way"])
         while beyond >= 0:
-            j = last_on(scratch, beyond, row["id"], ahead)
+            j = last_on(scratch, beyond, row["id"], ahead, travel.view_m)
             if j >= 0:
                 ahead += scratch.entries[j]["s"]
             if j >= 0 or not roads.lanes[beyond]["internal"]:
@@ -105,7 +105,7 @@ def _change_is_safe(
         after = accel_behind(kind, speed, desired, net, leader["speed"], leader["decel"])
     follower_before = 0.0
     follower_after = 0.0
-    k, gap = neighbor_behind(roads, scratch, target, s, row["id"], LOOK_BACK_M)
+    k, gap = neighbor_behind(roads, scratch, target, s, row["id"], LOOK_BACK_M, travel.view_m)
     if k >= 0:
         follower = scratch.entries[k]
         other = rows[follower["row"]]

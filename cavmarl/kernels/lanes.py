@@ -28,7 +28,7 @@ __all__ = [
 ]
 
 MAX_LOOK_BACK_LANES = 4
-VIEW_M = 250.0  # nobody asks for anybody further away than this along the road
+VIEW_M = 250.0  # the farthest view along the road that a world can have
 
 ENTRY = np.dtype(
     [
@@ -151,30 +151,30 @@ def _first_after(scratch: Scratch, lane: int, s: float, own_id: int) -> int:
 
 
 @kernel
-def ahead_on(scratch: Scratch, lane: int, s: float, own_id: int) -> int:
+def ahead_on(scratch: Scratch, lane: int, s: float, own_id: int, view_m: float) -> int:
     """Position in the index of the next other vehicle on `lane` ahead of place `s`, or -1.
 
-    Beyond `VIEW_M` nobody is found. At equal s the larger id counts as ahead, so that of two
+    Beyond `view_m` nobody is found. At equal s the larger id counts as ahead, so that of two
     vehicles one is always the leader.
     """
     k = _first_after(scratch, lane, s, own_id)
     end = scratch.lane_start[lane + 1]
     while k < end and scratch.entries[k]["id"] == own_id:
         k += 1
-    return k if k < end and scratch.entries[k]["s"] - s <= VIEW_M else -1
+    return k if k < end and scratch.entries[k]["s"] - s <= view_m else -1
 
 
 @inlined_kernel
-def last_on(scratch: Scratch, lane: int, own_id: int, distance: float) -> int:
+def last_on(scratch: Scratch, lane: int, own_id: int, distance: float, view_m: float) -> int:
     """Position in the index of the rearmost other vehicle on `lane`, or -1.
 
-    Who asks is `distance` m before the start of the lane and sees `VIEW_M` far.
+    Who asks is `distance` m before the start of the lane and sees `view_m` far.
     """
     k = int(scratch.lane_start[lane])
     end = scratch.lane_start[lane + 1]
     while k < end and scratch.entries[k]["id"] == own_id:
         k += 1
-    return k if k < end and distance + scratch.entries[k]["s"] <= VIEW_M else -1
+    return k if k < end and distance + scratch.entries[k]["s"] <= view_m else -1
 
 
 @kernel
@@ -189,18 +189,24 @@ def behind_on(scratch: Scratch, lane: int, s: float, own_id: int) -> int:
 
 @kernel
 def neighbor_behind(
-    roads: RoadArrays, scratch: Scratch, lane: int, s: float, own_id: int, reach_m: float
+    roads: RoadArrays,
+    scratch: Scratch,
+    lane: int,
+    s: float,
+    own_id: int,
+    reach_m: float,
+    view_m: float,
 ) -> tuple[int, float]:
     """The nearest vehicle behind place `s` of `lane`: (position in the index, distance in m).
 
     Looks back over lane borders that are up to `reach_m` away, along every lane that leads here; of
     several the nearest counts, at equal distances the smallest id. (-1, inf) where there is none
-    within `VIEW_M`.
+    within `view_m`.
     """
     best = behind_on(scratch, lane, s, own_id)
     if best >= 0:
         apart = s - scratch.entries[best]["s"]
-        return (best, apart) if apart <= VIEW_M else (-1, math.inf)
+        return (best, apart) if apart <= view_m else (-1, math.inf)
     best_distance = math.inf
     row = roads.lanes[lane]
     for k in range(row["first_into"], row["first_into"] + row["num_into"]):
@@ -213,7 +219,7 @@ def neighbor_behind(
             other = behind_on(scratch, before, math.inf, own_id)
             if other >= 0:
                 gap = distance + length - scratch.entries[other]["s"]
-                nearer = gap < best_distance and gap <= VIEW_M
+                nearer = gap < best_distance and gap <= view_m
                 tie = gap == best_distance and best >= 0
                 if tie:
                     tie = scratch.entries[other]["id"] < scratch.entries[best]["id"]

@@ -1,4 +1,4 @@
-"""The end of a step: observations, terms and rewards of all agents of all worlds."""
+"""The end of a step: what the agents of one shard observe, and their terms."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from cavmarl.kernels.observing import (
 )
 from cavmarl.kernels.observing_lanes import observe_lanes
 from cavmarl.kernels.stacking import has_entered, newest_frame, shift_frames
-from cavmarl.kernels.terms import NUM_TERMS, write_terms
+from cavmarl.kernels.terms import write_terms
 
 __all__ = ["sense"]
 
@@ -31,44 +31,34 @@ def sense(
     worlds: Worlds,
     grid: Grid,
     sensors: Sensors,
-    weights: NDArray[np.float64],
-    team_share: float,
     tick_s: float,
     ticks_per_step: int,
     chosen: NDArray[np.bool_],
     outputs: Outputs,
 ) -> None:
-    """Write what every agent of the chosen worlds gets, at its own index.
+    """Write what every owned agent of the chosen worlds gets, at its own index.
 
-    A vehicle that entered during the step has not acted: it is observed, its terms and reward are
-    0, and it does not end. `observe_further` and `fill_stacks` complete the observations.
+    A vehicle that entered during the step has not acted: it is observed, its terms are 0, and it
+    does not end. `observe_further` and `fill_stacks` complete the observations,
+    `kernels.outputs` does what concerns the agents of all shards.
 
     Args:
         roads: the road arrays.
         plans: PLAN (G, L), the ways of agents.
         travel: the ways of all.
-        worlds: committed rows at the end of the step; episode_return of agents' rows is written.
+        worlds: committed rows at the end of the step, ghosts among them.
         grid: room for the spatial index of one world.
         sensors: settings and room.
-        weights: (NUM_TERMS,) of the reward.
-        team_share: share of the reward that is the mean over the agents that acted.
         tick_s: seconds a tick.
         ticks_per_step: ticks a step.
         chosen: (W,) which worlds.
-        outputs: overwritten where chosen.
+        outputs: cleared where chosen; written at the indices of owned agents.
     """
     step_s = tick_s * ticks_per_step
     for w in range(worlds.ticks.shape[0]):
         if not chosen[w]:
             continue
         rows = worlds.rows[w]
-        outputs.terms[w] = 0.0
-        outputs.rewards[w] = 0.0
-        outputs.terminated[w] = False
-        outputs.present[w] = False
-        outputs.acted[w] = False
-        outputs.events[w] = 0
-        outputs.vehicle_ids[w] = -1
         fill_grid(rows, worlds.num_rows[w], grid)
         for i in range(worlds.num_owned[w]):
             row = rows[i]
@@ -97,35 +87,3 @@ def sense(
             outputs.acted[w, agent] = True
             outputs.terminated[w, agent] = row["events"] & EVENTS_THAT_END != 0
             outputs.events[w, agent] = row["events"]
-        for agent in range(outputs.present.shape[1]):
-            if not outputs.present[w, agent]:
-                outputs.observations[w, agent] = 0.0
-        _reward(worlds, w, weights, team_share, outputs)
-
-
-@kernel
-def _reward(
-    worlds: Worlds, w: int, weights: NDArray[np.float64], team_share: float, outputs: Outputs
-) -> None:
-    """Weighted sums of the terms, mixed with the team's mean; summed in agent order."""
-    team = 0.0
-    acted = 0
-    for agent in range(outputs.rewards.shape[1]):
-        if outputs.acted[w, agent]:
-            own = 0.0
-            for k in range(NUM_TERMS):
-                own += weights[k] * outputs.terms[w, agent, k]
-            outputs.rewards[w, agent] = own
-            team += own
-            acted += 1
-    if acted == 0:
-        return
-    team /= acted
-    for agent in range(outputs.rewards.shape[1]):
-        if outputs.acted[w, agent]:
-            own = outputs.rewards[w, agent]
-            outputs.rewards[w, agent] = (1.0 - team_share) * own + team_share * team
-    rows = worlds.rows[w]
-    for i in range(worlds.num_owned[w]):
-        if rows[i]["driver"] == DRIVER_AGENT:
-            rows[i]["episode_return"] += outputs.rewards[w, rows[i]["agent"]]

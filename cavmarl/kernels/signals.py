@@ -16,9 +16,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cavmarl.kernels import kernel
-from cavmarl.kernels.arrays import RoadArrays, Worlds
+from cavmarl.kernels.arrays import RoadArrays
 
-__all__ = ["DETECTOR_REACH_M", "program_at", "switch_signals"]
+__all__ = [
+    "DETECTOR_REACH_M",
+    "detect",
+    "merge_detections",
+    "program_at",
+    "switch_signals",
+]
 
 # From a detector to the centre of any vehicle that is over it or has left it in this tick.
 DETECTOR_REACH_M = 30.0
@@ -27,29 +33,81 @@ SECOND_MS = 1000  # SUMO prolongs phases to whole seconds, and looks no sooner a
 
 
 @kernel
-def switch_signals(roads: RoadArrays, worlds: Worlds, dt: float) -> None:
+def detect(
+    lane_place: NDArray[np.int32],
+    places: NDArray[np.void],
+    rows: NDArray[np.void],
+    num_owned: NDArray[np.int64],
+    ticks: NDArray[np.int64],
+    dt: float,
+    detected_s: NDArray[np.float64],
+) -> None:
+    """Note when bodies were over the detectors: now, or when their rear left in this tick.
+
+    The latest counts, so that neither the order of rows nor who owns them matters.
+
+    Args:
+        lane_place: (L,) see `RoadArrays`.
+        places: PLACE (num_places,).
+        rows: VEHICLE (W, C), the committed ones of the tick.
+        num_owned: (W,) rows to look at.
+        ticks: (W,) since reset.
+        dt: seconds of the tick.
+        detected_s: (W, D), written; begun afresh at a reset.
+    """
+    for w in range(ticks.size):
+        if ticks[w] == 0:
+            # As in SUMO, time since the beginning counts as time since a vehicle.
+            detected_s[w] = 0.0
+        for i in range(num_owned[w]):
+            row = rows[w, i]
+            place = lane_place[row["lane"]]
+            while place >= 0:
+                at = places[place]
+                ahead = row["s"] - at["s_m"]
+                if abs(ahead) < DETECTOR_REACH_M:
+                    _note(row, ahead, ticks[w] * dt, dt, at["detector"], detected_s[w])
+                place = at["next"]
+
+
+@kernel
+def merge_detections(into: NDArray[np.float64], others: NDArray[np.float64]) -> None:
+    """Keep the latest of what two shards have noted, `detected_s` (W, D) of each."""
+    np.maximum(into, others, into)
+
+
+@kernel
+def switch_signals(
+    roads: RoadArrays,
+    ticks: NDArray[np.int64],
+    detected_s: NDArray[np.float64],
+    dt: float,
+    controllers: NDArray[np.void],
+    signal_phase: NDArray[np.int32],
+) -> None:
     """Bring every signal to the worlds' ticks; once more at the same tick changes nothing.
 
     Args:
         roads: the road arrays.
-        worlds: signal_phase, controllers and detected_s are written; the rows are the committed
-            ones of the tick.
+        ticks: (W,) since reset.
+        detected_s: (W, D) what bodies of all shards did up to these ticks.
         dt: seconds of the tick.
+        controllers: CONTROLLER (W, num_controllers), written.
+        signal_phase: (W, num_signals), written.
     """
-    for w in range(worlds.ticks.shape[0]):
-        time = worlds.ticks[w] * dt
-        if worlds.controllers.shape[1] > 0:
-            if worlds.ticks[w] == 0:
-                _start(roads, worlds, w, dt)
-            _detect(roads, worlds.rows[w], worlds.num_owned[w], time, dt, worlds.detected_s[w])
-            _control(roads, worlds, w, dt)
+    for w in range(ticks.size):
+        time = ticks[w] * dt
+        if controllers.shape[1] > 0:
+            if ticks[w] == 0:
+                _start(roads, controllers[w], dt)
+            _control(roads, ticks[w], detected_s[w], dt, controllers[w])
         for k in range(roads.signals.shape[0]):
             program = program_at(roads, k, time, dt)
             controller = roads.programs[program]["controller"]
             if controller >= 0:
-                worlds.signal_phase[w, k] = worlds.controllers[w, controller]["phase"]
+                signal_phase[w, k] = controllers[w, controller]["phase"]
             else:
-                worlds.signal_phase[w, k] = _fixed_phase(roads, program, time, dt)
+                signal_phase[w, k] = _fixed_phase(roads, program, time, dt)
 
 
 @kernel
@@ -79,41 +137,15 @@ def _fixed_phase(roads: RoadArrays, program: int, time: float, dt: float) -> int
 
 
 @kernel
-def _start(roads: RoadArrays, worlds: Worlds, w: int, dt: float) -> None:
+def _start(roads: RoadArrays, controllers: NDArray[np.void], dt: float) -> None:
     """Begin every actuated program with the phase that its offset names, afresh."""
     for program in range(roads.programs.shape[0]):
         controller = roads.programs[program]["controller"]
         if controller >= 0:
-            state = worlds.controllers[w, controller]
+            state = controllers[controller]
             state["phase"] = _fixed_phase(roads, program, 0.0, dt)
             state["since_ms"] = 0
             state["next_ms"] = roads.phases[state["phase"]]["min_ms"]
-    # As in SUMO, time since the beginning counts as time since a vehicle.
-    worlds.detected_s[w] = 0.0
-
-
-@kernel
-def _detect(
-    roads: RoadArrays,
-    rows: NDArray[np.void],
-    num: int,
-    time: float,
-    dt: float,
-    detected_s: NDArray[np.float64],
-) -> None:
-    """Note when bodies were over the detectors: now, or when their rear left in this tick.
-
-    The latest counts, so that neither the order of rows nor who owns them matters.
-    """
-    for i in range(num):
-        row = rows[i]
-        place = roads.lane_place[row["lane"]]
-        while place >= 0:
-            at = roads.places[place]
-            ahead = row["s"] - at["s_m"]
-            if abs(ahead) < DETECTOR_REACH_M:
-                _note(row, ahead, time, dt, at["detector"], detected_s)
-            place = at["next"]
 
 
 @kernel
@@ -134,17 +166,23 @@ def _note(
 
 
 @kernel
-def _control(roads: RoadArrays, worlds: Worlds, w: int, dt: float) -> None:
+def _control(
+    roads: RoadArrays,
+    tick: int,
+    detected_s: NDArray[np.float64],
+    dt: float,
+    controllers: NDArray[np.void],
+) -> None:
     """Let every actuated program of a world look, as often as is due before the next tick."""
-    now_ms = _milliseconds(worlds.ticks[w] * dt)
-    end_ms = _milliseconds((worlds.ticks[w] + 1) * dt)
+    now_ms = _milliseconds(tick * dt)
+    end_ms = _milliseconds((tick + 1) * dt)
     for program in range(roads.programs.shape[0]):
         controller = roads.programs[program]["controller"]
         if controller >= 0:
-            state = worlds.controllers[w, controller]
+            state = controllers[controller]
             gap_s = roads.programs[program]["detector_gap_s"]
             while state["next_ms"] < end_ms:
-                state["next_ms"] += _look(roads, state, worlds.detected_s[w], gap_s, now_ms)
+                state["next_ms"] += _look(roads, state, detected_s, gap_s, now_ms)
 
 
 @kernel

@@ -23,7 +23,7 @@ from cavmarl.kernels.codes import (
 from cavmarl.kernels.neighbors import LEVEL_HEIGHT_M, Grid, cell_columns, cell_rows
 from cavmarl.kernels.scalars import clamp
 
-__all__ = ["NUM_TERMS", "TTC_HORIZON_S", "write_terms"]
+__all__ = ["NUM_TERMS", "TTC_HORIZON_S", "TTC_REACH_M", "write_terms"]
 
 NUM_TERMS = 10
 TTC_HORIZON_S = 4.0  # times to collision above this do not count

@@ -66,7 +66,7 @@ class Division:
         if len(self._shards) == 1:
             return
         first = self._shards[0].worlds
-        for w in np.flatnonzero(chosen):
+        for w in np.flatnonzero(chosen).tolist():
             everybody = first.rows[w, : first.num_owned[w]].copy()
             for shard in self._shards:
                 worlds = shard.worlds
@@ -80,7 +80,7 @@ class Division:
         """Renew all ghosts from the owned `next_rows`."""
         if len(self._shards) > 1:
             rows = [shard.worlds.next_rows for shard in self._shards]
-            for w in range(rows[0].shape[0]):
+            for w in range(len(rows[0])):
                 self._exchange(w, rows)
 
     def _exchange(self, w: int, rows: Sequence[NDArray[np.void]]) -> None:
@@ -91,7 +91,7 @@ class Division:
             num = int(source.worlds.num_owned[w])
             if publish(self._zones, self._halo, own[w], num, source.zone, self._published) == 0:
                 continue
-            for target in np.flatnonzero(np.diff(start)):
+            for target in np.flatnonzero(np.diff(start)).tolist():
                 begin, end = int(start[target]), int(start[target + 1])
                 held = self._shards[target].worlds.num_rows
                 take_ghosts(own[w], self._published.rows, begin, end, rows[target][w], held[w])
@@ -127,7 +127,7 @@ class Division:
 
     def running(self) -> NDArray[np.int64]:
         """(W,) vehicles of each world."""
-        return np.sum([shard.worlds.num_owned for shard in self._shards], axis=0, dtype=np.int64)
+        return _total([shard.worlds.num_owned for shard in self._shards])
 
     def loads(self) -> ZoneLoads:
         """What each zone holds, and how many vehicles have changed theirs."""
@@ -147,9 +147,13 @@ class Division:
             return first
         rows = np.zeros_like(first.rows)
         running = self.running()
-        for w, num in enumerate(running):
+        for w, num in enumerate(running.tolist()):
             rows[w, :num] = self.vehicles(w)
-        contacts = np.sum([s.worlds.num_contacts for s in self._shards], axis=0, dtype=np.int64)
+        contacts = _total([shard.worlds.num_contacts for shard in self._shards])
         return first._replace(
             rows=rows, next_rows=rows, num_owned=running, num_rows=running, num_contacts=contacts
         )
+
+
+def _total(counts: list[NDArray[np.int64]]) -> NDArray[np.int64]:
+    return np.asarray(np.sum(counts, axis=0), dtype=np.int64)

@@ -29,6 +29,7 @@ from cavmarl.roads.network import RoadNetwork
 from cavmarl.roads.zone_coverage import Coverage, zone_halo
 from cavmarl.roads.zone_layouts import cut_map
 from cavmarl.roads.zones import ZonePartition
+from cavmarl.runtime.commons import Commons
 from cavmarl.runtime.compilation import first_compilation
 from cavmarl.runtime.division import Division, ZoneLoads
 from cavmarl.runtime.executor import Executor, SerialExecutor
@@ -116,6 +117,7 @@ class Simulation:
             capacity = traffic.capacity
             self._traffic = traffic
             self._gate = make_gate(num_worlds, capacity, network.arrays, blank.dtype)
+            self._commons = Commons(config, network, num_worlds)
             self._shards = self._make_shards(partition or _cut(config, network))
             self._shard = self._shards[0]
             self._executor: Executor = SerialExecutor(self._shards)
@@ -127,7 +129,7 @@ class Simulation:
         config, traffic = self.config, self._traffic
         zones, settings = partition.arrays, config.zones
         coverage = Coverage.of(
-            (driving_reach_m(self.network, traffic.travel.types),),
+            (driving_reach_m(self.network, traffic.travel),),
             hysteresis_m=settings.hysteresis_m,
             max_deferred_ticks=settings.max_deferred_ticks,
             max_speed_mps=MAX_SPEED_MPS,
@@ -143,10 +145,11 @@ class Simulation:
                 traffic.travel,
                 self.num_worlds,
                 traffic.capacity,
+                self._commons.outputs,
                 zone,
                 zones,
                 halo,
-                shards[0] if shards else None,
+                shards[0].worlds if shards else None,
             )
             shards.append(shard)
         self._division = Division(shards, zones, halo, settings.hysteresis_m)
@@ -170,7 +173,7 @@ class Simulation:
     @property
     def outputs(self) -> Outputs:
         """What the agents got at the end of the last step; arrays that the next step overwrites."""
-        return self._shard.outputs
+        return self._commons.outputs
 
     @property
     def goal_edges(self) -> NDArray[np.int32]:
@@ -251,21 +254,22 @@ class Simulation:
         self._gate = self._traffic.draw_orders(self._gate, worlds, chosen)
         self._traffic.populate(self._gate, worlds, chosen)
         self._division.distribute(chosen)
-        self._executor.each("switch_signals")
-        self._executor.each("sense", chosen)
+        self._switch_signals()
+        self._sense(chosen)
 
     def step(self, commands: Commands) -> None:
         """One agent step: its ticks, then what the agents sense."""
         self._executor.each("begin_step", commands)
         for _ in range(self.config.clock.ticks_per_step):
             self._tick(commands)
-        self._executor.each("sense", self._everywhere)
+        self._sense(self._everywhere)
 
     def instrument(self, wrap: Callable[[Any], Any]) -> None:
-        """Put `wrap(part)` in the place of executor, division and traffic, to time their calls."""
+        """Put `wrap(part)` in the place of each part that phases are calls of, to time them."""
         self._executor = wrap(self._executor)
         self._division = wrap(self._division)
         self._traffic = wrap(self._traffic)
+        self._commons = wrap(self._commons)
 
     def _tick(self, commands: Commands) -> None:
         """Advance → leave → exchange → resolve → enter → migrate → commit → signals."""
@@ -277,7 +281,21 @@ class Simulation:
         self._division.migrate()
         self._executor.each("commit")
         self._shard.worlds.ticks[:] += 1
-        self._executor.each("switch_signals")
+        self._switch_signals()
+
+    def _switch_signals(self) -> None:
+        """Detect → switch."""
+        self._executor.each("detect")
+        self._commons.switch_signals(self._shard.worlds)
+
+    def _sense(self, chosen: NDArray[np.bool_]) -> None:
+        """Clear → sense → settle → credit."""
+        if self.config.population.agents == 0:
+            return
+        self._commons.clear_outputs(chosen)
+        self._executor.each("sense", chosen)
+        self._commons.settle_outputs(chosen)
+        self._executor.each("credit", chosen)
 
     def _leave(self) -> None:
         """Who needs it picks another goal, who has arrived leaves, who looks for a way finds it."""

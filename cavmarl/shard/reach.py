@@ -5,12 +5,9 @@ Distances are between centres, in the plane. What is measured along a road is at
 
 from __future__ import annotations
 
-import numpy as np
-from numpy.typing import NDArray
-
 from cavmarl.kernels.approach import APPROACH_M
+from cavmarl.kernels.arrays import Travel
 from cavmarl.kernels.junctions import EXIT_LOOK_M
-from cavmarl.kernels.lanes import VIEW_M
 from cavmarl.roads.network import RoadNetwork
 
 __all__ = ["driving_reach_m"]
@@ -18,19 +15,19 @@ __all__ = ["driving_reach_m"]
 ASIDE_M = 10.0  # between the centres of neighbour lanes, and of vehicles beside them
 
 
-def driving_reach_m(network: RoadNetwork, types: NDArray[np.void]) -> float:
+def driving_reach_m(network: RoadNetwork, travel: Travel) -> float:
     """The farthest vehicle that a driver's decision can depend on.
 
-    A driver looks `VIEW_M` ahead and asks at a line in view who comes to the junction beyond it,
+    A driver looks `view_m` ahead and asks at a line in view who comes to the junction beyond it,
     within `APPROACH_M` of the lines there, and who stands behind it, within `EXIT_LOOK_M`.
 
     Args:
         network: the roads.
-        types: VTYPE, the types of vehicles in the world.
+        travel: the types of vehicles, and how far they look.
     """
     links = network.links
     crossing_m = float((links["length_m"]).max()) if len(links) else 0.0
     back_m = float(network.lanes["stop_back_m"].max())
-    bodies_m = 2.0 * float(types["length"].max())
+    bodies_m = 2.0 * float(travel.types["length"].max())
     beyond_m = max(APPROACH_M, EXIT_LOOK_M)
-    return VIEW_M + back_m + crossing_m + beyond_m + bodies_m + ASIDE_M
+    return travel.view_m + back_m + crossing_m + beyond_m + bodies_m + ASIDE_M

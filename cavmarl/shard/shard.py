@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from cavmarl.config import TERMS, EnvConfig
+from cavmarl.config import EnvConfig
 from cavmarl.kernels.admission import admit, propose, rank_lanes
 from cavmarl.kernels.approach import APPROACH
 from cavmarl.kernels.arrays import (
@@ -30,22 +30,23 @@ from cavmarl.kernels.lanes import ENTRY
 from cavmarl.kernels.leaving import drop_ghosts, leave
 from cavmarl.kernels.neighbors import make_grid
 from cavmarl.kernels.observe_further import observe_further
+from cavmarl.kernels.outputs import credit
 from cavmarl.kernels.sense import sense
-from cavmarl.kernels.signals import switch_signals
+from cavmarl.kernels.signals import detect
 from cavmarl.kernels.stacking import fill_stacks
 from cavmarl.kernels.tick import advance, begin_step, resolve, suggest
 from cavmarl.kernels.zones import Halo, ZoneArrays
 from cavmarl.roads.network import RoadNetwork
 from cavmarl.roads.routing import PLAN, lane_grid
 from cavmarl.shard.controllers import CONTROLLER
-from cavmarl.shard.sensors import frame_size, further_arrays, sensor_arrays
+from cavmarl.shard.sensors import further_arrays, sensor_arrays
 from cavmarl.shard.vehicles import VEHICLE
 
 __all__ = ["Commands", "Shard", "make_worlds"]
 
-# What is the world's and not a zone's: shards in one process have the same arrays.
-SHARED = ("ticks", "keys", "signal_phase", "controllers", "detected_s", "pending")
 CELL_M = 25.0  # of the spatial index over vehicles
+# Fields of `Worlds` that the shards of one world have in common.
+COMMON = ("ticks", "keys", "signal_phase", "controllers", "detected_s", "pending")
 SUGGESTED_HORIZON_S = 1.0  # in which a suggested target speed is to be reached
 
 
@@ -72,10 +73,12 @@ class Shard:
         travel: types and ways.
         num_worlds: W.
         capacity: rows a world can hold.
+        outputs: where the agents of all shards get what they sense, each at its own index.
         zone: which one.
         zones: of the partition.
         halo: how far it sees over its borders.
-        of: another shard of the same worlds, with which it shares clock, keys and signals.
+        common: whose clock, keys and signals these worlds share, those of the first shard; None:
+            this is the first one.
     """
 
     def __init__(
@@ -86,10 +89,11 @@ class Shard:
         travel: Travel,
         num_worlds: int,
         capacity: int,
+        outputs: Outputs,
         zone: int,
         zones: ZoneArrays,
         halo: Halo,
-        of: Shard | None = None,
+        common: Worlds | None = None,
     ) -> None:
         self.zone = zone
         self._zones = zones
@@ -103,26 +107,32 @@ class Shard:
         self._further = further_arrays(config.sensors, network, plans)
         self._grid = make_grid(network.extent_m, CELL_M, capacity)
         self.scratch = _make_scratch(len(network.lanes), len(network.links), capacity)
-        self.worlds = make_worlds(
+        self.worlds: Worlds = make_worlds(
             num_worlds,
             capacity,
             network,
             config.population.num_ids,
             config.clock.control_latency_ticks,
+            common,
         )
-        self.outputs = _make_outputs(config, num_worlds)
-        if of is not None:
-            self.outputs = of.outputs
-            self.worlds = self.worlds._replace(
-                **{name: getattr(of.worlds, name) for name in SHARED}
-            )
-        self._weights = np.array([config.terms.weights.get(name, 0.0) for name in TERMS])
+        self.outputs = outputs
         self._target_speeds = np.array(config.action.target_speeds_mps)
         self._discrete = config.action.kind == "discrete"
 
-    def switch_signals(self) -> None:
-        """Bring the signals to the present tick."""
-        switch_signals(self._roads, self.worlds, self._config.clock.sim_dt_s)
+    def detect(self) -> None:
+        """Note when owned bodies were over the detectors of actuated signals."""
+        worlds = self.worlds
+        if worlds.controllers.shape[1] == 0:
+            return
+        detect(
+            self._roads.lane_place,
+            self._roads.places,
+            worlds.rows,
+            worlds.num_owned,
+            worlds.ticks,
+            self._config.clock.sim_dt_s,
+            worlds.detected_s,
+        )
 
     def begin_step(self, commands: Commands) -> None:
         """Open the accounts of a step and take its meta-actions."""
@@ -200,9 +210,7 @@ class Shard:
         self.worlds = worlds._replace(rows=worlds.next_rows, next_rows=worlds.rows)
 
     def sense(self, chosen: NDArray[np.bool_]) -> None:
-        """Write observations, terms and rewards of the chosen worlds' agents into `outputs`."""
-        if self._config.population.agents == 0:
-            return
+        """Write observations and terms of the chosen worlds' owned agents into `outputs`."""
         sense(
             self._roads,
             self._plans,
@@ -210,8 +218,6 @@ class Shard:
             self.worlds,
             self._grid,
             self._sensors,
-            self._weights,
-            self._config.terms.team_share,
             self._config.clock.sim_dt_s,
             self._config.clock.ticks_per_step,
             chosen,
@@ -232,6 +238,10 @@ class Shard:
         if stack > 1:
             ticks_per_step = self._config.clock.ticks_per_step
             fill_stacks(self.worlds, ticks_per_step, stack, chosen, observations)
+
+    def credit(self, chosen: NDArray[np.bool_]) -> None:
+        """Add the step's rewards to the episode's of the chosen worlds' owned agents."""
+        credit(self.worlds.rows, self.worlds.num_owned, self.outputs.rewards, chosen)
 
     def suggest(self, out: NDArray[np.float64]) -> None:
         """Write what the built-in driver would do in the agents' place into `out` (W, A, 2)."""
@@ -255,13 +265,15 @@ def make_worlds(
     network: RoadNetwork,
     num_agents: int = 0,
     latency_ticks: int = 0,
+    common: Worlds | None = None,
 ) -> Worlds:
     """Arrays of W worlds that hold `capacity` vehicles each, all of them empty.
 
-    Agents' commands take effect `latency_ticks` later.
+    Agents' commands take effect `latency_ticks` later. What all zones of a world have in
+    common (ticks, keys, signals and what detectors saw) are the arrays of `common`, if it is given.
     """
     shape = (num_worlds, capacity)
-    return Worlds(
+    worlds = Worlds(
         rows=np.zeros(shape, dtype=VEHICLE),
         next_rows=np.zeros(shape, dtype=VEHICLE),
         num_owned=np.zeros(num_worlds, dtype=np.int64),
@@ -276,6 +288,9 @@ def make_worlds(
         num_touching=np.zeros(num_worlds, dtype=np.int64),
         num_contacts=np.zeros(num_worlds, dtype=np.int64),
     )
+    if common is None:
+        return worlds
+    return worlds._replace(**{name: getattr(common, name) for name in COMMON})
 
 
 def _make_scratch(num_lanes: int, num_links: int, capacity: int) -> Scratch:
@@ -300,20 +315,4 @@ def _make_scratch(num_lanes: int, num_links: int, capacity: int) -> Scratch:
         blinker=integers(capacity),
         hold=integers(capacity),
         hit=np.zeros(capacity, dtype=np.int64),
-    )
-
-
-def _make_outputs(config: EnvConfig, num_worlds: int) -> Outputs:
-    agents = (num_worlds, config.population.num_ids)
-    size = config.sensors.stack * frame_size(config.sensors)
-    return Outputs(
-        # Not `zeros`: NumPy asks for huge pages where it fills the array itself.
-        observations=np.full((*agents, size), 0.0, dtype=np.float32),
-        terms=np.zeros((*agents, len(TERMS)), dtype=np.float32),
-        rewards=np.zeros(agents, dtype=np.float32),
-        terminated=np.zeros(agents, dtype=np.bool_),
-        present=np.zeros(agents, dtype=np.bool_),
-        acted=np.zeros(agents, dtype=np.bool_),
-        events=np.zeros(agents, dtype=np.int32),
-        vehicle_ids=np.full(agents, -1, dtype=np.int64),
     )

@@ -13,7 +13,10 @@ from cavmarl.config import PopulationConfig, TrafficConfig
 from cavmarl.errors import CapacityError, ConfigError, RouteError
 from cavmarl.kernels.admission import accept, assign_lanes
 from cavmarl.kernels.arrays import Demand, Gate, Travel, Worlds
+from cavmarl.kernels.codes import MODEL_KRAUSS
 from cavmarl.kernels.departures import call_orders, populate, settle
+from cavmarl.kernels.drivers import look_ahead_m
+from cavmarl.kernels.lanes import VIEW_M
 from cavmarl.roads.network import VEHICLE_CLASSES, RoadNetwork
 from cavmarl.roads.routing import make_plans
 from cavmarl.traffic.demand import STOP, DemandFile
@@ -26,6 +29,7 @@ from cavmarl.traffic.way_slots import WaySlots, way_slots
 __all__ = ["NativeTraffic"]
 
 PASSENGER = 1 << VEHICLE_CLASSES.index("passenger")
+FAST_FACTOR = 1.5  # a speed over the limit that hardly any driver of the demand wants
 MIN_ORIGIN_M = 15.0  # lanes shorter than this are no place to start
 JAM_GAP_M = 2.5  # between the bumpers of vehicles that stand in a queue
 MIN_GOAL_M = 10.0  # nor to arrive
@@ -95,13 +99,30 @@ class NativeTraffic:
         """Types and ways of all vehicles: the generator's first, then the demand file's."""
         types, steps = generated_types(), self.plans.reshape(-1)
         if self.file is None or self.schedule is None:
-            return Travel(types, steps, np.zeros(0, dtype=STOP), first_detour=0, begin_s=0.0)
+            return Travel(types, steps, np.zeros(0, dtype=STOP), 0, 0.0, VIEW_M)
         types = np.concatenate([types, self.file.types])
         steps = np.concatenate([steps, self.schedule.steps])
         if self._slots is not None:
             steps = np.concatenate([steps, self._slots.table()])
         first_detour = self.plans.size + self.schedule.first_detour
-        return Travel(types, steps, self.file.stops, first_detour, self.file.begin_ms / 1000.0)
+        begin_s = self.file.begin_ms / 1000.0
+        return Travel(types, steps, self.file.stops, first_detour, begin_s, self._view_m)
+
+    @property
+    def _view_m(self) -> float:
+        """How far anybody looks along the road: as fast drivers have to, where all brake as SUMO's.
+
+        IDM reacts to whatever is ahead, and agents may drive as fast as they like.
+        """
+        if self.file is None or self.population.agents + self.population.background > 0:
+            return VIEW_M
+        fast_mps = FAST_FACTOR * float(self.network.lanes["speed_mps"].max())
+        return max(
+            VIEW_M
+            if kind["model"] != MODEL_KRAUSS
+            else float(look_ahead_m(kind, min(fast_mps, float(kind["max_speed"]))))
+            for kind in self.file.types
+        )
 
     @cached_property
     def _slots(self) -> WaySlots | None:

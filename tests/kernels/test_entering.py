@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -9,10 +10,17 @@ import pytest
 from numpy.typing import NDArray
 
 from cavmarl.kernels import codes
-from cavmarl.kernels.arrays import Scratch
-from cavmarl.kernels.entering import entry_lane, entry_place, entry_speed, follower_brakes, speed_at
+from cavmarl.kernels.arrays import Scratch, Travel
+from cavmarl.kernels.entering import (
+    crowd,
+    entry_lane,
+    entry_place,
+    entry_speed,
+    follower_brakes,
+    speed_at,
+)
 from cavmarl.kernels.following import speed_behind
-from cavmarl.kernels.lanes import index_lanes
+from cavmarl.kernels.lanes import VIEW_M, index_lanes
 from cavmarl.kernels.rng import world_key
 from cavmarl.roads.routing import make_plans
 from cavmarl.traffic.departures import DEPARTURE
@@ -52,24 +60,34 @@ def traffic(*places: tuple[int, float, float]) -> tuple[NDArray[np.void], Scratc
     return cars, room
 
 
-def lane_of(code: int, room: Scratch, lane: int = WEAVE[0], vehicle: int = 50) -> int:
+def lane_of(
+    code: int,
+    room: Scratch,
+    lane: int = WEAVE[0],
+    vehicle: int = 50,
+    *,
+    taken: Sequence[int] = (),
+    travel: Travel = TRAVEL,
+) -> int:
     waiting = departure(lane, lane_code=code, id=vehicle)
-    return entry_lane(ROADS.arrays, TRAVEL, KEY, waiting, room)
+    edge = ROADS.edges[ROADS.lanes["edge"][lane]]
+    lanes = range(int(edge["first_lane"]), int(edge["first_lane"] + edge["num_lanes"]))
+    ranks = np.array([crowd(room, each, 0.0, VIEW_M) for each in lanes])
+    flags = np.isin(np.arange(len(ROADS.lanes)), taken)
+    return entry_lane(ROADS.arrays, travel, KEY, waiting, ranks, flags)
 
 
 def test_a_given_lane_is_taken_once_a_tick() -> None:
     _, room = traffic()
     for lane in WEAVE:
         assert lane_of(codes.LANE_GIVEN, room, lane) == lane
-    room.lane_taken[WEAVE[1]] = True
-    assert lane_of(codes.LANE_GIVEN, room, WEAVE[1]) == -1
+    assert lane_of(codes.LANE_GIVEN, room, WEAVE[1], taken=[WEAVE[1]]) == -1
 
 
 def test_first_is_the_rightmost_lane_that_leads_on() -> None:
     _, room = traffic()
     assert lane_of(codes.LANE_FIRST, room, WEAVE[2]) == WEAVE[0]
-    room.lane_taken[WEAVE[0]] = True
-    assert lane_of(codes.LANE_FIRST, room, WEAVE[2]) == -1
+    assert lane_of(codes.LANE_FIRST, room, WEAVE[2], taken=[WEAVE[0]]) == -1
 
 
 def test_random_takes_each_lane_as_often_and_the_same_again() -> None:
@@ -78,8 +96,7 @@ def test_random_takes_each_lane_as_often_and_the_same_again() -> None:
     assert picked == [lane_of(codes.LANE_RANDOM, room, vehicle=k) for k in range(600)]
     for lane in WEAVE:
         assert 150 < picked.count(lane) < 250
-    room.lane_taken[WEAVE[2]] = True
-    again = [lane_of(codes.LANE_RANDOM, room, vehicle=k) for k in range(600)]
+    again = [lane_of(codes.LANE_RANDOM, room, vehicle=k, taken=[WEAVE[2]]) for k in range(600)]
     assert again == [-1 if lane == WEAVE[2] else lane for lane in picked]
 
 
@@ -89,28 +106,26 @@ def test_free_is_the_emptiest_lane_and_the_right_one_of_two(code: int) -> None:
     assert lane_of(code, room) == WEAVE[2]
     _, room = traffic((WEAVE[0], 20.0, 5.0))
     assert lane_of(code, room) == WEAVE[1]
-    room.lane_taken[WEAVE[1]] = True
-    assert lane_of(code, room) == WEAVE[2]
+    assert lane_of(code, room, taken=[WEAVE[1]]) == WEAVE[2]
 
 
 def test_best_is_the_emptiest_of_the_lanes_that_need_no_change() -> None:
     assert PLAN[0][WEAVE[0]]["changes"] > 0
     _, room = traffic((WEAVE[1], 20.0, 5.0))
     assert lane_of(codes.LANE_BEST, room) == WEAVE[2]
-    room.lane_taken[WEAVE[1:]] = True
-    assert lane_of(codes.LANE_BEST, room) == WEAVE[0], "rather that one than none"
+    taken = WEAVE[1:]
+    assert lane_of(codes.LANE_BEST, room, taken=taken) == WEAVE[0], "rather that one than none"
 
 
 def test_no_lane_that_leads_nowhere_is_taken() -> None:
     nowhere = travel_by(make_plans(ROADS, [ROADS.edge_ids.index("ramp")]))
     _, room = traffic()
     for code in (codes.LANE_FIRST, codes.LANE_RANDOM, codes.LANE_FREE, codes.LANE_BEST):
-        waiting = departure(WEAVE[0], lane_code=code)
-        assert entry_lane(ROADS.arrays, nowhere, KEY, waiting, room) == -1
+        assert lane_of(code, room, travel=nowhere) == -1
 
 
 def place(room: Scratch, tick: int = 0, **fields: Any) -> float:
-    return entry_place(ROADS.arrays, KEY, departure(**fields), KIND, MAIN[0], tick, room)
+    return entry_place(ROADS.arrays, KEY, departure(**fields), KIND, MAIN[0], tick, room, VIEW_M)
 
 
 def test_given_places_are_of_the_front_bumper_from_either_end() -> None:

@@ -76,15 +76,17 @@ def test_neighbours_equal_twin(case: tuple[str, NDArray[np.void]], reach_m: floa
     room = indexed(name, rows)
     for i, lane, s in looked_for(roads, rows):
         own_id = rows[i]["id"]
-        assert seen(room, ahead_on(room, lane, s, own_id)) == naive.ahead(roads, rows, i, lane, s)
-        found, distance = neighbor_behind(roads.arrays, room, lane, s, own_id, reach_m)
+        assert seen(room, ahead_on(room, lane, s, own_id, VIEW_M)) == naive.ahead(
+            roads, rows, i, lane, s
+        )
+        found, distance = neighbor_behind(roads.arrays, room, lane, s, own_id, reach_m, VIEW_M)
         expected, true_distance = naive.behind(roads, rows, i, lane, s, reach_m)
         assert seen(room, found)[0] == expected
         assert distance == pytest.approx(true_distance)
         others = [(j, at) for at, _, j in naive.on_lane(roads, rows, lane) if j != i]
         for way in (0.0, 120.0):
             last = others[0] if others and way + others[0][1] <= VIEW_M else (-1, np.inf)
-            assert seen(room, last_on(room, lane, own_id, way)) == last
+            assert seen(room, last_on(room, lane, own_id, way, VIEW_M)) == last
         before = [
             j for at, k, j in naive.on_lane(roads, rows, lane) if j != i and (at, k) <= (s, own_id)
         ]
@@ -107,24 +109,29 @@ def test_the_order_of_rows_does_not_matter(
     np.testing.assert_array_equal(tidy.entries[fields][:listed], room.entries[fields][:listed])
     for i, lane, s in looked_for(roads, rows):
         own_id = rows[i]["id"]
-        assert ahead_on(tidy, lane, s, own_id) == ahead_on(room, lane, s, own_id)
-        assert neighbor_behind(roads.arrays, tidy, lane, s, own_id, 60.0) == neighbor_behind(
-            roads.arrays, room, lane, s, own_id, 60.0
+        assert ahead_on(tidy, lane, s, own_id, VIEW_M) == ahead_on(room, lane, s, own_id, VIEW_M)
+        one, other = (
+            neighbor_behind(roads.arrays, index, lane, s, own_id, 60.0, VIEW_M)
+            for index in (tidy, room)
         )
+        assert one == other
 
 
 def test_nobody_sees_further_than_the_view() -> None:
     roads = network("ring")
     lane = int(np.argmax(roads.lanes["length_m"]))
-    assert roads.lanes[lane]["length_m"] > VIEW_M + 1.0
+    view_m = 40.0
     rows = np.zeros(2, VEHICLE)
     rows["id"], rows["side_lane"], rows["lane"] = [0, 1], -1, lane
-    for apart, sees in ((VIEW_M, True), (VIEW_M + 0.5, False)):
+    for apart, sees in ((view_m, True), (view_m + 0.5, False)):
         rows["s"] = [0.0, apart]
         room = indexed("ring", rows)
-        assert (ahead_on(room, lane, 0.0, 0) >= 0) == sees
-        assert (neighbor_behind(roads.arrays, room, lane, apart, 1, 60.0)[0] >= 0) == sees
-        assert (last_on(room, lane, 9, VIEW_M - apart) >= 0) == (apart <= VIEW_M)
+        assert (ahead_on(room, lane, 0.0, 0, view_m) >= 0) == sees
+        behind, _ = neighbor_behind(roads.arrays, room, lane, apart, 1, 60.0, view_m)
+        assert (behind >= 0) == sees
+        rows["s"] = [apart - 15.0, 50.0]
+        room = indexed("ring", rows)
+        assert (last_on(room, lane, 9, 15.0, view_m) >= 0) == sees
 
 
 def test_of_two_at_one_place_the_larger_id_leads() -> None:
@@ -132,9 +139,9 @@ def test_of_two_at_one_place_the_larger_id_leads() -> None:
     rows = np.zeros(2, VEHICLE)
     rows["id"], rows["side_lane"], rows["s"] = [7, 3], -1, 10.0
     room = indexed("ring", rows)
-    assert seen(room, ahead_on(room, 0, 10.0, 3)) == (0, 10.0)
-    assert ahead_on(room, 0, 10.0, 7) == -1
-    k, distance = neighbor_behind(roads.arrays, room, 0, 10.0, 7, 60.0)
+    assert seen(room, ahead_on(room, 0, 10.0, 3, VIEW_M)) == (0, 10.0)
+    assert ahead_on(room, 0, 10.0, 7, VIEW_M) == -1
+    k, distance = neighbor_behind(roads.arrays, room, 0, 10.0, 7, 60.0, VIEW_M)
     assert (seen(room, k)[0], distance) == (1, 0.0)
 
 

@@ -35,7 +35,14 @@ def watch(
     for tick in range(len(shown)):
         worlds.ticks[:] = tick
         worlds.detected_s[random.random(worlds.detected_s.shape) < busy] = tick * DT
-        switch_signals(roads.arrays, worlds, DT)
+        switch_signals(
+            roads.arrays,
+            worlds.ticks,
+            worlds.detected_s,
+            DT,
+            worlds.controllers,
+            worlds.signal_phase,
+        )
         phase, controllers = worlds.signal_phase[0], worlds.controllers[0]
         for k, link in enumerate(links):
             shown[tick, k] = link_signal(roads.arrays, link, phase)

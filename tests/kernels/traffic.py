@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from cavmarl.kernels.arrays import Scratch, Travel
+from cavmarl.kernels.lanes import VIEW_M
 from cavmarl.kernels.motion import place_on_lane
 from cavmarl.registry import load_config, resolve_map
 from cavmarl.roads.cache import load_network
@@ -49,6 +50,7 @@ def travel_by(
         np.zeros(0, STOP) if stops is None else stops,
         first_detour=0,
         begin_s=0.0,
+        view_m=VIEW_M,
     )
 
 

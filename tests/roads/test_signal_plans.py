@@ -51,7 +51,14 @@ def states(network: RoadNetwork, times: list[int]) -> list[str]:
     shown = []
     for time in times:
         worlds.ticks[0] = time
-        switch_signals(network.arrays, worlds, 1.0)
+        switch_signals(
+            network.arrays,
+            worlds.ticks,
+            worlds.detected_s,
+            1.0,
+            worlds.controllers,
+            worlds.signal_phase,
+        )
         first = network.phases[worlds.signal_phase[0, 0]]["first_state"]
         codes = network.phase_states[first : first + 3]
         shown.append("".join(SIGNAL_STATES[code] for code in codes))

@@ -12,10 +12,11 @@ import numpy as np
 import pytest
 
 from cavmarl.kernels.arrays import Worlds
-from cavmarl.kernels.signals import switch_signals
+from cavmarl.kernels.signals import detect, switch_signals
 from cavmarl.roads.network import RoadNetwork
 from cavmarl.roads.reader import read_network
 from cavmarl.shard.shard import make_worlds
+from tests.actuated import actuated_grid
 from tests.driving import idle, make_traffic, start
 
 # Runs in a child process: a process holds one libsumo at most.
@@ -43,25 +44,10 @@ print(json.dumps({
 """
 
 
-def sumo_tool(*arguments: object) -> None:
-    import sumo
-
-    name, *rest = map(str, arguments)
-    subprocess.run([Path(sumo.SUMO_HOME) / "bin" / name, *rest], check=True, capture_output=True)
-
-
 @pytest.fixture(scope="module")
 def grid(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Four crossings with actuated signals and short roads, each of two lanes."""
     pytest.importorskip("libsumo")
-    path = tmp_path_factory.mktemp("grid") / "grid.net.xml"
-    sumo_tool(
-        *("netgenerate", "--grid", "--grid.number", 2, "--grid.length", 120),
-        *("--grid.attach-length", 100, "--default-junction-type", "traffic_light"),
-        *("--tls.default-type", "actuated", "--default.lanenumber", 2, "--no-turnarounds"),
-        *("--xml-validation", "never", "-o", path),
-    )
-    return path
+    return actuated_grid(tmp_path_factory.mktemp("grid"))
 
 
 def demand(path: Path, headway_s: float) -> Path:
@@ -96,6 +82,20 @@ def place(
     worlds.num_owned[0] = len(vehicles)
 
 
+def look_and_switch(network: RoadNetwork, worlds: Worlds, step_s: float) -> None:
+    """Look at the detectors, then switch."""
+    places = network.arrays.lane_place, network.arrays.places
+    detect(*places, worlds.rows, worlds.num_owned, worlds.ticks, step_s, worlds.detected_s)
+    switch_signals(
+        network.arrays,
+        worlds.ticks,
+        worlds.detected_s,
+        step_s,
+        worlds.controllers,
+        worlds.signal_phase,
+    )
+
+
 def shown(network: RoadNetwork, worlds: Worlds, world: int = 0) -> dict[str, str]:
     states = {}
     for name, signal, phase in zip(
@@ -118,7 +118,7 @@ def test_same_vehicles_make_the_signals_switch_at_sumos_ticks(
     seen = set()
     for tick, sumo_tick in enumerate(theirs["ticks"]):
         worlds.ticks[0] = tick
-        switch_signals(network.arrays, worlds, step_s)
+        look_and_switch(network, worlds, step_s)
         # What SUMO shows after a step is what ruled in it.
         assert shown(network, worlds) == sumo_tick["states"], f"at {tick * step_s} s"
         seen.add(tuple(sumo_tick["states"].values()))
@@ -148,9 +148,9 @@ def test_order_of_rows_and_other_worlds_change_nothing(grid: Path) -> None:
         many.rows[1] = rows[rng.permutation(40)]
         one.num_owned[:], many.num_owned[1] = 40, 40
         one.ticks[:], many.ticks[:] = tick, tick
-        switch_signals(network.arrays, one, 0.5)
-        switch_signals(network.arrays, many, 0.5)
-        switch_signals(network.arrays, many, 0.5)
+        look_and_switch(network, one, 0.5)
+        look_and_switch(network, many, 0.5)
+        look_and_switch(network, many, 0.5)
         for name in ("signal_phase", "controllers", "detected_s"):
             assert getattr(one, name)[0].tobytes() == getattr(many, name)[1].tobytes()
     assert shown(network, many, 0) != shown(network, many, 1), "the empty world switches otherwise"

@@ -143,9 +143,7 @@ def test_who_cannot_change_lanes_for_long_goes_on_another_way(world: World) -> N
         row["wait_s"] = waited
         worlds = simulation._shard.worlds
         worlds.next_rows[0, 0] = row
-        simulation._traffic.arrive_and_depart(
-            simulation._gate, worlds, simulation._shard.scratch, DT
-        )
+        simulation._leave()
         assert simulation.traffic_stats().rerouted == times
         worlds.rows[0, 0] = worlds.next_rows[0, 0]
     row = simulation.vehicles()[0]

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from cavmarl.config import SensorsConfig
 from cavmarl.kernels.arrays import Sensors
 from cavmarl.kernels.sensor_arrays import FurtherSensors
+from cavmarl.kernels.terms import TTC_REACH_M
 from cavmarl.roads.network import RoadNetwork
 from cavmarl.shard.sensors import (
     ego,
@@ -35,8 +36,9 @@ __all__ = [
     "Sensor",
     "frame_size",
     "further_arrays",
+    "largest_radius_m",
     "layout",
-    "reach_m",
+    "sensing_reach_m",
     "sensor_arrays",
 ]
 
@@ -47,7 +49,7 @@ SENSORS: tuple[Sensor, ...] = (
     Sensor("neighbors", neighbors.features, neighbors.reach_m),
     Sensor("signal", signal.features, signal.reach_m),
     Sensor("lanes", lanes.features, lanes.reach_m),
-    Sensor("lidar", lidar.features, lidar.reach_m),
+    Sensor("lidar", lidar.features, lidar.reach_m, sees_bodies=True),
     Sensor("kinematics", kinematics.features, kinematics.reach_m, kinematics.shape),
     Sensor(
         "occupancy_grid",
@@ -92,9 +94,29 @@ def frame_size(config: SensorsConfig) -> int:
     return sum(place.stop - place.start for place in layout(config).values())
 
 
-def reach_m(config: SensorsConfig) -> float:
-    """How far the sensors of an agent look, in m."""
-    return max(sensor.reach_m(config) for sensor in SENSORS)
+def largest_radius_m(types: NDArray[np.void]) -> float:
+    """Half the diagonal of the largest body, in m: no part of one is further from its centre.
+
+    Args:
+        types: VTYPE (num_types,), `Travel.types`: those of agents and of all others.
+    """
+    return 0.5 * float(np.hypot(types["length"], types["width"]).max())
+
+
+def sensing_reach_m(config: SensorsConfig, largest_radius_m: float) -> float:
+    """How far from an agent's centre the centre of a vehicle can be that it can tell, in m.
+
+    Whoever is further away changes no number of an observation and no term. Sensors that ask for
+    centres reach as far as they look, `lanes` too: it takes none that is further away in the plane.
+    Rays end at bodies, whose centres are up to half a diagonal behind. Of the terms, time to
+    collision alone looks at others; it is always on.
+
+    Args:
+        config: the sensors.
+        largest_radius_m: half the diagonal of the largest body.
+    """
+    reaches = (sensor.reach_of_centres_m(config, largest_radius_m) for sensor in SENSORS)
+    return max(TTC_REACH_M, *reaches)
 
 
 def _starts(config: SensorsConfig) -> dict[str, int]:

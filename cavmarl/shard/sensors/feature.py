@@ -47,9 +47,10 @@ class Sensor:
     Attributes:
         name: its key.
         features: its features in order; none where it is switched off.
-        reach_m: how far it looks, in m.
+        reach_m: how far it looks for others, in m.
         shape: of its part of a Dict observation; -1 stands for all features.
         dtype: of that part.
+        sees_bodies: whether it looks that far for any part of a body, and not for its centre.
     """
 
     name: str
@@ -57,3 +58,14 @@ class Sensor:
     reach_m: Callable[[SensorsConfig], float]
     shape: Callable[[SensorsConfig], tuple[int, ...]] = _flat
     dtype: Callable[[SensorsConfig], DTypeLike] = _float32
+    sees_bodies: bool = False
+
+    def reach_of_centres_m(self, config: SensorsConfig, largest_radius_m: float) -> float:
+        """How far away the centre of a vehicle can be that the sensor can tell, in m.
+
+        Args:
+            config: the sensors.
+            largest_radius_m: half the diagonal of the largest body.
+        """
+        reach_m = self.reach_m(config)
+        return reach_m + largest_radius_m if reach_m > 0.0 and self.sees_bodies else reach_m

@@ -39,5 +39,5 @@ def features(config: SensorsConfig) -> list[Feature]:
 
 
 def reach_m(config: SensorsConfig) -> float:
-    """Its range, along lanes and so in the plane too."""
+    """Its range, of gaps along lanes and of centres in the plane."""
     return config.lanes.range_m

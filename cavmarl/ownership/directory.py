@@ -1,0 +1,318 @@
+"""The coordinator's side of the protocol: who owns which vehicle, and what becomes of it next.
+
+Each method answers with an `Output`: records to append to the log, then messages to send. What a
+record changes is done by `Table.apply` and nowhere else, so a coordinator that replays its log
+(`restore`) decides nothing anew.
+
+A tick costs what changes in it: vehicles that stay where they are are never looked at.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterable, Mapping, Sequence
+
+from cavmarl.errors import JournalError, ProtocolError, StoreError, ZoneStepError
+from cavmarl.ownership.decisions import CommittedStates, Decisions
+from cavmarl.ownership.leases import make_step
+from cavmarl.ownership.ledger import world_digest
+from cavmarl.ownership.limits import DeadlinePolicy, Limits
+from cavmarl.ownership.messages import (
+    Ack,
+    Begin,
+    Birth,
+    Commit,
+    Done,
+    Fence,
+    Host,
+    Message,
+    Nack,
+    Need,
+    Output,
+    Record,
+    Refusal,
+    Reset,
+    Step,
+    ZoneLedger,
+)
+from cavmarl.ownership.planning import all_removed, check_done
+from cavmarl.ownership.reactions import Hosting
+from cavmarl.ownership.readiness import Readiness
+from cavmarl.ownership.safeguards import ALL_ON, Safeguards
+from cavmarl.ownership.table import Table
+from cavmarl.ownership.transitions import State
+
+SILENCE = Output()
+
+
+class Directory:
+    """Decides who owns what in the next tick, and sees it done.
+
+    Attributes:
+        table: owners, hosts and the tick in progress, as the log has them.
+        dones: zone → its DONE for the tick in progress.
+        readiness: what targets have acknowledged.
+        dropped: (kind, reason) → messages or entries that did not count.
+        refusals: reason → how often a target did not hold a state.
+    """
+
+    def __init__(
+        self,
+        run: bytes,
+        zones: Iterable[int],
+        store: CommittedStates,
+        limits: Limits | None = None,
+        safeguards: Safeguards = ALL_ON,
+    ) -> None:
+        self.run = run
+        self.table = Table(zones, safeguards)
+        self.dones: dict[int, Done] = {}
+        self.readiness = Readiness(safeguards)
+        self.dropped: Counter[tuple[str, str]] = Counter()
+        self.refusals: Counter[Refusal] = Counter()
+        self._payloads: Mapping[int, bytes] = {}
+        self._store = store
+        self._limits = Limits() if limits is None else limits
+        self._safeguards = safeguards
+        self._decisions = Decisions(self.readiness, store, self._limits, safeguards)
+
+    @classmethod
+    def restore(
+        cls,
+        records: Sequence[Record],
+        zones: Iterable[int],
+        store: CommittedStates,
+        limits: Limits | None = None,
+        safeguards: Safeguards = ALL_ON,
+    ) -> Directory:
+        """The coordinator that wrote these records. Send what `resend` says before all else.
+
+        Raises:
+            JournalError: the log does not begin with a RESET, or cannot have been written so.
+        """
+        if not records or not isinstance(records[0], Reset):
+            raise JournalError("a log begins with a RESET, which names the run")
+        directory = cls(records[0].run, zones, store, limits, safeguards)
+        for record in records:
+            directory.table.apply(record)
+        return directory
+
+    # Episodes and hosts
+
+    def reset(self) -> Output:
+        """Begin an episode, the first one or another. Whatever is under way is void."""
+        table = self.table
+        tick = table.tick if table.plan is None else table.plan.record.tick
+        episode = table.episode + 1
+        self.dones = {}
+        if not self._safeguards.tick_never_resets:
+            tick, episode = 0, 0
+        return self._logged(Reset(episode, tick, self.run))
+
+    def host(self, zone: int, worker: int) -> Output:
+        """Give a zone to a new process of `worker`, which has to be loaded with `hosting(zone)`.
+
+        In the middle of a tick the zone has to be fenced first; its STEP is sent again.
+
+        Raises:
+            ZoneStepError: this tick has had as many hosts of the zone as are allowed.
+            ProtocolError: the zone is hosted and a tick is in progress.
+        """
+        table = self.table
+        if table.plan is not None:
+            if table.states[zone] is State.HOSTED:
+                raise ProtocolError(f"zone {zone} moves in the middle of a tick: fence it first")
+            if table.repeats[zone] >= self._limits.repeats and self._safeguards.repeat_limit:
+                raise ZoneStepError(zone, table.plan.record.tick, table.repeats[zone] + 1)
+        incarnation = table.hosts[zone][1] + 1
+        output = self._logged(Host(table.episode, table.tick, zone, incarnation, worker))
+        return Output(output.records, self.resend((zone,)).messages)
+
+    def fence(self, zone: int) -> Output:
+        """The zone's process is dead to us; whatever it still says is dropped. Once is enough."""
+        if self.table.states[zone] is State.FENCED:
+            return SILENCE
+        self.dones.pop(zone, None)
+        incarnation = self.table.hosts[zone][1]
+        return self._logged(Fence(self.table.episode, self.table.tick, zone, incarnation))
+
+    def hosting(self, zone: int) -> Hosting:
+        """What the zone's present host has to be loaded with. Looks at every vehicle."""
+        table = self.table
+        owned = {vehicle: at[1] for vehicle, at in table.owners.items() if at[0] == zone}
+        return Hosting(
+            self.run, table.episode, table.tick, zone, table.hosts[zone][1], owned
+        )  # fmt: skip
+
+    # A tick
+
+    def begin(
+        self,
+        movers: Iterable[tuple[int, int]],
+        births: Iterable[Birth] = (),
+        inputs: bytes = b"",
+        payloads: Mapping[int, bytes] | None = None,
+    ) -> Output:
+        """Decide the way to the next tick: BEGIN, then a STEP for every zone.
+
+        Args:
+            movers: (vehicle, zone that contains it) for the vehicles outside their owner's zone
+                by more than the hysteresis, and for no others.
+            births: new vehicles.
+            inputs: digest of the actions.
+            payloads: zone → what rides with its STEP.
+
+        Raises:
+            ProtocolError: the tick before is not committed, or a mover is unknown.
+            SpawnError: an id that the episode has seen, or a zone that is none.
+        """
+        table = self.table
+        if table.plan is not None:
+            raise ProtocolError(f"tick {table.plan.record.tick} is not committed")
+        new = tuple(sorted(births))
+        self._decisions.check_births(table, new)
+        switches, deferred = self._decisions.switches(table, movers)
+        begun = self._logged(Begin(table.episode, table.tick + 1, switches, deferred, new, inputs))
+        records = begun.records if self._safeguards.log_before_send else ()
+        return Output(records, self.resend(payloads=payloads or {}).messages)
+
+    def resend(
+        self, zones: Iterable[int] | None = None, payloads: Mapping[int, bytes] | None = None
+    ) -> Output:
+        """The STEPs once more, of zones that have not answered.
+
+        Args:
+            zones: only these.
+            payloads: as in `begin`, whose payloads are kept; needed after `restore`.
+        """
+        if payloads is not None:
+            self._payloads = payloads
+        asked = self.waiting_for() if zones is None else tuple(zones)
+        if self.table.plan is None:
+            return SILENCE
+        return Output(
+            messages=tuple(
+                self._step(zone) for zone in asked if self.table.states[zone] is State.HOSTED
+            )
+        )
+
+    def waiting_for(self) -> tuple[int, ...]:
+        """Zones without a DONE for the tick in progress."""
+        if self.table.plan is None:
+            return ()
+        return tuple(zone for zone in self.table.hosts if zone not in self.dones)
+
+    def overdue(self) -> tuple[int, ...]:
+        """Vehicles that the policy HOLD or REROUTE asks the runtime to act upon in this tick."""
+        acts = self._limits.policy in (DeadlinePolicy.HOLD, DeadlinePolicy.REROUTE)
+        if self.table.plan is None or not acts:
+            return ()
+        deferred, bound = self.table.plan.record.deferred, self._limits.deferral
+        return tuple(vehicle for vehicle, ticks in deferred if ticks > bound)
+
+    def commit(self, rows: Mapping[int, int]) -> Output:
+        """Make the tick in progress the truth: every zone is done, and the ledger is exact.
+
+        Args:
+            rows: zone → digest of the rows that the store holds for the tick.
+
+        Raises:
+            ProtocolError: a zone has not answered.
+            LedgerError: a vehicle was lost or doubled.
+            StoreError: the store holds other rows than a zone told of. Fence and host it anew.
+        """
+        table = self.table
+        if table.plan is None or self.waiting_for():
+            raise ProtocolError(f"nothing to commit: zones {list(self.waiting_for())} are at work")
+        self._check_dones(rows)
+        dones = [self.dones[zone] for zone in table.hosts]
+        zones = tuple(
+            ZoneLedger(done.zone, done.incarnation, done.owned, done.rows) for done in dones
+        )
+        begin, world = table.plan.record, world_digest(done.rows for done in dones)
+        output = self._logged(Commit(begin.episode, begin.tick, all_removed(dones), zones, world))
+        self.dones = {}
+        self.readiness.forget(table.tick)
+        if self._safeguards.log_before_send:
+            return output
+        return Output((begin, *output.records))
+
+    def on_message(self, message: Message) -> Output:
+        """Take a message in. One that comes late or from elsewhere is dropped and counted."""
+        reason = self._misfit(message)
+        if reason is not None:
+            self.dropped[type(message).__name__, reason] += 1
+            return SILENCE
+        match message:
+            case Done():
+                self.dones[message.zone] = message
+            case Ack():
+                self._on_ack(message)
+            case Nack():
+                self.refusals.update(entry.reason for entry in message.entries)
+            case Need():
+                return self._on_need(message)
+        return SILENCE
+
+    # Inside
+
+    def _misfit(self, message: Message) -> str | None:
+        guards, table = self._safeguards, self.table
+        if message.run != self.run and guards.run_fence:
+            return "run"
+        if message.episode != table.episode and guards.tick_never_resets:
+            return "episode"
+        if not isinstance(message, Done | Ack | Nack | Need):
+            return "kind"
+        if message.zone not in table.hosts:
+            return "zone"
+        checked = guards.done_incarnation if isinstance(message, Done) else guards.ack_incarnation
+        if checked and not table.alive(message.zone, message.incarnation):
+            return "incarnation"
+        current = table.plan is not None and message.tick == table.tick + 1
+        if isinstance(message, Ack | Nack):
+            fresh = current or message.tick == table.tick or not guards.ack_freshness
+            return None if fresh else "tick"
+        if isinstance(message, Done):
+            if message.zone in self.dones:
+                return "answered"
+            current = current or not guards.done_tick
+        return None if current else "tick"
+
+    def _on_ack(self, ack: Ack) -> None:
+        births = {} if self.table.plan is None else self.table.plan.births
+        for vehicle, epoch, digest in ack.entries:
+            if vehicle in self.table.owners or vehicle in births:
+                self.readiness.note(ack, vehicle, epoch, digest)
+            else:
+                self.dropped["Ack", "unknown"] += 1
+
+    def _on_need(self, need: Need) -> Output:
+        if not self._safeguards.reattach:
+            return SILENCE
+        plan = self.table.planned
+        for vehicle in need.vehicles:
+            switch = plan.switches.get(vehicle)
+            if switch is not None and switch.target == need.zone:
+                plan.attach.add(vehicle)
+            else:
+                self.dropped["Need", "unknown"] += 1
+        return self.resend((need.zone,))
+
+    def _check_dones(self, rows: Mapping[int, int]) -> None:
+        if self._safeguards.digest_before_commit:
+            wrong = tuple(zone for zone, done in self.dones.items() if rows.get(zone) != done.rows)
+            for zone in wrong:
+                del self.dones[zone]
+            if wrong:
+                raise StoreError(tuple(sorted(wrong)))
+        if self._safeguards.ledger:
+            for done in self.dones.values():
+                check_done(self.run, self.table.planned, done, self.table.owners)
+
+    def _step(self, zone: int) -> Step:
+        return make_step(self.table, zone, self._store, self._payloads.get(zone, b""))
+
+    def _logged(self, record: Record) -> Output:
+        self.table.apply(record)
+        return Output((record,))

@@ -1,0 +1,278 @@
+"""A zone host's side of the protocol.
+
+The host may advance its vehicles while it has a lease, and a STEP is a lease for one tick:
+`on_message` answers it with an `Advance` for the shard to carry out, `complete` ends it with DONE,
+and `offer` then tells neighbours who comes near. Everything in here is volatile: a host that dies
+is loaded anew from the committed store.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterable, Sequence
+
+from cavmarl.errors import ProtocolError
+from cavmarl.ownership.ledger import Tally, tally
+from cavmarl.ownership.limits import Limits
+from cavmarl.ownership.messages import (
+    Abort,
+    Ack,
+    Confirmed,
+    Done,
+    Held,
+    Message,
+    Nack,
+    Need,
+    Offer,
+    Prepare,
+    Refusal,
+    Refused,
+    Removed,
+    Step,
+)
+from cavmarl.ownership.offers import Approach, Offers
+from cavmarl.ownership.reactions import Advance, Hosting, Reaction
+from cavmarl.ownership.replicas import Replicas
+from cavmarl.ownership.safeguards import ALL_ON, Safeguards
+from cavmarl.ownership.transitions import Event, Party, State, after
+
+NOTHING = Reaction()
+
+
+class Endpoint:
+    """The host of one zone.
+
+    Attributes:
+        tick: the tick that the rows are at.
+        lease: the tick that the rows may be advanced to now, or None.
+        owned: vehicle → epoch.
+        retained: vehicle → epoch of rows that wait for the commit of their switch.
+        replicas: states of vehicles that may come.
+        offers: states that neighbours were offered.
+        dropped: (kind, reason) → messages or entries that did not count.
+    """
+
+    def __init__(self, hosting: Hosting, limits: Limits, safeguards: Safeguards = ALL_ON) -> None:
+        self.run, self.episode = hosting.run, hosting.episode
+        self.zone, self.incarnation = hosting.zone, hosting.incarnation
+        self.tick = hosting.tick
+        self.lease: int | None = None
+        self.owned = dict(hosting.owned)
+        self.tally = tally(self.run, self.owned)
+        self.retained: dict[int, int] = {}
+        self.replicas = Replicas(limits, safeguards)
+        self.offers = Offers(limits)
+        self.dropped: Counter[tuple[str, str]] = Counter()
+        self._answer: Done | None = None
+        self._entering: tuple[Confirmed, ...] = ()
+        self._overwrites: dict[int, bytes] = {}
+        self._limits = limits
+        self._safeguards = safeguards
+
+    def row_state(self, vehicle: int) -> State:
+        """AUTHORITATIVE, RETAINED or NONE."""
+        if vehicle in self.owned:
+            return State.AUTHORITATIVE
+        return State.RETAINED if vehicle in self.retained else State.NONE
+
+    def on_message(self, message: Message) -> Reaction:
+        """Take a message in. One that comes late or from elsewhere is dropped and counted."""
+        reason = self._misfit(message)
+        if reason is not None:
+            return self._drop(message, reason)
+        match message:
+            case Step():
+                return self._on_step(message)
+            case Prepare():
+                return self._on_prepare(message)
+            case Abort():
+                return self._on_abort(message)
+            case Ack():
+                self.offers.answered(message)
+                return NOTHING
+            case Nack():
+                self.offers.refused(message)
+                return NOTHING
+        return self._drop(message, "kind")
+
+    def complete(self, rows: int, removed: Sequence[Removed] = (), payload: bytes = b"") -> Done:
+        """End the lease: the result is in the store.
+
+        Args:
+            rows: digest of the rows that were stored (`world_digest` of their `row_hash`).
+            removed: vehicles that left the world in this tick.
+            payload: for the runtime.
+
+        Raises:
+            ProtocolError: there is no lease.
+        """
+        if self.lease is None:
+            raise ProtocolError(f"zone {self.zone} has no lease: no STEP after tick {self.tick}")
+        for vehicle, _ in removed:
+            after(Party.ROW, self.row_state(vehicle), Event.REMOVE)
+            self.tally = self.tally.minus(self.run, vehicle, self.owned.pop(vehicle))
+        self.tick, self.lease = self.lease, None
+        self.offers.owed.clear()  # what is not answered by now is of the tick before
+        self._answer = Done(
+            self.run, self.episode, self.tick, self.zone, self.incarnation,
+            confirmed=self._entering, removed=tuple(sorted(removed)),
+            owned=self.tally, rows=rows, payload=payload,
+        )  # fmt: skip
+        return self._answer
+
+    def offer(self, approaches: Iterable[Approach]) -> tuple[Message, ...]:
+        """Tell other zones who comes near, after `complete`; every approach of the tick at once."""
+        offers, withdrawn = self.offers.renew(self.tick, approaches, self.owned)
+        aborts = tuple(
+            Abort(self.run, self.episode, self.tick, self.zone, self.incarnation, target, entries)
+            for target, entries in withdrawn.items()
+        )
+        return aborts + tuple(self._prepare(target, offers[target]) for target in offers)
+
+    def offer_again(self) -> tuple[Message, ...]:
+        """Repeat what was not answered; nothing after the last attempt of the tick."""
+        offers = self.offers.again()
+        return tuple(self._prepare(target, offers[target]) for target in offers)
+
+    def refuse(self, message: Prepare) -> Reaction:
+        """Answer a PREPARE with a NACK: the host has no room."""
+        if self._misfit(message) is not None:
+            return self.on_message(message)
+        refused = tuple(
+            Refused(
+                offer.vehicle,
+                offer.epoch,
+                self.replicas.refuse(offer, message.tick, Refusal.LOAD),
+            )
+            for offer in message.entries
+        )
+        return Reaction((Nack(*self._answer_header(message), refused),))
+
+    def _answer_header(self, message: Prepare) -> tuple[bytes, int, int, int, int, int]:
+        return (
+            self.run, self.episode, message.tick, self.zone, self.incarnation, message.source,
+        )  # fmt: skip
+
+    def _prepare(self, target: int, offers: tuple[Offer, ...]) -> Prepare:
+        return Prepare(
+            self.run, self.episode, self.tick, self.zone, self.incarnation, target,
+            self._limits.schema, offers,
+        )  # fmt: skip
+
+    def _misfit(self, message: Message) -> str | None:
+        if message.run != self.run and self._safeguards.run_fence:
+            return "run"
+        newer = isinstance(message, Step) and message.episode > self.episode
+        if message.episode != self.episode and not newer and self._safeguards.tick_never_resets:
+            return "episode"
+        match message:
+            case Step(zone=zone, incarnation=incarnation):
+                if zone != self.zone:
+                    return "zone"
+                return None if incarnation == self.incarnation else "incarnation"
+            case Prepare(target=zone) | Abort(target=zone) | Ack(source=zone) | Nack(source=zone):
+                if zone != self.zone:
+                    return "zone"
+        if isinstance(message, Ack | Nack):
+            return None if message.tick == self.tick else "tick"
+        near = self.tick - self._limits.lifetime < message.tick <= self.tick + 1
+        return None if near else "tick"
+
+    def _on_step(self, step: Step) -> Reaction:
+        if step.episode > self.episode:
+            self._begin_episode(step)
+        if step.tick == self.tick and self._answer is not None and self._safeguards.answer_again:
+            return Reaction((self._answer,))
+        stale = step.tick <= self.tick and self._safeguards.step_tick
+        if stale or step.tick > self.tick + 1 or self.lease is not None:
+            return self._drop(step, "tick")
+        needed = tuple(
+            vehicle
+            for vehicle, epoch, forced, digest, _ in step.enter
+            if not forced and not self.replicas.exact(vehicle, epoch - 1, self.tick, digest)
+        )
+        if needed:
+            return Reaction(
+                (Need(self.run, self.episode, step.tick, self.zone, self.incarnation, needed),)
+            )
+        return Reaction(advance=self._take_lease(step))
+
+    def _take_lease(self, step: Step) -> Advance:
+        release = tuple(self.retained)
+        for vehicle in release:
+            after(Party.ROW, self.row_state(vehicle), Event.RELEASE)
+            del self.retained[vehicle]
+        leave = tuple(vehicle for vehicle, _ in step.leave)
+        if self._safeguards.one_step_lease:
+            for vehicle in leave:
+                self._leave(vehicle)
+        overwrites, self._overwrites = tuple(self._overwrites.items()), {}
+        enter = []
+        for vehicle, epoch, forced, _, state in step.enter:
+            self._own(vehicle, epoch, Event.IN)
+            replica = self.replicas.take(vehicle)
+            enter.append((vehicle, state if forced else replica))
+        for vehicle, _ in step.spawn:
+            self._own(vehicle, 0, Event.SPAWN)
+        if self._safeguards.ledger:
+            step.owned.check(self.tally, f"zone {self.zone} on its way to tick {step.tick}")
+        self._entering = tuple(Confirmed(entry.vehicle, entry.epoch) for entry in step.enter)
+        self.lease, self._answer = step.tick, None
+        self.replicas.expire(self.tick)
+        return Advance(
+            self.episode, step.tick, release, leave, overwrites + tuple(enter), step.spawn,
+            step.payload,
+        )  # fmt: skip
+
+    def _own(self, vehicle: int, epoch: int, event: Event) -> None:
+        after(Party.ROW, self.row_state(vehicle), event)
+        self.owned[vehicle] = epoch
+        self.tally = self.tally.plus(self.run, vehicle, epoch)
+
+    def _leave(self, vehicle: int) -> None:
+        after(Party.ROW, self.row_state(vehicle), Event.OUT)
+        epoch = self.owned.pop(vehicle)
+        self.tally = self.tally.minus(self.run, vehicle, epoch)
+        self.offers.forget(vehicle)
+        if self._safeguards.copy_until_commit:
+            self.retained[vehicle] = epoch
+
+    def _begin_episode(self, step: Step) -> None:
+        self.episode, self.tick, self.lease, self._answer = step.episode, step.committed, None, None
+        self.owned, self.retained, self.tally = {}, {}, Tally()
+        self.replicas = Replicas(self._limits, self._safeguards)
+        self.offers = Offers(self._limits)
+
+    def _on_prepare(self, message: Prepare) -> Reaction:
+        held, refused = [], []
+        for offer in message.entries:
+            own = self.owned.get(offer.vehicle, -1)
+            if own >= offer.epoch:
+                if not self._safeguards.replica_slot:
+                    self._overwrites[offer.vehicle] = offer.state
+                self.dropped["Prepare", "owned"] += 1
+                continue
+            taken = self.replicas.prepare(offer, message.tick, message.schema)
+            if isinstance(taken, Refusal):
+                refused.append(Refused(offer.vehicle, offer.epoch, taken))
+            elif taken:
+                held.append(Held(offer.vehicle, offer.epoch, offer.digest))
+            else:
+                self.dropped["Prepare", "fence"] += 1
+        header = self._answer_header(message)
+        answers: list[Message] = []
+        if held:
+            answers.append(Ack(*header, tuple(held)))
+        if refused:
+            answers.append(Nack(*header, tuple(refused)))
+        return Reaction(tuple(answers))
+
+    def _on_abort(self, message: Abort) -> Reaction:
+        for vehicle, epoch in message.entries:
+            if not self.replicas.abort(vehicle, epoch, message.tick):
+                self.dropped["Abort", "fence"] += 1
+        return NOTHING
+
+    def _drop(self, message: Message, reason: str) -> Reaction:
+        self.dropped[type(message).__name__, reason] += 1
+        return NOTHING

@@ -1,0 +1,119 @@
+"""What always holds (I1 to I10), checked on the parties' own states while they run.
+
+A monitor is told which rows a host advances, and is asked to look before and after every tick.
+It is for tests, and for runs in which the user pays for it: it looks at every vehicle.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from typing import Protocol
+
+from cavmarl.errors import InvariantError
+from cavmarl.ownership.directory import Directory
+from cavmarl.ownership.endpoint import Endpoint
+from cavmarl.ownership.ledger import tally
+from cavmarl.ownership.limits import Limits
+
+
+class Store(Protocol):
+    """The part of the committed store that is checked."""
+
+    committed: Mapping[int, bytes]
+
+    def world(self) -> int:
+        """Digest of the committed world."""
+
+
+class Monitor:
+    """Raises InvariantError at the first invariant that does not hold."""
+
+    def __init__(self, limits: Limits) -> None:
+        self._limits = limits
+        self._writers: dict[int, tuple[int, int]] = {}  # vehicle → who advanced it in this tick
+        self._executed: dict[tuple[int, int], int] = {}  # process → newest tick that it advanced to
+        self._tick = -1
+
+    def advanced(self, zone: int, incarnation: int, tick: int, vehicles: Iterable[int]) -> None:
+        """I1: in a tick one zone advances a vehicle, and each of its processes once.
+
+        Raises:
+            InvariantError: somebody advanced it before.
+        """
+        if tick > self._tick:
+            self._tick, self._writers = tick, {}
+        if self._executed.get((zone, incarnation), -1) >= tick:
+            raise InvariantError(f"I1: zone {zone} executes tick {tick} twice")
+        self._executed[zone, incarnation] = tick
+        for vehicle in vehicles:
+            writer = self._writers.get(vehicle)
+            if writer is not None and writer[0] != zone:
+                raise InvariantError(
+                    f"I1: zones {writer[0]} and {zone} both advance vehicle {vehicle} to {tick}"
+                )
+            self._writers[vehicle] = (zone, incarnation)
+
+    def check(self, directory: Directory, endpoints: Mapping[int, Endpoint], store: Store) -> None:
+        """I1 to I6 and I10, at any time.
+
+        Args:
+            directory: the coordinator.
+            endpoints: zone → its living host; dead ones are left out.
+            store: the committed store.
+
+        Raises:
+            InvariantError: one of them does not hold.
+        """
+        self._check_copies(directory, store)
+        self._check_leases(directory, endpoints)
+        self._check_retained(directory, endpoints)
+        self._check_ledger(directory)
+        for vehicle, ticks in directory.table.deferred.items():
+            if ticks > self._limits.longest_deferral:
+                raise InvariantError(f"I5: vehicle {vehicle} waits for {ticks} ticks")
+
+    def committed(self, world: int, store: Store) -> None:
+        """I10: the digest of the world is the sum of the zones' digests.
+
+        Raises:
+            InvariantError: it is not.
+        """
+        if world != store.world():
+            raise InvariantError("I10: the committed world is not what the zones told of")
+
+    def _check_copies(self, directory: Directory, store: Store) -> None:
+        if store.committed.keys() != directory.table.owners.keys():
+            lost = sorted(directory.table.owners.keys() ^ store.committed.keys())
+            raise InvariantError(f"I2: vehicles {lost} are owned or stored, but not both")
+
+    def _check_leases(self, directory: Directory, endpoints: Mapping[int, Endpoint]) -> None:
+        leases: dict[int, int] = {}
+        for zone, endpoint in endpoints.items():
+            if endpoint.lease is None or endpoint.episode != directory.table.episode:
+                continue
+            for vehicle in endpoint.owned:
+                if vehicle in leases:
+                    raise InvariantError(
+                        f"I1: zones {leases[vehicle]} and {zone} have a lease for vehicle {vehicle}"
+                    )
+                leases[vehicle] = zone
+
+    def _check_retained(self, directory: Directory, endpoints: Mapping[int, Endpoint]) -> None:
+        plan = directory.table.plan
+        if plan is None:
+            return
+        for switch in plan.record.switches:
+            source = endpoints.get(switch.source)
+            if source is None or source.episode != directory.table.episode:
+                continue
+            if switch.vehicle not in source.owned and switch.vehicle not in source.retained:
+                raise InvariantError(
+                    f"I3: zone {switch.source} dropped vehicle {switch.vehicle} before the commit"
+                )
+
+    def _check_ledger(self, directory: Directory) -> None:
+        table = directory.table
+        for zone, expected in table.tallies.items():
+            owned = {v: epoch for v, (owner, epoch) in table.owners.items() if owner == zone}
+            if tally(table.run, owned) != expected:
+                raise InvariantError(f"I6: the ledger of zone {zone} is not that of its vehicles")

@@ -1,0 +1,103 @@
+"""Counts and digests of sets, cheap to change by one member and independent of order.
+
+A set's digest is the sum of its members' keyed hashes modulo a power of two (invariant I10).
+Two parties that hold the same (count, digest) hold the same set, but for a chance of 2**-64.
+"""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Iterable, Mapping
+from hashlib import blake2b
+from typing import NamedTuple
+
+from cavmarl.errors import LedgerError
+
+_PAIR = struct.Struct("<qq")
+_ID = struct.Struct("<q")
+_WORLD = 1 << 128
+_OWNED = 1 << 64
+DIGEST_BYTES = 16
+
+
+def state_digest(state: bytes) -> bytes:
+    """Digest of one vehicle's state, 16 bytes."""
+    return blake2b(state, digest_size=DIGEST_BYTES).digest()
+
+
+def row_hash(vehicle: int, state: bytes) -> int:
+    """What a row adds to the digest of the world, in [0, 2**128)."""
+    return int.from_bytes(
+        blake2b(_ID.pack(vehicle) + state, digest_size=16, person=b"cavmarl row").digest(),
+        "little",
+    )
+
+
+def world_digest(parts: Iterable[int]) -> int:
+    """Digest of a world from those of its rows, or of its zones."""
+    return sum(parts) % _WORLD
+
+
+class Tally(NamedTuple):
+    """How many vehicles a zone owns, and the digest of their (id, epoch)."""
+
+    vehicles: int = 0
+    digest: int = 0
+
+    def plus(self, run: bytes, vehicle: int, epoch: int) -> Tally:
+        """With one more member."""
+        return Tally(self.vehicles + 1, (self.digest + member(run, vehicle, epoch)) % _OWNED)
+
+    def minus(self, run: bytes, vehicle: int, epoch: int) -> Tally:
+        """With one member less."""
+        return Tally(self.vehicles - 1, (self.digest - member(run, vehicle, epoch)) % _OWNED)
+
+    def check(self, other: Tally, where: str) -> None:
+        """Compare with what somebody else counted.
+
+        Raises:
+            LedgerError: the sets differ.
+        """
+        if self == other:
+            return
+        what = (
+            f"{other.vehicles} vehicles instead of {self.vehicles}"
+            if self.vehicles != other.vehicles
+            else f"{self.vehicles} vehicles, but not the expected ones or not at their epochs"
+        )
+        raise LedgerError(f"{where}: {what}")
+
+
+def member(run: bytes, vehicle: int, epoch: int) -> int:
+    """Keyed hash of an owned vehicle, in [0, 2**64)."""
+    return int.from_bytes(
+        blake2b(_PAIR.pack(vehicle, epoch), digest_size=8, key=run).digest(), "little"
+    )
+
+
+def tally(run: bytes, owned: Mapping[int, int]) -> Tally:
+    """Tally of vehicles → epochs."""
+    return Tally(
+        len(owned), sum(member(run, vehicle, epoch) for vehicle, epoch in owned.items()) % _OWNED
+    )
+
+
+class SeenIds:
+    """Ids that have been in an episode; small as long as they are handed out in about their order.
+
+    All ids below `floor` have been seen, and those in `above`.
+    """
+
+    def __init__(self) -> None:
+        self.floor = 0
+        self.above: set[int] = set()
+
+    def __contains__(self, vehicle: int) -> bool:
+        return vehicle < self.floor or vehicle in self.above
+
+    def add(self, vehicle: int) -> None:
+        """Remember an id."""
+        self.above.add(vehicle)
+        while self.floor in self.above:
+            self.above.remove(self.floor)
+            self.floor += 1

@@ -1,0 +1,70 @@
+"""Deadlines of the protocol, in ticks and in counts. No clock is involved."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import StrEnum
+
+from cavmarl.errors import ConfigError
+
+
+class DeadlinePolicy(StrEnum):
+    """What becomes of a vehicle whose target has not confirmed after D ticks.
+
+    FORCE hands it over with its state attached. The others leave it with the source for `grace`
+    more ticks first; HOLD and REROUTE also name it in the plan, so that the runtime can make it
+    wait at the border or turn away. These two change what vehicles do, so the divided world then
+    equals the undivided one only as long as no deadline passes.
+    """
+
+    FORCE = "force"
+    EXTEND = "extend"
+    HOLD = "hold"
+    REROUTE = "reroute"
+
+
+@dataclass(frozen=True, slots=True)
+class Limits:
+    """Deadlines that all parties of a run share.
+
+    Attributes:
+        deferral: ticks for which the source goes on without a confirmation (D).
+        lifetime: ticks after which a replica that nobody refreshes is dropped (K).
+        attempts: how often a PREPARE is sent inside one tick (A).
+        repeats: new hosts for one tick of one zone (R_max).
+        backoff: ticks without an offer to a target that refused.
+        capacity: replicas that one host keeps.
+        policy: what happens after the deadline.
+        grace: further ticks that a policy other than FORCE grants.
+        schema: version of the vehicles' states.
+
+    Raises:
+        ConfigError: a number that is too small, or a grace without a policy that uses it.
+    """
+
+    deferral: int = 2
+    lifetime: int = 16
+    attempts: int = 3
+    repeats: int = 3
+    backoff: int = 4
+    capacity: int = 100_000
+    policy: DeadlinePolicy = DeadlinePolicy.FORCE
+    grace: int = 0
+    schema: int = 1
+
+    def __post_init__(self) -> None:
+        least = {"deferral": 0, "lifetime": 1, "attempts": 1, "repeats": 0, "backoff": 0}
+        least |= {"capacity": 0, "grace": 0, "schema": 0}
+        for name, bound in least.items():
+            if getattr(self, name) < bound:
+                raise ConfigError(f"{name} is {getattr(self, name)}: it has to be {bound} or more")
+        if (self.policy is DeadlinePolicy.FORCE) != (self.grace == 0):
+            raise ConfigError(
+                f"policy {self.policy} with a grace of {self.grace} ticks: "
+                "'force' takes no grace, the other policies need at least 1"
+            )
+
+    @property
+    def longest_deferral(self) -> int:
+        """Ticks that a vehicle may be with a zone that does not contain it."""
+        return self.deferral + self.grace

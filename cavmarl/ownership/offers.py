@@ -1,0 +1,109 @@
+"""The source's side of an approach: what it has offered to whom, and what it still owes.
+
+For each pair of vehicle and target a tick has at most one PREPARE or ABORT. A PREPARE that nobody
+answers is sent again, at most A times in its tick. A target that refused is left alone for some
+ticks.
+"""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Iterable, Mapping
+from typing import NamedTuple
+
+from cavmarl.errors import ProtocolError
+from cavmarl.ownership.ledger import state_digest
+from cavmarl.ownership.limits import Limits
+from cavmarl.ownership.messages import Ack, Nack, Offer, Refusal, Withdrawn
+
+
+class Approach(NamedTuple):
+    """A vehicle that comes near a zone, and its state."""
+
+    vehicle: int
+    target: int
+    state: bytes
+
+
+class Offers:
+    """Offers of one source.
+
+    Attributes:
+        open: (vehicle, target) → epoch of the last offer that has not been withdrawn.
+        owed: (vehicle, target) → offer of this tick that has not been answered.
+        barred: (vehicle, target) → first tick in which it may be offered again.
+    """
+
+    def __init__(self, limits: Limits) -> None:
+        self.open: dict[tuple[int, int], int] = {}
+        self.owed: dict[tuple[int, int], Offer] = {}
+        self.barred: dict[tuple[int, int], int] = {}
+        self.attempts = 0
+        self._limits = limits
+
+    def renew(
+        self, tick: int, approaches: Iterable[Approach], epochs: Mapping[int, int]
+    ) -> tuple[dict[int, tuple[Offer, ...]], dict[int, tuple[Withdrawn, ...]]]:
+        """The offers of a tick, and what is withdrawn because it is not among them.
+
+        Args:
+            tick: of the states.
+            approaches: owned vehicles and the zones that they come near.
+            epochs: owned vehicle → epoch.
+
+        Returns:
+            Target → offers, and target → withdrawals.
+
+        Raises:
+            ProtocolError: a vehicle is not owned.
+        """
+        self.barred = {pair: until for pair, until in self.barred.items() if until > tick}
+        before, self.open, self.owed, self.attempts = self.open, {}, {}, 1
+        for vehicle, target, state in approaches:
+            if vehicle not in epochs:
+                raise ProtocolError(f"a zone offers vehicle {vehicle}, which it does not own")
+            pair, epoch = (vehicle, target), epochs[vehicle]
+            if pair in self.barred:
+                if pair in before:
+                    self.open[pair] = before[pair]
+                continue
+            self.open[pair] = epoch
+            self.owed[pair] = Offer(vehicle, epoch, state_digest(state), state)
+        ended: defaultdict[int, list[Withdrawn]] = defaultdict(list)
+        for (vehicle, target), epoch in before.items():
+            if (vehicle, target) not in self.open:
+                ended[target].append(Withdrawn(vehicle, epoch))
+        withdrawn = {target: tuple(sorted(entries)) for target, entries in sorted(ended.items())}
+        return self._by_target(), withdrawn
+
+    def forget(self, vehicle: int) -> None:
+        """The vehicle has been handed over. An ABORT now could reach its target before the STEP."""
+        for pair in [pair for pair in self.open if pair[0] == vehicle]:
+            del self.open[pair]
+
+    def again(self) -> dict[int, tuple[Offer, ...]]:
+        """Offers without an answer, target → offers; none after the last attempt."""
+        if self.attempts >= self._limits.attempts:
+            return {}
+        self.attempts += 1
+        return self._by_target()
+
+    def answered(self, ack: Ack) -> None:
+        """Cross off what the target holds."""
+        for vehicle, epoch, digest in ack.entries:
+            offer = self.owed.get((vehicle, ack.zone))
+            if offer is not None and (offer.epoch, offer.digest) == (epoch, digest):
+                del self.owed[vehicle, ack.zone]
+
+    def refused(self, nack: Nack) -> None:
+        """Leave a target alone for a while. A state that was damaged on its way is sent again."""
+        for vehicle, _, reason in nack.entries:
+            if reason is not Refusal.DIGEST and (vehicle, nack.zone) in self.owed:
+                del self.owed[vehicle, nack.zone]
+                self.barred[vehicle, nack.zone] = nack.tick + 1 + self._limits.backoff
+
+    def _by_target(self) -> dict[int, tuple[Offer, ...]]:
+        targets: defaultdict[int, list[Offer]] = defaultdict(list)
+        for (_, target), offer in self.owed.items():
+            targets[target].append(offer)
+        return {target: tuple(sorted(offers)) for target, offers in sorted(targets.items())}

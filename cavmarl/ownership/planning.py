@@ -1,0 +1,93 @@
+"""What a logged BEGIN means: a plan that is a function of the record and of the committed owners.
+
+The plan of a live coordinator and that of one which replays its log are made by this same code.
+"""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
+
+from cavmarl.errors import LedgerError
+from cavmarl.ownership.ledger import Tally
+from cavmarl.ownership.messages import Begin, Confirmed, Done, Out, Removed, Spawn, Switch
+
+
+@dataclass(slots=True)
+class Plan:
+    """The way from the committed tick to the next.
+
+    Attributes:
+        record: the decision, as logged.
+        expected: zone → what it owns after IN, OUT and SPAWN, before anybody is removed.
+        switches: vehicle → its switch.
+        births: vehicle → its zone.
+        enter: zone → switches into it.
+        leave: zone → vehicles that it gives away.
+        spawn: zone → new vehicles.
+        attach: vehicles whose state rides with STEP.
+    """
+
+    record: Begin
+    expected: dict[int, Tally]
+    switches: dict[int, Switch] = field(default_factory=dict)
+    births: dict[int, int] = field(default_factory=dict)
+    enter: defaultdict[int, list[Switch]] = field(default_factory=lambda: defaultdict(list))
+    leave: defaultdict[int, list[Out]] = field(default_factory=lambda: defaultdict(list))
+    spawn: defaultdict[int, list[Spawn]] = field(default_factory=lambda: defaultdict(list))
+    attach: set[int] = field(default_factory=set)
+
+    def owner(self, vehicle: int, committed: Mapping[int, tuple[int, int]]) -> tuple[int, int]:
+        """(zone, epoch) of a vehicle under this plan."""
+        if vehicle in self.switches:
+            switch = self.switches[vehicle]
+            return switch.target, switch.epoch
+        if vehicle in self.births:
+            return self.births[vehicle], 0
+        return committed.get(vehicle, (-1, -1))
+
+
+def make_plan(run: bytes, record: Begin, committed: Mapping[int, Tally]) -> Plan:
+    """The plan of a BEGIN record, given what the zones owned when the last tick was committed."""
+    plan = Plan(record, dict(committed))
+    expected = plan.expected
+    for switch in record.switches:
+        vehicle, source, target, epoch, forced = switch
+        expected[source] = expected[source].minus(run, vehicle, epoch - 1)
+        expected[target] = expected[target].plus(run, vehicle, epoch)
+        plan.switches[vehicle] = switch
+        plan.enter[target].append(switch)
+        plan.leave[source].append(Out(vehicle, epoch - 1))
+        if forced:
+            plan.attach.add(vehicle)
+    for vehicle, zone, state in record.births:
+        expected[zone] = expected[zone].plus(run, vehicle, 0)
+        plan.births[vehicle] = zone
+        plan.spawn[zone].append(Spawn(vehicle, state))
+    return plan
+
+
+def check_done(run: bytes, plan: Plan, done: Done, owners: Mapping[int, tuple[int, int]]) -> None:
+    """Compare what a zone did with what was planned.
+
+    Raises:
+        LedgerError: it removed what it does not own, did not confirm what came in, or owns
+            something else than it should.
+    """
+    where = f"zone {done.zone} at tick {done.tick}"
+    expected = plan.expected[done.zone]
+    for vehicle, _ in done.removed:
+        zone, epoch = plan.owner(vehicle, owners)
+        if zone != done.zone:
+            raise LedgerError(f"{where} removed vehicle {vehicle}, which zone {zone} owns")
+        expected = expected.minus(run, vehicle, epoch)
+    planned = tuple(Confirmed(entry.vehicle, entry.epoch) for entry in plan.enter[done.zone])
+    if done.confirmed != planned:
+        raise LedgerError(f"{where} confirmed {list(done.confirmed)} instead of {list(planned)}")
+    expected.check(done.owned, where)
+
+
+def all_removed(dones: Iterable[Done]) -> tuple[Removed, ...]:
+    """Who left the world, in order of ids."""
+    return tuple(sorted(entry for done in dones for entry in done.removed))

@@ -1,0 +1,55 @@
+"""What goes between a zone's endpoint and those around it, apart from messages."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+from cavmarl.ownership.messages import Message, Spawn
+
+
+@dataclass(frozen=True, slots=True)
+class Hosting:
+    """What a new host is told: who it is, and what its zone owns at the committed tick.
+
+    Attributes:
+        owned: vehicle → epoch.
+    """
+
+    run: bytes
+    episode: int
+    tick: int
+    zone: int
+    incarnation: int
+    owned: Mapping[int, int]
+
+
+@dataclass(frozen=True, slots=True)
+class Advance:
+    """The shard's work for one tick: change the rows that are owned, then advance all of them.
+
+    Attributes:
+        episode: when it changes, all earlier rows are void.
+        tick: the tick to reach.
+        release: rows kept from earlier switches, which may go or become ghosts now.
+        leave: rows that are frozen as they are and kept.
+        enter: (vehicle, state) of rows that come in.
+        spawn: new rows.
+        payload: the STEP's own, for the runtime.
+    """
+
+    episode: int
+    tick: int
+    release: tuple[int, ...]
+    leave: tuple[int, ...]
+    enter: tuple[tuple[int, bytes], ...]
+    spawn: tuple[Spawn, ...]
+    payload: bytes
+
+
+@dataclass(frozen=True, slots=True)
+class Reaction:
+    """What a message leads to: messages to send, and with a new lease work for the shard."""
+
+    messages: tuple[Message, ...] = ()
+    advance: Advance | None = None

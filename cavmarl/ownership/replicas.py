@@ -1,0 +1,112 @@
+"""The replicas that a zone host keeps for vehicles which may come, and the fences around them.
+
+A fence is the newest (epoch, tick) of a vehicle that has been heard in a PREPARE or an ABORT. Only
+what is newer counts, in whatever order messages arrive. Nothing older than the lifetime is heard
+at all, so that older fences can be forgotten.
+"""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from typing import NamedTuple
+
+from cavmarl.ownership.ledger import state_digest
+from cavmarl.ownership.limits import Limits
+from cavmarl.ownership.messages import Offer, Refusal
+from cavmarl.ownership.safeguards import Safeguards
+from cavmarl.ownership.transitions import Event, Party, State, after
+
+
+class Replica(NamedTuple):
+    """A state as of a tick, which nobody advances."""
+
+    epoch: int
+    tick: int
+    digest: bytes
+    state: bytes
+
+
+class Replicas:
+    """Replicas by vehicle.
+
+    Attributes:
+        held: vehicle → replica.
+        fences: vehicle → (epoch, tick) of the newest PREPARE or ABORT heard.
+    """
+
+    def __init__(self, limits: Limits, safeguards: Safeguards) -> None:
+        self.held: dict[int, Replica] = {}
+        self.fences: dict[int, tuple[int, int]] = {}
+        self._heard: defaultdict[int, list[int]] = defaultdict(list)  # tick → vehicles
+        self._limits = limits
+        self._safeguards = safeguards
+
+    def state(self, vehicle: int) -> State:
+        """PREPARED or EMPTY."""
+        return State.PREPARED if vehicle in self.held else State.EMPTY
+
+    def prepare(self, offer: Offer, tick: int, schema: int) -> Refusal | bool:
+        """Take a state in: True if it is held now, False if it came too late, or why not."""
+        held = self.held.get(offer.vehicle)
+        if not self._newer(offer.vehicle, offer.epoch, tick):
+            return held is not None and held[:3] == (offer.epoch, tick, offer.digest)
+        if self._safeguards.state_digest and state_digest(offer.state) != offer.digest:
+            return Refusal.DIGEST  # damaged on its way: not heard, so it may be sent again
+        if self._safeguards.state_schema and schema != self._limits.schema:
+            return self.refuse(offer, tick, Refusal.SCHEMA)
+        if held is None and len(self.held) >= self._limits.capacity:
+            return self.refuse(offer, tick, Refusal.LOAD)
+        after(Party.REPLICA, self.state(offer.vehicle), Event.PREPARE)
+        self.held[offer.vehicle] = Replica(offer.epoch, tick, offer.digest, offer.state)
+        self._raise_fence(offer.vehicle, offer.epoch, tick)
+        return True
+
+    def refuse(self, offer: Offer, tick: int, reason: Refusal) -> Refusal:
+        """Hear a state, but do not take it in."""
+        self._raise_fence(offer.vehicle, offer.epoch, tick)
+        return reason
+
+    def abort(self, vehicle: int, epoch: int, tick: int) -> bool:
+        """Drop a replica; False if the message is older than what has been heard."""
+        if self._safeguards.abort_fence and not self._newer(vehicle, epoch, tick):
+            return False
+        after(Party.REPLICA, self.state(vehicle), Event.ABORT)
+        self.held.pop(vehicle, None)
+        if self._safeguards.fence_stays:
+            self._raise_fence(vehicle, epoch, tick)
+        else:
+            self.fences.pop(vehicle, None)
+        return True
+
+    def exact(self, vehicle: int, epoch: int, tick: int, digest: bytes) -> bool:
+        """Whether that very state is held."""
+        held = self.held.get(vehicle)
+        if held is not None and not self._safeguards.exact_promotion:
+            return True
+        return held is not None and held[:3] == (epoch, tick, digest)
+
+    def take(self, vehicle: int) -> bytes:
+        """Promote: the state leaves the slot, if there is one. The fence stays."""
+        after(Party.REPLICA, self.state(vehicle), Event.IN)
+        held = self.held.pop(vehicle, None)
+        return b"" if held is None else held.state
+
+    def expire(self, now: int) -> None:
+        """Drop what has not been refreshed for the lifetime, with its fence."""
+        if not self._safeguards.replica_lifetime:
+            return
+        last = now - self._limits.lifetime
+        for tick in sorted(tick for tick in self._heard if tick <= last):
+            for vehicle in self._heard.pop(tick):
+                if self.fences.get(vehicle, (0, now))[1] <= last:
+                    del self.fences[vehicle]
+                    if vehicle in self.held:
+                        after(Party.REPLICA, State.PREPARED, Event.EXPIRE)
+                        del self.held[vehicle]
+
+    def _newer(self, vehicle: int, epoch: int, tick: int) -> bool:
+        return (epoch, tick) > self.fences.get(vehicle, (-1, -1))
+
+    def _raise_fence(self, vehicle: int, epoch: int, tick: int) -> None:
+        self.fences[vehicle] = max((epoch, tick), self.fences.get(vehicle, (-1, -1)))
+        self._heard[tick].append(vehicle)

@@ -1,0 +1,78 @@
+"""The committed store in memory: what a store has to promise, in its smallest form.
+
+It holds the state of every vehicle at the committed tick, and room for the next. Each process
+writes to a segment of its own, and only `commit` makes segments the truth. The runtime's store
+promises the same of NumPy rows; tests of the protocol use this one.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+from cavmarl.ownership.ledger import row_hash, world_digest
+from cavmarl.ownership.safeguards import ALL_ON, Safeguards
+
+
+class MemoryStore:
+    """States as bytes, by vehicle.
+
+    Attributes:
+        tick: the committed tick.
+        committed: vehicle → state at that tick.
+        segments: (zone, incarnation) → what that process has written for the next tick.
+    """
+
+    def __init__(self, safeguards: Safeguards = ALL_ON) -> None:
+        self.tick = 0
+        self.committed: dict[int, bytes] = {}
+        self.segments: dict[tuple[int, int], dict[int, bytes]] = {}
+        self._safeguards = safeguards
+
+    def state(self, vehicle: int) -> bytes:
+        """The state at the committed tick."""
+        return self.committed[vehicle]
+
+    def write(self, zone: int, incarnation: int, vehicle: int, state: bytes) -> None:
+        """One row of the next tick, from the process of that incarnation."""
+        self.segments.setdefault(self._segment(zone, incarnation), {})[vehicle] = state
+        if not self._safeguards.double_buffer:
+            self.committed[vehicle] = state
+
+    def clear(self, zone: int, incarnation: int) -> None:
+        """Throw away what a process has written."""
+        self.segments.pop(self._segment(zone, incarnation), None)
+
+    def digest(self, zone: int, incarnation: int) -> int:
+        """Digest of the rows of a segment."""
+        rows = self.segments.get(self._segment(zone, incarnation), {})
+        return world_digest(row_hash(vehicle, state) for vehicle, state in rows.items())
+
+    def commit(self, tick: int, incarnations: Mapping[int, int]) -> None:
+        """Make the segments of the living hosts the truth of `tick`.
+
+        After a COMMIT that was logged but not carried out, a coordinator that starts again calls
+        it once more: the segments are still there.
+
+        Args:
+            tick: as the COMMIT record has it.
+            incarnations: zone → incarnation, from the same record.
+        """
+        self.committed = {
+            vehicle: state
+            for zone, incarnation in sorted(incarnations.items())
+            for vehicle, state in self.segments.get(self._segment(zone, incarnation), {}).items()
+        }
+        self.tick = tick
+        self.segments.clear()
+
+    def reset(self, tick: int) -> None:
+        """Begin an episode without vehicles."""
+        self.tick, self.committed = tick, {}
+        self.segments.clear()
+
+    def world(self) -> int:
+        """Digest of the committed world."""
+        return world_digest(row_hash(vehicle, state) for vehicle, state in self.committed.items())
+
+    def _segment(self, zone: int, incarnation: int) -> tuple[int, int]:
+        return (zone, incarnation if self._safeguards.segment_per_incarnation else 0)

@@ -1,0 +1,150 @@
+"""What the log says: owners, hosts and the tick in progress.
+
+The table changes by records alone, so a coordinator that replays its log comes to the table that
+it died with, and anybody else who replays it knows who owns what.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterable
+
+from cavmarl.errors import JournalError, ProtocolError
+from cavmarl.ownership.ledger import SeenIds, Tally
+from cavmarl.ownership.messages import RUN_BYTES, Begin, Commit, Fence, Host, Record, Reset
+from cavmarl.ownership.planning import Plan, make_plan
+from cavmarl.ownership.safeguards import ALL_ON, Safeguards
+from cavmarl.ownership.transitions import Event, Party, State, after
+
+
+class Table:
+    """The state that a log leads to.
+
+    Attributes:
+        run: as the first record says.
+        tick: the committed tick. It never goes back, also not at a reset.
+        episode: counts the resets; -1 before the first.
+        owners: vehicle → (zone, epoch) as of the committed tick.
+        deferred: vehicle → ticks that it has been with a zone which does not contain it.
+        hosts: zone → (worker, incarnation); incarnation 0 means never hosted.
+        states: zone → UNHOSTED, HOSTED or FENCED.
+        tallies: zone → what it owned at the committed tick.
+        seen: ids that have been in the episode.
+        repeats: zone → new hosts in the tick in progress.
+        plan: the tick in progress, or None.
+    """
+
+    def __init__(self, zones: Iterable[int], safeguards: Safeguards = ALL_ON) -> None:
+        self.run, self.tick, self.episode = b"", 0, -1
+        self.owners: dict[int, tuple[int, int]] = {}
+        self.deferred: dict[int, int] = {}
+        self.hosts = dict.fromkeys(sorted(zones), (-1, 0))
+        self.states = dict.fromkeys(self.hosts, State.UNHOSTED)
+        self.tallies = dict.fromkeys(self.hosts, Tally())
+        self.seen = SeenIds()
+        self.repeats: Counter[int] = Counter()
+        self.plan: Plan | None = None
+        self._safeguards = safeguards
+
+    @property
+    def planned(self) -> Plan:
+        """The tick in progress.
+
+        Raises:
+            ProtocolError: there is none.
+        """
+        if self.plan is None:
+            raise ProtocolError("no tick is in progress")
+        return self.plan
+
+    def state(self, vehicle: int) -> State:
+        """UNKNOWN, OWNED, SWITCHING or REMOVED."""
+        if vehicle not in self.owners:
+            return State.REMOVED if vehicle in self.seen else State.UNKNOWN
+        switching = self.plan is not None and vehicle in self.plan.switches
+        return State.SWITCHING if switching else State.OWNED
+
+    def alive(self, zone: int, incarnation: int) -> bool:
+        """Whether that process hosts the zone now."""
+        return self.states[zone] is State.HOSTED and self.hosts[zone][1] == incarnation
+
+    def apply(self, record: Record) -> None:
+        """Change by one record.
+
+        Raises:
+            JournalError: a coordinator would not have written it here.
+            TransitionError: the same, for one vehicle or zone.
+        """
+        match record:
+            case Reset():
+                self._reset(record)
+            case Begin():
+                self._begin(record)
+            case Commit():
+                self._commit(record)
+            case Fence():
+                self._move(record, Event.FENCE)
+            case Host():
+                self._host(record)
+
+    def _reset(self, record: Reset) -> None:
+        if len(record.run) != RUN_BYTES:
+            raise JournalError(f"a run has {RUN_BYTES} bytes, not {len(record.run)}")
+        self.run, self.tick, self.episode = record.run, record.tick, record.episode
+        self.owners, self.deferred, self.plan = {}, {}, None
+        self.tallies = dict.fromkeys(self.hosts, Tally())
+        self.seen = SeenIds()
+        self.repeats.clear()
+
+    def _begin(self, record: Begin) -> None:
+        if self.plan is not None or record.tick != self.tick + 1:
+            raise JournalError(f"BEGIN of tick {record.tick} after tick {self.tick}, or once more")
+        self._check_zones(switch.target for switch in record.switches)
+        self._check_zones(birth.zone for birth in record.births)
+        for vehicle, source, _, epoch, _ in record.switches:
+            after(Party.VEHICLE, self.state(vehicle), Event.SWITCH)
+            if self.owners[vehicle] != (source, epoch - 1):
+                raise JournalError(f"BEGIN of tick {record.tick} takes {vehicle} from {source}")
+        for vehicle, _, _ in record.births:
+            after(Party.VEHICLE, self.state(vehicle), Event.SPAWN)
+            self.seen.add(vehicle)
+        self.plan = make_plan(self.run, record, self.tallies)
+
+    def _commit(self, record: Commit) -> None:
+        plan = self.planned
+        if record.tick != plan.record.tick:
+            raise JournalError(f"COMMIT of tick {record.tick}, but {plan.record.tick} was begun")
+        told = [entry.zone for entry in record.zones]
+        if told != list(self.hosts):
+            raise JournalError(f"COMMIT of tick {record.tick} tells of zones {told}")
+        self.owners.update((vehicle, (zone, 0)) for vehicle, zone in plan.births.items())
+        for vehicle, _ in record.removed:
+            after(Party.VEHICLE, self.state(vehicle), Event.REMOVE)
+            del self.owners[vehicle]
+        for vehicle, switch in plan.switches.items():
+            if vehicle in self.owners:
+                after(Party.VEHICLE, self.state(vehicle), Event.COMMIT)
+                self.owners[vehicle] = (switch.target, switch.epoch)
+        self.deferred = {
+            vehicle: ticks for vehicle, ticks in plan.record.deferred if vehicle in self.owners
+        }
+        self.tallies = {entry.zone: entry.owned for entry in record.zones}
+        self.tick, self.plan = record.tick, None
+        self.repeats.clear()
+
+    def _host(self, record: Host) -> None:
+        self._move(record, Event.HOST)
+        self.hosts[record.zone] = (record.worker, record.incarnation)
+        if self.plan is not None:
+            self.repeats[record.zone] += 1
+            if self._safeguards.reattach:
+                self.plan.attach.update(entry.vehicle for entry in self.plan.enter[record.zone])
+
+    def _check_zones(self, zones: Iterable[int]) -> None:
+        unknown = sorted(set(zones) - self.hosts.keys())
+        if unknown:
+            raise JournalError(f"zones {unknown} do not exist")
+
+    def _move(self, record: Fence | Host, event: Event) -> None:
+        self._check_zones((record.zone,))
+        self.states[record.zone] = after(Party.ZONE, self.states[record.zone], event)

@@ -1,0 +1,124 @@
+"""What happened, in order: the coordinator's records, and every message that arrived somewhere.
+
+A driver notes each record when it is logged and each message when it is delivered, before it is
+known whether the receiver drops it. `trace_check` judges such a trace without any of the
+protocol's code; `Trace.text` prints it for people.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass, field
+from typing import NamedTuple
+
+from cavmarl.ownership.messages import (
+    COORDINATOR,
+    Abort,
+    Ack,
+    Begin,
+    Commit,
+    Done,
+    Fence,
+    Host,
+    Item,
+    Message,
+    Nack,
+    Need,
+    Prepare,
+    Record,
+    Reset,
+    Step,
+)
+
+LOG = -2
+"""The destination of records."""
+
+
+class Entry(NamedTuple):
+    """A record (destination LOG), or a message at its destination."""
+
+    destination: int
+    item: Item
+
+
+@dataclass(slots=True)
+class Trace:
+    """Entries in the order in which they happened."""
+
+    entries: list[Entry] = field(default_factory=list)
+
+    def logged(self, records: Iterable[Record]) -> None:
+        """Note records."""
+        self.entries.extend(Entry(LOG, record) for record in records)
+
+    def delivered(self, destination: int, message: Message) -> None:
+        """Note a message that arrives at a zone, or at the coordinator."""
+        self.entries.append(Entry(destination, message))
+
+    def text(self) -> str:
+        """One line an entry."""
+        return "".join(f"{describe(entry)}\n" for entry in self.entries)
+
+
+def describe(entry: Entry) -> str:
+    """An entry in words."""
+    item = entry.item
+    name = type(item).__name__.upper()
+    if isinstance(item, Record):
+        return f"log    {name} {item.tick}{_record(item)}"
+    sender = getattr(item, "source", getattr(item, "zone", COORDINATOR))
+    if isinstance(item, Ack | Nack):
+        sender = item.zone
+    if isinstance(item, Step):
+        sender = COORDINATOR
+    return f"{_name(sender)} → {_name(entry.destination)}  {name} {item.tick}{_message(item)}"
+
+
+def _name(place: int) -> str:
+    return "C" if place == COORDINATOR else str(place)
+
+
+def _record(record: Record) -> str:
+    match record:
+        case Reset():
+            return f" episode {record.episode}"
+        case Begin():
+            parts = [f"v{b.vehicle} born in {b.zone}" for b in record.births]
+            parts += [
+                f"v{s.vehicle} {s.source}→{s.target} epoch {s.epoch}{' forced' * s.forced}"
+                for s in record.switches
+            ]
+            parts += [f"v{d.vehicle} deferred {d.ticks}" for d in record.deferred]
+        case Commit():
+            parts = [f"v{entry.vehicle} removed" for entry in record.removed]
+            parts += [" ".join(f"{entry.zone}:{entry.owned.vehicles}" for entry in record.zones)]
+        case Fence() | Host():
+            return f" zone {record.zone} incarnation {record.incarnation}"
+        case _:
+            return ""
+    return "".join(f"  {part}" for part in parts)
+
+
+def _message(message: Message) -> str:
+    match message:
+        case Step():
+            parts = [f"spawn v{entry.vehicle}" for entry in message.spawn]
+            parts += [f"out v{entry.vehicle}" for entry in message.leave]
+            parts += [
+                f"in v{entry.vehicle} epoch {entry.epoch}{' with its state' * entry.forced}"
+                for entry in message.enter
+            ]
+        case Done():
+            parts = [
+                f"confirms v{entry.vehicle} epoch {entry.epoch}" for entry in message.confirmed
+            ]
+            parts += [f"removes v{entry.vehicle}" for entry in message.removed]
+        case Prepare() | Abort() | Ack():
+            parts = [f"v{entry.vehicle} epoch {entry.epoch}" for entry in message.entries]
+        case Nack():
+            parts = [f"v{entry.vehicle} {entry.reason.name.lower()}" for entry in message.entries]
+        case Need():
+            parts = [f"v{vehicle}" for vehicle in message.vehicles]
+        case _:
+            return ""
+    return "".join(f"  {part}" for part in parts)

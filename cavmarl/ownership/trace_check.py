@@ -1,0 +1,238 @@
+"""Judges a trace by the rules of docs/ownership.md, without any of the protocol's code.
+
+It accepts what every correct run leaves behind, and refuses a trace in which a vehicle has two
+owners or none, a hand-off begins without the exact state at its target (PREPARE < ACK < SWITCH <
+CONFIRM < RELEASE), something is sent before it is logged, or a tick is committed that a living
+host has not computed.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+from cavmarl.errors import InvariantError
+from cavmarl.ownership.ledger import state_digest, tally
+from cavmarl.ownership.messages import (
+    COORDINATOR,
+    Abort,
+    Ack,
+    Begin,
+    Commit,
+    Done,
+    Fence,
+    Host,
+    Message,
+    Prepare,
+    Record,
+    Reset,
+    Step,
+)
+from cavmarl.ownership.trace import Entry, describe
+
+Holding = tuple[int, int, int, int, int, bytes]
+"""(zone, incarnation, vehicle, epoch, tick, digest) of a state at a host."""
+
+
+def check_trace(entries: Iterable[Entry], longest_deferral: int, lifetime: int) -> None:
+    """Read a trace from its beginning.
+
+    Raises:
+        InvariantError: the first entry that a correct run does not leave, and why.
+    """
+    checker = TraceChecker(longest_deferral, lifetime)
+    for number, entry in enumerate(entries, start=1):
+        try:
+            checker.take(entry)
+        except InvariantError as error:
+            raise InvariantError(f"entry {number}, {describe(entry)}: {error}") from None
+
+
+def _require(holds: bool, otherwise: str) -> None:
+    if not holds:
+        raise InvariantError(otherwise)
+
+
+class TraceChecker:
+    """Follows a trace entry by entry; `take` raises InvariantError at the first that is wrong."""
+
+    def __init__(self, longest_deferral: int, lifetime: int) -> None:
+        self._longest, self._lifetime = longest_deferral, lifetime
+        self._run, self._episode, self._tick = b"", -1, 0
+        self._owners: dict[int, tuple[int, int]] = {}
+        self._deferred: dict[int, int] = {}
+        self._born: set[int] = set()
+        self._incarnations: dict[int, int] = {}
+        self._fenced: set[int] = set()
+        self._fences: dict[tuple[int, int], tuple[int, int]] = {}
+        self._holdings: set[Holding] = set()
+        self._acknowledged: set[Holding] = set()
+        self._begun: Begin | None = None
+        self._dones: dict[int, Done] = {}
+
+    def take(self, entry: Entry) -> None:
+        """The next entry."""
+        match entry.item:
+            case Reset():
+                self._reset(entry.item)
+            case Host():
+                self._host(entry.item)
+            case Fence(zone=zone, incarnation=incarnation):
+                _require(self._incarnations.get(zone) == incarnation, "fences an unknown process")
+                self._fenced.add(zone)
+                self._dones.pop(zone, None)
+            case Begin():
+                self._begin(entry.item)
+            case Commit():
+                self._commit(entry.item)
+            case Record():
+                _require(False, "unknown record")
+            case Message() if self._foreign(entry.item):
+                return
+            case Step():
+                self._step(entry.item)
+            case Prepare():
+                self._prepare(entry.item)
+            case Abort():
+                for vehicle, epoch in entry.item.entries:
+                    self._hear(entry.item.target, vehicle, epoch, entry.item.tick)
+            case Ack() if entry.destination == COORDINATOR:
+                self._ack(entry.item)
+            case Done():
+                self._done(entry.item)
+
+    def _foreign(self, message: Message) -> bool:
+        return message.run != self._run or message.episode != self._episode
+
+    def _reset(self, record: Reset) -> None:
+        _require(record.episode == self._episode + 1, f"after episode {self._episode}")
+        _require(record.tick >= self._tick, f"the tick goes back from {self._tick}")
+        self._run, self._episode, self._tick = record.run, record.episode, record.tick
+        self._owners, self._deferred, self._born = {}, {}, set()
+        self._begun, self._dones = None, {}
+        self._fences, self._holdings, self._acknowledged = {}, set(), set()
+
+    def _host(self, record: Host) -> None:
+        zone, before = record.zone, self._incarnations.get(record.zone, 0)
+        _require(record.incarnation == before + 1, f"after incarnation {before}")
+        moved = self._begun is not None and before > 0 and zone not in self._fenced
+        _require(not moved, "a zone moves in the middle of a tick")
+        self._incarnations[zone] = record.incarnation
+        self._fenced.discard(zone)
+        self._dones.pop(zone, None)
+        self._fences = {key: fence for key, fence in self._fences.items() if key[0] != zone}
+
+    def _begin(self, record: Begin) -> None:
+        _require(self._begun is None, "a tick is decided twice")
+        _require(record.tick == self._tick + 1, f"follows tick {self._tick}")
+        for vehicle, source, target, epoch, forced in record.switches:
+            owner = self._owners.get(vehicle)
+            _require(owner == (source, epoch - 1), f"v{vehicle} is owned by {owner}")
+            waited = self._deferred.get(vehicle, 0)
+            if forced:
+                _require(waited >= self._longest, f"v{vehicle} is forced after {waited} ticks")
+            else:
+                self._require_ready(vehicle, target, epoch - 1)
+        for vehicle, ticks in record.deferred:
+            follows = ticks == self._deferred.get(vehicle, 0) + 1
+            _require(
+                follows and vehicle in self._owners, f"v{vehicle} cannot wait for tick {ticks}"
+            )
+            _require(ticks <= self._longest, f"v{vehicle} waits longer than {self._longest} ticks")
+        for vehicle, _, _ in record.births:
+            _require(vehicle not in self._born, f"v{vehicle} is born twice")
+            self._born.add(vehicle)
+        self._begun = record
+
+    def _require_ready(self, vehicle: int, target: int, epoch: int) -> None:
+        _require(target not in self._fenced, f"zone {target} has no host")
+        process = (target, self._incarnations.get(target, 0))
+        acknowledged = any(
+            holding[:5] == (*process, vehicle, epoch, self._tick) for holding in self._acknowledged
+        )
+        _require(
+            acknowledged, f"v{vehicle} switches to {target} without an ACK of tick {self._tick}"
+        )
+
+    def _step(self, step: Step) -> None:
+        begun = self._begun
+        newest = self._tick if begun is None else begun.tick
+        _require(step.tick <= newest, "was sent before it was logged")
+        if begun is None or step.tick != begun.tick:
+            return
+        _require(step.committed == self._tick, "tells of a tick that is not committed")
+        entered = {(entry.vehicle, entry.epoch) for entry in step.enter}
+        left = {(entry.vehicle, entry.epoch) for entry in step.leave}
+        born = {entry.vehicle for entry in step.spawn}
+        switches, zone = begun.switches, step.zone
+        _require(
+            entered == {(s.vehicle, s.epoch) for s in switches if s.target == zone}
+            and left == {(s.vehicle, s.epoch - 1) for s in switches if s.source == zone}
+            and born == {b.vehicle for b in begun.births if b.zone == zone},
+            "says something else than BEGIN",
+        )
+
+    def _prepare(self, message: Prepare) -> None:
+        process = (message.target, self._incarnations.get(message.target, 0))
+        for vehicle, epoch, digest, state in message.entries:
+            if state_digest(state) == digest and self._hear(
+                message.target, vehicle, epoch, message.tick
+            ):
+                self._holdings.add((*process, vehicle, epoch, message.tick, digest))
+
+    def _hear(self, zone: int, vehicle: int, epoch: int, tick: int) -> bool:
+        newest = self._fences.get((zone, vehicle), (-1, -1))
+        self._fences[zone, vehicle] = max(newest, (epoch, tick))
+        return (epoch, tick) > newest
+
+    def _ack(self, message: Ack) -> None:
+        process = (message.zone, message.incarnation)
+        if self._incarnations.get(message.zone) != message.incarnation:
+            return  # a zombie's: what it still hears is not in the trace
+        for vehicle, epoch, digest in message.entries:
+            holding = (*process, vehicle, epoch, message.tick, digest)
+            known = holding in self._holdings or message.tick < self._tick - self._lifetime
+            _require(known, f"acknowledges v{vehicle}, which that host never held so")
+            self._acknowledged.add(holding)
+
+    def _done(self, message: Done) -> None:
+        current = self._incarnations.get(message.zone) == message.incarnation
+        alive = current and message.zone not in self._fenced
+        if self._begun is not None and message.tick == self._begun.tick and alive:
+            self._dones.setdefault(message.zone, message)
+
+    def _commit(self, record: Commit) -> None:
+        begun = self._begun
+        if begun is None or record.tick != begun.tick:
+            raise InvariantError("commits a tick that was not begun")
+        owners = dict(self._owners)
+        owners.update((s.vehicle, (s.target, s.epoch)) for s in begun.switches)
+        owners.update((b.vehicle, (b.zone, 0)) for b in begun.births)
+        told = [ledger.zone for ledger in record.zones]
+        _require(told == sorted(self._incarnations), f"tells of zones {told}")
+        removed = []
+        for zone in sorted(self._incarnations):
+            done = self._dones.get(zone)
+            if done is None:
+                raise InvariantError(f"zone {zone} has not said DONE")
+            confirmed = {(entry.vehicle, entry.epoch) for entry in done.confirmed}
+            planned = {(s.vehicle, s.epoch) for s in begun.switches if s.target == zone}
+            _require(confirmed == planned, f"zone {zone} did not CONFIRM what came in")
+            for entry in done.removed:
+                mine = owners.pop(entry.vehicle, (-1, 0))[0] == zone
+                _require(mine, f"zone {zone} removed v{entry.vehicle}, which it does not own")
+                removed.append(entry)
+        _require(record.removed == tuple(sorted(removed)), "removes others than the zones did")
+        for ledger in record.zones:
+            owned = {v: epoch for v, (zone, epoch) in owners.items() if zone == ledger.zone}
+            done = self._dones[ledger.zone]
+            exact = ledger.owned == done.owned == tally(self._run, owned)
+            _require(exact, f"zone {ledger.zone} does not own what it should")
+        self._owners, self._tick, self._begun, self._dones = owners, record.tick, None, {}
+        self._deferred = {v: ticks for v, ticks in begun.deferred if v in owners}
+        self._forget()
+
+    def _forget(self) -> None:
+        oldest = self._tick - self._lifetime
+        self._holdings = {held for held in self._holdings if held[4] >= oldest}
+        self._acknowledged = {held for held in self._acknowledged if held[4] >= self._tick}
+        self._fences = {key: fence for key, fence in self._fences.items() if fence[1] >= oldest}

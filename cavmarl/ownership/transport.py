@@ -1,0 +1,184 @@
+"""A network in memory that does to messages what a seed says.
+
+What becomes of a message is a function of the seed and of the message's key, never of timing: a
+message sent in phase k arrives in phase k + 1, or the plan drops or delays it. A run with faults
+can so be repeated bit for bit.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
+from hashlib import blake2b
+from typing import NamedTuple
+
+from cavmarl.errors import ConfigError, MessageError
+from cavmarl.ownership.codec import decode, encode
+from cavmarl.ownership.messages import COORDINATOR, Message, Step, destinations
+
+
+@dataclass(frozen=True, slots=True)
+class Rates:
+    """Probabilities of faults of one kind of message.
+
+    Attributes:
+        drop: it never arrives.
+        delay: it arrives 1 to `longest_delay` phases later.
+        duplicate: it arrives once more, later.
+        reorder: it arrives after others of its phase.
+        corrupt: a bit flips on the way, and the receiver refuses it.
+        refuse: the target of a PREPARE answers with a NACK.
+        longest_delay: in phases.
+
+    Raises:
+        ConfigError: not a probability.
+    """
+
+    drop: float = 0.0
+    delay: float = 0.0
+    duplicate: float = 0.0
+    reorder: float = 0.0
+    corrupt: float = 0.0
+    refuse: float = 0.0
+    longest_delay: int = 8
+
+    def __post_init__(self) -> None:
+        for name in ("drop", "delay", "duplicate", "reorder", "corrupt", "refuse"):
+            if not 0.0 <= getattr(self, name) <= 1.0:
+                raise ConfigError(f"the rate of {name} is {getattr(self, name)}: not in [0, 1]")
+
+
+FAULTLESS = Rates()
+
+
+@dataclass(frozen=True, slots=True)
+class FaultPlan:
+    """What happens to which messages.
+
+    Attributes:
+        seed: of all choices.
+        rates: name of the kind (`"Prepare"`, `"Ack"`, …) → its rates; others have `otherwise`.
+        until: the first phase in which nothing happens any more; None means never.
+    """
+
+    seed: int = 0
+    rates: Mapping[str, Rates] = field(default_factory=dict)
+    otherwise: Rates = FAULTLESS
+    until: int | None = None
+
+    def of(self, kind: str, phase: int) -> Rates:
+        """The rates of a kind of message in a phase."""
+        if self.until is not None and phase >= self.until:
+            return FAULTLESS
+        return self.rates.get(kind, self.otherwise)
+
+    def chance(self, key: tuple[object, ...], question: str) -> float:
+        """A number in [0, 1) that belongs to the seed, the message and the question."""
+        text = repr((self.seed, key, question)).encode()
+        return int.from_bytes(blake2b(text, digest_size=7).digest(), "little") / (1 << 56)
+
+
+class Delivery(NamedTuple):
+    """A message at its destination; `refused` asks a target to answer a PREPARE with a NACK."""
+
+    destination: int
+    message: Message
+    refused: bool = False
+
+
+class _Flight(NamedTuple):
+    phase: int
+    rank: float
+    sequence: int
+    delivery: Delivery
+
+
+class Network:
+    """Carries messages from phase to phase.
+
+    Attributes:
+        phase: how often `deliver` has been called.
+        sent: kind → copies that were sent.
+        faults: (kind, fault) → how often.
+    """
+
+    def __init__(self, plan: FaultPlan | None = None) -> None:
+        self.plan = FaultPlan() if plan is None else plan
+        self.phase = 0
+        self.sent: Counter[str] = Counter()
+        self.faults: Counter[tuple[str, str]] = Counter()
+        self._flights: list[_Flight] = []
+        self._copies: Counter[tuple[object, ...]] = Counter()
+        self._sequence = 0
+
+    def send(self, messages: Iterable[Message]) -> None:
+        """Take messages; each goes to all of its destinations."""
+        for message in messages:
+            for destination in destinations(message):
+                self._send(message, destination)
+
+    def deliver(self) -> list[Delivery]:
+        """Begin the next phase: what arrives in it, in order."""
+        self.phase += 1
+        self._copies.clear()
+        due = sorted(flight[:3] for flight in self._flights if flight.phase <= self.phase)
+        deliveries = {flight.sequence: flight.delivery for flight in self._flights}
+        self._flights = [flight for flight in self._flights if flight.phase > self.phase]
+        return [deliveries[sequence] for _, _, sequence in due]
+
+    def in_flight(self) -> int:
+        """Messages that have not arrived."""
+        return len(self._flights)
+
+    def _send(self, message: Message, destination: int) -> None:
+        kind = type(message).__name__
+        sender = COORDINATOR if isinstance(message, Step) else _sender(message)
+        place = (kind, message.episode, message.tick, sender, destination, self.phase)
+        self._copies[place] += 1
+        key = (*place, self._copies[place])
+        rates = self.plan.of(kind, self.phase)
+        self.sent[kind] += 1
+        if self._strikes(kind, key, "drop", rates.drop):
+            return
+        if self._strikes(kind, key, "corrupt", rates.corrupt) and self._damaged(message, key):
+            return
+        at, rank = self.phase + 1, 0.0
+        if self._strikes(kind, key, "delay", rates.delay):
+            at += self._later(key, "how long", rates)
+        if self._strikes(kind, key, "reorder", rates.reorder):
+            rank = self.plan.chance(key, "place")
+        refused = kind == "Prepare" and self._strikes(kind, key, "refuse", rates.refuse)
+        delivery = Delivery(destination, message, refused)
+        self._fly(at, rank, delivery)
+        if self._strikes(kind, key, "duplicate", rates.duplicate):
+            self._fly(at + self._later(key, "the copy", rates), rank, delivery)
+
+    def _strikes(self, kind: str, key: tuple[object, ...], fault: str, rate: float) -> bool:
+        if rate <= 0.0 or self.plan.chance(key, fault) >= rate:
+            return False
+        self.faults[kind, fault] += 1
+        return True
+
+    def _later(self, key: tuple[object, ...], question: str, rates: Rates) -> int:
+        return 1 + int(self.plan.chance(key, question) * rates.longest_delay)
+
+    def _fly(self, phase: int, rank: float, delivery: Delivery) -> None:
+        self._flights.append(_Flight(phase, rank, self._sequence, delivery))
+        self._sequence += 1
+
+    def _damaged(self, message: Message, key: tuple[object, ...]) -> bool:
+        """Whether the receiver sees that a bit of the message's wire form has flipped."""
+        wire = bytearray(encode(message))
+        bit = int(self.plan.chance(key, "bit") * len(wire) * 8)
+        wire[bit // 8] ^= 1 << (bit % 8)
+        try:
+            decode(bytes(wire))
+        except MessageError:
+            return True
+        return False
+
+
+def _sender(message: Message) -> int:
+    sender: int = getattr(message, "zone", getattr(message, "source", COORDINATOR))
+    return sender

@@ -1,0 +1,59 @@
+"""`Commons`: what no zone of a world can do alone, its signals and what agents get."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cavmarl.config import TERMS, EnvConfig
+from cavmarl.kernels.arrays import Worlds
+from cavmarl.kernels.outputs import clear_outputs, settle_outputs
+from cavmarl.kernels.signals import switch_signals
+from cavmarl.roads.network import RoadNetwork
+from cavmarl.shard.outputs import make_outputs
+
+__all__ = ["Commons"]
+
+
+class Commons:
+    """What all shards of W worlds share, and the steps that are taken once for all of them.
+
+    Args:
+        config: the environment.
+        network: the roads of the whole map.
+        num_worlds: W.
+
+    Attributes:
+        outputs: of all agents; every shard writes at the indices of its own ones.
+    """
+
+    def __init__(self, config: EnvConfig, network: RoadNetwork, num_worlds: int) -> None:
+        self.outputs = make_outputs(config, num_worlds)
+        self._roads = network.arrays
+        self._sim_dt_s = config.clock.sim_dt_s
+        self._weights = np.array([config.terms.weights.get(name, 0.0) for name in TERMS])
+        self._team_share = config.terms.team_share
+
+    def switch_signals(self, worlds: Worlds) -> None:
+        """Bring the signals to the present tick, after `detect` of all shards.
+
+        Args:
+            worlds: of any shard; the arrays of signals are those of all.
+        """
+        if self._roads.signals.size > 0:
+            switch_signals(
+                self._roads,
+                worlds.ticks,
+                worlds.detected_s,
+                self._sim_dt_s,
+                worlds.controllers,
+                worlds.signal_phase,
+            )
+
+    def clear_outputs(self, chosen: NDArray[np.bool_]) -> None:
+        """Make all agents of the chosen worlds (W,) absent, before `sense` of all shards."""
+        clear_outputs(self.outputs, chosen)
+
+    def settle_outputs(self, chosen: NDArray[np.bool_]) -> None:
+        """Finish the outputs of the chosen worlds (W,) after `sense`, before `credit`."""
+        settle_outputs(self.outputs, self._weights, self._team_share, chosen)

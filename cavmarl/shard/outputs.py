@@ -1,0 +1,28 @@
+"""The arrays in which all agents of W worlds get what they sense, whichever shards own them."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from cavmarl.config import TERMS, EnvConfig
+from cavmarl.kernels.arrays import Outputs
+from cavmarl.shard.sensors import frame_size
+
+__all__ = ["make_outputs"]
+
+
+def make_outputs(config: EnvConfig, num_worlds: int) -> Outputs:
+    """Outputs of W worlds in which nobody is present."""
+    agents = (num_worlds, config.population.num_ids)
+    size = config.sensors.stack * frame_size(config.sensors)
+    return Outputs(
+        # Not `zeros`: NumPy asks for huge pages where it fills the array itself.
+        observations=np.full((*agents, size), 0.0, dtype=np.float32),
+        terms=np.zeros((*agents, len(TERMS)), dtype=np.float32),
+        rewards=np.zeros(agents, dtype=np.float32),
+        terminated=np.zeros(agents, dtype=np.bool_),
+        present=np.zeros(agents, dtype=np.bool_),
+        acted=np.zeros(agents, dtype=np.bool_),
+        events=np.zeros(agents, dtype=np.int32),
+        vehicle_ids=np.full(agents, -1, dtype=np.int64),
+    )

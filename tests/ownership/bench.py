@@ -1,0 +1,138 @@
+"""A coordinator and its hosts on a bench: a test hands every message over itself.
+
+A vehicle's state is its version, (vehicle, tick). The bench is its own committed store.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+
+from cavmarl.ownership.directory import Directory
+from cavmarl.ownership.endpoint import Endpoint
+from cavmarl.ownership.ledger import row_hash, world_digest
+from cavmarl.ownership.limits import Limits
+from cavmarl.ownership.messages import (
+    COORDINATOR,
+    Birth,
+    Message,
+    Output,
+    Record,
+    Removed,
+    Step,
+    destinations,
+)
+from cavmarl.ownership.offers import Approach
+from cavmarl.ownership.safeguards import ALL_ON, Safeguards
+from cavmarl.ownership.trace import Trace
+from cavmarl.ownership.trace_check import check_trace
+from tests.ownership.explorer import version
+
+RUN = bytes(range(16))
+
+
+class Bench:
+    """Zones 0, 1, … of one world."""
+
+    def __init__(
+        self, zones: int = 2, limits: Limits | None = None, safeguards: Safeguards = ALL_ON
+    ) -> None:
+        self.limits, self.safeguards = limits or Limits(), safeguards
+        self.directory = Directory(RUN, range(zones), self, self.limits, safeguards)
+        self.trace, self.log = Trace(), list[Record]()
+        self.endpoints: dict[int, Endpoint] = {}
+        self.entered: dict[int, bytes] = {}
+        self.note(self.directory.reset())
+        for zone in range(zones):
+            self.host(zone)
+
+    def state(self, vehicle: int) -> bytes:
+        return version(vehicle, self.directory.table.tick)
+
+    def note(self, output: Output) -> Output:
+        """Log what is to be logged."""
+        self.log += output.records
+        self.trace.logged(output.records)
+        return output
+
+    def host(self, zone: int) -> Output:
+        output = self.note(self.directory.host(zone, worker=zone))
+        self.endpoints[zone] = Endpoint(self.directory.hosting(zone), self.limits, self.safeguards)
+        return output
+
+    def crash(self, zone: int) -> Output:
+        """The zone's host dies and is replaced."""
+        self.note(self.directory.fence(zone))
+        return self.host(zone)
+
+    def begin(
+        self, movers: Iterable[tuple[int, int]] = (), births: Iterable[tuple[int, int]] = ()
+    ) -> tuple[Step, ...]:
+        """BEGIN with vehicles in zones, and new vehicles in zones; the STEPs."""
+        new = [Birth(vehicle, zone, self.state(vehicle)) for vehicle, zone in births]
+        output = self.note(self.directory.begin(movers, new))
+        return tuple(message for message in output.messages if isinstance(message, Step))
+
+    def give(self, message: Message, removed: Sequence[int] = ()) -> tuple[Message, ...]:
+        """Deliver a message; what its receiver sends, with DONE after a STEP."""
+        destination, *copies = destinations(message)
+        for zone in copies:
+            self.trace.delivered(zone, message)
+            self.endpoints[zone].on_message(message)
+        self.trace.delivered(destination, message)
+        if destination == COORDINATOR:
+            return self.note(self.directory.on_message(message)).messages
+        endpoint = self.endpoints[destination]
+        reaction = endpoint.on_message(message)
+        if reaction.advance is None:
+            return reaction.messages
+        tick = reaction.advance.tick
+        self.entered |= dict(reaction.advance.enter)
+        rows = world_digest(
+            row_hash(vehicle, version(vehicle, tick))
+            for vehicle in endpoint.owned
+            if vehicle not in removed
+        )
+        gone = [Removed(vehicle, 0) for vehicle in removed if vehicle in endpoint.owned]
+        return (endpoint.complete(rows, gone),)
+
+    def offer(self, zone: int, *approaches: tuple[int, int]) -> tuple[Message, ...]:
+        """The offers of a zone's host: (vehicle, target)."""
+        endpoint = self.endpoints[zone]
+        return endpoint.offer(
+            Approach(vehicle, target, version(vehicle, endpoint.tick))
+            for vehicle, target in approaches
+        )
+
+    def pass_on(self, messages: Iterable[Message]) -> None:
+        """Deliver messages, what they lead to, and so on."""
+        for message in messages:
+            self.pass_on(self.give(message))
+
+    def commit(self) -> None:
+        rows = {zone: done.rows for zone, done in self.directory.dones.items()}
+        self.note(self.directory.commit(rows))
+
+    def tick(
+        self,
+        movers: Iterable[tuple[int, int]] = (),
+        births: Iterable[tuple[int, int]] = (),
+        offers: Sequence[tuple[int, int]] = (),
+        removed: Sequence[int] = (),
+    ) -> tuple[Message, ...]:
+        """A whole tick without faults; what was offered, (vehicle, target), is answered."""
+        sent: list[Message] = []
+        for step in self.begin(movers, births):
+            for done in self.give(step, removed):
+                self.give(done)
+        for zone, endpoint in self.endpoints.items():
+            mine = [offer for offer in offers if offer[0] in endpoint.owned and offer[1] != zone]
+            sent += self.offer(zone, *mine)
+        self.pass_on(sent)
+        self.commit()
+        return tuple(sent)
+
+    def owner(self, vehicle: int) -> int:
+        return self.directory.table.owners[vehicle][0]
+
+    def judge(self) -> None:
+        check_trace(self.trace.entries, self.limits.longest_deferral, self.limits.lifetime)

@@ -1,0 +1,60 @@
+"""Numbers that cannot work are refused, and small helpers do what they say."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+
+from cavmarl.errors import ConfigError, LedgerError
+from cavmarl.ownership.distances import Distances
+from cavmarl.ownership.ledger import SeenIds, Tally, tally
+from cavmarl.ownership.limits import DeadlinePolicy, Limits
+from cavmarl.ownership.transport import Rates
+
+RUN = bytes(range(16))
+
+
+@pytest.mark.parametrize(
+    ("change", "why"),
+    [
+        ({"deferral": -1}, "deferral is -1"),
+        ({"attempts": 0}, "attempts is 0"),
+        ({"grace": 2}, "'force' takes no grace"),
+        ({"policy": DeadlinePolicy.HOLD}, "need at least 1"),
+    ],
+)
+def test_deadlines_that_cannot_work_are_refused(change: dict[str, Any], why: str) -> None:
+    with pytest.raises(ConfigError, match=why):
+        Limits(**change)
+
+
+def test_distances_that_cannot_work_are_refused() -> None:
+    with pytest.raises(ConfigError, match="not below 0"):
+        Distances(approach_m=-1.0, hysteresis_m=0.0, overlap_m=10.0)
+    with pytest.raises(ConfigError, match="has to be wider"):
+        Distances(approach_m=10.0, hysteresis_m=0.0, overlap_m=10.0)
+
+
+def test_a_rate_is_a_probability() -> None:
+    with pytest.raises(ConfigError, match="rate of drop is 2"):
+        Rates(drop=2.0)
+
+
+def test_a_tally_is_that_of_its_set() -> None:
+    whole = tally(RUN, {7: 0, 8: 3, 9: 1})
+    assert whole == Tally().plus(RUN, 9, 1).plus(RUN, 7, 0).plus(RUN, 8, 3)
+    assert whole.minus(RUN, 8, 3) == tally(RUN, {7: 0, 9: 1})
+    assert tally(RUN, {7: 1}) != tally(RUN, {7: 0}) != tally(bytes(16), {7: 0})
+    with pytest.raises(LedgerError, match="2 vehicles instead of 3"):
+        whole.check(whole.minus(RUN, 8, 3), "here")
+
+
+def test_ids_that_were_seen_take_no_room_as_long_as_they_are_dense() -> None:
+    seen = SeenIds()
+    for block in range(0, 1000, 10):
+        for vehicle in reversed(range(block, block + 10)):
+            assert vehicle not in seen
+            seen.add(vehicle)
+            assert vehicle in seen
+    assert (seen.floor, seen.above) == (1000, set())

@@ -1,0 +1,154 @@
+"""The log as JSON lines: replayed, it is the table; damaged, it is refused by name."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+
+import pytest
+
+from cavmarl.errors import (
+    CorruptJournalError,
+    JournalError,
+    ProtocolError,
+    TornJournalError,
+    TransitionError,
+)
+from cavmarl.ownership.messages import Begin, Birth, Commit, Host, Removed, Reset
+from cavmarl.ownership.records import (
+    SCHEMA,
+    record_from_dict,
+    record_to_dict,
+    record_to_line,
+    records_from_lines,
+    replay,
+    sealed,
+    whole_lines,
+)
+from tests.ownership.bench import Bench
+from tests.ownership.test_simulator import campaign
+
+
+@pytest.fixture(scope="module")
+def log() -> str:
+    simulator = campaign(4, "corner")
+    simulator.run(15)
+    owners = simulator.directory.table.owners
+    assert replay(records_from_lines(simulator.log)).owners == owners
+    return simulator.log
+
+
+def test_a_line_says_what_it_is(log: str) -> None:
+    for sequence, line in enumerate(log.splitlines()):
+        content = json.loads(line)
+        assert (content["schema"], content["sequence"]) == (SCHEMA, sequence)
+        assert {"kind", "episode", "tick", "checksum"} <= set(content)
+
+
+def test_records_come_back_equal(log: str) -> None:
+    records = records_from_lines(log)
+    assert "".join(record_to_line(record, k) for k, record in enumerate(records)) == log
+    assert [record_from_dict(record_to_dict(r, k), k) for k, r in enumerate(records)] == list(
+        records
+    )
+
+
+def test_every_prefix_can_be_replayed(log: str) -> None:
+    records = records_from_lines(log)
+    ticks = [replay(records[:length]).tick for length in range(1, len(records) + 1)]
+    assert ticks == sorted(ticks)
+    assert ticks[-1] == 15
+
+
+def test_a_torn_last_line_is_named_and_what_precedes_it_is_whole(log: str) -> None:
+    torn = log[:-7]
+    with pytest.raises(TornJournalError, match=f"line {len(log.splitlines())} "):
+        records_from_lines(torn)
+    assert records_from_lines(whole_lines(torn)) == records_from_lines(log)[:-1]
+
+
+def test_every_changed_letter_of_a_line_is_noticed(log: str) -> None:
+    line = log.splitlines(keepends=True)[8]
+    for at in range(len(line) - 1):
+        for letter in ("0", "1", "f", '"', "x"):
+            damaged = line[:at] + letter + line[at + 1 :]
+            if damaged != line:
+                with pytest.raises(CorruptJournalError):
+                    records_from_lines("".join(log.splitlines(keepends=True)[:8]) + damaged)
+
+
+def test_a_missing_doubled_or_swapped_line_is_noticed(log: str) -> None:
+    lines = log.splitlines(keepends=True)
+    for wrong in (lines[:5] + lines[6:], lines[:5] + lines[4:], [*lines[:5], lines[6], lines[5]]):
+        with pytest.raises(CorruptJournalError, match="lines are missing"):
+            records_from_lines("".join(wrong))
+
+
+def changed(**change: object) -> dict[str, object]:
+    return sealed(record_to_dict(Host(0, 0, 1, 1, 1), 0) | change)
+
+
+@pytest.mark.parametrize(
+    ("change", "why"),
+    [
+        ({"schema": "cavmarl.ownership/9"}, "schema"),
+        ({"kind": "BLESS"}, "'BLESS', which is none"),
+        ({"zone": "one"}, "zone is 'one'"),
+        ({"zone": True}, "zone is True"),
+        ({"zone": 1 << 70}, "zone is"),
+        ({"kind": ["HOST"]}, "which is none"),
+    ],
+)
+def test_a_line_of_another_kind_is_refused(change: dict[str, object], why: str) -> None:
+    with pytest.raises(CorruptJournalError, match=why):
+        record_from_dict(changed(**change), 0)
+
+
+def test_lines_that_are_no_objects_are_refused() -> None:
+    for text in ("[1]\n", "nonsense\n", "\n"):
+        with pytest.raises(CorruptJournalError, match="line 1"):
+            records_from_lines(text)
+
+
+def test_a_log_that_no_coordinator_writes_cannot_be_replayed(log: str) -> None:
+    records = records_from_lines(log)
+    with pytest.raises(JournalError, match="begins with a RESET"):
+        replay(records[1:])
+    with pytest.raises(JournalError, match="begins with a RESET"):
+        replay(())
+    kinds = [type(record).__name__ for record in records]
+    begin, commit = kinds.index("Begin"), kinds.index("Commit")
+    with pytest.raises(JournalError, match="BEGIN of tick 1"):
+        replay([*records[: begin + 1], records[begin]])
+    second = kinds.index("Begin", begin + 1)
+    with pytest.raises(JournalError, match="BEGIN of tick 2"):
+        replay([*records[:begin], records[second]])
+    with pytest.raises(JournalError, match="COMMIT of tick 1"):
+        replay([*records[: second + 1], records[commit]])
+
+
+def test_a_log_whose_vehicles_do_what_they_cannot_is_refused() -> None:
+    bench = Bench()
+    bench.tick(births=[(7, 0), (8, 0)], offers=[(7, 1)])
+    bench.tick(movers=[(7, 1)], removed=[8])
+    kinds = [type(record).__name__ for record in bench.log]
+    k = [at for at, kind in enumerate(kinds) if kind == "Begin"][1]
+    begin, commit = bench.log[k], bench.log[k + 1]
+    assert isinstance(begin, Begin)
+    assert isinstance(commit, Commit)
+    switch = begin.switches[0]
+    for wrong in (
+        replace(begin, switches=(switch._replace(source=1),)),
+        replace(begin, switches=(switch._replace(epoch=5),)),
+        replace(begin, switches=(switch._replace(vehicle=9),)),
+        replace(begin, births=(Birth(7, 0, b""),)),
+        replace(begin, births=(Birth(9, 5, b""),)),
+    ):
+        with pytest.raises(ProtocolError):
+            replay([*bench.log[:k], wrong])
+    with pytest.raises(JournalError, match="zones \\[0\\]"):
+        replay([*bench.log[: k + 1], replace(commit, zones=commit.zones[:1])])
+    with pytest.raises(JournalError, match="16 bytes"):
+        replay([Reset(0, 0, b"short")])
+    with pytest.raises(TransitionError):
+        replay([*bench.log[: k + 1], replace(commit, removed=(Removed(9, 0),))])

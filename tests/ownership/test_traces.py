@@ -1,0 +1,305 @@
+"""Readable transcripts of what happens, and the judge of transcripts (AT6).
+
+`CAVMARL_REWRITE=1` writes the files anew; read the difference before you commit it.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from cavmarl.errors import InvariantError
+from cavmarl.ownership.directory import Directory
+from cavmarl.ownership.limits import Limits
+from cavmarl.ownership.messages import (
+    COORDINATOR,
+    Ack,
+    Begin,
+    Commit,
+    Done,
+    Host,
+    Prepare,
+    Reset,
+    Step,
+    Switch,
+)
+from cavmarl.ownership.trace import LOG, Entry
+from cavmarl.ownership.trace_check import check_trace
+from tests.ownership.bench import Bench
+from tests.ownership.simulator import Simulator
+from tests.ownership.test_simulator import campaign, world
+
+TRACES = Path(__file__).parent / "traces"
+
+
+def straight_crossing(bench: Bench) -> None:
+    bench.tick(births=[(7, 0)])
+    bench.tick(offers=[(7, 1)])
+    bench.tick(movers=[(7, 1)])
+    bench.tick()
+
+
+def lost_ack(bench: Bench) -> None:
+    bench.tick(births=[(7, 0)])
+    bench.tick(movers=[(7, 1)], offers=[])
+    bench.tick(movers=[(7, 1)], offers=[(7, 1)])
+    bench.tick(movers=[(7, 1)])
+
+
+def every_ack_lost(bench: Bench) -> None:
+    bench.tick(births=[(7, 0)])
+    for _ in range(3):
+        bench.tick(movers=[(7, 1)])
+
+
+def ping_pong(bench: Bench) -> None:
+    bench.tick(births=[(7, 0)], offers=[(7, 1)])
+    for zone in (1, 0, 1):
+        bench.tick(movers=[(7, zone)], offers=[(7, 1 - zone)])
+
+
+def corner(bench: Bench) -> None:
+    bench.tick(births=[(7, 0)], offers=[(7, 1), (7, 2), (7, 3)])
+    bench.tick(movers=[(7, 3)], offers=[(7, 1)])
+    bench.tick()
+
+
+def chain(bench: Bench) -> None:
+    bench.tick(births=[(7, 0)], offers=[(7, 1)])
+    bench.tick(movers=[(7, 1)], offers=[(7, 2)])
+    bench.tick(movers=[(7, 2)])
+
+
+def turn_back(bench: Bench) -> None:
+    bench.tick(births=[(7, 0)], offers=[(7, 1)])
+    bench.tick(offers=[(7, 1)])
+    bench.tick()
+
+
+def target_dies_after_its_ack(bench: Bench) -> None:
+    bench.tick(births=[(7, 0)], offers=[(7, 1)])
+    bench.crash(1)
+    bench.tick(movers=[(7, 1)], offers=[(7, 1)])
+    bench.tick(movers=[(7, 1)])
+
+
+def target_dies_after_begin(bench: Bench) -> None:
+    bench.tick(births=[(7, 0)], offers=[(7, 1)])
+    step = bench.begin(movers=[(7, 1)])[0]
+    bench.pass_on(bench.give(step))
+    bench.pass_on(bench.crash(1).messages)
+    bench.commit()
+
+
+def source_dies_in_its_step(bench: Bench) -> None:
+    bench.tick(births=[(7, 0)], offers=[(7, 1)])
+    source, target = bench.begin(movers=[(7, 1)])
+    bench.give(source)
+    bench.pass_on([target])
+    bench.pass_on(bench.crash(0).messages)
+    bench.commit()
+
+
+def coordinator_restarts(bench: Bench) -> None:
+    bench.tick(births=[(7, 0)], offers=[(7, 1)])
+    first, _ = bench.begin(movers=[(7, 1)])
+    bench.pass_on([first])
+    bench.directory = Directory.restore(bench.log, range(2), bench, bench.limits)
+    bench.pass_on(bench.directory.resend().messages)
+    bench.commit()
+
+
+def removed_in_its_switch(bench: Bench) -> None:
+    bench.tick(births=[(7, 0)], offers=[(7, 1)])
+    bench.tick(movers=[(7, 1)], removed=[7])
+    bench.tick()
+
+
+def reset_in_a_switch(bench: Bench) -> None:
+    bench.tick(births=[(7, 0)], offers=[(7, 1)])
+    late = bench.begin(movers=[(7, 1)])
+    bench.note(bench.directory.reset())
+    bench.tick(births=[(7, 1)])
+    for message in late:
+        bench.give(message)
+
+
+STORIES: dict[str, tuple[int, Callable[[Bench], None]]] = {
+    "straight_crossing": (2, straight_crossing),
+    "lost_ack": (2, lost_ack),
+    "every_ack_lost": (2, every_ack_lost),
+    "ping_pong": (2, ping_pong),
+    "corner": (4, corner),
+    "chain": (3, chain),
+    "turn_back": (2, turn_back),
+    "target_dies_after_its_ack": (2, target_dies_after_its_ack),
+    "target_dies_after_begin": (2, target_dies_after_begin),
+    "source_dies_in_its_step": (2, source_dies_in_its_step),
+    "coordinator_restarts": (2, coordinator_restarts),
+    "removed_in_its_switch": (2, removed_in_its_switch),
+    "reset_in_a_switch": (2, reset_in_a_switch),
+}
+
+
+@pytest.mark.parametrize("name", STORIES)
+def test_the_story_is_told_as_on_file(name: str) -> None:
+    zones, story = STORIES[name]
+    bench = Bench(zones)
+    story(bench)
+    bench.judge()
+    path = TRACES / f"{name}.txt"
+    if os.environ.get("CAVMARL_REWRITE"):
+        path.write_text(bench.trace.text(), encoding="utf-8")
+    assert bench.trace.text() == path.read_text(encoding="utf-8")
+
+
+def test_every_file_has_its_story() -> None:
+    assert sorted(path.stem for path in TRACES.glob("*.txt")) == sorted(STORIES)
+
+
+@pytest.fixture(scope="module")
+def entries() -> tuple[Entry, ...]:
+    simulator = Simulator(world("corner"))
+    simulator.run(10)
+    return tuple(simulator.trace.entries)
+
+
+def judge(entries: list[Entry]) -> None:
+    check_trace(entries, Limits().longest_deferral, Limits().lifetime)
+
+
+def places(entries: tuple[Entry, ...], kind: type, where: Callable[[Entry], bool]) -> list[int]:
+    return [k for k, entry in enumerate(entries) if type(entry.item) is kind and where(entry)]
+
+
+def switching(entry: Entry) -> bool:
+    return isinstance(entry.item, Begin) and bool(entry.item.switches)
+
+
+def first_switch(entries: tuple[Entry, ...]) -> tuple[int, Begin, Switch]:
+    k = places(entries, Begin, switching)[0]
+    begin = entries[k].item
+    assert isinstance(begin, Begin)
+    return k, begin, begin.switches[0]
+
+
+def changed_switch(entries: tuple[Entry, ...], **change: object) -> list[Entry]:
+    k, begin, switch = first_switch(entries)
+    lie = replace(begin, switches=(switch._replace(**change), *begin.switches[1:]))  # type: ignore[arg-type]
+    return [*entries[:k], Entry(LOG, lie), *entries[k + 1 :]]
+
+
+def without(entries: tuple[Entry, ...], kind: type, where: Callable[[Entry], bool]) -> list[Entry]:
+    gone = set(places(entries, kind, where))
+    assert gone
+    return [entry for k, entry in enumerate(entries) if k not in gone]
+
+
+def test_the_judge_accepts_a_correct_run(entries: tuple[Entry, ...]) -> None:
+    judge(list(entries))
+
+
+@pytest.mark.parametrize(
+    ("change", "why"),
+    [
+        ({"source": 9}, "is owned by"),
+        ({"epoch": 9}, "is owned by"),
+        ({"forced": True}, "is forced after 0 ticks"),
+        ({"target": 9}, "without an ACK"),
+    ],
+)
+def test_the_judge_refuses_another_switch(
+    entries: tuple[Entry, ...], change: dict[str, object], why: str
+) -> None:
+    with pytest.raises(InvariantError, match=why):
+        judge(changed_switch(entries, **change))
+
+
+@pytest.mark.parametrize(
+    ("kind", "why"),
+    [
+        (Prepare, "which that host never held so"),
+        (Ack, "without an ACK"),
+        (Done, "has not said DONE"),
+        (Begin, "was sent before it was logged"),
+        (Commit, "a tick is decided twice"),
+        (Host, "tells of zones"),
+        (Reset, "has not said DONE"),
+    ],
+)
+def test_the_judge_misses_what_is_left_out(
+    entries: tuple[Entry, ...], kind: type, why: str
+) -> None:
+    with pytest.raises(InvariantError, match=why):
+        judge(without(entries, kind, lambda entry: True))
+
+
+def test_the_judge_refuses_a_switch_without_its_ack(entries: tuple[Entry, ...]) -> None:
+    _, begin, switch = first_switch(entries)
+    lost = without(
+        entries,
+        Ack,
+        lambda entry: (
+            entry.destination == COORDINATOR
+            and isinstance(entry.item, Ack)
+            and entry.item.tick == begin.tick - 1
+            and switch.vehicle in [held.vehicle for held in entry.item.entries]
+        ),
+    )
+    with pytest.raises(InvariantError, match=f"v{switch.vehicle} switches"):
+        judge(lost)
+
+
+def test_the_judge_refuses_a_step_before_its_record(entries: tuple[Entry, ...]) -> None:
+    k, begin, _ = first_switch(entries)
+    (after, *_) = places(entries, Step, lambda entry: entry.item.tick == begin.tick)
+    swapped = list(entries)
+    swapped[k], swapped[after] = swapped[after], swapped[k]
+    with pytest.raises(InvariantError, match="before it was logged"):
+        judge(swapped)
+
+
+def test_the_judge_refuses_a_done_without_its_confirmation(entries: tuple[Entry, ...]) -> None:
+    lied = [
+        Entry(to, replace(item, confirmed=())) if isinstance(item, Done) else Entry(to, item)
+        for to, item in entries
+    ]
+    with pytest.raises(InvariantError, match="did not CONFIRM"):
+        judge(lied)
+
+
+def test_the_judge_refuses_a_wrong_ledger(entries: tuple[Entry, ...]) -> None:
+    k = places(entries, Commit, lambda entry: True)[3]
+    commit = entries[k].item
+    assert isinstance(commit, Commit)
+    zone = commit.zones[0]
+    lie = replace(
+        commit, zones=(zone._replace(owned=zone.owned._replace(digest=1)), *commit.zones[1:])
+    )
+    with pytest.raises(InvariantError, match="does not own what it should"):
+        judge([*entries[:k], Entry(LOG, lie), *entries[k + 1 :]])
+
+
+def test_the_judge_refuses_a_stale_acknowledgement() -> None:
+    bench = Bench()
+    bench.tick(births=[(7, 0)], offers=[(7, 1)])
+    acks = [entry for entry in bench.trace.entries if isinstance(entry.item, Ack)]
+    ack = acks[0].item
+    assert isinstance(ack, Ack)
+    bench.trace.delivered(COORDINATOR, replace(ack, tick=2))
+    with pytest.raises(InvariantError, match="never held so"):
+        bench.judge()
+
+
+@pytest.mark.parametrize("seed", [1, 3, 4])
+def test_the_judge_accepts_campaigns_and_refuses_them_when_a_record_is_gone(seed: int) -> None:
+    simulator = campaign(seed, "corner")
+    simulator.run(15)
+    entries = tuple(simulator.trace.entries)
+    for k in places(entries, Begin, lambda entry: True):
+        with pytest.raises(InvariantError):
+            judge([*entries[:k], *entries[k + 1 :]])
