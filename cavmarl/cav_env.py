@@ -19,6 +19,7 @@ from cavmarl.errors import ConfigError, EpisodeEndedError, ResetNeededError
 from cavmarl.kernels.codes import EVENTS_THAT_END
 from cavmarl.render.view import WorldView
 from cavmarl.roads.network import RoadNetwork
+from cavmarl.roads.zones import ZonePartition
 from cavmarl.runtime.simulation import Simulation
 from cavmarl.seeds import check_seed, first_seed
 from cavmarl.spaces import (
@@ -59,7 +60,7 @@ def parallel_env(
 
     Args:
         env: name of an entry of `envs/`, a folder with an env.yaml, or a map file.
-        zones: shadows zones.count; this version runs 1.
+        zones: shadows zones.count, how many shards run the world; results do not depend on it.
         workers: processes that run the shards; this version runs them in the caller's (0).
         agents: shadows population.agents.
         background: shadows population.background.
@@ -73,7 +74,7 @@ def parallel_env(
         MapError: the map cannot be read or driven.
     """
     check_placement(workers)
-    config, network, demand = load_world(
+    config, network, demand, partition = load_world(
         env,
         zones=zones,
         agents=agents,
@@ -81,7 +82,7 @@ def parallel_env(
         max_cycles=max_cycles,
         overrides=overrides,
     )
-    return CavEnv(config, network, demand, seed=seed, render_mode=render_mode)
+    return CavEnv(config, network, demand, partition, seed=seed, render_mode=render_mode)
 
 
 def _flags(agents: list[str], flags: NDArray[np.bool_]) -> dict[str, bool]:
@@ -102,6 +103,7 @@ class CavEnv(ParallelEnv[str, Any, Any]):  # type: ignore[misc] # PettingZoo is 
         config: the environment.
         network: its roads.
         demand: whose vehicles drive beside the generator's.
+        partition: the zones; None: cut as `config.zones` says.
         seed: of the first reset, if that is given none.
         render_mode: `human`, `rgb_array` or None.
     """
@@ -118,6 +120,7 @@ class CavEnv(ParallelEnv[str, Any, Any]):  # type: ignore[misc] # PettingZoo is 
         config: EnvConfig,
         network: RoadNetwork,
         demand: DemandFile | None = None,
+        partition: ZonePartition | None = None,
         *,
         seed: int | None = None,
         render_mode: str | None = None,
@@ -148,7 +151,7 @@ class CavEnv(ParallelEnv[str, Any, Any]):  # type: ignore[misc] # PettingZoo is 
         self._parts = (
             observation_parts(config.sensors) if config.observation.kind == "dict" else None
         )
-        self._simulation = Simulation(config, network, demand=demand)
+        self._simulation = Simulation(config, network, demand=demand, partition=partition)
         self.state_space = state_space(self._simulation.capacity)
         self._decoder = ActionDecoder(config.action, 1, self.possible_agents)
         self._first_seed = None if seed is None else check_seed(seed)

@@ -115,7 +115,7 @@ class ClockConfig:
 
 @dataclass(frozen=True)
 class ZonesConfig:
-    """How the map is divided; see docs/zones.md. This version runs one zone.
+    """How the map is divided; see docs/zones.md.
 
     Attributes:
         layout: how zones are cut: `grid`, `strips`, `bisection`, or a zone file named as

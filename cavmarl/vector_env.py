@@ -22,6 +22,7 @@ from cavmarl.config import EnvConfig
 from cavmarl.errors import ConfigError, ResetNeededError
 from cavmarl.kernels.codes import EVENTS_THAT_END
 from cavmarl.roads.network import RoadNetwork
+from cavmarl.roads.zones import ZonePartition
 from cavmarl.runtime.simulation import Simulation
 from cavmarl.seeds import check_seed, first_seed
 from cavmarl.spaces import action_space, flat_observation_space
@@ -59,7 +60,7 @@ def make_vec(
     Args:
         env: name of an entry of `envs/`, a folder with an env.yaml, or a map file.
         num_envs: number of worlds.
-        zones: shadows zones.count; this version runs 1.
+        zones: shadows zones.count, how many shards run the world; results do not depend on it.
         workers: processes that run the shards; this version runs them in the caller's (0).
         agents: shadows population.agents.
         background: shadows population.background.
@@ -77,7 +78,7 @@ def make_vec(
         raise ConfigError(f"num_envs = {num_envs!r}: must be a whole number")
     if not 1 <= num_envs <= MAX_WORLDS:
         raise ConfigError(f"num_envs = {num_envs}: must be from 1 to {MAX_WORLDS}")
-    config, network, demand = load_world(
+    config, network, demand, partition = load_world(
         env,
         zones=zones,
         agents=agents,
@@ -85,7 +86,7 @@ def make_vec(
         max_cycles=max_cycles,
         overrides=overrides,
     )
-    return CavVectorEnv(config, network, int(num_envs), demand, seed=seed, copy=copy)
+    return CavVectorEnv(config, network, int(num_envs), demand, partition, seed=seed, copy=copy)
 
 
 class CavVectorEnv:
@@ -102,6 +103,8 @@ class CavVectorEnv:
         config: the environment.
         network: its roads.
         num_envs: W.
+        demand: whose vehicles drive beside the generator's.
+        partition: the zones; None: cut as `config.zones` says.
         seed: of the first reset, if that is given none.
         copy: False returns observations as a read-only view that the next step or reset overwrites;
             large ones are copied for longer than they are made.
@@ -113,6 +116,7 @@ class CavVectorEnv:
         network: RoadNetwork,
         num_envs: int,
         demand: DemandFile | None = None,
+        partition: ZonePartition | None = None,
         *,
         seed: int | None = None,
         copy: bool = True,
@@ -136,7 +140,7 @@ class CavVectorEnv:
             "name": f"cavmarl/{config.name}-v{config.version}",
             "autoreset_mode": AutoresetMode.SAME_STEP,
         }
-        self._simulation = Simulation(config, network, num_envs, demand)
+        self._simulation = Simulation(config, network, num_envs, demand, partition)
         self._decoder = ActionDecoder(config.action, num_envs, self.possible_agents)
         self._steps = np.zeros(num_envs, dtype=np.int64)
         self._mask = np.zeros((num_envs, self.num_agents), dtype=np.bool_)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from cavmarl.config import EnvConfig
 from cavmarl.errors import ConfigError
@@ -24,7 +24,31 @@ from cavmarl.roads.zone_layouts import cut_map
 from cavmarl.roads.zones import ZonePartition
 from cavmarl.traffic.demand import DemandFile, read_demand
 
-__all__ = ["check_agents", "check_placement", "find_map", "load_roads", "load_world", "load_zones"]
+__all__ = [
+    "World",
+    "check_agents",
+    "check_placement",
+    "find_map",
+    "load_roads",
+    "load_world",
+    "load_zones",
+]
+
+
+class World(NamedTuple):
+    """What a world is made of.
+
+    Attributes:
+        config: the environment.
+        network: its roads.
+        demand: whose vehicles drive beside the generator's.
+        partition: its zones.
+    """
+
+    config: EnvConfig
+    network: RoadNetwork
+    demand: DemandFile | None
+    partition: ZonePartition
 
 
 def load_world(
@@ -35,14 +59,15 @@ def load_world(
     background: int | None = None,
     max_cycles: int | None = None,
     overrides: Mapping[str, Any] | None = None,
-) -> tuple[EnvConfig, RoadNetwork, DemandFile | None]:
-    """Config, roads and demand of an entry, a folder or a map file; keywords as in `parallel_env`.
+) -> World:
+    """What an entry, a folder or a map file describes; keywords as in `parallel_env`.
 
     Raises:
         ConfigError: a key, value or combination that cannot work.
         MapError: the map cannot be read or driven.
         DemandError: a demand file is missing, broken or another map's.
         RouteError: its routes do not connect.
+        ZoneError: the zones do not fit the map.
     """
     config, base_dir = load_config(
         env,
@@ -54,9 +79,10 @@ def load_world(
     )
     network = load_roads(config, base_dir)
     files = resolve_demand(config, base_dir)
-    if not files:
-        return config, network, None
-    return config, network, read_demand(files, network, on_bad_route=config.traffic.on_bad_route)
+    demand = None
+    if files:
+        demand = read_demand(files, network, on_bad_route=config.traffic.on_bad_route)
+    return World(config, network, demand, load_zones(config, base_dir, network))
 
 
 def load_roads(config: EnvConfig, base_dir: Path) -> RoadNetwork:

@@ -25,13 +25,13 @@ def make_simulation(
     overrides: Mapping[str, Any] | None = None,
 ) -> Simulation:
     """Worlds of an environment in one population; not reset yet."""
-    config, network, demand = load_world(
+    config, network, demand, partition = load_world(
         env,
         agents=agents,
         background=background,
         overrides={"population.mode": mode, **(overrides or {})},
     )
-    return Simulation(config, network, num_worlds, demand)
+    return Simulation(config, network, num_worlds, demand, partition)
 
 
 def make_traffic(

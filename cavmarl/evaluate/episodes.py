@@ -103,7 +103,7 @@ def drive_run(job: Job, progress: Progress | None = None) -> dict[str, RunData]:
         ConfigError: a key or a value that cannot work.
         PolicyError: a policy cannot be loaded or does not fit.
     """
-    config, network, demand = load_world(
+    config, network, demand, partition = load_world(
         job.env,
         agents=job.agents,
         background=job.background,
@@ -111,7 +111,8 @@ def drive_run(job: Job, progress: Progress | None = None) -> dict[str, RunData]:
         overrides=job.overrides,
     )
     vehicles = config.population.agents + config.population.background
-    vec = CavVectorEnv(config, network, worlds_at_once(job.episodes, vehicles), demand)
+    num_envs = worlds_at_once(job.episodes, vehicles)
+    vec = CavVectorEnv(config, network, num_envs, demand, partition)
     drivers = {name: load_policy(policy, vec) for name, policy in job.policies.items()}
     return {name: _drive(vec, driver, name, job, progress) for name, driver in drivers.items()}
 

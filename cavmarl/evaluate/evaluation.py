@@ -171,7 +171,7 @@ def _named(
 
 def _prepare(folder: Path, job: Job, repeats: int) -> None:
     """Refuse early what cannot work, then put everything on record."""
-    config, network, demand = load_world(
+    config, network, demand, partition = load_world(
         job.env,
         agents=job.agents,
         background=job.background,
@@ -179,7 +179,7 @@ def _prepare(folder: Path, job: Job, repeats: int) -> None:
         overrides=job.overrides,
     )
     policies = describe_policies(job.policies)
-    one_world = CavVectorEnv(config, network, 1, demand)
+    one_world = CavVectorEnv(config, network, 1, demand, partition)
     for policy in job.policies.values():
         load_policy(policy, one_world)
     try:

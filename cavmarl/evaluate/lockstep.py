@@ -34,8 +34,8 @@ def _main() -> None:
 
 def _steps(job: dict[str, Any]) -> Iterator[dict[str, Any]]:
     """Drive; what is told after the reset and after each step, until a dump is asked for."""
-    config, network, demand = load_world(job["env"], **job["world"])
-    vec = CavVectorEnv(config, network, 1, demand)
+    config, network, demand, partition = load_world(job["env"], **job["world"])
+    vec = CavVectorEnv(config, network, 1, demand, partition)
     driver = load_policy(job["policy"], vec)
     observations, infos = vec.reset(seed=job["seed"])
     driver.reset(job["seed"])

@@ -8,16 +8,13 @@ from typing import Any
 
 import numpy as np
 
-from cavmarl.config import EnvConfig
 from cavmarl.evaluate.sumo_input import read_input
 from cavmarl.evaluate.traffic_metrics import TrafficCounts, TrafficMeter, TrafficRun
 from cavmarl.kernels.codes import ACTION_IDLE
 from cavmarl.render.ground import signal_codes
-from cavmarl.roads.network import RoadNetwork
 from cavmarl.runtime.simulation import Simulation
 from cavmarl.shard.shard import Commands
-from cavmarl.traffic.demand import DemandFile
-from cavmarl.worlds import load_world
+from cavmarl.worlds import World, load_world
 
 __all__ = ["advance", "idle_commands", "load_demand", "make_world", "run_native"]
 
@@ -28,7 +25,7 @@ def load_demand(
     seconds: int,
     dt_s: float,
     overrides: Mapping[str, Any] | None = None,
-) -> tuple[EnvConfig, RoadNetwork, DemandFile | None]:
+) -> World:
     """What a world with background traffic and nobody to train is made of.
 
     Args:
@@ -70,8 +67,8 @@ def make_world(
         DemandError: see `load_demand`.
         MapError: see `load_demand`.
     """
-    config, network, file = load_demand(map_file, demand, seconds, dt_s)
-    simulation = Simulation(config, network, demand=file)
+    config, network, file, partition = load_demand(map_file, demand, seconds, dt_s)
+    simulation = Simulation(config, network, demand=file, partition=partition)
     simulation.seed(seed)
     simulation.reset()
     return simulation

@@ -80,14 +80,15 @@ def world_maker(
         MapError: the map cannot be driven.
     """
     if demand:
-        config, network, file = load_demand(find_map(env), demand, seconds, TICK_S, overrides)
+        world = load_demand(find_map(env), demand, seconds, TICK_S, overrides)
     else:
-        config, network, file = load_world(
+        world = load_world(
             env,
             agents=agents,
             background=background,
             overrides={"horizon_s": float(seconds), **(overrides or {})},
         )
+    config, network, file, _ = world
 
     def make(zones: int) -> Simulation:
         partition = named_zones(

@@ -145,6 +145,7 @@ class Scratch(NamedTuple):
     blinker: NDArray[np.int32]  # (C,)
     hold: NDArray[np.int32]  # (C,)
     hit: NDArray[np.int64]  # (C,) id of the vehicle each row touches
+    spare: NDArray[np.void]  # VEHICLE (1,)
 
 
 class Sensors(NamedTuple):

@@ -197,7 +197,35 @@ def advance(
 
 
 @kernel
-def resolve(worlds: Worlds, scratch: Scratch, grid: Grid) -> None:
+def _nearest_first(
+    rows: NDArray[np.void],
+    num_owned: int,
+    num_rows: int,
+    rect: NDArray[np.float64],
+    reach_m: float,
+    spare: NDArray[np.void],
+) -> int:
+    """Put the ghosts within reach of a rectangle before the others; rows up to the last of them."""
+    near = num_owned
+    for i in range(num_owned, num_rows):
+        x = rows[i]["x"]
+        y = rows[i]["y"]
+        if (
+            rect[0] - reach_m <= x <= rect[2] + reach_m
+            and rect[1] - reach_m <= y <= rect[3] + reach_m
+        ):
+            if i > near:
+                spare[0] = rows[near]
+                rows[near] = rows[i]
+                rows[i] = spare[0]
+            near += 1
+    return near
+
+
+@kernel
+def resolve(
+    worlds: Worlds, scratch: Scratch, grid: Grid, rect: NDArray[np.float64], touching_m: float
+) -> None:
     """Mark in `next_rows` who touches whom.
 
     Args:
@@ -205,11 +233,15 @@ def resolve(worlds: Worlds, scratch: Scratch, grid: Grid) -> None:
             each vehicle when it begins to touch another.
         scratch: room.
         grid: spatial index over the vehicles of one world, filled here.
+        rect: min_x, min_y, max_x, max_y of the shard's zone in m.
+        touching_m: ghosts further outside than this touch none of its vehicles.
     """
     for w in range(worlds.ticks.shape[0]):
         rows = worlds.next_rows[w]
-        fill_grid(rows, worlds.num_rows[w], grid)
-        touch = find_contacts(worlds.num_rows[w], grid, scratch.hit)
+        owned = worlds.num_owned[w]
+        num = _nearest_first(rows, owned, worlds.num_rows[w], rect, touching_m, scratch.spare)
+        fill_grid(rows, num, grid)
+        touch = find_contacts(num, grid, scratch.hit)
         if not touch and worlds.num_touching[w] == 0:
             continue
         for i in range(worlds.num_owned[w]):

@@ -34,6 +34,7 @@ from cavmarl.runtime.compilation import first_compilation
 from cavmarl.runtime.division import Division, ZoneLoads
 from cavmarl.runtime.executor import Executor, SerialExecutor
 from cavmarl.shard.reach import driving_reach_m
+from cavmarl.shard.sensors import largest_radius_m, sensing_reach_m
 from cavmarl.shard.shard import Commands, Shard
 from cavmarl.shard.vehicles import STATE_FIELDS, blank_vehicle
 from cavmarl.traffic.demand import DemandFile
@@ -83,7 +84,7 @@ class Simulation:
         network: its roads.
         num_worlds: W.
         demand: whose vehicles drive beside the generator's.
-        partition: the zones, if `config.zones` names a file.
+        partition: the zones; None: cut as `config.zones` says.
     """
 
     def __init__(
@@ -128,14 +129,21 @@ class Simulation:
         """One shard a zone, and the division that knows them all."""
         config, traffic = self.config, self._traffic
         zones, settings = partition.arrays, config.zones
-        coverage = Coverage.of(
-            (driving_reach_m(self.network, traffic.travel),),
-            hysteresis_m=settings.hysteresis_m,
-            max_deferred_ticks=settings.max_deferred_ticks,
-            max_speed_mps=MAX_SPEED_MPS,
-            sim_dt_s=config.clock.sim_dt_s,
-        )
-        halo = zone_halo(partition, coverage.halo_m)
+        radius_m = largest_radius_m(traffic.travel.types)
+
+        def halo_m(*reaches_m: float) -> float:
+            return Coverage.of(
+                reaches_m,
+                hysteresis_m=settings.hysteresis_m,
+                max_deferred_ticks=settings.max_deferred_ticks,
+                max_speed_mps=MAX_SPEED_MPS,
+                sim_dt_s=config.clock.sim_dt_s,
+            ).halo_m
+
+        driving_m = driving_reach_m(self.network, traffic.travel)
+        sensing_m = sensing_reach_m(config.sensors, radius_m)
+        halo = zone_halo(partition, halo_m(driving_m, sensing_m))
+        touching_m = halo_m(2.0 * radius_m)
         shards: list[Shard] = []
         for zone in range(partition.count):
             shard = Shard(
@@ -149,6 +157,7 @@ class Simulation:
                 zone,
                 zones,
                 halo,
+                touching_m,
                 shards[0].worlds if shards else None,
             )
             shards.append(shard)

@@ -77,6 +77,7 @@ class Shard:
         zone: which one.
         zones: of the partition.
         halo: how far it sees over its borders.
+        touching_m: no ghost further outside of the zone can touch one of its vehicles.
         common: whose clock, keys and signals these worlds share, those of the first shard; None:
             this is the first one.
     """
@@ -93,11 +94,13 @@ class Shard:
         zone: int,
         zones: ZoneArrays,
         halo: Halo,
+        touching_m: float,
         common: Worlds | None = None,
     ) -> None:
         self.zone = zone
         self._zones = zones
         self._halo = halo
+        self._touching_m = touching_m
         self._config = config
         self._roads: RoadArrays = network.arrays
         self._plans = plans
@@ -161,7 +164,8 @@ class Shard:
 
     def resolve(self) -> None:
         """Find who touches whom in `next_rows`."""
-        resolve(self.worlds, self.scratch, self._grid)
+        rect = self._zones.rects[self.zone]
+        resolve(self.worlds, self.scratch, self._grid, rect, self._touching_m)
 
     def choose_goals(self, demand: Demand, num_goals: int, gate: Gate) -> None:
         """Give the vehicles of `next_rows` that need it another goal."""
@@ -315,4 +319,5 @@ def _make_scratch(num_lanes: int, num_links: int, capacity: int) -> Scratch:
         blinker=integers(capacity),
         hold=integers(capacity),
         hit=np.zeros(capacity, dtype=np.int64),
+        spare=np.zeros(1, dtype=VEHICLE),
     )
