@@ -64,6 +64,7 @@ def load_world(
 
     Raises:
         ConfigError: a key, value or combination that cannot work.
+        ZoneError: zones that cannot be, or not on this map.
         MapError: the map cannot be read or driven.
         DemandError: a demand file is missing, broken or another map's.
         RouteError: its routes do not connect.

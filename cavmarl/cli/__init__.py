@@ -15,6 +15,7 @@ from cavmarl.cli import (
     listing,
     map,
     suite,
+    verify,
     verify_determinism,
     view,
 )
@@ -31,6 +32,7 @@ app = typer.Typer(
 app.command()(evaluate.evaluate)
 app.command()(evaluate.report)
 app.command()(suite.suite)
+app.command()(verify.verify)
 app.command()(verify_determinism.verify_determinism)
 app.command()(view.view)
 app.command()(demo.demo)

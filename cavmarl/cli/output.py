@@ -6,7 +6,7 @@ import json
 from collections.abc import Sequence
 from pathlib import Path
 from tempfile import TemporaryFile
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 from rich.console import Console
@@ -14,6 +14,9 @@ from rich.text import Text
 
 from cavmarl.errors import ConfigError
 from cavmarl.seeds import check_seed
+
+if TYPE_CHECKING:
+    from cavmarl.evaluate.differences import Difference
 
 __all__ = [
     "Agents",
@@ -27,6 +30,7 @@ __all__ = [
     "number",
     "parse_settings",
     "print_error",
+    "say_difference",
     "write_json",
 ]
 
@@ -126,6 +130,16 @@ def write_json(path: Path | None, document: dict[str, Any]) -> None:
 def number(value: float | None, scale: float = 1.0) -> str:
     """A number for a table, times `scale`; a dash where there is none."""
     return "-" if value is None else f"{scale * value:.2f}"
+
+
+def say_difference(difference: Difference, sides: tuple[str, str]) -> str:
+    """One sentence: when, whose, and what each of the two sides has."""
+    thing = difference.what if difference.vehicle is None else f"vehicle {difference.vehicle}"
+    one, other = difference.values
+    return (
+        f"different: step {difference.step} (tick {difference.tick}), {thing}, "
+        f"{difference.field}: {one} {sides[0]}, {other} {sides[1]}"
+    )
 
 
 def print_error(message: str) -> None:

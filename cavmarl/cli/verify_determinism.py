@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
 from rich.console import Console
@@ -17,11 +17,9 @@ from cavmarl.cli.output import (
     Seed,
     Settings,
     parse_settings,
+    say_difference,
     write_json,
 )
-
-if TYPE_CHECKING:
-    from cavmarl.evaluate.determinism import FirstDifference
 
 __all__ = ["verify_determinism"]
 
@@ -55,7 +53,9 @@ def verify_determinism(
         )
     write_json(json_path, found.to_dict())
     if found.difference is not None:
-        console.print(_sentence(found.difference), markup=False, soft_wrap=True)
+        one, other = (f"in process {number}" for number in found.difference.processes)
+        said = say_difference(found.difference, (one, other))
+        console.print(said, markup=False, soft_wrap=True)
         raise typer.Exit(1)
     console.print(
         f"equal: {found.steps} steps in {len(found.hash_seeds)} processes (PYTHONHASHSEED "
@@ -63,14 +63,4 @@ def verify_determinism(
         markup=False,
         highlight=False,
         soft_wrap=True,
-    )
-
-
-def _sentence(difference: FirstDifference) -> str:
-    one, other = difference.processes
-    thing = difference.what if difference.vehicle is None else f"vehicle {difference.vehicle}"
-    return (
-        f"different: step {difference.step} (tick {difference.tick}), {thing}, "
-        f"{difference.field}: {difference.values[0]} in process {one}, "
-        f"{difference.values[1]} in process {other}"
     )

@@ -20,43 +20,27 @@ from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from cavmarl import errors
 from cavmarl.errors import ConfigError, EvaluationError
+from cavmarl.evaluate.differences import Arrays, Difference, find_difference
 from cavmarl.seeds import check_seed
-from cavmarl.shard.vehicles import STATE_FIELDS
 
-__all__ = ["Determinism", "FirstDifference", "verify_determinism"]
+__all__ = ["Determinism", "FirstDifference", "check_steps", "verify_determinism"]
 
 HASH_SEEDS = ("0", "1", "4294967295")  # of the three processes
 MAX_STEPS = 10_000_000
 
-Arrays = dict[str, NDArray[Any]]
-
 
 @dataclass(frozen=True)
-class FirstDifference:
+class FirstDifference(Difference):
     """Where two processes first differ.
 
     Attributes:
-        step: number of the step, 0 is the reset.
-        tick: the world's tick at its end, as the first process has it.
-        processes: the numbers of the two.
-        what: `vehicle`, the name of another array, or `hidden state`: what hashes cover and
-            neither has (queue and random keys).
-        vehicle: id of the vehicle, the smallest that differs; None where it is none.
-        field: of its record, the first that differs; or the place in the array.
-        values: in the two; None where a vehicle is missing.
+        processes: the numbers of the two; the tick is that of the first.
     """
 
-    step: int
-    tick: int
     processes: tuple[int, int]
-    what: str
-    vehicle: int | None
-    field: str
-    values: tuple[Any, Any]
 
 
 @dataclass(frozen=True)
@@ -110,12 +94,10 @@ def verify_determinism(
         PolicyError: the policy cannot be loaded or does not fit.
         EvaluationError: a process died.
     """
-    if isinstance(steps, bool) or not isinstance(steps, int) or not 1 <= steps <= MAX_STEPS:
-        raise ConfigError(f"steps = {steps!r}: must be a whole number from 1 to {MAX_STEPS}")
     job = {
         "env": str(env),
         "policy": str(policy),
-        "steps": steps,
+        "steps": check_steps(steps),
         "seed": check_seed(seed),
         "world": {
             "agents": agents,
@@ -142,8 +124,20 @@ def verify_determinism(
         difference = None
         if odd is not None:
             states = [programs[k].dump(room / f"{k}.npz") for k in (0, odd)]
-            difference = _first_difference(step, told[0]["tick"], (0, odd), states)
+            found = find_difference(step, told[0]["tick"], *states)
+            difference = FirstDifference(**vars(found), processes=(0, odd))
         return Determinism(step, told[0]["tick"], HASH_SEEDS, told[0]["state"], difference)
+
+
+def check_steps(steps: int) -> int:
+    """A number of steps that can be compared.
+
+    Raises:
+        ConfigError: it is none.
+    """
+    if isinstance(steps, bool) or not isinstance(steps, int) or not 1 <= steps <= MAX_STEPS:
+        raise ConfigError(f"steps = {steps!r}: must be a whole number from 1 to {MAX_STEPS}")
+    return steps
 
 
 class _Program:
@@ -222,36 +216,3 @@ def _load_beside() -> Iterator[None]:
     finally:
         busy.kill()
         busy.wait()
-
-
-def _first_difference(
-    step: int, tick: int, processes: tuple[int, int], states: list[Arrays]
-) -> FirstDifference:
-    """The smallest id, and of its record the first field; else the first other array and place."""
-    one, other = states
-
-    def found(
-        what: str, vehicle: int | None, field: str, values: tuple[Any, Any]
-    ) -> FirstDifference:
-        return FirstDifference(step, tick, processes, what, vehicle, field, values)
-
-    mine, theirs = ({int(row["id"]): row for row in state["vehicles"]} for state in states)
-    for vehicle in sorted(mine.keys() | theirs.keys()):
-        if vehicle not in mine or vehicle not in theirs:
-            one_id, other_id = (vehicle if vehicle in rows else None for rows in (mine, theirs))
-            return found("vehicle", vehicle, "id", (one_id, other_id))
-        for name in STATE_FIELDS:
-            a, b = mine[vehicle][name], theirs[vehicle][name]
-            if a.tobytes() != b.tobytes():
-                return found("vehicle", vehicle, name, (a.tolist(), b.tolist()))
-    for name in one:
-        if name == "vehicles" or one[name].tobytes() == other[name].tobytes():
-            continue
-        if one[name].shape != other[name].shape:
-            return found(name, None, "shape", (one[name].shape, other[name].shape))
-        # Bytes and not numbers: -0.0 is not 0.0 here, and NaN is NaN.
-        raw = [state[name].view(f"V{state[name].itemsize}") for state in states]
-        place = tuple(int(k) for k in np.argwhere(raw[0] != raw[1])[0])
-        values = (one[name][place].item(), other[name][place].item())
-        return found(name, None, str(list(place)), values)
-    return found("hidden state", None, "queue or random keys", (None, None))

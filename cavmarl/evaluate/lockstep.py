@@ -13,9 +13,9 @@ from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from cavmarl import errors
+from cavmarl.evaluate.differences import Arrays, snapshot, step_results
 from cavmarl.policies import load_policy
 from cavmarl.vector_env import CavVectorEnv
 from cavmarl.worlds import load_world
@@ -39,7 +39,7 @@ def _steps(job: dict[str, Any]) -> Iterator[dict[str, Any]]:
     driver = load_policy(job["policy"], vec)
     observations, infos = vec.reset(seed=job["seed"])
     driver.reset(job["seed"])
-    results: list[NDArray[Any]] = [observations]
+    results = {"observations": observations}
     for step in range(job["steps"] + 1):
         yield {
             "step": step,
@@ -52,26 +52,21 @@ def _steps(job: dict[str, Any]) -> Iterator[dict[str, Any]]:
             _dump(wanted, vec, results)
             return
         actions = driver.act_batch(observations, infos["mask"])
-        observations, rewards, terminated, truncated, infos = vec.step(actions)
-        results = [observations, rewards, terminated, truncated, infos["terms"], actions]
+        told = vec.step(actions)
+        results = step_results(told, actions)
+        observations, infos = told[0], told[-1]
 
 
-def _digest(arrays: list[NDArray[Any]]) -> str:
+def _digest(arrays: Arrays) -> str:
     digest = hashlib.blake2b(digest_size=16)
-    for array in arrays:
+    for array in arrays.values():
         digest.update(np.ascontiguousarray(array).tobytes())
     return digest.hexdigest()
 
 
-def _dump(path: str, vec: CavVectorEnv, results: list[NDArray[Any]]) -> None:
+def _dump(path: str, vec: CavVectorEnv, results: Arrays) -> None:
     """Leave everything that the hashes are made of."""
-    vehicles = vec.simulation.vehicles()
-    names = ("observations", "rewards", "terminations", "truncations", "terms", "actions")
-    arrays: dict[str, Any] = {
-        "vehicles": vehicles[np.argsort(vehicles["id"])],
-        "signals": vec.simulation.signal_phases(),
-        **dict(zip(names, results, strict=False)),  # after a reset there are observations alone
-    }
+    arrays: dict[str, Any] = snapshot(vec, results)
     np.savez(path, **arrays)
     print(json.dumps({"dumped": path}), flush=True)
 

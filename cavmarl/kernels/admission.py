@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from cavmarl.kernels import kernel
 from cavmarl.kernels.arrays import Demand, Gate, RoadArrays, Scratch, Travel, Worlds
-from cavmarl.kernels.codes import COUNT_DEPARTED, LANE_FIRST, LANE_GIVEN, LANE_RANDOM
+from cavmarl.kernels.codes import COUNT_DEPARTED, LANE_FIRST, LANE_GIVEN, LANE_RANDOM, POS_LAST
 from cavmarl.kernels.departures import enter
 from cavmarl.kernels.entering import (
     crowd,
@@ -54,12 +54,15 @@ def rank_lanes(
 ) -> None:
     """Count who is around the places in this zone where departures may enter that choose a lane.
 
+    Who enters behind the last vehicle of a lane is told its place by the zone where the lane
+    starts: it alone sees all who could be the last.
+
     Args:
         roads: the road arrays.
         travel: types and ways.
         zones: of the partition.
         zone: the shard's own.
-        gate: `ranks` is written where a place lies in this zone.
+        gate: `ranks` and `last_s` are written where a place, or a lane's start, lies in this zone.
         worlds: `next_rows` is read.
         scratch: room.
     """
@@ -68,7 +71,9 @@ def rank_lanes(
         for q in range(gate.num_queue[w]):
             departure = gate.queue[w, q]
             code = departure["lane_code"]
-            if code == LANE_GIVEN or code == LANE_FIRST or code == LANE_RANDOM:
+            chooses = not (code == LANE_GIVEN or code == LANE_FIRST or code == LANE_RANDOM)
+            last = departure["pos_code"] == POS_LAST
+            if not (chooses or last):
                 continue
             if not indexed:
                 rows = worlds.next_rows[w]
@@ -78,8 +83,21 @@ def rank_lanes(
             first = edge["first_lane"]
             s = max(departure["pos"], 0.0)
             for lane in range(first, first + edge["num_lanes"]):
-                if _zone_on(roads, zones, lane, min(s, roads.lanes[lane]["length_m"])) == zone:
+                on_lane = min(s, roads.lanes[lane]["length_m"])
+                if chooses and _zone_on(roads, zones, lane, on_lane) == zone:
                     gate.ranks[w, q, lane - first] = crowd(scratch, lane, s, travel.view_m)
+                if last and _zone_on(roads, zones, lane, 0.0) == zone:
+                    kind = travel.types[departure["vtype"]]
+                    gate.last_s[w, q, lane - first] = entry_place(
+                        roads,
+                        worlds.keys[w],
+                        departure,
+                        kind,
+                        lane,
+                        worlds.ticks[w],
+                        scratch,
+                        travel.view_m,
+                    )
 
 
 @kernel
@@ -178,9 +196,13 @@ def propose(
                 continue
             departure = gate.queue[w, q]
             kind = travel.types[departure["vtype"]]
-            s = entry_place(
-                roads, key, departure, kind, lane, worlds.ticks[w], scratch, travel.view_m
-            )
+            if departure["pos_code"] == POS_LAST:
+                edge = roads.edges[roads.lanes[lane]["edge"]]
+                s = gate.last_s[w, q, lane - edge["first_lane"]]
+            else:
+                s = entry_place(
+                    roads, key, departure, kind, lane, worlds.ticks[w], scratch, travel.view_m
+                )
             if _zone_on(roads, zones, lane, s) != zone:
                 continue
             speed = entry_speed(roads, travel, key, departure, kind, lane, s, scratch)

@@ -108,6 +108,7 @@ class Gate(NamedTuple):
     places: NDArray[np.int64]  # (W, C + D) where in the queue those stand that are about to enter
     tries: NDArray[np.int32]  # (W, C + D) LANE on which each of the queue tries to enter, or -1
     ranks: NDArray[np.int64]  # (W, C + D, E) how crowded the lanes of its edge are, at most E
+    last_s: NDArray[np.float64]  # (W, C + D, E) where on them one enters that is to be the last, m
     lane_taken: NDArray[np.bool_]  # (L,) somebody tries to enter there in this tick
     spare: NDArray[np.void]  # VEHICLE (1,) room
 

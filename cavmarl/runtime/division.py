@@ -7,7 +7,8 @@ ghost already.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from typing import NamedTuple
 
 import numpy as np
@@ -139,6 +140,28 @@ class Division:
         """All live vehicles of a world: of several shards a copy, of one a view."""
         parts = [s.worlds.rows[world, : s.worlds.num_owned[world]] for s in self._shards]
         return parts[0] if len(parts) == 1 else np.concatenate(parts)
+
+    @contextmanager
+    def everybody_next(self) -> Iterator[Worlds]:
+        """All owned `next_rows` as one shard would hold them; what is changed there goes back."""
+        first = self._shards[0].worlds
+        if len(self._shards) == 1:
+            yield first
+            return
+        running = self.running()
+        parts = [
+            [s.worlds.next_rows[w, : s.worlds.num_owned[w]] for s in self._shards]
+            for w in range(running.size)
+        ]
+        rows = np.empty((running.size, running.max(initial=0)), dtype=first.next_rows.dtype)
+        for w, owned in enumerate(parts):
+            np.concatenate(owned, out=rows[w, : running[w]])
+        yield first._replace(rows=rows, next_rows=rows, num_owned=running, num_rows=running)
+        for w, owned in enumerate(parts):
+            place = 0
+            for part in owned:
+                part[:] = rows[w, place : place + len(part)]
+                place += len(part)
 
     def whole(self) -> Worlds:
         """All worlds as one shard would hold them, without its `next_rows`: of several, a copy."""

@@ -99,6 +99,7 @@ class Simulation:
         self.network = network
         self.demand = demand
         self.num_worlds = num_worlds
+        self.partition = _cut(config, network) if partition is None else partition
         self._seed = 0
         self._first_world = 0
         self._episodes = np.zeros(num_worlds, dtype=np.int64)
@@ -119,7 +120,7 @@ class Simulation:
             self._traffic = traffic
             self._gate = make_gate(num_worlds, capacity, network.arrays, blank.dtype)
             self._commons = Commons(config, network, num_worlds)
-            self._shards = self._make_shards(partition or _cut(config, network))
+            self._shards = self._make_shards(self.partition)
             self._shard = self._shards[0]
             self._executor: Executor = SerialExecutor(self._shards)
             if is_first:
@@ -309,13 +310,15 @@ class Simulation:
     def _leave(self) -> None:
         """Who needs it picks another goal, who has arrived leaves, who looks for a way finds it."""
         traffic, gate, worlds = self._traffic, self._gate, self._shard.worlds
-        if (worlds.ticks % traffic.ticks_per_s == 0).any():
+        begins_second = (worlds.ticks % traffic.ticks_per_s == 0).any()
+        if begins_second:
             self._executor.each("choose_goals", traffic.demand, len(traffic.plans), gate)
         self._executor.each("leave", gate)
         if gate.num_passing.any():
             traffic.settle(gate, worlds)
-        if traffic.rerouting is not None:
-            traffic.rerouting.act(gate, worlds)
+        if begins_second and traffic.rerouting is not None:
+            with self._division.everybody_next() as everybody:
+                traffic.rerouting.act(gate, everybody)
 
     def _enter(self) -> None:
         """Those who wait and find a gap enter `next_rows`."""

@@ -19,7 +19,8 @@ def driving_reach_m(network: RoadNetwork, travel: Travel) -> float:
     """The farthest vehicle that a driver's decision can depend on.
 
     A driver looks `view_m` ahead and asks at a line in view who comes to the junction beyond it,
-    within `APPROACH_M` of the lines there, and who stands behind it, within `EXIT_LOOK_M`.
+    within `APPROACH_M` of the lines there, and who stands behind it, within `EXIT_LOOK_M`. Own path
+    and foe's meet somewhere on the junction: between the lines may lie the lengths of both.
 
     Args:
         network: the roads.
@@ -30,4 +31,4 @@ def driving_reach_m(network: RoadNetwork, travel: Travel) -> float:
     back_m = float(network.lanes["stop_back_m"].max())
     bodies_m = 2.0 * float(travel.types["length"].max())
     beyond_m = max(APPROACH_M, EXIT_LOOK_M)
-    return travel.view_m + back_m + crossing_m + beyond_m + bodies_m + ASIDE_M
+    return travel.view_m + back_m + 2.0 * crossing_m + beyond_m + bodies_m + ASIDE_M

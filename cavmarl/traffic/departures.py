@@ -64,6 +64,7 @@ def _room(
         "places": np.zeros((num_worlds, waiting), dtype=np.int64),
         "tries": np.zeros((num_worlds, waiting), dtype=np.int32),
         "ranks": np.zeros((num_worlds, waiting, num_lanes), dtype=np.int64),
+        "last_s": np.zeros((num_worlds, waiting, num_lanes)),
     }
 
 

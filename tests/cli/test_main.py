@@ -10,11 +10,17 @@ from pathlib import Path
 import pytest
 
 from cavmarl.cli import main
+from cavmarl.roads.cache import load_network
+from cavmarl.roads.zone_coverage import Coverage
+from cavmarl.roads.zone_file import write_zones
+from cavmarl.roads.zone_layouts import cut_map
+from cavmarl.worlds import find_map
 
 COMMANDS = (
     "evaluate",
     "report",
     "suite",
+    "verify",
     "verify-determinism",
     "view",
     "demo",
@@ -125,6 +131,48 @@ def test_a_refused_evaluation_leaves_no_folder(
     assert not list(tmp_path.iterdir())
 
 
+def test_verify_says_for_each_number_of_zones_that_it_is_equal(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    path = tmp_path / "found.json"
+    words = ("verify", "merge", "--zones", "1,4", "--steps", "5", "--worlds", "2", *QUICK)
+    assert run(*words, "--layout", "strips", "--json", str(path)) == 0
+    found = json.loads(path.read_text())
+    assert found["holds"]
+    assert [(row["zones"], row["steps"]) for row in found["results"]] == [(1, 5), (4, 5)]
+    shown = capsys.readouterr().out
+    assert shown.count("equal") == 2
+    assert found["state_hashes"][1] in shown
+
+
+def test_verify_takes_the_zones_of_a_file(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    network = load_network(find_map("merge"))
+    write_zones(tmp_path / "mine.json", cut_map(network, "strips", 3))
+    words = ("verify", "merge", "--steps", "2", "--layout", "mine.json", *QUICK)
+    assert run(*words, "--json", "found.json") == 0
+    (row,) = json.loads((tmp_path / "found.json").read_text())["results"]
+    assert row["zones"] == 3
+    assert "has 3 zones; use 3" in refusal(capsys, *words, "--zones", "4")
+
+
+def test_verify_fails_and_names_the_first_difference_of_each(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(Coverage, "halo_m", property(lambda _: 1.0))
+    path = tmp_path / "found.json"
+    words = ("verify", "grid4x4", "--zones", "1,4", "--steps", "40", "--json", str(path))
+    assert run(*words) == 1
+    whole, divided = json.loads(path.read_text())["results"]
+    assert whole["difference"] is None
+    difference = divided["difference"]
+    said = " ".join(capsys.readouterr().out.split())
+    assert f"4 zones: different: step {difference['step']} (tick {difference['tick']})" in said
+    assert f"{difference['values'][0]} undivided, {difference['values'][1]} divided" in said
+
+
 def test_verify_determinism_says_equal_and_gives_the_hash(
     capsys: pytest.CaptureFixture[str], tmp_path: Path
 ) -> None:
@@ -171,6 +219,15 @@ def test_verify_determinism_fails_and_names_the_first_difference(
         (("report", "no-folder"), "no-folder: no manifest.json"),
         (("verify-determinism", "merge", "--steps", "0"), "steps = 0: must be"),
         (("verify-determinism", "merg"), "did you mean merge"),
+        (("verify", "merge", "--steps", "0"), "steps = 0: must be"),
+        (("verify", "merge", "--zones", "1,x"), "--zones 1,x: must be numbers"),
+        (("verify", "merge", "--zones", "0"), "zones = 0: must be whole numbers from 1"),
+        (("verify", "merge", "--layout", "hexagons"), "zones.layout"),
+        (("verify", "merge", "--layout", "none.json"), "none.json"),
+        (
+            ("verify", "merge", "--layout", "grid", "--set", "zones.layout=strips"),
+            "zones.layout stands in overrides and is given as layout",
+        ),
         (("evaluate", "merge", "--agents", "-1"), "population.agents = -1"),
         (("evaluate", "merge", "--seed", "-1"), "seed = -1"),
         (("evaluate", "merge", "--set", "lidar"), "must be KEY=VALUE"),
@@ -223,6 +280,7 @@ def test_a_json_path_is_tried_before_any_work(
         "evaluate": ("evaluate", "nowhere"),
         "report": ("report", "nowhere"),
         "suite": ("suite", "nowhere"),
+        "verify": ("verify", "nowhere"),
         "verify-determinism": ("verify-determinism", "nowhere"),
         "view": ("view", "nowhere"),
         "map": ("map", "check", str(network)),

@@ -5,12 +5,10 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 
 from cavmarl.errors import ConfigError, EvaluationError, PolicyError
-from cavmarl.evaluate.determinism import _first_difference, verify_determinism
-from cavmarl.shard.vehicles import VEHICLE
+from cavmarl.evaluate.determinism import verify_determinism
 
 # A driver whose actions depend on the order of a process's own hashes, in one step, for one agent.
 HASHING = """
@@ -70,34 +68,3 @@ def test_a_process_that_dies_is_reported(tmp_path: Path, capfd: pytest.CaptureFi
     script.write_text("import os\n\ndef make_policy(env):\n    os._exit(3)\n")
     with pytest.raises(EvaluationError, match="exit code 3"):
         verify_determinism("merge", script, steps=1)
-
-
-def state(**fields: object) -> dict[str, np.ndarray]:
-    vehicles = np.zeros(2, VEHICLE)
-    vehicles["id"] = [4, 9]
-    for name, values in fields.items():
-        vehicles[name] = values
-    return {"vehicles": vehicles, "rewards": np.zeros((1, 2), np.float32)}
-
-
-def test_the_smallest_id_and_the_first_field_come_first() -> None:
-    one, other = state(), state(speed=[2.0, 1.0], x=[0.0, 3.0])
-    found = _first_difference(5, 10, (0, 2), [one, other])
-    assert (found.vehicle, found.field, found.values) == (4, "speed", (0.0, 2.0))
-    assert (found.step, found.tick, found.processes) == (5, 10, (0, 2))
-
-
-def test_a_vehicle_that_only_one_has_is_named() -> None:
-    other = state()
-    other["vehicles"] = other["vehicles"][1:]
-    found = _first_difference(5, 10, (0, 1), [state(), other])
-    assert (found.vehicle, found.field, found.values) == (4, "id", (4, None))
-
-
-def test_signs_of_zero_are_a_difference_and_nan_is_none() -> None:
-    same = _first_difference(1, 2, (0, 1), [state(accel=np.nan), state(accel=np.nan)])
-    assert same.what == "hidden state"
-    other = state()
-    other["rewards"][0, 1] = -0.0
-    found = _first_difference(1, 2, (0, 1), [state(), other])
-    assert (found.what, found.vehicle, found.field) == ("rewards", None, "[0, 1]")

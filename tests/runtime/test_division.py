@@ -1,0 +1,140 @@
+"""Who owns what in a divided world, and who sees what: looked at between its steps."""
+
+from __future__ import annotations
+
+from collections import Counter
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from cavmarl.errors import ZoneError
+from cavmarl.kernels.zones import squared_distance
+from cavmarl.roads.zone_coverage import Coverage
+from cavmarl.runtime.simulation import Simulation
+from cavmarl.shard.vehicles import PLACEMENT_FIELDS, STATE_FIELDS
+from tests.driving import drive, make_simulation, start
+
+STEPS = 80
+HYSTERESIS_M = 2.0
+# What contacts write after ghosts are sent, and what nobody asks of a ghost.
+OF_OWNERS_ALONE = {"hit", "events", "episode_return"}
+SEEN = [name for name in STATE_FIELDS if name not in OF_OWNERS_ALONE]
+
+
+def divided(zones: int = 4, **overrides: Any) -> Simulation:
+    simulation = make_simulation(
+        "grid4x4",
+        mode="seats",
+        agents=4,
+        background=60,
+        num_worlds=2,
+        overrides={"zones.count": zones, "clock.sim_dt_s": 0.1, **overrides},
+    )
+    start(simulation, seed=1)
+    return simulation
+
+
+def owned(simulation: Simulation, world: int) -> list[NDArray[np.void]]:
+    """Of each shard."""
+    parts = [shard.worlds for shard in simulation._shards]
+    return [worlds.rows[world, : worlds.num_owned[world]] for worlds in parts]
+
+
+def ghosts(simulation: Simulation, world: int) -> list[NDArray[np.void]]:
+    """Of each shard."""
+    parts = [shard.worlds for shard in simulation._shards]
+    return [
+        worlds.rows[world, worlds.num_owned[world] : worlds.num_rows[world]] for worlds in parts
+    ]
+
+
+def test_each_vehicle_has_one_owner_and_is_seen_wherever_it_is_near(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(Coverage, "halo_m", property(lambda _: 60.0))  # less than the whole map
+    simulation = divided(9)
+    rects = simulation.partition.reaching
+    owners: list[dict[int, int]] = [{}, {}]
+    moved = 0
+    for _ in range(STEPS):
+        drive(simulation)
+        for world in range(2):
+            parts = owned(simulation, world)
+            everybody = {int(row["id"]): row for part in parts for row in part}
+            assert len(everybody) == sum(map(len, parts)) == len(simulation.vehicles(world))
+            now = {int(i): zone for zone, part in enumerate(parts) for i in part["id"]}
+            moved += sum(now[i] != zone for i, zone in owners[world].items() if i in now)
+            owners[world] = now
+            for zone, seen in enumerate(ghosts(simulation, world)):
+                away = {
+                    i: squared_distance(rects, zone, row["x"], row["y"]) ** 0.5
+                    for i, row in everybody.items()
+                }
+                assert max((away[i] for i in now if now[i] == zone), default=0) <= HYSTERESIS_M
+                near = {i for i, distance in away.items() if distance <= 60.0 and now[i] != zone}
+                assert Counter(seen["id"].tolist()) == Counter(near)
+                for row in seen:
+                    assert row[SEEN] == everybody[int(row["id"])][SEEN]
+    assert moved > 20
+
+
+def test_a_vehicle_that_a_zone_has_not_seen_come_is_an_error() -> None:
+    simulation = divided()
+    for shard in simulation._shards:
+        worlds = shard.worlds
+        np.copyto(worlds.next_rows, worlds.rows)
+        worlds.num_rows[:] = worlds.num_owned
+    here, there = (owned(simulation, 0)[zone][0] for zone in (0, 3))
+    row = simulation._shards[0].worlds.next_rows[0, 0]
+    row["x"], row["y"] = there["x"], there["y"]
+    with pytest.raises(ZoneError, match=f"vehicle {here['id']} entered zone 3, which has not seen"):
+        simulation._division.migrate()
+
+
+def test_all_shards_together_are_the_world() -> None:
+    whole, parts = divided(1), divided(4)
+    for _ in range(5):
+        drive(whole)
+        drive(parts)
+    first, second = whole.worlds, parts.worlds
+    for world in range(2):
+        rows = [w.rows[world, : w.num_owned[world]] for w in (first, second)]
+        one, other = (part[np.argsort(part["id"])] for part in rows)
+        assert (one[list(STATE_FIELDS)] == other[list(STATE_FIELDS)]).all()
+        assert len(one) == parts._division.running()[world]
+    assert set(PLACEMENT_FIELDS).isdisjoint(STATE_FIELDS)
+
+
+def test_what_is_changed_in_all_next_rows_goes_back_to_their_shards() -> None:
+    simulation = divided()
+    drive(simulation)
+    for shard in simulation._shards:
+        np.copyto(shard.worlds.next_rows, shard.worlds.rows)
+    before = [[part.copy() for part in owned(simulation, world)] for world in range(2)]
+    with simulation._division.everybody_next() as everybody:
+        for world in range(2):
+            num = everybody.num_owned[world]
+            assert num == len(simulation.vehicles(world))
+            rows = everybody.next_rows[world, :num]
+            rows["leg"] += rows["id"] % 3
+    for world in range(2):
+        for shard, part in zip(simulation._shards, before[world], strict=True):
+            after = shard.worlds.next_rows[world, : len(part)]
+            part["leg"] += part["id"] % 3
+            assert (after == part).all()
+
+
+def test_a_reset_of_one_world_leaves_the_others_as_they_are() -> None:
+    simulation = divided()
+    for _ in range(20):
+        drive(simulation)
+    hashes = [simulation.state_hash(world) for world in range(2)]
+    simulation.reset(np.array([False, True]))
+    assert simulation.state_hash(0) == hashes[0]
+    assert simulation.state_hash(1) != hashes[1]
+    assert simulation.ticks().tolist()[1] == 0
+    rects = simulation.partition.reaching
+    for zone, part in enumerate(owned(simulation, 1)):
+        assert all(squared_distance(rects, zone, row["x"], row["y"]) == 0.0 for row in part)

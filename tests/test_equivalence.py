@@ -1,0 +1,281 @@
+"""A divided world is the undivided one, bit for bit: seen from outside, at every step."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from cavmarl import make_vec, parallel_env
+from cavmarl.evaluate.equivalence import Equivalence, verify_zones
+from cavmarl.roads.cache import load_network
+from cavmarl.roads.zone_coverage import Coverage
+from cavmarl.roads.zone_file import write_zones
+from cavmarl.roads.zones import ZonePartition
+from cavmarl.runtime.simulation import Simulation
+from cavmarl.vector_env import StepResult
+from cavmarl.worlds import find_map
+from tests.actuated import actuated_grid
+from tests.demand_worlds import make, tiny
+from tests.driving import drive, start
+from tests.rerouting import CARS, DEVICE, FLOW, make_map, rerouter, write_demand
+
+ZONES = (2, 3, 4, 9)
+# The built-in driver with a trembling hand: some collide, leave the road, and are followed.
+TREMBLING = """
+import numpy as np
+from cavmarl.policies import Policy
+
+class Trembling(Policy):
+    def reset(self, seed=None):
+        self.random = np.random.default_rng(seed)
+
+    def act_batch(self, observations, mask):
+        actions = self.env.suggest_actions()
+        return np.clip(actions + self.random.normal(0.0, 0.3, actions.shape), -1.0, 1.0)
+
+def make_policy(env):
+    return Trembling(env)
+"""
+FAST = {"clock.sim_dt_s": 0.1, "clock.ctrl_dt_s": 0.2}
+SENSORS = {
+    "sensors.kinematics.vehicles_count": 6,
+    "sensors.occupancy_grid.features": ["presence", "vx", "on_road"],
+    "sensors.lidar_observation.cells": 16,
+    "sensors.puffer_drive.enabled": True,
+}
+
+
+@pytest.fixture(scope="module")
+def trembling(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("policy") / "trembling.py"
+    path.write_text(TREMBLING, encoding="utf-8")
+    return path
+
+
+def equal(env: str | Path, *, crossings: int, **settings: Any) -> Equivalence:
+    """What `verify_zones` says; each division holds, and enough goes over all their borders."""
+    overrides = FAST | dict(settings.pop("overrides", {}))
+    found = verify_zones(env, settings.pop("zones", ZONES), overrides=overrides, **settings)
+    for result in found.results:
+        assert result.difference is None, result
+        assert result.steps == settings["steps"]
+    assert sum(result.crossings for result in found.results) >= crossings
+    return found
+
+
+@dataclass(frozen=True)
+class Case:
+    """Worlds to divide."""
+
+    env: str
+    overrides: Mapping[str, Any] = field(default_factory=dict)
+    worlds: int = 1
+    steps: int = 50
+    seed: int = 0
+    zones: tuple[int, ...] = ZONES
+
+
+CASES = {
+    "closed": Case("grid4x4", {"population.mode": "closed"}),
+    "entering": Case("merge", {"population.mode": "entering"}),
+    "seats": Case("merge", {"population.mode": "seats", "population.agents": 8}),
+    "town": Case("town", {"population.background": 150}, steps=30, zones=(4, 9)),
+    "worlds": Case("merge", {"population.mode": "seats"}, worlds=3),
+    "another seed": Case("grid4x4", {"population.mode": "entering"}, seed=71),
+    "late controls": Case("merge", {"clock.control_latency_ticks": 5}),
+    "meta-actions": Case("merge", {"action.kind": "discrete"}),
+    "team's rewards": Case("merge", {"terms.team_share": 0.4, "population.agents": 12}),
+    "stacked frames": Case("grid4x4", {"sensors.stack": 4}, worlds=2),
+    "all sensors": Case("grid4x4", SENSORS, steps=30),
+    "short episodes": Case("merge", {"horizon_s": 2.0}, worlds=2),
+}
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_what_agents_get_does_not_depend_on_zones(name: str, trembling: Path) -> None:
+    case = CASES[name]
+    equal(
+        case.env,
+        crossings=10,
+        zones=case.zones,
+        policy="random_actions" if name == "meta-actions" else trembling,
+        worlds=case.worlds,
+        steps=case.steps,
+        seed=case.seed,
+        overrides=case.overrides,
+    )
+
+
+@pytest.mark.parametrize("avoid", [False, True])
+@pytest.mark.parametrize("layout", ["grid", "strips", "bisection"])
+def test_cuts_may_lie_anywhere(layout: str, avoid: bool, trembling: Path) -> None:
+    overrides = {"population.background": 90, "zones.avoid_junctions": avoid}
+    equal("grid4x4", crossings=10, layout=layout, policy=trembling, steps=40, overrides=overrides)
+
+
+def test_zones_of_a_file_as_narrow_as_cars(tmp_path: Path) -> None:
+    # Cuts along a junction and through it, and zones that a car crosses in a second.
+    low_x, low_y, high_x, high_y = load_network(find_map("grid4x4")).extent_m
+    middle_x, middle_y = 0.5 * (low_x + high_x), 0.5 * (low_y + high_y)
+    cuts = [low_x - 9.0, middle_x - 8.0, middle_x, middle_x + 8.0, high_x + 9.0]
+    rects = [
+        [x, y, end_x, end_y]
+        for x, end_x in pairwise(cuts)
+        for y, end_y in ((low_y - 9.0, middle_y), (middle_y, high_y + 9.0))
+    ]
+    bounds = (low_x - 9.0, low_y - 9.0, high_x + 9.0, high_y + 9.0)
+    path = tmp_path / "zones.json"
+    write_zones(path, ZonePartition(bounds, np.array(rects)))
+    overrides = {"population.background": 90}
+    found = equal("grid4x4", crossings=20, zones=None, layout=path, steps=40, overrides=overrides)
+    assert [result.zones for result in found.results] == [8]
+
+
+def test_actuated_signals_switch_as_in_one_zone(tmp_path: Path) -> None:
+    equal(actuated_grid(tmp_path), crossings=20, zones=(4, 9), steps=60)
+
+
+def test_a_real_map_with_its_demand(shared_maps: Path, trembling: Path) -> None:
+    folder = shared_maps / "net" / "mcity"
+    demand = [str(folder / "mcity.rou.xml"), str(folder / "mcity.add.xml")]
+    equal(
+        folder / "mcity.net.xml",
+        crossings=20,
+        zones=(4, 9),
+        policy=trembling,
+        steps=60,
+        overrides={"traffic.demand": demand, "population.mode": "seats"},
+    )
+
+
+def same(one: StepResult, other: StepResult) -> None:
+    for mine, theirs in zip(one[:4], other[:4], strict=True):
+        np.testing.assert_array_equal(mine, theirs)
+    for key, array in one[4].items():
+        np.testing.assert_array_equal(array, other[4][key], err_msg=key)
+
+
+def test_one_world_begins_anew_while_others_go_on() -> None:
+    # Agents that are alone in their world leave the road at different times.
+    settings: dict[str, Any] = {
+        "num_envs": 4,
+        "agents": 1,
+        "overrides": {"population.mode": "closed"} | FAST,
+    }
+    whole, divided = (make_vec("grid4x4", zones=zones, **settings) for zones in (1, 4))
+    for vec in (whole, divided):
+        vec.reset(seed=2)
+    alone = 0
+    for step in range(60):
+        actions = whole.suggest_actions()
+        np.testing.assert_array_equal(actions, divided.suggest_actions())
+        actions[step % 15 // 4 :, 0] = 1.0  # full throttle, full lock
+        results = [vec.step(actions) for vec in (whole, divided)]
+        same(*results)
+        over = results[0][4]["episode_over"]
+        alone += over.any() and not over.all()
+        for world in range(4):
+            assert whole.state_hash(world) == divided.state_hash(world)
+            assert whole.traffic_stats(world) == divided.traffic_stats(world)
+    assert alone > 3
+
+
+def test_dicts_and_the_global_state_are_the_same() -> None:
+    settings: dict[str, Any] = {"agents": 6, "overrides": {"population.mode": "seats"} | FAST}
+    whole, divided = (parallel_env("merge", zones=zones, **settings) for zones in (1, 4))
+    (seen, infos), (other_seen, other_infos) = (env.reset(seed=4) for env in (whole, divided))
+    rng = np.random.default_rng(1)
+    for _ in range(50):
+        assert infos == other_infos
+        for agent, observation in seen.items():
+            np.testing.assert_array_equal(observation, other_seen[agent])
+        np.testing.assert_array_equal(whole.state(), divided.state())
+        assert whole.agents == divided.agents
+        agents = rng.permutation(whole.agents)
+        actions = {a: rng.uniform(-1.0, 1.0, 2).astype(np.float32) for a in agents}
+        seen, rewards, ended, cut, infos = whole.step(actions)
+        shuffled = {agent: actions[agent] for agent in rng.permutation(agents)}
+        other_seen, *others, other_infos = divided.step(shuffled)
+        assert [rewards, ended, cut] == others
+        assert whole.state_hash() == divided.state_hash()
+
+
+# Worlds of demand files alone have no agents, and so no public view: their hashes are compared.
+def hashes_agree(
+    build: Callable[[dict[str, Any]], Simulation], steps: int, zones: tuple[int, ...] = ZONES
+) -> Simulation:
+    whole, *divided = (build({"zones.count": count}) for count in (1, *zones))
+    for simulation in (whole, *divided):
+        start(simulation, seed=3)
+    for step in range(steps):
+        for simulation in (whole, *divided):
+            drive(simulation)
+        for world in range(whole.num_worlds):
+            for count, simulation in zip(zones, divided, strict=True):
+                told = f"step {step}, world {world}, {count} zones"
+                assert simulation.state_hash(world) == whole.state_hash(world), told
+                assert simulation.traffic_stats(world) == whole.traffic_stats(world), told
+    return whole
+
+
+@pytest.mark.parametrize("env", ["merge", "grid4x4"])
+def test_whatever_a_demand_orders_enters_alike(env: str, tmp_path: Path) -> None:
+    whole = hashes_agree(lambda zones: tiny(env, tmp_path, overrides=FAST | zones), 350)
+    assert whole.traffic_stats().departed > 30
+
+
+def test_vehicles_that_look_for_their_way_find_the_same(tmp_path: Path) -> None:
+    net = make_map(tmp_path)
+    files = write_demand(
+        tmp_path, CARS.format(device=DEVICE) + FLOW, rerouter('<closingReroute id="narrow"/>')
+    )
+    clock = {"clock.sim_dt_s": 0.2, "clock.ctrl_dt_s": 1.0, "horizon_s": 1200.0}
+    whole = hashes_agree(
+        lambda zones: make(net, files, num_worlds=2, overrides=clock | zones), 200, (2, 4)
+    )
+    assert whole.traffic_stats().rerouted > 20
+
+
+LONG_ROAD = """<?xml version="1.0" encoding="UTF-8"?>
+<net version="1.20">
+  <location netOffset="0,0" convBoundary="0,0,0,0" origBoundary="0,0,0,0" projParameter="!"/>
+  <edge id="road" from="W" to="E">
+    <lane id="road_0" index="0" speed="14" length="3000" shape="0,0,0 3000,0,0"/>
+  </edge>
+  <junction id="W" type="dead_end" x="0" y="0" incLanes="" intLanes="" shape=""/>
+  <junction id="E" type="dead_end" x="3000" y="0" incLanes="road_0" intLanes="" shape=""/>
+</net>"""
+BEHIND_THE_LAST = """<routes>
+  <vType id="car" sigma="0.5"/><route id="r" edges="road"/>
+  <vehicle id="first" type="car" route="r" depart="0" departPos="40">
+    <stop lane="road_0" endPos="120" duration="40"/>
+  </vehicle>
+  <flow id="f" type="car" route="r" begin="1" end="60" period="9" departPos="last"/>
+</routes>"""
+
+
+def test_who_enters_behind_the_last_enters_once_however_far_the_last_is(tmp_path: Path) -> None:
+    # The zone at the end of the road sees nobody on it, the one at its start does.
+    road, demand = tmp_path / "long.net.xml", tmp_path / "x.rou.xml"
+    road.write_text(LONG_ROAD, encoding="utf-8")
+    demand.write_text(BEHIND_THE_LAST, encoding="utf-8")
+    hashes_agree(lambda zones: make(road, [demand], overrides=FAST | zones), 300, (2, 4))
+
+
+@pytest.mark.parametrize("halo_m", [0.0, 12.0])
+def test_a_halo_that_is_too_narrow_is_found_out(
+    halo_m: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(Coverage, "halo_m", property(lambda _: halo_m))
+    overrides = FAST | {"population.background": 90}
+    found = verify_zones("grid4x4", (4,), steps=40, overrides=overrides)
+    difference = found.results[0].difference
+    assert not found.holds
+    assert difference is not None
+    assert difference.values[0] != difference.values[1]
