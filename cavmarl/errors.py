@@ -17,7 +17,8 @@
     │   └── EpisodeEndedError     step after the end
     ├── CapacityError          more vehicles or seats than the world can take
     ├── EvaluationError        an evaluation that could not be brought to its end
-    │   └── ManifestError         results whose origin is not on record
+    │   ├── ManifestError         results whose origin is not on record
+    │   └── UnequalWorldsError    divided and undivided worlds that are not the same
     ├── ProtocolError          the hand-off protocol was broken, or cannot go on
     │   ├── TransitionError       an event that its state does not know
     │   ├── SpawnError            a vehicle id that has been used, or a zone that is none
@@ -75,6 +76,7 @@ __all__ = [
     "TornJournalError",
     "TransitionError",
     "TruncatedMessageError",
+    "UnequalWorldsError",
     "UnknownAgentError",
     "UnknownEnvironmentError",
     "UnknownVersionError",
@@ -154,6 +156,10 @@ class EvaluationError(CavmarlError):
 
 class ManifestError(EvaluationError):
     """Results without a manifest, with one that was never closed, or with one of other results."""
+
+
+class UnequalWorldsError(EvaluationError):
+    """Worlds of different division that should be the same bit for bit and are not."""
 
 
 class ProtocolError(CavmarlError):

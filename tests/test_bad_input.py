@@ -313,7 +313,7 @@ def test_a_number_of_worlds_that_cannot_be_is_refused(num_envs: Any) -> None:
         ({"agents": True}, ("population.agents", "True")),
         ({"background": -1}, ("population.background", "-1")),
         ({"background": "many"}, ("population.background", "many")),
-        ({"zones": 4}, ("zones.count", "4", "use 1")),
+        ({"zones": 0}, ("zones.count", "0", "1 to 256")),
         ({"workers": 2}, ("workers", "2", "use 0")),
         ({"max_cycles": 0}, ("max_cycles", "0")),
         ({"max_cycles": -5}, ("max_cycles", "-5")),

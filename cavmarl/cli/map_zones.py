@@ -12,14 +12,13 @@ from rich.table import Table
 from rich.text import Text
 
 from cavmarl.cli.output import JsonPath, write_json
-from cavmarl.config import ZONE_FILE_SUFFIXES, ZONE_LAYOUTS
+from cavmarl.config import ZONE_LAYOUTS
 from cavmarl.errors import ConfigError
 from cavmarl.maps.netconvert import map_file
 from cavmarl.maps.zone_loops import zones_without_loop
 from cavmarl.roads.cache import load_network
 from cavmarl.roads.network import RoadNetwork
-from cavmarl.roads.zone_file import write_zones, zones_for
-from cavmarl.roads.zone_layouts import cut_map
+from cavmarl.roads.zone_file import named_zones, write_zones
 from cavmarl.roads.zone_statistics import ZoneStatistics, zone_statistics
 from cavmarl.roads.zones import ZonePartition
 
@@ -61,19 +60,7 @@ def zones(
     if picture is not None and picture.suffix != ".png":
         raise typer.BadParameter(f"'{picture}' must end in .png", param_hint="--picture")
     network = load_network(map_file(source))
-    if layout in ZONE_LAYOUTS:
-        partition = cut_map(
-            network, layout, 4 if count is None else count,
-            avoid_junctions=avoid_junctions, weight=weight,
-        )  # fmt: skip
-    elif layout.endswith(ZONE_FILE_SUFFIXES):
-        partition = zones_for(network, layout, count)
-    else:
-        raise typer.BadParameter(
-            f"'{layout}' is none of {', '.join(ZONE_LAYOUTS)}, and no zone file "
-            f"({', '.join(ZONE_FILE_SUFFIXES)})",
-            param_hint="--layout",
-        )
+    partition = named_zones(network, layout, count, avoid_junctions=avoid_junctions, weight=weight)
     statistics = zone_statistics(partition, network, halo_m=halo)
     console = Console()
     _print_table(console, network, partition, statistics)

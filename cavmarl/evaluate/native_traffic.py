@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -13,40 +14,60 @@ from cavmarl.kernels.codes import ACTION_IDLE
 from cavmarl.render.ground import signal_codes
 from cavmarl.runtime.simulation import Simulation
 from cavmarl.shard.shard import Commands
-from cavmarl.worlds import load_world
+from cavmarl.worlds import World, load_world
 
-__all__ = ["advance", "idle_commands", "make_world", "run_native"]
+__all__ = ["advance", "idle_commands", "load_demand", "make_world", "run_native"]
 
 
-def make_world(
-    map_file: Path, demand: Sequence[Path], seconds: int, seed: int, dt_s: float
-) -> Simulation:
-    """One world with background traffic and nobody to train, at the start of an episode.
+def load_demand(
+    map_file: Path,
+    demand: Sequence[Path],
+    seconds: int,
+    dt_s: float,
+    overrides: Mapping[str, Any] | None = None,
+) -> World:
+    """What a world with background traffic and nobody to train is made of.
 
     Args:
         map_file: a SUMO network.
         demand: what drives on it, and the signal programs that its additional files have.
         seconds: how long.
-        seed: root of all random numbers.
         dt_s: seconds a tick.
+        overrides: values for other keys.
 
     Raises:
         ConfigError: a demand or a tick that cannot work.
         DemandError: a demand that cannot be, or not on this map.
         MapError: the map cannot be driven.
     """
-    config, network, file, partition = load_world(
-        map_file,
-        agents=0,
-        background=0,
-        overrides={
-            "clock.sim_dt_s": dt_s,
-            "clock.ctrl_dt_s": dt_s,
-            "horizon_s": float(seconds),
-            "traffic.demand": [str(path.resolve()) for path in demand],
-            "map.programs": [str(path) for path in read_input(demand).additional_files],
-        },
-    )
+    own = {
+        "clock.sim_dt_s": dt_s,
+        "clock.ctrl_dt_s": dt_s,
+        "horizon_s": float(seconds),
+        "traffic.demand": [str(path.resolve()) for path in demand],
+        "map.programs": [str(path) for path in read_input(demand).additional_files],
+    }
+    return load_world(map_file, agents=0, background=0, overrides={**own, **(overrides or {})})
+
+
+def make_world(
+    map_file: Path, demand: Sequence[Path], seconds: int, seed: int, dt_s: float
+) -> Simulation:
+    """The world of `load_demand` at the start of an episode.
+
+    Args:
+        map_file: a SUMO network.
+        demand: what drives on it.
+        seconds: how long.
+        seed: root of all random numbers.
+        dt_s: seconds a tick.
+
+    Raises:
+        ConfigError: see `load_demand`.
+        DemandError: see `load_demand`.
+        MapError: see `load_demand`.
+    """
+    config, network, file, partition = load_demand(map_file, demand, seconds, dt_s)
     simulation = Simulation(config, network, demand=file, partition=partition)
     simulation.seed(seed)
     simulation.reset()

@@ -9,12 +9,12 @@ from dataclasses import asdict, dataclass
 from typing import Any
 
 from cavmarl.errors import ConfigError
+from cavmarl.evaluate.stopwatch import Stopwatch
 from cavmarl.vector_env import CavVectorEnv
 
 __all__ = ["StepProfile", "profile_step"]
 
 VIEW = "view"  # actions checked and decoded, results copied: what is no phase
-CALIBRATION = 20_000  # empty calls
 
 
 @dataclass(frozen=True)
@@ -42,70 +42,6 @@ class StepProfile:
         return asdict(self)
 
 
-class _Stopwatch:
-    """Adds up the processor's time of named calls, less what it takes itself."""
-
-    def __init__(self) -> None:
-        self.spent: Counter[str] = Counter()
-        self.calls: Counter[str] = Counter()
-        self._inside = self._around = 0.0
-        empty = _Timed(self, _Nothing())
-        began = time.process_time_ns()
-        for _ in range(CALIBRATION):
-            empty.each("nothing")
-        self._around = (time.process_time_ns() - began) / CALIBRATION
-        self._inside = self.spent["nothing"] / CALIBRATION
-        self.clear()
-
-    def clear(self) -> None:
-        """Back to zero."""
-        self.spent.clear()
-        self.calls.clear()
-
-    def forget(self, name: str) -> None:
-        """As if it had never been called."""
-        del self.spent[name], self.calls[name]
-
-    def phases(self) -> dict[str, float]:
-        """Time of each name in ns."""
-        return {name: ns - self._inside * self.calls[name] for name, ns in self.spent.items()}
-
-    def own(self) -> float:
-        """What all calls together took for themselves, in ns."""
-        return self._around * self.calls.total()
-
-
-class _Nothing:
-    def each(self, phase: str) -> None:
-        pass
-
-
-class _Timed:
-    """Stands for a part of the runtime and times each call of its methods."""
-
-    def __init__(self, watch: _Stopwatch, part: Any) -> None:
-        self._watch = watch
-        self._part = part
-
-    def __getattr__(self, name: str) -> Any:
-        method = getattr(self._part, name)
-        if not callable(method):
-            return method
-        watch = self._watch
-
-        def timed(*arguments: Any) -> Any:
-            # An executor's `each` runs the phase that its first argument names.
-            phase = arguments[0] if name == "each" else name
-            began = time.process_time_ns()
-            result = method(*arguments)
-            watch.spent[phase] += time.process_time_ns() - began
-            watch.calls[phase] += 1
-            return result
-
-        self.__dict__[name] = timed
-        return timed
-
-
 def profile_step(
     make: Callable[[], CavVectorEnv], steps: int = 200, seed: int = 0, repeats: int = 5
 ) -> StepProfile:
@@ -126,9 +62,9 @@ def profile_step(
     for name, value in (("steps", steps), ("repeats", repeats)):
         if not 1 <= value <= 1_000_000:
             raise ConfigError(f"{name} = {value}: must be from 1 to 1000000")
-    watch = _Stopwatch()
+    watch = Stopwatch()
     plain, timed = make(), make()
-    timed.simulation.instrument(lambda part: _Timed(watch, part))
+    timed.simulation.instrument(watch.around)
     turns = []
     for _ in range(repeats):
         without = _drive(plain, watch, steps, seed)
@@ -153,7 +89,7 @@ class _Turn:
     agent_steps: int
 
 
-def _drive(vec: CavVectorEnv, watch: _Stopwatch, steps: int, seed: int) -> _Turn:
+def _drive(vec: CavVectorEnv, watch: Stopwatch, steps: int, seed: int) -> _Turn:
     """Step from a reset, with the built-in driver in all seats; nothing else is timed."""
     vec.reset(seed=seed)
     vec.step(vec.suggest_actions())
@@ -166,5 +102,5 @@ def _drive(vec: CavVectorEnv, watch: _Stopwatch, steps: int, seed: int) -> _Turn
         ns += time.process_time_ns() - began
         agent_steps += int(acted.sum())
         vehicle_steps += sum(len(vec.simulation.vehicles(w)) for w in range(vec.num_envs))
-    watch.forget("suggest")
+    watch.forget("suggest", "vehicles")
     return _Turn(ns - watch.own(), vehicle_steps, agent_steps)

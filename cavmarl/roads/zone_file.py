@@ -18,15 +18,17 @@ from typing import Literal
 
 import numpy as np
 
-from cavmarl.config import MAX_ZONES
-from cavmarl.errors import ZoneError
+from cavmarl.config import MAX_ZONES, ZONE_FILE_SUFFIXES, ZONE_LAYOUTS
+from cavmarl.errors import ConfigError, ZoneError
 from cavmarl.roads.network import RoadNetwork
+from cavmarl.roads.zone_layouts import cut_map
 from cavmarl.roads.zones import Bounds, ZonePartition
 
-__all__ = ["SCHEMA", "VERSION", "read_zones", "write_zones", "zones_for"]
+__all__ = ["SCHEMA", "VERSION", "named_zones", "read_zones", "write_zones", "zones_for"]
 
 SCHEMA = "cavmarl.zones"
 VERSION = 1
+DEFAULT_COUNT = 4
 
 
 @dataclass(frozen=True)
@@ -94,6 +96,42 @@ def zones_for(network: RoadNetwork, path: str | Path, count: int | None) -> Zone
             "is it another map's? Cut this one with `cavmarl map zones`"
         )
     return partition
+
+
+def named_zones(
+    network: RoadNetwork,
+    layout: str,
+    count: int | None,
+    *,
+    avoid_junctions: bool = False,
+    weight: str = "lane_length",
+) -> ZonePartition:
+    """The partition that a layout's name or the path of a zone file stands for.
+
+    Args:
+        network: the map.
+        layout: one of ZONE_LAYOUTS, or a path.
+        count: how many zones; None: as many as the file has, of a layout 4.
+        avoid_junctions: of `cut_map`.
+        weight: of `cut_map`.
+
+    Raises:
+        ConfigError: neither a layout nor a zone file; see `cut_map` and `zones_for`.
+    """
+    if layout in ZONE_LAYOUTS:
+        return cut_map(
+            network,
+            layout,
+            DEFAULT_COUNT if count is None else count,
+            avoid_junctions=avoid_junctions,
+            weight=weight,
+        )
+    if layout.endswith(ZONE_FILE_SUFFIXES):
+        return zones_for(network, layout, count)
+    raise ConfigError(
+        f"layout '{layout}': is none of {', '.join(ZONE_LAYOUTS)}, and no zone file "
+        f"({', '.join(ZONE_FILE_SUFFIXES)})"
+    )
 
 
 def write_zones(path: str | Path, partition: ZonePartition) -> None:

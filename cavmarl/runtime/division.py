@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,7 +20,23 @@ from cavmarl.kernels.exchange import adopt, find_movers, release, take_ghosts, t
 from cavmarl.kernels.zones import Halo, ZoneArrays, make_publication, publish, zone_of
 from cavmarl.shard.shard import Shard
 
-__all__ = ["Division"]
+__all__ = ["Division", "ZoneLoads"]
+
+
+class ZoneLoads(NamedTuple):
+    """What the zones of W worlds hold.
+
+    Attributes:
+        owned: (k, W) vehicles.
+        ghosts: (k, W) copies of other zones' vehicles.
+        migrations: vehicles that have changed their zone since the worlds were made.
+        halo_m: how far zones see over their borders.
+    """
+
+    owned: NDArray[np.int64]
+    ghosts: NDArray[np.int64]
+    migrations: int
+    halo_m: float
 
 
 class Division:
@@ -39,6 +56,7 @@ class Division:
         self._zones = zones
         self._halo = halo
         self._hysteresis_m = hysteresis_m
+        self._migrations = 0
         capacity = shards[0].worlds.rows.shape[1]
         self._published = make_publication(capacity, len(shards))
         self._movers = np.zeros(capacity, dtype=np.int32)
@@ -92,6 +110,7 @@ class Division:
         worlds = source.worlds
         rows, num = worlds.next_rows[w], int(worlds.num_owned[w])
         found = find_movers(self._zones, source.zone, self._hysteresis_m, rows, num, self._movers)
+        self._migrations += int(found)
         # From the last row to the first: who is released is swapped with the last owned one.
         for i in self._movers[:found][::-1]:
             zone = zone_of(self._zones, rows[i]["x"], rows[i]["y"])
@@ -110,6 +129,12 @@ class Division:
     def running(self) -> NDArray[np.int64]:
         """(W,) vehicles of each world."""
         return _total([shard.worlds.num_owned for shard in self._shards])
+
+    def loads(self) -> ZoneLoads:
+        """What each zone holds, and how many vehicles have changed theirs."""
+        owned = np.array([shard.worlds.num_owned for shard in self._shards])
+        rows = np.array([shard.worlds.num_rows for shard in self._shards])
+        return ZoneLoads(owned, rows - owned, self._migrations, self._halo.halo_m)
 
     def vehicles(self, world: int) -> NDArray[np.void]:
         """All live vehicles of a world: of several shards a copy, of one a view."""

@@ -31,7 +31,7 @@ from cavmarl.roads.zone_layouts import cut_map
 from cavmarl.roads.zones import ZonePartition
 from cavmarl.runtime.commons import Commons
 from cavmarl.runtime.compilation import first_compilation
-from cavmarl.runtime.division import Division
+from cavmarl.runtime.division import Division, ZoneLoads
 from cavmarl.runtime.executor import Executor, SerialExecutor
 from cavmarl.shard.reach import driving_reach_m
 from cavmarl.shard.sensors import largest_radius_m, sensing_reach_m
@@ -202,6 +202,10 @@ class Simulation:
         """
         return self._division.vehicles(world)
 
+    def zone_loads(self) -> ZoneLoads:
+        """What each zone holds now, and how many vehicles have changed their zone."""
+        return self._division.loads()
+
     @property
     def worlds(self) -> Worlds:
         """The vehicles and signals of all worlds, for tools that measure; each tick swaps them.
@@ -273,6 +277,7 @@ class Simulation:
     def instrument(self, wrap: Callable[[Any], Any]) -> None:
         """Put `wrap(part)` in the place of each part that phases are calls of, to time them."""
         self._executor = wrap(self._executor)
+        self._division = wrap(self._division)
         self._traffic = wrap(self._traffic)
         self._commons = wrap(self._commons)
 

@@ -174,20 +174,14 @@ def test_zones_are_drawn(shared_maps: Path, tmp_path: Path) -> None:
     assert isinstance(result.exception, ConfigError)
 
 
-@pytest.mark.parametrize(
-    ("words", "error"),
-    [
-        (["--layout", "rings"], "is none of grid, strips, bisection"),
-        (["--picture", "zones.jpg"], "must end in .png"),
-    ],
-)
-def test_wrong_options_of_zones_are_refused(
-    shared_maps: Path, words: list[str], error: str
-) -> None:
+def test_wrong_options_of_zones_are_refused(shared_maps: Path) -> None:
     source = str(shared_maps / "net" / "Town10HD.net.xml")
-    result = runner.invoke(app, ["zones", source, *words])
+    result = runner.invoke(app, ["zones", source, "--picture", "zones.jpg"])
     assert result.exit_code == 2
-    assert error in " ".join(result.output.replace("│", " ").split())
+    assert "must end in .png" in " ".join(result.output.replace("│", " ").split())
+    result = runner.invoke(app, ["zones", source, "--layout", "rings"])
+    assert isinstance(result.exception, ConfigError)
+    assert "is none of grid, strips, bisection" in str(result.exception)
 
 
 def test_more_zones_than_the_map_can_hold_are_refused(shared_maps: Path) -> None:

@@ -12,6 +12,8 @@ from numpy.typing import NDArray
 from cavmarl.kernels.arrays import Worlds
 from cavmarl.kernels.codes import DRIVER_AGENT
 from cavmarl.kernels.signals import merge_detections
+from cavmarl.roads.zone_coverage import zone_halo
+from cavmarl.roads.zone_layouts import cut_map
 from cavmarl.runtime.commons import Commons
 from cavmarl.runtime.executor import SerialExecutor
 from cavmarl.runtime.simulation import Simulation
@@ -34,6 +36,8 @@ SENSORS: dict[str, Any] = {
     "terms.team_share": 0.3,
 }
 
+EVERYWHERE_M = 1e5
+
 
 class Halves:
     """The vehicles of undivided worlds in two shards, by x, each with the others as ghosts.
@@ -47,7 +51,9 @@ class Halves:
         self.commons = Commons(whole.config, whole.network, whole.num_worlds)
         traffic = whole._traffic
         shards = []
-        for _ in range(2):
+        partition = cut_map(whole.network, "strips", 2)
+        halo = zone_halo(partition, EVERYWHERE_M)
+        for zone in range(2):
             shard = Shard(
                 whole.config,
                 whole.network,
@@ -56,6 +62,10 @@ class Halves:
                 whole.num_worlds,
                 whole.capacity,
                 self.commons.outputs,
+                zone,
+                partition.arrays,
+                halo,
+                EVERYWHERE_M,
                 shards[0].worlds if shards else None,
             )
             shards.append(shard)
@@ -171,12 +181,8 @@ def test_signals_are_the_same(together: bool, tmp_path: Path) -> None:
     assert all(times.any() for times in noted)
 
 
-def test_one_shard_counts_the_ticks_of_all() -> None:
-    whole = make_simulation("ring", mode="closed", agents=1, background=2)
-    halves = Halves(whole)
-    for _ in range(3):
-        halves.executor.each("commit")
-    assert [shard.worlds.ticks.tolist() for shard in halves.shards] == [[3], [3]]
+def test_shards_of_one_world_share_its_clock_and_signals() -> None:
+    halves = Halves(make_simulation("ring", mode="closed", agents=1, background=2))
     first, second = (shard.worlds for shard in halves.shards)
     shared = {name for name in Worlds._fields if getattr(first, name) is getattr(second, name)}
     assert shared == set(COMMON)

@@ -1,0 +1,146 @@
+"""Turns of one world in some number of zones, without a stopwatch and with one on every phase."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from itertools import pairwise
+
+from cavmarl.errors import ConfigError
+from cavmarl.evaluate.sharded_worlds import DrivenWorld
+from cavmarl.evaluate.stopwatch import Stopwatch
+from cavmarl.roads.zone_statistics import imbalance
+from cavmarl.runtime.simulation import Simulation
+
+__all__ = ["PHASES", "Pair", "Turn", "TwinWorlds"]
+
+PHASES = ("traffic", "advance", "exchange", "resolve", "migrate", "sense", "other")
+# Calls of the runtime that belong to a phase of another name; what is left is `other`.
+_MEMBERS = {
+    "traffic": (
+        "choose_goals", "leave", "settle",
+        "call_orders", "rank_lanes", "assign_lanes", "propose", "running", "accept", "admit",
+        "retire", "forget",
+    ),
+    "sense": ("clear_outputs", "settle_outputs", "credit"),
+}  # fmt: skip
+_PHASE_OF = {phase: phase for phase in PHASES} | {
+    name: phase for phase, names in _MEMBERS.items() for name in names
+}
+
+
+@dataclass(frozen=True)
+class Turn:
+    """One turn of one world: sums over its steps.
+
+    Attributes:
+        ns: in steps.
+        steps: how many.
+        vehicles: in the world.
+        ghosts: in all zones.
+        imbalance: maximum over mean of the vehicles that zones own.
+        largest: rows of the zone with most.
+        moves: vehicles that changed their zone, step by step.
+        move_ns: in `migrate`, step by step; 0 without a stopwatch.
+    """
+
+    ns: float
+    steps: int
+    vehicles: int
+    ghosts: int
+    imbalance: float
+    largest: int
+    moves: tuple[int, ...]
+    move_ns: tuple[int, ...]
+
+
+@dataclass(frozen=True)
+class Pair:
+    """One turn of both worlds; times in ns a vehicle and tick.
+
+    Attributes:
+        plain: of the world without a stopwatch.
+        timed: of that with one.
+        plain_ns: a tick of the first.
+        timed_ns: a tick of the second, less the stopwatch's own time.
+        phases: by the names of `PHASES`; their sum is `timed_ns`.
+        calls: by the names of the runtime's calls.
+    """
+
+    plain: Turn
+    timed: Turn
+    plain_ns: float
+    timed_ns: float
+    phases: dict[str, float]
+    calls: dict[str, float]
+
+
+class TwinWorlds:
+    """The same world twice in some number of zones, once with a stopwatch.
+
+    Args:
+        make: the world in k zones, at the start of an episode.
+        zones: k.
+        watch: for the second one.
+
+    Attributes:
+        zones: k.
+        plain: the one without.
+        timed: the one with it.
+        turns: those that count.
+    """
+
+    def __init__(self, make: Callable[[int], Simulation], zones: int, watch: Stopwatch) -> None:
+        self.zones = zones
+        self.turns: list[Pair] = []
+        self.plain, self.timed = DrivenWorld(make(zones)), DrivenWorld(make(zones))
+        self.timed.simulation.instrument(watch.around)
+        self._watch = watch
+
+    def run(self, steps: int) -> Pair:
+        """The next steps of both.
+
+        Raises:
+            ConfigError: nobody drives in them.
+        """
+        watch = self._watch
+        plain = _run(self.plain, steps, watch)
+        watch.clear()
+        timed = _run(self.timed, steps, watch)
+        watch.forget("suggest", "loads")
+        if not plain.vehicles:
+            raise ConfigError("nobody drives: another --after, or more demand")
+        share = 1.0 / (plain.vehicles * self.plain.simulation.config.clock.ticks_per_step)
+        timed_ns = (timed.ns - watch.own()) * share
+        calls = {name: ns * share for name, ns in sorted(watch.phases().items())}
+        phases = dict.fromkeys(PHASES, 0.0)
+        for name, ns in calls.items():
+            phases[_PHASE_OF.get(name, "other")] += ns
+        phases["other"] += timed_ns - sum(phases.values())
+        return Pair(plain, timed, plain.ns * share, timed_ns, phases, calls)
+
+
+def _run(world: DrivenWorld, steps: int, watch: Stopwatch) -> Turn:
+    """Steps of a world; what its agents decide and how many there are is not timed."""
+    simulation = world.simulation
+    ns = vehicles = ghosts = largest = 0
+    uneven = 0.0
+    migrations, spent = [simulation.zone_loads().migrations], [watch.spent["migrate"]]
+    for _ in range(steps):
+        commands = world.commands()
+        began = time.process_time_ns()
+        world.step(commands)
+        ns += time.process_time_ns() - began
+        loads = simulation.zone_loads()
+        owned = loads.owned[:, 0]
+        vehicles += int(owned.sum())
+        ghosts += int(loads.ghosts.sum())
+        largest += int((owned + loads.ghosts[:, 0]).max())
+        uneven += imbalance(owned.tolist())
+        migrations.append(loads.migrations)
+        spent.append(watch.spent["migrate"])
+    moves, move_ns = (
+        tuple(new - old for old, new in pairwise(sums)) for sums in (migrations, spent)
+    )
+    return Turn(ns, steps, vehicles, ghosts, uneven, largest, moves, move_ns)
