@@ -14,7 +14,7 @@ from cavmarl.kernels.zones import squared_distance
 from cavmarl.roads.zone_coverage import Coverage
 from cavmarl.runtime.simulation import Simulation
 from cavmarl.shard.vehicles import PLACEMENT_FIELDS, STATE_FIELDS
-from tests.driving import drive, make_simulation, start
+from tests.driving import drive, idle, make_simulation, start
 
 STEPS = 80
 HYSTERESIS_M = 2.0
@@ -91,6 +91,41 @@ def test_a_vehicle_that_a_zone_has_not_seen_come_is_an_error() -> None:
     row["x"], row["y"] = there["x"], there["y"]
     with pytest.raises(ZoneError, match=f"vehicle {here['id']} entered zone 3, which has not seen"):
         simulation._division.migrate()
+
+
+def test_a_collision_over_a_border_is_found_once_and_of_both() -> None:
+    # Agents that press on regardless, in strips not much wider than a car is long.
+    settings: dict[str, Any] = {
+        "mode": "seats",
+        "agents": 40,
+        "background": 40,
+        "overrides": {"zones.layout": "strips", "clock.ctrl_dt_s": 0.05},
+    }
+    whole = make_simulation("grid4x4", **settings)
+    settings["overrides"] |= {"zones.count": 48, "zones.hysteresis_m": 0.0}
+    parts = make_simulation("grid4x4", **settings)
+    for simulation in (whole, parts):
+        start(simulation, seed=1)
+    over_borders = set()
+    for _ in range(150):
+        commands = idle(whole)
+        commands.controls[..., 0] = 3.0
+        for simulation in (whole, parts):
+            simulation.step(commands)
+        touching = {}
+        owner = {}
+        for zone, part in enumerate(owned(parts, 0)):
+            owner |= {int(row["id"]): zone for row in part}
+            touching |= {int(row["id"]): int(row["hit"]) for row in part if row["hit"] >= 0}
+        for vehicle, other in touching.items():
+            assert other in touching
+            if touching[other] == vehicle and owner[vehicle] != owner[other]:
+                over_borders.add(frozenset((vehicle, other)))
+        assert parts.traffic_stats() == whole.traffic_stats()
+        for simulation in (whole, parts):
+            simulation.retire_agents()
+        assert parts.state_hash() == whole.state_hash()
+    assert len(over_borders) > 1
 
 
 def test_all_shards_together_are_the_world() -> None:
