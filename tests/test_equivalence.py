@@ -230,6 +230,19 @@ def test_whatever_a_demand_orders_enters_alike(env: str, tmp_path: Path) -> None
     assert whole.traffic_stats().departed > 30
 
 
+def test_a_full_world_is_full_wherever_its_vehicles_are(tmp_path: Path) -> None:
+    most = 9
+
+    def build(zones: dict[str, Any]) -> Simulation:
+        simulation = tiny("merge", tmp_path, overrides=FAST | zones)
+        vars(simulation._traffic)["capacity"] = most
+        return simulation
+
+    whole = hashes_agree(build, 150, (2, 4))
+    assert whole.traffic_stats().running == most
+    assert whole.traffic_stats().waiting > 5
+
+
 def test_vehicles_that_look_for_their_way_find_the_same(tmp_path: Path) -> None:
     net = make_map(tmp_path)
     files = write_demand(
