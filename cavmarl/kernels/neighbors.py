@@ -127,13 +127,16 @@ def _fill_body(body: np.void, vehicle: np.void, row: int) -> None:
     """Copy what others see of a vehicle."""
     half_length = 0.5 * vehicle["length"]
     half_width = 0.5 * vehicle["width"]
+    heading = vehicle["heading"]
+    cos = math.cos(heading)
+    sin = math.sin(heading)
     body["id"] = vehicle["id"]
     body["row"] = row
     body["x"] = vehicle["x"]
     body["y"] = vehicle["y"]
     body["z"] = vehicle["z"]
-    body["cos"] = math.cos(vehicle["heading"])
-    body["sin"] = math.sin(vehicle["heading"])
+    body["cos"] = cos
+    body["sin"] = sin
     body["speed"] = vehicle["speed"]
     body["half_length"] = half_length
     body["half_width"] = half_width

@@ -37,6 +37,8 @@ from cavmarl.kernels.ways import own_step
 
 __all__ = ["advance", "begin_step", "resolve", "suggest"]
 
+TICKS_IN_ORDER = 8  # for so long rows that have been put in the order of the lanes nearly stay so
+
 
 @kernel
 def begin_step(
@@ -71,6 +73,13 @@ def _any_driver(rows: NDArray[np.void], num: int, driver: int) -> bool:
         if rows[i]["driver"] == driver:
             return True
     return False
+
+
+@kernel
+def _keep_order(owned: int, scratch: Scratch) -> None:
+    """The owned rows as they lie."""
+    for i in range(owned):
+        scratch.order[i] = i
 
 
 @kernel
@@ -130,16 +139,17 @@ def advance(
         rows = worlds.rows[w]
         owned = worlds.num_owned[w]
         phase = worlds.signal_phase[w]
-        if _any_driver(rows, owned, DRIVER_BACKGROUND):
+        drivers = _any_driver(rows, owned, DRIVER_BACKGROUND)
+        if drivers:
             index_lanes(roads, travel, rows, worlds.num_rows[w], scratch)
             register_links(roads, travel, rows, worlds.num_rows[w], scratch)
             decide(
                 roads, travel, rows, owned, DRIVER_BACKGROUND, worlds.ticks[w], dt, phase, scratch
             )
+        if drivers and worlds.ticks[w] % TICKS_IN_ORDER == 0:
             _order_by_lane(roads, owned, scratch)
         else:
-            for i in range(owned):
-                scratch.order[i] = i
+            _keep_order(owned, scratch)
         through = 0
         touching = 0
         for k in range(owned):
