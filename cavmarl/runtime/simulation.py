@@ -172,7 +172,11 @@ class Simulation:
         self._populate(self._everywhere)
         self.suggest(controls)
         self.step(Commands(controls, np.full(shape, ACTION_IDLE, dtype=np.int64)))
-        self.retire_agents()
+        # Once more what is only called when somebody leaves or waits.
+        self._let_in()
+        self._executor.each("retire", self._gate)
+        self._executor.each("forget", self._gate)
+        self._traffic.settle(self._gate, self._shard.worlds)
         self._episodes[:] = 0
 
     @property
@@ -324,8 +328,12 @@ class Simulation:
         """Those who wait and find a gap enter `next_rows`."""
         traffic, gate, worlds = self._traffic, self._gate, self._shard.worlds
         traffic.call_orders(gate, worlds)
-        if not gate.num_queue.any():
-            return
+        if gate.num_queue.any():
+            self._let_in()
+
+    def _let_in(self) -> None:
+        """Rank → assign → propose → accept → admit."""
+        traffic, gate, worlds = self._traffic, self._gate, self._shard.worlds
         self._executor.each("rank_lanes", gate)
         traffic.assign_lanes(gate, worlds)
         self._executor.each("propose", traffic.demand, gate)
