@@ -125,6 +125,8 @@ class ZonesConfig:
         weight: what `bisection` shares out evenly: length of lanes, or area.
         hysteresis_m: how far behind a border a vehicle changes its zone.
         max_deferred_ticks: ticks after which a change that was not acknowledged is forced.
+        approach_ticks: so many ticks before a vehicle is there at its present speed, the zone that
+            it drives to is told.
     """
 
     layout: str = "bisection"
@@ -133,6 +135,7 @@ class ZonesConfig:
     weight: Literal["lane_length", "uniform"] = "lane_length"
     hysteresis_m: float = 2.0
     max_deferred_ticks: int = 2
+    approach_ticks: int = 2
 
     def __post_init__(self) -> None:
         _check(
@@ -153,6 +156,12 @@ class ZonesConfig:
             "zones.max_deferred_ticks",
             self.max_deferred_ticks,
             "must be a whole number from 0 to 1000",
+        )
+        _check(
+            1 <= self.approach_ticks <= 1000,
+            "zones.approach_ticks",
+            self.approach_ticks,
+            "must be a whole number from 1 to 1000",
         )
 
 

@@ -23,6 +23,7 @@ _MEMBERS = {
         "call_orders", "rank_lanes", "assign_lanes", "propose", "running", "accept", "admit",
         "retire", "forget",
     ),
+    "migrate": ("begin", "end", "left", "entered"),
     "sense": ("clear_outputs", "settle_outputs", "credit"),
 }  # fmt: skip
 _PHASE_OF = {phase: phase for phase in PHASES} | {
@@ -42,7 +43,7 @@ class Turn:
         imbalance: maximum over mean of the vehicles that zones own.
         largest: rows of the zone with most.
         moves: vehicles that changed their zone, step by step.
-        move_ns: in `migrate`, step by step; 0 without a stopwatch.
+        move_ns: in the phase `migrate`, step by step; 0 without a stopwatch.
     """
 
     ns: float
@@ -126,7 +127,7 @@ def _run(world: DrivenWorld, steps: int, watch: Stopwatch) -> Turn:
     simulation = world.simulation
     ns = vehicles = ghosts = largest = 0
     uneven = 0.0
-    migrations, spent = [simulation.zone_loads().migrations], [watch.spent["migrate"]]
+    migrations, spent = [simulation.migrations], [_spent(watch)]
     for _ in range(steps):
         commands = world.commands()
         began = time.process_time_ns()
@@ -138,9 +139,14 @@ def _run(world: DrivenWorld, steps: int, watch: Stopwatch) -> Turn:
         ghosts += int(loads.ghosts.sum())
         largest += int((owned + loads.ghosts[:, 0]).max())
         uneven += imbalance(owned.tolist())
-        migrations.append(loads.migrations)
-        spent.append(watch.spent["migrate"])
+        migrations.append(simulation.migrations)
+        spent.append(_spent(watch))
     moves, move_ns = (
         tuple(new - old for old, new in pairwise(sums)) for sums in (migrations, spent)
     )
     return Turn(ns, steps, vehicles, ghosts, uneven, largest, moves, move_ns)
+
+
+def _spent(watch: Stopwatch) -> int:
+    """In the phase `migrate` up to now, ns."""
+    return sum(watch.spent[name] for name in _MEMBERS["migrate"])

@@ -196,7 +196,8 @@ def below(key: int | np.uint64, vehicle: int, tick: int, stream: int, n: int) ->
 
 
 @kernel
-def _mix(word: np.uint64) -> np.uint64:
+def mix(word: np.uint64) -> np.uint64:
+    """The finaliser of SplitMix64: each bit of the word changes about half of the bits."""
     word = (word ^ (word >> _SHIFT_30)) * _MIX_0
     word = (word ^ (word >> _SHIFT_27)) * _MIX_1
     return word ^ (word >> _SHIFT_31)
@@ -209,7 +210,7 @@ def quick_uniform(key: int | np.uint64, vehicle: int, tick: int, stream: int) ->
     The finaliser of SplitMix64 (Steele, Lea, Flood: "Fast splittable pseudorandom number
     generators", OOPSLA 2014) over key, vehicle and (stream, tick) in turn.
     """
-    word = _mix(np.uint64(key) + _GOLDEN)
-    word = _mix(word ^ (np.uint64(vehicle) * _GOLDEN))
-    word = _mix(word ^ ((np.uint64(stream) << _SHIFT_32) + np.uint64(tick)) * _GOLDEN)
+    word = mix(np.uint64(key) + _GOLDEN)
+    word = mix(word ^ (np.uint64(vehicle) * _GOLDEN))
+    word = mix(word ^ ((np.uint64(stream) << _SHIFT_32) + np.uint64(tick)) * _GOLDEN)
     return float(word >> _SHIFT_11) * _ULP

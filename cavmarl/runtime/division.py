@@ -1,8 +1,8 @@
 """`Division`: the shards of one set of worlds, and the rows that go between them.
 
-Ghosts go each tick to every zone that may see them (decision 012). A vehicle that has left its zone
-changes its owner between two ticks: its old shard keeps it as a ghost, the new one has had it as a
-ghost already.
+Ghosts go each tick to every zone that may see them (decision 012). A vehicle changes its owner
+between two ticks, when the coordinator says so: its old shard keeps it as a ghost, the new one has
+had it as a ghost already, and goes on with the state that it was sent.
 """
 
 from __future__ import annotations
@@ -16,8 +16,12 @@ from numpy.typing import NDArray
 
 from cavmarl.errors import ZoneError
 from cavmarl.kernels.arrays import Worlds
-from cavmarl.kernels.exchange import adopt, find_movers, release, take_ghosts, take_own
-from cavmarl.kernels.zones import Halo, ZoneArrays, make_publication, publish, zone_of
+from cavmarl.kernels.borders import NEAR, find_near, pass_on
+from cavmarl.kernels.exchange import take_ghosts, take_own
+from cavmarl.kernels.motion import MAX_SPEED_MPS
+from cavmarl.kernels.zones import Halo, ZoneArrays, make_publication, publish
+from cavmarl.ownership.messages import Switch
+from cavmarl.runtime.coordinator import Near
 from cavmarl.shard.shard import Shard
 
 __all__ = ["Division", "ZoneLoads"]
@@ -29,13 +33,11 @@ class ZoneLoads(NamedTuple):
     Attributes:
         owned: (k, W) vehicles.
         ghosts: (k, W) copies of other zones' vehicles.
-        migrations: vehicles that have changed their zone since the worlds were made.
         halo_m: how far zones see over their borders.
     """
 
     owned: NDArray[np.int64]
     ghosts: NDArray[np.int64]
-    migrations: int
     halo_m: float
 
 
@@ -47,20 +49,39 @@ class Division:
         zones: of the partition.
         halo: how far each zone sees over its borders.
         hysteresis_m: so far behind its border a vehicle changes its zone.
+        ahead_s: so long before it does, its next zone is told.
+
+    Attributes:
+        zones: of the partition.
     """
 
     def __init__(
-        self, shards: Sequence[Shard], zones: ZoneArrays, halo: Halo, hysteresis_m: float
+        self,
+        shards: Sequence[Shard],
+        zones: ZoneArrays,
+        halo: Halo,
+        hysteresis_m: float,
+        ahead_s: float,
     ) -> None:
+        self.zones = zones
         self._shards = tuple(shards)
-        self._zones = zones
         self._halo = halo
         self._hysteresis_m = hysteresis_m
-        self._migrations = 0
+        self._ahead_s = ahead_s
         capacity = shards[0].worlds.rows.shape[1]
         self._published = make_publication(capacity, len(shards))
-        self._movers = np.zeros(capacity, dtype=np.int32)
+        self._near = np.zeros(2 * capacity, dtype=NEAR)
         self._spare = np.zeros(1, dtype=shards[0].worlds.rows.dtype)
+
+    @property
+    def count(self) -> int:
+        """How many zones."""
+        return len(self._shards)
+
+    @property
+    def num_worlds(self) -> int:
+        """W."""
+        return len(self._shards[0].worlds.ticks)
 
     def distribute(self, chosen: NDArray[np.bool_]) -> None:
         """Give every shard its vehicles of the chosen worlds (W,), which are all in the first."""
@@ -72,7 +93,7 @@ class Division:
             for shard in self._shards:
                 worlds = shard.worlds
                 worlds.num_owned[w] = take_own(
-                    self._zones, shard.zone, everybody, len(everybody), worlds.rows[w]
+                    self.zones, shard.zone, everybody, len(everybody), worlds.rows[w]
                 )
                 worlds.num_contacts[w] = 0
             self._exchange(w, [shard.worlds.rows for shard in self._shards])
@@ -90,7 +111,7 @@ class Division:
         start = self._published.start
         for source, own in zip(self._shards, rows, strict=True):
             num = int(source.worlds.num_owned[w])
-            if publish(self._zones, self._halo, own[w], num, source.zone, self._published) == 0:
+            if publish(self.zones, self._halo, own[w], num, source.zone, self._published) == 0:
                 continue
             for target in np.flatnonzero(np.diff(start)).tolist():
                 begin, end = int(start[target]), int(start[target + 1])
@@ -98,43 +119,79 @@ class Division:
                 take_ghosts(own[w], self._published.rows, begin, end, rows[target][w], held[w])
                 held[w] += end - begin
 
-    def migrate(self) -> None:
-        """Let the vehicles of `next_rows` that have left their zone change their owner."""
-        if len(self._shards) == 1:
-            return
-        for source in self._shards:
-            for w in range(source.worlds.num_owned.size):
-                self._let_go(source, w)
+    def near(self, w: int) -> list[Near]:
+        """Who of a world is near a border, by its committed rows."""
+        found: list[Near] = []
+        for shard in self._shards:
+            worlds = shard.worlds
+            num = find_near(
+                self.zones, shard.zone, self._hysteresis_m, self._ahead_s, MAX_SPEED_MPS,
+                worlds.rows[w], int(worlds.num_owned[w]), self._near,
+            )  # fmt: skip
+            for vehicle, row, target, crossed, depth_m in self._near[:num].tolist():
+                found.append(Near(vehicle, shard.zone, row, target, crossed, depth_m))
+        return found
 
-    def _let_go(self, source: Shard, w: int) -> None:
-        worlds = source.worlds
-        rows, num = worlds.next_rows[w], int(worlds.num_owned[w])
-        found = find_movers(self._zones, source.zone, self._hysteresis_m, rows, num, self._movers)
-        self._migrations += int(found)
-        # From the last row to the first: who is released is swapped with the last owned one.
-        for i in self._movers[:found][::-1]:
-            zone = zone_of(self._zones, rows[i]["x"], rows[i]["y"])
-            target = self._shards[zone].worlds
-            if not adopt(
-                target.next_rows[w], int(target.num_owned[w]), int(target.num_rows[w]), rows[i]
-            ):
-                raise ZoneError(
-                    f"vehicle {rows[i]['id']} entered zone {zone}, which has not seen it come: "
-                    "the halo is too narrow"
-                )
-            target.num_owned[w] += 1
-            release(rows, int(i), int(worlds.num_owned[w]), self._spare)
-            worlds.num_owned[w] -= 1
+    def find(self, w: int, vehicle: int) -> tuple[int, int]:
+        """The zone that owns a vehicle, and its committed row there.
+
+        Raises:
+            ZoneError: nobody owns it.
+        """
+        for shard in self._shards:
+            worlds = shard.worlds
+            found = np.flatnonzero(worlds.rows["id"][w, : worlds.num_owned[w]] == vehicle)
+            if len(found):
+                return shard.zone, int(found[0])
+        raise ZoneError(f"vehicle {vehicle} is in no zone of world {w}")
+
+    def state(self, w: int, zone: int, row: int) -> bytes:
+        """The whole state of an owned vehicle of a zone, by its committed row."""
+        return self._shards[zone].worlds.rows[w, row].tobytes()
+
+    def hand_over(self, w: int, switch: Switch, state: bytes, row: int = 0) -> None:
+        """Let a vehicle change its owner, by its committed row.
+
+        Args:
+            w: in which world.
+            switch: who, from where, to where.
+            state: what the new owner goes on with.
+            row: where the old one probably keeps it.
+
+        Raises:
+            ZoneError: the old owner does not have it, or the new one has not seen it come.
+        """
+        source, target = (self._shards[z].worlds for z in (switch.source, switch.target))
+        place = pass_on(
+            switch.vehicle, source.rows, source.num_owned, row,
+            target.rows, target.num_owned, target.num_rows, w, self._spare,
+        )  # fmt: skip
+        if place == -1:
+            raise ZoneError(f"zone {switch.source} does not own vehicle {switch.vehicle}")
+        if place == -2:
+            raise ZoneError(
+                f"vehicle {switch.vehicle} entered zone {switch.target}, which has not seen it "
+                "come: the halo is too narrow"
+            )
+        target.rows[w, place] = np.frombuffer(state, dtype=target.rows.dtype)[0]
+
+    def owners(self, w: int) -> list[tuple[int, int]]:
+        """(id, zone) of all vehicles of a world."""
+        return [
+            (vehicle, shard.zone)
+            for shard in self._shards
+            for vehicle in shard.worlds.rows["id"][w, : shard.worlds.num_owned[w]].tolist()
+        ]
 
     def running(self) -> NDArray[np.int64]:
         """(W,) vehicles of each world."""
         return _total([shard.worlds.num_owned for shard in self._shards])
 
     def loads(self) -> ZoneLoads:
-        """What each zone holds, and how many vehicles have changed theirs."""
+        """What each zone holds."""
         owned = np.array([shard.worlds.num_owned for shard in self._shards])
         rows = np.array([shard.worlds.num_rows for shard in self._shards])
-        return ZoneLoads(owned, rows - owned, self._migrations, self._halo.halo_m)
+        return ZoneLoads(owned, rows - owned, self._halo.halo_m)
 
     def vehicles(self, world: int) -> NDArray[np.void]:
         """All live vehicles of a world: of several shards a copy, of one a view."""

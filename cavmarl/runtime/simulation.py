@@ -25,12 +25,14 @@ from cavmarl.kernels.codes import (
 )
 from cavmarl.kernels.motion import MAX_SPEED_MPS
 from cavmarl.kernels.rng import world_key
+from cavmarl.ownership.limits import Limits
 from cavmarl.roads.network import RoadNetwork
 from cavmarl.roads.zone_coverage import Coverage, zone_halo
 from cavmarl.roads.zone_layouts import cut_map
 from cavmarl.roads.zones import ZonePartition
 from cavmarl.runtime.commons import Commons
 from cavmarl.runtime.compilation import first_compilation
+from cavmarl.runtime.coordination import Coordination
 from cavmarl.runtime.division import Division, ZoneLoads
 from cavmarl.runtime.executor import Executor, SerialExecutor
 from cavmarl.shard.reach import driving_reach_m
@@ -162,8 +164,16 @@ class Simulation:
                 shards[0].worlds if shards else None,
             )
             shards.append(shard)
-        self._division = Division(shards, zones, halo, settings.hysteresis_m)
+        ahead_s = settings.approach_ticks * config.clock.sim_dt_s
+        self._division = Division(shards, zones, halo, settings.hysteresis_m, ahead_s)
+        self._coordination = self._make_coordination()
         return shards
+
+    def _make_coordination(self) -> Coordination | None:
+        """Of a divided world; nobody asks who owns what where all is one zone."""
+        if self.partition.count == 1:
+            return None
+        return Coordination(self._division, Limits(deferral=self.config.zones.max_deferred_ticks))
 
     def _call_every_kernel(self) -> None:
         """Run one step of a world that the first reset forgets."""
@@ -207,8 +217,13 @@ class Simulation:
         return self._division.vehicles(world)
 
     def zone_loads(self) -> ZoneLoads:
-        """What each zone holds now, and how many vehicles have changed their zone."""
+        """What each zone holds now."""
         return self._division.loads()
+
+    @property
+    def migrations(self) -> int:
+        """How many vehicles have changed their owner since the worlds were made."""
+        return 0 if self._coordination is None else self._coordination.switched
 
     @property
     def worlds(self) -> Worlds:
@@ -268,15 +283,22 @@ class Simulation:
         self._gate = self._traffic.draw_orders(self._gate, worlds, chosen)
         self._traffic.populate(self._gate, worlds, chosen)
         self._division.distribute(chosen)
+        if self._coordination is not None:
+            self._coordination.reset(chosen)
         self._switch_signals()
         self._sense(chosen)
 
     def step(self, commands: Commands) -> None:
         """One agent step: its ticks, then what the agents sense."""
-        self._executor.each("begin_step", commands)
-        for _ in range(self.config.clock.ticks_per_step):
-            self._tick(commands)
-        self._sense(self._everywhere)
+        ticks = self.config.clock.ticks_per_step
+        for tick in range(ticks):
+            self._begin()
+            if tick == 0:
+                self._executor.each("begin_step", commands)
+            self._advance(commands)
+            if tick == ticks - 1:
+                self._sense(self._everywhere)
+            self._end()
 
     def instrument(self, wrap: Callable[[Any], Any]) -> None:
         """Put `wrap(part)` in the place of each part that phases are calls of, to time them."""
@@ -284,15 +306,24 @@ class Simulation:
         self._division = wrap(self._division)
         self._traffic = wrap(self._traffic)
         self._commons = wrap(self._commons)
+        if self._coordination is not None:
+            self._coordination = wrap(self._coordination)
 
-    def _tick(self, commands: Commands) -> None:
-        """Advance → leave → exchange → resolve → enter → migrate → commit → signals."""
+    def _begin(self) -> None:
+        if self._coordination is not None:
+            self._coordination.begin()
+
+    def _end(self) -> None:
+        if self._coordination is not None:
+            self._coordination.end()
+
+    def _advance(self, commands: Commands) -> None:
+        """Advance → leave → exchange → resolve → enter → commit → signals."""
         self._executor.each("advance", commands)
         self._leave()
         self._division.exchange()
         self._executor.each("resolve")
         self._enter()
-        self._division.migrate()
         self._executor.each("commit")
         self._shard.worlds.ticks[:] += 1
         self._switch_signals()
@@ -319,10 +350,15 @@ class Simulation:
             self._executor.each("choose_goals", traffic.demand, len(traffic.plans), gate)
         self._executor.each("leave", gate)
         if gate.num_passing.any():
+            self._note_left()
             traffic.settle(gate, worlds)
         if begins_second and traffic.rerouting is not None:
             with self._division.everybody_next() as everybody:
                 traffic.rerouting.act(gate, everybody)
+
+    def _note_left(self) -> None:
+        if self._coordination is not None:
+            self._coordination.left(self._gate)
 
     def _enter(self) -> None:
         """Those who wait and find a gap enter `next_rows`."""
@@ -339,6 +375,8 @@ class Simulation:
         self._executor.each("propose", traffic.demand, gate)
         traffic.accept(gate, self._division.running())
         self._executor.each("admit", gate)
+        if self._coordination is not None:
+            self._coordination.entered(gate)
         gate.num_passing[:] = 0
 
     def retire_agents(self) -> None:
@@ -346,6 +384,7 @@ class Simulation:
         gate = self._gate
         self._executor.each("retire", gate)
         if gate.num_passing.any():
+            self._note_left()
             self._executor.each("forget", gate)
             self._traffic.settle(gate, self._shard.worlds)
 

@@ -51,8 +51,8 @@ def test_what_zones_hold_is_counted(make: Callable[[int], Simulation]) -> None:
     assert four.imbalance > 1.0
     assert 0.25 < four.largest_share <= 1.0
     ticks = 200
-    moved = _at_end(make, 40, zones=4).zone_loads().migrations
-    before = _at_end(make, 20, zones=4).zone_loads().migrations
+    moved = _at_end(make, 40, zones=4).migrations
+    before = _at_end(make, 20, zones=4).migrations
     assert four.migrations == pytest.approx((moved - before) / ticks)
     assert four.migration_us is not None
 

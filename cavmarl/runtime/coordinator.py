@@ -1,0 +1,338 @@
+"""`Coordinator`: the referee of one world, with the directory of owners and an endpoint a zone.
+
+It says who advances which vehicle to the next tick, and sees it done. Rows are not its affair: what
+is near a border, what stands in a row and how rows change hands is told and done by the division.
+"""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from typing import NamedTuple, Protocol
+
+from cavmarl.errors import ProtocolError
+from cavmarl.ownership.directory import Directory
+from cavmarl.ownership.endpoint import Endpoint
+from cavmarl.ownership.limits import Limits
+from cavmarl.ownership.messages import (
+    COORDINATOR,
+    Birth,
+    Message,
+    Output,
+    Prepare,
+    Record,
+    Removed,
+    Switch,
+)
+from cavmarl.ownership.offers import Approach
+from cavmarl.ownership.reactions import Advance
+from cavmarl.ownership.transport import Delivery
+from cavmarl.runtime.post import DirectPost, Post
+
+__all__ = ["Coordinator", "Entry", "Journal", "Near", "Watcher"]
+
+PATIENCE = 10_000
+"""So often a tick asks a zone that does not answer, before it gives up."""
+
+
+class Near(NamedTuple):
+    """A vehicle that another zone has to be told of; see `kernels.borders.NEAR`."""
+
+    vehicle: int
+    source: int
+    row: int
+    target: int
+    crossed: bool
+    depth_m: float
+
+
+class Entry(NamedTuple):
+    """A vehicle that changes its owner now, with the state that the new one has of it."""
+
+    switch: Switch
+    state: bytes
+
+
+class Journal(Protocol):
+    """Where records go before anything is sent."""
+
+    def append(self, records: Sequence[Record]) -> None:
+        """Write them down; when this returns, they are."""
+        ...
+
+
+class Watcher(Protocol):
+    """Is told what happens, as `ownership.trace.Trace` is."""
+
+    def logged(self, records: Iterable[Record]) -> None:
+        """Records, in the order of the journal."""
+        ...
+
+    def delivered(self, destination: int, message: Message) -> None:
+        """A message that has arrived."""
+        ...
+
+
+class States(Protocol):
+    """States of vehicles at the committed tick."""
+
+    def state(self, vehicle: int) -> bytes:
+        """The vehicle's whole state."""
+        ...
+
+
+class Coordinator:
+    """Runs the protocol of one world, tick by tick: `begin`, then the zones' work, then `end`.
+
+    Args:
+        run: 16 bytes that no other run has.
+        zones: how many.
+        states: of vehicles at the committed tick.
+        limits: deadlines.
+        post: carries the messages; None: directly.
+        journal: takes the records; None: nobody keeps them.
+        watchers: told of every record and delivery.
+
+    Attributes:
+        directory: who owns what.
+        endpoints: zone → its host's side.
+        post: what carries the messages.
+        switched: vehicles that have changed their owner.
+    """
+
+    def __init__(
+        self,
+        run: bytes,
+        zones: int,
+        states: States,
+        limits: Limits,
+        post: Post | None = None,
+        journal: Journal | None = None,
+        watchers: Sequence[Watcher] = (),
+    ) -> None:
+        self.directory = Directory(run, range(zones), states, limits)
+        self.endpoints: dict[int, Endpoint] = {}
+        self.post: Post = DirectPost() if post is None else post
+        self.switched = 0
+        self._limits = limits
+        self._journal = journal
+        self._watchers = tuple(watchers)
+        self._leases: dict[int, Advance] = {}
+        self._births: list[Birth] = []
+        self._gone: list[Removed] = []  # between two ticks
+        self._removed: list[Removed] = []  # in the tick
+
+    @property
+    def tick(self) -> int:
+        """The committed tick, of the run."""
+        return self.directory.table.tick
+
+    @property
+    def is_open(self) -> bool:
+        """Whether a tick has been begun and is not committed."""
+        return self.directory.table.plan is not None
+
+    # Between ticks
+
+    def reset(self) -> None:
+        """Begin an episode without vehicles."""
+        self.resume()
+        self._leases = {}
+        self._do(self.directory.reset())
+        for zone in self.directory.table.hosts:
+            if zone not in self.endpoints:
+                self.host(zone)
+
+    def host(self, zone: int) -> None:
+        """Give a zone to a new host, in this process."""
+        output = self.directory.host(zone, worker=0)
+        self.endpoints[zone] = Endpoint(self.directory.hosting(zone), self._limits)
+        self._leases.pop(zone, None)
+        self._do(output)
+
+    def fence(self, zone: int) -> Endpoint:
+        """The zone's host is dead to us; it is returned."""
+        self._do(self.directory.fence(zone))
+        return self.endpoints.pop(zone)
+
+    def resume(
+        self, births: Iterable[tuple[int, int]] = (), gone: Iterable[tuple[int, int]] = ()
+    ) -> None:
+        """Know again what has happened since the last COMMIT: as `entered` and `left` told."""
+        self._births, self._gone, self._removed = [], [], []
+        self.entered(births)
+        self._gone.extend(Removed(vehicle, reason) for vehicle, reason in gone)
+
+    def entered(self, vehicles: Iterable[tuple[int, int]]) -> None:
+        """(id, zone) of vehicles that are new since the last BEGIN."""
+        self._births.extend(Birth(vehicle, zone, b"") for vehicle, zone in vehicles)
+
+    def left(self, vehicles: Iterable[tuple[int, int]]) -> None:
+        """(id, reason) of vehicles that have left the world."""
+        place = self._removed if self.is_open else self._gone
+        place.extend(Removed(vehicle, reason) for vehicle, reason in vehicles)
+
+    # A tick
+
+    def begin(
+        self, near: Sequence[Near], state: Callable[[Near], bytes], inputs: bytes = b""
+    ) -> list[Entry]:
+        """Offer who comes near, decide the way to the next tick, and lease it to every zone.
+
+        Called again in the same tick, it goes on with what was decided.
+
+        Args:
+            near: who is near a border in the committed tick.
+            state: of such a vehicle.
+            inputs: digest of the actions.
+
+        Returns:
+            the vehicles that change their owner now.
+
+        Raises:
+            ProtocolError: a zone does not answer.
+        """
+        directory = self.directory
+        births, self._births, self._removed = self._births, [], []
+        if not self.is_open:
+            self._offer(near, state)
+            owners = directory.table.owners
+            movers = [(v.vehicle, v.target) for v in near if v.crossed and v.vehicle in owners]
+            self._leases = {}
+            self._do(directory.begin(movers, births, inputs))
+        self._until(self._unleased, lambda: directory.resend(self._unleased()))
+        return self._entries()
+
+    def end(
+        self, rows: Callable[[int], int], stored: Callable[[int], int] | None = None
+    ) -> None:
+        """Every zone is through: DONE and COMMIT.
+
+        Args:
+            rows: zone → digest of its rows.
+            stored: zone → digest of its rows in the store; None: where `rows` are is the store.
+
+        Raises:
+            LedgerError: a vehicle was lost or doubled.
+            StoreError: the store holds other rows than a zone told of.
+            ProtocolError: a zone does not answer.
+        """
+        self._complete(rows)
+        self._until(self.directory.waiting_for, self.directory.resend)
+        told = {
+            zone: done.rows if stored is None else stored(zone)
+            for zone, done in self.directory.dones.items()
+        }
+        self.switched += len(self.directory.table.planned.switches)
+        self._do(self.directory.commit(told))
+        self._gone = []
+
+    def _complete(self, rows: Callable[[int], int]) -> None:
+        """End the leases that are still open."""
+        table = self.directory.table
+        owner, owners = table.planned.owner, table.owners
+        removed: defaultdict[int, list[Removed]] = defaultdict(list)
+        for entry in (*self._gone, *self._removed):
+            removed[owner(entry.vehicle, owners)[0]].append(entry)
+        for zone, endpoint in self.endpoints.items():
+            if endpoint.lease is not None:
+                self.post.send((endpoint.complete(rows(zone), removed[zone]),))
+
+    def _offer(self, near: Sequence[Near], state: Callable[[Near], bytes]) -> None:
+        """Tell the zones who comes near; what is not answered after A attempts stays so."""
+        approaches: defaultdict[int, list[Approach]] = defaultdict(list)
+        for entry in near:
+            if entry.vehicle in self.endpoints[entry.source].owned:
+                approaches[entry.source].append(
+                    Approach(entry.vehicle, entry.target, state(entry))
+                )
+        for zone, endpoint in self.endpoints.items():
+            if approaches[zone] or endpoint.offers.open:
+                self.post.send(endpoint.offer(approaches[zone]))
+        self._deliver()
+        for _ in range(1, self._limits.attempts):
+            again = [m for endpoint in self.endpoints.values() for m in endpoint.offer_again()]
+            if not again:
+                return
+            self.post.send(again)
+            self._deliver()
+
+    # Messages
+
+    def _unleased(self) -> tuple[int, ...]:
+        return tuple(
+            zone
+            for zone in self.endpoints
+            if zone not in self._leases and zone not in self.directory.dones
+        )
+
+    def _entries(self) -> list[Entry]:
+        plan = self.directory.table.planned
+        return [
+            Entry(plan.switches[vehicle], state)
+            for zone in sorted(self._leases)
+            for vehicle, state in self._leases[zone].enter
+        ]
+
+    def _until(self, missing: Callable[[], Sequence[int]], again: Callable[[], Output]) -> None:
+        """Deliver until nobody is missing, and ask again where nothing comes."""
+        self._deliver()
+        for _ in range(PATIENCE):
+            if not missing():
+                return
+            self._do(again())
+            self._deliver()
+        raise ProtocolError(
+            f"zones {list(missing())} do not answer in tick {self.tick + 1}, asked {PATIENCE} "
+            "times: STEP and DONE must arrive now and then"
+        )
+
+    def _deliver(self) -> None:
+        """Let arrive what is under way, and what that leads to, until a phase brings nothing."""
+        while arrived := self.post.deliver():
+            for delivery in arrived:
+                self._take(delivery)
+
+    def _take(self, delivery: Delivery) -> None:
+        destination, message, refused = delivery
+        for watcher in self._watchers:
+            watcher.delivered(destination, message)
+        if destination == COORDINATOR:
+            self._do(self.directory.on_message(message))
+            return
+        endpoint = self.endpoints.get(destination)
+        if endpoint is None:
+            return
+        if refused and isinstance(message, Prepare):
+            reaction = endpoint.refuse(message)
+        else:
+            reaction = endpoint.on_message(message)
+        if reaction.advance is not None:
+            self._leases[destination] = reaction.advance
+        if reaction.messages:
+            self.post.send(reaction.messages)
+
+    def _do(self, output: Output) -> None:
+        """Write down, then send."""
+        if output.records:
+            if self._journal is not None:
+                self._journal.append(output.records)
+            for watcher in self._watchers:
+                watcher.logged(output.records)
+        if output.messages:
+            self.post.send(output.messages)
+
+    # Recovery
+
+    def restart(self, records: Sequence[Record], states: States) -> None:
+        """The coordinator has died: a new one reads its journal, and sends what was decided.
+
+        Zones that nobody hosts then have to be hosted anew before the tick goes on.
+        """
+        table = self.directory.table
+        self.directory = Directory.restore(records, table.hosts, states, self._limits)
+        self._do(self.directory.resend())
+
+    def owners(self) -> Mapping[int, tuple[int, int]]:
+        """Vehicle → (zone, epoch) at the committed tick."""
+        return self.directory.table.owners
