@@ -165,7 +165,7 @@ def test_signals_are_the_same(together: bool, tmp_path: Path) -> None:
         if tick == TICKS // 2:
             whole.reset(np.array([False, True]))
         elif tick > 0:
-            whole._tick(idle(whole))
+            whole.step(idle(whole))
         halves.take(whole.worlds, {})
         halves.executor.each("detect")
         if not together:
