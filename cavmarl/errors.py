@@ -31,7 +31,12 @@
     │   │   ├── CorruptMessageError
     │   │   ├── UnknownVersionError
     │   │   └── ForeignRunError
-    │   └── JournalError          a log that cannot be replayed
+    │   ├── TransferError         bytes from which no vehicle can go on here
+    │   │   ├── TruncatedTransferError
+    │   │   ├── TransferVersionError
+    │   │   ├── TransferLayoutError   of another build, or of another environment
+    │   │   └── ForeignTransferError  of another vehicle or tick
+    │   └── JournalError          a log that cannot be written or replayed
     │       ├── TornJournalError     only its last line is cut short
     │       └── CorruptJournalError  a line is damaged, missing or out of order
     ├── PolicyError            a policy that cannot be loaded or does not fit
@@ -58,6 +63,7 @@ __all__ = [
     "EpisodeError",
     "EvaluationError",
     "ForeignRunError",
+    "ForeignTransferError",
     "InvalidActionError",
     "InvariantError",
     "JournalError",
@@ -74,8 +80,12 @@ __all__ = [
     "SpawnError",
     "StoreError",
     "TornJournalError",
+    "TransferError",
+    "TransferLayoutError",
+    "TransferVersionError",
     "TransitionError",
     "TruncatedMessageError",
+    "TruncatedTransferError",
     "UnequalWorldsError",
     "UnknownAgentError",
     "UnknownEnvironmentError",
@@ -227,8 +237,28 @@ class ForeignRunError(MessageError):
     """A message of another run."""
 
 
+class TransferError(ProtocolError):
+    """Bytes from which no vehicle can go on here."""
+
+
+class TruncatedTransferError(TransferError):
+    """The state of a vehicle that ends too early, or goes on after its end."""
+
+
+class TransferVersionError(TransferError):
+    """The state of a vehicle in another major version."""
+
+
+class TransferLayoutError(TransferError):
+    """The state of a vehicle from another build, or from another environment."""
+
+
+class ForeignTransferError(TransferError):
+    """The state of another vehicle, or of another tick."""
+
+
 class JournalError(ProtocolError):
-    """A log that cannot be replayed."""
+    """A log that cannot be written or replayed."""
 
 
 class TornJournalError(JournalError):
