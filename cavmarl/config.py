@@ -127,6 +127,9 @@ class ZonesConfig:
         max_deferred_ticks: ticks after which a change that was not acknowledged is forced.
         approach_ticks: so many ticks before a vehicle is there at its present speed, the zone that
             it drives to is told.
+        journal: file for the coordinator's log; empty: none. It must not exist.
+        check: watch the invariants of ownership at run time.
+        faults: a plan of faults to inject, as JSON or a file of it; empty: none.
     """
 
     layout: str = "bisection"
@@ -136,6 +139,9 @@ class ZonesConfig:
     hysteresis_m: float = 2.0
     max_deferred_ticks: int = 2
     approach_ticks: int = 2
+    journal: str = ""
+    check: bool = False
+    faults: str = ""
 
     def __post_init__(self) -> None:
         _check(

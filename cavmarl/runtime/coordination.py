@@ -2,19 +2,18 @@
 
 from __future__ import annotations
 
-import secrets
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
 
+from cavmarl.errors import JournalError
 from cavmarl.kernels.arrays import Gate
 from cavmarl.kernels.zones import zones_of
-from cavmarl.ownership.limits import Limits
-from cavmarl.ownership.messages import RUN_BYTES
-from cavmarl.runtime.coordinator import Coordinator, Journal, Near, Watcher
+from cavmarl.runtime.coordinator import Coordinator, Near
 from cavmarl.runtime.division import Division
-from cavmarl.runtime.post import Post
+from cavmarl.runtime.row_digests import RowDigests
+from cavmarl.runtime.store import CommittedStore
 
 __all__ = ["Coordination", "RowStates"]
 
@@ -58,34 +57,25 @@ class Coordination:
 
     Args:
         division: whose rows change hands.
-        limits: deadlines of the protocol.
-        posts: what carries the messages, by world; empty: they arrive directly.
-        journals: what takes the records, by world; empty: nothing.
-        watchers: told of all that happens in a world, by world; empty: nobody.
+        coordinators: one a world.
+        states: of the vehicles of each world, as the coordinators read them.
+        digests: of zones' rows; None: nobody asks for them.
+        store: keeps what is committed; None: nobody can die apart from the others.
     """
 
     def __init__(
         self,
         division: Division,
-        limits: Limits,
-        posts: Sequence[Post] = (),
-        journals: Sequence[Journal] = (),
-        watchers: Sequence[Sequence[Watcher]] = (),
+        coordinators: Sequence[Coordinator],
+        states: Sequence[RowStates],
+        digests: RowDigests | None = None,
+        store: CommittedStore | None = None,
     ) -> None:
+        self.coordinators = tuple(coordinators)
         self._division = division
-        self._states = tuple(RowStates(division, w) for w in range(division.num_worlds))
-        self.coordinators = tuple(
-            Coordinator(
-                secrets.token_bytes(RUN_BYTES),
-                division.count,
-                states,
-                limits,
-                posts[w] if posts else None,
-                journals[w] if journals else None,
-                watchers[w] if watchers else (),
-            )
-            for w, states in enumerate(self._states)
-        )
+        self._states = tuple(states)
+        self._digests = digests
+        self._store = store
 
     @property
     def switched(self) -> int:
@@ -110,8 +100,31 @@ class Coordination:
 
     def end(self) -> None:
         """Commit the tick that all zones have computed."""
-        for coordinator in self.coordinators:
-            coordinator.end(lambda zone: 0)
+        if self._store is not None:
+            self._store.write(tuple((c.notes()[0], ()) for c in self.coordinators))
+        for w, coordinator in enumerate(self.coordinators):
+            coordinator.end(self._live(w), self._stored(w))
+        if self._store is not None:
+            self._store.flip()
+
+    def save(self) -> None:
+        """What has changed between two ticks is committed."""
+        if self._store is not None:
+            self._store.write(tuple(coordinator.notes() for coordinator in self.coordinators))
+            self._store.flip()
+
+    def restart(self, w: int) -> Coordinator:
+        """The coordinator of a world has died: another one has read its journal.
+
+        Raises:
+            JournalError: there is none, or it cannot be read.
+        """
+        coordinator, journal = self.coordinators[w], self.coordinators[w].journal
+        if journal is None:
+            raise JournalError("a coordinator that dies without a journal is gone for good")
+        coordinator.journal = journal.reopened()
+        coordinator.restart(tuple(coordinator.journal.read()))
+        return coordinator
 
     def left(self, gate: Gate) -> None:
         """Those in `gate.passing` have left their worlds."""
@@ -128,3 +141,15 @@ class Coordination:
                 zones = np.empty(len(new), dtype=np.int32)
                 zones_of(self._division.zones, new, len(new), zones)
                 coordinator.entered(zip(new["id"].tolist(), zones.tolist(), strict=True))
+
+    def _live(self, w: int) -> Callable[[int], int]:
+        digests = self._digests
+        if digests is None:
+            return lambda zone: 0
+        return lambda zone: digests.of(self._division.owned(w, zone))
+
+    def _stored(self, w: int) -> Callable[[int], int] | None:
+        digests, store = self._digests, self._store
+        if digests is None or store is None:
+            return None
+        return lambda zone: digests.of(store.written(zone, w))

@@ -7,7 +7,7 @@ is near a border, what stands in a row and how rows change hands is told and don
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from typing import NamedTuple, Protocol
 
 from cavmarl.errors import ProtocolError
@@ -27,9 +27,10 @@ from cavmarl.ownership.messages import (
 from cavmarl.ownership.offers import Approach
 from cavmarl.ownership.reactions import Advance
 from cavmarl.ownership.transport import Delivery
+from cavmarl.runtime.journal import AnyJournal
 from cavmarl.runtime.post import DirectPost, Post
 
-__all__ = ["Coordinator", "Entry", "Journal", "Near", "Watcher"]
+__all__ = ["Coordinator", "Entry", "Near", "Watcher"]
 
 PATIENCE = 10_000
 """So often a tick asks a zone that does not answer, before it gives up."""
@@ -51,14 +52,6 @@ class Entry(NamedTuple):
 
     switch: Switch
     state: bytes
-
-
-class Journal(Protocol):
-    """Where records go before anything is sent."""
-
-    def append(self, records: Sequence[Record]) -> None:
-        """Write them down; when this returns, they are."""
-        ...
 
 
 class Watcher(Protocol):
@@ -97,6 +90,7 @@ class Coordinator:
         directory: who owns what.
         endpoints: zone → its host's side.
         post: what carries the messages.
+        journal: what takes the records.
         switched: vehicles that have changed their owner.
     """
 
@@ -107,15 +101,16 @@ class Coordinator:
         states: States,
         limits: Limits,
         post: Post | None = None,
-        journal: Journal | None = None,
+        journal: AnyJournal | None = None,
         watchers: Sequence[Watcher] = (),
     ) -> None:
         self.directory = Directory(run, range(zones), states, limits)
         self.endpoints: dict[int, Endpoint] = {}
         self.post: Post = DirectPost() if post is None else post
         self.switched = 0
+        self._states = states
         self._limits = limits
-        self._journal = journal
+        self.journal = journal
         self._watchers = tuple(watchers)
         self._leases: dict[int, Advance] = {}
         self._births: list[Birth] = []
@@ -155,13 +150,13 @@ class Coordinator:
         self._do(self.directory.fence(zone))
         return self.endpoints.pop(zone)
 
-    def resume(
-        self, births: Iterable[tuple[int, int]] = (), gone: Iterable[tuple[int, int]] = ()
-    ) -> None:
-        """Know again what has happened since the last COMMIT: as `entered` and `left` told."""
-        self._births, self._gone, self._removed = [], [], []
-        self.entered(births)
-        self._gone.extend(Removed(vehicle, reason) for vehicle, reason in gone)
+    def notes(self) -> tuple[tuple[Birth, ...], tuple[Removed, ...]]:
+        """Who is new since the last BEGIN, and who is gone since the last COMMIT."""
+        return tuple(self._births), tuple(self._gone)
+
+    def resume(self, births: Iterable[Birth] = (), gone: Iterable[Removed] = ()) -> None:
+        """Know again what `notes` told."""
+        self._births, self._gone, self._removed = list(births), list(gone), []
 
     def entered(self, vehicles: Iterable[tuple[int, int]]) -> None:
         """(id, zone) of vehicles that are new since the last BEGIN."""
@@ -203,9 +198,7 @@ class Coordinator:
         self._until(self._unleased, lambda: directory.resend(self._unleased()))
         return self._entries()
 
-    def end(
-        self, rows: Callable[[int], int], stored: Callable[[int], int] | None = None
-    ) -> None:
+    def end(self, rows: Callable[[int], int], stored: Callable[[int], int] | None = None) -> None:
         """Every zone is through: DONE and COMMIT.
 
         Args:
@@ -243,9 +236,7 @@ class Coordinator:
         approaches: defaultdict[int, list[Approach]] = defaultdict(list)
         for entry in near:
             if entry.vehicle in self.endpoints[entry.source].owned:
-                approaches[entry.source].append(
-                    Approach(entry.vehicle, entry.target, state(entry))
-                )
+                approaches[entry.source].append(Approach(entry.vehicle, entry.target, state(entry)))
         for zone, endpoint in self.endpoints.items():
             if approaches[zone] or endpoint.offers.open:
                 self.post.send(endpoint.offer(approaches[zone]))
@@ -315,24 +306,27 @@ class Coordinator:
     def _do(self, output: Output) -> None:
         """Write down, then send."""
         if output.records:
-            if self._journal is not None:
-                self._journal.append(output.records)
-            for watcher in self._watchers:
-                watcher.logged(output.records)
+            self._write(output)
         if output.messages:
             self.post.send(output.messages)
 
+    def _write(self, output: Output) -> None:
+        if self.journal is not None:
+            self.journal.append(output.records)
+        for watcher in self._watchers:
+            watcher.logged(output.records)
+
     # Recovery
 
-    def restart(self, records: Sequence[Record], states: States) -> None:
-        """The coordinator has died: a new one reads its journal, and sends what was decided.
+    def restart(self, records: Sequence[Record]) -> None:
+        """The coordinator has died: a new one knows what its journal says.
 
-        Zones that nobody hosts then have to be hosted anew before the tick goes on.
+        Then `resume` tells it what the store says, and `resend` the zones what was decided.
         """
-        table = self.directory.table
-        self.directory = Directory.restore(records, table.hosts, states, self._limits)
-        self._do(self.directory.resend())
+        zones = tuple(self.directory.table.hosts)
+        self.directory = Directory.restore(records, zones, self._states, self._limits)
+        self.resume()
 
-    def owners(self) -> Mapping[int, tuple[int, int]]:
-        """Vehicle → (zone, epoch) at the committed tick."""
-        return self.directory.table.owners
+    def resend(self) -> None:
+        """Repeat what was decided, to all zones that have not answered."""
+        self._do(self.directory.resend())

@@ -23,6 +23,7 @@ from cavmarl.kernels.zones import Halo, ZoneArrays, make_publication, publish
 from cavmarl.ownership.messages import Switch
 from cavmarl.runtime.coordinator import Near
 from cavmarl.shard.shard import Shard
+from cavmarl.shard.transfer import TransferCodec
 
 __all__ = ["Division", "ZoneLoads"]
 
@@ -50,9 +51,11 @@ class Division:
         halo: how far each zone sees over its borders.
         hysteresis_m: so far behind its border a vehicle changes its zone.
         ahead_s: so long before it does, its next zone is told.
+        codec: of vehicles' states.
 
     Attributes:
         zones: of the partition.
+        codec: of vehicles' states.
     """
 
     def __init__(
@@ -62,8 +65,10 @@ class Division:
         halo: Halo,
         hysteresis_m: float,
         ahead_s: float,
+        codec: TransferCodec,
     ) -> None:
         self.zones = zones
+        self.codec = codec
         self._shards = tuple(shards)
         self._halo = halo
         self._hysteresis_m = hysteresis_m
@@ -147,23 +152,24 @@ class Division:
 
     def state(self, w: int, zone: int, row: int) -> bytes:
         """The whole state of an owned vehicle of a zone, by its committed row."""
-        return self._shards[zone].worlds.rows[w, row].tobytes()
+        worlds = self._shards[zone].worlds
+        return self.codec.pack(worlds.rows, w, row, int(worlds.ticks[w]))
 
-    def hand_over(self, w: int, switch: Switch, state: bytes, row: int = 0) -> None:
+    def hand_over(self, w: int, switch: Switch, state: bytes, hint: int = 0) -> None:
         """Let a vehicle change its owner, by its committed row.
 
         Args:
             w: in which world.
             switch: who, from where, to where.
             state: what the new owner goes on with.
-            row: where the old one probably keeps it.
+            hint: the row where the old one probably keeps it.
 
         Raises:
             ZoneError: the old owner does not have it, or the new one has not seen it come.
         """
         source, target = (self._shards[z].worlds for z in (switch.source, switch.target))
         place = pass_on(
-            switch.vehicle, source.rows, source.num_owned, row,
+            switch.vehicle, source.rows, source.num_owned, hint,
             target.rows, target.num_owned, target.num_rows, w, self._spare,
         )  # fmt: skip
         if place == -1:
@@ -173,7 +179,16 @@ class Division:
                 f"vehicle {switch.vehicle} entered zone {switch.target}, which has not seen it "
                 "come: the halo is too narrow"
             )
-        target.rows[w, place] = np.frombuffer(state, dtype=target.rows.dtype)[0]
+        tick = int(target.ticks[w])
+        self.codec.unpack(state, switch.vehicle, tick, target.rows, w, place)
+        row = target.rows[w, place]
+        row["owner"], row["epoch"] = switch.target, switch.epoch
+
+    def owned(self, w: int, zone: int) -> NDArray[np.void]:
+        """VEHICLE (n,), the committed rows that a zone owns; a view."""
+        worlds = self._shards[zone].worlds
+        rows: NDArray[np.void] = worlds.rows[w, : worlds.num_owned[w]]
+        return rows
 
     def owners(self, w: int) -> list[tuple[int, int]]:
         """(id, zone) of all vehicles of a world."""

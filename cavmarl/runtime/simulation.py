@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from cavmarl.config import EnvConfig
-from cavmarl.errors import CapacityError
+from cavmarl.errors import CapacityError, ZoneError
 from cavmarl.kernels.arrays import Outputs, Worlds
 from cavmarl.kernels.codes import (
     ACTION_IDLE,
@@ -25,7 +27,8 @@ from cavmarl.kernels.codes import (
 )
 from cavmarl.kernels.motion import MAX_SPEED_MPS
 from cavmarl.kernels.rng import world_key
-from cavmarl.ownership.limits import Limits
+from cavmarl.ownership.messages import Switch
+from cavmarl.ownership.transfers import TransferLog
 from cavmarl.roads.network import RoadNetwork
 from cavmarl.roads.zone_coverage import Coverage, zone_halo
 from cavmarl.roads.zone_layouts import cut_map
@@ -35,15 +38,24 @@ from cavmarl.runtime.compilation import first_compilation
 from cavmarl.runtime.coordination import Coordination
 from cavmarl.runtime.division import Division, ZoneLoads
 from cavmarl.runtime.executor import Executor, SerialExecutor
+from cavmarl.runtime.recovery import Recovery, Revival
+from cavmarl.runtime.refereeing import make_refereeing
 from cavmarl.shard.reach import driving_reach_m
 from cavmarl.shard.sensors import largest_radius_m, sensing_reach_m
 from cavmarl.shard.shard import Commands, Shard
+from cavmarl.shard.transfer import TransferCodec
 from cavmarl.shard.vehicles import STATE_FIELDS, blank_vehicle
 from cavmarl.traffic.demand import DemandFile
 from cavmarl.traffic.departures import make_gate
 from cavmarl.traffic.native import NativeTraffic
 
 __all__ = ["Simulation", "TrafficStats"]
+
+# Fields of `Gate` that outlive a tick.
+KEPT_BY_GATE = (
+    "next_order", "queue", "num_queue", "next_id", "num_entered", "counts", "sums", "num_passing",
+    "lane_taken",
+)  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -106,6 +118,7 @@ class Simulation:
         self._first_world = 0
         self._episodes = np.zeros(num_worlds, dtype=np.int64)
         self._everywhere = np.ones(num_worlds, dtype=np.bool_)
+        self.transfers: tuple[TransferLog, ...] = ()
         with first_compilation() as is_first:
             blank = blank_vehicle()
             traffic = NativeTraffic(
@@ -125,8 +138,12 @@ class Simulation:
             self._shards = self._make_shards(self.partition)
             self._shard = self._shards[0]
             self._executor: Executor = SerialExecutor(self._shards)
+            self._coordination: Coordination | None = None
+            self._recovery: Recovery | None = None
             if is_first:
                 self._call_every_kernel()
+            if self.partition.count > 1:
+                self._divide()
 
     def _make_shards(self, partition: ZonePartition) -> list[Shard]:
         """One shard a zone, and the division that knows them all."""
@@ -165,15 +182,30 @@ class Simulation:
             )
             shards.append(shard)
         ahead_s = settings.approach_ticks * config.clock.sim_dt_s
-        self._division = Division(shards, zones, halo, settings.hysteresis_m, ahead_s)
-        self._coordination = self._make_coordination()
+        stack = config.sensors.stack
+        codec = TransferCodec.of(shards[0].worlds, self._commons.outputs, stack)
+        self._division = Division(shards, zones, halo, settings.hysteresis_m, ahead_s, codec)
         return shards
 
-    def _make_coordination(self) -> Coordination | None:
-        """Of a divided world; nobody asks who owns what where all is one zone."""
-        if self.partition.count == 1:
-            return None
-        return Coordination(self._division, Limits(deferral=self.config.zones.max_deferred_ticks))
+    def _divide(self) -> None:
+        """Let coordinators say who owns what; nobody asks where all is one zone."""
+        refereeing = make_refereeing(
+            self.config.zones, self._shards, self._division, self._shared_arrays
+        )
+        self._coordination = refereeing.coordination
+        self._recovery = refereeing.recovery
+        self.transfers = refereeing.transfers
+        if refereeing.phases is not None:
+            self._executor = refereeing.phases
+
+    def _shared_arrays(self) -> Iterator[NDArray[Any]]:
+        """What a tick changes beside the shards' own and what they have in common."""
+        gate = self._gate
+        for name in KEPT_BY_GATE:
+            yield getattr(gate, name)
+        yield from self.outputs
+        if self._traffic.rerouting is not None:
+            yield from self._traffic.rerouting.arrays()
 
     def _call_every_kernel(self) -> None:
         """Run one step of a world that the first reset forgets."""
@@ -187,6 +219,9 @@ class Simulation:
         self._executor.each("retire", self._gate)
         self._executor.each("forget", self._gate)
         self._traffic.settle(self._gate, self._shard.worlds)
+        self._division.near(0)
+        with suppress(ZoneError):
+            self._division.hand_over(0, Switch(-1, 0, 0, 0, False), b"")
         self._episodes[:] = 0
 
     @property
@@ -253,6 +288,11 @@ class Simulation:
         self._first_world = first_world
         self._episodes[:] = 0
 
+    @property
+    def revivals(self) -> Sequence[Revival]:
+        """What it took to go on after each death; see `zones.faults`."""
+        return () if self._recovery is None else self._recovery.revivals
+
     def reset(self, chosen: NDArray[np.bool_] | None = None) -> None:
         """Begin a new episode in the chosen worlds (W,), all by default, and sense.
 
@@ -287,18 +327,18 @@ class Simulation:
             self._coordination.reset(chosen)
         self._switch_signals()
         self._sense(chosen)
+        if self._coordination is not None:
+            self._coordination.save()
 
     def step(self, commands: Commands) -> None:
         """One agent step: its ticks, then what the agents sense."""
         ticks = self.config.clock.ticks_per_step
-        for tick in range(ticks):
-            self._begin()
-            if tick == 0:
-                self._executor.each("begin_step", commands)
-            self._advance(commands)
-            if tick == ticks - 1:
-                self._sense(self._everywhere)
-            self._end()
+        for number in range(ticks):
+            tick = partial(self._tick, commands, number == 0, number == ticks - 1)
+            if self._recovery is None:
+                tick()
+            else:
+                self._recovery.run(tick)
 
     def instrument(self, wrap: Callable[[Any], Any]) -> None:
         """Put `wrap(part)` in the place of each part that phases are calls of, to time them."""
@@ -309,11 +349,15 @@ class Simulation:
         if self._coordination is not None:
             self._coordination = wrap(self._coordination)
 
-    def _begin(self) -> None:
+    def _tick(self, commands: Commands, is_first: bool, is_last: bool) -> None:
+        """Begin → begin the step → advance … signals → sense → end."""
         if self._coordination is not None:
             self._coordination.begin()
-
-    def _end(self) -> None:
+        if is_first:
+            self._executor.each("begin_step", commands)
+        self._advance(commands)
+        if is_last:
+            self._sense(self._everywhere)
         if self._coordination is not None:
             self._coordination.end()
 
@@ -387,6 +431,8 @@ class Simulation:
             self._note_left()
             self._executor.each("forget", gate)
             self._traffic.settle(gate, self._shard.worlds)
+            if self._coordination is not None:
+                self._coordination.save()
 
     def agents_to_come(self) -> NDArray[np.bool_]:
         """(W,) whether an agent waits to enter."""

@@ -140,6 +140,11 @@ class Rerouting:
             for name in records.dtype.names or ():
                 yield np.ascontiguousarray(records[name])
 
+    def arrays(self) -> Iterator[NDArray[np.generic]]:
+        """What a tick changes here, of all worlds; to be copied and put back."""
+        yield from (self._past, self._speed_sums, self._looks)
+        yield self._travel.steps[self._slots.first :]
+
     def _sample(self, worlds: Worlds, w: int, tick: int) -> None:
         interval_ms = self._schedule.demand.device.adaptation_interval_ms
         ticks = self._ticks_per_s * (interval_ms // 1000)

@@ -1,0 +1,143 @@
+"""`Recovery`: a tick in which somebody dies is begun again from the committed state.
+
+The host of a zone that dies is fenced, and its zone is given to another; a coordinator that dies is
+made anew from its journal. Either way the half tick is thrown away and run again. It reads the
+same rows, so it leads to the same ones.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from cavmarl.errors import StoreError
+from cavmarl.runtime.coordination import Coordination
+from cavmarl.runtime.faults import (
+    CoordinatorDeath,
+    Crashes,
+    FaultyPhases,
+    ZoneDeath,
+    give_up,
+)
+from cavmarl.runtime.store import COUNTS, CommittedStore
+from cavmarl.shard.shard import Shard
+
+__all__ = ["Recovery", "Revival"]
+
+GARBAGE = 0xA5  # what is in a memory that is lost, byte by byte
+
+
+class Revival(NamedTuple):
+    """What it took to go on after a death.
+
+    Attributes:
+        tick: of the run, that was on its way.
+        point: at which somebody died.
+        zone: whose host it was; None: the coordinator.
+        ms: from the death to the tick's next beginning.
+    """
+
+    tick: int
+    point: str
+    zone: int | None
+    ms: float
+
+
+class Recovery:
+    """Runs ticks of one world until they are committed.
+
+    Args:
+        shards: whose hosts may die.
+        coordination: of the one world.
+        store: the committed state.
+        phases: of the tick, in which somebody may die.
+        crashes: who dies where.
+
+    Attributes:
+        revivals: one for each death.
+    """
+
+    def __init__(
+        self,
+        shards: Sequence[Shard],
+        coordination: Coordination,
+        store: CommittedStore,
+        phases: FaultyPhases,
+        crashes: Crashes,
+    ) -> None:
+        self.revivals: list[Revival] = []
+        self._shards = tuple(shards)
+        self._coordination = coordination
+        self._store = store
+        self._phases = phases
+        self._crashes = crashes
+
+    def run(self, tick: Callable[[], None]) -> None:
+        """One tick, as often as it takes.
+
+        Raises:
+            ZoneStepError: every host of a zone dies of it.
+        """
+        coordinator = self._coordination.coordinators[0]
+        self._crashes.tick = coordinator.tick + 1
+        while True:
+            self._phases.on = True
+            try:
+                tick()
+            except (ZoneDeath, CoordinatorDeath, StoreError) as death:
+                self._phases.on = False
+                if self._revive(death):
+                    return
+            else:
+                self._phases.on = False
+                return
+
+    def _revive(self, death: ZoneDeath | CoordinatorDeath | StoreError) -> bool:
+        """Whether the tick has been committed all the same."""
+        began = time.perf_counter()
+        if isinstance(death, CoordinatorDeath):
+            self._lose_gate()
+            is_done = self._restart()
+            self._note(death.point, None, began)
+            return is_done
+        zones = death.zones if isinstance(death, StoreError) else (death.zone,)
+        for zone in zones:
+            self._lose(self._shards[zone])
+        coordinator = self._coordination.coordinators[0]
+        coordinator.resume(*self._store.load()[0])
+        for zone in zones:
+            if isinstance(death, ZoneDeath):
+                give_up(coordinator, death)
+            else:
+                coordinator.fence(zone)
+            coordinator.host(zone)
+            point = death.point if isinstance(death, ZoneDeath) else "wrong rows"
+            self._note(point, zone, began)
+        return False
+
+    def _restart(self) -> bool:
+        """A new coordinator reads the journal; whether the tick stands in it as committed."""
+        coordinator = self._coordination.restart(0)
+        is_done = coordinator.tick == self._crashes.tick
+        if is_done:
+            self._store.flip()
+        coordinator.resume(*self._store.load()[0])
+        coordinator.resend()
+        return is_done
+
+    def _lose(self, shard: Shard) -> None:
+        """What the process of a host had in its memory."""
+        worlds = shard.worlds
+        for array in (worlds.rows, worlds.next_rows, *(getattr(worlds, name) for name in COUNTS)):
+            array.view(np.uint8)[...] = GARBAGE
+
+    def _lose_gate(self) -> None:
+        for array in self._store.shared():
+            array.view(np.uint8)[...] = GARBAGE
+
+    def _note(self, point: str, zone: int | None, began: float) -> None:
+        ms = 1000.0 * (time.perf_counter() - began)
+        self.revivals.append(Revival(self._crashes.tick, point, zone, ms))

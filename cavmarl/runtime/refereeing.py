@@ -1,0 +1,130 @@
+"""Makes the coordinators of a divided world, as `zones` in an environment's settings asks for."""
+
+from __future__ import annotations
+
+import secrets
+from collections.abc import Callable, Iterable, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from numpy.typing import NDArray
+
+from cavmarl.config import ZonesConfig
+from cavmarl.errors import ConfigError
+from cavmarl.ownership.limits import Limits
+from cavmarl.ownership.messages import RUN_BYTES
+from cavmarl.ownership.transfers import TransferLog
+from cavmarl.ownership.transport import Network
+from cavmarl.runtime.coordination import Coordination, RowStates
+from cavmarl.runtime.coordinator import Coordinator
+from cavmarl.runtime.division import Division
+from cavmarl.runtime.faults import (
+    Crashes,
+    Faults,
+    FaultyCoordinator,
+    FaultyPhases,
+    read_faults,
+)
+from cavmarl.runtime.journal import Journal, MemoryJournal
+from cavmarl.runtime.recovery import Recovery
+from cavmarl.runtime.row_digests import RowDigests
+from cavmarl.runtime.store import CommittedStore
+from cavmarl.shard.shard import Shard
+
+__all__ = ["Refereeing", "make_refereeing"]
+
+
+class Refereeing(NamedTuple):
+    """Who says who owns what.
+
+    Attributes:
+        coordination: of all worlds.
+        transfers: world → what became of each hand-over.
+        recovery: runs the ticks of the one world in which somebody may die.
+        phases: runs the phases of its ticks.
+    """
+
+    coordination: Coordination
+    transfers: tuple[TransferLog, ...]
+    recovery: Recovery | None = None
+    phases: FaultyPhases | None = None
+
+
+def make_refereeing(
+    settings: ZonesConfig,
+    shards: Sequence[Shard],
+    division: Division,
+    shared: Callable[[], Iterable[NDArray[Any]]],
+) -> Refereeing:
+    """The coordinators of a divided world.
+
+    Args:
+        settings: journal, faults, checks and deadlines.
+        shards: one a zone.
+        division: of them.
+        shared: the arrays beside theirs that a tick changes.
+
+    Raises:
+        ConfigError: faults that cannot be, or deaths in several worlds at once.
+        JournalError: a journal cannot be begun.
+    """
+    limits = Limits(deferral=settings.max_deferred_ticks, schema=division.codec.schema)
+    faults = read_faults(settings.faults) if settings.faults else None
+    deaths = faults is not None and faults.may_crash
+    if deaths and division.num_worlds > 1:
+        raise ConfigError(
+            f"zones.faults: hosts die in one world at a time, not in {division.num_worlds}; "
+            "messages may be lost in any number"
+        )
+    crashes = Crashes(faults) if faults is not None and deaths else None
+    states = [RowStates(division, w) for w in range(division.num_worlds)]
+    transfers = tuple(TransferLog(limits.lifetime) for _ in states)
+    coordinators = [
+        _coordinator(settings, w, division, states[w], limits, transfers[w], faults, crashes)
+        for w in range(division.num_worlds)
+    ]
+    checked = settings.check or bool(settings.journal) or deaths
+    digests = RowDigests() if checked else None
+    if crashes is None:
+        return Refereeing(Coordination(division, coordinators, states, digests), transfers)
+    store = CommittedStore(shards, shared)
+    phases = FaultyPhases(shards, crashes)
+    coordination = Coordination(division, coordinators, states, digests, store)
+    recovery = Recovery(shards, coordination, store, phases, crashes)
+    return Refereeing(coordination, transfers, recovery, phases)
+
+
+def _coordinator(
+    settings: ZonesConfig,
+    w: int,
+    division: Division,
+    states: RowStates,
+    limits: Limits,
+    transfers: TransferLog,
+    faults: Faults | None,
+    crashes: Crashes | None,
+) -> Coordinator:
+    """Of one world."""
+    journal: Journal | MemoryJournal | None = None
+    if settings.journal:
+        journal = Journal(_path(settings.journal, w, division.num_worlds))
+    elif crashes is not None:
+        journal = MemoryJournal()
+    arguments = (
+        secrets.token_bytes(RUN_BYTES),
+        division.count,
+        states,
+        limits,
+        None if faults is None else Network(faults.plan()),
+        journal,
+        (transfers,),
+    )
+    if crashes is None:
+        return Coordinator(*arguments)
+    return FaultyCoordinator(*arguments, crashes=crashes)
+
+
+def _path(journal: str, w: int, num_worlds: int) -> Path:
+    """Of several worlds each has a file: `run.jsonl` becomes `run.0.jsonl` and so on."""
+    path = Path(journal)
+    return path if num_worlds == 1 else path.with_suffix(f".{w}{path.suffix}")

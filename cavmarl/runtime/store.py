@@ -1,0 +1,114 @@
+"""`CommittedStore`: all that a tick changes, as of the committed tick, and room for the next one.
+
+A tick works on the shards' arrays and on those that they share. `write` copies what it has led to,
+`flip` makes that the truth, `load` takes everything back to the truth. So whatever becomes of a
+tick that is not committed, it can be begun again.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cavmarl.errors import ProtocolError
+from cavmarl.ownership.messages import Birth, Removed
+from cavmarl.shard.shard import COMMON, Shard
+
+__all__ = ["COUNTS", "CommittedStore", "Notes"]
+
+# Counts of `Worlds` that each shard has of its own.
+COUNTS = ("num_owned", "num_rows", "num_through", "num_touching", "num_contacts")
+
+Array = NDArray[Any]
+Arrays = list[Array]
+Notes = tuple[tuple[Birth, ...], tuple[Removed, ...]]
+"""What has happened since the last BEGIN: who is new, and who is gone."""
+
+
+class _Image(NamedTuple):
+    """A copy of everything."""
+
+    counts: list[Arrays]  # by shard
+    rows: list[Arrays]  # by shard and world, owned rows and ghosts
+    shared: Arrays
+    notes: tuple[Notes, ...]  # by world
+
+
+class CommittedStore:
+    """Two copies of the worlds.
+
+    Args:
+        shards: whose rows are kept.
+        shared: the arrays beside theirs that a tick changes, as they are now.
+    """
+
+    def __init__(self, shards: Sequence[Shard], shared: Callable[[], Iterable[Array]]) -> None:
+        self._shards = tuple(shards)
+        self._others = shared
+        self._committed: _Image | None = None
+        self._next: _Image | None = None
+
+    def write(self, notes: tuple[Notes, ...]) -> None:
+        """Copy what there is now; the truth stays what it was.
+
+        Args:
+            notes: by world.
+        """
+        counts: list[Arrays] = []
+        rows: list[Arrays] = []
+        for shard in self._shards:
+            worlds = shard.worlds
+            counts.append([getattr(worlds, name).copy() for name in COUNTS])
+            rows.append([worlds.rows[w, :num].copy() for w, num in enumerate(worlds.num_rows)])
+        shared = [array.copy() for array in self.shared()]
+        self._next = _Image(counts, rows, shared, notes)
+
+    def flip(self) -> None:
+        """Make what was written last the truth.
+
+        Raises:
+            ProtocolError: nothing has been written since.
+        """
+        if self._next is None:
+            raise ProtocolError("nothing has been written to the store since it was flipped")
+        self._committed, self._next = self._next, None
+
+    def load(self) -> tuple[Notes, ...]:
+        """Take the worlds back to the truth; the notes of each."""
+        image = self._truth()
+        for shard, counts, rows in zip(self._shards, image.counts, image.rows, strict=True):
+            worlds = shard.worlds
+            for name, kept in zip(COUNTS, counts, strict=True):
+                getattr(worlds, name)[:] = kept
+            for w, own in enumerate(rows):
+                worlds.rows[w, : len(own)] = own
+        for array, kept in zip(self.shared(), image.shared, strict=True):
+            array[...] = kept
+        return image.notes
+
+    def written(self, zone: int, world: int) -> NDArray[np.void]:
+        """VEHICLE (n,), a zone's owned rows as they were written last.
+
+        Raises:
+            ProtocolError: nothing has been written since the store was flipped.
+        """
+        if self._next is None:
+            raise ProtocolError("nothing has been written to the store since it was flipped")
+        num = int(self._next.counts[zone][0][world])
+        rows: NDArray[np.void] = self._next.rows[zone][world][:num]
+        return rows
+
+    def shared(self) -> Iterator[Array]:
+        """What is kept beside the shards' own, as it is now."""
+        worlds = self._shards[0].worlds
+        for name in COMMON:
+            yield getattr(worlds, name)
+        yield from self._others()
+
+    def _truth(self) -> _Image:
+        if self._committed is None:
+            raise ProtocolError("nothing is committed: reset the worlds first")
+        return self._committed
