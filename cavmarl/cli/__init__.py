@@ -12,6 +12,7 @@ from cavmarl.cli import (
     demand,
     demo,
     evaluate,
+    journal,
     listing,
     map,
     suite,
@@ -34,6 +35,7 @@ app.command()(evaluate.report)
 app.command()(suite.suite)
 app.command()(verify.verify)
 app.command()(verify_determinism.verify_determinism)
+app.command()(journal.journal)
 app.command()(view.view)
 app.command()(demo.demo)
 app.command("list")(listing.list_entries)

@@ -9,8 +9,9 @@ written in hex, digests of rows and sets too. A list of entries is a list of lis
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import fields
+from functools import partial
 from hashlib import blake2b
 from typing import Any, get_args, get_origin, get_type_hints
 
@@ -33,16 +34,13 @@ _WIDE = frozenset({"world", "rows", "digest"})
 
 def record_to_dict(record: Record, sequence: int) -> dict[str, Any]:
     """A record as plain values, with its checksum."""
-    line: dict[str, Any] = {"schema": SCHEMA, "sequence": sequence, "kind": _NAMES[type(record)]}
-    for field in fields(record):
-        line[field.name] = _plain(field.name, getattr(record, field.name))
-    return sealed(line)
+    return sealed(_content(record, sequence))
 
 
 def sealed(line: dict[str, Any]) -> dict[str, Any]:
     """A line with the checksum of what stands in it."""
     content = {key: value for key, value in line.items() if key != "checksum"}
-    return content | {"checksum": _checksum(content)}
+    return content | {"checksum": _checksum(_json(content))}
 
 
 def record_from_dict(line: dict[str, Any], sequence: int) -> Record:
@@ -61,20 +59,32 @@ def record_from_dict(line: dict[str, Any], sequence: int) -> Record:
     kind = KINDS.get(str(line.get("kind")))
     if kind is None:
         raise CorruptJournalError(f"{where} is of kind {line.get('kind')!r}, which is none")
-    hints = get_type_hints(kind)
     try:
-        values = {
-            field.name: _value(field.name, hints[field.name], line[field.name])
-            for field in fields(kind)
-        }
+        values = [parse(line[name]) for name, parse in _PARSE[kind]]
     except (KeyError, TypeError, ValueError) as error:
         raise CorruptJournalError(f"{where}: {error!r}") from error
-    return kind(**values)
+    return kind(*values)
 
 
 def record_to_line(record: Record, sequence: int) -> str:
     """A line of the log, with its end."""
-    return _json(record_to_dict(record, sequence)) + "\n"
+    body = _json(_content(record, sequence))
+    return f'{body[:-1]},"checksum":"{_checksum(body)}"}}\n'
+
+
+def record_from_line(line: str | bytes, sequence: int) -> Record:
+    """The record of a line of the log.
+
+    Raises:
+        CorruptJournalError: the line is damaged, or another one.
+    """
+    try:
+        content = json.loads(line)
+    except (ValueError, RecursionError) as error:
+        raise CorruptJournalError(f"line {sequence + 1} of the log: {error}") from error
+    if not isinstance(content, dict):
+        raise CorruptJournalError(f"line {sequence + 1} of the log is no JSON object")
+    return record_from_dict(content, sequence)
 
 
 def records_from_lines(text: str) -> tuple[Record, ...]:
@@ -88,13 +98,7 @@ def records_from_lines(text: str) -> tuple[Record, ...]:
     for sequence, line in enumerate(text.splitlines(keepends=True)):
         if not line.endswith("\n"):
             raise TornJournalError(f"line {sequence + 1} of the log is cut short: {line[:40]!r}")
-        try:
-            content = json.loads(line)
-        except (ValueError, RecursionError) as error:
-            raise CorruptJournalError(f"line {sequence + 1} of the log: {error}") from error
-        if not isinstance(content, dict):
-            raise CorruptJournalError(f"line {sequence + 1} of the log is no JSON object")
-        records.append(record_from_dict(content, sequence))
+        records.append(record_from_line(line, sequence))
     return tuple(records)
 
 
@@ -118,35 +122,68 @@ def replay(records: Iterable[Record]) -> Table:
     return table
 
 
-def _plain(name: str, value: Any) -> Any:
-    if isinstance(value, bytes):
-        return value.hex()
-    if isinstance(value, tuple):
-        names = getattr(value, "_fields", [name] * len(value))
-        return [_plain(inner, entry) for inner, entry in zip(names, value, strict=True)]
-    return f"{value:x}" if name in _WIDE else value
+def _content(record: Record, sequence: int) -> dict[str, Any]:
+    line: dict[str, Any] = {"schema": SCHEMA, "sequence": sequence, "kind": _NAMES[type(record)]}
+    for name, plain in _PLAIN[type(record)]:
+        value = getattr(record, name)
+        line[name] = value if plain is None else plain(value)
+    return line
 
 
-def _value(name: str, hint: Any, value: Any) -> Any:
+def _plain(name: str, hint: Any) -> Callable[[Any], Any] | None:
+    """What makes plain values of a field's; None: they are."""
     if hint is bytes:
-        return bytes.fromhex(value)
-    if get_origin(hint) is tuple:
-        return tuple(_value(name, get_args(hint)[0], entry) for entry in value)
+        return bytes.hex
     if hint is int and name in _WIDE:
-        return int(value, 16)
+        return "{:x}".format
+    if get_origin(hint) is tuple:
+        entry = _plain(name, get_args(hint)[0])
+        return None if entry is None else lambda entries: [entry(value) for value in entries]
     if hint in (int, bool):
-        if type(value) is not hint or abs(value) >= _LARGEST:
-            raise TypeError(f"{name} is {value!r}")
-        return value
-    inner = get_type_hints(hint)
-    return hint(
-        *(_value(field, inner[field], entry) for field, entry in zip(inner, value, strict=True))
-    )
+        return None
+    parts = [_plain(field, inner) for field, inner in get_type_hints(hint).items()]
+    if not any(parts):
+        return None
+    return lambda entry: [
+        value if part is None else part(value) for part, value in zip(parts, entry, strict=True)
+    ]
 
 
-def _json(line: dict[str, Any]) -> str:
-    return json.dumps(line, separators=(",", ":"))
+def _parse(name: str, hint: Any) -> Callable[[Any], Any]:
+    """What makes a field's value of plain ones."""
+    if hint is bytes:
+        return bytes.fromhex
+    if hint is int and name in _WIDE:
+        return partial(int, base=16)
+    if get_origin(hint) is tuple:
+        entry = _parse(name, get_args(hint)[0])
+        return lambda values: tuple(entry(value) for value in values)
+    if hint in (int, bool):
+        return partial(_checked, name, hint)
+    parts = [_parse(field, inner) for field, inner in get_type_hints(hint).items()]
+    return lambda values: hint(*(part(value) for part, value in zip(parts, values, strict=True)))
 
 
-def _checksum(line: dict[str, Any]) -> str:
-    return blake2b(_json(line).encode(), digest_size=8).hexdigest()
+def _checked(name: str, kind: type[int], value: Any) -> int:
+    if type(value) is not kind or abs(value) >= _LARGEST:
+        raise TypeError(f"{name} is {value!r}")
+    return value
+
+
+def _checksum(body: str) -> str:
+    return blake2b(body.encode(), digest_size=8).hexdigest()
+
+
+_json = json.JSONEncoder(separators=(",", ":")).encode
+_HINTS = {
+    kind: {field.name: get_type_hints(kind)[field.name] for field in fields(kind)}
+    for kind in KINDS.values()
+}
+_PLAIN = {
+    kind: [(name, _plain(name, hint)) for name, hint in hints.items()]
+    for kind, hints in _HINTS.items()
+}
+_PARSE = {
+    kind: [(name, _parse(name, hint)) for name, hint in hints.items()]
+    for kind, hints in _HINTS.items()
+}

@@ -22,6 +22,7 @@ COMMANDS = (
     "suite",
     "verify",
     "verify-determinism",
+    "journal",
     "view",
     "demo",
     "list",

@@ -51,7 +51,7 @@ def test_the_page_lists_every_safeguard() -> None:
 
 
 def test_the_program_of_the_page_runs() -> None:
-    (program,) = re.findall(r"```python\n(.*?)```", PAGE.read_text(encoding="utf-8"), re.DOTALL)
+    program, *_ = re.findall(r"```python\n(.*?)```", PAGE.read_text(encoding="utf-8"), re.DOTALL)
     exec(compile(program, str(PAGE), "exec"), {})
 
 

@@ -1,0 +1,101 @@
+"""`cavmarl journal`: replay a coordinator's log and say who owned what."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+from rich import box
+from rich.console import Console
+from rich.markup import escape
+from rich.table import Table
+
+from cavmarl.cli.output import JsonPath, write_json
+
+if TYPE_CHECKING:
+    from cavmarl.ownership.table import Table as OwnerTable
+    from cavmarl.runtime.journal_summary import JournalSummary
+
+__all__ = ["journal"]
+
+
+def journal(
+    file: Annotated[
+        Path,
+        typer.Argument(metavar="FILE", help="A journal of a run.", exists=True, dir_okay=False),
+    ],
+    at: Annotated[
+        int | None, typer.Option(metavar="TICK", help="Print who owned what at this tick.")
+    ] = None,
+    json_path: JsonPath = None,
+) -> None:
+    """Replay the log of a divided run: hand-offs, hosts, and the owners at its end or at a tick."""
+    from cavmarl.runtime.journal_summary import owners_at, summarize
+
+    console = Console()
+    if at is not None:
+        table = owners_at(file, at)
+        console.print(_owners(table))
+        write_json(json_path, {"tick": table.tick, "owners": _rows(table)})
+        return
+    summary, table = summarize(file)
+    console.print(_counts(summary))
+    console.print(_zones(table))
+    if summary.unfinished >= 0:
+        console.print(f"note: tick {summary.unfinished} was begun and not committed")
+    if summary.torn:
+        console.print(f"note: {escape(summary.torn)}; left out", soft_wrap=True, style="yellow")
+    write_json(json_path, {**summary.to_dict(), "tick": table.tick, "owners": _rows(table)})
+
+
+def _rows(table: OwnerTable) -> list[list[int]]:
+    """Vehicle, zone, epoch and ticks of waiting, by vehicle."""
+    return [
+        [vehicle, zone, epoch, table.deferred.get(vehicle, 0)]
+        for vehicle, (zone, epoch) in sorted(table.owners.items())
+    ]
+
+
+def _grid(*heads: str) -> Table:
+    grid = Table(box=box.SIMPLE_HEAD, pad_edge=False)
+    for head in heads:
+        grid.add_column(head, justify="right", no_wrap=True)
+    return grid
+
+
+def _owners(table: OwnerTable) -> Table:
+    grid = _grid("vehicle", "zone", "epoch", "ticks late")
+    for row in _rows(table):
+        grid.add_row(*map(str, row))
+    return grid
+
+
+def _counts(summary: JournalSummary) -> Table:
+    grid = Table.grid(padding=(0, 2))
+    span = f", {summary.first_tick} to {summary.last_tick}" if summary.ticks else ""
+    for name, text in (
+        ("run", summary.run),
+        ("lines", f"{summary.lines}"),
+        ("episodes", f"{summary.episodes}"),
+        ("ticks", f"{summary.ticks}{span}"),
+        ("vehicles", f"{summary.births} entered, {summary.removals} left"),
+        (
+            "hand-offs",
+            f"{summary.switches}, {summary.forced} of them forced; "
+            f"{summary.deferrals} deferred by a tick",
+        ),
+        ("hosts", f"{summary.hosts} named, {summary.fences} fenced"),
+    ):
+        grid.add_row(name, text)
+    return grid
+
+
+def _zones(table: OwnerTable) -> Table:
+    """Who hosts each zone at the end, and how many vehicles it owns."""
+    grid = _grid("zone", "vehicles", "worker", "incarnation", "state")
+    owned = [zone for zone, _ in table.owners.values()]
+    for zone, (worker, incarnation) in table.hosts.items():
+        state = table.states[zone].name.lower()
+        grid.add_row(str(zone), str(owned.count(zone)), str(worker), str(incarnation), state)
+    return grid

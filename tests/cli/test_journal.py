@@ -1,0 +1,67 @@
+"""`cavmarl journal`: what a run's log tells, and how a damaged one is refused."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+
+from cavmarl.runtime.journal import Journal
+from tests.cli.test_main import refusal, run
+from tests.runtime.test_journal import eventful
+
+
+@pytest.fixture
+def written(tmp_path: Path) -> Path:
+    path = tmp_path / "run.journal"
+    with Journal(path) as journal:
+        journal.append(eventful().log)
+    return path
+
+
+def words(capsys: pytest.CaptureFixture[str]) -> str:
+    return " ".join(capsys.readouterr().out.split())
+
+
+def test_it_counts_and_names_the_owners(written: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert run("journal", str(written)) == 0
+    said = words(capsys)
+    for part in (
+        f"run {bytes(range(16)).hex()}",
+        "ticks 6, 1 to 6",
+        "2 entered, 1 left",
+        "2, 1 of them forced; 2 deferred by a tick",
+        "3 named, 1 fenced",
+        "1 1 1 2 hosted",
+    ):
+        assert part in said
+    assert "note" not in said
+
+
+def test_it_prints_the_owners_of_a_tick(
+    written: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "owners.json"
+    assert run("journal", str(written), "--at", "4", "--json", str(out)) == 0
+    assert "7 1 1 0 8 1 0 2" in words(capsys)
+    assert json.loads(out.read_text()) == {"tick": 4, "owners": [[7, 1, 1, 0], [8, 1, 0, 2]]}
+
+
+def test_what_was_left_out_is_named(written: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    written.write_bytes(written.read_bytes()[:-5])
+    assert run("journal", str(written)) == 0
+    said = words(capsys)
+    assert "tick 6 was begun and not committed" in said
+    assert "is cut short" in said
+
+
+def test_damage_and_unknown_ticks_are_one_line(
+    written: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert "tick 99 was not committed" in refusal(capsys, "journal", str(written), "--at", "99")
+    lines = written.read_bytes().splitlines(keepends=True)
+    written.write_bytes(b"".join(lines[:2] + lines[3:]))
+    said = refusal(capsys, "journal", str(written))
+    assert f"error: {written}: line 3 of the log has number 3: lines are missing" in said
+    assert "none.journal" in refusal(capsys, "journal", str(written.parent / "none.journal"))
