@@ -127,7 +127,7 @@ def pass_on(
             row += 1
         if row == owned:
             return -1
-    place = target_owned[w]
+    place: int = target_owned[w]
     ghost = place
     while ghost < target_rows[w] and target[w, ghost]["id"] != vehicle:
         ghost += 1

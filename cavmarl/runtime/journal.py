@@ -8,7 +8,7 @@ same calls and keeps the records in a list.
 from __future__ import annotations
 
 import os
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from types import TracebackType
 from typing import Literal, Self, TypeAlias, get_args
@@ -141,6 +141,21 @@ class Journal:
         """Close the file; once more does nothing."""
         self._file.close()
 
+    def read(self) -> Iterator[Record]:
+        """What has been written, from the first line on; errors as of `JournalReader`."""
+        return iter(JournalReader(self.path))
+
+    def reopened(self) -> Journal:
+        """What another process finds when the one that wrote here has died."""
+        self.close()
+        sync: Sync = "fsync" if self._fsync else "flush"
+        return Journal(self.path, resume=True, sync=sync)
+
+    def tear(self, records: Sequence[Record]) -> None:
+        """Write as a process does that dies meanwhile: half of the first line."""
+        line = record_to_line(records[0], self.sequence).encode()
+        self._file.write(line[: len(line) // 2])
+
     def __enter__(self) -> Self:
         return self
 
@@ -213,6 +228,17 @@ class MemoryJournal:
         trace: TracebackType | None,
     ) -> None:
         self.close()
+
+    def read(self) -> Iterator[Record]:
+        """What has been written, from the first record on."""
+        return iter(self.records)
+
+    def reopened(self) -> MemoryJournal:
+        """What another process finds when the one that wrote here has died."""
+        return self
+
+    def tear(self, records: Sequence[Record]) -> None:
+        """Half of a record is none."""
 
 
 AnyJournal: TypeAlias = Journal | MemoryJournal
