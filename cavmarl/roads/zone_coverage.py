@@ -87,7 +87,7 @@ class Coverage:
 
 
 def zone_halo(partition: ZonePartition, halo_m: float) -> Halo:
-    """What `kernels.zones.publish` takes.
+    """What `kernels.exchange.exchange` takes.
 
     Raises:
         ZoneError: `halo_m` is negative or not finite.

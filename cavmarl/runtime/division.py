@@ -15,9 +15,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cavmarl.errors import ZoneError
-from cavmarl.kernels.arrays import Worlds
-from cavmarl.kernels.exchange import adopt, find_movers, release, take_ghosts, take_own
-from cavmarl.kernels.zones import Halo, ZoneArrays, make_publication, publish, zone_of
+from cavmarl.kernels.arrays import Worlds, Zoned
+from cavmarl.kernels.exchange import adopt, exchange, find_movers, release, take_own
+from cavmarl.kernels.repeated import repeated
+from cavmarl.kernels.zones import Halo, ZoneArrays, zone_of
 from cavmarl.shard.shard import Shard
 
 __all__ = ["Division", "ZoneLoads"]
@@ -44,23 +45,35 @@ class Division:
 
     Args:
         shards: one a zone, in the order of zones.
+        zoned: their rows.
         zones: of the partition.
         halo: how far each zone sees over its borders.
+        touching_m: no ghost further outside of a zone can touch one of its vehicles.
         hysteresis_m: so far behind its border a vehicle changes its zone.
     """
 
     def __init__(
-        self, shards: Sequence[Shard], zones: ZoneArrays, halo: Halo, hysteresis_m: float
+        self,
+        shards: Sequence[Shard],
+        zoned: Zoned,
+        zones: ZoneArrays,
+        halo: Halo,
+        touching_m: float,
+        hysteresis_m: float,
     ) -> None:
         self._shards = tuple(shards)
+        self._zoned = zoned
+        self._first_side = shards[0].worlds.rows
         self._zones = zones
         self._halo = halo
+        self._touching_m = touching_m
         self._hysteresis_m = hysteresis_m
         self._migrations = 0
         capacity = shards[0].worlds.rows.shape[1]
-        self._published = make_publication(capacity, len(shards))
-        self._movers = np.zeros(capacity, dtype=np.int32)
+        self._movers = np.zeros((capacity, 2), dtype=np.int32)
         self._spare = np.zeros(1, dtype=shards[0].worlds.rows.dtype)
+        self._call_exchange = repeated(exchange)
+        self._find_movers = repeated(find_movers)
 
     def distribute(self, chosen: NDArray[np.bool_]) -> None:
         """Give every shard its vehicles of the chosen worlds (W,), which are all in the first."""
@@ -75,56 +88,50 @@ class Division:
                     self._zones, shard.zone, everybody, len(everybody), worlds.rows[w]
                 )
                 worlds.num_contacts[w] = 0
-            self._exchange(w, [shard.worlds.rows for shard in self._shards])
+            self._exchange(first.rows, w, w + 1)
 
     def exchange(self) -> None:
         """Renew all ghosts from the owned `next_rows`."""
-        if len(self._shards) > 1:
-            rows = [shard.worlds.next_rows for shard in self._shards]
-            for w in range(len(rows[0])):
-                self._exchange(w, rows)
+        worlds = self._shards[0].worlds
+        self._exchange(worlds.next_rows, 0, len(worlds.ticks))
 
-    def _exchange(self, w: int, rows: Sequence[NDArray[np.void]]) -> None:
-        for shard in self._shards:
-            shard.worlds.num_rows[w] = shard.worlds.num_owned[w]
-        start = self._published.start
-        for source, own in zip(self._shards, rows, strict=True):
-            num = int(source.worlds.num_owned[w])
-            if publish(self._zones, self._halo, own[w], num, source.zone, self._published) == 0:
-                continue
-            for target in np.flatnonzero(np.diff(start)).tolist():
-                begin, end = int(start[target]), int(start[target + 1])
-                held = self._shards[target].worlds.num_rows
-                take_ghosts(own[w], self._published.rows, begin, end, rows[target][w], held[w])
-                held[w] += end - begin
+    def _exchange(self, rows: NDArray[np.void], first: int, last: int) -> None:
+        """Renew the ghosts of some worlds; `rows` are the first shard's rows or next ones."""
+        self._call_exchange(
+            self._zones, self._halo, self._touching_m, self._zoned, self._side(rows), first, last
+        )
+
+    def _side(self, rows: NDArray[np.void]) -> int:
+        return 0 if rows is self._first_side else 1
 
     def migrate(self) -> None:
-        """Let the vehicles of `next_rows` that have left their zone change their owner."""
+        """Let the vehicles of `next_rows` that had left their zone at `exchange` change owners."""
         if len(self._shards) == 1:
             return
-        for source in self._shards:
-            for w in range(source.worlds.num_owned.size):
-                self._let_go(source, w)
+        side = self._side(self._shards[0].worlds.next_rows)
+        for w in range(len(self._shards[0].worlds.ticks)):
+            found = self._find_movers(
+                self._zones, self._hysteresis_m, self._zoned, side, w, self._movers
+            )
+            self._migrations += found
+            # From the last row to the first: who is released is swapped with the last owned one.
+            for zone, row in self._movers[:found][::-1].tolist():
+                self._let_go(self._shards[zone].worlds, w, row)
 
-    def _let_go(self, source: Shard, w: int) -> None:
-        worlds = source.worlds
-        rows, num = worlds.next_rows[w], int(worlds.num_owned[w])
-        found = find_movers(self._zones, source.zone, self._hysteresis_m, rows, num, self._movers)
-        self._migrations += int(found)
-        # From the last row to the first: who is released is swapped with the last owned one.
-        for i in self._movers[:found][::-1]:
-            zone = zone_of(self._zones, rows[i]["x"], rows[i]["y"])
-            target = self._shards[zone].worlds
-            if not adopt(
-                target.next_rows[w], int(target.num_owned[w]), int(target.num_rows[w]), rows[i]
-            ):
-                raise ZoneError(
-                    f"vehicle {rows[i]['id']} entered zone {zone}, which has not seen it come: "
-                    "the halo is too narrow"
-                )
-            target.num_owned[w] += 1
-            release(rows, int(i), int(worlds.num_owned[w]), self._spare)
-            worlds.num_owned[w] -= 1
+    def _let_go(self, source: Worlds, w: int, row: int) -> None:
+        rows = source.next_rows[w]
+        zone = zone_of(self._zones, rows[row]["x"], rows[row]["y"])
+        target = self._shards[zone].worlds
+        if not adopt(
+            target.next_rows[w], int(target.num_owned[w]), int(target.num_rows[w]), rows[row]
+        ):
+            raise ZoneError(
+                f"vehicle {rows[row]['id']} entered zone {zone}, which has not seen it come: "
+                "the halo is too narrow"
+            )
+        target.num_owned[w] += 1
+        release(rows, row, int(source.num_owned[w]), self._spare)
+        source.num_owned[w] -= 1
 
     def running(self) -> NDArray[np.int64]:
         """(W,) vehicles of each world."""

@@ -35,7 +35,7 @@ from cavmarl.runtime.division import Division, ZoneLoads
 from cavmarl.runtime.executor import Executor, SerialExecutor
 from cavmarl.shard.reach import driving_reach_m
 from cavmarl.shard.sensors import largest_radius_m, sensing_reach_m
-from cavmarl.shard.shard import Commands, Shard
+from cavmarl.shard.shard import Commands, Shard, make_zoned
 from cavmarl.shard.vehicles import STATE_FIELDS, blank_vehicle
 from cavmarl.traffic.demand import DemandFile
 from cavmarl.traffic.departures import make_gate
@@ -144,7 +144,7 @@ class Simulation:
         driving_m = driving_reach_m(self.network, traffic.travel)
         sensing_m = sensing_reach_m(config.sensors, radius_m)
         halo = zone_halo(partition, halo_m(driving_m, sensing_m))
-        touching_m = halo_m(2.0 * radius_m)
+        zoned = make_zoned(partition.count, self.num_worlds, traffic.capacity)
         shards: list[Shard] = []
         for zone in range(partition.count):
             shard = Shard(
@@ -152,17 +152,17 @@ class Simulation:
                 self.network,
                 traffic.plans,
                 traffic.travel,
-                self.num_worlds,
-                traffic.capacity,
+                zoned,
                 self._commons.outputs,
                 zone,
                 zones,
                 halo,
-                touching_m,
-                shards[0].worlds if shards else None,
+                shards[0] if shards else None,
             )
             shards.append(shard)
-        self._division = Division(shards, zones, halo, settings.hysteresis_m)
+        self._division = Division(
+            shards, zoned, zones, halo, halo_m(2.0 * radius_m), settings.hysteresis_m
+        )
         return shards
 
     def _call_every_kernel(self) -> None:
