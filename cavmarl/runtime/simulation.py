@@ -33,6 +33,7 @@ from cavmarl.runtime.commons import Commons
 from cavmarl.runtime.compilation import first_compilation
 from cavmarl.runtime.division import Division, ZoneLoads
 from cavmarl.runtime.executor import Executor, SerialExecutor
+from cavmarl.runtime.zone_view import ZoneView, view_zones
 from cavmarl.shard.reach import driving_reach_m
 from cavmarl.shard.sensors import largest_radius_m, sensing_reach_m
 from cavmarl.shard.shard import Commands, Shard
@@ -209,6 +210,10 @@ class Simulation:
     def zone_loads(self) -> ZoneLoads:
         """What each zone holds now, and how many vehicles have changed their zone."""
         return self._division.loads()
+
+    def zone_view(self, world: int = 0) -> ZoneView:
+        """Who owns and sees which vehicles of one world now."""
+        return view_zones(self._shards, self.partition, self.zone_loads().halo_m, world)
 
     @property
     def worlds(self) -> Worlds:
