@@ -14,6 +14,7 @@ from cavmarl.runtime.coordinator import Coordinator, Near
 from cavmarl.runtime.division import Division
 from cavmarl.runtime.row_digests import RowDigests
 from cavmarl.runtime.store import CommittedStore
+from cavmarl.runtime.zone_view import TransferInFlight
 
 __all__ = ["Coordination", "RowStates"]
 
@@ -116,6 +117,10 @@ class Coordination:
         if self._store is not None:
             self._store.write(tuple(coordinator.notes() for coordinator in self.coordinators))
             self._store.flip()
+
+    def in_flight(self, w: int) -> list[TransferInFlight]:
+        """Who of a world is on the way from one zone to another."""
+        return [TransferInFlight(*entry) for entry in self.coordinators[w].in_flight()]
 
     def load(self) -> None:
         """Take everything back to what is committed.

@@ -39,6 +39,7 @@ from cavmarl.runtime.division import ZoneLoads
 from cavmarl.runtime.executor import Executor, SerialExecutor
 from cavmarl.runtime.recovery import Recovery, Revival
 from cavmarl.runtime.refereeing import make_refereeing
+from cavmarl.runtime.zone_view import ZoneView, view_zones
 from cavmarl.shard.shard import Commands
 from cavmarl.shard.vehicles import STATE_FIELDS, blank_vehicle
 from cavmarl.traffic.demand import DemandFile
@@ -210,6 +211,12 @@ class Simulation:
     def zone_loads(self) -> ZoneLoads:
         """What each zone holds now."""
         return self._division.loads()
+
+    def zone_view(self, world: int = 0) -> ZoneView:
+        """Who owns and sees which vehicles of one world now."""
+        halo_m, coordination = self.zone_loads().halo_m, self._coordination
+        transfers = () if coordination is None else coordination.in_flight(world)
+        return view_zones(self._shards, self.partition, halo_m, world, transfers)
 
     @property
     def migrations(self) -> int:

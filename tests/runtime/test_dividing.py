@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import pytest
 
-from cavmarl.registry import load_config
 from cavmarl.errors import CoverageError
 from cavmarl.kernels.motion import MAX_SPEED_MPS
+from cavmarl.registry import load_config
 from cavmarl.runtime.dividing import halo_m
 from tests.driving import make_simulation
 
