@@ -1,7 +1,6 @@
 from __future__ import annotations
 
 import math
-from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -9,10 +8,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from cavmarl.kernels.zones import make_publication, publish, squared_distance, zone_of, zones_of
-from cavmarl.roads.zone_coverage import Coverage, zone_halo
+from cavmarl.kernels.zones import squared_distance, zone_of, zones_of
+from cavmarl.roads.zone_coverage import Coverage
 from cavmarl.roads.zones import ZonePartition
 from tests.kernels.builders import vehicles
+from tests.kernels.zoned import exchanged, ghosts_of
 from tests.naive import zones as naive
 from tests.partitions import PINWHEEL, four, partitions, places
 
@@ -26,13 +26,12 @@ def cars(xy: NDArray[np.float64]) -> NDArray[np.void]:
 def ghosts(
     partition: ZonePartition, halo_m: float, rows: NDArray[np.void], zone: int
 ) -> list[list[int]]:
-    out = make_publication(len(rows), partition.count)
-    out.start[:] = 7
-    halo = zone_halo(partition, halo_m)
-    found = publish(partition.arrays, halo, rows, len(rows), zone, out)
-    assert found == out.start[-1]
-    assert out.start[0] == 0
-    return [out.rows[a:b].tolist() for a, b in pairwise(out.start)]
+    """The rows, all owned by `zone`, that each zone gets."""
+    rows = rows.copy()
+    rows["id"] = np.arange(len(rows))
+    parts = [rows if own == zone else rows[:0] for own in range(partition.count)]
+    zoned = exchanged(partition, halo_m, parts)
+    return [sorted(ghosts_of(zoned, other)["id"].tolist()) for other in range(partition.count)]
 
 
 @given(st.data(), partitions())

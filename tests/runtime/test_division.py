@@ -85,10 +85,12 @@ def test_a_vehicle_that_a_zone_has_not_seen_come_is_an_error() -> None:
     for shard in simulation._shards:
         worlds = shard.worlds
         np.copyto(worlds.next_rows, worlds.rows)
-        worlds.num_rows[:] = worlds.num_owned
     here, there = (owned(simulation, 0)[zone][0] for zone in (0, 3))
     row = simulation._shards[0].worlds.next_rows[0, 0]
     row["x"], row["y"] = there["x"], there["y"]
+    simulation._division.exchange()
+    for shard in simulation._shards:
+        shard.worlds.num_rows[:] = shard.worlds.num_owned
     with pytest.raises(ZoneError, match=f"vehicle {here['id']} entered zone 3, which has not seen"):
         simulation._division.migrate()
 
