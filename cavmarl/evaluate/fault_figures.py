@@ -23,14 +23,14 @@ class HandOverClock:
     Attributes:
         latency_ms: of each that is committed, from the BEGIN that found its vehicle over the border
             to the COMMIT.
-        begun: hand-overs that were decided.
+        failed: hand-overs that were decided, and neither committed nor still under way.
         late: vehicles that were over the border before their target was ready.
         asked: states that a target had not, and asked for.
     """
 
     def __init__(self) -> None:
         self.latency_ms: list[float] = []
-        self.begun = self.late = self.asked = 0
+        self.failed = self.late = self.asked = 0
         self._since: dict[int, float] = {}
         self._plan: Begin | None = None
 
@@ -40,12 +40,14 @@ class HandOverClock:
         for record in records:
             match record:
                 case Reset():
-                    self._since, self._plan = {}, None
+                    self._drop_plan()
+                    self._since = {}
                 case Begin():
                     self._begin(record, now)
                 case Commit() if self._plan is not None:
                     for switch in self._plan.switches:
                         self.latency_ms.append(1000.0 * (now - self._since.pop(switch.vehicle)))
+                    self._plan = None
 
     def delivered(self, destination: int, message: Message) -> None:
         """A message that has arrived."""
@@ -53,12 +55,17 @@ class HandOverClock:
             self.asked += len(message.vehicles)
 
     def _begin(self, record: Begin, now: float) -> None:
+        self._drop_plan()
         self._plan = record
-        self.begun += len(record.switches)
         self.late += sum(ticks == 1 for _, ticks in record.deferred)
         crossed = [vehicle for vehicle, _ in record.deferred]
         crossed += [switch.vehicle for switch in record.switches]
         self._since = {vehicle: self._since.get(vehicle, now) for vehicle in crossed}
+
+    def _drop_plan(self) -> None:
+        if self._plan is not None:
+            self.failed += len(self._plan.switches)
+            self._plan = None
 
 
 @dataclass(frozen=True)
@@ -71,7 +78,7 @@ class FaultFigures:
         messages: (kind, fault) → messages that it struck.
         stale: (kind, reason) → messages or entries that came late or from elsewhere and did not
             count.
-        hand_overs: `begun`, `switched`, `forced`, `deferred` (ticks), `late` (vehicles), `asked`,
+        hand_overs: `failed`, `switched`, `forced`, `deferred` (ticks), `late` (vehicles), `asked`,
             `refused`, `aborted`.
         recovery_ms: of each death, until its tick began again.
         repeats: of each tick in which somebody died, how often it was begun again.
@@ -115,7 +122,7 @@ class FaultFigures:
             found.state_bytes.extend(row.state_bytes for row in log.rows if row.offers)
         for clock in clocks:
             found.latency_ms.extend(clock.latency_ms)
-            found.hand_overs.update(begun=clock.begun, late=clock.late, asked=clock.asked)
+            found.hand_overs.update(failed=clock.failed, late=clock.late, asked=clock.asked)
         return found
 
     def add(self, other: FaultFigures) -> None:
@@ -144,9 +151,9 @@ class FaultFigures:
 
     @property
     def failure_rate(self) -> float:
-        """Share of the hand-overs that were decided and never committed."""
-        begun = self.hand_overs["begun"]
-        return 0.0 if begun == 0 else 1.0 - self.handed_over / begun
+        """Share of the hand-overs that were decided and neither committed nor under way."""
+        failed = self.hand_overs["failed"]
+        return failed / max(1, failed + self.handed_over)
 
     def to_dict(self) -> dict[str, Any]:
         """Plain values, for JSON."""

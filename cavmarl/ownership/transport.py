@@ -11,7 +11,7 @@ from collections import Counter
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from hashlib import blake2b
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from cavmarl.errors import ConfigError, MessageError
 from cavmarl.ownership.codec import decode, encode
@@ -49,7 +49,7 @@ class Rates:
         check_whole("longest_delay", self.longest_delay, 1)
 
 
-def check_rate(name: str, value: object, most: float) -> None:
+def check_rate(name: str, value: Any, most: float) -> None:
     """See that a value is a probability up to `most`.
 
     Raises:
@@ -60,7 +60,7 @@ def check_rate(name: str, value: object, most: float) -> None:
         raise ConfigError(f"{name} is {value!r}: must be a number from 0 to {most:g}")
 
 
-def check_whole(name: str, value: object, least: int) -> None:
+def check_whole(name: str, value: Any, least: int) -> None:
     """See that a value is a whole number, `least` or more.
 
     Raises:

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 from cavmarl.errors import ConfigError
 from cavmarl.ownership.transport import FaultPlan, Rates, check_rate, check_whole
@@ -14,6 +14,7 @@ from cavmarl.ownership.transport import FaultPlan, Rates, check_rate, check_whol
 __all__ = [
     "COORDINATOR_POINTS",
     "MESSAGES",
+    "PHASES",
     "ZONE_POINTS",
     "Crash",
     "Faults",
@@ -154,6 +155,9 @@ def read_faults(text: str) -> Faults:
     return _faults(where, content)
 
 
+Made = TypeVar("Made", Crash, Faults, Rates)
+
+
 def _faults(where: str, content: Any) -> Faults:
     known = _object(where, content, Faults)
     rates, crashes = known.pop("messages", {}), known.pop("crashes", [])
@@ -167,12 +171,11 @@ def _faults(where: str, content: Any) -> Faults:
     deaths = [
         _made(f"{where}, crashes[{number}]", entry, Crash) for number, entry in enumerate(crashes)
     ]
-    return _placed(where, lambda: Faults(**known, messages=messages, crashes=tuple(deaths)))
+    return _placed(where, Faults, known | {"messages": messages, "crashes": tuple(deaths)})
 
 
-def _made(where: str, content: Any, kind: type[Any]) -> Any:
-    known = _object(where, content, kind)
-    return _placed(where, lambda: kind(**known))
+def _made(where: str, content: Any, kind: type[Made]) -> Made:
+    return _placed(where, kind, _object(where, content, kind))
 
 
 def _object(where: str, content: Any, kind: type[Any]) -> dict[str, Any]:
@@ -189,8 +192,8 @@ def _object(where: str, content: Any, kind: type[Any]) -> dict[str, Any]:
     return dict(content)
 
 
-def _placed(where: str, make: Callable[[], Any]) -> Any:
+def _placed(where: str, kind: type[Made], values: dict[str, Any]) -> Made:
     try:
-        return make()
+        return kind(**values)
     except ConfigError as error:
         raise ConfigError(f"{where}: {error}") from None

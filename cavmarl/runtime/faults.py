@@ -13,7 +13,6 @@ from typing import Any, TypeAlias
 from cavmarl.errors import CavmarlError
 from cavmarl.ownership.endpoint import Endpoint
 from cavmarl.ownership.messages import COORDINATOR, Begin, Commit, Output, Prepare, Step
-from cavmarl.ownership.safeguards import ALL_ON, Safeguards
 from cavmarl.ownership.transport import Delivery
 from cavmarl.runtime.coordinator import Coordinator
 from cavmarl.runtime.executor import Phase
@@ -142,11 +141,10 @@ class FaultyCoordinator(Coordinator):
     Args:
         arguments: as of `Coordinator`.
         crashes: who dies where.
-        safeguards: remedies of the protocol.
     """
 
-    def __init__(self, *arguments: Any, crashes: Crashes, safeguards: Safeguards = ALL_ON) -> None:
-        super().__init__(*arguments, safeguards=safeguards)
+    def __init__(self, *arguments: Any, crashes: Crashes) -> None:
+        super().__init__(*arguments)
         self.crashes = crashes
 
     def _offer(self, *arguments: Any) -> None:

@@ -92,7 +92,7 @@ def make_refereeing(
     store = CommittedStore(shards, shared, safeguards)
     phases = FaultyPhases(shards, crashes)
     coordination = Coordination(division, coordinators, states, digests, store)
-    recovery = Recovery(shards, coordination, store, phases, crashes)
+    recovery = Recovery(shards, coordination, store, phases, crashes, limits.repeats)
     return Refereeing(coordination, transfers, recovery, phases)
 
 
@@ -121,10 +121,11 @@ def _coordinator(
         None if faults is None else Network(faults.plan()),
         journal,
         (transfers,),
+        safeguards,
     )
     if crashes is None:
-        return Coordinator(*arguments, safeguards=safeguards)
-    return FaultyCoordinator(*arguments, crashes=crashes, safeguards=safeguards)
+        return Coordinator(*arguments)
+    return FaultyCoordinator(*arguments, crashes=crashes)
 
 
 def _path(journal: str, w: int, num_worlds: int) -> Path:
