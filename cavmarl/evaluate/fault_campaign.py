@@ -18,6 +18,7 @@ from cavmarl.evaluate.differences import Arrays, step_results
 from cavmarl.evaluate.fault_figures import FaultFigures, HandOverClock, spread
 from cavmarl.evaluate.fault_matrix import Line, Rehearsal, matrix
 from cavmarl.ownership.messages import Begin, Message, Record
+from cavmarl.ownership.transport import check_whole
 from cavmarl.policies import load_policy
 from cavmarl.runtime.fault_plan import PHASES, Crash, Faults
 from cavmarl.runtime.faults import FaultyCoordinator
@@ -130,7 +131,7 @@ def run_campaign(
     env: str | Path | None = None,
     zones: Sequence[int] | None = None,
     *,
-    steps: int = 60,
+    steps: int = 40,
     seed: int = 0,
     seeds: int = 12,
     policy: str | Path = "idm",
@@ -154,6 +155,7 @@ def run_campaign(
     """
     check_steps(steps)
     check_seed(seed)
+    check_whole("seeds", seeds, 0)
     counts = ZONES if zones is None else tuple(dict.fromkeys(zones))
     if not counts or min(counts) < 2:
         raise ConfigError(f"zones = {list(counts)}: a campaign needs numbers of 2 or more")
