@@ -13,18 +13,14 @@ from cavmarl.config import ZonesConfig
 from cavmarl.errors import ConfigError
 from cavmarl.ownership.limits import Limits
 from cavmarl.ownership.messages import RUN_BYTES
+from cavmarl.ownership.safeguards import ALL_ON, Safeguards
 from cavmarl.ownership.transfers import TransferLog
 from cavmarl.ownership.transport import Network
 from cavmarl.runtime.coordination import Coordination, RowStates
 from cavmarl.runtime.coordinator import Coordinator
 from cavmarl.runtime.division import Division
-from cavmarl.runtime.faults import (
-    Crashes,
-    Faults,
-    FaultyCoordinator,
-    FaultyPhases,
-    read_faults,
-)
+from cavmarl.runtime.fault_plan import Faults, read_faults
+from cavmarl.runtime.faults import Crashes, FaultyCoordinator, FaultyPhases
 from cavmarl.runtime.journal import Journal, MemoryJournal
 from cavmarl.runtime.recovery import Recovery
 from cavmarl.runtime.row_digests import RowDigests
@@ -55,6 +51,7 @@ def make_refereeing(
     shards: Sequence[Shard],
     division: Division,
     shared: Callable[[], Iterable[NDArray[Any]]],
+    safeguards: Safeguards = ALL_ON,
 ) -> Refereeing:
     """The coordinators of a divided world.
 
@@ -63,6 +60,7 @@ def make_refereeing(
         shards: one a zone.
         division: of them.
         shared: the arrays beside theirs that a tick changes.
+        safeguards: remedies of the protocol; tests take one away.
 
     Raises:
         ConfigError: faults that cannot be, or deaths in several worlds at once.
@@ -71,6 +69,8 @@ def make_refereeing(
     limits = Limits(deferral=settings.max_deferred_ticks, schema=division.codec.schema)
     faults = read_faults(settings.faults) if settings.faults else None
     deaths = faults is not None and faults.may_crash
+    if faults is not None:
+        faults.check_zones(division.count)
     if deaths and division.num_worlds > 1:
         raise ConfigError(
             f"zones.faults: hosts die in one world at a time, not in {division.num_worlds}; "
@@ -80,17 +80,19 @@ def make_refereeing(
     states = [RowStates(division, w) for w in range(division.num_worlds)]
     transfers = tuple(TransferLog(limits.lifetime) for _ in states)
     coordinators = [
-        _coordinator(settings, w, division, states[w], limits, transfers[w], faults, crashes)
+        _coordinator(
+            settings, w, division, states[w], limits, transfers[w], faults, crashes, safeguards
+        )
         for w in range(division.num_worlds)
     ]
     checked = settings.check or bool(settings.journal) or deaths
     digests = RowDigests() if checked else None
     if crashes is None:
         return Refereeing(Coordination(division, coordinators, states, digests), transfers)
-    store = CommittedStore(shards, shared)
+    store = CommittedStore(shards, shared, safeguards)
     phases = FaultyPhases(shards, crashes)
     coordination = Coordination(division, coordinators, states, digests, store)
-    recovery = Recovery(shards, coordination, store, phases, crashes)
+    recovery = Recovery(shards, coordination, store, phases, crashes, limits.repeats)
     return Refereeing(coordination, transfers, recovery, phases)
 
 
@@ -103,6 +105,7 @@ def _coordinator(
     transfers: TransferLog,
     faults: Faults | None,
     crashes: Crashes | None,
+    safeguards: Safeguards,
 ) -> Coordinator:
     """Of one world."""
     journal: Journal | MemoryJournal | None = None
@@ -118,6 +121,7 @@ def _coordinator(
         None if faults is None else Network(faults.plan()),
         journal,
         (transfers,),
+        safeguards,
     )
     if crashes is None:
         return Coordinator(*arguments)
