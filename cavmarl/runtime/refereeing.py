@@ -18,6 +18,7 @@ from cavmarl.ownership.transfers import TransferLog
 from cavmarl.ownership.transport import Network
 from cavmarl.runtime.coordination import Coordination, RowStates
 from cavmarl.runtime.coordinator import Coordinator
+from cavmarl.runtime.dividing import limits_of
 from cavmarl.runtime.division import Division
 from cavmarl.runtime.fault_plan import Faults, read_faults
 from cavmarl.runtime.faults import Crashes, FaultyCoordinator, FaultyPhases
@@ -66,7 +67,7 @@ def make_refereeing(
         ConfigError: faults that cannot be, or deaths in several worlds at once.
         JournalError: a journal cannot be begun.
     """
-    limits = Limits(deferral=settings.max_deferred_ticks, schema=division.codec.schema)
+    limits = limits_of(settings, division.codec.schema)
     faults = read_faults(settings.faults) if settings.faults else None
     deaths = faults is not None and faults.may_crash
     if faults is not None:
