@@ -100,7 +100,10 @@ class Coordination:
             near = self._division.near(w, self._stirred[w])
             self._stirred[w] = False
             rows = {entry.vehicle: entry.row for entry in near}
-            for switch, state in coordinator.begin(near, self._states[w].near):
+            entries = coordinator.begin(near, self._states[w].near)
+            for switch, _ in entries:
+                self._states[w].state(switch.vehicle)  # a STEP may be repeated after rows moved
+            for switch, state in entries:
                 self._division.hand_over(w, switch, state, rows.get(switch.vehicle, 0))
 
     def end(self) -> None:
