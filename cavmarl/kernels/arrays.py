@@ -102,7 +102,7 @@ class Zoned(NamedTuple):
     num_owned: NDArray[np.int64]  # (k, W)
     num_rows: NDArray[np.int64]  # (k, W)
     num_near: NDArray[np.int64]  # (k, W)
-    border: NDArray[np.int32]  # (k, W, C) owned rows that other zones see, rising
+    border: NDArray[np.int32]  # (k, W, C) owned rows that are noted at a border, rising
     num_border: NDArray[np.int64]  # (k, W)
 
 
