@@ -115,7 +115,7 @@ class Division:
 
     def migrate(self) -> None:
         """Let the vehicles of `next_rows` that had left their zone at `exchange` change owners."""
-        if not self._zoned.num_border.any():
+        if len(self._shards) == 1:
             return
         side = self._side(self._shards[0].worlds.next_rows)
         for w in range(len(self._shards[0].worlds.ticks)):
