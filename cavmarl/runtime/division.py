@@ -81,6 +81,7 @@ class Division:
         self._touching_m = touching_m
         self._hysteresis_m = hysteresis_m
         self._ahead_s = ahead_s
+        self._border_m = MAX_SPEED_MPS * ahead_s  # nobody else can be behind it by then
         self._near = np.zeros(2 * shards[0].worlds.rows.shape[1], dtype=NEAR)
         self._call_exchange = repeated(exchange)
         self._find_near = repeated(find_near)
@@ -118,7 +119,14 @@ class Division:
     def _exchange(self, rows: NDArray[np.void], first: int, last: int) -> None:
         """Renew the ghosts of some worlds; `rows` are the first shard's rows or next ones."""
         self._call_exchange(
-            self.zones, self._halo, self._touching_m, self._zoned, self._side(rows), first, last
+            self.zones,
+            self._halo,
+            self._touching_m,
+            self._border_m,
+            self._zoned,
+            self._side(rows),
+            first,
+            last,
         )
 
     def _side(self, rows: NDArray[np.void]) -> int:
