@@ -125,6 +125,8 @@ class ZonesConfig:
         weight: what `bisection` shares out evenly: length of lanes, or area.
         hysteresis_m: how far behind a border a vehicle changes its zone.
         max_deferred_ticks: ticks after which a change that was not acknowledged is forced.
+        halo_m: how far zones see over their borders; default: as far as exactness needs, and less
+            is refused.
         approach_ticks: so many ticks before a vehicle is there at its present speed, the zone that
             it drives to is told.
         journal: file for the coordinator's log; empty: none. It must not exist.
@@ -138,6 +140,7 @@ class ZonesConfig:
     weight: Literal["lane_length", "uniform"] = "lane_length"
     hysteresis_m: float = 2.0
     max_deferred_ticks: int = 2
+    halo_m: float | None = None
     approach_ticks: int = 2
     journal: str = ""
     check: bool = False
@@ -163,6 +166,8 @@ class ZonesConfig:
             self.max_deferred_ticks,
             "must be a whole number from 0 to 1000",
         )
+        if self.halo_m is not None:
+            _check_finite("zones.halo_m", self.halo_m, 0.0, 1e6)
         _check(
             1 <= self.approach_ticks <= 1000,
             "zones.approach_ticks",

@@ -141,7 +141,7 @@ def _shared_start(
     for link in range(first, first + roads.lanes[lane]["num_links"]):
         if link == chosen:
             continue
-        for k in range(scratch.link_start[link], scratch.link_start[link + 1]):
+        for k in range(scratch.link_start[link], scratch.link_end[link]):
             other = scratch.approach[k]
             place = -other["dist"]
             if place > max(-distance, 0.0) and place - other["half"] < roads.links[link]["fork_m"]:

@@ -192,7 +192,7 @@ def _blocked_by_foes(
     for c in range(first, first + roads.links[link]["num_conflicts"]):
         conflict = roads.conflicts[c]
         begin = scratch.link_start[conflict["foe"]]
-        end = scratch.link_start[conflict["foe"] + 1]
+        end = scratch.link_end[conflict["foe"]]
         if begin == end or (conflict["enter_m"] >= wait_m - LINE_MARGIN_M) != inside:
             continue
         time_in = _earliest(distance + conflict["enter_m"] - half, speed, limit, FOE_ACCEL)
@@ -391,9 +391,7 @@ def press_inside(
         conflict = roads.conflicts[c]
         if place - half > conflict["leave_m"]:
             continue
-        for k in range(
-            scratch.link_start[conflict["foe"]], scratch.link_start[conflict["foe"] + 1]
-        ):
+        for k in range(scratch.link_start[conflict["foe"]], scratch.link_end[conflict["foe"]]):
             foe = scratch.approach[k]
             if foe["row"] != i:
                 press = max(press, _press_of(roads, kind, row, conflict, foe, place, dt))

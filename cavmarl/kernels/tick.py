@@ -119,7 +119,7 @@ def advance(
     accel_limit: float,
     steering_limit: float,
     dt: float,
-) -> None:
+) -> int:
     """Decide all controls from the committed rows, then move every owned row into `next_rows`.
 
     Args:
@@ -134,7 +134,11 @@ def advance(
         accel_limit: m/s², of the agents' throttle.
         steering_limit: rad, of the agents' front wheels.
         dt: seconds of the tick.
+
+    Returns:
+        how many background vehicles have arrived, in all worlds.
     """
+    arrived = 0
     for w in range(worlds.ticks.shape[0]):
         rows = worlds.rows[w]
         owned = worlds.num_owned[w]
@@ -204,38 +208,12 @@ def advance(
             row["blinker"] = needed_change(roads, travel, row, travel.steps[own_step(roads, row)])
         worlds.num_through[w] = through
         worlds.num_touching[w] = touching
+        arrived += through
+    return arrived
 
 
 @kernel
-def _nearest_first(
-    rows: NDArray[np.void],
-    num_owned: int,
-    num_rows: int,
-    rect: NDArray[np.float64],
-    reach_m: float,
-    spare: NDArray[np.void],
-) -> int:
-    """Put the ghosts within reach of a rectangle before the others; rows up to the last of them."""
-    near = num_owned
-    for i in range(num_owned, num_rows):
-        x = rows[i]["x"]
-        y = rows[i]["y"]
-        if (
-            rect[0] - reach_m <= x <= rect[2] + reach_m
-            and rect[1] - reach_m <= y <= rect[3] + reach_m
-        ):
-            if i > near:
-                spare[0] = rows[near]
-                rows[near] = rows[i]
-                rows[i] = spare[0]
-            near += 1
-    return near
-
-
-@kernel
-def resolve(
-    worlds: Worlds, scratch: Scratch, grid: Grid, rect: NDArray[np.float64], touching_m: float
-) -> None:
+def resolve(worlds: Worlds, scratch: Scratch, grid: Grid) -> None:
     """Mark in `next_rows` who touches whom.
 
     Args:
@@ -243,13 +221,10 @@ def resolve(
             each vehicle when it begins to touch another.
         scratch: room.
         grid: spatial index over the vehicles of one world, filled here.
-        rect: min_x, min_y, max_x, max_y of the shard's zone in m.
-        touching_m: ghosts further outside than this touch none of its vehicles.
     """
     for w in range(worlds.ticks.shape[0]):
         rows = worlds.next_rows[w]
-        owned = worlds.num_owned[w]
-        num = _nearest_first(rows, owned, worlds.num_rows[w], rect, touching_m, scratch.spare)
+        num = worlds.num_near[w]
         fill_grid(rows, num, grid)
         touch = find_contacts(num, grid, scratch.hit)
         if not touch and worlds.num_touching[w] == 0:

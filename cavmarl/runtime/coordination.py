@@ -7,13 +7,14 @@ from collections.abc import Callable, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from cavmarl.errors import JournalError
+from cavmarl.errors import JournalError, ProtocolError
 from cavmarl.kernels.arrays import Gate
 from cavmarl.kernels.zones import zones_of
 from cavmarl.runtime.coordinator import Coordinator, Near
 from cavmarl.runtime.division import Division
 from cavmarl.runtime.row_digests import RowDigests
 from cavmarl.runtime.store import CommittedStore
+from cavmarl.runtime.zone_view import TransferInFlight
 
 __all__ = ["Coordination", "RowStates"]
 
@@ -76,6 +77,8 @@ class Coordination:
         self._states = tuple(states)
         self._digests = digests
         self._store = store
+        # Worlds whose rows have changed since their ghosts were renewed.
+        self._stirred = [True] * len(self.coordinators)
 
     @property
     def switched(self) -> int:
@@ -88,12 +91,14 @@ class Coordination:
             if chosen[w]:
                 coordinator.reset()
                 coordinator.entered(self._division.owners(w))
+                self._stirred[w] = True
 
     def begin(self) -> None:
         """Lease the next tick, and hand over whose owner changes."""
         for w, coordinator in enumerate(self.coordinators):
             self._states[w].forget()
-            near = self._division.near(w)
+            near = self._division.near(w, self._stirred[w])
+            self._stirred[w] = False
             rows = {entry.vehicle: entry.row for entry in near}
             for switch, state in coordinator.begin(near, self._states[w].near):
                 self._division.hand_over(w, switch, state, rows.get(switch.vehicle, 0))
@@ -112,6 +117,23 @@ class Coordination:
         if self._store is not None:
             self._store.write(tuple(coordinator.notes() for coordinator in self.coordinators))
             self._store.flip()
+
+    def in_flight(self, w: int) -> list[TransferInFlight]:
+        """Who of a world is on the way from one zone to another."""
+        return [TransferInFlight(*entry) for entry in self.coordinators[w].in_flight()]
+
+    def load(self) -> None:
+        """Take everything back to what is committed.
+
+        Raises:
+            ProtocolError: nobody keeps it.
+        """
+        if self._store is None:
+            raise ProtocolError("nobody keeps what is committed")
+        self._division.align()
+        for w, notes in enumerate(self._store.load()):
+            self.coordinators[w].resume(*notes)
+            self._stirred[w] = True
 
     def restart(self, w: int) -> Coordinator:
         """The coordinator of a world has died: another one has read its journal.
@@ -132,6 +154,7 @@ class Coordination:
             gone = gate.passing[w, : gate.num_passing[w]]
             if len(gone):
                 coordinator.left(zip(gone["id"].tolist(), gone["events"].tolist(), strict=True))
+                self._stirred[w] |= not coordinator.is_open
 
     def entered(self, gate: Gate) -> None:
         """Those in `gate.passing` have come into their worlds."""

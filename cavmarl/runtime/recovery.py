@@ -106,8 +106,8 @@ class Recovery:
         zones = death.zones if isinstance(death, StoreError) else (death.zone,)
         for zone in zones:
             self._lose(self._shards[zone])
+        self._coordination.load()
         coordinator = self._coordination.coordinators[0]
-        coordinator.resume(*self._store.load()[0])
         for zone in zones:
             if isinstance(death, ZoneDeath):
                 give_up(coordinator, death)
@@ -124,7 +124,7 @@ class Recovery:
         is_done = coordinator.tick == self._crashes.tick
         if is_done:
             self._store.flip()
-        coordinator.resume(*self._store.load()[0])
+        self._coordination.load()
         coordinator.resend()
         return is_done
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -17,6 +18,7 @@ from cavmarl.kernels.codes import MODEL_KRAUSS
 from cavmarl.kernels.departures import call_orders, populate, settle
 from cavmarl.kernels.drivers import look_ahead_m
 from cavmarl.kernels.lanes import VIEW_M
+from cavmarl.kernels.repeated import repeated
 from cavmarl.roads.network import VEHICLE_CLASSES, RoadNetwork
 from cavmarl.roads.routing import make_plans
 from cavmarl.traffic.demand import STOP, DemandFile
@@ -225,7 +227,11 @@ class NativeTraffic:
 
     def call_orders(self, gate: Gate, worlds: Worlds) -> None:
         """Put the orders that are due by the coming tick into the queue."""
-        call_orders(gate, worlds)
+        self._call_orders(gate, worlds)
+
+    @cached_property
+    def _call_orders(self) -> Callable[[Gate, Worlds], None]:
+        return repeated(call_orders)
 
     def accept(self, gate: Gate, running: NDArray[np.int64]) -> None:
         """Choose among those who could enter; `running` (W,) are in the worlds already."""

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import numpy as np
-import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from cavmarl.kernels import codes
 from cavmarl.kernels.arrays import Gate, Worlds
-from cavmarl.kernels.exchange import adopt, find_movers, release, take_ghosts, take_own
+from cavmarl.kernels.exchange import take_ghosts, take_own
 from cavmarl.kernels.leaving import drop_ghosts, leave
 from cavmarl.roads.zones import ZonePartition
 from cavmarl.shard.shard import make_worlds
@@ -52,59 +51,12 @@ def test_each_vehicle_is_taken_by_one_zone_in_the_given_order(
         assert (rows[:found] == everybody[expected]).all()
 
 
-@given(st.data(), partitions(), st.sampled_from([0.0, 2.0, 7.5]))
-def test_who_is_behind_the_hysteresis_moves(
-    data: st.DataObject, partition: ZonePartition, hysteresis_m: float
-) -> None:
-    xy = data.draw(places(partition))
-    zone = data.draw(st.integers(0, partition.count - 1))
-    rows = vehicles([(x, y, 0.0) for x, y in xy.tolist()])
-    out = np.full(len(rows), -1, dtype=np.int32)
-    found = find_movers(partition.arrays, zone, hysteresis_m, rows, len(rows) - 1, out)
-    movers = set(out[:found].tolist())
-    assert sorted(movers) == out[:found].tolist()
-    for k, (x, y) in enumerate(xy[:-1].tolist()):
-        behind_m = naive.distance(partition.reaching[zone], x, y) - hysteresis_m
-        # Squares round otherwise than roots.
-        assert (k in movers) == (behind_m > 0.0) or abs(behind_m) < 1e-6
-    assert len(rows) - 1 not in movers, "it is not owned"
-
-
 def test_ghosts_are_copied_behind_the_rows_that_are_there() -> None:
     source, rows = cars(5), np.zeros(6, VEHICLE)
     rows["id"] = -1
     take_ghosts(source, np.array([4, 0, 2, 3], np.int32), 1, 3, rows, 2)
     assert ids(rows) == [-1, -1, 100, 102, -1, -1]
     assert rows[3] == source[2]
-
-
-@pytest.mark.parametrize("i", [0, 1, 2])
-def test_who_is_released_is_the_first_ghost(i: int) -> None:
-    rows = cars(5)
-    before = rows.copy()
-    release(rows, i, 3, np.zeros(1, VEHICLE))
-    assert rows[2] == before[i]
-    assert set(ids(rows[:2])) == {100, 101, 102} - {100 + i}
-    assert (rows[3:] == before[3:]).all()
-
-
-@pytest.mark.parametrize("ghost", [2, 3, 4])
-def test_who_is_adopted_is_the_last_owned_row_as_its_owner_left_it(ghost: int) -> None:
-    rows = cars(6)
-    row = rows[ghost : ghost + 1].copy()
-    row["speed"] = 3.0
-    assert adopt(rows, 2, 5, row[0])
-    assert rows[2] == row[0]
-    assert set(ids(rows[3:5])) == {102, 103, 104} - {100 + ghost}
-    assert ids(rows[[0, 1, 5]]) == [100, 101, 105]
-
-
-def test_nobody_is_adopted_who_was_no_ghost() -> None:
-    rows = cars(6)
-    before = rows.copy()
-    for stranger in (0, 5):  # an owned one, and one that is not there any more
-        assert not adopt(rows, 2, 5, before[stranger])
-    assert (rows == before).all()
 
 
 def world(rows: NDArray[np.void], owned: int) -> tuple[Worlds, Gate]:

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from cavmarl.kernels.zones import make_publication, publish, squared_distance, zone_of, zones_of
-from cavmarl.roads.zone_coverage import Coverage, zone_halo
+from cavmarl.roads.zone_halo import Coverage, zone_halo
 from cavmarl.roads.zones import ZonePartition
 from tests.kernels.builders import vehicles
 from tests.naive import zones as naive

@@ -38,3 +38,27 @@ def published(
                 rows.append(row)
         needed.append(rows)
     return needed
+
+
+def near_borders(
+    rects: NDArray[np.float64],
+    zone: int,
+    hysteresis_m: float,
+    ahead_s: float,
+    rows: NDArray[np.void],
+) -> list[tuple[int, int, bool]]:
+    """(row, other zone, whether it has crossed) of the vehicles that other zones are told of."""
+    found = []
+    for i, row in enumerate(rows):
+        here = zone
+        if distance(rects[zone], row["x"], row["y"]) > hysteresis_m:
+            (here,) = owners(rects, row["x"], row["y"])
+            found.append((i, here, True))
+        way = row["speed"] * ahead_s
+        x = row["x"] + math.cos(row["heading"]) * way
+        y = row["y"] + math.sin(row["heading"]) * way
+        if distance(rects[zone], x, y) > hysteresis_m:
+            (there,) = owners(rects, x, y)
+            if there != here:
+                found.append((i, there, False))
+    return found

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from cavmarl.errors import ZoneError
 from cavmarl.kernels.zones import squared_distance
 from cavmarl.ownership.messages import Switch
-from cavmarl.roads.zone_coverage import Coverage
+from cavmarl.runtime import dividing
 from cavmarl.runtime.simulation import Simulation
 from cavmarl.shard.vehicles import PLACEMENT_FIELDS, STATE_FIELDS
 from tests.driving import drive, idle, make_simulation, start
@@ -54,7 +54,7 @@ def ghosts(simulation: Simulation, world: int) -> list[NDArray[np.void]]:
 def test_each_vehicle_has_one_owner_and_is_seen_wherever_it_is_near(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(Coverage, "halo_m", property(lambda _: 60.0))  # less than the whole map
+    monkeypatch.setattr(dividing, "halo_m", lambda *_: 60.0)  # less than the whole map
     simulation = divided(9)
     rects = simulation.partition.reaching
     owners: list[dict[int, int]] = [{}, {}]

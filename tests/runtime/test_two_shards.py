@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from cavmarl.kernels.arrays import Worlds
 from cavmarl.kernels.codes import DRIVER_AGENT
 from cavmarl.kernels.signals import merge_detections
-from cavmarl.roads.zone_coverage import zone_halo
+from cavmarl.roads.zone_halo import zone_halo
 from cavmarl.roads.zone_layouts import cut_map
 from cavmarl.runtime.commons import Commons
 from cavmarl.runtime.executor import SerialExecutor
