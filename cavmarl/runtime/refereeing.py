@@ -16,7 +16,7 @@ from cavmarl.ownership.messages import RUN_BYTES
 from cavmarl.ownership.transfers import TransferLog
 from cavmarl.ownership.transport import Network
 from cavmarl.runtime.coordination import Coordination, RowStates
-from cavmarl.runtime.coordinator import Coordinator
+from cavmarl.runtime.coordinator import Coordinator, Watcher
 from cavmarl.runtime.division import Division
 from cavmarl.runtime.faults import (
     Crashes,
@@ -26,6 +26,7 @@ from cavmarl.runtime.faults import (
     read_faults,
 )
 from cavmarl.runtime.journal import Journal, MemoryJournal
+from cavmarl.runtime.monitor import Monitor, OwnersOnRecord
 from cavmarl.runtime.recovery import Recovery
 from cavmarl.runtime.row_digests import RowDigests
 from cavmarl.runtime.store import CommittedStore
@@ -55,6 +56,7 @@ def make_refereeing(
     shards: Sequence[Shard],
     division: Division,
     shared: Callable[[], Iterable[NDArray[Any]]],
+    dt: float,
 ) -> Refereeing:
     """The coordinators of a divided world.
 
@@ -63,6 +65,7 @@ def make_refereeing(
         shards: one a zone.
         division: of them.
         shared: the arrays beside theirs that a tick changes.
+        dt: seconds of a tick.
 
     Raises:
         ConfigError: faults that cannot be, or deaths in several worlds at once.
@@ -79,17 +82,22 @@ def make_refereeing(
     crashes = Crashes(faults) if faults is not None and deaths else None
     states = [RowStates(division, w) for w in range(division.num_worlds)]
     transfers = tuple(TransferLog(limits.lifetime) for _ in states)
+    records = [OwnersOnRecord(division.count, limits) for _ in states] if settings.check else []
     coordinators = [
-        _coordinator(settings, w, division, states[w], limits, transfers[w], faults, crashes)
+        _coordinator(
+            settings, w, division, states[w], limits,
+            (transfers[w], *records[w : w + 1]), faults, crashes,
+        )
         for w in range(division.num_worlds)
-    ]
-    checked = settings.check or bool(settings.journal) or deaths
-    digests = RowDigests() if checked else None
+    ]  # fmt: skip
+    digests = RowDigests() if settings.journal or deaths else None
+    monitor = Monitor(division, records, dt) if settings.check else None
     if crashes is None:
-        return Refereeing(Coordination(division, coordinators, states, digests), transfers)
+        coordination = Coordination(division, coordinators, states, digests, monitor=monitor)
+        return Refereeing(coordination, transfers)
     store = CommittedStore(shards, shared)
     phases = FaultyPhases(shards, crashes)
-    coordination = Coordination(division, coordinators, states, digests, store)
+    coordination = Coordination(division, coordinators, states, digests, store, monitor)
     recovery = Recovery(shards, coordination, store, phases, crashes)
     return Refereeing(coordination, transfers, recovery, phases)
 
@@ -100,7 +108,7 @@ def _coordinator(
     division: Division,
     states: RowStates,
     limits: Limits,
-    transfers: TransferLog,
+    watchers: tuple[Watcher, ...],
     faults: Faults | None,
     crashes: Crashes | None,
 ) -> Coordinator:
@@ -117,7 +125,7 @@ def _coordinator(
         limits,
         None if faults is None else Network(faults.plan()),
         journal,
-        (transfers,),
+        watchers,
     )
     if crashes is None:
         return Coordinator(*arguments)

@@ -147,7 +147,11 @@ class Simulation:
     def _divide(self) -> None:
         """Let coordinators say who owns what; nobody asks where all is one zone."""
         refereeing = make_refereeing(
-            self.config.zones, self._shards, self._division, self._shared_arrays
+            self.config.zones,
+            self._shards,
+            self._division,
+            self._shared_arrays,
+            self.config.clock.sim_dt_s,
         )
         self._coordination = refereeing.coordination
         self._recovery = refereeing.recovery
