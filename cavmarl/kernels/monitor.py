@@ -96,13 +96,13 @@ def _digest(
 @inlined_kernel
 def _place(table: NDArray[np.void], vehicle: int, hashed: np.uint64, look: int) -> int:
     """Where a vehicle of that look stands, or the first blank behind its hash; -1: no room."""
-    last = np.uint64(table.shape[0] - 1)
-    place = hashed & last
+    last = table.shape[0] - 1
+    place = np.int64(hashed & np.uint64(last))
     for _ in range(table.shape[0]):
         entry = table[place]
         if entry["look"] != look or entry["id"] == vehicle:
-            return int(place)
-        place = (place + np.uint64(1)) & last
+            return place
+        place = (place + 1) & last
     return -1
 
 
