@@ -222,6 +222,13 @@ class Simulation:
         transfers = () if coordination is None else coordination.in_flight(world)
         return view_zones(self._shards, self.partition, halo_m, world, transfers)
 
+    def ghosts(self, zone: int, world: int = 0) -> NDArray[np.void]:
+        """What a zone sees of other zones' vehicles: VEHICLE (n,), a view that cannot be written.
+
+        It shows the present tick, until the next one.
+        """
+        return self._division.ghosts(world, zone)
+
     @property
     def migrations(self) -> int:
         """How many vehicles have changed their owner since the worlds were made."""
