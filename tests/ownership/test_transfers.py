@@ -27,7 +27,7 @@ def test_a_prepared_transfer_has_its_row() -> None:
     bench.tick(offers=[(7, 1)])
     bench.tick(movers=[(7, 1)])
     log = followed(bench.trace)
-    assert log.rows == [Transfer(0, 3, 7, 0, 1, 1, False, False, 1, 0, 2, 16)]
+    assert list(log.rows) == [Transfer(0, 3, 7, 0, 1, 1, False, False, 1, 0, 2, 16)]
     assert log.counts == {"switched": 1, "acknowledged": 2, "deferred": 0}
 
 
@@ -38,7 +38,7 @@ def test_a_forced_transfer_tells_how_long_it_waited() -> None:
         bench.tick(movers=[(7, 1)])
     bench.tick(movers=[(7, 1)], removed=[7])
     log = followed(bench.trace)
-    assert log.rows == [Transfer(0, 4, 7, 0, 1, 1, True, True, -1, 2, 0, 0)]
+    assert list(log.rows) == [Transfer(0, 4, 7, 0, 1, 1, True, True, -1, 2, 0, 0)]
     assert log.counts == {"forced": 1, "deferred": 2}
 
 
