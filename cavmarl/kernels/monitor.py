@@ -200,7 +200,9 @@ def watch(
                 _note(found[0], kind, row["id"])
         tallies[zone]["vehicles"] = num_owned
         tallies[zone]["owned"] = owned
-        _owe_ghosts(zones, halo, zone, rows, words[side, zone, w], num_owned, masks, factors, tallies)
+        _owe_ghosts(
+            zones, halo, zone, rows, words[side, zone, w], num_owned, masks, factors, tallies
+        )
         seen = np.uint64(0)
         for i in range(num_owned, zoned.num_rows[zone, w]):
             seen += _digest(words[side, zone, w], i, masks, factors)

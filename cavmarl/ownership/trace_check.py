@@ -161,9 +161,7 @@ class TraceChecker:
                 self._require_ready(vehicle, target, epoch - 1)
         for vehicle, ticks in record.deferred:
             follows = ticks == self._deferred.get(vehicle, 0) + 1
-            _require(
-                follows and vehicle in self.owners, f"v{vehicle} cannot wait for tick {ticks}"
-            )
+            _require(follows and vehicle in self.owners, f"v{vehicle} cannot wait for tick {ticks}")
             _require(ticks <= self._longest, f"v{vehicle} waits longer than {self._longest} ticks")
         for vehicle, _, _ in record.births:
             _require(vehicle not in self._born, f"v{vehicle} is born twice")
@@ -174,7 +172,8 @@ class TraceChecker:
         _require(target not in self._fenced, f"zone {target} has no host")
         process = (target, self._incarnations.get(target, 0))
         _require(
-            (*process, vehicle, epoch, self._tick) in self._ready, f"v{vehicle} switches to {target} without an ACK of tick {self._tick}"
+            (*process, vehicle, epoch, self._tick) in self._ready,
+            f"v{vehicle} switches to {target} without an ACK of tick {self._tick}",
         )
 
     def _step(self, step: Step) -> None:
@@ -233,7 +232,7 @@ class TraceChecker:
         told = [ledger.zone for ledger in record.zones]
         _require(told == sorted(self._incarnations), f"tells of zones {told}")
         changed = self._planned(begun)
-        removed = []
+        removed: list[Removed] = []
         for zone in told:
             removed += self._confirmed(zone, begun, changed)
         _require(record.removed == tuple(sorted(removed)), "removes others than the zones did")

@@ -113,7 +113,8 @@ class TransferLog:
 
     Attributes:
         rows: the newest KEPT_ROWS transfers that have been committed; `take` takes them away.
-        counts: `aborted`, `acknowledged`, `deferred`, `expired`, `forced`, `refused`, `switched`.
+        counts: `aborted`, `acknowledged`, `deferred`, `expired`, `forced`, `refused`, `removed`,
+            `switched`.
         episode: of the newest record.
     """
 
@@ -199,6 +200,7 @@ class TransferLog:
         gone = {entry.vehicle for entry in record.removed}
         for vehicle, source, target, epoch, forced in begun.switches:
             self.counts["forced" if forced else "switched"] += 1
+            self.counts["removed"] += vehicle in gone
             found = self._approaches.pop((vehicle, target, epoch - 1), _Approach(-1, -1, 0, 0))
             switching = self._switching.get(vehicle, UNKNOWN)
             began_ms = switching.began_ms if found.began_ms is None else found.began_ms

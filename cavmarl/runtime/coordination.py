@@ -15,6 +15,7 @@ from cavmarl.runtime.division import Division
 from cavmarl.runtime.monitor import Monitor
 from cavmarl.runtime.row_digests import RowDigests
 from cavmarl.runtime.store import CommittedStore
+from cavmarl.runtime.surroundings import NearBorders
 from cavmarl.runtime.zone_view import TransferInFlight
 
 __all__ = ["Coordination", "RowStates"]
@@ -26,9 +27,13 @@ class RowStates:
     Args:
         division: of all worlds.
         world: which one.
+
+    Attributes:
+        borders: who was near a border when the tick began.
     """
 
     def __init__(self, division: Division, world: int) -> None:
+        self.borders = NearBorders()
         self._division = division
         self._world = world
         self._known: dict[int, bytes] = {}
@@ -105,6 +110,7 @@ class Coordination:
             self._states[w].forget()
             near = self._division.near(w, self._stirred[w])
             self._stirred[w] = False
+            self._states[w].borders.near = near
             rows = {entry.vehicle: entry.row for entry in near}
             for switch, state in coordinator.begin(near, self._states[w].near):
                 self._division.hand_over(w, switch, state, rows.get(switch.vehicle, 0))

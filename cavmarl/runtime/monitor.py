@@ -35,7 +35,8 @@ from cavmarl.shard.vehicles import GHOST_FIELDS
 __all__ = ["Monitor", "OwnersOnRecord", "longest_move_m"]
 
 WORD = 1 << 64
-KINK_M = 5.0  # m that a body can jump sideways where its lane or its way has a kink
+# m that a body a lane's width aside jumps where its lane turns by a right angle at once.
+KINK_M = 5.0
 
 
 def longest_move_m(dt: float) -> float:
@@ -94,7 +95,7 @@ class OwnersOnRecord:
         self._take(destination, message)
 
     def sums(self, births: Sequence[Birth]) -> list[int]:
-        """By zone the sum of `owner_hash` of its vehicles, with those that are not on record yet."""
+        """By zone the sum of `owner_hash` of its vehicles, those not on record yet among them."""
         sums = list(self._sums)
         for vehicle, zone, _ in births:
             sums[zone] = (sums[zone] + int(owner_hash(vehicle, 0))) % WORD

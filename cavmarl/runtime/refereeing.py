@@ -81,7 +81,7 @@ def make_refereeing(
         )
     crashes = Crashes(faults) if faults is not None and deaths else None
     states = [RowStates(division, w) for w in range(division.num_worlds)]
-    transfers = tuple(TransferLog(limits.lifetime) for _ in states)
+    transfers = tuple(TransferLog(limits.lifetime, known.borders) for known in states)
     records = [OwnersOnRecord(division.count, limits) for _ in states] if settings.check else []
     coordinators = [
         _coordinator(

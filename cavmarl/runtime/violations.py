@@ -36,9 +36,7 @@ class Violations:
         before: KEPT, what the look before wrote.
     """
 
-    def __init__(
-        self, division: Division, w: int, clock: Clock, before: NDArray[np.void]
-    ) -> None:
+    def __init__(self, division: Division, w: int, clock: Clock, before: NDArray[np.void]) -> None:
         self._division = division
         self._w = w
         self._clock = clock

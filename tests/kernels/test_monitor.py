@@ -32,7 +32,6 @@ from cavmarl.shard.vehicles import GHOST_FIELDS, VEHICLE
 from tests.naive import monitor as naive
 from tests.naive.zones import distance
 
-
 CAPACITY = 40
 HALO_M = 30.0
 LIMIT_M = 5.0

@@ -1,4 +1,4 @@
-"""What the monitor's look at the rows of a world has to find, with Python's own sets and numbers."""
+"""What the monitor's look at a world's rows has to find, with Python's own sets and numbers."""
 
 from __future__ import annotations
 
