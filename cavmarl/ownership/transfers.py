@@ -200,7 +200,8 @@ class TransferLog:
         gone = {entry.vehicle for entry in record.removed}
         for vehicle, source, target, epoch, forced in begun.switches:
             self.counts["forced" if forced else "switched"] += 1
-            self.counts["removed"] += vehicle in gone
+            if vehicle in gone:
+                self.counts["removed"] += 1
             found = self._approaches.pop((vehicle, target, epoch - 1), _Approach(-1, -1, 0, 0))
             switching = self._switching.get(vehicle, UNKNOWN)
             began_ms = switching.began_ms if found.began_ms is None else found.began_ms
