@@ -101,7 +101,7 @@ def _place(table: NDArray[np.void], vehicle: int, hashed: np.uint64, look: int) 
     for _ in range(table.shape[0]):
         entry = table[place]
         if entry["look"] != look or entry["id"] == vehicle:
-            return place
+            return int(place)
         place = (place + 1) & last
     return -1
 
@@ -163,8 +163,8 @@ def watch(
     now: NDArray[np.void],
     tallies: NDArray[np.void],
     found: NDArray[np.void],
-) -> None:
-    """Look at all rows of one world after a tick.
+) -> int:
+    """Look at all rows of one world after a tick; KIND_* of what is found.
 
     Args:
         zones: of the partition.
@@ -207,6 +207,7 @@ def watch(
         for i in range(num_owned, zoned.num_rows[zone, w]):
             seen += _digest(words[side, zone, w], i, masks, factors)
         tallies[zone]["seen"] = seen
+    return int(found[0]["kind"])
 
 
 @inlined_kernel

@@ -11,8 +11,9 @@ A tick costs what changes in it: vehicles that stay where they are are never loo
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Iterable
-from typing import NamedTuple
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, field
+from typing import Any, NamedTuple
 
 from cavmarl.errors import InvariantError
 from cavmarl.ownership.ledger import SeenIds, Tally, state_digest
@@ -47,6 +48,15 @@ class Change(NamedTuple):
     vehicle: int
     before: Owner | None
     after: Owner | None
+
+
+@dataclass(slots=True)
+class _Orders:
+    """What a BEGIN says to one zone."""
+
+    entered: set[tuple[int, int]] = field(default_factory=set)
+    left: set[tuple[int, int]] = field(default_factory=set)
+    born: set[int] = field(default_factory=set)
 
 
 def check_trace(entries: Iterable[Entry], longest_deferral: int, lifetime: int) -> None:
@@ -91,38 +101,24 @@ class TraceChecker:
         self._holdings: defaultdict[int, set[Holding]] = defaultdict(set)  # by tick
         self._ready: set[tuple[int, int, int, int, int]] = set()  # acknowledged, with the tick
         self._begun: Begin | None = None
+        self._orders: defaultdict[int, _Orders] = defaultdict(_Orders)  # by zone, of that BEGIN
         self._dones: dict[int, Done] = {}
+        self._judges: dict[type, Callable[[Any], None]] = {
+            Reset: self._reset, Host: self._host, Fence: self._fence, Begin: self._begin,
+            Commit: self._commit, Step: self._step, Prepare: self._prepare, Abort: self._abort,
+            Ack: self._ack, Done: self._done,
+        }  # fmt: skip
 
     def take(self, entry: Entry) -> None:
         """The next entry."""
-        match entry.item:
-            case Reset():
-                self._reset(entry.item)
-            case Host():
-                self._host(entry.item)
-            case Fence(zone=zone, incarnation=incarnation):
-                _require(self._incarnations.get(zone) == incarnation, "fences an unknown process")
-                self._fenced.add(zone)
-                self._dones.pop(zone, None)
-            case Begin():
-                self._begin(entry.item)
-            case Commit():
-                self._commit(entry.item)
-            case Record():
-                _require(False, "unknown record")
-            case Message() if self._foreign(entry.item):
-                return
-            case Step():
-                self._step(entry.item)
-            case Prepare():
-                self._prepare(entry.item)
-            case Abort():
-                for vehicle, epoch in entry.item.entries:
-                    self._hear(entry.item.target, vehicle, epoch, entry.item.tick)
-            case Ack() if entry.destination == COORDINATOR:
-                self._ack(entry.item)
-            case Done():
-                self._done(entry.item)
+        item = entry.item
+        judge = self._judges.get(type(item))
+        if isinstance(item, Record):
+            _require(judge is not None, "unknown record")
+        elif self._foreign(item) or (type(item) is Ack and entry.destination != COORDINATOR):
+            return
+        if judge is not None:
+            judge(item)
 
     def _foreign(self, message: Message) -> bool:
         return message.run != self._run or message.episode != self._episode
@@ -148,6 +144,12 @@ class TraceChecker:
         self._dones.pop(zone, None)
         self._fences = {key: fence for key, fence in self._fences.items() if key[0] != zone}
 
+    def _fence(self, record: Fence) -> None:
+        known = self._incarnations.get(record.zone) == record.incarnation
+        _require(known, "fences an unknown process")
+        self._fenced.add(record.zone)
+        self._dones.pop(record.zone, None)
+
     def _begin(self, record: Begin) -> None:
         _require(self._begun is None, "a tick is decided twice")
         _require(record.tick == self._tick + 1, f"follows tick {self._tick}")
@@ -167,6 +169,12 @@ class TraceChecker:
             _require(vehicle not in self._born, f"v{vehicle} is born twice")
             self._born.add(vehicle)
         self._begun = record
+        self._orders = defaultdict(_Orders)
+        for vehicle, source, target, epoch, _ in record.switches:
+            self._orders[target].entered.add((vehicle, epoch))
+            self._orders[source].left.add((vehicle, epoch - 1))
+        for vehicle, zone, _ in record.births:
+            self._orders[zone].born.add(vehicle)
 
     def _require_ready(self, vehicle: int, target: int, epoch: int) -> None:
         _require(target not in self._fenced, f"zone {target} has no host")
@@ -183,14 +191,11 @@ class TraceChecker:
         if begun is None or step.tick != begun.tick:
             return
         _require(step.committed == self._tick, "tells of a tick that is not committed")
-        entered = {(entry.vehicle, entry.epoch) for entry in step.enter}
-        left = {(entry.vehicle, entry.epoch) for entry in step.leave}
-        born = {entry.vehicle for entry in step.spawn}
-        switches, zone = begun.switches, step.zone
+        orders = self._orders[step.zone]
         _require(
-            entered == {(s.vehicle, s.epoch) for s in switches if s.target == zone}
-            and left == {(s.vehicle, s.epoch - 1) for s in switches if s.source == zone}
-            and born == {b.vehicle for b in begun.births if b.zone == zone},
+            {(entry.vehicle, entry.epoch) for entry in step.enter} == orders.entered
+            and {(entry.vehicle, entry.epoch) for entry in step.leave} == orders.left
+            and {entry.vehicle for entry in step.spawn} == orders.born,
             "says something else than BEGIN",
         )
 
@@ -201,6 +206,10 @@ class TraceChecker:
                 message.target, vehicle, epoch, message.tick
             ):
                 self._holdings[message.tick].add((*process, vehicle, epoch, digest))
+
+    def _abort(self, message: Abort) -> None:
+        for vehicle, epoch in message.entries:
+            self._hear(message.target, vehicle, epoch, message.tick)
 
     def _hear(self, zone: int, vehicle: int, epoch: int, tick: int) -> bool:
         newest = self._fences.get((zone, vehicle), (-1, -1))
@@ -234,7 +243,7 @@ class TraceChecker:
         changed = self._planned(begun)
         removed: list[Removed] = []
         for zone in told:
-            removed += self._confirmed(zone, begun, changed)
+            removed += self._confirmed(zone, changed)
         _require(record.removed == tuple(sorted(removed)), "removes others than the zones did")
         self.changes = [
             Change(vehicle, self.owners.get(vehicle), after) for vehicle, after in changed.items()
@@ -255,16 +264,15 @@ class TraceChecker:
         changed.update((b.vehicle, (b.zone, 0)) for b in begun.births)
         return changed
 
-    def _confirmed(
-        self, zone: int, begun: Begin, changed: dict[int, Owner | None]
-    ) -> tuple[Removed, ...]:
+    def _confirmed(self, zone: int, changed: dict[int, Owner | None]) -> tuple[Removed, ...]:
         """What a zone's DONE adds to the changes: whom it removed."""
         done = self._dones.get(zone)
         if done is None:
             raise InvariantError(f"zone {zone} has not said DONE")
         confirmed = {(entry.vehicle, entry.epoch) for entry in done.confirmed}
-        planned = {(s.vehicle, s.epoch) for s in begun.switches if s.target == zone}
-        _require(confirmed == planned, f"zone {zone} did not CONFIRM what came in")
+        _require(
+            confirmed == self._orders[zone].entered, f"zone {zone} did not CONFIRM what came in"
+        )
         for entry in done.removed:
             owner = changed.get(entry.vehicle, self.owners.get(entry.vehicle))
             mine = owner is not None and owner[0] == zone

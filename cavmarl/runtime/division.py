@@ -206,9 +206,9 @@ class Division:
         rows.flags.writeable = False
         return rows
 
-    def tick(self, w: int, zone: int) -> int:
-        """What a zone's clock says: ticks since the world's reset."""
-        return int(self._shards[zone].worlds.ticks[w])
+    def ticks(self, w: int) -> list[int]:
+        """What the zones' clocks say: ticks since the world's reset."""
+        return [shard.worlds.ticks.item(w) for shard in self._shards]
 
     @property
     def zoned(self) -> Zoned:

@@ -185,7 +185,7 @@ class Monitor:
         clock = Clock(self._ticks[w], self._looks[w], new_late, self._limit_m)
         now = self._kept[w, clock.look & 1]
         before = self._kept[w, (clock.look + 1) & 1]
-        self._watch(
+        kind = self._watch(
             division.zones, division.halo, division.zoned, self._words, division.side, w, clock,
             self._masks, self._factors, before, now, self._tallies, self._found,
         )  # fmt: skip
@@ -193,13 +193,13 @@ class Monitor:
         expected = record.sums(births)
         live = sum(tally[0] for tally in tallies)
         holds = (
-            self._found[0]["kind"] == KIND_NONE
-            and all(division.tick(w, zone) == clock.tick for zone in range(division.count))
+            kind == KIND_NONE
+            and division.ticks(w) == [clock.tick] * len(tallies)
             and live == record.entered + len(births) - record.left
             and [tally[1] for tally in tallies] == expected
             and all(due == seen for _, _, due, seen in tallies)
         )
         if not holds:
-            found = self._found[0]
+            vehicle = int(self._found["vehicle"][0])
             violations = Violations(division, w, clock, before)
-            violations.explain(int(found["kind"]), int(found["vehicle"]), record.owners, births)
+            violations.explain(kind, vehicle, record.owners, births)

@@ -108,8 +108,7 @@ class Violations:
         return found[0] if len(found) else None
 
     def _clocks(self) -> Iterator[str]:
-        for zone in range(self._division.count):
-            tick = self._division.tick(self._w, zone)
+        for zone, tick in enumerate(self._division.ticks(self._w)):
             if tick != self._clock.tick:
                 yield f"one clock: zone {zone} is at tick {tick}, not at {self._clock.tick}"
 
