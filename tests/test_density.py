@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -23,13 +24,21 @@ DENSITIES = (LOW, MEDIUM, HIGH)
 ZONES = 4
 # The fullest of four zones has at least this share, so maximum ÷ mean is at least four times that.
 SHARE = 0.6
-APPROACH_M = 30.0
+APPROACH_TICKS = 100
 EPISODE = 600  # steps
 CITY = "net/Town10HD.net.xml"
 
 
-def world(vehicles: int, seed: int = 0, env: str = "rush") -> Simulation:
-    config, network, demand, partition = load_world(env, agents=vehicles, background=0, zones=ZONES)
+def world(
+    vehicles: int, seed: int = 0, env: str = "rush", zones: int = ZONES, approach_ticks: int = 2
+) -> Simulation:
+    config, network, demand, partition = load_world(
+        env,
+        agents=vehicles,
+        background=0,
+        zones=zones,
+        overrides={"zones.approach_ticks": approach_ticks},
+    )
     simulation = Simulation(config, network, demand=demand, partition=partition)
     start(simulation, seed)
     return simulation
@@ -81,15 +90,13 @@ def test_who_starts_in_one_zone_shows_as_imbalance(vehicles: int, seed: int) -> 
 
 def test_low_density_crosses_now_and_then() -> None:
     simulation = world(LOW)
-    crossings = []
-    before = simulation.zone_loads().migrations
+    at_once: Counter[tuple[int, int]] = Counter()
     for _ in first_minute(simulation):
-        loads = simulation.zone_loads()
-        assert loads.owned.sum() == len(simulation.vehicles())
-        crossings.append(loads.migrations - before)
-        before = loads.migrations
-    assert sum(crossings) >= 1
-    assert max(crossings) == 1
+        assert simulation.zone_loads().owned.sum() == len(simulation.vehicles())
+        in_flight = simulation.zone_view().transfers
+        at_once |= Counter((transfer.source, transfer.target) for transfer in in_flight)
+    assert simulation.migrations >= 1
+    assert min(at_once.values()) == 1, "at some border there are never two at a time"
 
 
 def test_medium_density_has_twice_the_updates_of_low() -> None:
@@ -101,15 +108,21 @@ def test_medium_density_has_twice_the_updates_of_low() -> None:
 
 
 def test_high_density_has_many_at_borders_at_once() -> None:
-    simulation = world(HIGH)
-    near = []
+    # Told four seconds ahead.
+    simulation = world(HIGH, zones=9, approach_ticks=APPROACH_TICKS)
+    in_flight = []
     for _ in first_minute(simulation):
-        xy = places(simulation)
-        rects = simulation.partition.reaching[simulation.partition.zones_of(xy)]
-        to_border_m = np.minimum(xy - rects[:, :2], rects[:, 2:] - xy).min(axis=1)
-        near.append(int((to_border_m < APPROACH_M).sum()))
-    assert max(near) >= 10
-    assert simulation.zone_loads().migrations >= 20
+        in_flight.append(len({transfer.vehicle for transfer in simulation.zone_view().transfers}))
+        ids = simulation.vehicles()["id"]
+        assert len(set(ids.tolist())) == len(ids), "nobody twice"
+        stats = simulation.traffic_stats()
+        assert stats.departed - stats.arrived - stats.removed == len(ids), "nobody lost"
+    assert max(in_flight) >= 10
+    assert simulation.migrations >= 50
+    (transfers,) = simulation.transfers
+    assert len(transfers.rows) == simulation.migrations
+    assert all(0 <= row.tick - row.approached for row in transfers.rows), "nobody unannounced"
+    assert {row.forced for row in transfers.rows} == {False}
 
 
 @pytest.mark.parametrize("vehicles", DENSITIES)

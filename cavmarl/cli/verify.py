@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 from rich import box
@@ -15,15 +15,16 @@ from cavmarl.cli.evaluate import progress_bar
 from cavmarl.cli.output import (
     Agents,
     Background,
-    Environment,
     JsonPath,
     PolicyName,
     Seed,
     Settings,
+    make_folder,
     parse_settings,
     say_difference,
     write_json,
 )
+from cavmarl.cli.verify_faults import check_campaign, print_campaign, print_figures
 from cavmarl.config import ZONE_LAYOUTS
 from cavmarl.errors import ConfigError
 
@@ -34,14 +35,23 @@ __all__ = ["verify"]
 
 
 def verify(
-    env: Environment,
+    env: Annotated[
+        str | None,
+        typer.Argument(
+            metavar="[ENV]",
+            help="Name, folder or map file of an environment; of a campaign, default: a busy grid.",
+        ),
+    ] = None,
     zones: Annotated[
         str | None,
         typer.Option(
-            metavar="K,K,…", help="Numbers of zones; default: 1,2,4,9, or what a zone file has."
+            metavar="K,K,…",
+            help="Numbers of zones; default: 1,2,4,9, or what a zone file has; of a campaign 4,9.",
         ),
     ] = None,
-    steps: Annotated[int, typer.Option(help="That are compared.")] = 200,
+    steps: Annotated[
+        int | None, typer.Option(help="That are compared; default: 200, of a campaign 40 a run.")
+    ] = None,
     seed: Seed = 0,
     layout: Annotated[
         str | None,
@@ -54,20 +64,49 @@ def verify(
     agents: Agents = None,
     background: Background = None,
     settings: Settings = None,
+    faults: Annotated[
+        str | None,
+        typer.Option(
+            metavar="PLAN",
+            help="JSON file of faults in the divided worlds, see docs/faults.md; `campaign`: "
+            "the whole matrix.",
+        ),
+    ] = None,
+    seeds: Annotated[
+        int, typer.Option(help="Of a campaign: runs in which anybody dies at any time.")
+    ] = 12,
+    check: Annotated[
+        bool, typer.Option("--check", help="Watch the invariants of ownership, too.")
+    ] = False,
+    journal: Annotated[
+        Path | None,
+        typer.Option(metavar="DIR", help="Folder for the journals of the divided worlds."),
+    ] = None,
     json_path: JsonPath = None,
 ) -> None:
     """Drive divided worlds beside the undivided one; exit code 1 and where one first differs."""
-    from cavmarl.evaluate.equivalence import verify_zones
-
     overrides = parse_settings(settings)
     counts = None if zones is None else _counts(zones)
     console = Console()
+    if faults == "campaign":
+        check_campaign(layout, worlds, journal)
+        named = {"population.agents": agents, "population.background": background}
+        overrides |= {key: value for key, value in named.items() if value is not None}
+        overrides |= {"zones.check": True} if check else {}
+        _campaign(console, env, counts, steps, seed, seeds, policy, overrides, json_path)
+        return
+    if env is None:
+        raise ConfigError("verify: name an environment; without one goes --faults campaign only")
+    if journal is not None:
+        make_folder(journal)
+    from cavmarl.evaluate.equivalence import verify_zones
+
     with progress_bar(console) as bar:
         task = bar.add_task(f"{policy} drives {env}, undivided and divided")
         found = verify_zones(
             env,
             counts,
-            steps=steps,
+            steps=200 if steps is None else steps,
             seed=seed,
             layout=layout,
             policy=policy,
@@ -75,10 +114,15 @@ def verify(
             agents=agents,
             background=background,
             overrides=overrides,
+            faults=faults,
+            check=check,
+            journals=journal,
             progress=lambda k, n: bar.update(task, completed=k, total=n),
         )
     write_json(json_path, found.to_dict())
     console.print(_table(found, seed))
+    if faults is not None:
+        print_figures(console, found)
     for result in found.results:
         if result.difference is not None:
             console.print(_sentence(result, found.worlds), markup=False, soft_wrap=True)
@@ -86,6 +130,38 @@ def verify(
         raise typer.Exit(1)
     hashes = ", ".join(found.state_hashes)
     console.print(f"state after tick {found.ticks}: {hashes}", highlight=False, soft_wrap=True)
+
+
+def _campaign(
+    console: Console,
+    env: str | None,
+    counts: list[int] | None,
+    steps: int | None,
+    seed: int,
+    seeds: int,
+    policy: str,
+    overrides: dict[str, Any],
+    json_path: Path | None,
+) -> None:
+    """The whole matrix of faults; exit code 1 if a run is not as it has to be."""
+    from cavmarl.evaluate.fault_campaign import run_campaign
+
+    with progress_bar(console) as bar:
+        task = bar.add_task("faults beside the undivided world")
+        campaign = run_campaign(
+            env,
+            counts,
+            steps=40 if steps is None else steps,
+            seed=seed,
+            seeds=seeds,
+            policy=policy,
+            overrides=overrides,
+            progress=lambda k, n: bar.update(task, completed=k, total=n),
+        )
+    write_json(json_path, campaign.to_dict())
+    print_campaign(console, campaign, seed)
+    if not campaign.holds:
+        raise typer.Exit(1)
 
 
 def _counts(text: str) -> list[int]:

@@ -7,7 +7,7 @@ every step the hashes of all worlds and everything that `step` returned.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cavmarl.config import MAX_ZONES, ZONE_FILE_SUFFIXES
-from cavmarl.errors import ConfigError, ZoneError
+from cavmarl.errors import ConfigError, ProtocolError, ZoneError
 from cavmarl.evaluate.determinism import check_steps
 from cavmarl.evaluate.differences import (
     Arrays,
@@ -25,9 +25,11 @@ from cavmarl.evaluate.differences import (
     snapshot,
     step_results,
 )
+from cavmarl.evaluate.fault_figures import FaultFigures, HandOverClock
 from cavmarl.kernels.zones import zones_of
 from cavmarl.policies import load_policy
 from cavmarl.roads.zone_file import read_zones
+from cavmarl.runtime.fault_plan import read_faults
 from cavmarl.seeds import check_seed
 from cavmarl.vector_env import CavVectorEnv, make_vec
 
@@ -47,6 +49,7 @@ class ZoneResult:
         vehicles: in all worlds, on average over the steps.
         world: the first that differs; None if all were equal.
         difference: in it; None if all were equal.
+        figures: hand-overs, and what faults did to them.
     """
 
     zones: int
@@ -55,6 +58,11 @@ class ZoneResult:
     vehicles: float
     world: int | None
     difference: Difference | None
+    figures: FaultFigures
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain values, for JSON."""
+        return asdict(replace(self, figures=FaultFigures())) | {"figures": self.figures.to_dict()}
 
 
 @dataclass(frozen=True)
@@ -84,7 +92,8 @@ class Equivalence:
 
     def to_dict(self) -> dict[str, Any]:
         """Plain values, for JSON."""
-        return {**asdict(self), "holds": self.holds}
+        results = [result.to_dict() for result in self.results]
+        return {**asdict(replace(self, results=())), "results": results, "holds": self.holds}
 
 
 def verify_zones(
@@ -99,6 +108,9 @@ def verify_zones(
     agents: int | None = None,
     background: int | None = None,
     overrides: Mapping[str, Any] | None = None,
+    faults: str | Path | None = None,
+    check: bool = False,
+    journals: Path | None = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> Equivalence:
     """Drive divided worlds beside the undivided ones and compare everything after each step.
@@ -114,10 +126,14 @@ def verify_zones(
         agents: shadows population.agents.
         background: shadows population.background.
         overrides: values for any other key; those of `zones` count for the divided worlds.
+        faults: what is done to the divided worlds, as `runtime.fault_plan.read_faults` takes it.
+        check: watch the invariants of ownership in the divided worlds.
+        journals: folder for the journals of the divided worlds, one for each number of zones.
         progress: called after each step with its number and `steps`.
 
     Raises:
         ConfigError: a number or a key that cannot work.
+        JournalError: a journal that cannot be begun.
         PolicyError: the policy cannot be loaded or does not fit.
         ZoneError: more zones than the map can hold, or a zone file of another number.
     """
@@ -125,9 +141,11 @@ def verify_zones(
     check_seed(seed)
     divided = dict(overrides or {})
     if layout is not None:
-        if "zones.layout" in divided:
-            raise ConfigError("zones.layout stands in overrides and is given as layout; use one")
-        divided["zones.layout"] = _layout(layout)
+        _shadow(divided, "zones.layout", _layout(layout), "layout")
+    if faults is not None:
+        _shadow(divided, "zones.faults", read_faults(str(faults)).to_json(), "faults")
+    if check:
+        divided["zones.check"] = True
     plain = {key: value for key, value in divided.items() if not key.startswith("zones.")}
 
     def run(count: int, settings: Mapping[str, Any]) -> _Run:
@@ -142,7 +160,10 @@ def verify_zones(
         return _Run(vec, policy, seed)
 
     whole = run(1, plain)
-    compared = [_Compared(run(count, divided)) for count in _counts(zones, divided)]
+    compared = [
+        _Compared(run(count, divided | _journal(journals, count)))
+        for count in _counts(zones, divided)
+    ]
     for step in range(steps + 1):
         if step > 0:
             whole.step()
@@ -161,6 +182,18 @@ def verify_zones(
         tuple(vec.state_hash(w) for w in range(worlds)),
         tuple(other.result() for other in compared),
     )
+
+
+def _shadow(settings: dict[str, Any], key: str, value: Any, name: str) -> None:
+    if key in settings:
+        raise ConfigError(f"{key} stands in overrides and is given as {name}; use one")
+    settings[key] = value
+
+
+def _journal(folder: Path | None, count: int) -> dict[str, str]:
+    if folder is None or count == 1:
+        return {}
+    return {"zones.journal": str(folder / f"zones-{count}.jsonl")}
 
 
 def _layout(layout: str | Path) -> str:
@@ -217,6 +250,9 @@ class _Compared:
 
     def __init__(self, run: _Run) -> None:
         self._run = run
+        self._clocks = [HandOverClock() for _ in run.vec.simulation.coordinators]
+        for coordinator, clock in zip(run.vec.simulation.coordinators, self._clocks, strict=True):
+            coordinator.watch(clock)
         self._steps = 0
         self._crossings = 0
         self._vehicles = 0
@@ -231,7 +267,7 @@ class _Compared:
         try:
             if step > 0:
                 self._run.step()
-        except ZoneError as error:
+        except (ProtocolError, ZoneError) as error:
             tick = int(whole.vec.simulation.ticks()[0])
             self._world = 0
             self.difference = Difference(step, tick, "error", None, "", (None, str(error)))
@@ -242,10 +278,15 @@ class _Compared:
 
     def result(self) -> ZoneResult:
         """What was found up to now."""
-        count = self._run.vec.simulation.partition.count
-        vehicles = self._vehicles / (self._steps + 1)
+        simulation = self._run.vec.simulation
         return ZoneResult(
-            count, self._steps, self._crossings, vehicles, self._world, self.difference
+            simulation.partition.count,
+            self._steps,
+            self._crossings,
+            self._vehicles / (self._steps + 1),
+            self._world,
+            self.difference,
+            FaultFigures.of(simulation, self._clocks),
         )
 
     def _compare(self, step: int, whole: _Run) -> None:

@@ -16,7 +16,8 @@ from cavmarl.kernels import inlined_kernel, kernel
 
 __all__ = ["Lists", "add", "forget", "lay_out", "make_lists"]
 
-BLOCK = 8
+BLOCK_BITS = 3
+BLOCK = 1 << BLOCK_BITS
 WORD = 8 * BLOCK
 
 
@@ -39,7 +40,9 @@ def forget(lists: Lists) -> None:
     """Make all lists empty."""
     for word in range(lists.words.size):
         if lists.words[word] != 0:
-            lists.bounds[word * WORD : (word + 1) * WORD] = 0
+            for k in range(word * WORD, (word + 1) * WORD):
+                lists.bounds[k, 0] = 0
+                lists.bounds[k, 1] = 0
             lists.words[word] = 0
 
 
@@ -47,7 +50,7 @@ def forget(lists: Lists) -> None:
 def add(lists: Lists, k: int) -> None:
     """One item more in list k."""
     lists.bounds[k, 1] += 1
-    lists.used[k // BLOCK] = True
+    lists.used[k >> BLOCK_BITS] = True
 
 
 @kernel

@@ -11,7 +11,7 @@ from collections import Counter
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from hashlib import blake2b
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from cavmarl.errors import ConfigError, MessageError
 from cavmarl.ownership.codec import decode, encode
@@ -45,8 +45,29 @@ class Rates:
 
     def __post_init__(self) -> None:
         for name in ("drop", "delay", "duplicate", "reorder", "corrupt", "refuse"):
-            if not 0.0 <= getattr(self, name) <= 1.0:
-                raise ConfigError(f"the rate of {name} is {getattr(self, name)}: not in [0, 1]")
+            check_rate(f"the rate of {name}", getattr(self, name), 1.0)
+        check_whole("longest_delay", self.longest_delay, 1)
+
+
+def check_rate(name: str, value: Any, most: float) -> None:
+    """See that a value is a probability up to `most`.
+
+    Raises:
+        ConfigError: it is not.
+    """
+    is_number = isinstance(value, int | float) and not isinstance(value, bool)
+    if not is_number or not 0.0 <= value <= most:
+        raise ConfigError(f"{name} is {value!r}: must be a number from 0 to {most:g}")
+
+
+def check_whole(name: str, value: Any, least: int) -> None:
+    """See that a value is a whole number, `least` or more.
+
+    Raises:
+        ConfigError: it is not.
+    """
+    if not isinstance(value, int) or isinstance(value, bool) or value < least:
+        raise ConfigError(f"{name} is {value!r}: must be a whole number, {least} or more")
 
 
 FAULTLESS = Rates()
@@ -60,16 +81,20 @@ class FaultPlan:
         seed: of all choices.
         rates: name of the kind (`"Prepare"`, `"Ack"`, …) → its rates; others have `otherwise`.
         until: the first phase in which nothing happens any more; None means never.
+        until_tick: the first tick whose messages nothing happens to any more; None means never.
     """
 
     seed: int = 0
     rates: Mapping[str, Rates] = field(default_factory=dict)
     otherwise: Rates = FAULTLESS
     until: int | None = None
+    until_tick: int | None = None
 
-    def of(self, kind: str, phase: int) -> Rates:
-        """The rates of a kind of message in a phase."""
+    def of(self, kind: str, phase: int, tick: int = 0) -> Rates:
+        """The rates of a kind of message in a phase, about a tick."""
         if self.until is not None and phase >= self.until:
+            return FAULTLESS
+        if self.until_tick is not None and tick >= self.until_tick:
             return FAULTLESS
         return self.rates.get(kind, self.otherwise)
 
@@ -137,7 +162,7 @@ class Network:
         place = (kind, message.episode, message.tick, sender, destination, self.phase)
         self._copies[place] += 1
         key = (*place, self._copies[place])
-        rates = self.plan.of(kind, self.phase)
+        rates = self.plan.of(kind, self.phase, message.tick)
         self.sent[kind] += 1
         if self._strikes(kind, key, "drop", rates.drop):
             return

@@ -6,7 +6,7 @@ is near a border, what stands in a row and how rows change hands is told and don
 
 from __future__ import annotations
 
-from collections import defaultdict
+from collections import Counter, defaultdict
 from collections.abc import Callable, Iterable, Sequence
 from typing import NamedTuple, Protocol
 
@@ -16,6 +16,7 @@ from cavmarl.ownership.endpoint import Endpoint
 from cavmarl.ownership.limits import Limits
 from cavmarl.ownership.messages import (
     COORDINATOR,
+    Begin,
     Birth,
     Message,
     Output,
@@ -26,6 +27,7 @@ from cavmarl.ownership.messages import (
 )
 from cavmarl.ownership.offers import Approach
 from cavmarl.ownership.reactions import Advance
+from cavmarl.ownership.safeguards import ALL_ON, Safeguards
 from cavmarl.ownership.transport import Delivery
 from cavmarl.runtime.journal import AnyJournal
 from cavmarl.runtime.post import DirectPost, Post
@@ -85,6 +87,7 @@ class Coordinator:
         post: carries the messages; None: directly.
         journal: takes the records; None: nobody keeps them.
         watchers: told of every record and delivery.
+        safeguards: remedies of the protocol; tests take one away.
 
     Attributes:
         directory: who owns what.
@@ -103,15 +106,18 @@ class Coordinator:
         post: Post | None = None,
         journal: AnyJournal | None = None,
         watchers: Sequence[Watcher] = (),
+        safeguards: Safeguards = ALL_ON,
     ) -> None:
-        self.directory = Directory(run, range(zones), states, limits)
+        self.directory = Directory(run, range(zones), states, limits, safeguards)
         self.endpoints: dict[int, Endpoint] = {}
         self.post: Post = DirectPost() if post is None else post
         self.switched = 0
         self._states = states
         self._limits = limits
+        self._safeguards = safeguards
         self.journal = journal
         self._watchers = tuple(watchers)
+        self._dropped: Counter[tuple[str, str]] = Counter()  # by those that have died since
         self._leases: dict[int, Advance] = {}
         self._births: list[Birth] = []
         self._gone: list[Removed] = []  # between two ticks
@@ -127,6 +133,17 @@ class Coordinator:
         """Whether a tick has been begun and is not committed."""
         return self.directory.table.plan is not None
 
+    def watch(self, watcher: Watcher) -> None:
+        """Tell one more of all that happens from now on."""
+        self._watchers = (*self._watchers, watcher)
+
+    def dropped(self) -> Counter[tuple[str, str]]:
+        """(kind, reason) → messages or entries that did not count, at any of the parties."""
+        total = self._dropped + self.directory.dropped
+        for endpoint in self.endpoints.values():
+            total += endpoint.dropped
+        return total
+
     # Between ticks
 
     def reset(self) -> None:
@@ -141,14 +158,18 @@ class Coordinator:
     def host(self, zone: int) -> None:
         """Give a zone to a new host, in this process."""
         output = self.directory.host(zone, worker=0)
-        self.endpoints[zone] = Endpoint(self.directory.hosting(zone), self._limits)
+        self.endpoints[zone] = Endpoint(
+            self.directory.hosting(zone), self._limits, self._safeguards
+        )
         self._leases.pop(zone, None)
         self._do(output)
 
     def fence(self, zone: int) -> Endpoint:
         """The zone's host is dead to us; it is returned."""
         self._do(self.directory.fence(zone))
-        return self.endpoints.pop(zone)
+        endpoint = self.endpoints.pop(zone)
+        self._dropped += endpoint.dropped
+        return endpoint
 
     def notes(self) -> tuple[tuple[Birth, ...], tuple[Removed, ...]]:
         """Who is new since the last BEGIN, and who is gone since the last COMMIT."""
@@ -216,7 +237,6 @@ class Coordinator:
             zone: done.rows if stored is None else stored(zone)
             for zone, done in self.directory.dones.items()
         }
-        self.switched += len(self.directory.table.planned.switches)
         self._do(self.directory.commit(told))
         self._gone = []
 
@@ -331,6 +351,7 @@ class Coordinator:
     def _write(self, output: Output) -> None:
         if self.journal is not None:
             self.journal.append(output.records)
+        self.switched += sum(len(r.switches) for r in output.records if isinstance(r, Begin))
         for watcher in self._watchers:
             watcher.logged(output.records)
 
@@ -342,7 +363,10 @@ class Coordinator:
         Then `resume` tells it what the store says, and `resend` the zones what was decided.
         """
         zones = tuple(self.directory.table.hosts)
-        self.directory = Directory.restore(records, zones, self._states, self._limits)
+        self._dropped += self.directory.dropped
+        self.directory = Directory.restore(
+            records, zones, self._states, self._limits, self._safeguards
+        )
         self.resume()
 
     def resend(self) -> None:

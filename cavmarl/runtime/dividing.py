@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from cavmarl.config import EnvConfig
+from cavmarl.config import EnvConfig, ZonesConfig
 from cavmarl.kernels.arrays import Outputs
 from cavmarl.kernels.motion import MAX_SPEED_MPS
 from cavmarl.ownership.distances import Distances, check_coverage, needed_overlap_m
-from cavmarl.ownership.limits import Limits
+from cavmarl.ownership.limits import DeadlinePolicy, Limits
 from cavmarl.roads.network import RoadNetwork
 from cavmarl.roads.zone_halo import zone_halo
 from cavmarl.roads.zones import ZonePartition
@@ -17,7 +17,7 @@ from cavmarl.shard.shard import Shard, make_zoned
 from cavmarl.shard.transfer import TransferCodec
 from cavmarl.traffic.native import NativeTraffic
 
-__all__ = ["divide", "halo_m"]
+__all__ = ["divide", "halo_m", "limits_of"]
 
 # Added to the halo, so that no rounding of its sum can make it too narrow.
 _ROUNDING_M = 1e-6
@@ -88,7 +88,7 @@ def halo_m(config: EnvConfig, reach_m: float, zones: int) -> float:
         approach_m = settings.approach_ticks * MAX_SPEED_MPS * dt
         check_coverage(
             Distances(approach_m, settings.hysteresis_m, wide_m),
-            Limits(deferral=settings.max_deferred_ticks),
+            limits_of(settings),
             reach_m=reach_m,
             v_max_mps=MAX_SPEED_MPS,
             dt_s=dt,
@@ -96,8 +96,20 @@ def halo_m(config: EnvConfig, reach_m: float, zones: int) -> float:
     return wide_m
 
 
+def limits_of(settings: ZonesConfig, schema: int = 1) -> Limits:
+    """Deadlines of the protocol; `schema` is the version of vehicles' states."""
+    grace = settings.grace_ticks
+    return Limits(
+        deferral=settings.max_deferred_ticks,
+        policy=DeadlinePolicy.EXTEND if grace else DeadlinePolicy.FORCE,
+        grace=grace,
+        backoff=settings.backoff_ticks,
+        schema=schema,
+    )
+
+
 def _needed_m(config: EnvConfig, reach_m: float) -> float:
-    limits = Limits(deferral=config.zones.max_deferred_ticks)
+    limits = limits_of(config.zones)
     needed_m = needed_overlap_m(
         reach_m, config.zones.hysteresis_m, limits, MAX_SPEED_MPS, config.clock.sim_dt_s
     )

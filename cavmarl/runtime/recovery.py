@@ -8,12 +8,13 @@ same rows, so it leads to the same ones.
 from __future__ import annotations
 
 import time
+from collections import Counter
 from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import numpy as np
 
-from cavmarl.errors import StoreError
+from cavmarl.errors import ProtocolError, StoreError, ZoneStepError
 from cavmarl.runtime.coordination import Coordination
 from cavmarl.runtime.faults import (
     CoordinatorDeath,
@@ -55,6 +56,8 @@ class Recovery:
         store: the committed state.
         phases: of the tick, in which somebody may die.
         crashes: who dies where.
+        repeats: new hosts that a zone may have for one tick, and new coordinators that may come to
+            the same point.
 
     Attributes:
         revivals: one for each death.
@@ -67,6 +70,7 @@ class Recovery:
         store: CommittedStore,
         phases: FaultyPhases,
         crashes: Crashes,
+        repeats: int,
     ) -> None:
         self.revivals: list[Revival] = []
         self._shards = tuple(shards)
@@ -74,13 +78,17 @@ class Recovery:
         self._store = store
         self._phases = phases
         self._crashes = crashes
+        self._repeats = repeats
+        self._deaths: Counter[int | str] = Counter()  # in the tick
 
     def run(self, tick: Callable[[], None]) -> None:
         """One tick, as often as it takes.
 
         Raises:
             ZoneStepError: every host of a zone dies of it.
+            ProtocolError: every coordinator dies of it.
         """
+        self._deaths.clear()
         coordinator = self._coordination.coordinators[0]
         self._crashes.tick = coordinator.tick + 1
         while True:
@@ -99,12 +107,14 @@ class Recovery:
         """Whether the tick has been committed all the same."""
         began = time.perf_counter()
         if isinstance(death, CoordinatorDeath):
+            self._count(death.point)
             self._lose_gate()
             is_done = self._restart()
             self._note(death.point, None, began)
             return is_done
         zones = death.zones if isinstance(death, StoreError) else (death.zone,)
         for zone in zones:
+            self._count(zone)
             self._lose(self._shards[zone])
         self._coordination.load()
         coordinator = self._coordination.coordinators[0]
@@ -117,6 +127,18 @@ class Recovery:
             point = death.point if isinstance(death, ZoneDeath) else "wrong rows"
             self._note(point, zone, began)
         return False
+
+    def _count(self, dead: int | str) -> None:
+        """Note that the host of a zone has died, or the coordinator at a point."""
+        self._deaths[dead] += 1
+        if self._deaths[dead] <= self._repeats:
+            return
+        tick, times = self._crashes.tick, self._deaths[dead]
+        if isinstance(dead, int):
+            raise ZoneStepError(dead, tick, times)
+        raise ProtocolError(
+            f"the coordinator could not reach tick {tick}: {times} of them died at '{dead}'"
+        )
 
     def _restart(self) -> bool:
         """A new coordinator reads the journal; whether the tick stands in it as committed."""

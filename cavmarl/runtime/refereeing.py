@@ -13,18 +13,15 @@ from cavmarl.config import ZonesConfig
 from cavmarl.errors import ConfigError
 from cavmarl.ownership.limits import Limits
 from cavmarl.ownership.messages import RUN_BYTES
+from cavmarl.ownership.safeguards import ALL_ON, Safeguards
 from cavmarl.ownership.transfers import TransferLog
 from cavmarl.ownership.transport import Network
 from cavmarl.runtime.coordination import Coordination, RowStates
-from cavmarl.runtime.coordinator import Coordinator, Watcher
+from cavmarl.runtime.coordinator import Coordinator
+from cavmarl.runtime.dividing import limits_of
 from cavmarl.runtime.division import Division
-from cavmarl.runtime.faults import (
-    Crashes,
-    Faults,
-    FaultyCoordinator,
-    FaultyPhases,
-    read_faults,
-)
+from cavmarl.runtime.fault_plan import Faults, read_faults
+from cavmarl.runtime.faults import Crashes, FaultyCoordinator, FaultyPhases
 from cavmarl.runtime.journal import Journal, MemoryJournal
 from cavmarl.runtime.monitor import Monitor, OwnersOnRecord
 from cavmarl.runtime.recovery import Recovery
@@ -57,6 +54,7 @@ def make_refereeing(
     division: Division,
     shared: Callable[[], Iterable[NDArray[Any]]],
     dt: float,
+    safeguards: Safeguards = ALL_ON,
 ) -> Refereeing:
     """The coordinators of a divided world.
 
@@ -66,14 +64,17 @@ def make_refereeing(
         division: of them.
         shared: the arrays beside theirs that a tick changes.
         dt: seconds of a tick.
+        safeguards: remedies of the protocol; tests take one away.
 
     Raises:
         ConfigError: faults that cannot be, or deaths in several worlds at once.
         JournalError: a journal cannot be begun.
     """
-    limits = Limits(deferral=settings.max_deferred_ticks, schema=division.codec.schema)
+    limits = limits_of(settings, division.codec.schema)
     faults = read_faults(settings.faults) if settings.faults else None
     deaths = faults is not None and faults.may_crash
+    if faults is not None:
+        faults.check_zones(division.count)
     if deaths and division.num_worlds > 1:
         raise ConfigError(
             f"zones.faults: hosts die in one world at a time, not in {division.num_worlds}; "
@@ -82,23 +83,21 @@ def make_refereeing(
     crashes = Crashes(faults) if faults is not None and deaths else None
     states = [RowStates(division, w) for w in range(division.num_worlds)]
     transfers = tuple(TransferLog(limits.lifetime, known.borders) for known in states)
-    records = [OwnersOnRecord(division.count, limits) for _ in states] if settings.check else []
     coordinators = [
         _coordinator(
-            settings, w, division, states[w], limits,
-            (transfers[w], *records[w : w + 1]), faults, crashes,
+            settings, w, division, states[w], limits, transfers[w], faults, crashes, safeguards
         )
         for w in range(division.num_worlds)
-    ]  # fmt: skip
+    ]
     digests = RowDigests() if settings.journal or deaths else None
-    monitor = Monitor(division, records, dt) if settings.check else None
+    monitor = _monitor(division, coordinators, limits, dt) if settings.check else None
     if crashes is None:
         coordination = Coordination(division, coordinators, states, digests, monitor=monitor)
         return Refereeing(coordination, transfers)
-    store = CommittedStore(shards, shared)
+    store = CommittedStore(shards, shared, safeguards)
     phases = FaultyPhases(shards, crashes)
     coordination = Coordination(division, coordinators, states, digests, store, monitor)
-    recovery = Recovery(shards, coordination, store, phases, crashes)
+    recovery = Recovery(shards, coordination, store, phases, crashes, limits.repeats)
     return Refereeing(coordination, transfers, recovery, phases)
 
 
@@ -108,9 +107,10 @@ def _coordinator(
     division: Division,
     states: RowStates,
     limits: Limits,
-    watchers: tuple[Watcher, ...],
+    transfers: TransferLog,
     faults: Faults | None,
     crashes: Crashes | None,
+    safeguards: Safeguards,
 ) -> Coordinator:
     """Of one world."""
     journal: Journal | MemoryJournal | None = None
@@ -125,11 +125,22 @@ def _coordinator(
         limits,
         None if faults is None else Network(faults.plan()),
         journal,
-        watchers,
+        (transfers,),
+        safeguards,
     )
     if crashes is None:
         return Coordinator(*arguments)
     return FaultyCoordinator(*arguments, crashes=crashes)
+
+
+def _monitor(
+    division: Division, coordinators: Sequence[Coordinator], limits: Limits, dt: float
+) -> Monitor:
+    """What looks at all worlds, and is told what their coordinators do."""
+    records = [OwnersOnRecord(division.count, limits) for _ in coordinators]
+    for coordinator, record in zip(coordinators, records, strict=True):
+        coordinator.watch(record)
+    return Monitor(division, records, dt)
 
 
 def _path(journal: str, w: int, num_worlds: int) -> Path:

@@ -34,6 +34,7 @@ from cavmarl.roads.zones import ZonePartition
 from cavmarl.runtime.commons import Commons
 from cavmarl.runtime.compilation import first_compilation
 from cavmarl.runtime.coordination import Coordination
+from cavmarl.runtime.coordinator import Coordinator
 from cavmarl.runtime.dividing import divide
 from cavmarl.runtime.division import ZoneLoads
 from cavmarl.runtime.executor import Executor, SerialExecutor
@@ -233,6 +234,11 @@ class Simulation:
     def migrations(self) -> int:
         """How many vehicles have changed their owner since the worlds were made."""
         return 0 if self._coordination is None else self._coordination.switched
+
+    @property
+    def coordinators(self) -> tuple[Coordinator, ...]:
+        """Who says who owns what, one a world; none where all is one zone."""
+        return () if self._coordination is None else self._coordination.coordinators
 
     @property
     def worlds(self) -> Worlds:

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from cavmarl.errors import ProtocolError
 from cavmarl.ownership.messages import Birth, Removed
+from cavmarl.ownership.safeguards import ALL_ON, Safeguards
 from cavmarl.shard.shard import COMMON, Shard
 
 __all__ = ["COUNTS", "CommittedStore", "Notes"]
@@ -43,9 +44,16 @@ class CommittedStore:
     Args:
         shards: whose rows are kept.
         shared: the arrays beside theirs that a tick changes, as they are now.
+        safeguards: remedies of the protocol; without `double_buffer` there is one copy only.
     """
 
-    def __init__(self, shards: Sequence[Shard], shared: Callable[[], Iterable[Array]]) -> None:
+    def __init__(
+        self,
+        shards: Sequence[Shard],
+        shared: Callable[[], Iterable[Array]],
+        safeguards: Safeguards = ALL_ON,
+    ) -> None:
+        self._has_two = safeguards.double_buffer
         self._shards = tuple(shards)
         self._others = shared
         self._committed: _Image | None = None
@@ -65,6 +73,8 @@ class CommittedStore:
             rows.append([worlds.rows[w, :num].copy() for w, num in enumerate(worlds.num_rows)])
         shared = [array.copy() for array in self.shared()]
         self._next = _Image(counts, rows, shared, notes)
+        if not self._has_two:
+            self._committed = self._next
 
     def flip(self) -> None:
         """Make what was written last the truth.

@@ -131,6 +131,7 @@ class Shard:
         self._num_through = 0
         self._call_advance = repeated(advance)
         self._call_resolve = repeated(resolve)
+        self._call_choose_goals = repeated(choose_goals)
 
     def detect(self) -> None:
         """Note when owned bodies were over the detectors of actuated signals."""
@@ -181,7 +182,7 @@ class Shard:
     def choose_goals(self, demand: Demand, num_goals: int, gate: Gate) -> None:
         """Give the vehicles of `next_rows` that need it another goal."""
         dt = self._config.clock.sim_dt_s
-        choose_goals(demand, self._roads, self._travel, num_goals, gate, self.worlds, dt)
+        self._call_choose_goals(demand, self._roads, self._travel, num_goals, gate, self.worlds, dt)
 
     def leave(self, gate: Gate) -> None:
         """Hand the background vehicles of `next_rows` that have arrived to the gate."""

@@ -9,16 +9,18 @@ from numpy.typing import NDArray
 
 from cavmarl.kernels import codes
 from cavmarl.kernels.arrays import Gate, Worlds
-from cavmarl.kernels.exchange import take_ghosts, take_own
+from cavmarl.kernels.exchange import exchange, take_own
 from cavmarl.kernels.leaving import drop_ghosts, leave
+from cavmarl.roads.zone_halo import zone_halo
 from cavmarl.roads.zones import ZonePartition
-from cavmarl.shard.shard import make_worlds
+from cavmarl.shard.shard import make_worlds, make_zoned
 from cavmarl.shard.vehicles import VEHICLE
 from cavmarl.traffic.departures import make_gate
 from tests.kernels.builders import vehicles
 from tests.kernels.traffic import network
+from tests.kernels.zoned import SIDE, exchanged, ghosts_of
 from tests.naive import zones as naive
-from tests.partitions import partitions, places
+from tests.partitions import four, partitions, places
 
 TICKS_PER_STEP = 2
 
@@ -51,12 +53,55 @@ def test_each_vehicle_is_taken_by_one_zone_in_the_given_order(
         assert (rows[:found] == everybody[expected]).all()
 
 
-def test_ghosts_are_copied_behind_the_rows_that_are_there() -> None:
-    source, rows = cars(5), np.zeros(6, VEHICLE)
-    rows["id"] = -1
-    take_ghosts(source, np.array([4, 0, 2, 3], np.int32), 1, 3, rows, 2)
-    assert ids(rows) == [-1, -1, 100, 102, -1, -1]
-    assert rows[3] == source[2]
+def spread(data: st.DataObject, partition: ZonePartition) -> list[NDArray[np.void]]:
+    """Rows of each zone, anywhere: a transfer may be late."""
+    parts, next_id = [], 0
+    for _ in range(partition.count):
+        xy = data.draw(places(partition, size=4))
+        rows = vehicles([(x, y, 0.0) for x, y in xy.tolist()])
+        rows["id"] = next_id + np.arange(len(rows))
+        rows["speed"] = 0.5 * rows["id"]
+        next_id += len(rows)
+        parts.append(rows)
+    return parts
+
+
+@given(st.data(), partitions(3), st.sampled_from([0.0, 7.5, 30.0, 1000.0]), st.sampled_from([0, 5]))
+def test_exchange_equals_twin(
+    data: st.DataObject, partition: ZonePartition, halo_m: float, touching_m: float
+) -> None:
+    parts = spread(data, partition)
+    zoned = exchanged(partition, halo_m, parts, touching_m)
+    rects = partition.reaching
+    for zone, own in enumerate(parts):
+        others = [row for other, part in enumerate(parts) for row in part if other != zone]
+        ghosts = ghosts_of(zoned, zone)
+        assert (zoned.rows[SIDE, zone, 0, : len(own)] == own).all()
+        expected = naive.within(rects[zone], halo_m, others)
+        assert sorted(ids(ghosts)) == sorted(row["id"] for row in expected)
+        for ghost in ghosts:
+            assert ghost == next(row for row in others if row["id"] == ghost["id"])
+        near = zoned.num_near[zone, 0] - len(own)
+        touching = naive.within(rects[zone], min(halo_m, touching_m), others)
+        assert sorted(ids(ghosts[:near])) == sorted(row["id"] for row in touching)
+        border = own[zoned.border[zone, 0, : zoned.num_border[zone, 0]]]
+        assert len(set(ids(border))) == len(border)
+        seen = {int(i) for z in range(partition.count) for i in ghosts_of(zoned, z)["id"]}
+        assert seen & set(ids(own)) <= set(ids(border))
+
+
+def test_a_world_of_one_zone_has_no_ghosts() -> None:
+    whole = ZonePartition((0.0, 0.0, 9.0, 9.0), np.array([[0.0, 0.0, 9.0, 9.0]]))
+    zoned = exchanged(whole, 5.0, [cars(3)], touching_m=5.0)
+    assert zoned.num_rows.tolist() == zoned.num_near.tolist() == [[3]]
+
+
+def test_other_worlds_keep_their_ghosts() -> None:
+    halo = zone_halo(four(), 5.0)
+    zoned = make_zoned(4, 3, 2)
+    zoned.num_rows[:] = 2
+    exchange(four().arrays, halo, 1.0, zoned, SIDE, 1, 2)
+    assert zoned.num_rows.tolist() == [[2, 0, 2]] * 4
 
 
 def world(rows: NDArray[np.void], owned: int) -> tuple[Worlds, Gate]:

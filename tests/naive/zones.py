@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,6 +22,18 @@ def distance(rect: NDArray[np.float64], x: float, y: float) -> float:
     """From a place to the nearest point of a rectangle."""
     min_x, min_y, max_x, max_y = rect.tolist()
     return math.hypot(x - min(max(x, min_x), max_x), y - min(max(y, min_y), max_y))
+
+
+def within(rect: NDArray[np.float64], distance_m: float, rows: Sequence[np.void]) -> list[np.void]:
+    """The rows that lie within a distance of a rectangle."""
+    found = []
+    for row in rows:
+        dx = max(rect[0] - row["x"], row["x"] - rect[2], 0.0)
+        dy = max(rect[1] - row["y"], row["y"] - rect[3], 0.0)
+        # Squares, as the kernel: a root would round once more.
+        if dx * dx + dy * dy <= distance_m * distance_m:
+            found.append(row)
+    return found
 
 
 def published(

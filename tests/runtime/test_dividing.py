@@ -8,7 +8,7 @@ from cavmarl.errors import CoverageError
 from cavmarl.kernels.motion import MAX_SPEED_MPS
 from cavmarl.registry import load_config
 from cavmarl.runtime.dividing import halo_m
-from tests.driving import make_simulation
+from tests.driving import drive, make_simulation, start
 
 SETTINGS = {"clock.sim_dt_s": 0.1, "zones.count": 4, "zones.hysteresis_m": 3.0}
 
@@ -36,3 +36,31 @@ def test_a_world_is_not_made_that_could_not_be_exact() -> None:
         make_simulation("grid4x4", **settings)
     settings["overrides"] = SETTINGS | {"zones.halo_m": 5000.0}
     assert make_simulation("grid4x4", **settings).zone_loads().halo_m == 5000.0
+
+
+def test_who_may_stay_longer_is_seen_from_farther_away() -> None:
+    config = load_config("grid4x4", overrides=SETTINGS)[0]
+    patient = load_config("grid4x4", overrides=SETTINGS | {"zones.grace_ticks": 5})[0]
+    more_m = halo_m(patient, 100.0, 4) - halo_m(config, 100.0, 4)
+    assert more_m == pytest.approx(5 * MAX_SPEED_MPS * 0.1)
+
+
+def test_after_the_grace_the_change_is_forced() -> None:
+    lost = '{"messages": {"Prepare": {"drop": 1.0}}}'
+    waited: set[int] = set()
+    for grace in (0, 3):
+        simulation = make_simulation(
+            "grid4x4",
+            mode="seats",
+            agents=4,
+            background=60,
+            overrides=SETTINGS | {"zones.grace_ticks": grace, "zones.faults": lost},
+        )
+        start(simulation, seed=1)
+        for _ in range(40):
+            drive(simulation)
+        (transfers,) = simulation.transfers
+        assert transfers.rows
+        assert all(row.forced for row in transfers.rows)
+        waited |= {row.waited for row in transfers.rows}
+    assert waited == {2, 5}

@@ -2,9 +2,9 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from cavmarl.roads.zone_coverage import Coverage
 
 from cavmarl.kernels.zones import squared_distance
+from cavmarl.roads.zone_halo import Coverage
 from cavmarl.runtime.simulation import Simulation
 from cavmarl.runtime.zone_view import TransferInFlight, view_zones
 from tests.driving import drive, make_simulation, start
