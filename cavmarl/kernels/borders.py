@@ -20,7 +20,8 @@ NEAR = np.dtype(
         ("row", np.int64),  # where the owner keeps it
         ("target", np.int64),  # zone that it is in, or will be in
         ("crossed", np.bool_),  # it is further than the hysteresis outside of its owner's zone
-        ("depth_m", np.float64),  # how far outside it is; 0 inside
+        ("depth_m", np.float64),  # how far outside of its owner's zone; inside, less than 0: how
+        # far it has to go to the target
     ],
     align=True,
 )
@@ -106,6 +107,8 @@ def _tell_of(
     if squared_distance(rects, zone, then_x, then_y) > limit:
         there = zone_of(zones, then_x, then_y)
         if there != here:
+            if squared == 0.0:
+                squared = -squared_distance(rects, there, x, y)
             _note(out[found], row["id"], zone, i, there, False, squared)
             found += 1
     return found
@@ -120,7 +123,7 @@ def _note(
     entry["row"] = row
     entry["target"] = target
     entry["crossed"] = crossed
-    entry["depth_m"] = math.sqrt(squared)
+    entry["depth_m"] = math.copysign(math.sqrt(abs(squared)), squared)
 
 
 @kernel

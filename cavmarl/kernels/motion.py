@@ -29,7 +29,14 @@ from cavmarl.kernels.stopping import make_stop
 from cavmarl.kernels.tracking import locate, side_lane
 from cavmarl.kernels.ways import next_step, own_step, way_left
 
-__all__ = ["ARRIVE_M", "MAX_SPEED_MPS", "move_agent", "move_background", "place_on_lane"]
+__all__ = [
+    "ARRIVE_M",
+    "LATERAL_MPS",
+    "MAX_SPEED_MPS",
+    "move_agent",
+    "move_background",
+    "place_on_lane",
+]
 
 LATERAL_MPS = 1.4  # fastest sideways motion of a lane change
 LATERAL_RATIO = 0.35  # and no faster than this share of the speed,

@@ -12,8 +12,10 @@ from cavmarl.kernels.arrays import Gate
 from cavmarl.kernels.zones import zones_of
 from cavmarl.runtime.coordinator import Coordinator, Near
 from cavmarl.runtime.division import Division
+from cavmarl.runtime.monitor import Monitor
 from cavmarl.runtime.row_digests import RowDigests
 from cavmarl.runtime.store import CommittedStore
+from cavmarl.runtime.surroundings import NearBorders
 from cavmarl.runtime.zone_view import TransferInFlight
 
 __all__ = ["Coordination", "RowStates"]
@@ -25,9 +27,13 @@ class RowStates:
     Args:
         division: of all worlds.
         world: which one.
+
+    Attributes:
+        borders: who was near a border when the tick began.
     """
 
     def __init__(self, division: Division, world: int) -> None:
+        self.borders = NearBorders()
         self._division = division
         self._world = world
         self._known: dict[int, bytes] = {}
@@ -62,6 +68,7 @@ class Coordination:
         states: of the vehicles of each world, as the coordinators read them.
         digests: of zones' rows; None: nobody asks for them.
         store: keeps what is committed; None: nobody can die apart from the others.
+        monitor: looks at every tick that is committed; None: nobody does.
     """
 
     def __init__(
@@ -71,12 +78,14 @@ class Coordination:
         states: Sequence[RowStates],
         digests: RowDigests | None = None,
         store: CommittedStore | None = None,
+        monitor: Monitor | None = None,
     ) -> None:
         self.coordinators = tuple(coordinators)
         self._division = division
         self._states = tuple(states)
         self._digests = digests
         self._store = store
+        self._monitor = monitor
         # Worlds whose rows have changed since their ghosts were renewed.
         self._stirred = [True] * len(self.coordinators)
 
@@ -92,6 +101,8 @@ class Coordination:
                 coordinator.reset()
                 coordinator.entered(self._division.owners(w))
                 self._stirred[w] = True
+                if self._monitor is not None:
+                    self._monitor.begin(w, coordinator.notes()[0])
 
     def begin(self) -> None:
         """Lease the next tick, and hand over whose owner changes."""
@@ -99,6 +110,7 @@ class Coordination:
             self._states[w].forget()
             near = self._division.near(w, self._stirred[w])
             self._stirred[w] = False
+            self._states[w].borders.near = near
             rows = {entry.vehicle: entry.row for entry in near}
             entries = coordinator.begin(near, self._states[w].near)
             for switch, _ in entries:
@@ -114,6 +126,17 @@ class Coordination:
             coordinator.end(self._live(w), self._stored(w))
         if self._store is not None:
             self._store.flip()
+        self.check()
+
+    def check(self) -> None:
+        """Look whether the invariants hold in the tick that has been committed.
+
+        Raises:
+            InvariantError: one does not.
+        """
+        if self._monitor is not None:
+            for w, coordinator in enumerate(self.coordinators):
+                self._monitor.end(w, coordinator.notes()[0])
 
     def save(self) -> None:
         """What has changed between two ticks is committed."""

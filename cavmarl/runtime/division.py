@@ -204,6 +204,35 @@ class Division:
         rows: NDArray[np.void] = worlds.rows[w, : worlds.num_owned[w]]
         return rows
 
+    def ghosts(self, w: int, zone: int) -> NDArray[np.void]:
+        """VEHICLE (n,), the committed copies that a zone has of others' vehicles.
+
+        A view that cannot be written: nobody but its owner changes a vehicle.
+        """
+        worlds = self._shards[zone].worlds
+        rows: NDArray[np.void] = worlds.rows[w, worlds.num_owned[w] : worlds.num_rows[w]]
+        rows.flags.writeable = False
+        return rows
+
+    def ticks(self, w: int) -> list[int]:
+        """What the zones' clocks say: ticks since the world's reset."""
+        return [shard.worlds.ticks.item(w) for shard in self._shards]
+
+    @property
+    def zoned(self) -> Zoned:
+        """The rows of all zones."""
+        return self._zoned
+
+    @property
+    def halo(self) -> Halo:
+        """How far each zone sees over its borders."""
+        return self._halo
+
+    @property
+    def side(self) -> int:
+        """On which side of `zoned.rows` the committed rows are."""
+        return self._side(self._shards[0].worlds.rows)
+
     def owners(self, w: int) -> list[tuple[int, int]]:
         """(id, zone) of all vehicles of a world."""
         return [

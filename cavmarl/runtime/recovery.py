@@ -148,6 +148,8 @@ class Recovery:
             self._store.flip()
         self._coordination.load()
         coordinator.resend()
+        if is_done:
+            self._coordination.check()
         return is_done
 
     def _lose(self, shard: Shard) -> None:

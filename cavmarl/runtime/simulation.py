@@ -148,7 +148,11 @@ class Simulation:
     def _divide(self) -> None:
         """Let coordinators say who owns what; nobody asks where all is one zone."""
         refereeing = make_refereeing(
-            self.config.zones, self._shards, self._division, self._shared_arrays
+            self.config.zones,
+            self._shards,
+            self._division,
+            self._shared_arrays,
+            self.config.clock.sim_dt_s,
         )
         self._coordination = refereeing.coordination
         self._recovery = refereeing.recovery
@@ -218,6 +222,13 @@ class Simulation:
         halo_m, coordination = self.zone_loads().halo_m, self._coordination
         transfers = () if coordination is None else coordination.in_flight(world)
         return view_zones(self._shards, self.partition, halo_m, world, transfers)
+
+    def ghosts(self, zone: int, world: int = 0) -> NDArray[np.void]:
+        """What a zone sees of other zones' vehicles: VEHICLE (n,), a view that cannot be written.
+
+        It shows the present tick, until the next one.
+        """
+        return self._division.ghosts(world, zone)
 
     @property
     def migrations(self) -> int:
