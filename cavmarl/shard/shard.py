@@ -47,6 +47,7 @@ __all__ = ["Commands", "Shard", "make_worlds"]
 CELL_M = 25.0  # of the spatial index over vehicles
 # Fields of `Worlds` that the shards of one world have in common.
 COMMON = ("ticks", "keys", "signal_phase", "controllers", "detected_s", "pending")
+TICKS_IN_ORDER = 8  # for so long rows that have been put in the order of the lanes nearly stay so
 SUGGESTED_HORIZON_S = 1.0  # in which a suggested target speed is to be reached
 
 
@@ -118,6 +119,7 @@ class Shard:
             config.clock.control_latency_ticks,
             common,
         )
+        self._spare_rows = np.zeros_like(self.worlds.rows)
         self.outputs = outputs
         self._target_speeds = np.array(config.action.target_speeds_mps)
         self._discrete = config.action.kind == "discrete"
@@ -148,6 +150,9 @@ class Shard:
     def advance(self, commands: Commands) -> None:
         """Decide every control from the committed rows and move the owned ones into `next_rows`."""
         action = self._config.action
+        in_place = bool(self.worlds.ticks[0] % TICKS_IN_ORDER)
+        if not in_place:
+            self.worlds = self.worlds._replace(next_rows=self._spare_rows)
         advance(
             self._roads,
             self._plans,
@@ -160,6 +165,7 @@ class Shard:
             action.acceleration_mps2,
             action.steering_rad,
             self._config.clock.sim_dt_s,
+            in_place,
         )
 
     def resolve(self) -> None:
@@ -211,7 +217,9 @@ class Shard:
     def commit(self) -> None:
         """Make `next_rows` the committed state."""
         worlds = self.worlds
-        self.worlds = worlds._replace(rows=worlds.next_rows, next_rows=worlds.rows)
+        if worlds.next_rows is not worlds.rows:
+            self._spare_rows = worlds.rows
+            self.worlds = worlds._replace(rows=worlds.next_rows)
 
     def sense(self, chosen: NDArray[np.bool_]) -> None:
         """Write observations and terms of the chosen worlds' owned agents into `outputs`."""
@@ -277,9 +285,10 @@ def make_worlds(
     common (ticks, keys, signals and what detectors saw) are the arrays of `common`, if it is given.
     """
     shape = (num_worlds, capacity)
+    rows = np.zeros(shape, dtype=VEHICLE)
     worlds = Worlds(
-        rows=np.zeros(shape, dtype=VEHICLE),
-        next_rows=np.zeros(shape, dtype=VEHICLE),
+        rows=rows,
+        next_rows=rows,
         num_owned=np.zeros(num_worlds, dtype=np.int64),
         num_rows=np.zeros(num_worlds, dtype=np.int64),
         ticks=np.zeros(num_worlds, dtype=np.int64),
