@@ -31,7 +31,7 @@ from cavmarl.kernels.junctions import STOP_SIGN_S
 from cavmarl.kernels.lane_choice import needed_change
 from cavmarl.kernels.lanes import index_lanes
 from cavmarl.kernels.motion import move_agent, move_background
-from cavmarl.kernels.neighbors import Grid, fill_grid
+from cavmarl.kernels.neighbors import Grid
 from cavmarl.kernels.scalars import clamp
 from cavmarl.kernels.steering import nearest_speed, steer_to_lane, take_meta_action
 from cavmarl.kernels.ways import own_step
@@ -250,7 +250,7 @@ def resolve(
         worlds: events and hit of the owned next_rows are written; num_contacts rises by one for
             each vehicle when it begins to touch another.
         scratch: room.
-        grid: spatial index over the vehicles of one world, filled here.
+        grid: spatial index over the vehicles of one world, filled here as far as it is needed.
         rect: min_x, min_y, max_x, max_y of the shard's zone in m.
         touching_m: ghosts further outside than this touch none of its vehicles.
     """
@@ -258,8 +258,7 @@ def resolve(
         rows = worlds.next_rows[w]
         owned = worlds.num_owned[w]
         num = _nearest_first(rows, owned, worlds.num_rows[w], rect, touching_m, scratch.spare)
-        fill_grid(rows, num, grid)
-        touch = find_contacts(num, grid, scratch.hit)
+        touch = find_contacts(rows, num, grid, scratch.hit)
         if not touch and worlds.num_touching[w] == 0:
             continue
         for i in range(worlds.num_owned[w]):
