@@ -69,6 +69,7 @@ class Travel(NamedTuple):
     first_detour: int  # PLAN row of the first goal of demand vehicles that take another way
     begin_s: float  # the clock of the demand at tick 0
     view_m: float  # how far anybody looks for others along the road, at most VIEW_M
+    see_m: float  # how far before a line its centre is when anybody first asks about the junction
 
 
 class Worlds(NamedTuple):
@@ -103,7 +104,7 @@ class Zoned(NamedTuple):
     num_owned: NDArray[np.int64]  # (k, W)
     num_rows: NDArray[np.int64]  # (k, W)
     num_near: NDArray[np.int64]  # (k, W)
-    border: NDArray[np.int32]  # (k, W, C) owned rows that other zones see, rising
+    border: NDArray[np.int32]  # (k, W, C) owned rows that are noted at a border, rising
     num_border: NDArray[np.int64]  # (k, W)
 
 

@@ -23,6 +23,8 @@ from cavmarl.shard.shard import Shard
 
 __all__ = ["Division", "ZoneLoads"]
 
+BORDER_M = 0.0  # whoever is so near another zone is looked at by `migrate`: who lies in one
+
 
 class ZoneLoads(NamedTuple):
     """What the zones of W worlds hold.
@@ -98,7 +100,14 @@ class Division:
     def _exchange(self, rows: NDArray[np.void], first: int, last: int) -> None:
         """Renew the ghosts of some worlds; `rows` are the first shard's rows or next ones."""
         self._call_exchange(
-            self._zones, self._halo, self._touching_m, self._zoned, self._side(rows), first, last
+            self._zones,
+            self._halo,
+            self._touching_m,
+            BORDER_M,
+            self._zoned,
+            self._side(rows),
+            first,
+            last,
         )
 
     def _side(self, rows: NDArray[np.void]) -> int:
