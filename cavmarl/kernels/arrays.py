@@ -75,7 +75,8 @@ class Travel(NamedTuple):
 class Worlds(NamedTuple):
     """A shard's part of W worlds: the vehicles and signals that a tick reads and writes.
 
-    `rows` is the committed state of the tick, `next_rows` the room for the one after; they swap.
+    `rows` is the committed state of the tick, `next_rows` what `advance` makes of it: the same array,
+    but in the ticks that put rows in order.
     """
 
     rows: NDArray[np.void]  # VEHICLE (W, C)

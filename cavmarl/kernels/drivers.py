@@ -309,7 +309,8 @@ def _road_ahead(
         limit = ahead["speed_mps"] * row["speed_factor"]
         if steered:
             allowed = min(allowed, _bend_speed(roads, lane, distance))
-        allowed = min(allowed, _slowing_to(kind, limit, distance, speed, dt))
+        if limit < allowed:
+            allowed = min(allowed, _slowing_to(kind, limit, distance, speed, dt))
         j = last_on(scratch, lane, row["id"], distance, travel.view_m)
         if j >= 0:
             leader = scratch.entries[j]
@@ -421,9 +422,9 @@ def decide(
         if row["side_lane"] >= 0:
             press = max(press, _beside(roads, travel, kind, row, row["side_lane"], scratch))
         needed = needed_change(roads, travel, row, scratch.step[i])
-        own_wish = wish(kind, speed, allowed, press)
         change = 0
         if thinks_of_lanes(row, needed, tick, dt):
+            own_wish = wish(kind, speed, allowed, press)
             change = choose_lane(roads, travel, rows, i, tick, needed, own_wish, scratch)
         if change != 0 and driver == DRIVER_AGENT:
             # A steered vehicle on its way into a neighbour lane still minds its own lane, to the

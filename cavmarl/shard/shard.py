@@ -50,6 +50,7 @@ __all__ = ["Commands", "Shard", "make_worlds", "make_zoned"]
 CELL_M = 25.0  # of the spatial index over vehicles
 # Fields of `Worlds` that the shards of one world have in common.
 COMMON = ("ticks", "keys", "signal_phase", "controllers", "detected_s", "pending")
+TICKS_IN_ORDER = 8  # for so long rows that have been put in the order of the lanes nearly stay so
 SUGGESTED_HORIZON_S = 1.0  # in which a suggested target speed is to be reached
 
 
@@ -124,6 +125,7 @@ class Shard:
             zone,
             None if first is None else first.worlds,
         )
+        self._spare_rows = zoned.rows[1, zone]
         self.outputs = outputs
         self._target_speeds = np.array(config.action.target_speeds_mps)
         self._discrete = config.action.kind == "discrete"
@@ -161,6 +163,9 @@ class Shard:
         action = self._config.action
         if self._controls.size:
             np.copyto(self._controls, commands.controls)
+        in_place = bool(self.worlds.ticks[0] % TICKS_IN_ORDER)
+        if not in_place:
+            self.worlds = self.worlds._replace(next_rows=self._spare_rows)
         self._num_through = self._call_advance(
             self._roads,
             self._plans,
@@ -173,6 +178,7 @@ class Shard:
             action.acceleration_mps2,
             action.steering_rad,
             self._config.clock.sim_dt_s,
+            in_place,
         )
 
     def resolve(self) -> None:
@@ -225,7 +231,9 @@ class Shard:
     def commit(self) -> None:
         """Make `next_rows` the committed state."""
         worlds = self.worlds
-        self.worlds = worlds._replace(rows=worlds.next_rows, next_rows=worlds.rows)
+        if worlds.next_rows is not worlds.rows:
+            self._spare_rows = worlds.rows
+            self.worlds = worlds._replace(rows=worlds.next_rows)
 
     def sense(self, chosen: NDArray[np.bool_]) -> None:
         """Write observations and terms of the chosen worlds' owned agents into `outputs`."""
@@ -297,7 +305,7 @@ def make_worlds(
         zoned = make_zoned(1, num_worlds, capacity)
     worlds = Worlds(
         rows=zoned.rows[0, zone],
-        next_rows=zoned.rows[1, zone],
+        next_rows=zoned.rows[0, zone],
         num_owned=zoned.num_owned[zone],
         num_rows=zoned.num_rows[zone],
         ticks=np.zeros(num_worlds, dtype=np.int64),
