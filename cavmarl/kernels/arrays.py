@@ -66,13 +66,14 @@ class Travel(NamedTuple):
     first_detour: int  # PLAN row of the first goal of demand vehicles that take another way
     begin_s: float  # the clock of the demand at tick 0
     view_m: float  # how far anybody looks for others along the road, at most VIEW_M
+    num_fixed: int  # steps from here on are written while the world runs
 
 
 class Worlds(NamedTuple):
     """A shard's part of W worlds: the vehicles and signals that a tick reads and writes.
 
-    `rows` is the committed state of the tick, `next_rows` what `advance` makes of it: the same array,
-    but in the ticks that put rows in order.
+    `rows` is the committed state of the tick, `next_rows` what `advance` makes of it: the same
+    array, but in the ticks that put rows in order.
     """
 
     rows: NDArray[np.void]  # VEHICLE (W, C)
@@ -131,12 +132,13 @@ class Demand(NamedTuple):
 
 
 class Scratch(NamedTuple):
-    """Room that a tick works in; holds nothing between calls."""
+    """Room that a tick works in; what it holds between calls are copies of fixed steps."""
 
     lane_start: NDArray[np.int32]  # (L + 1,) entries of lane l: [lane_start[l], lane_start[l + 1])
     lane_end: NDArray[np.int32]  # (L,) lane_start[l + 1] again
     entries: NDArray[np.void]  # ENTRY (2 C,) vehicles by (lane, s, id), side lanes included
     step: NDArray[np.void]  # PLAN (C,) of each row the step of its lane, see `ways.own_step`
+    step_at: NDArray[np.int64]  # (C,) which of `Travel.steps` that is, -1: none yet
     link_start: NDArray[np.int32]  # (K + 2,) approach of link k: [link_start[k], link_start[k + 1])
     approach: NDArray[np.void]  # APPROACH (3 C,) vehicles on or before links, by link
     pairs: NDArray[np.void]  # APPROACH (3 C,) the same before sorting

@@ -47,7 +47,7 @@ __all__ = ["Commands", "Shard", "make_worlds"]
 CELL_M = 25.0  # of the spatial index over vehicles
 # Fields of `Worlds` that the shards of one world have in common.
 COMMON = ("ticks", "keys", "signal_phase", "controllers", "detected_s", "pending")
-TICKS_IN_ORDER = 8  # for so long rows that have been put in the order of the lanes nearly stay so
+TICKS_IN_ORDER = 32  # for so long rows that have been put in the order of the lanes nearly stay so
 SUGGESTED_HORIZON_S = 1.0  # in which a suggested target speed is to be reached
 
 
@@ -318,6 +318,7 @@ def _make_scratch(num_lanes: int, num_links: int, capacity: int) -> Scratch:
         lane_end=integers(num_lanes),
         entries=np.zeros(2 * capacity, dtype=ENTRY),
         step=np.zeros(capacity, dtype=PLAN),
+        step_at=np.full(capacity, -1, dtype=np.int64),
         link_start=integers(num_links + 2),
         approach=np.zeros(3 * capacity, dtype=APPROACH),
         pairs=np.zeros(3 * capacity, dtype=APPROACH),

@@ -99,14 +99,15 @@ class NativeTraffic:
         """Types and ways of all vehicles: the generator's first, then the demand file's."""
         types, steps = generated_types(), self.plans.reshape(-1)
         if self.file is None or self.schedule is None:
-            return Travel(types, steps, np.zeros(0, dtype=STOP), 0, 0.0, VIEW_M)
+            return Travel(types, steps, np.zeros(0, dtype=STOP), 0, 0.0, VIEW_M, len(steps))
         types = np.concatenate([types, self.file.types])
         steps = np.concatenate([steps, self.schedule.steps])
+        num_fixed = len(steps)
         if self._slots is not None:
             steps = np.concatenate([steps, self._slots.table()])
         first_detour = self.plans.size + self.schedule.first_detour
         begin_s = self.file.begin_ms / 1000.0
-        return Travel(types, steps, self.file.stops, first_detour, begin_s, self._view_m)
+        return Travel(types, steps, self.file.stops, first_detour, begin_s, self._view_m, num_fixed)
 
     @property
     def _view_m(self) -> float:
