@@ -150,7 +150,9 @@ class Shard:
     def advance(self, commands: Commands) -> None:
         """Decide every control from the committed rows and move the owned ones into `next_rows`."""
         action = self._config.action
-        in_place = bool(self.worlds.ticks[0] % TICKS_IN_ORDER)
+        # Of a divided world tick t stays whole until t + 1 is committed (docs/ownership.md).
+        undivided = len(self._zones.rects) == 1
+        in_place = undivided and self.worlds.ticks[0] % TICKS_IN_ORDER != 0
         if not in_place:
             self.worlds = self.worlds._replace(next_rows=self._spare_rows)
         advance(
@@ -165,7 +167,7 @@ class Shard:
             action.acceleration_mps2,
             action.steering_rad,
             self._config.clock.sim_dt_s,
-            in_place,
+            bool(in_place),
         )
 
     def resolve(self) -> None:
