@@ -54,9 +54,13 @@ def register_links(
     for first in range(0, num, BLOCK):
         last = min(first + BLOCK, num)
         # One look for all that follows: in a city the steps lie far apart, each is a cache miss,
-        # and a loop that does nothing else has many of them under way at once.
+        # and a loop that does nothing else has many of them under way at once. And most rows are
+        # where they were a tick before, with the same vehicle on the same lane.
         for i in range(first, last):
-            scratch.step[i] = travel.steps[own_step(roads, rows[i])]
+            at = own_step(roads, rows[i])
+            if at != scratch.step_at[i] or at >= travel.num_fixed:
+                scratch.step[i] = travel.steps[at]
+                scratch.step_at[i] = at
         for i in range(first, last):
             pairs = _announce(roads, travel, rows[i], i, pairs, scratch)
     end = scratch.link_end

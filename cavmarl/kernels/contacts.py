@@ -39,9 +39,7 @@ def _bodies_touch(one: np.void, other: np.void) -> bool:
 
 
 @kernel
-def find_contacts(
-    rows: NDArray[np.void], num: int, grid: Grid, hit: NDArray[np.int64]
-) -> bool:
+def find_contacts(rows: NDArray[np.void], num: int, grid: Grid, hit: NDArray[np.int64]) -> bool:
     """For each vehicle the smallest id of those that it touches; whether any two do.
 
     One pass: each vehicle looks at those that are in the cells already and joins them.

@@ -66,9 +66,7 @@ class Before(NamedTuple):
 @inlined_kernel
 def before_tick(row: np.void) -> Before:
     """Of a record that nothing has moved yet."""
-    return Before(
-        row["speed"], row["accel"], row["heading"], row["lane"], row["link"], row["way"]
-    )
+    return Before(row["speed"], row["accel"], row["heading"], row["lane"], row["link"], row["way"])
 
 
 @kernel

@@ -48,9 +48,7 @@ def lane_to_stop(roads: RoadArrays, travel: Travel, row: np.void) -> int:
 
 
 @inlined_kernel
-def make_stop(
-    roads: RoadArrays, travel: Travel, row: np.void, lane_before: int, dt: float
-) -> None:
+def make_stop(roads: RoadArrays, travel: Travel, row: np.void, lane_before: int, dt: float) -> None:
     """Count the time of a vehicle at its stop, and let it go when that is over.
 
     A stop that the vehicle could not make any more is left out.

@@ -120,7 +120,7 @@ def _drive_agent(
     steering_limit: float,
     dt: float,
 ) -> None:
-    """Move an agent's vehicle by its command, or by the controllers; one whose trip is over stays."""
+    """Move an agent's vehicle by its command or by the controllers, unless its trip is over."""
     if row["events"] & EVENTS_THAT_END:
         row["tick"] += 1
         return
@@ -134,9 +134,7 @@ def _drive_agent(
     throttle, steering = _delay(
         worlds.pending, w, row["agent"], worlds.ticks[w], throttle, steering
     )
-    move_agent(
-        roads, plans, lane_grid, row, throttle, steering, worlds.signal_phase[w], dt
-    )
+    move_agent(roads, plans, lane_grid, row, throttle, steering, worlds.signal_phase[w], dt)
     # The indicator is automatic: drivers behind make room for who has to change lanes.
     row["blinker"] = needed_change(roads, travel, row, travel.steps[own_step(roads, row)])
 
@@ -201,8 +199,18 @@ def advance(
             touching += row["hit"] >= 0
             if row["driver"] != DRIVER_BACKGROUND:
                 _drive_agent(
-                    roads, plans, travel, lane_grid, worlds, w, row, commands, discrete,
-                    accel_limit, steering_limit, dt,
+                    roads,
+                    plans,
+                    travel,
+                    lane_grid,
+                    worlds,
+                    w,
+                    row,
+                    commands,
+                    discrete,
+                    accel_limit,
+                    steering_limit,
+                    dt,
                 )
                 continue
             row["events"] = 0

@@ -76,7 +76,7 @@ class Division:
         self.codec = codec
         self._shards = tuple(shards)
         self._zoned = zoned
-        self._sides = [(shard.worlds.rows, shard.worlds.next_rows) for shard in shards]
+        self._first_side = shards[0].worlds.rows
         self._halo = halo
         self._touching_m = touching_m
         self._hysteresis_m = hysteresis_m
@@ -130,12 +130,12 @@ class Division:
         )
 
     def _side(self, rows: NDArray[np.void]) -> int:
-        return 0 if rows is self._sides[0][0] else 1
+        return 0 if rows is self._first_side else 1
 
     def align(self) -> None:
         """Let all shards keep their rows on the same side, whatever a tick has come to."""
-        for shard, (rows, next_rows) in zip(self._shards, self._sides, strict=True):
-            shard.worlds = shard.worlds._replace(rows=rows, next_rows=next_rows)
+        for shard in self._shards:
+            shard.align()
 
     def near(self, w: int, everybody: bool) -> list[Near]:
         """Who of a world is near a border, by its committed rows.

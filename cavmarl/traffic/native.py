@@ -101,9 +101,11 @@ class NativeTraffic:
         """Types and ways of all vehicles: the generator's first, then the demand file's."""
         types, steps = generated_types(), self.plans.reshape(-1)
         if self.file is None or self.schedule is None:
-            return Travel(types, steps, np.zeros(0, dtype=STOP), 0, 0.0, VIEW_M, VIEW_M)
+            none = np.zeros(0, dtype=STOP)
+            return Travel(types, steps, none, 0, 0.0, VIEW_M, VIEW_M, num_fixed=len(steps))
         types = np.concatenate([types, self.file.types])
         steps = np.concatenate([steps, self.schedule.steps])
+        num_fixed = len(steps)
         if self._slots is not None:
             steps = np.concatenate([steps, self._slots.table()])
         first_detour = self.plans.size + self.schedule.first_detour
@@ -116,6 +118,7 @@ class NativeTraffic:
             begin_s,
             view_m=self._farthest_m(look_ahead_m),
             see_m=self._farthest_m(_centre_sees_line_m),
+            num_fixed=num_fixed,
         )
 
     def _farthest_m(self, look_m: Callable[[np.void, float], float]) -> float:

@@ -52,6 +52,7 @@ def travel_by(
         begin_s=0.0,
         view_m=VIEW_M,
         see_m=VIEW_M,
+        num_fixed=steps.size,
     )
 
 
