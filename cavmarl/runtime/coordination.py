@@ -92,7 +92,8 @@ class Coordination:
     def begin(self) -> None:
         """Lease the next tick, and hand over whose owner changes."""
         for w, coordinator in enumerate(self.coordinators):
-            self._states[w].forget()
+            if not coordinator.is_open:
+                self._states[w].forget()
             near = self._division.near(w)
             rows = {entry.vehicle: entry.row for entry in near}
             for switch, state in coordinator.begin(near, self._states[w].near):
