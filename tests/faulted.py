@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from cavmarl import CavVectorEnv, make_vec
 from cavmarl.evaluate.differences import Arrays, same_bytes, step_results
-from cavmarl.ownership.messages import Message, Record
+from cavmarl.ownership.messages import Message, Record, Step
 from cavmarl.ownership.trace import LOG, Entry
 from cavmarl.ownership.trace_check import TraceChecker
 from cavmarl.ownership.transport import Rates
@@ -35,10 +35,14 @@ ROUGH = Faults(seed=5, messages=NOISE, crash_rate=0.002)
 
 
 class Checked:
-    """A watcher that lets the trace checker judge all that happens."""
+    """A watcher that lets the trace checker judge all that happens.
+
+    A STEP that is sent again has to say the same, too.
+    """
 
     def __init__(self, deferral: int, lifetime: int = 16) -> None:
         self._checker = TraceChecker(deferral, lifetime)
+        self._sent: dict[tuple[int, int], bytes] = {}
 
     def logged(self, records: Iterable[Record]) -> None:
         for record in records:
@@ -46,6 +50,11 @@ class Checked:
 
     def delivered(self, destination: int, message: Message) -> None:
         self._checker.take(Entry(destination, message))
+        if isinstance(message, Step):
+            for vehicle, _, forced, _, state in message.enter:
+                if forced:
+                    told = self._sent.setdefault((message.tick, vehicle), state)
+                    assert told == state, f"vehicle {vehicle} on its way to tick {message.tick}"
 
 
 @dataclass

@@ -11,6 +11,7 @@ import pytest
 from cavmarl import make_vec
 from cavmarl.errors import ProtocolError, ZoneStepError
 from cavmarl.evaluate.fault_campaign import Campaign, LineResult, run_campaign
+from cavmarl.ownership.transport import Rates
 from cavmarl.runtime.fault_plan import COORDINATOR_POINTS, ZONE_POINTS, Crash, Faults
 from cavmarl.runtime.recovery import GARBAGE
 from cavmarl.runtime.store import CommittedStore
@@ -103,6 +104,14 @@ def test_what_a_dead_host_had_is_really_gone(
     monkeypatch.setattr(CommittedStore, "load", look)
     replay(busy, ZONES, Faults(crashes=(Crash(7, "resolve", 1),)))
     assert lost == [{GARBAGE}]
+
+
+def test_a_step_that_is_sent_again_has_the_states_of_the_committed_tick(busy: Recorded) -> None:
+    # Some zones have computed the tick and others have died; then DONE is lost.
+    deaths = tuple(Crash(tick, "commit", tick % ZONES) for tick in TICKS)
+    messages = {"Ack": Rates(drop=1.0), "Done": Rates(drop=0.8)}
+    vec = replay(busy, ZONES, Faults(messages=messages, crashes=deaths))
+    assert vec.simulation.transfers[0].counts["forced"] > 0
 
 
 def test_at10_nobody_is_lost_or_doubled(busy: Recorded) -> None:
