@@ -63,11 +63,10 @@ def _lines(campaign: Campaign, seed: int) -> Table:
         box=box.SIMPLE_HEAD,
         pad_edge=False,
     )
-    table.add_column("fault")
-    table.add_column("where")
-    for heading in ("runs", "injected", "survived", "late", "forced", "ms p50"):
-        table.add_column(heading, justify="right")
-    table.add_column("")
+    table.add_column("fault", ratio=1)
+    for heading in ("runs", "injected", "survived", "late", "forced"):
+        table.add_column(heading, justify="right", no_wrap=True)
+    table.add_column("", no_wrap=True)
     for name in dict.fromkeys(line.name for line in campaign.lines):
         table.add_row(*_line([line for line in campaign.lines if line.name == name]))
     return table
@@ -81,14 +80,12 @@ def _line(lines: list[LineResult]) -> tuple[str, ...]:
     points = " / ".join(dict.fromkeys(line.points for line in lines))
     wrong = any(line.failures for line in lines)
     return (
-        lines[0].name,
-        points,
+        f"{lines[0].name} [dim]({points})[/]",
         f"{sum(line.runs for line in lines)}",
         f"{figures.injected:,}",
         f"{sum(line.survived for line in lines):,}",
         f"{figures.hand_overs['late']:,}",
         f"{figures.hand_overs['forced']:,}",
-        _middle(figures.recovery_ms),
         "[red]different[/]" if wrong else "[green]equal[/]",
     )
 
@@ -151,13 +148,6 @@ def _pairs(counts: Counter[tuple[str, str]]) -> str:
         for kind in kinds
     ]
     return "; ".join(parts) or "none"
-
-
-def _middle(values: list[float]) -> str:
-    from cavmarl.evaluate.fault_figures import spread
-
-    found = spread(values)
-    return "-" if found is None else f"{found['p50']:.2f}"
 
 
 def _spread(values: list[float] | list[int], unit: str) -> str:

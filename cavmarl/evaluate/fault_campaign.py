@@ -35,6 +35,7 @@ BUSY: Mapping[str, Any] = {
     "population.mode": "seats",
     "population.agents": 8,
     "population.background": 120,
+    "clock.sim_dt_s": 0.1,
     "clock.control_latency_ticks": 3,
     "zones.approach_ticks": 12,
     "sensors.stack": 2,

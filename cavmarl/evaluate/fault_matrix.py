@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 
+from cavmarl.ownership.messages import COORDINATOR
 from cavmarl.ownership.transport import Rates
 from cavmarl.runtime.fault_plan import COORDINATOR_POINTS, MESSAGES, ZONE_POINTS, Crash, Faults
 from cavmarl.runtime.faults import Visit
@@ -66,11 +67,19 @@ class Rehearsal:
             found += [(tick, z) for z in sorted(parts[role]) if (tick, point, z) in self.visits]
         return found
 
-    def ticks_at(self, point: str, parties: Iterable[int]) -> list[int]:
-        """Ticks in which all of these are at a point."""
-        wanted = tuple(parties)
-        ticks = sorted({tick for tick, at, _ in self.visits if at == point})
-        return [t for t in ticks if all((t, point, party) in self.visits for party in wanted)]
+    def together(self, point: str) -> list[tuple[int, list[int]]]:
+        """(tick, all zones at the point) where they are several; first where they are most."""
+        found: dict[int, list[int]] = {}
+        for tick, at, party in sorted(self.visits):
+            if at == point and party != COORDINATOR:
+                found.setdefault(tick, []).append(party)
+        several = [(tick, zones) for tick, zones in found.items() if len(zones) > 1]
+        return sorted(several, key=lambda entry: (-len(entry[1]), entry[0]))
+
+    def coordinator_at(self, point: str) -> list[int]:
+        """Ticks of hand-overs in which the coordinator is at a point."""
+        switching = {tick for tick, _, _ in self.switches}
+        return sorted(t for t in switching if (t, point, COORDINATOR) in self.visits)
 
 
 @dataclass(frozen=True)
@@ -118,12 +127,11 @@ def _host_lines(seen: Rehearsal) -> list[Line]:
         ("a host is given up, and lives on", lives),
     ):
         lines.append(_line(name, [case for role in ROLES for case in _cases(seen, role, crash)]))
-    zones = range(seen.zones)
     everybody = [
-        (point, [tuple(Crash(t, point, z) for z in zones) for t in seen.ticks_at(point, zones)])
+        (point, [tuple(Crash(t, point, z) for z in zones) for t, zones in seen.together(point)])
         for point in ZONE_POINTS
     ]
-    lines.append(_line("all hosts die", everybody))
+    lines.append(_line("all hosts die that come to a point", everybody))
     poison = _line("every host of a zone dies", _cases(seen, "target", replace(twice, times=MANY)))
     alone = [Faults(crashes=(crash,)) for plan in poison.plans for crash in plan.crashes]
     lines.append(replace(poison, plans=tuple(alone), poison=True))
@@ -142,14 +150,11 @@ def _cases(seen: Rehearsal, role: str, like: Crash) -> list[tuple[str, list[Opti
 
 
 def _coordinator_lines(seen: Rehearsal) -> list[Line]:
-    switching = {tick for tick, _, _ in seen.switches}
-
     def cases(points: Iterable[str], times: int) -> list[tuple[str, list[Option]]]:
         return [
             (
                 f"{point} (coordinator)",
-                [(Crash(t, point, None, False, times),) for t in seen.ticks_at(point, (-1,))
-                 if t in switching],
+                [(Crash(t, point, None, False, times),) for t in seen.coordinator_at(point)],
             )
             for point in points
         ]  # fmt: skip

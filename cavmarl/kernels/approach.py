@@ -19,6 +19,7 @@ APPROACH_M = 150.0  # how far ahead a vehicle announces itself at most,
 APPROACH_S = 8.0  # which it does this time before it arrives,
 APPROACH_STANDING_M = 30.0  # and this far ahead in any case
 MAX_LINKS_AHEAD = 2
+BLOCK = 64  # rows that are still near in memory when they are looked at again
 FORK_BEYOND_M = 3.0  # how far beyond a junction paths from one lane can still run together
 
 APPROACH = np.dtype(
@@ -49,13 +50,19 @@ def register_links(
         num: live rows.
         scratch: step, the lists by link and approach are written.
     """
-    # One look for all that follows: in a city the steps lie far apart, each is a cache miss, and a
-    # loop that does nothing else has many of them under way at once.
-    for i in range(num):
-        scratch.step[i] = travel.steps[own_step(roads, rows[i])]
     pairs = 0
-    for i in range(num):
-        pairs = _announce(roads, travel, rows[i], i, pairs, scratch)
+    for first in range(0, num, BLOCK):
+        last = min(first + BLOCK, num)
+        # One look for all that follows: in a city the steps lie far apart, each is a cache miss,
+        # and a loop that does nothing else has many of them under way at once. And most rows are
+        # where they were a tick before, with the same vehicle on the same lane.
+        for i in range(first, last):
+            at = own_step(roads, rows[i])
+            if at != scratch.step_at[i] or at >= travel.num_fixed:
+                scratch.step[i] = travel.steps[at]
+                scratch.step_at[i] = at
+        for i in range(first, last):
+            pairs = _announce(roads, travel, rows[i], i, pairs, scratch)
     end = scratch.link_end
     forget(scratch.links)
     for k in range(pairs):

@@ -69,12 +69,15 @@ class Travel(NamedTuple):
     first_detour: int  # PLAN row of the first goal of demand vehicles that take another way
     begin_s: float  # the clock of the demand at tick 0
     view_m: float  # how far anybody looks for others along the road, at most VIEW_M
+    see_m: float  # how far before a line its centre is when anybody first asks about the junction
+    num_fixed: int  # steps from here on are written while the world runs
 
 
 class Worlds(NamedTuple):
     """A shard's part of W worlds: the vehicles and signals that a tick reads and writes.
 
-    `rows` is the committed state of the tick, `next_rows` the room for the one after; they swap.
+    `rows` is the committed state of the tick, `next_rows` what `advance` makes of it: the same
+    array, but in the ticks that put rows in order.
     """
 
     rows: NDArray[np.void]  # VEHICLE (W, C)
@@ -102,7 +105,7 @@ class Zoned(NamedTuple):
     num_owned: NDArray[np.int64]  # (k, W)
     num_rows: NDArray[np.int64]  # (k, W)
     num_near: NDArray[np.int64]  # (k, W)
-    border: NDArray[np.int32]  # (k, W, C) owned rows that other zones see, rising
+    border: NDArray[np.int32]  # (k, W, C) owned rows that are noted at a border, rising
     num_border: NDArray[np.int64]  # (k, W)
     spare: NDArray[np.void]  # VEHICLE (1,)
 
@@ -146,13 +149,14 @@ class Demand(NamedTuple):
 
 
 class Scratch(NamedTuple):
-    """Room that a tick works in; between calls it only knows which lists to clear."""
+    """Room that a tick works in; between calls it knows which lists to clear, and fixed steps."""
 
     lanes: Lists  # by lane, lists of entries
     lane_start: NDArray[np.int32]  # entries of lane l: [lane_start[l], lane_end[l]); at L: of all.
     lane_end: NDArray[np.int32]  # Both are views of `lanes.bounds`: one look into memory
     entries: NDArray[np.void]  # ENTRY (2 C,) vehicles by (lane, s, id), side lanes included
     step: NDArray[np.void]  # PLAN (C,) of each row the step of its lane, see `ways.own_step`
+    step_at: NDArray[np.int64]  # (C,) which of `Travel.steps` that is, -1: none yet
     links: Lists  # by link, lists of approach
     link_start: NDArray[np.int32]  # approach of link k: [link_start[k], link_end[k])
     link_end: NDArray[np.int32]

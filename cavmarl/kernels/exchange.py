@@ -17,7 +17,14 @@ __all__ = ["exchange", "take_own"]
 
 @kernel
 def exchange(
-    zones: ZoneArrays, halo: Halo, touching_m: float, zoned: Zoned, side: int, first: int, last: int
+    zones: ZoneArrays,
+    halo: Halo,
+    touching_m: float,
+    border_m: float,
+    zoned: Zoned,
+    side: int,
+    first: int,
+    last: int,
 ) -> None:
     """Renew all ghosts of some worlds from the owned rows, and note who is near a border.
 
@@ -29,6 +36,7 @@ def exchange(
         zones: of the partition.
         halo: from `roads.zone_halo.zone_halo`, for the same partition.
         touching_m: no ghost further outside of a zone can touch one of its vehicles.
+        border_m: who is so near another zone is noted; 0: who lies in one.
         zoned: the ghosts and how many there are, border and num_border are written.
         side: whose rows, 0 or 1.
         first: the first world.
@@ -42,16 +50,24 @@ def exchange(
             zoned.num_near[zone, w] = owned
         if count > 1:
             for zone in range(count):
-                _publish(zones, halo, touching_m, zoned, side, zone, w)
+                _publish(zones, halo, touching_m, border_m, zoned, side, zone, w)
 
 
 @inlined_kernel
 def _publish(
-    zones: ZoneArrays, halo: Halo, touching_m: float, zoned: Zoned, side: int, zone: int, w: int
+    zones: ZoneArrays,
+    halo: Halo,
+    touching_m: float,
+    border_m: float,
+    zoned: Zoned,
+    side: int,
+    zone: int,
+    w: int,
 ) -> None:
     """Copy the owned rows of one zone behind those of all that need them."""
     limit = halo.halo_m * halo.halo_m
     near_limit = touching_m * touching_m
+    border_limit = border_m * border_m
     min_x, min_y = halo.inner[zone, 0], halo.inner[zone, 1]
     max_x, max_y = halo.inner[zone, 2], halo.inner[zone, 3]
     found = 0
@@ -61,8 +77,7 @@ def _publish(
         y = row["y"]
         if min_x < x and x < max_x and min_y < y and y < max_y:
             continue
-        zoned.border[zone, w, found] = i
-        found += 1
+        at_border = False
         here = zone_of(zones, x, y)
         for n in range(halo.near_start[here], halo.near_start[here + 1]):
             other = halo.near[n]
@@ -71,6 +86,10 @@ def _publish(
             squared = squared_distance(zones.rects, other, x, y)
             if squared <= limit:
                 _take_ghost(row, zoned, side, other, w, squared <= near_limit)
+                at_border |= squared <= border_limit
+        if at_border:
+            zoned.border[zone, w, found] = i
+            found += 1
     zoned.num_border[zone, w] = found
 
 

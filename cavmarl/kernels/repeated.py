@@ -1,7 +1,7 @@
 """Calls that are made again and again, with arguments of the same types every time.
 
 Before each call Numba finds out the type of every argument, and of every array in a bundle: in a
-small world that takes longer than what the kernel does (decision 014).
+small world that takes longer than what the kernel does (decision 008).
 """
 
 from __future__ import annotations

@@ -112,7 +112,10 @@ class Coordination:
             self._stirred[w] = False
             self._states[w].borders.near = near
             rows = {entry.vehicle: entry.row for entry in near}
-            for switch, state in coordinator.begin(near, self._states[w].near):
+            entries = coordinator.begin(near, self._states[w].near)
+            for switch, _ in entries:
+                self._states[w].state(switch.vehicle)  # a STEP may be repeated after rows moved
+            for switch, state in entries:
                 self._division.hand_over(w, switch, state, rows.get(switch.vehicle, 0))
 
     def end(self) -> None:

@@ -76,11 +76,12 @@ class Division:
         self.codec = codec
         self._shards = tuple(shards)
         self._zoned = zoned
-        self._sides = [(shard.worlds.rows, shard.worlds.next_rows) for shard in shards]
+        self._first_side = shards[0].worlds.rows
         self._halo = halo
         self._touching_m = touching_m
         self._hysteresis_m = hysteresis_m
         self._ahead_s = ahead_s
+        self._border_m = MAX_SPEED_MPS * ahead_s  # nobody else can be behind it by then
         self._near = np.zeros(2 * shards[0].worlds.rows.shape[1], dtype=NEAR)
         self._call_exchange = repeated(exchange)
         self._find_near = repeated(find_near)
@@ -118,16 +119,23 @@ class Division:
     def _exchange(self, rows: NDArray[np.void], first: int, last: int) -> None:
         """Renew the ghosts of some worlds; `rows` are the first shard's rows or next ones."""
         self._call_exchange(
-            self.zones, self._halo, self._touching_m, self._zoned, self._side(rows), first, last
+            self.zones,
+            self._halo,
+            self._touching_m,
+            self._border_m,
+            self._zoned,
+            self._side(rows),
+            first,
+            last,
         )
 
     def _side(self, rows: NDArray[np.void]) -> int:
-        return 0 if rows is self._sides[0][0] else 1
+        return 0 if rows is self._first_side else 1
 
     def align(self) -> None:
         """Let all shards keep their rows on the same side, whatever a tick has come to."""
-        for shard, (rows, next_rows) in zip(self._shards, self._sides, strict=True):
-            shard.worlds = shard.worlds._replace(rows=rows, next_rows=next_rows)
+        for shard in self._shards:
+            shard.align()
 
     def near(self, w: int, everybody: bool) -> list[Near]:
         """Who of a world is near a border, by its committed rows.

@@ -8,6 +8,7 @@ same calls and keeps the records in a list.
 from __future__ import annotations
 
 import os
+import weakref
 from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from types import TracebackType
@@ -113,6 +114,8 @@ class Journal:
             ) from error
         except OSError as error:
             raise self._unwritable(error) from error
+        # Worlds are not closed: their journal is, when nobody has it any more.
+        weakref.finalize(self, self._file.close)
 
     def append(self, records: Iterable[Record]) -> None:
         """Write records down; when it returns, messages may be sent.

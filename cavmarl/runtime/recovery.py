@@ -82,7 +82,7 @@ class Recovery:
         self._deaths: Counter[int | str] = Counter()  # in the tick
 
     def run(self, tick: Callable[[], None]) -> None:
-        """One tick, as often as it takes.
+        """One tick, as often as it takes; after an error the worlds are at the committed tick.
 
         Raises:
             ZoneStepError: every host of a zone dies of it.
@@ -107,18 +107,18 @@ class Recovery:
         """Whether the tick has been committed all the same."""
         began = time.perf_counter()
         if isinstance(death, CoordinatorDeath):
-            self._count(death.point)
             self._lose_gate()
             is_done = self._restart()
+            self._count(death.point)
             self._note(death.point, None, began)
             return is_done
         zones = death.zones if isinstance(death, StoreError) else (death.zone,)
         for zone in zones:
-            self._count(zone)
             self._lose(self._shards[zone])
         self._coordination.load()
         coordinator = self._coordination.coordinators[0]
         for zone in zones:
+            self._count(zone)
             if isinstance(death, ZoneDeath):
                 give_up(coordinator, death)
             else:

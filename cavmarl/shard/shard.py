@@ -50,6 +50,7 @@ __all__ = ["Commands", "Shard", "make_worlds", "make_zoned"]
 CELL_M = 25.0  # of the spatial index over vehicles
 # Fields of `Worlds` that the shards of one world have in common.
 COMMON = ("ticks", "keys", "signal_phase", "controllers", "detected_s", "pending")
+TICKS_IN_ORDER = 32  # for so long rows that have been put in the order of the lanes nearly stay so
 SUGGESTED_HORIZON_S = 1.0  # in which a suggested target speed is to be reached
 
 
@@ -124,6 +125,9 @@ class Shard:
             zone,
             None if first is None else first.worlds,
         )
+        # Between ticks `next_rows` is `rows`; the other side is used where a tick puts rows in order.
+        self._sides = (self.worlds.rows, zoned.rows[1, zone])
+        self._spare_rows = self._sides[1]
         self.outputs = outputs
         self._target_speeds = np.array(config.action.target_speeds_mps)
         self._discrete = config.action.kind == "discrete"
@@ -161,6 +165,10 @@ class Shard:
         action = self._config.action
         if self._controls.size:
             np.copyto(self._controls, commands.controls)
+        # Where a host may die alone, a store keeps tick t whole (docs/ownership.md).
+        in_place = bool(self.worlds.ticks[0] % TICKS_IN_ORDER)
+        if not in_place:
+            self.worlds = self.worlds._replace(next_rows=self._spare_rows)
         self._num_through = self._call_advance(
             self._roads,
             self._plans,
@@ -173,6 +181,7 @@ class Shard:
             action.acceleration_mps2,
             action.steering_rad,
             self._config.clock.sim_dt_s,
+            in_place,
         )
 
     def resolve(self) -> None:
@@ -225,7 +234,14 @@ class Shard:
     def commit(self) -> None:
         """Make `next_rows` the committed state."""
         worlds = self.worlds
-        self.worlds = worlds._replace(rows=worlds.next_rows, next_rows=worlds.rows)
+        if worlds.next_rows is not worlds.rows:
+            self._spare_rows = worlds.rows
+            self.worlds = worlds._replace(rows=worlds.next_rows)
+
+    def align(self) -> None:
+        """Keep the rows on the first side, wherever a tick that is given up has them."""
+        rows, self._spare_rows = self._sides
+        self.worlds = self.worlds._replace(rows=rows, next_rows=rows)
 
     def sense(self, chosen: NDArray[np.bool_]) -> None:
         """Write observations and terms of the chosen worlds' owned agents into `outputs`."""
@@ -295,9 +311,10 @@ def make_worlds(
     """
     if zoned is None:
         zoned = make_zoned(1, num_worlds, capacity)
+    rows = zoned.rows[0, zone]
     worlds = Worlds(
-        rows=zoned.rows[0, zone],
-        next_rows=zoned.rows[1, zone],
+        rows=rows,
+        next_rows=rows,
         num_owned=zoned.num_owned[zone],
         num_rows=zoned.num_rows[zone],
         ticks=np.zeros(num_worlds, dtype=np.int64),
@@ -359,6 +376,7 @@ def _make_scratch(num_lanes: int, num_links: int, capacity: int) -> Scratch:
         lane_end=lanes.bounds[:, 1],
         entries=np.zeros(2 * capacity, dtype=ENTRY),
         step=np.zeros(capacity, dtype=PLAN),
+        step_at=np.full(capacity, -1, dtype=np.int64),
         links=links,
         link_start=links.bounds[:, 0],
         link_end=links.bounds[:, 1],

@@ -47,8 +47,8 @@ def test_who_has_crossed_or_soon_will_is_told_of(
             id=100 * zone + np.arange(len(xy)),
         )
         parts.append(rows)
-    # The halo reaches as far as anybody can drive.
-    zoned = exchanged(partition, MAX_SPEED_MPS * ahead_s, parts)
+    reach_m = MAX_SPEED_MPS * ahead_s  # as far as anybody can drive by then
+    zoned = exchanged(partition, reach_m, parts, border_m=reach_m)
     if everybody:
         zoned.num_border[:] = 0
     out = np.zeros(2 * zoned.rows.shape[-1] * partition.count, dtype=NEAR)
@@ -101,7 +101,7 @@ def test_who_drives_over_a_corner_is_told_to_both_zones() -> None:
     partition = four()
     row = vehicles([(13.0, 12.0, math.pi / 2)], speed=10.0)  # of zone 0, 3 m to the east of it
     none = row[:0]
-    zoned = exchanged(partition, 60.0, [row, none, none, none])
+    zoned = exchanged(partition, 60.0, [row, none, none, none], border_m=60.0)
     out = np.zeros(2, dtype=NEAR)
     found = find_near(partition.arrays, 2.0, 1.0, MAX_SPEED_MPS, zoned, SIDE, 0, False, out)
     assert found == 2
@@ -113,7 +113,7 @@ def test_rows_that_are_not_there_any_more_are_not_looked_at() -> None:
     partition = four()
     rows = vehicles([(13.0, 12.0, 0.0), (13.0, 12.0, 0.0)])
     none = rows[:0]
-    zoned = exchanged(partition, 60.0, [rows, none, none, none])
+    zoned = exchanged(partition, 60.0, [rows, none, none, none], border_m=60.0)
     zoned.num_owned[0, 0] = 1
     out = np.zeros(4, dtype=NEAR)
     found = find_near(partition.arrays, 2.0, 1.0, MAX_SPEED_MPS, zoned, SIDE, 0, False, out)

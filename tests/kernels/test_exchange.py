@@ -66,12 +66,22 @@ def spread(data: st.DataObject, partition: ZonePartition) -> list[NDArray[np.voi
     return parts
 
 
-@given(st.data(), partitions(3), st.sampled_from([0.0, 7.5, 30.0, 1000.0]), st.sampled_from([0, 5]))
+@given(
+    st.data(),
+    partitions(3),
+    st.sampled_from([0.0, 7.5, 30.0, 1000.0]),
+    st.sampled_from([0.0, 5.0]),
+    st.sampled_from([0.0, 3.0]),
+)
 def test_exchange_equals_twin(
-    data: st.DataObject, partition: ZonePartition, halo_m: float, touching_m: float
+    data: st.DataObject,
+    partition: ZonePartition,
+    halo_m: float,
+    touching_m: float,
+    border_m: float,
 ) -> None:
     parts = spread(data, partition)
-    zoned = exchanged(partition, halo_m, parts, touching_m)
+    zoned = exchanged(partition, halo_m, parts, touching_m, border_m)
     rects = partition.reaching
     for zone, own in enumerate(parts):
         others = [row for other, part in enumerate(parts) for row in part if other != zone]
@@ -84,10 +94,14 @@ def test_exchange_equals_twin(
         near = zoned.num_near[zone, 0] - len(own)
         touching = naive.within(rects[zone], min(halo_m, touching_m), others)
         assert sorted(ids(ghosts[:near])) == sorted(row["id"] for row in touching)
-        border = own[zoned.border[zone, 0, : zoned.num_border[zone, 0]]]
-        assert len(set(ids(border))) == len(border)
-        seen = {int(i) for z in range(partition.count) for i in ghosts_of(zoned, z)["id"]}
-        assert seen & set(ids(own)) <= set(ids(border))
+        elsewhere = [rect for other, rect in enumerate(rects) if other != zone]
+        at_border = {
+            row["id"]
+            for rect in elsewhere
+            for row in naive.within(rect, min(halo_m, border_m), list(own))
+        }
+        noted = max(zoned.num_border[zone, 0], 0)
+        assert ids(own[zoned.border[zone, 0, :noted]]) == sorted(at_border)
 
 
 def test_a_world_of_one_zone_has_no_ghosts() -> None:
@@ -100,7 +114,7 @@ def test_other_worlds_keep_their_ghosts() -> None:
     halo = zone_halo(four(), 5.0)
     zoned = make_zoned(4, 3, 2)
     zoned.num_rows[:] = 2
-    exchange(four().arrays, halo, 1.0, zoned, SIDE, 1, 2)
+    exchange(four().arrays, halo, 1.0, 0.0, zoned, SIDE, 1, 2)
     assert zoned.num_rows.tolist() == [[2, 0, 2]] * 4
 
 

@@ -38,11 +38,12 @@ def exchanged(
     halo_m: float,
     parts: Sequence[NDArray[np.void]],
     touching_m: float = 0.0,
+    border_m: float = 0.0,
 ) -> Zoned:
     """The same after the zones have exchanged their ghosts."""
     zoned = zoned_of(parts)
     halo = zone_halo(partition, halo_m)
-    exchange(partition.arrays, halo, touching_m, zoned, SIDE, 0, 1)
+    exchange(partition.arrays, halo, touching_m, border_m, zoned, SIDE, 0, 1)
     return zoned
 
 

@@ -1,0 +1,97 @@
+"""The coordinator of a divided world: its journal, what it counts, who watches it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from cavmarl.ownership.messages import Begin, Commit
+from cavmarl.ownership.records import replay as replay_records
+from cavmarl.ownership.trace import LOG, Trace
+from cavmarl.ownership.transport import Rates
+from cavmarl.runtime.fault_plan import Crash, Faults
+from cavmarl.runtime.journal import JournalReader
+from cavmarl.runtime.journal_summary import owners_at
+from tests.cli.test_main import run as command
+from tests.faulted import BUSY, ROUGH, Recorded, record, replay
+
+ZONES = 4
+STEPS = 15
+
+
+@pytest.fixture(scope="module")
+def busy() -> Recorded:
+    return record("grid4x4", BUSY, STEPS)
+
+
+def test_at05_the_journal_of_a_run_with_deaths_names_the_owners(
+    busy: Recorded, tmp_path: Path
+) -> None:
+    path = tmp_path / "run.jsonl"
+    vec = replay(busy, ZONES, ROUGH, {"zones.journal": str(path)})
+    table = vec.simulation.coordinators[0].directory.table
+    records = tuple(JournalReader(path))
+    told = replay_records(records)
+    assert told.owners == table.owners
+    assert told.hosts == table.hosts
+    assert told.tick == table.tick == 2 * STEPS
+    rows = dict(vec.simulation._division.owners(0))
+    gone = {entry.vehicle for entry in vec.simulation.coordinators[0].notes()[1]}
+    owners = {v: zone for v, (zone, _) in table.owners.items() if v not in gone}
+    assert owners.items() <= rows.items()
+    assert owners_at(path, table.tick).owners == table.owners
+    assert command("journal", str(path)) == 0
+
+
+def test_a_journal_on_disk_outlives_its_coordinator_at_every_line(
+    busy: Recorded, tmp_path: Path
+) -> None:
+    points = ("BEGIN torn", "BEGIN written", "COMMIT torn", "COMMIT written")
+    deaths = tuple(Crash(tick, point) for tick in range(1, 2 * STEPS, 3) for point in points)
+    path = tmp_path / "run.jsonl"
+    vec = replay(busy, ZONES, Faults(crashes=deaths), {"zones.journal": str(path)})
+    assert len(vec.simulation.revivals) == len(deaths)
+    commits = [r.tick for r in JournalReader(path) if isinstance(r, Commit)]
+    assert commits == list(range(1, 2 * STEPS + 1))
+
+
+def test_each_world_has_a_journal_of_its_own(tmp_path: Path) -> None:
+    run = record("grid4x4", BUSY, 6, worlds=2)
+    vec = replay(run, 2, None, {"zones.journal": str(tmp_path / "run.jsonl")})
+    for w, coordinator in enumerate(vec.simulation.coordinators):
+        told = replay_records(JournalReader(tmp_path / f"run.{w}.jsonl"))
+        assert told.owners == coordinator.directory.table.owners
+
+
+def test_hand_overs_are_counted_once_whoever_dies(busy: Recorded) -> None:
+    deaths = tuple(
+        Crash(tick, point)
+        for tick in range(1, 2 * STEPS)
+        for point in ("BEGIN torn", "STEP sent", "COMMIT torn", "COMMIT written")
+    )
+    calm, harmed = replay(busy, ZONES), replay(busy, ZONES, Faults(crashes=deaths))
+    rows = harmed.simulation.transfers[0].rows
+    assert harmed.simulation.migrations == len(rows) == calm.simulation.migrations
+
+
+def test_what_did_not_count_is_known_after_its_party_has_died(busy: Recorded) -> None:
+    rates = Rates(duplicate=1.0, longest_delay=4)
+    messages = dict.fromkeys(("Prepare", "Step", "Done", "Ack"), rates)
+    everybody = (*range(ZONES), None)
+    last = tuple(Crash(2 * STEPS, "advance", zone) for zone in everybody)
+    vec = replay(busy, ZONES, Faults(messages=messages, crashes=last))
+    (coordinator,) = vec.simulation.coordinators
+    assert coordinator.dropped()["Step", "tick"] > sum(
+        endpoint.dropped["Step", "tick"] for endpoint in coordinator.endpoints.values()
+    )
+    assert coordinator.dropped()["Done", "tick"] > coordinator.directory.dropped["Done", "tick"]
+
+
+def test_at06_a_watcher_sees_the_log_and_every_arrival(busy: Recorded) -> None:
+    trace = Trace()
+    vec = replay(busy, ZONES, ROUGH, watchers=[trace])
+    log = [entry.item for entry in trace.entries if entry.destination == LOG]
+    assert sum(len(r.switches) for r in log if isinstance(r, Begin)) == vec.simulation.migrations
+    assert any(entry.destination == 0 for entry in trace.entries)
+    assert trace.text().count("COMMIT") == 2 * STEPS
