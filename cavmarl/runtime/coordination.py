@@ -89,11 +89,6 @@ class Coordination:
         # Worlds whose rows have changed since their ghosts were renewed.
         self._stirred = [True] * len(self.coordinators)
 
-    @property
-    def switched(self) -> int:
-        """Vehicles that have changed their owner since the worlds were made."""
-        return sum(coordinator.switched for coordinator in self.coordinators)
-
     def reset(self, chosen: NDArray[np.bool_]) -> None:
         """Begin an episode in the chosen worlds (W,), with the vehicles that are there."""
         for w, coordinator in enumerate(self.coordinators):

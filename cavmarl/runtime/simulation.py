@@ -233,7 +233,7 @@ class Simulation:
     @property
     def migrations(self) -> int:
         """How many vehicles have changed their owner since the worlds were made."""
-        return 0 if self._coordination is None else self._coordination.switched
+        return sum(coordinator.switched for coordinator in self.coordinators)
 
     @property
     def coordinators(self) -> tuple[Coordinator, ...]:
