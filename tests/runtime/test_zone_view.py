@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from cavmarl.kernels.zones import squared_distance
-from cavmarl.roads.zone_halo import Coverage
+from cavmarl.runtime import dividing
 from cavmarl.runtime.simulation import Simulation
 from cavmarl.runtime.zone_view import TransferInFlight, view_zones
 from tests.driving import drive, make_simulation, start
@@ -15,7 +15,7 @@ HALO_M = 60.0
 @pytest.fixture
 def divided(monkeypatch: pytest.MonkeyPatch) -> Simulation:
     """Nine zones that see less than the whole map."""
-    monkeypatch.setattr(Coverage, "halo_m", property(lambda _: HALO_M))
+    monkeypatch.setattr(dividing, "halo_m", lambda *_: HALO_M)
     simulation = make_simulation(
         "grid4x4",
         mode="seats",
