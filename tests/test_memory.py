@@ -93,7 +93,8 @@ def test_a_hundred_thousand_ticks_of_a_divided_city() -> None:
         if step % (steps // 20) == 0:
             memory_mb.append(resident_mb())
 
-    found = verify_zones("rush", (4, 9), steps=steps, agents=100, progress=look)
+    watched = {"zones.check": True}
+    found = verify_zones("rush", (4, 9), steps=steps, agents=100, overrides=watched, progress=look)
     assert found.holds, found.results
     assert all(result.crossings > 1000 for result in found.results)
     assert max(memory_mb[2:]) - memory_mb[2] < GROWTH_MB

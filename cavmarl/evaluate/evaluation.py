@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -199,7 +199,8 @@ def _prepare(folder: Path, job: Job, repeats: int) -> bool:
         overrides=job.overrides,
     )
     policies = describe_policies(job.policies)
-    one_world = CavVectorEnv(config, network, 1, demand, partition)
+    unlogged = replace(config, zones=replace(config.zones, journal=""))
+    one_world = CavVectorEnv(unlogged, network, 1, demand, partition)
     for policy in job.policies.values():
         load_policy(policy, one_world)
     try:
