@@ -133,6 +133,7 @@ class CavEnv(ParallelEnv[str, Any, Any]):  # type: ignore[misc] # PettingZoo is 
         self.config = config
         self.network = network
         self.render_mode = render_mode
+        self.ghosts_of: int | None = None
         self.metadata = {
             **self.metadata,
             "name": f"cavmarl/{config.name}-v{config.version}",
@@ -349,7 +350,15 @@ class CavEnv(ParallelEnv[str, Any, Any]):  # type: ignore[misc] # PettingZoo is 
         return dict(zip(self.agents, batch[self._rows], strict=True))
 
     def render(self) -> NDArray[np.uint8] | None:
-        """A frame (height, width, 3) for `rgb_array`; None and a window for `human`."""
+        """A frame (height, width, 3) for `rgb_array`; None and a window for `human`.
+
+        A divided world is shown with its zones and owners, and with `ghosts_of` set to a zone,
+        what that one sees of the others.
+
+        Raises:
+            ConfigError: no render_mode, or no zone of that number.
+            ResetNeededError: before the first reset.
+        """
         if self.render_mode is None:
             raise ConfigError("render() without a render_mode: make the environment with one")
         if self._steps < 0:
@@ -361,7 +370,7 @@ class CavEnv(ParallelEnv[str, Any, Any]):  # type: ignore[misc] # PettingZoo is 
                 self.metadata["name"],
                 self.metadata["render_fps"],
             )
-        return self._view.show()
+        return self._view.show(self.ghosts_of)
 
     def close(self) -> None:
         """Close the window, if there is one; the environment can be used on."""

@@ -124,7 +124,12 @@ class ZonesConfig:
         avoid_junctions: move cuts aside where that keeps junctions whole.
         weight: what `bisection` shares out evenly: length of lanes, or area.
         hysteresis_m: how far behind a border a vehicle changes its zone.
-        max_deferred_ticks: ticks after which a change that was not acknowledged is forced.
+        max_deferred_ticks: ticks for which a vehicle that has crossed stays with its old zone, if
+            the new one does not acknowledge it; after `grace_ticks` more the change is forced.
+        grace_ticks: that the policy after the deadline grants; 0: it is forced at once.
+        backoff_ticks: for which a zone that has refused a vehicle is not asked again.
+        halo_m: how far zones see over their borders; default: as far as exactness needs, and less
+            is refused.
         approach_ticks: so many ticks before a vehicle is there at its present speed, the zone that
             it drives to is told.
         journal: file for the coordinator's log; empty: none. It must not exist.
@@ -138,6 +143,9 @@ class ZonesConfig:
     weight: Literal["lane_length", "uniform"] = "lane_length"
     hysteresis_m: float = 2.0
     max_deferred_ticks: int = 2
+    grace_ticks: int = 0
+    backoff_ticks: int = 4
+    halo_m: float | None = None
     approach_ticks: int = 2
     journal: str = ""
     check: bool = False
@@ -157,12 +165,11 @@ class ZonesConfig:
             f"must be a whole number from 1 to {MAX_ZONES}",
         )
         _check_finite("zones.hysteresis_m", self.hysteresis_m, 0.0, 100.0)
-        _check(
-            0 <= self.max_deferred_ticks <= 1000,
-            "zones.max_deferred_ticks",
-            self.max_deferred_ticks,
-            "must be a whole number from 0 to 1000",
-        )
+        for name in ("max_deferred_ticks", "grace_ticks", "backoff_ticks"):
+            value = getattr(self, name)
+            _check(0 <= value <= 1000, f"zones.{name}", value, "must be a whole number to 1000")
+        if self.halo_m is not None:
+            _check_finite("zones.halo_m", self.halo_m, 0.0, 1e6)
         _check(
             1 <= self.approach_ticks <= 1000,
             "zones.approach_ticks",

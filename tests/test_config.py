@@ -280,6 +280,13 @@ def test_zones_are_laid_out_by_name_or_by_a_file(tmp_path: Path, layout: str) ->
         ("hysteresis_m", float("nan")),
         ("max_deferred_ticks", -1),
         ("max_deferred_ticks", 2.5),
+        ("approach_ticks", 0),
+        ("grace_ticks", -1),
+        ("backoff_ticks", 1001),
+        ("halo_m", -1.0),
+        ("halo_m", float("inf")),
+        ("check", 1),
+        ("journal", 3),
     ],
 )
 def test_settings_of_zones_are_checked(key: str, value: object) -> None:

@@ -14,9 +14,9 @@ import pytest
 from cavmarl import make_vec, parallel_env
 from cavmarl.evaluate.equivalence import Equivalence, verify_zones
 from cavmarl.roads.cache import load_network
-from cavmarl.roads.zone_coverage import Coverage
 from cavmarl.roads.zone_file import write_zones
 from cavmarl.roads.zones import ZonePartition
+from cavmarl.runtime import dividing
 from cavmarl.runtime.simulation import Simulation
 from cavmarl.vector_env import StepResult
 from cavmarl.worlds import find_map
@@ -285,7 +285,7 @@ def test_who_enters_behind_the_last_enters_once_however_far_the_last_is(tmp_path
 def test_a_halo_that_is_too_narrow_is_found_out(
     halo_m: float, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(Coverage, "halo_m", property(lambda _: halo_m))
+    monkeypatch.setattr(dividing, "halo_m", lambda *_: halo_m)
     overrides = FAST | {"population.background": 90}
     found = verify_zones("grid4x4", (4,), steps=40, overrides=overrides)
     difference = found.results[0].difference

@@ -10,11 +10,14 @@ from typing import Any
 import pytest
 
 from cavmarl import make_vec, parallel_env
+from cavmarl.evaluate.equivalence import verify_zones
+from cavmarl.registry import load_config
 
 STATM = Path("/proc/self/statm")
 GROWTH_MB = 5.0
 RESETS = 1000
 AGENT_STEPS = 1_000_000
+CITY_TICKS = 100_000
 
 DEMAND = """<routes>
   <flow id="f" begin="0" end="60" period="1"><route edges="bottom0A0 A0B0 B0C0 C0D0"/></flow>
@@ -78,6 +81,22 @@ def test_a_million_agent_steps(world: dict[str, Any]) -> None:
     number = AGENT_STEPS // (vec.num_envs * world["agents"])
     assert growth_mb(step, number) < GROWTH_MB
     assert acted > AGENT_STEPS // 10, "too few agents drove for this to mean anything"
+
+
+def test_a_hundred_thousand_ticks_of_a_divided_city() -> None:
+    # Divided and undivided side by side: equal after every step, to the end, and no larger.
+    step_ticks = load_config("rush")[0].clock.ticks_per_step
+    steps = CITY_TICKS // step_ticks
+    memory_mb: list[float] = []
+
+    def look(step: int, steps: int) -> None:
+        if step % (steps // 20) == 0:
+            memory_mb.append(resident_mb())
+
+    found = verify_zones("rush", (4, 9), steps=steps, agents=100, progress=look)
+    assert found.holds, found.results
+    assert all(result.crossings > 1000 for result in found.results)
+    assert max(memory_mb[2:]) - memory_mb[2] < GROWTH_MB
 
 
 def test_a_thousand_worlds_made() -> None:

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 from rich.console import Console
@@ -26,6 +27,7 @@ from cavmarl.errors import ConfigError, UnequalWorldsError
 
 if TYPE_CHECKING:
     from cavmarl.evaluate.sharding_speed import ShardingSpeed
+    from cavmarl.runtime.simulation import Simulation
 
 __all__ = ["sharding"]
 
@@ -46,6 +48,9 @@ def sharding(
     background: Background = None,
     after: Annotated[int, typer.Option(help="Simulated seconds before the first turn.")] = 120,
     repeats: Annotated[int, typer.Option(help="Turns of 10 simulated seconds of each.")] = 5,
+    check: Annotated[
+        bool, typer.Option("--check", help="What the monitor of invariants costs, too.")
+    ] = False,
     seed: Seed = 0,
     settings: Settings = None,
     json_path: JsonPath = None,
@@ -60,19 +65,27 @@ def sharding(
         raise ConfigError("--demand: its vehicles are alone; leave --agents and --background out")
     console = Console()
     with console.status("reading") as status:
-        make = world_maker(
-            env,
-            demand or (),
-            layout=layout,
-            seconds=after + (repeats + 1) * TURN_S,
-            seed=seed,
-            agents=agents,
-            background=background,
-            overrides=parse_settings(settings),
-        )
+
+        def maker(**more: Any) -> Callable[[int], Simulation]:
+            return world_maker(
+                env,
+                demand or (),
+                layout=layout,
+                seconds=after + (repeats + 1) * TURN_S,
+                seed=seed,
+                agents=agents,
+                background=background,
+                overrides={**parse_settings(settings), **more},
+            )
+
         try:
             found = measure_sharding(
-                make, counts, after_s=after, repeats=repeats, progress=status.update
+                maker(),
+                counts,
+                after_s=after,
+                repeats=repeats,
+                make_checked=maker(**{"zones.check": True}) if check else None,
+                progress=status.update,
             )
         except UnequalWorldsError as error:
             print_error(str(error))
@@ -136,4 +149,8 @@ def _phases(found: ShardingSpeed) -> Table:
     table.add_row("sum", *(f"{row.timed_ns:,.1f}" for row in found.rows))
     table.add_row("without stopwatches", *(f"{row.plain_ns:,.1f}" for row in found.rows))
     table.add_row("sum beside it", *(f"{row.timed_ratio - 1.0:+.1%}" for row in found.rows))
+    monitor = [row.checked_ratio for row in found.rows]
+    if any(ratio is not None for ratio in monitor):
+        cells = ("" if ratio is None else f"{ratio - 1.0:+.1%}" for ratio in monitor)
+        table.add_row("the monitor", *cells)
     return table

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Sequence
 from datetime import datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -31,6 +32,7 @@ if TYPE_CHECKING:
     from cavmarl.evaluate import EvaluationReport
     from cavmarl.evaluate.metrics import Metric
     from cavmarl.evaluate.report import Difference, Found, PolicyReport
+    from cavmarl.ownership.transfer_summary import TransferSummary
 
 __all__ = [
     "difference_table",
@@ -153,6 +155,8 @@ def report_table(found: EvaluationReport) -> Table:
         cells = [report_cell(metric, driver[metric.name]) for driver in drivers]
         if not metric.name.startswith("reward_") and set(cells) != {number(None)}:
             table.add_row(_title(metric), *cells)
+    for title, cells in _transfer_rows([driver.transfers for driver in drivers]):
+        table.add_row(title, *cells)
     table.add_row("world step, ms", *(_least(driver, "step_ms") for driver in drivers))
     table.add_row("policy, ms", *(_least(driver, "policy_ms") for driver in drivers))
     return table
@@ -177,6 +181,21 @@ def difference_table(found: EvaluationReport) -> Table:
         if not metric.name.startswith("reward_") and set(cells) != {number(None)}:
             table.add_row(_title(metric), *cells)
     return table
+
+
+def _transfer_rows(
+    found: Sequence[TransferSummary | None],
+) -> Iterator[tuple[str, list[str]]]:
+    """Title and cells of what is told of changes of owner; nothing of undivided worlds."""
+    summaries = [summary for summary in found if summary is not None]
+    if not summaries:
+        return
+    yield "transfers, forced", [f"{each.transfers}, {each.forced}" for each in summaries]
+    for title, spreads in (
+        ("p50, p95, max ticks", [each.latency_ticks for each in summaries]),
+        ("p50, p95, max ms", [each.latency_ms for each in summaries]),
+    ):
+        yield title, [", ".join(map(number, spread)) for spread in spreads]
 
 
 def _show(

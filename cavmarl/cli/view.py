@@ -41,6 +41,9 @@ def view(
     agents: Agents = None,
     background: Background = None,
     settings: Settings = None,
+    ghosts_of: Annotated[
+        int | None, typer.Option(help="Outline the ghosts of this zone of a divided world.")
+    ] = None,
     json_path: JsonPath = None,
 ) -> None:
     """Drive one world and show it from above."""
@@ -57,6 +60,7 @@ def view(
         render_mode="human" if video is None else "rgb_array",
         overrides=parse_settings(settings),
     )
+    world.ghosts_of = ghosts_of
     console = Console()
     stats = record(world, policy, seconds, seed, video, console)
     if video is not None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import time
+from collections import Counter
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, field
 from typing import Any
@@ -15,6 +16,7 @@ from cavmarl.config import TERMS
 from cavmarl.evaluate.encounters import Watch
 from cavmarl.evaluate.recorder import Recorder
 from cavmarl.evaluate.tables import EPISODE, TRACK, TRIP
+from cavmarl.evaluate.transfer_rows import TRANSFER, TransferRecorder
 from cavmarl.policies import Policy, load_policy
 from cavmarl.vector_env import CavVectorEnv
 from cavmarl.worlds import load_world
@@ -82,12 +84,16 @@ class RunData:
         episodes: EPISODE records.
         tracks: TRACK records of the agents of the first episode.
         speed: how fast it ran.
+        transfers: TRANSFER records of the changes of owner; none in undivided worlds.
+        transfer_counts: of a `TransferLog`, summed over the episodes.
     """
 
     trips: NDArray[np.void]
     episodes: NDArray[np.void]
     tracks: NDArray[np.void]
     speed: Speed
+    transfers: NDArray[np.void]
+    transfer_counts: Mapping[str, int]
 
 
 def worlds_at_once(episodes: int, vehicles: int) -> int:
@@ -135,8 +141,14 @@ def _drive(
         parts.append(part)
     trips = np.concatenate([np.zeros(0, TRIP), *(part.trips for part in parts)])
     episodes = np.concatenate([np.zeros(0, EPISODE), *(part.episodes for part in parts)])
-    trips["run"], episodes["run"] = job.run, job.run
-    return RunData(trips, episodes, parts[0].tracks, _speed(parts, vec.num_envs))
+    transfers = np.concatenate([np.zeros(0, TRANSFER), *(part.transfers for part in parts)])
+    counts: Counter[str] = Counter()
+    for part in parts:
+        counts.update(part.transfer_counts)
+    for table in (trips, episodes, transfers):
+        table["run"] = job.run
+    speed = _speed(parts, vec.num_envs)
+    return RunData(trips, episodes, parts[0].tracks, speed, transfers, dict(counts))
 
 
 def _policy_seed(seed: int, part: int) -> int:
@@ -173,6 +185,8 @@ class _Part:
         self.decisions = self.timed_steps = 0
         self.trips = np.zeros(0, TRIP)
         self.episodes = np.zeros(0, EPISODE)
+        self.transfers = np.zeros(0, TRANSFER)
+        self.transfer_counts: Mapping[str, int] = {}
 
     @property
     def tracks(self) -> NDArray[np.void]:
@@ -191,6 +205,7 @@ class _Part:
         vec = self._vec
         observations, infos = vec.reset(seed=seed, options={"first_world": first})
         driver.reset(policy_seed)
+        handed_over = TransferRecorder(vec.simulation.transfers)
         running = np.arange(vec.num_envs) < self._count
         every = max(1, round(TRACK_S / vec.step_s))
         steps = 0
@@ -212,6 +227,7 @@ class _Part:
             over = infos["episode_over"] & running
             done = infos["vehicle_done"] & acted
             self._recorder.add(steps, acted, rewards, infos["terms"], done, over, infos["arrivals"])
+            handed_over.collect(np.flatnonzero(running).tolist(), over)
             running &= ~over
             steps += 1
             self._watch.encounters(steps * vec.step_s, running, infos["mask"])
@@ -220,6 +236,8 @@ class _Part:
         self.episodes = self._recorder.episodes()[: self._count]
         self.trips["episode"] += first
         self.episodes["episode"] += first
+        self.transfers, self.transfer_counts = handed_over.records(), handed_over.counts
+        self.transfers["episode"] += first
 
     def _note_track(self, steps: int, mask: NDArray[np.bool_]) -> None:
         agents = np.flatnonzero(mask)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
@@ -26,6 +27,8 @@ from cavmarl.evaluate.manifest import (
 from cavmarl.evaluate.map_outline import map_outline
 from cavmarl.evaluate.report import EvaluationReport, make_report
 from cavmarl.evaluate.tables import EPISODE, TRACK, TRIP, read_table, write_table
+from cavmarl.evaluate.transfer_rows import TRANSFER, transfers_of
+from cavmarl.ownership.transfer_summary import TransferSummary
 from cavmarl.policies import load_policy
 from cavmarl.seeds import check_seed
 from cavmarl.vector_env import CavVectorEnv
@@ -43,7 +46,10 @@ EPISODES_FILE = "episodes.csv"
 TRACKS_FILE = "tracks.csv"
 MAP_FILE = "map.json"
 SPEED_FILE = "speed.json"
+TRANSFERS_FILE = "transfers.csv"
+TRANSFER_COUNTS_FILE = "transfer_counts.json"
 RESULT_FILES = [TRIPS_FILE, EPISODES_FILE, TRACKS_FILE, MAP_FILE, SPEED_FILE]
+TRANSFER_FILES = [TRANSFERS_FILE, TRANSFER_COUNTS_FILE]  # of divided worlds
 
 
 def evaluate(
@@ -98,8 +104,8 @@ def evaluate(
     )
     with TemporaryDirectory() as room:
         folder = Path(room) if out is None else out
-        _prepare(folder, job, repeats)
-        _drive_all(folder, job, run_seeds(seed, repeats), progress)
+        is_divided = _prepare(folder, job, repeats)
+        _drive_all(folder, job, run_seeds(seed, repeats), progress, is_divided)
         return load_report(folder)
 
 
@@ -112,7 +118,7 @@ def load_report(folder: Path) -> EvaluationReport:
     manifest = read_closed(folder)
     speeds = json.loads((folder / SPEED_FILE).read_text(encoding="utf-8"))
     timed = {name: tuple(Speed(**run) for run in speeds[name]) for name in manifest["policies"]}
-    return make_report(load_tables(folder), timed, manifest)
+    return make_report(load_tables(folder), timed, manifest, load_transfers(folder))
 
 
 def load_tables(folder: Path) -> dict[str, tuple[Rows, Rows]]:
@@ -128,6 +134,20 @@ def load_tracks(folder: Path) -> dict[str, Rows]:
     names = read_closed(folder)["policies"]
     tracks = read_table(folder / TRACKS_FILE, TRACK)
     return {name: tracks.get(name, np.zeros(0, TRACK)) for name in names}
+
+
+def load_transfers(folder: Path) -> dict[str, TransferSummary]:
+    """What became of transfers, by policy; nothing of undivided worlds. Raises as `load_report`."""
+    manifest = read_closed(folder)
+    if TRANSFERS_FILE not in manifest["results_sha256"]:
+        return {}
+    rows = read_table(folder / TRANSFERS_FILE, TRANSFER)
+    counts = json.loads((folder / TRANSFER_COUNTS_FILE).read_text(encoding="utf-8"))
+    none = np.zeros(0, TRANSFER)
+    return {
+        name: TransferSummary.of(transfers_of(rows.get(name, none)), counts[name])
+        for name in manifest["policies"]
+    }
 
 
 def load_map(folder: Path) -> dict[str, Any]:
@@ -169,8 +189,8 @@ def _named(
     return named
 
 
-def _prepare(folder: Path, job: Job, repeats: int) -> None:
-    """Refuse early what cannot work, then put everything on record."""
+def _prepare(folder: Path, job: Job, repeats: int) -> bool:
+    """Refuse early what cannot work, then put everything on record; whether worlds have zones."""
     config, network, demand, partition = load_world(
         job.env,
         agents=job.agents,
@@ -199,13 +219,16 @@ def _prepare(folder: Path, job: Job, repeats: int) -> None:
             "seeds": run_seeds(job.seed, repeats),
             "job": job.to_dict(),
             "plan": plan,
-            "world": describe_world(config, network, demand),
+            "world": describe_world(config, network, demand, partition),
         },
     )
     write_text(folder / MAP_FILE, json.dumps(map_outline(network)))
+    return partition.count > 1
 
 
-def _drive_all(folder: Path, job: Job, seeds: list[int], progress: Progress | None) -> None:
+def _drive_all(
+    folder: Path, job: Job, seeds: list[int], progress: Progress | None, is_divided: bool
+) -> None:
     """Drive all runs, leave their tables, close the manifest."""
     runs: list[dict[str, RunData]] = []
     for run, seed in enumerate(seeds):
@@ -223,4 +246,18 @@ def _drive_all(folder: Path, job: Job, seeds: list[int], progress: Progress | No
     write_table(folder / EPISODES_FILE, episodes, EPISODE)
     write_table(folder / TRACKS_FILE, tracks, TRACK)
     write_text(folder / SPEED_FILE, json.dumps(speeds, indent=2))
-    close_manifest(folder, RESULT_FILES)
+    files = list(RESULT_FILES)
+    if is_divided:
+        _write_transfers(folder, names, runs)
+        files += TRANSFER_FILES
+    close_manifest(folder, files)
+
+
+def _write_transfers(folder: Path, names: list[str], runs: list[dict[str, RunData]]) -> None:
+    transfers = {name: np.concatenate([run[name].transfers for run in runs]) for name in names}
+    counts: dict[str, Counter[str]] = {name: Counter() for name in names}
+    for run in runs:
+        for name in names:
+            counts[name].update(run[name].transfer_counts)
+    write_table(folder / TRANSFERS_FILE, transfers, TRANSFER)
+    write_text(folder / TRANSFER_COUNTS_FILE, json.dumps(counts, indent=2))

@@ -73,6 +73,8 @@ def _read(path: Path, policies: list[str]) -> dict[str, RunData]:
                 arrays[f"episodes_{k}"],
                 arrays[f"tracks_{k}"],
                 Speed(**json.loads(str(arrays[f"speed_{k}"]))),
+                arrays[f"transfers_{k}"],
+                json.loads(str(arrays[f"transfer_counts_{k}"])),
             )
             for k, name in enumerate(policies)
         }
@@ -85,6 +87,8 @@ def _write(path: Path, found: dict[str, RunData]) -> None:
         arrays[f"episodes_{k}"] = data.episodes
         arrays[f"tracks_{k}"] = data.tracks
         arrays[f"speed_{k}"] = json.dumps(asdict(data.speed))
+        arrays[f"transfers_{k}"] = data.transfers
+        arrays[f"transfer_counts_{k}"] = json.dumps(data.transfer_counts)
     np.savez(path, **arrays)
 
 

@@ -24,6 +24,7 @@ from cavmarl.evaluate.machine import describe_code, describe_hardware, describe_
 from cavmarl.kernels import kernel_cache_dir
 from cavmarl.policies import policy_files
 from cavmarl.roads.network import RoadNetwork
+from cavmarl.roads.zones import ZonePartition
 from cavmarl.traffic.demand import DemandFile
 
 __all__ = [
@@ -43,8 +44,13 @@ SCHEMA = 1
 Document = dict[str, Any]
 
 
-def describe_world(config: EnvConfig, network: RoadNetwork, demand: DemandFile | None) -> Document:
-    """The environment whole; its roads, its demand and the kernels by their hashes."""
+def describe_world(
+    config: EnvConfig,
+    network: RoadNetwork,
+    demand: DemandFile | None,
+    partition: ZonePartition,
+) -> Document:
+    """The environment whole; its roads, its demand, its zones and the kernels by their hashes."""
     resolved = asdict(config)
     text = json.dumps(resolved, sort_keys=True)
     return {
@@ -56,7 +62,8 @@ def describe_world(config: EnvConfig, network: RoadNetwork, demand: DemandFile |
         "map_content_sha256": network.content_hash,
         "demand_content_sha256": None if demand is None else demand.content_hash,
         "kernels": kernel_cache_dir().name,
-        "zones": config.zones.count,
+        "zones": partition.count,
+        "zones_content_sha256": partition.content_hash,
         "channel": "none: there are no messages between vehicles",
     }
 

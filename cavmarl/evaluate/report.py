@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from cavmarl.evaluate.episodes import Speed
 from cavmarl.evaluate.metrics import METRICS, Metric, metric_values
 from cavmarl.evaluate.statistics import Interval, Within, mean_interval, within_run
+from cavmarl.ownership.transfer_summary import TransferSummary
 
 __all__ = ["Difference", "EvaluationReport", "Found", "PolicyReport", "make_report"]
 
@@ -83,12 +84,15 @@ class PolicyReport:
         metrics: by the names of `metrics.METRICS`.
         minus_first: by metric, paired differences from the first policy; empty for itself.
         speed: of each run; not repeatable.
+        transfers: between zones, in all runs; None in undivided worlds. Milliseconds are not
+            repeatable.
     """
 
     trips: int
     metrics: Mapping[str, Found]
     minus_first: Mapping[str, Difference]
     speed: tuple[Speed, ...]
+    transfers: TransferSummary | None = None
 
     def __getitem__(self, metric: str) -> Found:
         return self.metrics[metric]
@@ -135,6 +139,7 @@ def make_report(
     tables: Mapping[str, tuple[NDArray[np.void], NDArray[np.void]]],
     speeds: Mapping[str, tuple[Speed, ...]],
     manifest: Mapping[str, Any],
+    transfers: Mapping[str, TransferSummary],
 ) -> EvaluationReport:
     """Reduce raw tables to a report.
 
@@ -142,6 +147,7 @@ def make_report(
         tables: by policy, TRIP and EPISODE records of all runs.
         speeds: by policy, of each run.
         manifest: of the same results.
+        transfers: by policy, between zones; empty where worlds are undivided.
     """
     seeds = tuple(manifest["seeds"])
     found = {
@@ -157,6 +163,7 @@ def make_report(
             if name == first
             else {key: _difference(metrics[key], found[first][key]) for key in metrics},
             speed=speeds[name],
+            transfers=transfers.get(name),
         )
         for name, metrics in found.items()
     }

@@ -48,6 +48,8 @@ class ZoneCost:
         migrations: vehicles that changed their zone, a tick.
         migration_us: by how many µs each of them makes `migrate` longer, by linear regression over
             steps; None: all steps have the same number. The rest of `migrate` finds them.
+        checked_ratio: a tick with the monitor of invariants over that without, median of the turns;
+            None: it was not measured.
     """
 
     zones: int
@@ -65,6 +67,7 @@ class ZoneCost:
     ratio: float
     migrations: float
     migration_us: float | None
+    checked_ratio: float | None = None
 
 
 @dataclass(frozen=True)
@@ -100,6 +103,7 @@ def measure_sharding(
     *,
     after_s: int = 120,
     repeats: int = 5,
+    make_checked: Callable[[int], Simulation] | None = None,
     progress: Callable[[str], None] = lambda text: None,
 ) -> ShardingSpeed:
     """Measure by turns on one core.
@@ -109,6 +113,7 @@ def measure_sharding(
         zones: numbers of zones; the undivided world is measured in any case.
         after_s: simulated seconds before the first turn.
         repeats: turns of each world, of `TURN_S` simulated seconds.
+        make_checked: as `make`, with `zones.check`; None: what the monitor costs is not measured.
         progress: told what is going on.
 
     Raises:
@@ -121,7 +126,7 @@ def measure_sharding(
     watch = Stopwatch()
     with one_core():
         progress("making the worlds")
-        worlds = [TwinWorlds(make, count, watch) for count in counts]
+        worlds = [TwinWorlds(make, count, watch, make_checked) for count in counts]
         first = worlds[0].plain.simulation
         clock = first.config.clock
         for count, own in zip(counts, worlds, strict=True):
@@ -169,7 +174,7 @@ def _check_equal(worlds: Sequence[TwinWorlds]) -> None:
     first = worlds[0].plain.simulation
     expected = first.state_hash()
     for own in worlds:
-        for world in (own.plain, own.timed):
+        for world in own.worlds:
             found = world.simulation.state_hash()
             if found != expected:
                 raise UnequalWorldsError(
@@ -193,6 +198,7 @@ def _cost(own: TwinWorlds, undivided: TwinWorlds) -> ZoneCost:
     ratios = (
         turn.plain_ns / other.plain_ns for turn, other in zip(turns, undivided.turns, strict=True)
     )
+    checked = [turn.checked_ns / turn.plain_ns for turn in turns if turn.checked_ns is not None]
     return ZoneCost(
         zones=own.zones,
         side_m=math.sqrt((max_x - min_x) * (max_y - min_y) / own.zones),
@@ -209,6 +215,7 @@ def _cost(own: TwinWorlds, undivided: TwinWorlds) -> ZoneCost:
         ratio=median(ratios),
         migrations=migrations / (steps * simulation.config.clock.ticks_per_step),
         migration_us=_migration_us([turn.timed for turn in turns]),
+        checked_ratio=median(checked) if checked else None,
     )
 
 

@@ -58,13 +58,14 @@ class Turn:
 
 @dataclass(frozen=True)
 class Pair:
-    """One turn of both worlds; times in ns a vehicle and tick.
+    """One turn of all worlds; times in ns a vehicle and tick.
 
     Attributes:
         plain: of the world without a stopwatch.
         timed: of that with one.
         plain_ns: a tick of the first.
         timed_ns: a tick of the second, less the stopwatch's own time.
+        checked_ns: a tick of the third, with the monitor; None: there is none.
         phases: by the names of `PHASES`; their sum is `timed_ns`.
         calls: by the names of the runtime's calls.
     """
@@ -73,6 +74,7 @@ class Pair:
     timed: Turn
     plain_ns: float
     timed_ns: float
+    checked_ns: float | None
     phases: dict[str, float]
     calls: dict[str, float]
 
@@ -84,23 +86,39 @@ class TwinWorlds:
         make: the world in k zones, at the start of an episode.
         zones: k.
         watch: for the second one.
+        make_checked: the same world with the monitor of invariants; None: it is not measured.
 
     Attributes:
         zones: k.
         plain: the one without.
         timed: the one with it.
+        checked: a third one, with the monitor; None where nobody asks or nothing is divided.
         turns: those that count.
     """
 
-    def __init__(self, make: Callable[[int], Simulation], zones: int, watch: Stopwatch) -> None:
+    def __init__(
+        self,
+        make: Callable[[int], Simulation],
+        zones: int,
+        watch: Stopwatch,
+        make_checked: Callable[[int], Simulation] | None = None,
+    ) -> None:
         self.zones = zones
         self.turns: list[Pair] = []
         self.plain, self.timed = DrivenWorld(make(zones)), DrivenWorld(make(zones))
         self.timed.simulation.instrument(watch.around)
+        self.checked: DrivenWorld | None = None
+        if make_checked is not None and zones > 1:
+            self.checked = DrivenWorld(make_checked(zones))
         self._watch = watch
 
+    @property
+    def worlds(self) -> list[DrivenWorld]:
+        """All of them."""
+        return [self.plain, self.timed, *([] if self.checked is None else [self.checked])]
+
     def run(self, steps: int) -> Pair:
-        """The next steps of both.
+        """The next steps of all.
 
         Raises:
             ConfigError: nobody drives in them.
@@ -110,6 +128,7 @@ class TwinWorlds:
         watch.clear()
         timed = _run(self.timed, steps, watch)
         watch.forget("suggest", "loads")
+        checked = None if self.checked is None else _run(self.checked, steps, watch)
         if not plain.vehicles:
             raise ConfigError("nobody drives: another --after, or more demand")
         share = 1.0 / (plain.vehicles * self.plain.simulation.config.clock.ticks_per_step)
@@ -119,7 +138,8 @@ class TwinWorlds:
         for name, ns in calls.items():
             phases[_PHASE_OF.get(name, "other")] += ns
         phases["other"] += timed_ns - sum(phases.values())
-        return Pair(plain, timed, plain.ns * share, timed_ns, phases, calls)
+        checked_ns = None if checked is None else checked.ns * share
+        return Pair(plain, timed, plain.ns * share, timed_ns, checked_ns, phases, calls)
 
 
 def _run(world: DrivenWorld, steps: int, watch: Stopwatch) -> Turn:

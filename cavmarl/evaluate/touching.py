@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cavmarl.kernels.contacts import find_contacts
-from cavmarl.kernels.neighbors import fill_grid, make_grid
+from cavmarl.kernels.neighbors import make_grid
 
 __all__ = ["TouchCounter"]
 
@@ -39,8 +39,7 @@ class TouchCounter:
         """
         if len(rows) > len(self._hit):
             self._make_room(2 * len(rows))
-        fill_grid(rows, len(rows), self._grid)
-        find_contacts(len(rows), self._grid, self._hit)
+        find_contacts(rows, len(rows), self._grid, self._hit)
         hitting = np.flatnonzero(self._hit[: len(rows)] >= 0)
         ids, others = rows["id"][hitting].tolist(), self._hit[hitting].tolist()
         touching = {(min(pair), max(pair)) for pair in zip(ids, others, strict=True)}

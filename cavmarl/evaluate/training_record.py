@@ -42,7 +42,9 @@ def begin_training(
             "program": program,
             "settings": dict(settings),
             "seeds": [settings["seed"]],
-            "world": describe_world(config, simulation.network, simulation.demand),
+            "world": describe_world(
+                config, simulation.network, simulation.demand, simulation.partition
+            ),
         },
     )
 

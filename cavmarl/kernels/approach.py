@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from cavmarl.kernels import inlined_kernel, kernel
 from cavmarl.kernels.arrays import RoadArrays, Scratch, Travel
+from cavmarl.kernels.buckets import add, forget, lay_out
 from cavmarl.kernels.ways import leave, next_step, own_step
 
 __all__ = ["APPROACH", "APPROACH_M", "FORK_BEYOND_M", "register_links"]
@@ -18,6 +19,7 @@ APPROACH_M = 150.0  # how far ahead a vehicle announces itself at most,
 APPROACH_S = 8.0  # which it does this time before it arrives,
 APPROACH_STANDING_M = 30.0  # and this far ahead in any case
 MAX_LINKS_AHEAD = 2
+BLOCK = 64  # rows that are still near in memory when they are looked at again
 FORK_BEYOND_M = 3.0  # how far beyond a junction paths from one lane can still run together
 
 APPROACH = np.dtype(
@@ -46,27 +48,30 @@ def register_links(
         travel: the ways.
         rows: VEHICLE (C,), of which `num` live.
         num: live rows.
-        scratch: step, link_start and approach are written.
+        scratch: step, the lists by link and approach are written.
     """
-    # One look for all that follows: in a city the steps lie far apart, each is a cache miss, and a
-    # loop that does nothing else has many of them under way at once.
-    for i in range(num):
-        scratch.step[i] = travel.steps[own_step(roads, rows[i])]
     pairs = 0
-    for i in range(num):
-        pairs = _announce(roads, travel, rows[i], i, pairs, scratch)
-    start = scratch.link_start
-    num_links = roads.links.shape[0]
-    start[: num_links + 2] = 0
+    for first in range(0, num, BLOCK):
+        last = min(first + BLOCK, num)
+        # One look for all that follows: in a city the steps lie far apart, each is a cache miss,
+        # and a loop that does nothing else has many of them under way at once. And most rows are
+        # where they were a tick before, with the same vehicle on the same lane.
+        for i in range(first, last):
+            at = own_step(roads, rows[i])
+            if at != scratch.step_at[i] or at >= travel.num_fixed:
+                scratch.step[i] = travel.steps[at]
+                scratch.step_at[i] = at
+        for i in range(first, last):
+            pairs = _announce(roads, travel, rows[i], i, pairs, scratch)
+    end = scratch.link_end
+    forget(scratch.links)
     for k in range(pairs):
-        start[scratch.pairs[k]["link"] + 2] += 1
-    for link in range(num_links):
-        start[link + 2] += start[link + 1]
+        add(scratch.links, scratch.pairs[k]["link"])
+    lay_out(scratch.links)
     for k in range(pairs):
         link = scratch.pairs[k]["link"]
-        place = start[link + 1]
-        scratch.approach[place] = scratch.pairs[k]
-        start[link + 1] = place + 1
+        scratch.approach[end[link]] = scratch.pairs[k]
+        end[link] += 1
 
 
 @inlined_kernel

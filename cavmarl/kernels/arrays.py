@@ -12,6 +12,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from cavmarl.kernels.buckets import Lists
+
 __all__ = [
     "Demand",
     "Gate",
@@ -22,6 +24,7 @@ __all__ = [
     "Sensors",
     "Travel",
     "Worlds",
+    "Zoned",
 ]
 
 
@@ -66,12 +69,15 @@ class Travel(NamedTuple):
     first_detour: int  # PLAN row of the first goal of demand vehicles that take another way
     begin_s: float  # the clock of the demand at tick 0
     view_m: float  # how far anybody looks for others along the road, at most VIEW_M
+    see_m: float  # how far before a line its centre is when anybody first asks about the junction
+    num_fixed: int  # steps from here on are written while the world runs
 
 
 class Worlds(NamedTuple):
     """A shard's part of W worlds: the vehicles and signals that a tick reads and writes.
 
-    `rows` is the committed state of the tick, `next_rows` the room for the one after; they swap.
+    `rows` is the committed state of the tick, `next_rows` what `advance` makes of it: the same
+    array, but in the ticks that put rows in order.
     """
 
     rows: NDArray[np.void]  # VEHICLE (W, C)
@@ -87,8 +93,21 @@ class Worlds(NamedTuple):
     pending: NDArray[
         np.float64
     ]  # (W, A, D + 1, 2) agents' commands of the last D ticks of latency, by tick modulo D + 1
+    num_near: NDArray[np.int64]  # (W,) the first ghosts, up to here, can touch owned vehicles
     num_touching: NDArray[np.int64]  # (W,) owned vehicles that touched another before this tick
     num_contacts: NDArray[np.int64]  # (W,) vehicles that began to touch another, since reset
+
+
+class Zoned(NamedTuple):
+    """The rows of all k zones of W worlds side by side; each shard's `Worlds` are views of it."""
+
+    rows: NDArray[np.void]  # VEHICLE (2, k, W, C) what `rows` and `next_rows` are views of
+    num_owned: NDArray[np.int64]  # (k, W)
+    num_rows: NDArray[np.int64]  # (k, W)
+    num_near: NDArray[np.int64]  # (k, W)
+    border: NDArray[np.int32]  # (k, W, C) owned rows that are noted at a border, rising
+    num_border: NDArray[np.int64]  # (k, W)
+    spare: NDArray[np.void]  # VEHICLE (1,)
 
 
 class Gate(NamedTuple):
@@ -130,13 +149,17 @@ class Demand(NamedTuple):
 
 
 class Scratch(NamedTuple):
-    """Room that a tick works in; holds nothing between calls."""
+    """Room that a tick works in; between calls it knows which lists to clear, and fixed steps."""
 
-    lane_start: NDArray[np.int32]  # (L + 1,) entries of lane l: [lane_start[l], lane_start[l + 1])
-    lane_end: NDArray[np.int32]  # (L,) lane_start[l + 1] again
+    lanes: Lists  # by lane, lists of entries
+    lane_start: NDArray[np.int32]  # entries of lane l: [lane_start[l], lane_end[l]); at L: of all.
+    lane_end: NDArray[np.int32]  # Both are views of `lanes.bounds`: one look into memory
     entries: NDArray[np.void]  # ENTRY (2 C,) vehicles by (lane, s, id), side lanes included
     step: NDArray[np.void]  # PLAN (C,) of each row the step of its lane, see `ways.own_step`
-    link_start: NDArray[np.int32]  # (K + 2,) approach of link k: [link_start[k], link_start[k + 1])
+    step_at: NDArray[np.int64]  # (C,) which of `Travel.steps` that is, -1: none yet
+    links: Lists  # by link, lists of approach
+    link_start: NDArray[np.int32]  # approach of link k: [link_start[k], link_end[k])
+    link_end: NDArray[np.int32]
     approach: NDArray[np.void]  # APPROACH (3 C,) vehicles on or before links, by link
     pairs: NDArray[np.void]  # APPROACH (3 C,) the same before sorting
     order: NDArray[np.int32]  # (C,) the owned rows as they lie along the lanes
@@ -146,7 +169,6 @@ class Scratch(NamedTuple):
     blinker: NDArray[np.int32]  # (C,)
     hold: NDArray[np.int32]  # (C,)
     hit: NDArray[np.int64]  # (C,) id of the vehicle each row touches
-    spare: NDArray[np.void]  # VEHICLE (1,)
 
 
 class Sensors(NamedTuple):

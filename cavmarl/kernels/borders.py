@@ -7,7 +7,8 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from cavmarl.kernels import kernel
+from cavmarl.kernels import inlined_kernel, kernel
+from cavmarl.kernels.arrays import Zoned
 from cavmarl.kernels.zones import ZoneArrays, squared_distance, zone_of
 
 __all__ = ["NEAR", "find_near", "pass_on"]
@@ -15,10 +16,12 @@ __all__ = ["NEAR", "find_near", "pass_on"]
 NEAR = np.dtype(
     [
         ("vehicle", np.int64),
+        ("source", np.int64),  # zone that owns it
         ("row", np.int64),  # where the owner keeps it
         ("target", np.int64),  # zone that it is in, or will be in
         ("crossed", np.bool_),  # it is further than the hysteresis outside of its owner's zone
-        ("depth_m", np.float64),  # how far outside it is; 0 inside
+        ("depth_m", np.float64),  # how far outside of its owner's zone; inside, less than 0: how
+        # far it has to go to the target
     ],
     align=True,
 )
@@ -27,12 +30,13 @@ NEAR = np.dtype(
 @kernel
 def find_near(
     zones: ZoneArrays,
-    zone: int,
     hysteresis_m: float,
     ahead_s: float,
     max_speed_mps: float,
-    rows: NDArray[np.void],
-    num: int,
+    zoned: Zoned,
+    side: int,
+    w: int,
+    everybody: bool,
     out: NDArray[np.void],
 ) -> int:
     """The owned rows that other zones have to be told of; how many entries there are.
@@ -42,105 +46,128 @@ def find_near(
 
     Args:
         zones: of the partition.
-        zone: the shard's own.
         hysteresis_m: so far behind the border a vehicle still stays.
         ahead_s: how far ahead to look, s.
         max_speed_mps: which no vehicle exceeds.
-        rows: VEHICLE (C,).
-        num: owned rows.
-        out: NEAR (2 C,) overwritten: by rows, a crossing before an approach.
+        zoned: the rows of all zones.
+        side: whose rows, 0 or 1.
+        w: in which world.
+        everybody: whether to look at all owned rows, and not only at those that `exchange` has
+            found near a border.
+        out: NEAR (2 C,) overwritten: by zones and rows, a crossing before an approach.
     """
-    limit = hysteresis_m * hysteresis_m
-    # Whoever lies further inside cannot come out in that time. Infinite rims stay infinite.
-    margin = max_speed_mps * ahead_s
-    min_x = zones.rects[zone, 0] + margin
-    min_y = zones.rects[zone, 1] + margin
-    max_x = zones.rects[zone, 2] - margin
-    max_y = zones.rects[zone, 3] - margin
     found = 0
-    for i in range(num):
-        x = rows[i]["x"]
-        y = rows[i]["y"]
-        if min_x < x and x < max_x and min_y < y and y < max_y:
-            continue
-        squared = squared_distance(zones.rects, zone, x, y)
-        here = zone
-        if squared > limit:
-            here = zone_of(zones, x, y)
-            _note(out[found], rows[i]["id"], i, here, True, squared)
-            found += 1
-        way = rows[i]["speed"] * ahead_s
-        then_x = x + math.cos(rows[i]["heading"]) * way
-        then_y = y + math.sin(rows[i]["heading"]) * way
-        if squared_distance(zones.rects, zone, then_x, then_y) > limit:
-            there = zone_of(zones, then_x, then_y)
-            if there != here:
-                _note(out[found], rows[i]["id"], i, there, False, squared)
-                found += 1
+    for zone in range(zones.rects.shape[0]):
+        owned = zoned.num_owned[zone, w]
+        for n in range(owned if everybody else zoned.num_border[zone, w]):
+            i = n if everybody else zoned.border[zone, w, n]
+            if i < owned:
+                row = zoned.rows[side, zone, w, i]
+                found = _tell_of(
+                    zones, hysteresis_m, ahead_s, max_speed_mps, row, zone, i, out, found
+                )
     return found
 
 
-@kernel
+@inlined_kernel
+def _tell_of(
+    zones: ZoneArrays,
+    hysteresis_m: float,
+    ahead_s: float,
+    max_speed_mps: float,
+    row: np.void,
+    zone: int,
+    i: int,
+    out: NDArray[np.void],
+    found: int,
+) -> int:
+    """Note row i of a zone once for each zone that it is near to; how many entries there are."""
+    rects = zones.rects
+    x = row["x"]
+    y = row["y"]
+    # Whoever lies further inside cannot come out in that time. Infinite rims stay infinite.
+    margin = max_speed_mps * ahead_s
+    if (
+        rects[zone, 0] + margin < x
+        and x < rects[zone, 2] - margin
+        and rects[zone, 1] + margin < y
+        and y < rects[zone, 3] - margin
+    ):
+        return found
+    limit = hysteresis_m * hysteresis_m
+    squared = squared_distance(rects, zone, x, y)
+    here = zone
+    if squared > limit:
+        here = zone_of(zones, x, y)
+        _note(out[found], row["id"], zone, i, here, True, squared)
+        found += 1
+    way = row["speed"] * ahead_s
+    then_x = x + math.cos(row["heading"]) * way
+    then_y = y + math.sin(row["heading"]) * way
+    if squared_distance(rects, zone, then_x, then_y) > limit:
+        there = zone_of(zones, then_x, then_y)
+        if there != here:
+            if squared == 0.0:
+                squared = -squared_distance(rects, there, x, y)
+            _note(out[found], row["id"], zone, i, there, False, squared)
+            found += 1
+    return found
+
+
+@inlined_kernel
 def _note(
-    entry: np.void, vehicle: int, row: int, target: int, crossed: bool, squared: float
+    entry: np.void, vehicle: int, source: int, row: int, target: int, crossed: bool, squared: float
 ) -> None:
     entry["vehicle"] = vehicle
+    entry["source"] = source
     entry["row"] = row
     entry["target"] = target
     entry["crossed"] = crossed
-    entry["depth_m"] = math.sqrt(squared)
+    entry["depth_m"] = math.copysign(math.sqrt(abs(squared)), squared)
 
 
 @kernel
 def pass_on(
-    vehicle: int,
-    source: NDArray[np.void],
-    source_owned: NDArray[np.int64],
-    row: int,
-    target: NDArray[np.void],
-    target_owned: NDArray[np.int64],
-    target_rows: NDArray[np.int64],
-    w: int,
-    spare: NDArray[np.void],
+    vehicle: int, source: int, row: int, target: int, zoned: Zoned, side: int, w: int
 ) -> int:
     """Make a vehicle a ghost of the zone that owned it, and an owned row where it was a ghost.
 
     Args:
         vehicle: its id.
-        source: VEHICLE (W, C), of the shard that owns it.
-        source_owned: (W,) owned rows there; becomes one less.
+        source: the zone that owns it.
         row: where it probably is there.
-        target: VEHICLE (W, C), of the shard that will own it.
-        target_owned: (W,) owned rows there; becomes one more.
-        target_rows: (W,) owned rows and ghosts there.
+        target: the zone that will own it.
+        zoned: the rows of all zones, and how many they are.
+        side: whose rows, 0 or 1.
         w: in which world.
-        spare: VEHICLE (1,), room.
 
     Returns:
         its row at the target, with what the ghost said; -1: the source does not own it; -2: the
         target has no ghost of it.
     """
-    owned = source_owned[w]
-    if row >= owned or source[w, row]["id"] != vehicle:
+    old = zoned.rows[side, source, w]
+    new = zoned.rows[side, target, w]
+    owned = zoned.num_owned[source, w]
+    if row >= owned or old[row]["id"] != vehicle:
         row = 0
-        while row < owned and source[w, row]["id"] != vehicle:
+        while row < owned and old[row]["id"] != vehicle:
             row += 1
         if row == owned:
             return -1
-    place: int = target_owned[w]
+    place = zoned.num_owned[target, w]
     ghost = place
-    while ghost < target_rows[w] and target[w, ghost]["id"] != vehicle:
+    while ghost < zoned.num_rows[target, w] and new[ghost]["id"] != vehicle:
         ghost += 1
-    if ghost == target_rows[w]:
+    if ghost == zoned.num_rows[target, w]:
         return -2
-    _swap(target[w], ghost, place, spare)
-    target_owned[w] = place + 1
-    _swap(source[w], row, owned - 1, spare)
-    source_owned[w] = owned - 1
-    return place
+    _swap(new, ghost, place, zoned.spare)
+    zoned.num_owned[target, w] = place + 1
+    _swap(old, row, owned - 1, zoned.spare)
+    zoned.num_owned[source, w] = owned - 1
+    return int(place)
 
 
-@kernel
+@inlined_kernel
 def _swap(rows: NDArray[np.void], i: int, j: int, spare: NDArray[np.void]) -> None:
     if i != j:
         spare[0] = rows[i]

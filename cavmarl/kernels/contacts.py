@@ -2,72 +2,101 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 from numpy.typing import NDArray
 
 from cavmarl.kernels import inlined_kernel, kernel
 from cavmarl.kernels.geometry import boxes_overlap
-from cavmarl.kernels.neighbors import Grid, cell_columns, cell_rows
+from cavmarl.kernels.neighbors import Grid, cell_at, cell_columns, cell_rows
 
-__all__ = ["bodies_touch", "find_contacts"]
+__all__ = ["find_contacts"]
 
 
-@inlined_kernel
-def bodies_touch(one: np.void, other: np.void) -> bool:
-    """Whether two BODY records overlap: their rectangles share area and their heights overlap.
+@kernel
+def _bodies_touch(one: np.void, other: np.void) -> bool:
+    """Whether two VEHICLE records overlap: their rectangles share area and their heights overlap.
 
     Vehicles on and under a bridge do not touch: their `z` differ by half the sum of their heights.
     """
-    dx = one["x"] - other["x"]
-    dy = one["y"] - other["y"]
-    reach = one["radius"] + other["radius"]
-    if not dx * dx + dy * dy < reach * reach:
-        return False
     if not abs(one["z"] - other["z"]) < 0.5 * (one["height"] + other["height"]):
         return False
     return boxes_overlap(
         one["x"],
         one["y"],
-        one["cos"],
-        one["sin"],
-        one["half_length"],
-        one["half_width"],
+        math.cos(one["heading"]),
+        math.sin(one["heading"]),
+        0.5 * one["length"],
+        0.5 * one["width"],
         other["x"],
         other["y"],
-        other["cos"],
-        other["sin"],
-        other["half_length"],
-        other["half_width"],
+        math.cos(other["heading"]),
+        math.sin(other["heading"]),
+        0.5 * other["length"],
+        0.5 * other["width"],
     )
 
 
 @kernel
-def find_contacts(num: int, grid: Grid, hit: NDArray[np.int64]) -> bool:
+def find_contacts(rows: NDArray[np.void], num: int, grid: Grid, hit: NDArray[np.int64]) -> bool:
     """For each vehicle the smallest id of those that it touches; whether any two do.
 
+    One pass: each vehicle looks at those that are in the cells already and joins them.
+
     Args:
-        num: live rows of the world.
-        grid: filled for this tick from these rows.
+        rows: VEHICLE (C,).
+        num: live rows of the world; at most the grid's capacity.
+        grid: its `newest` and `spots` are overwritten.
         hit: (C,) by VEHICLE row, overwritten up to `num`: an id, or -1.
     """
-    hit[:num] = -1
+    grid.newest[:] = -1
+    largest = 0.0
     found = False
-    bodies = grid.bodies
-    for a in range(num):
-        body = bodies[a]
-        reach = body["radius"] + grid.largest[0]
-        first_column, last_column = cell_columns(grid, body["x"], reach)
-        first_row, last_row = cell_rows(grid, body["y"], reach)
-        for j in range(first_row, last_row + 1):
-            # Each pair once, from its body that lies further ahead in the array.
-            begin = grid.start[j * grid.num_x + first_column]
-            end = min(grid.start[j * grid.num_x + last_column + 1], a)
-            for b in range(begin, end):
-                other = bodies[b]
-                if bodies_touch(body, other):
-                    _note(hit, body["row"], other["id"])
-                    _note(hit, other["row"], body["id"])
+    for i in range(num):
+        hit[i] = -1
+        row = rows[i]
+        half_length = 0.5 * row["length"]
+        half_width = 0.5 * row["width"]
+        radius = math.sqrt(half_length * half_length + half_width * half_width)
+        largest = max(largest, radius)
+        spot = grid.spots[i]
+        spot["x"] = row["x"]
+        spot["y"] = row["y"]
+        spot["radius"] = radius
+        found |= _touches_earlier(rows, i, spot, radius + largest, grid, hit)
+        cell = cell_at(grid, row["x"], row["y"])
+        spot["next"] = grid.newest[cell]
+        grid.newest[cell] = i
+    return found
+
+
+@inlined_kernel
+def _touches_earlier(
+    rows: NDArray[np.void],
+    i: int,
+    spot: np.void,
+    reach: float,
+    grid: Grid,
+    hit: NDArray[np.int64],
+) -> bool:
+    """Note whom of those in the cells row i touches."""
+    found = False
+    first_column, last_column = cell_columns(grid, spot["x"], reach)
+    first_row, last_row = cell_rows(grid, spot["y"], reach)
+    for j in range(first_row, last_row + 1):
+        for cell in range(j * grid.num_x + first_column, j * grid.num_x + last_column + 1):
+            k = grid.newest[cell]
+            while k >= 0:
+                other = grid.spots[k]
+                dx = spot["x"] - other["x"]
+                dy = spot["y"] - other["y"]
+                near = spot["radius"] + other["radius"]
+                if dx * dx + dy * dy < near * near and _bodies_touch(rows[i], rows[k]):
+                    _note(hit, i, rows[k]["id"])
+                    _note(hit, k, rows[i]["id"])
                     found = True
+                k = other["next"]
     return found
 
 

@@ -39,7 +39,7 @@ from cavmarl.kernels.rng import STREAM_DRIVER, quick_uniform
 from cavmarl.kernels.stopping import way_to_stop
 from cavmarl.kernels.ways import leave, next_step
 
-__all__ = ["decide", "look_ahead_m"]
+__all__ = ["decide", "look_ahead_m", "see_line_m"]
 
 SEE_LINE_M = 8.0
 NEAR_M = 8.0  # to a leader so near the corner between matters,
@@ -72,7 +72,7 @@ def look_ahead_m(kind: np.void, speed: float) -> float:
 
 
 @inlined_kernel
-def _see_line_m(kind: np.void, speed: float) -> float:
+def see_line_m(kind: np.void, speed: float) -> float:
     """How far before its front a driver asks whether it may pass a line, in m.
 
     IDM asks as soon as it sees the line; Krauss's driver when it may soon have to brake.
@@ -141,7 +141,7 @@ def _shared_start(
     for link in range(first, first + roads.lanes[lane]["num_links"]):
         if link == chosen:
             continue
-        for k in range(scratch.link_start[link], scratch.link_start[link + 1]):
+        for k in range(scratch.link_start[link], scratch.link_end[link]):
             other = scratch.approach[k]
             place = -other["dist"]
             if place > max(-distance, 0.0) and place - other["half"] < roads.links[link]["fork_m"]:
@@ -271,7 +271,7 @@ def _road_ahead(
         )
         press = max(press, fork)
     look = min(look_ahead_m(kind, speed), travel.view_m)
-    see = _see_line_m(kind, speed) + half
+    see = min(see_line_m(kind, speed) + half, travel.see_m)
     # Behind a leader on its own lane a driver minds the next line only where it could not stop
     # any more once the leader has passed it.
     if k + 1 < scratch.lane_end[lane] and (scratch.entries[k + 1]["s"] - row["s"] <= travel.view_m):
@@ -309,7 +309,8 @@ def _road_ahead(
         limit = ahead["speed_mps"] * row["speed_factor"]
         if steered:
             allowed = min(allowed, _bend_speed(roads, lane, distance))
-        allowed = min(allowed, _slowing_to(kind, limit, distance, speed, dt))
+        if limit < allowed:
+            allowed = min(allowed, _slowing_to(kind, limit, distance, speed, dt))
         j = last_on(scratch, lane, row["id"], distance, travel.view_m)
         if j >= 0:
             leader = scratch.entries[j]
@@ -421,9 +422,9 @@ def decide(
         if row["side_lane"] >= 0:
             press = max(press, _beside(roads, travel, kind, row, row["side_lane"], scratch))
         needed = needed_change(roads, travel, row, scratch.step[i])
-        own_wish = wish(kind, speed, allowed, press)
         change = 0
         if thinks_of_lanes(row, needed, tick, dt):
+            own_wish = wish(kind, speed, allowed, press)
             change = choose_lane(roads, travel, rows, i, tick, needed, own_wish, scratch)
         if change != 0 and driver == DRIVER_AGENT:
             # A steered vehicle on its way into a neighbour lane still minds its own lane, to the

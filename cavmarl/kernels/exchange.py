@@ -1,4 +1,4 @@
-"""Rows that go from shard to shard: ghosts every tick.
+"""Rows that go from shard to shard: ghosts, every tick.
 
 A shard's owned rows come first, its ghosts after them.
 """
@@ -8,24 +8,102 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from cavmarl.kernels import kernel
-from cavmarl.kernels.zones import ZoneArrays, zone_of
+from cavmarl.kernels import inlined_kernel, kernel
+from cavmarl.kernels.arrays import Zoned
+from cavmarl.kernels.zones import Halo, ZoneArrays, squared_distance, zone_of
 
-__all__ = ["take_ghosts", "take_own"]
+__all__ = ["exchange", "take_own"]
 
 
 @kernel
-def take_ghosts(
-    source: NDArray[np.void],
-    chosen: NDArray[np.int32],
+def exchange(
+    zones: ZoneArrays,
+    halo: Halo,
+    touching_m: float,
+    border_m: float,
+    zoned: Zoned,
+    side: int,
     first: int,
     last: int,
-    rows: NDArray[np.void],
-    num: int,
 ) -> None:
-    """Copy `source[chosen[first:last]]` behind the first `num` rows."""
-    for n in range(first, last):
-        rows[num + n - first] = source[chosen[n]]
+    """Renew all ghosts of some worlds from the owned rows, and note who is near a border.
+
+    Zone z needs a vehicle if and only if it lies within `halo_m` of z's rectangle. A vehicle that
+    has left its own zone's rectangle, because its transfer is late, is published like any other,
+    to the zone that it is in as well.
+
+    Args:
+        zones: of the partition.
+        halo: from `roads.zone_halo.zone_halo`, for the same partition.
+        touching_m: no ghost further outside of a zone can touch one of its vehicles.
+        border_m: who is so near another zone is noted; 0: who lies in one.
+        zoned: the ghosts and how many there are, border and num_border are written.
+        side: whose rows, 0 or 1.
+        first: the first world.
+        last: the one after the last.
+    """
+    count = zones.rects.shape[0]
+    for w in range(first, last):
+        for zone in range(count):
+            owned = zoned.num_owned[zone, w]
+            zoned.num_rows[zone, w] = owned
+            zoned.num_near[zone, w] = owned
+        if count > 1:
+            for zone in range(count):
+                _publish(zones, halo, touching_m, border_m, zoned, side, zone, w)
+
+
+@inlined_kernel
+def _publish(
+    zones: ZoneArrays,
+    halo: Halo,
+    touching_m: float,
+    border_m: float,
+    zoned: Zoned,
+    side: int,
+    zone: int,
+    w: int,
+) -> None:
+    """Copy the owned rows of one zone behind those of all that need them."""
+    limit = halo.halo_m * halo.halo_m
+    near_limit = touching_m * touching_m
+    border_limit = border_m * border_m
+    min_x, min_y = halo.inner[zone, 0], halo.inner[zone, 1]
+    max_x, max_y = halo.inner[zone, 2], halo.inner[zone, 3]
+    found = 0
+    for i in range(zoned.num_owned[zone, w]):
+        row = zoned.rows[side, zone, w, i]
+        x = row["x"]
+        y = row["y"]
+        if min_x < x and x < max_x and min_y < y and y < max_y:
+            continue
+        at_border = False
+        here = zone_of(zones, x, y)
+        for n in range(halo.near_start[here], halo.near_start[here + 1]):
+            other = halo.near[n]
+            if other == zone:
+                continue
+            squared = squared_distance(zones.rects, other, x, y)
+            if squared <= limit:
+                _take_ghost(row, zoned, side, other, w, squared <= near_limit)
+                at_border |= squared <= border_limit
+        if at_border:
+            zoned.border[zone, w, found] = i
+            found += 1
+    zoned.num_border[zone, w] = found
+
+
+@inlined_kernel
+def _take_ghost(row: np.void, zoned: Zoned, side: int, zone: int, w: int, near: bool) -> None:
+    """Put a row behind those of a zone, before the ghosts that can touch nobody if it can."""
+    place = zoned.num_rows[zone, w]
+    if near:
+        first_far = zoned.num_near[zone, w]
+        zoned.rows[side, zone, w, place] = zoned.rows[side, zone, w, first_far]
+        place = first_far
+        zoned.num_near[zone, w] += 1
+    zoned.rows[side, zone, w, place] = row
+    zoned.num_rows[zone, w] += 1
 
 
 @kernel

@@ -110,58 +110,84 @@ def _ignores(row: np.void, foe: np.void, link: int, signal: int) -> bool:
 
 
 @kernel
-def _foe_blocks(
+def _is_harmless(
     roads: RoadArrays,
     rows: NDArray[np.void],
     row: np.void,
     link: int,
     conflict: np.void,
     foe: np.void,
+    front: float,
+    apart: float,
     gives_way: bool,
-    foe_signal: int,
-    to_leave: float,
-    time_in: float,
-    time_out: float,
+    phase: NDArray[np.int32],
+) -> bool:
+    """Whether an APPROACH need not be minded, whenever it comes to the shared area.
+
+    Its `front` has so many m to where it can still stop; its rear leaves the shared area `apart` m
+    before the own one.
+    """
+    if front <= 0.0:
+        # Who stands on the junction before the shared area is kept from it by somebody else.
+        before_area = foe["dist"] + conflict["foe_enter_m"] - foe["half"] > 0.0
+        if before_area and foe["speed"] < STANDING_MPS and rows[foe["row"]]["wait_s"] > IMPATIENT_S:
+            return True
+        # Behind one that is faster and leads into the same lane, one can follow.
+        follows: bool = conflict["merging"] and apart > ROOM_M and row["speed"] <= foe["speed"]
+        return follows
+    committed = foe["speed"] * foe["speed"] > 2.0 * HARD_STOP * max(front, 0.01)
+    if committed:
+        return False
+    if not (gives_way and conflict["must_yield"]):
+        return True
+    if _ignores(row, rows[foe["row"]], link, link_signal(roads, conflict["foe"], phase)):
+        return True
+    patience = min(row["wait_s"] / IMPATIENCE_S, 1.0)
+    if row["hold"] == HOLD_NONE and row["stopped_at"] == link:
+        patience = 1.0  # it has been let in and goes on
+    brakes: bool = foe["speed"] * foe["speed"] < 2.0 * FORCED_STOP * patience * front
+    return brakes
+
+
+@kernel
+def _foe_blocks(
+    roads: RoadArrays,
+    rows: NDArray[np.void],
+    row: np.void,
+    link: int,
+    distance: float,
+    limit: float,
+    conflict: np.void,
+    foe: np.void,
+    gives_way: bool,
+    phase: NDArray[np.int32],
 ) -> bool:
     """Whether one APPROACH is, or will be, in the shared area while `row` is, or goes first."""
     to_clear = foe["dist"] + conflict["foe_leave_m"] + foe["half"]
     if to_clear <= 0.0:
         return False
-    cleared = to_clear / max(foe["speed"], 0.1)
-    foe_lane = roads.links[foe["link"]]["from_lane"]
+    foe_link = roads.links[conflict["foe"]]
+    foe_lane = roads.lanes[foe_link["from_lane"]]
     # Its front before the line that it can still stop at: the stop line, or, where the shared
     # area lies beyond that, its waiting position inside.
-    front = foe["dist"] - foe["half"] - roads.lanes[foe_lane]["stop_back_m"]
-    wait_m = roads.links[foe["link"]]["wait_m"]
+    front = foe["dist"] - foe["half"] - foe_lane["stop_back_m"]
+    wait_m = foe_link["wait_m"]
     if front <= 0.0 and conflict["foe_enter_m"] >= wait_m - LINE_MARGIN_M:
         front += wait_m + WAIT_SLACK_M
+    half = 0.5 * row["length"]
+    apart = distance + conflict["leave_m"] - half - to_clear
+    if _is_harmless(roads, rows, row, link, conflict, foe, front, apart, gives_way, phase):
+        return False
+    cleared = to_clear / max(foe["speed"], 0.1)
+    time_in = _earliest(distance + conflict["enter_m"] - half, row["speed"], limit, FOE_ACCEL)
     if front <= 0.0:
-        # Who stands on the junction before the shared area is kept from it by somebody else.
-        before_area = foe["dist"] + conflict["foe_enter_m"] - foe["half"] > 0.0
-        if before_area and foe["speed"] < STANDING_MPS and rows[foe["row"]]["wait_s"] > IMPATIENT_S:
-            return False
-        # Behind one that is faster and leads into the same lane, one can follow.
-        apart = to_leave - to_clear
-        if conflict["merging"] and apart > ROOM_M and row["speed"] <= foe["speed"]:
-            return False
         inside: bool = cleared + 0.5 * GAP_S > time_in
         return inside
-    committed = foe["speed"] * foe["speed"] > 2.0 * HARD_STOP * max(front, 0.01)
-    if not committed:
-        if not (gives_way and conflict["must_yield"]):
-            return False
-        if _ignores(row, rows[foe["row"]], link, foe_signal):
-            return False
-        patience = min(row["wait_s"] / IMPATIENCE_S, 1.0)
-        if row["hold"] == HOLD_NONE and row["stopped_at"] == link:
-            patience = 1.0  # it has been let in and goes on
-        if foe["speed"] * foe["speed"] < 2.0 * FORCED_STOP * patience * front:
-            return False
     if cleared + GAP_S < time_in:
         return False
-    foe_limit = roads.lanes[foe_lane]["speed_mps"]
+    time_out = _earliest(distance + conflict["leave_m"] + half, row["speed"], limit, OWN_ACCEL)
     to_area = foe["dist"] + conflict["foe_enter_m"] - foe["half"]
-    arrives = _earliest(to_area, foe["speed"], foe_limit, FOE_ACCEL)
+    arrives = _earliest(to_area, foe["speed"], foe_lane["speed_mps"], FOE_ACCEL)
     return arrives < time_out + GAP_S
 
 
@@ -183,8 +209,6 @@ def _blocked_by_foes(
     Asks about the shared areas before `wait_m`, or, from `inside`, about those beyond.
     """
     row = rows[i]
-    speed = row["speed"]
-    half = 0.5 * row["length"]
     limit = roads.lanes[roads.links[link]["next_lane"]]["speed_mps"]
     if row["driver"] == DRIVER_AGENT:
         limit = min(limit, STEERED_MPS)
@@ -192,27 +216,13 @@ def _blocked_by_foes(
     for c in range(first, first + roads.links[link]["num_conflicts"]):
         conflict = roads.conflicts[c]
         begin = scratch.link_start[conflict["foe"]]
-        end = scratch.link_start[conflict["foe"] + 1]
+        end = scratch.link_end[conflict["foe"]]
         if begin == end or (conflict["enter_m"] >= wait_m - LINE_MARGIN_M) != inside:
             continue
-        time_in = _earliest(distance + conflict["enter_m"] - half, speed, limit, FOE_ACCEL)
-        time_out = _earliest(distance + conflict["leave_m"] + half, speed, limit, OWN_ACCEL)
-        foe_signal = link_signal(roads, conflict["foe"], phase)
-        to_leave = distance + conflict["leave_m"] - half
         for k in range(begin, end):
             foe = scratch.approach[k]
             if foe["row"] != i and _foe_blocks(
-                roads,
-                rows,
-                row,
-                link,
-                conflict,
-                foe,
-                gives_way,
-                foe_signal,
-                to_leave,
-                time_in,
-                time_out,
+                roads, rows, row, link, distance, limit, conflict, foe, gives_way, phase
             ):
                 return True
     return False
@@ -391,9 +401,7 @@ def press_inside(
         conflict = roads.conflicts[c]
         if place - half > conflict["leave_m"]:
             continue
-        for k in range(
-            scratch.link_start[conflict["foe"]], scratch.link_start[conflict["foe"] + 1]
-        ):
+        for k in range(scratch.link_start[conflict["foe"]], scratch.link_end[conflict["foe"]]):
             foe = scratch.approach[k]
             if foe["row"] != i:
                 press = max(press, _press_of(roads, kind, row, conflict, foe, place, dt))

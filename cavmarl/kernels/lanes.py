@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from cavmarl.kernels import inlined_kernel, kernel
 from cavmarl.kernels.arrays import RoadArrays, Scratch, Travel
+from cavmarl.kernels.buckets import add, forget, lay_out
 from cavmarl.kernels.geometry import segment_at
 
 __all__ = [
@@ -83,24 +84,15 @@ def index_lanes(
         travel: the vehicles' types.
         rows: VEHICLE (C,), of which `num` live.
         num: live rows.
-        scratch: lane_start, lane_end and entries are written.
+        scratch: the lists by lane and entries are written.
     """
-    lanes = roads.lanes
-    start = scratch.lane_start
-    end = scratch.lane_end
-    num_lanes = lanes.shape[0]
-    end[:num_lanes] = 0
+    forget(scratch.lanes)
     for i in range(num):
         row = rows[i]
-        end[row["lane"]] += 1
+        add(scratch.lanes, row["lane"])
         if row["side_lane"] >= 0:
-            end[row["side_lane"]] += 1
-    begin = 0
-    for lane in range(num_lanes):
-        start[lane] = begin
-        begin += end[lane]
-        end[lane] = start[lane]
-    start[num_lanes] = begin
+            add(scratch.lanes, row["side_lane"])
+    scratch.lane_start[roads.lanes.shape[0]] = lay_out(scratch.lanes)
     for i in range(num):
         row = rows[i]
         lane = row["lane"]
@@ -139,7 +131,7 @@ def _insert(
 def _first_after(scratch: Scratch, lane: int, s: float, own_id: int) -> int:
     """Position of the first entry on `lane` beyond (s, own_id)."""
     low = int(scratch.lane_start[lane])
-    high = int(scratch.lane_start[lane + 1])
+    high = int(scratch.lane_end[lane])
     while low < high:
         middle = (low + high) // 2
         other = scratch.entries[middle]
@@ -158,7 +150,7 @@ def ahead_on(scratch: Scratch, lane: int, s: float, own_id: int, view_m: float) 
     vehicles one is always the leader.
     """
     k = _first_after(scratch, lane, s, own_id)
-    end = scratch.lane_start[lane + 1]
+    end = scratch.lane_end[lane]
     while k < end and scratch.entries[k]["id"] == own_id:
         k += 1
     return k if k < end and scratch.entries[k]["s"] - s <= view_m else -1
@@ -171,7 +163,7 @@ def last_on(scratch: Scratch, lane: int, own_id: int, distance: float, view_m: f
     Who asks is `distance` m before the start of the lane and sees `view_m` far.
     """
     k = int(scratch.lane_start[lane])
-    end = scratch.lane_start[lane + 1]
+    end = scratch.lane_end[lane]
     while k < end and scratch.entries[k]["id"] == own_id:
         k += 1
     return k if k < end and distance + scratch.entries[k]["s"] <= view_m else -1

@@ -1,4 +1,4 @@
-"""Motion of one vehicle over one tick, from the committed record to the next one.
+"""Motion of one vehicle over one tick, within its record.
 
 Background vehicles move along their lanes: arc length by the decided acceleration, lateral offset
 towards the lane's centre, the body a chord of the way. Agents' vehicles are kinematic
@@ -8,6 +8,7 @@ bicycles that go where they are steered; `tracking.locate` then finds their plac
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,7 +30,16 @@ from cavmarl.kernels.stopping import make_stop
 from cavmarl.kernels.tracking import locate, side_lane
 from cavmarl.kernels.ways import next_step, own_step, way_left
 
-__all__ = ["ARRIVE_M", "MAX_SPEED_MPS", "move_agent", "move_background", "place_on_lane"]
+__all__ = [
+    "ARRIVE_M",
+    "LATERAL_MPS",
+    "MAX_SPEED_MPS",
+    "Before",
+    "before_tick",
+    "move_agent",
+    "move_background",
+    "place_on_lane",
+]
 
 LATERAL_MPS = 1.4  # fastest sideways motion of a lane change
 LATERAL_RATIO = 0.35  # and no faster than this share of the speed,
@@ -40,6 +50,23 @@ STANDING_MPS = 0.1
 ARRIVE_M = 5.0  # a trip ends this far before the end of its goal edge
 MAX_SPEED_MPS = 60.0
 CROSSINGS_PER_TICK = 16  # lane borders that one tick can cross
+
+
+class Before(NamedTuple):
+    """What motion still asks of the committed record once it has begun to write the next one."""
+
+    speed: float  # m/s
+    accel: float  # m/s²
+    heading: float  # rad
+    lane: int
+    link: int
+    way: int
+
+
+@inlined_kernel
+def before_tick(row: np.void) -> Before:
+    """Of a record that nothing has moved yet."""
+    return Before(row["speed"], row["accel"], row["heading"], row["lane"], row["link"], row["way"])
 
 
 @kernel
@@ -120,20 +147,20 @@ def place_on_lane(roads: RoadArrays, travel: Travel, row: np.void) -> float:
 
 
 @inlined_kernel
-def _account(row: np.void, old: np.void, roads: RoadArrays, pace: float, dt: float) -> None:
+def _account(row: np.void, before: Before, roads: RoadArrays, pace: float, dt: float) -> None:
     """What motion of both kinds leaves in the record: rates, ways, waiting time.
 
     `pace` is the speed over the limit with which the way would have been driven freely.
     """
-    row["accel"] = (row["speed"] - old["speed"]) / dt
-    row["jerk"] = (row["accel"] - old["accel"]) / dt
-    row["yaw_rate"] = wrap_angle(row["heading"] - old["heading"]) / dt
-    driven = abs(old["speed"]) * dt
-    row["distance_m"] = old["distance_m"] + driven
-    row["free_s"] = old["free_s"] + driven / (pace * roads.lanes[old["lane"]]["speed_mps"])
-    row["wait_s"] = old["wait_s"] + dt if abs(row["speed"]) < STANDING_MPS else 0.0
-    row["step_jerk"] = old["step_jerk"] + abs(row["jerk"]) * dt
-    row["tick"] = old["tick"] + 1
+    row["accel"] = (row["speed"] - before.speed) / dt
+    row["jerk"] = (row["accel"] - before.accel) / dt
+    row["yaw_rate"] = wrap_angle(row["heading"] - before.heading) / dt
+    driven = abs(before.speed) * dt
+    row["distance_m"] += driven
+    row["free_s"] += driven / (pace * roads.lanes[before.lane]["speed_mps"])
+    row["wait_s"] = row["wait_s"] + dt if abs(row["speed"]) < STANDING_MPS else 0.0
+    row["step_jerk"] += abs(row["jerk"]) * dt
+    row["tick"] += 1
 
 
 @kernel
@@ -158,23 +185,22 @@ def _cross_borders(roads: RoadArrays, travel: Travel, row: np.void) -> bool:
 
 
 @inlined_kernel
-def _stand(old: np.void, row: np.void, throttle: float, dt: float) -> None:
+def _stand(row: np.void, throttle: float, dt: float) -> None:
     """What changes in the record of a background vehicle that stands."""
     row["throttle"] = throttle
+    row["jerk"] = -row["accel"] / dt
     row["accel"] = 0.0
-    row["jerk"] = -old["accel"] / dt
     row["yaw_rate"] = 0.0
     row["steering"] = 0.0
-    row["wait_s"] = old["wait_s"] + dt
-    row["step_jerk"] = old["step_jerk"] + abs(row["jerk"]) * dt
-    row["tick"] = old["tick"] + 1
+    row["wait_s"] += dt
+    row["step_jerk"] += abs(row["jerk"]) * dt
+    row["tick"] += 1
 
 
 @inlined_kernel
 def move_background(
     roads: RoadArrays,
     travel: Travel,
-    old: np.void,
     row: np.void,
     step: np.void,
     accel: float,
@@ -189,53 +215,53 @@ def move_background(
     Args:
         roads: the road arrays.
         travel: the ways.
-        old: VEHICLE, the committed record.
-        row: VEHICLE, a copy of it that becomes the next one.
+        row: VEHICLE, the committed record, which becomes the next one.
         step: PLAN, its own step before the tick.
         accel: decided acceleration in m/s².
         lane_change: 1 to the left, -1 to the right, 0 none.
         dt: seconds of the tick.
     """
-    speed = clamp(old["speed"] + accel * dt, 0.0, MAX_SPEED_MPS)
-    if speed == 0.0 and old["speed"] == 0.0 and lane_change == 0 and old["d"] == 0.0:
-        _stand(old, row, accel, dt)
-        make_stop(roads, travel, old, row, travel.begin_s, dt)
+    before = before_tick(row)
+    speed = clamp(before.speed + accel * dt, 0.0, MAX_SPEED_MPS)
+    if speed == 0.0 and before.speed == 0.0 and lane_change == 0 and row["d"] == 0.0:
+        _stand(row, accel, dt)
+        make_stop(roads, travel, row, before.lane, dt)
         return
     row["throttle"] = accel
     row["speed"] = speed
-    row["s"] = old["s"] + speed * dt
+    row["s"] += speed * dt
     if lane_change != 0:
-        lane = roads.lanes[old["lane"]]
+        lane = roads.lanes[before.lane]
         target = lane["left"] if lane_change > 0 else lane["right"]
-        row["s"] = beside_s(roads, old["lane"], target, row["s"])
+        row["s"] = beside_s(roads, before.lane, target, row["s"])
         apart = 0.5 * (lane["width_m"] + roads.lanes[target]["width_m"])
-        row["d"] = old["d"] - lane_change * apart
+        row["d"] -= lane_change * apart
         row["lane"] = target
         row["target_lane"] = target
-        row["last_change"] = old["tick"]
+        row["last_change"] = row["tick"]
     if not _cross_borders(roads, travel, row):
         row["speed"] = 0.0
     sideways = min(LATERAL_MPS, max(LATERAL_RATIO * speed, LATERAL_MIN_MPS)) * dt
-    before = row["d"]
-    row["d"] = before - clamp(before, -sideways, sideways)
+    offset = row["d"]
+    row["d"] = offset - clamp(offset, -sideways, sideways)
     row["side_lane"] = side_lane(roads.lanes, row["lane"], row["d"], row["width"])
     heading = place_on_lane(roads, travel, row)
-    if row["d"] != before and speed > STANDING_MPS:
-        drift = math.atan2((row["d"] - before) / dt, speed)
+    if row["d"] != offset and speed > STANDING_MPS:
+        drift = math.atan2((row["d"] - offset) / dt, speed)
         heading = wrap_angle(heading + clamp(drift, -MAX_DRIFT_RAD, MAX_DRIFT_RAD))
     row["heading"] = heading
-    turned = wrap_angle(heading - old["heading"])
+    turned = wrap_angle(heading - before.heading)
     row["steering"] = 0.0
     if turned != 0.0 and speed > STANDING_MPS:
         row["steering"] = clamp(math.atan(row["length"] * turned / (speed * dt)), -0.8, 0.8)
-    if row["lane"] == old["lane"] and row["way"] == old["way"]:
+    if row["lane"] == before.lane and row["way"] == before.way:
         row["to_go"] = way_left(roads, row, step)
     else:
         row["to_go"] = way_left(roads, row, travel.steps[own_step(roads, row)])
     if row["to_go"] <= ARRIVE_M:
         row["events"] |= EVENT_ARRIVED
-    _account(row, old, roads, old["speed_factor"], dt)
-    make_stop(roads, travel, old, row, travel.begin_s, dt)
+    _account(row, before, roads, row["speed_factor"], dt)
+    make_stop(roads, travel, row, before.lane, dt)
 
 
 @kernel
@@ -243,7 +269,6 @@ def move_agent(
     roads: RoadArrays,
     plans: NDArray[np.void],
     grid: LaneGrid,
-    old: np.void,
     row: np.void,
     throttle: float,
     steering: float,
@@ -256,17 +281,17 @@ def move_agent(
         roads: the road arrays.
         plans: PLAN (G, L).
         grid: which lanes lie near a place.
-        old: VEHICLE, the committed record.
-        row: VEHICLE, a copy of it that becomes the next one.
+        row: VEHICLE, the committed record, which becomes the next one.
         throttle: commanded acceleration in m/s².
         steering: commanded angle of the front wheels in rad.
         phase: (num_signals,) PHASE rows that are on.
         dt: seconds of the tick.
     """
+    before = before_tick(row)
     # No reverse gear: the brake ends at a standstill.
-    throttle = max(throttle, -old["speed"] / dt)
+    throttle = max(throttle, -before.speed / dt)
     x, y, heading, speed, _ = bicycle_step(
-        old["x"], old["y"], old["heading"], old["speed"], throttle, steering, old["length"], dt
+        row["x"], row["y"], before.heading, before.speed, throttle, steering, row["length"], dt
     )
     row["x"] = x
     row["y"] = y
@@ -275,7 +300,7 @@ def move_agent(
     row["throttle"] = throttle
     row["steering"] = steering
     row["events"] |= locate(roads, plans, grid, row)
-    if row["link"] != old["link"] and row["link"] >= 0:
+    if row["link"] != before.link and row["link"] >= 0:
         signal = link_signal(roads, row["link"], phase)
         if signal == SIGNAL_RED or signal == SIGNAL_RED_YELLOW:
             row["events"] |= EVENT_RED_LIGHT
@@ -290,4 +315,4 @@ def move_agent(
     row["to_go"] = step["to_go"] - row["s"]
     if row["to_go"] <= ARRIVE_M:
         row["events"] |= EVENT_ARRIVED
-    _account(row, old, roads, 1.0, dt)
+    _account(row, before, roads, 1.0, dt)

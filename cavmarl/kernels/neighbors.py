@@ -20,7 +20,9 @@ from cavmarl.kernels import kernel
 __all__ = [
     "BODY",
     "LEVEL_HEIGHT_M",
+    "SPOT",
     "Grid",
+    "cell_at",
     "cell_columns",
     "cell_rows",
     "fill_grid",
@@ -54,6 +56,16 @@ BODY = np.dtype(
     align=True,
 )
 
+SPOT = np.dtype(
+    [
+        ("x", np.float64),  # centre, m
+        ("y", np.float64),
+        ("radius", np.float64),  # half the diagonal, m
+        ("next", np.int32),  # VEHICLE row of another one in the same cell, or -1
+    ],
+    align=True,
+)
+
 
 class Grid(NamedTuple):
     """Square cells over a map and the bodies in them; holds nothing between ticks."""
@@ -69,6 +81,8 @@ class Grid(NamedTuple):
     bodies: NDArray[np.void]  # BODY (capacity,)             c = j * num_x + i
     cell: NDArray[np.int32]  # (capacity,) the cell of each row
     largest: NDArray[np.float64]  # (1,) the largest radius of all bodies, m
+    newest: NDArray[np.int32]  # (num_x * num_y,) the VEHICLE row put last into each cell, or -1
+    spots: NDArray[np.void]  # SPOT (capacity,) by VEHICLE row; both only `contacts` uses
 
 
 def make_grid(bounds: tuple[float, float, float, float], cell_m: float, capacity: int) -> Grid:
@@ -92,6 +106,8 @@ def make_grid(bounds: tuple[float, float, float, float], cell_m: float, capacity
         bodies=np.zeros(capacity, BODY),
         cell=np.zeros(capacity, np.int32),
         largest=np.zeros(1),
+        newest=np.zeros(num_x * num_y, np.int32),
+        spots=np.zeros(capacity, SPOT),
     )
 
 
@@ -102,6 +118,13 @@ def _slot(offset: float, cells_per_m: float, count: int) -> int:
     if not cells > 0.0:
         return 0
     return int(cells) if cells < count else count - 1
+
+
+@kernel
+def cell_at(grid: Grid, x: float, y: float) -> int:
+    """The cell of a place."""
+    column = _slot(x - grid.min_x, grid.cells_per_m, grid.num_x)
+    return _slot(y - grid.min_y, grid.cells_per_m, grid.num_y) * grid.num_x + column
 
 
 @kernel
@@ -157,8 +180,7 @@ def fill_grid(rows: NDArray[np.void], num: int, grid: Grid) -> None:
     cell = grid.cell
     start[:] = 0
     for i in range(num):
-        column = _slot(rows[i]["x"] - grid.min_x, grid.cells_per_m, grid.num_x)
-        c = _slot(rows[i]["y"] - grid.min_y, grid.cells_per_m, grid.num_y) * grid.num_x + column
+        c = cell_at(grid, rows[i]["x"], rows[i]["y"])
         cell[i] = c
         start[c] += 1
     for c in range(1, start.size):

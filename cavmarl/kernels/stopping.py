@@ -48,9 +48,7 @@ def lane_to_stop(roads: RoadArrays, travel: Travel, row: np.void) -> int:
 
 
 @inlined_kernel
-def make_stop(
-    roads: RoadArrays, travel: Travel, old: np.void, row: np.void, begin_s: float, dt: float
-) -> None:
+def make_stop(roads: RoadArrays, travel: Travel, row: np.void, lane_before: int, dt: float) -> None:
     """Count the time of a vehicle at its stop, and let it go when that is over.
 
     A stop that the vehicle could not make any more is left out.
@@ -58,9 +56,8 @@ def make_stop(
     Args:
         roads: the road arrays.
         travel: with the stops.
-        old: VEHICLE before the tick.
-        row: VEHICLE after it, written.
-        begin_s: clock at tick 0, s.
+        row: VEHICLE after the tick, written.
+        lane_before: LANE that it was on before.
         dt: seconds a tick.
     """
     if row["stop"] < 0 or row["stop"] == row["stops_end"]:
@@ -69,15 +66,15 @@ def make_stop(
     edge = roads.lanes[stop["lane"]]["edge"]
     left = way_to_stop(roads, travel, row)
     if left <= STOPPED_M and row["speed"] < STANDING_MPS:
-        row["stopped_s"] = old["stopped_s"] + dt
+        row["stopped_s"] += dt
         row["wait_s"] = 0.0
-        now = begin_s + row["tick"] * dt
+        now = travel.begin_s + row["tick"] * dt
         until = stop["until"]
         if until >= 0.0 and stop["until_from"] == UNTIL_DEPARTURE:
-            until += begin_s + row["departed"] * dt
+            until += travel.begin_s + row["departed"] * dt
         if row["stopped_s"] >= stop["duration"] and now >= until:
             row["stop"] += 1
             row["stopped_s"] = 0.0
-    elif roads.lanes[old["lane"]]["edge"] == edge and left == np.inf:
+    elif roads.lanes[lane_before]["edge"] == edge and left == np.inf:
         row["stop"] += 1
         row["stopped_s"] = 0.0

@@ -1,6 +1,7 @@
 """The phases of one tick over many worlds: decide and move, find contacts, take out, let in.
 
-Each phase reads the committed rows and writes the next ones; no phase depends on the order of rows.
+Drivers decide from the committed rows alone; then these become the next ones, one by one. No phase
+depends on the order of rows.
 """
 
 from __future__ import annotations
@@ -30,14 +31,12 @@ from cavmarl.kernels.junctions import STOP_SIGN_S
 from cavmarl.kernels.lane_choice import needed_change
 from cavmarl.kernels.lanes import index_lanes
 from cavmarl.kernels.motion import move_agent, move_background
-from cavmarl.kernels.neighbors import Grid, fill_grid
+from cavmarl.kernels.neighbors import Grid
 from cavmarl.kernels.scalars import clamp
 from cavmarl.kernels.steering import nearest_speed, steer_to_lane, take_meta_action
 from cavmarl.kernels.ways import own_step
 
 __all__ = ["advance", "begin_step", "resolve", "suggest"]
-
-TICKS_IN_ORDER = 8  # for so long rows that have been put in the order of the lanes nearly stay so
 
 
 @kernel
@@ -106,6 +105,40 @@ def _delay(
     return pending[w, agent, due, 0], pending[w, agent, due, 1]
 
 
+@inlined_kernel
+def _drive_agent(
+    roads: RoadArrays,
+    plans: NDArray[np.void],
+    travel: Travel,
+    lane_grid: LaneGrid,
+    worlds: Worlds,
+    w: int,
+    row: np.void,
+    commands: NDArray[np.float64],
+    discrete: bool,
+    accel_limit: float,
+    steering_limit: float,
+    dt: float,
+) -> None:
+    """Move an agent's vehicle by its command or by the controllers, unless its trip is over."""
+    if row["events"] & EVENTS_THAT_END:
+        row["tick"] += 1
+        return
+    throttle = commands[w, row["agent"], 0]
+    steering = commands[w, row["agent"], 1]
+    if discrete:
+        throttle = speed_control(row["speed"], row["target_speed"])
+        steering = steer_to_lane(roads, plans, row, row["target_lane"])
+    throttle = clamp(throttle, -accel_limit, accel_limit)
+    steering = clamp(steering, -steering_limit, steering_limit)
+    throttle, steering = _delay(
+        worlds.pending, w, row["agent"], worlds.ticks[w], throttle, steering
+    )
+    move_agent(roads, plans, lane_grid, row, throttle, steering, worlds.signal_phase[w], dt)
+    # The indicator is automatic: drivers behind make room for who has to change lanes.
+    row["blinker"] = needed_change(roads, travel, row, travel.steps[own_step(roads, row)])
+
+
 @kernel
 def advance(
     roads: RoadArrays,
@@ -119,7 +152,8 @@ def advance(
     accel_limit: float,
     steering_limit: float,
     dt: float,
-) -> None:
+    in_place: bool,
+) -> int:
     """Decide all controls from the committed rows, then move every owned row into `next_rows`.
 
     Args:
@@ -134,19 +168,24 @@ def advance(
         accel_limit: m/s², of the agents' throttle.
         steering_limit: rad, of the agents' front wheels.
         dt: seconds of the tick.
+        in_place: whether `next_rows` is `rows`; if not, rows are put in the order of the lanes.
+
+    Returns:
+        how many background vehicles have arrived, in all worlds.
     """
+    arrived = 0
     for w in range(worlds.ticks.shape[0]):
         rows = worlds.rows[w]
         owned = worlds.num_owned[w]
-        phase = worlds.signal_phase[w]
         drivers = _any_driver(rows, owned, DRIVER_BACKGROUND)
         if drivers:
+            phase = worlds.signal_phase[w]
             index_lanes(roads, travel, rows, worlds.num_rows[w], scratch)
             register_links(roads, travel, rows, worlds.num_rows[w], scratch)
             decide(
                 roads, travel, rows, owned, DRIVER_BACKGROUND, worlds.ticks[w], dt, phase, scratch
             )
-        if drivers and worlds.ticks[w] % TICKS_IN_ORDER == 0:
+        if drivers and not in_place:
             _order_by_lane(roads, owned, scratch)
         else:
             _keep_order(owned, scratch)
@@ -154,104 +193,54 @@ def advance(
         touching = 0
         for k in range(owned):
             i = scratch.order[k]
-            old = rows[i]
-            touching += old["hit"] >= 0
-            worlds.next_rows[w, k] = old
+            if not in_place:
+                worlds.next_rows[w, k] = rows[i]
             row = worlds.next_rows[w, k]
-            if old["driver"] == DRIVER_BACKGROUND:
-                row["events"] = 0
-                row["hold"] = scratch.hold[i]
-                row["blinker"] = scratch.blinker[i]
-                if scratch.link_ahead[i] >= 0 and old["wait_s"] >= STOP_SIGN_S:
-                    row["stopped_at"] = scratch.link_ahead[i]
-                move_background(
+            touching += row["hit"] >= 0
+            if row["driver"] != DRIVER_BACKGROUND:
+                _drive_agent(
                     roads,
+                    plans,
                     travel,
-                    old,
+                    lane_grid,
+                    worlds,
+                    w,
                     row,
-                    scratch.step[i],
-                    scratch.accel[i],
-                    scratch.lane_change[i],
+                    commands,
+                    discrete,
+                    accel_limit,
+                    steering_limit,
                     dt,
                 )
-                through += row["events"] & EVENT_ARRIVED
                 continue
-            if old["events"] & EVENTS_THAT_END:
-                row["tick"] = old["tick"] + 1
-                continue
-            throttle = commands[w, old["agent"], 0]
-            steering = commands[w, old["agent"], 1]
-            if discrete:
-                throttle = speed_control(old["speed"], old["target_speed"])
-                steering = steer_to_lane(roads, plans, old, old["target_lane"])
-            throttle = clamp(throttle, -accel_limit, accel_limit)
-            steering = clamp(steering, -steering_limit, steering_limit)
-            throttle, steering = _delay(
-                worlds.pending, w, old["agent"], worlds.ticks[w], throttle, steering
+            row["events"] = 0
+            row["hold"] = scratch.hold[i]
+            row["blinker"] = scratch.blinker[i]
+            if scratch.link_ahead[i] >= 0 and row["wait_s"] >= STOP_SIGN_S:
+                row["stopped_at"] = scratch.link_ahead[i]
+            move_background(
+                roads, travel, row, scratch.step[i], scratch.accel[i], scratch.lane_change[i], dt
             )
-            move_agent(
-                roads,
-                plans,
-                lane_grid,
-                old,
-                row,
-                throttle,
-                steering,
-                phase,
-                dt,
-            )
-            # The indicator is automatic: drivers behind make room for who has to change lanes.
-            row["blinker"] = needed_change(roads, travel, row, travel.steps[own_step(roads, row)])
+            through += row["events"] & EVENT_ARRIVED
         worlds.num_through[w] = through
         worlds.num_touching[w] = touching
+        arrived += through
+    return arrived
 
 
 @kernel
-def _nearest_first(
-    rows: NDArray[np.void],
-    num_owned: int,
-    num_rows: int,
-    rect: NDArray[np.float64],
-    reach_m: float,
-    spare: NDArray[np.void],
-) -> int:
-    """Put the ghosts within reach of a rectangle before the others; rows up to the last of them."""
-    near = num_owned
-    for i in range(num_owned, num_rows):
-        x = rows[i]["x"]
-        y = rows[i]["y"]
-        if (
-            rect[0] - reach_m <= x <= rect[2] + reach_m
-            and rect[1] - reach_m <= y <= rect[3] + reach_m
-        ):
-            if i > near:
-                spare[0] = rows[near]
-                rows[near] = rows[i]
-                rows[i] = spare[0]
-            near += 1
-    return near
-
-
-@kernel
-def resolve(
-    worlds: Worlds, scratch: Scratch, grid: Grid, rect: NDArray[np.float64], touching_m: float
-) -> None:
+def resolve(worlds: Worlds, scratch: Scratch, grid: Grid) -> None:
     """Mark in `next_rows` who touches whom.
 
     Args:
         worlds: events and hit of the owned next_rows are written; num_contacts rises by one for
             each vehicle when it begins to touch another.
         scratch: room.
-        grid: spatial index over the vehicles of one world, filled here.
-        rect: min_x, min_y, max_x, max_y of the shard's zone in m.
-        touching_m: ghosts further outside than this touch none of its vehicles.
+        grid: spatial index over the vehicles of one world, filled here as far as it is needed.
     """
     for w in range(worlds.ticks.shape[0]):
         rows = worlds.next_rows[w]
-        owned = worlds.num_owned[w]
-        num = _nearest_first(rows, owned, worlds.num_rows[w], rect, touching_m, scratch.spare)
-        fill_grid(rows, num, grid)
-        touch = find_contacts(num, grid, scratch.hit)
+        touch = find_contacts(rows, worlds.num_near[w], grid, scratch.hit)
         if not touch and worlds.num_touching[w] == 0:
             continue
         for i in range(worlds.num_owned[w]):

@@ -20,10 +20,7 @@ from cavmarl.kernels import kernel
 
 __all__ = [
     "Halo",
-    "Publication",
     "ZoneArrays",
-    "make_publication",
-    "publish",
     "squared_distance",
     "zone_of",
     "zones_of",
@@ -47,32 +44,6 @@ class Halo(NamedTuple):
     near_start: NDArray[np.int32]  # (k + 1,)
     near: NDArray[np.int32]  # near[near_start[z] : near_start[z + 1]]: zones within the halo of
     # zone z, z itself among them
-
-
-class Publication(NamedTuple):
-    """Which rows of a shard which zones have to get; `publish` overwrites it."""
-
-    start: NDArray[np.int64]  # (k + 1,)
-    rows: NDArray[np.int32]  # rows[start[z] : start[z + 1]]: the rows that zone z needs, rising
-    pair_row: NDArray[np.int32]  # the same as they were found: row after row
-    pair_zone: NDArray[np.int32]
-
-
-def make_publication(capacity: int, num_zones: int) -> Publication:
-    """Room for the ghosts of a shard.
-
-    Args:
-        capacity: most vehicles that the shard can own.
-        num_zones: k of the partition.
-    """
-    pairs = capacity * (num_zones - 1)
-    # Memory that is never written is never taken: a vehicle seldom has more than one ghost.
-    return Publication(
-        start=np.zeros(num_zones + 1, np.int64),
-        rows=np.empty(pairs, np.int32),
-        pair_row=np.empty(pairs, np.int32),
-        pair_zone=np.empty(pairs, np.int32),
-    )
 
 
 @kernel
@@ -130,53 +101,3 @@ def squared_distance(rects: NDArray[np.float64], zone: int, x: float, y: float) 
     elif y > rects[zone, 3]:
         dy = y - rects[zone, 3]
     return dx * dx + dy * dy
-
-
-@kernel
-def publish(
-    zones: ZoneArrays, halo: Halo, rows: NDArray[np.void], num: int, zone: int, out: Publication
-) -> int:
-    """Decide which of a shard's vehicles which other zones need as ghosts.
-
-    Zone z needs a vehicle if and only if it lies within `halo_m` of z's rectangle. A vehicle that
-    has left its own zone's rectangle, because its transfer is late, is published like any other,
-    to the zone that it is in as well.
-
-    Args:
-        zones: of the partition.
-        halo: from `roads.zone_coverage.zone_halo`, for the same partition.
-        rows: VEHICLE (C,).
-        num: the vehicles that the shard owns, `rows[:num]`; at most the capacity of `out`.
-        zone: the shard's own.
-        out: from `make_publication`, overwritten.
-
-    Returns:
-        how many ghosts there are in all zones together, `out.start[-1]`.
-    """
-    start = out.start
-    start[:] = 0
-    limit = halo.halo_m * halo.halo_m
-    min_x, min_y = halo.inner[zone, 0], halo.inner[zone, 1]
-    max_x, max_y = halo.inner[zone, 2], halo.inner[zone, 3]
-    found = 0
-    for i in range(num):
-        x = rows[i]["x"]
-        y = rows[i]["y"]
-        if min_x < x and x < max_x and min_y < y and y < max_y:
-            continue
-        here = zone_of(zones, x, y)
-        for n in range(halo.near_start[here], halo.near_start[here + 1]):
-            other = halo.near[n]
-            if other != zone and squared_distance(zones.rects, other, x, y) <= limit:
-                out.pair_row[found] = i
-                out.pair_zone[found] = other
-                start[other] += 1
-                found += 1
-    for z in range(1, start.size):
-        start[z] += start[z - 1]
-    # From the ends of the zones' parts to their beginnings, hence from the last pair to the first.
-    for pair in range(found - 1, -1, -1):
-        z = out.pair_zone[pair]
-        start[z] -= 1
-        out.rows[start[z]] = out.pair_row[pair]
-    return found

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import struct
 from collections.abc import Iterable, Mapping
+from functools import lru_cache
 from hashlib import blake2b
 from typing import NamedTuple
 
@@ -20,6 +21,8 @@ _OWNED = 1 << 64
 DIGEST_BYTES = 16
 
 
+# One hand-over asks for a state's digest in five places, and for each member's hash in two.
+@lru_cache(maxsize=256)
 def state_digest(state: bytes) -> bytes:
     """Digest of one vehicle's state, 16 bytes."""
     return blake2b(state, digest_size=DIGEST_BYTES).digest()
@@ -68,6 +71,7 @@ class Tally(NamedTuple):
         raise LedgerError(f"{where}: {what}")
 
 
+@lru_cache(maxsize=4096)
 def member(run: bytes, vehicle: int, epoch: int) -> int:
     """Keyed hash of an owned vehicle, in [0, 2**64)."""
     return int.from_bytes(

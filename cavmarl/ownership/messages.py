@@ -5,6 +5,9 @@ that it comes from or is meant for. Each entry about a vehicle carries the vehic
 of vehicles are opaque bytes with a digest; what stands in them is the runtime's affair.
 
 The rule of the core: **write the records down, then send the messages** (`Output`).
+
+Nobody changes a message or a record once it is made. The classes are not frozen all the same: to
+make a frozen one takes 2.4 µs instead of 0.4, and an idle tick of four zones makes twenty.
 """
 
 from __future__ import annotations
@@ -99,7 +102,7 @@ class Removed(NamedTuple):
     reason: int
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(slots=True, unsafe_hash=True)
 class Message:
     """What every message carries.
 
@@ -114,7 +117,7 @@ class Message:
     tick: int
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(slots=True, unsafe_hash=True)
 class Step(Message):
     """C → Z: the lease to advance the owned vehicles to `tick`; it also says what is committed."""
 
@@ -128,7 +131,7 @@ class Step(Message):
     payload: bytes = b""
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(slots=True, unsafe_hash=True)
 class Done(Message):
     """Z → C: `tick` is in the store. `owned` counts after `removed`; `rows` is their digest."""
 
@@ -141,7 +144,7 @@ class Done(Message):
     payload: bytes = b""
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(slots=True, unsafe_hash=True)
 class Prepare(Message):
     """S → T: here are vehicles as of `tick`."""
 
@@ -152,7 +155,7 @@ class Prepare(Message):
     entries: tuple[Offer, ...]
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(slots=True, unsafe_hash=True)
 class Abort(Message):
     """S → T: these approaches are over."""
 
@@ -162,7 +165,7 @@ class Abort(Message):
     entries: tuple[Withdrawn, ...]
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(slots=True, unsafe_hash=True)
 class Ack(Message):
     """T → C and S: `zone` holds exactly these states of `tick`."""
 
@@ -172,7 +175,7 @@ class Ack(Message):
     entries: tuple[Held, ...]
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(slots=True, unsafe_hash=True)
 class Nack(Message):
     """T → C and S: `zone` does not hold these states."""
 
@@ -182,7 +185,7 @@ class Nack(Message):
     entries: tuple[Refused, ...]
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(slots=True, unsafe_hash=True)
 class Need(Message):
     """Z → C: vehicles came IN without a matching replica; send their states."""
 
@@ -238,7 +241,7 @@ class ZoneLedger(NamedTuple):
     rows: int
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(slots=True, unsafe_hash=True)
 class Record:
     """A line of the coordinator's log."""
 
@@ -246,14 +249,14 @@ class Record:
     tick: int
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(slots=True, unsafe_hash=True)
 class Reset(Record):
     """An episode begins without vehicles; whatever was under way is void. First line of a log."""
 
     run: bytes
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(slots=True, unsafe_hash=True)
 class Begin(Record):
     """What has been decided for the way to `tick`. `inputs` is the digest of the actions."""
 
@@ -263,7 +266,7 @@ class Begin(Record):
     inputs: bytes = b""
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(slots=True, unsafe_hash=True)
 class Commit(Record):
     """`tick` is the truth."""
 
@@ -272,7 +275,7 @@ class Commit(Record):
     world: int = 0
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(slots=True, unsafe_hash=True)
 class Fence(Record):
     """That process is dead to us."""
 
@@ -280,7 +283,7 @@ class Fence(Record):
     incarnation: int
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(slots=True, unsafe_hash=True)
 class Host(Record):
     """A new process of `worker` hosts the zone."""
 
@@ -289,7 +292,7 @@ class Host(Record):
     worker: int
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(slots=True, unsafe_hash=True)
 class Output:
     """Records to write down, then messages to send."""
 

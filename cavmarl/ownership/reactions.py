@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from cavmarl.ownership.messages import Message, Spawn
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(slots=True)
 class Hosting:
     """What a new host is told: who it is, and what its zone owns at the committed tick.
 
@@ -24,7 +24,7 @@ class Hosting:
     owned: Mapping[int, int]
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(slots=True)
 class Advance:
     """The shard's work for one tick: change the rows that are owned, then advance all of them.
 
@@ -47,7 +47,7 @@ class Advance:
     payload: bytes
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(slots=True)
 class Reaction:
     """What a message leads to: messages to send, and with a new lease work for the shard."""
 

@@ -4,14 +4,19 @@ It accepts what every correct run leaves behind, and refuses a trace in which a 
 owners or none, a hand-off begins without the exact state at its target (PREPARE < ACK < SWITCH <
 CONFIRM < RELEASE), something is sent before it is logged, or a tick is committed that a living
 host has not computed.
+
+A tick costs what changes in it: vehicles that stay where they are are never looked at.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections import defaultdict
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, field
+from typing import Any, NamedTuple
 
 from cavmarl.errors import InvariantError
-from cavmarl.ownership.ledger import state_digest, tally
+from cavmarl.ownership.ledger import SeenIds, Tally, state_digest
 from cavmarl.ownership.messages import (
     COORDINATOR,
     Abort,
@@ -24,13 +29,34 @@ from cavmarl.ownership.messages import (
     Message,
     Prepare,
     Record,
+    Removed,
     Reset,
     Step,
 )
 from cavmarl.ownership.trace import Entry, describe
 
-Holding = tuple[int, int, int, int, int, bytes]
-"""(zone, incarnation, vehicle, epoch, tick, digest) of a state at a host."""
+Holding = tuple[int, int, int, int, bytes]
+"""(zone, incarnation, vehicle, epoch, digest) of a state at a host."""
+
+Owner = tuple[int, int]
+"""(zone, epoch) of a vehicle."""
+
+
+class Change(NamedTuple):
+    """What a tick did to the owner of a vehicle; None: it is not in the world."""
+
+    vehicle: int
+    before: Owner | None
+    after: Owner | None
+
+
+@dataclass(slots=True)
+class _Orders:
+    """What a BEGIN says to one zone."""
+
+    entered: set[tuple[int, int]] = field(default_factory=set)
+    left: set[tuple[int, int]] = field(default_factory=set)
+    born: set[int] = field(default_factory=set)
 
 
 def check_trace(entries: Iterable[Entry], longest_deferral: int, lifetime: int) -> None:
@@ -53,52 +79,46 @@ def _require(holds: bool, otherwise: str) -> None:
 
 
 class TraceChecker:
-    """Follows a trace entry by entry; `take` raises InvariantError at the first that is wrong."""
+    """Follows a trace entry by entry; `take` raises InvariantError at the first that is wrong.
+
+    Attributes:
+        owners: vehicle → owner as of the committed tick.
+        changes: what the last COMMIT did to them.
+    """
 
     def __init__(self, longest_deferral: int, lifetime: int) -> None:
+        self.owners: dict[int, Owner] = {}
+        self.changes: list[Change] = []
         self._longest, self._lifetime = longest_deferral, lifetime
         self._run, self._episode, self._tick = b"", -1, 0
-        self._owners: dict[int, tuple[int, int]] = {}
+        self._tallies: defaultdict[int, Tally] = defaultdict(Tally)
         self._deferred: dict[int, int] = {}
-        self._born: set[int] = set()
+        self._born = SeenIds()
         self._incarnations: dict[int, int] = {}
         self._fenced: set[int] = set()
         self._fences: dict[tuple[int, int], tuple[int, int]] = {}
-        self._holdings: set[Holding] = set()
-        self._acknowledged: set[Holding] = set()
+        self._heard: defaultdict[int, set[tuple[int, int]]] = defaultdict(set)  # tick → fences
+        self._holdings: defaultdict[int, set[Holding]] = defaultdict(set)  # by tick
+        self._ready: set[tuple[int, int, int, int, int]] = set()  # acknowledged, with the tick
         self._begun: Begin | None = None
+        self._orders: defaultdict[int, _Orders] = defaultdict(_Orders)  # by zone, of that BEGIN
         self._dones: dict[int, Done] = {}
+        self._judges: dict[type, Callable[[Any], None]] = {
+            Reset: self._reset, Host: self._host, Fence: self._fence, Begin: self._begin,
+            Commit: self._commit, Step: self._step, Prepare: self._prepare, Abort: self._abort,
+            Ack: self._ack, Done: self._done,
+        }  # fmt: skip
 
     def take(self, entry: Entry) -> None:
         """The next entry."""
-        match entry.item:
-            case Reset():
-                self._reset(entry.item)
-            case Host():
-                self._host(entry.item)
-            case Fence(zone=zone, incarnation=incarnation):
-                _require(self._incarnations.get(zone) == incarnation, "fences an unknown process")
-                self._fenced.add(zone)
-                self._dones.pop(zone, None)
-            case Begin():
-                self._begin(entry.item)
-            case Commit():
-                self._commit(entry.item)
-            case Record():
-                _require(False, "unknown record")
-            case Message() if self._foreign(entry.item):
-                return
-            case Step():
-                self._step(entry.item)
-            case Prepare():
-                self._prepare(entry.item)
-            case Abort():
-                for vehicle, epoch in entry.item.entries:
-                    self._hear(entry.item.target, vehicle, epoch, entry.item.tick)
-            case Ack() if entry.destination == COORDINATOR:
-                self._ack(entry.item)
-            case Done():
-                self._done(entry.item)
+        item = entry.item
+        judge = self._judges.get(type(item))
+        if isinstance(item, Record):
+            _require(judge is not None, "unknown record")
+        elif self._foreign(item) or (type(item) is Ack and entry.destination != COORDINATOR):
+            return
+        if judge is not None:
+            judge(item)
 
     def _foreign(self, message: Message) -> bool:
         return message.run != self._run or message.episode != self._episode
@@ -107,9 +127,12 @@ class TraceChecker:
         _require(record.episode == self._episode + 1, f"after episode {self._episode}")
         _require(record.tick >= self._tick, f"the tick goes back from {self._tick}")
         self._run, self._episode, self._tick = record.run, record.episode, record.tick
-        self._owners, self._deferred, self._born = {}, {}, set()
+        self.owners, self.changes, self._deferred, self._born = {}, [], {}, SeenIds()
+        self._tallies.clear()
         self._begun, self._dones = None, {}
-        self._fences, self._holdings, self._acknowledged = {}, set(), set()
+        self._fences, self._ready = {}, set()
+        self._heard.clear()
+        self._holdings.clear()
 
     def _host(self, record: Host) -> None:
         zone, before = record.zone, self._incarnations.get(record.zone, 0)
@@ -121,11 +144,17 @@ class TraceChecker:
         self._dones.pop(zone, None)
         self._fences = {key: fence for key, fence in self._fences.items() if key[0] != zone}
 
+    def _fence(self, record: Fence) -> None:
+        known = self._incarnations.get(record.zone) == record.incarnation
+        _require(known, "fences an unknown process")
+        self._fenced.add(record.zone)
+        self._dones.pop(record.zone, None)
+
     def _begin(self, record: Begin) -> None:
         _require(self._begun is None, "a tick is decided twice")
         _require(record.tick == self._tick + 1, f"follows tick {self._tick}")
         for vehicle, source, target, epoch, forced in record.switches:
-            owner = self._owners.get(vehicle)
+            owner = self.owners.get(vehicle)
             _require(owner == (source, epoch - 1), f"v{vehicle} is owned by {owner}")
             waited = self._deferred.get(vehicle, 0)
             if forced:
@@ -134,23 +163,25 @@ class TraceChecker:
                 self._require_ready(vehicle, target, epoch - 1)
         for vehicle, ticks in record.deferred:
             follows = ticks == self._deferred.get(vehicle, 0) + 1
-            _require(
-                follows and vehicle in self._owners, f"v{vehicle} cannot wait for tick {ticks}"
-            )
+            _require(follows and vehicle in self.owners, f"v{vehicle} cannot wait for tick {ticks}")
             _require(ticks <= self._longest, f"v{vehicle} waits longer than {self._longest} ticks")
         for vehicle, _, _ in record.births:
             _require(vehicle not in self._born, f"v{vehicle} is born twice")
             self._born.add(vehicle)
         self._begun = record
+        self._orders = defaultdict(_Orders)
+        for vehicle, source, target, epoch, _ in record.switches:
+            self._orders[target].entered.add((vehicle, epoch))
+            self._orders[source].left.add((vehicle, epoch - 1))
+        for vehicle, zone, _ in record.births:
+            self._orders[zone].born.add(vehicle)
 
     def _require_ready(self, vehicle: int, target: int, epoch: int) -> None:
         _require(target not in self._fenced, f"zone {target} has no host")
         process = (target, self._incarnations.get(target, 0))
-        acknowledged = any(
-            holding[:5] == (*process, vehicle, epoch, self._tick) for holding in self._acknowledged
-        )
         _require(
-            acknowledged, f"v{vehicle} switches to {target} without an ACK of tick {self._tick}"
+            (*process, vehicle, epoch, self._tick) in self._ready,
+            f"v{vehicle} switches to {target} without an ACK of tick {self._tick}",
         )
 
     def _step(self, step: Step) -> None:
@@ -160,14 +191,11 @@ class TraceChecker:
         if begun is None or step.tick != begun.tick:
             return
         _require(step.committed == self._tick, "tells of a tick that is not committed")
-        entered = {(entry.vehicle, entry.epoch) for entry in step.enter}
-        left = {(entry.vehicle, entry.epoch) for entry in step.leave}
-        born = {entry.vehicle for entry in step.spawn}
-        switches, zone = begun.switches, step.zone
+        orders = self._orders[step.zone]
         _require(
-            entered == {(s.vehicle, s.epoch) for s in switches if s.target == zone}
-            and left == {(s.vehicle, s.epoch - 1) for s in switches if s.source == zone}
-            and born == {b.vehicle for b in begun.births if b.zone == zone},
+            {(entry.vehicle, entry.epoch) for entry in step.enter} == orders.entered
+            and {(entry.vehicle, entry.epoch) for entry in step.leave} == orders.left
+            and {entry.vehicle for entry in step.spawn} == orders.born,
             "says something else than BEGIN",
         )
 
@@ -177,11 +205,16 @@ class TraceChecker:
             if state_digest(state) == digest and self._hear(
                 message.target, vehicle, epoch, message.tick
             ):
-                self._holdings.add((*process, vehicle, epoch, message.tick, digest))
+                self._holdings[message.tick].add((*process, vehicle, epoch, digest))
+
+    def _abort(self, message: Abort) -> None:
+        for vehicle, epoch in message.entries:
+            self._hear(message.target, vehicle, epoch, message.tick)
 
     def _hear(self, zone: int, vehicle: int, epoch: int, tick: int) -> bool:
         newest = self._fences.get((zone, vehicle), (-1, -1))
-        self._fences[zone, vehicle] = max(newest, (epoch, tick))
+        kept = self._fences[zone, vehicle] = max(newest, (epoch, tick))
+        self._heard[kept[1]].add((zone, vehicle))
         return (epoch, tick) > newest
 
     def _ack(self, message: Ack) -> None:
@@ -189,10 +222,11 @@ class TraceChecker:
         if self._incarnations.get(message.zone) != message.incarnation:
             return  # a zombie's: what it still hears is not in the trace
         for vehicle, epoch, digest in message.entries:
-            holding = (*process, vehicle, epoch, message.tick, digest)
-            known = holding in self._holdings or message.tick < self._tick - self._lifetime
-            _require(known, f"acknowledges v{vehicle}, which that host never held so")
-            self._acknowledged.add(holding)
+            holding = (*process, vehicle, epoch, digest)
+            known = holding in self._holdings.get(message.tick, ())
+            expired = message.tick < self._tick - self._lifetime
+            _require(known or expired, f"acknowledges v{vehicle}, which that host never held so")
+            self._ready.add((*process, vehicle, epoch, message.tick))
 
     def _done(self, message: Done) -> None:
         current = self._incarnations.get(message.zone) == message.incarnation
@@ -204,35 +238,64 @@ class TraceChecker:
         begun = self._begun
         if begun is None or record.tick != begun.tick:
             raise InvariantError("commits a tick that was not begun")
-        owners = dict(self._owners)
-        owners.update((s.vehicle, (s.target, s.epoch)) for s in begun.switches)
-        owners.update((b.vehicle, (b.zone, 0)) for b in begun.births)
         told = [ledger.zone for ledger in record.zones]
         _require(told == sorted(self._incarnations), f"tells of zones {told}")
-        removed = []
-        for zone in sorted(self._incarnations):
-            done = self._dones.get(zone)
-            if done is None:
-                raise InvariantError(f"zone {zone} has not said DONE")
-            confirmed = {(entry.vehicle, entry.epoch) for entry in done.confirmed}
-            planned = {(s.vehicle, s.epoch) for s in begun.switches if s.target == zone}
-            _require(confirmed == planned, f"zone {zone} did not CONFIRM what came in")
-            for entry in done.removed:
-                mine = owners.pop(entry.vehicle, (-1, 0))[0] == zone
-                _require(mine, f"zone {zone} removed v{entry.vehicle}, which it does not own")
-                removed.append(entry)
+        changed = self._planned(begun)
+        removed: list[Removed] = []
+        for zone in told:
+            removed += self._confirmed(zone, changed)
         _require(record.removed == tuple(sorted(removed)), "removes others than the zones did")
+        self.changes = [
+            Change(vehicle, self.owners.get(vehicle), after) for vehicle, after in changed.items()
+        ]
+        self._change_owners()
         for ledger in record.zones:
-            owned = {v: epoch for v, (zone, epoch) in owners.items() if zone == ledger.zone}
             done = self._dones[ledger.zone]
-            exact = ledger.owned == done.owned == tally(self._run, owned)
+            exact = ledger.owned == done.owned == self._tallies[ledger.zone]
             _require(exact, f"zone {ledger.zone} does not own what it should")
-        self._owners, self._tick, self._begun, self._dones = owners, record.tick, None, {}
-        self._deferred = {v: ticks for v, ticks in begun.deferred if v in owners}
+        self._tick, self._begun, self._dones = record.tick, None, {}
+        self._deferred = {v: ticks for v, ticks in begun.deferred if v in self.owners}
         self._forget()
+
+    @staticmethod
+    def _planned(begun: Begin) -> dict[int, Owner | None]:
+        """Who changes owner by a plan, and to whom."""
+        changed: dict[int, Owner | None] = {s.vehicle: (s.target, s.epoch) for s in begun.switches}
+        changed.update((b.vehicle, (b.zone, 0)) for b in begun.births)
+        return changed
+
+    def _confirmed(self, zone: int, changed: dict[int, Owner | None]) -> tuple[Removed, ...]:
+        """What a zone's DONE adds to the changes: whom it removed."""
+        done = self._dones.get(zone)
+        if done is None:
+            raise InvariantError(f"zone {zone} has not said DONE")
+        confirmed = {(entry.vehicle, entry.epoch) for entry in done.confirmed}
+        _require(
+            confirmed == self._orders[zone].entered, f"zone {zone} did not CONFIRM what came in"
+        )
+        for entry in done.removed:
+            owner = changed.get(entry.vehicle, self.owners.get(entry.vehicle))
+            mine = owner is not None and owner[0] == zone
+            _require(mine, f"zone {zone} removed v{entry.vehicle}, which it does not own")
+            changed[entry.vehicle] = None
+        return done.removed
+
+    def _change_owners(self) -> None:
+        tallies = self._tallies
+        for vehicle, before, after in self.changes:
+            if before is not None:
+                tallies[before[0]] = tallies[before[0]].minus(self._run, vehicle, before[1])
+                del self.owners[vehicle]
+            if after is not None:
+                tallies[after[0]] = tallies[after[0]].plus(self._run, vehicle, after[1])
+                self.owners[vehicle] = after
 
     def _forget(self) -> None:
         oldest = self._tick - self._lifetime
-        self._holdings = {held for held in self._holdings if held[4] >= oldest}
-        self._acknowledged = {held for held in self._acknowledged if held[4] >= self._tick}
-        self._fences = {key: fence for key, fence in self._fences.items() if fence[1] >= oldest}
+        for tick in [tick for tick in self._holdings if tick < oldest]:
+            del self._holdings[tick]
+        for tick in [tick for tick in self._heard if tick < oldest]:
+            for key in self._heard.pop(tick):
+                if self._fences.get(key, (0, oldest))[1] < oldest:
+                    del self._fences[key]
+        self._ready = {ready for ready in self._ready if ready[4] >= self._tick}

@@ -1,14 +1,14 @@
 """A row for every transfer: when it was prepared, how long it waited, how it ended.
 
-A `TransferLog` is told what a `Trace` is told, and keeps only what is under way.
+A `TransferLog` is told what a `Trace` is told, and keeps what is under way and the newest rows.
 """
 
 from __future__ import annotations
 
-from collections import Counter
+from collections import Counter, deque
 from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import NamedTuple, Protocol
 
 from cavmarl.ownership.messages import (
     COORDINATOR,
@@ -16,12 +16,15 @@ from cavmarl.ownership.messages import (
     Ack,
     Begin,
     Commit,
+    Done,
     Message,
     Nack,
     Prepare,
     Record,
     Reset,
 )
+
+KEPT_ROWS = 10_000
 
 
 class Transfer(NamedTuple):
@@ -40,6 +43,11 @@ class Transfer(NamedTuple):
         waited: ticks for which the source went on after the crossing.
         offers: states that arrived at the target, repeats included.
         state_bytes: size of the last of them.
+        prepare_depth_m: how far it was outside of its owner's zone when the first of them arrived,
+            less than 0 inside; None: nobody told.
+        switch_depth_m: the same when its switch was decided.
+        ms: from that first state, or else from BEGIN, until the target has confirmed; None: nobody
+            has a clock.
     """
 
     episode: int
@@ -54,6 +62,26 @@ class Transfer(NamedTuple):
     waited: int
     offers: int
     state_bytes: int
+    prepare_depth_m: float | None = None
+    switch_depth_m: float | None = None
+    ms: float | None = None
+
+    @property
+    def ticks(self) -> int:
+        """From the first state that arrived at the target, or else from BEGIN, until DONE."""
+        return self.tick - self.approached if self.approached >= 0 else 1 + self.waited
+
+
+class Surroundings(Protocol):
+    """What the core does not know of itself."""
+
+    def depth_m(self, vehicle: int, target: int) -> float | None:
+        """How far outside of its owner's zone a vehicle near another one is; None: unknown."""
+        ...
+
+    def now_ms(self) -> float:
+        """Of a clock that never goes back."""
+        ...
 
 
 @dataclass(slots=True)
@@ -62,33 +90,60 @@ class _Approach:
     last: int
     offers: int
     state_bytes: int
+    depth_m: float | None = None
+    began_ms: float | None = None
+
+
+@dataclass(slots=True)
+class _Switching:
+    depth_m: float | None
+    began_ms: float | None
+    ended_ms: float | None = None
+
+
+UNKNOWN = _Switching(None, None)
 
 
 class TransferLog:
     """Follows records and deliveries.
 
+    Args:
+        lifetime: ticks after which a state that nobody refreshes is forgotten.
+        surroundings: tells depths and times; None: they are left out.
+
     Attributes:
-        rows: transfers that have been committed; the user may take them away.
-        counts: `aborted`, `acknowledged`, `deferred`, `forced`, `refused`, `switched`.
+        rows: the newest KEPT_ROWS transfers that have been committed; `take` takes them away.
+        counts: `aborted`, `acknowledged`, `deferred`, `expired`, `forced`, `refused`, `removed`,
+            `switched`.
+        episode: of the newest record.
     """
 
-    def __init__(self, lifetime: int) -> None:
-        self.rows: list[Transfer] = []
+    def __init__(self, lifetime: int, surroundings: Surroundings | None = None) -> None:
+        self.rows: deque[Transfer] = deque(maxlen=KEPT_ROWS)
         self.counts: Counter[str] = Counter()
+        self.episode = -1
         self._lifetime = lifetime
+        self._surroundings = surroundings
         self._approaches: dict[tuple[int, int, int], _Approach] = {}  # vehicle, target, epoch
         self._waited: dict[int, int] = {}
         self._begun: Begin | None = None
+        self._switching: dict[int, _Switching] = {}
+
+    def take(self) -> list[Transfer]:
+        """The rows, which are not kept any longer."""
+        rows = list(self.rows)
+        self.rows.clear()
+        return rows
 
     def logged(self, records: Iterable[Record]) -> None:
         """Note records, in the order of the log."""
         for record in records:
             match record:
                 case Reset():
+                    self.episode = record.episode
                     self._approaches, self._waited, self._begun = {}, {}, None
                 case Begin():
-                    self._begun = record
-                    self.counts["deferred"] += len(record.deferred)
+                    self._begin(record)
                 case Commit():
                     self._commit(record)
 
@@ -101,6 +156,9 @@ class TransferLog:
                     known = self._approaches.get(key)
                     if known is None:
                         new = _Approach(message.tick, message.tick, 1, len(state))
+                        if self._surroundings is not None:
+                            new.depth_m = self._surroundings.depth_m(vehicle, message.target)
+                            new.began_ms = self._surroundings.now_ms()
                         self._approaches[key] = new
                     else:
                         known.last = max(known.last, message.tick)
@@ -110,10 +168,30 @@ class TransferLog:
                 for vehicle, epoch in message.entries:
                     if self._approaches.pop((vehicle, message.target, epoch), None) is not None:
                         self.counts["aborted"] += 1
+            case Done() if message.confirmed:
+                self._confirm(message)
             case Ack() if destination == COORDINATOR:
                 self.counts["acknowledged"] += len(message.entries)
             case Nack() if destination == COORDINATOR:
                 self.counts["refused"] += len(message.entries)
+
+    def _begin(self, record: Begin) -> None:
+        self._begun = record
+        self.counts["deferred"] += len(record.deferred)
+        self._switching = {}
+        around = self._surroundings
+        if around is not None:
+            for switch in record.switches:
+                depth_m = around.depth_m(switch.vehicle, switch.target)
+                self._switching[switch.vehicle] = _Switching(depth_m, around.now_ms())
+
+    def _confirm(self, message: Done) -> None:
+        if self._surroundings is None:
+            return
+        for vehicle, _ in message.confirmed:
+            switching = self._switching.get(vehicle)
+            if switching is not None:
+                switching.ended_ms = self._surroundings.now_ms()
 
     def _commit(self, record: Commit) -> None:
         begun, self._begun = self._begun, None
@@ -122,15 +200,22 @@ class TransferLog:
         gone = {entry.vehicle for entry in record.removed}
         for vehicle, source, target, epoch, forced in begun.switches:
             self.counts["forced" if forced else "switched"] += 1
+            if vehicle in gone:
+                self.counts["removed"] += 1
             found = self._approaches.pop((vehicle, target, epoch - 1), _Approach(-1, -1, 0, 0))
+            switching = self._switching.get(vehicle, UNKNOWN)
+            began_ms = switching.began_ms if found.began_ms is None else found.began_ms
+            ended_ms = switching.ended_ms
             self.rows.append(
                 Transfer(
                     record.episode, record.tick, vehicle, source, target, epoch, forced,
                     vehicle in gone, found.first, self._waited.get(vehicle, 0), found.offers,
-                    found.state_bytes,
+                    found.state_bytes, found.depth_m, switching.depth_m,
+                    None if began_ms is None or ended_ms is None else ended_ms - began_ms,
                 )
             )  # fmt: skip
         self._waited = dict(begun.deferred)
         oldest = record.tick - self._lifetime
         for key in [key for key, known in self._approaches.items() if known.last < oldest]:
             del self._approaches[key]
+            self.counts["expired"] += 1

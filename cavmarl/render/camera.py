@@ -7,9 +7,14 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["Bounds", "Camera"]
+__all__ = ["Bounds", "Camera", "suitable_size"]
 
 Bounds = tuple[float, float, float, float]  # min_x, min_y, max_x, max_y in metres
+
+# Pixels of a picture whose size is not given, and how much wider than high it may be.
+PICTURE_PX = 960 * 720
+MIN_ASPECT = 1.25
+MAX_ASPECT = 3.0
 
 
 @dataclass(frozen=True)
@@ -69,3 +74,12 @@ class Camera:
             self.scale * (target.scale / self.scale) ** share,
             target.size,
         )
+
+
+def suitable_size(bounds: Bounds) -> tuple[int, int]:
+    """A size in the proportions of `bounds`, in steps of 16 pixels, which all video coders take."""
+    min_x, min_y, max_x, max_y = bounds
+    aspect = max(max_x - min_x, 1.0) / max(max_y - min_y, 1.0)
+    aspect = min(max(aspect, MIN_ASPECT), MAX_ASPECT)
+    width, height = (PICTURE_PX * aspect) ** 0.5, (PICTURE_PX / aspect) ** 0.5
+    return round(width / 16) * 16, round(height / 16) * 16

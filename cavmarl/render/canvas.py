@@ -9,12 +9,15 @@ from functools import lru_cache
 from types import ModuleType
 from typing import TYPE_CHECKING
 
+import numpy as np
+from numpy.typing import NDArray
+
 from cavmarl.errors import require
 
 if TYPE_CHECKING:
     from pygame import Font, Surface
 
-__all__ = ["Part", "blank", "lettering", "load_pygame", "stamp"]
+__all__ = ["Part", "blank", "lettering", "load_pygame", "pixels", "stamp"]
 
 Part = tuple[Sequence[int], Sequence[Sequence[float]]]  # colour with alpha, corners in pixels
 
@@ -66,6 +69,13 @@ def blank(size: tuple[int, int], *, transparent: bool = False) -> Surface:
     flags = pygame.SRCALPHA if transparent else 0
     surface: Surface = pygame.Surface(size, flags, 32)
     return surface
+
+
+def pixels(surface: Surface) -> NDArray[np.uint8]:
+    """A picture as uint8 (height, width, 3), red green blue."""
+    data = load_pygame().image.tobytes(surface, "RGB")
+    width, height = surface.get_size()
+    return np.frombuffer(data, dtype=np.uint8).reshape(height, width, 3).copy()
 
 
 def stamp(target: Surface, parts: Sequence[Part]) -> None:

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,6 +11,7 @@ from numpy.typing import NDArray
 from cavmarl.kernels.codes import EVENT_COLLIDED
 from cavmarl.render.camera import Camera
 from cavmarl.render.canvas import Part, stamp
+from cavmarl.render.marks import opaque
 from cavmarl.render.palette import (
     BACKGROUND_CAR,
     BLINKER,
@@ -24,7 +26,7 @@ from cavmarl.render.palette import (
 if TYPE_CHECKING:
     from pygame import Surface
 
-__all__ = ["BRAKING_MPS2", "draw_cars", "in_view"]
+__all__ = ["BRAKING_MPS2", "Paint", "draw_cars", "in_view"]
 
 BRAKING_MPS2 = -1.0  # below this acceleration the brake lights are on
 
@@ -63,21 +65,51 @@ def in_view(vehicles: NDArray[np.void], camera: Camera) -> NDArray[np.void]:
     return seen[np.lexsort((seen["id"], seen["z"], seen["agent"] >= 0))]
 
 
-def draw_cars(surface: Surface, vehicles: NDArray[np.void], camera: Camera) -> None:
+class Paint(NamedTuple):
+    """How a car is painted.
+
+    Attributes:
+        body: its colour.
+        rims: colours of rims around it, the outer one first.
+        lined: whether a thin light line surrounds it.
+    """
+
+    body: Color
+    rims: tuple[Color, ...] = ()
+    lined: bool = False
+
+
+def draw_cars(
+    surface: Surface,
+    vehicles: NDArray[np.void],
+    camera: Camera,
+    paints: Sequence[Paint] | None = None,
+) -> None:
     """Paint VEHICLE rows, later rows over earlier ones.
 
-    Agents have the colours of `palette.agent_color`; brake lights shine below `BRAKING_MPS2`; a red
-    outline is a vehicle that has collided.
+    Brake lights shine below `BRAKING_MPS2`; a red outline is a vehicle that has collided.
+
+    Args:
+        surface: where to.
+        vehicles: VEHICLE rows.
+        camera: the view.
+        paints: of each; by default agents have the colours of `palette.agent_color`.
     """
+    if paints is None:
+        paints = [_paint_of_driver(agent) for agent in vehicles["agent"].tolist()]
     centers = camera.to_pixels(np.stack([vehicles["x"], vehicles["y"]], axis=1)).tolist()
-    for row, center in zip(vehicles, centers, strict=True):
-        _draw_car(surface, row, center, camera.scale)
+    for row, center, paint in zip(vehicles, centers, paints, strict=True):
+        _draw_car(surface, row, center, camera.scale, paint)
 
 
-def _draw_car(surface: Surface, row: np.void, center: list[float], scale: float) -> None:
-    agent = int(row["agent"])
-    is_agent = agent >= 0
-    color = agent_color(agent) if is_agent else BACKGROUND_CAR
+def _paint_of_driver(agent: int) -> Paint:
+    return Paint(agent_color(agent), lined=True) if agent >= 0 else Paint(BACKGROUND_CAR)
+
+
+def _draw_car(
+    surface: Surface, row: np.void, center: list[float], scale: float, paint: Paint
+) -> None:
+    is_agent = row["agent"] >= 0
     half_length = max(row["length"] * scale, AGENT_MIN_LENGTH_PX if is_agent else MIN_LENGTH_PX) / 2
     half_width = max(row["width"] * scale, AGENT_MIN_WIDTH_PX if is_agent else MIN_WIDTH_PX) / 2
     heading = float(row["heading"])
@@ -98,17 +130,19 @@ def _draw_car(surface: Surface, row: np.void, center: list[float], scale: float)
         ]
 
     parts: list[Part] = [((0, 0, 0, 46), place(BODY, 0.3, half_width * 0.22))]
+    for n, rim in enumerate(paint.rims):
+        parts.append((opaque(rim), place(BODY, OUTLINE_PX * (len(paint.rims) - n + 1))))
     if row["hit"] >= 0 or row["events"] & EVENT_COLLIDED:
-        parts.append((_opaque(COLLIDED), place(BODY, OUTLINE_PX + 1.0)))
-    elif is_agent:
+        parts.append((opaque(COLLIDED), place(BODY, OUTLINE_PX + 1.0)))
+    elif paint.lined:
         parts.append(((236, 236, 236, 236), place(BODY, OUTLINE_PX / 2)))
-    parts.append((_opaque(color), place(BODY)))
+    parts.append((opaque(paint.body), place(BODY)))
     braking = row["accel"] < BRAKING_MPS2
     if 2 * half_width < WIDTH_OF_DETAILS_PX:
         if braking:
-            parts.append((_opaque(BRAKE), place(REAR_BAR)))
+            parts.append((opaque(BRAKE), place(REAR_BAR)))
     else:
-        parts += [(_opaque(tint), place(shape)) for tint, shape in _details(row, braking)]
+        parts += [(opaque(tint), place(shape)) for tint, shape in _details(row, braking)]
     stamp(surface, parts)
 
 
@@ -125,7 +159,3 @@ def _details(row: np.void, braking: bool) -> list[tuple[Color, Shape]]:
 
 def _mirrored(shape: Shape) -> Shape:
     return tuple((x, -y) for x, y in shape)
-
-
-def _opaque(color: Color) -> tuple[int, int, int, int]:
-    return (*color, 255)

@@ -3,22 +3,17 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from cavmarl.render.camera import Camera
-from cavmarl.render.canvas import Part, blank, lettering, load_pygame, stamp
-from cavmarl.render.palette import (
-    BACKGROUND_CAR,
-    COLLIDED,
-    INK,
-    MUTED_INK,
-    PANEL,
-    Color,
-    agent_color,
-)
+from cavmarl.render.canvas import blank, lettering, load_pygame, stamp
+from cavmarl.render.legend import SWATCH_PX, Sample
+from cavmarl.render.marks import pill, target
+from cavmarl.render.palette import INK, MUTED_INK, PANEL, agent_color, ink_on
 
 if TYPE_CHECKING:
     from pygame import Surface
@@ -33,8 +28,6 @@ TEXT_PX = 17
 LABEL_PX = 15
 SCALE_OF_LABELS_ON_CARS = 8.0  # pixels a metre: a car is wider than its number
 SCALE_BAR_PX = 140
-SWATCH_PX = 16
-LEGEND = ("agents", "destination", "background", "collided")
 
 
 def clock_text(seconds: float) -> str:
@@ -76,7 +69,7 @@ class Overlay:
     ) -> None:
         """A ring in the agent's colour at each destination, (n, 2) metres."""
         for agent, (x, y) in zip(agents.tolist(), camera.to_pixels(places).tolist(), strict=True):
-            stamp(surface, _target(x, y, agent_color(agent)))
+            stamp(surface, target(x, y, agent_color(agent)))
 
     def title(self, surface: Surface, title: str, note: str) -> None:
         """A panel at the upper left: a title, and a quieter note under it."""
@@ -108,29 +101,28 @@ class Overlay:
         for x in (left, left + length_px - 2):
             pygame.draw.rect(surface, INK, (x, bottom - 6, 2, 6))
 
-    def legend(self, surface: Surface, *, destinations: bool) -> None:
+    def legend(self, surface: Surface, samples: Sequence[Sample]) -> None:
         """What the colours mean, at the lower right."""
-        names = [name for name in LEGEND if destinations or name != "destination"]
-        texts = [lettering(name, TEXT_PX, INK) for name in names]
+        texts = [lettering(sample.text, TEXT_PX, INK) for sample in samples]
         width = sum(SWATCH_PX + 6 + text.get_width() for text in texts) + 12 * (len(texts) - 1)
         height = texts[0].get_height()
         left = surface.get_width() - MARGIN_PX - 2 * PADDING_PX - width
         top = surface.get_height() - MARGIN_PX - 2 * PADDING_PX - height
         self._panel(surface, left, top, width, height)
         x, middle = float(left + PADDING_PX), top + PADDING_PX + height / 2
-        for name, text in zip(names, texts, strict=True):
-            stamp(surface, _swatch(name, x, middle))
+        for sample, text in zip(samples, texts, strict=True):
+            stamp(surface, sample.draw(x, middle))
             x += SWATCH_PX + 6
             surface.blit(text, (x, top + PADDING_PX))
             x += text.get_width() + 12
 
     def _label(self, agent: int) -> Surface:
         if agent not in self._labels:
-            text = lettering(str(agent), TEXT_PX, _ink_on(agent_color(agent)))
+            text = lettering(str(agent), TEXT_PX, ink_on(agent_color(agent)))
             width, height = max(text.get_width() + 9, LABEL_PX), LABEL_PX
             label = blank((width + 2, height + 2), transparent=True)
-            stamp(label, [((255, 255, 255, 255), _pill(0.0, 0.0, width + 2, height + 2))])
-            stamp(label, [((*agent_color(agent), 255), _pill(1.0, 1.0, width, height))])
+            stamp(label, [((255, 255, 255, 255), pill(0.0, 0.0, width + 2, height + 2))])
+            stamp(label, [((*agent_color(agent), 255), pill(1.0, 1.0, width, height))])
             label.blit(text, text.get_rect(center=(width / 2 + 1, height / 2 + 1.5)))
             self._labels[agent] = label
         return self._labels[agent]
@@ -141,53 +133,3 @@ class Overlay:
         panel = blank(size, transparent=True)
         pygame.draw.rect(panel, (*PANEL, PANEL_ALPHA), panel.get_rect(), border_radius=7)
         surface.blit(panel, (left, top))
-
-
-def _target(x: float, y: float, color: Color) -> list[Part]:
-    return [
-        ((0, 0, 0, 50), _disc(x + 0.8, y + 0.8, 6.0)),
-        ((255, 255, 255, 255), _disc(x, y, 5.6)),
-        ((*color, 255), _disc(x, y, 4.4)),
-        ((255, 255, 255, 255), _disc(x, y, 2.0)),
-    ]
-
-
-def _swatch(name: str, x: float, y: float) -> list[Part]:
-    """The legend's sample, `SWATCH_PX` wide, y its middle."""
-    top = y - 5.0
-    if name == "destination":
-        return _target(x + SWATCH_PX / 2.0, y, agent_color(0))
-    if name == "agents":
-        step = SWATCH_PX / 4.0
-        return [((*agent_color(k), 255), _bar(x + k * step, top, step, 10.0)) for k in range(4)]
-    if name == "collided":
-        inside = _bar(x + 2.0, top + 2.0, SWATCH_PX - 4.0, 6.0)
-        outside = _bar(x, top, SWATCH_PX, 10.0)
-        return [((*COLLIDED, 255), outside), ((*BACKGROUND_CAR, 255), inside)]
-    return [((*BACKGROUND_CAR, 255), _bar(x, top, SWATCH_PX, 10.0))]
-
-
-def _ink_on(color: Color) -> Color:
-    """Dark or light ink, whichever reads better (luma of ITU-R BT.601)."""
-    luma = 0.299 * color[0] + 0.587 * color[1] + 0.114 * color[2]
-    return INK if luma > 140 else PANEL
-
-
-def _disc(x: float, y: float, radius: float) -> list[tuple[float, float]]:
-    angles = [2.0 * math.pi * k / 32 for k in range(32)]
-    return [(x + radius * math.cos(a), y + radius * math.sin(a)) for a in angles]
-
-
-def _bar(x: float, y: float, width: float, height: float) -> list[tuple[float, float]]:
-    return [(x, y), (x + width, y), (x + width, y + height), (x, y + height)]
-
-
-def _pill(x: float, y: float, width: float, height: float) -> list[tuple[float, float]]:
-    radius = height / 2.0
-    turns = [math.pi * k / 12 for k in range(13)]
-    right = [
-        (x + width - radius + radius * math.sin(a), y + radius - radius * math.cos(a))
-        for a in turns
-    ]
-    left = [(x + radius - radius * math.sin(a), y + radius + radius * math.cos(a)) for a in turns]
-    return right + left

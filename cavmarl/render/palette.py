@@ -23,6 +23,7 @@ __all__ = [
     "ZONES",
     "Color",
     "agent_color",
+    "ink_on",
     "zone_color",
 ]
 
@@ -56,15 +57,16 @@ AGENTS: tuple[Color, ...] = (
     (205, 92, 190),
 )
 
-# Of zones, washed over the map; zones that touch seldom have the same.
+# Of zones and their vehicles; zones that touch seldom have the same. They are those of M. Okabe and
+# K. Ito, Color Universal Design (2008), which people with any colour vision can tell apart.
 ZONES: tuple[Color, ...] = (
-    (38, 110, 196),
-    (214, 96, 40),
-    (46, 150, 84),
-    (150, 76, 178),
-    (196, 150, 22),
-    (18, 148, 160),
-    (204, 62, 104),
+    (0, 114, 178),
+    (230, 159, 0),
+    (0, 158, 115),
+    (204, 121, 167),
+    (213, 94, 0),
+    (86, 180, 233),
+    (240, 228, 66),
 )
 
 # By signal code, the positions in roads.network.SIGNAL_STATES = "rugGysoOY".
@@ -93,3 +95,9 @@ def agent_color(agent: int) -> Color:
 def zone_color(zone: int) -> Color:
     """The colour of a zone, by its number."""
     return ZONES[zone % len(ZONES)]
+
+
+def ink_on(color: Color) -> Color:
+    """Dark or light ink, whichever reads better (luma of ITU-R BT.601)."""
+    luma = 0.299 * color[0] + 0.587 * color[1] + 0.114 * color[2]
+    return INK if luma > 140 else PANEL

@@ -40,6 +40,7 @@ class Picture:
         focus: the part of the map to show, m; by default all of it.
         agents: instead of the entry's number.
         background: instead of the entry's number.
+        ghosts_of: the zone whose ghosts are outlined; a divided world is drawn with its zones.
     """
 
     env: str
@@ -48,6 +49,7 @@ class Picture:
     focus: Bounds | None = None
     agents: int | None = None
     background: int | None = None
+    ghosts_of: int | None = None
 
 
 PICTURES = {
@@ -55,6 +57,8 @@ PICTURES = {
     "merge": Picture("merge", 9.0, (1280, 400), (150.0, -76.0, 660.0, 40.0)),
     "grid4x4": Picture("grid4x4", 16.0),
     "town": Picture("town", 20.0, background=250),
+    "rush": Picture("rush", 60.0),
+    "ghosts": Picture("rush", 60.0, (1280, 720), (880.0, 500.0, 1340.0, 760.0), ghosts_of=1),
     "hero": Picture(
         "town", 30.0, (1280, 720), (1230.0, 560.0, 1720.0, 835.0), agents=60, background=240
     ),
@@ -80,6 +84,8 @@ def draw_picture(picture: Picture) -> Surface:
         simulation.signal_phases(),
         title=config.name,
         clock_s=float(simulation.ticks()[0]) * config.clock.sim_dt_s,
+        zones=simulation.zone_view() if simulation.partition.count > 1 else None,
+        ghosts_of=picture.ghosts_of,
     )
 
 

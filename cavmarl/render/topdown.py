@@ -8,24 +8,24 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from cavmarl.render.camera import Bounds, Camera
-from cavmarl.render.canvas import load_pygame
+from cavmarl.render.camera import Bounds, Camera, suitable_size
+from cavmarl.render.canvas import load_pygame, pixels
 from cavmarl.render.cars import draw_cars, in_view
 from cavmarl.render.ground import draw_ground, draw_stop_lines, signal_codes
+from cavmarl.render.legend import Sample, samples_of_drivers, samples_of_zones
 from cavmarl.render.overlay import Overlay, clock_text
+from cavmarl.render.owners import draw_transfers, owner_paints
 from cavmarl.render.shapes import road_shapes
 from cavmarl.render.window import Window
+from cavmarl.render.zones import draw_sight, draw_zones
 from cavmarl.roads.network import RoadNetwork
+from cavmarl.runtime.zone_view import ZoneView
 
 if TYPE_CHECKING:
     from pygame import Surface
 
-__all__ = ["TopDownRenderer", "suitable_size"]
+__all__ = ["TopDownRenderer"]
 
-# Pixels of a picture whose size is not given, and how much wider than high it may be.
-PICTURE_PX = 960 * 720
-MIN_ASPECT = 1.25
-MAX_ASPECT = 3.0
 # Smallest part of the world that a following camera shows, and how fast it turns to a new aim.
 FOLLOW_M = 150.0
 FOLLOW_SHARE = 0.12
@@ -82,6 +82,8 @@ class TopDownRenderer:
         clock_s: float | None = None,
         follow: Sequence[int] | None = None,
         center: tuple[float, float] | None = None,
+        zones: ZoneView | None = None,
+        ghosts_of: int | None = None,
     ) -> Surface:
         """Draw one picture.
 
@@ -93,6 +95,9 @@ class TopDownRenderer:
             follow: agents, by index, that the camera stays close to; it waits while none of them
                 is in the world. By default it shows `focus`.
             center: (x, y) in metres that the camera stays close to, instead of agents.
+            zones: of a divided world: vehicles get the colours of their owners. `vehicles` are all
+                of the world then, as `Simulation.vehicles` gives them.
+            ghosts_of: the zone whose sight and ghosts are outlined.
 
         Returns:
             A new surface; see `frame` for an array.
@@ -100,6 +105,21 @@ class TopDownRenderer:
         self._aim(vehicles, follow, center)
         camera = self._camera
         surface = self._background(signal_phases).copy()
+        notes = [] if clock_s is None else [clock_text(clock_s)]
+        notes.append(f"{len(vehicles)} vehicles")
+        if zones is None:
+            samples = self._draw_drivers(surface, vehicles)
+        else:
+            samples = self._draw_owners(surface, vehicles, zones, ghosts_of)
+            notes += [f"{zones.partition.count} zones", f"{len(zones.transfers)} in transfer"]
+        self._overlay.title(surface, title, "   ".join(notes))
+        self._overlay.scale_bar(surface, camera)
+        self._overlay.legend(surface, samples)
+        return surface
+
+    def _draw_drivers(self, surface: Surface, vehicles: NDArray[np.void]) -> list[Sample]:
+        """Vehicles by who drives them; agents with their numbers and destinations."""
+        camera = self._camera
         seen = in_view(vehicles, camera)
         if self._goals is not None:
             agents = vehicles[vehicles["agent"] >= 0]
@@ -108,12 +128,20 @@ class TopDownRenderer:
             )
         draw_cars(surface, seen, camera)
         self._overlay.agents(surface, seen, camera)
-        notes = [] if clock_s is None else [clock_text(clock_s)]
-        notes.append(f"{len(vehicles)} vehicles")
-        self._overlay.title(surface, title, "   ".join(notes))
-        self._overlay.scale_bar(surface, camera)
-        self._overlay.legend(surface, destinations=self._goals is not None)
-        return surface
+        return samples_of_drivers(destinations=self._goals is not None)
+
+    def _draw_owners(
+        self, surface: Surface, vehicles: NDArray[np.void], zones: ZoneView, ghosts_of: int | None
+    ) -> list[Sample]:
+        """Zones, and vehicles by who owns them, sees them and is to have them."""
+        camera = self._camera
+        draw_zones(surface, zones.partition, zones.halo_m, camera)
+        if ghosts_of is not None:
+            draw_sight(surface, zones.partition, zones.halo_m, ghosts_of, camera)
+        seen = in_view(vehicles, camera)
+        draw_cars(surface, seen, camera, owner_paints(zones, vehicles, seen, ghosts_of))
+        draw_transfers(surface, zones, vehicles, camera)
+        return samples_of_zones(zones.partition.count, ghosts_of)
 
     def frame(
         self,
@@ -124,13 +152,21 @@ class TopDownRenderer:
         clock_s: float | None = None,
         follow: Sequence[int] | None = None,
         center: tuple[float, float] | None = None,
+        zones: ZoneView | None = None,
+        ghosts_of: int | None = None,
     ) -> NDArray[np.uint8]:
         """The picture of `draw` as uint8 (height, width, 3), red green blue."""
         surface = self.draw(
-            vehicles, signal_phases, title=title, clock_s=clock_s, follow=follow, center=center
+            vehicles,
+            signal_phases,
+            title=title,
+            clock_s=clock_s,
+            follow=follow,
+            center=center,
+            zones=zones,
+            ghosts_of=ghosts_of,
         )
-        data = load_pygame().image.tobytes(surface, "RGB")
-        return np.frombuffer(data, dtype=np.uint8).reshape(*self.size[::-1], 3).copy()
+        return pixels(surface)
 
     def show(self, surface: Surface, title: str, fps: float) -> None:
         """Put a picture of `draw` in a window, no sooner than 1/`fps` s after the last one."""
@@ -187,15 +223,6 @@ class TopDownRenderer:
             draw_stop_lines(scene, self._shapes, codes, camera)
             self._scene = camera, key, scene
         return self._scene[2]
-
-
-def suitable_size(bounds: Bounds) -> tuple[int, int]:
-    """A size in the proportions of `bounds`, in steps of 16 pixels, which all video coders take."""
-    min_x, min_y, max_x, max_y = bounds
-    aspect = max(max_x - min_x, 1.0) / max(max_y - min_y, 1.0)
-    aspect = min(max(aspect, MIN_ASPECT), MAX_ASPECT)
-    width, height = (PICTURE_PX * aspect) ** 0.5, (PICTURE_PX / aspect) ** 0.5
-    return round(width / 16) * 16, round(height / 16) * 16
 
 
 def _edge_ends(network: RoadNetwork, edges: NDArray[np.int32]) -> NDArray[np.float64]:

@@ -5,6 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from cavmarl.errors import ConfigError
+from cavmarl.render.canvas import pixels
 from cavmarl.render.topdown import TopDownRenderer
 from cavmarl.runtime.simulation import Simulation
 
@@ -31,15 +33,32 @@ class WorldView:
         self._fps = fps
         self._renderer = TopDownRenderer(simulation.network, goal_edges=simulation.goal_edges)
 
-    def show(self) -> NDArray[np.uint8] | None:
-        """Draw the present moment: (height, width, 3) for `rgb_array`, None for `human`."""
+    def show(self, ghosts_of: int | None = None) -> NDArray[np.uint8] | None:
+        """Draw the present moment: (height, width, 3) for `rgb_array`, None for `human`.
+
+        A divided world is drawn with its zones, and vehicles in the colours of their owners.
+
+        Args:
+            ghosts_of: the zone whose sight and ghosts are outlined.
+
+        Raises:
+            ConfigError: the world has no such zone.
+        """
         simulation = self._simulation
-        vehicles, phases = simulation.vehicles(), simulation.signal_phases()
-        clock_s = float(simulation.ticks()[0]) * simulation.config.clock.sim_dt_s
+        count = simulation.partition.count
+        if ghosts_of is not None and not 0 <= ghosts_of < count:
+            raise ConfigError(f"ghosts_of = {ghosts_of}: the world has the zones 0 to {count - 1}")
+        picture = self._renderer.draw(
+            simulation.vehicles(),
+            simulation.signal_phases(),
+            title=self._title,
+            clock_s=float(simulation.ticks()[0]) * simulation.config.clock.sim_dt_s,
+            zones=simulation.zone_view() if count > 1 else None,
+            ghosts_of=ghosts_of,
+        )
         if self._mode == "rgb_array":
-            return self._renderer.frame(vehicles, phases, title=self._title, clock_s=clock_s)
-        surface = self._renderer.draw(vehicles, phases, title=self._title, clock_s=clock_s)
-        self._renderer.show(surface, self._title, self._fps)
+            return pixels(picture)
+        self._renderer.show(picture, self._title, self._fps)
         return None
 
     def close(self) -> None:

@@ -7,24 +7,24 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from cavmarl.render.camera import Camera
+from cavmarl.render.camera import Camera, suitable_size
 from cavmarl.render.canvas import blank, lettering, load_pygame
 from cavmarl.render.ground import draw_ground
 from cavmarl.render.overlay import Overlay
-from cavmarl.render.palette import INK, PANEL, zone_color
+from cavmarl.render.palette import INK, ink_on, zone_color
 from cavmarl.render.shapes import road_shapes
-from cavmarl.render.topdown import suitable_size
 from cavmarl.roads.network import RoadNetwork
 from cavmarl.roads.zones import ZonePartition
 
 if TYPE_CHECKING:
-    from pygame import Surface
+    from pygame import Rect, Surface
 
-__all__ = ["draw_zones", "zone_picture"]
+__all__ = ["draw_sight", "draw_zones", "zone_picture"]
 
-WASH_ALPHA = 36
-HALO_ALPHA = 92
+WASH_ALPHA = 20
+HALO_ALPHA = 52
 BORDER_PX = 2
+SIGHT_PX = 4
 NUMBER_PX = 26
 NUMBER_PADDING_PX = 7
 MARGIN_PX = 50.0
@@ -79,13 +79,37 @@ def draw_zones(surface: Surface, partition: ZonePartition, halo_m: float, camera
         pygame.draw.rect(
             surface, INK, (left - 1, top - 1, width + BORDER_PX, height + BORDER_PX), BORDER_PX
         )
-        _number(surface, zone, (left + width // 2, top + height // 2))
+        _number(surface, zone, pygame.Rect(left, top, width, height))
 
 
-def _clipped(rects: NDArray[np.float64], camera: Camera) -> NDArray[np.float64]:
-    """Rectangles (k, 4) without what is out of view."""
-    min_x, min_y, max_x, max_y = camera.bounds
-    return np.clip(rects, (min_x, min_y, min_x, min_y), (max_x, max_y, max_x, max_y))
+def draw_sight(
+    surface: Surface, partition: ZonePartition, halo_m: float, zone: int, camera: Camera
+) -> None:
+    """Draw how far a zone sees: the line at the end of its halo, in its colour.
+
+    Args:
+        surface: where to.
+        partition: of the map.
+        halo_m: as in `zone_picture`.
+        zone: which.
+        camera: the view.
+    """
+    pygame = load_pygame()
+    seen = partition.reaching[[zone]] + np.array([-halo_m, -halo_m, halo_m, halo_m])
+    # Far enough out of view for the round corners of what is clipped to stay there.
+    beyond = halo_m + 2.0 * SIGHT_PX / camera.scale
+    box = _pixels(_clipped(seen, camera, beyond)[0], camera)
+    radius = round(halo_m * camera.scale)
+    for width, color in ((SIGHT_PX + 2, INK), (SIGHT_PX, zone_color(zone))):
+        pygame.draw.rect(surface, color, box, width, border_radius=radius)
+
+
+def _clipped(
+    rects: NDArray[np.float64], camera: Camera, beyond_m: float = 0.0
+) -> NDArray[np.float64]:
+    """Rectangles (k, 4) without what is further than `beyond_m` out of view."""
+    low, high = np.array(camera.bounds).reshape(2, 2) + np.array([[-beyond_m], [beyond_m]])
+    return np.clip(rects, np.tile(low, 2), np.tile(high, 2))
 
 
 def _pixels(rect: NDArray[np.float64], camera: Camera) -> tuple[int, int, int, int]:
@@ -94,9 +118,12 @@ def _pixels(rect: NDArray[np.float64], camera: Camera) -> tuple[int, int, int, i
     return int(left), int(top), int(right - left), int(bottom - top)
 
 
-def _number(surface: Surface, zone: int, center: tuple[int, int]) -> None:
+def _number(surface: Surface, zone: int, room: Rect) -> None:
+    """The zone's number in the middle of what is seen of it, if there is room."""
     pygame = load_pygame()
-    text = lettering(str(zone), NUMBER_PX, PANEL)
-    plate = text.get_rect(center=center).inflate(2 * NUMBER_PADDING_PX, NUMBER_PADDING_PX)
-    pygame.draw.rect(surface, zone_color(zone), plate, border_radius=NUMBER_PADDING_PX)
-    surface.blit(text, text.get_rect(center=center))
+    color = zone_color(zone)
+    text = lettering(str(zone), NUMBER_PX, ink_on(color))
+    plate = text.get_rect(center=room.center).inflate(2 * NUMBER_PADDING_PX, NUMBER_PADDING_PX)
+    if room.contains(plate):
+        pygame.draw.rect(surface, color, plate, border_radius=NUMBER_PADDING_PX)
+        surface.blit(text, text.get_rect(center=room.center))

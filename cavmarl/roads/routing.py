@@ -7,6 +7,7 @@ to change lanes, has a new way at once, and a record that migrates carries its w
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import lru_cache
 from itertools import pairwise
 
 import numpy as np
@@ -81,6 +82,7 @@ def way(network: RoadNetwork, plan: NDArray[np.void], lane: int) -> list[int]:
             return lanes
 
 
+@lru_cache(maxsize=1)  # the shards of a world are made one after the other, of one network
 def lane_grid(network: RoadNetwork, cell_m: float = 25.0) -> LaneGrid:
     """Cells of `cell_m` over the map with the lanes whose surface may reach into each."""
     min_x, min_y, max_x, max_y = (float(bound) for bound in network.extent_m)

@@ -106,7 +106,7 @@ def zone_statistics(
 
 
 def _within(rect: Floats, places: Floats, halo_m: float) -> NDArray[np.bool_]:
-    """Whether places lie within the halo of a rectangle, as `kernels.zones.publish` decides it."""
+    """Whether places lie within the halo of a rectangle, as `kernels.exchange` decides it."""
     away = np.maximum(np.maximum(rect[:2] - places, places - rect[2:]), 0.0)
     return np.asarray((away * away).sum(axis=1) <= halo_m * halo_m)
 

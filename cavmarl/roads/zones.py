@@ -2,7 +2,7 @@
 
 Zones are half-open: [min_x, max_x) by [min_y, max_y). So a place on a border, or where four corners
 meet, belongs to one zone; and as those at the rim reach to infinity, so does every other place.
-`zone_layouts` makes partitions of maps, `zone_file` keeps them, `zone_coverage` says how far zones
+`zone_layouts` makes partitions of maps, `zone_file` keeps them, `zone_halo` says how far zones
 must see over their borders, and `zone_statistics` what is in them.
 """
 

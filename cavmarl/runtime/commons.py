@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 from cavmarl.config import TERMS, EnvConfig
 from cavmarl.kernels.arrays import Worlds
 from cavmarl.kernels.outputs import clear_outputs, settle_outputs
+from cavmarl.kernels.repeated import repeated
 from cavmarl.kernels.signals import switch_signals
 from cavmarl.roads.network import RoadNetwork
 from cavmarl.shard.outputs import make_outputs
@@ -33,6 +34,7 @@ class Commons:
         self._sim_dt_s = config.clock.sim_dt_s
         self._weights = np.array([config.terms.weights.get(name, 0.0) for name in TERMS])
         self._team_share = config.terms.team_share
+        self._switch_signals = repeated(switch_signals)
 
     def switch_signals(self, worlds: Worlds) -> None:
         """Bring the signals to the present tick, after `detect` of all shards.
@@ -41,7 +43,7 @@ class Commons:
             worlds: of any shard; the arrays of signals are those of all.
         """
         if self._roads.signals.size > 0:
-            switch_signals(
+            self._switch_signals(
                 self._roads,
                 worlds.ticks,
                 worlds.detected_s,

@@ -7,13 +7,16 @@ from collections.abc import Callable, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from cavmarl.errors import JournalError
+from cavmarl.errors import JournalError, ProtocolError
 from cavmarl.kernels.arrays import Gate
 from cavmarl.kernels.zones import zones_of
 from cavmarl.runtime.coordinator import Coordinator, Near
 from cavmarl.runtime.division import Division
+from cavmarl.runtime.monitor import Monitor
 from cavmarl.runtime.row_digests import RowDigests
 from cavmarl.runtime.store import CommittedStore
+from cavmarl.runtime.surroundings import NearBorders
+from cavmarl.runtime.zone_view import TransferInFlight
 
 __all__ = ["Coordination", "RowStates"]
 
@@ -24,9 +27,13 @@ class RowStates:
     Args:
         division: of all worlds.
         world: which one.
+
+    Attributes:
+        borders: who was near a border when the tick began.
     """
 
     def __init__(self, division: Division, world: int) -> None:
+        self.borders = NearBorders()
         self._division = division
         self._world = world
         self._known: dict[int, bytes] = {}
@@ -61,6 +68,7 @@ class Coordination:
         states: of the vehicles of each world, as the coordinators read them.
         digests: of zones' rows; None: nobody asks for them.
         store: keeps what is committed; None: nobody can die apart from the others.
+        monitor: looks at every tick that is committed; None: nobody does.
     """
 
     def __init__(
@@ -70,12 +78,16 @@ class Coordination:
         states: Sequence[RowStates],
         digests: RowDigests | None = None,
         store: CommittedStore | None = None,
+        monitor: Monitor | None = None,
     ) -> None:
         self.coordinators = tuple(coordinators)
         self._division = division
         self._states = tuple(states)
         self._digests = digests
         self._store = store
+        self._monitor = monitor
+        # Worlds whose rows have changed since their ghosts were renewed.
+        self._stirred = [True] * len(self.coordinators)
 
     @property
     def switched(self) -> int:
@@ -88,15 +100,22 @@ class Coordination:
             if chosen[w]:
                 coordinator.reset()
                 coordinator.entered(self._division.owners(w))
+                self._stirred[w] = True
+                if self._monitor is not None:
+                    self._monitor.begin(w, coordinator.notes()[0])
 
     def begin(self) -> None:
         """Lease the next tick, and hand over whose owner changes."""
         for w, coordinator in enumerate(self.coordinators):
-            if not coordinator.is_open:
-                self._states[w].forget()
-            near = self._division.near(w)
+            self._states[w].forget()
+            near = self._division.near(w, self._stirred[w])
+            self._stirred[w] = False
+            self._states[w].borders.near = near
             rows = {entry.vehicle: entry.row for entry in near}
-            for switch, state in coordinator.begin(near, self._states[w].near):
+            entries = coordinator.begin(near, self._states[w].near)
+            for switch, _ in entries:
+                self._states[w].state(switch.vehicle)  # a STEP may be repeated after rows moved
+            for switch, state in entries:
                 self._division.hand_over(w, switch, state, rows.get(switch.vehicle, 0))
 
     def end(self) -> None:
@@ -107,12 +126,40 @@ class Coordination:
             coordinator.end(self._live(w), self._stored(w))
         if self._store is not None:
             self._store.flip()
+        self.check()
+
+    def check(self) -> None:
+        """Look whether the invariants hold in the tick that has been committed.
+
+        Raises:
+            InvariantError: one does not.
+        """
+        if self._monitor is not None:
+            for w, coordinator in enumerate(self.coordinators):
+                self._monitor.end(w, coordinator.notes()[0])
 
     def save(self) -> None:
         """What has changed between two ticks is committed."""
         if self._store is not None:
             self._store.write(tuple(coordinator.notes() for coordinator in self.coordinators))
             self._store.flip()
+
+    def in_flight(self, w: int) -> list[TransferInFlight]:
+        """Who of a world is on the way from one zone to another."""
+        return [TransferInFlight(*entry) for entry in self.coordinators[w].in_flight()]
+
+    def load(self) -> None:
+        """Take everything back to what is committed.
+
+        Raises:
+            ProtocolError: nobody keeps it.
+        """
+        if self._store is None:
+            raise ProtocolError("nobody keeps what is committed")
+        self._division.align()
+        for w, notes in enumerate(self._store.load()):
+            self.coordinators[w].resume(*notes)
+            self._stirred[w] = True
 
     def restart(self, w: int) -> Coordinator:
         """The coordinator of a world has died: another one has read its journal.
@@ -133,6 +180,7 @@ class Coordination:
             gone = gate.passing[w, : gate.num_passing[w]]
             if len(gone):
                 coordinator.left(zip(gone["id"].tolist(), gone["events"].tolist(), strict=True))
+                self._stirred[w] |= not coordinator.is_open
 
     def entered(self, gate: Gate) -> None:
         """Those in `gate.passing` have come into their worlds."""

@@ -268,6 +268,24 @@ class Coordinator:
             self.post.send(again)
             self._deliver()
 
+    def in_flight(self) -> list[tuple[int, int, int, str]]:
+        """(vehicle, owner, zone that it was offered to, how it stands), between two ticks.
+
+        `offered`, `prepared` once the zone has acknowledged it, and then for how many ticks it has
+        waited behind the border.
+        """
+        table, held = self.directory.table, self.directory.readiness.held
+        prepared = {pair for pairs in held.values() for pair in pairs}
+        found = []
+        for zone, endpoint in self.endpoints.items():
+            for vehicle, target in endpoint.offers.open:
+                state = "prepared" if (vehicle, target) in prepared else "offered"
+                waited = table.deferred.get(vehicle, 0)
+                if waited:
+                    state += f", {waited} behind the border"
+                found.append((vehicle, zone, target, state))
+        return sorted(found)
+
     # Messages
 
     def _unleased(self) -> tuple[int, ...]:

@@ -15,11 +15,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cavmarl.errors import ZoneError
-from cavmarl.kernels.arrays import Worlds
+from cavmarl.kernels.arrays import Worlds, Zoned
 from cavmarl.kernels.borders import NEAR, find_near, pass_on
-from cavmarl.kernels.exchange import take_ghosts, take_own
+from cavmarl.kernels.exchange import exchange, take_own
 from cavmarl.kernels.motion import MAX_SPEED_MPS
-from cavmarl.kernels.zones import Halo, ZoneArrays, make_publication, publish
+from cavmarl.kernels.repeated import repeated
+from cavmarl.kernels.zones import Halo, ZoneArrays
 from cavmarl.ownership.messages import Switch
 from cavmarl.runtime.coordinator import Near
 from cavmarl.shard.shard import Shard
@@ -47,8 +48,10 @@ class Division:
 
     Args:
         shards: one a zone, in the order of zones.
+        zoned: their rows.
         zones: of the partition.
         halo: how far each zone sees over its borders.
+        touching_m: no ghost further outside of a zone can touch one of its vehicles.
         hysteresis_m: so far behind its border a vehicle changes its zone.
         ahead_s: so long before it does, its next zone is told.
         codec: of vehicles' states.
@@ -61,8 +64,10 @@ class Division:
     def __init__(
         self,
         shards: Sequence[Shard],
+        zoned: Zoned,
         zones: ZoneArrays,
         halo: Halo,
+        touching_m: float,
         hysteresis_m: float,
         ahead_s: float,
         codec: TransferCodec,
@@ -70,13 +75,16 @@ class Division:
         self.zones = zones
         self.codec = codec
         self._shards = tuple(shards)
+        self._zoned = zoned
+        self._first_side = shards[0].worlds.rows
         self._halo = halo
+        self._touching_m = touching_m
         self._hysteresis_m = hysteresis_m
         self._ahead_s = ahead_s
-        capacity = shards[0].worlds.rows.shape[1]
-        self._published = make_publication(capacity, len(shards))
-        self._near = np.zeros(2 * capacity, dtype=NEAR)
-        self._spare = np.zeros(1, dtype=shards[0].worlds.rows.dtype)
+        self._border_m = MAX_SPEED_MPS * ahead_s  # nobody else can be behind it by then
+        self._near = np.zeros(2 * shards[0].worlds.rows.shape[1], dtype=NEAR)
+        self._call_exchange = repeated(exchange)
+        self._find_near = repeated(find_near)
 
     @property
     def count(self) -> int:
@@ -101,41 +109,47 @@ class Division:
                     self.zones, shard.zone, everybody, len(everybody), worlds.rows[w]
                 )
                 worlds.num_contacts[w] = 0
-            self._exchange(w, [shard.worlds.rows for shard in self._shards])
+            self._exchange(first.rows, w, w + 1)
 
     def exchange(self) -> None:
         """Renew all ghosts from the owned `next_rows`."""
-        if len(self._shards) > 1:
-            rows = [shard.worlds.next_rows for shard in self._shards]
-            for w in range(len(rows[0])):
-                self._exchange(w, rows)
+        worlds = self._shards[0].worlds
+        self._exchange(worlds.next_rows, 0, len(worlds.ticks))
 
-    def _exchange(self, w: int, rows: Sequence[NDArray[np.void]]) -> None:
-        for shard in self._shards:
-            shard.worlds.num_rows[w] = shard.worlds.num_owned[w]
-        start = self._published.start
-        for source, own in zip(self._shards, rows, strict=True):
-            num = int(source.worlds.num_owned[w])
-            if publish(self.zones, self._halo, own[w], num, source.zone, self._published) == 0:
-                continue
-            for target in np.flatnonzero(np.diff(start)).tolist():
-                begin, end = int(start[target]), int(start[target + 1])
-                held = self._shards[target].worlds.num_rows
-                take_ghosts(own[w], self._published.rows, begin, end, rows[target][w], held[w])
-                held[w] += end - begin
+    def _exchange(self, rows: NDArray[np.void], first: int, last: int) -> None:
+        """Renew the ghosts of some worlds; `rows` are the first shard's rows or next ones."""
+        self._call_exchange(
+            self.zones,
+            self._halo,
+            self._touching_m,
+            self._border_m,
+            self._zoned,
+            self._side(rows),
+            first,
+            last,
+        )
 
-    def near(self, w: int) -> list[Near]:
-        """Who of a world is near a border, by its committed rows."""
-        found: list[Near] = []
+    def _side(self, rows: NDArray[np.void]) -> int:
+        return 0 if rows is self._first_side else 1
+
+    def align(self) -> None:
+        """Let all shards keep their rows on the same side, whatever a tick has come to."""
         for shard in self._shards:
-            worlds = shard.worlds
-            num = find_near(
-                self.zones, shard.zone, self._hysteresis_m, self._ahead_s, MAX_SPEED_MPS,
-                worlds.rows[w], int(worlds.num_owned[w]), self._near,
-            )  # fmt: skip
-            for vehicle, row, target, crossed, depth_m in self._near[:num].tolist():
-                found.append(Near(vehicle, shard.zone, row, target, crossed, depth_m))
-        return found
+            shard.align()
+
+    def near(self, w: int, everybody: bool) -> list[Near]:
+        """Who of a world is near a border, by its committed rows.
+
+        Args:
+            w: which world.
+            everybody: look at all of them: rows have changed since the ghosts were renewed.
+        """
+        side = self._side(self._shards[0].worlds.rows)
+        num = self._find_near(
+            self.zones, self._hysteresis_m, self._ahead_s, MAX_SPEED_MPS,
+            self._zoned, side, w, everybody, self._near,
+        )  # fmt: skip
+        return [Near(*entry) for entry in self._near[:num].tolist()]
 
     def find(self, w: int, vehicle: int) -> tuple[int, int]:
         """The zone that owns a vehicle, and its committed row there.
@@ -167,10 +181,10 @@ class Division:
         Raises:
             ZoneError: the old owner does not have it, or the new one has not seen it come.
         """
-        source, target = (self._shards[z].worlds for z in (switch.source, switch.target))
+        target = self._shards[switch.target].worlds
         place = pass_on(
-            switch.vehicle, source.rows, source.num_owned, hint,
-            target.rows, target.num_owned, target.num_rows, w, self._spare,
+            switch.vehicle, switch.source, hint, switch.target,
+            self._zoned, self._side(self._shards[0].worlds.rows), w,
         )  # fmt: skip
         if place == -1:
             raise ZoneError(f"zone {switch.source} does not own vehicle {switch.vehicle}")
@@ -189,6 +203,35 @@ class Division:
         worlds = self._shards[zone].worlds
         rows: NDArray[np.void] = worlds.rows[w, : worlds.num_owned[w]]
         return rows
+
+    def ghosts(self, w: int, zone: int) -> NDArray[np.void]:
+        """VEHICLE (n,), the committed copies that a zone has of others' vehicles.
+
+        A view that cannot be written: nobody but its owner changes a vehicle.
+        """
+        worlds = self._shards[zone].worlds
+        rows: NDArray[np.void] = worlds.rows[w, worlds.num_owned[w] : worlds.num_rows[w]]
+        rows.flags.writeable = False
+        return rows
+
+    def ticks(self, w: int) -> list[int]:
+        """What the zones' clocks say: ticks since the world's reset."""
+        return [shard.worlds.ticks.item(w) for shard in self._shards]
+
+    @property
+    def zoned(self) -> Zoned:
+        """The rows of all zones."""
+        return self._zoned
+
+    @property
+    def halo(self) -> Halo:
+        """How far each zone sees over its borders."""
+        return self._halo
+
+    @property
+    def side(self) -> int:
+        """On which side of `zoned.rows` the committed rows are."""
+        return self._side(self._shards[0].worlds.rows)
 
     def owners(self, w: int) -> list[tuple[int, int]]:
         """(id, zone) of all vehicles of a world."""

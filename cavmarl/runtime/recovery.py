@@ -115,8 +115,8 @@ class Recovery:
         zones = death.zones if isinstance(death, StoreError) else (death.zone,)
         for zone in zones:
             self._lose(self._shards[zone])
+        self._coordination.load()
         coordinator = self._coordination.coordinators[0]
-        coordinator.resume(*self._store.load()[0])
         for zone in zones:
             self._count(zone)
             if isinstance(death, ZoneDeath):
@@ -146,8 +146,10 @@ class Recovery:
         is_done = coordinator.tick == self._crashes.tick
         if is_done:
             self._store.flip()
-        coordinator.resume(*self._store.load()[0])
+        self._coordination.load()
         coordinator.resend()
+        if is_done:
+            self._coordination.check()
         return is_done
 
     def _lose(self, shard: Shard) -> None:

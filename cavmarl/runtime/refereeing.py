@@ -18,10 +18,12 @@ from cavmarl.ownership.transfers import TransferLog
 from cavmarl.ownership.transport import Network
 from cavmarl.runtime.coordination import Coordination, RowStates
 from cavmarl.runtime.coordinator import Coordinator
+from cavmarl.runtime.dividing import limits_of
 from cavmarl.runtime.division import Division
 from cavmarl.runtime.fault_plan import Faults, read_faults
 from cavmarl.runtime.faults import Crashes, FaultyCoordinator, FaultyPhases
 from cavmarl.runtime.journal import Journal, MemoryJournal
+from cavmarl.runtime.monitor import Monitor, OwnersOnRecord
 from cavmarl.runtime.recovery import Recovery
 from cavmarl.runtime.row_digests import RowDigests
 from cavmarl.runtime.store import CommittedStore
@@ -51,6 +53,7 @@ def make_refereeing(
     shards: Sequence[Shard],
     division: Division,
     shared: Callable[[], Iterable[NDArray[Any]]],
+    dt: float,
     safeguards: Safeguards = ALL_ON,
 ) -> Refereeing:
     """The coordinators of a divided world.
@@ -60,13 +63,14 @@ def make_refereeing(
         shards: one a zone.
         division: of them.
         shared: the arrays beside theirs that a tick changes.
+        dt: seconds of a tick.
         safeguards: remedies of the protocol; tests take one away.
 
     Raises:
         ConfigError: faults that cannot be, or deaths in several worlds at once.
         JournalError: a journal cannot be begun.
     """
-    limits = Limits(deferral=settings.max_deferred_ticks, schema=division.codec.schema)
+    limits = limits_of(settings, division.codec.schema)
     faults = read_faults(settings.faults) if settings.faults else None
     deaths = faults is not None and faults.may_crash
     if faults is not None:
@@ -78,20 +82,21 @@ def make_refereeing(
         )
     crashes = Crashes(faults) if faults is not None and deaths else None
     states = [RowStates(division, w) for w in range(division.num_worlds)]
-    transfers = tuple(TransferLog(limits.lifetime) for _ in states)
+    transfers = tuple(TransferLog(limits.lifetime, known.borders) for known in states)
     coordinators = [
         _coordinator(
             settings, w, division, states[w], limits, transfers[w], faults, crashes, safeguards
         )
         for w in range(division.num_worlds)
     ]
-    checked = settings.check or bool(settings.journal) or deaths
-    digests = RowDigests() if checked else None
+    digests = RowDigests() if settings.journal or deaths else None
+    monitor = _monitor(division, coordinators, limits, dt) if settings.check else None
     if crashes is None:
-        return Refereeing(Coordination(division, coordinators, states, digests), transfers)
+        coordination = Coordination(division, coordinators, states, digests, monitor=monitor)
+        return Refereeing(coordination, transfers)
     store = CommittedStore(shards, shared, safeguards)
     phases = FaultyPhases(shards, crashes)
-    coordination = Coordination(division, coordinators, states, digests, store)
+    coordination = Coordination(division, coordinators, states, digests, store, monitor)
     recovery = Recovery(shards, coordination, store, phases, crashes, limits.repeats)
     return Refereeing(coordination, transfers, recovery, phases)
 
@@ -126,6 +131,16 @@ def _coordinator(
     if crashes is None:
         return Coordinator(*arguments)
     return FaultyCoordinator(*arguments, crashes=crashes)
+
+
+def _monitor(
+    division: Division, coordinators: Sequence[Coordinator], limits: Limits, dt: float
+) -> Monitor:
+    """What looks at all worlds, and is told what their coordinators do."""
+    records = [OwnersOnRecord(division.count, limits) for _ in coordinators]
+    for coordinator, record in zip(coordinators, records, strict=True):
+        coordinator.watch(record)
+    return Monitor(division, records, dt)
 
 
 def _path(journal: str, w: int, num_worlds: int) -> Path:

@@ -2,28 +2,33 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+
 import numpy as np
 from numpy.typing import NDArray
 
 from cavmarl.kernels.digests import digest_rows
 from cavmarl.shard.vehicles import STATE_FIELDS, VEHICLE
 
-__all__ = ["RowDigests"]
+__all__ = ["RowDigests", "digest_tables"]
 
-WORD = np.dtype(np.uint64).itemsize
+
+def digest_tables(fields: Iterable[str]) -> tuple[NDArray[np.uint64], NDArray[np.uint64]]:
+    """Masks and factors (n,) of the words of VEHICLE, for digests in which some fields count."""
+    blank = np.zeros(1, dtype=VEHICLE)
+    for name in fields:
+        blank[name].view(np.uint8)[:] = 0xFF
+    masks = blank.view(np.uint64)
+    rng = np.random.Generator(np.random.Philox(key=0))
+    factors = rng.integers(0, 1 << 64, len(masks), dtype=np.uint64)
+    return masks, factors | np.uint64(1)
 
 
 class RowDigests:
     """Digests of rows, which add up: that of two zones is the sum of theirs modulo 2**128."""
 
     def __init__(self) -> None:
-        blank = np.zeros(1, dtype=VEHICLE)
-        for name in STATE_FIELDS:
-            blank[name].view(np.uint8)[:] = 0xFF
-        self._masks = blank.view(np.uint64)
-        rng = np.random.Generator(np.random.Philox(key=0))
-        factors = rng.integers(0, 1 << 64, len(self._masks), dtype=np.uint64)
-        self._factors = factors | np.uint64(1)
+        self._masks, self._factors = digest_tables(STATE_FIELDS)
 
     def of(self, rows: NDArray[np.void]) -> int:
         """Of VEHICLE (n,), in [0, 2**128)."""

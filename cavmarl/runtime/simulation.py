@@ -25,26 +25,23 @@ from cavmarl.kernels.codes import (
     SUM_DISTANCE_M,
     SUM_TIME_S,
 )
-from cavmarl.kernels.motion import MAX_SPEED_MPS
 from cavmarl.kernels.rng import world_key
 from cavmarl.ownership.messages import Switch
 from cavmarl.ownership.transfers import TransferLog
 from cavmarl.roads.network import RoadNetwork
-from cavmarl.roads.zone_coverage import Coverage, zone_halo
 from cavmarl.roads.zone_layouts import cut_map
 from cavmarl.roads.zones import ZonePartition
 from cavmarl.runtime.commons import Commons
 from cavmarl.runtime.compilation import first_compilation
 from cavmarl.runtime.coordination import Coordination
 from cavmarl.runtime.coordinator import Coordinator
-from cavmarl.runtime.division import Division, ZoneLoads
+from cavmarl.runtime.dividing import divide
+from cavmarl.runtime.division import ZoneLoads
 from cavmarl.runtime.executor import Executor, SerialExecutor
 from cavmarl.runtime.recovery import Recovery, Revival
 from cavmarl.runtime.refereeing import make_refereeing
-from cavmarl.shard.reach import driving_reach_m
-from cavmarl.shard.sensors import largest_radius_m, sensing_reach_m
-from cavmarl.shard.shard import Commands, Shard
-from cavmarl.shard.transfer import TransferCodec
+from cavmarl.runtime.zone_view import ZoneView, view_zones
+from cavmarl.shard.shard import Commands
 from cavmarl.shard.vehicles import STATE_FIELDS, blank_vehicle
 from cavmarl.traffic.demand import DemandFile
 from cavmarl.traffic.departures import make_gate
@@ -136,7 +133,9 @@ class Simulation:
             self._traffic = traffic
             self._gate = make_gate(num_worlds, capacity, network.arrays, blank.dtype)
             self._commons = Commons(config, network, num_worlds)
-            self._shards = self._make_shards(self.partition)
+            self._shards, self._division = divide(
+                config, network, self.partition, traffic, self._commons.outputs, num_worlds
+            )
             self._shard = self._shards[0]
             self._executor: Executor = SerialExecutor(self._shards)
             self._coordination: Coordination | None = None
@@ -146,52 +145,14 @@ class Simulation:
             if self.partition.count > 1:
                 self._divide()
 
-    def _make_shards(self, partition: ZonePartition) -> list[Shard]:
-        """One shard a zone, and the division that knows them all."""
-        config, traffic = self.config, self._traffic
-        zones, settings = partition.arrays, config.zones
-        radius_m = largest_radius_m(traffic.travel.types)
-
-        def halo_m(*reaches_m: float) -> float:
-            return Coverage.of(
-                reaches_m,
-                hysteresis_m=settings.hysteresis_m,
-                max_deferred_ticks=settings.max_deferred_ticks,
-                max_speed_mps=MAX_SPEED_MPS,
-                sim_dt_s=config.clock.sim_dt_s,
-            ).halo_m
-
-        driving_m = driving_reach_m(self.network, traffic.travel)
-        sensing_m = sensing_reach_m(config.sensors, radius_m)
-        halo = zone_halo(partition, halo_m(driving_m, sensing_m))
-        touching_m = halo_m(2.0 * radius_m)
-        shards: list[Shard] = []
-        for zone in range(partition.count):
-            shard = Shard(
-                config,
-                self.network,
-                traffic.plans,
-                traffic.travel,
-                self.num_worlds,
-                traffic.capacity,
-                self._commons.outputs,
-                zone,
-                zones,
-                halo,
-                touching_m,
-                shards[0].worlds if shards else None,
-            )
-            shards.append(shard)
-        ahead_s = settings.approach_ticks * config.clock.sim_dt_s
-        stack = config.sensors.stack
-        codec = TransferCodec.of(shards[0].worlds, self._commons.outputs, stack)
-        self._division = Division(shards, zones, halo, settings.hysteresis_m, ahead_s, codec)
-        return shards
-
     def _divide(self) -> None:
         """Let coordinators say who owns what; nobody asks where all is one zone."""
         refereeing = make_refereeing(
-            self.config.zones, self._shards, self._division, self._shared_arrays
+            self.config.zones,
+            self._shards,
+            self._division,
+            self._shared_arrays,
+            self.config.clock.sim_dt_s,
         )
         self._coordination = refereeing.coordination
         self._recovery = refereeing.recovery
@@ -220,7 +181,7 @@ class Simulation:
         self._executor.each("retire", self._gate)
         self._executor.each("forget", self._gate)
         self._traffic.settle(self._gate, self._shard.worlds)
-        self._division.near(0)
+        self._division.near(0, everybody=True)
         with suppress(ZoneError):
             self._division.hand_over(0, Switch(-1, 0, 0, 0, False), b"")
         self._episodes[:] = 0
@@ -255,6 +216,19 @@ class Simulation:
     def zone_loads(self) -> ZoneLoads:
         """What each zone holds now."""
         return self._division.loads()
+
+    def zone_view(self, world: int = 0) -> ZoneView:
+        """Who owns and sees which vehicles of one world now."""
+        halo_m, coordination = self.zone_loads().halo_m, self._coordination
+        transfers = () if coordination is None else coordination.in_flight(world)
+        return view_zones(self._shards, self.partition, halo_m, world, transfers)
+
+    def ghosts(self, zone: int, world: int = 0) -> NDArray[np.void]:
+        """What a zone sees of other zones' vehicles: VEHICLE (n,), a view that cannot be written.
+
+        It shows the present tick, until the next one.
+        """
+        return self._division.ghosts(world, zone)
 
     @property
     def migrations(self) -> int:

@@ -22,20 +22,20 @@ ASIDE_M = 10.0  # between the centres of neighbour lanes, and of vehicles beside
 def driving_reach_m(network: RoadNetwork, travel: Travel) -> float:
     """The farthest vehicle that a driver's decision can depend on.
 
-    A driver looks `view_m` ahead, or is on a junction, and asks there who comes to that junction,
-    within `APPROACH_M` of the ends of the lanes that lead to it or on it, and who stands behind it,
-    within `EXIT_LOOK_M`.
+    A driver looks `view_m` ahead. With a line within `see_m`, or on a junction, it asks who comes
+    to that junction, within `APPROACH_M` of the ends of the lanes that lead to it or on it, and who
+    stands behind it, within `EXIT_LOOK_M`.
 
     Args:
         network: the roads.
         travel: the types of vehicles, and how far they look.
     """
     longest_m = float(network.links["length_m"].max(initial=0.0))
-    ahead_m = max(travel.view_m, longest_m)
+    junction_m = max(travel.see_m, longest_m)
     beyond_m = max(APPROACH_M, EXIT_LOOK_M, longest_m)
     stretch, jump_m = _jumps(network)
     bodies_m = 2.0 * float(travel.types["length"].max())
-    roads_m = stretch * (ahead_m + beyond_m) + 2.0 * jump_m
+    roads_m = stretch * max(travel.view_m, junction_m + beyond_m) + 2.0 * jump_m
     return roads_m + _across_m(network) + bodies_m + ASIDE_M
 
 

@@ -23,7 +23,9 @@ from cavmarl.kernels.arrays import (
     Scratch,
     Travel,
     Worlds,
+    Zoned,
 )
+from cavmarl.kernels.buckets import make_lists
 from cavmarl.kernels.codes import DRIVER_AGENT, DRIVER_BACKGROUND
 from cavmarl.kernels.departures import choose_goals
 from cavmarl.kernels.lanes import ENTRY
@@ -31,6 +33,7 @@ from cavmarl.kernels.leaving import drop_ghosts, leave
 from cavmarl.kernels.neighbors import make_grid
 from cavmarl.kernels.observe_further import observe_further
 from cavmarl.kernels.outputs import credit
+from cavmarl.kernels.repeated import repeated
 from cavmarl.kernels.sense import sense
 from cavmarl.kernels.signals import detect
 from cavmarl.kernels.stacking import fill_stacks
@@ -42,11 +45,12 @@ from cavmarl.shard.controllers import CONTROLLER
 from cavmarl.shard.sensors import further_arrays, sensor_arrays
 from cavmarl.shard.vehicles import VEHICLE
 
-__all__ = ["Commands", "Shard", "make_worlds"]
+__all__ = ["Commands", "Shard", "make_worlds", "make_zoned"]
 
 CELL_M = 25.0  # of the spatial index over vehicles
 # Fields of `Worlds` that the shards of one world have in common.
 COMMON = ("ticks", "keys", "signal_phase", "controllers", "detected_s", "pending")
+TICKS_IN_ORDER = 32  # for so long rows that have been put in the order of the lanes nearly stay so
 SUGGESTED_HORIZON_S = 1.0  # in which a suggested target speed is to be reached
 
 
@@ -71,15 +75,13 @@ class Shard:
         network: the roads.
         plans: PLAN (G, L), the ways of agents.
         travel: types and ways.
-        num_worlds: W.
-        capacity: rows a world can hold.
+        zoned: the rows of all zones.
         outputs: where the agents of all shards get what they sense, each at its own index.
         zone: which one.
         zones: of the partition.
         halo: how far it sees over its borders.
-        touching_m: no ghost further outside of the zone can touch one of its vehicles.
-        common: whose clock, keys and signals these worlds share, those of the first shard; None:
-            this is the first one.
+        first: the first shard of this process, whose clock, keys, signals and room to work in this
+            one shares; None: this is it.
     """
 
     def __init__(
@@ -88,19 +90,16 @@ class Shard:
         network: RoadNetwork,
         plans: NDArray[np.void],
         travel: Travel,
-        num_worlds: int,
-        capacity: int,
+        zoned: Zoned,
         outputs: Outputs,
         zone: int,
         zones: ZoneArrays,
         halo: Halo,
-        touching_m: float,
-        common: Worlds | None = None,
+        first: Shard | None = None,
     ) -> None:
         self.zone = zone
         self._zones = zones
         self._halo = halo
-        self._touching_m = touching_m
         self._config = config
         self._roads: RoadArrays = network.arrays
         self._plans = plans
@@ -108,19 +107,35 @@ class Shard:
         self._lane_grid: LaneGrid = lane_grid(network)
         self._sensors = sensor_arrays(config.sensors)
         self._further = further_arrays(config.sensors, network, plans)
-        self._grid = make_grid(network.extent_m, CELL_M, capacity)
-        self.scratch = _make_scratch(len(network.lanes), len(network.links), capacity)
+        num_worlds, capacity = zoned.rows.shape[2:]
+        self._grid = make_grid(_seen(network, zones, zone, halo.halo_m), CELL_M, capacity)
+        # One after the other works in it: what the last one has left is still near in memory.
+        self.scratch: Scratch = (
+            _make_scratch(len(network.lanes), len(network.links), capacity)
+            if first is None
+            else first.scratch
+        )
         self.worlds: Worlds = make_worlds(
             num_worlds,
             capacity,
             network,
             config.population.num_ids,
             config.clock.control_latency_ticks,
-            common,
+            zoned,
+            zone,
+            None if first is None else first.worlds,
         )
+        # Between ticks `next_rows` is `rows`; the other side is used where a tick puts rows in order.
+        self._sides = (self.worlds.rows, zoned.rows[1, zone])
+        self._spare_rows = self._sides[1]
         self.outputs = outputs
         self._target_speeds = np.array(config.action.target_speeds_mps)
         self._discrete = config.action.kind == "discrete"
+        self._controls = np.zeros((num_worlds, config.population.num_ids, 2))
+        self._num_through = 0
+        self._call_advance = repeated(advance)
+        self._call_resolve = repeated(resolve)
+        self._call_choose_goals = repeated(choose_goals)
 
     def detect(self) -> None:
         """Note when owned bodies were over the detectors of actuated signals."""
@@ -148,32 +163,40 @@ class Shard:
     def advance(self, commands: Commands) -> None:
         """Decide every control from the committed rows and move the owned ones into `next_rows`."""
         action = self._config.action
-        advance(
+        if self._controls.size:
+            np.copyto(self._controls, commands.controls)
+        # Where a host may die alone, a store keeps tick t whole (docs/ownership.md).
+        in_place = bool(self.worlds.ticks[0] % TICKS_IN_ORDER)
+        if not in_place:
+            self.worlds = self.worlds._replace(next_rows=self._spare_rows)
+        self._num_through = self._call_advance(
             self._roads,
             self._plans,
             self._travel,
             self._lane_grid,
             self.worlds,
             self.scratch,
-            commands.controls,
+            self._controls,
             self._discrete,
             action.acceleration_mps2,
             action.steering_rad,
             self._config.clock.sim_dt_s,
+            in_place,
         )
 
     def resolve(self) -> None:
         """Find who touches whom in `next_rows`."""
-        rect = self._zones.rects[self.zone]
-        resolve(self.worlds, self.scratch, self._grid, rect, self._touching_m)
+        self._call_resolve(self.worlds, self.scratch, self._grid)
 
     def choose_goals(self, demand: Demand, num_goals: int, gate: Gate) -> None:
         """Give the vehicles of `next_rows` that need it another goal."""
         dt = self._config.clock.sim_dt_s
-        choose_goals(demand, self._roads, self._travel, num_goals, gate, self.worlds, dt)
+        self._call_choose_goals(demand, self._roads, self._travel, num_goals, gate, self.worlds, dt)
 
     def leave(self, gate: Gate) -> None:
         """Hand the background vehicles of `next_rows` that have arrived to the gate."""
+        if self._num_through == 0:
+            return
         leave(gate, self.worlds, self.worlds.next_rows, DRIVER_BACKGROUND, 1)
 
     def retire(self, gate: Gate) -> None:
@@ -211,7 +234,14 @@ class Shard:
     def commit(self) -> None:
         """Make `next_rows` the committed state."""
         worlds = self.worlds
-        self.worlds = worlds._replace(rows=worlds.next_rows, next_rows=worlds.rows)
+        if worlds.next_rows is not worlds.rows:
+            self._spare_rows = worlds.rows
+            self.worlds = worlds._replace(rows=worlds.next_rows)
+
+    def align(self) -> None:
+        """Keep the rows on the first side, wherever a tick that is given up has them."""
+        rows, self._spare_rows = self._sides
+        self.worlds = self.worlds._replace(rows=rows, next_rows=rows)
 
     def sense(self, chosen: NDArray[np.bool_]) -> None:
         """Write observations and terms of the chosen worlds' owned agents into `outputs`."""
@@ -269,19 +299,24 @@ def make_worlds(
     network: RoadNetwork,
     num_agents: int = 0,
     latency_ticks: int = 0,
+    zoned: Zoned | None = None,
+    zone: int = 0,
     common: Worlds | None = None,
 ) -> Worlds:
     """Arrays of W worlds that hold `capacity` vehicles each, all of them empty.
 
-    Agents' commands take effect `latency_ticks` later. What all zones of a world have in
-    common (ticks, keys, signals and what detectors saw) are the arrays of `common`, if it is given.
+    Agents' commands take effect `latency_ticks` later. The rows are those of a zone of `zoned`, if
+    it is given. What all zones of a world have in common (ticks, keys, signals and what detectors
+    saw) are the arrays of `common`, if it is given.
     """
-    shape = (num_worlds, capacity)
+    if zoned is None:
+        zoned = make_zoned(1, num_worlds, capacity)
+    rows = zoned.rows[0, zone]
     worlds = Worlds(
-        rows=np.zeros(shape, dtype=VEHICLE),
-        next_rows=np.zeros(shape, dtype=VEHICLE),
-        num_owned=np.zeros(num_worlds, dtype=np.int64),
-        num_rows=np.zeros(num_worlds, dtype=np.int64),
+        rows=rows,
+        next_rows=rows,
+        num_owned=zoned.num_owned[zone],
+        num_rows=zoned.num_rows[zone],
         ticks=np.zeros(num_worlds, dtype=np.int64),
         keys=np.zeros(num_worlds, dtype=np.uint64),
         signal_phase=np.zeros((num_worlds, len(network.signals)), dtype=np.int32),
@@ -289,12 +324,42 @@ def make_worlds(
         detected_s=np.zeros((num_worlds, len(network.detectors)), dtype=np.float64),
         num_through=np.zeros(num_worlds, dtype=np.int64),
         pending=np.zeros((num_worlds, num_agents, latency_ticks + 1, 2)),
+        num_near=zoned.num_near[zone],
         num_touching=np.zeros(num_worlds, dtype=np.int64),
         num_contacts=np.zeros(num_worlds, dtype=np.int64),
     )
     if common is None:
         return worlds
     return worlds._replace(**{name: getattr(common, name) for name in COMMON})
+
+
+def make_zoned(num_zones: int, num_worlds: int, capacity: int) -> Zoned:
+    """Room for the rows of k zones of W worlds that hold `capacity` vehicles each."""
+    # Memory that is never written is never taken.
+    numbers = np.zeros((4, num_zones, num_worlds), dtype=np.int64)
+    return Zoned(
+        rows=np.zeros((2, num_zones, num_worlds, capacity), dtype=VEHICLE),
+        num_owned=numbers[0],
+        num_rows=numbers[1],
+        num_near=numbers[2],
+        border=np.zeros((num_zones, num_worlds, capacity), dtype=np.int32),
+        num_border=numbers[3],
+        spare=np.zeros(1, dtype=VEHICLE),
+    )
+
+
+def _seen(
+    network: RoadNetwork, zones: ZoneArrays, zone: int, halo_m: float
+) -> tuple[float, float, float, float]:
+    """The part of the map where a zone has vehicles or ghosts."""
+    min_x, min_y, max_x, max_y = network.extent_m
+    left, low, right, high = zones.rects[zone].tolist()
+    return (
+        max(min_x, left - halo_m),
+        max(min_y, low - halo_m),
+        min(max_x, right + halo_m),
+        min(max_y, high + halo_m),
+    )
 
 
 def _make_scratch(num_lanes: int, num_links: int, capacity: int) -> Scratch:
@@ -304,12 +369,17 @@ def _make_scratch(num_lanes: int, num_links: int, capacity: int) -> Scratch:
     def floats(size: int) -> NDArray[np.float64]:
         return np.zeros(size, dtype=np.float64)
 
+    lanes, links = make_lists(num_lanes + 1), make_lists(num_links)
     return Scratch(
-        lane_start=integers(num_lanes + 1),
-        lane_end=integers(num_lanes),
+        lanes=lanes,
+        lane_start=lanes.bounds[:, 0],
+        lane_end=lanes.bounds[:, 1],
         entries=np.zeros(2 * capacity, dtype=ENTRY),
         step=np.zeros(capacity, dtype=PLAN),
-        link_start=integers(num_links + 2),
+        step_at=np.full(capacity, -1, dtype=np.int64),
+        links=links,
+        link_start=links.bounds[:, 0],
+        link_end=links.bounds[:, 1],
         approach=np.zeros(3 * capacity, dtype=APPROACH),
         pairs=np.zeros(3 * capacity, dtype=APPROACH),
         order=integers(capacity),
@@ -319,5 +389,4 @@ def _make_scratch(num_lanes: int, num_links: int, capacity: int) -> Scratch:
         blinker=integers(capacity),
         hold=integers(capacity),
         hit=np.zeros(capacity, dtype=np.int64),
-        spare=np.zeros(1, dtype=VEHICLE),
     )

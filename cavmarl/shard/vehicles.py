@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 __all__ = [
+    "GHOST_FIELDS",
     "PLACEMENT_FIELDS",
     "RECORD_VERSION",
     "STATE_FIELDS",
@@ -106,6 +107,12 @@ PLACEMENT_FIELDS = ("owner", "source_zone", "target_zone", "epoch", "transfer")
 # Fields of the state's hash, in record order.
 STATE_FIELDS = tuple(name for name in VEHICLE.names or () if name not in PLACEMENT_FIELDS)
 
+
+# Fields that a ghost has in common with its owner's row of the same tick. Contacts and rewards are
+# written after ghosts are sent, and nobody asks a ghost for them.
+GHOST_FIELDS = tuple(
+    name for name in STATE_FIELDS if name not in ("hit", "events", "episode_return")
+)
 
 # Fields of a new vehicle that point at nothing.
 _NOTHING = (

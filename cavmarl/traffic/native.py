@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -15,8 +16,9 @@ from cavmarl.kernels.admission import accept, assign_lanes
 from cavmarl.kernels.arrays import Demand, Gate, Travel, Worlds
 from cavmarl.kernels.codes import MODEL_KRAUSS
 from cavmarl.kernels.departures import call_orders, populate, settle
-from cavmarl.kernels.drivers import look_ahead_m
+from cavmarl.kernels.drivers import look_ahead_m, see_line_m
 from cavmarl.kernels.lanes import VIEW_M
+from cavmarl.kernels.repeated import repeated
 from cavmarl.roads.network import VEHICLE_CLASSES, RoadNetwork
 from cavmarl.roads.routing import make_plans
 from cavmarl.traffic.demand import STOP, DemandFile
@@ -99,18 +101,28 @@ class NativeTraffic:
         """Types and ways of all vehicles: the generator's first, then the demand file's."""
         types, steps = generated_types(), self.plans.reshape(-1)
         if self.file is None or self.schedule is None:
-            return Travel(types, steps, np.zeros(0, dtype=STOP), 0, 0.0, VIEW_M)
+            none = np.zeros(0, dtype=STOP)
+            return Travel(types, steps, none, 0, 0.0, VIEW_M, VIEW_M, num_fixed=len(steps))
         types = np.concatenate([types, self.file.types])
         steps = np.concatenate([steps, self.schedule.steps])
+        num_fixed = len(steps)
         if self._slots is not None:
             steps = np.concatenate([steps, self._slots.table()])
         first_detour = self.plans.size + self.schedule.first_detour
         begin_s = self.file.begin_ms / 1000.0
-        return Travel(types, steps, self.file.stops, first_detour, begin_s, self._view_m)
+        return Travel(
+            types,
+            steps,
+            self.file.stops,
+            first_detour,
+            begin_s,
+            view_m=self._farthest_m(look_ahead_m),
+            see_m=self._farthest_m(_centre_sees_line_m),
+            num_fixed=num_fixed,
+        )
 
-    @property
-    def _view_m(self) -> float:
-        """How far anybody looks along the road: as fast drivers have to, where all brake as SUMO's.
+    def _farthest_m(self, look_m: Callable[[np.void, float], float]) -> float:
+        """How far anybody looks: as fast drivers have to, where all brake as SUMO's.
 
         IDM reacts to whatever is ahead, and agents may drive as fast as they like.
         """
@@ -120,7 +132,7 @@ class NativeTraffic:
         return max(
             VIEW_M
             if kind["model"] != MODEL_KRAUSS
-            else float(look_ahead_m(kind, min(fast_mps, float(kind["max_speed"]))))
+            else min(look_m(kind, min(fast_mps, float(kind["max_speed"]))), VIEW_M)
             for kind in self.file.types
         )
 
@@ -225,7 +237,11 @@ class NativeTraffic:
 
     def call_orders(self, gate: Gate, worlds: Worlds) -> None:
         """Put the orders that are due by the coming tick into the queue."""
-        call_orders(gate, worlds)
+        self._call_orders(gate, worlds)
+
+    @cached_property
+    def _call_orders(self) -> Callable[[Gate, Worlds], None]:
+        return repeated(call_orders)
 
     def accept(self, gate: Gate, running: NDArray[np.int64]) -> None:
         """Choose among those who could enter; `running` (W,) are in the worlds already."""
@@ -320,3 +336,8 @@ class NativeTraffic:
         if len(trips) > MAX_TRIPS:
             trips = trips[:: -(-len(trips) // MAX_TRIPS)]
         return np.ascontiguousarray(trips)
+
+
+def _centre_sees_line_m(kind: np.void, speed: float) -> float:
+    """How far before its centre a driver asks whether it may pass a line, in m."""
+    return float(see_line_m(kind, speed) + 0.5 * kind["length"])

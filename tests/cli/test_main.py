@@ -11,9 +11,9 @@ import pytest
 
 from cavmarl.cli import main
 from cavmarl.roads.cache import load_network
-from cavmarl.roads.zone_coverage import Coverage
 from cavmarl.roads.zone_file import write_zones
 from cavmarl.roads.zone_layouts import cut_map
+from cavmarl.runtime import dividing
 from cavmarl.worlds import find_map
 
 COMMANDS = (
@@ -162,7 +162,7 @@ def test_verify_takes_the_zones_of_a_file(
 def test_verify_fails_and_names_the_first_difference_of_each(
     capsys: pytest.CaptureFixture[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(Coverage, "halo_m", property(lambda _: 1.0))
+    monkeypatch.setattr(dividing, "halo_m", lambda *_: 1.0)
     path = tmp_path / "found.json"
     words = ("verify", "grid4x4", "--zones", "1,4", "--steps", "40", "--json", str(path))
     assert run(*words) == 1

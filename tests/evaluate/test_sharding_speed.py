@@ -65,6 +65,16 @@ def test_agents_are_driven_and_their_deciding_is_no_phase() -> None:
     assert found.phases["sense"] > 0.0
 
 
+def test_what_the_monitor_costs_is_measured_on_request(
+    make: Callable[[int], Simulation], demand: Path
+) -> None:
+    checked = world_maker("grid4x4", [demand], seconds=60, seed=1, overrides={"zones.check": True})
+    one, two = measure_sharding(make, [2], after_s=10, repeats=1, make_checked=checked).rows
+    assert one.checked_ratio is None
+    assert two.checked_ratio is not None
+    assert two.checked_ratio > 0.0
+
+
 def test_different_worlds_are_not_compared(make: Callable[[int], Simulation], demand: Path) -> None:
     other = world_maker("grid4x4", [demand], seconds=60, seed=2)
     with pytest.raises(UnequalWorldsError, match="after 100 ticks: 2 zones have the state"):
@@ -104,9 +114,10 @@ def test_the_command_shows_and_writes(
 ) -> None:
     path = tmp_path / "cost.json"
     words = ("bench", "sharding", "grid4x4", "-d", str(demand), "--zones", "1,4")
-    assert _run(*words, "--after", "10", "--repeats", "1", "--json", str(path)) == 0
+    assert _run(*words, "--after", "10", "--repeats", "1", "--check", "--json", str(path)) == 0
     shown = capsys.readouterr().out
-    assert all(word in shown for word in (*PHASES, "sum", "without stopwatches", "equal"))
+    told = (*PHASES, "sum", "without stopwatches", "the monitor", "equal")
+    assert all(word in shown for word in told)
     assert [row["zones"] for row in json.loads(path.read_text())["rows"]] == [1, 4]
 
 

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from cavmarl.kernels import codes
 from cavmarl.kernels.admission import accept, admit, assign_lanes
 from cavmarl.kernels.arrays import Gate
-from cavmarl.roads.zone_coverage import zone_halo
+from cavmarl.roads.zone_halo import zone_halo
 from cavmarl.shard.shard import make_worlds
 from cavmarl.shard.vehicles import VEHICLE
 from cavmarl.traffic.departures import make_gate

@@ -8,16 +8,15 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from cavmarl.kernels.contacts import find_contacts
-from cavmarl.kernels.neighbors import fill_grid, make_grid
+from cavmarl.kernels.neighbors import make_grid
 from tests.kernels.builders import crowds, vehicles
 from tests.naive import contacts as naive
 
 
 def contacts(rows: NDArray[np.void], cell_m: float = 10.0) -> list[int]:
     grid = make_grid((-20.0, -15.0, 25.0, 20.0), cell_m, len(rows))
-    fill_grid(rows, len(rows), grid)
     hit = np.full(len(rows), 99, np.int64)
-    find_contacts(len(rows), grid, hit)
+    find_contacts(rows, len(rows), grid, hit)
     return hit.tolist()
 
 

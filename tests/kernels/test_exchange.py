@@ -3,23 +3,24 @@
 from __future__ import annotations
 
 import numpy as np
-import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from cavmarl.kernels import codes
 from cavmarl.kernels.arrays import Gate, Worlds
-from cavmarl.kernels.exchange import adopt, find_movers, release, take_ghosts, take_own
+from cavmarl.kernels.exchange import exchange, take_own
 from cavmarl.kernels.leaving import drop_ghosts, leave
+from cavmarl.roads.zone_halo import zone_halo
 from cavmarl.roads.zones import ZonePartition
-from cavmarl.shard.shard import make_worlds
+from cavmarl.shard.shard import make_worlds, make_zoned
 from cavmarl.shard.vehicles import VEHICLE
 from cavmarl.traffic.departures import make_gate
 from tests.kernels.builders import vehicles
 from tests.kernels.traffic import network
+from tests.kernels.zoned import SIDE, exchanged, ghosts_of
 from tests.naive import zones as naive
-from tests.partitions import partitions, places
+from tests.partitions import four, partitions, places
 
 TICKS_PER_STEP = 2
 
@@ -52,59 +53,69 @@ def test_each_vehicle_is_taken_by_one_zone_in_the_given_order(
         assert (rows[:found] == everybody[expected]).all()
 
 
-@given(st.data(), partitions(), st.sampled_from([0.0, 2.0, 7.5]))
-def test_who_is_behind_the_hysteresis_moves(
-    data: st.DataObject, partition: ZonePartition, hysteresis_m: float
+def spread(data: st.DataObject, partition: ZonePartition) -> list[NDArray[np.void]]:
+    """Rows of each zone, anywhere: a transfer may be late."""
+    parts, next_id = [], 0
+    for _ in range(partition.count):
+        xy = data.draw(places(partition, size=4))
+        rows = vehicles([(x, y, 0.0) for x, y in xy.tolist()])
+        rows["id"] = next_id + np.arange(len(rows))
+        rows["speed"] = 0.5 * rows["id"]
+        next_id += len(rows)
+        parts.append(rows)
+    return parts
+
+
+@given(
+    st.data(),
+    partitions(3),
+    st.sampled_from([0.0, 7.5, 30.0, 1000.0]),
+    st.sampled_from([0.0, 5.0]),
+    st.sampled_from([0.0, 3.0]),
+)
+def test_exchange_equals_twin(
+    data: st.DataObject,
+    partition: ZonePartition,
+    halo_m: float,
+    touching_m: float,
+    border_m: float,
 ) -> None:
-    xy = data.draw(places(partition))
-    zone = data.draw(st.integers(0, partition.count - 1))
-    rows = vehicles([(x, y, 0.0) for x, y in xy.tolist()])
-    out = np.full(len(rows), -1, dtype=np.int32)
-    found = find_movers(partition.arrays, zone, hysteresis_m, rows, len(rows) - 1, out)
-    movers = set(out[:found].tolist())
-    assert sorted(movers) == out[:found].tolist()
-    for k, (x, y) in enumerate(xy[:-1].tolist()):
-        behind_m = naive.distance(partition.reaching[zone], x, y) - hysteresis_m
-        # Squares round otherwise than roots.
-        assert (k in movers) == (behind_m > 0.0) or abs(behind_m) < 1e-6
-    assert len(rows) - 1 not in movers, "it is not owned"
+    parts = spread(data, partition)
+    zoned = exchanged(partition, halo_m, parts, touching_m, border_m)
+    rects = partition.reaching
+    for zone, own in enumerate(parts):
+        others = [row for other, part in enumerate(parts) for row in part if other != zone]
+        ghosts = ghosts_of(zoned, zone)
+        assert (zoned.rows[SIDE, zone, 0, : len(own)] == own).all()
+        expected = naive.within(rects[zone], halo_m, others)
+        assert sorted(ids(ghosts)) == sorted(row["id"] for row in expected)
+        for ghost in ghosts:
+            assert ghost == next(row for row in others if row["id"] == ghost["id"])
+        near = zoned.num_near[zone, 0] - len(own)
+        touching = naive.within(rects[zone], min(halo_m, touching_m), others)
+        assert sorted(ids(ghosts[:near])) == sorted(row["id"] for row in touching)
+        elsewhere = [rect for other, rect in enumerate(rects) if other != zone]
+        at_border = {
+            row["id"]
+            for rect in elsewhere
+            for row in naive.within(rect, min(halo_m, border_m), list(own))
+        }
+        noted = max(zoned.num_border[zone, 0], 0)
+        assert ids(own[zoned.border[zone, 0, :noted]]) == sorted(at_border)
 
 
-def test_ghosts_are_copied_behind_the_rows_that_are_there() -> None:
-    source, rows = cars(5), np.zeros(6, VEHICLE)
-    rows["id"] = -1
-    take_ghosts(source, np.array([4, 0, 2, 3], np.int32), 1, 3, rows, 2)
-    assert ids(rows) == [-1, -1, 100, 102, -1, -1]
-    assert rows[3] == source[2]
+def test_a_world_of_one_zone_has_no_ghosts() -> None:
+    whole = ZonePartition((0.0, 0.0, 9.0, 9.0), np.array([[0.0, 0.0, 9.0, 9.0]]))
+    zoned = exchanged(whole, 5.0, [cars(3)], touching_m=5.0)
+    assert zoned.num_rows.tolist() == zoned.num_near.tolist() == [[3]]
 
 
-@pytest.mark.parametrize("i", [0, 1, 2])
-def test_who_is_released_is_the_first_ghost(i: int) -> None:
-    rows = cars(5)
-    before = rows.copy()
-    release(rows, i, 3, np.zeros(1, VEHICLE))
-    assert rows[2] == before[i]
-    assert set(ids(rows[:2])) == {100, 101, 102} - {100 + i}
-    assert (rows[3:] == before[3:]).all()
-
-
-@pytest.mark.parametrize("ghost", [2, 3, 4])
-def test_who_is_adopted_is_the_last_owned_row_as_its_owner_left_it(ghost: int) -> None:
-    rows = cars(6)
-    row = rows[ghost : ghost + 1].copy()
-    row["speed"] = 3.0
-    assert adopt(rows, 2, 5, row[0])
-    assert rows[2] == row[0]
-    assert set(ids(rows[3:5])) == {102, 103, 104} - {100 + ghost}
-    assert ids(rows[[0, 1, 5]]) == [100, 101, 105]
-
-
-def test_nobody_is_adopted_who_was_no_ghost() -> None:
-    rows = cars(6)
-    before = rows.copy()
-    for stranger in (0, 5):  # an owned one, and one that is not there any more
-        assert not adopt(rows, 2, 5, before[stranger])
-    assert (rows == before).all()
+def test_other_worlds_keep_their_ghosts() -> None:
+    halo = zone_halo(four(), 5.0)
+    zoned = make_zoned(4, 3, 2)
+    zoned.num_rows[:] = 2
+    exchange(four().arrays, halo, 1.0, 0.0, zoned, SIDE, 1, 2)
+    assert zoned.num_rows.tolist() == [[2, 0, 2]] * 4
 
 
 def world(rows: NDArray[np.void], owned: int) -> tuple[Worlds, Gate]:

@@ -55,7 +55,6 @@ def test_the_index_lists_everybody_on_every_lane_he_covers(
     decel = travel(name).types[0]["decel"]
     for lane in range(len(roads.lanes)):
         entries = room.entries[room.lane_start[lane] : room.lane_end[lane]]
-        assert room.lane_end[lane] == room.lane_start[lane + 1]
         assert [(e["s"], e["id"], e["row"]) for e in entries] == naive.on_lane(roads, rows, lane)
         for entry in entries:
             row = rows[entry["row"]]
@@ -104,8 +103,8 @@ def test_the_order_of_rows_does_not_matter(
     shuffled = rows[order]
     tidy, room = indexed(name, rows), indexed(name, shuffled)
     fields = [field for field in tidy.entries.dtype.names if field != "row"]
-    listed = tidy.lane_start[-1]
-    np.testing.assert_array_equal(tidy.lane_start, room.lane_start)
+    listed = tidy.lane_start[len(roads.lanes)]
+    np.testing.assert_array_equal(tidy.lanes.bounds, room.lanes.bounds)
     np.testing.assert_array_equal(tidy.entries[fields][:listed], room.entries[fields][:listed])
     for i, lane, s in looked_for(roads, rows):
         own_id = rows[i]["id"]

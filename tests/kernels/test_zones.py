@@ -1,7 +1,6 @@
 from __future__ import annotations
 
 import math
-from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -9,10 +8,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from cavmarl.kernels.zones import make_publication, publish, squared_distance, zone_of, zones_of
-from cavmarl.roads.zone_coverage import Coverage, zone_halo
+from cavmarl.kernels.zones import squared_distance, zone_of, zones_of
+from cavmarl.ownership.distances import needed_overlap_m
+from cavmarl.ownership.limits import Limits
 from cavmarl.roads.zones import ZonePartition
 from tests.kernels.builders import vehicles
+from tests.kernels.zoned import exchanged, ghosts_of
 from tests.naive import zones as naive
 from tests.partitions import PINWHEEL, four, partitions, places
 
@@ -26,13 +27,12 @@ def cars(xy: NDArray[np.float64]) -> NDArray[np.void]:
 def ghosts(
     partition: ZonePartition, halo_m: float, rows: NDArray[np.void], zone: int
 ) -> list[list[int]]:
-    out = make_publication(len(rows), partition.count)
-    out.start[:] = 7
-    halo = zone_halo(partition, halo_m)
-    found = publish(partition.arrays, halo, rows, len(rows), zone, out)
-    assert found == out.start[-1]
-    assert out.start[0] == 0
-    return [out.rows[a:b].tolist() for a, b in pairwise(out.start)]
+    """The rows, all owned by `zone`, that each zone gets."""
+    rows = rows.copy()
+    rows["id"] = np.arange(len(rows))
+    parts = [rows if own == zone else rows[:0] for own in range(partition.count)]
+    zoned = exchanged(partition, halo_m, parts)
+    return [sorted(ghosts_of(zoned, other)["id"].tolist()) for other in range(partition.count)]
 
 
 @given(st.data(), partitions())
@@ -102,7 +102,7 @@ def test_zones_are_skipped_diagonal_and_narrow() -> None:
 def test_whoever_is_within_reach_of_a_shard_s_vehicle_is_a_ghost_there(
     data: st.DataObject, partition: ZonePartition, reach_m: float, deferred: int
 ) -> None:
-    coverage = Coverage(reach_m, 2.0, deferred, 50.0, 0.1)
+    halo_m = needed_overlap_m(reach_m, 2.0, Limits(deferral=deferred), 50.0, 0.1) + 1e-6
     drift_m = 2.0 + (deferred + 1) * 5.0
     places_then = data.draw(places(partition))
     owners = partition.zones_of(places_then)
@@ -114,7 +114,7 @@ def test_whoever_is_within_reach_of_a_shard_s_vehicle_is_a_ghost_there(
     needed = {zone: set[int]() for zone in range(partition.count)}
     for zone in range(partition.count):
         own = np.flatnonzero(owners == zone)
-        for other, rows in enumerate(ghosts(partition, coverage.halo_m, cars(now[own]), zone)):
+        for other, rows in enumerate(ghosts(partition, halo_m, cars(now[own]), zone)):
             needed[other] |= set(own[rows].tolist())
     for a in range(len(now)):
         for b in range(len(now)):

@@ -51,6 +51,8 @@ def travel_by(
         first_detour=0,
         begin_s=0.0,
         view_m=VIEW_M,
+        see_m=VIEW_M,
+        num_fixed=steps.size,
     )
 
 

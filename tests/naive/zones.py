@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,6 +24,18 @@ def distance(rect: NDArray[np.float64], x: float, y: float) -> float:
     return math.hypot(x - min(max(x, min_x), max_x), y - min(max(y, min_y), max_y))
 
 
+def within(rect: NDArray[np.float64], distance_m: float, rows: Sequence[np.void]) -> list[np.void]:
+    """The rows that lie within a distance of a rectangle."""
+    found = []
+    for row in rows:
+        dx = max(rect[0] - row["x"], row["x"] - rect[2], 0.0)
+        dy = max(rect[1] - row["y"], row["y"] - rect[3], 0.0)
+        # Squares, as the kernel: a root would round once more.
+        if dx * dx + dy * dy <= distance_m * distance_m:
+            found.append(row)
+    return found
+
+
 def published(
     rects: NDArray[np.float64], halo_m: float, xy: NDArray[np.float64], zone: int
 ) -> list[list[int]]:
@@ -38,3 +51,27 @@ def published(
                 rows.append(row)
         needed.append(rows)
     return needed
+
+
+def near_borders(
+    rects: NDArray[np.float64],
+    zone: int,
+    hysteresis_m: float,
+    ahead_s: float,
+    rows: NDArray[np.void],
+) -> list[tuple[int, int, bool]]:
+    """(row, other zone, whether it has crossed) of the vehicles that other zones are told of."""
+    found = []
+    for i, row in enumerate(rows):
+        here = zone
+        if distance(rects[zone], row["x"], row["y"]) > hysteresis_m:
+            (here,) = owners(rects, row["x"], row["y"])
+            found.append((i, here, True))
+        way = row["speed"] * ahead_s
+        x = row["x"] + math.cos(row["heading"]) * way
+        y = row["y"] + math.sin(row["heading"]) * way
+        if distance(rects[zone], x, y) > hysteresis_m:
+            (there,) = owners(rects, x, y)
+            if there != here:
+                found.append((i, there, False))
+    return found

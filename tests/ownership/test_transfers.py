@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from cavmarl.ownership.limits import Limits
-from cavmarl.ownership.messages import Record
+from cavmarl.ownership.messages import Prepare, Record
 from cavmarl.ownership.trace import LOG, Trace
-from cavmarl.ownership.transfers import Transfer, TransferLog
+from cavmarl.ownership.transfer_summary import TransferSummary
+from cavmarl.ownership.transfers import KEPT_ROWS, Transfer, TransferLog
 from tests.ownership.bench import Bench
 from tests.ownership.test_simulator import campaign
 
@@ -27,7 +28,7 @@ def test_a_prepared_transfer_has_its_row() -> None:
     bench.tick(offers=[(7, 1)])
     bench.tick(movers=[(7, 1)])
     log = followed(bench.trace)
-    assert log.rows == [Transfer(0, 3, 7, 0, 1, 1, False, False, 1, 0, 2, 16)]
+    assert list(log.rows) == [Transfer(0, 3, 7, 0, 1, 1, False, False, 1, 0, 2, 16)]
     assert log.counts == {"switched": 1, "acknowledged": 2, "deferred": 0}
 
 
@@ -38,8 +39,8 @@ def test_a_forced_transfer_tells_how_long_it_waited() -> None:
         bench.tick(movers=[(7, 1)])
     bench.tick(movers=[(7, 1)], removed=[7])
     log = followed(bench.trace)
-    assert log.rows == [Transfer(0, 4, 7, 0, 1, 1, True, True, -1, 2, 0, 0)]
-    assert log.counts == {"forced": 1, "deferred": 2}
+    assert list(log.rows) == [Transfer(0, 4, 7, 0, 1, 1, True, True, -1, 2, 0, 0)]
+    assert log.counts == {"forced": 1, "deferred": 2, "removed": 1}
 
 
 def test_an_approach_that_ends_is_counted_and_one_that_is_forgotten_takes_no_room() -> None:
@@ -63,3 +64,68 @@ def test_the_rows_of_a_campaign_are_the_switches_of_its_log() -> None:
     assert log.counts["deferred"] == simulator.deferred
     assert all(row.waited <= Limits().longest_deferral for row in log.rows)
     assert all(row.forced or row.offers for row in log.rows)
+
+
+class Around:
+    """Depths by vehicle, and a clock that goes on by one when it is asked."""
+
+    def __init__(self, depths: dict[int, float]) -> None:
+        self.depths, self.ms = depths, 0.0
+
+    def depth_m(self, vehicle: int, target: int) -> float | None:
+        return self.depths.get(vehicle)
+
+    def now_ms(self) -> float:
+        self.ms += 1.0
+        return self.ms
+
+
+def test_depths_and_times_come_from_outside() -> None:
+    bench = Bench()
+    bench.tick(births=[(7, 0)], offers=[(7, 1)])
+    bench.tick(movers=[(7, 1)])
+    around = Around({7: -3.0})
+    log = TransferLog(Limits().lifetime, around)
+    for destination, item in bench.trace.entries:
+        if isinstance(item, Record):
+            log.logged([item])
+        else:
+            log.delivered(destination, item)
+            if isinstance(item, Prepare):
+                around.depths[7] = 2.5  # it drives on
+    (row,) = log.rows
+    assert (row.prepare_depth_m, row.switch_depth_m) == (-3.0, 2.5)
+    assert row.ms == 2.0  # the state, BEGIN, DONE
+    assert row.ticks == row.tick - row.approached == 1
+
+
+def test_rows_do_not_grow_for_ever_and_can_be_taken_away() -> None:
+    simulator = campaign(3, "corner")
+    simulator.run(25)
+    log = followed(simulator.trace)
+    rows = list(log.rows)
+    assert log.rows.maxlen == KEPT_ROWS
+    assert log.take() == rows
+    assert log.take() == []
+    assert log.counts["switched"] + log.counts["forced"] == len(rows)
+
+
+def test_the_summary_counts_and_ranks() -> None:
+    rows = [
+        Transfer(0, 20, n, 0, 1, 1, n == 5, False, 20 - n, 0, 1, 100 + n, -1.0 * n, 2.0, 0.5 * n)
+        for n in range(1, 101)
+    ]
+    counts = {"switched": 199, "forced": 1, "deferred": 3, "refused": 2, "aborted": 4, "expired": 6}
+    found = TransferSummary.of(rows, counts)
+    assert (found.transfers, found.forced, found.deferred) == (200, 1, 3)
+    assert (found.refused, found.aborted, found.failure_rate) == (2, 4, 0.005)
+    assert found.timeouts == {"acknowledge": 3, "switch": 1, "replica": 6}
+    assert found.latency_ms == (25.0, 47.5, 50.0)
+    assert found.state_bytes == (150, 195, 200)
+    assert found.prepare_depth_m == (-51.0, -6.0, -1.0)
+
+
+def test_the_summary_of_nothing_has_no_figures() -> None:
+    found = TransferSummary.of([], {})
+    assert (found.transfers, found.failure_rate) == (0, None)
+    assert found.latency_ticks == (None, None, None)

@@ -12,16 +12,13 @@ from numpy.typing import NDArray
 from cavmarl.errors import ZoneError
 from cavmarl.kernels.zones import squared_distance
 from cavmarl.ownership.messages import Switch
-from cavmarl.roads.zone_coverage import Coverage
+from cavmarl.runtime import dividing
 from cavmarl.runtime.simulation import Simulation
-from cavmarl.shard.vehicles import PLACEMENT_FIELDS, STATE_FIELDS
+from cavmarl.shard.vehicles import GHOST_FIELDS, PLACEMENT_FIELDS, STATE_FIELDS
 from tests.driving import drive, idle, make_simulation, start
 
 STEPS = 80
 HYSTERESIS_M = 2.0
-# What contacts write after ghosts are sent, and what nobody asks of a ghost.
-OF_OWNERS_ALONE = {"hit", "events", "episode_return"}
-SEEN = [name for name in STATE_FIELDS if name not in OF_OWNERS_ALONE]
 
 
 def divided(zones: int = 4, **overrides: Any) -> Simulation:
@@ -54,11 +51,12 @@ def ghosts(simulation: Simulation, world: int) -> list[NDArray[np.void]]:
 def test_each_vehicle_has_one_owner_and_is_seen_wherever_it_is_near(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(Coverage, "halo_m", property(lambda _: 60.0))  # less than the whole map
+    monkeypatch.setattr(dividing, "halo_m", lambda *_: 60.0)  # less than the whole map
     simulation = divided(9)
     rects = simulation.partition.reaching
     owners: list[dict[int, int]] = [{}, {}]
     moved = 0
+    same = list(GHOST_FIELDS)
     for _ in range(STEPS):
         drive(simulation)
         for world in range(2):
@@ -78,7 +76,7 @@ def test_each_vehicle_has_one_owner_and_is_seen_wherever_it_is_near(
                 near = {i for i, distance in away.items() if distance <= 60.0 and now[i] != zone}
                 assert Counter(seen["id"].tolist()) == Counter(near)
                 for row in seen:
-                    assert row[SEEN] == everybody[int(row["id"])][SEEN]
+                    assert row[same] == everybody[int(row["id"])][same]
     assert moved > 20
 
 

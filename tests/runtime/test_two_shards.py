@@ -12,12 +12,12 @@ from numpy.typing import NDArray
 from cavmarl.kernels.arrays import Worlds
 from cavmarl.kernels.codes import DRIVER_AGENT
 from cavmarl.kernels.signals import merge_detections
-from cavmarl.roads.zone_coverage import zone_halo
+from cavmarl.roads.zone_halo import zone_halo
 from cavmarl.roads.zone_layouts import cut_map
 from cavmarl.runtime.commons import Commons
 from cavmarl.runtime.executor import SerialExecutor
 from cavmarl.runtime.simulation import Simulation
-from cavmarl.shard.shard import COMMON, Commands, Shard
+from cavmarl.shard.shard import COMMON, Commands, Shard, make_zoned
 from tests.actuated import actuated_grid
 from tests.driving import idle, make_simulation, make_traffic, start, suggested
 
@@ -53,20 +53,19 @@ class Halves:
         shards = []
         partition = cut_map(whole.network, "strips", 2)
         halo = zone_halo(partition, EVERYWHERE_M)
+        zoned = make_zoned(2, whole.num_worlds, whole.capacity)
         for zone in range(2):
             shard = Shard(
                 whole.config,
                 whole.network,
                 traffic.plans,
                 traffic.travel,
-                whole.num_worlds,
-                whole.capacity,
+                zoned,
                 self.commons.outputs,
                 zone,
                 partition.arrays,
                 halo,
-                EVERYWHERE_M,
-                shards[0].worlds if shards else None,
+                shards[0] if shards else None,
             )
             shards.append(shard)
         if not together:

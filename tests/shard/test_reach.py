@@ -58,12 +58,20 @@ def test_reach_covers_view_junction_and_those_who_come_to_it(name: str) -> None:
     assert rest_m <= 40.0, "no halo of a whole map"
 
 
-def test_reach_shrinks_with_the_view() -> None:
-    near = travel("merge")._replace(view_m=100.0)
+def test_reach_shrinks_with_how_far_lines_are_seen() -> None:
+    near = travel("merge")._replace(see_m=100.0)
     shrunk = driving_reach_m(network("merge"), travel("merge")) - driving_reach_m(
         network("merge"), near
     )
     assert shrunk == pytest.approx(VIEW_M - 100.0)
+
+
+def test_reach_grows_with_a_view_beyond_the_junctions() -> None:
+    roads = network("merge")
+    blind = travel("merge")._replace(see_m=0.0)
+    assert roads.links["length_m"].max() + APPROACH_M < VIEW_M
+    grown = driving_reach_m(roads, blind._replace(view_m=2000.0)) - driving_reach_m(roads, blind)
+    assert grown == pytest.approx(2000.0 - VIEW_M)
 
 
 def test_jumps_over_junctions_without_lanes_count(tmp_path: Path) -> None:

@@ -1,0 +1,108 @@
+"""What many transfers have in common: how many, how they ended, how long they took."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from typing import NamedTuple
+
+from cavmarl.ownership.transfers import Transfer
+
+__all__ = ["Spread", "TransferSummary"]
+
+
+class Spread(NamedTuple):
+    """Nearest-rank percentiles; all None without values."""
+
+    p50: float | None
+    p95: float | None
+    max: float | None
+
+    @classmethod
+    def of(cls, values: Iterable[float]) -> Spread:
+        """Of any values."""
+        ordered = sorted(values)
+        if not ordered:
+            return cls(None, None, None)
+        last = len(ordered)
+        return cls(
+            ordered[math.ceil(0.50 * last) - 1], ordered[math.ceil(0.95 * last) - 1], ordered[-1]
+        )
+
+
+@dataclass(frozen=True)
+class TransferSummary:
+    """Of transfers and of what led to none.
+
+    Attributes:
+        transfers: vehicles that have changed their owner.
+        forced: of them, with the state attached, since no acknowledgement came in time.
+        removed: of them, that left the world in the same tick.
+        deferred: ticks in which a vehicle that had crossed stayed with its owner, summed.
+        refused: states that a target did not take.
+        aborted: approaches that ended without a transfer.
+        timeouts: by phase: `acknowledge`, no answer by the end of the tick (as many as `deferred`);
+            `switch`, none by the deadline (as many as `forced`); `replica`, states that were
+            neither asked for nor withdrawn in their lifetime.
+        latency_ticks: from the first state at the target until it had confirmed.
+        waited_ticks: of these, those behind the border.
+        latency_ms: the same as `latency_ticks`, by the clock.
+        state_bytes: of a vehicle.
+        prepare_depth_m: how far outside of its owner's zone at the first state, less than 0 inside.
+        switch_depth_m: at the switch.
+        failure_rate: share of transfers that had to be forced; None without transfers.
+    """
+
+    transfers: int
+    forced: int
+    removed: int
+    deferred: int
+    refused: int
+    aborted: int
+    timeouts: Mapping[str, int]
+    latency_ticks: Spread
+    waited_ticks: Spread
+    latency_ms: Spread
+    state_bytes: Spread
+    prepare_depth_m: Spread
+    switch_depth_m: Spread
+    failure_rate: float | None
+
+    @classmethod
+    def of(cls, rows: Iterable[Transfer], counts: Mapping[str, int]) -> TransferSummary:
+        """A summary.
+
+        Args:
+            rows: whose spread is told.
+            counts: of a `TransferLog`, or the sum of several; they may know of more transfers than
+                there are rows left.
+        """
+        kept = list(rows)
+        forced = counts.get("forced", 0)
+        transfers = forced + counts.get("switched", 0)
+        deferred = counts.get("deferred", 0)
+        return cls(
+            transfers=transfers,
+            forced=forced,
+            removed=counts.get("removed", 0),
+            deferred=deferred,
+            refused=counts.get("refused", 0),
+            aborted=counts.get("aborted", 0),
+            timeouts={
+                "acknowledge": deferred,
+                "switch": forced,
+                "replica": counts.get("expired", 0),
+            },
+            latency_ticks=Spread.of(row.ticks for row in kept),
+            waited_ticks=Spread.of(row.waited for row in kept),
+            latency_ms=_spread(row.ms for row in kept),
+            state_bytes=Spread.of(row.state_bytes for row in kept if row.offers),
+            prepare_depth_m=_spread(row.prepare_depth_m for row in kept),
+            switch_depth_m=_spread(row.switch_depth_m for row in kept),
+            failure_rate=forced / transfers if transfers else None,
+        )
+
+
+def _spread(values: Iterable[float | None]) -> Spread:
+    return Spread.of(value for value in values if value is not None)

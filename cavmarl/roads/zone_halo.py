@@ -1,0 +1,39 @@
+"""Which zones see over which borders.
+
+Ghosts go by reach and not by contact (decision 012): the halo is a distance, and a zone gets every
+vehicle within it, from neighbours or from far behind them.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from cavmarl.errors import ZoneError
+from cavmarl.kernels.zones import Halo
+from cavmarl.roads.zones import ZonePartition
+
+__all__ = ["zone_halo"]
+
+# Added to the halo, so that no rounding of the sum below can make it too narrow.
+_ROUNDING_M = 1e-6
+
+
+def zone_halo(partition: ZonePartition, halo_m: float) -> Halo:
+    """What `kernels.exchange.exchange` takes.
+
+    Raises:
+        ZoneError: `halo_m` is negative or not finite.
+    """
+    if not (math.isfinite(halo_m) and halo_m >= 0.0):
+        raise ZoneError(f"halo_m = {halo_m!r}: must be a finite number from 0")
+    rects = partition.reaching
+    # A little further in: whoever lies inside is out of every other zone's halo by any rounding.
+    margin = halo_m + _ROUNDING_M
+    inner = rects + np.array([margin, margin, -margin, -margin])
+    gaps = np.maximum(rects[:, None, :2] - rects[None, :, 2:], 0.0)
+    gaps = np.maximum(gaps, gaps.swapaxes(0, 1))
+    near = (gaps * gaps).sum(axis=2) <= halo_m * halo_m
+    start = np.concatenate([[0], np.cumsum(near.sum(axis=1))]).astype(np.int32)
+    return Halo(float(halo_m), inner, start, np.nonzero(near)[1].astype(np.int32))

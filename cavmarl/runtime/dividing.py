@@ -1,0 +1,116 @@
+"""Makes the shards of a map, and says how far they have to see over their borders."""
+
+from __future__ import annotations
+
+from cavmarl.config import EnvConfig, ZonesConfig
+from cavmarl.kernels.arrays import Outputs
+from cavmarl.kernels.motion import MAX_SPEED_MPS
+from cavmarl.ownership.distances import Distances, check_coverage, needed_overlap_m
+from cavmarl.ownership.limits import DeadlinePolicy, Limits
+from cavmarl.roads.network import RoadNetwork
+from cavmarl.roads.zone_halo import zone_halo
+from cavmarl.roads.zones import ZonePartition
+from cavmarl.runtime.division import Division
+from cavmarl.shard.reach import driving_reach_m
+from cavmarl.shard.sensors import largest_radius_m, sensing_reach_m
+from cavmarl.shard.shard import Shard, make_zoned
+from cavmarl.shard.transfer import TransferCodec
+from cavmarl.traffic.native import NativeTraffic
+
+__all__ = ["divide", "halo_m", "limits_of"]
+
+# Added to the halo, so that no rounding of its sum can make it too narrow.
+_ROUNDING_M = 1e-6
+
+
+def divide(
+    config: EnvConfig,
+    network: RoadNetwork,
+    partition: ZonePartition,
+    traffic: NativeTraffic,
+    outputs: Outputs,
+    num_worlds: int,
+) -> tuple[list[Shard], Division]:
+    """One shard a zone, and the division that knows them all.
+
+    Raises:
+        CoverageError: `zones.halo_m` is less than exactness needs.
+    """
+    settings, dt = config.zones, config.clock.sim_dt_s
+    radius_m = largest_radius_m(traffic.travel.types)
+    reach_m = max(
+        driving_reach_m(network, traffic.travel), sensing_reach_m(config.sensors, radius_m)
+    )
+    halo = zone_halo(partition, halo_m(config, reach_m, partition.count))
+    zoned = make_zoned(partition.count, num_worlds, traffic.capacity)
+    shards: list[Shard] = []
+    for zone in range(partition.count):
+        shard = Shard(
+            config,
+            network,
+            traffic.plans,
+            traffic.travel,
+            zoned,
+            outputs,
+            zone,
+            partition.arrays,
+            halo,
+            shards[0] if shards else None,
+        )
+        shards.append(shard)
+    division = Division(
+        shards,
+        zoned,
+        partition.arrays,
+        halo,
+        _needed_m(config, 2.0 * radius_m),
+        settings.hysteresis_m,
+        settings.approach_ticks * dt,
+        TransferCodec.of(shards[0].worlds, outputs, config.sensors.stack),
+    )
+    return shards, division
+
+
+def halo_m(config: EnvConfig, reach_m: float, zones: int) -> float:
+    """How far zones see over their borders.
+
+    Args:
+        config: `zones.halo_m` is taken if it is given.
+        reach_m: the farthest that anybody looks.
+        zones: how many there are.
+
+    Raises:
+        CoverageError: that is less than exactness needs, with all numbers.
+    """
+    settings, dt = config.zones, config.clock.sim_dt_s
+    wide_m = _needed_m(config, reach_m) if settings.halo_m is None else settings.halo_m
+    if zones > 1:
+        approach_m = settings.approach_ticks * MAX_SPEED_MPS * dt
+        check_coverage(
+            Distances(approach_m, settings.hysteresis_m, wide_m),
+            limits_of(settings),
+            reach_m=reach_m,
+            v_max_mps=MAX_SPEED_MPS,
+            dt_s=dt,
+        )
+    return wide_m
+
+
+def limits_of(settings: ZonesConfig, schema: int = 1) -> Limits:
+    """Deadlines of the protocol; `schema` is the version of vehicles' states."""
+    grace = settings.grace_ticks
+    return Limits(
+        deferral=settings.max_deferred_ticks,
+        policy=DeadlinePolicy.EXTEND if grace else DeadlinePolicy.FORCE,
+        grace=grace,
+        backoff=settings.backoff_ticks,
+        schema=schema,
+    )
+
+
+def _needed_m(config: EnvConfig, reach_m: float) -> float:
+    limits = limits_of(config.zones)
+    needed_m = needed_overlap_m(
+        reach_m, config.zones.hysteresis_m, limits, MAX_SPEED_MPS, config.clock.sim_dt_s
+    )
+    return needed_m + _ROUNDING_M

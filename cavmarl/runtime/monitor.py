@@ -1,0 +1,205 @@
+"""`Monitor`: the invariants of ownership, looked at after every tick of every world.
+
+What it needs of the vehicles is taken in one compiled look at their rows (`kernels.monitor`); what
+it knows of owners comes from the coordinators' records, and costs what changes in them. The words
+of an error are found when there is one (`runtime.violations`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+
+import numpy as np
+
+from cavmarl.errors import InvariantError
+from cavmarl.kernels.monitor import (
+    FINDING,
+    KEPT,
+    KIND_NONE,
+    TALLY,
+    Clock,
+    owner_hash,
+    watch,
+)
+from cavmarl.kernels.motion import LATERAL_MPS, MAX_SPEED_MPS
+from cavmarl.kernels.repeated import repeated
+from cavmarl.ownership.limits import Limits
+from cavmarl.ownership.messages import Birth, Commit, Item, Message, Record, Reset
+from cavmarl.ownership.trace import LOG, Entry, describe
+from cavmarl.ownership.trace_check import Owner, TraceChecker
+from cavmarl.runtime.division import Division
+from cavmarl.runtime.row_digests import digest_tables
+from cavmarl.runtime.violations import Violations
+from cavmarl.shard.vehicles import GHOST_FIELDS
+
+__all__ = ["Monitor", "OwnersOnRecord", "longest_move_m"]
+
+WORD = 1 << 64
+# m that a body a lane's width aside jumps where its lane turns by a right angle at once.
+KINK_M = 5.0
+
+
+def longest_move_m(dt: float) -> float:
+    """So far, in m, a vehicle moves in a tick of `dt` seconds, and no further.
+
+    Along its lane at the speed that the dynamics do not exceed, sideways as a lane change goes, and
+    over the kinks between the pieces of a map's lines.
+    """
+    return (MAX_SPEED_MPS + LATERAL_MPS) * dt + KINK_M
+
+
+class OwnersOnRecord:
+    """Who owns what by the records of a coordinator, whose trace is judged on the way.
+
+    It is told what a `Trace` is told.
+
+    Args:
+        zones: how many.
+        limits: deadlines.
+
+    Attributes:
+        entered: vehicles that zones have begun to own, since the reset.
+        left: vehicles that have been removed.
+    """
+
+    def __init__(self, zones: int, limits: Limits) -> None:
+        self.entered = self.left = 0
+        self._checker = TraceChecker(limits.longest_deferral, limits.lifetime)
+        self._sums = [0] * zones
+
+    @property
+    def owners(self) -> dict[int, Owner]:
+        """Vehicle → (zone, epoch) as of the committed tick."""
+        return self._checker.owners
+
+    def logged(self, records: Iterable[Record]) -> None:
+        """Note records.
+
+        Raises:
+            InvariantError: one that a correct run does not leave here.
+        """
+        for record in records:
+            self._take(LOG, record)
+            if isinstance(record, Reset):
+                self.entered = self.left = 0
+                self._sums = [0] * len(self._sums)
+            elif isinstance(record, Commit):
+                self._commit()
+
+    def delivered(self, destination: int, message: Message) -> None:
+        """Note a message that has arrived.
+
+        Raises:
+            InvariantError: one that a correct run does not leave here.
+        """
+        self._take(destination, message)
+
+    def sums(self, births: Sequence[Birth]) -> list[int]:
+        """By zone the sum of `owner_hash` of its vehicles, those not on record yet among them."""
+        sums = list(self._sums)
+        for vehicle, zone, _ in births:
+            sums[zone] = (sums[zone] + int(owner_hash(vehicle, 0))) % WORD
+        return sums
+
+    def _take(self, destination: int, item: Item) -> None:
+        entry = Entry(destination, item)
+        try:
+            self._checker.take(entry)
+        except InvariantError as error:
+            raise InvariantError(
+                f"tick {item.tick}: order of records and messages: {describe(entry)}: {error}"
+            ) from None
+
+    def _commit(self) -> None:
+        sums = self._sums
+        for vehicle, before, after in self._checker.changes:
+            if before is None:
+                self.entered += 1
+            else:
+                sums[before[0]] = (sums[before[0]] - int(owner_hash(vehicle, before[1]))) % WORD
+            if after is None:
+                self.left += 1
+            else:
+                sums[after[0]] = (sums[after[0]] + int(owner_hash(vehicle, after[1]))) % WORD
+
+
+class Monitor:
+    """Raises InvariantError after the first tick in which an invariant does not hold.
+
+    Its memory is as large as the worlds are, however long they run.
+
+    Args:
+        division: whose rows are looked at.
+        records: of the coordinator of each world.
+        dt: seconds of a tick.
+    """
+
+    def __init__(self, division: Division, records: Sequence[OwnersOnRecord], dt: float) -> None:
+        self._division = division
+        self._records = tuple(records)
+        self._limit_m = longest_move_m(dt)
+        num_worlds, capacity = division.zoned.rows.shape[2:]
+        self._ticks = [0] * num_worlds
+        self._looks = [0] * num_worlds
+        self._masks, self._factors = digest_tables(GHOST_FIELDS)
+        self._words = division.zoned.rows.view(np.uint64).reshape(
+            *division.zoned.rows.shape, len(self._masks)
+        )
+        # Half empty, so that places are found at once.
+        size = 1 << max(2 * capacity - 1, 1).bit_length()
+        self._kept = np.zeros((num_worlds, 2, size), dtype=KEPT)
+        self._tallies = np.zeros(division.count, dtype=TALLY)
+        self._found = np.zeros(1, dtype=FINDING)
+        self._watch = repeated(watch)
+
+    def begin(self, w: int, births: Sequence[Birth]) -> None:
+        """Look at a world that has been reset.
+
+        Args:
+            w: which one.
+            births: who is there.
+
+        Raises:
+            InvariantError: an invariant does not hold.
+        """
+        self._ticks[w] = 0
+        self._looks[w] += 2  # what the last look wrote is of another episode
+        self._look(w, births, new_late=0)
+
+    def end(self, w: int, births: Sequence[Birth]) -> None:
+        """Look at a world after a tick.
+
+        Args:
+            w: which one.
+            births: who entered in the tick, and is not in the records yet.
+
+        Raises:
+            InvariantError: an invariant does not hold.
+        """
+        self._ticks[w] += 1
+        self._looks[w] += 1
+        self._look(w, births, new_late=1)
+
+    def _look(self, w: int, births: Sequence[Birth], new_late: int) -> None:
+        division, record = self._division, self._records[w]
+        clock = Clock(self._ticks[w], self._looks[w], new_late, self._limit_m)
+        now = self._kept[w, clock.look & 1]
+        before = self._kept[w, (clock.look + 1) & 1]
+        kind = self._watch(
+            division.zones, division.halo, division.zoned, self._words, division.side, w, clock,
+            self._masks, self._factors, before, now, self._tallies, self._found,
+        )  # fmt: skip
+        tallies = self._tallies.tolist()
+        expected = record.sums(births)
+        live = sum(tally[0] for tally in tallies)
+        holds = (
+            kind == KIND_NONE
+            and division.ticks(w) == [clock.tick] * len(tallies)
+            and live == record.entered + len(births) - record.left
+            and [tally[1] for tally in tallies] == expected
+            and all(due == seen for _, _, due, seen in tallies)
+        )
+        if not holds:
+            vehicle = int(self._found["vehicle"][0])
+            violations = Violations(division, w, clock, before)
+            violations.explain(kind, vehicle, record.owners, births)

@@ -1,0 +1,76 @@
+"""Evaluations of divided worlds tell what became of every transfer."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from cavmarl.evaluate import EvaluationReport, evaluate, load_report
+from cavmarl.evaluate.evaluation import TRANSFERS_FILE
+from cavmarl.evaluate.tables import read_table
+from cavmarl.evaluate.transfer_rows import TRANSFER, transfers_of
+from cavmarl.worlds import load_world
+
+SMALL: dict[str, Any] = {"episodes": 3, "agents": 4, "background": 40, "max_cycles": 40}
+ZONES = {"zones.count": 4}
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("divided")
+    evaluate("grid4x4", "idm", seed=2, repeats=2, out=folder, overrides=ZONES, **SMALL)
+    return folder
+
+
+def test_each_transfer_has_its_row(folder: Path) -> None:
+    rows = read_table(folder / TRANSFERS_FILE, TRANSFER)["idm"]
+    assert len(rows) > 10
+    assert set(rows["run"].tolist()) == {0, 1}
+    assert set(rows["episode"].tolist()) == {0, 1, 2}
+    assert (rows["source"] != rows["target"]).all()
+    assert (rows["switch_depth_m"] > 2.0).all()  # the hysteresis
+    prepared = rows[rows["approached"] >= 0]
+    assert (prepared["prepare_depth_m"] < prepared["switch_depth_m"]).all()
+    assert (rows["ms"] > 0.0).all()
+
+
+def test_the_report_has_the_summary(folder: Path) -> None:
+    found = load_report(folder)["idm"].transfers
+    assert found is not None
+    rows = read_table(folder / TRANSFERS_FILE, TRANSFER)["idm"]
+    assert found.transfers == len(rows)
+    assert found.latency_ticks.max == max(row.ticks for row in transfers_of(rows))
+    assert found.latency_ms.p50 is not None
+    assert found.state_bytes.max is not None
+    assert 0.0 <= (found.failure_rate or 0.0) < 0.2
+    assert load_report(folder).to_dict()["policies"]["idm"]["transfers"]["transfers"] == len(rows)
+
+
+def test_the_manifest_knows_the_zones(folder: Path) -> None:
+    world = load_report(folder).manifest["world"]
+    partition = load_world("grid4x4", overrides=ZONES).partition
+    assert world["zones"] == 4
+    assert world["zones_content_sha256"] == partition.content_hash
+    assert world["config"]["zones"]["hysteresis_m"] == 2.0
+
+
+def test_zones_change_nothing_else(folder: Path) -> None:
+    whole = evaluate("grid4x4", "idm", seed=2, repeats=2, **SMALL)
+    assert whole["idm"].transfers is None
+    assert load_report(folder)["idm"].metrics == whole["idm"].metrics
+
+
+def test_an_undivided_world_leaves_no_file(tmp_path: Path) -> None:
+    report: EvaluationReport = evaluate("ring", "idm", out=tmp_path, **{**SMALL, "episodes": 1})
+    assert not (tmp_path / TRANSFERS_FILE).exists()
+    assert report.to_dict()["policies"]["idm"]["transfers"] is None
+
+
+def test_records_give_the_rows_back() -> None:
+    rows = np.zeros(2, TRANSFER)
+    rows["ms"] = [1.5, np.nan]
+    first, second = transfers_of(rows)
+    assert (first.ms, second.ms) == (1.5, None)

@@ -1,0 +1,186 @@
+"""The monitor's look at the rows of a world, beside its plain twin."""
+
+from __future__ import annotations
+
+from collections import Counter
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from cavmarl.kernels.arrays import Zoned
+from cavmarl.kernels.monitor import (
+    FINDING,
+    KEPT,
+    KIND_DOUBLED,
+    KIND_FAR,
+    KIND_FULL,
+    KIND_NONE,
+    KIND_TICK,
+    TALLY,
+    Clock,
+    owner_hash,
+    watch,
+)
+from cavmarl.kernels.zones import Halo, zone_of
+from cavmarl.roads.zone_halo import zone_halo
+from cavmarl.roads.zones import ZonePartition
+from cavmarl.runtime.row_digests import digest_tables
+from cavmarl.shard.shard import make_zoned
+from cavmarl.shard.vehicles import GHOST_FIELDS, VEHICLE
+from tests.naive import monitor as naive
+from tests.naive.zones import distance
+
+CAPACITY = 40
+HALO_M = 30.0
+LIMIT_M = 5.0
+RECTS = [(0, 0, 100, 60), (100, 0, 160, 60), (0, 60, 100, 100), (100, 60, 160, 100)]
+NAMES = {"doubled": KIND_DOUBLED, "tick": KIND_TICK, "far": KIND_FAR}
+
+PARTITION = ZonePartition((0.0, 0.0, 160.0, 100.0), np.array(RECTS, dtype=np.float64))
+HALO: Halo = zone_halo(PARTITION, HALO_M)
+MASKS, FACTORS = digest_tables(GHOST_FIELDS)
+
+
+class Looks:
+    """A world that is looked at tick after tick, by the kernel and by its twin."""
+
+    def __init__(self) -> None:
+        self.zoned: Zoned = make_zoned(PARTITION.count, 1, CAPACITY)
+        self.words = self.zoned.rows.view(np.uint64).reshape(*self.zoned.rows.shape, len(MASKS))
+        self.kept = np.zeros((2, 128), dtype=KEPT)
+        self.found = np.zeros(1, dtype=FINDING)
+        self.tallies = np.zeros(PARTITION.count, dtype=TALLY)
+        self.before: dict[int, naive.Kept] = {}
+        self.look = 1
+
+    def put(self, zones: list[naive.Zone]) -> None:
+        for z, zone in enumerate(zones):
+            rows = np.concatenate([zone.owned, zone.ghosts])
+            self.zoned.rows[0, z, 0, : len(rows)] = rows
+            self.zoned.num_owned[z, 0], self.zoned.num_rows[z, 0] = len(zone.owned), len(rows)
+
+    def compare(self, zones: list[naive.Zone], tick: int, new_late: int = 1) -> dict[int, set[str]]:
+        """Both look; what they find is the same."""
+        self.put(zones)
+        self.look += 1
+        watch(
+            PARTITION.arrays, HALO, self.zoned, self.words, 0, 0,
+            Clock(tick, self.look, new_late, LIMIT_M), MASKS, FACTORS,
+            self.kept[(self.look + 1) & 1], self.kept[self.look & 1], self.tallies, self.found,
+        )  # fmt: skip
+        wrong = naive.findings(zones, self.before, tick, new_late, LIMIT_M)
+        kind, vehicle = self.found[0].tolist()
+        assert (kind == KIND_NONE) == (not wrong)
+        if wrong:
+            assert vehicle == min(wrong)
+            assert kind in {NAMES[name] for name in wrong[vehicle]}
+        masks, factors = MASKS.tolist(), FACTORS.tolist()
+        rects = PARTITION.reaching
+        assert self.tallies.tolist() == naive.tallies(zones, rects, HALO_M, masks, factors)
+        self.before = {
+            int(row["id"]): naive.Kept(row["x"], row["y"], int(tick - row["tick"]))
+            for zone in zones
+            for row in zone.owned
+        }
+        return wrong
+
+
+def drawn(rng: np.random.Generator, number: int, tick: int) -> NDArray[np.void]:
+    """Vehicles anywhere, of that tick or, every other one, of the tick before."""
+    rows = np.zeros(number, dtype=VEHICLE)
+    rows["id"] = rng.choice(10_000, number, replace=False)
+    rows["x"], rows["y"] = rng.uniform(0, 160, number), rng.uniform(0, 100, number)
+    rows["speed"], rows["epoch"] = rng.uniform(0, 30, number), rng.integers(0, 9, number)
+    rows["tick"] = tick - rows["id"] % 2
+    return rows
+
+
+def dealt(rows: NDArray[np.void]) -> list[naive.Zone]:
+    """Each to the zone that it is in, with the ghosts that are due."""
+    owners = np.array([zone_of(PARTITION.arrays, row["x"], row["y"]) for row in rows])
+    result = []
+    for z, rect in enumerate(PARTITION.reaching):
+        near = np.array([distance(rect, row["x"], row["y"]) <= HALO_M for row in rows])
+        result.append(naive.Zone(rows[owners == z], rows[near & (owners != z)]))
+    return result
+
+
+def moved(rng: np.random.Generator, rows: NDArray[np.void], furthest_m: float) -> NDArray[np.void]:
+    after = rows.copy()
+    after["x"] += rng.uniform(-furthest_m, furthest_m, len(rows))
+    after["tick"] += 1
+    return after
+
+
+def started(seed: int) -> tuple[Looks, np.random.Generator, NDArray[np.void]]:
+    """A world of ten ticks, and its rows."""
+    rng = np.random.default_rng(seed)
+    looks, rows = Looks(), drawn(rng, 25, 10)
+    rows["tick"] = 10
+    assert not looks.compare(dealt(rows), 10, new_late=0)
+    return looks, rng, rows
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_a_run_is_looked_at_as_by_the_plain_twin(seed: int) -> None:
+    looks, rng, rows = started(seed)
+    kinds: Counter[str] = Counter()
+    for tick in range(11, 60):
+        rows = moved(rng, rows[rng.random(len(rows)) > 0.1], LIMIT_M + 0.1)
+        new = drawn(rng, min(3, CAPACITY - len(rows)), tick)
+        rows = np.concatenate([rows, new[~np.isin(new["id"], rows["id"])]])
+        rows["tick"][rng.random(len(rows)) < 0.01] += 1
+        for wrong in looks.compare(dealt(rng.permutation(rows)), tick).values():
+            kinds.update(wrong)
+    assert kinds["tick"] > 5
+    assert kinds["far"] > 2
+
+
+def test_sums_tell_that_all_is_well() -> None:
+    looks, rng, rows = started(7)
+    assert not looks.compare(dealt(moved(rng, rows, 1.0)), 11)
+    assert (looks.tallies["due"] == looks.tallies["seen"]).all()
+    assert looks.tallies["seen"].all()
+    for z, zone in enumerate(dealt(rows)):
+        hashes = (int(owner_hash(int(row["id"]), int(row["epoch"]))) for row in zone.owned)
+        assert sum(hashes) % (1 << 64) == int(looks.tallies["owned"][z])
+
+
+def test_a_vehicle_that_two_zones_own_is_found() -> None:
+    looks, rng, rows = started(8)
+    zones = dealt(moved(rng, rows, 1.0))
+    doubled = zones[0].owned[:1]
+    zones[2] = naive.Zone(np.concatenate([zones[2].owned, doubled]), zones[2].ghosts)
+    assert looks.compare(zones, 11) == {int(doubled["id"][0]): {"doubled"}}
+
+
+@pytest.mark.parametrize("name", ["x", "speed", "tick", "lane"])
+def test_a_ghost_that_is_not_its_owners_row_changes_the_sum(name: str) -> None:
+    looks, rng, rows = started(9)
+    zones = dealt(moved(rng, rows, 1.0))
+    ghosts: Any = zones[1].ghosts
+    ghosts[name][0] += 1
+    assert not looks.compare(zones, 11)
+    assert (looks.tallies["due"] != looks.tallies["seen"]).tolist() == [False, True, False, False]
+
+
+@pytest.mark.parametrize("name", ["hit", "events", "episode_return", "epoch"])
+def test_what_a_ghost_need_not_know_does_not(name: str) -> None:
+    looks, rng, rows = started(9)
+    zones = dealt(moved(rng, rows, 1.0))
+    zones[1].ghosts[name][0] += 1
+    looks.compare(zones, 11)
+    assert (looks.tallies["due"] == looks.tallies["seen"]).all()
+
+
+def test_more_vehicles_than_there_are_places_are_found() -> None:
+    looks, _, rows = started(10)
+    looks.kept = np.zeros((2, 16), dtype=KEPT)
+    looks.put(dealt(rows))
+    watch(
+        PARTITION.arrays, HALO, looks.zoned, looks.words, 0, 0, Clock(10, 5, 0, LIMIT_M),
+        MASKS, FACTORS, looks.kept[0], looks.kept[1], looks.tallies, looks.found,
+    )  # fmt: skip
+    assert looks.found["kind"] == KIND_FULL

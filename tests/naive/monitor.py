@@ -1,0 +1,83 @@
+"""What the monitor's look at a world's rows has to find, with Python's own sets and numbers."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tests.naive.digests import WORD, digest, mixed
+from tests.naive.zones import distance
+
+
+class Kept(NamedTuple):
+    """A vehicle a tick before."""
+
+    x: float
+    y: float
+    late: int
+
+
+class Zone(NamedTuple):
+    """VEHICLE records of a zone."""
+
+    owned: NDArray[np.void]
+    ghosts: NDArray[np.void]
+
+
+def owner_hash(vehicle: int, epoch: int) -> int:
+    """What a vehicle adds to its owner's sum."""
+    return mixed((mixed(vehicle) + epoch) & WORD)
+
+
+def findings(
+    zones: list[Zone], before: Mapping[int, Kept], tick: int, new_late: int, limit_m: float
+) -> dict[int, set[str]]:
+    """Vehicle → what is wrong with it: `doubled`, `tick`, `far`."""
+    found: dict[int, set[str]] = {}
+    seen: set[int] = set()
+    for zone in zones:
+        for row in zone.owned:
+            vehicle = int(row["id"])
+            wrong = found.setdefault(vehicle, set())
+            if vehicle in seen:
+                wrong.add("doubled")
+                continue
+            seen.add(vehicle)
+            last = before.get(vehicle)
+            if tick - row["tick"] != (new_late if last is None else last.late):
+                wrong.add("tick")
+            elif last is not None:
+                way = (row["x"] - last.x) ** 2 + (row["y"] - last.y) ** 2
+                if way > limit_m * limit_m:
+                    wrong.add("far")
+    return {vehicle: wrong for vehicle, wrong in found.items() if wrong}
+
+
+def tallies(
+    zones: list[Zone],
+    rects: NDArray[np.float64],
+    halo_m: float,
+    masks: list[int],
+    factors: list[int],
+) -> list[tuple[int, int, int, int]]:
+    """By zone: vehicles, and the sums of owners, of ghosts that it should have and that it has."""
+
+    def sum_of(rows: list[np.void]) -> int:
+        words = [np.frombuffer(row.tobytes(), np.uint64).tolist() for row in rows]
+        return digest(words, masks, factors) & WORD
+
+    result = []
+    for z, zone in enumerate(zones):
+        due = [
+            row
+            for other, part in enumerate(zones)
+            if other != z
+            for row in part.owned
+            if distance(rects[z], row["x"], row["y"]) <= halo_m
+        ]
+        owned = sum(owner_hash(int(row["id"]), int(row["epoch"])) for row in zone.owned) & WORD
+        result.append((len(zone.owned), owned, sum_of(due), sum_of(list(zone.ghosts))))
+    return result
