@@ -107,7 +107,8 @@ class Coordination:
     def begin(self) -> None:
         """Lease the next tick, and hand over whose owner changes."""
         for w, coordinator in enumerate(self.coordinators):
-            self._states[w].forget()
+            if not coordinator.is_open:
+                self._states[w].forget()
             near = self._division.near(w, self._stirred[w])
             self._stirred[w] = False
             self._states[w].borders.near = near

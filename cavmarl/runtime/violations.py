@@ -142,11 +142,12 @@ class Violations:
                 owner, row = self._places[vehicle][0]
                 squared = squared_distance(rects, zone, row["x"], row["y"])
                 due = owner != zone and squared <= halo_m * halo_m
-                if copies.pop(vehicle, 0) != due:
+                found = copies.pop(vehicle, 0)
+                if found != due:
                     yield (
-                        f"ghosts: zone {zone} has {'no' if due else 'a needless or second'} ghost "
-                        f"of vehicle {vehicle}, which zone {owner} owns {math.sqrt(squared):.2f} m "
-                        f"outside of it; it sees {halo_m:.2f} m far"
+                        f"ghosts: zone {zone} has {found} ghosts of vehicle {vehicle}, not "
+                        f"{int(due)}: zone {owner} owns it {math.sqrt(squared):.2f} m outside of "
+                        f"that zone, which sees {halo_m:.2f} m far"
                     )
             for vehicle in sorted(copies):
                 yield f"ghosts: zone {zone} has a ghost of vehicle {vehicle}, which is not there"

@@ -125,7 +125,7 @@ class Shard:
             zone,
             None if first is None else first.worlds,
         )
-        # Between ticks `next_rows` is `rows`; the other side is used where a tick puts rows in order.
+        # Between ticks `next_rows` is `rows`; a tick that puts rows in order uses the other side.
         self._sides = (self.worlds.rows, zoned.rows[1, zone])
         self._spare_rows = self._sides[1]
         self.outputs = outputs

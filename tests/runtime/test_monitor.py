@@ -9,7 +9,9 @@ import numpy as np
 import pytest
 
 from cavmarl.errors import InvariantError
+from cavmarl.kernels.zones import squared_distance
 from cavmarl.ownership.messages import Ack, Birth, Done, Message
+from cavmarl.runtime import dividing
 from cavmarl.runtime.division import Division
 from cavmarl.runtime.simulation import Simulation
 from tests.driving import drive, make_simulation, start
@@ -202,25 +204,46 @@ def test_a_ghost_that_is_not_there(meddling: Meddling) -> None:
     def meddle() -> None:
         meddling.simulation._shards[1].worlds.num_rows[0] -= 1
 
-    meddling.caught(meddle, r"ghosts: zone 1 has no ghost of vehicle \d+, which zone \d owns")
+    meddling.caught(meddle, r"ghosts: zone 1 has 0 ghosts of vehicle \d+, not 1: zone \d owns")
 
 
-def test_a_ghost_that_is_there_twice(meddling: Meddling) -> None:
+@pytest.fixture
+def narrow(monkeypatch: pytest.MonkeyPatch) -> Meddling:
+    """Zones that do not see the whole map, and have room for more ghosts."""
+    monkeypatch.setattr(dividing, "halo_m", lambda *_: 60.0)
+    found = watched()
+    drive(found)
+    return Meddling(found, monkeypatch)
+
+
+def test_a_ghost_that_is_there_twice(narrow: Meddling) -> None:
     def meddle() -> None:
-        rows, owned, num = meddling.zone(1)
+        rows, owned, num = narrow.zone(1)
         rows[num] = rows[owned]
-        meddling.simulation._shards[1].worlds.num_rows[0] += 1
+        narrow.simulation._shards[1].worlds.num_rows[0] += 1
 
-    meddling.caught(meddle, r"ghosts: zone 1 has a needless or second ghost of vehicle \d+")
+    narrow.caught(meddle, r"ghosts: zone 1 has 2 ghosts of vehicle \d+, not 1: zone \d owns it")
 
 
-def test_a_ghost_of_nobody(meddling: Meddling) -> None:
+def test_a_ghost_that_is_of_no_use(narrow: Meddling) -> None:
     def meddle() -> None:
-        rows, _, num = meddling.zone(1)
-        rows[num]["id"] = 7_777
-        meddling.simulation._shards[1].worlds.num_rows[0] += 1
+        rows, _, num = narrow.zone(1)
+        others, owned, _ = narrow.zone(2)
+        rects = narrow.division.zones.rects
+        away = [squared_distance(rects, 1, row["x"], row["y"]) for row in others[:owned]]
+        rows[num] = others[int(np.argmax(away))]
+        narrow.simulation._shards[1].worlds.num_rows[0] += 1
 
-    meddling.caught(meddle, r"ghosts: zone 1 has a ghost of vehicle 7777, which is not there")
+    narrow.caught(meddle, r"ghosts: zone 1 has 1 ghosts of vehicle \d+, not 0: zone 2 owns it")
+
+
+def test_a_ghost_of_nobody(narrow: Meddling) -> None:
+    def meddle() -> None:
+        rows, _, num = narrow.zone(1)
+        rows[num]["id"] = 7_777
+        narrow.simulation._shards[1].worlds.num_rows[0] += 1
+
+    narrow.caught(meddle, r"ghosts: zone 1 has a ghost of vehicle 7777, which is not there")
 
 
 def test_an_arrival_that_nobody_has_told_of(
