@@ -155,7 +155,7 @@ class Recovery:
     def _lose(self, shard: Shard) -> None:
         """What the process of a host had in its memory."""
         worlds = shard.worlds
-        for array in (worlds.rows, worlds.next_rows, *(getattr(worlds, name) for name in COUNTS)):
+        for array in (*shard.sides, *(getattr(worlds, name) for name in COUNTS)):
             array.view(np.uint8)[...] = GARBAGE
 
     def _lose_gate(self) -> None:

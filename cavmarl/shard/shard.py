@@ -82,6 +82,9 @@ class Shard:
         halo: how far it sees over its borders.
         first: the first shard of this process, whose clock, keys, signals and room to work in this
             one shares; None: this is it.
+
+    Attributes:
+        sides: VEHICLE (W, C), the two memories that rows are kept in by turns.
     """
 
     def __init__(
@@ -126,8 +129,8 @@ class Shard:
             None if first is None else first.worlds,
         )
         # Between ticks `next_rows` is `rows`; a tick that puts rows in order uses the other side.
-        self._sides = (self.worlds.rows, zoned.rows[1, zone])
-        self._spare_rows = self._sides[1]
+        self.sides = (self.worlds.rows, zoned.rows[1, zone])
+        self._spare_rows = self.sides[1]
         self.outputs = outputs
         self._target_speeds = np.array(config.action.target_speeds_mps)
         self._discrete = config.action.kind == "discrete"
@@ -240,7 +243,7 @@ class Shard:
 
     def align(self) -> None:
         """Keep the rows on the first side, wherever a tick that is given up has them."""
-        rows, self._spare_rows = self._sides
+        rows, self._spare_rows = self.sides
         self.worlds = self.worlds._replace(rows=rows, next_rows=rows)
 
     def sense(self, chosen: NDArray[np.bool_]) -> None:

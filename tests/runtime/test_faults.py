@@ -122,7 +122,7 @@ def test_at02_vehicles_that_look_for_their_way_find_the_same(tmp_path: Path) -> 
         tmp_path, CARS.format(device=DEVICE) + FLOW, rerouter('<closingReroute id="narrow"/>')
     )
     clock = {"clock.sim_dt_s": 0.2, "clock.ctrl_dt_s": 1.0, "horizon_s": 1200.0}
-    whole = same_hashes(lambda zones: make(net, files, overrides=clock | zones), 100, 3, ROUGH)
+    whole = same_hashes(lambda zones: make(net, files, overrides=clock | zones), 150, 3, ROUGH)
     assert whole.traffic_stats().rerouted > 10
 
 

@@ -95,9 +95,9 @@ def test_what_a_dead_host_had_is_really_gone(
     load, lost = CommittedStore.load, []
 
     def look(store: CommittedStore) -> object:
-        worlds = store._shards[1].worlds
+        shard = store._shards[1]
         lost.append({value for array in
-                     (worlds.rows, worlds.next_rows, worlds.num_owned, worlds.num_rows)
+                     (*shard.sides, shard.worlds.num_owned, shard.worlds.num_rows)
                      for value in np.unique(array.view(np.uint8)).tolist()})  # fmt: skip
         return load(store)
 
