@@ -287,6 +287,7 @@ def admit(zones: ZoneArrays, halo: Halo, zone: int, gate: Gate, worlds: Worlds) 
                 owned = worlds.num_owned[w]
                 rows[num] = rows[owned]  # a ghost moves back
                 rows[owned] = row
+                rows[owned]["owner"] = zone
                 worlds.num_owned[w] = owned + 1
             elif squared_distance(zones.rects, zone, row["x"], row["y"]) <= halo.halo_m**2:
                 rows[num] = row

@@ -110,13 +110,17 @@ def _take_ghost(row: np.void, zoned: Zoned, side: int, zone: int, w: int, near: 
 def take_own(
     zones: ZoneArrays, zone: int, source: NDArray[np.void], num: int, rows: NDArray[np.void]
 ) -> int:
-    """Copy the rows of `source[:num]` that lie in a zone to the front of `rows`; how many.
+    """Copy the rows of `source[:num]` that lie in a zone, as its own, to the front of `rows`.
 
     `source` and `rows` may be the same array.
+
+    Returns:
+        how many.
     """
     found = 0
     for i in range(num):
         if zone_of(zones, source[i]["x"], source[i]["y"]) == zone:
             rows[found] = source[i]
+            rows[found]["owner"] = zone
             found += 1
     return found

@@ -50,6 +50,8 @@ def test_each_vehicle_is_taken_by_one_zone_in_the_given_order(
             if naive.owners(partition.reaching, x, y) == [zone]
         ]  # fmt: skip
         assert ids(rows[:found]) == expected
+        assert (rows["owner"][:found] == zone).all()
+        rows["owner"] = 0
         assert (rows[:found] == everybody[expected]).all()
 
 

@@ -36,11 +36,14 @@ def test_owners_stand_beside_the_vehicles_and_ghosts_are_those_near(divided: Sim
             view, rows = divided.zone_view(world), divided.vehicles(world)
             for row, owner in zip(rows, view.owners.tolist(), strict=True):
                 away = [squared_distance(rects, k, row["x"], row["y"]) for k in range(len(rects))]
-                assert away[owner] == 0.0
+                # Who has crossed in this tick is handed over when the next one begins.
+                assert away[owner] ** 0.5 <= divided.config.clock.sim_dt_s * row["speed"] + 1e-9
                 seen_by = {k for k, ghosts in enumerate(view.ghosts) if row["id"] in ghosts}
                 assert seen_by == {k for k in range(len(rects)) if away[k] <= HALO_M**2} - {owner}
+            owner_of = dict(zip(rows["id"].tolist(), view.owners.tolist(), strict=True))
+            assert all(owner_of[t.vehicle] == t.source != t.target for t in view.transfers)
+            np.testing.assert_array_equal(rows["owner"], view.owners)
     assert view.halo_m == HALO_M
-    assert view.transfers == ()
 
 
 def test_a_view_stays_what_it_was(divided: Simulation) -> None:
