@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from hashlib import blake2b
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,6 +18,7 @@ from cavmarl.runtime.row_digests import RowDigests
 from cavmarl.runtime.store import CommittedStore
 from cavmarl.runtime.surroundings import NearBorders
 from cavmarl.runtime.zone_view import TransferInFlight
+from cavmarl.shard.shard import Commands
 
 __all__ = ["Coordination", "RowStates"]
 
@@ -99,8 +101,12 @@ class Coordination:
                 if self._monitor is not None:
                     self._monitor.begin(w, coordinator.notes()[0])
 
-    def begin(self) -> None:
-        """Lease the next tick, and hand over whose owner changes."""
+    def begin(self, commands: Commands) -> None:
+        """Lease the next tick, and hand over whose owner changes.
+
+        Args:
+            commands: what the agents do in it; a journal keeps their digest.
+        """
         for w, coordinator in enumerate(self.coordinators):
             if not coordinator.is_open:
                 self._states[w].forget()
@@ -108,7 +114,8 @@ class Coordination:
             self._stirred[w] = False
             self._states[w].borders.near = near
             rows = {entry.vehicle: entry.row for entry in near}
-            entries = coordinator.begin(near, self._states[w].near)
+            inputs = b"" if coordinator.journal is None else _digest(commands, w)
+            entries = coordinator.begin(near, self._states[w].near, inputs)
             for switch, _ in entries:
                 self._states[w].state(switch.vehicle)  # a STEP may be repeated after rows moved
             for switch, state in entries:
@@ -198,3 +205,10 @@ class Coordination:
         if digests is None or store is None:
             return None
         return lambda zone: digests.of(store.written(zone, w))
+
+
+def _digest(commands: Commands, w: int) -> bytes:
+    """Digest of what the agents of a world do, 16 bytes."""
+    digest = blake2b(commands.controls[w].tobytes(), digest_size=16)
+    digest.update(commands.meta_actions[w].tobytes())
+    return digest.digest()

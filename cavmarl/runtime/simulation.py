@@ -332,7 +332,7 @@ class Simulation:
     def _tick(self, commands: Commands, is_first: bool, is_last: bool) -> None:
         """Begin → begin the step → advance … signals → sense → end."""
         if self._coordination is not None:
-            self._coordination.begin()
+            self._coordination.begin(commands)
         if is_first:
             self._executor.each("begin_step", commands)
         self._advance(commands)

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import numpy as np
 import pytest
 
+from cavmarl import make_vec
 from cavmarl.ownership.messages import Begin, Commit
 from cavmarl.ownership.records import replay as replay_records
 from cavmarl.ownership.trace import LOG, Trace
@@ -95,3 +97,19 @@ def test_at06_a_watcher_sees_the_log_and_every_arrival(busy: Recorded) -> None:
     assert sum(len(r.switches) for r in log if isinstance(r, Begin)) == vec.simulation.migrations
     assert any(entry.destination == 0 for entry in trace.entries)
     assert trace.text().count("COMMIT") == 2 * STEPS
+
+
+def test_the_journal_tells_actions_apart(tmp_path: Path) -> None:
+    told = []
+    for name, throttle in (("one", 0.0), ("again", 0.0), ("other", 0.5)):
+        path = tmp_path / f"{name}.jsonl"
+        settings = {"zones.count": 4, "zones.journal": str(path)}
+        vec = make_vec("grid4x4", num_envs=1, agents=4, background=10, overrides=settings)
+        vec.reset(seed=3)
+        for _ in range(3):
+            vec.step(np.full((1, vec.num_agents, 2), throttle, dtype=np.float32))
+        told.append([record.inputs for record in JournalReader(path) if isinstance(record, Begin)])
+    one, again, other = told
+    assert one == again
+    assert all(len(inputs) == 16 for inputs in one)
+    assert not set(one) & set(other)
