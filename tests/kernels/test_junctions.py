@@ -13,11 +13,14 @@ from numpy.typing import NDArray
 
 from cavmarl.kernels.codes import DRIVER_AGENT
 from cavmarl.kernels.geometry import boxes_overlap, lane_pose
+from cavmarl.kernels.junctions import STANDING_MPS, _exit_blocked
+from cavmarl.kernels.lanes import index_lanes
 from cavmarl.roads.network import RoadNetwork
 from cavmarl.roads.reader import read_network
 from cavmarl.runtime.simulation import Simulation
 from tests.driving import drive, make_traffic, start
-from tests.kernels.traffic import on_lane
+from tests.kernels.traffic import network as network_of
+from tests.kernels.traffic import on_lane, scratch, travel
 
 sumo = pytest.importorskip("sumo", reason="crossings are made by netconvert of the extra 'sumo'")
 
@@ -432,3 +435,34 @@ def test_who_gives_way_follows_a_faster_one_into_the_same_lane_and_waits_for_a_s
     here.put("side", "N_in_0", 8.0, "E_out", speed=6.0)
     slowest = min(float(here["side"]["speed"]) for _ in here.run(3.0))
     assert (slowest < 5.9) == brakes
+
+
+@pytest.mark.parametrize(("place_m", "blocked"), [(149.0, True), (151.0, False)])
+def test_nobody_counts_who_stands_farther_beyond_the_junction_than_is_looked(
+    place_m: float, blocked: bool
+) -> None:
+    # A slow queue fills the way up to the one that stands: there is no room, wherever that is.
+    roads, ways = network_of("merge"), travel("merge")
+    link = next(
+        k
+        for k, row in enumerate(roads.links)
+        if roads.lanes["length_m"][_beyond(roads, int(row["next_lane"]))] > 200.0
+    )
+    lane = _beyond(roads, int(roads.links[link]["next_lane"]))
+    queue = [
+        on_lane(roads, lane, 4.0 + 8.0 * k, ways, id=k, speed=2.0 * STANDING_MPS) for k in range(18)
+    ]
+    standing = on_lane(roads, lane, place_m, ways, id=98)
+    before = on_lane(roads, int(roads.links[link]["from_lane"]), 5.0, ways, id=99, speed=10.0)
+    rows = np.concatenate([*queue, standing, before])
+    room = scratch(roads, len(rows))
+    index_lanes(roads.arrays, ways, rows, len(rows), room)
+    way = int(before[0]["way"])
+    assert _exit_blocked(roads.arrays, ways, rows[-1], link, way, room) == blocked
+
+
+def _beyond(roads: RoadNetwork, lane: int) -> int:
+    """The first lane from here on that is not part of a junction."""
+    while roads.lanes["internal"][lane]:
+        lane = int(roads.lanes["successor"][lane])
+    return lane
