@@ -142,10 +142,11 @@ class Simulation:
             self._recovery: Recovery | None = None
             if is_first:
                 self._call_every_kernel()
-            if self.partition.count > 1:
-                self._divide()
+            zones = config.zones
+            if self.partition.count > 1 or zones.journal or zones.check or zones.faults:
+                self._let_coordinate()
 
-    def _divide(self) -> None:
+    def _let_coordinate(self) -> None:
         """Let coordinators say who owns what; nobody asks where all is one zone."""
         refereeing = make_refereeing(
             self.config.zones,

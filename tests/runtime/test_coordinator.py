@@ -113,3 +113,18 @@ def test_the_journal_tells_actions_apart(tmp_path: Path) -> None:
     assert one == again
     assert all(len(inputs) == 16 for inputs in one)
     assert not set(one) & set(other)
+
+
+def test_an_undivided_world_has_a_journal_if_asked_for_one(tmp_path: Path) -> None:
+    path = tmp_path / "one.jsonl"
+    settings = {"zones.journal": str(path), "zones.check": True}
+    vec = make_vec("grid4x4", num_envs=1, agents=4, background=10, overrides=settings)
+    vec.reset(seed=3)
+    for _ in range(5):
+        vec.step(np.zeros((1, vec.num_agents, 2), dtype=np.float32))
+    (coordinator,) = vec.simulation.coordinators
+    owners = owners_at(path, coordinator.tick).owners
+    assert set(owners) == set(vec.simulation.vehicles()["id"].tolist())
+    assert {zone for zone, _ in owners.values()} == {0}
+    undivided = make_vec("grid4x4", num_envs=1, agents=4, background=10)
+    assert not undivided.simulation.coordinators, "nobody keeps what nobody asks for"
