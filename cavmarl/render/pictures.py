@@ -41,6 +41,7 @@ class Picture:
         agents: instead of the entry's number.
         background: instead of the entry's number.
         ghosts_of: the zone whose ghosts are outlined; a divided world is drawn with its zones.
+        approach_ticks: so many ticks before a crossing the transfer begins.
     """
 
     env: str
@@ -50,6 +51,7 @@ class Picture:
     agents: int | None = None
     background: int | None = None
     ghosts_of: int | None = None
+    approach_ticks: int = 2
 
 
 PICTURES = {
@@ -58,7 +60,14 @@ PICTURES = {
     "grid4x4": Picture("grid4x4", 16.0),
     "town": Picture("town", 20.0, background=250),
     "rush": Picture("rush", 60.0),
-    "ghosts": Picture("rush", 60.0, (1280, 720), (880.0, 500.0, 1340.0, 760.0), ghosts_of=1),
+    "ghosts": Picture(
+        "rush",
+        60.0,
+        (1280, 720),
+        (880.0, 500.0, 1340.0, 760.0),
+        ghosts_of=1,
+        approach_ticks=75,
+    ),
     "hero": Picture(
         "town", 30.0, (1280, 720), (1230.0, 560.0, 1720.0, 835.0), agents=60, background=240
     ),
@@ -67,7 +76,12 @@ PICTURES = {
 
 def draw_picture(picture: Picture) -> Surface:
     """Run the world up to the moment of the picture, and draw it."""
-    config, folder = load_config(picture.env, agents=picture.agents, background=picture.background)
+    config, folder = load_config(
+        picture.env,
+        agents=picture.agents,
+        background=picture.background,
+        overrides={"zones.approach_ticks": picture.approach_ticks},
+    )
     network = load_roads(config, folder)
     simulation = Simulation(config, network)
     simulation.seed(SEED)
