@@ -200,6 +200,8 @@ class Directory:
         """Zones without a DONE for the tick in progress."""
         if self.table.plan is None:
             return ()
+        if len(self.dones) == len(self.table.hosts):
+            return ()
         return tuple(zone for zone in self.table.hosts if zone not in self.dones)
 
     def overdue(self) -> tuple[int, ...]:
@@ -262,7 +264,7 @@ class Directory:
             return "run"
         if message.episode != table.episode and guards.tick_never_resets:
             return "episode"
-        if not isinstance(message, Done | Ack | Nack | Need):
+        if not isinstance(message, (Done, Ack, Nack, Need)):
             return "kind"
         if message.zone not in table.hosts:
             return "zone"
@@ -270,7 +272,7 @@ class Directory:
         if checked and not table.alive(message.zone, message.incarnation):
             return "incarnation"
         current = table.plan is not None and message.tick == table.tick + 1
-        if isinstance(message, Ack | Nack):
+        if isinstance(message, (Ack, Nack)):
             fresh = current or message.tick == table.tick or not guards.ack_freshness
             return None if fresh else "tick"
         if isinstance(message, Done):

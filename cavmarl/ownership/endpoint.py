@@ -173,7 +173,7 @@ class Endpoint:
             case Prepare(target=zone) | Abort(target=zone) | Ack(source=zone) | Nack(source=zone):
                 if zone != self.zone:
                     return "zone"
-        if isinstance(message, Ack | Nack):
+        if isinstance(message, (Ack, Nack)):
             return None if message.tick == self.tick else "tick"
         near = self.tick - self._limits.lifetime < message.tick <= self.tick + 1
         return None if near else "tick"
@@ -214,7 +214,7 @@ class Endpoint:
             enter.append((vehicle, state if forced else replica))
         for vehicle, _ in step.spawn:
             self._own(vehicle, 0, Event.SPAWN)
-        if self._safeguards.ledger:
+        if self._safeguards.ledger and step.owned != self.tally:
             step.owned.check(self.tally, f"zone {self.zone} on its way to tick {step.tick}")
         self._entering = tuple(Confirmed(entry.vehicle, entry.epoch) for entry in step.enter)
         self.lease, self._answer = step.tick, None

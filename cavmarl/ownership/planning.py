@@ -75,17 +75,23 @@ def check_done(run: bytes, plan: Plan, done: Done, owners: Mapping[int, tuple[in
         LedgerError: it removed what it does not own, did not confirm what came in, or owns
             something else than it should.
     """
-    where = f"zone {done.zone} at tick {done.tick}"
     expected = plan.expected[done.zone]
     for vehicle, _ in done.removed:
         zone, epoch = plan.owner(vehicle, owners)
         if zone != done.zone:
-            raise LedgerError(f"{where} removed vehicle {vehicle}, which zone {zone} owns")
+            raise LedgerError(f"{_where(done)} removed vehicle {vehicle}, which zone {zone} owns")
         expected = expected.minus(run, vehicle, epoch)
     planned = tuple(Confirmed(entry.vehicle, entry.epoch) for entry in plan.enter[done.zone])
     if done.confirmed != planned:
-        raise LedgerError(f"{where} confirmed {list(done.confirmed)} instead of {list(planned)}")
-    expected.check(done.owned, where)
+        raise LedgerError(
+            f"{_where(done)} confirmed {list(done.confirmed)} instead of {list(planned)}"
+        )
+    if expected != done.owned:
+        expected.check(done.owned, _where(done))
+
+
+def _where(done: Done) -> str:
+    return f"zone {done.zone} at tick {done.tick}"
 
 
 def all_removed(dones: Iterable[Done]) -> tuple[Removed, ...]:

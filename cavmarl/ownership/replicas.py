@@ -96,6 +96,8 @@ class Replicas:
         if not self._safeguards.replica_lifetime:
             return
         last = now - self._limits.lifetime
+        if not self._heard or min(self._heard) > last:
+            return
         for tick in sorted(tick for tick in self._heard if tick <= last):
             for vehicle in self._heard.pop(tick):
                 if self.fences.get(vehicle, (0, now))[1] <= last:

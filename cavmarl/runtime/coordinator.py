@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterable, Sequence
 from typing import NamedTuple, Protocol
 
 from cavmarl.errors import ProtocolError
-from cavmarl.ownership.directory import Directory
+from cavmarl.ownership.directory import SILENCE, Directory
 from cavmarl.ownership.endpoint import Endpoint
 from cavmarl.ownership.limits import Limits
 from cavmarl.ownership.messages import (
@@ -28,9 +28,8 @@ from cavmarl.ownership.messages import (
 from cavmarl.ownership.offers import Approach
 from cavmarl.ownership.reactions import Advance
 from cavmarl.ownership.safeguards import ALL_ON, Safeguards
-from cavmarl.ownership.transport import Delivery
 from cavmarl.runtime.journal import AnyJournal
-from cavmarl.runtime.post import DirectPost, Post
+from cavmarl.runtime.post import DirectPost, Parcel, Post
 
 __all__ = ["Coordinator", "Entry", "Near", "Watcher"]
 
@@ -247,9 +246,11 @@ class Coordinator:
         removed: defaultdict[int, list[Removed]] = defaultdict(list)
         for entry in (*self._gone, *self._removed):
             removed[owner(entry.vehicle, owners)[0]].append(entry)
-        for zone, endpoint in self.endpoints.items():
-            if endpoint.lease is not None:
-                self.post.send((endpoint.complete(rows(zone), removed[zone]),))
+        self.post.send(
+            endpoint.complete(rows(zone), removed[zone])
+            for zone, endpoint in self.endpoints.items()
+            if endpoint.lease is not None
+        )
 
     def _offer(self, near: Sequence[Near], state: Callable[[Near], bytes]) -> None:
         """Tell the zones who comes near; what is not answered after A attempts stays so."""
@@ -262,10 +263,11 @@ class Coordinator:
                 self.post.send(endpoint.offer(approaches[zone]))
         self._deliver()
         for _ in range(1, self._limits.attempts):
-            again = [m for endpoint in self.endpoints.values() for m in endpoint.offer_again()]
-            if not again:
+            unanswered = [endpoint for endpoint in self.endpoints.values() if endpoint.offers.owed]
+            if not unanswered:
                 return
-            self.post.send(again)
+            for endpoint in unanswered:
+                self.post.send(endpoint.offer_again())
             self._deliver()
 
     def in_flight(self) -> list[tuple[int, int, int, str]]:
@@ -289,6 +291,8 @@ class Coordinator:
     # Messages
 
     def _unleased(self) -> tuple[int, ...]:
+        if len(self._leases) == len(self.endpoints):
+            return ()
         return tuple(
             zone
             for zone in self.endpoints
@@ -319,15 +323,17 @@ class Coordinator:
     def _deliver(self) -> None:
         """Let arrive what is under way, and what that leads to, until a phase brings nothing."""
         while arrived := self.post.deliver():
-            for delivery in arrived:
-                self._take(delivery)
+            for parcel in arrived:
+                self._take(parcel)
 
-    def _take(self, delivery: Delivery) -> None:
-        destination, message, refused = delivery
+    def _take(self, parcel: Parcel) -> None:
+        destination, message, refused = parcel
         for watcher in self._watchers:
             watcher.delivered(destination, message)
         if destination == COORDINATOR:
-            self._do(self.directory.on_message(message))
+            output = self.directory.on_message(message)
+            if output is not SILENCE:
+                self._do(output)
             return
         endpoint = self.endpoints.get(destination)
         if endpoint is None:

@@ -13,10 +13,10 @@ from typing import Any, TypeAlias
 from cavmarl.errors import CavmarlError
 from cavmarl.ownership.endpoint import Endpoint
 from cavmarl.ownership.messages import COORDINATOR, Begin, Commit, Output, Prepare, Step
-from cavmarl.ownership.transport import Delivery
 from cavmarl.runtime.coordinator import Coordinator
 from cavmarl.runtime.executor import Phase
 from cavmarl.runtime.fault_plan import PHASES, Crash, Faults
+from cavmarl.runtime.post import Parcel
 from cavmarl.shard.shard import Shard
 
 __all__ = [
@@ -160,13 +160,13 @@ class FaultyCoordinator(Coordinator):
             self.crashes.zone("before DONE", zone)
         super()._complete(rows)
 
-    def _take(self, delivery: Delivery) -> None:
-        zone, message, _ = delivery
+    def _take(self, parcel: Parcel) -> None:
+        zone, message, _ = parcel
         if isinstance(message, Prepare):
             self.crashes.zone("PREPARE arrives", zone)
         elif isinstance(message, Step):
             self.crashes.zone("STEP arrives", zone)
-        super()._take(delivery)
+        super()._take(parcel)
         if isinstance(message, Prepare):
             self.crashes.zone("ACK sent", zone)
         elif isinstance(message, Step):

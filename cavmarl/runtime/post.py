@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-from typing import Protocol
+from collections.abc import Iterable, Sequence
+from typing import Protocol, TypeAlias
 
 from cavmarl.ownership.messages import Message, destinations
-from cavmarl.ownership.transport import Delivery
 
-__all__ = ["DirectPost", "Post"]
+__all__ = ["DirectPost", "Parcel", "Post"]
+
+Parcel: TypeAlias = tuple[int, Message, bool]
+"""A message at its destination, and whether it is to be refused; see `transport.Delivery`."""
 
 
 class Post(Protocol):
@@ -18,7 +20,7 @@ class Post(Protocol):
         """Take messages; each goes to all of its destinations."""
         ...
 
-    def deliver(self) -> list[Delivery]:
+    def deliver(self) -> Sequence[Parcel]:
         """What arrives now, in order."""
         ...
 
@@ -27,15 +29,15 @@ class DirectPost:
     """Everything arrives once, in the order in which it was sent."""
 
     def __init__(self) -> None:
-        self._waiting: list[Delivery] = []
+        self._waiting: list[Parcel] = []
 
     def send(self, messages: Iterable[Message]) -> None:
         """Take messages; each goes to all of its destinations."""
         for message in messages:
             for destination in destinations(message):
-                self._waiting.append(Delivery(destination, message))
+                self._waiting.append((destination, message, False))
 
-    def deliver(self) -> list[Delivery]:
+    def deliver(self) -> Sequence[Parcel]:
         """What has been sent since the last time."""
         arrived, self._waiting = self._waiting, []
         return arrived

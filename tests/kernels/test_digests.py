@@ -12,6 +12,9 @@ from cavmarl.runtime.row_digests import RowDigests
 from cavmarl.shard.vehicles import PLACEMENT_FIELDS, STATE_FIELDS, VEHICLE
 from tests.naive import digests as naive
 
+# Without the compiler NumPy warns where a product wraps around, as it shall.
+pytestmark = pytest.mark.filterwarnings("ignore:overflow encountered in scalar:RuntimeWarning")
+
 WORDS = st.integers(0, (1 << 64) - 1)
 
 

@@ -32,6 +32,9 @@ from cavmarl.shard.vehicles import GHOST_FIELDS, VEHICLE
 from tests.naive import monitor as naive
 from tests.naive.zones import distance
 
+# Without the compiler NumPy warns where a product wraps around, as it shall.
+pytestmark = pytest.mark.filterwarnings("ignore:overflow encountered in scalar:RuntimeWarning")
+
 CAPACITY = 40
 HALO_M = 30.0
 LIMIT_M = 5.0
