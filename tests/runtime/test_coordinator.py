@@ -8,14 +8,17 @@ import numpy as np
 import pytest
 
 from cavmarl import make_vec
+from cavmarl.kernels.codes import DRIVER_AGENT, EVENT_COLLIDED
 from cavmarl.ownership.messages import Begin, Commit
 from cavmarl.ownership.records import replay as replay_records
 from cavmarl.ownership.trace import LOG, Trace
 from cavmarl.ownership.transport import Rates
+from cavmarl.runtime.coordinator import Near
 from cavmarl.runtime.fault_plan import Crash, Faults
 from cavmarl.runtime.journal import JournalReader
 from cavmarl.runtime.journal_summary import owners_at
 from tests.cli.test_main import run as command
+from tests.driving import idle, make_simulation, start
 from tests.faulted import BUSY, ROUGH, Recorded, record, replay
 
 ZONES = 4
@@ -128,3 +131,29 @@ def test_an_undivided_world_has_a_journal_if_asked_for_one(tmp_path: Path) -> No
     assert {zone for zone, _ in owners.values()} == {0}
     undivided = make_vec("grid4x4", num_envs=1, agents=4, background=10)
     assert not undivided.simulation.coordinators, "nobody keeps what nobody asks for"
+
+
+def test_all_rows_are_looked_at_where_the_list_of_those_near_a_border_is_stale(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    plan = '{"crashes": [{"tick": 3, "point": "resolve", "zone": 1}]}'
+    settings = {"zones.count": 4, "zones.faults": plan, "clock.ctrl_dt_s": 0.05}
+    simulation = make_simulation("grid4x4", mode="seats", agents=4, overrides=settings)
+    start(simulation, seed=1)
+    division, looked = simulation._division, []
+    near = division.near
+
+    def look(w: int, everybody: bool) -> list[Near]:
+        looked.append((simulation.coordinators[0].tick + 1, everybody))
+        return near(w, everybody)
+
+    monkeypatch.setattr(division, "near", look)
+    for step in range(5):
+        if step == 4:
+            # Somebody is taken out between two ticks, and the last row moves to its place.
+            rows = simulation._shards[0].worlds.rows
+            rows[0, 0]["driver"], rows[0, 0]["events"] = DRIVER_AGENT, EVENT_COLLIDED
+            rows[0, 0]["departed"] = -9
+            simulation.retire_agents()
+        simulation.step(idle(simulation))
+    assert looked == [(1, True), (2, False), (3, False), (3, True), (4, False), (5, True)]
