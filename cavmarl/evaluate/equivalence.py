@@ -192,7 +192,7 @@ def _shadow(settings: dict[str, Any], key: str, value: Any, name: str) -> None:
 
 
 def _journal(folder: Path | None, count: int) -> dict[str, str]:
-    if folder is None or count == 1:
+    if folder is None:
         return {}
     return {"zones.journal": str(folder / f"zones-{count}.jsonl")}
 

@@ -107,7 +107,7 @@ class CommittedStore:
         """
         if self._next is None:
             raise ProtocolError("nothing has been written to the store since it was flipped")
-        num = int(self._next.counts[zone][0][world])
+        num = int(self._next.counts[zone][COUNTS.index("num_owned")][world])
         rows: NDArray[np.void] = self._next.rows[zone][world][:num]
         return rows
 
