@@ -12,6 +12,7 @@ import numpy as np
 
 from cavmarl.ownership.messages import Begin, Commit, Message, Need, Record, Reset
 from cavmarl.ownership.transport import Network
+from cavmarl.runtime.coordinator import Coordinator
 from cavmarl.runtime.simulation import Simulation
 
 __all__ = ["FaultFigures", "HandOverClock", "spread"]
@@ -114,7 +115,7 @@ class FaultFigures:
         found.repeats.extend(Counter(revival.tick for revival in simulation.revivals).values())
         for coordinator in simulation.coordinators:
             found.stale.update(coordinator.dropped())
-            if isinstance(coordinator.post, Network):
+            if isinstance(coordinator, Coordinator) and isinstance(coordinator.post, Network):
                 found.messages.update(coordinator.post.faults)
         for log in simulation.transfers:
             found.hand_overs.update(log.counts)

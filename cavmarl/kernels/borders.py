@@ -128,22 +128,24 @@ def _note(
 
 @kernel
 def pass_on(
-    vehicle: int, source: int, row: int, target: int, zoned: Zoned, side: int, w: int
+    vehicle: int, source: int, row: int, target: int, epoch: int, zoned: Zoned, side: int, w: int
 ) -> int:
     """Make a vehicle a ghost of the zone that owned it, and an owned row where it was a ghost.
+
+    The new row says what the old one does, but for its owner and epoch.
 
     Args:
         vehicle: its id.
         source: the zone that owns it.
         row: where it probably is there.
         target: the zone that will own it.
+        epoch: from then on.
         zoned: the rows of all zones, and how many they are.
         side: whose rows, 0 or 1.
         w: in which world.
 
     Returns:
-        its row at the target, with what the ghost said; -1: the source does not own it; -2: the
-        target has no ghost of it.
+        its row at the target; -1: the source does not own it; -2: the target has no ghost of it.
     """
     old = zoned.rows[side, source, w]
     new = zoned.rows[side, target, w]
@@ -161,6 +163,9 @@ def pass_on(
     if ghost == zoned.num_rows[target, w]:
         return -2
     _swap(new, ghost, place, zoned.spare)
+    new[place] = old[row]
+    new[place]["owner"] = target
+    new[place]["epoch"] = epoch
     zoned.num_owned[target, w] = place + 1
     _swap(old, row, owned - 1, zoned.spare)
     zoned.num_owned[source, w] = owned - 1

@@ -170,11 +170,19 @@ class Directory:
         if table.plan is not None:
             raise ProtocolError(f"tick {table.plan.record.tick} is not committed")
         new = tuple(sorted(births))
-        self._decisions.check_births(table, new)
+        self.check_births(new)
         switches, deferred = self._decisions.switches(table, movers)
         begun = self._logged(Begin(table.episode, table.tick + 1, switches, deferred, new, inputs))
         records = begun.records if self._safeguards.log_before_send else ()
         return Output(records, self.resend(payloads=payloads or {}).messages)
+
+    def check_births(self, births: Sequence[Birth]) -> None:
+        """See that new vehicles are new.
+
+        Raises:
+            SpawnError: an id that the episode has seen, or a zone that does not exist.
+        """
+        self._decisions.check_births(self.table, births)
 
     def resend(
         self, zones: Iterable[int] | None = None, payloads: Mapping[int, bytes] | None = None

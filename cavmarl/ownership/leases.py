@@ -16,11 +16,12 @@ def make_step(table: Table, zone: int, store: CommittedStates, payload: bytes) -
     plan = table.planned
     enter = tuple(
         _entry(switch, store.state(switch.vehicle), switch.vehicle in plan.attach)
-        for switch in plan.enter[zone]
+        for switch in plan.enter.get(zone, ())
     )
     return Step(
         table.run, table.episode, plan.record.tick, zone, table.hosts[zone][1], table.tick,
-        enter, tuple(plan.leave[zone]), tuple(plan.spawn[zone]), plan.expected[zone], payload,
+        enter, tuple(plan.leave.get(zone, ())), tuple(plan.spawn.get(zone, ())),
+        plan.expected[zone], payload,
     )  # fmt: skip
 
 

@@ -23,6 +23,8 @@ COORDINATOR = -1
 
 RUN_BYTES = 16
 
+_TO_COORDINATOR = (COORDINATOR,)
+
 
 class Refusal(IntEnum):
     """Why a target does not hold a state."""
@@ -116,6 +118,10 @@ class Message:
     episode: int
     tick: int
 
+    def destinations(self) -> tuple[int, ...]:
+        """Zones, or COORDINATOR, that it goes to."""
+        return _TO_COORDINATOR
+
 
 @dataclass(slots=True, unsafe_hash=True)
 class Step(Message):
@@ -129,6 +135,10 @@ class Step(Message):
     spawn: tuple[Spawn, ...] = ()
     owned: Tally = field(default_factory=Tally)
     payload: bytes = b""
+
+    def destinations(self) -> tuple[int, ...]:
+        """Its zone."""
+        return (self.zone,)
 
 
 @dataclass(slots=True, unsafe_hash=True)
@@ -154,6 +164,10 @@ class Prepare(Message):
     schema: int
     entries: tuple[Offer, ...]
 
+    def destinations(self) -> tuple[int, ...]:
+        """The target."""
+        return (self.target,)
+
 
 @dataclass(slots=True, unsafe_hash=True)
 class Abort(Message):
@@ -163,6 +177,10 @@ class Abort(Message):
     incarnation: int
     target: int
     entries: tuple[Withdrawn, ...]
+
+    def destinations(self) -> tuple[int, ...]:
+        """The target."""
+        return (self.target,)
 
 
 @dataclass(slots=True, unsafe_hash=True)
@@ -174,6 +192,10 @@ class Ack(Message):
     source: int
     entries: tuple[Held, ...]
 
+    def destinations(self) -> tuple[int, ...]:
+        """The coordinator, and the source of the states."""
+        return (COORDINATOR, self.source)
+
 
 @dataclass(slots=True, unsafe_hash=True)
 class Nack(Message):
@@ -184,6 +206,10 @@ class Nack(Message):
     source: int
     entries: tuple[Refused, ...]
 
+    def destinations(self) -> tuple[int, ...]:
+        """The coordinator, and the source of the states."""
+        return (COORDINATOR, self.source)
+
 
 @dataclass(slots=True, unsafe_hash=True)
 class Need(Message):
@@ -192,19 +218,6 @@ class Need(Message):
     zone: int
     incarnation: int
     vehicles: tuple[int, ...]
-
-
-def destinations(message: Message) -> tuple[int, ...]:
-    """Zones, or COORDINATOR, that a message goes to."""
-    match message:
-        case Step(zone=zone):
-            return (zone,)
-        case Prepare(target=target) | Abort(target=target):
-            return (target,)
-        case Ack(source=source) | Nack(source=source):
-            return (COORDINATOR, source)
-        case _:
-            return (COORDINATOR,)
 
 
 class Switch(NamedTuple):

@@ -5,7 +5,6 @@ The plan of a live coordinator and that of one which replays its log are made by
 
 from __future__ import annotations
 
-from collections import defaultdict
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 
@@ -30,13 +29,17 @@ class Plan:
     """
 
     record: Begin
-    expected: dict[int, Tally]
+    expected: Mapping[int, Tally]
     switches: dict[int, Switch] = field(default_factory=dict)
     births: dict[int, int] = field(default_factory=dict)
-    enter: defaultdict[int, list[Switch]] = field(default_factory=lambda: defaultdict(list))
-    leave: defaultdict[int, list[Out]] = field(default_factory=lambda: defaultdict(list))
-    spawn: defaultdict[int, list[Spawn]] = field(default_factory=lambda: defaultdict(list))
+    enter: dict[int, list[Switch]] = field(default_factory=dict)
+    leave: dict[int, list[Out]] = field(default_factory=dict)
+    spawn: dict[int, list[Spawn]] = field(default_factory=dict)
     attach: set[int] = field(default_factory=set)
+
+    def changes(self, zone: int) -> bool:
+        """Whether somebody enters the zone, leaves it, or is born there."""
+        return zone in self.enter or zone in self.leave or zone in self.spawn
 
     def owner(self, vehicle: int, committed: Mapping[int, tuple[int, int]]) -> tuple[int, int]:
         """(zone, epoch) of a vehicle under this plan."""
@@ -50,21 +53,23 @@ class Plan:
 
 def make_plan(run: bytes, record: Begin, committed: Mapping[int, Tally]) -> Plan:
     """The plan of a BEGIN record, given what the zones owned when the last tick was committed."""
-    plan = Plan(record, dict(committed))
-    expected = plan.expected
+    if not record.switches and not record.births:
+        return Plan(record, committed)
+    expected = dict(committed)
+    plan = Plan(record, expected)
     for switch in record.switches:
         vehicle, source, target, epoch, forced = switch
         expected[source] = expected[source].minus(run, vehicle, epoch - 1)
         expected[target] = expected[target].plus(run, vehicle, epoch)
         plan.switches[vehicle] = switch
-        plan.enter[target].append(switch)
-        plan.leave[source].append(Out(vehicle, epoch - 1))
+        plan.enter.setdefault(target, []).append(switch)
+        plan.leave.setdefault(source, []).append(Out(vehicle, epoch - 1))
         if forced:
             plan.attach.add(vehicle)
     for vehicle, zone, state in record.births:
         expected[zone] = expected[zone].plus(run, vehicle, 0)
         plan.births[vehicle] = zone
-        plan.spawn[zone].append(Spawn(vehicle, state))
+        plan.spawn.setdefault(zone, []).append(Spawn(vehicle, state))
     return plan
 
 
@@ -81,7 +86,9 @@ def check_done(run: bytes, plan: Plan, done: Done, owners: Mapping[int, tuple[in
         if zone != done.zone:
             raise LedgerError(f"{_where(done)} removed vehicle {vehicle}, which zone {zone} owns")
         expected = expected.minus(run, vehicle, epoch)
-    planned = tuple(Confirmed(entry.vehicle, entry.epoch) for entry in plan.enter[done.zone])
+    planned = tuple(
+        Confirmed(entry.vehicle, entry.epoch) for entry in plan.enter.get(done.zone, ())
+    )
     if done.confirmed != planned:
         raise LedgerError(
             f"{_where(done)} confirmed {list(done.confirmed)} instead of {list(planned)}"

@@ -6,7 +6,7 @@ A `TransferLog` is told what a `Trace` is told, and keeps what is under way and 
 from __future__ import annotations
 
 from collections import Counter, deque
-from collections.abc import Iterable
+from collections.abc import Collection, Iterable
 from dataclasses import dataclass
 from typing import NamedTuple, Protocol
 
@@ -42,7 +42,8 @@ class Transfer(NamedTuple):
         approached: tick of the first state that arrived at the target, or -1.
         waited: ticks for which the source went on after the crossing.
         offers: states that arrived at the target, repeats included.
-        state_bytes: size of the last of them.
+        state_bytes: size of the last of them; 0 where no bytes were sent, since both zones live in
+            one process.
         prepare_depth_m: how far it was outside of its owner's zone when the first of them arrived,
             less than 0 inside; None: nobody told.
         switch_depth_m: the same when its switch was decided.
@@ -169,11 +170,43 @@ class TransferLog:
                     if self._approaches.pop((vehicle, message.target, epoch), None) is not None:
                         self.counts["aborted"] += 1
             case Done() if message.confirmed:
-                self._confirm(message)
+                self.confirmed(vehicle for vehicle, _ in message.confirmed)
             case Ack() if destination == COORDINATOR:
                 self.counts["acknowledged"] += len(message.entries)
             case Nack() if destination == COORDINATOR:
                 self.counts["refused"] += len(message.entries)
+
+    def approached(self, tick: int, states: Collection[tuple[int, int, int]]) -> None:
+        """Note who comes near, where targets know it without messages.
+
+        Args:
+            tick: of the states.
+            states: (vehicle, target, epoch) of all of them; the approaches of others are over.
+        """
+        known, around = self._approaches, self._surroundings
+        for key in states:
+            found = known.get(key)
+            if found is not None:
+                found.last = tick
+                found.offers += 1
+                continue
+            found = known[key] = _Approach(tick, tick, 1, 0)
+            if around is not None:
+                found.depth_m = around.depth_m(key[0], key[1])
+                found.began_ms = around.now_ms()
+        for key in [key for key in known if key not in states]:
+            del known[key]
+            self.counts["aborted"] += 1
+        self.counts["acknowledged"] += len(states)
+
+    def confirmed(self, vehicles: Iterable[int]) -> None:
+        """Note vehicles that their new owners have advanced."""
+        if self._surroundings is None:
+            return
+        for vehicle in vehicles:
+            switching = self._switching.get(vehicle)
+            if switching is not None:
+                switching.ended_ms = self._surroundings.now_ms()
 
     def _begin(self, record: Begin) -> None:
         self._begun = record
@@ -184,14 +217,6 @@ class TransferLog:
             for switch in record.switches:
                 depth_m = around.depth_m(switch.vehicle, switch.target)
                 self._switching[switch.vehicle] = _Switching(depth_m, around.now_ms())
-
-    def _confirm(self, message: Done) -> None:
-        if self._surroundings is None:
-            return
-        for vehicle, _ in message.confirmed:
-            switching = self._switching.get(vehicle)
-            if switching is not None:
-                switching.ended_ms = self._surroundings.now_ms()
 
     def _commit(self, record: Commit) -> None:
         begun, self._begun = self._begun, None

@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 
 from cavmarl.errors import ConfigError, MessageError
 from cavmarl.ownership.codec import decode, encode
-from cavmarl.ownership.messages import COORDINATOR, Message, Step, destinations
+from cavmarl.ownership.messages import COORDINATOR, Message, Step
 
 
 @dataclass(frozen=True, slots=True)
@@ -140,7 +140,7 @@ class Network:
     def send(self, messages: Iterable[Message]) -> None:
         """Take messages; each goes to all of its destinations."""
         for message in messages:
-            for destination in destinations(message):
+            for destination in message.destinations():
                 self._send(message, destination)
 
     def deliver(self) -> list[Delivery]:

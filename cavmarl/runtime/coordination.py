@@ -8,12 +8,12 @@ from hashlib import blake2b
 import numpy as np
 from numpy.typing import NDArray
 
-from cavmarl.errors import JournalError, ProtocolError
+from cavmarl.errors import ProtocolError
 from cavmarl.kernels.arrays import Gate
 from cavmarl.kernels.zones import zones_of
-from cavmarl.runtime.coordinator import Coordinator, Near
 from cavmarl.runtime.division import Division
 from cavmarl.runtime.monitor import Monitor
+from cavmarl.runtime.referee import Near, Referee
 from cavmarl.runtime.row_digests import RowDigests
 from cavmarl.runtime.store import CommittedStore
 from cavmarl.runtime.surroundings import NearBorders
@@ -76,7 +76,7 @@ class Coordination:
     def __init__(
         self,
         division: Division,
-        coordinators: Sequence[Coordinator],
+        coordinators: Sequence[Referee],
         states: Sequence[RowStates],
         digests: RowDigests | None = None,
         store: CommittedStore | None = None,
@@ -113,13 +113,12 @@ class Coordination:
             near = self._division.near(w, self._stirred[w])
             self._stirred[w] = False
             self._states[w].borders.near = near
-            rows = {entry.vehicle: entry.row for entry in near}
             inputs = b"" if coordinator.journal is None else _digest(commands, w)
             entries = coordinator.begin(near, self._states[w].near, inputs)
-            for switch, _ in entries:
-                self._states[w].state(switch.vehicle)  # a STEP may be repeated after rows moved
-            for switch, state in entries:
-                self._division.hand_over(w, switch, state, rows.get(switch.vehicle, 0))
+            if entries:
+                rows = {entry.vehicle: entry.row for entry in near}
+                for switch, state in entries:
+                    self._division.hand_over(w, switch, state, rows.get(switch.vehicle, 0))
 
     def end(self) -> None:
         """Commit the tick that all zones have computed."""
@@ -163,19 +162,6 @@ class Coordination:
         for w, notes in enumerate(self._store.load()):
             self.coordinators[w].resume(*notes)
             self._stirred[w] = True
-
-    def restart(self, w: int) -> Coordinator:
-        """The coordinator of a world has died: another one has read its journal.
-
-        Raises:
-            JournalError: there is none, or it cannot be read.
-        """
-        coordinator, journal = self.coordinators[w], self.coordinators[w].journal
-        if journal is None:
-            raise JournalError("a coordinator that dies without a journal is gone for good")
-        coordinator.journal = journal.reopened()
-        coordinator.restart(tuple(coordinator.journal.read()))
-        return coordinator
 
     def left(self, gate: Gate) -> None:
         """Those in `gate.passing` have left their worlds."""

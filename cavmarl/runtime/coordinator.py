@@ -1,14 +1,10 @@
-"""`Coordinator`: the referee of one world, with the directory of owners and an endpoint a zone.
-
-It says who advances which vehicle to the next tick, and sees it done. Rows are not its affair: what
-is near a border, what stands in a row and how rows change hands is told and done by the division.
-"""
+"""`Coordinator`: the referee of a world who tells the hosts of its zones by messages."""
 
 from __future__ import annotations
 
 from collections import Counter, defaultdict
-from collections.abc import Callable, Iterable, Sequence
-from typing import NamedTuple, Protocol
+from collections.abc import Callable, Sequence
+from typing import Protocol
 
 from cavmarl.errors import ProtocolError
 from cavmarl.ownership.directory import SILENCE, Directory
@@ -16,55 +12,22 @@ from cavmarl.ownership.endpoint import Endpoint
 from cavmarl.ownership.limits import Limits
 from cavmarl.ownership.messages import (
     COORDINATOR,
-    Begin,
-    Birth,
-    Message,
     Output,
     Prepare,
     Record,
     Removed,
-    Switch,
 )
 from cavmarl.ownership.offers import Approach
 from cavmarl.ownership.reactions import Advance
 from cavmarl.ownership.safeguards import ALL_ON, Safeguards
 from cavmarl.runtime.journal import AnyJournal
-from cavmarl.runtime.post import DirectPost, Parcel, Post
+from cavmarl.runtime.post import Parcel, Post
+from cavmarl.runtime.referee import Entry, Near, Referee
 
-__all__ = ["Coordinator", "Entry", "Near", "Watcher"]
+__all__ = ["Coordinator"]
 
 PATIENCE = 10_000
 """So often a tick asks a zone that does not answer, before it gives up."""
-
-
-class Near(NamedTuple):
-    """A vehicle that another zone has to be told of; see `kernels.borders.NEAR`."""
-
-    vehicle: int
-    source: int
-    row: int
-    target: int
-    crossed: bool
-    depth_m: float
-
-
-class Entry(NamedTuple):
-    """A vehicle that changes its owner now, with the state that the new one has of it."""
-
-    switch: Switch
-    state: bytes
-
-
-class Watcher(Protocol):
-    """Is told what happens, as `ownership.trace.Trace` is."""
-
-    def logged(self, records: Iterable[Record]) -> None:
-        """Records, in the order of the journal."""
-        ...
-
-    def delivered(self, destination: int, message: Message) -> None:
-        """A message that has arrived."""
-        ...
 
 
 class States(Protocol):
@@ -75,25 +38,21 @@ class States(Protocol):
         ...
 
 
-class Coordinator:
-    """Runs the protocol of one world, tick by tick: `begin`, then the zones' work, then `end`.
+class Coordinator(Referee):
+    """Runs the protocol of one world over messages.
 
     Args:
         run: 16 bytes that no other run has.
         zones: how many.
         states: of vehicles at the committed tick.
         limits: deadlines.
-        post: carries the messages; None: directly.
+        post: carries the messages.
         journal: takes the records; None: nobody keeps them.
-        watchers: told of every record and delivery.
         safeguards: remedies of the protocol; tests take one away.
 
     Attributes:
-        directory: who owns what.
         endpoints: zone → its host's side.
         post: what carries the messages.
-        journal: what takes the records.
-        switched: vehicles that have changed their owner.
     """
 
     def __init__(
@@ -102,39 +61,23 @@ class Coordinator:
         zones: int,
         states: States,
         limits: Limits,
-        post: Post | None = None,
+        post: Post,
         journal: AnyJournal | None = None,
-        watchers: Sequence[Watcher] = (),
         safeguards: Safeguards = ALL_ON,
     ) -> None:
-        self.directory = Directory(run, range(zones), states, limits, safeguards)
+        super().__init__(Directory(run, range(zones), states, limits, safeguards), journal)
         self.endpoints: dict[int, Endpoint] = {}
-        self.post: Post = DirectPost() if post is None else post
-        self.switched = 0
+        self.post = post
         self._states = states
         self._limits = limits
         self._safeguards = safeguards
-        self.journal = journal
-        self._watchers = tuple(watchers)
         self._dropped: Counter[tuple[str, str]] = Counter()  # by those that have died since
         self._leases: dict[int, Advance] = {}
-        self._births: list[Birth] = []
-        self._gone: list[Removed] = []  # between two ticks
-        self._removed: list[Removed] = []  # in the tick
-
-    @property
-    def tick(self) -> int:
-        """The committed tick, of the run."""
-        return self.directory.table.tick
 
     @property
     def is_open(self) -> bool:
         """Whether a tick has been begun and is not committed."""
         return self.directory.table.plan is not None
-
-    def watch(self, watcher: Watcher) -> None:
-        """Tell one more of all that happens from now on."""
-        self._watchers = (*self._watchers, watcher)
 
     def dropped(self) -> Counter[tuple[str, str]]:
         """(kind, reason) → messages or entries that did not count, at any of the parties."""
@@ -170,23 +113,6 @@ class Coordinator:
         self._dropped += endpoint.dropped
         return endpoint
 
-    def notes(self) -> tuple[tuple[Birth, ...], tuple[Removed, ...]]:
-        """Who is new since the last BEGIN, and who is gone since the last COMMIT."""
-        return tuple(self._births), tuple(self._gone)
-
-    def resume(self, births: Iterable[Birth] = (), gone: Iterable[Removed] = ()) -> None:
-        """Know again what `notes` told."""
-        self._births, self._gone, self._removed = list(births), list(gone), []
-
-    def entered(self, vehicles: Iterable[tuple[int, int]]) -> None:
-        """(id, zone) of vehicles that are new since the last BEGIN."""
-        self._births.extend(Birth(vehicle, zone, b"") for vehicle, zone in vehicles)
-
-    def left(self, vehicles: Iterable[tuple[int, int]]) -> None:
-        """(id, reason) of vehicles that have left the world."""
-        place = self._removed if self.is_open else self._gone
-        place.extend(Removed(vehicle, reason) for vehicle, reason in vehicles)
-
     # A tick
 
     def begin(
@@ -216,7 +142,10 @@ class Coordinator:
             self._leases = {}
             self._do(directory.begin(movers, births, inputs))
         self._until(self._unleased, lambda: directory.resend(self._unleased()))
-        return self._entries()
+        entries = self._entries()
+        for switch, _ in entries:
+            self._states.state(switch.vehicle)  # a STEP may be repeated after rows moved
+        return entries
 
     def end(self, rows: Callable[[int], int], stored: Callable[[int], int] | None = None) -> None:
         """Every zone is through: DONE and COMMIT.
@@ -355,11 +284,7 @@ class Coordinator:
             self.post.send(output.messages)
 
     def _write(self, output: Output) -> None:
-        if self.journal is not None:
-            self.journal.append(output.records)
-        self.switched += sum(len(r.switches) for r in output.records if isinstance(r, Begin))
-        for watcher in self._watchers:
-            watcher.logged(output.records)
+        self._log(output.records)
 
     # Recovery
 

@@ -22,7 +22,7 @@ from cavmarl.kernels.motion import MAX_SPEED_MPS
 from cavmarl.kernels.repeated import repeated
 from cavmarl.kernels.zones import Halo, ZoneArrays
 from cavmarl.ownership.messages import Switch
-from cavmarl.runtime.coordinator import Near
+from cavmarl.runtime.referee import Near
 from cavmarl.shard.shard import Shard
 from cavmarl.shard.transfer import TransferCodec
 
@@ -85,6 +85,7 @@ class Division:
         self._near = np.zeros(2 * shards[0].worlds.rows.shape[1], dtype=NEAR)
         self._call_exchange = repeated(exchange)
         self._find_near = repeated(find_near)
+        self._pass_on = repeated(pass_on)
 
     @property
     def count(self) -> int:
@@ -149,6 +150,8 @@ class Division:
             self.zones, self._hysteresis_m, self._ahead_s, MAX_SPEED_MPS,
             self._zoned, side, w, everybody, self._near,
         )  # fmt: skip
+        if num == 0:
+            return []
         return [Near(*entry) for entry in self._near[:num].tolist()]
 
     def find(self, w: int, vehicle: int) -> tuple[int, int]:
@@ -169,21 +172,20 @@ class Division:
         worlds = self._shards[zone].worlds
         return self.codec.pack(worlds.rows, w, row, int(worlds.ticks[w]))
 
-    def hand_over(self, w: int, switch: Switch, state: bytes, hint: int = 0) -> None:
+    def hand_over(self, w: int, switch: Switch, state: bytes | None, hint: int = 0) -> None:
         """Let a vehicle change its owner, by its committed row.
 
         Args:
             w: in which world.
             switch: who, from where, to where.
-            state: what the new owner goes on with.
+            state: what the new owner goes on with; None: the old one's row as it is.
             hint: the row where the old one probably keeps it.
 
         Raises:
             ZoneError: the old owner does not have it, or the new one has not seen it come.
         """
-        target = self._shards[switch.target].worlds
-        place = pass_on(
-            switch.vehicle, switch.source, hint, switch.target,
+        place = self._pass_on(
+            switch.vehicle, switch.source, hint, switch.target, switch.epoch,
             self._zoned, self._side(self._shards[0].worlds.rows), w,
         )  # fmt: skip
         if place == -1:
@@ -193,10 +195,12 @@ class Division:
                 f"vehicle {switch.vehicle} entered zone {switch.target}, which has not seen it "
                 "come: the halo is too narrow"
             )
-        tick = int(target.ticks[w])
-        self.codec.unpack(state, switch.vehicle, tick, target.rows, w, place)
-        row = target.rows[w, place]
-        row["owner"], row["epoch"] = switch.target, switch.epoch
+        if state is not None:
+            target = self._shards[switch.target].worlds
+            tick = int(target.ticks[w])
+            self.codec.unpack(state, switch.vehicle, tick, target.rows, w, place)
+            row = target.rows[w, place]
+            row["owner"], row["epoch"] = switch.target, switch.epoch
 
     def owned(self, w: int, zone: int) -> NDArray[np.void]:
         """VEHICLE (n,), the committed rows that a zone owns; a view."""
@@ -240,6 +244,11 @@ class Division:
             for shard in self._shards
             for vehicle in shard.worlds.rows["id"][w, : shard.worlds.num_owned[w]].tolist()
         ]
+
+    def counts(self, w: int) -> list[int]:
+        """How many vehicles of a world each zone owns."""
+        counts: list[int] = self._zoned.num_owned[:, w].tolist()
+        return counts
 
     def running(self) -> NDArray[np.int64]:
         """(W,) vehicles of each world."""

@@ -56,15 +56,16 @@ class OwnersOnRecord:
     Args:
         zones: how many.
         limits: deadlines.
+        is_direct: there are records alone; see `TraceChecker`.
 
     Attributes:
         entered: vehicles that zones have begun to own, since the reset.
         left: vehicles that have been removed.
     """
 
-    def __init__(self, zones: int, limits: Limits) -> None:
+    def __init__(self, zones: int, limits: Limits, is_direct: bool = False) -> None:
         self.entered = self.left = 0
-        self._checker = TraceChecker(limits.longest_deferral, limits.lifetime)
+        self._checker = TraceChecker(limits.longest_deferral, limits.lifetime, is_direct)
         self._sums = [0] * zones
 
     @property

@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from typing import Protocol, TypeAlias
 
-from cavmarl.ownership.messages import Message, destinations
+from cavmarl.ownership.messages import Message
 
-__all__ = ["DirectPost", "Parcel", "Post"]
+__all__ = ["Parcel", "Post"]
 
 Parcel: TypeAlias = tuple[int, Message, bool]
 """A message at its destination, and whether it is to be refused; see `transport.Delivery`."""
@@ -23,21 +23,3 @@ class Post(Protocol):
     def deliver(self) -> Sequence[Parcel]:
         """What arrives now, in order."""
         ...
-
-
-class DirectPost:
-    """Everything arrives once, in the order in which it was sent."""
-
-    def __init__(self) -> None:
-        self._waiting: list[Parcel] = []
-
-    def send(self, messages: Iterable[Message]) -> None:
-        """Take messages; each goes to all of its destinations."""
-        for message in messages:
-            for destination in destinations(message):
-                self._waiting.append((destination, message, False))
-
-    def deliver(self) -> Sequence[Parcel]:
-        """What has been sent since the last time."""
-        arrived, self._waiting = self._waiting, []
-        return arrived

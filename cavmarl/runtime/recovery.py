@@ -14,8 +14,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from cavmarl.errors import ProtocolError, StoreError, ZoneStepError
+from cavmarl.errors import JournalError, ProtocolError, StoreError, ZoneStepError
 from cavmarl.runtime.coordination import Coordination
+from cavmarl.runtime.coordinator import Coordinator
 from cavmarl.runtime.faults import (
     CoordinatorDeath,
     Crashes,
@@ -53,6 +54,7 @@ class Recovery:
     Args:
         shards: whose hosts may die.
         coordination: of the one world.
+        coordinator: its own.
         store: the committed state.
         phases: of the tick, in which somebody may die.
         crashes: who dies where.
@@ -67,6 +69,7 @@ class Recovery:
         self,
         shards: Sequence[Shard],
         coordination: Coordination,
+        coordinator: Coordinator,
         store: CommittedStore,
         phases: FaultyPhases,
         crashes: Crashes,
@@ -75,6 +78,7 @@ class Recovery:
         self.revivals: list[Revival] = []
         self._shards = tuple(shards)
         self._coordination = coordination
+        self._coordinator = coordinator
         self._store = store
         self._phases = phases
         self._crashes = crashes
@@ -89,8 +93,7 @@ class Recovery:
             ProtocolError: every coordinator dies of it.
         """
         self._deaths.clear()
-        coordinator = self._coordination.coordinators[0]
-        self._crashes.tick = coordinator.tick + 1
+        self._crashes.tick = self._coordinator.tick + 1
         while True:
             self._phases.on = True
             try:
@@ -116,7 +119,7 @@ class Recovery:
         for zone in zones:
             self._lose(self._shards[zone])
         self._coordination.load()
-        coordinator = self._coordination.coordinators[0]
+        coordinator = self._coordinator
         for zone in zones:
             self._count(zone)
             if isinstance(death, ZoneDeath):
@@ -142,7 +145,11 @@ class Recovery:
 
     def _restart(self) -> bool:
         """A new coordinator reads the journal; whether the tick stands in it as committed."""
-        coordinator = self._coordination.restart(0)
+        coordinator, journal = self._coordinator, self._coordinator.journal
+        if journal is None:
+            raise JournalError("a coordinator that dies without a journal is gone for good")
+        coordinator.journal = journal.reopened()
+        coordinator.restart(tuple(coordinator.journal.read()))
         is_done = coordinator.tick == self._crashes.tick
         if is_done:
             self._store.flip()

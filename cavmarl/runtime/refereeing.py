@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from cavmarl.config import ZonesConfig
 from cavmarl.errors import ConfigError
+from cavmarl.ownership.directory import Directory
 from cavmarl.ownership.limits import Limits
 from cavmarl.ownership.messages import RUN_BYTES
 from cavmarl.ownership.safeguards import ALL_ON, Safeguards
@@ -18,6 +19,7 @@ from cavmarl.ownership.transfers import TransferLog
 from cavmarl.ownership.transport import Network
 from cavmarl.runtime.coordination import Coordination, RowStates
 from cavmarl.runtime.coordinator import Coordinator
+from cavmarl.runtime.direct import DirectCoordinator
 from cavmarl.runtime.dividing import limits_of
 from cavmarl.runtime.division import Division
 from cavmarl.runtime.fault_plan import Faults, read_faults
@@ -25,6 +27,7 @@ from cavmarl.runtime.faults import Crashes, FaultyCoordinator, FaultyPhases
 from cavmarl.runtime.journal import Journal, MemoryJournal
 from cavmarl.runtime.monitor import Monitor, OwnersOnRecord
 from cavmarl.runtime.recovery import Recovery
+from cavmarl.runtime.referee import Referee
 from cavmarl.runtime.row_digests import RowDigests
 from cavmarl.runtime.store import CommittedStore
 from cavmarl.shard.shard import Shard
@@ -84,60 +87,56 @@ def make_refereeing(
     states = [RowStates(division, w) for w in range(division.num_worlds)]
     transfers = tuple(TransferLog(limits.lifetime, known.borders) for known in states)
     coordinators = [
-        _coordinator(
-            settings, w, division, states[w], limits, transfers[w], faults, crashes, safeguards
-        )
+        _referee(settings, w, division, states[w], limits, faults, crashes, safeguards)
         for w in range(division.num_worlds)
     ]
+    for coordinator, log in zip(coordinators, transfers, strict=True):
+        coordinator.watch(log)
     digests = RowDigests() if settings.journal or deaths else None
     monitor = _monitor(division, coordinators, limits, dt) if settings.check else None
-    if crashes is None:
+    dying = coordinators[0]
+    if crashes is None or not isinstance(dying, Coordinator):
         coordination = Coordination(division, coordinators, states, digests, monitor=monitor)
         return Refereeing(coordination, transfers)
     store = CommittedStore(shards, shared, safeguards)
     phases = FaultyPhases(shards, crashes)
     coordination = Coordination(division, coordinators, states, digests, store, monitor)
-    recovery = Recovery(shards, coordination, store, phases, crashes, limits.repeats)
+    recovery = Recovery(shards, coordination, dying, store, phases, crashes, limits.repeats)
     return Refereeing(coordination, transfers, recovery, phases)
 
 
-def _coordinator(
+def _referee(
     settings: ZonesConfig,
     w: int,
     division: Division,
     states: RowStates,
     limits: Limits,
-    transfers: TransferLog,
     faults: Faults | None,
     crashes: Crashes | None,
     safeguards: Safeguards,
-) -> Coordinator:
-    """Of one world."""
+) -> Referee:
+    """Of one world; over messages where a plan says what may be lost, and directly else."""
+    run, zones = secrets.token_bytes(RUN_BYTES), division.count
     journal: Journal | MemoryJournal | None = None
     if settings.journal:
         journal = Journal(_path(settings.journal, w, division.num_worlds))
     elif crashes is not None:
         journal = MemoryJournal()
-    arguments = (
-        secrets.token_bytes(RUN_BYTES),
-        division.count,
-        states,
-        limits,
-        None if faults is None else Network(faults.plan()),
-        journal,
-        (transfers,),
-        safeguards,
-    )
+    if faults is None:
+        directory = Directory(run, range(zones), states, limits, safeguards)
+        return DirectCoordinator(directory, journal, lambda: division.counts(w))
+    arguments = (run, zones, states, limits, Network(faults.plan()), journal, safeguards)
     if crashes is None:
         return Coordinator(*arguments)
     return FaultyCoordinator(*arguments, crashes=crashes)
 
 
 def _monitor(
-    division: Division, coordinators: Sequence[Coordinator], limits: Limits, dt: float
+    division: Division, coordinators: Sequence[Referee], limits: Limits, dt: float
 ) -> Monitor:
     """What looks at all worlds, and is told what their coordinators do."""
-    records = [OwnersOnRecord(division.count, limits) for _ in coordinators]
+    is_direct = isinstance(coordinators[0], DirectCoordinator)
+    records = [OwnersOnRecord(division.count, limits, is_direct) for _ in coordinators]
     for coordinator, record in zip(coordinators, records, strict=True):
         coordinator.watch(record)
     return Monitor(division, records, dt)

@@ -34,11 +34,11 @@ from cavmarl.roads.zones import ZonePartition
 from cavmarl.runtime.commons import Commons
 from cavmarl.runtime.compilation import first_compilation
 from cavmarl.runtime.coordination import Coordination
-from cavmarl.runtime.coordinator import Coordinator
 from cavmarl.runtime.dividing import divide
 from cavmarl.runtime.division import ZoneLoads
 from cavmarl.runtime.executor import Executor, SerialExecutor
 from cavmarl.runtime.recovery import Recovery, Revival
+from cavmarl.runtime.referee import Referee
 from cavmarl.runtime.refereeing import make_refereeing
 from cavmarl.runtime.zone_view import ZoneView, view_zones
 from cavmarl.shard.shard import Commands
@@ -184,7 +184,7 @@ class Simulation:
         self._traffic.settle(self._gate, self._shard.worlds)
         self._division.near(0, everybody=True)
         with suppress(ZoneError):
-            self._division.hand_over(0, Switch(-1, 0, 0, 0, False), b"")
+            self._division.hand_over(0, Switch(-1, 0, 0, 0, False), None)
         self._episodes[:] = 0
 
     @property
@@ -237,7 +237,7 @@ class Simulation:
         return sum(coordinator.switched for coordinator in self.coordinators)
 
     @property
-    def coordinators(self) -> tuple[Coordinator, ...]:
+    def coordinators(self) -> tuple[Referee, ...]:
         """Who says who owns what, one a world; none where all is one zone."""
         return () if self._coordination is None else self._coordination.coordinators
 

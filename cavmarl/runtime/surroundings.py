@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Sequence
 
-from cavmarl.runtime.coordinator import Near
+from cavmarl.runtime.referee import Near
 
 __all__ = ["NearBorders"]
 

@@ -19,7 +19,6 @@ from cavmarl.ownership.messages import (
     Record,
     Removed,
     Step,
-    destinations,
 )
 from cavmarl.ownership.offers import Approach
 from cavmarl.ownership.safeguards import ALL_ON, Safeguards
@@ -74,7 +73,7 @@ class Bench:
 
     def give(self, message: Message, removed: Sequence[int] = ()) -> tuple[Message, ...]:
         """Deliver a message; what its receiver sends, with DONE after a STEP."""
-        destination, *copies = destinations(message)
+        destination, *copies = message.destinations()
         for zone in copies:
             self.trace.delivered(zone, message)
             self.endpoints[zone].on_message(message)

@@ -35,7 +35,6 @@ from cavmarl.ownership.messages import (
     Prepare,
     Record,
     Step,
-    destinations,
 )
 from cavmarl.ownership.offers import Approach, Offers
 from cavmarl.ownership.planning import Plan
@@ -358,7 +357,7 @@ class Explorer:
             number = self._message_numbers.setdefault(message, len(self._messages))
             if number == len(self._messages):
                 self._messages.append(message)
-            items.append((destinations(message)[0], number))
+            items.append((message.destinations()[0], number))
         return frozenset(items)
 
     def _remembered(self, number: int, tick: int) -> bool:

@@ -13,7 +13,7 @@ from cavmarl.ownership.messages import Begin, Commit
 from cavmarl.ownership.records import replay as replay_records
 from cavmarl.ownership.trace import LOG, Trace
 from cavmarl.ownership.transport import Rates
-from cavmarl.runtime.coordinator import Near
+from cavmarl.runtime.referee import Near
 from cavmarl.runtime.fault_plan import Crash, Faults
 from cavmarl.runtime.journal import JournalReader
 from cavmarl.runtime.journal_summary import owners_at
