@@ -40,8 +40,8 @@ class Checked:
     A STEP that is sent again has to say the same, too.
     """
 
-    def __init__(self, deferral: int, lifetime: int = 16) -> None:
-        self._checker = TraceChecker(deferral, lifetime)
+    def __init__(self, deferral: int, lifetime: int = 16, is_direct: bool = False) -> None:
+        self._checker = TraceChecker(deferral, lifetime, is_direct)
         self._sent: dict[tuple[int, int], bytes] = {}
 
     def logged(self, records: Iterable[Record]) -> None:
@@ -105,7 +105,8 @@ def replay(
         wanted["zones.faults"] = faults.to_json()
     vec = make_vec(run.env, num_envs=run.worlds, zones=zones, overrides=wanted)
     for coordinator in vec.simulation.coordinators:
-        coordinator.watch(Checked(vec.simulation.config.zones.max_deferred_ticks))
+        deferral = vec.simulation.config.zones.max_deferred_ticks
+        coordinator.watch(Checked(deferral, is_direct=faults is None))
         for watcher in watchers:
             coordinator.watch(watcher)
     follow(run, vec)

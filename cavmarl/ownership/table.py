@@ -7,11 +7,22 @@ it died with, and anybody else who replays it knows who owns what.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 
 from cavmarl.errors import JournalError, ProtocolError
 from cavmarl.ownership.ledger import SeenIds, Tally
-from cavmarl.ownership.messages import RUN_BYTES, Begin, Commit, Fence, Host, Record, Reset
+from cavmarl.ownership.messages import (
+    RUN_BYTES,
+    Begin,
+    Birth,
+    Commit,
+    Fence,
+    Host,
+    Record,
+    Removed,
+    Reset,
+    Switch,
+)
 from cavmarl.ownership.planning import Plan, make_plan
 from cavmarl.ownership.safeguards import ALL_ON, Safeguards
 from cavmarl.ownership.transitions import Event, Party, State, after
@@ -64,16 +75,38 @@ class Table:
         switching = self.plan is not None and vehicle in self.plan.switches
         return State.SWITCHING if switching else State.OWNED
 
-    def pass_quietly(self) -> None:
-        """Reach the next tick without a record, as a BEGIN and a COMMIT that tell of nobody would.
+    def settle(
+        self,
+        switches: Iterable[Switch] = (),
+        births: Iterable[Birth] = (),
+        removed: Iterable[Removed] = (),
+        tallies: Mapping[int, Tally] | None = None,
+    ) -> None:
+        """Reach the next tick at once, as a BEGIN and a COMMIT with the same contents would.
 
-        For those who keep no log.
+        For a coordinator who has looked at them itself, and whose log, if there is one, has them.
+
+        Args:
+            switches: who changes owner.
+            births: who is new.
+            removed: who has left the world, of those before and of these.
+            tallies: zone → what it owns then; None: the same as before.
 
         Raises:
             ProtocolError: a tick is in progress, or vehicles wait for their transfer.
         """
         if self.plan is not None or self.deferred:
-            raise ProtocolError(f"tick {self.tick + 1} has to be on record")
+            raise ProtocolError(f"tick {self.tick + 1} is in progress")
+        owners = self.owners
+        for vehicle, zone, _ in births:
+            self.seen.add(vehicle)
+            owners[vehicle] = (zone, 0)
+        for vehicle, _, target, epoch, _ in switches:
+            owners[vehicle] = (target, epoch)
+        for vehicle, _ in removed:
+            del owners[vehicle]
+        if tallies is not None:
+            self.tallies = dict(tallies)
         self.tick += 1
 
     def alive(self, zone: int, incarnation: int) -> bool:
@@ -87,13 +120,13 @@ class Table:
             JournalError: a coordinator would not have written it here.
             TransitionError: the same, for one vehicle or zone.
         """
-        match record:
-            case Reset():
-                self._reset(record)
+        match record:  # the frequent ones first
             case Begin():
                 self._begin(record)
             case Commit():
                 self._commit(record)
+            case Reset():
+                self._reset(record)
             case Fence():
                 self._move(record, Event.FENCE)
             case Host():

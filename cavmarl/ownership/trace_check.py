@@ -85,7 +85,7 @@ class TraceChecker:
         longest_deferral: ticks that a vehicle may be with a zone that does not contain it.
         lifetime: ticks after which a state that nobody refreshes is forgotten.
         is_direct: zones and coordinator live in one process, so that there are records alone, and
-            only of ticks that they have something to tell of.
+            perhaps only of ticks that have something to tell of.
 
     Attributes:
         owners: vehicle → owner as of the committed tick.

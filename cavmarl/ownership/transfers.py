@@ -21,7 +21,9 @@ from cavmarl.ownership.messages import (
     Nack,
     Prepare,
     Record,
+    Removed,
     Reset,
+    Switch,
 )
 
 KEPT_ROWS = 10_000
@@ -102,6 +104,7 @@ class _Switching:
     ended_ms: float | None = None
 
 
+_NEVER = _Approach(-1, -1, 0, 0)
 UNKNOWN = _Switching(None, None)
 
 
@@ -139,14 +142,14 @@ class TransferLog:
     def logged(self, records: Iterable[Record]) -> None:
         """Note records, in the order of the log."""
         for record in records:
-            match record:
-                case Reset():
-                    self.episode = record.episode
-                    self._approaches, self._waited, self._begun = {}, {}, None
+            match record:  # the frequent ones first
                 case Begin():
                     self._begin(record)
                 case Commit():
                     self._commit(record)
+                case Reset():
+                    self.episode = record.episode
+                    self._approaches, self._waited, self._begun = {}, {}, None
 
     def delivered(self, destination: int, message: Message) -> None:
         """Note a message that arrived."""
@@ -170,7 +173,7 @@ class TransferLog:
                     if self._approaches.pop((vehicle, message.target, epoch), None) is not None:
                         self.counts["aborted"] += 1
             case Done() if message.confirmed:
-                self.confirmed(vehicle for vehicle, _ in message.confirmed)
+                self._confirmed(message)
             case Ack() if destination == COORDINATOR:
                 self.counts["acknowledged"] += len(message.entries)
             case Nack() if destination == COORDINATOR:
@@ -199,14 +202,23 @@ class TransferLog:
             self.counts["aborted"] += 1
         self.counts["acknowledged"] += len(states)
 
-    def confirmed(self, vehicles: Iterable[int]) -> None:
-        """Note vehicles that their new owners have advanced."""
-        if self._surroundings is None:
-            return
-        for vehicle in vehicles:
-            switching = self._switching.get(vehicle)
-            if switching is not None:
-                switching.ended_ms = self._surroundings.now_ms()
+    def settled(
+        self, episode: int, tick: int, switches: Collection[Switch], removed: Iterable[Removed]
+    ) -> None:
+        """Note who has changed owner in a tick, where no message tells of it.
+
+        Args:
+            episode: of the tick.
+            tick: that is about to be committed.
+            switches: who.
+            removed: who has left the world in it.
+        """
+        around, gone = self._surroundings, {entry.vehicle for entry in removed}
+        now_ms = None if around is None else around.now_ms()
+        for switch in switches:
+            depth_m = None if around is None else around.depth_m(switch.vehicle, switch.target)
+            switching = _Switching(depth_m, now_ms, now_ms)
+            self._note(episode, tick, switch, switching, switch.vehicle in gone)
 
     def _begin(self, record: Begin) -> None:
         self._begun = record
@@ -218,29 +230,45 @@ class TransferLog:
                 depth_m = around.depth_m(switch.vehicle, switch.target)
                 self._switching[switch.vehicle] = _Switching(depth_m, around.now_ms())
 
+    def _confirmed(self, message: Done) -> None:
+        if self._surroundings is None:
+            return
+        for vehicle, _ in message.confirmed:
+            switching = self._switching.get(vehicle)
+            if switching is not None:
+                switching.ended_ms = self._surroundings.now_ms()
+
     def _commit(self, record: Commit) -> None:
         begun, self._begun = self._begun, None
         if begun is None:
             return
         gone = {entry.vehicle for entry in record.removed}
-        for vehicle, source, target, epoch, forced in begun.switches:
-            self.counts["forced" if forced else "switched"] += 1
-            if vehicle in gone:
-                self.counts["removed"] += 1
-            found = self._approaches.pop((vehicle, target, epoch - 1), _Approach(-1, -1, 0, 0))
+        for switch in begun.switches:
+            vehicle = switch.vehicle
             switching = self._switching.get(vehicle, UNKNOWN)
-            began_ms = switching.began_ms if found.began_ms is None else found.began_ms
-            ended_ms = switching.ended_ms
-            self.rows.append(
-                Transfer(
-                    record.episode, record.tick, vehicle, source, target, epoch, forced,
-                    vehicle in gone, found.first, self._waited.get(vehicle, 0), found.offers,
-                    found.state_bytes, found.depth_m, switching.depth_m,
-                    None if began_ms is None or ended_ms is None else ended_ms - began_ms,
-                )
-            )  # fmt: skip
+            self._note(record.episode, record.tick, switch, switching, vehicle in gone)
         self._waited = dict(begun.deferred)
         oldest = record.tick - self._lifetime
         for key in [key for key, known in self._approaches.items() if known.last < oldest]:
             del self._approaches[key]
             self.counts["expired"] += 1
+
+    def _note(
+        self, episode: int, tick: int, switch: Switch, switching: _Switching, removed: bool
+    ) -> None:
+        """Write a row."""
+        vehicle, source, target, epoch, forced = switch
+        self.counts["forced" if forced else "switched"] += 1
+        if removed:
+            self.counts["removed"] += 1
+        found = self._approaches.pop((vehicle, target, epoch - 1), _NEVER)
+        began_ms = switching.began_ms if found.began_ms is None else found.began_ms
+        ended_ms = switching.ended_ms
+        self.rows.append(
+            Transfer(
+                episode, tick, vehicle, source, target, epoch, forced, removed, found.first,
+                self._waited.get(vehicle, 0), found.offers, found.state_bytes, found.depth_m,
+                switching.depth_m,
+                None if began_ms is None or ended_ms is None else ended_ms - began_ms,
+            )
+        )  # fmt: skip

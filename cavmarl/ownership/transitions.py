@@ -14,7 +14,12 @@ from enum import StrEnum
 from cavmarl.errors import TransitionError
 
 
-class Party(StrEnum):
+class _Word(StrEnum):
+    # Tables of words are looked up in every tick: an enumeration's own hash is a call in Python.
+    __hash__ = str.__hash__
+
+
+class Party(_Word):
     """Whose state it is."""
 
     VEHICLE = "a vehicle, at the coordinator"
@@ -23,7 +28,7 @@ class Party(StrEnum):
     REPLICA = "a vehicle's replica, at a zone host"
 
 
-class State(StrEnum):
+class State(_Word):
     """States of all parties."""
 
     UNKNOWN = "UNKNOWN"
@@ -40,7 +45,7 @@ class State(StrEnum):
     PREPARED = "PREPARED"
 
 
-class Event(StrEnum):
+class Event(_Word):
     """What moves them."""
 
     SPAWN = "SPAWN"

@@ -88,6 +88,8 @@ class Coordination:
         self._digests = digests
         self._store = store
         self._monitor = monitor
+        self._rows = [self._live(w) for w in range(len(self.coordinators))]
+        self._in_store = [self._stored(w) for w in range(len(self.coordinators))]
         # Worlds whose rows have changed since their ghosts were renewed.
         self._stirred = [True] * len(self.coordinators)
 
@@ -125,10 +127,11 @@ class Coordination:
         if self._store is not None:
             self._store.write(tuple((c.notes()[0], ()) for c in self.coordinators))
         for w, coordinator in enumerate(self.coordinators):
-            coordinator.end(self._live(w), self._stored(w))
+            coordinator.end(self._rows[w], self._in_store[w])
         if self._store is not None:
             self._store.flip()
-        self.check()
+        if self._monitor is not None:
+            self.check()
 
     def check(self) -> None:
         """Look whether the invariants hold in the tick that has been committed.

@@ -12,6 +12,7 @@ from cavmarl.ownership.endpoint import Endpoint
 from cavmarl.ownership.limits import Limits
 from cavmarl.ownership.messages import (
     COORDINATOR,
+    Begin,
     Output,
     Prepare,
     Record,
@@ -284,7 +285,8 @@ class Coordinator(Referee):
             self.post.send(output.messages)
 
     def _write(self, output: Output) -> None:
-        self._log(output.records)
+        self._record(*output.records)
+        self.switched += sum(len(r.switches) for r in output.records if isinstance(r, Begin))
 
     # Recovery
 

@@ -6,38 +6,24 @@ border is offered, acknowledged and handed over in one call, the new owner takes
 as it is, and a lease is the call that advances a shard. What is decided and written down is the
 same, record by record, as over messages of which none is lost.
 
-A tick in which nobody enters, leaves, or changes its zone is not even written down, unless there is
-a journal.
+Records are made only where somebody reads them: all of them for a journal, and for watchers those
+of ticks in which a vehicle has entered, left, or changed its owner.
 """
 
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Collection, Iterable, Sequence
-from typing import Protocol, runtime_checkable
+from collections.abc import Callable, Iterable, Mapping, Sequence
 
 from cavmarl.errors import LedgerError, ProtocolError
 from cavmarl.ownership.directory import Directory
 from cavmarl.ownership.ledger import Tally, world_digest
-from cavmarl.ownership.messages import Begin, Birth, Commit, Record, Removed, Switch, ZoneLedger
-from cavmarl.ownership.planning import Plan
+from cavmarl.ownership.messages import Begin, Birth, Commit, Removed, Switch, ZoneLedger
+from cavmarl.ownership.transfers import TransferLog
 from cavmarl.runtime.journal import AnyJournal
-from cavmarl.runtime.referee import Entry, Near, Referee, Watcher
+from cavmarl.runtime.referee import Entry, Near, Referee
 
-__all__ = ["DirectCoordinator", "DirectWatcher"]
-
-
-@runtime_checkable
-class DirectWatcher(Watcher, Protocol):
-    """Is told what goes on without messages, too."""
-
-    def approached(self, tick: int, states: Collection[tuple[int, int, int]]) -> None:
-        """(vehicle, target, epoch) of all whom their targets know of, as of a tick."""
-        ...
-
-    def confirmed(self, vehicles: Iterable[int]) -> None:
-        """Vehicles that their new owners have advanced."""
-        ...
+__all__ = ["DirectCoordinator"]
 
 
 class DirectCoordinator(Referee):
@@ -47,78 +33,87 @@ class DirectCoordinator(Referee):
         directory: who owns what.
         journal: takes the records; None: nobody keeps them.
         counts: how many vehicles each zone owns now, by its rows.
+        transfers: told of all that goes on.
     """
 
     def __init__(
-        self, directory: Directory, journal: AnyJournal | None, counts: Callable[[], list[int]]
+        self,
+        directory: Directory,
+        journal: AnyJournal | None,
+        counts: Callable[[], list[int]],
+        transfers: TransferLog,
     ) -> None:
         super().__init__(directory, journal)
         self._counts = counts
-        self._direct_watchers: tuple[DirectWatcher, ...] = ()
+        self._transfers = transfers
         self._is_open = False
         self._pairs: dict[tuple[int, int, int], int] = {}  # vehicle, target, epoch → owner
-        self._told = 0  # how many of them the watchers know of
+        self._has_told = False  # of somebody near, whose approach may be over
+        self._switches: list[Switch] = []
+        self._new: tuple[Birth, ...] = ()
 
     @property
     def is_open(self) -> bool:
         """Whether a tick has been begun and is not committed."""
         return self._is_open
 
-    def watch(self, watcher: Watcher) -> None:
-        """Tell one more of all that happens from now on."""
-        super().watch(watcher)
-        if isinstance(watcher, DirectWatcher):
-            self._direct_watchers = (*self._direct_watchers, watcher)
-
     def reset(self) -> None:
         """Begin an episode without vehicles."""
         self.resume()
-        self._is_open, self._pairs, self._told = False, {}, 0
+        self._is_open, self._pairs, self._has_told = False, {}, False
         directory = self.directory
-        self._log(directory.reset().records)
+        self._record(*directory.reset().records)
         for zone, (_, incarnation) in directory.table.hosts.items():
             if incarnation == 0:
-                self._log(directory.host(zone, worker=0).records)
+                self._record(*directory.host(zone, worker=0).records)
 
     def begin(
         self, near: Sequence[Near], state: Callable[[Near], bytes], inputs: bytes = b""
     ) -> list[Entry]:
         """Hand over whoever is in another zone than its owner's, as `Referee.begin` says."""
         self._is_open, self._removed = True, []
-        births, self._births = self._births, []
-        switches = self._approach(near) if near or self._told else []
-        if not switches and not births and self.journal is None:
-            return []
-        self._plan(tuple(sorted(switches)), births, inputs)
-        return [Entry(switch, None) for switch in switches]
+        self._switches = self._approach(near) if near or self._has_told else []
+        self._new = ()
+        if self._births:
+            self._new, self._births = tuple(sorted(self._births)), []
+            self.directory.check_births(self._new)
+        if self.journal is not None:
+            self._record(self._begun(inputs))
+        return [Entry(switch, None) for switch in self._switches]
 
     def end(self, rows: Callable[[int], int], stored: Callable[[int], int] | None = None) -> None:
         """Commit, if the zones own what they should, as `Referee.end` says."""
         table = self.directory.table
-        removed = tuple(sorted((*self._gone, *self._removed)))
-        if table.plan is None and removed:
-            self._plan((), (), b"")
-        plan = table.plan
-        expected = table.tallies if plan is None else _after(plan, removed, self.directory)
-        owned = [tally.vehicles for tally in expected.values()]
-        for birth in self._births:  # they are in the rows, and will be on record in the next tick
-            owned[birth.zone] += 1
-        counts = self._counts()
-        if counts != owned:
-            raise LedgerError(f"tick {table.tick + 1}: zones own {counts} vehicles, not {owned}")
+        removed: tuple[Removed, ...] = ()
+        tallies: Mapping[int, Tally] | None = None
+        if self._switches or self._new or self._gone or self._removed:
+            removed = tuple(sorted((*self._gone, *self._removed)))
+            tallies = self._tallies(removed)
+        self._check(table.tallies if tallies is None else tallies)
+        is_watched = tallies is not None and self.journal is None and self._watchers
+        began = self._begun() if is_watched else None
+        table.settle(self._switches, self._new, removed, tallies)
         self._is_open, self._gone = False, []
-        if plan is None:
-            table.pass_quietly()
-            return
+        if self._switches:
+            self.switched += len(self._switches)
+            self._transfers.settled(table.episode, table.tick, self._switches, removed)
+        if self.journal is not None:
+            self._record(self._committed(removed, rows))
+        elif began is not None:
+            self._record(began, self._committed(removed, rows))
+
+    def _begun(self, inputs: bytes = b"") -> Begin:
+        table = self.directory.table
+        return Begin(table.episode, table.tick + 1, tuple(self._switches), (), self._new, inputs)
+
+    def _committed(self, removed: tuple[Removed, ...], rows: Callable[[int], int]) -> Commit:
+        table = self.directory.table
         zones = tuple(
-            ZoneLedger(zone, table.hosts[zone][1], tally, rows(zone))
-            for zone, tally in expected.items()
+            ZoneLedger(zone, incarnation, table.tallies[zone], rows(zone))
+            for zone, (_, incarnation) in table.hosts.items()
         )
-        begin, world = plan.record, world_digest(ledger.rows for ledger in zones)
-        if plan.switches:
-            for watcher in self._direct_watchers:
-                watcher.confirmed(plan.switches)
-        self._apply(Commit(begin.episode, begin.tick, removed, zones, world))
+        world = world_digest(ledger.rows for ledger in zones)
+        return Commit(table.episode, table.tick, removed, zones, world)
 
     def in_flight(self) -> list[tuple[int, int, int, str]]:
         """(vehicle, owner, zone that knows that it comes, `prepared`), between two ticks."""
@@ -145,36 +140,45 @@ class DirectCoordinator(Referee):
             pairs[vehicle, target, epoch] = source
             if crossed:
                 switches.append(Switch(vehicle, source, target, epoch + 1, False))
-        for watcher in self._direct_watchers:
-            watcher.approached(self.tick, pairs)
-        self._told = len(pairs)
-        for switch in switches:
-            del pairs[switch.vehicle, switch.target, switch.epoch - 1]
+        self._transfers.approached(self.tick, pairs)
+        self._has_told = bool(pairs)
         self._pairs = pairs
+        if switches:
+            switches.sort()
+            for switch in switches:
+                del pairs[switch.vehicle, switch.target, switch.epoch - 1]
         return switches
 
-    def _plan(self, switches: tuple[Switch, ...], births: Sequence[Birth], inputs: bytes) -> None:
-        table = self.directory.table
-        new = tuple(sorted(births))
-        if new:
-            self.directory.check_births(new)
-        self._apply(Begin(table.episode, table.tick + 1, switches, (), new, inputs))
+    def _tallies(self, removed: Iterable[Removed]) -> Mapping[int, Tally]:
+        """What the zones own after the tick."""
+        table, run = self.directory.table, self.directory.run
+        tallies = dict(table.tallies)
+        moved: dict[int, tuple[int, int]] = {}
+        for vehicle, zone, _ in self._new:
+            tallies[zone] = tallies[zone].plus(run, vehicle, 0)
+            moved[vehicle] = (zone, 0)
+        for vehicle, source, target, epoch, _ in self._switches:
+            tallies[source] = tallies[source].minus(run, vehicle, epoch - 1)
+            tallies[target] = tallies[target].plus(run, vehicle, epoch)
+            moved[vehicle] = (target, epoch)
+        for vehicle, _ in removed:
+            zone, epoch = moved.get(vehicle) or table.owners.get(vehicle, (-1, -1))
+            if zone < 0:
+                raise LedgerError(f"vehicle {vehicle} has left the world, and nobody owned it")
+            tallies[zone] = tallies[zone].minus(run, vehicle, epoch)
+        return tallies
 
-    def _apply(self, record: Record) -> None:
-        self.directory.table.apply(record)
-        self._log((record,))
+    def _check(self, expected: Mapping[int, Tally]) -> None:
+        """Compare what zones should own with their rows.
 
-
-def _after(plan: Plan, removed: Iterable[Removed], directory: Directory) -> dict[int, Tally]:
-    """Zone → what it owns when a plan is carried out and vehicles have been removed.
-
-    Raises:
-        LedgerError: nobody owns one of these.
-    """
-    expected, owners = dict(plan.expected), directory.table.owners
-    for vehicle, _ in removed:
-        zone, epoch = plan.owner(vehicle, owners)
-        if zone < 0:
-            raise LedgerError(f"vehicle {vehicle} is removed, which nobody owns")
-        expected[zone] = expected[zone].minus(directory.run, vehicle, epoch)
-    return expected
+        Raises:
+            LedgerError: a zone has more or fewer.
+        """
+        owned = [vehicles for vehicles, _ in expected.values()]
+        for birth in self._births:  # they are in the rows, and will be on record in the next tick
+            owned[birth.zone] += 1
+        counts = self._counts()
+        if counts != owned:
+            raise LedgerError(
+                f"on the way to tick {self.tick + 1} zones own {counts} vehicles, not {owned}"
+            )

@@ -7,7 +7,7 @@ had it as a ghost already, and goes on with the state that it was sent.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from typing import NamedTuple
 
@@ -245,9 +245,9 @@ class Division:
             for vehicle in shard.worlds.rows["id"][w, : shard.worlds.num_owned[w]].tolist()
         ]
 
-    def counts(self, w: int) -> list[int]:
-        """How many vehicles of a world each zone owns."""
-        counts: list[int] = self._zoned.num_owned[:, w].tolist()
+    def counter(self, w: int) -> Callable[[], list[int]]:
+        """Tells how many vehicles of a world each zone owns."""
+        counts: Callable[[], list[int]] = self._zoned.num_owned[:, w].tolist
         return counts
 
     def running(self) -> NDArray[np.int64]:

@@ -15,7 +15,7 @@ from collections.abc import Callable, Iterable, Sequence
 from typing import NamedTuple, Protocol
 
 from cavmarl.ownership.directory import Directory
-from cavmarl.ownership.messages import Begin, Birth, Message, Record, Removed, Switch
+from cavmarl.ownership.messages import Birth, Message, Record, Removed, Switch
 from cavmarl.runtime.journal import AnyJournal
 
 __all__ = ["Entry", "Near", "Referee", "Watcher"]
@@ -151,10 +151,9 @@ class Referee(ABC):
     def dropped(self) -> Counter[tuple[str, str]]:
         """(kind, reason) → messages or entries that did not count, at any of the parties."""
 
-    def _log(self, records: tuple[Record, ...]) -> None:
+    def _record(self, *records: Record) -> None:
         """Write records down."""
         if self.journal is not None:
             self.journal.append(records)
-        self.switched += sum(len(r.switches) for r in records if isinstance(r, Begin))
         for watcher in self._watchers:
             watcher.logged(records)

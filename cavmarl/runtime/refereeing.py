@@ -87,11 +87,11 @@ def make_refereeing(
     states = [RowStates(division, w) for w in range(division.num_worlds)]
     transfers = tuple(TransferLog(limits.lifetime, known.borders) for known in states)
     coordinators = [
-        _referee(settings, w, division, states[w], limits, faults, crashes, safeguards)
+        _referee(
+            settings, w, division, states[w], limits, transfers[w], faults, crashes, safeguards
+        )
         for w in range(division.num_worlds)
     ]
-    for coordinator, log in zip(coordinators, transfers, strict=True):
-        coordinator.watch(log)
     digests = RowDigests() if settings.journal or deaths else None
     monitor = _monitor(division, coordinators, limits, dt) if settings.check else None
     dying = coordinators[0]
@@ -111,6 +111,7 @@ def _referee(
     division: Division,
     states: RowStates,
     limits: Limits,
+    transfers: TransferLog,
     faults: Faults | None,
     crashes: Crashes | None,
     safeguards: Safeguards,
@@ -124,11 +125,15 @@ def _referee(
         journal = MemoryJournal()
     if faults is None:
         directory = Directory(run, range(zones), states, limits, safeguards)
-        return DirectCoordinator(directory, journal, lambda: division.counts(w))
+        return DirectCoordinator(directory, journal, division.counter(w), transfers)
     arguments = (run, zones, states, limits, Network(faults.plan()), journal, safeguards)
-    if crashes is None:
-        return Coordinator(*arguments)
-    return FaultyCoordinator(*arguments, crashes=crashes)
+    coordinator = (
+        Coordinator(*arguments)
+        if crashes is None
+        else FaultyCoordinator(*arguments, crashes=crashes)
+    )
+    coordinator.watch(transfers)
+    return coordinator
 
 
 def _monitor(

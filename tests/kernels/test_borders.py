@@ -138,7 +138,7 @@ def ids(zoned: Zoned, zone: int, first: int, last: int) -> set[int]:
 @pytest.mark.parametrize("vehicle", [10, 11, 12])
 def test_who_is_passed_on_is_a_ghost_here_and_owned_there(vehicle: int, hint: int) -> None:
     zoned = two_zones()
-    assert pass_on(vehicle, 0, hint, 1, zoned, SIDE, 0) == 2
+    assert pass_on(vehicle, 0, hint, 1, 5, zoned, SIDE, 0) == 2
     assert zoned.num_owned[:, 0].tolist() == [2, 3]
     assert zoned.num_rows[:, 0].tolist() == [5, 5]
     assert ids(zoned, 1, 2, 3) == {vehicle}
@@ -153,6 +153,6 @@ def test_nobody_is_passed_on_who_is_not_owned_or_has_no_ghost(vehicle: int, why:
     zoned = two_zones()
     zoned.rows["id"][SIDE, 0, 0, 1] = 13  # whom the other zone has not seen
     before = zoned.rows.copy()
-    assert pass_on(vehicle, 0, 0, 1, zoned, SIDE, 0) == why
+    assert pass_on(vehicle, 0, 0, 1, 5, zoned, SIDE, 0) == why
     assert zoned.num_owned[:, 0].tolist() == [3, 2]
     assert (zoned.rows == before).all()

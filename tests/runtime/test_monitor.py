@@ -261,9 +261,8 @@ def test_an_arrival_that_nobody_has_told_of(
     ("kind", "words"),
     [(Ack, "without an ACK of tick"), (Done, "has not said DONE")],
 )
-def test_a_step_of_a_transfer_that_is_left_out(
-    simulation: Simulation, kind: type[Message], words: str
-) -> None:
+def test_a_step_of_a_transfer_that_is_left_out(kind: type[Message], words: str) -> None:
+    simulation = watched(**{"zones.faults": "{}"})
     coordination: Any = simulation._coordination
     coordinator = coordination.coordinators[0]
     (record,) = coordinator._watchers[1:]
@@ -283,14 +282,16 @@ def test_a_step_of_a_transfer_that_is_left_out(
         long_drive()
 
 
-def test_the_monitor_takes_as_much_memory_as_it_began_with(simulation: Simulation) -> None:
+@pytest.mark.parametrize("faults", ["", "{}"], ids=["directly", "by messages"])
+def test_the_monitor_takes_as_much_memory_as_it_began_with(faults: str) -> None:
+    simulation = watched(**{"zones.faults": faults})
     coordination: Any = simulation._coordination
     monitor = coordination._monitor
     kept = monitor._kept
     for _ in range(100):
         drive(simulation)
     assert monitor._kept is kept
-    checker = coordination.coordinators[0]._watchers[1]._checker
+    checker = coordination.coordinators[0]._watchers[-1]._checker
     assert len(checker.owners) <= simulation.capacity
     assert len(checker._born.above) <= simulation.capacity
     assert len(checker._holdings) <= 18
