@@ -75,18 +75,20 @@ def rank_lanes(
             last = departure["pos_code"] == POS_LAST
             if not (chooses or last):
                 continue
-            if not indexed:
-                rows = worlds.next_rows[w]
-                index_lanes(roads, travel, rows, worlds.num_rows[w], scratch)
-                indexed = True
             edge = roads.edges[roads.lanes[departure["lane"]]["edge"]]
             first = edge["first_lane"]
             s = max(departure["pos"], 0.0)
             for lane in range(first, first + edge["num_lanes"]):
                 on_lane = min(s, roads.lanes[lane]["length_m"])
-                if chooses and _zone_on(roads, zones, lane, on_lane) == zone:
+                ranked = chooses and _zone_on(roads, zones, lane, on_lane) == zone
+                placed = last and _zone_on(roads, zones, lane, 0.0) == zone
+                if (ranked or placed) and not indexed:
+                    rows = worlds.next_rows[w]
+                    index_lanes(roads, travel, rows, worlds.num_rows[w], scratch)
+                    indexed = True
+                if ranked:
                     gate.ranks[w, q, lane - first] = crowd(scratch, lane, s, travel.view_m)
-                if last and _zone_on(roads, zones, lane, 0.0) == zone:
+                if placed:
                     kind = travel.types[departure["vtype"]]
                     gate.last_s[w, q, lane - first] = entry_place(
                         roads,
@@ -189,7 +191,7 @@ def propose(
         rows = worlds.next_rows[w]
         num = worlds.num_rows[w]
         key = worlds.keys[w]
-        index_lanes(roads, travel, rows, num, scratch)
+        indexed = False
         for q in range(gate.num_queue[w]):
             lane = gate.tries[w, q]
             if lane < 0:
@@ -205,6 +207,9 @@ def propose(
                 )
             if _zone_on(roads, zones, lane, s) != zone:
                 continue
+            if not indexed:
+                index_lanes(roads, travel, rows, num, scratch)
+                indexed = True
             speed = entry_speed(roads, travel, key, departure, kind, lane, s, scratch)
             if speed < 0.0:
                 continue

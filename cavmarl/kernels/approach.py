@@ -37,7 +37,13 @@ APPROACH = np.dtype(
 
 @kernel
 def register_links(
-    roads: RoadArrays, travel: Travel, rows: NDArray[np.void], num: int, scratch: Scratch
+    roads: RoadArrays,
+    travel: Travel,
+    rows: NDArray[np.void],
+    num: int,
+    step: NDArray[np.void],
+    step_at: NDArray[np.int64],
+    scratch: Scratch,
 ) -> None:
     """List for every link the vehicles that are on it or will reach it, into `scratch.approach`.
 
@@ -48,7 +54,9 @@ def register_links(
         travel: the ways.
         rows: VEHICLE (C,), of which `num` live.
         num: live rows.
-        scratch: step, the lists by link and approach are written.
+        step: PLAN (C,) of each row the step of its lane; written where it is another one.
+        step_at: (C,) which one that is, see `Worlds`; written.
+        scratch: the lists by link and approach are written.
     """
     pairs = 0
     for first in range(0, num, BLOCK):
@@ -58,11 +66,11 @@ def register_links(
         # where they were a tick before, with the same vehicle on the same lane.
         for i in range(first, last):
             at = own_step(roads, rows[i])
-            if at != scratch.step_at[i] or at >= travel.num_fixed:
-                scratch.step[i] = travel.steps[at]
-                scratch.step_at[i] = at
+            if at + 1 != step_at[i] or at >= travel.num_fixed:
+                step[i] = travel.steps[at]
+                step_at[i] = at + 1
         for i in range(first, last):
-            pairs = _announce(roads, travel, rows[i], i, pairs, scratch)
+            pairs = _announce(roads, travel, rows[i], i, step[i], pairs, scratch)
     end = scratch.link_end
     forget(scratch.links)
     for k in range(pairs):
@@ -88,9 +96,15 @@ def _note(scratch: Scratch, pairs: int, link: int, row: np.void, i: int, dist: f
 
 @inlined_kernel
 def _announce(
-    roads: RoadArrays, travel: Travel, row: np.void, i: int, pairs: int, scratch: Scratch
+    roads: RoadArrays,
+    travel: Travel,
+    row: np.void,
+    i: int,
+    step: np.void,
+    pairs: int,
+    scratch: Scratch,
 ) -> int:
-    """Append row i's entries; returns the new number of pairs."""
+    """Append row i's entries; returns the new number of pairs. `step` is its own one."""
     lane = row["lane"]
     here = roads.lanes[lane]
     s = row["s"]
@@ -108,7 +122,7 @@ def _announce(
     found = 0
     while distance < reach:
         if lane == row["lane"] and way == row["way"]:
-            lane, way, link = leave(roads, scratch.step[i], lane, way)
+            lane, way, link = leave(roads, step, lane, way)
         else:
             lane, way, link = next_step(roads, travel, lane, way)
         if lane < 0:

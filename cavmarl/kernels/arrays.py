@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from cavmarl.kernels.buckets import Lists
 
 __all__ = [
+    "Common",
     "Demand",
     "Gate",
     "LaneGrid",
@@ -73,6 +74,17 @@ class Travel(NamedTuple):
     num_fixed: int  # steps from here on are written while the world runs
 
 
+class Common(NamedTuple):
+    """What the shards of one process have in common of W worlds; see `Worlds`."""
+
+    ticks: NDArray[np.int64]
+    keys: NDArray[np.uint64]
+    signal_phase: NDArray[np.int32]
+    controllers: NDArray[np.void]
+    detected_s: NDArray[np.float64]
+    pending: NDArray[np.float64]
+
+
 class Worlds(NamedTuple):
     """A shard's part of W worlds: the vehicles and signals that a tick reads and writes.
 
@@ -96,15 +108,22 @@ class Worlds(NamedTuple):
     num_near: NDArray[np.int64]  # (W,) the first ghosts, up to here, can touch owned vehicles
     num_touching: NDArray[np.int64]  # (W,) owned vehicles that touched another before this tick
     num_contacts: NDArray[np.int64]  # (W,) vehicles that began to touch another, since reset
+    step: NDArray[np.void]  # PLAN (W, C) of each row the step of its lane, see `ways.own_step`
+    step_at: NDArray[np.int64]  # (W, C) 1 + which of `Travel.steps` that is, 0: none yet
 
 
 class Zoned(NamedTuple):
-    """The rows of all k zones of W worlds side by side; each shard's `Worlds` are views of it."""
+    """What all k zones have of W worlds, side by side; each shard's `Worlds` are views of it."""
 
     rows: NDArray[np.void]  # VEHICLE (2, k, W, C) what `rows` and `next_rows` are views of
     num_owned: NDArray[np.int64]  # (k, W)
     num_rows: NDArray[np.int64]  # (k, W)
     num_near: NDArray[np.int64]  # (k, W)
+    num_through: NDArray[np.int64]  # (k, W)
+    num_touching: NDArray[np.int64]  # (k, W)
+    num_contacts: NDArray[np.int64]  # (k, W)
+    step: NDArray[np.void]  # PLAN (k, W, C)
+    step_at: NDArray[np.int64]  # (k, W, C)
     border: NDArray[np.int32]  # (k, W, C) owned rows that are noted at a border, rising
     num_border: NDArray[np.int64]  # (k, W)
     spare: NDArray[np.void]  # VEHICLE (1,)
@@ -149,14 +168,12 @@ class Demand(NamedTuple):
 
 
 class Scratch(NamedTuple):
-    """Room that a tick works in; between calls it knows which lists to clear, and fixed steps."""
+    """Room that a tick works in; between calls it knows nothing but which lists to clear."""
 
     lanes: Lists  # by lane, lists of entries
     lane_start: NDArray[np.int32]  # entries of lane l: [lane_start[l], lane_end[l]); at L: of all.
     lane_end: NDArray[np.int32]  # Both are views of `lanes.bounds`: one look into memory
     entries: NDArray[np.void]  # ENTRY (2 C,) vehicles by (lane, s, id), side lanes included
-    step: NDArray[np.void]  # PLAN (C,) of each row the step of its lane, see `ways.own_step`
-    step_at: NDArray[np.int64]  # (C,) which of `Travel.steps` that is, -1: none yet
     links: Lists  # by link, lists of approach
     link_start: NDArray[np.int32]  # approach of link k: [link_start[k], link_end[k])
     link_end: NDArray[np.int32]

@@ -227,12 +227,15 @@ def _road_ahead(
     travel: Travel,
     rows: NDArray[np.void],
     k: int,
+    step: np.void,
     phase: NDArray[np.int32],
     merge_room_m: float,
     dt: float,
     scratch: Scratch,
 ) -> tuple[float, float, int, int]:
     """Walk the way of entry k: (press, allowed speed, why it holds, link near its line).
+
+    `step` is its own one.
 
     Who stands close behind its leader, too far from the line to look at it, need not: nothing that
     lies further ahead could make it stay more. Before the end of a lane that its way does not
@@ -286,7 +289,7 @@ def _road_ahead(
         before = lane
         before_way = way
         if before == row["lane"] and before_way == row["way"]:
-            lane, way, link = leave(roads, scratch.step[i], before, way)
+            lane, way, link = leave(roads, step, before, way)
         else:
             lane, way, link = next_step(roads, travel, before, way)
         if lane < 0:
@@ -389,6 +392,7 @@ def decide(
     tick: int,
     dt: float,
     phase: NDArray[np.int32],
+    step: NDArray[np.void],
     scratch: Scratch,
 ) -> None:
     """Decide acceleration and lane change of all vehicles of one kind of driver in one world.
@@ -402,6 +406,7 @@ def decide(
         tick: of the committed state.
         dt: seconds of a tick.
         phase: (num_signals,) PHASE rows that are on.
+        step: PLAN (C,) of each row the step of its lane.
         scratch: with the lane and link indices of this tick; accel (m/s²), lane_change, blinker,
             hold and link_ahead are written.
     """
@@ -414,14 +419,14 @@ def decide(
         kind = travel.types[row["vtype"]]
         speed = row["speed"]
         press, allowed, hold, link_ahead = _road_ahead(
-            roads, travel, rows, k, phase, MERGE_ROOM_M, dt, scratch
+            roads, travel, rows, k, step[i], phase, MERGE_ROOM_M, dt, scratch
         )
         to_stop = way_to_stop(roads, travel, row)
         if to_stop < math.inf:
             press = max(press, before_line(kind, speed, to_stop + LINE_MARGIN_M, dt))
         if row["side_lane"] >= 0:
             press = max(press, _beside(roads, travel, kind, row, row["side_lane"], scratch))
-        needed = needed_change(roads, travel, row, scratch.step[i])
+        needed = needed_change(roads, travel, row, step[i])
         change = 0
         if thinks_of_lanes(row, needed, tick, dt):
             own_wish = wish(kind, speed, allowed, press)
@@ -430,7 +435,9 @@ def decide(
             # A steered vehicle on its way into a neighbour lane still minds its own lane, to the
             # very end, and already the leader in the other one.
             lane = roads.lanes[row["lane"]]
-            press, allowed, _, _ = _road_ahead(roads, travel, rows, k, phase, 0.0, dt, scratch)
+            press, allowed, _, _ = _road_ahead(
+                roads, travel, rows, k, step[i], phase, 0.0, dt, scratch
+            )
             target = lane["left"] if change > 0 else lane["right"]
             press = max(press, _beside(roads, travel, kind, row, target, scratch))
         share = 0.0
@@ -440,7 +447,7 @@ def decide(
         if needed != 0 and change == 0 and driver == DRIVER_BACKGROUND:
             lane = roads.lanes[row["lane"]]
             target = lane["left"] if needed > 0 else lane["right"]
-            room = scratch.step[i]["room"] - row["s"]
+            room = step[i]["room"] - row["s"]
             if target >= 0 and room < FALL_IN_M:
                 # Fall in behind whom it wants to follow on the other lane.
                 fall_in = wish(

@@ -176,14 +176,26 @@ def advance(
     arrived = 0
     for w in range(worlds.ticks.shape[0]):
         rows = worlds.rows[w]
+        step = worlds.step[w]
         owned = worlds.num_owned[w]
         drivers = _any_driver(rows, owned, DRIVER_BACKGROUND)
         if drivers:
             phase = worlds.signal_phase[w]
             index_lanes(roads, travel, rows, worlds.num_rows[w], scratch)
-            register_links(roads, travel, rows, worlds.num_rows[w], scratch)
+            register_links(
+                roads, travel, rows, worlds.num_rows[w], step, worlds.step_at[w], scratch
+            )
             decide(
-                roads, travel, rows, owned, DRIVER_BACKGROUND, worlds.ticks[w], dt, phase, scratch
+                roads,
+                travel,
+                rows,
+                owned,
+                DRIVER_BACKGROUND,
+                worlds.ticks[w],
+                dt,
+                phase,
+                step,
+                scratch,
             )
         if drivers and not in_place:
             _order_by_lane(roads, owned, scratch)
@@ -219,7 +231,7 @@ def advance(
             if scratch.link_ahead[i] >= 0 and row["wait_s"] >= STOP_SIGN_S:
                 row["stopped_at"] = scratch.link_ahead[i]
             move_background(
-                roads, travel, row, scratch.step[i], scratch.accel[i], scratch.lane_change[i], dt
+                roads, travel, row, step[i], scratch.accel[i], scratch.lane_change[i], dt
             )
             through += row["events"] & EVENT_ARRIVED
         worlds.num_through[w] = through
@@ -286,8 +298,9 @@ def suggest(
         owned = worlds.num_owned[w]
         phase = worlds.signal_phase[w]
         index_lanes(roads, travel, rows, worlds.num_rows[w], scratch)
-        register_links(roads, travel, rows, worlds.num_rows[w], scratch)
-        decide(roads, travel, rows, owned, DRIVER_AGENT, worlds.ticks[w], dt, phase, scratch)
+        step = worlds.step[w]
+        register_links(roads, travel, rows, worlds.num_rows[w], step, worlds.step_at[w], scratch)
+        decide(roads, travel, rows, owned, DRIVER_AGENT, worlds.ticks[w], dt, phase, step, scratch)
         for i in range(owned):
             row = rows[i]
             if row["driver"] != DRIVER_AGENT:

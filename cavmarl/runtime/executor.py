@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import Any, Literal, Protocol
 
-from cavmarl.shard.shard import Shard
+__all__ = ["Executor", "Phase"]
 
-__all__ = ["Executor", "Phase", "SerialExecutor"]
-
-# The methods of a shard that a tick is made of: a name and its arguments can be sent anywhere.
+# What a tick is made of, by the names of methods of `ShardGroup` or `Shard`: a name and its
+# arguments can be sent anywhere.
 Phase = Literal[
     "begin_step",
     "advance",
@@ -35,15 +33,3 @@ class Executor(Protocol):
     def each(self, phase: Phase, *arguments: Any) -> None:
         """Call the method `phase` of every shard with the same arguments."""
         ...
-
-
-class SerialExecutor:
-    """All shards in the caller's process, one after the other."""
-
-    def __init__(self, shards: Sequence[Shard]) -> None:
-        self._shards = tuple(shards)
-
-    def each(self, phase: Phase, *arguments: Any) -> None:
-        """Call the method `phase` of every shard, in order."""
-        for shard in self._shards:
-            getattr(shard, phase)(*arguments)

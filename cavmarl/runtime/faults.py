@@ -17,6 +17,7 @@ from cavmarl.runtime.coordinator import Coordinator
 from cavmarl.runtime.executor import Phase
 from cavmarl.runtime.fault_plan import PHASES, Crash, Faults
 from cavmarl.runtime.post import Parcel
+from cavmarl.shard.group import ShardGroup
 from cavmarl.shard.shard import Shard
 
 __all__ = [
@@ -112,7 +113,7 @@ class Crashes:
 
 
 class FaultyPhases:
-    """Runs the phases of a tick as `SerialExecutor` does; hosts die after their part of one.
+    """Runs the phases of a tick zone by zone; hosts die after their part of one.
 
     Args:
         shards: all of them.
@@ -120,17 +121,17 @@ class FaultyPhases:
     """
 
     def __init__(self, shards: Sequence[Shard], crashes: Crashes) -> None:
-        self._shards = tuple(shards)
+        self._hosts = [(shard.zone, ShardGroup((shard,))) for shard in shards]
         self._crashes = crashes
         self.on = False
 
     def each(self, phase: Phase, *arguments: Any) -> None:
-        """Call the method `phase` of every shard, in order, while all live."""
+        """Run a phase on every shard, in order, while all live."""
         watched = self.on and phase in PHASES
-        for shard in self._shards:
-            getattr(shard, phase)(*arguments)
+        for zone, host in self._hosts:
+            host.each(phase, *arguments)
             if watched:
-                self._crashes.zone(phase, shard.zone)
+                self._crashes.zone(phase, zone)
         if watched:
             self._crashes.coordinator(phase)
 

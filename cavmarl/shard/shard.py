@@ -12,10 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cavmarl.config import EnvConfig
-from cavmarl.kernels.admission import admit, propose, rank_lanes
 from cavmarl.kernels.approach import APPROACH
 from cavmarl.kernels.arrays import (
-    Demand,
+    Common,
     Gate,
     LaneGrid,
     Outputs,
@@ -27,17 +26,15 @@ from cavmarl.kernels.arrays import (
 )
 from cavmarl.kernels.buckets import make_lists
 from cavmarl.kernels.codes import DRIVER_AGENT, DRIVER_BACKGROUND
-from cavmarl.kernels.departures import choose_goals
 from cavmarl.kernels.lanes import ENTRY
 from cavmarl.kernels.leaving import drop_ghosts, leave
 from cavmarl.kernels.neighbors import make_grid
 from cavmarl.kernels.observe_further import observe_further
 from cavmarl.kernels.outputs import credit
-from cavmarl.kernels.repeated import repeated
 from cavmarl.kernels.sense import sense
 from cavmarl.kernels.signals import detect
 from cavmarl.kernels.stacking import fill_stacks
-from cavmarl.kernels.tick import advance, begin_step, resolve, suggest
+from cavmarl.kernels.tick import begin_step, suggest
 from cavmarl.kernels.zones import Halo, ZoneArrays
 from cavmarl.roads.network import RoadNetwork
 from cavmarl.roads.routing import PLAN, lane_grid
@@ -48,8 +45,7 @@ from cavmarl.shard.vehicles import VEHICLE
 __all__ = ["Commands", "Shard", "make_worlds", "make_zoned"]
 
 CELL_M = 25.0  # of the spatial index over vehicles
-# Fields of `Worlds` that the shards of one world have in common.
-COMMON = ("ticks", "keys", "signal_phase", "controllers", "detected_s", "pending")
+COMMON = Common._fields
 TICKS_IN_ORDER = 32  # for so long rows that have been put in the order of the lanes nearly stay so
 SUGGESTED_HORIZON_S = 1.0  # in which a suggested target speed is to be reached
 
@@ -101,17 +97,18 @@ class Shard:
         first: Shard | None = None,
     ) -> None:
         self.zone = zone
-        self._zones = zones
-        self._halo = halo
-        self._config = config
-        self._roads: RoadArrays = network.arrays
-        self._plans = plans
-        self._travel = travel
-        self._lane_grid: LaneGrid = lane_grid(network)
+        self.zoned = zoned
+        self.zones = zones
+        self.halo = halo
+        self.config = config
+        self.roads: RoadArrays = network.arrays
+        self.plans = plans
+        self.travel = travel
+        self.lane_grid: LaneGrid = lane_grid(network)
         self._sensors = sensor_arrays(config.sensors)
         self._further = further_arrays(config.sensors, network, plans)
         num_worlds, capacity = zoned.rows.shape[2:]
-        self._grid = make_grid(_seen(network, zones, zone, halo.halo_m), CELL_M, capacity)
+        self.grid = make_grid(_seen(network, zones, zone, halo.halo_m), CELL_M, capacity)
         # One after the other works in it: what the last one has left is still near in memory.
         self.scratch: Scratch = (
             _make_scratch(len(network.lanes), len(network.links), capacity)
@@ -130,15 +127,10 @@ class Shard:
         )
         # Between ticks `next_rows` is `rows`; a tick that puts rows in order uses the other side.
         self.sides = (self.worlds.rows, zoned.rows[1, zone])
-        self._spare_rows = self.sides[1]
+        self.side = self.next_side = 0
         self.outputs = outputs
         self._target_speeds = np.array(config.action.target_speeds_mps)
         self._discrete = config.action.kind == "discrete"
-        self._controls = np.zeros((num_worlds, config.population.num_ids, 2))
-        self._num_through = 0
-        self._call_advance = repeated(advance)
-        self._call_resolve = repeated(resolve)
-        self._call_choose_goals = repeated(choose_goals)
 
     def detect(self) -> None:
         """Note when owned bodies were over the detectors of actuated signals."""
@@ -146,134 +138,82 @@ class Shard:
         if worlds.controllers.shape[1] == 0:
             return
         detect(
-            self._roads.lane_place,
-            self._roads.places,
+            self.roads.lane_place,
+            self.roads.places,
             worlds.rows,
             worlds.num_owned,
             worlds.ticks,
-            self._config.clock.sim_dt_s,
+            self.config.clock.sim_dt_s,
             worlds.detected_s,
         )
 
     def begin_step(self, commands: Commands) -> None:
         """Open the accounts of a step and take its meta-actions."""
-        if self._config.population.agents == 0:
+        if self.config.population.agents == 0:
             return
         begin_step(
-            self._roads, self.worlds, self._discrete, commands.meta_actions, self._target_speeds
+            self.roads, self.worlds, self._discrete, commands.meta_actions, self._target_speeds
         )
 
-    def advance(self, commands: Commands) -> None:
-        """Decide every control from the committed rows and move the owned ones into `next_rows`."""
-        action = self._config.action
-        if self._controls.size:
-            np.copyto(self._controls, commands.controls)
-        # Where a host may die alone, a store keeps tick t whole (docs/ownership.md).
-        in_place = bool(self.worlds.ticks[0] % TICKS_IN_ORDER)
-        if not in_place:
-            self.worlds = self.worlds._replace(next_rows=self._spare_rows)
-        self._num_through = self._call_advance(
-            self._roads,
-            self._plans,
-            self._travel,
-            self._lane_grid,
-            self.worlds,
-            self.scratch,
-            self._controls,
-            self._discrete,
-            action.acceleration_mps2,
-            action.steering_rad,
-            self._config.clock.sim_dt_s,
-            in_place,
-        )
-
-    def resolve(self) -> None:
-        """Find who touches whom in `next_rows`."""
-        self._call_resolve(self.worlds, self.scratch, self._grid)
-
-    def choose_goals(self, demand: Demand, num_goals: int, gate: Gate) -> None:
-        """Give the vehicles of `next_rows` that need it another goal."""
-        dt = self._config.clock.sim_dt_s
-        self._call_choose_goals(demand, self._roads, self._travel, num_goals, gate, self.worlds, dt)
+    def turn(self) -> None:
+        """Let the next rows be on the other side, for a tick that puts rows in order."""
+        self._face(self.side, 1 - self.side)
 
     def leave(self, gate: Gate) -> None:
         """Hand the background vehicles of `next_rows` that have arrived to the gate."""
-        if self._num_through == 0:
+        if not self.worlds.num_through.any():
             return
         leave(gate, self.worlds, self.worlds.next_rows, DRIVER_BACKGROUND, 1)
 
     def retire(self, gate: Gate) -> None:
         """Hand the agents' vehicles of the committed rows whose trip has ended to the gate."""
-        ticks = self._config.clock.ticks_per_step
+        ticks = self.config.clock.ticks_per_step
         leave(gate, self.worlds, self.worlds.rows, DRIVER_AGENT, ticks)
 
     def forget(self, gate: Gate) -> None:
         """Drop the ghosts of those who have been retired."""
         drop_ghosts(gate, self.worlds, self.worlds.rows)
 
-    def rank_lanes(self, gate: Gate) -> None:
-        """Count who is around the places of this zone where departures may enter."""
-        rank_lanes(
-            self._roads, self._travel, self._zones, self.zone, gate, self.worlds, self.scratch
-        )
-
-    def propose(self, demand: Demand, gate: Gate) -> None:
-        """Tell the gate which departures find a safe gap in this zone."""
-        propose(
-            demand,
-            self._roads,
-            self._travel,
-            self._zones,
-            self.zone,
-            gate,
-            self.worlds,
-            self.scratch,
-        )
-
-    def admit(self, gate: Gate) -> None:
-        """Take in those whom the gate has accepted, as owned or as ghosts."""
-        admit(self._zones, self._halo, self.zone, gate, self.worlds)
-
     def commit(self) -> None:
-        """Make `next_rows` the committed state."""
-        worlds = self.worlds
-        if worlds.next_rows is not worlds.rows:
-            self._spare_rows = worlds.rows
-            self.worlds = worlds._replace(rows=worlds.next_rows)
+        """Make the next rows the committed state."""
+        self._face(self.next_side, self.next_side)
 
     def align(self) -> None:
         """Keep the rows on the first side, wherever a tick that is given up has them."""
-        rows, self._spare_rows = self.sides
-        self.worlds = self.worlds._replace(rows=rows, next_rows=rows)
+        self._face(0, 0)
+
+    def _face(self, side: int, next_side: int) -> None:
+        self.side, self.next_side = side, next_side
+        self.worlds = self.worlds._replace(rows=self.sides[side], next_rows=self.sides[next_side])
 
     def sense(self, chosen: NDArray[np.bool_]) -> None:
         """Write observations and terms of the chosen worlds' owned agents into `outputs`."""
         sense(
-            self._roads,
-            self._plans,
-            self._travel,
+            self.roads,
+            self.plans,
+            self.travel,
             self.worlds,
-            self._grid,
+            self.grid,
             self._sensors,
-            self._config.clock.sim_dt_s,
-            self._config.clock.ticks_per_step,
+            self.config.clock.sim_dt_s,
+            self.config.clock.ticks_per_step,
             chosen,
             self.outputs,
         )
-        observations, stack = self.outputs.observations, self._config.sensors.stack
+        observations, stack = self.outputs.observations, self.config.sensors.stack
         if self._further is not None:
             observe_further(
-                self._roads,
-                self._lane_grid,
+                self.roads,
+                self.lane_grid,
                 self.worlds,
-                self._grid,
+                self.grid,
                 self._further,
                 stack,
                 chosen,
                 observations,
             )
         if stack > 1:
-            ticks_per_step = self._config.clock.ticks_per_step
+            ticks_per_step = self.config.clock.ticks_per_step
             fill_stacks(self.worlds, ticks_per_step, stack, chosen, observations)
 
     def credit(self, chosen: NDArray[np.bool_]) -> None:
@@ -283,15 +223,15 @@ class Shard:
     def suggest(self, out: NDArray[np.float64]) -> None:
         """Write what the built-in driver would do in the agents' place into `out` (W, A, 2)."""
         suggest(
-            self._roads,
-            self._plans,
-            self._travel,
+            self.roads,
+            self.plans,
+            self.travel,
             self.worlds,
             self.scratch,
             self._discrete,
             self._target_speeds,
             SUGGESTED_HORIZON_S,
-            self._config.clock.sim_dt_s,
+            self.config.clock.sim_dt_s,
             out,
         )
 
@@ -325,11 +265,13 @@ def make_worlds(
         signal_phase=np.zeros((num_worlds, len(network.signals)), dtype=np.int32),
         controllers=np.zeros((num_worlds, network.num_controllers), dtype=CONTROLLER),
         detected_s=np.zeros((num_worlds, len(network.detectors)), dtype=np.float64),
-        num_through=np.zeros(num_worlds, dtype=np.int64),
+        num_through=zoned.num_through[zone],
         pending=np.zeros((num_worlds, num_agents, latency_ticks + 1, 2)),
         num_near=zoned.num_near[zone],
-        num_touching=np.zeros(num_worlds, dtype=np.int64),
-        num_contacts=np.zeros(num_worlds, dtype=np.int64),
+        num_touching=zoned.num_touching[zone],
+        num_contacts=zoned.num_contacts[zone],
+        step=zoned.step[zone],
+        step_at=zoned.step_at[zone],
     )
     if common is None:
         return worlds
@@ -339,14 +281,20 @@ def make_worlds(
 def make_zoned(num_zones: int, num_worlds: int, capacity: int) -> Zoned:
     """Room for the rows of k zones of W worlds that hold `capacity` vehicles each."""
     # Memory that is never written is never taken.
-    numbers = np.zeros((4, num_zones, num_worlds), dtype=np.int64)
+    numbers = np.zeros((7, num_zones, num_worlds), dtype=np.int64)
+    everybody = (num_zones, num_worlds, capacity)
     return Zoned(
-        rows=np.zeros((2, num_zones, num_worlds, capacity), dtype=VEHICLE),
+        rows=np.zeros((2, *everybody), dtype=VEHICLE),
         num_owned=numbers[0],
         num_rows=numbers[1],
         num_near=numbers[2],
-        border=np.zeros((num_zones, num_worlds, capacity), dtype=np.int32),
-        num_border=numbers[3],
+        num_through=numbers[3],
+        num_touching=numbers[4],
+        num_contacts=numbers[5],
+        step=np.zeros(everybody, dtype=PLAN),
+        step_at=np.zeros(everybody, dtype=np.int64),
+        border=np.zeros(everybody, dtype=np.int32),
+        num_border=numbers[6],
         spare=np.zeros(1, dtype=VEHICLE),
     )
 
@@ -378,8 +326,6 @@ def _make_scratch(num_lanes: int, num_links: int, capacity: int) -> Scratch:
         lane_start=lanes.bounds[:, 0],
         lane_end=lanes.bounds[:, 1],
         entries=np.zeros(2 * capacity, dtype=ENTRY),
-        step=np.zeros(capacity, dtype=PLAN),
-        step_at=np.full(capacity, -1, dtype=np.int64),
         links=links,
         link_start=links.bounds[:, 0],
         link_end=links.bounds[:, 1],

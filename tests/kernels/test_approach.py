@@ -6,6 +6,7 @@ from numpy.typing import NDArray
 
 from cavmarl.kernels.approach import register_links
 from cavmarl.kernels.arrays import Scratch
+from cavmarl.roads.routing import PLAN
 from cavmarl.runtime.simulation import Simulation
 from tests.driving import drive, make_traffic, start
 from tests.kernels.traffic import scratch
@@ -27,7 +28,8 @@ def world(request: pytest.FixtureRequest) -> Simulation:
 def listed(simulation: Simulation, rows: NDArray[np.void]) -> Scratch:
     room = scratch(simulation.network, len(rows))
     travel = simulation._traffic.travel
-    register_links(simulation.network.arrays, travel, rows, len(rows), room)
+    step, step_at = np.zeros(len(rows), PLAN), np.zeros(len(rows), np.int64)
+    register_links(simulation.network.arrays, travel, rows, len(rows), step, step_at, room)
     return room
 
 
