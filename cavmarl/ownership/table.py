@@ -7,9 +7,10 @@ it died with, and anybody else who replays it knows who owns what.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
+from typing import TypeAlias
 
-from cavmarl.errors import JournalError, ProtocolError
+from cavmarl.errors import JournalError, LedgerError, ProtocolError
 from cavmarl.ownership.ledger import SeenIds, Tally
 from cavmarl.ownership.messages import (
     RUN_BYTES,
@@ -27,6 +28,12 @@ from cavmarl.ownership.planning import Plan, make_plan
 from cavmarl.ownership.safeguards import ALL_ON, Safeguards
 from cavmarl.ownership.transitions import Event, Party, State, after
 
+MOVES_AT_ONCE = 256
+"""So many changes are put into the tallies together, unless somebody asks before."""
+
+_Move: TypeAlias = tuple[int, int, int, bool]
+"""(vehicle, zone, epoch, whether it comes or goes)."""
+
 
 class Table:
     """The state that a log leads to.
@@ -39,7 +46,7 @@ class Table:
         deferred: vehicle → ticks that it has been with a zone which does not contain it.
         hosts: zone → (worker, incarnation); incarnation 0 means never hosted.
         states: zone → UNHOSTED, HOSTED or FENCED.
-        tallies: zone → what it owned at the committed tick.
+        counts: zone → how many vehicles it owned at the committed tick.
         seen: ids that have been in the episode.
         repeats: zone → new hosts in the tick in progress.
         plan: the tick in progress, or None.
@@ -51,11 +58,24 @@ class Table:
         self.deferred: dict[int, int] = {}
         self.hosts = dict.fromkeys(sorted(zones), (-1, 0))
         self.states = dict.fromkeys(self.hosts, State.UNHOSTED)
-        self.tallies = dict.fromkeys(self.hosts, Tally())
         self.seen = SeenIds()
         self.repeats: Counter[int] = Counter()
         self.plan: Plan | None = None
         self._safeguards = safeguards
+        self.counts = dict.fromkeys(self.hosts, 0)
+        self._tallies = dict.fromkeys(self.hosts, Tally())
+        self._moves: list[_Move] = []  # that are not in the tallies yet
+
+    @property
+    def tallies(self) -> dict[int, Tally]:
+        """Zone → what it owned at the committed tick."""
+        tallies, run = self._tallies, self.run
+        for vehicle, zone, epoch, comes in self._moves:
+            tally = tallies[zone]
+            change = tally.plus if comes else tally.minus
+            tallies[zone] = change(run, vehicle, epoch)
+        self._moves.clear()
+        return tallies
 
     @property
     def planned(self) -> Plan:
@@ -80,7 +100,6 @@ class Table:
         switches: Iterable[Switch] = (),
         births: Iterable[Birth] = (),
         removed: Iterable[Removed] = (),
-        tallies: Mapping[int, Tally] | None = None,
     ) -> None:
         """Reach the next tick at once, as a BEGIN and a COMMIT with the same contents would.
 
@@ -90,23 +109,33 @@ class Table:
             switches: who changes owner.
             births: who is new.
             removed: who has left the world, of those before and of these.
-            tallies: zone → what it owns then; None: the same as before.
 
         Raises:
             ProtocolError: a tick is in progress, or vehicles wait for their transfer.
+            LedgerError: nobody owned one of those who have left.
         """
         if self.plan is not None or self.deferred:
             raise ProtocolError(f"tick {self.tick + 1} is in progress")
-        owners = self.owners
+        owners, counts, moves = self.owners, self.counts, self._moves
         for vehicle, zone, _ in births:
             self.seen.add(vehicle)
             owners[vehicle] = (zone, 0)
-        for vehicle, _, target, epoch, _ in switches:
+            counts[zone] += 1
+            moves.append((vehicle, zone, 0, True))
+        for vehicle, source, target, epoch, _ in switches:
             owners[vehicle] = (target, epoch)
+            counts[source] -= 1
+            counts[target] += 1
+            moves.append((vehicle, source, epoch - 1, False))
+            moves.append((vehicle, target, epoch, True))
         for vehicle, _ in removed:
-            del owners[vehicle]
-        if tallies is not None:
-            self.tallies = dict(tallies)
+            if vehicle not in owners:
+                raise LedgerError(f"vehicle {vehicle} has left the world, and nobody owned it")
+            zone, epoch = owners.pop(vehicle)
+            counts[zone] -= 1
+            moves.append((vehicle, zone, epoch, False))
+        if len(moves) > MOVES_AT_ONCE:
+            _ = self.tallies
         self.tick += 1
 
     def alive(self, zone: int, incarnation: int) -> bool:
@@ -137,7 +166,9 @@ class Table:
             raise JournalError(f"a run has {RUN_BYTES} bytes, not {len(record.run)}")
         self.run, self.tick, self.episode = record.run, record.tick, record.episode
         self.owners, self.deferred, self.plan = {}, {}, None
-        self.tallies = dict.fromkeys(self.hosts, Tally())
+        self.counts = dict.fromkeys(self.hosts, 0)
+        self._tallies = dict.fromkeys(self.hosts, Tally())
+        self._moves.clear()
         self.seen = SeenIds()
         self.repeats.clear()
 
@@ -174,7 +205,8 @@ class Table:
                 self.owners[vehicle] = (switch.target, switch.epoch)
         deferred = plan.record.deferred
         self.deferred = {vehicle: ticks for vehicle, ticks in deferred if vehicle in self.owners}
-        self.tallies = {entry.zone: entry.owned for entry in record.zones}
+        self._tallies = {entry.zone: entry.owned for entry in record.zones}
+        self.counts = {entry.zone: entry.owned.vehicles for entry in record.zones}
         self.tick, self.plan = record.tick, None
         self.repeats.clear()
 

@@ -6,7 +6,7 @@ A `TransferLog` is told what a `Trace` is told, and keeps what is under way and 
 from __future__ import annotations
 
 from collections import Counter, deque
-from collections.abc import Collection, Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import NamedTuple, Protocol
 
@@ -95,6 +95,7 @@ class _Approach:
     state_bytes: int
     depth_m: float | None = None
     began_ms: float | None = None
+    depth_now_m: float | None = None
 
 
 @dataclass(slots=True)
@@ -179,31 +180,31 @@ class TransferLog:
             case Nack() if destination == COORDINATOR:
                 self.counts["refused"] += len(message.entries)
 
-    def approached(self, tick: int, states: Collection[tuple[int, int, int]]) -> None:
+    def approached(self, tick: int, states: Mapping[tuple[int, int, int], float]) -> None:
         """Note who comes near, where targets know it without messages.
 
         Args:
             tick: of the states.
-            states: (vehicle, target, epoch) of all of them; the approaches of others are over.
+            states: (vehicle, target, epoch) of all of them → how far it is outside of its owner's
+                zone; the approaches of others are over.
         """
         known, around = self._approaches, self._surroundings
-        for key in states:
+        for key, depth_m in states.items():
             found = known.get(key)
-            if found is not None:
-                found.last = tick
+            if found is None:
+                began_ms = None if around is None else around.now_ms()
+                known[key] = _Approach(tick, tick, 1, 0, depth_m, began_ms, depth_m)
+            else:
+                found.last, found.depth_now_m = tick, depth_m
                 found.offers += 1
-                continue
-            found = known[key] = _Approach(tick, tick, 1, 0)
-            if around is not None:
-                found.depth_m = around.depth_m(key[0], key[1])
-                found.began_ms = around.now_ms()
-        for key in [key for key in known if key not in states]:
-            del known[key]
-            self.counts["aborted"] += 1
+        if len(known) > len(states):
+            for key in [key for key in known if key not in states]:
+                del known[key]
+                self.counts["aborted"] += 1
         self.counts["acknowledged"] += len(states)
 
     def settled(
-        self, episode: int, tick: int, switches: Collection[Switch], removed: Iterable[Removed]
+        self, episode: int, tick: int, switches: Iterable[Switch], removed: Iterable[Removed]
     ) -> None:
         """Note who has changed owner in a tick, where no message tells of it.
 
@@ -216,9 +217,10 @@ class TransferLog:
         around, gone = self._surroundings, {entry.vehicle for entry in removed}
         now_ms = None if around is None else around.now_ms()
         for switch in switches:
-            depth_m = None if around is None else around.depth_m(switch.vehicle, switch.target)
+            vehicle, _, target, epoch, _ = switch
+            depth_m = self._approaches[vehicle, target, epoch - 1].depth_now_m
             switching = _Switching(depth_m, now_ms, now_ms)
-            self._note(episode, tick, switch, switching, switch.vehicle in gone)
+            self._note(episode, tick, switch, switching, vehicle in gone)
 
     def _begin(self, record: Begin) -> None:
         self._begun = record

@@ -13,11 +13,11 @@ of ticks in which a vehicle has entered, left, or changed its owner.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 
 from cavmarl.errors import LedgerError, ProtocolError
 from cavmarl.ownership.directory import Directory
-from cavmarl.ownership.ledger import Tally, world_digest
+from cavmarl.ownership.ledger import world_digest
 from cavmarl.ownership.messages import Begin, Birth, Commit, Removed, Switch, ZoneLedger
 from cavmarl.ownership.transfers import TransferLog
 from cavmarl.runtime.journal import AnyJournal
@@ -47,7 +47,7 @@ class DirectCoordinator(Referee):
         self._counts = counts
         self._transfers = transfers
         self._is_open = False
-        self._pairs: dict[tuple[int, int, int], int] = {}  # vehicle, target, epoch → owner
+        self._pairs: dict[tuple[int, int, int], float] = {}  # vehicle, target, epoch → depth, m
         self._has_told = False  # of somebody near, whose approach may be over
         self._switches: list[Switch] = []
         self._new: tuple[Birth, ...] = ()
@@ -84,23 +84,28 @@ class DirectCoordinator(Referee):
     def end(self, rows: Callable[[int], int], stored: Callable[[int], int] | None = None) -> None:
         """Commit, if the zones own what they should, as `Referee.end` says."""
         table = self.directory.table
-        removed: tuple[Removed, ...] = ()
-        tallies: Mapping[int, Tally] | None = None
+        self._is_open = False
         if self._switches or self._new or self._gone or self._removed:
-            removed = tuple(sorted((*self._gone, *self._removed)))
-            tallies = self._tallies(removed)
-        self._check(table.tallies if tallies is None else tallies)
-        is_watched = tallies is not None and self.journal is None and self._watchers
-        began = self._begun() if is_watched else None
-        table.settle(self._switches, self._new, removed, tallies)
-        self._is_open, self._gone = False, []
-        if self._switches:
-            self.switched += len(self._switches)
-            self._transfers.settled(table.episode, table.tick, self._switches, removed)
+            self._settle(rows)
+            return
+        table.settle()
         if self.journal is not None:
-            self._record(self._committed(removed, rows))
-        elif began is not None:
-            self._record(began, self._committed(removed, rows))
+            self._record(self._committed((), rows))
+
+    def _settle(self, rows: Callable[[int], int]) -> None:
+        """Commit a tick in which somebody has entered, left, or changed its owner."""
+        table, switches = self.directory.table, self._switches
+        removed = tuple(sorted((*self._gone, *self._removed)))
+        self._gone = []
+        is_watched = self.journal is None and self._watchers
+        begun = (self._begun(),) if is_watched else ()
+        table.settle(switches, self._new, removed)
+        self._check()
+        if switches:
+            self.switched += len(switches)
+            self._transfers.settled(table.episode, table.tick, switches, removed)
+        if self.journal is not None or is_watched:
+            self._record(*begun, self._committed(removed, rows))
 
     def _begun(self, inputs: bytes = b"") -> Begin:
         table = self.directory.table
@@ -109,17 +114,19 @@ class DirectCoordinator(Referee):
     def _committed(self, removed: tuple[Removed, ...], rows: Callable[[int], int]) -> Commit:
         table = self.directory.table
         zones = tuple(
-            ZoneLedger(zone, incarnation, table.tallies[zone], rows(zone))
-            for zone, (_, incarnation) in table.hosts.items()
+            ZoneLedger(zone, table.hosts[zone][1], tally, rows(zone))
+            for zone, tally in table.tallies.items()
         )
         world = world_digest(ledger.rows for ledger in zones)
         return Commit(table.episode, table.tick, removed, zones, world)
 
     def in_flight(self) -> list[tuple[int, int, int, str]]:
         """(vehicle, owner, zone that knows that it comes, `prepared`), between two ticks."""
+        owners = self.directory.table.owners
         return sorted(
-            (vehicle, owner, target, "prepared")
-            for (vehicle, target, _), owner in self._pairs.items()
+            (vehicle, owners[vehicle][0], target, "prepared")
+            for vehicle, target, _ in self._pairs
+            if vehicle in owners
         )
 
     def dropped(self) -> Counter[tuple[str, str]]:
@@ -129,15 +136,15 @@ class DirectCoordinator(Referee):
     def _approach(self, near: Sequence[Near]) -> list[Switch]:
         """Let targets know who comes; who is there already changes its owner."""
         owners = self.directory.table.owners
-        pairs: dict[tuple[int, int, int], int] = {}
+        pairs: dict[tuple[int, int, int], float] = {}
         switches = []
-        for vehicle, source, _, target, crossed, _ in near:
+        for vehicle, source, _, target, crossed, depth_m in near:
             if vehicle not in owners:  # it has entered since the last BEGIN
                 continue
             owner, epoch = owners[vehicle]
             if owner != source:
                 raise ProtocolError(f"vehicle {vehicle} is in the rows of {source}, not of {owner}")
-            pairs[vehicle, target, epoch] = source
+            pairs[vehicle, target, epoch] = depth_m
             if crossed:
                 switches.append(Switch(vehicle, source, target, epoch + 1, False))
         self._transfers.approached(self.tick, pairs)
@@ -149,36 +156,15 @@ class DirectCoordinator(Referee):
                 del pairs[switch.vehicle, switch.target, switch.epoch - 1]
         return switches
 
-    def _tallies(self, removed: Iterable[Removed]) -> Mapping[int, Tally]:
-        """What the zones own after the tick."""
-        table, run = self.directory.table, self.directory.run
-        tallies = dict(table.tallies)
-        moved: dict[int, tuple[int, int]] = {}
-        for vehicle, zone, _ in self._new:
-            tallies[zone] = tallies[zone].plus(run, vehicle, 0)
-            moved[vehicle] = (zone, 0)
-        for vehicle, source, target, epoch, _ in self._switches:
-            tallies[source] = tallies[source].minus(run, vehicle, epoch - 1)
-            tallies[target] = tallies[target].plus(run, vehicle, epoch)
-            moved[vehicle] = (target, epoch)
-        for vehicle, _ in removed:
-            zone, epoch = moved.get(vehicle) or table.owners.get(vehicle, (-1, -1))
-            if zone < 0:
-                raise LedgerError(f"vehicle {vehicle} has left the world, and nobody owned it")
-            tallies[zone] = tallies[zone].minus(run, vehicle, epoch)
-        return tallies
-
-    def _check(self, expected: Mapping[int, Tally]) -> None:
+    def _check(self) -> None:
         """Compare what zones should own with their rows.
 
         Raises:
             LedgerError: a zone has more or fewer.
         """
-        owned = [vehicles for vehicles, _ in expected.values()]
+        owned = list(self.directory.table.counts.values())
         for birth in self._births:  # they are in the rows, and will be on record in the next tick
             owned[birth.zone] += 1
         counts = self._counts()
         if counts != owned:
-            raise LedgerError(
-                f"on the way to tick {self.tick + 1} zones own {counts} vehicles, not {owned}"
-            )
+            raise LedgerError(f"at tick {self.tick} zones own {counts} vehicles, not {owned}")

@@ -2,21 +2,25 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from cavmarl import make_vec
+from cavmarl.errors import LedgerError
 from cavmarl.kernels.codes import DRIVER_AGENT, EVENT_COLLIDED
-from cavmarl.ownership.messages import Begin, Commit
+from cavmarl.ownership.messages import Begin, Commit, Reset
 from cavmarl.ownership.records import replay as replay_records
 from cavmarl.ownership.trace import LOG, Trace
 from cavmarl.ownership.transport import Rates
-from cavmarl.runtime.referee import Near
+from cavmarl.runtime.coordinator import Coordinator
+from cavmarl.runtime.direct import DirectCoordinator
 from cavmarl.runtime.fault_plan import Crash, Faults
 from cavmarl.runtime.journal import JournalReader
 from cavmarl.runtime.journal_summary import owners_at
+from cavmarl.runtime.referee import Near
 from tests.cli.test_main import run as command
 from tests.driving import idle, make_simulation, start
 from tests.faulted import BUSY, ROUGH, Recorded, record, replay
@@ -67,6 +71,45 @@ def test_each_world_has_a_journal_of_its_own(tmp_path: Path) -> None:
     for w, coordinator in enumerate(vec.simulation.coordinators):
         told = replay_records(JournalReader(tmp_path / f"run.{w}.jsonl"))
         assert told.owners == coordinator.directory.table.owners
+
+
+def on_record(path: Path) -> list[object]:
+    """What a journal says, but for what is drawn anew for every run."""
+    told: list[object] = []
+    for entry in JournalReader(path):
+        if isinstance(entry, Commit):
+            zones = [(z.zone, z.incarnation, z.owned.vehicles, z.rows) for z in entry.zones]
+            told.append((entry.tick, entry.removed, zones, entry.world))
+        else:
+            told.append(replace(entry, run=b"") if isinstance(entry, Reset) else entry)
+    return told
+
+
+@pytest.mark.parametrize("env", ["grid4x4", "merge", "town"])
+def test_without_messages_the_same_is_put_on_record_as_with_them(env: str, tmp_path: Path) -> None:
+    settings = {"clock.sim_dt_s": 0.1}
+    run = record(env, settings, 40)
+    direct, sent = tmp_path / "direct.jsonl", tmp_path / "sent.jsonl"
+    one = replay(run, 4, None, {"zones.journal": str(direct)})
+    two = replay(run, 4, Faults(), {"zones.journal": str(sent)})
+    assert isinstance(one.simulation.coordinators[0], DirectCoordinator)
+    assert isinstance(two.simulation.coordinators[0], Coordinator)
+    assert on_record(direct) == on_record(sent)
+    for name in ("switched", "acknowledged", "aborted", "removed"):
+        mine, theirs = one.simulation.transfers[0], two.simulation.transfers[0]
+        assert mine.counts[name] == theirs.counts[name], name
+    kept = [row._replace(ms=None, state_bytes=0) for row in mine.rows]
+    assert kept == [row._replace(ms=None, state_bytes=0) for row in theirs.rows]
+
+
+def test_a_vehicle_that_is_lost_is_missed(busy: Recorded) -> None:
+    vec = make_vec("grid4x4", zones=4, overrides=BUSY)
+    vec.reset(seed=1)
+    lost = vec.simulation._shards[1].worlds.num_owned
+    with pytest.raises(LedgerError, match=r"zones own \[.*\] vehicles, not \["):  # noqa: PT012
+        for _ in range(STEPS):
+            lost[0] -= 1
+            vec.step(vec.suggest_actions())
 
 
 def test_hand_overs_are_counted_once_whoever_dies(busy: Recorded) -> None:

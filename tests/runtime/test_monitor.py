@@ -246,9 +246,8 @@ def test_a_ghost_of_nobody(narrow: Meddling) -> None:
     narrow.caught(meddle, r"ghosts: zone 1 has a ghost of vehicle 7777, which is not there")
 
 
-def test_an_arrival_that_nobody_has_told_of(
-    simulation: Simulation, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_an_arrival_that_nobody_has_told_of(monkeypatch: pytest.MonkeyPatch) -> None:
+    simulation = watched(**{"zones.faults": "{}"})
     coordination: Any = simulation._coordination
     coordinator = coordination.coordinators[0]
     coordinator._births.append(Birth(8_888, 0, b""))
