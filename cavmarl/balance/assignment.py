@@ -27,8 +27,9 @@ def assign(problem: Problem) -> tuple[Placement, str]:
 
     Shards without one (none yet, or theirs does not answer) go where they are done first. Shards
     with one move only if the slowest worker takes longer than a perfect division by more than the
-    tolerance, at most `max_moves` of them, and only if that saves the tolerance's share of a tick.
-    A worker that is excluded keeps what it has until balance takes it away.
+    tolerance, at most `max_moves` of them, and only if that is worth it: it saves the tolerance's
+    share of a tick, and its price in time. A worker that is excluded keeps what it has until
+    balance takes it away.
 
     Raises:
         NoAdmissibleWorkerError: there are shards to be placed and all workers are excluded.
@@ -87,7 +88,9 @@ def _rebalance(placement: Placement, method: str) -> tuple[Placement, str]:
         max_moves=rule.max_moves,
     )
     gain_s = placement.excess_s() - moved.excess_s()
-    if gain_s > 0.0 and gain_s >= rule.tolerance * placement.fair_s:
+    moves = sum(one != other for one, other in zip(placement.homes, moved.homes, strict=True))
+    price_s = max(rule.tolerance * placement.fair_s, moves * rule.move_s / rule.payback_ticks)
+    if gain_s > 0.0 and gain_s >= price_s:
         return moved, "moved from the slowest"
     return placement, method
 

@@ -39,20 +39,28 @@ class BalanceRule:
             would, nothing moves; a round that gains less than this is not made; and so much may be
             given up to keep neighbours together.
         max_moves: shards that change their worker in one round, those of lost workers not counted.
+        move_s: what a move costs, once.
+        payback_ticks: a round is made only if it saves the workers together that much in so many
+            ticks.
 
     Raises:
-        PlacementError: a tolerance below 0, or no move a round.
+        PlacementError: a tolerance or a price below 0, no move a round, or no tick.
     """
 
     load: LoadRule = field(default_factory=LoadRule)
     tolerance: float = 0.1
     max_moves: int = 4
+    move_s: float = 0.01
+    payback_ticks: int = 1000
 
     def __post_init__(self) -> None:
-        if not (math.isfinite(self.tolerance) and self.tolerance >= 0.0):
-            raise PlacementError(f"tolerance = {self.tolerance}: must be a number from 0 up")
-        if self.max_moves < 1:
-            raise PlacementError(f"max_moves = {self.max_moves}: must be at least 1")
+        for name in ("tolerance", "move_s"):
+            value = getattr(self, name)
+            if not (math.isfinite(value) and value >= 0.0):
+                raise PlacementError(f"{name} = {value}: must be a number from 0 up")
+        for name in ("max_moves", "payback_ticks"):
+            if getattr(self, name) < 1:
+                raise PlacementError(f"{name} = {getattr(self, name)}: must be at least 1")
 
 
 @dataclass(frozen=True)

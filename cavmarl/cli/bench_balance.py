@@ -45,12 +45,11 @@ def balance(
 ) -> None:
     """Static, balanced and the extensions on the same traces: makespans beside the static one's."""
     from cavmarl.balance.problem import BalanceRule
-    from cavmarl.evaluate.balance_replay import ReplayPrices, replay_traces
+    from cavmarl.evaluate.balance_replay import replay_traces
     from cavmarl.evaluate.balance_worlds import generated_traces, recorded_traces
     from cavmarl.evaluate.selection_study import study_selection
 
-    rule = BalanceRule(tolerance=tolerance, max_moves=max_moves)
-    prices = ReplayPrices(move_s=1e-3 * move_ms)
+    rule = BalanceRule(tolerance=tolerance, max_moves=max_moves, move_s=1e-3 * move_ms)
     if workers < 1:
         raise ConfigError(f"workers = {workers}: must be at least 1")
     console = Console()
@@ -69,10 +68,11 @@ def balance(
             found.append(trace)
             status.update(f"trace {len(found)} of {traces}")
         status.update("replaying")
-        replay = replay_traces(found, rule, prices)
+        replay = replay_traces(found, rule)
         status.update("choosing")
         study = study_selection(seed=seed)
     console.print(_replay_table(replay, recorded))
+    console.print(_verdicts(replay))
     console.print(_weights_table(study))
     write_json(
         json_path,
@@ -88,32 +88,48 @@ def _replay_table(found: BalanceReplay, recorded: bool) -> Table:
             f"{'recorded' if recorded else 'generated'} traces of {found.rounds} rounds"
         ),
         caption=(
-            "time: of all rounds, waiting for the slowest, over static's, [95 % between traces];\n"
-            "calibrated, predicted, re-cut: extensions of balanced; perfect: no shard is whole;\n"
-            f"a move costs {1e3 * found.prices.move_s:g} ms, a round has {found.prices.ticks} "
-            "ticks;\nwhat others use of the workers is generated"
+            "time: waiting for the slowest, all rounds, over static's; [95 % between traces]\n"
+            "calibrated, predicted, re-cut: extensions of balanced; perfect: no shard whole\n"
+            f"supposed: {1e3 * found.rule.move_s:g} ms a move, {found.ticks} ticks a round, "
+            "what others use of workers"
         ),
     )
-    for column in ("time", "beside balanced", "max /\nmean", "shards\nmoved", "handed\nover", ""):
-        table.add_column(column, justify="left" if not column else "right")
+    for column in ("time", "beside balanced", "max /\nmean", "moves", "handed\nover"):
+        table.add_column(column, justify="right", no_wrap=True)
     for row in found.rows:
         table.add_row(
             row.name,
             _with_interval(row.ratio, row.ratio95),
             _with_interval(row.beside_balanced, row.beside_balanced95),
-            f"{row.imbalance:.3f}",
+            f"{row.imbalance:.2f}",
             f"{row.moves:.2f}",
             f"{row.handoffs:.1f}",
-            "" if row.name in ("static", "perfect") else row.verdict,
         )
     return table
+
+
+def _verdicts(found: BalanceReplay) -> str:
+    """Who takes less or more time than the static placement; what weights were fitted."""
+    placed = [row for row in found.rows if row.name not in ("static", "perfect")]
+    verdicts = dict.fromkeys(row.verdict for row in placed)
+    (fitted,) = (row.weights for row in placed if row.name == "calibrated")
+    cpu, ram, gpu = fitted
+    return "\n".join(
+        [
+            *(
+                f"{verdict}: {', '.join(row.name for row in placed if row.verdict == verdict)}"
+                for verdict in verdicts
+            ),
+            f"calibrated, mean: {cpu:.2f} CPU + {ram:.2f} RAM + {gpu:.2f} GPU",
+        ]
+    )
 
 
 def _weights_table(study: SelectionStudy) -> Table:
     latency = ", ".join(f"{name} {value:.0f} µs" for name, value in study.latency_us.items())
     table = Table(
         "weights",
-        title=f"other weights than 0.6, 0.2, 0.2: {study.choices} choices of {study.workers}",
+        title=f"weights beside 0.6, 0.2, 0.2: {study.choices} choices of {study.workers}",
         caption=f"one choice of {study.timed_workers} workers: {latency}",
     )
     table.add_column("other choice", justify="right")
@@ -129,5 +145,5 @@ def _weights_table(study: SelectionStudy) -> Table:
 
 def _with_interval(value: float, interval: Interval | None) -> str:
     if interval is None:
-        return f"{value:.3f}"
-    return f"{value:.3f} \\[{interval.low:.3f}, {interval.high:.3f}]"
+        return f"{value:.2f}"
+    return f"{value:.2f} \\[{interval.low:.2f}, {interval.high:.2f}]"

@@ -2,8 +2,8 @@
 
 The truth of the replay is a model: a worker gets the share of its processor that others leave, so
 its shards take their cost over 1 - CPU, and memory and GPU in use slow nobody down. All workers
-wait for the slowest. A shard that moves costs `move_s` once, a vehicle that is given to another
-zone `handoff_s`.
+wait for the slowest. A shard that moves costs the rule's `move_s` once, a vehicle that is given to
+another zone because the map is cut anew `HANDOFF_S`.
 """
 
 from __future__ import annotations
@@ -27,30 +27,10 @@ from cavmarl.evaluate.balance_strategies import (
 from cavmarl.evaluate.load_traces import LoadTrace
 from cavmarl.evaluate.statistics import Interval, mean_interval
 
-__all__ = ["BalanceReplay", "ReplayPrices", "StrategyResult", "Verdict", "replay_traces"]
+__all__ = ["BalanceReplay", "StrategyResult", "Verdict", "replay_traces"]
 
+HANDOFF_S = 1e-4
 WARM_SHARE = 0.25  # of the rounds, before what is learnt is used and times count
-
-
-@dataclass(frozen=True)
-class ReplayPrices:
-    """What the replay supposes.
-
-    Attributes:
-        ticks: of a round.
-        move_s: of a shard that changes its worker.
-        handoff_s: of a vehicle that gets another zone because the map is cut anew.
-    """
-
-    ticks: int = 200
-    move_s: float = 1e-2
-    handoff_s: float = 1e-4
-
-    def __post_init__(self) -> None:
-        if self.ticks < 1 or not all(
-            math.isfinite(price) and price >= 0.0 for price in (self.move_s, self.handoff_s)
-        ):
-            raise ConfigError(f"{self}: at least one tick, and prices from 0 s up")
 
 
 Verdict = Literal[
@@ -74,6 +54,7 @@ class StrategyResult:
         imbalance: maximum over mean of the workers' ticks, mean over rounds.
         moves: shards a round.
         handoffs: vehicles a round that the cutting moved.
+        weights: of the last round's score, mean.
         verdict: `ratio95` beside 1.
     """
 
@@ -85,6 +66,7 @@ class StrategyResult:
     imbalance: float
     moves: float
     handoffs: float
+    weights: tuple[float, float, float]
     verdict: Verdict
 
 
@@ -98,7 +80,8 @@ class BalanceReplay:
         workers: m.
         traces: how many.
         rounds: of each, those before times count among them.
-        prices: what the replay supposes.
+        ticks: of a round.
+        rule: when shards move, and what that costs.
         rows: by strategy.
     """
 
@@ -107,7 +90,8 @@ class BalanceReplay:
     workers: int
     traces: int
     rounds: int
-    prices: ReplayPrices
+    ticks: int
+    rule: BalanceRule
     rows: tuple[StrategyResult, ...]
 
     def to_dict(self) -> dict[str, Any]:
@@ -123,24 +107,21 @@ class _Totals:
     imbalance: float
     moves: float
     handoffs: float
+    weights: tuple[float, float, float]
 
 
-def replay_traces(
-    traces: Sequence[LoadTrace], rule: BalanceRule, prices: ReplayPrices | None = None
-) -> BalanceReplay:
+def replay_traces(traces: Sequence[LoadTrace], rule: BalanceRule) -> BalanceReplay:
     """Replay every trace through every strategy.
 
     Args:
         traces: of the same map, zones, workers and number of rounds.
         rule: when shards move.
-        prices: what the replay supposes.
 
     Raises:
         ConfigError: no trace, or too few rounds to learn from.
         NoAdmissibleWorkerError: at the first plan all workers are excluded.
         PlacementError: more workers than zones.
     """
-    prices = prices or ReplayPrices()
     if not traces:
         raise ConfigError("traces: there must be at least one")
     first = traces[0]
@@ -148,7 +129,7 @@ def replay_traces(
     warm = math.ceil(WARM_SHARE * rounds)
     if rounds < 4:
         raise ConfigError(f"rounds = {rounds}: must be at least 4, of which the first are learnt")
-    totals = {name: [_replay(name, one, rule, warm, prices) for one in traces]
+    totals = {name: [_replay(name, one, rule, warm) for one in traces]
               for name in (*STRATEGIES, "perfect")}  # fmt: skip
     static, balanced = (
         np.array([one.time_s for one in totals[name]]) for name in ("static", "balanced")
@@ -159,7 +140,8 @@ def replay_traces(
         workers=len(first.rounds[0].snapshot.workers),
         traces=len(traces),
         rounds=rounds,
-        prices=prices,
+        ticks=first.ticks,
+        rule=rule,
         rows=tuple(_summary(name, found, static, balanced) for name, found in totals.items()),
     )
 
@@ -177,9 +159,7 @@ def _strategy(name: str, trace: LoadTrace, rule: BalanceRule, warm: int) -> Stat
     )
 
 
-def _replay(
-    name: str, trace: LoadTrace, rule: BalanceRule, warm: int, prices: ReplayPrices
-) -> _Totals:
+def _replay(name: str, trace: LoadTrace, rule: BalanceRule, warm: int) -> _Totals:
     strategy = _strategy(name, trace, rule, warm)
     found = []
     for number in range(len(trace.rounds)):
@@ -187,14 +167,18 @@ def _replay(
         slowest_s, fair_s = _tick_s(trace, number, placed)
         if name == "perfect":
             slowest_s = fair_s
-        time_s = prices.ticks * slowest_s
-        time_s += prices.move_s * placed.moved_shards + prices.handoff_s * placed.moved_vehicles
+        time_s = trace.ticks * slowest_s
+        time_s += rule.move_s * placed.moved_shards + HANDOFF_S * placed.moved_vehicles
         imbalance = slowest_s / fair_s if fair_s else 1.0
         found.append((time_s, imbalance, placed.moved_shards, placed.moved_vehicles))
         strategy.learn(number)
     times, imbalances, moves, handoffs = np.array(found[warm:]).T
     return _Totals(
-        float(times.sum()), float(imbalances.mean()), float(moves.mean()), float(handoffs.mean())
+        float(times.sum()),
+        float(imbalances.mean()),
+        float(moves.mean()),
+        float(handoffs.mean()),
+        strategy.plan.problem.rule.load.weights,
     )
 
 
@@ -217,6 +201,7 @@ def _summary(
     times = np.array([one.time_s for one in found])
     ratios, beside = times / static, times / balanced
     interval = mean_interval(ratios)
+    cpu, ram, gpu = np.mean([one.weights for one in found], axis=0).tolist()
     return StrategyResult(
         name=name,
         ratio=float(ratios.mean()),
@@ -226,6 +211,7 @@ def _summary(
         imbalance=float(np.mean([one.imbalance for one in found])),
         moves=float(np.mean([one.moves for one in found])),
         handoffs=float(np.mean([one.handoffs for one in found])),
+        weights=(cpu, ram, gpu),
         verdict=_verdict(interval),
     )
 

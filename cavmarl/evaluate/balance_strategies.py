@@ -81,7 +81,8 @@ class LoadStrategy(StaticPlacement):
         warm: rounds before anything that was learnt is used.
         calibrated: fit the score's weights to what workers took.
         predicted: cost of the coming round from what is in the zones now.
-        recut: cut the map anew, every `RECUT_EVERY` rounds at most.
+        recut: cut the map anew where moving shards does not help, at most every `RECUT_EVERY`
+            rounds.
     """
 
     def __init__(
@@ -108,19 +109,16 @@ class LoadStrategy(StaticPlacement):
         if number == 0:
             return Placed(self.partition, self.plan.homes)
         before = self.plan.homes
-        moved_vehicles = 0
-        if self._recut and number >= self._warm and number % RECUT_EVERY == 0:
-            moved_vehicles = self._cut_anew(number)
-        if not moved_vehicles:
-            self.plan = make_plan(
-                replace(
-                    self.plan.problem,
-                    shards=self._expected(number),
-                    snapshot=self.trace.rounds[number].snapshot,
-                    rule=self._rule(number),
-                    present=before,
-                )
+        self.plan = make_plan(
+            replace(
+                self.plan.problem,
+                shards=self._expected(number),
+                snapshot=self.trace.rounds[number].snapshot,
+                rule=self._rule(number),
+                present=before,
             )
+        )
+        moved_vehicles = self._cut_anew(number) if self._may_cut(number) else 0
         moved = sum(one != other for one, other in zip(before, self.plan.homes, strict=True))
         return Placed(self.partition, self.plan.homes, moved, moved_vehicles)
 
@@ -152,6 +150,11 @@ class LoadStrategy(StaticPlacement):
         model = fit_costs(self._contents, self._measured_s)
         contents = self.trace.contents(number, self.partition)
         return shards_of([model.predict(content) for content in contents])
+
+    def _may_cut(self, number: int) -> bool:
+        """Whether moving shards does not help, and the last cut was long ago."""
+        due = self._recut and number >= self._warm and number % RECUT_EVERY == 0
+        return due and self.plan.imbalance > 1.0 + self.rule.tolerance
 
     def _cut_anew(self, number: int) -> int:
         """Other zones, if they pay; how many vehicles get another one."""

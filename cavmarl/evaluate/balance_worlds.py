@@ -15,7 +15,7 @@ from cavmarl.worlds import find_map
 
 __all__ = ["generated_traces", "recorded_traces"]
 
-ROUND_S = 2  # simulated seconds of a recorded round
+ROUND_S = 10  # simulated seconds of a recorded round
 BEFORE_S = 20  # simulated seconds before the first one
 AFTER_S = 1  # so that no episode ends within the last one
 
@@ -63,15 +63,14 @@ def recorded_traces(
             seed=seed,
             overrides=overrides,
         )(zones)
-        step_s = simulation.config.clock.ctrl_dt_s
-        measured = list(
-            measure_rounds(
-                simulation,
-                rounds,
-                max(round(ROUND_S / step_s), 1),
-                before=max(round(BEFORE_S / step_s), 1),
-            )
-        )
+        clock = simulation.config.clock
+        steps = max(round(ROUND_S / clock.ctrl_dt_s), 1)
+        before = max(round(BEFORE_S / clock.ctrl_dt_s), 1)
         yield recorded_trace(
-            simulation.network, simulation.partition, measured, workers=workers, seed=seed
+            simulation.network,
+            simulation.partition,
+            list(measure_rounds(simulation, rounds, steps, before=before)),
+            ticks=steps * clock.ticks_per_step,
+            workers=workers,
+            seed=seed,
         )

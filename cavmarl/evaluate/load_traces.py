@@ -55,6 +55,7 @@ class LoadTrace:
     Attributes:
         network: the map.
         partition: its zones at first.
+        ticks: of a round.
         migration_s: what a vehicle costs more that has come to its zone since the last round,
             seconds a tick.
         rounds: in time.
@@ -62,6 +63,7 @@ class LoadTrace:
 
     network: RoadNetwork
     partition: ZonePartition
+    ticks: int
     migration_s: float
     rounds: tuple[LoadRound, ...]
 
@@ -106,8 +108,8 @@ class Crowd:
         agents: share that agents drive.
         vehicle_s: seconds a tick of each.
         agent_s: more of one that senses.
-        migration_s: more of one that has come to its zone since the last round, each tick of it:
-            20 µs once, over 200 ticks.
+        migration_s: of one that changes its zone, once.
+        ticks: of a round.
         pull: how many times as many drive in the middle of the crowd as elsewhere.
         width: of the crowd, as a share of the map's shorter side.
         stride: how far its middle wanders a round, as the same share.
@@ -119,7 +121,8 @@ class Crowd:
     agents: float = 0.2
     vehicle_s: float = 1e-6
     agent_s: float = 4e-6
-    migration_s: float = 1e-7
+    migration_s: float = 2e-5
+    ticks: int = 200
     pull: float = 15.0
     width: float = 0.2
     stride: float = 0.04
@@ -163,7 +166,7 @@ def generated_trace(
                 snapshot=snapshot,
             )
         )
-    return LoadTrace(network, partition, crowd.migration_s, tuple(found))
+    return LoadTrace(network, partition, crowd.ticks, crowd.migration_s / crowd.ticks, tuple(found))
 
 
 def recorded_trace(
@@ -171,6 +174,7 @@ def recorded_trace(
     partition: ZonePartition,
     measured: Sequence[MeasuredRound],
     *,
+    ticks: int,
     workers: int,
     seed: int,
 ) -> LoadTrace:
@@ -179,6 +183,7 @@ def recorded_trace(
     return LoadTrace(
         network,
         partition,
+        ticks,
         0.0,  # what migrations cost is in what vehicles cost
         tuple(
             LoadRound(
