@@ -23,12 +23,15 @@ from cavmarl.config import ZONE_LAYOUTS
 from cavmarl.errors import ConfigError
 
 if TYPE_CHECKING:
-    from cavmarl.balance.problem import Problem
     from cavmarl.balance.snapshot import Snapshot
+    from cavmarl.evaluate.shard_costs import MeasuredWorlds
+    from cavmarl.roads.network import RoadNetwork
+    from cavmarl.roads.zones import ZonePartition
 
 __all__ = ["plan"]
 
 NOW, IDLE = "now", "idle"
+LASTING_S = 3600  # of the worlds: longer than anybody measures
 
 
 def plan(
@@ -58,6 +61,14 @@ def plan(
             help="Make a stored plan once more from what it says; exit code 1 if it is another.",
         ),
     ] = None,
+    cut: Annotated[
+        Path | None,
+        typer.Option(
+            "--cut-anew",
+            metavar="FILE",
+            help="Extension: write a zone file here that shares out what was measured.",
+        ),
+    ] = None,
     agents: Agents = None,
     background: Background = None,
     seed: Seed = 0,
@@ -67,6 +78,9 @@ def plan(
     """Measure what each zone costs, place the shards, and print the plan; nothing is started."""
     from cavmarl.balance.plan import make_plan
     from cavmarl.balance.plan_text import describe_plan
+    from cavmarl.balance.problem import BalanceRule, Problem
+    from cavmarl.evaluate.shard_costs import measure_shards, side_neighbors
+    from cavmarl.evaluate.sharded_worlds import world_maker
 
     if again is not None:
         _make_again(again)
@@ -75,45 +89,51 @@ def plan(
         raise ConfigError("name an environment, or give --again with a stored plan")
     if workers < 1:
         raise ConfigError(f"workers = {workers}: must be at least 1")
+    rule = BalanceRule(tolerance=tolerance)
+    seen = _snapshot(snapshot, workers)
     console = Console()
     with console.status("measuring"):
-        problem = _measured(
+        make = world_maker(
             env,
-            zones,
-            worlds,
-            layout,
-            _snapshot(snapshot, workers),
-            tolerance,
-            (steps, before),
-            seed,
+            layout=layout,
+            seconds=LASTING_S,
+            seed=seed,
             agents=agents,
             background=background,
             overrides=parse_settings(settings),
         )
-    made = make_plan(problem)
+        simulation = make(zones)
+        measured = measure_shards(simulation, worlds, seed, steps=steps, before=before)
+    partition = simulation.partition
+    made = make_plan(Problem(measured.costs, side_neighbors(partition), seen, rule))
     console.print(describe_plan(made), markup=False, highlight=False, soft_wrap=True)
+    if cut is not None:
+        said = _cut_anew(simulation.network, partition, measured, tolerance, cut)
+        console.print(said, markup=False, highlight=False, soft_wrap=True)
     write_json(json_path, made.to_dict())
 
 
-def _measured(
-    env: str,
-    zones: int,
-    worlds: int,
-    layout: str,
-    snapshot: Snapshot,
+def _cut_anew(
+    network: RoadNetwork,
+    partition: ZonePartition,
+    measured: MeasuredWorlds,
     tolerance: float,
-    steps: tuple[int, int],
-    seed: int,
-    **world: Any,
-) -> Problem:
-    from cavmarl.balance.problem import BalanceRule, Problem
-    from cavmarl.evaluate.shard_costs import measure_shards, side_neighbors
-    from cavmarl.evaluate.sharded_worlds import world_maker
+    path: Path,
+) -> str:
+    """Write zones of about the same cost, if that gains anything, and say what."""
+    from cavmarl.balance.repartition import propose_zones
+    from cavmarl.roads.zone_file import write_zones
 
-    rule = BalanceRule(tolerance=tolerance)
-    simulation = world_maker(env, layout=layout, seconds=3600, seed=seed, **world)(zones)
-    costs = measure_shards(simulation, worlds, seed, steps=steps[0], before=steps[1])
-    return Problem(costs, side_neighbors(simulation.partition), snapshot, rule)
+    found = propose_zones(
+        network, partition, measured.places, measured.zone_costs_s(), tolerance=tolerance
+    )
+    if found is None:
+        return f"cut anew: no other zones are more even by the tolerance; {path} is not written"
+    write_zones(path, found.partition)
+    return (
+        f"cut anew: costs of zones, max / mean, from {found.before:.3f} to {found.after:.3f}; "
+        f"{found.moved} of {len(measured.places)} vehicles are in other zones: {path}"
+    )
 
 
 def _snapshot(said: str, workers: int) -> Snapshot:

@@ -14,7 +14,7 @@ from cavmarl.evaluate.sharded_worlds import DrivenWorld
 from cavmarl.roads.zones import ZonePartition
 from cavmarl.runtime.simulation import Simulation
 
-__all__ = ["MeasuredRound", "measure_rounds", "measure_shards", "side_neighbors"]
+__all__ = ["MeasuredRound", "MeasuredWorlds", "measure_rounds", "measure_shards", "side_neighbors"]
 
 PARTS = 5
 
@@ -39,6 +39,25 @@ class MeasuredRound:
     ids: NDArray[np.int64]
     places: NDArray[np.float64]
     agents: NDArray[np.bool_]
+
+
+@dataclass(frozen=True)
+class MeasuredWorlds:
+    """Worlds of one environment.
+
+    Attributes:
+        costs: of their shards.
+        places: (n, 2) where the vehicles of all worlds are after the last step, m.
+    """
+
+    costs: tuple[ShardCost, ...]
+    places: NDArray[np.float64]
+
+    def zone_costs_s(self) -> list[float]:
+        """What each zone costs in all worlds together, seconds a tick."""
+        zones = [shard.zone for shard in self.costs]
+        sums: list[float] = np.bincount(zones, [shard.cost_s for shard in self.costs]).tolist()
+        return sums
 
 
 def measure_rounds(
@@ -78,7 +97,7 @@ def measure_rounds(
 
 def measure_shards(
     simulation: Simulation, worlds: int, seed: int, *, steps: int, before: int
-) -> tuple[ShardCost, ...]:
+) -> MeasuredWorlds:
     """Costs of all zones of the first `worlds` worlds of a seed, one world after the other.
 
     Of each zone the median of `PARTS` parts of the steps counts: what happens once, as a kernel
@@ -96,11 +115,13 @@ def measure_shards(
     """
     if steps < PARTS:
         raise ConfigError(f"steps = {steps}: must be at least {PARTS}")
-    found = []
+    costs: list[ShardCost] = []
+    places = []
     for number in range(worlds):
         simulation.seed(seed, number)
         simulation.reset()
         parts = list(measure_rounds(simulation, PARTS, steps // PARTS, before=before))
-        costs_s = np.median([part.costs_s for part in parts], axis=0)
-        found += [ShardCost(number, zone, cost_s) for zone, cost_s in enumerate(costs_s.tolist())]
-    return tuple(found)
+        median_s = np.median([part.costs_s for part in parts], axis=0).tolist()
+        costs += [ShardCost(number, zone, cost_s) for zone, cost_s in enumerate(median_s)]
+        places.append(parts[-1].places)
+    return MeasuredWorlds(tuple(costs), np.concatenate(places))

@@ -54,6 +54,34 @@ def test_a_plan_that_cannot_be_is_refused(
     assert "has 2 workers, not 3" in refusal(capsys, "plan", "ring", "--snapshot", str(path))
 
 
+def test_zones_can_be_cut_by_what_was_measured(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    path = tmp_path / "zones.json"
+    rush = (
+        "plan",
+        "rush",
+        "--zones",
+        "4",
+        "--workers",
+        "2",
+        "--snapshot",
+        "idle",
+        "--agents",
+        "50",
+    )
+    short = ("--steps", "5", "--before", "5")
+    assert run(*rush, *short, "--layout", "grid", "--cut-anew", str(path)) == 0
+    said = capsys.readouterr().out.splitlines()[-1]
+    assert f"of 50 vehicles are in other zones: {path}" in said
+    assert run(*rush, *short, "--layout", str(path)) == 0
+    assert run("verify", "rush", "--zones", "4", "--layout", str(path), "--steps", "5") == 0
+    path.unlink()
+    assert run(*rush, *short, "--tolerance", "4", "--cut-anew", str(path)) == 0
+    assert "is not written" in capsys.readouterr().out
+    assert not path.exists()
+
+
 def test_placements_are_compared(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
     path = tmp_path / "found.json"
     words = ("bench", "balance", "grid4x4", "--traces", "2", "--rounds", "8", "--zones", "4")

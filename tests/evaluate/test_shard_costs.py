@@ -31,11 +31,16 @@ def test_a_clock_on_each_zone_changes_nothing(simulation: Simulation) -> None:
 
 
 def test_every_zone_takes_some_time(simulation: Simulation) -> None:
-    costs = measure_shards(simulation, 2, 1, steps=10, before=2)
+    found = measure_shards(simulation, 2, 1, steps=10, before=2)
+    costs = found.costs
     assert [(shard.world, shard.zone) for shard in costs] == [
         (world, zone) for world in (0, 1) for zone in range(4)
     ]
     assert all(shard.cost_s > 0.0 for shard in costs)
+    assert found.zone_costs_s() == [
+        costs[zone].cost_s + costs[4 + zone].cost_s for zone in range(4)
+    ]
+    assert len(found.places) > 24
 
 
 def test_what_drivers_would_do_is_no_cost(simulation: Simulation) -> None:
@@ -57,7 +62,7 @@ def test_numbers_are_checked(simulation: Simulation) -> None:
 
 
 def test_where_hosts_die_nothing_is_timed() -> None:
-    faults = '{"crash_rate": 0.5}'
+    faults = '{"crash_rate": 0.1}'
     make = world_maker("grid4x4", seconds=60, overrides={"zones.faults": faults})
     with pytest.raises(ConfigError, match="no host dies"):
         make(4).time_shards()
