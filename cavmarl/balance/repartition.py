@@ -89,6 +89,7 @@ def propose_zones(
         proposed = cut_map(network, "bisection", partition.count, density=density)
     except ZoneError:
         return None  # all stand in one place: no cut divides them
+    proposed = _renumbered(proposed, zones, proposed.zones_of(positions))
     proposed_zones = proposed.zones_of(positions)
     before, after = (
         imbalance(np.bincount(owners, weights, partition.count).tolist())
@@ -97,3 +98,23 @@ def propose_zones(
     if before - after <= tolerance:
         return None
     return Proposal(proposed, before, after, int((zones != proposed_zones).sum()))
+
+
+def _renumbered(
+    partition: ZonePartition, before: NDArray[np.int32], after: NDArray[np.int32]
+) -> ZonePartition:
+    """The same zones, numbered so that many vehicles stay in the zone that they were in.
+
+    Args:
+        partition: the proposed one.
+        before: zone of each vehicle as it is.
+        after: zone of each vehicle in the proposed one.
+    """
+    count = partition.count
+    common = np.bincount(before * count + after, minlength=count * count).reshape(count, count)
+    order = np.empty(count, dtype=np.int64)
+    for _ in range(count):
+        old, new = np.unravel_index(int(common.argmax()), common.shape)
+        order[old] = new
+        common[old, :] = common[:, new] = -1
+    return ZonePartition(partition.bounds, partition.rects[order])

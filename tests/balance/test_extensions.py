@@ -18,6 +18,7 @@ from cavmarl.balance.repartition import propose_zones
 from cavmarl.errors import PlacementError
 from cavmarl.roads.cache import load_network
 from cavmarl.roads.zone_layouts import cut_map
+from cavmarl.roads.zones import ZonePartition
 from cavmarl.worlds import find_map
 
 NUMBERS = st.floats(-10.0, 10.0).map(lambda value: round(value, 3))
@@ -120,6 +121,17 @@ def test_zones_follow_the_measured_cost(town: tuple[object, np.ndarray]) -> None
     assert found.after < 1.2 < 2.0 < found.before
     moved = (found.partition.zones_of(places) != partition.zones_of(places)).sum()
     assert found.moved == moved > 0
+
+
+def test_other_zones_keep_their_numbers_where_they_can(town: tuple[object, np.ndarray]) -> None:
+    network, places = town
+    halves = cut_map(network, "strips", 2)  # type: ignore[arg-type]
+    for rects in (halves.rects, halves.rects[::-1]):
+        first = ZonePartition(halves.bounds, rects)
+        counts = np.bincount(first.zones_of(places), minlength=2)
+        found = propose_zones(network, first, places, counts.tolist())  # type: ignore[arg-type]
+        assert found is not None
+        assert found.moved < len(places) / 2
 
 
 def test_zones_stay_where_they_are_good_enough(town: tuple[object, np.ndarray]) -> None:
