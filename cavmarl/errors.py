@@ -4,7 +4,8 @@
     ├── ConfigError            a key, a value or a combination that cannot work
     │   ├── UnknownEnvironmentError   no entry, path or map of that name
     │   ├── ZoneError                 zones that overlap, leak or do not fit the map
-    │   └── CoverageError         a zone sees less than its vehicles may need
+    │   ├── CoverageError         a zone sees less than its vehicles may need
+    │   └── PlacementError        loads, weights or workers that no shard can be placed by
     ├── MapError               a map that cannot be read, built or driven
     │   └── RouteError         no way from here to there
     ├── DemandError            a file of traffic that cannot be read or does not fit its map
@@ -39,6 +40,7 @@
     │   └── JournalError          a log that cannot be written or replayed
     │       ├── TornJournalError     only its last line is cut short
     │       └── CorruptJournalError  a line is damaged, missing or out of order
+    ├── NoAdmissibleWorkerError   every worker is too busy to be given a shard
     ├── PolicyError            a policy that cannot be loaded or does not fit
     └── MissingExtraError      an optional dependency is not installed
 
@@ -73,6 +75,8 @@ __all__ = [
     "MessageError",
     "MissingActionError",
     "MissingExtraError",
+    "NoAdmissibleWorkerError",
+    "PlacementError",
     "PolicyError",
     "ProtocolError",
     "ResetNeededError",
@@ -114,6 +118,10 @@ class ZoneError(ConfigError):
 
 class CoverageError(ConfigError):
     """A zone would see less than a vehicle may need before it is handed over."""
+
+
+class PlacementError(ConfigError):
+    """Loads, weights or workers by which no shard can be placed."""
 
 
 class MapError(CavmarlError):
@@ -267,6 +275,20 @@ class TornJournalError(JournalError):
 
 class CorruptJournalError(JournalError):
     """A line of the log is damaged, missing or out of order."""
+
+
+class NoAdmissibleWorkerError(CavmarlError):
+    """Every worker is too busy, or does not answer.
+
+    Attributes:
+        rejections: (worker, resource, value, threshold) of each reason; see `balance.load_score`.
+    """
+
+    def __init__(
+        self, message: str, rejections: tuple[tuple[int, str, float | None, float | None], ...]
+    ) -> None:
+        super().__init__(message)
+        self.rejections = rejections
 
 
 class PolicyError(CavmarlError):

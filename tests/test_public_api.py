@@ -33,6 +33,7 @@ LATE = (
     "rich",
     "fastapi",
     "ray",
+    "psutil",
 )
 
 PROBE = """

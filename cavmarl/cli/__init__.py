@@ -15,6 +15,7 @@ from cavmarl.cli import (
     journal,
     listing,
     map,
+    plan,
     suite,
     verify,
     verify_determinism,
@@ -36,6 +37,7 @@ app.command()(suite.suite)
 app.command()(verify.verify)
 app.command()(verify_determinism.verify_determinism)
 app.command()(journal.journal)
+app.command()(plan.plan)
 app.command()(view.view)
 app.command()(demo.demo)
 app.command("list")(listing.list_entries)

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cavmarl.config import EnvConfig
-from cavmarl.errors import CapacityError, ZoneError
+from cavmarl.errors import CapacityError, ConfigError, ZoneError
 from cavmarl.kernels.arrays import Outputs, Worlds
 from cavmarl.kernels.codes import (
     ACTION_IDLE,
@@ -40,6 +40,7 @@ from cavmarl.runtime.executor import Executor
 from cavmarl.runtime.recovery import Recovery, Revival
 from cavmarl.runtime.referee import Referee
 from cavmarl.runtime.refereeing import make_refereeing
+from cavmarl.runtime.shard_clock import ShardClock
 from cavmarl.runtime.zone_view import ZoneView, view_zones
 from cavmarl.shard.group import ShardGroup
 from cavmarl.shard.shard import Commands
@@ -330,6 +331,18 @@ class Simulation:
         self._commons = wrap(self._commons)
         if self._coordination is not None:
             self._coordination = wrap(self._coordination)
+
+    def time_shards(self) -> ShardClock:
+        """From now on run phases zone by zone, with a clock on each.
+
+        Raises:
+            ConfigError: hosts die by plan, and what is repeated would be counted, too.
+        """
+        if self._recovery is not None:
+            raise ConfigError("zones.faults: shards are timed where no host dies; leave it out")
+        clock = ShardClock(self._shards)
+        self._executor = clock
+        return clock
 
     def _tick(self, commands: Commands, is_first: bool, is_last: bool) -> None:
         """Begin → begin the step → advance … signals → sense → end."""

@@ -23,6 +23,7 @@ COMMANDS = (
     "verify",
     "verify-determinism",
     "journal",
+    "plan",
     "view",
     "demo",
     "list",

@@ -1,0 +1,1 @@
+"""Which worker hosts which shard: scores of workers, costs of shards, plans."""

@@ -1,0 +1,100 @@
+"""Shards of all worlds to workers: a first plan, and what moves later."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from itertools import groupby
+
+from cavmarl.balance.load_score import Candidate, Rejection, admissible, find_rejections
+from cavmarl.balance.placement import Placement, Workers
+from cavmarl.balance.problem import Problem
+from cavmarl.balance.refining import refine
+from cavmarl.balance.spreading import spread, string
+
+__all__ = ["assign", "workers_of"]
+
+
+def workers_of(problem: Problem) -> tuple[Workers, tuple[Rejection, ...]]:
+    """Those that answer, and why which ones are given nothing."""
+    candidates: Sequence[Candidate] = problem.snapshot.workers
+    rejections = find_rejections(candidates, problem.rule.load)
+    answering = [candidate for candidate in candidates if candidate.available]
+    return Workers(answering, rejections, problem.rule.load.weights), rejections
+
+
+def assign(problem: Problem) -> tuple[Placement, str]:
+    """Place all shards, or move some of those that have a worker; and say how in a few words.
+
+    Shards without one (none yet, or theirs does not answer) go where they are done first. Shards
+    with one move only if the slowest worker takes longer than a perfect division by more than the
+    tolerance, at most `max_moves` of them, and only if that is worth it: it saves the tolerance's
+    share of a tick, and its price in time. A worker that is excluded keeps what it has until
+    balance takes it away.
+
+    Raises:
+        NoAdmissibleWorkerError: there are shards to be placed and all workers are excluded.
+    """
+    workers, rejections = workers_of(problem)
+    if problem.present is None:
+        admissible(problem.snapshot.workers, rejections)
+        return _place(problem, workers)
+    place = {number: n for n, number in enumerate(workers.numbers)}
+    placement = Placement(problem, workers, [place.get(home, -1) for home in problem.present])
+    lost = [shard for shard, home in enumerate(placement.homes) if home < 0]
+    if lost:
+        admissible(problem.snapshot.workers, rejections)
+        spread(placement, [[shard] for shard in lost])
+    return _rebalance(placement, "those of lost workers" if lost else "as it was")
+
+
+def _place(problem: Problem, workers: Workers) -> tuple[Placement, str]:
+    """Of several ways the one that keeps most neighbours together and is about as fast as any."""
+    shards = range(len(problem.shards))
+    nowhere = Placement(problem, workers, [-1 for _ in shards])
+    worlds = [list(part) for _, part in groupby(shards, lambda n: problem.shards[n].world)]
+    longest = refine(spread(nowhere.copy(), [[shard] for shard in shards]))
+    if not longest.fair_s:
+        return longest, "evenly by number: no shard costs anything"
+    limit_s = longest.makespan_s * (1.0 + problem.rule.tolerance)
+    slack_s = _slack_s(longest)
+    whole, row = spread(nowhere.copy(), worlds), string(nowhere.copy())
+    ways = [
+        (whole, "worlds whole"),
+        (row, "neighbours in a row"),
+        (
+            refine(whole.copy(), until_s=limit_s, slack_s=slack_s),
+            "worlds whole, but for a few shards",
+        ),
+        (
+            refine(row.copy(), until_s=limit_s, slack_s=slack_s),
+            "neighbours in a row, but for a few shards",
+        ),
+        (longest, "the costliest first"),
+    ]
+    good = [way for way in ways if way[0].makespan_s <= limit_s]
+    return min(good, key=lambda way: (way[0].cut_pairs, way[0].makespan_s))
+
+
+def _rebalance(placement: Placement, method: str) -> tuple[Placement, str]:
+    """One bounded round, if it is worth it."""
+    rule = placement.problem.rule
+    if placement.imbalance <= 1.0 + rule.tolerance:
+        return placement, method
+    slack_s = _slack_s(placement)
+    moved = refine(
+        placement.copy(),
+        until_s=placement.fair_s + slack_s,
+        slack_s=slack_s,
+        max_moves=rule.max_moves,
+    )
+    gain_s = placement.excess_s() - moved.excess_s()
+    moves = sum(one != other for one, other in zip(placement.homes, moved.homes, strict=True))
+    price_s = max(rule.tolerance * placement.fair_s, moves * rule.move_s / rule.payback_ticks)
+    if gain_s > 0.0 and gain_s >= price_s:
+        return moved, "moved from the slowest"
+    return placement, method
+
+
+def _slack_s(placement: Placement) -> float:
+    """What a worker's tick may be longer than a perfect division's while neighbours are sorted."""
+    return 0.5 * placement.problem.rule.tolerance * placement.fair_s

@@ -1,0 +1,271 @@
+"""LoadScore: which worker is least loaded, and which ones are not asked at all.
+
+    LoadScore_i = 0.6 CPU_i + 0.2 RAM_i + 0.2 GPU_i       eq. (1)
+    worker*     = arg min LoadScore_i over the admissible   eq. (2)
+
+after "Distributed CARLA architecture for multi-agent CAV simulation: design and preliminary
+multi-GPU evaluation", section 3.5. A worker one of whose resources is used above its threshold
+(CPU 0.85, RAM 0.90, GPU 0.95) is excluded before anybody scores, so that free resources cannot
+hide a critical one. All utilisations are shares from 0 to 1.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from typing import Literal, NamedTuple
+
+from cavmarl.errors import NoAdmissibleWorkerError, PlacementError
+
+__all__ = [
+    "RESOURCES",
+    "THRESHOLDS",
+    "WEIGHTS",
+    "Candidate",
+    "LoadRule",
+    "Outcome",
+    "Rejection",
+    "Selection",
+    "Utilisation",
+    "admissible",
+    "find_rejections",
+    "load_score",
+    "select",
+]
+
+RESOURCES = ("cpu", "ram", "gpu")
+WEIGHTS = (0.6, 0.2, 0.2)  # empirical in the paper; the processor carries nearly everything
+THRESHOLDS = (0.85, 0.90, 0.95)
+UNAVAILABLE = "unavailable"
+SUM_ERROR = 1e-9  # of weights that are decimal fractions
+
+Outcome = Literal[
+    "lowest score",
+    "preferred",
+    "preferred excluded",
+    "preferred unavailable",
+    "preferred above margin",
+]
+
+
+def _check_share(name: str, value: float) -> None:
+    if not 0.0 <= value <= 1.0:  # NaN is not, either
+        cure = f"; percent? use {value / 100.0:g}" if 1.0 < value <= 100.0 else ""
+        raise PlacementError(f"{name} = {value}: must be a share from 0 to 1{cure}")
+
+
+@dataclass(frozen=True)
+class Utilisation:
+    """How much of each resource is in use, as shares of it.
+
+    Attributes:
+        cpu: of the processors.
+        ram: of the memory.
+        gpu: of the GPU; 0 where there is none.
+
+    Raises:
+        PlacementError: a value outside of [0, 1], or none.
+    """
+
+    cpu: float
+    ram: float
+    gpu: float = 0.0
+
+    def __post_init__(self) -> None:
+        for name in RESOURCES:
+            _check_share(f"utilisation {name}", getattr(self, name))
+
+
+@dataclass(frozen=True)
+class LoadRule:
+    """How workers are scored and which ones are excluded.
+
+    Attributes:
+        weights: of CPU, RAM and GPU in the score; they add up to 1.
+        thresholds: a worker that uses more is excluded; one that uses as much is not.
+        margin: a preferred worker is kept while its score is at most this above the best one.
+
+    Raises:
+        PlacementError: a weight below 0, weights that do not sum to 1, a threshold outside of
+            [0, 1], thresholds that would leave nothing of a worker, a margin below 0.
+    """
+
+    weights: tuple[float, float, float] = WEIGHTS
+    thresholds: tuple[float, float, float] = THRESHOLDS
+    margin: float = 0.05
+
+    def __post_init__(self) -> None:
+        for name, weight in zip(RESOURCES, self.weights, strict=True):
+            if not (math.isfinite(weight) and weight >= 0.0):
+                raise PlacementError(f"weight {name} = {weight}: must be a number from 0 to 1")
+        total = math.fsum(self.weights)
+        if abs(total - 1.0) > SUM_ERROR:
+            raise PlacementError(f"weights {self.weights} sum to {total:g}: they must sum to 1")
+        for name, threshold in zip(RESOURCES, self.thresholds, strict=True):
+            _check_share(f"threshold {name}", threshold)
+        if load_score(Utilisation(*self.thresholds), self.weights) >= 1.0:
+            raise PlacementError(
+                f"thresholds {self.thresholds}: a worker may be used up and still be admissible; "
+                "lower one that has a weight"
+            )
+        if not (math.isfinite(self.margin) and self.margin >= 0.0):
+            raise PlacementError(f"margin = {self.margin}: must be a number from 0 up")
+
+
+def load_score(use: Utilisation, weights: tuple[float, float, float] = WEIGHTS) -> float:
+    """Eq. (1): from 0, where all is free, to 1, where all is used."""
+    pairs = zip(weights, (use.cpu, use.ram, use.gpu), strict=True)
+    return math.fsum(weight * share for weight, share in pairs)
+
+
+DEFAULT_RULE = LoadRule()
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """A worker that could be chosen.
+
+    Attributes:
+        worker: its number.
+        use: what is used of its resources.
+        hosted: how many shards it has; of two with the same score the one with fewer is chosen.
+        available: whether it answers, and what is known of it is recent.
+    """
+
+    worker: int
+    use: Utilisation
+    hosted: int = 0
+    available: bool = True
+
+
+class Rejection(NamedTuple):
+    """Why a worker is not asked.
+
+    Attributes:
+        worker: its number.
+        resource: `cpu`, `ram`, `gpu` or `unavailable`.
+        value: the share in use; None: it is not available.
+        threshold: what the value is above; None: it is not available.
+    """
+
+    worker: int
+    resource: str
+    value: float | None
+    threshold: float | None
+
+    def __str__(self) -> str:
+        if self.value is None:
+            return f"worker {self.worker} is {self.resource}"
+        return f"worker {self.worker}: {self.resource} {self.value!r} > {self.threshold!r}"
+
+
+@dataclass(frozen=True)
+class Selection:
+    """Whom `select` chose and why.
+
+    Attributes:
+        worker: the one.
+        preferred: who was asked for, if anybody.
+        outcome: why it is this one.
+        scores: (worker, LoadScore) of all admissible ones, by worker.
+        rejections: of the others, by worker; one for each resource that is too busy.
+    """
+
+    worker: int
+    preferred: int | None
+    outcome: Outcome
+    scores: tuple[tuple[int, float], ...]
+    rejections: tuple[Rejection, ...]
+
+    @property
+    def redirected(self) -> bool:
+        """Whether another one was asked for."""
+        return self.preferred not in (None, self.worker)
+
+
+def find_rejections(
+    candidates: Iterable[Candidate], rule: LoadRule = DEFAULT_RULE
+) -> tuple[Rejection, ...]:
+    """Why which workers are excluded, by worker; a value at its threshold is no reason."""
+    found: list[Rejection] = []
+    for candidate in sorted(candidates, key=lambda one: one.worker):
+        if not candidate.available:
+            found.append(Rejection(candidate.worker, UNAVAILABLE, None, None))
+            continue
+        for resource, threshold in zip(RESOURCES, rule.thresholds, strict=True):
+            value = getattr(candidate.use, resource)
+            if value > threshold:
+                found.append(Rejection(candidate.worker, resource, value, threshold))
+    return tuple(found)
+
+
+def admissible(
+    candidates: Sequence[Candidate], rejections: Sequence[Rejection]
+) -> tuple[Candidate, ...]:
+    """Those without a reason against them, by worker.
+
+    Raises:
+        NoAdmissibleWorkerError: there is none.
+        PlacementError: two candidates are the same worker.
+    """
+    numbers = [candidate.worker for candidate in candidates]
+    if len(set(numbers)) != len(numbers):
+        raise PlacementError(f"workers {sorted(numbers)}: one of them is named twice")
+    out = {rejection.worker for rejection in rejections}
+    left = [candidate for candidate in candidates if candidate.worker not in out]
+    if not left:
+        said = "; ".join(map(str, rejections)) or "there are no workers"
+        raise NoAdmissibleWorkerError(
+            f"no admissible worker: {said}. Wait until they are less busy, add workers, or raise "
+            "the thresholds",
+            tuple(rejections),
+        )
+    return tuple(sorted(left, key=lambda one: one.worker))
+
+
+def select(
+    candidates: Sequence[Candidate],
+    rule: LoadRule = DEFAULT_RULE,
+    preferred: int | None = None,
+) -> Selection:
+    """The admissible worker of the lowest score, or the preferred one if it is about as good.
+
+    Of equal scores the one that hosts fewer shards wins, then the lower number: the order of
+    `candidates` never counts.
+
+    Args:
+        candidates: all workers.
+        rule: weights, thresholds, and how much worse a preferred worker may be.
+        preferred: who is kept while it is admissible and within the margin.
+
+    Raises:
+        NoAdmissibleWorkerError: all are excluded; the error holds every reason.
+        PlacementError: the preferred worker is none of them.
+    """
+    known = {candidate.worker for candidate in candidates}
+    if preferred is not None and preferred not in known:
+        raise PlacementError(f"preferred worker {preferred}: there are {sorted(known)}")
+    rejections = find_rejections(candidates, rule)
+    left = admissible(candidates, rejections)
+    scores = {candidate.worker: load_score(candidate.use, rule.weights) for candidate in left}
+    best = min(left, key=lambda one: (scores[one.worker], one.hosted, one.worker)).worker
+    outcome = _judge(preferred, best, scores, rejections, rule)
+    chosen = preferred if outcome == "preferred" and preferred is not None else best
+    return Selection(chosen, preferred, outcome, tuple(scores.items()), rejections)
+
+
+def _judge(
+    preferred: int | None,
+    best: int,
+    scores: dict[int, float],
+    rejections: Sequence[Rejection],
+    rule: LoadRule,
+) -> Outcome:
+    if preferred is None:
+        return "lowest score"
+    if preferred in scores:
+        near = scores[preferred] <= scores[best] + rule.margin
+        return "preferred" if near else "preferred above margin"
+    gone = Rejection(preferred, UNAVAILABLE, None, None) in rejections
+    return "preferred unavailable" if gone else "preferred excluded"

@@ -1,0 +1,137 @@
+"""`Problem`: what a plan is made from, whole: costs, neighbours, workers, rules, present homes."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import NamedTuple
+
+from cavmarl.balance.load_score import LoadRule
+from cavmarl.balance.snapshot import Snapshot
+from cavmarl.errors import PlacementError
+
+__all__ = ["BalanceRule", "Problem", "ShardCost"]
+
+
+class ShardCost(NamedTuple):
+    """What one shard costs.
+
+    Attributes:
+        world: its world.
+        zone: its zone.
+        cost_s: seconds a tick, on a processor that nobody else uses.
+    """
+
+    world: int
+    zone: int
+    cost_s: float
+
+
+@dataclass(frozen=True)
+class BalanceRule:
+    """When shards move, and how many at once.
+
+    Attributes:
+        load: how workers are scored and excluded.
+        tolerance: while the slowest worker takes at most this share longer than a perfect division
+            would, nothing moves; a round that gains less than this is not made; and so much may be
+            given up to keep neighbours together.
+        max_moves: shards that change their worker in one round, those of lost workers not counted.
+        move_s: what a move costs, once.
+        payback_ticks: a round is made only if it saves the workers together that much in so many
+            ticks.
+
+    Raises:
+        PlacementError: a tolerance or a price below 0, no move a round, or no tick.
+    """
+
+    load: LoadRule = field(default_factory=LoadRule)
+    tolerance: float = 0.1
+    max_moves: int = 4
+    move_s: float = 0.01
+    payback_ticks: int = 1000
+
+    def __post_init__(self) -> None:
+        for name in ("tolerance", "move_s"):
+            value = getattr(self, name)
+            if not (math.isfinite(value) and value >= 0.0):
+                raise PlacementError(f"{name} = {value}: must be a number from 0 up")
+        for name in ("max_moves", "payback_ticks"):
+            if getattr(self, name) < 1:
+                raise PlacementError(f"{name} = {getattr(self, name)}: must be at least 1")
+
+
+@dataclass(frozen=True)
+class Problem:
+    """Everything that a plan follows from; it is put in order, so that no order ever counts.
+
+    Attributes:
+        shards: of all worlds, by world and zone.
+        neighbors: for each zone those that share a side with it.
+        snapshot: of the workers.
+        rule: when shards move.
+        present: worker of each shard now, in the order of `shards`; None: nobody hosts any yet.
+
+    Raises:
+        PlacementError: no shard, one twice, a cost below 0 or none, a zone without a row in
+            `neighbors`, more workers than shards, not one present worker a shard.
+    """
+
+    shards: tuple[ShardCost, ...]
+    neighbors: tuple[tuple[int, ...], ...]
+    snapshot: Snapshot
+    rule: BalanceRule = field(default_factory=BalanceRule)
+    present: tuple[int, ...] | None = None
+
+    def __post_init__(self) -> None:
+        _check_shards(self.shards, len(self.neighbors))
+        workers = len(self.snapshot.workers)
+        if workers > len(self.shards):
+            raise PlacementError(
+                f"{workers} workers for {len(self.shards)} shards: use at most as many workers as "
+                "there are shards, or more zones or worlds"
+            )
+        if self.present is not None and len(self.present) != len(self.shards):
+            raise PlacementError(
+                f"{len(self.present)} present workers of {len(self.shards)} shards: name one each"
+            )
+        order = sorted(range(len(self.shards)), key=lambda n: self.shards[n])
+        object.__setattr__(self, "shards", tuple(self.shards[n] for n in order))
+        if self.present is not None:
+            object.__setattr__(self, "present", tuple(self.present[n] for n in order))
+
+    @cached_property
+    def pairs(self) -> tuple[tuple[int, int], ...]:
+        """Shards, by their place in `shards`, whose zones share a side in one world."""
+        place = {(shard.world, shard.zone): n for n, shard in enumerate(self.shards)}
+        return tuple(
+            sorted(
+                {
+                    (n, place[shard.world, zone])
+                    for n, shard in enumerate(self.shards)
+                    for zone in self.neighbors[shard.zone]
+                    if (shard.world, zone) in place and n < place[shard.world, zone]
+                }
+            )
+        )
+
+
+def _check_shards(shards: Sequence[ShardCost], zones: int) -> None:
+    if not shards:
+        raise PlacementError("no shards: there must be at least one")
+    names = [(shard.world, shard.zone) for shard in shards]
+    if len(set(names)) != len(names):
+        twice = next(name for name in names if names.count(name) > 1)
+        raise PlacementError(f"world {twice[0]}, zone {twice[1]}: is named twice")
+    for shard in shards:
+        if not 0 <= shard.zone < zones:
+            raise PlacementError(
+                f"world {shard.world}, zone {shard.zone}: there are neighbours of {zones} zones"
+            )
+        if not (math.isfinite(shard.cost_s) and shard.cost_s >= 0.0):
+            raise PlacementError(
+                f"world {shard.world}, zone {shard.zone}: cost_s = {shard.cost_s}: must be "
+                "seconds from 0 up; measure it again"
+            )

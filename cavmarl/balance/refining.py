@@ -1,0 +1,119 @@
+"""Moves and swaps that make the slowest worker faster, one after the other."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cavmarl.balance.placement import Placement
+from cavmarl.balance.problem import Problem
+
+__all__ = ["refine"]
+
+Floats = NDArray[np.float64]
+LEAST_GAIN = 1e-9  # of a tick: below it sums may differ by rounding
+MOVES_A_SHARD = 4  # a limit that is not met: every change makes the slowest pair faster
+
+
+def refine(
+    placement: Placement,
+    *,
+    until_s: float = 0.0,
+    slack_s: float = 0.0,
+    max_moves: int | None = None,
+) -> Placement:
+    """Move one shard off the slowest worker, or swap it for one of another, as long as that helps.
+
+    A change helps if both workers then take less long than the slowest took. Nothing is moved to
+    a worker that is excluded.
+
+    Args:
+        placement: it is changed, and returned.
+        until_s: a makespan that is good enough.
+        slack_s: of all changes that help and are worse than the best by no more than this, the one
+            that tears fewest neighbours apart is made.
+        max_moves: of shards; a swap is two. None: as many as help.
+    """
+    left = MOVES_A_SHARD * len(placement.homes) if max_moves is None else max_moves
+    touching = _touching(placement.problem)
+    while left > 0 and placement.makespan_s > until_s:
+        change = _best_change(placement, touching, slack_s, may_swap=left > 1)
+        if change is None:
+            break
+        shard, other, target = change
+        if other is not None:
+            placement.homes[other] = placement.homes[shard]
+        placement.homes[shard] = target
+        left -= 1 if other is None else 2
+    return placement
+
+
+def _touching(problem: Problem) -> NDArray[np.int64]:
+    """(n, n) 1 where two shards are neighbours."""
+    touching = np.zeros((len(problem.shards), len(problem.shards)), dtype=np.int64)
+    for a, b in problem.pairs:
+        touching[a, b] = touching[b, a] = 1
+    return touching
+
+
+def _best_change(
+    placement: Placement, touching: NDArray[np.int64], slack_s: float, *, may_swap: bool
+) -> tuple[int, int | None, int] | None:
+    """(shard of the slowest worker, whom it is swapped for, its new worker); None: none helps."""
+    workers = placement.workers
+    homes, count = np.array(placement.homes), len(workers)
+    costs = np.array([shard.cost_s for shard in placement.problem.shards])
+    loads, ticks = placement.loads_s(), placement.ticks_s()
+    source = int(ticks.argmax())
+    own = np.flatnonzero(homes == source)
+    others = np.flatnonzero(homes != source)
+    if not (may_swap and workers.is_open[source]):
+        others = others[:0]
+    # What comes back: nothing, from each worker, or one of the others.
+    targets = np.concatenate([np.arange(count), homes[others]])
+    back = np.concatenate([np.zeros(count), costs[others]])
+    change = costs[own][:, None] - back[None, :]
+    worst = np.maximum(
+        (loads[source] - change) / workers.speeds[source],
+        (loads[targets] + change) / workers.speeds[targets],
+    )
+    worst[:, ~workers.is_open[targets] | (targets == source)] = math.inf
+    if not worst.size or not worst.min() < ticks[source] * (1.0 - LEAST_GAIN):
+        return None
+    limit_s = min(worst.min() + slack_s, ticks[source] * (1.0 - LEAST_GAIN))
+    near = touching @ (homes[:, None] == np.arange(count)).astype(np.int64)
+    cut = _more_cut(near, touching, own, others, source, targets)
+    rows, columns = np.nonzero(worst <= limit_s)
+    best = np.lexsort((columns, rows, worst[rows, columns], cut[rows, columns]))[0]
+    row, column = int(rows[best]), int(columns[best])
+    other = None if column < count else int(others[column - count])
+    return int(own[row]), other, int(targets[column])
+
+
+def _more_cut(
+    near: NDArray[np.int64],
+    touching: NDArray[np.int64],
+    own: NDArray[np.int64],
+    others: NDArray[np.int64],
+    source: int,
+    targets: NDArray[np.int64],
+) -> NDArray[np.int64]:
+    """How many more pairs of neighbours each change cuts, (own, targets).
+
+    Args:
+        near: (n, m) neighbours of each shard on each worker.
+        touching: (n, n) who is a neighbour of whom.
+        own: shards of the source.
+        others: those that may be swapped for; they are the last columns.
+        source: the worker that gives.
+        targets: the worker that takes, column by column.
+    """
+    cut = near[own, source][:, None] - near[own][:, targets]
+    first = len(targets) - len(others)
+    homes = targets[first:]
+    cut[:, first:] += (near[others, homes] - near[others, source])[None, :]
+    # Two neighbours that change places stay apart.
+    cut[:, first:] += 2 * touching[np.ix_(own, others)]
+    return np.asarray(cut)

@@ -1,0 +1,37 @@
+"""Measured costs without their noise."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+from cavmarl.balance.problem import ShardCost
+from cavmarl.errors import PlacementError
+
+__all__ = ["SmoothCosts"]
+
+
+class SmoothCosts:
+    """The exponentially weighted mean of each shard's cost.
+
+    Args:
+        newest: weight of the newest measurement; the first one of a shard counts whole.
+
+    Raises:
+        PlacementError: a weight that is not above 0 and at most 1.
+    """
+
+    def __init__(self, newest: float = 0.3) -> None:
+        if not 0.0 < newest <= 1.0:
+            raise PlacementError(f"newest = {newest}: must be above 0 and at most 1")
+        self._newest = newest
+        self._mean_s: dict[tuple[int, int], float] = {}
+
+    def update(self, measured: Iterable[ShardCost]) -> tuple[ShardCost, ...]:
+        """Take in one round of measurements; the means of its shards."""
+        means = []
+        for shard in measured:
+            name = (shard.world, shard.zone)
+            before_s = self._mean_s.get(name, shard.cost_s)
+            self._mean_s[name] = before_s + self._newest * (shard.cost_s - before_s)
+            means.append(shard._replace(cost_s=self._mean_s[name]))
+        return tuple(means)

@@ -1,0 +1,91 @@
+"""Where shards go that have no worker yet: the longest first, or in a row."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Sequence
+
+from cavmarl.balance.placement import Placement
+
+__all__ = ["spread", "string"]
+
+HALVINGS = 60  # of an interval: more than a float can tell
+
+
+def spread(placement: Placement, groups: Iterable[Sequence[int]]) -> Placement:
+    """Give each group, the costliest first, to the worker that would be through with it first.
+
+    LPT: at most 4/3 - 1/(3m) times the least makespan for m equal workers (Graham, SIAM J. Appl.
+    Math. 17, 1969), at most twice with different speeds (Gonzalez, Ibarra, Sahni, SIAM J. Comput.
+    6, 1977). Of equal workers the one with fewer shards wins, then the lower score, then the lower
+    number.
+
+    Args:
+        placement: it is changed, and returned.
+        groups: of shards that stay together.
+    """
+    workers, shards = placement.workers, placement.problem.shards
+    loads = placement.loads_s().tolist()
+    hosted = [len(placement.on(worker)) for worker in range(len(workers))]
+    able = [worker for worker, is_open in enumerate(workers.is_open) if is_open]
+    priced = [(math.fsum(shards[shard].cost_s for shard in group), group) for group in groups]
+    for cost_s, group in sorted(priced, key=lambda entry: (-entry[0], entry[1])):
+
+        def end(worker: int, cost_s: float = cost_s) -> tuple[float, int, float, int]:
+            tick_s = (loads[worker] + cost_s) / float(workers.speeds[worker])
+            return tick_s, hosted[worker], workers.scores[worker], worker
+
+        best = min(able, key=end)
+        loads[best] += cost_s
+        hosted[best] += len(group)
+        for shard in group:
+            placement.homes[shard] = best
+    return placement
+
+
+def string(placement: Placement) -> Placement:
+    """Divide the row of all shards, by world and zone, into one piece a worker.
+
+    Zones of a bisection that follow each other are neighbours, so pieces hold together. Of all such
+    divisions it is one of the least makespan: the limit is halved in, and each worker takes as many
+    as it can within the limit (chains on chains; Pinar and Aykanat, J. Parallel Distrib. Comput.
+    64, 2004).
+
+    Args:
+        placement: it is changed, and returned.
+    """
+    low, high = 0.0, _longest_s(placement)
+    homes = _within(placement, high)
+    for _ in range(HALVINGS):
+        middle = 0.5 * (low + high)
+        found = _within(placement, middle)
+        if found is None:
+            low = middle
+        else:
+            high, homes = middle, found
+    placement.homes[:] = homes or placement.homes
+    return placement
+
+
+def _longest_s(placement: Placement) -> float:
+    """A limit within which the slowest worker alone could take all."""
+    workers = placement.workers
+    slowest = float(workers.speeds[workers.is_open].min())
+    return 2.0 * math.fsum(shard.cost_s for shard in placement.problem.shards) / slowest
+
+
+def _within(placement: Placement, limit_s: float) -> list[int] | None:
+    """The pieces where no worker takes longer than the limit; None: they are not enough."""
+    workers = placement.workers
+    homes: list[int] = []
+    able = iter([worker for worker, is_open in enumerate(workers.is_open) if is_open])
+    worker, left_s = -1, -1.0
+    for shard in placement.problem.shards:
+        while shard.cost_s > left_s:
+            worker = next(able, -1)
+            if worker < 0:
+                return None
+            left_s = limit_s * float(workers.speeds[worker])
+        left_s -= shard.cost_s
+        homes.append(worker)
+    return homes

@@ -1,0 +1,172 @@
+"""`cavmarl plan`: which worker would host which shard, by what zones cost here and now."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+from rich.console import Console
+
+from cavmarl.cli.output import (
+    Agents,
+    Background,
+    JsonPath,
+    Seed,
+    Settings,
+    parse_settings,
+    print_error,
+    write_json,
+)
+from cavmarl.config import ZONE_LAYOUTS
+from cavmarl.errors import ConfigError
+
+if TYPE_CHECKING:
+    from cavmarl.balance.snapshot import Snapshot
+    from cavmarl.evaluate.shard_costs import MeasuredWorlds
+    from cavmarl.roads.network import RoadNetwork
+    from cavmarl.roads.zones import ZonePartition
+
+__all__ = ["plan"]
+
+NOW, IDLE = "now", "idle"
+LASTING_S = 3600  # of the worlds: longer than anybody measures
+
+
+def plan(
+    env: Annotated[
+        str | None,
+        typer.Argument(metavar="[ENV]", help="Name, folder or map file; not with --again."),
+    ] = None,
+    zones: Annotated[int, typer.Option(help="Of each world.")] = 9,
+    workers: Annotated[int, typer.Option(help="That shards are placed on.")] = 3,
+    worlds: Annotated[int, typer.Option(min=1, help="Of the environment.")] = 1,
+    layout: Annotated[
+        str, typer.Option(help=f"{', '.join(ZONE_LAYOUTS)}, or a zone file.")
+    ] = "bisection",
+    snapshot: Annotated[
+        str,
+        typer.Option(
+            help=f"How busy workers are: {NOW} as this machine is, {IDLE}, or the plan of a file."
+        ),
+    ] = NOW,
+    steps: Annotated[int, typer.Option(help="Of each world that are measured.")] = 50,
+    before: Annotated[int, typer.Option(help="Steps of each world that come first.")] = 50,
+    tolerance: Annotated[float, typer.Option(help="Imbalance below which nothing moves.")] = 0.1,
+    again: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FILE",
+            help="Make a stored plan once more from what it says; exit code 1 if it is another.",
+        ),
+    ] = None,
+    cut: Annotated[
+        Path | None,
+        typer.Option(
+            "--cut-anew",
+            metavar="FILE",
+            help="Extension: write a zone file here that shares out what was measured.",
+        ),
+    ] = None,
+    agents: Agents = None,
+    background: Background = None,
+    seed: Seed = 0,
+    settings: Settings = None,
+    json_path: JsonPath = None,
+) -> None:
+    """Measure what each zone costs, place the shards, and print the plan; nothing is started."""
+    from cavmarl.balance.plan import make_plan
+    from cavmarl.balance.plan_text import describe_plan
+    from cavmarl.balance.problem import BalanceRule, Problem
+    from cavmarl.evaluate.shard_costs import measure_shards, side_neighbors
+    from cavmarl.evaluate.sharded_worlds import world_maker
+
+    if again is not None:
+        _make_again(again)
+        return
+    if env is None:
+        raise ConfigError("name an environment, or give --again with a stored plan")
+    if workers < 1:
+        raise ConfigError(f"workers = {workers}: must be at least 1")
+    rule = BalanceRule(tolerance=tolerance)
+    seen = _snapshot(snapshot, workers)
+    console = Console()
+    with console.status("measuring"):
+        make = world_maker(
+            env,
+            layout=layout,
+            seconds=LASTING_S,
+            seed=seed,
+            agents=agents,
+            background=background,
+            overrides=parse_settings(settings),
+        )
+        simulation = make(zones)
+        measured = measure_shards(simulation, worlds, seed, steps=steps, before=before)
+    partition = simulation.partition
+    made = make_plan(Problem(measured.costs, side_neighbors(partition), seen, rule))
+    console.print(describe_plan(made), markup=False, highlight=False, soft_wrap=True)
+    if cut is not None:
+        said = _cut_anew(simulation.network, partition, measured, tolerance, cut)
+        console.print(said, markup=False, highlight=False, soft_wrap=True)
+    write_json(json_path, made.to_dict())
+
+
+def _cut_anew(
+    network: RoadNetwork,
+    partition: ZonePartition,
+    measured: MeasuredWorlds,
+    tolerance: float,
+    path: Path,
+) -> str:
+    """Write zones of about the same cost, if that gains anything, and say what."""
+    from cavmarl.balance.repartition import propose_zones
+    from cavmarl.roads.zone_file import write_zones
+
+    found = propose_zones(
+        network, partition, measured.places, measured.zone_costs_s(), tolerance=tolerance
+    )
+    if found is None:
+        return f"cut anew: no other zones are more even by the tolerance; {path} is not written"
+    write_zones(path, found.partition)
+    return (
+        f"cut anew: costs of zones, max / mean, from {found.before:.3f} to {found.after:.3f}; "
+        f"{found.moved} of {len(measured.places)} vehicles are in other zones: {path}"
+    )
+
+
+def _snapshot(said: str, workers: int) -> Snapshot:
+    from cavmarl.balance.probe import take_snapshot
+    from cavmarl.balance.snapshot import idle_snapshot, snapshot_from_dict
+
+    if said == NOW:
+        return take_snapshot(dict.fromkeys(range(workers)))
+    if said == IDLE:
+        return idle_snapshot(workers)
+    found = snapshot_from_dict(_read(Path(said)).get("snapshot", {}))
+    if len(found.workers) != workers:
+        raise ConfigError(f"{said}: has {len(found.workers)} workers, not {workers}: --workers")
+    return found
+
+
+def _make_again(path: Path) -> None:
+    from cavmarl.balance.plan import plan_from_dict, replan
+    from cavmarl.balance.plan_text import describe_plan
+
+    stored = plan_from_dict(_read(path))
+    made = replan(stored, stored.problem.snapshot)
+    Console().print(describe_plan(made), markup=False, highlight=False, soft_wrap=True)
+    if made != stored:
+        print_error(f"{path}: its shards do not stand where its own figures put them")
+        raise typer.Exit(1)
+
+
+def _read(path: Path) -> dict[str, Any]:
+    try:
+        document = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError, RecursionError) as error:
+        raise ConfigError(f"{path}: cannot be read ({error})") from error
+    if not isinstance(document, dict):
+        raise ConfigError(f"{path}: not a plan")
+    return document

@@ -1,0 +1,101 @@
+"""A plan can be read, kept, and made again from what is kept."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from typing import Any
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from cavmarl.balance.load_score import Candidate, LoadRule, Utilisation
+from cavmarl.balance.plan import Plan, make_plan, plan_from_dict, replan
+from cavmarl.balance.plan_text import describe_plan
+from cavmarl.balance.problem import BalanceRule, Problem
+from cavmarl.balance.snapshot import Snapshot, idle_snapshot
+from cavmarl.errors import PlacementError
+from tests.balance.shards import COSTS, busy, grid, row
+
+
+@pytest.fixture
+def plan() -> Plan:
+    away = Candidate(3, Utilisation(0.0, 0.0), available=False)
+    snapshot = Snapshot((*busy(0.1, 0.2, 0.9).workers, away), "none", "generated")
+    rule = BalanceRule(LoadRule((0.5, 0.25, 0.25)), tolerance=0.05, max_moves=3)
+    present = (0, 0, 0, 0, 0, 1, 1, 2)
+    costs = [0.004, 0.001, 0.002, 0.001, 0.003, 0.001, 0.001, 0.001]
+    return make_plan(Problem(row(costs, worlds=2), grid(2, 2), snapshot, rule, present))
+
+
+def test_a_plan_goes_to_json_and_back(plan: Plan) -> None:
+    again = plan_from_dict(json.loads(json.dumps(plan.to_dict())))
+    assert again == plan
+    assert again.to_dict() == plan.to_dict()
+
+
+@settings(deadline=None)
+@given(
+    st.lists(COSTS, min_size=4, max_size=9), st.lists(st.floats(0.0, 0.85), min_size=1, max_size=4)
+)
+def test_a_plan_is_made_again_from_its_snapshot(costs: list[float], cpus: list[float]) -> None:
+    plan = make_plan(Problem(row(costs), grid(1, len(costs)), busy(*cpus)))
+    kept = plan_from_dict(json.loads(json.dumps(plan.to_dict())))
+    assert replan(kept, kept.problem.snapshot) == plan
+
+
+def test_another_snapshot_gives_another_plan(plan: Plan) -> None:
+    first = make_plan(replace(plan.problem, present=None))
+    assert replan(first, idle_snapshot(1)).homes == (0,) * 8
+
+
+def test_what_follows_from_a_plan(plan: Plan) -> None:
+    document = plan.to_dict()
+    assert [worker["worker"] for worker in document["workers"]] == [0, 1, 2]
+    assert sum(worker["load_s"] for worker in document["workers"]) == pytest.approx(0.014)
+    assert {reason["worker"] for reason in document["rejections"]} == {2, 3}
+    for move in plan.moves:
+        assert plan.homes[4 * move.world + move.zone] == move.target != move.source
+    assert document["imbalance"] == plan.imbalance > 0.0
+
+
+def test_a_plan_can_be_read(plan: Plan) -> None:
+    text = describe_plan(plan)
+    assert text.startswith("8 shards on 4 workers, moved from the slowest\n")
+    assert "score = 0.5 CPU + 0.25 RAM + 0.25 GPU; workers generated, GPU: none" in text
+    assert "excluded: worker 2: cpu 0.9 > 0.85" in text
+    assert "excluded: worker 3 is unavailable" in text
+    (first,) = (line for line in text.splitlines() if line.startswith("     0"))
+    assert "0.050" in first
+    assert f"moves: {len(plan.moves)}" in text
+    assert all(f"worker {move.source} → {move.target}" in text for move in plan.moves)
+
+
+def test_zones_are_named_by_runs() -> None:
+    plan = make_plan(Problem(row([1.0] * 8, worlds=2), grid(2, 2), idle_snapshot(1)))
+    assert describe_plan(plan).splitlines()[-1].endswith("  0: 0-3; 1: 0-3")
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        ({"schema": "other"}, "no schema 'cavmarl.plan'"),
+        ({"version": 2}, "version 2"),
+        ({"shards": None}, "not a plan"),
+        ({"rule": {}}, "not a plan"),
+        ({"snapshot": {"workers": []}}, "not a snapshot"),
+        ({"snapshot": {"workers": [], "gpu_source": "none", "origin": ""}}, "no workers"),
+        ({"present": [0]}, "1 present workers"),
+    ],
+)
+def test_what_is_no_plan_is_refused(plan: Plan, change: dict[str, Any], said: str) -> None:
+    with pytest.raises(PlacementError, match=said):
+        plan_from_dict(plan.to_dict() | change)
+
+
+def test_a_share_that_is_none_is_refused_in_a_stored_plan(plan: Plan) -> None:
+    document = plan.to_dict()
+    document["snapshot"]["workers"][0]["use"]["cpu"] = 12.0
+    with pytest.raises(PlacementError, match="utilisation cpu = 12"):
+        plan_from_dict(document)

@@ -1,0 +1,35 @@
+"""The balancer needs the standard library and NumPy; two files need more, and say so."""
+
+from __future__ import annotations
+
+import ast
+import sys
+from pathlib import Path
+
+import pytest
+
+FILES = sorted((Path(__file__).resolve().parents[2] / "cavmarl/balance").glob("*.py"))
+MORE = {"probe": {"psutil"}, "repartition": {"cavmarl.roads"}}
+IMPURE = {"datetime", "multiprocessing", "os", "random", "shutil", "socket", "subprocess", "time"}
+
+
+@pytest.mark.parametrize("path", FILES, ids=lambda path: path.stem)
+def test_what_a_file_imports(path: Path) -> None:
+    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+        if isinstance(node, ast.Import):
+            names = [alias.name for alias in node.names]
+        elif isinstance(node, ast.ImportFrom):
+            names = [node.module or ""]
+        else:
+            continue
+        for name in names:
+            if any(name.startswith(more) for more in MORE.get(path.stem, ())):
+                continue
+            ours = name == "cavmarl.errors" or name.startswith("cavmarl.balance.")
+            top = name.split(".")[0]
+            assert ours or top == "numpy" or top in sys.stdlib_module_names, name
+            assert path.stem == "probe" or top not in IMPURE, name
+
+
+def test_there_are_files() -> None:
+    assert len(FILES) > 10

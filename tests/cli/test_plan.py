@@ -1,0 +1,96 @@
+"""`cavmarl plan` and `cavmarl bench balance`."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+
+from tests.cli.test_main import refusal, run
+
+QUICK = ("--steps", "5", "--before", "1", "--agents", "2", "--background", "8")
+
+
+def test_a_plan_is_printed_kept_and_made_again(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    path = tmp_path / "plan.json"
+    words = ("plan", "grid4x4", "--zones", "4", "--workers", "2", "--worlds", "2", *QUICK)
+    assert run(*words, "--snapshot", "idle", "--json", str(path)) == 0
+    shown = capsys.readouterr().out
+    assert shown.startswith("8 shards on 2 workers")
+    assert "supposed idle" in shown
+    assert run("plan", "--again", str(path)) == 0
+    assert capsys.readouterr().out == shown
+    assert run(*words, "--snapshot", str(path)) == 0
+    document = json.loads(path.read_text())
+    document["shards"][0]["worker"] = 1 - document["shards"][0]["worker"]
+    path.write_text(json.dumps(document))
+    assert run("plan", "--again", str(path)) == 1
+    assert "do not stand" in capsys.readouterr().err
+
+
+def test_a_plan_that_cannot_be_is_refused(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    few = ("plan", "ring", "--zones", "2", "--snapshot", "idle", *QUICK)
+    assert "3 workers for 2 shards" in refusal(capsys, *few, "--workers", "3")
+    assert "workers = 0" in refusal(capsys, *few, "--workers", "0")
+    assert "name an environment" in refusal(capsys, "plan")
+    assert "cannot be read" in refusal(capsys, "plan", "--again", str(tmp_path / "none"))
+    path = tmp_path / "other.json"
+    path.write_text("[]")
+    assert "not a plan" in refusal(capsys, "plan", "--again", str(path))
+    path.write_text("{}")
+    assert "no schema" in refusal(capsys, "plan", "--again", str(path))
+    assert "not a snapshot" in refusal(capsys, "plan", "ring", "--snapshot", str(path))
+    busy = {"cpu": 0.99, "ram": 0.1, "gpu": 0.0}
+    workers = [{"worker": n, "use": busy, "hosted": 0, "available": True} for n in (0, 1)]
+    snapshot = {"workers": workers, "gpu_source": "none", "origin": "measured"}
+    path.write_text(json.dumps({"snapshot": snapshot}))
+    said = refusal(capsys, *few[:4], "--workers", "2", "--snapshot", str(path), *QUICK)
+    assert "no admissible worker: worker 0: cpu 0.99 > 0.85; worker 1: cpu 0.99 > 0.85" in said
+    assert "has 2 workers, not 3" in refusal(capsys, "plan", "ring", "--snapshot", str(path))
+
+
+def test_zones_can_be_cut_by_what_was_measured(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    path = tmp_path / "zones.json"
+    rush = (
+        "plan",
+        "rush",
+        "--zones",
+        "4",
+        "--workers",
+        "2",
+        "--snapshot",
+        "idle",
+        "--agents",
+        "50",
+    )
+    short = ("--steps", "5", "--before", "5")
+    assert run(*rush, *short, "--layout", "grid", "--cut-anew", str(path)) == 0
+    said = capsys.readouterr().out.splitlines()[-1]
+    assert f"of 50 vehicles are in other zones: {path}" in said
+    assert run(*rush, *short, "--layout", str(path)) == 0
+    assert run("verify", "rush", "--zones", "4", "--layout", str(path), "--steps", "5") == 0
+    path.unlink()
+    assert run(*rush, *short, "--tolerance", "4", "--cut-anew", str(path)) == 0
+    assert "is not written" in capsys.readouterr().out
+    assert not path.exists()
+
+
+def test_placements_are_compared(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    path = tmp_path / "found.json"
+    words = ("bench", "balance", "grid4x4", "--traces", "2", "--rounds", "8", "--zones", "4")
+    assert run(*words, "--workers", "2", "--json", str(path)) == 0
+    shown = capsys.readouterr().out
+    for name in ("static", "balanced", "calibrated", "predicted", "re-cut", "perfect"):
+        assert name in shown
+    document = json.loads(path.read_text())
+    assert len(document["replay"]["rows"]) == 6
+    assert document["recorded"] is False
+    assert "workers = 0" in refusal(capsys, *words, "--workers", "0")
+    assert "no settings" in refusal(capsys, *words, "--set", "horizon_s=1")
