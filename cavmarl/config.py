@@ -135,6 +135,8 @@ class ZonesConfig:
         journal: file for the coordinator's log; empty: none. It must not exist.
         check: watch the invariants of ownership at run time.
         faults: a plan of faults to inject, as JSON or a file of it; empty: none.
+        reproducers: folder for a tick that every host of a zone died of, from which it can be run
+            again; empty: the system's folder for temporary files.
     """
 
     layout: str = "bisection"
@@ -150,6 +152,7 @@ class ZonesConfig:
     journal: str = ""
     check: bool = False
     faults: str = ""
+    reproducers: str = ""
 
     def __post_init__(self) -> None:
         _check(

@@ -11,11 +11,12 @@ from numpy.typing import NDArray
 from cavmarl.errors import JournalError, ProtocolError
 from cavmarl.kernels.arrays import Gate
 from cavmarl.kernels.zones import zones_of
+from cavmarl.ownership.messages import Record
 from cavmarl.runtime.coordinator import Coordinator, Near
 from cavmarl.runtime.division import Division
 from cavmarl.runtime.monitor import Monitor
 from cavmarl.runtime.row_digests import RowDigests
-from cavmarl.runtime.store import CommittedStore
+from cavmarl.runtime.store import CommittedStore, Notes
 from cavmarl.runtime.surroundings import NearBorders
 from cavmarl.runtime.zone_view import TransferInFlight
 from cavmarl.shard.shard import Commands
@@ -176,6 +177,18 @@ class Coordination:
         coordinator.journal = journal.reopened()
         coordinator.restart(tuple(coordinator.journal.read()))
         return coordinator
+
+    def take_up(self, records: Sequence[Record], notes: Sequence[Notes]) -> None:
+        """Go on in the one world where others have stopped.
+
+        Args:
+            records: of their coordinator.
+            notes: what has happened since its last BEGIN.
+        """
+        (coordinator,) = self.coordinators
+        coordinator.take_up(records)
+        coordinator.resume(*notes[0])
+        self._stirred[0] = True
 
     def left(self, gate: Gate) -> None:
         """Those in `gate.passing` have left their worlds."""

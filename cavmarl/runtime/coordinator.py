@@ -28,7 +28,7 @@ from cavmarl.ownership.messages import (
 from cavmarl.ownership.offers import Approach
 from cavmarl.ownership.reactions import Advance
 from cavmarl.ownership.safeguards import ALL_ON, Safeguards
-from cavmarl.runtime.journal import AnyJournal
+from cavmarl.runtime.journal import AnyJournal, MemoryJournal
 from cavmarl.runtime.post import DirectPost, Parcel, Post
 
 __all__ = ["Coordinator", "Entry", "Near", "Watcher"]
@@ -374,6 +374,17 @@ class Coordinator:
             records, zones, self._states, self._limits, self._safeguards
         )
         self.resume()
+
+    def take_up(self, records: Sequence[Record]) -> None:
+        """All parties are new, and know what another coordinator's records say."""
+        self.restart(records)
+        self.endpoints, self._leases = {}, {}
+        for zone in self.directory.table.hosts:
+            hosting = self.directory.hosting(zone)
+            self.endpoints[zone] = Endpoint(hosting, self._limits, self._safeguards)
+        if self.journal is not None:
+            self.journal = MemoryJournal()
+            self.journal.append(records)
 
     def resend(self) -> None:
         """Repeat what was decided, to all zones that have not answered."""

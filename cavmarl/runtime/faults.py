@@ -33,11 +33,19 @@ Visit: TypeAlias = tuple[int, str, int]
 
 
 class ZoneDeath(CavmarlError):
-    """The host of a zone has died; `zone` says which, `lives_on` whether it only seemed so."""
+    """The host of a zone has died.
 
-    def __init__(self, zone: int, point: str, lives_on: bool) -> None:
+    Attributes:
+        zone: which.
+        point: of the tick.
+        lives_on: it only seemed so.
+        cause: of which.
+    """
+
+    def __init__(self, zone: int, point: str, lives_on: bool, cause: str = "on purpose") -> None:
         super().__init__(f"the host of zone {zone} died: {point}")
         self.zone, self.point, self.lives_on = zone, point, lives_on
+        self.cause = f"at '{point}', {cause}"
 
 
 class CoordinatorDeath(CavmarlError):
@@ -112,7 +120,7 @@ class Crashes:
 
 
 class FaultyPhases:
-    """Runs the phases of a tick as `SerialExecutor` does; hosts die after their part of one.
+    """Runs the phases of a tick as `SerialExecutor` does; hosts die in or after their part of one.
 
     Args:
         shards: all of them.
@@ -128,11 +136,27 @@ class FaultyPhases:
         """Call the method `phase` of every shard, in order, while all live."""
         watched = self.on and phase in PHASES
         for shard in self._shards:
-            getattr(shard, phase)(*arguments)
             if watched:
+                _call_hosted(shard, phase, arguments)
                 self._crashes.zone(phase, shard.zone)
+            else:
+                getattr(shard, phase)(*arguments)
         if watched:
             self._crashes.coordinator(phase)
+
+
+def _call_hosted(shard: Shard, phase: Phase, arguments: tuple[Any, ...]) -> None:
+    """Call a shard as its host does: whatever nobody has foreseen ends the host and no more.
+
+    Raises:
+        ZoneDeath: something else than cavmarl's own errors was raised.
+    """
+    try:
+        getattr(shard, phase)(*arguments)
+    except CavmarlError:
+        raise
+    except Exception as error:
+        raise ZoneDeath(shard.zone, phase, False, f"of {error!r}") from error
 
 
 class FaultyCoordinator(Coordinator):

@@ -40,12 +40,14 @@ class Refereeing(NamedTuple):
         transfers: world → what became of each hand-over.
         recovery: runs the ticks of the one world in which somebody may die.
         phases: runs the phases of its ticks.
+        store: its committed state.
     """
 
     coordination: Coordination
     transfers: tuple[TransferLog, ...]
     recovery: Recovery | None = None
     phases: FaultyPhases | None = None
+    store: CommittedStore | None = None
 
 
 def make_refereeing(
@@ -98,7 +100,7 @@ def make_refereeing(
     phases = FaultyPhases(shards, crashes)
     coordination = Coordination(division, coordinators, states, digests, store, monitor)
     recovery = Recovery(shards, coordination, store, phases, crashes, limits.repeats)
-    return Refereeing(coordination, transfers, recovery, phases)
+    return Refereeing(coordination, transfers, recovery, phases, store)
 
 
 def _coordinator(
