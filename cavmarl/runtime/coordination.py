@@ -36,7 +36,7 @@ class RowStates:
     """
 
     def __init__(self, division: Division, world: int) -> None:
-        self.borders = NearBorders()
+        self.borders = NearBorders(division, world)
         self._division = division
         self._world = world
         self._known: dict[int, bytes] = {}
@@ -119,8 +119,12 @@ class Coordination:
             entries = coordinator.begin(near, self._states[w].near, inputs)
             for switch, _ in entries:
                 self._states[w].state(switch.vehicle)  # a STEP may be repeated after rows moved
-            for switch, state in entries:
-                self._division.hand_over(w, switch, state, rows.get(switch.vehicle, 0))
+            self._states[w].borders.places = {
+                switch.vehicle: self._division.hand_over(
+                    w, switch, state, rows.get(switch.vehicle, 0)
+                )
+                for switch, state in entries
+            }
 
     def end(self) -> None:
         """Commit the tick that all zones have computed."""

@@ -7,6 +7,7 @@ had it as a ghost already, and goes on with the state that it was sent.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from typing import NamedTuple
@@ -20,7 +21,7 @@ from cavmarl.kernels.borders import NEAR, find_near, pass_on
 from cavmarl.kernels.exchange import exchange, take_own
 from cavmarl.kernels.motion import MAX_SPEED_MPS
 from cavmarl.kernels.repeated import repeated
-from cavmarl.kernels.zones import Halo, ZoneArrays
+from cavmarl.kernels.zones import Halo, ZoneArrays, squared_distance
 from cavmarl.ownership.messages import Switch
 from cavmarl.runtime.coordinator import Near
 from cavmarl.shard.shard import Shard
@@ -169,7 +170,7 @@ class Division:
         worlds = self._shards[zone].worlds
         return self.codec.pack(worlds.rows, w, row, int(worlds.ticks[w]))
 
-    def hand_over(self, w: int, switch: Switch, state: bytes, hint: int = 0) -> None:
+    def hand_over(self, w: int, switch: Switch, state: bytes, hint: int = 0) -> int:
         """Let a vehicle change its owner, by its committed row.
 
         Args:
@@ -177,6 +178,9 @@ class Division:
             switch: who, from where, to where.
             state: what the new owner goes on with.
             hint: the row where the old one probably keeps it.
+
+        Returns:
+            the row where the new one keeps it.
 
         Raises:
             ZoneError: the old owner does not have it, or the new one has not seen it come.
@@ -197,6 +201,30 @@ class Division:
         self.codec.unpack(state, switch.vehicle, tick, target.rows, w, place)
         row = target.rows[w, place]
         row["owner"], row["epoch"] = switch.target, switch.epoch
+        return place
+
+    def depth_m(self, w: int, vehicle: int, zone: int, outside: int, hint: int) -> float | None:
+        """How far outside of a zone a vehicle is, by its committed row.
+
+        Args:
+            w: in which world.
+            vehicle: its id.
+            zone: that owns it.
+            outside: of which zone.
+            hint: the row where its owner probably keeps it.
+
+        Returns:
+            the distance in m, 0 inside; None: its owner does not have it.
+        """
+        worlds = self._shards[zone].worlds
+        rows, num = worlds.rows[w], int(worlds.num_owned[w])
+        if hint >= num or rows[hint]["id"] != vehicle:
+            found = np.flatnonzero(rows["id"][:num] == vehicle)
+            if not len(found):
+                return None
+            hint = int(found[0])
+        row = rows[hint]
+        return math.sqrt(squared_distance(self.zones.rects, outside, row["x"], row["y"]))
 
     def owned(self, w: int, zone: int) -> NDArray[np.void]:
         """VEHICLE (n,), the committed rows that a zone owns; a view."""

@@ -191,6 +191,7 @@ class Simulation:
         self._executor.each("forget", self._gate)
         self._traffic.settle(self._gate, self._shard.worlds)
         self._division.near(0, everybody=True)
+        self._division.depth_m(0, int(self._shard.worlds.rows["id"][0, 0]), 0, 0, 0)
         with suppress(ZoneError):
             self._division.hand_over(0, Switch(-1, 0, 0, 0, False), b"")
         self._episodes[:] = 0

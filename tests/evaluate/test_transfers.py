@@ -12,6 +12,7 @@ from cavmarl.evaluate import EvaluationReport, evaluate, load_report
 from cavmarl.evaluate.evaluation import TRANSFERS_FILE
 from cavmarl.evaluate.tables import read_table
 from cavmarl.evaluate.transfer_rows import TRANSFER, transfers_of
+from cavmarl.runtime.monitor import longest_move_m
 from cavmarl.worlds import load_world
 
 SMALL: dict[str, Any] = {"episodes": 3, "agents": 4, "background": 40, "max_cycles": 40}
@@ -34,6 +35,12 @@ def test_each_transfer_has_its_row(folder: Path) -> None:
     assert (rows["switch_depth_m"] > 2.0).all()  # the hysteresis
     prepared = rows[rows["approached"] >= 0]
     assert (prepared["prepare_depth_m"] < prepared["switch_depth_m"]).all()
+    staying = rows[~rows["removed"]]
+    moved_m = staying["release_depth_m"] - staying["switch_depth_m"]
+    assert (moved_m > -0.5).all()
+    assert (moved_m < longest_move_m(0.1)).all()
+    assert np.median(moved_m) > 0.0
+    assert np.isnan(rows[rows["removed"]]["release_depth_m"]).all()
     assert (rows["ms"] > 0.0).all()
 
 
