@@ -105,7 +105,8 @@ def replay(
         wanted["zones.faults"] = faults.to_json()
     vec = make_vec(run.env, num_envs=run.worlds, zones=zones, overrides=wanted)
     for coordinator in vec.simulation.coordinators:
-        coordinator.watch(Checked(vec.simulation.config.zones.max_deferred_ticks))
+        deadlines = vec.simulation.config.zones
+        coordinator.watch(Checked(deadlines.max_deferred_ticks + deadlines.grace_ticks))
         for watcher in watchers:
             coordinator.watch(watcher)
     follow(run, vec)
