@@ -23,6 +23,7 @@ from cavmarl.kernels.motion import MAX_SPEED_MPS
 from cavmarl.kernels.repeated import repeated
 from cavmarl.kernels.zones import Halo, ZoneArrays, squared_distance
 from cavmarl.ownership.messages import Switch
+from cavmarl.roads.zone_statistics import imbalance
 from cavmarl.runtime.coordinator import Near
 from cavmarl.shard.shard import Shard
 from cavmarl.shard.transfer import TransferCodec
@@ -42,6 +43,10 @@ class ZoneLoads(NamedTuple):
     owned: NDArray[np.int64]
     ghosts: NDArray[np.int64]
     halo_m: float
+
+    def imbalance(self) -> NDArray[np.float64]:
+        """(W,) maximum over mean of the vehicles that zones own."""
+        return np.array([imbalance(owned) for owned in self.owned.T.tolist()])
 
 
 class Division:

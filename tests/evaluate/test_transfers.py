@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -9,9 +10,11 @@ import numpy as np
 import pytest
 
 from cavmarl.evaluate import EvaluationReport, evaluate, load_report
-from cavmarl.evaluate.evaluation import TRANSFERS_FILE
-from cavmarl.evaluate.tables import read_table
+from cavmarl.evaluate.evaluation import EPISODES_FILE, TRANSFERS_FILE
+from cavmarl.evaluate.tables import EPISODE, read_table
 from cavmarl.evaluate.transfer_rows import TRANSFER, transfers_of
+from cavmarl.roads.zone_file import write_zones
+from cavmarl.roads.zones import ZonePartition
 from cavmarl.runtime.monitor import longest_move_m
 from cavmarl.worlds import load_world
 
@@ -67,7 +70,30 @@ def test_the_manifest_knows_the_zones(folder: Path) -> None:
 def test_zones_change_nothing_else(folder: Path) -> None:
     whole = evaluate("grid4x4", "idm", seed=2, repeats=2, **SMALL)
     assert whole["idm"].transfers is None
-    assert load_report(folder)["idm"].metrics == whole["idm"].metrics
+    assert whole["idm"]["zone_imbalance"].mean is None
+    divided = load_report(folder)["idm"].metrics
+    alike = [name for name in divided if name != "zone_imbalance"]
+    assert [divided[name] for name in alike] == [whole["idm"][name] for name in alike]
+
+
+def test_each_episode_tells_how_unevenly_vehicles_are_shared_out(
+    folder: Path, tmp_path: Path
+) -> None:
+    rows = read_table(folder / EPISODES_FILE, EPISODE)["idm"]
+    assert len(rows) == 6
+    assert ((rows["zone_imbalance"] > 1.0) & (rows["zone_imbalance"] < 2.0)).all()
+    assert len(set(rows["zone_imbalance"].tolist())) == 6
+    found = load_report(folder)["idm"]["zone_imbalance"].mean
+    assert found == pytest.approx(rows["zone_imbalance"].mean())
+    # Three slivers at the rim of the map, and all the rest: one zone has everybody.
+    low_x, low_y, high_x, high_y = load_world("grid4x4").network.extent_m
+    cuts = [low_x - 9.0, low_x - 8.0, low_x - 7.0, low_x - 6.0, high_x + 9.0]
+    rects = [(a, low_y - 9.0, b, high_y + 9.0) for a, b in pairwise(cuts)]
+    bounds = (cuts[0], low_y - 9.0, cuts[-1], high_y + 9.0)
+    write_zones(tmp_path / "zones.json", ZonePartition(bounds, np.array(rects)))
+    one = {"zones.count": 4, "zones.layout": str(tmp_path / "zones.json")}
+    crowded = evaluate("grid4x4", "idm", overrides=one, **{**SMALL, "episodes": 1})
+    assert crowded["idm"]["zone_imbalance"].mean == 4.0
 
 
 def test_an_undivided_world_leaves_no_file(tmp_path: Path) -> None:
