@@ -214,13 +214,14 @@ class ZoneStepError(ProtocolError):
             is none; nothing if none was asked for.
     """
 
+    reproducer: Path | str = ""
+
     def __init__(self, zone: int, tick: int, hosts: int, cause: str = "") -> None:
         of = f", the last one {cause}" if cause else ""
         super().__init__(
             f"zone {zone} could not reach tick {tick}: {hosts} hosts in a row died{of}"
         )
         self.zone, self.tick, self.cause = zone, tick, cause
-        self.reproducer: Path | str = ""
 
     def __str__(self) -> str:
         """With the way to see it again."""

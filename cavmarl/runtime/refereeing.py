@@ -29,7 +29,7 @@ from cavmarl.runtime.row_digests import RowDigests
 from cavmarl.runtime.store import CommittedStore
 from cavmarl.shard.shard import Shard
 
-__all__ = ["Refereeing", "make_refereeing"]
+__all__ = ["Refereeing", "journal_path", "make_refereeing"]
 
 
 class Refereeing(NamedTuple):
@@ -117,7 +117,7 @@ def _coordinator(
     """Of one world."""
     journal: Journal | MemoryJournal | None = None
     if settings.journal:
-        journal = Journal(_path(settings.journal, w, division.num_worlds))
+        journal = Journal(journal_path(settings.journal, w, division.num_worlds))
     elif crashes is not None:
         journal = MemoryJournal()
     arguments = (
@@ -145,7 +145,7 @@ def _monitor(
     return Monitor(division, records, dt)
 
 
-def _path(journal: str, w: int, num_worlds: int) -> Path:
+def journal_path(journal: str, w: int, num_worlds: int) -> Path:
     """Of several worlds each has a file: `run.jsonl` becomes `run.0.jsonl` and so on."""
     path = Path(journal)
     return path if num_worlds == 1 else path.with_suffix(f".{w}{path.suffix}")

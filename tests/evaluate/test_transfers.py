@@ -9,12 +9,14 @@ from typing import Any
 import numpy as np
 import pytest
 
+from cavmarl.errors import JournalError
 from cavmarl.evaluate import EvaluationReport, evaluate, load_report
 from cavmarl.evaluate.evaluation import EPISODES_FILE, TRANSFERS_FILE
 from cavmarl.evaluate.tables import EPISODE, read_table
 from cavmarl.evaluate.transfer_rows import TRANSFER, transfers_of
 from cavmarl.roads.zone_file import write_zones
 from cavmarl.roads.zones import ZonePartition
+from cavmarl.runtime.journal_summary import summarize
 from cavmarl.runtime.monitor import longest_move_m
 from cavmarl.worlds import load_world
 
@@ -107,3 +109,20 @@ def test_records_give_the_rows_back() -> None:
     rows["ms"] = [1.5, np.nan]
     first, second = transfers_of(rows)
     assert (first.ms, second.ms) == (1.5, None)
+
+
+def test_each_run_has_journals_of_its_own(tmp_path: Path) -> None:
+    logged = ZONES | {"zones.journal": str(tmp_path / "run.jsonl")}
+    few: dict[str, Any] = {**SMALL, "episodes": 2, "repeats": 2, "overrides": logged}
+    found = evaluate("grid4x4", "idm", **few)["idm"].transfers
+    assert found is not None
+    names = {"run.0.jsonl", "run.1.jsonl", "run.run-1.0.jsonl", "run.run-1.1.jsonl"}
+    assert {path.name for path in tmp_path.iterdir()} == names
+    switches = sum(summarize(tmp_path / name)[0].switches for name in names)
+    assert switches >= found.transfers > 0  # the last step of an episode is followed by a reset
+    (tmp_path / "run.0.jsonl").unlink()
+    (tmp_path / "run.1.jsonl").unlink()
+    out = tmp_path / "out"
+    with pytest.raises(JournalError, match=r"run\.run-1\.0\.jsonl: exists; take it away"):
+        evaluate("grid4x4", "idm", out=out, **few)
+    assert not (out / "manifest.json").exists(), "it is refused before the first run"
