@@ -94,6 +94,8 @@ class Coordinator:
         post: what carries the messages.
         journal: what takes the records.
         switched: vehicles that have changed their owner.
+        resent: phase → messages that were sent again, since no answer had come: PREPARE; STEP, for
+            a lease that nobody had taken; DONE, STEPs for an answer that had not come.
     """
 
     def __init__(
@@ -111,6 +113,7 @@ class Coordinator:
         self.endpoints: dict[int, Endpoint] = {}
         self.post: Post = DirectPost() if post is None else post
         self.switched = 0
+        self.resent: Counter[str] = Counter()
         self._states = states
         self._limits = limits
         self._safeguards = safeguards
@@ -215,7 +218,7 @@ class Coordinator:
             movers = [(v.vehicle, v.target) for v in near if v.crossed and v.vehicle in owners]
             self._leases = {}
             self._do(directory.begin(movers, births, inputs))
-        self._until(self._unleased, lambda: directory.resend(self._unleased()))
+        self._until("STEP", self._unleased, lambda: directory.resend(self._unleased()))
         return self._entries()
 
     def end(self, rows: Callable[[int], int], stored: Callable[[int], int] | None = None) -> None:
@@ -231,7 +234,7 @@ class Coordinator:
             ProtocolError: a zone does not answer.
         """
         self._complete(rows)
-        self._until(self.directory.waiting_for, self.directory.resend)
+        self._until("DONE", self.directory.waiting_for, self.directory.resend)
         told = {
             zone: done.rows if stored is None else stored(zone)
             for zone, done in self.directory.dones.items()
@@ -267,7 +270,9 @@ class Coordinator:
             if not unanswered:
                 return
             for endpoint in unanswered:
-                self.post.send(endpoint.offer_again())
+                again = endpoint.offer_again()
+                self.resent["PREPARE"] += len(again)
+                self.post.send(again)
             self._deliver()
 
     def in_flight(self) -> list[tuple[int, int, int, str]]:
@@ -307,13 +312,17 @@ class Coordinator:
             for vehicle, state in self._leases[zone].enter
         ]
 
-    def _until(self, missing: Callable[[], Sequence[int]], again: Callable[[], Output]) -> None:
+    def _until(
+        self, phase: str, missing: Callable[[], Sequence[int]], again: Callable[[], Output]
+    ) -> None:
         """Deliver until nobody is missing, and ask again where nothing comes."""
         self._deliver()
         for _ in range(PATIENCE):
             if not missing():
                 return
-            self._do(again())
+            output = again()
+            self.resent[phase] += len(output.messages)
+            self._do(output)
             self._deliver()
         raise ProtocolError(
             f"zones {list(missing())} do not answer in tick {self.tick + 1}, asked {PATIENCE} "
