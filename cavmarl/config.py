@@ -125,8 +125,11 @@ class ZonesConfig:
         weight: what `bisection` shares out evenly: length of lanes, or area.
         hysteresis_m: how far behind a border a vehicle changes its zone.
         max_deferred_ticks: ticks for which a vehicle that has crossed stays with its old zone, if
-            the new one does not acknowledge it; after `grace_ticks` more the change is forced.
-        grace_ticks: that the policy after the deadline grants; 0: it is forced at once.
+            the new one does not acknowledge it.
+        policy: what follows: `force`: the change is forced at once; `extend`: after `grace_ticks`
+            more. `hold` (it waits at the border) and `reroute` (it turns away) are refused: a
+            divided world would not be the undivided one any more.
+        grace_ticks: that `extend` grants.
         backoff_ticks: for which a zone that has refused a vehicle is not asked again.
         halo_m: how far zones see over their borders; default: as far as exactness needs, and less
             is refused.
@@ -135,6 +138,8 @@ class ZonesConfig:
         journal: file for the coordinator's log; empty: none. It must not exist.
         check: watch the invariants of ownership at run time.
         faults: a plan of faults to inject, as JSON or a file of it; empty: none.
+        reproducers: folder for a tick that every host of a zone died of, from which it can be run
+            again; empty: the system's folder for temporary files.
     """
 
     layout: str = "bisection"
@@ -143,6 +148,7 @@ class ZonesConfig:
     weight: Literal["lane_length", "uniform"] = "lane_length"
     hysteresis_m: float = 2.0
     max_deferred_ticks: int = 2
+    policy: Literal["force", "extend", "hold", "reroute"] = "force"
     grace_ticks: int = 0
     backoff_ticks: int = 4
     halo_m: float | None = None
@@ -150,6 +156,7 @@ class ZonesConfig:
     journal: str = ""
     check: bool = False
     faults: str = ""
+    reproducers: str = ""
 
     def __post_init__(self) -> None:
         _check(
@@ -168,6 +175,19 @@ class ZonesConfig:
         for name in ("max_deferred_ticks", "grace_ticks", "backoff_ticks"):
             value = getattr(self, name)
             _check(0 <= value <= 1000, f"zones.{name}", value, "must be a whole number to 1000")
+        _check(
+            self.policy not in ("hold", "reroute"),
+            "zones.policy",
+            self.policy,
+            "would change what vehicles do, and then the divided world is not the undivided one, "
+            "bit for bit; use extend, which lets them drive on, or force",
+        )
+        _check(
+            (self.policy == "extend") == (self.grace_ticks > 0),
+            "zones.grace_ticks",
+            self.grace_ticks,
+            "must be 1 or more with zones.policy = extend, and 0 with force",
+        )
         if self.halo_m is not None:
             _check_finite("zones.halo_m", self.halo_m, 0.0, 1e6)
         _check(

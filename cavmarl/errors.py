@@ -26,6 +26,7 @@
     │   ├── LedgerError           a vehicle lost, doubled, or at another epoch
     │   ├── StoreError            what is stored is not what the zones say they stored
     │   ├── ZoneStepError         a tick that every host of a zone died of
+    │   ├── ReproducerError       a file from which no tick can be run again
     │   ├── InvariantError        what always holds did not hold
     │   ├── MessageError          bytes that are no message of this run
     │   │   ├── TruncatedMessageError
@@ -50,6 +51,7 @@ A message names the thing, the place and the cure.
 from __future__ import annotations
 
 import importlib
+from pathlib import Path
 from types import ModuleType
 
 __all__ = [
@@ -79,6 +81,7 @@ __all__ = [
     "PlacementError",
     "PolicyError",
     "ProtocolError",
+    "ReproducerError",
     "ResetNeededError",
     "RouteError",
     "SpawnError",
@@ -214,11 +217,34 @@ class ZoneStepError(ProtocolError):
     Attributes:
         zone: the zone.
         tick: the tick that could not be computed.
+        cause: what the last host died of; nothing if nobody knows.
+        reproducer: the file from which `cavmarl verify --replay` runs that tick again, or why there
+            is none; nothing if none was asked for.
     """
 
-    def __init__(self, zone: int, tick: int, hosts: int) -> None:
-        super().__init__(f"zone {zone} could not reach tick {tick}: {hosts} hosts in a row died")
-        self.zone, self.tick = zone, tick
+    reproducer: Path | str = ""
+
+    def __init__(self, zone: int, tick: int, hosts: int, cause: str = "") -> None:
+        of = f", the last one {cause}" if cause else ""
+        super().__init__(
+            f"zone {zone} could not reach tick {tick}: {hosts} hosts in a row died{of}"
+        )
+        self.zone, self.tick, self.cause = zone, tick, cause
+
+    def __str__(self) -> str:
+        """With the way to see it again."""
+        match self.reproducer:
+            case Path():
+                again = f"; to run that tick again: cavmarl verify --replay {self.reproducer}"
+            case "":
+                again = ""
+            case why:
+                again = f"; it cannot be run again: {why}"
+        return super().__str__() + again
+
+
+class ReproducerError(ProtocolError):
+    """A file from which no tick can be run again: damaged, of another build or of another world."""
 
 
 class InvariantError(ProtocolError):

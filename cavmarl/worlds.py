@@ -32,6 +32,7 @@ __all__ = [
     "load_roads",
     "load_world",
     "load_zones",
+    "make_world",
 ]
 
 
@@ -78,6 +79,19 @@ def load_world(
         max_cycles=max_cycles,
         overrides=overrides,
     )
+    return make_world(config, base_dir)
+
+
+def make_world(config: EnvConfig, base_dir: Path) -> World:
+    """What a configuration describes.
+
+    Args:
+        config: of the environment.
+        base_dir: the folder that relative files start from.
+
+    Raises:
+        CavmarlError: as of `load_world`.
+    """
     network = load_roads(config, base_dir)
     files = resolve_demand(config, base_dir)
     demand = None

@@ -105,8 +105,9 @@ def replay(
         wanted["zones.faults"] = faults.to_json()
     vec = make_vec(run.env, num_envs=run.worlds, zones=zones, overrides=wanted)
     for coordinator in vec.simulation.coordinators:
-        deferral = vec.simulation.config.zones.max_deferred_ticks
-        coordinator.watch(Checked(deferral, is_direct=faults is None))
+        deadlines = vec.simulation.config.zones
+        longest = deadlines.max_deferred_ticks + deadlines.grace_ticks
+        coordinator.watch(Checked(longest, is_direct=faults is None))
         for watcher in watchers:
             coordinator.watch(watcher)
     follow(run, vec)

@@ -25,6 +25,7 @@ from cavmarl.cli.output import (
     write_json,
 )
 from cavmarl.cli.verify_faults import check_campaign, print_campaign, print_figures
+from cavmarl.cli.verify_replay import run_again
 from cavmarl.config import ZONE_LAYOUTS
 from cavmarl.errors import ConfigError
 
@@ -82,9 +83,23 @@ def verify(
         Path | None,
         typer.Option(metavar="DIR", help="Folder for the journals of the divided worlds."),
     ] = None,
+    replay: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FILE",
+            help="Run a tick again that every host of a zone died of, see docs/faults.md; beside "
+            "it goes ENV only, where the map is found.",
+        ),
+    ] = None,
     json_path: JsonPath = None,
 ) -> None:
     """Drive divided worlds beside the undivided one; exit code 1 and where one first differs."""
+    if replay is not None:
+        given = (zones, steps, layout, agents, background, settings, faults, journal)
+        if check or worlds != 1 or any(value is not None for value in given):
+            raise ConfigError("--replay: all else stands in the file; beside it goes ENV only")
+        run_again(replay, env, json_path)
+        return
     overrides = parse_settings(settings)
     counts = None if zones is None else _counts(zones)
     console = Console()

@@ -92,16 +92,18 @@ def _line(lines: list[LineResult]) -> tuple[str, ...]:
 
 def _figures(figures: FaultFigures) -> Table:
     grid = Table.grid(padding=(0, 2))
-    moved = figures.hand_overs
+    moved, resent = figures.hand_overs, figures.resent
     for name, text in (
         ("deaths", f"{figures.zone_deaths.total():,} of zones' hosts, "
                    f"{figures.coordinator_deaths.total():,} of coordinators"),
         ("messages", _pairs(figures.messages)),
         ("hand-overs", f"{figures.handed_over:,}, {moved['forced']:,} of them forced; "
                        f"{moved['failed']:,} failed ({figures.failure_rate:.2%})"),
-        ("timeouts", f"PREPARE: {moved['late']:,} not ready in time; deferral: "
-                     f"{moved['deferred']:,} ticks; deadline: {moved['forced']:,} forced; "
-                     f"STEP: {moved['asked']:,} states asked for"),
+        ("timeouts", f"PREPARE: {resent['PREPARE']:,} sent again, {moved['late']:,} not ready in "
+                     f"time; deferral: {moved['deferred']:,} ticks; deadline: "
+                     f"{moved['forced']:,} forced; STEP: {resent['STEP']:,} sent again, "
+                     f"{moved['asked']:,} states asked for; DONE: {resent['DONE']:,} asked for "
+                     "again"),
         ("refused", f"{moved['refused']:,}; withdrawn {moved['aborted']:,}"),
         ("stale", _pairs(figures.stale)),
         ("recovery", f"{_spread(figures.recovery_ms, 'ms')}; the tick begun again "

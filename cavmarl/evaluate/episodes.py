@@ -206,11 +206,13 @@ class _Part:
         observations, infos = vec.reset(seed=seed, options={"first_world": first})
         driver.reset(policy_seed)
         handed_over = TransferRecorder(vec.simulation.transfers)
+        imbalance = _Imbalance(vec)
         running = np.arange(vec.num_envs) < self._count
         every = max(1, round(TRACK_S / vec.step_s))
         steps = 0
         while running.any():
             self._watch.locate()
+            imbalance.add(running)
             if self._tracked and running[0] and steps % every == 0:
                 self._note_track(steps, infos["mask"][0])
             before = time.perf_counter()
@@ -236,6 +238,7 @@ class _Part:
         self.episodes = self._recorder.episodes()[: self._count]
         self.trips["episode"] += first
         self.episodes["episode"] += first
+        self.episodes["zone_imbalance"] = imbalance.means()[: self._count]
         self.transfers, self.transfer_counts = handed_over.records(), handed_over.counts
         self.transfers["episode"] += first
 
@@ -246,6 +249,30 @@ class _Part:
         rows["time_s"] = steps * self._vec.step_s
         rows["x_m"], rows["y_m"] = self._recorder.places_m[0, agents].T
         self._tracks.append(rows)
+
+
+class _Imbalance:
+    """How unevenly vehicles are shared out among zones, world by world.
+
+    Args:
+        vec: the worlds.
+    """
+
+    def __init__(self, vec: CavVectorEnv) -> None:
+        self._simulation = vec.simulation
+        self._is_divided = vec.simulation.partition.count > 1
+        self._sums = np.zeros(vec.num_envs)
+        self._steps = np.zeros(vec.num_envs, dtype=np.int64)
+
+    def add(self, running: NDArray[np.bool_]) -> None:
+        """Before a step of the worlds (W,) that are in their episode."""
+        if self._is_divided:
+            self._sums[running] += self._simulation.zone_loads().imbalance()[running]
+            self._steps[running] += 1
+
+    def means(self) -> NDArray[np.float64]:
+        """(W,) over the steps; NaN of undivided worlds."""
+        return np.where(self._steps > 0, self._sums / np.maximum(self._steps, 1), np.nan)
 
 
 def _speed(parts: list[_Part], worlds: int) -> Speed:

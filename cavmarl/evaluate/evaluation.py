@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from cavmarl.errors import ConfigError, PolicyError
+from cavmarl.errors import ConfigError, JournalError, PolicyError
 from cavmarl.evaluate.episodes import Job, Progress, RunData, Speed, drive_run, worlds_at_once
 from cavmarl.evaluate.fresh import drive_in_fresh_process
 from cavmarl.evaluate.manifest import (
@@ -30,6 +30,7 @@ from cavmarl.evaluate.tables import EPISODE, TRACK, TRIP, read_table, write_tabl
 from cavmarl.evaluate.transfer_rows import TRANSFER, transfers_of
 from cavmarl.ownership.transfer_summary import TransferSummary
 from cavmarl.policies import load_policy
+from cavmarl.runtime.refereeing import journal_path
 from cavmarl.seeds import check_seed
 from cavmarl.vector_env import CavVectorEnv
 from cavmarl.worlds import load_world
@@ -89,6 +90,7 @@ def evaluate(
         ConfigError: a number or a key that cannot work, or `out` cannot be made.
         PolicyError: a policy cannot be loaded or does not fit, or two have one name.
         ManifestError: `out` holds results already.
+        JournalError: a journal is there already.
     """
     _check_count("episodes", episodes, MAX_EPISODES)
     _check_count("repeats", repeats, MAX_REPEATS)
@@ -104,8 +106,8 @@ def evaluate(
     )
     with TemporaryDirectory() as room:
         folder = Path(room) if out is None else out
-        is_divided = _prepare(folder, job, repeats)
-        _drive_all(folder, job, run_seeds(seed, repeats), progress, is_divided)
+        jobs, is_divided = _prepare(folder, job, repeats)
+        _drive_all(folder, jobs, progress, is_divided)
         return load_report(folder)
 
 
@@ -189,8 +191,12 @@ def _named(
     return named
 
 
-def _prepare(folder: Path, job: Job, repeats: int) -> bool:
-    """Refuse early what cannot work, then put everything on record; whether worlds have zones."""
+def _prepare(folder: Path, job: Job, repeats: int) -> tuple[list[Job], bool]:
+    """Refuse early what cannot work, then put everything on record.
+
+    Returns:
+        the runs, and whether worlds have zones.
+    """
     config, network, demand, partition = load_world(
         job.env,
         agents=job.agents,
@@ -207,38 +213,57 @@ def _prepare(folder: Path, job: Job, repeats: int) -> bool:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise ConfigError(f"{folder}: cannot be made ({error.strerror or error})") from error
-    vehicles = config.population.agents + config.population.background
+    worlds = worlds_at_once(job.episodes, config.population.agents + config.population.background)
+    seeds = run_seeds(job.seed, repeats)
+    jobs = _runs(job, seeds, config.zones.journal, worlds)
     plan = {
         "processes": "this one" if repeats == 1 else "a fresh one for each run, one at a time",
-        "worlds_at_once": worlds_at_once(job.episodes, vehicles),
+        "worlds_at_once": worlds,
     }
     open_manifest(
         folder,
         {
             "policies": policies,
             "episodes": job.episodes,
-            "seeds": run_seeds(job.seed, repeats),
+            "seeds": seeds,
             "job": job.to_dict(),
             "plan": plan,
             "world": describe_world(config, network, demand, partition),
         },
     )
     write_text(folder / MAP_FILE, json.dumps(map_outline(network)))
-    return partition.count > 1
+    return jobs, partition.count > 1
 
 
-def _drive_all(
-    folder: Path, job: Job, seeds: list[int], progress: Progress | None, is_divided: bool
-) -> None:
+def _runs(job: Job, seeds: list[int], journal: str, worlds: int) -> list[Job]:
+    """The runs of a job; of several, each has journals of its own: `run.jsonl`, `run.run-1.jsonl`.
+
+    Raises:
+        JournalError: a journal is there already.
+    """
+    jobs = []
+    for run, seed in enumerate(seeds):
+        overrides = dict(job.overrides)
+        if journal:
+            path = Path(journal)
+            own = path if run == 0 else path.with_suffix(f".run-{run}{path.suffix}")
+            overrides["zones.journal"] = str(own)
+            taken = [p for w in range(worlds) if (p := journal_path(str(own), w, worlds)).exists()]
+            if taken:
+                raise JournalError(f"{taken[0]}: exists; take it away, or name another journal")
+        jobs.append(replace(job, seed=seed, run=run, overrides=overrides))
+    return jobs
+
+
+def _drive_all(folder: Path, jobs: list[Job], progress: Progress | None, is_divided: bool) -> None:
     """Drive all runs, leave their tables, close the manifest."""
     runs: list[dict[str, RunData]] = []
-    for run, seed in enumerate(seeds):
-        one = Job(**{**job.to_dict(), "seed": seed, "run": run})
-        if len(seeds) == 1:
-            runs.append(drive_run(one, progress))
+    for job in jobs:
+        if len(jobs) == 1:
+            runs.append(drive_run(job, progress))
         else:
-            runs.append(drive_in_fresh_process(one, folder, progress))
-    names = list(job.policies)
+            runs.append(drive_in_fresh_process(job, folder, progress))
+    names = list(jobs[0].policies)
     trips = {name: np.concatenate([run[name].trips for run in runs]) for name in names}
     episodes = {name: np.concatenate([run[name].episodes for run in runs]) for name in names}
     tracks = {name: runs[0][name].tracks for name in names}

@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from hashlib import blake2b
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
@@ -17,11 +18,13 @@ from cavmarl.evaluate.determinism import check_steps
 from cavmarl.evaluate.differences import Arrays, step_results
 from cavmarl.evaluate.fault_figures import FaultFigures, HandOverClock, spread
 from cavmarl.evaluate.fault_matrix import Line, Rehearsal, matrix
+from cavmarl.evaluate.replay import replay_tick, world_of
 from cavmarl.ownership.messages import Begin, Message, Record
 from cavmarl.ownership.transport import check_whole
 from cavmarl.policies import load_policy
 from cavmarl.runtime.fault_plan import PHASES, Crash, Faults
 from cavmarl.runtime.faults import FaultyCoordinator
+from cavmarl.runtime.reproducer import read_reproducer
 from cavmarl.seeds import check_seed
 from cavmarl.vector_env import CavVectorEnv, make_vec
 from cavmarl.worlds import load_world
@@ -161,13 +164,23 @@ def run_campaign(
     if not counts or min(counts) < 2:
         raise ConfigError(f"zones = {list(counts)}: a campaign needs numbers of 2 or more")
     settings = (dict(BUSY) if env is None else {}) | dict(overrides or {})
-    stage = _Stage(ENV if env is None else env, settings, steps, seed, policy)
-    campaign = Campaign(str(stage.env), counts, steps)
+    campaign = Campaign(str(ENV if env is None else env), counts, steps)
+    with TemporaryDirectory() as folder:
+        settings["zones.reproducers"] = folder
+        stage = _Stage(ENV if env is None else env, settings, steps, seed, policy)
+        _run_matrix(stage, campaign, seeds, progress)
+    return campaign
+
+
+def _run_matrix(
+    stage: _Stage, campaign: Campaign, seeds: int, progress: Callable[[int, int], None] | None
+) -> None:
+    """All lines, with all numbers of zones."""
     lines = []
-    for count in counts:
+    for count in campaign.zones:
         seen = stage.rehearse(count)
         campaign.ticks = seen.ticks
-        lines += [(count, line) for line in matrix(seen, seed, seeds)]
+        lines += [(count, line) for line in matrix(seen, stage.seed, seeds)]
     runs, done = sum(len(line.plans) for _, line in lines), 0
     for count, line in lines:
         result = LineResult(line.name, line.points, count, unmet=line.unmet)
@@ -177,7 +190,6 @@ def run_campaign(
             done += 1
             if progress is not None:
                 progress(done, runs)
-    return campaign
 
 
 class _Stage:
@@ -200,7 +212,7 @@ class _Stage:
         policy: str | Path,
     ) -> None:
         self.env = env
-        self._seed = seed
+        self.seed = seed
         clock = load_world(env, overrides=dict(settings))[0].clock
         episode_s = clock.ctrl_dt_s * max(1, steps // EPISODES)
         self._settings = {"horizon_s": episode_s, **settings}
@@ -272,10 +284,24 @@ class _Stage:
                     return f"differs from the undivided world in step {step}"
                 began, deaths = time.perf_counter(), len(revivals)
         except ZoneStepError as error:
-            return "" if line.poison else str(error)
+            return self._unlike(error) if line.poison else str(error)
         except ProtocolError as error:
             return str(error)
         return "a tick that kills every host was survived" if line.poison else ""
+
+    def _unlike(self, error: ZoneStepError) -> str:
+        """How the tick is not as it was when it is run again from its file."""
+        if not isinstance(error.reproducer, Path):
+            return str(error)
+        kept = read_reproducer(error.reproducer)
+        world = world_of(kept, self.env)
+        try:
+            replay_tick(kept, world)
+        except ZoneStepError as again:
+            replay_tick(kept, world, faults=False)
+            same = (again.zone, again.tick) == (error.zone, error.tick)
+            return "" if same else f"run again, {again}"
+        return f"tick {error.tick} is reached when it is run again"
 
     def _divided(self, count: int, plan: Faults) -> CavVectorEnv:
         faults = {"zones.faults": plan.to_json()}
@@ -283,7 +309,7 @@ class _Stage:
 
     def _drive(self, vec: CavVectorEnv) -> Iterator[tuple[int, bool]]:
         """Each step's number, and whether all is as in the undivided world."""
-        observations, _ = vec.reset(seed=self._seed)
+        observations, _ = vec.reset(seed=self.seed)
         yield 0, _fingerprint(vec, {"observations": observations}) == self._prints[0]
         for step, actions in enumerate(self._actions, start=1):
             results = step_results(vec.step(actions), actions)

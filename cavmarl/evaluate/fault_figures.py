@@ -81,6 +81,7 @@ class FaultFigures:
             count.
         hand_overs: `failed`, `switched`, `forced`, `deferred` (ticks), `late` (vehicles), `asked`,
             `refused`, `aborted`.
+        resent: phase → messages that were sent again for want of an answer, as of `Coordinator`.
         recovery_ms: of each death, until its tick began again.
         repeats: of each tick in which somebody died, how often it was begun again.
         waited_ticks: of each hand-over, from the crossing to the switch.
@@ -93,6 +94,7 @@ class FaultFigures:
     messages: Counter[tuple[str, str]] = field(default_factory=Counter)
     stale: Counter[tuple[str, str]] = field(default_factory=Counter)
     hand_overs: Counter[str] = field(default_factory=Counter)
+    resent: Counter[str] = field(default_factory=Counter)
     recovery_ms: list[float] = field(default_factory=list)
     repeats: list[int] = field(default_factory=list)
     waited_ticks: list[int] = field(default_factory=list)
@@ -115,7 +117,10 @@ class FaultFigures:
         found.repeats.extend(Counter(revival.tick for revival in simulation.revivals).values())
         for coordinator in simulation.coordinators:
             found.stale.update(coordinator.dropped())
-            if isinstance(coordinator, Coordinator) and isinstance(coordinator.post, Network):
+            if not isinstance(coordinator, Coordinator):
+                continue
+            found.resent.update(coordinator.resent)
+            if isinstance(coordinator.post, Network):
                 found.messages.update(coordinator.post.faults)
         for log in simulation.transfers:
             found.hand_overs.update(log.counts)
@@ -164,6 +169,7 @@ class FaultFigures:
             "messages": _nested(self.messages),
             "stale": _nested(self.stale),
             "hand_overs": dict(self.hand_overs),
+            "resent": dict(self.resent),
             "failure_rate": self.failure_rate,
             "recovery_ms": spread(self.recovery_ms),
             "tick_begun_again": spread(self.repeats),

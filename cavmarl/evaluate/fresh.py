@@ -51,7 +51,7 @@ def drive_in_fresh_process(
         for line in program.stdout:
             told = json.loads(line)
             if "error" in told:
-                raise getattr(errors, told["error"])(told["message"])
+                raise _told_error(told["error"], told["message"])
             if progress is not None:
                 progress(told["policy"], told["steps"], told["most"])
     if program.returncode:
@@ -63,6 +63,12 @@ def drive_in_fresh_process(
         return _read(path, list(job.policies))
     finally:
         path.unlink()
+
+
+def _told_error(kind: str, message: str) -> errors.CavmarlError:
+    """The error of another process; what it was made of, beside its words, has stayed there."""
+    found: type[errors.CavmarlError] = getattr(errors, kind)
+    return found.__new__(found, message)
 
 
 def _read(path: Path, policies: list[str]) -> dict[str, RunData]:

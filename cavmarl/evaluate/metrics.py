@@ -145,6 +145,14 @@ METRICS = (
         "Gini's coefficient of the agents' delays a kilometre: 0 is even",
         better="less",
     ),
+    Metric(
+        "zone_imbalance",
+        "zone imbalance",
+        "",
+        "episode",
+        "vehicles of the fullest zone over those of a mean one, mean over the steps: 1 is even",
+        better="less",
+    ),
     *(
         Metric(
             reward_column(term),

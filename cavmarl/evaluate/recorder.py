@@ -138,8 +138,12 @@ class Recorder:
         return rows[np.lexsort((rows["began_s"], rows["agent"], rows["episode"]))]
 
     def episodes(self) -> NDArray[np.void]:
-        """EPISODE (W,) of all worlds; those that have not ended have a duration of 0."""
+        """EPISODE (W,) of all worlds; those that have not ended have a duration of 0.
+
+        Of zones nothing is known here.
+        """
         rows = np.zeros(self._world_steps.size, dtype=EPISODE)
+        rows["zone_imbalance"] = np.nan
         num_agents = self._steps.shape[1]
         trips = self.trips()
         bounds = np.searchsorted(trips["episode"], np.arange(rows.size + 1))

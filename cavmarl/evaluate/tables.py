@@ -60,6 +60,7 @@ EPISODE = np.dtype(
         ("background_arrivals_per_h", np.float64),
         ("jain_speed", np.float64),  # of the mean speeds of its trips that count
         ("gini_delay", np.float64),  # of their delays a kilometre
+        ("zone_imbalance", np.float64),  # max / mean of vehicles by zone; NaN: undivided
         *((reward_column(term), np.float64) for term in TERMS),  # that part of the return
     ]
 )

@@ -29,6 +29,7 @@ TRANSFER = np.dtype(
         ("state_bytes", np.int64),
         ("prepare_depth_m", np.float64),  # outside of the source's zone at the first state
         ("switch_depth_m", np.float64),  # at the switch
+        ("release_depth_m", np.float64),  # when the switch was committed
         ("ms", np.float64),  # from the first state until the target had confirmed; not repeatable
     ]
 )

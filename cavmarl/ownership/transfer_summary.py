@@ -51,6 +51,7 @@ class TransferSummary:
         state_bytes: of a vehicle.
         prepare_depth_m: how far outside of its owner's zone at the first state, less than 0 inside.
         switch_depth_m: at the switch.
+        release_depth_m: outside of its old zone when the switch was committed.
         failure_rate: share of transfers that had to be forced; None without transfers.
     """
 
@@ -67,6 +68,7 @@ class TransferSummary:
     state_bytes: Spread
     prepare_depth_m: Spread
     switch_depth_m: Spread
+    release_depth_m: Spread
     failure_rate: float | None
 
     @classmethod
@@ -100,6 +102,7 @@ class TransferSummary:
             state_bytes=Spread.of(row.state_bytes for row in kept if row.offers),
             prepare_depth_m=_spread(row.prepare_depth_m for row in kept),
             switch_depth_m=_spread(row.switch_depth_m for row in kept),
+            release_depth_m=_spread(row.release_depth_m for row in kept),
             failure_rate=forced / transfers if transfers else None,
         )
 

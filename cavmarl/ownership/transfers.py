@@ -49,6 +49,8 @@ class Transfer(NamedTuple):
         prepare_depth_m: how far it was outside of its owner's zone when the first of them arrived,
             less than 0 inside; None: nobody told.
         switch_depth_m: the same when its switch was decided.
+        release_depth_m: how far outside of its old zone when that was committed, and the old
+            owner's copy went; None: nobody told, or it has left the world.
         ms: from that first state, or else from BEGIN, until the target has confirmed; None: nobody
             has a clock.
     """
@@ -67,6 +69,7 @@ class Transfer(NamedTuple):
     state_bytes: int
     prepare_depth_m: float | None = None
     switch_depth_m: float | None = None
+    release_depth_m: float | None = None
     ms: float | None = None
 
     @property
@@ -80,6 +83,10 @@ class Surroundings(Protocol):
 
     def depth_m(self, vehicle: int, target: int) -> float | None:
         """How far outside of its owner's zone a vehicle near another one is; None: unknown."""
+        ...
+
+    def release_depth_m(self, vehicle: int, source: int, target: int) -> float | None:
+        """How far outside of its old zone a vehicle is that has changed; None: it has left."""
         ...
 
     def now_ms(self) -> float:
@@ -265,12 +272,13 @@ class TransferLog:
             self.counts["removed"] += 1
         found = self._approaches.pop((vehicle, target, epoch - 1), _NEVER)
         began_ms = switching.began_ms if found.began_ms is None else found.began_ms
-        ended_ms = switching.ended_ms
+        ended_ms, around = switching.ended_ms, self._surroundings
+        release_m = None if around is None else around.release_depth_m(vehicle, source, target)
         self.rows.append(
             Transfer(
                 episode, tick, vehicle, source, target, epoch, forced, removed, found.first,
                 self._waited.get(vehicle, 0), found.offers, found.state_bytes, found.depth_m,
-                switching.depth_m,
+                switching.depth_m, release_m,
                 None if began_ms is None or ended_ms is None else ended_ms - began_ms,
             )
         )  # fmt: skip

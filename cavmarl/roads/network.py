@@ -16,6 +16,7 @@ from __future__ import annotations
 import hashlib
 from dataclasses import dataclass, fields
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -39,6 +40,7 @@ __all__ = [
     "SWITCH",
     "VEHICLE_CLASSES",
     "RoadNetwork",
+    "content_of",
 ]
 
 # The permission bits of LANE["permissions"], SUMO's abstract vehicle classes that drive on roads.
@@ -372,7 +374,15 @@ class RoadNetwork:
         for field in fields(self):
             value = getattr(self, field.name)
             if isinstance(value, np.ndarray):
-                digest.update(value.tobytes())
+                digest.update(content_of(value))
             elif isinstance(value, tuple):
                 digest.update("\0".join(value).encode())
         return digest.hexdigest()
+
+
+def content_of(array: NDArray[Any]) -> bytes:
+    """The bytes of an array, of records field by field: what lies between these is anything."""
+    names = array.dtype.names
+    if names is None:
+        return array.tobytes()
+    return b"".join(array[name].tobytes() for name in names)

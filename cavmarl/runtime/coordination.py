@@ -11,11 +11,13 @@ from numpy.typing import NDArray
 from cavmarl.errors import ProtocolError
 from cavmarl.kernels.arrays import Gate
 from cavmarl.kernels.zones import zones_of
+from cavmarl.ownership.messages import Record
+from cavmarl.runtime.coordinator import Coordinator
 from cavmarl.runtime.division import Division
 from cavmarl.runtime.monitor import Monitor
 from cavmarl.runtime.referee import Near, Referee
 from cavmarl.runtime.row_digests import RowDigests
-from cavmarl.runtime.store import CommittedStore
+from cavmarl.runtime.store import CommittedStore, Notes
 from cavmarl.runtime.surroundings import NearBorders
 from cavmarl.runtime.zone_view import TransferInFlight
 from cavmarl.shard.shard import Commands
@@ -35,7 +37,7 @@ class RowStates:
     """
 
     def __init__(self, division: Division, world: int) -> None:
-        self.borders = NearBorders()
+        self.borders = NearBorders(division, world)
         self._division = division
         self._world = world
         self._known: dict[int, bytes] = {}
@@ -119,8 +121,12 @@ class Coordination:
             entries = coordinator.begin(near, self._states[w].near, inputs)
             if entries:
                 rows = {entry.vehicle: entry.row for entry in near}
-                for switch, state in entries:
-                    self._division.hand_over(w, switch, state, rows.get(switch.vehicle, 0))
+                self._states[w].borders.places = {
+                    switch.vehicle: self._division.hand_over(
+                        w, switch, state, rows.get(switch.vehicle, 0)
+                    )
+                    for switch, state in entries
+                }
 
     def end(self) -> None:
         """Commit the tick that all zones have computed."""
@@ -165,6 +171,23 @@ class Coordination:
         for w, notes in enumerate(self._store.load()):
             self.coordinators[w].resume(*notes)
             self._stirred[w] = True
+
+    def take_up(self, records: Sequence[Record], notes: Sequence[Notes]) -> None:
+        """Go on in the one world where others have stopped.
+
+        Args:
+            records: of their coordinator.
+            notes: what has happened since its last BEGIN.
+
+        Raises:
+            ProtocolError: its coordinator is not one that can stop.
+        """
+        (coordinator,) = self.coordinators
+        if not isinstance(coordinator, Coordinator):
+            raise ProtocolError("a coordinator without messages never stops in a tick")
+        coordinator.take_up(records)
+        coordinator.resume(*notes[0])
+        self._stirred[0] = True
 
     def left(self, gate: Gate) -> None:
         """Those in `gate.passing` have left their worlds."""

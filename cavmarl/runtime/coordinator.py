@@ -21,7 +21,7 @@ from cavmarl.ownership.messages import (
 from cavmarl.ownership.offers import Approach
 from cavmarl.ownership.reactions import Advance
 from cavmarl.ownership.safeguards import ALL_ON, Safeguards
-from cavmarl.runtime.journal import AnyJournal
+from cavmarl.runtime.journal import AnyJournal, MemoryJournal
 from cavmarl.runtime.post import Parcel, Post
 from cavmarl.runtime.referee import Entry, Near, Referee
 
@@ -54,6 +54,8 @@ class Coordinator(Referee):
     Attributes:
         endpoints: zone → its host's side.
         post: what carries the messages.
+        resent: phase → messages that were sent again, since no answer had come: PREPARE; STEP, for
+            a lease that nobody had taken; DONE, STEPs for an answer that had not come.
     """
 
     def __init__(
@@ -69,6 +71,7 @@ class Coordinator(Referee):
         super().__init__(Directory(run, range(zones), states, limits, safeguards), journal)
         self.endpoints: dict[int, Endpoint] = {}
         self.post = post
+        self.resent: Counter[str] = Counter()
         self._states = states
         self._limits = limits
         self._safeguards = safeguards
@@ -142,7 +145,7 @@ class Coordinator(Referee):
             movers = [(v.vehicle, v.target) for v in near if v.crossed and v.vehicle in owners]
             self._leases = {}
             self._do(directory.begin(movers, births, inputs))
-        self._until(self._unleased, lambda: directory.resend(self._unleased()))
+        self._until("STEP", self._unleased, lambda: directory.resend(self._unleased()))
         entries = self._entries()
         for switch, _ in entries:
             self._states.state(switch.vehicle)  # a STEP may be repeated after rows moved
@@ -161,7 +164,7 @@ class Coordinator(Referee):
             ProtocolError: a zone does not answer.
         """
         self._complete(rows)
-        self._until(self.directory.waiting_for, self.directory.resend)
+        self._until("DONE", self.directory.waiting_for, self.directory.resend)
         told = {
             zone: done.rows if stored is None else stored(zone)
             for zone, done in self.directory.dones.items()
@@ -197,7 +200,9 @@ class Coordinator(Referee):
             if not unanswered:
                 return
             for endpoint in unanswered:
-                self.post.send(endpoint.offer_again())
+                again = endpoint.offer_again()
+                self.resent["PREPARE"] += len(again)
+                self.post.send(again)
             self._deliver()
 
     def in_flight(self) -> list[tuple[int, int, int, str]]:
@@ -237,13 +242,17 @@ class Coordinator(Referee):
             for vehicle, state in self._leases[zone].enter
         ]
 
-    def _until(self, missing: Callable[[], Sequence[int]], again: Callable[[], Output]) -> None:
+    def _until(
+        self, phase: str, missing: Callable[[], Sequence[int]], again: Callable[[], Output]
+    ) -> None:
         """Deliver until nobody is missing, and ask again where nothing comes."""
         self._deliver()
         for _ in range(PATIENCE):
             if not missing():
                 return
-            self._do(again())
+            output = again()
+            self.resent[phase] += len(output.messages)
+            self._do(output)
             self._deliver()
         raise ProtocolError(
             f"zones {list(missing())} do not answer in tick {self.tick + 1}, asked {PATIENCE} "
@@ -301,6 +310,17 @@ class Coordinator(Referee):
             records, zones, self._states, self._limits, self._safeguards
         )
         self.resume()
+
+    def take_up(self, records: Sequence[Record]) -> None:
+        """All parties are new, and know what another coordinator's records say."""
+        self.restart(records)
+        self.endpoints, self._leases = {}, {}
+        for zone in self.directory.table.hosts:
+            hosting = self.directory.hosting(zone)
+            self.endpoints[zone] = Endpoint(hosting, self._limits, self._safeguards)
+        if self.journal is not None:
+            self.journal = MemoryJournal()
+            self.journal.append(records)
 
     def resend(self) -> None:
         """Repeat what was decided, to all zones that have not answered."""

@@ -98,11 +98,10 @@ def halo_m(config: EnvConfig, reach_m: float, zones: int) -> float:
 
 def limits_of(settings: ZonesConfig, schema: int = 1) -> Limits:
     """Deadlines of the protocol; `schema` is the version of vehicles' states."""
-    grace = settings.grace_ticks
     return Limits(
         deferral=settings.max_deferred_ticks,
-        policy=DeadlinePolicy.EXTEND if grace else DeadlinePolicy.FORCE,
-        grace=grace,
+        policy=DeadlinePolicy(settings.policy),
+        grace=settings.grace_ticks,
         backoff=settings.backoff_ticks,
         schema=schema,
     )

@@ -7,6 +7,7 @@ had it as a ghost already, and goes on with the state that it was sent.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from typing import NamedTuple
@@ -22,6 +23,7 @@ from cavmarl.kernels.motion import MAX_SPEED_MPS
 from cavmarl.kernels.repeated import repeated
 from cavmarl.kernels.zones import Halo, ZoneArrays
 from cavmarl.ownership.messages import Switch
+from cavmarl.roads.zone_statistics import imbalance
 from cavmarl.runtime.referee import Near
 from cavmarl.shard.shard import Shard
 from cavmarl.shard.transfer import TransferCodec
@@ -41,6 +43,10 @@ class ZoneLoads(NamedTuple):
     owned: NDArray[np.int64]
     ghosts: NDArray[np.int64]
     halo_m: float
+
+    def imbalance(self) -> NDArray[np.float64]:
+        """(W,) maximum over mean of the vehicles that zones own."""
+        return np.array([imbalance(owned) for owned in self.owned.T.tolist()])
 
 
 class Division:
@@ -82,6 +88,7 @@ class Division:
         self._hysteresis_m = hysteresis_m
         self._ahead_s = ahead_s
         self._border_m = MAX_SPEED_MPS * ahead_s  # nobody else can be behind it by then
+        self._rects: list[list[float]] = zones.rects.tolist()
         self._near = np.zeros(2 * shards[0].worlds.rows.shape[1], dtype=NEAR)
         self._call_exchange = repeated(exchange)
         self._find_near = repeated(find_near)
@@ -172,7 +179,7 @@ class Division:
         worlds = self._shards[zone].worlds
         return self.codec.pack(worlds.rows, w, row, int(worlds.ticks[w]))
 
-    def hand_over(self, w: int, switch: Switch, state: bytes | None, hint: int = 0) -> None:
+    def hand_over(self, w: int, switch: Switch, state: bytes | None, hint: int = 0) -> int:
         """Let a vehicle change its owner, by its committed row.
 
         Args:
@@ -180,6 +187,9 @@ class Division:
             switch: who, from where, to where.
             state: what the new owner goes on with; None: the old one's row as it is.
             hint: the row where the old one probably keeps it.
+
+        Returns:
+            the row where the new one keeps it.
 
         Raises:
             ZoneError: the old owner does not have it, or the new one has not seen it come.
@@ -201,6 +211,32 @@ class Division:
             self.codec.unpack(state, switch.vehicle, tick, target.rows, w, place)
             row = target.rows[w, place]
             row["owner"], row["epoch"] = switch.target, switch.epoch
+        return place
+
+    def depth_m(self, w: int, vehicle: int, zone: int, outside: int, hint: int) -> float | None:
+        """How far outside of a zone a vehicle is, by its committed row.
+
+        Args:
+            w: in which world.
+            vehicle: its id.
+            zone: that owns it.
+            outside: of which zone.
+            hint: the row where its owner probably keeps it.
+
+        Returns:
+            the distance in m, 0 inside; None: its owner does not have it.
+        """
+        worlds = self._shards[zone].worlds
+        rows, num = worlds.rows[w], int(worlds.num_owned[w])
+        if hint >= num or rows[hint]["id"] != vehicle:
+            found = np.flatnonzero(rows["id"][:num] == vehicle)
+            if not len(found):
+                return None
+            hint = int(found[0])
+        row = rows[hint]
+        x, y = row["x"].item(), row["y"].item()
+        min_x, min_y, max_x, max_y = self._rects[outside]
+        return math.hypot(max(min_x - x, 0.0, x - max_x), max(min_y - y, 0.0, y - max_y))
 
     def owned(self, w: int, zone: int) -> NDArray[np.void]:
         """VEHICLE (n,), the committed rows that a zone owns; a view."""

@@ -34,11 +34,19 @@ Visit: TypeAlias = tuple[int, str, int]
 
 
 class ZoneDeath(CavmarlError):
-    """The host of a zone has died; `zone` says which, `lives_on` whether it only seemed so."""
+    """The host of a zone has died.
 
-    def __init__(self, zone: int, point: str, lives_on: bool) -> None:
+    Attributes:
+        zone: which.
+        point: of the tick.
+        lives_on: it only seemed so.
+        cause: of which.
+    """
+
+    def __init__(self, zone: int, point: str, lives_on: bool, cause: str = "on purpose") -> None:
         super().__init__(f"the host of zone {zone} died: {point}")
         self.zone, self.point, self.lives_on = zone, point, lives_on
+        self.cause = f"at '{point}', {cause}"
 
 
 class CoordinatorDeath(CavmarlError):
@@ -113,7 +121,7 @@ class Crashes:
 
 
 class FaultyPhases:
-    """Runs the phases of a tick zone by zone; hosts die after their part of one.
+    """Runs the phases of a tick zone by zone; hosts die in or after their part of one.
 
     Args:
         shards: all of them.
@@ -129,11 +137,27 @@ class FaultyPhases:
         """Run a phase on every shard, in order, while all live."""
         watched = self.on and phase in PHASES
         for zone, host in self._hosts:
-            host.each(phase, *arguments)
             if watched:
+                _call_hosted(zone, host, phase, arguments)
                 self._crashes.zone(phase, zone)
+            else:
+                host.each(phase, *arguments)
         if watched:
             self._crashes.coordinator(phase)
+
+
+def _call_hosted(zone: int, host: ShardGroup, phase: Phase, arguments: tuple[Any, ...]) -> None:
+    """Call a zone as its host does: whatever nobody has foreseen ends the host and no more.
+
+    Raises:
+        ZoneDeath: something else than cavmarl's own errors was raised.
+    """
+    try:
+        host.each(phase, *arguments)
+    except CavmarlError:
+        raise
+    except Exception as error:
+        raise ZoneDeath(zone, phase, False, f"of {error!r}") from error
 
 
 class FaultyCoordinator(Coordinator):

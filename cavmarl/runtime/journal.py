@@ -8,6 +8,7 @@ same calls and keeps the records in a list.
 from __future__ import annotations
 
 import os
+import sys
 import weakref
 from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
@@ -17,6 +18,9 @@ from typing import Literal, Self, TypeAlias, get_args
 from cavmarl.errors import ConfigError, CorruptJournalError, JournalError, TornJournalError
 from cavmarl.ownership.messages import Record
 from cavmarl.ownership.records import record_from_line, record_to_line
+
+if sys.platform != "win32":
+    import fcntl
 
 __all__ = ["AnyJournal", "Journal", "JournalReader", "MemoryJournal", "Sync"]
 
@@ -77,7 +81,7 @@ class JournalReader:
 
 
 class Journal:
-    """A file that records are appended to.
+    """A file that records are appended to, by one run at a time.
 
     Args:
         path: of the file; without `resume` it must not exist.
@@ -94,7 +98,7 @@ class Journal:
 
     Raises:
         ConfigError: no such `sync`.
-        JournalError: the file exists, or does not, or cannot be opened.
+        JournalError: the file exists, or does not, or cannot be opened, or another run writes it.
         CorruptJournalError: what is there is damaged.
     """
 
@@ -104,8 +108,8 @@ class Journal:
         self.path = path
         self.sequence, self.dropped = 0, ""
         self._fsync = sync == "fsync"
-        if resume:
-            self._read()
+        if resume and not path.is_file():
+            raise JournalError(f"{path}: is no file to go on with; begin one without resume")
         try:
             self._file = path.open("ab" if resume else "xb", buffering=0)
         except FileExistsError as error:
@@ -116,6 +120,13 @@ class Journal:
             raise self._unwritable(error) from error
         # Worlds are not closed: their journal is, when nobody has it any more.
         weakref.finalize(self, self._file.close)
+        try:
+            self._lock()
+            if resume:
+                self._read()
+        except JournalError:
+            self._file.close()
+            raise
 
     def append(self, records: Iterable[Record]) -> None:
         """Write records down; when it returns, messages may be sent.
@@ -170,10 +181,22 @@ class Journal:
     ) -> None:
         self.close()
 
+    def _lock(self) -> None:
+        """Keep all others from writing here, as long as the file is open."""
+        if sys.platform == "win32":  # there an open file can be shared, and nothing says by whom
+            return
+        try:
+            fcntl.flock(self._file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError as error:
+            raise JournalError(
+                f"{self.path}: another run is writing this journal; choose another path, or wait "
+                "until it has ended"
+            ) from error
+        except OSError as error:
+            raise self._unwritable(error) from error
+
     def _read(self) -> None:
         """Find the end of what is there, and cut off what follows it."""
-        if not self.path.is_file():
-            raise JournalError(f"{self.path}: is no file to go on with; begin one without resume")
         reader = JournalReader(self.path, drop_torn=True)
         for _ in reader:
             pass

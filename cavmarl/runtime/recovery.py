@@ -121,7 +121,7 @@ class Recovery:
         self._coordination.load()
         coordinator = self._coordinator
         for zone in zones:
-            self._count(zone)
+            self._count(zone, death.cause if isinstance(death, ZoneDeath) else "with wrong rows")
             if isinstance(death, ZoneDeath):
                 give_up(coordinator, death)
             else:
@@ -131,14 +131,14 @@ class Recovery:
             self._note(point, zone, began)
         return False
 
-    def _count(self, dead: int | str) -> None:
+    def _count(self, dead: int | str, cause: str = "") -> None:
         """Note that the host of a zone has died, or the coordinator at a point."""
         self._deaths[dead] += 1
         if self._deaths[dead] <= self._repeats:
             return
         tick, times = self._crashes.tick, self._deaths[dead]
         if isinstance(dead, int):
-            raise ZoneStepError(dead, tick, times)
+            raise ZoneStepError(dead, tick, times, cause)
         raise ProtocolError(
             f"the coordinator could not reach tick {tick}: {times} of them died at '{dead}'"
         )

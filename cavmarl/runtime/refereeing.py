@@ -32,7 +32,7 @@ from cavmarl.runtime.row_digests import RowDigests
 from cavmarl.runtime.store import CommittedStore
 from cavmarl.shard.shard import Shard
 
-__all__ = ["Refereeing", "make_refereeing"]
+__all__ = ["Refereeing", "journal_path", "make_refereeing"]
 
 
 class Refereeing(NamedTuple):
@@ -43,12 +43,14 @@ class Refereeing(NamedTuple):
         transfers: world → what became of each hand-over.
         recovery: runs the ticks of the one world in which somebody may die.
         phases: runs the phases of its ticks.
+        store: its committed state.
     """
 
     coordination: Coordination
     transfers: tuple[TransferLog, ...]
     recovery: Recovery | None = None
     phases: FaultyPhases | None = None
+    store: CommittedStore | None = None
 
 
 def make_refereeing(
@@ -102,7 +104,7 @@ def make_refereeing(
     phases = FaultyPhases(shards, crashes)
     coordination = Coordination(division, coordinators, states, digests, store, monitor)
     recovery = Recovery(shards, coordination, dying, store, phases, crashes, limits.repeats)
-    return Refereeing(coordination, transfers, recovery, phases)
+    return Refereeing(coordination, transfers, recovery, phases, store)
 
 
 def _referee(
@@ -120,7 +122,7 @@ def _referee(
     run, zones = secrets.token_bytes(RUN_BYTES), division.count
     journal: Journal | MemoryJournal | None = None
     if settings.journal:
-        journal = Journal(_path(settings.journal, w, division.num_worlds))
+        journal = Journal(journal_path(settings.journal, w, division.num_worlds))
     elif crashes is not None:
         journal = MemoryJournal()
     if faults is None:
@@ -147,7 +149,7 @@ def _monitor(
     return Monitor(division, records, dt)
 
 
-def _path(journal: str, w: int, num_worlds: int) -> Path:
+def journal_path(journal: str, w: int, num_worlds: int) -> Path:
     """Of several worlds each has a file: `run.jsonl` becomes `run.0.jsonl` and so on."""
     path = Path(journal)
     return path if num_worlds == 1 else path.with_suffix(f".{w}{path.suffix}")

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cavmarl.config import EnvConfig
-from cavmarl.errors import CapacityError, ConfigError, ZoneError
+from cavmarl.errors import CapacityError, ConfigError, ZoneError, ZoneStepError
 from cavmarl.kernels.arrays import Outputs, Worlds
 from cavmarl.kernels.codes import (
     ACTION_IDLE,
@@ -40,7 +40,10 @@ from cavmarl.runtime.executor import Executor
 from cavmarl.runtime.recovery import Recovery, Revival
 from cavmarl.runtime.referee import Referee
 from cavmarl.runtime.refereeing import make_refereeing
+from cavmarl.runtime.reproducer import Reproducer
+from cavmarl.runtime.reproducing import Keeper, Moment, sources_of
 from cavmarl.runtime.shard_clock import ShardClock
+from cavmarl.runtime.store import CommittedStore
 from cavmarl.runtime.zone_view import ZoneView, view_zones
 from cavmarl.shard.group import ShardGroup
 from cavmarl.shard.shard import Commands
@@ -142,6 +145,7 @@ class Simulation:
             self._executor: Executor = ShardGroup(self._shards)
             self._coordination: Coordination | None = None
             self._recovery: Recovery | None = None
+            self._keeper: Keeper | None = None
             if is_first:
                 self._call_every_kernel()
             zones = config.zones
@@ -162,6 +166,10 @@ class Simulation:
         self.transfers = refereeing.transfers
         if refereeing.phases is not None:
             self._executor = refereeing.phases
+        if refereeing.store is not None:
+            sources = sources_of(self.network, self.demand, self.partition)
+            (coordinator,) = self.coordinators
+            self._keeper = Keeper(self.config, sources, refereeing.store, coordinator)
 
     def _shared_arrays(self) -> Iterator[NDArray[Any]]:
         """What a tick changes beside the shards' own and what they have in common."""
@@ -317,11 +325,48 @@ class Simulation:
         """One agent step: its ticks, then what the agents sense."""
         ticks = self.config.clock.ticks_per_step
         for number in range(ticks):
-            tick = partial(self._tick, commands, number == 0, number == ticks - 1)
-            if self._recovery is None:
-                tick()
-            else:
-                self._recovery.run(tick)
+            self.run_tick(commands, number == 0, number == ticks - 1)
+
+    def run_tick(self, commands: Commands, is_first: bool, is_last: bool) -> None:
+        """One tick of a step, begun again as often as it takes where hosts may die.
+
+        Args:
+            commands: of the agents, the same in all ticks of a step.
+            is_first: whether it begins the step.
+            is_last: whether it ends it.
+
+        Raises:
+            ZoneStepError: every host of a zone died of it.
+        """
+        if self._recovery is None:
+            self._tick(commands, is_first, is_last)
+            return
+        try:
+            self._recovery.run(partial(self._tick, commands, is_first, is_last))
+        except ZoneStepError as error:
+            if self._keeper is not None:
+                episode = int(self._episodes[0])
+                moment = (self._seed, self._first_world, episode, commands, is_first, is_last)
+                error.reproducer = self._keeper.keep(error, Moment(*moment))
+            raise
+
+    def resume(self, kept: Reproducer) -> None:
+        """Go to the committed tick of a reproducer; `run_tick` runs the next one.
+
+        No further reproducers are written.
+
+        Raises:
+            ReproducerError: it is of other worlds.
+        """
+        self._keeper = None
+        self.seed(kept.seed, kept.first_world)
+        self._episodes[:] = kept.episode - 1
+        self.reset()
+        self._division.align()
+        notes = CommittedStore(self._shards, self._shared_arrays).adopt(kept.image)
+        if self._coordination is not None:
+            self._coordination.take_up(kept.records, notes)
+            self._coordination.save()
 
     def instrument(self, wrap: Callable[[Any], Any]) -> None:
         """Put `wrap(part)` in the place of each part that phases are calls of, to time them."""

@@ -3,21 +3,30 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
+from cavmarl.runtime.division import Division
 from cavmarl.runtime.referee import Near
 
 __all__ = ["NearBorders"]
 
 
 class NearBorders:
-    """Who was near a border when the tick began.
+    """Who was near a border when the tick began, and who has crossed one.
+
+    Args:
+        division: of all worlds.
+        world: which one.
 
     Attributes:
         near: of the tick that is on its way; to be set.
+        places: vehicle that has changed its owner in it → the row that it had there; to be set.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, division: Division, world: int) -> None:
+        self.places: Mapping[int, int] = {}
+        self._division = division
+        self._world = world
         self.near: Sequence[Near] = ()
         self._depths: dict[tuple[int, int], float] = {}
         self._told: Sequence[Near] = ()
@@ -28,6 +37,11 @@ class NearBorders:
             self._told = self.near
             self._depths = {(entry.vehicle, entry.target): entry.depth_m for entry in self.near}
         return self._depths.get((vehicle, target))
+
+    def release_depth_m(self, vehicle: int, source: int, target: int) -> float | None:
+        """How far outside of its old zone a vehicle is that has changed; None: it has left."""
+        hint = self.places.get(vehicle, 0)
+        return self._division.depth_m(self._world, vehicle, target, source, hint)
 
     @staticmethod
     def now_ms() -> float:

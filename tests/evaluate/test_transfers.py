@@ -2,16 +2,22 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
+from cavmarl.errors import JournalError
 from cavmarl.evaluate import EvaluationReport, evaluate, load_report
-from cavmarl.evaluate.evaluation import TRANSFERS_FILE
-from cavmarl.evaluate.tables import read_table
+from cavmarl.evaluate.evaluation import EPISODES_FILE, TRANSFERS_FILE
+from cavmarl.evaluate.tables import EPISODE, read_table
 from cavmarl.evaluate.transfer_rows import TRANSFER, transfers_of
+from cavmarl.roads.zone_file import write_zones
+from cavmarl.roads.zones import ZonePartition
+from cavmarl.runtime.journal_summary import summarize
+from cavmarl.runtime.monitor import longest_move_m
 from cavmarl.worlds import load_world
 
 SMALL: dict[str, Any] = {"episodes": 3, "agents": 4, "background": 40, "max_cycles": 40}
@@ -34,6 +40,12 @@ def test_each_transfer_has_its_row(folder: Path) -> None:
     assert (rows["switch_depth_m"] > 2.0).all()  # the hysteresis
     prepared = rows[rows["approached"] >= 0]
     assert (prepared["prepare_depth_m"] < prepared["switch_depth_m"]).all()
+    staying = rows[~rows["removed"]]
+    moved_m = staying["release_depth_m"] - staying["switch_depth_m"]
+    assert (moved_m > -0.5).all()
+    assert (moved_m < longest_move_m(0.1)).all()
+    assert np.median(moved_m) > 0.0
+    assert np.isnan(rows[rows["removed"]]["release_depth_m"]).all()
     assert (rows["ms"] > 0.0).all()
 
 
@@ -60,7 +72,30 @@ def test_the_manifest_knows_the_zones(folder: Path) -> None:
 def test_zones_change_nothing_else(folder: Path) -> None:
     whole = evaluate("grid4x4", "idm", seed=2, repeats=2, **SMALL)
     assert whole["idm"].transfers is None
-    assert load_report(folder)["idm"].metrics == whole["idm"].metrics
+    assert whole["idm"]["zone_imbalance"].mean is None
+    divided = load_report(folder)["idm"].metrics
+    alike = [name for name in divided if name != "zone_imbalance"]
+    assert [divided[name] for name in alike] == [whole["idm"][name] for name in alike]
+
+
+def test_each_episode_tells_how_unevenly_vehicles_are_shared_out(
+    folder: Path, tmp_path: Path
+) -> None:
+    rows = read_table(folder / EPISODES_FILE, EPISODE)["idm"]
+    assert len(rows) == 6
+    assert ((rows["zone_imbalance"] > 1.0) & (rows["zone_imbalance"] < 2.0)).all()
+    assert len(set(rows["zone_imbalance"].tolist())) == 6
+    found = load_report(folder)["idm"]["zone_imbalance"].mean
+    assert found == pytest.approx(rows["zone_imbalance"].mean())
+    # Three slivers at the rim of the map, and all the rest: one zone has everybody.
+    low_x, low_y, high_x, high_y = load_world("grid4x4").network.extent_m
+    cuts = [low_x - 9.0, low_x - 8.0, low_x - 7.0, low_x - 6.0, high_x + 9.0]
+    rects = [(a, low_y - 9.0, b, high_y + 9.0) for a, b in pairwise(cuts)]
+    bounds = (cuts[0], low_y - 9.0, cuts[-1], high_y + 9.0)
+    write_zones(tmp_path / "zones.json", ZonePartition(bounds, np.array(rects)))
+    one = {"zones.count": 4, "zones.layout": str(tmp_path / "zones.json")}
+    crowded = evaluate("grid4x4", "idm", overrides=one, **{**SMALL, "episodes": 1})
+    assert crowded["idm"]["zone_imbalance"].mean == 4.0
 
 
 def test_an_undivided_world_leaves_no_file(tmp_path: Path) -> None:
@@ -74,3 +109,20 @@ def test_records_give_the_rows_back() -> None:
     rows["ms"] = [1.5, np.nan]
     first, second = transfers_of(rows)
     assert (first.ms, second.ms) == (1.5, None)
+
+
+def test_each_run_has_journals_of_its_own(tmp_path: Path) -> None:
+    logged = ZONES | {"zones.journal": str(tmp_path / "run.jsonl")}
+    few: dict[str, Any] = {**SMALL, "episodes": 2, "repeats": 2, "overrides": logged}
+    found = evaluate("grid4x4", "idm", **few)["idm"].transfers
+    assert found is not None
+    names = {"run.0.jsonl", "run.1.jsonl", "run.run-1.0.jsonl", "run.run-1.1.jsonl"}
+    assert {path.name for path in tmp_path.iterdir()} == names
+    switches = sum(summarize(tmp_path / name)[0].switches for name in names)
+    assert switches >= found.transfers > 0  # the last step of an episode is followed by a reset
+    (tmp_path / "run.0.jsonl").unlink()
+    (tmp_path / "run.1.jsonl").unlink()
+    out = tmp_path / "out"
+    with pytest.raises(JournalError, match=r"run\.run-1\.0\.jsonl: exists; take it away"):
+        evaluate("grid4x4", "idm", out=out, **few)
+    assert not (out / "manifest.json").exists(), "it is refused before the first run"

@@ -75,6 +75,9 @@ class Around:
     def depth_m(self, vehicle: int, target: int) -> float | None:
         return self.depths.get(vehicle)
 
+    def release_depth_m(self, vehicle: int, source: int, target: int) -> float | None:
+        return {(7, 0, 1): 4.5}.get((vehicle, source, target))
+
     def now_ms(self) -> float:
         self.ms += 1.0
         return self.ms
@@ -94,7 +97,7 @@ def test_depths_and_times_come_from_outside() -> None:
             if isinstance(item, Prepare):
                 around.depths[7] = 2.5  # it drives on
     (row,) = log.rows
-    assert (row.prepare_depth_m, row.switch_depth_m) == (-3.0, 2.5)
+    assert (row.prepare_depth_m, row.switch_depth_m, row.release_depth_m) == (-3.0, 2.5, 4.5)
     assert row.ms == 2.0  # the state, BEGIN, DONE
     assert row.ticks == row.tick - row.approached == 1
 
@@ -112,7 +115,9 @@ def test_rows_do_not_grow_for_ever_and_can_be_taken_away() -> None:
 
 def test_the_summary_counts_and_ranks() -> None:
     rows = [
-        Transfer(0, 20, n, 0, 1, 1, n == 5, False, 20 - n, 0, 1, 100 + n, -1.0 * n, 2.0, 0.5 * n)
+        Transfer(
+            0, 20, n, 0, 1, 1, n == 5, False, 20 - n, 0, 1, 100 + n, -1.0 * n, 2.0, 2.0 + n, 0.5 * n
+        )
         for n in range(1, 101)
     ]
     counts = {"switched": 199, "forced": 1, "deferred": 3, "refused": 2, "aborted": 4, "expired": 6}
@@ -123,6 +128,7 @@ def test_the_summary_counts_and_ranks() -> None:
     assert found.latency_ms == (25.0, 47.5, 50.0)
     assert found.state_bytes == (150, 195, 200)
     assert found.prepare_depth_m == (-51.0, -6.0, -1.0)
+    assert found.release_depth_m == (52.0, 97.0, 102.0)
 
 
 def test_the_summary_of_nothing_has_no_figures() -> None:

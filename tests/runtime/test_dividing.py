@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import pytest
 
 from cavmarl.errors import CoverageError
@@ -38,9 +40,14 @@ def test_a_world_is_not_made_that_could_not_be_exact() -> None:
     assert make_simulation("grid4x4", **settings).zone_loads().halo_m == 5000.0
 
 
+def extended(grace: int) -> dict[str, Any]:
+    """The policy that grants so many ticks."""
+    return {"zones.policy": "extend" if grace else "force", "zones.grace_ticks": grace}
+
+
 def test_who_may_stay_longer_is_seen_from_farther_away() -> None:
     config = load_config("grid4x4", overrides=SETTINGS)[0]
-    patient = load_config("grid4x4", overrides=SETTINGS | {"zones.grace_ticks": 5})[0]
+    patient = load_config("grid4x4", overrides=SETTINGS | extended(5))[0]
     more_m = halo_m(patient, 100.0, 4) - halo_m(config, 100.0, 4)
     assert more_m == pytest.approx(5 * MAX_SPEED_MPS * 0.1)
 
@@ -54,7 +61,7 @@ def test_after_the_grace_the_change_is_forced() -> None:
             mode="seats",
             agents=4,
             background=60,
-            overrides=SETTINGS | {"zones.grace_ticks": grace, "zones.faults": lost},
+            overrides=SETTINGS | extended(grace) | {"zones.faults": lost},
         )
         start(simulation, seed=1)
         for _ in range(40):

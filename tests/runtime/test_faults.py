@@ -15,6 +15,7 @@ from hypothesis import strategies as st
 
 from cavmarl import make_vec
 from cavmarl.errors import CavmarlError, InvalidActionError
+from cavmarl.evaluate.fault_figures import FaultFigures
 from cavmarl.ownership.messages import Begin, Commit, Message, Record, Reset
 from cavmarl.ownership.safeguards import ALL_ON
 from cavmarl.ownership.transport import Network, Rates
@@ -83,6 +84,7 @@ CASES: dict[str, tuple[str, dict[str, Any]]] = {
     "short episodes": ("grid4x4", {**BUSY, "horizon_s": 1.2}),
     "team's rewards": ("grid4x4", {**BUSY, "terms.team_share": 0.4}),
     "no deferral": ("grid4x4", {**BUSY, "zones.max_deferred_ticks": 0}),
+    "a grace": ("grid4x4", {**BUSY, "zones.policy": "extend", "zones.grace_ticks": 3}),
 }  # fmt: skip
 
 
@@ -167,6 +169,22 @@ def test_at03_what_comes_late_or_twice_is_dropped_and_counted(
 ) -> None:
     vec = replay(busy, 9, Faults(messages=dict.fromkeys(NOISE, fault)))
     assert vec.simulation.coordinators[0].dropped()[reason] > 0
+
+
+@pytest.mark.parametrize(
+    ("lost", "phases"),
+    [("Ack", {"PREPARE"}), ("Step", {"STEP"}), ("Done", {"DONE"}), ("Abort", set())],
+)
+def test_at03_what_is_sent_again_is_counted_by_phase(
+    busy: Recorded, lost: str, phases: set[str]
+) -> None:
+    vec = replay(busy, 4, Faults(messages={lost: Rates(drop=0.5)}))
+    (coordinator,) = vec.simulation.coordinators
+    assert {phase for phase, count in coordinator.resent.items() if count} == phases
+    figures = FaultFigures.of(vec.simulation, [])
+    assert figures.resent == coordinator.resent
+    figures.add(figures)
+    assert sum(figures.to_dict()["resent"].values()) == 2 * coordinator.resent.total()
 
 
 def test_at03_several_worlds_lose_their_own_messages() -> None:

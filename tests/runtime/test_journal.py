@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import json
 import re
+import subprocess
+import sys
 import tracemalloc
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -87,6 +89,47 @@ def test_a_journal_goes_on_behind_what_is_there(tmp_path: Path) -> None:
             assert (journal.sequence, journal.dropped) == (at, "")
             journal.append(log[at : at + 3])
     assert list(JournalReader(path)) == log
+
+
+HOLD = """
+import sys, time
+from pathlib import Path
+from cavmarl.errors import JournalError
+from cavmarl.runtime.journal import Journal
+try:
+    journal = Journal(Path(sys.argv[1]), resume=True)
+except JournalError as error:
+    sys.exit(str(error))
+print("held", flush=True)
+time.sleep(float(sys.argv[2]))
+"""
+
+
+def other_process(path: Path, seconds: float) -> subprocess.Popen[str]:
+    """Goes on with a journal, and keeps it for so long."""
+    words = [sys.executable, "-c", HOLD, str(path), str(seconds)]
+    return subprocess.Popen(words, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="files are not locked there")
+def test_two_runs_do_not_write_one_journal(tmp_path: Path) -> None:
+    path = tmp_path / "run.journal"
+    words = f"{re.escape(str(path))}: another run is writing this journal; choose another"
+    with Journal(path) as journal:
+        journal.append(eventful().log[:2])
+        with other_process(path, 0.0) as late:
+            _, said = late.communicate(timeout=60.0)
+        assert late.returncode == 1
+        assert re.match(words, said)
+        assert len(list(journal.read())) == 2
+    with other_process(path, 600.0) as writer:
+        assert writer.stdout is not None
+        assert writer.stdout.readline() == "held\n"
+        with pytest.raises(JournalError, match=words):
+            Journal(path, resume=True)
+        writer.kill()
+    with Journal(path, resume=True) as journal:  # a lock dies with its process
+        assert journal.sequence == 2
 
 
 def test_a_line_that_is_cut_short_is_named_and_dropped_at_every_byte(tmp_path: Path) -> None:

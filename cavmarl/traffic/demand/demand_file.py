@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cavmarl.errors import DemandError
-from cavmarl.roads.network import RoadNetwork
+from cavmarl.roads.network import RoadNetwork, content_of
 from cavmarl.traffic.demand.collector import Collector
 from cavmarl.traffic.demand.drawing import (
     DRAW_REROUTE,
@@ -113,7 +113,7 @@ class DemandFile:
             elif isinstance(value, DeviceOptions):
                 digest.update(repr(value).encode())
             elif isinstance(value, np.ndarray):
-                digest.update(value.tobytes())
+                digest.update(content_of(value))
             elif isinstance(value, tuple):
                 digest.update("\0".join(value).encode())
             elif isinstance(value, int):

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -30,6 +32,22 @@ def test_draws_depend_on_the_key_and_on_nothing_else(demand: Reader) -> None:
     early = file.draw(KEY, until_s=300.0)
     assert early.tobytes() == orders[: len(early)].tobytes()
     assert len(early) == np.count_nonzero(orders["depart"] < 300.0)
+
+
+def test_the_hash_is_of_what_stands_in_records_and_not_of_what_lies_between(
+    demand: Reader,
+) -> None:
+    file = demand('<flow id="f" end="900" period="9"><route edges="AB BC"/></flow>')
+    assert file.routes.dtype.itemsize > sum(file.routes.dtype[k].itemsize for k in range(5))
+    routes = np.full(len(file.routes), 0xA5, dtype=np.uint8).repeat(file.routes.dtype.itemsize)
+    routes = routes.view(file.routes.dtype)
+    for name in file.routes.dtype.names or ():
+        routes[name] = file.routes[name]
+    assert routes.tobytes() != file.routes.tobytes()
+    assert replace(file, routes=routes).content_hash == file.content_hash
+    other = file.routes.copy()
+    other["num_edges"] += 1
+    assert replace(file, routes=other).content_hash != file.content_hash
 
 
 def test_another_element_behind_changes_nothing(demand: Reader) -> None:
