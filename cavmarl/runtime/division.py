@@ -88,6 +88,7 @@ class Division:
         self._hysteresis_m = hysteresis_m
         self._ahead_s = ahead_s
         self._border_m = MAX_SPEED_MPS * ahead_s  # nobody else can be behind it by then
+        self._ids, self._x, self._y = (zoned.rows[name] for name in ("id", "x", "y"))
         self._rects: list[list[float]] = zones.rects.tolist()
         self._near = np.zeros(2 * shards[0].worlds.rows.shape[1], dtype=NEAR)
         self._call_exchange = repeated(exchange)
@@ -226,15 +227,14 @@ class Division:
         Returns:
             the distance in m, 0 inside; None: its owner does not have it.
         """
-        worlds = self._shards[zone].worlds
-        rows, num = worlds.rows[w], int(worlds.num_owned[w])
-        if hint >= num or rows[hint]["id"] != vehicle:
-            found = np.flatnonzero(rows["id"][:num] == vehicle)
+        place = (self.side, zone, w, hint)
+        num = self._zoned.num_owned.item(zone, w)
+        if hint >= num or self._ids.item(place) != vehicle:
+            found = np.flatnonzero(self._ids[self.side, zone, w, :num] == vehicle)
             if not len(found):
                 return None
-            hint = int(found[0])
-        row = rows[hint]
-        x, y = row["x"].item(), row["y"].item()
+            place = (self.side, zone, w, int(found[0]))
+        x, y = self._x.item(place), self._y.item(place)
         min_x, min_y, max_x, max_y = self._rects[outside]
         return math.hypot(max(min_x - x, 0.0, x - max_x), max(min_y - y, 0.0, y - max_y))
 
