@@ -19,7 +19,7 @@ from cavmarl.cli.output import (
     write_json,
 )
 from cavmarl.config import ZONE_LAYOUTS
-from cavmarl.errors import ConfigError
+from cavmarl.errors import ConfigError, NoAdmissibleWorkerError
 
 if TYPE_CHECKING:
     from cavmarl.balance.snapshot import Snapshot
@@ -104,7 +104,12 @@ def plan(
         simulation = make(zones)
         measured = measure_shards(simulation, worlds, seed, steps=steps, before=before)
     partition = simulation.partition
-    made = make_plan(Problem(measured.costs, side_neighbors(partition), seen, rule))
+    try:
+        made = make_plan(Problem(measured.costs, side_neighbors(partition), seen, rule))
+    except NoAdmissibleWorkerError as error:
+        raise NoAdmissibleWorkerError(
+            f"{error}; --snapshot {IDLE} supposes that nobody else uses them", error.rejections
+        ) from error
     console.print(describe_plan(made), markup=False, highlight=False, soft_wrap=True)
     if cut is not None:
         said = _cut_anew(simulation.network, partition, measured, tolerance, cut)

@@ -66,6 +66,7 @@ def test_a_plan_can_be_read(plan: Plan) -> None:
     text = describe_plan(plan)
     assert text.startswith("8 shards on 4 workers, moved from the slowest\n")
     assert "score = 0.5 CPU + 0.25 RAM + 0.25 GPU; workers generated, GPU: none" in text
+    assert "costliest shard 4.000 ms a tick, 2.286 times the mean" in text
     assert "excluded: worker 2: cpu 0.9 > 0.85" in text
     assert "excluded: worker 3 is unavailable" in text
     (first,) = (line for line in text.splitlines() if line.startswith("     0"))

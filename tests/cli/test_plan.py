@@ -55,6 +55,7 @@ def test_nobody_admissible_says_so(capsys: pytest.CaptureFixture[str], tmp_path:
     path.write_text(json.dumps(document))
     said = refusal(capsys, *words, str(path))
     assert "no admissible worker: worker 0: cpu 0.99 > 0.85; worker 1: cpu 0.99 > 0.85" in said
+    assert "--snapshot idle supposes" in said
     three = ("plan", "ring", "--zones", "3", "--workers", "3", *QUICK, "--snapshot")
     assert "has 2 workers, not 3" in refusal(capsys, *three, str(path))
 
