@@ -13,7 +13,7 @@ OLDEST_TESTS := tests/kernels tests/roads tests/runtime tests/traffic tests/test
     tests/test_bad_input.py tests/test_public_api.py
 FUZZ_SECONDS ?= 60
 FUZZ_TARGETS ?= network programs map cached zones demand sumocfg entry overrides driver manifest \
-    message log
+    plan message log
 MAPS := envs/ring/map/map.net.xml envs/merge/map/map.net.xml envs/grid4x4/map/map.net.xml
 
 .PHONY: help demo test check bench bounds soak model fuzz oldest maps pictures clean

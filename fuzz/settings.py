@@ -1,11 +1,18 @@
-"""Targets that read settings and records: env.yaml, overrides, drivers' folders, manifests."""
+"""Targets that read settings and records: env.yaml, overrides, drivers, manifests, plans."""
 
 from __future__ import annotations
 
+import json
 import tempfile
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
 
+from cavmarl.balance.plan import make_plan, replan
+from cavmarl.balance.plan_file import read_plan
+from cavmarl.balance.plan_text import describe_plan
+from cavmarl.balance.problem import Problem, equal_costs
+from cavmarl.balance.snapshot import idle_snapshot
 from cavmarl.cli.output import parse_settings
 from cavmarl.config import ActionConfig, EnvConfig, SensorsConfig
 from cavmarl.config_io import read_yaml, validate
@@ -21,7 +28,7 @@ from cavmarl.networks import (
 from cavmarl.registry import load_config
 from fuzz.files import ROOT, Target, scratch, seed
 
-__all__ = ["DRIVERS", "ENTRIES", "MANIFESTS", "OVERRIDES"]
+__all__ = ["DRIVERS", "ENTRIES", "MANIFESTS", "OVERRIDES", "PLANS"]
 
 # Between the two files of a driver, in one input.
 _BORDER = b"\n----\n"
@@ -69,6 +76,17 @@ def _manifests() -> tuple[bytes, ...]:
     return tuple(found)
 
 
+def _plan(content: bytes) -> object:
+    plan = read_plan(scratch("plan.json", content))
+    return describe_plan(plan), replan(plan, plan.problem.snapshot).to_dict()
+
+
+def _plans() -> tuple[bytes, ...]:
+    first = make_plan(Problem(equal_costs(2, 2), ((1,), (0,)), idle_snapshot(2)))
+    later = make_plan(replace(first.problem, present=(0, 0, 0, 1)))
+    return tuple(json.dumps(plan.to_dict()).encode() for plan in (first, later))
+
+
 @cache
 def _drivers() -> tuple[bytes, ...]:
     found = []
@@ -90,4 +108,5 @@ def _drivers() -> tuple[bytes, ...]:
 ENTRIES = Target(_entry, _entries)
 OVERRIDES = Target(_overrides, lambda: (seed("overrides.txt"),))
 MANIFESTS = Target(_manifest, _manifests)
+PLANS = Target(_plan, _plans)
 DRIVERS = Target(_driver, _drivers)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from fuzz.protocol import LOGS, MESSAGES
 from fuzz.roads import CACHED, MAPS, NETWORKS, PROGRAMS, ZONES
-from fuzz.settings import DRIVERS, ENTRIES, MANIFESTS, OVERRIDES
+from fuzz.settings import DRIVERS, ENTRIES, MANIFESTS, OVERRIDES, PLANS
 from fuzz.traffic import DEMAND, SUMO_CONFIGS
 
 __all__ = ["TARGETS"]
@@ -21,6 +21,7 @@ TARGETS = {
     "overrides": OVERRIDES,
     "driver": DRIVERS,
     "manifest": MANIFESTS,
+    "plan": PLANS,
     "message": MESSAGES,
     "log": LOGS,
 }

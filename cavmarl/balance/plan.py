@@ -2,19 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import asdict, dataclass, replace
 from functools import cached_property
 from typing import Any, NamedTuple
 
 from cavmarl.balance.assignment import assign, workers_of
-from cavmarl.balance.load_score import LoadRule, Rejection
+from cavmarl.balance.load_score import Rejection
 from cavmarl.balance.placement import Placement
-from cavmarl.balance.problem import BalanceRule, Problem, ShardCost
-from cavmarl.balance.snapshot import Snapshot, snapshot_from_dict
+from cavmarl.balance.problem import Problem
+from cavmarl.balance.snapshot import Snapshot
 from cavmarl.errors import PlacementError
 
-__all__ = ["Move", "Plan", "WorkerLoad", "make_plan", "plan_from_dict", "replan"]
+__all__ = ["Move", "Plan", "WorkerLoad", "make_plan", "replan"]
 
 SCHEMA = "cavmarl.plan"
 VERSION = 1
@@ -62,11 +61,22 @@ class Plan:
         problem: what it follows from.
         homes: worker of each shard, in the order of `problem.shards`.
         method: how it was found, in words.
+
+    Raises:
+        PlacementError: not one home a shard, or one that does not answer.
     """
 
     problem: Problem
     homes: tuple[int, ...]
     method: str
+
+    def __post_init__(self) -> None:
+        answering = {one.worker for one in self.problem.snapshot.workers if one.available}
+        if len(self.homes) != len(self.problem.shards) or not answering.issuperset(self.homes):
+            raise PlacementError(
+                f"homes {self.homes}: must be one a shard of {len(self.problem.shards)}, among "
+                f"the workers that answer, {sorted(answering)}"
+            )
 
     @cached_property
     def rejections(self) -> tuple[Rejection, ...]:
@@ -148,39 +158,3 @@ def make_plan(problem: Problem) -> Plan:
 def replan(plan: Plan, snapshot: Snapshot) -> Plan:
     """The plan that follows from another snapshot, or from the same one again."""
     return make_plan(replace(plan.problem, snapshot=snapshot))
-
-
-def plan_from_dict(document: Mapping[str, Any]) -> Plan:
-    """What `to_dict` has written.
-
-    Raises:
-        PlacementError: not a plan of this version, or a value in it is none.
-    """
-    if not isinstance(document, Mapping) or document.get("schema") != SCHEMA:
-        raise PlacementError(f"not a plan: there is no schema '{SCHEMA}'")
-    if document.get("version") != VERSION:
-        raise PlacementError(
-            f"a plan of version {document.get('version')!r}, but this cavmarl reads {VERSION}"
-        )
-    try:
-        rule = document["rule"]
-        load = {name: _plain(value) for name, value in rule["load"].items()}
-        present = document["present"]
-        problem = Problem(
-            shards=tuple(
-                ShardCost(row["world"], row["zone"], row["cost_s"]) for row in document["shards"]
-            ),
-            neighbors=tuple(tuple(row) for row in document["neighbors"]),
-            snapshot=snapshot_from_dict(document["snapshot"]),
-            rule=BalanceRule(**{**rule, "load": LoadRule(**load)}),
-            present=None if present is None else tuple(present),
-        )
-        homes = tuple(row["worker"] for row in document["shards"])
-        return Plan(problem, homes, document["method"])
-    except (KeyError, TypeError, AttributeError, ValueError) as error:
-        raise PlacementError(f"not a plan: {error!r}; make it anew") from error
-
-
-def _plain(value: Any) -> Any:
-    """JSON knows no tuples."""
-    return tuple(value) if isinstance(value, list) else value

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Sequence
 from itertools import groupby
 
@@ -27,7 +28,7 @@ def describe_plan(plan: Plan) -> str:
     """Lines without a last line break: the whole, each worker, who is excluded, who moves."""
     problem, placement = plan.problem, plan.placement
     snapshot = problem.snapshot
-    first = problem.present is None
+    costs = [shard.cost_s for shard in problem.shards]
     weights = " + ".join(
         f"{weight:g} {name}"
         for weight, name in zip(problem.rule.load.weights, ("CPU", "RAM", "GPU"), strict=True)
@@ -37,18 +38,25 @@ def describe_plan(plan: Plan) -> str:
         f"slowest worker {1e3 * placement.makespan_s:.3f} ms a tick, "
         f"{plan.imbalance:.3f} times a perfect division; "
         f"neighbours apart: {placement.cut_pairs} of {len(problem.pairs)}",
+        f"costliest shard {1e3 * max(costs):.3f} ms a tick, {_over_mean(costs):.3f} times the mean",
         f"score = {weights}; workers {snapshot.origin}, GPU: {snapshot.gpu_source}",
         "",
         *_table(HEADINGS, _rows(plan)),
         *(f"excluded: {rejection}" for rejection in plan.rejections),
     ]
-    if not first:
+    if problem.present is not None:
         lines.append(f"moves: {len(plan.moves)}")
         lines += [
             f"  world {move.world}, zone {move.zone}: worker {move.source} → {move.target}"
             for move in plan.moves
         ]
     return "\n".join(lines)
+
+
+def _over_mean(costs: Sequence[float]) -> float:
+    """The imbalance that zones would have with a worker each."""
+    total = math.fsum(costs)
+    return max(costs) * len(costs) / total if total else 1.0
 
 
 def _rows(plan: Plan) -> Iterable[tuple[str, ...]]:

@@ -5,6 +5,9 @@ and how many vehicles change their zone is known at once. A linear model without
 coefficients, fitted to logged rows, says what that will cost:
 
     cost_s = a + b · vehicles + c · readings + d · migrations
+
+What a shard costs beside that, such as where its vehicles are, stays as it was measured: the model
+says what a change of its content changes.
 """
 
 from __future__ import annotations
@@ -50,6 +53,10 @@ class CostModel(NamedTuple):
             + self.reading_s * content.readings
             + self.migration_s * content.migrations
         )
+
+    def shift(self, cost_s: float, before: ShardContent, now: ShardContent) -> float:
+        """What a shard will cost with its content of now that cost `cost_s` with that before."""
+        return max(cost_s + self.predict(now) - self.predict(before), 0.0)
 
 
 def fit_costs(contents: Sequence[ShardContent], costs_s: Sequence[float]) -> CostModel:

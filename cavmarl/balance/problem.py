@@ -12,7 +12,9 @@ from cavmarl.balance.load_score import LoadRule
 from cavmarl.balance.snapshot import Snapshot
 from cavmarl.errors import PlacementError
 
-__all__ = ["BalanceRule", "Problem", "ShardCost"]
+__all__ = ["BalanceRule", "Problem", "ShardCost", "equal_costs"]
+
+MAX_COST_S = 1e6  # of a tick: sums stay finite
 
 
 class ShardCost(NamedTuple):
@@ -27,6 +29,11 @@ class ShardCost(NamedTuple):
     world: int
     zone: int
     cost_s: float
+
+
+def equal_costs(worlds: int, zones: int) -> tuple[ShardCost, ...]:
+    """Shards of which nothing has been measured: each counts as much as another."""
+    return tuple(ShardCost(world, zone, 1.0) for world in range(worlds) for zone in range(zones))
 
 
 @dataclass(frozen=True)
@@ -76,7 +83,8 @@ class Problem:
 
     Raises:
         PlacementError: no shard, one twice, a cost below 0 or none, a zone without a row in
-            `neighbors`, more workers than shards, not one present worker a shard.
+            `neighbors`, neighbours that are not each other's, more workers than shards, not one
+            present worker a shard.
     """
 
     shards: tuple[ShardCost, ...]
@@ -87,6 +95,7 @@ class Problem:
 
     def __post_init__(self) -> None:
         _check_shards(self.shards, len(self.neighbors))
+        _check_neighbors(self.neighbors)
         workers = len(self.snapshot.workers)
         if workers > len(self.shards):
             raise PlacementError(
@@ -130,8 +139,17 @@ def _check_shards(shards: Sequence[ShardCost], zones: int) -> None:
             raise PlacementError(
                 f"world {shard.world}, zone {shard.zone}: there are neighbours of {zones} zones"
             )
-        if not (math.isfinite(shard.cost_s) and shard.cost_s >= 0.0):
+        if not 0.0 <= shard.cost_s <= MAX_COST_S:  # NaN is not, either
             raise PlacementError(
                 f"world {shard.world}, zone {shard.zone}: cost_s = {shard.cost_s}: must be "
-                "seconds from 0 up; measure it again"
+                f"seconds from 0 to {MAX_COST_S:g}; measure it again"
             )
+
+
+def _check_neighbors(neighbors: Sequence[Sequence[int]]) -> None:
+    for zone, row in enumerate(neighbors):
+        for other in row:
+            if not (0 <= other < len(neighbors) and zone in neighbors[other] and zone != other):
+                raise PlacementError(
+                    f"zone {zone} names {other} as its neighbour, which does not name it"
+                )

@@ -7,7 +7,9 @@ from collections.abc import Iterable
 from cavmarl.balance.problem import ShardCost
 from cavmarl.errors import PlacementError
 
-__all__ = ["SmoothCosts"]
+__all__ = ["NEWEST", "SmoothCosts"]
+
+NEWEST = 0.3  # weight of the newest measurement
 
 
 class SmoothCosts:
@@ -20,7 +22,7 @@ class SmoothCosts:
         PlacementError: a weight that is not above 0 and at most 1.
     """
 
-    def __init__(self, newest: float = 0.3) -> None:
+    def __init__(self, newest: float = NEWEST) -> None:
         if not 0.0 < newest <= 1.0:
             raise PlacementError(f"newest = {newest}: must be above 0 and at most 1")
         self._newest = newest

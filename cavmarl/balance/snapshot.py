@@ -6,14 +6,13 @@ plan again. `probe` takes one of this machine.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from typing import Any
 
 from cavmarl.balance.load_score import Candidate, Utilisation
 from cavmarl.errors import PlacementError
 
-__all__ = ["NO_GPU", "SUPPOSED_IDLE", "Snapshot", "idle_snapshot", "snapshot_from_dict"]
+__all__ = ["NO_GPU", "SUPPOSED_IDLE", "Snapshot", "idle_snapshot"]
 
 NO_GPU = "none"
 SUPPOSED_IDLE = "supposed idle"
@@ -55,21 +54,3 @@ def idle_snapshot(count: int) -> Snapshot:
     idle = Utilisation(0.0, 0.0)
     workers = tuple(Candidate(worker, idle) for worker in range(count))
     return Snapshot(workers, NO_GPU, SUPPOSED_IDLE)
-
-
-def snapshot_from_dict(document: Mapping[str, Any]) -> Snapshot:
-    """What `to_dict` has written.
-
-    Raises:
-        PlacementError: a key is missing or unknown, or a value is none.
-    """
-    try:
-        workers = tuple(
-            Candidate(**{**worker, "use": Utilisation(**worker["use"])})
-            for worker in document["workers"]
-        )
-        return Snapshot(**{**document, "workers": workers})
-    except (KeyError, TypeError) as error:
-        raise PlacementError(
-            f"not a snapshot of workers ({error}): take one anew, or give the file that has one"
-        ) from error

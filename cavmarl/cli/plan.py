@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 from rich.console import Console
@@ -20,7 +19,7 @@ from cavmarl.cli.output import (
     write_json,
 )
 from cavmarl.config import ZONE_LAYOUTS
-from cavmarl.errors import ConfigError
+from cavmarl.errors import ConfigError, NoAdmissibleWorkerError
 
 if TYPE_CHECKING:
     from cavmarl.balance.snapshot import Snapshot
@@ -105,7 +104,12 @@ def plan(
         simulation = make(zones)
         measured = measure_shards(simulation, worlds, seed, steps=steps, before=before)
     partition = simulation.partition
-    made = make_plan(Problem(measured.costs, side_neighbors(partition), seen, rule))
+    try:
+        made = make_plan(Problem(measured.costs, side_neighbors(partition), seen, rule))
+    except NoAdmissibleWorkerError as error:
+        raise NoAdmissibleWorkerError(
+            f"{error}; --snapshot {IDLE} supposes that nobody else uses them", error.rejections
+        ) from error
     console.print(describe_plan(made), markup=False, highlight=False, soft_wrap=True)
     if cut is not None:
         said = _cut_anew(simulation.network, partition, measured, tolerance, cut)
@@ -137,36 +141,28 @@ def _cut_anew(
 
 
 def _snapshot(said: str, workers: int) -> Snapshot:
+    from cavmarl.balance.plan_file import read_plan
     from cavmarl.balance.probe import take_snapshot
-    from cavmarl.balance.snapshot import idle_snapshot, snapshot_from_dict
+    from cavmarl.balance.snapshot import idle_snapshot
 
     if said == NOW:
         return take_snapshot(dict.fromkeys(range(workers)))
     if said == IDLE:
         return idle_snapshot(workers)
-    found = snapshot_from_dict(_read(Path(said)).get("snapshot", {}))
+    found = read_plan(Path(said)).problem.snapshot
     if len(found.workers) != workers:
         raise ConfigError(f"{said}: has {len(found.workers)} workers, not {workers}: --workers")
     return found
 
 
 def _make_again(path: Path) -> None:
-    from cavmarl.balance.plan import plan_from_dict, replan
+    from cavmarl.balance.plan import replan
+    from cavmarl.balance.plan_file import read_plan
     from cavmarl.balance.plan_text import describe_plan
 
-    stored = plan_from_dict(_read(path))
+    stored = read_plan(path)
     made = replan(stored, stored.problem.snapshot)
     Console().print(describe_plan(made), markup=False, highlight=False, soft_wrap=True)
     if made != stored:
         print_error(f"{path}: its shards do not stand where its own figures put them")
         raise typer.Exit(1)
-
-
-def _read(path: Path) -> dict[str, Any]:
-    try:
-        document = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError, RecursionError) as error:
-        raise ConfigError(f"{path}: cannot be read ({error})") from error
-    if not isinstance(document, dict):
-        raise ConfigError(f"{path}: not a plan")
-    return document

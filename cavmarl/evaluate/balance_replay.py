@@ -178,7 +178,7 @@ def _replay(name: str, trace: LoadTrace, rule: BalanceRule, warm: int) -> _Total
         float(imbalances.mean()),
         float(moves.mean()),
         float(handoffs.mean()),
-        strategy.plan.problem.rule.load.weights,
+        strategy.balancer.plan.problem.rule.load.weights,
     )
 
 

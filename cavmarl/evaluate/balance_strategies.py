@@ -7,12 +7,12 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from cavmarl.balance.balancer import Balancer
 from cavmarl.balance.calibration import LoggedTick, calibrate
-from cavmarl.balance.plan import Plan, make_plan
 from cavmarl.balance.prediction import ShardContent, fit_costs
-from cavmarl.balance.problem import BalanceRule, Problem, ShardCost
+from cavmarl.balance.problem import BalanceRule, Problem, ShardCost, equal_costs
 from cavmarl.balance.repartition import propose_zones, vehicle_costs
-from cavmarl.balance.smoothing import SmoothCosts
+from cavmarl.balance.smoothing import NEWEST
 from cavmarl.evaluate.load_traces import LoadTrace
 from cavmarl.evaluate.shard_costs import side_neighbors
 from cavmarl.roads.zones import ZonePartition
@@ -46,30 +46,30 @@ class StaticPlacement:
     Args:
         trace: the loads.
         rule: of the first plan.
+
+    Attributes:
+        partition: the zones now.
+        balancer: has the plan.
     """
 
     def __init__(self, trace: LoadTrace, rule: BalanceRule) -> None:
         self.trace = trace
         self.rule = rule
         self.partition = trace.partition
-        self.plan = self._first_plan(trace.partition, [1.0] * trace.partition.count, 0)
+        self.balancer = self._begin(trace.partition, equal_costs(1, trace.partition.count), 0)
 
     def place(self, number: int) -> Placed:
         """Where shards are in a round, from what is known before it."""
-        return Placed(self.partition, self.plan.homes)
+        return Placed(self.partition, self.balancer.plan.homes)
 
     def learn(self, number: int) -> None:
         """Take in what was measured in a round."""
 
-    def _first_plan(self, partition: ZonePartition, costs_s: Sequence[float], number: int) -> Plan:
-        return make_plan(
-            Problem(
-                shards=shards_of(costs_s),
-                neighbors=side_neighbors(partition),
-                snapshot=self.trace.rounds[number].snapshot,
-                rule=self.rule,
-            )
-        )
+    def _begin(
+        self, partition: ZonePartition, costs: tuple[ShardCost, ...], number: int
+    ) -> Balancer:
+        snapshot = self.trace.rounds[number].snapshot
+        return Balancer(Problem(costs, side_neighbors(partition), snapshot, self.rule))
 
 
 class LoadStrategy(StaticPlacement):
@@ -98,39 +98,39 @@ class LoadStrategy(StaticPlacement):
         super().__init__(trace, rule)
         self._warm = warm
         self._calibrated, self._predicted, self._recut = calibrated, predicted, recut
-        self._smooth = SmoothCosts()
-        self._costs = self.plan.problem.shards
         self._ticks: list[LoggedTick] = []
         self._contents: list[ShardContent] = []
         self._measured_s: list[float] = []
+        self._usual = np.array(trace.contents(0, trace.partition))  # smoothed as costs are
 
     def place(self, number: int) -> Placed:
         """Where shards are in a round, from what is known before it."""
+        before = self.balancer.plan.homes
         if number == 0:
-            return Placed(self.partition, self.plan.homes)
-        before = self.plan.homes
-        self.plan = make_plan(
-            replace(
-                self.plan.problem,
-                shards=self._expected(number),
-                snapshot=self.trace.rounds[number].snapshot,
-                rule=self._rule(number),
-                present=before,
-            )
+            return Placed(self.partition, before)
+        plan = self.balancer.round(
+            self.trace.rounds[number].snapshot,
+            costs=self._expected(number),
+            rule=self._rule(number),
         )
-        moved_vehicles = self._cut_anew(number) if self._may_cut(number) else 0
-        moved = sum(one != other for one, other in zip(before, self.plan.homes, strict=True))
-        return Placed(self.partition, self.plan.homes, moved, moved_vehicles)
+        moved_vehicles = 0
+        if self._may_cut(number) and plan.imbalance > 1.0 + self.rule.tolerance:
+            moved_vehicles = self._cut_anew(number)
+        homes = self.balancer.plan.homes
+        moved = sum(one != other for one, other in zip(before, homes, strict=True))
+        return Placed(self.partition, homes, moved, moved_vehicles)
 
     def learn(self, number: int) -> None:
         """Take in what was measured in a round."""
         trace, partition = self.trace, self.partition
         measured_s = trace.measured_s(number, partition)
-        self._costs = self._smooth.update(shards_of(measured_s.tolist()))
-        self._contents += trace.contents(number, partition)
+        contents = trace.contents(number, partition)
+        self.balancer.measure(_shards(measured_s.tolist()))
+        self._usual += NEWEST * (np.array(contents) - self._usual)
+        self._contents += contents
         self._measured_s += measured_s.tolist()
         true_s = trace.costs_s(number, partition)
-        homes = np.array(self.plan.homes)
+        homes = np.array(self.balancer.plan.homes)
         for candidate in trace.rounds[number].snapshot.workers:
             own = homes == candidate.worker
             tick_s = float(true_s[own].sum()) / (1.0 - candidate.use.cpu)
@@ -145,22 +145,24 @@ class LoadStrategy(StaticPlacement):
         return replace(self.rule, load=replace(given, weights=weights))
 
     def _expected(self, number: int) -> tuple[ShardCost, ...]:
+        known = self.balancer.costs
         if not self._predicted or number < self._warm:
-            return self._costs
+            return known
         model = fit_costs(self._contents, self._measured_s)
-        contents = self.trace.contents(number, self.partition)
-        return shards_of([model.predict(content) for content in contents])
+        now = self.trace.contents(number, self.partition)
+        return tuple(
+            shard._replace(cost_s=model.shift(shard.cost_s, ShardContent(*usual), content))
+            for shard, usual, content in zip(known, self._usual.tolist(), now, strict=True)
+        )
 
     def _may_cut(self, number: int) -> bool:
-        """Whether moving shards does not help, and the last cut was long ago."""
-        due = self._recut and number >= self._warm and number % RECUT_EVERY == 0
-        return due and self.plan.imbalance > 1.0 + self.rule.tolerance
+        return self._recut and number >= self._warm and number % RECUT_EVERY == 0
 
     def _cut_anew(self, number: int) -> int:
         """Other zones, if they pay; how many vehicles get another one."""
         trace = self.trace
         places = trace.rounds[number - 1].places
-        costs_s = [shard.cost_s for shard in self._costs]
+        costs_s = [shard.cost_s for shard in self.balancer.costs]
         proposal = propose_zones(
             trace.network, self.partition, places, costs_s, tolerance=self.rule.tolerance
         )
@@ -170,12 +172,10 @@ class LoadStrategy(StaticPlacement):
         self.partition = proposal.partition
         zones = self.partition.zones_of(places)
         shared_s = np.bincount(zones, weights, self.partition.count).tolist()
-        self._smooth = SmoothCosts()
-        self._costs = self._smooth.update(shards_of(shared_s))
-        self.plan = self._first_plan(self.partition, shared_s, number)
+        self.balancer = self._begin(self.partition, _shards(shared_s), number)
         return proposal.moved
 
 
-def shards_of(costs_s: Sequence[float]) -> tuple[ShardCost, ...]:
+def _shards(costs_s: Sequence[float]) -> tuple[ShardCost, ...]:
     """Zones of the one world of a trace."""
     return tuple(ShardCost(0, zone, cost_s) for zone, cost_s in enumerate(costs_s))

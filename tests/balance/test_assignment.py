@@ -147,6 +147,22 @@ def test_who_is_excluded_keeps_what_balance_does_not_take() -> None:
     assert {move.source for move in drained.moves} == {1}
 
 
+def test_who_has_nothing_left_is_slow_and_not_endless() -> None:
+    used_up = Candidate(1, Utilisation(1.0, 1.0, 1.0))
+    snapshot = Snapshot((*busy(0.0).workers, used_up), "none", "")
+    problem = replace(alone([1.0] * 3, snapshot), present=(0, 1, 1))
+    plan = make_plan(problem)
+    assert math.isfinite(plan.imbalance)
+    assert plan.homes == (0, 0, 0)
+
+
+def test_a_worker_that_joins_is_given_shards_round_by_round() -> None:
+    plan = make_plan(alone([1.0] * 12, idle_snapshot(2)))
+    for _ in range(3):
+        plan = make_plan(replace(plan.problem, snapshot=idle_snapshot(3), present=plan.homes))
+    assert sorted(plan.homes.count(worker) for worker in range(3)) == [4, 4, 4]
+
+
 def test_shards_of_a_lost_worker_are_placed_beyond_the_bound() -> None:
     rule = BalanceRule(max_moves=1)
     problem = replace(alone([1.0] * 6, idle_snapshot(2), rule), present=(0, 0, 7, 7, 7, 7))

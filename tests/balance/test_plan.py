@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -11,7 +12,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from cavmarl.balance.load_score import Candidate, LoadRule, Utilisation
-from cavmarl.balance.plan import Plan, make_plan, plan_from_dict, replan
+from cavmarl.balance.plan import Plan, make_plan, replan
+from cavmarl.balance.plan_file import plan_from_dict, read_plan
 from cavmarl.balance.plan_text import describe_plan
 from cavmarl.balance.problem import BalanceRule, Problem
 from cavmarl.balance.snapshot import Snapshot, idle_snapshot
@@ -64,6 +66,7 @@ def test_a_plan_can_be_read(plan: Plan) -> None:
     text = describe_plan(plan)
     assert text.startswith("8 shards on 4 workers, moved from the slowest\n")
     assert "score = 0.5 CPU + 0.25 RAM + 0.25 GPU; workers generated, GPU: none" in text
+    assert "costliest shard 4.000 ms a tick, 2.286 times the mean" in text
     assert "excluded: worker 2: cpu 0.9 > 0.85" in text
     assert "excluded: worker 3 is unavailable" in text
     (first,) = (line for line in text.splitlines() if line.startswith("     0"))
@@ -82,11 +85,17 @@ def test_zones_are_named_by_runs() -> None:
     [
         ({"schema": "other"}, "no schema 'cavmarl.plan'"),
         ({"version": 2}, "version 2"),
-        ({"shards": None}, "not a plan"),
-        ({"rule": {}}, "not a plan"),
-        ({"snapshot": {"workers": []}}, "not a snapshot"),
+        ({"shards": None}, "shards is None, must be a list"),
+        ({"shards": [1]}, "shard is 1, must be a table"),
+        ({"rule": {}}, "load is None"),
+        ({"method": 1}, "method is 1, must be text"),
+        ({"snapshot": {"workers": []}}, "gpu_source is None"),
         ({"snapshot": {"workers": [], "gpu_source": "none", "origin": ""}}, "no workers"),
         ({"present": [0]}, "1 present workers"),
+        ({"present": [0, True]}, "present is True, must be a whole number"),
+        ({"neighbors": [[1], [], [], []]}, "zone 0 names 1 as its neighbour"),
+        ({"neighbors": [[0], [], [], []]}, "zone 0 names 0"),
+        ({"neighbors": [["x"], [], [], []]}, "neighbors is 'x'"),
     ],
 )
 def test_what_is_no_plan_is_refused(plan: Plan, change: dict[str, Any], said: str) -> None:
@@ -99,3 +108,42 @@ def test_a_share_that_is_none_is_refused_in_a_stored_plan(plan: Plan) -> None:
     document["snapshot"]["workers"][0]["use"]["cpu"] = 12.0
     with pytest.raises(PlacementError, match="utilisation cpu = 12"):
         plan_from_dict(document)
+
+
+@pytest.mark.parametrize(
+    ("path", "value", "said"),
+    [
+        (("shards", 0, "worker"), 9, r"homes .*: must be one a shard of 8, among .* \[0, 1, 2\]"),
+        (("shards", 0, "worker"), 3, "among the workers that answer"),
+        (("shards", 0, "cost_s"), 1e300, "cost_s = 1e"),
+        (("shards", 0, "cost_s"), 10**400, "cost_s is 1000"),
+        (("shards", 0, "zone"), 0.0, "zone is 0.0, must be a whole number"),
+        (("rule", "load", "weights"), [1.0], "weights is .*three numbers"),
+        (("rule", "load", "weights"), [1.0, "", 0.0], "weights is ''"),
+        (("rule", "max_moves"), 2.5, "max_moves is 2.5"),
+        (("snapshot", "workers", 0, "available"), 1, "available is 1, must be true or false"),
+    ],
+)
+def test_a_value_of_a_plan_that_is_none_is_named(
+    plan: Plan, path: tuple[str | int, ...], value: object, said: str
+) -> None:
+    document = plan.to_dict()
+    part: Any = document
+    for key in path[:-1]:
+        part = part[key]
+    part[path[-1]] = value
+    with pytest.raises(PlacementError, match=said):
+        plan_from_dict(json.loads(json.dumps(document)))
+
+
+def test_a_plan_is_read_from_a_file(plan: Plan, tmp_path: Path) -> None:
+    path = tmp_path / "plan.json"
+    path.write_text(json.dumps(plan.to_dict()), encoding="utf-8")
+    assert read_plan(path) == plan
+    path.write_text("{}", encoding="utf-8")
+    with pytest.raises(PlacementError, match=r"plan\.json: not a plan"):
+        read_plan(path)
+    for content in (b"\xff", b"[" * 100_000, b'{"a": ' + b"9" * 5000 + b"}"):
+        path.write_bytes(content)
+        with pytest.raises(PlacementError, match="cannot be read"):
+            read_plan(path)

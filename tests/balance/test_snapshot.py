@@ -12,8 +12,9 @@ from pathlib import Path
 import pytest
 
 from cavmarl.balance.load_score import Candidate, Utilisation
+from cavmarl.balance.plan_file import snapshot_from_dict
 from cavmarl.balance.probe import take_snapshot
-from cavmarl.balance.snapshot import Snapshot, idle_snapshot, snapshot_from_dict
+from cavmarl.balance.snapshot import Snapshot, idle_snapshot
 from cavmarl.errors import PlacementError
 
 

@@ -42,16 +42,22 @@ def test_a_plan_that_cannot_be_is_refused(
     path = tmp_path / "other.json"
     path.write_text("[]")
     assert "not a plan" in refusal(capsys, "plan", "--again", str(path))
-    path.write_text("{}")
-    assert "no schema" in refusal(capsys, "plan", "--again", str(path))
-    assert "not a snapshot" in refusal(capsys, "plan", "ring", "--snapshot", str(path))
-    busy = {"cpu": 0.99, "ram": 0.1, "gpu": 0.0}
-    workers = [{"worker": n, "use": busy, "hosted": 0, "available": True} for n in (0, 1)]
-    snapshot = {"workers": workers, "gpu_source": "none", "origin": "measured"}
-    path.write_text(json.dumps({"snapshot": snapshot}))
-    said = refusal(capsys, *few[:4], "--workers", "2", "--snapshot", str(path), *QUICK)
+    assert "no schema" in refusal(capsys, "plan", "ring", "--snapshot", str(path))
+
+
+def test_nobody_admissible_says_so(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    path = tmp_path / "plan.json"
+    words = ("plan", "ring", "--zones", "2", "--workers", "2", *QUICK, "--snapshot")
+    assert run(*words, "idle", "--json", str(path)) == 0
+    document = json.loads(path.read_text())
+    for worker in document["snapshot"]["workers"]:
+        worker["use"]["cpu"] = 0.99
+    path.write_text(json.dumps(document))
+    said = refusal(capsys, *words, str(path))
     assert "no admissible worker: worker 0: cpu 0.99 > 0.85; worker 1: cpu 0.99 > 0.85" in said
-    assert "has 2 workers, not 3" in refusal(capsys, "plan", "ring", "--snapshot", str(path))
+    assert "--snapshot idle supposes" in said
+    three = ("plan", "ring", "--zones", "3", "--workers", "3", *QUICK, "--snapshot")
+    assert "has 2 workers, not 3" in refusal(capsys, *three, str(path))
 
 
 def test_zones_can_be_cut_by_what_was_measured(

@@ -1,0 +1,158 @@
+"""Plans and snapshots from JSON: what `to_dict` of them has written, checked value by value."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from cavmarl.balance.load_score import RESOURCES, Candidate, LoadRule, Utilisation
+from cavmarl.balance.plan import SCHEMA, VERSION, Plan
+from cavmarl.balance.problem import BalanceRule, Problem, ShardCost
+from cavmarl.balance.snapshot import Snapshot
+from cavmarl.errors import PlacementError
+
+__all__ = ["plan_from_dict", "read_plan", "snapshot_from_dict"]
+
+LARGEST = 1 << 53  # whole numbers beyond it are not whole in every reader of JSON
+LONGEST = 40  # letters of a wrong value in a message
+
+
+def read_plan(path: Path) -> Plan:
+    """The plan of a file.
+
+    Raises:
+        PlacementError: it cannot be read, or holds no plan of this version.
+    """
+    try:
+        document = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError, RecursionError) as error:
+        raise PlacementError(f"{path}: cannot be read ({error}); make the plan anew") from error
+    try:
+        return plan_from_dict(document)
+    except PlacementError as error:
+        raise PlacementError(f"{path}: {error}") from error
+
+
+def plan_from_dict(document: Mapping[str, Any]) -> Plan:
+    """The plan of a document; what follows from the rest is not read.
+
+    Raises:
+        PlacementError: not a plan of this version, or a value in it is none.
+    """
+    if not isinstance(document, Mapping) or document.get("schema") != SCHEMA:
+        raise PlacementError(f"not a plan: there is no schema '{SCHEMA}'")
+    if document.get("version") != VERSION:
+        raise PlacementError(
+            f"a plan of version {document.get('version')!r}, but this cavmarl reads {VERSION}"
+        )
+    get = document.get
+    shards = [_table(row, "shard") for row in _list(get("shards"), "shards")]
+    present = get("present")
+    problem = Problem(
+        shards=tuple(
+            ShardCost(
+                _whole(row.get("world"), "world"),
+                _whole(row.get("zone"), "zone"),
+                _real(row.get("cost_s"), "cost_s"),
+            )
+            for row in shards
+        ),
+        neighbors=tuple(_wholes(row, "neighbors") for row in _list(get("neighbors"), "neighbors")),
+        snapshot=snapshot_from_dict(_table(get("snapshot"), "snapshot")),
+        rule=_rule(_table(get("rule"), "rule")),
+        present=None if present is None else _wholes(present, "present"),
+    )
+    homes = tuple(_whole(row.get("worker"), "worker") for row in shards)
+    return Plan(problem, homes, _text(get("method"), "method"))
+
+
+def snapshot_from_dict(document: Mapping[str, Any]) -> Snapshot:
+    """The snapshot of a document.
+
+    Raises:
+        PlacementError: a key is missing, or a value is none.
+    """
+    rows = _list(document.get("workers"), "workers")
+    return Snapshot(
+        workers=tuple(_candidate(_table(row, "worker")) for row in rows),
+        gpu_source=_text(document.get("gpu_source"), "gpu_source"),
+        origin=_text(document.get("origin"), "origin"),
+    )
+
+
+def _candidate(row: Mapping[str, Any]) -> Candidate:
+    use, available = _table(row.get("use"), "use"), row.get("available")
+    if not isinstance(available, bool):
+        raise _none("available", available, "true or false")
+    cpu, ram, gpu = (_real(use.get(name), name) for name in RESOURCES)
+    return Candidate(
+        worker=_whole(row.get("worker"), "worker"),
+        use=Utilisation(cpu, ram, gpu),
+        hosted=_whole(row.get("hosted"), "hosted"),
+        available=available,
+    )
+
+
+def _rule(document: Mapping[str, Any]) -> BalanceRule:
+    load = _table(document.get("load"), "load")
+    return BalanceRule(
+        load=LoadRule(
+            _three(load.get("weights"), "weights"),
+            _three(load.get("thresholds"), "thresholds"),
+            _real(load.get("margin"), "margin"),
+        ),
+        tolerance=_real(document.get("tolerance"), "tolerance"),
+        max_moves=_whole(document.get("max_moves"), "max_moves"),
+        move_s=_real(document.get("move_s"), "move_s"),
+        payback_ticks=_whole(document.get("payback_ticks"), "payback_ticks"),
+    )
+
+
+def _three(value: object, name: str) -> tuple[float, float, float]:
+    values = [_real(one, name) for one in _list(value, name)]
+    if len(values) != 3:
+        raise _none(name, value, "three numbers")
+    cpu, ram, gpu = values
+    return cpu, ram, gpu
+
+
+def _table(value: object, name: str) -> Mapping[str, Any]:
+    if not isinstance(value, dict):
+        raise _none(name, value, "a table")
+    return value
+
+
+def _list(value: object, name: str) -> Sequence[Any]:
+    if not isinstance(value, list | tuple):
+        raise _none(name, value, "a list")
+    return value
+
+
+def _text(value: object, name: str) -> str:
+    if not isinstance(value, str):
+        raise _none(name, value, "text")
+    return value
+
+
+def _whole(value: object, name: str) -> int:
+    if not isinstance(value, int) or isinstance(value, bool) or not 0 <= value <= LARGEST:
+        raise _none(name, value, "a whole number from 0 up")
+    return value
+
+
+def _wholes(value: object, name: str) -> tuple[int, ...]:
+    return tuple(_whole(one, name) for one in _list(value, name))
+
+
+def _real(value: object, name: str) -> float:
+    if isinstance(value, float):
+        return value
+    return float(_whole(value, name))
+
+
+def _none(name: str, value: object, needed: str) -> PlacementError:
+    said = repr(value)
+    shown = said if len(said) <= LONGEST else f"{said[:LONGEST]}…"
+    return PlacementError(f"not a plan: {name} is {shown}, must be {needed}")

@@ -1,0 +1,65 @@
+"""The plan of a run: what is measured goes in, a bounded round comes out."""
+
+from __future__ import annotations
+
+import pytest
+
+from cavmarl.balance.balancer import Balancer
+from cavmarl.balance.plan import replan
+from cavmarl.balance.problem import BalanceRule, Problem, ShardCost, equal_costs
+from cavmarl.balance.snapshot import Snapshot, idle_snapshot
+from cavmarl.errors import PlacementError
+from tests.balance.shards import grid, row
+
+
+@pytest.fixture
+def balancer() -> Balancer:
+    return Balancer(Problem(equal_costs(4, 4), grid(2, 2), idle_snapshot(2)))
+
+
+def test_worlds_of_which_nothing_is_known_are_shared_out_whole(balancer: Balancer) -> None:
+    homes = balancer.plan.homes
+    assert [len({*homes[first : first + 4]}) for first in (0, 4, 8, 12)] == [1, 1, 1, 1]
+    assert homes.count(0) == homes.count(1) == 8
+
+
+def test_a_round_goes_by_what_was_measured(balancer: Balancer) -> None:
+    heavy = balancer.plan.homes[0]
+    costs = [4.0 if home == heavy else 1.0 for home in balancer.plan.homes]
+    balancer.measure(reversed(row(costs, worlds=4)))
+    assert [shard.cost_s for shard in balancer.costs] == costs
+    before = balancer.plan.homes
+    plan = balancer.round(idle_snapshot(2))
+    assert plan is balancer.plan
+    assert 0 < len(plan.moves) <= BalanceRule().max_moves
+    assert {move.source for move in plan.moves} >= {heavy}
+    assert plan.problem.present == before
+    assert replan(plan, plan.problem.snapshot) == plan
+
+
+def test_a_new_measurement_counts_in_part(balancer: Balancer) -> None:
+    balancer.measure(row([1.0] * 16, worlds=4))
+    balancer.measure(row([2.0] * 16, worlds=4))
+    assert {shard.cost_s for shard in balancer.costs} == {1.3}
+
+
+def test_a_round_may_go_by_other_costs_and_another_rule(balancer: Balancer) -> None:
+    strict = BalanceRule(tolerance=0.0, move_s=0.0, max_moves=1)
+    costs = tuple(ShardCost(*shard[:2], 1.0 + shard.zone) for shard in balancer.costs)
+    plan = balancer.round(idle_snapshot(2), costs=costs, rule=strict)
+    assert plan.problem.shards == costs
+    assert plan.problem.rule == strict
+
+
+def test_who_is_lost_is_replaced_in_a_round(balancer: Balancer) -> None:
+    left = Snapshot(idle_snapshot(2).workers[1:], "none", "")
+    assert set(balancer.round(left).homes) == {1}
+
+
+@pytest.mark.parametrize("costs", [[1.0] * 15, [1.0] * 20])
+def test_other_shards_than_those_of_the_plan_are_refused(
+    balancer: Balancer, costs: list[float]
+) -> None:
+    shards = tuple(ShardCost(n // 4, n % 4, cost) for n, cost in enumerate(costs))
+    with pytest.raises(PlacementError, match="must be those of the plan"):
+        balancer.measure(shards)
