@@ -85,10 +85,6 @@ class Job(Protocol):
         """All that a successor needs to go on from here."""
         ...
 
-    def dtypes(self) -> Sequence[np.dtype[Any]]:
-        """Of the arrays that `save` gives."""
-        ...
-
     def load(self, arrays: Sequence[Any]) -> None:
         """Go on from what `save` has given."""
         ...
@@ -222,7 +218,8 @@ def _obey(job: Job, meeting: Meeting, images: Sequence[Image]) -> NoReturn:
         letter = _receive(meeting.wire) if theirs[LETTER] else None
         try:
             if (is_new or theirs[LOADS]) and theirs[TRUTH] >= 0:
-                job.load(list(images[theirs[TRUTH]].read(job.dtypes())))
+                dtypes = [array.dtype for array in job.save()]
+                job.load(list(images[theirs[TRUTH]].read(dtypes)))
             is_new = False
             answer = None
             if theirs[TASK] != NOTHING:
