@@ -13,10 +13,8 @@ from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
 from cavmarl.actions import ActionDecoder
-from cavmarl.config import EnvConfig
 from cavmarl.errors import ConfigError, ResetNeededError
 from cavmarl.registry import load_config
-from cavmarl.roads.network import RoadNetwork
 from cavmarl.runtime.simulation import Simulation
 from cavmarl.seeds import check_seed, first_seed
 from cavmarl.spaces import action_space, flat_observation_space
@@ -93,7 +91,7 @@ def make_vec(
         if num_workers
         else LocalWorlds(world, num_envs)
     )
-    return CavVectorEnv(config, world.network, worlds, seed=first_seed, copy=copy)
+    return CavVectorEnv(worlds, seed=first_seed, copy=copy)
 
 
 class CavVectorEnv:
@@ -110,8 +108,6 @@ class CavVectorEnv:
     comes out is the same bit for bit.
 
     Args:
-        config: the environment.
-        network: its roads.
         worlds: that are stepped.
         seed: of the first reset, if that is given none.
         copy: False returns observations as a read-only view that the next step or reset overwrites;
@@ -119,17 +115,11 @@ class CavVectorEnv:
     """
 
     def __init__(
-        self,
-        config: EnvConfig,
-        network: RoadNetwork,
-        worlds: SteppedWorlds,
-        *,
-        seed: int | None = None,
-        copy: bool = True,
+        self, worlds: SteppedWorlds, *, seed: int | None = None, copy: bool = True
     ) -> None:
-        self.config = config
-        self.network = network
         self.worlds = worlds
+        self.config = config = worlds.world.config
+        self.network = worlds.world.network
         self.num_envs = num_envs = len(worlds.arrays.mask)
         self.possible_agents = [f"car_{k}" for k in range(config.population.num_ids)]
         self.num_agents = len(self.possible_agents)

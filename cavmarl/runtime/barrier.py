@@ -56,11 +56,12 @@ def usable_cores() -> int:
 
 
 _external: Any = types.ExternalFunction
-_int64: Any = types.int64
+_intrinsic: Any = intrinsic
+_function: Any = cgutils.get_or_insert_function
 _let_others_run = _external("sched_yield", types.int32())
 
 
-@intrinsic  # type: ignore[untyped-decorator, unused-ignore]
+@_intrinsic  # type: ignore[untyped-decorator]
 def _load(typing: Any, words: Any, at: Any) -> Any:
     """`words[at]`, read anew, after all that this thread has written."""
 
@@ -72,7 +73,7 @@ def _load(typing: Any, words: Any, at: Any) -> Any:
     return types.int64(words, types.intp), generate
 
 
-@intrinsic  # type: ignore[untyped-decorator, unused-ignore]
+@_intrinsic  # type: ignore[untyped-decorator]
 def _store(typing: Any, words: Any, at: Any, value: Any) -> Any:
     """`words[at] = value`, seen by others after all that was written before."""
 
@@ -85,14 +86,14 @@ def _store(typing: Any, words: Any, at: Any, value: Any) -> Any:
     return types.void(words, types.intp, types.int64), generate
 
 
-@intrinsic  # type: ignore[untyped-decorator, unused-ignore]
+@_intrinsic  # type: ignore[untyped-decorator]
 def _pause(typing: Any) -> Any:
     """Tell the processor that this is a loop of waiting."""
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         if _PAUSE is not None:
             nothing = ir.FunctionType(ir.VoidType(), [])
-            builder.call(cgutils.get_or_insert_function(builder.module, nothing, _PAUSE), [])
+            builder.call(_function(builder.module, nothing, _PAUSE), [])
         return context.get_dummy_value()
 
     return types.void(), generate

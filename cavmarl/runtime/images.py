@@ -1,4 +1,4 @@
-"""`Image`: a list of arrays in a segment, with a checksum; what a worker's successor begins from."""
+"""`Image`: arrays in a segment, with a checksum; what a worker's successor begins from."""
 
 from __future__ import annotations
 
@@ -55,7 +55,8 @@ class Image:
             if array.nbytes:
                 words[end - 1] = 0  # what rounds it up
                 place = words[at:end].view(np.uint8)[: array.nbytes]
-                place.view(array.dtype).reshape(array.shape)[...] = array
+                raw = np.dtype((np.void, array.itemsize))  # NumPy copies records field by field
+                place.view(raw).reshape(array.shape)[...] = array.view(raw)
             at = end
         words[0] = size
         words[1] = _checksum(words[2:size])

@@ -30,16 +30,13 @@ from cavmarl.runtime.watchdog import CHECK_S, Watchdog
 from cavmarl.runtime.worker import (
     ANSWER,
     FAILED,
-    LETTER,
     LOADS,
     MAIL,
     MAX_MESSAGE,
     NOTHING,
     OUT_OF_MEMORY,
     SILENT,
-    SLOT,
     TASK,
-    TRUTH,
 )
 
 __all__ = ["Death", "Pool", "Program"]
@@ -204,9 +201,7 @@ class Pool:
         self._held.processes[k] = process
         self._poll.register(process.pidfd, select.POLLIN)
         self._poll.register(process.wire, select.POLLIN)
-        self._meetings[k] = Meeting(
-            self._orders[k], self._statuses[k], process.wire, self._crowded
-        )
+        self._meetings[k] = Meeting(self._orders[k], self._statuses[k], process.wire, self._crowded)
 
     def _command(
         self, workers: tuple[int, ...], task: int, letter: Any, commits: bool
@@ -301,8 +296,8 @@ class Pool:
     def _sleep(self, pending: list[int]) -> dict[int, str]:
         """Sleep until a worker is done, or dead, or for `CHECK_S`; who is dead."""
         ready: set[int] = set()
-        # Not `all`: whoever is done meanwhile sees that this side sleeps, and wakes it.
-        if all([self._meetings[k].lie_down(self._orders.item(k, NUMBER)) for k in pending]):
+        lying = [self._meetings[k].lie_down(self._orders.item(k, NUMBER)) for k in pending]
+        if all(lying):
             ready = {fd for fd, _ in self._poll.poll(1000.0 * CHECK_S)}
         for k in pending:
             self._meetings[k].get_up()
@@ -401,7 +396,8 @@ class Pool:
         answers: list[Any] = []
         failures: list[WorkerFailureError] = []
         for k in workers:
-            kind, answer = self._statuses[k].item(ANSWER), None
+            kind = self._statuses[k].item(ANSWER)
+            answer: Any = None
             if kind != SILENT:
                 process = self._held.processes[k]
                 process.collect()

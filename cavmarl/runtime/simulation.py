@@ -441,6 +441,7 @@ class Simulation:
             self._traffic,
             self.outputs,
             self._coordination,
+            self.config.sensors.stack > 1,
         )
 
     def agents_to_come(self) -> NDArray[np.bool_]:

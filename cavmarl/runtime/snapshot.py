@@ -36,6 +36,7 @@ class Parts(NamedTuple):
         traffic: what comes.
         outputs: what agents have got; the frames of the next observation, too.
         coordination: who says who owns what; None: all is one zone.
+        has_frames: an observation has frames of the ones before.
     """
 
     worlds: Worlds
@@ -44,6 +45,7 @@ class Parts(NamedTuple):
     traffic: NativeTraffic
     outputs: Outputs
     coordination: Coordination | None
+    has_frames: bool
 
 
 def save(parts: Parts) -> list[Array]:
@@ -54,7 +56,11 @@ def save(parts: Parts) -> list[Array]:
         *_fixed(parts),
         gate.queue[:, :waiting],
         parts.division.contacts(),
-        *(parts.division.vehicles(w) for w in range(len(worlds.ticks))),
+        *(
+            parts.division.owned(w, zone)
+            for w in range(len(worlds.ticks))
+            for zone in range(parts.division.count)
+        ),
         *_of_rerouting(parts),
     ]
 
@@ -79,7 +85,9 @@ def load(parts: Parts, saved: Sequence[Array]) -> Gate:
     queue, contacts = next(rest), next(rest)
     gate.queue[:, : queue.shape[1]] = queue
     gate.num_passing[:] = 0
-    parts.division.place([next(rest) for _ in everywhere], contacts)
+    zones = range(parts.division.count)
+    vehicles = [np.concatenate([next(rest) for _ in zones]) for _ in everywhere]
+    parts.division.place(vehicles, contacts)
     for array in _of_rerouting(parts):
         _put(array, next(rest))
     if parts.coordination is not None:
@@ -93,7 +101,9 @@ def _fixed(parts: Parts) -> Iterator[Array]:
         yield getattr(parts.worlds, name)
     for name in _OF_GATE:
         yield getattr(parts.gate, name)
-    yield from parts.outputs
+    for name, array in parts.outputs._asdict().items():
+        if name != "observations" or parts.has_frames:
+            yield array
 
 
 def _of_rerouting(parts: Parts) -> Iterator[Array]:

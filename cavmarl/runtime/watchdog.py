@@ -1,4 +1,4 @@
-"""Whether a process that should be working is: one that hangs is to be told from one that is slow."""
+"""Whether a process does the work that it should: one that hangs, or one that is slow."""
 
 from __future__ import annotations
 

@@ -144,10 +144,8 @@ def _read(fd: int, size: int) -> Any:
 
 def _failure(error: BaseException) -> bytes:
     text = "".join(traceback.format_exception(error))[-MAX_TRACEBACK:]
-    message = str(error)[:MAX_TRACEBACK // 4]
-    return json.dumps(
-        {"kind": type(error).__name__, "text": message, "traceback": text}
-    ).encode()
+    message = str(error)[: MAX_TRACEBACK // 4]
+    return json.dumps({"kind": type(error).__name__, "text": message, "traceback": text}).encode()
 
 
 def _fork_on_demand(

@@ -12,8 +12,9 @@ from cavmarl.runtime.shared_memory import Layout
 from cavmarl.runtime.simulation import Simulation
 from cavmarl.shard.shard import Commands
 from cavmarl.spaces import flat_observation_space
+from cavmarl.worlds import World
 
-__all__ = ["SteppedWorlds", "StepArrays", "layout_of"]
+__all__ = ["StepArrays", "SteppedWorlds", "layout_of"]
 
 
 class StepArrays(NamedTuple):
@@ -39,7 +40,8 @@ class StepArrays(NamedTuple):
 
     def part(self, first: int, last: int) -> StepArrays:
         """Those of some of the worlds, as views."""
-        return StepArrays(*(array[first:last] for array in self))
+        parts: list[Any] = [array[first:last] for array in self]
+        return StepArrays(*parts)
 
 
 def layout_of(config: EnvConfig, num_worlds: int) -> Layout:
@@ -62,8 +64,14 @@ def layout_of(config: EnvConfig, num_worlds: int) -> Layout:
 
 
 class SteppedWorlds(Protocol):
-    """W worlds that begin a new episode in the step in which the old one ends."""
+    """W worlds that begin a new episode in the step in which the old one ends.
 
+    Attributes:
+        world: what each is made of.
+        arrays: what goes into a step, and what comes out.
+    """
+
+    world: World
     arrays: StepArrays
 
     @property

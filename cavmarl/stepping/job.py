@@ -12,7 +12,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cavmarl.config import EnvConfig
-from cavmarl.config_io import validate
 from cavmarl.errors import WorkerStartError
 from cavmarl.runtime.shared_memory import Segment, arrays_in
 from cavmarl.shard.shard import Commands
@@ -91,6 +90,8 @@ def make_jobs(recipe: Mapping[str, Any]) -> list[WorldsJob]:
     Raises:
         WorkerStartError: a file is not what it was.
     """
+    from cavmarl.config_io import validate  # pydantic is slow to import
+
     config = validate(EnvConfig, recipe["config"], "the environment")
     world = make_world(config, Path(recipe["base_dir"]))
     if fingerprint(world) != recipe["fingerprint"]:

@@ -28,6 +28,7 @@ class LocalWorlds:
         warm: have all kernels ready now.
 
     Attributes:
+        world: what each is made of.
         arrays: what goes into a step, and what comes out.
         simulation: the worlds.
     """
@@ -39,6 +40,7 @@ class LocalWorlds:
         arrays: StepArrays | None = None,
         warm: bool = False,
     ) -> None:
+        self.world = world
         self.simulation = Simulation(
             world.config,
             world.network,

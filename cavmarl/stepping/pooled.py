@@ -38,6 +38,7 @@ class PooledWorlds:
         workers: m, from 1 to W.
 
     Attributes:
+        world: what each is made of.
         arrays: in shared memory; each worker writes those of its worlds.
         pool: the processes.
 
@@ -47,6 +48,7 @@ class PooledWorlds:
     """
 
     def __init__(self, world: World, base_dir: Path, num_worlds: int, workers: int) -> None:
+        self.world = world
         config = world.config
         _check(config.zones)
         cores = usable_cores()
