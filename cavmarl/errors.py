@@ -297,9 +297,10 @@ class WorkerDeathError(WorkerError):
 
     def __init__(self, worker: int, part: str, order: int, what: str, causes: list[str]) -> None:
         super().__init__(
-            f"worker {worker} ({part}) could not do its {what} (order {order}): "
-            f"{len(causes)} processes died of it, {', '.join(causes)}; what they print stands on "
-            "standard error; workers=0 runs the same in this process"
+            f"worker {worker} ({part}) could not do its {what} (order {order}): {len(causes)} "
+            f"processes died of it ({', '.join(causes)}). SIGKILL is sent by somebody, or by the "
+            "system when memory runs out; what a process prints stands on standard error; "
+            "workers=0 runs the same in this process"
         )
         self.worker, self.part, self.order, self.causes = worker, part, order, tuple(causes)
 

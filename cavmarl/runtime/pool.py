@@ -65,13 +65,14 @@ class Program(NamedTuple):
 
 @dataclass
 class Death:
-    """What became of one process and of what it did.
+    """What became of one process and of what it did; times are those of `time.monotonic`.
 
     Attributes:
         worker: whose process it was.
         order: that was to be carried out.
         cause: signal or exit status, or why it was taken for dead.
-        noticed_s: when that was noticed, by `time.monotonic`.
+        ordered_s: when the order was given.
+        noticed_s: when that was noticed.
         replaced_s: when its successor had its order.
         done_s: when that was carried out; nan: not yet.
     """
@@ -79,6 +80,7 @@ class Death:
     worker: int
     order: int
     cause: str
+    ordered_s: float
     noticed_s: float
     replaced_s: float
     done_s: float = float("nan")
@@ -114,6 +116,7 @@ class Pool:
         self._stale = [False] * self._count  # whose memory is not what is committed
         self._poll = select.poll()
         self._checked_s = 0.0
+        self._ordered_s = 0.0
         held = _Held(list(program.segments))
         self._held = held
         self._finalizer = weakref.finalize(self, held.release)
@@ -215,6 +218,7 @@ class Pool:
             raise WorkerError(f"a letter of {len(mail)} bytes: at most {MAX_MESSAGE} can be sent")
         slot = 1 - max(self._truth, 0) if commits else -1
         self._open = workers
+        self._ordered_s = time.monotonic()
         head = (task, mail is not None, slot, self._truth)
         for k in workers:
             words = self._orders[k]
@@ -363,7 +367,7 @@ class Pool:
             raise
         now = time.monotonic()
         order = self._orders.item(k, NUMBER)
-        self.deaths.append(Death(k, order, cause, noticed_s, now))
+        self.deaths.append(Death(k, order, cause, self._ordered_s, noticed_s, now))
         return cause
 
     def _start_anew(self, k: int, mail: bytes | None) -> None:
@@ -415,10 +419,7 @@ def _say(status: int) -> str:
         return "out of memory"
     if status >= 0:
         return f"exit status {status}"
-    name = signal.Signals(-status).name
-    if -status == signal.SIGKILL:
-        return f"{name} (sent by somebody, or by the system when memory ran out)"
-    return name
+    return signal.Signals(-status).name
 
 
 class _Held:
@@ -451,3 +452,4 @@ class _Held:
             process.release()
         for segment in self.segments:
             segment.close()
+        self.processes.clear()

@@ -12,7 +12,7 @@ import numpy as np
 
 import cavmarl.errors
 from cavmarl.config import ZonesConfig
-from cavmarl.errors import CavmarlError, ConfigError, WorkerFailureError
+from cavmarl.errors import CavmarlError, ConfigError, WorkerDeathError, WorkerFailureError
 from cavmarl.runtime.barrier import usable_cores
 from cavmarl.runtime.compilation import compiled_before
 from cavmarl.runtime.pool import Death, Pool, Program
@@ -81,6 +81,7 @@ class PooledWorlds:
             self.pool = Pool(program, config.workers.timeout_s, config.workers.repeats)
         except WorkerFailureError as failure:
             raise _own(failure) from failure
+        self._steps = 0
         self._last_worlds = np.array(bounds[1:])
 
     @property
@@ -100,12 +101,14 @@ class PooledWorlds:
     def reset(self, seed: int | None, first_world: int) -> None:
         """Begin an episode in every world."""
         self._run(Task.RESET, {"seed": seed, "first_world": first_world})
+        self._steps = 0
 
     def step(self, commands: Commands) -> None:
         """Let the agents act, and reset the worlds whose episode is over by then."""
         self.arrays.controls[:] = commands.controls
         self.arrays.meta_actions[:] = commands.meta_actions
         self._run(Task.STEP)
+        self._steps += 1
 
     def suggest(self) -> None:
         """Write what the built-in driver would do in the agents' place."""
@@ -129,6 +132,9 @@ class PooledWorlds:
             self.pool.run(task, letter, commits)
         except WorkerFailureError as failure:
             raise _own(failure) from failure
+        except WorkerDeathError as death:
+            death.add_note(f"in step {self._steps + 1} since the reset")
+            raise
 
     def _ask(self, task: Task, world: int) -> Any:
         """Of the worker that hosts a world; numbers from the end count as they do for arrays."""
