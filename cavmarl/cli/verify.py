@@ -24,8 +24,8 @@ from cavmarl.cli.output import (
     say_difference,
     write_json,
 )
-from cavmarl.cli.verify_kills import verify_with_kills
 from cavmarl.cli.verify_faults import check_campaign, print_campaign, print_figures
+from cavmarl.cli.verify_kills import verify_with_kills
 from cavmarl.config import ZONE_LAYOUTS
 from cavmarl.errors import ConfigError
 
@@ -104,7 +104,9 @@ def verify(
     counts = None if zones is None else _counts(zones)
     console = Console()
     if kill is not None:
-        _refuse_with_kill(env, counts, {"--faults": faults, "--layout": layout, "--journal": journal})
+        _refuse_with_kill(
+            env, counts, {"--faults": faults, "--layout": layout, "--journal": journal}
+        )
         verify_with_kills(
             console,
             str(env),

@@ -72,7 +72,7 @@ def _spreads(found: KillReport) -> Table:
         ("killed at work: noticed after, ms", "SIGKILL", "noticed_ms"),
         ("stopped at work: noticed after, ms", "SIGSTOP", "noticed_ms"),
         ("successor has the order after, ms", None, "replaced_ms"),
-        ("all are done after, ms", None, "recovered_ms"),
+        ("successor has done it after, ms", None, "recovered_ms"),
     ):
         values = [
             getattr(kill, name)
@@ -96,6 +96,8 @@ def _histogram(kills: tuple[Kill, ...]) -> Table:
     labels = [f"below {BOUNDS_MS[0]}", *(f"from {bound}" for bound in BOUNDS_MS)]
     for n, label in enumerate(labels):
         if any(counts[name][n] for name in names):
-            bars = (f"{'█' * -(-WIDTH * counts[name][n] // most)} {counts[name][n]}" for name in names)
+            bars = (
+                f"{'█' * -(-WIDTH * counts[name][n] // most)} {counts[name][n]}" for name in names
+            )
             table.add_row(label, *bars)
     return table

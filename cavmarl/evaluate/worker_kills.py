@@ -41,8 +41,8 @@ class Kill:
         cause: of the death, as the pool saw it.
         noticed_ms: from the signal, or from the next order to one that was idle, until the pool
             knew.
-        replaced_ms: from there until the successor had its order.
-        recovered_ms: from there until all workers were done.
+        replaced_ms: from then until the successor had its order.
+        recovered_ms: from when the pool knew until the successor had done what was asked for.
     """
 
     signal: str
@@ -109,13 +109,17 @@ def verify_kills(
     """Kill and stop workers at random times and compare everything with undisturbed worlds.
 
     Args:
-        env: as in `make_vec`, like the other keywords that are not explained here.
+        env: as in `make_vec`.
         kills: how many signals; three in four are SIGKILL, the others SIGSTOP.
         workers: over which the worlds are shared out.
         worlds: stepped together; default: two a worker.
         steps: how many; default: three a kill.
         seed: root of all random numbers, those of the kills, too.
         policy: as in `load_policy`.
+        zones: shadows zones.count.
+        agents: shadows population.agents.
+        background: shadows population.background.
+        overrides: values for any other key.
         progress: called with steps done and steps in all.
 
     Raises:
@@ -145,7 +149,9 @@ def verify_kills(
         for step in range(steps):
             first = runs[0].step()
             second = killer.watch(runs[1].step, step, step in struck)
-            if not same_bytes(first, second) or whole.state_hash(step % worlds) != parted.state_hash(step % worlds):
+            if not same_bytes(first, second) or whole.state_hash(
+                step % worlds
+            ) != parted.state_hash(step % worlds):
                 different = step
                 break
             if progress is not None:

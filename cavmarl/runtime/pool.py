@@ -18,6 +18,7 @@ import weakref
 from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import dataclass
+from math import isnan, nan
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -26,7 +27,7 @@ from cavmarl.errors import WorkerDeathError, WorkerError, WorkerFailureError, Wo
 from cavmarl.runtime.barrier import NUMBER, WORDS, Meeting, usable_cores
 from cavmarl.runtime.fork_server import ForkServer, Process, ServerGoneError
 from cavmarl.runtime.shared_memory import Segment
-from cavmarl.runtime.watchdog import CHECK_S, Watchdog
+from cavmarl.runtime.watchdog import CHECK_S, Watchdog, processor_s
 from cavmarl.runtime.worker import (
     ANSWER,
     FAILED,
@@ -83,7 +84,7 @@ class Death:
     ordered_s: float
     noticed_s: float
     replaced_s: float
-    done_s: float = float("nan")
+    done_s: float = nan
 
 
 class Pool:
@@ -137,6 +138,10 @@ class Pool:
         """Of the process that forks them."""
         server = self._held.server
         return 0 if server is None else server.pid
+
+    def processor_s(self) -> float:
+        """Processor time that the workers' processes have taken."""
+        return sum(processor_s(pid) for pid in self.pids)
 
     def run(self, task: int, letter: Any = None, commits: bool = True) -> list[Any]:
         """Let all workers do a task.
@@ -284,8 +289,11 @@ class Pool:
         while True:
             dead = self._sleep(pending)
             pending = [k for k in pending if not self._has(k)]
+            for death in self.deaths[first:]:
+                if death.worker not in pending and isnan(death.done_s):
+                    death.done_s = time.monotonic()
             if not pending:
-                break
+                return
             for k, cause in (dead or self._hanging(pending, watchdogs)).items():
                 cause = self._replace(k, cause, mail)
                 watchdogs.pop(k, None)
@@ -293,9 +301,6 @@ class Pool:
                     causes[k].append(cause)
                     if len(causes[k]) > self._repeats:
                         self._give_up(k, causes[k])
-        now = time.monotonic()
-        for death in self.deaths[first:]:
-            death.done_s = now
 
     def _sleep(self, pending: list[int]) -> dict[int, str]:
         """Sleep until a worker is done, or dead, or for `CHECK_S`; who is dead."""

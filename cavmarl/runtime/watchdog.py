@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 
-__all__ = ["CHECK_S", "Watchdog"]
+__all__ = ["CHECK_S", "Watchdog", "processor_s"]
 
 CHECK_S = 0.1
 STILL_CHECKS = 8  # for so long a process may sleep without the processor
@@ -23,9 +24,9 @@ class Watchdog:
     """
 
     def __init__(self, pid: int, timeout_s: float) -> None:
-        self._stat = Path(f"/proc/{pid}/stat")
+        self._pid = pid
         self._timeout_s = timeout_s
-        self._spent: str | None = None
+        self._spent = -1
         self._checks = 0
         self._still = 0
         self._stopped = 0
@@ -33,10 +34,9 @@ class Watchdog:
     def verdict(self) -> str | None:
         """What is wrong with it, in words; to be asked every `CHECK_S`."""
         try:
-            fields = self._stat.read_text(encoding="ascii").rpartition(")")[2].split()
+            state, spent = _look(self._pid)
         except OSError:
             return None  # it has ended, which others notice
-        state, spent = fields[0], " ".join(fields[11:13])
         self._checks += 1
         self._stopped = self._stopped + 1 if state in "Tt" else 0
         self._still = self._still + 1 if state == "S" and spent == self._spent else 0
@@ -48,3 +48,15 @@ class Watchdog:
         if self._checks * CHECK_S > self._timeout_s:
             return f"not done after workers.timeout_s = {self._timeout_s:g}"
         return None
+
+
+def processor_s(pid: int) -> float:
+    """Processor time that a process has taken, s."""
+    return _look(pid)[1] / os.sysconf("SC_CLK_TCK")
+
+
+def _look(pid: int) -> tuple[str, int]:
+    """State of a process, a letter, and its processor time in ticks of the system."""
+    text = Path(f"/proc/{pid}/stat").read_text(encoding="utf-8", errors="replace")
+    fields = text.rpartition(")")[2].split()
+    return fields[0], int(fields[11]) + int(fields[12])

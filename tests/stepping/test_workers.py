@@ -203,7 +203,9 @@ def test_a_step_that_everybody_dies_of(make: Make, monkeypatch: pytest.MonkeyPat
 
     monkeypatch.setattr(Pool, "_fork", fork_and_kill)
     os.kill(pool.pids[1], signal.SIGKILL)
-    with pytest.raises(WorkerDeathError, match=r"worker 1 \(world 1\).*step.*2 .*SIGKILL") as caught:
+    with pytest.raises(
+        WorkerDeathError, match=r"worker 1 \(world 1\).*step.*2 .*SIGKILL"
+    ) as caught:
         vec.step(actions)
     assert caught.value.__notes__ == ["in step 1 since the reset"]
     assert pool.pids == []
