@@ -68,8 +68,9 @@ def workers(
     console.print(_table(found))
     low, middle, high, highest = found.barrier_us
     console.print(
-        f"{count} workers over one: [bold]{found.ratio:.2f}[/]; one worker costs "
-        f"{found.cost_of_one:.2f} times the step without\n"
+        f"{count} workers over one: [bold]{found.ratio:.2f}[/], by the busiest one's processor "
+        f"time {found.processor_ratio:.2f}; one worker costs {found.cost_of_one:.2f} times the "
+        "step without\n"
         f"an empty order to all {count}: [bold]{middle:.1f}[/] µs "
         f"({low:.1f} / {high:.1f} / {highest:.1f}: 5, 95, 99 %); idle workers take "
         f"{found.idle_s:.1%} of a core",
@@ -90,9 +91,11 @@ def _table(found: WorkerSpeed) -> Table:
             f"{hardware['cpu']}, {hardware['usable_cores']} cores"
         ),
     )
-    for column in ("made in, s", "step, ms: min", "median", "max"):
+    for column in ("made in, s", "step, ms: min", "median", "max", "busiest, ms"):
         table.add_column(column, justify="right")
     for row in found.rows:
         times = (min(row.step_ms), statistics.median(row.step_ms), max(row.step_ms))
-        table.add_row(str(row.workers), f"{row.made_s:.2f}", *(f"{ms:.2f}" for ms in times))
+        busiest = "-" if row.busiest_ms is None else f"{row.busiest_ms:.2f}"
+        shown = (f"{ms:.2f}" for ms in times)
+        table.add_row(str(row.workers), f"{row.made_s:.2f}", *shown, busiest)
     return table

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import statistics
 import time
 from collections.abc import Callable, Mapping
@@ -10,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from cavmarl.errors import ConfigError
 from cavmarl.evaluate.machine import describe_hardware
@@ -32,11 +34,13 @@ class Row:
         workers: how many; 0: all in the caller's process.
         made_s: until they could be reset.
         step_ms: of each turn, ms a step.
+        busiest_ms: processor time that the busiest worker took for a step, ms.
     """
 
     workers: int
     made_s: float
     step_ms: tuple[float, ...]
+    busiest_ms: float | None
 
 
 @dataclass(frozen=True)
@@ -68,6 +72,12 @@ class WorkerSpeed:
         return statistics.median(a / b for a, b in zip(one, many, strict=True))
 
     @property
+    def processor_ratio(self) -> float:
+        """The same by processor time of the busiest worker: what free cores would lead to."""
+        one, many = self.rows[1].busiest_ms, self.rows[2].busiest_ms
+        return math.nan if one is None or many is None else one / many
+
+    @property
     def cost_of_one(self) -> float:
         """What a step takes with one worker, over that without; median of the turns."""
         none, one = self.rows[0].step_ms, self.rows[1].step_ms
@@ -80,7 +90,11 @@ class WorkerSpeed:
 
     def to_dict(self) -> dict[str, Any]:
         """Plain values, for JSON."""
-        ratios = {"ratio": self.ratio, "cost_of_one": self.cost_of_one}
+        ratios = {
+            "ratio": self.ratio,
+            "processor_ratio": self.processor_ratio,
+            "cost_of_one": self.cost_of_one,
+        }
         return {**asdict(self), **ratios, "is_crowded": self.is_crowded}
 
 
@@ -121,7 +135,7 @@ def measure_workers(
         raise ConfigError(
             f"{workers} workers, {steps} steps, {repeats} turns: must be at least 2, 1 and 1"
         )
-    made: list[tuple[int, float, CavVectorEnv]] = []
+    measured: list[_Measured] = []
     try:
         for count in (0, 1, workers):
             say(f"making worlds over {count} workers")
@@ -134,43 +148,63 @@ def measure_workers(
                 background=background,
                 overrides=overrides,
             )
-            made.append((count, time.perf_counter() - began, vec))
+            measured.append(_Measured(vec, count, time.perf_counter() - began))
             vec.reset(seed=seed)
-            _turn(vec, WARM_STEPS)
-        turns: list[list[float]] = [[] for _ in made]
+            measured[-1].turn(WARM_STEPS)
+        pool = measured[-1].pool
+        assert pool is not None
         pings: list[float] = []
         for n in range(repeats):
             say(f"turn {n + 1} of {repeats}")
-            for times, (_, _, vec) in zip(turns, made, strict=True):
-                times.append(_turn(vec, steps))
-            pings += _pings(_pool(made[-1][2]))
-        idle_s = _idle_s(_pool(made[-1][2]))
+            for one in measured:
+                one.count_turn(steps)
+            pings += _pings(pool)
+        idle_s = _idle_s(pool)
     finally:
-        for _, _, vec in made:
-            vec.close()
-    rows = tuple(
-        Row(count, made_s, tuple(times))
-        for times, (count, made_s, _) in zip(turns, made, strict=True)
-    )
+        for one in measured:
+            one.vec.close()
+    rows = tuple(one.row(repeats * steps) for one in measured)
     low, middle, high, highest = (float(np.quantile(pings, q)) for q in (0.05, 0.5, 0.95, 0.99))
     quantiles = (low, middle, high, highest)
     return WorkerSpeed(str(env), worlds, steps, rows, quantiles, idle_s, describe_hardware())
 
 
-def _pool(vec: CavVectorEnv) -> Pool:
-    assert isinstance(vec.worlds, PooledWorlds)
-    return vec.worlds.pool
+class _Measured:
+    """Worlds over some number of workers, and what their turns have taken."""
 
+    def __init__(self, vec: CavVectorEnv, workers: int, made_s: float) -> None:
+        self.vec = vec
+        self.pool = vec.worlds.pool if isinstance(vec.worlds, PooledWorlds) else None
+        self._workers = workers
+        self._made_s = made_s
+        self._step_ms: list[float] = []
+        self._busy_s = np.zeros(workers)
 
-def _turn(vec: CavVectorEnv, steps: int) -> float:
-    """Milliseconds a step; what the agents decide is not timed."""
-    spent = 0.0
-    for _ in range(steps):
-        actions = vec.suggest_actions()
-        began = time.perf_counter()
-        vec.step(actions)
-        spent += time.perf_counter() - began
-    return 1000.0 * spent / steps
+    def turn(self, steps: int) -> float:
+        """Milliseconds a step; what the agents decide is not timed."""
+        spent = 0.0
+        for _ in range(steps):
+            actions = self.vec.suggest_actions()
+            before = self._processor_s()
+            began = time.perf_counter()
+            self.vec.step(actions)
+            spent += time.perf_counter() - began
+            self._busy_s += self._processor_s() - before
+        return 1000.0 * spent / steps
+
+    def count_turn(self, steps: int) -> None:
+        """One that counts."""
+        if not self._step_ms:
+            self._busy_s[:] = 0.0
+        self._step_ms.append(self.turn(steps))
+
+    def row(self, steps: int) -> Row:
+        """What has been found in so many steps."""
+        busiest = 1000.0 * float(self._busy_s.max()) / steps if self._workers else None
+        return Row(self._workers, self._made_s, tuple(self._step_ms), busiest)
+
+    def _processor_s(self) -> NDArray[np.float64]:
+        return np.array([] if self.pool is None else self.pool.processor_s())
 
 
 def _pings(pool: Pool) -> list[float]:
@@ -185,6 +219,6 @@ def _pings(pool: Pool) -> list[float]:
 
 def _idle_s(pool: Pool) -> float:
     """Processor time of the workers a second while nobody asks for anything."""
-    before = pool.processor_s()
+    before = sum(pool.processor_s())
     time.sleep(IDLE_S)
-    return (pool.processor_s() - before) / IDLE_S
+    return (sum(pool.processor_s()) - before) / IDLE_S

@@ -139,9 +139,9 @@ class Pool:
         server = self._held.server
         return 0 if server is None else server.pid
 
-    def processor_s(self) -> float:
-        """Processor time that the workers' processes have taken."""
-        return sum(processor_s(pid) for pid in self.pids)
+    def processor_s(self) -> list[float]:
+        """Processor time that each worker's process has taken."""
+        return [processor_s(pid) for pid in self.pids]
 
     def run(self, task: int, letter: Any = None, commits: bool = True) -> list[Any]:
         """Let all workers do a task.

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from pathlib import Path
 
 __all__ = ["CHECK_S", "Watchdog", "processor_s"]
@@ -52,7 +51,7 @@ class Watchdog:
 
 def processor_s(pid: int) -> float:
     """Processor time that a process has taken, s."""
-    return _look(pid)[1] / os.sysconf("SC_CLK_TCK")
+    return int(Path(f"/proc/{pid}/schedstat").read_text(encoding="ascii").split()[0]) / 1e9
 
 
 def _look(pid: int) -> tuple[str, int]:
