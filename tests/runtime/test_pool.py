@@ -307,7 +307,7 @@ def test_a_fork_of_the_pools_process_leaves_the_workers_alone(make: Make) -> Non
     pool = make(workers=1)
     with pytest.MonkeyPatch.context() as patched:
         patched.setattr(os, "getpid", lambda: 1)
-        pool._held.release()
+        pool._crew.release()
     pool.run(ADD)
     assert totals(pool) == [[3.0, MORE]]
 

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from cavmarl import CapacityError, CavVectorEnv, ConfigError, InvalidActionError, make_vec
 from cavmarl.errors import WorkerDeathError, WorkerError
 from cavmarl.registry import entries
+from cavmarl.runtime.crew import Crew
 from cavmarl.runtime.pool import Pool
 from cavmarl.stepping.pooled import PooledWorlds
 
@@ -195,13 +196,13 @@ def test_a_step_that_everybody_dies_of(make: Make, monkeypatch: pytest.MonkeyPat
     vec.reset(seed=0)
     actions = vec.suggest_actions()
     pool = pool_of(vec)
-    fork = Pool._fork
+    fork = Crew._fork
 
-    def fork_and_kill(self: Pool, k: int) -> None:
+    def fork_and_kill(self: Crew, k: int) -> None:
         fork(self, k)
-        os.kill(self._held.processes[k].pid, signal.SIGKILL)
+        os.kill(self.processes[k].pid, signal.SIGKILL)
 
-    monkeypatch.setattr(Pool, "_fork", fork_and_kill)
+    monkeypatch.setattr(Crew, "_fork", fork_and_kill)
     os.kill(pool.pids[1], signal.SIGKILL)
     with pytest.raises(
         WorkerDeathError, match=r"worker 1 \(world 1\).*step.*2 .*SIGKILL"
