@@ -32,6 +32,7 @@ from cavmarl.ownership.transfer_summary import TransferSummary
 from cavmarl.policies import load_policy
 from cavmarl.runtime.refereeing import journal_path
 from cavmarl.seeds import check_seed
+from cavmarl.stepping.local import LocalWorlds
 from cavmarl.vector_env import CavVectorEnv
 from cavmarl.worlds import load_world
 
@@ -197,7 +198,7 @@ def _prepare(folder: Path, job: Job, repeats: int) -> tuple[list[Job], bool]:
     Returns:
         the runs, and whether worlds have zones.
     """
-    config, network, demand, partition = load_world(
+    world = load_world(
         job.env,
         agents=job.agents,
         background=job.background,
@@ -205,8 +206,9 @@ def _prepare(folder: Path, job: Job, repeats: int) -> tuple[list[Job], bool]:
         overrides=job.overrides,
     )
     policies = describe_policies(job.policies)
+    config, network, demand, partition = world
     unlogged = replace(config, zones=replace(config.zones, journal=""))
-    one_world = CavVectorEnv(unlogged, network, 1, demand, partition)
+    one_world = CavVectorEnv(LocalWorlds(world._replace(config=unlogged), 1))
     for policy in job.policies.values():
         load_policy(policy, one_world)
     try:

@@ -1,0 +1,107 @@
+"""`WorldsJob`: what a worker does that runs some of the worlds."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Mapping, Sequence
+from enum import IntEnum
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cavmarl.config import EnvConfig
+from cavmarl.errors import WorkerStartError
+from cavmarl.runtime.shared_memory import Segment, arrays_in
+from cavmarl.shard.shard import Commands
+from cavmarl.stepping.arrays import StepArrays, layout_of
+from cavmarl.stepping.local import LocalWorlds
+from cavmarl.worlds import World, make_world
+
+__all__ = ["Task", "WorldsJob", "fingerprint", "make_jobs"]
+
+
+class Task(IntEnum):
+    """What a worker can be asked for."""
+
+    STEP = 0
+    RESET = 1
+    SUGGEST = 2
+    STATE_HASH = 3
+    TRAFFIC_STATS = 4
+
+
+class WorldsJob:
+    """Some of the worlds, next to each other.
+
+    Args:
+        worlds: that write their part of the shared arrays.
+        first: number of the first one among all.
+    """
+
+    def __init__(self, worlds: LocalWorlds, first: int) -> None:
+        self._worlds = worlds
+        self._first = first
+        self._commands = Commands(worlds.arrays.controls, worlds.arrays.meta_actions)
+
+    def perform(self, task: int, letter: Any) -> Any:
+        """Do a task; the answer of those that have one."""
+        worlds = self._worlds
+        if task == Task.STEP:
+            worlds.step(self._commands)
+        elif task == Task.RESET:
+            worlds.reset(letter["seed"], letter["first_world"] + self._first)
+        elif task == Task.SUGGEST:
+            worlds.suggest()
+        elif task == Task.STATE_HASH:
+            return worlds.state_hash(letter - self._first)
+        else:
+            return worlds.traffic_stats(letter - self._first)
+        return None
+
+    def save(self) -> list[NDArray[Any]]:
+        """All that the next step depends on."""
+        return self._worlds.save()
+
+    def load(self, saved: Sequence[NDArray[Any]]) -> None:
+        """Go on from what `save` gave."""
+        self._worlds.load(saved)
+
+
+def fingerprint(world: World) -> str:
+    """What tells two readings of the same files apart, if somebody has changed one between."""
+    digest = hashlib.sha256()
+    if world.demand is not None:
+        for name in ("types", "routes", "stops", "elements"):
+            records = getattr(world.demand, name)
+            for field in records.dtype.names:
+                digest.update(np.ascontiguousarray(records[field]).tobytes())
+        digest.update(world.demand.route_edges.tobytes())
+    return f"{world.network.content_hash} {world.partition.content_hash} {digest.hexdigest()}"
+
+
+def make_jobs(recipe: Mapping[str, Any]) -> list[WorldsJob]:
+    """The jobs of all workers, every kernel loaded.
+
+    Args:
+        recipe: what `pooled.PooledWorlds` writes.
+
+    Raises:
+        WorkerStartError: a file is not what it was.
+    """
+    from cavmarl.config_io import validate  # pydantic is slow to import
+
+    config = validate(EnvConfig, recipe["config"], "the environment")
+    world = make_world(config, Path(recipe["base_dir"]))
+    if fingerprint(world) != recipe["fingerprint"]:
+        raise WorkerStartError(
+            f"the files of '{config.name}' have changed while workers were started: try again"
+        )
+    layout = layout_of(config, recipe["num_worlds"])
+    arrays = StepArrays(**arrays_in(Segment(recipe["arrays"], 0).map(), layout))
+    LocalWorlds(world, 1, warm=True)
+    return [
+        WorldsJob(LocalWorlds(world, last - first, arrays.part(first, last)), first)
+        for first, last in recipe["parts"]
+    ]
