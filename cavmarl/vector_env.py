@@ -52,6 +52,7 @@ def make_vec(
     background: int | None = None,
     seed: int | None = None,
     max_cycles: int | None = None,
+    autoreset_mode: AutoresetMode | str = AutoresetMode.SAME_STEP,
     copy: bool = True,
     overrides: Mapping[str, Any] | None = None,
 ) -> CavVectorEnv:
@@ -66,6 +67,8 @@ def make_vec(
         background: shadows population.background.
         seed: of the first reset, if that is given none.
         max_cycles: steps until truncation; shadows horizon_s.
+        autoreset_mode: when a world that is over begins anew, in the `SameStep` or in the
+            `NextStep`; see `CavVectorEnv`.
         copy: False returns observations without a copy; see `CavVectorEnv`.
         overrides: values for any other key.
 
@@ -86,7 +89,30 @@ def make_vec(
         max_cycles=max_cycles,
         overrides=overrides,
     )
-    return CavVectorEnv(config, network, int(num_envs), demand, partition, seed=seed, copy=copy)
+    return CavVectorEnv(
+        config,
+        network,
+        int(num_envs),
+        demand,
+        partition,
+        seed=seed,
+        autoreset_mode=autoreset_mode,
+        copy=copy,
+    )
+
+
+def _autoreset(mode: AutoresetMode | str) -> AutoresetMode:
+    """The mode of that name, or an error for one that is none or means no reset at all."""
+    try:
+        found = AutoresetMode(mode)
+    except ValueError:
+        found = AutoresetMode.DISABLED
+    if found is AutoresetMode.DISABLED:
+        raise ConfigError(
+            f"autoreset_mode = {mode!r}: must be 'SameStep' or 'NextStep'; reset() takes "
+            "options={'reset_mask': …} to begin some worlds anew earlier"
+        )
+    return found
 
 
 class CavVectorEnv:
@@ -95,9 +121,13 @@ class CavVectorEnv:
     Arrays have the shape (num_envs, num_agents, …). `infos["mask"]` says which agents have a
     vehicle and will be asked for the next action; the others' observations are 0 and their actions
     are not read. A world whose episode is over (truncated, or all agents gone and none to come) is
-    reset in the same step: the observations returned are those of the new episode,
-    `infos["final_observations"]` keeps the last ones of the old (Gymnasium's
-    `AutoresetMode.SAME_STEP`).
+    begun anew by itself, as Gymnasium's `AutoresetMode` says:
+
+    - `SAME_STEP`: in the same step. The observations returned are those of the new episode,
+      `infos["final_observations"]` keeps the last ones of the old, and of each agent that left.
+    - `NEXT_STEP`: in the next step. The observations returned are the last ones, those of agents
+      that leave too; in the next step the world's actions are not read, its rewards are 0 and the
+      observations are those of the new episode.
 
     Args:
         config: the environment.
@@ -106,6 +136,7 @@ class CavVectorEnv:
         demand: whose vehicles drive beside the generator's.
         partition: the zones; None: cut as `config.zones` says.
         seed: of the first reset, if that is given none.
+        autoreset_mode: when a world that is over begins anew.
         copy: False returns observations as a read-only view that the next step or reset overwrites;
             large ones are copied for longer than they are made.
     """
@@ -119,9 +150,11 @@ class CavVectorEnv:
         partition: ZonePartition | None = None,
         *,
         seed: int | None = None,
+        autoreset_mode: AutoresetMode | str = AutoresetMode.SAME_STEP,
         copy: bool = True,
     ) -> None:
         check_agents(config)
+        autoreset_mode = _autoreset(autoreset_mode)
         self.config = config
         self.network = network
         self.num_envs = num_envs
@@ -138,12 +171,14 @@ class CavVectorEnv:
         self.max_cycles = config.max_steps
         self.metadata = {
             "name": f"cavmarl/{config.name}-v{config.version}",
-            "autoreset_mode": AutoresetMode.SAME_STEP,
+            "autoreset_mode": autoreset_mode,
         }
         self._simulation = Simulation(config, network, num_envs, demand, partition)
         self._decoder = ActionDecoder(config.action, num_envs, self.possible_agents)
         self._steps = np.zeros(num_envs, dtype=np.int64)
         self._mask = np.zeros((num_envs, self.num_agents), dtype=np.bool_)
+        self._in_next_step = autoreset_mode is AutoresetMode.NEXT_STEP
+        self._over = np.zeros(num_envs, dtype=np.bool_)  # and not begun anew yet
         self._first_seed = None if seed is None else check_seed(seed)
         self._copy = copy
         self._ready = False
@@ -161,27 +196,60 @@ class CavVectorEnv:
     def reset(
         self, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[NDArray[np.float32], dict[str, NDArray[Any]]]:
-        """Begin an episode in every world.
+        """Begin an episode in every world, or in some.
 
         Args:
             seed: root of all random numbers; world w's episodes depend on (seed, w) alone. None
                 goes on with the next episodes of the last seed.
             options: `first_world`, with a seed: these are the worlds from that number on, so that
-                many worlds can be run a part at a time. Others are not used.
+                many worlds can be run a part at a time. `reset_mask`, without one: (W,) which
+                worlds begin anew; the others stay as they are. Others are not used.
 
         Returns:
             observations (W, A, D) and infos.
+
+        Raises:
+            ConfigError: a reset_mask of another shape or dtype, or one that comes with a seed.
+            ResetNeededError: a reset_mask before the first reset.
         """
+        options = options or {}
+        chosen = self._chosen(options.get("reset_mask"), seed)
         if seed is not None or not self._ready:
-            first_world = int((options or {}).get("first_world", 0))
+            first_world = int(options.get("first_world", 0))
             self._simulation.seed(first_seed(seed, self._first_seed), first_world)
-        everywhere = np.ones(self.num_envs, dtype=np.bool_)
-        self._simulation.reset()
-        self._decoder.forget(everywhere)
-        self._steps[:] = 0
-        self._mask = self._simulation.outputs.present.copy()
+        self._begin(chosen)
         self._ready = True
-        return self._observations(), {"mask": self._mask.copy()}
+        observations = self._observations()
+        if not chosen.all():
+            absent = ~self._mask
+            (observations if self._copy else self._simulation.outputs.observations)[absent] = 0.0
+        return observations, {"mask": self._mask.copy()}
+
+    def _chosen(self, reset_mask: Any, seed: int | None) -> NDArray[np.bool_]:
+        """(W,) the worlds that a reset begins anew."""
+        if reset_mask is None:
+            return np.ones(self.num_envs, dtype=np.bool_)
+        chosen = np.asarray(reset_mask)
+        if chosen.shape != (self.num_envs,) or chosen.dtype != np.bool_:
+            raise ConfigError(
+                f"reset_mask has shape {chosen.shape} and dtype {chosen.dtype}: must be "
+                f"({self.num_envs},) and bool, one a world"
+            )
+        if seed is not None:
+            raise ConfigError(
+                "reset_mask with a seed: a seed is that of all worlds; leave one of the two out"
+            )
+        if not self._ready:
+            raise ResetNeededError("reset_mask before the first reset: call vec.reset(seed=…)")
+        return chosen
+
+    def _begin(self, chosen: NDArray[np.bool_]) -> None:
+        """Begin an episode in the chosen worlds (W,)."""
+        self._simulation.reset(chosen)
+        self._decoder.forget(chosen)
+        self._steps[chosen] = 0
+        self._over[chosen] = False
+        self._mask[chosen] = self._simulation.outputs.present[chosen]
 
     def step(self, actions: NDArray[Any]) -> StepResult:
         """Let every agent of every world act.
@@ -195,8 +263,8 @@ class CavVectorEnv:
             truncations (W, A): the episode was cut at the horizon; and infos: `mask` (W, A) who
             acts next; `acted` (W, A) who acted in this step, so whose reward counts; `terms` (W, A,
             T) in the order of `config.TERMS`; `arrivals` (W,) vehicles that reached their goal
-            since the reset, agents included; `episode_over` (W,) which worlds were reset;
-            `final_observations` (W, A, D) before that reset and with the last ones of those who
+            since the reset, agents included; `episode_over` (W,) which worlds are over;
+            `final_observations` (W, A, D) before a reset and with the last ones of those who
             left: the same array as the observations in a step where nobody did.
 
         Raises:
@@ -209,6 +277,8 @@ class CavVectorEnv:
         simulation = self._simulation
         simulation.step(commands)
         self._steps += 1
+        if self._over.any():
+            self._begin(self._over.copy())
         outputs = simulation.outputs
         horizon = self._steps >= self.max_cycles
         rewards = outputs.rewards.copy()
@@ -226,25 +296,39 @@ class CavVectorEnv:
         infos["arrivals"] = simulation.arrivals()
         staying = outputs.present & ~terminations
         over = horizon | ~(staying.any(axis=1) | simulation.agents_to_come())
-        observations = final_observations
-        if terminations.any() or over.any():
-            if self._copy:
-                observations = final_observations.copy()
-                observations[terminations] = 0.0
-            else:  # what is written from here on, a reset's too, is what the view shows
-                infos["final_observations"] = final_observations.copy()
-                outputs.observations[terminations] = 0.0
-        if over.any():
-            simulation.reset(over)
-            self._decoder.forget(over)
-            self._steps[over] = 0
-            staying[over] = simulation.outputs.present[over]
-            if self._copy:
-                observations[over] = simulation.outputs.observations[over]
         self._mask = staying
-        infos["mask"] = staying.copy()
+        observations = self._go_on(final_observations, terminations, over, infos)
+        infos["mask"] = self._mask.copy()
         infos["episode_over"] = over
         return observations, rewards, terminations, truncations, infos
+
+    def _go_on(
+        self,
+        final_observations: NDArray[np.float32],
+        terminations: NDArray[np.bool_],
+        over: NDArray[np.bool_],
+        infos: dict[str, NDArray[Any]],
+    ) -> NDArray[np.float32]:
+        """Begin anew what is over, now or in the next step; the observations of who goes on."""
+        if self._in_next_step:
+            self._over = over.copy()
+            self._mask[over] = False
+            return final_observations
+        if not (terminations.any() or over.any()):
+            return final_observations
+        seen = self._simulation.outputs.observations
+        if self._copy:
+            observations = final_observations.copy()
+            observations[terminations] = 0.0
+        else:  # what is written from here on, a reset's too, is what the view shows
+            infos["final_observations"] = final_observations.copy()
+            observations = final_observations
+            seen[terminations] = 0.0
+        if over.any():
+            self._begin(over)
+            if self._copy:
+                observations[over] = seen[over]
+        return observations
 
     def _observations(self) -> NDArray[np.float32]:
         observations = self._simulation.outputs.observations
