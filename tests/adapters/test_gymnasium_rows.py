@@ -1,4 +1,4 @@
-"""Agents as the rows of a Gymnasium vector: against the worlds that they show, and with wrappers."""
+"""Agents as the rows of a Gymnasium vector: the worlds that they show, and Gymnasium's wrappers."""
 
 from __future__ import annotations
 
