@@ -59,6 +59,7 @@ class CavAgentRows(VectorEnv[Any, Any, Any]):
         overrides: Mapping[str, Any] | None = None,
         **arguments: Any,
     ) -> None:
+        self.closed = True  # until there is something to close: Gymnasium does so when it is freed
         refuse_decided(DECIDED, overrides, arguments)
         wanted = {"population.mode": "seats", **(overrides or {})}
         self._vec = make_vec(
@@ -68,6 +69,7 @@ class CavAgentRows(VectorEnv[Any, Any, Any]):
             overrides=wanted | _rows_a_world(env, wanted, num_envs, num_worlds),
             **arguments,
         )
+        self.closed = False
         self._shape = (num_worlds, self._vec.num_agents)
         self._form = ObservationForm(self._vec.config)
         self._same_step = self._vec.metadata["autoreset_mode"] is AutoresetMode.SAME_STEP
