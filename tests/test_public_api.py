@@ -33,6 +33,9 @@ LATE = (
     "rich",
     "fastapi",
     "ray",
+    "torchrl",
+    "tensordict",
+    "benchmarl",
 )
 
 PROBE = """

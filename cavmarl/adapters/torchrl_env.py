@@ -11,11 +11,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
 from gymnasium import spaces
 from gymnasium.vector import AutoresetMode
 from numpy.typing import NDArray
-from torch import Tensor
 
 from cavmarl.adapters.decided import refuse_decided
 from cavmarl.adapters.observations import ObservationForm
@@ -25,7 +23,9 @@ from cavmarl.seeds import check_seed
 from cavmarl.vector_env import make_vec
 
 try:
+    import torch
     from tensordict import TensorDict, TensorDictBase
+    from torch import Tensor
     from torchrl.data import Bounded, Categorical, Composite, TensorSpec, Unbounded
     from torchrl.envs import EnvBase
 except ModuleNotFoundError as error:

@@ -9,6 +9,7 @@ import typer
 from rich.console import Console
 from rich.table import Table
 
+from cavmarl.cli.bench_libraries import libraries
 from cavmarl.cli.bench_sharding import sharding
 from cavmarl.cli.bench_traffic import traffic
 from cavmarl.cli.output import (
@@ -33,6 +34,7 @@ __all__ = ["app"]
 app = typer.Typer(help="How fast it is, measured side by side.", no_args_is_help=True)
 app.command()(traffic)
 app.command()(sharding)
+app.command()(libraries)
 
 _SENSORS = {"lidar": "64 rays", "kinematics": "no rays", "puffer_drive": "pufferlib's"}
 _WHO = {
