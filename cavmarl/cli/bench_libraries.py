@@ -30,21 +30,20 @@ _VIEWS = {
 def libraries(
     env: Annotated[str, typer.Option(help="A name, a folder or a map file.")] = "town",
     agents: Annotated[int, typer.Option(help="Seats of the one world.")] = 1000,
-    steps: Annotated[int, typer.Option(help="Steps a turn.")] = 20,
-    repeats: Annotated[int, typer.Option(help="Turns.")] = 5,
+    steps: Annotated[int, typer.Option(help="Steps of each view.")] = 30,
     at_most: Annotated[
         float | None, typer.Option(help="Exit with 1 if TorchRL's view adds more ms a step.")
     ] = None,
     json_path: JsonPath = None,
 ) -> None:
-    """What the libraries' views add to a step of the same world; one core, one thread."""
+    """What the libraries' views add to a step of the same world, in the processor's time."""
     from cavmarl.evaluate.library_speed import measure_library_speed
 
     if at_most is not None and not 0.0 < at_most < math.inf:
         raise ConfigError(f"--at-most {at_most:g}: must be a number above 0")
     console = Console()
     with console.status("") as status:
-        found = measure_library_speed(env, agents, steps, repeats, status.update)
+        found = measure_library_speed(env, agents, steps, status.update)
     console.print(_table(found))
     write_json(json_path, found.to_dict())
     added = next(row.added_ms for row in found.rows if row.view == "torchrl")
@@ -56,11 +55,11 @@ def _table(found: LibrarySpeed) -> Table:
     table = Table(
         "view",
         title=(
-            f"a step of one world with {found.agents:,} agents, of one core; "
-            f"{found.repeats} turns of {found.steps} steps"
+            f"a step of one world with {found.agents:,} agents, in ms of one core: "
+            f"medians of {found.steps} steps"
         ),
     )
-    for column in ("ms a step", "of it the view's"):
+    for column in ("a step", "of it the view's"):
         table.add_column(column, justify="right")
     for row in found.rows:
         if row.step_ms is None or row.added_ms is None:

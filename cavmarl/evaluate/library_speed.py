@@ -31,9 +31,8 @@ class LibraryRow:
     Attributes:
         view: `arrays` (`make_vec`), `dicts` (`parallel_env`), `gymnasium`, `sb3`, `torchrl`, or
             `torchrl_stock`: TorchRL's own `PettingZooWrapper` around the dicts.
-        step_ms: wall time of a step, the median over the turns' medians; None: the library is
-            missing.
-        added_ms: median of what a step takes longer than one of `arrays` in the same turn.
+        step_ms: the processor's time of a step, the median; None: the library is missing.
+        added_ms: median of what a step takes longer than one of `arrays` right before it.
         missing: how to install the library, where it is missing.
     """
 
@@ -45,18 +44,16 @@ class LibraryRow:
 
 @dataclass(frozen=True)
 class LibrarySpeed:
-    """All views, measured by turns on one core.
+    """All views, each measured step by step beside the arrays, on one core.
 
     Attributes:
         agents: of the one world.
-        steps: a turn.
-        repeats: turns.
+        steps: of each view.
         rows: the views.
     """
 
     agents: int
     steps: int
-    repeats: int
     rows: tuple[LibraryRow, ...]
 
     def to_dict(self) -> dict[str, Any]:
@@ -67,8 +64,7 @@ class LibrarySpeed:
 def measure_library_speed(
     env: str = "town",
     agents: int = 1000,
-    steps: int = 20,
-    repeats: int = 5,
+    steps: int = 30,
     progress: Callable[[str], None] = lambda text: None,
 ) -> LibrarySpeed:
     """Step the same world through every library that is installed, kernels warm.
@@ -78,15 +74,13 @@ def measure_library_speed(
     Args:
         env: a name, a folder or a map file.
         agents: seats of the world; nobody else drives.
-        steps: a turn.
-        repeats: turns.
+        steps: of each view.
         progress: told what is going on.
 
     Raises:
         ConfigError: a number out of range, or an environment that cannot work.
     """
-    limits = {"agents": (agents, MAX_AGENTS), "steps": (steps, 10_000), "repeats": (repeats, 100)}
-    for name, (value, most) in limits.items():
+    for name, value, most in (("agents", agents, MAX_AGENTS), ("steps", steps, 10_000)):
         if not 1 <= value <= most:
             raise ConfigError(f"{name} = {value}: must be from 1 to {most}")
     keys = {
@@ -95,42 +89,34 @@ def measure_library_speed(
         "action.kind": "continuous",
     }
     settings = {"agents": agents, "background": 0, "overrides": keys}
-    viewed: dict[str, Step | str] = {}
+    rows = []
     with one_core(), _one_thread(), warnings.catch_warnings():
         warnings.simplefilter("ignore")  # what libraries say of themselves
         for view, make in VIEWS.items():
-            progress(f"making the world of {view}")
+            progress(f"measuring {view}")
             try:
-                viewed[view] = make(env, settings)
+                step = make(env, settings)
             except MissingExtraError as error:
-                viewed[view] = str(error)
-        steppers = {view: step for view, step in viewed.items() if not isinstance(step, str)}
-        turns: dict[str, list[float]] = {view: [] for view in steppers}
-        for step in steppers.values():
-            _milliseconds(step, WARM_STEPS)
-        for repeat in range(repeats):
-            progress(f"measuring, {repeat + 1} of {repeats}")
-            for view, step in steppers.items():
-                turns[view].append(_milliseconds(step, steps))
-    rows = tuple(_row(view, found, turns) for view, found in viewed.items())
-    return LibrarySpeed(agents, steps, repeats, rows)
+                rows.append(LibraryRow(view, None, None, str(error)))
+            else:
+                rows.append(_measure(view, step, _arrays(env, settings), steps))
+    return LibrarySpeed(agents, steps, tuple(rows))
 
 
-def _row(view: str, found: Step | str, turns: dict[str, list[float]]) -> LibraryRow:
-    if isinstance(found, str):
-        return LibraryRow(view, None, None, found)
-    added = [mine - arrays for mine, arrays in zip(turns[view], turns["arrays"], strict=True)]
-    return LibraryRow(view, median(turns[view]), median(added))
-
-
-def _milliseconds(step: Step, steps: int) -> float:
-    """Of one step, the median."""
-    spent_ns = []
-    for _ in range(steps):
-        began = time.perf_counter_ns()
+def _measure(view: str, step: Step, arrays: Step, steps: int) -> LibraryRow:
+    for _ in range(WARM_STEPS):
+        arrays()
         step()
-        spent_ns.append(time.perf_counter_ns() - began)
-    return median(spent_ns) / 1e6
+    pairs = [(_milliseconds(arrays), _milliseconds(step)) for _ in range(steps)]
+    added = median(mine - plain for plain, mine in pairs)
+    return LibraryRow(view, median(mine for _, mine in pairs), added)
+
+
+def _milliseconds(step: Step) -> float:
+    """Of the processor: others on a busy machine do not count."""
+    began = time.process_time_ns()
+    step()
+    return (time.process_time_ns() - began) / 1e6
 
 
 @contextmanager
