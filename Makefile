@@ -6,21 +6,23 @@ READY := .venv/.ready
 # Debian keeps Python's venv in a package of its own; root can fetch it.
 VENV_PACKAGE := { test "$$(id -u)" = 0 && apt-get update && apt-get install --yes python3-venv; }
 OLDEST := .venv-oldest
+LIBRARIES := .venv-libraries
 # What old versions of others will no longer do is no news; the rest stays an error.
 OLDEST_WARNINGS := -W default::DeprecationWarning -W default::PendingDeprecationWarning
 OLDEST_TESTS := tests/kernels tests/roads tests/runtime tests/traffic tests/test_config.py \
     tests/test_registry.py tests/test_registration.py tests/test_env.py tests/test_vector_env.py \
-    tests/test_bad_input.py tests/test_public_api.py
+    tests/test_bad_input.py tests/test_public_api.py tests/adapters
+LIBRARIES_TESTS := tests/adapters tests/train/test_programs.py
 FUZZ_SECONDS ?= 60
 FUZZ_TARGETS ?= network programs map cached zones demand sumocfg entry overrides driver manifest \
     plan message log
 MAPS := envs/ring/map/map.net.xml envs/merge/map/map.net.xml envs/grid4x4/map/map.net.xml
 
-.PHONY: help demo test check bench bounds soak model fuzz oldest maps pictures clean
+.PHONY: help demo test check bench bounds soak model fuzz oldest libraries maps pictures clean
 .DEFAULT_GOAL := help
 
 help: ## say what there is
-	@awk -F':.*## ' '/^[a-z]+:.*## / { printf "make %-8s  %s\n", $$1, $$2 }' Makefile
+	@awk -F':.*## ' '/^[a-z]+:.*## / { printf "make %-9s  %s\n", $$1, $$2 }' Makefile
 
 demo: $(READY) ## train on merge, evaluate, drive through town, leave a video (some minutes)
 	$(BIN)/cavmarl demo
@@ -56,6 +58,9 @@ fuzz: $(READY) ## each file parser, FUZZ_SECONDS long; what crashes one stays in
 oldest: $(OLDEST)/.ready ## the heart of the tests with the oldest versions that are allowed
 	$(OLDEST)/bin/pytest $(OLDEST_WARNINGS) $(OLDEST_TESTS)
 
+libraries: $(LIBRARIES)/.ready ## what needs RLlib or BenchMARL, in an environment of its own (1.7 GB)
+	$(LIBRARIES)/bin/pytest $(LIBRARIES_TESTS)
+
 # Without the comment that netconvert and netgenerate begin with (date, version, options), the same
 # options give the same bytes.
 maps: $(READY) ## make the maps of ring, merge and grid4x4 anew from the options beside them
@@ -68,7 +73,7 @@ pictures: $(READY) ## draw the pictures of the README and the cards anew
 	$(BIN)/python -m cavmarl.render.pictures docs/images
 
 clean: ## remove .venv, builds and caches; runs/ stays
-	rm -rf .venv .venv-oldest fuzz/corpus build dist .mypy_cache .ruff_cache .pytest_cache .hypothesis .import_linter_cache
+	rm -rf .venv $(OLDEST) $(LIBRARIES) fuzz/corpus build dist .mypy_cache .ruff_cache .pytest_cache .hypothesis .import_linter_cache
 	find cavmarl agents train tests -name __pycache__ -prune -exec rm -rf {} +
 
 # torch comes first and alone, so that a CPU build that pip is told of (PIP_EXTRA_INDEX_URL,
@@ -87,4 +92,12 @@ $(OLDEST)/.ready: pyproject.toml constraints-oldest.txt
 	"$(PYTHON)" -m venv --clear $(OLDEST)
 	$(OLDEST)/bin/python -m pip install --editable '.[sumo]' pytest hypothesis \
 	    --constraint constraints-oldest.txt
+	@touch $@
+
+$(LIBRARIES)/.ready: pyproject.toml constraints-libraries.txt
+	"$(PYTHON)" -m venv --clear $(LIBRARIES)
+	$(LIBRARIES)/bin/python -m pip install $$(grep '^torch==' constraints-libraries.txt) \
+	    --constraint constraints-libraries.txt
+	$(LIBRARIES)/bin/python -m pip install --editable '.[sb3,torchrl,benchmarl,rllib]' pytest \
+	    hypothesis --constraint constraints-libraries.txt
 	@touch $@

@@ -107,6 +107,7 @@ __all__ = [
     "WorkerStartError",
     "ZoneError",
     "ZoneStepError",
+    "missing",
     "require",
 ]
 
@@ -376,6 +377,11 @@ class MissingExtraError(CavmarlError, ImportError):
     """An optional dependency is not installed; the message is the command that installs it."""
 
 
+def missing(error: ModuleNotFoundError, extra: str) -> MissingExtraError:
+    """What to raise in the place of an import `error`: it says which `extra` brings the module."""
+    return MissingExtraError(f"'{error.name}' is not installed: pip install 'cavmarl[{extra}]'")
+
+
 def require(module: str, extra: str) -> ModuleType:
     """Import an optional `module` or say which `extra` brings it.
 
@@ -387,6 +393,4 @@ def require(module: str, extra: str) -> ModuleType:
     except ModuleNotFoundError as error:
         if error.name is not None and module.split(".")[0] != error.name.split(".")[0]:
             raise
-        raise MissingExtraError(
-            f"'{module}' is not installed: pip install 'cavmarl[{extra}]'"
-        ) from error
+        raise missing(error, extra) from error

@@ -134,6 +134,11 @@ class ActorCritic(nn.Module):
         if self.continuous:
             self.log_std = nn.Parameter(torch.tensor(initial_std).log())
 
+    def forward(self, observations: Tensor) -> Tensor:
+        """The policy's numbers: means (N, 2) of actions, or log-weights (N, 5) of meta-actions."""
+        output: Tensor = self.actor(self._normal(observations))
+        return output
+
     def value(self, observations: Tensor) -> Tensor:
         """Expected return (N,) of observations (N, D)."""
         values: Tensor = self.critic(self._normal(observations)).squeeze(-1)
@@ -141,12 +146,12 @@ class ActorCritic(nn.Module):
 
     def best(self, observations: Tensor) -> Tensor:
         """The most likely actions: (N, 2) within [-1, 1], or (N,) meta-actions."""
-        output: Tensor = self.actor(self._normal(observations))
+        output = self.forward(observations)
         return output.clamp(-1.0, 1.0) if self.continuous else output.argmax(-1)
 
     def sample(self, observations: Tensor) -> tuple[Tensor, Tensor]:
         """Random actions, continuous ones not clipped, and their log probabilities (N,)."""
-        output: Tensor = self.actor(self._normal(observations))
+        output = self.forward(observations)
         if self.continuous:
             actions = output + torch.randn_like(output) * self.log_std.exp()
         else:
@@ -157,7 +162,7 @@ class ActorCritic(nn.Module):
 
     def evaluate(self, observations: Tensor, actions: Tensor) -> tuple[Tensor, Tensor]:
         """Log probabilities (N,) of what `sample` gave, and entropies (N,)."""
-        output: Tensor = self.actor(self._normal(observations))
+        output = self.forward(observations)
         if self.continuous:
             entropy = (0.5 + 0.5 * LOG_2_PI + self.log_std).sum().expand(output.shape[0])
         else:
@@ -167,7 +172,7 @@ class ActorCritic(nn.Module):
 
     def distance(self, observations: Tensor, actions: Tensor) -> Tensor:
         """How far (N,) the policy is from given actions: squares, or surprise at meta-actions."""
-        output: Tensor = self.actor(self._normal(observations))
+        output = self.forward(observations)
         if self.continuous:
             return (output - actions).square().sum(-1)
         return nn.functional.cross_entropy(output, actions, reduction="none")

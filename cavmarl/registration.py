@@ -72,7 +72,7 @@ def register_all() -> None:
         )
         gymnasium.register(
             rows,
-            vector_entry_point="cavmarl.adapters.gymnasium_env:CavAgentRows",
+            vector_entry_point="cavmarl.adapters.gymnasium_rows:CavAgentRows",
             kwargs={"env": name},
             disable_env_checker=True,
         )

@@ -46,6 +46,7 @@ def make_vec(
     background: int | None = None,
     seed: int | None = None,
     max_cycles: int | None = None,
+    autoreset_mode: AutoresetMode | str = AutoresetMode.SAME_STEP,
     copy: bool = True,
     overrides: Mapping[str, Any] | None = None,
 ) -> CavVectorEnv:
@@ -61,6 +62,8 @@ def make_vec(
         background: shadows population.background.
         seed: of the first reset, if that is given none.
         max_cycles: steps until truncation; shadows horizon_s.
+        autoreset_mode: when a world that is over begins anew, in the `SameStep` or in the
+            `NextStep`; see `CavVectorEnv`.
         copy: False returns observations without a copy; see `CavVectorEnv`.
         overrides: values for any other key.
 
@@ -75,6 +78,7 @@ def make_vec(
         raise ConfigError(f"num_envs = {num_envs}: must be from 1 to {MAX_WORLDS}")
     num_envs = int(num_envs)
     num_workers = check_workers(workers, num_envs)
+    in_next_step = _in_next_step(autoreset_mode)
     first_seed = None if seed is None else check_seed(seed)
     config, base_dir = load_config(
         env,
@@ -87,11 +91,25 @@ def make_vec(
     check_agents(config)
     world = make_world(config, base_dir)
     worlds: SteppedWorlds = (
-        PooledWorlds(world, base_dir, num_envs, num_workers)
+        PooledWorlds(world, base_dir, num_envs, num_workers, in_next_step)
         if num_workers
-        else LocalWorlds(world, num_envs)
+        else LocalWorlds(world, num_envs, in_next_step=in_next_step)
     )
     return CavVectorEnv(worlds, seed=first_seed, copy=copy)
+
+
+def _in_next_step(mode: AutoresetMode | str) -> bool:
+    """Whether worlds begin anew in the next step; an error for a mode that means no reset."""
+    try:
+        found = AutoresetMode(mode)
+    except ValueError:
+        found = AutoresetMode.DISABLED
+    if found is AutoresetMode.DISABLED:
+        raise ConfigError(
+            f"autoreset_mode = {mode!r}: must be 'SameStep' or 'NextStep'; reset() takes "
+            "options={'reset_mask': …} to begin some worlds anew earlier"
+        )
+    return found is AutoresetMode.NEXT_STEP
 
 
 class CavVectorEnv:
@@ -100,9 +118,13 @@ class CavVectorEnv:
     Arrays have the shape (num_envs, num_agents, …). `infos["mask"]` says which agents have a
     vehicle and will be asked for the next action; the others' observations are 0 and their actions
     are not read. A world whose episode is over (truncated, or all agents gone and none to come) is
-    reset in the same step: the observations returned are those of the new episode,
-    `infos["final_observations"]` keeps the last ones of the old (Gymnasium's
-    `AutoresetMode.SAME_STEP`).
+    begun anew by itself, as Gymnasium's `AutoresetMode` says:
+
+    - `SAME_STEP`: in the same step. The observations returned are those of the new episode,
+      `infos["final_observations"]` keeps the last ones of the old, and of each agent that left.
+    - `NEXT_STEP`: in the next step. The observations returned are the last ones, those of agents
+      that leave too; in the next step the world's actions are not read, its rewards are 0 and the
+      observations are those of the new episode.
 
     The worlds run in this process, or shared out over worker processes (docs/workers.md): what
     comes out is the same bit for bit.
@@ -134,10 +156,11 @@ class CavVectorEnv:
         self.max_cycles = config.max_steps
         self.metadata = {
             "name": f"cavmarl/{config.name}-v{config.version}",
-            "autoreset_mode": AutoresetMode.SAME_STEP,
+            "autoreset_mode": (
+                AutoresetMode.NEXT_STEP if worlds.in_next_step else AutoresetMode.SAME_STEP
+            ),
         }
         self._decoder = ActionDecoder(config.action, num_envs, self.possible_agents)
-        self._everywhere = np.ones(num_envs, dtype=np.bool_)
         self._mask = np.zeros((num_envs, self.num_agents), dtype=np.bool_)
         self._first_seed = None if seed is None else check_seed(seed)
         self._copy = copy
@@ -160,25 +183,51 @@ class CavVectorEnv:
     def reset(
         self, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[NDArray[np.float32], dict[str, NDArray[Any]]]:
-        """Begin an episode in every world.
+        """Begin an episode in every world, or in some.
 
         Args:
             seed: root of all random numbers; world w's episodes depend on (seed, w) alone. None
                 goes on with the next episodes of the last seed.
             options: `first_world`, with a seed: these are the worlds from that number on, so that
-                many worlds can be run a part at a time. Others are not used.
+                many worlds can be run a part at a time. `reset_mask`, without one: (W,) which
+                worlds begin anew; the others stay as they are. Others are not used.
 
         Returns:
             observations (W, A, D) and infos.
+
+        Raises:
+            ConfigError: a reset_mask of another shape or dtype, or one that comes with a seed.
+            ResetNeededError: a reset_mask before the first reset.
         """
-        first_world = int((options or {}).get("first_world", 0))
+        options = options or {}
+        chosen = self._chosen(options.get("reset_mask"), seed)
+        first_world = int(options.get("first_world", 0))
         if seed is not None or not self._ready:
             seed = first_seed(seed, self._first_seed)
+        self.worlds.arrays.chosen[:] = chosen
         self.worlds.reset(seed, first_world)
-        self._decoder.forget(self._everywhere)
+        self._decoder.forget(chosen)
         self._mask = self.worlds.arrays.mask.copy()
         self._ready = True
         return self._observations(), {"mask": self._mask.copy()}
+
+    def _chosen(self, reset_mask: Any, seed: int | None) -> NDArray[np.bool_]:
+        """(W,) the worlds that a reset begins anew."""
+        if reset_mask is None:
+            return np.ones(self.num_envs, dtype=np.bool_)
+        chosen = np.asarray(reset_mask)
+        if chosen.shape != (self.num_envs,) or chosen.dtype != np.bool_:
+            raise ConfigError(
+                f"reset_mask has shape {chosen.shape} and dtype {chosen.dtype}: must be "
+                f"({self.num_envs},) and bool, one a world"
+            )
+        if seed is not None:
+            raise ConfigError(
+                "reset_mask with a seed: a seed is that of all worlds; leave one of the two out"
+            )
+        if not self._ready:
+            raise ResetNeededError("reset_mask before the first reset: call vec.reset(seed=…)")
+        return chosen
 
     def step(self, actions: NDArray[Any]) -> StepResult:
         """Let every agent of every world act.
@@ -192,8 +241,8 @@ class CavVectorEnv:
             truncations (W, A): the episode was cut at the horizon; and infos: `mask` (W, A) who
             acts next; `acted` (W, A) who acted in this step, so whose reward counts; `terms` (W, A,
             T) in the order of `config.TERMS`; `arrivals` (W,) vehicles that reached their goal
-            since the reset, agents included; `episode_over` (W,) which worlds were reset;
-            `final_observations` (W, A, D) before that reset and with the last ones of those who
+            since the reset, agents included; `episode_over` (W,) which worlds are over;
+            `final_observations` (W, A, D) before a reset and with the last ones of those who
             left: the same array as the observations in a step where nobody did.
 
         Raises:

@@ -34,6 +34,9 @@ LATE = (
     "fastapi",
     "ray",
     "psutil",
+    "torchrl",
+    "tensordict",
+    "benchmarl",
 )
 
 PROBE = """

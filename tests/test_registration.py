@@ -6,10 +6,9 @@ import gymnasium
 import numpy as np
 import pettingzoo
 import pytest
-from gymnasium.utils.env_checker import check_env
 
 import cavmarl
-from cavmarl.registry import entries, load_config
+from cavmarl.registry import entries
 from cavmarl.seeds import check_seed, first_seed
 
 ALL = sorted(entries())
@@ -25,52 +24,6 @@ def test_every_entry_has_its_ids(name: str) -> None:
         world = pettingzoo.make(kind, f"cavmarl/{name}-v0", max_cycles=3)
         world.reset(seed=0)
         assert world.agents
-
-
-def test_one_vehicle_of_a_world_passes_gymnasiums_checker() -> None:
-    world = gymnasium.make("cavmarl/merge-v0", disable_env_checker=True).unwrapped
-    check_env(world, skip_render_check=True)
-    entry, _ = load_config("merge")
-    population = world._env.config.population
-    everybody = entry.population.agents + entry.population.background
-    assert (population.agents, population.background) == (1, everybody - 1)
-
-
-@pytest.mark.parametrize(
-    ("arguments", "key"),
-    [
-        ({"agents": 2}, "agents"),
-        ({"overrides": {"population.mode": "seats"}}, r"population\.mode"),
-        ({"overrides": {"population.agents": 2}}, r"population\.agents"),
-    ],
-)
-def test_a_view_refuses_the_keys_that_it_decides(arguments: dict[str, object], key: str) -> None:
-    with pytest.raises(cavmarl.ConfigError, match=f"^{key}: this view decides it"):
-        gymnasium.make("cavmarl/ring-v0", **arguments)
-    with pytest.raises(cavmarl.ConfigError, match=f"^{key}: this view decides it"):
-        gymnasium.make_vec("cavmarl/ringAgents-v0", num_envs=2, **arguments)
-
-
-def test_one_vehicle_takes_another_background_by_override() -> None:
-    world = gymnasium.make("cavmarl/ring-v0", overrides={"population.background": 3})
-    assert world.unwrapped._env.config.population.background == 3
-
-
-def test_agents_are_rows_that_end_singly() -> None:
-    rows = gymnasium.make_vec("cavmarl/mergeAgents-v0", num_envs=5, max_cycles=60)
-    rows.action_space.seed(0)
-    observations, infos = rows.reset(seed=0)
-    assert observations.shape == rows.observation_space.shape
-    single = 0
-    for _ in range(60):
-        observations, rewards, ended, cut, infos = rows.step(rows.action_space.sample())
-        assert rewards.shape == ended.shape == cut.shape == (5,)
-        single += int(ended.any() and not ended.all())
-        if ended.any():
-            assert infos["_final_obs"][ended].all()
-            assert np.abs(infos["final_obs"][ended]).sum() > 0
-        assert not observations[~infos["active"]].any()
-    assert single > 0
 
 
 def test_the_aec_form_refuses_a_wrong_action_and_goes_on() -> None:

@@ -9,7 +9,7 @@ import pytest
 from gymnasium.vector import AutoresetMode
 from numpy.typing import NDArray
 
-from cavmarl import TERMS, CavVectorEnv, make_vec, parallel_env
+from cavmarl import TERMS, CavVectorEnv, ConfigError, ResetNeededError, make_vec, parallel_env
 
 MODES = ("closed", "entering", "seats")
 
@@ -158,6 +158,84 @@ def test_a_world_that_is_over_begins_anew_in_the_same_step(mode: str) -> None:
                 observations[world][going_on], infos["final_observations"][world][going_on]
             )
     assert (over_early > 0) == (mode != "seats")
+
+
+@pytest.mark.parametrize("copy", [True, False])
+@pytest.mark.parametrize("mode", MODES)
+def test_a_world_may_begin_anew_in_the_next_step(mode: str, copy: bool) -> None:
+    """The same steps as with `SAME_STEP`, but for one more between two episodes."""
+    late, now = make(1, mode, autoreset_mode="NextStep", copy=copy), make(1, mode)
+    assert late.metadata["autoreset_mode"] is AutoresetMode.NEXT_STEP
+    rng = np.random.default_rng(4)
+    np.testing.assert_array_equal(late.reset(seed=0)[0], now.reset(seed=0)[0])
+    episodes = 0
+    for step in range(130):
+        actions = wild(rng, now)
+        *shown, told = late.step(actions)
+        *wanted, infos = now.step(actions)
+        np.testing.assert_array_equal(shown[0], infos["final_observations"], f"step {step}")
+        for mine, other in zip(shown[1:], wanted[1:], strict=True):
+            np.testing.assert_array_equal(mine, other, f"step {step}")
+        for key in ("acted", "terms", "arrivals", "vehicle_done", "episode_over"):
+            np.testing.assert_array_equal(told[key], infos[key], f"step {step}: {key}")
+        if not infos["episode_over"][0]:
+            np.testing.assert_array_equal(told["mask"], infos["mask"])
+            continue
+        episodes += 1
+        assert not told["mask"].any()
+        first, rewards, ended, cut, told = late.step(np.full_like(actions, np.nan))  # not read
+        np.testing.assert_array_equal(first, wanted[0])
+        np.testing.assert_array_equal(told["mask"], infos["mask"])
+        assert not rewards.any()
+        assert not (ended | cut | told["acted"]).any()
+        assert not told["episode_over"].any()
+        assert late.state_hash() == now.state_hash()
+    assert episodes >= 3
+
+
+def test_chosen_worlds_begin_anew_and_the_others_go_on() -> None:
+    vec, alone = make(3), make(3)
+    vec.reset(seed=3)
+    alone.reset(seed=3)
+    rng = np.random.default_rng(0)
+    chosen = np.array([False, True, False])
+    for _ in range(7):
+        actions = wild(rng, vec)
+        seen = vec.step(actions)[0]
+        alone.step(actions)
+    hashes = [vec.state_hash(w) for w in range(3)]
+    observations, infos = vec.reset(options={"reset_mask": chosen})
+    begun, _ = alone.reset()
+    np.testing.assert_array_equal(observations[chosen], begun[chosen])
+    np.testing.assert_array_equal(observations[~chosen], seen[~chosen])
+    assert infos["mask"][chosen].all()
+    assert [vec.state_hash(0), vec.state_hash(2)] == [hashes[0], hashes[2]]
+    assert vec.state_hash(1) == alone.state_hash(1) != hashes[1]
+
+
+@pytest.mark.parametrize(
+    ("options", "seed", "message"),
+    [
+        ({"reset_mask": [True]}, None, r"reset_mask has shape \(1,\)"),
+        ({"reset_mask": [1, 0]}, None, "dtype int64: must be"),
+        ({"reset_mask": [True, False]}, 3, "reset_mask with a seed"),
+    ],
+)
+def test_a_wrong_reset_mask_is_refused(
+    options: dict[str, Any], seed: int | None, message: str
+) -> None:
+    vec = make(2)
+    with pytest.raises(ResetNeededError, match="before the first reset"):
+        vec.reset(options={"reset_mask": np.ones(2, dtype=bool)})
+    vec.reset(seed=0)
+    with pytest.raises(ConfigError, match=message):
+        vec.reset(seed=seed, options=options)
+
+
+@pytest.mark.parametrize("mode", ["Disabled", "same_step", None])
+def test_a_wrong_autoreset_mode_is_refused(mode: Any) -> None:
+    with pytest.raises(ConfigError, match="must be 'SameStep' or 'NextStep'"):
+        make(1, autoreset_mode=mode)
 
 
 @pytest.mark.parametrize("mode", MODES)

@@ -1,4 +1,4 @@
-"""Gymnasium's two forms: one vehicle as an `Env`, all agents as the rows of a `VectorEnv`."""
+"""Gymnasium's single-agent form: one vehicle of a world."""
 
 from __future__ import annotations
 
@@ -6,38 +6,23 @@ from pathlib import Path
 from typing import Any
 
 import gymnasium
-import numpy as np
-from gymnasium.vector import AutoresetMode
-from gymnasium.vector.utils import batch_space
-from numpy.typing import NDArray
 
+from cavmarl.adapters.decided import refuse_decided
 from cavmarl.cav_env import CavEnv, parallel_env
-from cavmarl.errors import ConfigError
 from cavmarl.registry import load_config
-from cavmarl.vector_env import make_vec
 
-__all__ = ["CavAgentRows", "CavEgoEnv"]
+__all__ = ["CavEgoEnv"]
 
 EGO = "car_0"
-
-
-def _without(
-    overrides: dict[str, Any] | None, arguments: dict[str, Any], fixed: tuple[str, ...]
-) -> dict[str, Any]:
-    """The overrides, or an error for a key that the view itself decides."""
-    given = overrides or {}
-    for key in fixed:
-        if key in given or key in arguments:
-            raise ConfigError(
-                f"{key}: this view decides it; cavmarl.parallel_env and make_vec leave it to you"
-            )
-    return given
+DECIDED = ("agents", "population.agents", "population.budget")
 
 
 class CavEgoEnv(gymnasium.Env[Any, Any]):
     """One vehicle of a world; the built-in drivers drive all others.
 
     The entry's other agents become background vehicles, so that the traffic is as dense as there.
+    An episode is the trip of one vehicle. In `closed` worlds, the default, the others leave one by
+    one; in `entering` and `seats` worlds new ones come for those that leave.
 
     Args:
         env: as for `parallel_env`.
@@ -45,6 +30,9 @@ class CavEgoEnv(gymnasium.Env[Any, Any]):
         background: other vehicles; None: all of the entry but one.
         overrides: as for `parallel_env`.
         arguments: other keywords of `parallel_env`.
+
+    Raises:
+        ConfigError: a key that this view decides, or that cannot work.
     """
 
     metadata: dict[str, Any] = CavEnv.metadata
@@ -58,8 +46,9 @@ class CavEgoEnv(gymnasium.Env[Any, Any]):
         overrides: dict[str, Any] | None = None,
         **arguments: Any,
     ) -> None:
-        wanted = _without(overrides, arguments, ("agents", "population.agents", "population.mode"))
-        population = load_config(env, overrides=overrides)[0].population
+        refuse_decided(DECIDED, overrides, arguments)
+        wanted = overrides or {}
+        population = load_config(env, overrides=wanted)[0].population
         if background is None and "population.background" not in wanted:
             background = population.background + population.agents - 1
         self._env = parallel_env(
@@ -67,7 +56,7 @@ class CavEgoEnv(gymnasium.Env[Any, Any]):
             agents=1,
             background=background,
             render_mode=render_mode,
-            overrides={**wanted, "population.mode": "closed"},
+            overrides={"population.mode": "closed", **wanted, "population.budget": 1},
             **arguments,
         )
         self.render_mode = render_mode
@@ -85,14 +74,10 @@ class CavEgoEnv(gymnasium.Env[Any, Any]):
 
     def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
         """Let the vehicle act."""
-        observations, rewards, terminations, truncations, infos = self._env.step({EGO: action})
-        return (
-            observations[EGO],
-            rewards[EGO],
-            terminations[EGO],
-            truncations[EGO],
-            dict(infos[EGO]),
-        )
+        observations, rewards, _, truncations, infos = self._env.step({EGO: action})
+        ended = bool(infos[EGO]["vehicle_done"])  # a seat itself does not end
+        cut = truncations[EGO] and not ended
+        return observations[EGO], rewards[EGO], ended, cut, dict(infos[EGO])
 
     def render(self) -> Any:
         """As `CavEnv.render`."""
@@ -101,69 +86,3 @@ class CavEgoEnv(gymnasium.Env[Any, Any]):
     def close(self) -> None:
         """As `CavEnv.close`."""
         self._env.close()
-
-
-class CavAgentRows(gymnasium.vector.VectorEnv[Any, Any, Any]):
-    """The agents of one world as rows, for programs written for vectors of single agents.
-
-    Always in `seats`: a row whose vehicle ended gets a new one. Rows end singly (terminations), all
-    of them at the horizon (truncations). `infos["active"]` says which rows have a vehicle; the
-    others' observations are 0 and their actions are not read. Rows that ended carry their last
-    observation in `infos["final_obs"]`.
-
-    Args:
-        env: as for `make_vec`.
-        num_envs: rows, so agents.
-        arguments: other keywords of `make_vec`.
-    """
-
-    def __init__(
-        self,
-        env: str | Path = "merge",
-        *,
-        num_envs: int = 1,
-        overrides: dict[str, Any] | None = None,
-        **arguments: Any,
-    ) -> None:
-        wanted = _without(overrides, arguments, ("agents", "population.agents", "population.mode"))
-        self._vec = make_vec(
-            env,
-            num_envs=1,
-            agents=num_envs,
-            overrides={**wanted, "population.mode": "seats"},
-            **arguments,
-        )
-        self.num_envs = num_envs
-        self.metadata = {"autoreset_mode": AutoresetMode.SAME_STEP}
-        self.single_observation_space = self._vec.single_observation_space
-        self.single_action_space = self._vec.single_action_space
-        self.observation_space = batch_space(self.single_observation_space, num_envs)
-        self.action_space = batch_space(self.single_action_space, num_envs)
-
-    def reset(
-        self, *, seed: int | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[NDArray[np.float32], dict[str, Any]]:
-        """Begin an episode."""
-        super().reset(seed=seed)
-        observations, infos = self._vec.reset(seed=seed, options=options)
-        return observations[0], {"active": infos["mask"][0]}
-
-    def step(
-        self, actions: NDArray[Any]
-    ) -> tuple[
-        NDArray[np.float32],
-        NDArray[np.float32],
-        NDArray[np.bool_],
-        NDArray[np.bool_],
-        dict[str, Any],
-    ]:
-        """Let every row act."""
-        observations, rewards, terminations, truncations, infos = self._vec.step(
-            np.asarray(actions)[None]
-        )
-        ended = terminations[0] | truncations[0]
-        shown: dict[str, Any] = {"active": infos["mask"][0]}
-        if ended.any():
-            shown["final_obs"] = infos["final_observations"][0]
-            shown["_final_obs"] = ended
-        return observations[0], rewards[0], terminations[0], truncations[0], shown

@@ -12,32 +12,42 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from stable_baselines3.common.vec_env.base_vec_env import VecEnv
 
+from cavmarl.adapters.decided import refuse_decided
+from cavmarl.adapters.observations import ObservationForm, Observations
 from cavmarl.config import TERMS
-from cavmarl.errors import ConfigError
+from cavmarl.errors import missing
 from cavmarl.vector_env import make_vec
+
+try:
+    from stable_baselines3.common.vec_env.base_vec_env import VecEnv
+except ModuleNotFoundError as error:
+    raise missing(error, "sb3") from error
 
 __all__ = ["CavSb3VecEnv"]
 
+DECIDED = ("autoreset_mode", "copy")  # stable-baselines3 resets in the same step and keeps views
 ARRIVAL = TERMS.index("arrival")
-MODE = "population.mode"
 
 Indices = int | Iterable[int] | None
 
 
 class CavSb3VecEnv(VecEnv):
-    """W worlds with A seats each as W · A environments that share one policy; row w · A + a.
+    """W worlds with A agents each as W · A environments that share one policy; row w · A + a.
 
-    Always in `seats`: a row whose vehicle ended gets a new one. A row that ended is `done` and
-    carries its last observation as `terminal_observation`, whether the horizon cut it as
-    `TimeLimit.truncated`, and whether it arrived as `is_success`. While a row waits for a vehicle
-    its observation and reward are 0, its actions are not read and its info says `inactive`.
+    In `seats` worlds, the default, a row whose vehicle ended gets a new one as soon as there is
+    room. In `closed` worlds it waits until the world begins anew, and in `entering` worlds each row
+    is used once an episode, from when its agent enters.
+
+    A row that ended is `done` and carries its last observation as `terminal_observation`, whether
+    the horizon cut it as `TimeLimit.truncated`, and whether it arrived as `is_success`. While a row
+    waits for a vehicle its observation and reward are 0, its actions are not read and its info says
+    `inactive`.
 
     Args:
         env: as for `make_vec`.
         num_worlds: W.
-        overrides: values for any key but `population.mode`.
+        overrides: values for any other key.
         arguments: other keywords of `make_vec`.
 
     Raises:
@@ -52,26 +62,27 @@ class CavSb3VecEnv(VecEnv):
         overrides: Mapping[str, Any] | None = None,
         **arguments: Any,
     ) -> None:
-        if MODE in (overrides or {}):
-            raise ConfigError(f"{MODE}: rows need seats; cavmarl.make_vec leaves it to you")
+        refuse_decided(DECIDED, arguments)
         self._vec = make_vec(
-            env, num_envs=num_worlds, overrides={**(overrides or {}), MODE: "seats"}, **arguments
+            env,
+            num_envs=num_worlds,
+            overrides={"population.mode": "seats", **(overrides or {})},
+            **arguments,
         )
+        self._form = ObservationForm(self._vec.config)
         self._shape = (num_worlds, self._vec.num_agents)
         self._actions: NDArray[Any] = np.zeros(0)
         super().__init__(
-            num_worlds * self._vec.num_agents,
-            self._vec.single_observation_space,
-            self._vec.single_action_space,
+            num_worlds * self._vec.num_agents, self._form.space, self._vec.single_action_space
         )
 
-    def reset(self) -> NDArray[np.float32]:
+    def reset(self) -> Observations:
         """Begin an episode in every world; the first row's seed is the root of all."""
         observations, infos = self._vec.reset(seed=self._seeds[0])
         self._reset_seeds()
         self._reset_options()
         self.reset_infos = [{} if active else {"inactive": True} for active in infos["mask"].flat]
-        return self._rows(observations)
+        return self._form(self._rows(observations))
 
     def step_async(self, actions: NDArray[Any]) -> None:
         """Take the actions of all rows."""
@@ -79,7 +90,7 @@ class CavSb3VecEnv(VecEnv):
 
     def step_wait(
         self,
-    ) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.bool_], list[dict[str, Any]]]:
+    ) -> tuple[Observations, NDArray[np.float32], NDArray[np.bool_], list[dict[str, Any]]]:
         """Let every row act."""
         observations, rewards, ended, cut, infos = self._vec.step(self._actions)
         done = self._rows(ended | cut)
@@ -91,11 +102,11 @@ class CavSb3VecEnv(VecEnv):
         truncated = self._rows(cut)
         for row in np.flatnonzero(done):
             shown[row] = {
-                "terminal_observation": last[row],
+                "terminal_observation": self._form(last[row]),
                 "TimeLimit.truncated": bool(truncated[row]),
                 "is_success": bool(arrived[row]),
             }
-        return self._rows(observations), self._rows(rewards), done, shown
+        return self._form(self._rows(observations)), self._rows(rewards), done, shown
 
     def close(self) -> None:
         """As `CavVectorEnv.close`."""

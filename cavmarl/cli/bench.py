@@ -10,6 +10,7 @@ from rich.console import Console
 from rich.table import Table
 
 from cavmarl.cli.bench_balance import balance
+from cavmarl.cli.bench_libraries import libraries
 from cavmarl.cli.bench_sharding import sharding
 from cavmarl.cli.bench_traffic import traffic
 from cavmarl.cli.bench_workers import workers
@@ -37,6 +38,7 @@ app.command()(traffic)
 app.command()(sharding)
 app.command()(balance)
 app.command()(workers)
+app.command()(libraries)
 
 _SENSORS = {"lidar": "64 rays", "kinematics": "no rays", "puffer_drive": "pufferlib's"}
 _WHO = {

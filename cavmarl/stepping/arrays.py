@@ -33,7 +33,8 @@ class StepArrays(NamedTuple):
     mask: NDArray[np.bool_]  # (W, A) who acts next
     terms: NDArray[np.float32]  # (W, A, T)
     arrivals: NDArray[np.int64]  # (W,) since each world's reset
-    episode_over: NDArray[np.bool_]  # (W,) which worlds were reset
+    episode_over: NDArray[np.bool_]  # (W,) which worlds were reset, or will be in the next step
+    chosen: NDArray[np.bool_]  # (W,) which worlds are to be reset
     controls: NDArray[np.float64]  # (W, A, 2) what agents do, as in `Commands`
     meta_actions: NDArray[np.int64]  # (W, A)
     suggested: NDArray[np.float64]  # (W, A, 2) what the built-in driver would do
@@ -57,6 +58,7 @@ def layout_of(config: EnvConfig, num_worlds: int) -> Layout:
         "terms": ("<f4", (*agents, len(TERMS))),
         "arrivals": ("<i8", (num_worlds,)),
         "episode_over": ("|b1", (num_worlds,)),
+        "chosen": ("|b1", (num_worlds,)),
         "controls": ("<f8", (*agents, 2)),
         "meta_actions": ("<i8", agents),
         "suggested": ("<f8", (*agents, 2)),
@@ -64,15 +66,17 @@ def layout_of(config: EnvConfig, num_worlds: int) -> Layout:
 
 
 class SteppedWorlds(Protocol):
-    """W worlds that begin a new episode in the step in which the old one ends.
+    """W worlds that begin a new episode by themselves, as `CavVectorEnv` describes it.
 
     Attributes:
         world: what each is made of.
         arrays: what goes into a step, and what comes out.
+        in_next_step: a new episode begins in the step after the one in which the old one ends.
     """
 
     world: World
     arrays: StepArrays
+    in_next_step: bool
 
     @property
     def simulation(self) -> Simulation:
@@ -80,7 +84,7 @@ class SteppedWorlds(Protocol):
         ...
 
     def reset(self, seed: int | None, first_world: int) -> None:
-        """Begin an episode in every world; writes `observations` and `mask`.
+        """Begin an episode in the worlds of `chosen`; writes `observations` and `mask`.
 
         Args:
             seed: root of all random numbers; None goes on with those of the last seed.

@@ -102,6 +102,14 @@ def make_jobs(recipe: Mapping[str, Any]) -> list[WorldsJob]:
     arrays = StepArrays(**arrays_in(Segment(recipe["arrays"], 0).map(), layout))
     LocalWorlds(world, 1, warm=True)
     return [
-        WorldsJob(LocalWorlds(world, last - first, arrays.part(first, last)), first)
+        WorldsJob(
+            LocalWorlds(
+                world,
+                last - first,
+                arrays.part(first, last),
+                in_next_step=recipe["in_next_step"],
+            ),
+            first,
+        )
         for first, last in recipe["parts"]
     ]

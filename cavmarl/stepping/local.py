@@ -26,11 +26,13 @@ class LocalWorlds:
         num_worlds: W.
         arrays: where to write; None: arrays of its own.
         warm: have all kernels ready now.
+        in_next_step: when worlds begin anew; see `SteppedWorlds`.
 
     Attributes:
         world: what each is made of.
         arrays: what goes into a step, and what comes out.
         simulation: the worlds.
+        in_next_step: when worlds begin anew.
     """
 
     def __init__(
@@ -39,8 +41,10 @@ class LocalWorlds:
         num_worlds: int,
         arrays: StepArrays | None = None,
         warm: bool = False,
+        in_next_step: bool = False,
     ) -> None:
         self.world = world
+        self.in_next_step = in_next_step
         self.simulation = Simulation(
             world.config,
             world.network,
@@ -55,20 +59,25 @@ class LocalWorlds:
         self.arrays = arrays
         self._horizon = world.config.max_steps
         self._steps = np.zeros(num_worlds, dtype=np.int64)
+        self._waiting = np.zeros(num_worlds, dtype=np.bool_)  # over, and not begun anew yet
 
     def reset(self, seed: int | None, first_world: int) -> None:
-        """Begin an episode in every world."""
+        """Begin an episode in the worlds of `chosen`."""
+        arrays, chosen = self.arrays, self.arrays.chosen
         if seed is not None:
             self.simulation.seed(seed, first_world)
-        self.simulation.reset()
-        self._steps[:] = 0
-        self.arrays.mask[:] = self.simulation.outputs.present
+        self._begin(chosen)
+        arrays.mask[chosen] = self.simulation.outputs.present[chosen]
+        if not chosen.all():
+            arrays.observations[~arrays.mask] = 0.0
 
     def step(self, commands: Commands) -> None:
-        """Let the agents act, and reset the worlds whose episode is over by then."""
+        """Let the agents act, and reset the worlds whose episode is over, now or a step later."""
         simulation, arrays = self.simulation, self.arrays
         simulation.step(commands)
         self._steps += 1
+        if self._waiting.any():  # what they have done in this step counts for nothing
+            self._begin(self._waiting.copy())
         outputs = simulation.outputs
         at_horizon = self._steps >= self._horizon
         terminations = outputs.terminated
@@ -92,11 +101,19 @@ class LocalWorlds:
         if not ended.any():
             return
         arrays.final_observations[ended] = arrays.observations[ended]
+        if self.in_next_step:
+            self._waiting[over] = True
+            arrays.mask[over] = False
+            return
         arrays.observations[arrays.terminations] = 0.0
         if over.any():
-            simulation.reset(over)
-            self._steps[over] = 0
+            self._begin(over)
             arrays.mask[over] = simulation.outputs.present[over]
+
+    def _begin(self, chosen: NDArray[np.bool_]) -> None:
+        self.simulation.reset(chosen)
+        self._steps[chosen] = 0
+        self._waiting[chosen] = False
 
     def suggest(self) -> None:
         """Write what the built-in driver would do in the agents' place."""
@@ -113,12 +130,12 @@ class LocalWorlds:
 
     def save(self) -> list[NDArray[Any]]:
         """All that the next step depends on; views, to be copied."""
-        return [self._steps, *self.simulation.save()]
+        return [self._steps, self._waiting, *self.simulation.save()]
 
     def load(self, saved: Sequence[NDArray[Any]]) -> None:
         """Go on from what `save` gave."""
-        self._steps[:] = saved[0]
-        self.simulation.load(saved[1:])
+        self._steps[:], self._waiting[:] = saved[:2]
+        self.simulation.load(saved[2:])
 
     def close(self) -> None:
         """Nothing to release."""

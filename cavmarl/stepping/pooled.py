@@ -36,19 +36,29 @@ class PooledWorlds:
         base_dir: the folder that its relative files start from.
         num_worlds: W.
         workers: m, from 1 to W.
+        in_next_step: when worlds begin anew; see `SteppedWorlds`.
 
     Attributes:
         world: what each is made of.
         arrays: in shared memory; each worker writes those of its worlds.
         pool: the processes.
+        in_next_step: when worlds begin anew.
 
     Raises:
         ConfigError: a setting that worlds of several processes cannot have.
         WorkerError: no process, or no memory.
     """
 
-    def __init__(self, world: World, base_dir: Path, num_worlds: int, workers: int) -> None:
+    def __init__(
+        self,
+        world: World,
+        base_dir: Path,
+        num_worlds: int,
+        workers: int,
+        in_next_step: bool = False,
+    ) -> None:
         self.world = world
+        self.in_next_step = in_next_step
         config = world.config
         _check(config.zones)
         cores = usable_cores()
@@ -72,6 +82,7 @@ class PooledWorlds:
             "fingerprint": fingerprint(world),
             "num_worlds": num_worlds,
             "arrays": segment.fd,
+            "in_next_step": in_next_step,
             "parts": parts,
         }
         named = tuple(_name(first, last) for first, last in parts)
@@ -99,12 +110,12 @@ class PooledWorlds:
         return self.pool.deaths
 
     def reset(self, seed: int | None, first_world: int) -> None:
-        """Begin an episode in every world."""
+        """Begin an episode in the worlds of `chosen`."""
         self._run(Task.RESET, {"seed": seed, "first_world": first_world})
         self._steps = 0
 
     def step(self, commands: Commands) -> None:
-        """Let the agents act, and reset the worlds whose episode is over by then."""
+        """Let the agents act, and reset the worlds whose episode is over, now or a step later."""
         self.arrays.controls[:] = commands.controls
         self.arrays.meta_actions[:] = commands.meta_actions
         self._run(Task.STEP)

@@ -8,19 +8,27 @@ import numpy as np
 import pytest
 
 from cavmarl.errors import ConfigError, InvalidActionError
+from cavmarl.registry import load_config
+from cavmarl.spaces import flat_observation, observation_parts
 from cavmarl.vector_env import make_vec
 
 sb3 = pytest.importorskip("stable_baselines3")
 
-WORLDS, SEATS = 2, 3
+MODES = ("closed", "entering", "seats")
+WORLDS, SEATS, BUDGET = 2, 3, 5
 SMALL: dict[str, Any] = {"num_worlds": WORLDS, "agents": SEATS, "background": 2}
+
+
+def make(mode: str = "seats", kind: str = "flat") -> Any:
+    from cavmarl.adapters.sb3_vec_env import CavSb3VecEnv
+
+    keys = {"population.mode": mode, "population.budget": BUDGET, "observation.kind": kind}
+    return CavSb3VecEnv("merge", **SMALL, max_cycles=20, overrides=keys)
 
 
 @pytest.fixture
 def rows() -> Any:
-    from cavmarl.adapters.sb3_vec_env import CavSb3VecEnv
-
-    return CavSb3VecEnv("merge", **SMALL, max_cycles=40)
+    return make()
 
 
 def wild(rows: Any, seed: int) -> list[Any]:
@@ -70,15 +78,19 @@ def test_sb3_learns_saves_and_loads(rows: Any, tmp_path: Any) -> None:
     assert np.isfinite(mean)
 
 
-def test_rows_are_the_worlds_seats(rows: Any) -> None:
+@pytest.mark.parametrize("mode", MODES)
+def test_rows_are_the_worlds_agents(mode: str) -> None:
+    rows = make(mode)
     vec = make_vec(
         "merge",
         num_envs=WORLDS,
         agents=SEATS,
         background=2,
-        max_cycles=40,
-        overrides={"population.mode": "seats"},
+        max_cycles=20,
+        overrides={"population.mode": mode, "population.budget": BUDGET},
     )
+    agents = vec.num_agents
+    assert agents == (BUDGET if mode == "entering" else SEATS)
     observations, _ = vec.reset(seed=5)
     random = np.random.default_rng(0)
     found = wild(rows, 5)
@@ -87,22 +99,53 @@ def test_rows_are_the_worlds_seats(rows: Any) -> None:
     for seen, rewards, done, infos in found[1:]:
         actions = random.uniform(-1.0, 1.0, (rows.num_envs, 2)).astype(np.float32)
         actions[:, 0] = 1.0
-        theirs = vec.step(actions.reshape(WORLDS, SEATS, 2))
+        theirs = vec.step(actions.reshape(WORLDS, agents, 2))
         assert np.array_equal(seen, theirs[0].reshape(rows.num_envs, -1))
         assert np.array_equal(rewards, theirs[1].ravel())
         assert np.array_equal(done, (theirs[2] | theirs[3]).ravel())
         for row, info in enumerate(infos):
-            world, seat = divmod(row, SEATS)
+            world, agent = divmod(row, agents)
             assert ("terminal_observation" in info) == done[row]
-            assert ("inactive" in info) == (not theirs[4]["acted"][world, seat])
+            assert ("inactive" in info) == (not theirs[4]["acted"][world, agent])
             kinds["inactive"] += "inactive" in info
             if done[row]:
-                last = theirs[4]["final_observations"][world, seat]
+                last = theirs[4]["final_observations"][world, agent]
                 assert np.array_equal(info["terminal_observation"], last)
-                assert info["TimeLimit.truncated"] == theirs[3][world, seat]
-                kinds["cut" if theirs[3][world, seat] else "ended"] += 1
+                assert info["TimeLimit.truncated"] == theirs[3][world, agent]
+                kinds["cut" if theirs[3][world, agent] else "ended"] += 1
     assert kinds["ended"] > 0
     assert kinds["cut"] > 0
+    assert kinds["inactive"] > 0
+
+
+@pytest.mark.parametrize("kind", ["flat", "dict"])
+@pytest.mark.parametrize("mode", MODES)
+def test_every_population_trains(mode: str, kind: str) -> None:
+    from stable_baselines3.common.vec_env import VecMonitor, VecNormalize
+
+    watched = VecNormalize(VecMonitor(make(mode, kind)))
+    policy = "MultiInputPolicy" if kind == "dict" else "MlpPolicy"
+    model = sb3.PPO(policy, watched, n_steps=16, batch_size=32, n_epochs=1, seed=0, device="cpu")
+    model.learn(3 * 16 * watched.num_envs)
+    assert model.ep_info_buffer
+
+
+def test_a_row_may_show_a_dict() -> None:
+    named, flat = wild(make(kind="dict"), 5), wild(make(), 5)
+    parts = observation_parts(load_config("merge")[0].sensors)
+
+    def check(shown: Any, wanted: Any) -> None:
+        assert list(shown) == list(parts)
+        assert np.array_equal(flat_observation(parts, shown, stack=1), wanted)
+
+    ended = 0
+    for shown, wanted in zip(named[1:], flat[1:], strict=True):
+        for row, info in enumerate(shown[3]):
+            check({name: part[row] for name, part in shown[0].items()}, wanted[0][row])
+            if "terminal_observation" in info:
+                check(info["terminal_observation"], wanted[3][row]["terminal_observation"])
+                ended += 1
+    assert ended > 0
 
 
 def test_the_same_seed_gives_the_same_rows(rows: Any) -> None:
@@ -113,8 +156,8 @@ def test_the_same_seed_gives_the_same_rows(rows: Any) -> None:
 
 def test_attributes_and_methods_are_those_of_the_worlds(rows: Any) -> None:
     rows.reset()
-    assert rows.get_attr("max_cycles") == [40] * rows.num_envs
-    assert rows.get_attr("max_cycles", 1) == [40]
+    assert rows.get_attr("max_cycles") == [20] * rows.num_envs
+    assert rows.get_attr("max_cycles", 1) == [20]
     assert not rows.has_attr("nonsense")
     assert rows.env_method("state_hash", 1, indices=[0]) == [rows.env_method("state_hash", 1)[0]]
     assert rows.env_is_wrapped(object) == [False] * rows.num_envs
@@ -125,8 +168,9 @@ def test_attributes_and_methods_are_those_of_the_worlds(rows: Any) -> None:
 def test_wrong_use_is_refused(rows: Any) -> None:
     from cavmarl.adapters.sb3_vec_env import CavSb3VecEnv
 
-    with pytest.raises(ConfigError, match=r"population\.mode: rows need seats"):
-        CavSb3VecEnv("merge", overrides={"population.mode": "closed"})
+    for key, value in {"autoreset_mode": "NextStep", "copy": False}.items():
+        with pytest.raises(ConfigError, match=f"^{key}: this view decides it"):
+            CavSb3VecEnv("merge", **{key: value})
     rows.reset()
     with pytest.raises(InvalidActionError, match="must be finite"):
         rows.step(np.full((rows.num_envs, 2), np.nan, dtype=np.float32))

@@ -11,9 +11,11 @@ import pytest
 
 from cavmarl.evaluate.manifest import read_closed
 from cavmarl.evaluate.training_record import is_trained
+from cavmarl.registry import load_config
 
 pytest.importorskip("torch", reason="needs the extra: torch")
 
+AGENTS = load_config("merge")[0].population.agents
 TRAIN = Path(__file__).resolve().parents[2] / "train"
 SMALL = """\
 env: merge
@@ -32,20 +34,72 @@ def call(program: str, *words: object) -> subprocess.CompletedProcess[str]:
     return subprocess.run(command, capture_output=True, text=True, check=False)
 
 
-def test_sb3_trains_a_driver_that_evaluate_takes(tmp_path: Path) -> None:
-    pytest.importorskip("stable_baselines3", reason="needs the extra: sb3")
+def small(updates: int) -> list[object]:
+    """Options of a run of so many updates, each of 2 worlds · 8 steps."""
     sizes = ["--num-worlds", 2, "--num-steps", 8, "--minibatches", 2, "--hidden", 8]
-    done = call("ppo_sb3.py", *sizes, "--total-agent-steps", 300, "--runs", tmp_path, "--name", "a")
+    return [*sizes, "--total-agent-steps", 2 * 8 * AGENTS * (updates - 1) + 1]
+
+
+@pytest.mark.parametrize(
+    ("program", "module", "extra"),
+    [
+        ("ppo_sb3.py", "stable_baselines3", "sb3"),
+        ("ippo_torchrl.py", "torchrl", "torchrl"),
+        ("ppo_rllib.py", "ray.rllib", "rllib (make libraries)"),
+    ],
+)
+@pytest.mark.filterwarnings("ignore")  # what the libraries warn of themselves
+def test_a_library_trains_a_driver_that_evaluate_takes(
+    tmp_path: Path, program: str, module: str, extra: str
+) -> None:
+    pytest.importorskip(module, reason=f"needs the extra: {extra}")
+    done = call(program, *small(updates=2), "--runs", tmp_path, "--name", "a")
     assert done.returncode == 0, done.stderr
     manifest = read_closed(tmp_path / "a")
-    assert manifest["program"] == "ppo_sb3.py"
-    assert set(manifest["results_sha256"]) >= {"model.zip", "model.safetensors", "progress.csv"}
+    assert manifest["program"] == program
+    files = {"model.safetensors", "config.json", "progress.csv"}
+    assert set(manifest["results_sha256"]) >= files
+    header, *rows = (tmp_path / "a" / "progress.csv").read_text().splitlines()
+    assert header == "updates,agent_steps,seconds,trips,trip_return,success"
+    assert len(rows) == 2
     from cavmarl.policies import load_policy
     from cavmarl.vector_env import make_vec
 
     vec = make_vec("merge")
     observations, infos = vec.reset(seed=0)
     vec.step(load_policy(tmp_path / "a", vec).act_batch(observations, infos["mask"]))
+
+
+@pytest.mark.parametrize("algorithm", ["ippo", "mappo"])
+@pytest.mark.filterwarnings("ignore")  # what the libraries warn of themselves
+def test_benchmarl_trains(tmp_path: Path, algorithm: str) -> None:
+    pytest.importorskip("benchmarl", reason="needs the extra: benchmarl (make libraries)")
+    sizes = ["--num-worlds", 2, "--num-steps", 8, "--minibatches", 2, "--hidden", 8]
+    words = [*sizes, "--updates", 2, "--algorithm", algorithm]
+    done = call("ippo_benchmarl.py", *words, "--runs", tmp_path, "--name", "a")
+    assert done.returncode == 0, done.stderr
+    assert read_closed(tmp_path / "a")["program"] == "ippo_benchmarl.py"
+    (table,) = (tmp_path / "a").rglob("collection_reward_reward_mean.csv")
+    assert len(table.read_text().splitlines()) == 2
+
+
+@pytest.mark.parametrize(
+    ("program", "module", "words", "message"),
+    [
+        ("ippo_torchrl.py", "torchrl", ["--num-steps", 0], "--num-steps 0: must be at least 1"),
+        ("ppo_rllib.py", "ray.rllib", ["--num-runners", -1], "--num-runners -1: must be"),
+        ("ippo_benchmarl.py", "benchmarl", ["--algorithm", "x"], "--algorithm x: must be one of"),
+        ("ippo_torchrl.py", "torchrl", ["--env", "nowhere"], "nowhere"),
+    ],
+)
+@pytest.mark.filterwarnings("ignore")  # what the libraries warn of themselves
+def test_wrong_use_of_a_librarys_program_is_refused(
+    tmp_path: Path, program: str, module: str, words: list[object], message: str
+) -> None:
+    pytest.importorskip(module)
+    done = call(program, *words, "--runs", tmp_path)
+    assert done.returncode == 2
+    assert message in done.stderr
 
 
 def test_five_seeds_trains_what_is_missing_and_writes_the_table(tmp_path: Path) -> None:

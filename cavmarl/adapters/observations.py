@@ -1,0 +1,40 @@
+"""What agents observe, in the form that `observation.kind` asks for."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cavmarl.config import EnvConfig
+from cavmarl.spaces import named_observation, observation_parts, observation_space
+
+__all__ = ["ObservationForm"]
+
+Observations = NDArray[np.float32] | dict[str, NDArray[Any]]
+
+
+class ObservationForm:
+    """Leads from flat observations, which `CavVectorEnv` gives, to those of `observation.kind`.
+
+    Args:
+        config: the environment.
+
+    Attributes:
+        space: of one agent: a flat Box, or a Dict with one Box a sensor.
+    """
+
+    def __init__(self, config: EnvConfig) -> None:
+        self.space = observation_space(config)
+        self._stack = config.sensors.stack
+        self._parts = (
+            observation_parts(config.sensors) if config.observation.kind == "dict" else None
+        )
+
+    def __call__(self, flat: NDArray[np.float32]) -> Observations:
+        """Observations of any number of agents: (…, D) as they are, or (…, *shape) a sensor."""
+        if self._parts is None:
+            return flat
+        frames = flat.reshape(*flat.shape[:-1], self._stack, -1)
+        return named_observation(self._parts, frames)

@@ -1,0 +1,96 @@
+"""RLlib's `MultiAgentEnv`, for its new API stack.
+
+Importing this module loads Ray and RLlib; nothing that `import cavmarl` loads imports it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping
+from typing import Any
+
+from cavmarl.cav_env import parallel_env
+from cavmarl.errors import missing
+
+try:
+    from ray.rllib.env.multi_agent_env import MultiAgentEnv
+except ModuleNotFoundError as error:
+    raise missing(error, "rllib") from error
+
+__all__ = ["CavRllibEnv"]
+
+Step = tuple[
+    dict[str, Any], dict[str, float], dict[str, bool], dict[str, bool], dict[str, dict[str, float]]
+]
+
+
+class CavRllibEnv(MultiAgentEnv):  # type: ignore[misc] # found in an environment of its own only
+    """One world; what `config` holds are the arguments of `parallel_env`.
+
+        PPOConfig().environment(CavRllibEnv, env_config={"env": "town", "agents": 25})
+
+    Agents enter and leave in every population: all ids that an episode can use are declared
+    beforehand, and an id that has ended does not come back. The end of everybody (`__all__`) is a
+    truncation where the horizon cut somebody. RLlib ends an episode as soon as all agents that it
+    knows have ended, also where others enter in that very step: these are then the agents of its
+    next episode, for which the same world goes on.
+
+    In `seats` worlds an id is a seat; the end of its vehicle is `infos[agent]["vehicle_done"]`, and
+    RLlib's values go on across it, so that `closed` and `entering` worlds are learnt more exactly.
+
+    Each environment of an env runner is a world of its own, seeded by RLlib.
+
+    Args:
+        config: keywords of `parallel_env`, as RLlib's `env_config` gives them.
+
+    Raises:
+        ConfigError: a key, value or combination that cannot work.
+    """
+
+    def __init__(self, config: Mapping[str, Any] | None = None) -> None:
+        self._env = parallel_env(**(config or {}))
+        self.possible_agents = list(self._env.possible_agents)
+        self.agents: list[str] = []
+        self.observation_spaces = dict(self._env.observation_spaces)
+        self.action_spaces = dict(self._env.action_spaces)
+        self.render_mode = self._env.render_mode
+        self._entered: tuple[dict[str, Any], dict[str, Any]] | None = None
+        super().__init__()
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[dict[str, Any], dict[str, Any]]:
+        """Begin an episode; without a seed it is that of the agents who entered last, if any."""
+        if self._entered is None or seed is not None:
+            self._entered = self._env.reset(seed=seed, options=options)
+        (observations, infos), self._entered = self._entered, None
+        self.agents = self._env.agents
+        return observations, infos
+
+    def step(self, action_dict: Mapping[str, Any]) -> Step:
+        """Let every agent act."""
+        known, step = set(self.agents), self._env.step(action_dict)
+        self.agents = self._env.agents
+        if self.agents and known.isdisjoint(self.agents):
+            observations, _, _, _, infos = (_only(self.agents, part) for part in step)
+            self._entered = observations, infos
+            observations, rewards, ended, cut, infos = (_only(known, part) for part in step)
+            over = True
+        else:
+            observations, rewards, ended, cut, infos = step
+            over = not self.agents
+        at_horizon = over and any(cut.values())
+        ends = {**ended, "__all__": over and not at_horizon}
+        return observations, rewards, ends, {**cut, "__all__": at_horizon}, infos
+
+    def render(self) -> Any:
+        """As `CavEnv.render`."""
+        return self._env.render()
+
+    def close(self) -> None:
+        """As `CavEnv.close`."""
+        self._env.close()
+
+
+def _only(agents: Collection[str], part: Mapping[str, Any]) -> dict[str, Any]:
+    """What a part of a step's results says of these agents."""
+    return {agent: value for agent, value in part.items() if agent in agents}

@@ -1,0 +1,92 @@
+"""Every population as a task of BenchMARL, whose algorithms run on it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from cavmarl.errors import ConfigError
+from cavmarl.registry import entries
+
+benchmarl = pytest.importorskip("benchmarl", reason="needs the extra: benchmarl (make libraries)")
+
+pytestmark = pytest.mark.filterwarnings("ignore")  # TorchRL's warnings of itself are many
+
+MODES = ("closed", "entering", "seats")
+SMALL = {"agents": 2, "background": 2, "max_cycles": 8}
+
+
+def run(
+    folder: Path, algorithm: str = "Ippo", continuous: bool = True, **overrides: Any
+) -> tuple[Any, list[float]]:
+    """The experiment after two iterations, with an evaluation; its logged mean rewards."""
+    import benchmarl.algorithms
+    from benchmarl.experiment import Experiment, ExperimentConfig
+    from benchmarl.models.mlp import MlpConfig
+
+    from cavmarl.adapters.benchmarl_task import CavTask
+
+    folder.mkdir(exist_ok=True)
+    config = ExperimentConfig.get_from_yaml()
+    config.sampling_device = config.train_device = config.buffer_device = "cpu"
+    config.prefer_continuous_actions = continuous
+    config.on_policy_n_envs_per_worker = 2
+    config.on_policy_collected_frames_per_batch = config.off_policy_collected_frames_per_batch = 32
+    config.on_policy_n_minibatch_iters, config.on_policy_minibatch_size = 1, 16
+    config.max_n_iters, config.max_n_frames = 2, None
+    config.evaluation, config.evaluation_interval, config.evaluation_episodes = True, 32, 2
+    config.loggers, config.create_json, config.render = ["csv"], False, False
+    config.checkpoint_at_end, config.save_folder = False, str(folder)
+    experiment = Experiment(
+        task=CavTask.MERGE.get_task({**SMALL, "overrides": overrides}),
+        algorithm_config=getattr(benchmarl.algorithms, f"{algorithm}Config").get_from_yaml(),
+        model_config=MlpConfig.get_from_yaml(),
+        critic_model_config=MlpConfig.get_from_yaml(),
+        seed=0,
+        config=config,
+    )
+    experiment.run()
+    (table,) = folder.rglob("collection_reward_reward_mean.csv")
+    rewards = [float(line.split(",")[1]) for line in table.read_text().splitlines()]
+    return experiment, rewards
+
+
+@pytest.mark.parametrize("mode", MODES)
+def test_ippo_runs_two_iterations(tmp_path: Path, mode: str) -> None:
+    keys = {"population.mode": mode, "population.budget": 4}
+    experiment, rewards = run(tmp_path, **keys)
+    assert experiment.n_iters_performed == 2
+    assert len(rewards) == 2
+    assert np.isfinite(rewards).all()
+    assert experiment.group_map == {
+        "car": [f"car_{k}" for k in range(4 if mode == "entering" else 2)]
+    }
+
+
+def test_a_central_critic_meta_actions_and_named_observations_run(tmp_path: Path) -> None:
+    keys = {"observation.kind": "dict"}
+    experiment, _ = run(tmp_path, "Mappo", continuous=False, **keys)
+    assert experiment.n_iters_performed == 2
+
+
+def test_the_seed_decides(tmp_path: Path) -> None:
+    assert run(tmp_path / "one")[1] == run(tmp_path / "other")[1]
+
+
+def test_every_entry_is_a_task() -> None:
+    from cavmarl.adapters.benchmarl_task import CavTask
+
+    assert {task.name.lower() for task in CavTask} == set(entries())
+    assert CavTask.RING.get_task().config == {"env": "ring"}
+
+
+def test_what_benchmarl_decides_is_refused() -> None:
+    from cavmarl.adapters.benchmarl_task import CavTaskClass
+
+    with pytest.raises(ConfigError, match=r"^num_envs: this view decides it"):
+        CavTaskClass("merge", {"num_envs": 2})
+    with pytest.raises(ConfigError, match=r"^action\.kind: this view decides it"):
+        CavTaskClass("merge", {"overrides": {"action.kind": "discrete"}})

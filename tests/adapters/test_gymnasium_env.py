@@ -1,0 +1,73 @@
+"""One vehicle as a Gymnasium environment, by Gymnasium's checker and wrappers."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import gymnasium
+import numpy as np
+import pytest
+from gymnasium.utils.env_checker import check_env
+from gymnasium.wrappers import FlattenObservation, RecordEpisodeStatistics
+
+from cavmarl.errors import ConfigError
+from cavmarl.registry import load_config
+
+MODES = ("closed", "entering", "seats")
+
+
+def make(mode: str = "closed", kind: str = "flat", **arguments: Any) -> gymnasium.Env[Any, Any]:
+    overrides = {"population.mode": mode, "observation.kind": kind}
+    return gymnasium.make("cavmarl/merge-v0", max_cycles=40, overrides=overrides, **arguments)
+
+
+@pytest.mark.parametrize("kind", ["flat", "dict"])
+@pytest.mark.parametrize("mode", MODES)
+def test_one_vehicle_of_a_world_passes_gymnasiums_checker(mode: str, kind: str) -> None:
+    world = make(mode, kind, background=5).unwrapped
+    assert isinstance(world.observation_space, gymnasium.spaces.Dict) == (kind == "dict")
+    check_env(world, skip_render_check=True)
+
+
+def test_the_other_agents_become_background() -> None:
+    population = make().unwrapped._env.config.population
+    entry, _ = load_config("merge")
+    everybody = entry.population.agents + entry.population.background
+    assert (population.agents, population.background) == (1, everybody - 1)
+    overridden = gymnasium.make("cavmarl/ring-v0", overrides={"population.background": 3})
+    assert overridden.unwrapped._env.config.population.background == 3
+
+
+@pytest.mark.parametrize("mode", MODES)
+def test_an_episode_is_one_trip_or_is_cut_at_the_horizon(mode: str) -> None:
+    world = RecordEpisodeStatistics(FlattenObservation(make(mode, "dict", background=5)))
+    crashes = cuts = 0
+    for seed in range(6):
+        world.reset(seed=seed)
+        crash = seed % 2 == 0
+        action = np.array([1.0, 1.0] if crash else [-1.0, 0.0], dtype=np.float32)
+        total, steps, done = 0.0, 0, False
+        while not done:
+            _, reward, ended, cut, info = world.step(action)
+            total, steps, done = total + reward, steps + 1, ended or cut
+            assert not (ended and cut)
+        crashes, cuts = crashes + ended, cuts + cut
+        assert info["vehicle_done"] == float(ended)
+        assert info["episode"]["r"] == pytest.approx(total)
+        assert info["episode"]["l"] == steps
+        assert cut == (steps == 40 and not ended)
+    assert crashes > 0
+    assert cuts > 0
+
+
+@pytest.mark.parametrize(
+    ("arguments", "key"),
+    [
+        ({"agents": 2}, "agents"),
+        ({"overrides": {"population.budget": 2}}, r"population\.budget"),
+        ({"overrides": {"population.agents": 2}}, r"population\.agents"),
+    ],
+)
+def test_one_vehicle_is_one_vehicle(arguments: dict[str, Any], key: str) -> None:
+    with pytest.raises(ConfigError, match=f"^{key}: this view decides it"):
+        gymnasium.make("cavmarl/ring-v0", **arguments)

@@ -1,0 +1,188 @@
+"""Agents as the rows of a Gymnasium vector: the worlds that they show, and Gymnasium's wrappers."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import gymnasium
+import numpy as np
+import pytest
+from gymnasium.vector import AutoresetMode
+from gymnasium.wrappers import vector as wrappers
+from numpy.typing import NDArray
+
+from cavmarl.config import TERMS
+from cavmarl.errors import ConfigError
+from cavmarl.spaces import flat_observation
+from cavmarl.vector_env import make_vec
+
+MODES = ("closed", "entering", "seats")
+AUTORESET = (AutoresetMode.SAME_STEP, AutoresetMode.NEXT_STEP)
+ROWS = 8
+WORLDS = 2
+
+
+def overrides(mode: str, kind: str = "flat") -> dict[str, Any]:
+    chosen = {"population.mode": mode, "observation.kind": kind}
+    return chosen | ({"population.agents": 2} if mode == "entering" else {})
+
+
+def make(mode: str = "seats", kind: str = "flat", **arguments: Any) -> Any:
+    settings = {"num_worlds": WORLDS, "background": 4, "max_cycles": 12} | arguments
+    name = "cavmarl/mergeAgents-v0"
+    return gymnasium.make_vec(name, num_envs=ROWS, overrides=overrides(mode, kind), **settings)
+
+
+def wild(rng: np.random.Generator, count: int) -> NDArray[np.float32]:
+    """(count, 2) full throttle and any steering: most leave the road or hit somebody soon."""
+    actions = rng.uniform(-1.0, 1.0, (count, 2)).astype(np.float32)
+    actions[:, 0] = 1.0
+    return actions
+
+
+@pytest.mark.parametrize("autoreset", AUTORESET)
+@pytest.mark.parametrize("mode", MODES)
+def test_rows_are_the_worlds_agents(mode: str, autoreset: AutoresetMode) -> None:
+    rows = make(mode, autoreset_mode=autoreset)
+    per_world = ROWS // WORLDS
+    vec = make_vec(
+        "merge",
+        num_envs=WORLDS,
+        background=4,
+        max_cycles=12,
+        autoreset_mode=autoreset,
+        overrides={
+            "population.agents": 2 if mode == "entering" else per_world,
+            "population.budget": per_world,
+            "population.mode": mode,
+        },
+    )
+    assert rows.metadata["autoreset_mode"] is autoreset
+    observations, told = rows.reset(seed=5)
+    np.testing.assert_array_equal(observations, vec.reset(seed=5)[0].reshape(ROWS, -1))
+    rng = np.random.default_rng(0)
+    singly = cut_at_once = 0
+    for _ in range(100):
+        actions = wild(rng, ROWS)
+        observations, rewards, ended, cut, told = rows.step(actions)
+        theirs = vec.step(actions.reshape(WORLDS, per_world, 2))
+        np.testing.assert_array_equal(observations, theirs[0].reshape(ROWS, -1))
+        for mine, other in zip((rewards, ended, cut), theirs[1:4], strict=True):
+            np.testing.assert_array_equal(mine, other.ravel())
+        infos = theirs[4]
+        np.testing.assert_array_equal(told["active"], infos["mask"].ravel())
+        for k, term in enumerate(TERMS):
+            np.testing.assert_array_equal(told[term], infos["terms"][..., k].ravel())
+        over = ended | cut
+        singly += bool(over.any() and not over.all())
+        cut_at_once += bool(cut.any())
+        last = infos["final_observations"].reshape(ROWS, -1)
+        if autoreset is AutoresetMode.NEXT_STEP:
+            assert "final_obs" not in told
+            np.testing.assert_array_equal(observations[over], last[over])
+        else:
+            assert not observations[~told["active"]].any()
+            assert ("final_obs" in told) == over.any()
+            for row in np.flatnonzero(over):
+                assert told["_final_obs"][row]
+                np.testing.assert_array_equal(told["final_obs"][row], last[row])
+    assert singly > 0
+    assert cut_at_once > 0
+
+
+@pytest.mark.parametrize("autoreset", AUTORESET)
+@pytest.mark.parametrize("mode", MODES)
+def test_gymnasium_records_the_trips_of_all_rows(mode: str, autoreset: AutoresetMode) -> None:
+    rows = wrappers.RecordEpisodeStatistics(make(mode, autoreset_mode=autoreset))
+    if autoreset is AutoresetMode.SAME_STEP and gymnasium.__version__.startswith("1.2."):
+        pytest.skip("this Gymnasium's wrapper counts as if every reset had a step of its own")
+    rows.reset(seed=1)
+    rng = np.random.default_rng(0)
+    returns, found, wanted = np.zeros(ROWS), [], []
+    for _ in range(90):
+        _, rewards, ended, cut, told = rows.step(wild(rng, ROWS))
+        returns += rewards
+        over = ended | cut
+        if over.any():
+            found += told["episode"]["r"][over].tolist()
+            wanted += returns[over].tolist()
+            returns[over] = 0.0
+    assert len(found) > ROWS
+    assert rows.episode_count == len(found)
+    np.testing.assert_allclose(found, wanted, rtol=1e-5)
+
+
+@pytest.mark.parametrize("autoreset", AUTORESET)
+def test_a_row_may_show_a_dict(autoreset: AutoresetMode) -> None:
+    named = make(kind="dict", autoreset_mode=autoreset)
+    flat = make(autoreset_mode=autoreset)
+    parts = named.unwrapped._form._parts
+
+    def flattened(observation: dict[str, Any]) -> NDArray[np.float32]:
+        return flat_observation(parts, observation, stack=1)
+
+    def check(shown: Any, wanted: NDArray[np.float32]) -> None:
+        assert named.observation_space.contains(shown)
+        for row in range(ROWS):
+            one = {name: part[row] for name, part in shown.items()}
+            np.testing.assert_array_equal(flattened(one), wanted[row])
+
+    check(named.reset(seed=0)[0], flat.reset(seed=0)[0])
+    rng = np.random.default_rng(0)
+    ended = 0
+    for _ in range(60):
+        actions = wild(rng, ROWS)
+        shown, _, _, _, told = named.step(actions)
+        wanted, _, _, _, infos = flat.step(actions)
+        check(shown, wanted)
+        for row in np.flatnonzero(infos.get("_final_obs", False)):
+            np.testing.assert_array_equal(
+                flattened(told["final_obs"][row]), infos["final_obs"][row]
+            )
+            ended += 1
+    assert (ended > 0) == (autoreset is AutoresetMode.SAME_STEP)
+
+
+def test_gymnasiums_wrappers_take_the_rows() -> None:
+    rows: Any = wrappers.NormalizeObservation(make(autoreset_mode="NextStep"))
+    rows = wrappers.NormalizeReward(wrappers.DictInfoToList(rows))
+    rows.reset(seed=0)
+    rng = np.random.default_rng(0)
+    for _ in range(50):
+        observations, *_ = rows.step(wild(rng, ROWS))
+    assert np.isfinite(observations).all()
+    flattened = wrappers.FlattenObservation(make(kind="dict", autoreset_mode="NextStep"))
+    flattened.reset(seed=0)
+    for _ in range(50):
+        observations, *_ = flattened.step(wild(rng, ROWS))
+        assert observations.shape == flattened.observation_space.shape
+
+
+def test_the_same_seed_gives_the_same_rows() -> None:
+    def episode(seed: int) -> list[bytes]:
+        rng = np.random.default_rng(0)
+        rows = make()
+        return [rows.reset(seed=seed)[0].tobytes()] + [
+            rows.step(wild(rng, ROWS))[0].tobytes() for _ in range(20)
+        ]
+
+    first = episode(3)
+    assert first == episode(3)
+    assert first[0] != episode(4)[0]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"agents": 2}, "^agents: this view decides it"),
+        ({"overrides": {"population.agents": 2}}, r"^population\.agents: this view"),
+        ({"overrides": {"population.budget": 9}}, r"^population\.budget: this view"),
+        ({"num_worlds": 3}, "num_envs = 8: must be a multiple of num_worlds = 3"),
+        ({"num_worlds": 0}, "num_envs = 8: must be a multiple of num_worlds = 0"),
+        ({"autoreset_mode": "Disabled"}, "autoreset_mode = 'Disabled': must be"),
+        ({"overrides": {"population.mode": "open"}}, r"population\.mode"),
+    ],
+)
+def test_rows_that_cannot_be_are_refused(arguments: dict[str, Any], message: str) -> None:
+    with pytest.raises(ConfigError, match=message):
+        gymnasium.make_vec("cavmarl/mergeAgents-v0", num_envs=ROWS, **arguments)

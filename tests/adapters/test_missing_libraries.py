@@ -1,0 +1,41 @@
+"""A view without its library says what to install."""
+
+from __future__ import annotations
+
+import importlib
+import sys
+
+import pytest
+
+from cavmarl.errors import MissingExtraError
+
+
+@pytest.mark.parametrize(
+    ("view", "library", "extra"),
+    [
+        ("sb3_vec_env", "stable_baselines3", "sb3"),
+        ("torchrl_env", "torch", "torchrl"),
+        ("torchrl_env", "torchrl", "torchrl"),
+        ("benchmarl_task", "benchmarl", "benchmarl"),
+        ("rllib_env", "ray", "rllib"),
+    ],
+)
+@pytest.mark.filterwarnings("ignore")  # TorchRL's warnings of itself are many
+def test_a_missing_library_is_named_with_its_extra(
+    monkeypatch: pytest.MonkeyPatch, view: str, library: str, extra: str
+) -> None:
+    pytest.importorskip("torch", reason="needs the extra: torch")
+
+    class Hidden:
+        def find_spec(self, name: str, path: object = None, target: object = None) -> None:
+            if name.split(".")[0] == library:
+                raise ModuleNotFoundError(f"No module named {name!r}", name=name)
+
+    for name in [*sys.modules]:
+        if name.split(".")[0] == library or name == f"cavmarl.adapters.{view}":
+            monkeypatch.delitem(sys.modules, name)
+    if extra == "benchmarl":
+        pytest.importorskip("torchrl", reason="needs the extra: torchrl")
+    monkeypatch.setattr(sys, "meta_path", [Hidden(), *sys.meta_path])
+    with pytest.raises(MissingExtraError, match=rf"'{library}.*pip install 'cavmarl\[{extra}\]'"):
+        importlib.import_module(f"cavmarl.adapters.{view}")

@@ -1,0 +1,154 @@
+"""The worlds as RLlib's multi-agent environments: its algorithms run on them, near and far."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from functools import partial
+from typing import Any
+
+import pytest
+
+from cavmarl.cav_env import parallel_env
+from cavmarl.errors import ConfigError
+
+ray = pytest.importorskip("ray", reason="needs the extra: rllib (make libraries)")
+pytest.importorskip("ray.rllib", reason="needs the extra: rllib (make libraries)")
+
+pytestmark = pytest.mark.filterwarnings("ignore")  # Ray's warnings of itself are many
+
+MODES = ("closed", "entering", "seats")
+HORIZON = 16
+
+
+def config(mode: str = "entering", kind: str = "flat") -> dict[str, Any]:
+    return {
+        "env": "merge",
+        "agents": 3,
+        "background": 3,
+        "max_cycles": HORIZON,
+        "overrides": {
+            "population.mode": mode,
+            "population.budget": 5,
+            "observation.kind": kind,
+            "action.out_of_range": "clip",
+        },
+    }
+
+
+@pytest.fixture(scope="module")
+def cluster() -> Iterator[None]:
+    ray.init(num_cpus=2, include_dashboard=False, log_to_driver=False, logging_level="ERROR")
+    yield
+    ray.shutdown()
+
+
+@pytest.mark.parametrize("mode", MODES)
+def test_the_worlds_agents_are_rllibs(mode: str) -> None:
+    """All that the world says reaches RLlib once, though its episodes may end earlier."""
+    from cavmarl.adapters.rllib_env import CavRllibEnv
+
+    # One after the other: the next one enters when the last one has ended.
+    chosen = config(mode) | ({"agents": 1} if mode == "entering" else {})
+    env, twin = CavRllibEnv(chosen), parallel_env(**chosen)
+    sampled = env.get_action_space("car_0")
+    sampled.seed(0)
+    handed_on = 0
+    for seed in range(5):
+        observations, infos = env.reset(seed=seed)
+        assert observations.keys() == twin.reset(seed=seed)[0].keys()
+        gone: set[str] = set()
+        while twin.agents:
+            assert all(env.get_observation_space(a).contains(o) for a, o in observations.items())
+            actions = {agent: sampled.sample() for agent in env.agents}
+            known = set(env.agents)
+            observations, rewards, ended, cut, infos = env.step(actions)
+            _, paid, theirs, their_cut, told = twin.step(actions)
+            at_end = ended.pop("__all__"), cut.pop("__all__")
+            gone |= {agent for agent in ended if ended[agent] or cut[agent]}
+            assert any(at_end) == (known <= gone)
+            assert at_end[1] == (any(at_end) and any(their_cut.values()))
+            if any(at_end) and twin.agents:
+                assert set(observations) == known
+                entered, more_infos = env.reset()
+                assert set(entered) == set(twin.agents)
+                observations, infos = observations | entered, infos | more_infos
+                absent = dict.fromkeys(entered, False)
+                rewards, ended, cut = (
+                    rewards | dict.fromkeys(entered, 0.0),
+                    ended | absent,
+                    cut | absent,
+                )
+                handed_on += 1
+            assert (rewards, ended, cut, infos) == (paid, theirs, their_cut, told)
+            assert env.agents == twin.agents
+            assert not gone & set(env.agents)
+    assert (handed_on > 0) == (mode == "entering")
+
+
+def test_a_cut_is_no_end() -> None:
+    from cavmarl.adapters.rllib_env import CavRllibEnv
+
+    env = CavRllibEnv(config("closed"))
+    env.reset(seed=0)
+    brake = {agent: [-1.0, 0.0] for agent in env.agents}
+    for _ in range(HORIZON):
+        _, _, ended, cut, _ = env.step(brake)
+    assert cut["__all__"]
+    assert not ended["__all__"]
+
+
+def train(flat: bool = True, **runners: Any) -> dict[str, Any]:
+    """One update of PPO; what its runners say of the episodes."""
+    from ray.rllib.algorithms.ppo import PPOConfig
+    from ray.rllib.connectors.env_to_module import FlattenObservations
+
+    from cavmarl.adapters.rllib_env import CavRllibEnv
+
+    if not flat:
+        flatten = partial(FlattenObservations, multi_agent=True)
+        runners["env_to_module_connector"] = lambda env, spaces=None, device=None: flatten()
+    mode = runners.pop("mode", "entering")
+    algorithm = (
+        PPOConfig()
+        .environment(CavRllibEnv, env_config=config(mode, "flat" if flat else "dict"))
+        .env_runners(rollout_fragment_length=64, **runners)
+        .multi_agent(policies={"shared"}, policy_mapping_fn=lambda agent, *_, **__: "shared")
+        .training(train_batch_size_per_learner=128, minibatch_size=64, num_epochs=1)
+        .learners(num_learners=0)
+        .debugging(seed=0, log_level="ERROR")
+        .build_algo()
+    )
+    found: dict[str, Any] = algorithm.train()["env_runners"]
+    algorithm.stop()
+    return found
+
+
+@pytest.mark.usefixtures("cluster")
+@pytest.mark.parametrize("mode", MODES)
+def test_every_population_trains(mode: str) -> None:
+    found = train(mode=mode, num_env_runners=0)
+    assert found["num_episodes"] > 0
+    seen = set(found["agent_episode_returns_mean"])
+    assert seen == {f"car_{k}" for k in range(5 if mode == "entering" else 3)}
+
+
+@pytest.mark.usefixtures("cluster")
+def test_two_worlds_train_side_by_side() -> None:
+    assert train(num_env_runners=0, num_envs_per_env_runner=2)["num_episodes"] > 0
+
+
+@pytest.mark.usefixtures("cluster")
+def test_a_remote_runner_trains() -> None:
+    assert train(num_env_runners=1)["num_episodes"] > 0
+
+
+@pytest.mark.usefixtures("cluster")
+def test_observations_named_by_sensor_train_through_a_connector() -> None:
+    assert train(flat=False, num_env_runners=0)["num_episodes"] > 0
+
+
+def test_wrong_settings_are_refused() -> None:
+    from cavmarl.adapters.rllib_env import CavRllibEnv
+
+    with pytest.raises(ConfigError, match=r"population\.agents = 0"):
+        CavRllibEnv({"env": "merge", "agents": 0})

@@ -1,0 +1,138 @@
+"""BenchMARL's algorithms on the same worlds: IPPO, MAPPO, and what else it has.
+
+    python train/ippo_benchmarl.py --env merge --updates 300
+    python train/ippo_benchmarl.py --env town --algorithm mappo
+
+BenchMARL's algorithm, model and experiment, on `cavmarl.adapters.benchmarl_task`. The run's folder
+holds its tables (`ippo_merge_mlp…/…/scalars/*.csv`), the policy's weights as `policy.pt`, and
+`manifest.json`, which says what it was trained with. BenchMARL's networks are its own: other
+programs of ours do not read them.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, fields
+from pathlib import Path
+from typing import Annotated, get_args, get_type_hints
+
+import torch
+from benchmarl.algorithms import algorithm_config_registry
+from benchmarl.experiment import Experiment, ExperimentConfig
+from benchmarl.models.mlp import MlpConfig
+
+from cavmarl.adapters.benchmarl_task import CavTaskClass
+from cavmarl.errors import CavmarlError, ConfigError
+from cavmarl.evaluate.training_record import begin_training, end_training
+
+POLICY_FILE = "policy.pt"
+
+
+@dataclass(frozen=True)
+class Args:
+    """The settings of a run; each is an option of the command line."""
+
+    env: Annotated[str, "environment: a name, a folder or a map file"] = "merge"
+    algorithm: Annotated[str, "as BenchMARL calls it"] = "ippo"
+    num_worlds: Annotated[int, "worlds that are stepped together"] = 32
+    seed: Annotated[int, "root of all random numbers"] = 0
+    updates: Annotated[int, "how often to collect and to learn"] = 100
+    num_steps: Annotated[int, "steps of every world between two updates"] = 128
+    epochs: Annotated[int, "passes over the steps of an update"] = 4
+    minibatches: Annotated[int, "parts that a pass is cut into"] = 8
+    learning_rate: Annotated[float, "of Adam"] = 1e-3
+    gamma: Annotated[float, "discount a step"] = 0.99
+    hidden: Annotated[int, "width of the two hidden layers"] = 64
+    runs: Annotated[str, "folder of all runs"] = "runs"
+    name: Annotated[str, "folder of this run; empty: ENV_benchmarl_SEED"] = ""
+
+    def __post_init__(self) -> None:
+        for name in ("num_worlds", "updates", "num_steps", "epochs", "minibatches"):
+            if getattr(self, name) < 1:
+                option = name.replace("_", "-")
+                raise ConfigError(f"--{option} {getattr(self, name)}: must be at least 1")
+        if self.algorithm not in algorithm_config_registry:
+            known = ", ".join(algorithm_config_registry)
+            raise ConfigError(f"--algorithm {self.algorithm}: must be one of {known}")
+
+    @property
+    def folder(self) -> Path:
+        """Where this run lies."""
+        stem = Path(self.env).name.split(".")[0]
+        return Path(self.runs) / (self.name or f"{stem}_benchmarl_{self.seed}")
+
+
+def parse_args(words: Sequence[str] | None = None) -> Args:
+    """The settings that the command line asks for."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    hints = get_type_hints(Args, include_extras=True)
+    for field in fields(Args):
+        kind, text = get_args(hints[field.name])
+        option = f"--{field.name.replace('_', '-')}"
+        shown = f"{text} (default: {field.default!r})"
+        parser.add_argument(option, type=kind, default=field.default, help=shown)
+    return Args(**vars(parser.parse_args(words)))
+
+
+def make_experiment(args: Args) -> Experiment:
+    """BenchMARL's experiment on our worlds."""
+    config = ExperimentConfig.get_from_yaml()
+    config.sampling_device = config.train_device = config.buffer_device = "cpu"
+    config.gamma, config.lr = args.gamma, args.learning_rate
+    config.max_n_iters, config.max_n_frames = args.updates, None
+    frames = args.num_worlds * args.num_steps
+    for policy in ("on_policy", "off_policy"):
+        setattr(config, f"{policy}_n_envs_per_worker", args.num_worlds)
+        setattr(config, f"{policy}_collected_frames_per_batch", frames)
+    config.on_policy_n_minibatch_iters = args.epochs
+    config.on_policy_minibatch_size = max(frames // args.minibatches, 1)
+    config.evaluation = config.render = config.create_json = config.checkpoint_at_end = False
+    config.loggers, config.save_folder = ["csv"], str(args.folder)
+    model = MlpConfig(
+        num_cells=[args.hidden, args.hidden],
+        layer_class=torch.nn.Linear,
+        activation_class=torch.nn.Tanh,
+    )
+    stem = Path(args.env).name.split(".")[0]
+    return Experiment(
+        task=CavTaskClass(stem, {"env": args.env}),
+        algorithm_config=algorithm_config_registry[args.algorithm].get_from_yaml(),
+        model_config=model,
+        critic_model_config=model,
+        seed=args.seed,
+        config=config,
+    )
+
+
+def train(args: Args) -> Path:
+    """Run the experiment to its last update; returns its folder.
+
+    Raises:
+        CavmarlError: settings or an environment that cannot work.
+    """
+    torch.set_num_threads(1)  # more cost small networks more than they bring
+    args.folder.mkdir(parents=True, exist_ok=True)
+    experiment = make_experiment(args)
+    simulation = experiment.test_env.base_env.vec.simulation
+    begin_training(args.folder, "ippo_benchmarl.py", asdict(args), simulation)
+    experiment.run()
+    torch.save(experiment.policy.state_dict(), args.folder / POLICY_FILE)
+    end_training(args.folder, (POLICY_FILE,))
+    return args.folder
+
+
+def main(words: Sequence[str] | None = None) -> int:
+    """Train; 0: trained, 2: wrong use."""
+    try:
+        folder = train(parse_args(words))
+    except CavmarlError as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 2
+    print(f"run: {folder}")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

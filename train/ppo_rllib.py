@@ -1,0 +1,230 @@
+"""RLlib's PPO (its new API stack) on the same worlds, with one network shared by all agents.
+
+    python train/ppo_rllib.py --env merge --num-runners 2 --minutes 8
+
+RLlib's algorithm, env runners and learner, on `cavmarl.adapters.rllib_env`; the network is ours, as
+an `RLModule`. The run's folder holds it as `model.safetensors` and `config.json`, which
+`cavmarl evaluate --policy FOLDER` takes, `progress.csv` with the columns of `ippo_torch.py`, and
+`manifest.json`, which says what it was trained with.
+"""
+
+from __future__ import annotations
+
+import argparse
+import csv
+import sys
+import time
+from collections import defaultdict
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, fields, replace
+from pathlib import Path
+from typing import Annotated, Any, get_args, get_type_hints
+
+import ray
+import torch
+from ray.rllib.algorithms.ppo import PPO, PPOConfig
+from ray.rllib.callbacks.callbacks import RLlibCallback
+from ray.rllib.core import Columns
+from ray.rllib.core.rl_module.apis import ValueFunctionAPI
+from ray.rllib.core.rl_module.rl_module import RLModuleSpec
+from ray.rllib.core.rl_module.torch import TorchRLModule
+from torch import Tensor
+
+from cavmarl.adapters.rllib_env import CavRllibEnv
+from cavmarl.cav_env import parallel_env
+from cavmarl.errors import CavmarlError, ConfigError
+from cavmarl.evaluate.training_record import begin_training, end_training
+from cavmarl.networks import CONFIG_FILE, WEIGHTS_FILE, ActorCritic, NetworkConfig, save_network
+
+WINDOW = 400  # trips
+CURVE_FILE = "progress.csv"
+DRIVER = "driver"  # the policy that all agents share
+
+
+@dataclass(frozen=True)
+class Args:
+    """The settings of a run; each is an option of the command line."""
+
+    env: Annotated[str, "environment: a name, a folder or a map file"] = "merge"
+    num_runners: Annotated[int, "processes that step worlds; 0: this one does"] = 0
+    num_worlds: Annotated[int, "worlds of each runner"] = 4
+    seed: Annotated[int, "root of all random numbers"] = 0
+    total_agent_steps: Annotated[int, "decisions to learn from"] = 1_000_000
+    minutes: Annotated[float, "stop after this time, whatever is left; 0: no limit"] = 0.0
+    num_steps: Annotated[int, "steps of every world between two updates"] = 128
+    epochs: Annotated[int, "passes over the decisions of an update"] = 4
+    minibatches: Annotated[int, "parts that a pass is cut into"] = 8
+    learning_rate: Annotated[float, "of Adam"] = 5e-4
+    gamma: Annotated[float, "discount a step"] = 0.99
+    hidden: Annotated[int, "width of the two hidden layers"] = 64
+    initial_std: Annotated[float, "standard deviation of continuous actions at the start"] = 0.3
+    runs: Annotated[str, "folder of all runs"] = "runs"
+    name: Annotated[str, "folder of this run; empty: ENV_rllib_SEED"] = ""
+
+    def __post_init__(self) -> None:
+        least = {"num_runners": 0}
+        for name in ("num_worlds", "total_agent_steps", "num_steps", "epochs", "minibatches"):
+            least[name] = 1
+        for name, bound in least.items():
+            if getattr(self, name) < bound:
+                option = name.replace("_", "-")
+                raise ConfigError(f"--{option} {getattr(self, name)}: must be at least {bound}")
+
+    @property
+    def folder(self) -> Path:
+        """Where this run lies."""
+        stem = Path(self.env).name.split(".")[0]
+        return Path(self.runs) / (self.name or f"{stem}_rllib_{self.seed}")
+
+
+def parse_args(words: Sequence[str] | None = None) -> Args:
+    """The settings that the command line asks for."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    hints = get_type_hints(Args, include_extras=True)
+    for field in fields(Args):
+        kind, text = get_args(hints[field.name])
+        option = f"--{field.name.replace('_', '-')}"
+        shown = f"{text} (default: {field.default!r})"
+        parser.add_argument(option, type=kind, default=field.default, help=shown)
+    return Args(**vars(parser.parse_args(words)))
+
+
+class Driver(TorchRLModule, ValueFunctionAPI):  # type: ignore[misc] # RLlib is not typed
+    """Our network, as RLlib's algorithms call it."""
+
+    network: ActorCritic
+
+    def setup(self) -> None:
+        """Make the network of `model_config`."""
+        deviation = self.model_config["initial_std"]
+        self.network = ActorCritic(self.model_config["network"], (deviation, deviation))
+
+    def _forward(self, batch: Mapping[str, Tensor], **_: Any) -> dict[str, Tensor]:
+        output = self.network(batch[Columns.OBS])
+        if self.network.continuous:
+            output = torch.cat([output, self.network.log_std.expand_as(output)], dim=-1)
+        return {Columns.ACTION_DIST_INPUTS: output}
+
+    def compute_values(self, batch: Mapping[str, Tensor], embeddings: Any = None) -> Tensor:
+        """Expected returns (N,)."""
+        return self.network.value(batch[Columns.OBS])
+
+
+class Trips(RLlibCallback):  # type: ignore[misc] # RLlib is not typed
+    """Tells RLlib's metrics how trips end. Those that the horizon cut do not count."""
+
+    def on_episode_step(self, *, episode: Any, metrics_logger: Any, **_: Any) -> None:
+        """Add each agent's reward, and its trip if that has ended."""
+        returns = episode.custom_data.setdefault("returns", defaultdict(float))
+        infos = episode.get_infos(-1)
+        for agent, reward in episode.get_rewards(-1).items():
+            returns[agent] += reward
+            if infos[agent]["vehicle_done"]:
+                metrics_logger.log_value("trips", 1, reduce="lifetime_sum")
+                metrics_logger.log_value("trip_return", returns.pop(agent), window=WINDOW)
+                arrived = float(infos[agent]["arrival"] > 0.0)
+                metrics_logger.log_value("success", arrived, window=WINDOW)
+
+
+def make_algorithm(args: Args, network: NetworkConfig) -> PPO:
+    """RLlib's PPO on our worlds."""
+    runners = max(args.num_runners, 1)
+    world_steps = args.num_steps * args.num_worlds * runners
+    decisions = world_steps * parallel_env(args.env).config.population.agents
+    config = (
+        PPOConfig()
+        .environment(CavRllibEnv, env_config={"env": args.env})
+        .env_runners(
+            num_env_runners=args.num_runners,
+            num_envs_per_env_runner=args.num_worlds,
+            rollout_fragment_length=args.num_steps,
+        )
+        .multi_agent(policies={DRIVER}, policy_mapping_fn=lambda *_, **__: DRIVER)
+        .rl_module(
+            rl_module_spec=RLModuleSpec(
+                module_class=Driver,
+                model_config={"network": network, "initial_std": args.initial_std},
+            )
+        )
+        .training(
+            lr=args.learning_rate,
+            gamma=args.gamma,
+            lambda_=0.95,
+            entropy_coeff=0.0,
+            use_kl_loss=False,
+            clip_param=0.2,
+            vf_clip_param=float("inf"),
+            grad_clip=0.5,
+            grad_clip_by="global_norm",
+            train_batch_size_per_learner=world_steps,
+            # Of decisions, though the batch is counted in steps of worlds and bounds it.
+            minibatch_size=min(max(decisions // args.minibatches, 2), world_steps),
+            num_epochs=args.epochs,
+        )
+        .learners(num_learners=0)
+        .callbacks(Trips)
+        .debugging(seed=args.seed, log_level="ERROR")
+    )
+    return config.build_algo()
+
+
+def train(args: Args) -> Path:
+    """Run PPO until its decisions or its minutes are used up; returns the folder of the run.
+
+    Raises:
+        CavmarlError: settings or an environment that cannot work.
+    """
+    torch.set_num_threads(1)  # more cost small networks more than they bring
+    world = parallel_env(args.env, overrides={"observation.kind": "flat"})
+    env = world.config
+    network = NetworkConfig(
+        environment=env.name,
+        observation_size=world.observation_space("car_0").shape[0],  # type: ignore[index]
+        sensors=env.sensors,
+        action=env.action,
+        hidden=(args.hidden, args.hidden),
+        seed=args.seed,
+    )
+    args.folder.mkdir(parents=True, exist_ok=True)
+    begin_training(args.folder, "ppo_rllib.py", asdict(args), world.simulation)
+    ray.init(num_cpus=args.num_runners + 1, include_dashboard=False, log_to_driver=False)
+    algorithm = make_algorithm(args, network)
+    limit_s = 60.0 * args.minutes if args.minutes else float("inf")
+    began_at, updates, decisions, seconds = time.perf_counter(), 0, 0, 0.0
+    with (args.folder / CURVE_FILE).open("w", encoding="utf-8", newline="") as file:
+        writer = csv.writer(file)
+        writer.writerow(("updates", "agent_steps", "seconds", "trips", "trip_return", "success"))
+        while decisions < args.total_agent_steps and seconds < limit_s:
+            found = algorithm.train()["env_runners"]
+            updates, seconds = updates + 1, time.perf_counter() - began_at
+            decisions = int(found["num_module_steps_sampled_lifetime"][DRIVER])
+            trips = [found.get(name, float("nan")) for name in ("trip_return", "success")]
+            row = (updates, decisions, seconds, found.get("trips", 0), *trips)
+            writer.writerow([f"{value:.6g}" for value in row])
+            file.flush()
+    algorithm.learner_group.foreach_learner(
+        lambda learner: save_network(
+            args.folder.absolute(),
+            learner.module[DRIVER].network,
+            replace(network, agent_steps=decisions),
+        )
+    )
+    algorithm.stop()
+    ray.shutdown()
+    end_training(args.folder, (WEIGHTS_FILE, CONFIG_FILE, CURVE_FILE))
+    return args.folder
+
+
+def main(words: Sequence[str] | None = None) -> int:
+    """Train; 0: trained, 2: wrong use."""
+    try:
+        folder = train(parse_args(words))
+    except CavmarlError as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 2
+    print(f"driver: {folder}  (cavmarl evaluate ENV --policy {folder})")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
