@@ -78,7 +78,7 @@ def plan(
     from cavmarl.balance.plan import make_plan
     from cavmarl.balance.plan_text import describe_plan
     from cavmarl.balance.problem import BalanceRule, Problem
-    from cavmarl.evaluate.shard_costs import measure_shards, side_neighbors
+    from cavmarl.evaluate.shard_costs import measure_shards
     from cavmarl.evaluate.sharded_worlds import world_maker
 
     if again is not None:
@@ -105,7 +105,7 @@ def plan(
         measured = measure_shards(simulation, worlds, seed, steps=steps, before=before)
     partition = simulation.partition
     try:
-        made = make_plan(Problem(measured.costs, side_neighbors(partition), seen, rule))
+        made = make_plan(Problem(measured.costs, partition.side_neighbors, seen, rule))
     except NoAdmissibleWorkerError as error:
         raise NoAdmissibleWorkerError(
             f"{error}; --snapshot {IDLE} supposes that nobody else uses them", error.rejections

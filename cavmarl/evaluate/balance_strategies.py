@@ -14,7 +14,6 @@ from cavmarl.balance.problem import BalanceRule, Problem, ShardCost, equal_costs
 from cavmarl.balance.repartition import propose_zones, vehicle_costs
 from cavmarl.balance.smoothing import NEWEST
 from cavmarl.evaluate.load_traces import LoadTrace
-from cavmarl.evaluate.shard_costs import side_neighbors
 from cavmarl.roads.zones import ZonePartition
 
 __all__ = ["STRATEGIES", "LoadStrategy", "Placed", "StaticPlacement"]
@@ -69,7 +68,7 @@ class StaticPlacement:
         self, partition: ZonePartition, costs: tuple[ShardCost, ...], number: int
     ) -> Balancer:
         snapshot = self.trace.rounds[number].snapshot
-        return Balancer(Problem(costs, side_neighbors(partition), snapshot, self.rule))
+        return Balancer(Problem(costs, partition.side_neighbors, snapshot, self.rule))
 
 
 class LoadStrategy(StaticPlacement):

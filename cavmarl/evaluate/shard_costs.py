@@ -11,17 +11,11 @@ from numpy.typing import NDArray
 from cavmarl.balance.problem import ShardCost
 from cavmarl.errors import ConfigError
 from cavmarl.evaluate.sharded_worlds import DrivenWorld
-from cavmarl.roads.zones import ZonePartition
 from cavmarl.runtime.simulation import Simulation
 
-__all__ = ["MeasuredRound", "MeasuredWorlds", "measure_rounds", "measure_shards", "side_neighbors"]
+__all__ = ["MeasuredRound", "MeasuredWorlds", "measure_rounds", "measure_shards"]
 
 PARTS = 5
-
-
-def side_neighbors(partition: ZonePartition) -> tuple[tuple[int, ...], ...]:
-    """For each zone those that share a side with it; hardly anybody drives over a corner."""
-    return tuple(tuple(near.zone for near in row if not near.corner) for row in partition.neighbors)
 
 
 @dataclass(frozen=True)

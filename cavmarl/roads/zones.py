@@ -112,6 +112,11 @@ class ZonePartition:
             for a in range(self.count)
         )
 
+    @property
+    def side_neighbors(self) -> tuple[tuple[int, ...], ...]:
+        """For each zone those that share a side with it: hardly anybody drives over a corner."""
+        return tuple(tuple(near.zone for near in row if not near.corner) for row in self.neighbors)
+
     @cached_property
     def content_hash(self) -> str:
         """SHA-256 of which place belongs to which zone, hex: for manifests."""

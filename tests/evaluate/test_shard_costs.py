@@ -6,9 +6,8 @@ import numpy as np
 import pytest
 
 from cavmarl.errors import ConfigError
-from cavmarl.evaluate.shard_costs import measure_rounds, measure_shards, side_neighbors
+from cavmarl.evaluate.shard_costs import measure_rounds, measure_shards
 from cavmarl.evaluate.sharded_worlds import DrivenWorld, world_maker
-from cavmarl.roads.zone_layouts import cut_map
 from cavmarl.runtime.simulation import Simulation
 
 
@@ -47,11 +46,6 @@ def test_what_drivers_would_do_is_no_cost(simulation: Simulation) -> None:
     clock = simulation.time_shards()
     simulation.suggest(np.zeros((*simulation.outputs.present.shape, 2)))
     assert not clock.take_s().any()
-
-
-def test_corners_are_no_sides(simulation: Simulation) -> None:
-    partition = cut_map(simulation.network, "grid", 4)
-    assert side_neighbors(partition) == ((1, 2), (0, 3), (0, 3), (1, 2))
 
 
 def test_numbers_are_checked(simulation: Simulation) -> None:

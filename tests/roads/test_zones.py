@@ -31,6 +31,7 @@ def test_no_places_have_no_zones() -> None:
 
 def test_neighbors_touch_along_a_side_or_at_a_corner() -> None:
     assert four().neighbors[0] == (Neighbor(1, False), Neighbor(2, False), Neighbor(3, True))
+    assert four().side_neighbors == ((1, 2), (0, 3), (0, 3), (1, 2))
     assert [[other.zone for other in row] for row in PINWHEEL.neighbors] == [
         [1, 3, 4], [0, 2, 4], [1, 3, 4], [0, 2, 4], [0, 1, 2, 3]
     ]  # fmt: skip
