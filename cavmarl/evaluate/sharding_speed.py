@@ -1,8 +1,9 @@
 """What it costs to divide a world, by phases of the tick, beside the same world undivided.
 
 All zones run in this process on one core, so the whole of the work is seen. Every number of zones
-has two worlds, one with a stopwatch on every phase. All worlds are advanced by turns, and ratios
-are taken within a turn: what else the machine does falls on all of them.
+has two worlds, one with a stopwatch on every phase. All worlds are advanced by turns, each of them
+a part of its turn at a time, and ratios are taken within a turn: what else the machine does falls
+on all of them.
 """
 
 from __future__ import annotations
@@ -17,12 +18,12 @@ from cavmarl.config import MAX_ZONES
 from cavmarl.errors import ConfigError, UnequalWorldsError
 from cavmarl.evaluate.sharding_turns import Turn, TwinWorlds
 from cavmarl.evaluate.step_speed import one_core
-from cavmarl.evaluate.stopwatch import Stopwatch
 from cavmarl.runtime.simulation import Simulation
 
 __all__ = ["TURN_S", "ShardingSpeed", "ZoneCost", "check_numbers", "measure_sharding"]
 
 TURN_S = 10
+PARTS = 5  # of a turn, of all worlds in between
 LIMITS = {"after": 3600, "repeats": 100}
 
 
@@ -123,20 +124,24 @@ def measure_sharding(
     """
     check_numbers(zones, after_s, repeats)
     counts = sorted({1, *zones})
-    watch = Stopwatch()
     with one_core():
         progress("making the worlds")
-        worlds = [TwinWorlds(make, count, watch, make_checked) for count in counts]
+        worlds = [TwinWorlds(make, count, make_checked) for count in counts]
         first = worlds[0].plain.simulation
         clock = first.config.clock
         for count, own in zip(counts, worlds, strict=True):
             progress(f"the first {after_s} s in {count} zones")
             own.run(round(after_s / clock.ctrl_dt_s))
+            own.end_turn()
         _check_equal(worlds)
         for repeat in range(repeats):
             progress(f"measuring, {repeat + 1} of {repeats}")
+            steps = round(TURN_S / clock.ctrl_dt_s)
+            for part in range(PARTS):
+                for own in worlds:
+                    own.run(steps * (part + 1) // PARTS - steps * part // PARTS)
             for own in worlds:
-                own.turns.append(own.run(round(TURN_S / clock.ctrl_dt_s)))
+                own.turns.append(own.end_turn())
             _check_equal(worlds)
     return ShardingSpeed(
         map_name=first.network.name,

@@ -1,9 +1,13 @@
-"""Turns of one world in some number of zones, without a stopwatch and with one on every phase."""
+"""Turns of one world in some number of zones, without a stopwatch and with one on every phase.
+
+A turn is run in parts, so that those of all worlds can be taken in between: the machine's other
+work does not fall on one of them alone.
+"""
 
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 
@@ -33,7 +37,7 @@ _PHASE_OF = {phase: phase for phase in PHASES} | {
 
 @dataclass(frozen=True)
 class Turn:
-    """One turn of one world: sums over its steps.
+    """One turn of one world, or a part of it: sums over its steps.
 
     Attributes:
         ns: in steps.
@@ -85,7 +89,6 @@ class TwinWorlds:
     Args:
         make: the world in k zones, at the start of an episode.
         zones: k.
-        watch: for the second one.
         make_checked: the same world with the monitor of invariants; None: it is not measured.
 
     Attributes:
@@ -100,35 +103,39 @@ class TwinWorlds:
         self,
         make: Callable[[int], Simulation],
         zones: int,
-        watch: Stopwatch,
         make_checked: Callable[[int], Simulation] | None = None,
     ) -> None:
         self.zones = zones
         self.turns: list[Pair] = []
         self.plain, self.timed = DrivenWorld(make(zones)), DrivenWorld(make(zones))
-        self.timed.simulation.instrument(watch.around)
+        self._watch = Stopwatch()
+        self.timed.simulation.instrument(self._watch.around)
         self.checked: DrivenWorld | None = None
         if make_checked is not None and zones > 1:
             self.checked = DrivenWorld(make_checked(zones))
-        self._watch = watch
+        self._parts: list[list[Turn]] = [[] for _ in self.worlds]
 
     @property
     def worlds(self) -> list[DrivenWorld]:
         """All of them."""
         return [self.plain, self.timed, *([] if self.checked is None else [self.checked])]
 
-    def run(self, steps: int) -> Pair:
-        """The next steps of all.
+    def run(self, steps: int) -> None:
+        """The next steps of all, as a part of the present turn."""
+        if not self._parts[0]:
+            self._watch.clear()
+        for world, parts in zip(self.worlds, self._parts, strict=True):
+            parts.append(_run(world, steps, self._watch))
+
+    def end_turn(self) -> Pair:
+        """The turn that has been run; another one begins.
 
         Raises:
-            ConfigError: nobody drives in them.
+            ConfigError: nobody drives in it.
         """
+        plain, timed, *checked = (_joined(parts) for parts in self._parts)
         watch = self._watch
-        plain = _run(self.plain, steps, watch)
-        watch.clear()
-        timed = _run(self.timed, steps, watch)
         watch.forget("suggest", "loads")
-        checked = None if self.checked is None else _run(self.checked, steps, watch)
         if not plain.vehicles:
             raise ConfigError("nobody drives: another --after, or more demand")
         share = 1.0 / (plain.vehicles * self.plain.simulation.config.clock.ticks_per_step)
@@ -138,8 +145,24 @@ class TwinWorlds:
         for name, ns in calls.items():
             phases[_PHASE_OF.get(name, "other")] += ns
         phases["other"] += timed_ns - sum(phases.values())
-        checked_ns = None if checked is None else checked.ns * share
+        checked_ns = checked[0].ns * share if checked else None
+        for parts in self._parts:
+            parts.clear()
         return Pair(plain, timed, plain.ns * share, timed_ns, checked_ns, phases, calls)
+
+
+def _joined(parts: Sequence[Turn]) -> Turn:
+    """One turn of its parts."""
+    return Turn(
+        ns=sum(part.ns for part in parts),
+        steps=sum(part.steps for part in parts),
+        vehicles=sum(part.vehicles for part in parts),
+        ghosts=sum(part.ghosts for part in parts),
+        imbalance=sum(part.imbalance for part in parts),
+        largest=sum(part.largest for part in parts),
+        moves=tuple(move for part in parts for move in part.moves),
+        move_ns=tuple(ns for part in parts for ns in part.move_ns),
+    )
 
 
 def _run(world: DrivenWorld, steps: int, watch: Stopwatch) -> Turn:

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from cavmarl.kernels import inlined_kernel, kernel
 from cavmarl.kernels.arrays import Zoned
-from cavmarl.kernels.zones import Halo, ZoneArrays, squared_distance, zone_of
+from cavmarl.kernels.zones import Halo, ZoneArrays, is_inside, squared_distance, zone_of
 
 __all__ = ["exchange", "take_own"]
 
@@ -37,7 +37,8 @@ def exchange(
         halo: from `roads.zone_halo.zone_halo`, for the same partition.
         touching_m: no ghost further outside of a zone can touch one of its vehicles.
         border_m: who is so near another zone is noted; 0: who lies in one.
-        zoned: the ghosts and how many there are, border and num_border are written.
+        zoned: the ghosts and how many there are, border and num_border are written. Of the owned
+            rows those in `outer` are looked at, where they are noted.
         side: whose rows, 0 or 1.
         first: the first world.
         last: the one after the last.
@@ -68,14 +69,14 @@ def _publish(
     limit = halo.halo_m * halo.halo_m
     near_limit = touching_m * touching_m
     border_limit = border_m * border_m
-    min_x, min_y = halo.inner[zone, 0], halo.inner[zone, 1]
-    max_x, max_y = halo.inner[zone, 2], halo.inner[zone, 3]
+    noted = zoned.num_outer[zone, w]
     found = 0
-    for i in range(zoned.num_owned[zone, w]):
+    for n in range(noted if noted >= 0 else zoned.num_owned[zone, w]):
+        i = zoned.outer[zone, w, n] if noted >= 0 else n
         row = zoned.rows[side, zone, w, i]
         x = row["x"]
         y = row["y"]
-        if min_x < x and x < max_x and min_y < y and y < max_y:
+        if is_inside(halo.inner[zone], x, y):
             continue
         at_border = False
         here = zone_of(zones, x, y)
@@ -91,6 +92,7 @@ def _publish(
             zoned.border[zone, w, found] = i
             found += 1
     zoned.num_border[zone, w] = found
+    zoned.num_outer[zone, w] = -1
 
 
 @inlined_kernel

@@ -59,6 +59,7 @@ def leave(
             rows[w, last_owned] = rows[w, last]  # a ghost moves up
             worlds.num_owned[w] = last_owned
             worlds.num_rows[w] = last
+            worlds.num_outer[w] = -1
 
 
 @kernel

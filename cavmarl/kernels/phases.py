@@ -59,6 +59,7 @@ class Members(NamedTuple):
     numbers: NDArray[np.int64]  # (n,) which ones, rising
     frames: NDArray[np.void]  # FRAME (n,) of the spatial index of each
     zones: ZoneArrays  # of the partition
+    halo: Halo
     zoned: Zoned
     common: Common
 
@@ -85,6 +86,8 @@ def _worlds(members: Members, zone: int, side: int, next_side: int) -> Worlds:
         zoned.num_contacts[zone],
         zoned.step[zone],
         zoned.step_at[zone],
+        zoned.outer[zone],
+        zoned.num_outer[zone],
     )
 
 
@@ -132,6 +135,7 @@ def advance_each(
             travel,
             lane_grid,
             _worlds(members, zone, side, next_side),
+            members.halo.inner[zone],
             scratch,
             commands,
             discrete,
@@ -203,7 +207,8 @@ def propose_each(
 
 
 @kernel
-def admit_each(members: Members, side: int, next_side: int, halo: Halo, gate: Gate) -> None:
+def admit_each(members: Members, side: int, next_side: int, gate: Gate) -> None:
     """`admit` in each zone."""
     for zone in members.numbers:
-        admit(members.zones, halo, zone, gate, _worlds(members, zone, side, next_side))
+        worlds = _worlds(members, zone, side, next_side)
+        admit(members.zones, members.halo, zone, gate, worlds)

@@ -35,6 +35,7 @@ from cavmarl.kernels.neighbors import Grid
 from cavmarl.kernels.scalars import clamp
 from cavmarl.kernels.steering import nearest_speed, steer_to_lane, take_meta_action
 from cavmarl.kernels.ways import own_step
+from cavmarl.kernels.zones import is_inside
 
 __all__ = ["advance", "begin_step", "resolve", "suggest"]
 
@@ -146,6 +147,7 @@ def advance(
     travel: Travel,
     lane_grid: LaneGrid,
     worlds: Worlds,
+    inner: NDArray[np.float64],
     scratch: Scratch,
     commands: NDArray[np.float64],
     discrete: bool,
@@ -162,6 +164,7 @@ def advance(
         travel: types and ways.
         lane_grid: which lanes lie near a place.
         worlds: next_rows is written.
+        inner: the part of the zone that no other one sees; see `Halo`.
         scratch: room.
         commands: (W, A, 2) throttle in m/s² and steering in rad of continuous actions.
         discrete: whether agents are driven by the controllers instead.
@@ -202,6 +205,7 @@ def advance(
         else:
             _keep_order(owned, scratch)
         through = 0
+        outer = 0
         touching = 0
         for k in range(owned):
             i = scratch.order[k]
@@ -209,7 +213,16 @@ def advance(
                 worlds.next_rows[w, k] = rows[i]
             row = worlds.next_rows[w, k]
             touching += row["hit"] >= 0
-            if row["driver"] != DRIVER_BACKGROUND:
+            if row["driver"] == DRIVER_BACKGROUND:
+                row["events"] = 0
+                row["hold"] = scratch.hold[i]
+                row["blinker"] = scratch.blinker[i]
+                if scratch.link_ahead[i] >= 0 and row["wait_s"] >= STOP_SIGN_S:
+                    row["stopped_at"] = scratch.link_ahead[i]
+                accel, change = scratch.accel[i], scratch.lane_change[i]
+                move_background(roads, travel, row, step[i], accel, change, dt)
+                through += row["events"] & EVENT_ARRIVED
+            else:
                 _drive_agent(
                     roads,
                     plans,
@@ -224,16 +237,10 @@ def advance(
                     steering_limit,
                     dt,
                 )
-                continue
-            row["events"] = 0
-            row["hold"] = scratch.hold[i]
-            row["blinker"] = scratch.blinker[i]
-            if scratch.link_ahead[i] >= 0 and row["wait_s"] >= STOP_SIGN_S:
-                row["stopped_at"] = scratch.link_ahead[i]
-            move_background(
-                roads, travel, row, step[i], scratch.accel[i], scratch.lane_change[i], dt
-            )
-            through += row["events"] & EVENT_ARRIVED
+            if not is_inside(inner, row["x"], row["y"]):
+                worlds.outer[w, outer] = k
+                outer += 1
+        worlds.num_outer[w] = outer
         worlds.num_through[w] = through
         worlds.num_touching[w] = touching
         arrived += through

@@ -16,11 +16,12 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from cavmarl.kernels import kernel
+from cavmarl.kernels import inlined_kernel, kernel
 
 __all__ = [
     "Halo",
     "ZoneArrays",
+    "is_inside",
     "squared_distance",
     "zone_of",
     "zones_of",
@@ -81,6 +82,13 @@ def zones_of(zones: ZoneArrays, rows: NDArray[np.void], num: int, out: NDArray[n
     """
     for i in range(num):
         out[i] = zone_of(zones, rows[i]["x"], rows[i]["y"])
+
+
+@inlined_kernel
+def is_inside(rect: NDArray[np.float64], x: float, y: float) -> bool:
+    """Whether a place is within a rectangle and not on its rim."""
+    inside: bool = rect[0] < x and x < rect[2] and rect[1] < y and y < rect[3]
+    return inside
 
 
 @kernel

@@ -118,6 +118,7 @@ class Division:
                     self.zones, shard.zone, everybody, len(everybody), worlds.rows[w]
                 )
                 worlds.num_contacts[w] = 0
+                worlds.num_outer[w] = -1
             self._exchange(first.rows, w, w + 1)
 
     def exchange(self) -> None:
@@ -308,7 +309,7 @@ class Division:
 
     def running(self) -> NDArray[np.int64]:
         """(W,) vehicles of each world."""
-        return _total([shard.worlds.num_owned for shard in self._shards])
+        return np.asarray(self._zoned.num_owned.sum(axis=0))
 
     def loads(self) -> ZoneLoads:
         """What each zone holds."""

@@ -49,6 +49,7 @@ class ShardGroup:
             np.array([shard.zone for shard in shards]),
             np.array(frames, dtype=FRAME),
             first.zones,
+            first.halo,
             first.zoned,
             Common(*(getattr(first.worlds, name) for name in Common._fields)),
         )
@@ -141,7 +142,7 @@ class ShardGroup:
     def admit(self, gate: Gate) -> None:
         """Take in those whom the gate has accepted, as owned or as ghosts."""
         first = self._first
-        self._admit(self._members, first.side, first.next_side, first.halo, gate)
+        self._admit(self._members, first.side, first.next_side, gate)
 
     def commit(self) -> None:
         """Make the next rows the committed state."""

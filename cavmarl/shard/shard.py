@@ -272,6 +272,8 @@ def make_worlds(
         num_contacts=zoned.num_contacts[zone],
         step=zoned.step[zone],
         step_at=zoned.step_at[zone],
+        outer=zoned.outer[zone],
+        num_outer=zoned.num_outer[zone],
     )
     if common is None:
         return worlds
@@ -293,6 +295,8 @@ def make_zoned(num_zones: int, num_worlds: int, capacity: int) -> Zoned:
         num_contacts=numbers[5],
         step=np.zeros(everybody, dtype=PLAN),
         step_at=np.zeros(everybody, dtype=np.int64),
+        outer=np.zeros(everybody, dtype=np.int32),
+        num_outer=np.full((num_zones, num_worlds), -1),
         border=np.zeros(everybody, dtype=np.int32),
         num_border=numbers[6],
         spare=np.zeros(1, dtype=VEHICLE),
