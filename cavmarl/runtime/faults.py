@@ -14,7 +14,7 @@ from cavmarl.errors import CavmarlError
 from cavmarl.ownership.endpoint import Endpoint
 from cavmarl.ownership.messages import COORDINATOR, Begin, Commit, Output, Prepare, Step
 from cavmarl.runtime.coordinator import Coordinator
-from cavmarl.runtime.executor import Phase
+from cavmarl.runtime.executor import Executor, Phase, SerialExecutor
 from cavmarl.runtime.fault_plan import PHASES, Crash, Faults
 from cavmarl.runtime.post import Parcel
 from cavmarl.shard.shard import Shard
@@ -128,35 +128,35 @@ class FaultyPhases:
     """
 
     def __init__(self, shards: Sequence[Shard], crashes: Crashes) -> None:
-        self._shards = tuple(shards)
+        self._hosts = [(shard.zone, SerialExecutor((shard,))) for shard in shards]
         self._crashes = crashes
         self.on = False
 
     def each(self, phase: Phase, *arguments: Any) -> None:
         """Call the method `phase` of every shard, in order, while all live."""
         watched = self.on and phase in PHASES
-        for shard in self._shards:
+        for zone, host in self._hosts:
             if watched:
-                _call_hosted(shard, phase, arguments)
-                self._crashes.zone(phase, shard.zone)
+                _call_hosted(zone, host, phase, arguments)
+                self._crashes.zone(phase, zone)
             else:
-                getattr(shard, phase)(*arguments)
+                host.each(phase, *arguments)
         if watched:
             self._crashes.coordinator(phase)
 
 
-def _call_hosted(shard: Shard, phase: Phase, arguments: tuple[Any, ...]) -> None:
-    """Call a shard as its host does: whatever nobody has foreseen ends the host and no more.
+def _call_hosted(zone: int, host: Executor, phase: Phase, arguments: tuple[Any, ...]) -> None:
+    """Run a phase in a host's process: whatever nobody has foreseen ends the host and no more.
 
     Raises:
         ZoneDeath: something else than cavmarl's own errors was raised.
     """
     try:
-        getattr(shard, phase)(*arguments)
+        host.each(phase, *arguments)
     except CavmarlError:
         raise
     except Exception as error:
-        raise ZoneDeath(shard.zone, phase, False, f"of {error!r}") from error
+        raise ZoneDeath(zone, phase, False, f"of {error!r}") from error
 
 
 class FaultyCoordinator(Coordinator):

@@ -10,7 +10,9 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from cavmarl import CavVectorEnv, make_vec
 from cavmarl.errors import ConfigError, MapError, ReproducerError, ZoneStepError
@@ -68,7 +70,7 @@ def test_the_tick_fails_as_it_did_and_without_its_faults_is_the_undivided_one(
 
 
 class Poison:
-    """Makes a phase of a zone raise on one state, wherever and however often it is run.
+    """Lets a zone raise on one state, wherever and however often it senses there.
 
     Args:
         zone: which.
@@ -77,24 +79,24 @@ class Poison:
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch, zone: int, tick: int) -> None:
         self.calls = 0
-        resolve = Shard.resolve
+        sense = Shard.sense
 
-        def poisoned(shard: Shard) -> None:
-            resolve(shard)
+        def poisoned(shard: Shard, chosen: NDArray[np.bool_]) -> None:
+            sense(shard, chosen)
             if shard.zone == zone and shard.worlds.ticks[0] == tick:
                 self.calls += 1
                 raise ZeroDivisionError("poison")
 
-        monkeypatch.setattr(Shard, "resolve", poisoned)
+        monkeypatch.setattr(Shard, "sense", poisoned)
 
 
 def test_a_state_that_the_code_breaks_on_is_found_again(
     busy: Recorded, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    poison = Poison(monkeypatch, zone=2, tick=13)
+    poison = Poison(monkeypatch, zone=2, tick=14)
     kept = poisoned(busy, None, tmp_path)
     assert (kept.zone, kept.tick, kept.is_first, kept.is_last) == (2, 14, False, True)
-    assert "the last one at 'resolve', of ZeroDivisionError('poison')" in kept.cause
+    assert "the last one at 'sense', of ZeroDivisionError('poison')" in kept.cause
     assert poison.calls == 4
     world = world_of(kept)
     for path in tmp_path.iterdir():  # the folder is another machine's
@@ -111,7 +113,7 @@ def test_a_state_that_the_code_breaks_on_is_found_again(
 def test_without_the_folder_an_exception_of_a_zone_is_what_it_is(
     busy: Recorded, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    poison = Poison(monkeypatch, zone=2, tick=13)
+    poison = Poison(monkeypatch, zone=2, tick=14)
     with pytest.raises(ZeroDivisionError):
         follow(busy, make_vec(busy.env, num_envs=1, zones=ZONES, overrides=busy.settings))
     assert poison.calls == 1
@@ -120,7 +122,7 @@ def test_without_the_folder_an_exception_of_a_zone_is_what_it_is(
 def test_an_undivided_world_has_one_host(
     busy: Recorded, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    Poison(monkeypatch, zone=0, tick=13)
+    Poison(monkeypatch, zone=0, tick=14)
     settings = {"zones.reproducers": str(tmp_path)}
     whole = make_vec(busy.env, num_envs=1, overrides=busy.settings | settings)
     with pytest.raises(ZoneStepError, match="zone 0 could not reach tick 14") as died:
