@@ -139,8 +139,9 @@ class ZonesConfig:
         journal: file for the coordinator's log; empty: none. It must not exist.
         check: watch the invariants of ownership at run time.
         faults: a plan of faults to inject, as JSON or a file of it; empty: none.
-        reproducers: folder for a tick that every host of a zone died of, from which it can be run
-            again; empty: the system's folder for temporary files.
+        reproducers: folder for ticks that every host of a zone died of, from which they can be run
+            again. With it, what a zone's code raises is the death of its host. Empty: only where
+            faults kill hosts, and then the system's folder for temporary files.
     """
 
     layout: str = "bisection"

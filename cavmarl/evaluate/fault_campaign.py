@@ -166,8 +166,7 @@ def run_campaign(
     settings = (dict(BUSY) if env is None else {}) | dict(overrides or {})
     campaign = Campaign(str(ENV if env is None else env), counts, steps)
     with TemporaryDirectory() as folder:
-        settings["zones.reproducers"] = folder
-        stage = _Stage(ENV if env is None else env, settings, steps, seed, policy)
+        stage = _Stage(ENV if env is None else env, settings, steps, seed, policy, folder)
         _run_matrix(stage, campaign, seeds, progress)
     return campaign
 
@@ -201,6 +200,7 @@ class _Stage:
         steps: of each run.
         seed: of the world and its driver.
         policy: as in `load_policy`.
+        folder: for ticks that nobody survives.
     """
 
     def __init__(
@@ -210,8 +210,10 @@ class _Stage:
         steps: int,
         seed: int,
         policy: str | Path,
+        folder: str,
     ) -> None:
         self.env = env
+        self._folder = folder
         self.seed = seed
         clock = load_world(env, overrides=dict(settings))[0].clock
         episode_s = clock.ctrl_dt_s * max(1, steps // EPISODES)
@@ -305,6 +307,8 @@ class _Stage:
 
     def _divided(self, count: int, plan: Faults) -> CavVectorEnv:
         faults = {"zones.faults": plan.to_json()}
+        if plan.may_crash:
+            faults["zones.reproducers"] = self._folder
         return make_vec(self.env, num_envs=1, zones=count, overrides=self._settings | faults)
 
     def _drive(self, vec: CavVectorEnv) -> Iterator[tuple[int, bool]]:

@@ -11,6 +11,7 @@ from cavmarl.errors import require
 from cavmarl.evaluate.evaluation import load_map, load_report, load_tables, load_tracks
 from cavmarl.evaluate.manifest import write_text
 from cavmarl.evaluate.metrics import METRICS, Metric
+from cavmarl.evaluate.page_transfers import transfer_rows
 from cavmarl.evaluate.report import Difference, EvaluationReport, Found
 from cavmarl.evaluate.statistics import Interval
 
@@ -58,6 +59,7 @@ def _content(folder: Path, report: EvaluationReport) -> dict[str, Any]:
         "reward_rows": _rows(report, rewards=True),
         "differences": _differences(report, others),
         "runs": _runs(report),
+        "transfers": transfer_rows(report),
         "outcomes": plots.plot_outcomes(report),
         "metrics": plots.plot_metrics(report),
         "distributions": plots.plot_distributions(tables),
@@ -156,6 +158,7 @@ def _facts(manifest: Mapping[str, Any]) -> dict[str, str]:
         "configuration": f"{world['environment']}, SHA-256 {world['config_sha256']}",
         "map": f"{world['map']}, SHA-256 of its content {world['map_content_sha256']}",
         "demand": f"SHA-256 of its content {world.get('demand_content_sha256') or '- (generated)'}",
+        "zones": f"{world.get('zones', 1)}, SHA-256 {world.get('zones_content_sha256') or '-'}",
         "kernels": str(world["kernels"]),
         "seeds of the runs": ", ".join(map(str, manifest["seeds"])),
         "processes": str(manifest["plan"]["processes"]),

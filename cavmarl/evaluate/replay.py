@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from tempfile import gettempdir
 
 from cavmarl.config import EnvConfig
 from cavmarl.config_io import validate
@@ -56,7 +57,10 @@ def replay_tick(kept: Reproducer, world: World, *, faults: bool = True) -> str:
         Exception: without faults whatever a zone's code raises, from where it does.
     """
     config = world.config
-    zones = config.zones if faults else replace(config.zones, faults="")
+    if faults:  # hosts may die as they did, wherever the folder was; nothing is written
+        zones = replace(config.zones, reproducers=gettempdir())
+    else:
+        zones = replace(config.zones, reproducers="", faults="")
     simulation = Simulation(
         replace(config, zones=zones), world.network, 1, world.demand, world.partition
     )

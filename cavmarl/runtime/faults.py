@@ -14,7 +14,7 @@ from cavmarl.errors import CavmarlError
 from cavmarl.ownership.endpoint import Endpoint
 from cavmarl.ownership.messages import COORDINATOR, Begin, Commit, Output, Prepare, Step
 from cavmarl.runtime.coordinator import Coordinator
-from cavmarl.runtime.executor import Phase
+from cavmarl.runtime.executor import Executor, Phase
 from cavmarl.runtime.fault_plan import PHASES, Crash, Faults
 from cavmarl.runtime.post import Parcel
 from cavmarl.shard.group import ShardGroup
@@ -146,8 +146,8 @@ class FaultyPhases:
             self._crashes.coordinator(phase)
 
 
-def _call_hosted(zone: int, host: ShardGroup, phase: Phase, arguments: tuple[Any, ...]) -> None:
-    """Call a zone as its host does: whatever nobody has foreseen ends the host and no more.
+def _call_hosted(zone: int, host: Executor, phase: Phase, arguments: tuple[Any, ...]) -> None:
+    """Run a phase in a host's process: whatever nobody has foreseen ends the host and no more.
 
     Raises:
         ZoneDeath: something else than cavmarl's own errors was raised.

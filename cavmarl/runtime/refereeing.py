@@ -72,19 +72,24 @@ def make_refereeing(
         safeguards: remedies of the protocol; tests take one away.
 
     Raises:
-        ConfigError: faults that cannot be, or deaths in several worlds at once.
+        ConfigError: faults that cannot be, deaths in several worlds at once, or no folder for
+            reproducers.
         JournalError: a journal cannot be begun.
     """
     limits = limits_of(settings, division.codec.schema)
     faults = read_faults(settings.faults) if settings.faults else None
-    deaths = faults is not None and faults.may_crash
+    if settings.reproducers and faults is None:
+        faults = Faults()  # none on purpose
+    deaths = faults is not None and (faults.may_crash or bool(settings.reproducers))
     if faults is not None:
         faults.check_zones(division.count)
     if deaths and division.num_worlds > 1:
         raise ConfigError(
-            f"zones.faults: hosts die in one world at a time, not in {division.num_worlds}; "
-            "messages may be lost in any number"
+            "zones.faults and zones.reproducers: hosts die in one world at a time, not in "
+            f"{division.num_worlds}; messages may be lost in any number"
         )
+    if settings.reproducers and not Path(settings.reproducers).is_dir():
+        raise ConfigError(f"zones.reproducers = {settings.reproducers!r}: no such folder; make it")
     crashes = Crashes(faults) if faults is not None and deaths else None
     states = [RowStates(division, w) for w in range(division.num_worlds)]
     transfers = tuple(TransferLog(limits.lifetime, known.borders) for known in states)

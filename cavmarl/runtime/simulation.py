@@ -155,7 +155,8 @@ class Simulation:
             if is_first or warm:
                 self._call_every_kernel()
             zones = config.zones
-            if self.partition.count > 1 or zones.journal or zones.check or zones.faults:
+            watched = zones.journal or zones.check or zones.faults or zones.reproducers
+            if self.partition.count > 1 or watched:
                 self._let_coordinate()
 
     def _let_coordinate(self) -> None:

@@ -172,6 +172,25 @@ def test_one_run_says_that_there_is_no_interval(tmp_path: Path) -> None:
     assert "no interval between runs" in (tmp_path / "one.html").read_text(encoding="utf-8")
 
 
+def test_a_divided_world_shows_the_changes_of_zone(page: Path, tmp_path: Path) -> None:
+    small = {**SMALL, "background": 40, "overrides": {"zones.count": 4}}
+    found = evaluate("grid4x4", "idm", out=tmp_path / "four", **small)["idm"].transfers
+    assert found is not None
+    assert found.transfers > 0
+    write_page(tmp_path / "four", tmp_path / "four.html")
+    text = (tmp_path / "four.html").read_text(encoding="utf-8")
+    (block,) = re.findall(r'<table id="transfers">(.*?)</table>', text, re.DOTALL)
+    shown = dict(re.findall(r'<td title=".*?">(.*?)</td><td class="mean">(.*?)</td>', block))
+    assert shown["changes"] == f"{found.transfers:,}"
+    assert shown["forced"] == str(found.forced)
+    depths = (found.switch_depth_m, found.release_depth_m)
+    for name, spread in zip(("SWITCH", "RELEASE"), depths, strict=True):
+        cell = " / ".join(f"{value:.2f}" for value in spread if value is not None)
+        assert shown[f"depth at {name} <small>m</small>"] == cell
+    assert "zone imbalance" in text
+    assert 'id="transfers"' not in page.read_text(encoding="utf-8"), "that one is undivided"
+
+
 def test_a_page_of_results_without_a_manifest_is_refused(tmp_path: Path) -> None:
     with pytest.raises(ManifestError):
         write_page(tmp_path, tmp_path / "page.html")

@@ -1,10 +1,9 @@
-"""AT1 to AT8 of the acceptance tests, on whole worlds: nobody can tell who computed what."""
+"""AT1 to AT9 and AT13 on whole worlds (AT8 in test_safeguards.py): nobody can tell who did what."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -14,10 +13,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from cavmarl import make_vec
-from cavmarl.errors import CavmarlError, InvalidActionError
+from cavmarl.errors import InvalidActionError
 from cavmarl.evaluate.fault_figures import FaultFigures
 from cavmarl.ownership.messages import Begin, Commit, Message, Record, Reset
-from cavmarl.ownership.safeguards import ALL_ON
 from cavmarl.ownership.transport import Network, Rates
 from cavmarl.roads.cache import load_network
 from cavmarl.roads.zone_file import write_zones
@@ -29,7 +27,6 @@ from cavmarl.runtime.fault_plan import (
     Crash,
     Faults,
 )
-from cavmarl.runtime.refereeing import make_refereeing
 from cavmarl.worlds import find_map
 from tests.actuated import actuated_grid
 from tests.demand_worlds import make, tiny
@@ -230,41 +227,6 @@ def test_at07_when_faults_end_open_hand_overs_do_too(busy: Recorded) -> None:
     assert max(forced) <= until + deferral + 2
     assert not any(begin.deferred for begin in begins if begin.tick > until + deferral + 2)
     assert vec.simulation.transfers[0].counts["switched"] > 0
-
-
-# AT8: remedies that a whole world is seen to need. Those that only a certain order of messages
-# needs, or that another one stands behind, have their scenario in tests/ownership/scenarios.py.
-NEEDED: dict[str, Faults] = {
-    "one_step_lease": Faults(),
-    "double_buffer": Faults(crashes=(Crash(9, "all done"),)),
-    "log_before_send": Faults(
-        messages={"Ack": Rates(drop=0.5)},
-        crashes=tuple(Crash(tick, "STEP sent") for tick in range(3, 30)),
-    ),
-    "reattach": Faults(
-        crashes=tuple(
-            Crash(tick, "STEP arrives", zone) for tick in range(3, 30) for zone in range(4)
-        )
-    ),
-    "done_tick": Faults(messages={"Done": Rates(duplicate=1.0, longest_delay=20)}),
-    "answer_again": Faults(messages={"Done": Rates(drop=0.5)}),
-    "deadline": Faults(messages={"Ack": Rates(drop=1.0)}),
-}
-
-
-@pytest.mark.parametrize("name", NEEDED)
-def test_at08_without_a_safeguard_somebody_can_tell(
-    busy: Recorded, name: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    without = partial(make_refereeing, safeguards=replace(ALL_ON, **{name: False}))
-    monkeypatch.setattr("cavmarl.runtime.simulation.make_refereeing", without)
-    with pytest.raises((AssertionError, CavmarlError, KeyError)):
-        replay(busy, 4, NEEDED[name])
-
-
-@pytest.mark.parametrize("name", NEEDED)
-def test_at08_with_all_safeguards_nobody_can(busy: Recorded, name: str) -> None:
-    replay(busy, 4, NEEDED[name])
 
 
 @settings(max_examples=12, deadline=None)

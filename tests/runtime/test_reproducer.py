@@ -10,10 +10,12 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from cavmarl import CavVectorEnv, make_vec
-from cavmarl.errors import MapError, ReproducerError, ZoneStepError
+from cavmarl.errors import ConfigError, MapError, ReproducerError, ZoneStepError
 from cavmarl.evaluate.replay import changed_versions, replay_tick, world_of
 from cavmarl.ownership.transport import Rates
 from cavmarl.runtime.fault_plan import Crash, Faults
@@ -24,8 +26,6 @@ from tests.rerouting import CARS, DEVICE, FLOW, make_map, rerouter, write_demand
 
 ZONES = 4
 STEPS = 12
-# Somebody may die, and nobody does: so there is a store.
-CALM = Faults(crashes=(Crash(1 << 40, "advance", 0),))
 
 
 @pytest.fixture(scope="module")
@@ -33,12 +33,14 @@ def busy() -> Recorded:
     return record("grid4x4", BUSY, STEPS)
 
 
-def worlds(run: Recorded, faults: Faults, folder: Path) -> CavVectorEnv:
-    settings = {"zones.faults": faults.to_json(), "zones.reproducers": str(folder)}
+def worlds(run: Recorded, faults: Faults | None, folder: Path) -> CavVectorEnv:
+    settings = {"zones.reproducers": str(folder)}
+    if faults is not None:
+        settings["zones.faults"] = faults.to_json()
     return make_vec(run.env, num_envs=1, zones=ZONES, overrides=run.settings | settings)
 
 
-def poisoned(run: Recorded, faults: Faults, folder: Path) -> Reproducer:
+def poisoned(run: Recorded, faults: Faults | None, folder: Path) -> Reproducer:
     """What is left of a run that ends in a tick which no host survives."""
     with pytest.raises(ZoneStepError, match="to run that tick again: cavmarl verify --rep") as died:
         follow(run, worlds(run, faults, folder))
@@ -68,7 +70,7 @@ def test_the_tick_fails_as_it_did_and_without_its_faults_is_the_undivided_one(
 
 
 class Poison:
-    """Makes a phase of a zone raise on one state, wherever and however often it is run.
+    """Lets a zone raise on one state, wherever and however often it senses there.
 
     Args:
         zone: which.
@@ -77,30 +79,64 @@ class Poison:
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch, zone: int, tick: int) -> None:
         self.calls = 0
-        resolve = Shard.resolve
+        sense = Shard.sense
 
-        def poisoned(shard: Shard) -> None:
-            resolve(shard)
+        def poisoned(shard: Shard, chosen: NDArray[np.bool_]) -> None:
+            sense(shard, chosen)
             if shard.zone == zone and shard.worlds.ticks[0] == tick:
                 self.calls += 1
                 raise ZeroDivisionError("poison")
 
-        monkeypatch.setattr(Shard, "resolve", poisoned)
+        monkeypatch.setattr(Shard, "sense", poisoned)
 
 
 def test_a_state_that_the_code_breaks_on_is_found_again(
     busy: Recorded, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    poison = Poison(monkeypatch, zone=2, tick=13)
-    kept = poisoned(busy, CALM, tmp_path)
+    poison = Poison(monkeypatch, zone=2, tick=14)
+    kept = poisoned(busy, None, tmp_path)
     assert (kept.zone, kept.tick, kept.is_first, kept.is_last) == (2, 14, False, True)
-    assert "the last one at 'resolve', of ZeroDivisionError('poison')" in kept.cause
+    assert "the last one at 'sense', of ZeroDivisionError('poison')" in kept.cause
     assert poison.calls == 4
     world = world_of(kept)
+    for path in tmp_path.iterdir():  # the folder is another machine's
+        path.unlink()
+    tmp_path.rmdir()
+    with pytest.raises(ZoneStepError, match="tick 14: 4 hosts in a row"):
+        replay_tick(kept, world)
     with pytest.raises(ZeroDivisionError):
         replay_tick(kept, world, faults=False)
     monkeypatch.undo()
     assert replay_tick(kept, world) == busy.hashes[7][0]
+
+
+def test_without_the_folder_an_exception_of_a_zone_is_what_it_is(
+    busy: Recorded, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    poison = Poison(monkeypatch, zone=2, tick=14)
+    with pytest.raises(ZeroDivisionError):
+        follow(busy, make_vec(busy.env, num_envs=1, zones=ZONES, overrides=busy.settings))
+    assert poison.calls == 1
+
+
+def test_an_undivided_world_has_one_host(
+    busy: Recorded, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    Poison(monkeypatch, zone=0, tick=14)
+    settings = {"zones.reproducers": str(tmp_path)}
+    whole = make_vec(busy.env, num_envs=1, overrides=busy.settings | settings)
+    with pytest.raises(ZoneStepError, match="zone 0 could not reach tick 14") as died:
+        follow(busy, whole)
+    monkeypatch.undo()
+    assert isinstance(died.value.reproducer, Path)
+    kept = read_reproducer(died.value.reproducer)
+    assert replay_tick(kept, world_of(kept)) == busy.hashes[7][0]
+
+
+def test_one_world_at_a_time_is_kept(busy: Recorded, tmp_path: Path) -> None:
+    settings = {"zones.reproducers": str(tmp_path)}
+    with pytest.raises(ConfigError, match=r"zones\.reproducers: hosts die in one world at a time"):
+        make_vec(busy.env, num_envs=2, zones=ZONES, overrides=busy.settings | settings)
 
 
 def test_a_later_episode_of_a_long_run_is_found_again(
@@ -161,8 +197,14 @@ def test_a_folder_that_cannot_be_written_is_named_in_the_error(
     busy: Recorded, tmp_path: Path
 ) -> None:
     faults = Faults(messages={"Ack": Rates(drop=0.5)}, crashes=(Crash(5, "resolve", 1, times=4),))
+    folder = tmp_path / "kept"
+    with pytest.raises(ConfigError, match=r"zones\.reproducers = '.*kept': no such folder"):
+        worlds(busy, faults, folder)
+    folder.mkdir()
+    vec = worlds(busy, faults, folder)
+    folder.rmdir()
     with pytest.raises(ZoneStepError, match=r"cannot be run again: .* cannot be written \(No such"):
-        follow(busy, worlds(busy, faults, tmp_path / "nowhere"))
+        follow(busy, vec)
 
 
 @pytest.fixture(scope="module")

@@ -8,7 +8,9 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from cavmarl.runtime.executor import Phase
+from cavmarl.runtime.executor import Executor, Phase
+from cavmarl.runtime.fault_plan import Faults
+from cavmarl.runtime.faults import Crashes, FaultyPhases
 from cavmarl.runtime.simulation import Simulation
 from cavmarl.shard.shard import Commands, Shard
 from tests.driving import drive, make_simulation, start
@@ -37,17 +39,18 @@ class Strict:
     def __init__(self, simulation: Simulation, strangers: float) -> None:
         self.controlled = 0
         self.sensed: list[set[int]] = []
-        self._shards = simulation._shards
+        hosts = FaultyPhases(simulation._shards, Crashes(Faults()))._hosts
+        self._hosts = [(simulation._shards[zone], host) for zone, host in hosts]
         self._strangers = strangers
 
     def each(self, phase: Phase, *arguments: Any) -> None:
-        for shard in self._shards:
+        for shard, host in self._hosts:
             if phase in ("begin_step", "advance"):
-                getattr(shard, phase)(self._own(shard, *arguments))
+                host.each(phase, self._own(shard, *arguments))
             elif phase == "sense":
-                self._sense(shard, *arguments)
+                self._sense(shard, host, *arguments)
             else:
-                getattr(shard, phase)(*arguments)
+                host.each(phase, *arguments)
 
     def _own(self, shard: Shard, commands: Commands) -> Commands:
         others = ~np.isin(np.arange(commands.controls.shape[1]), agents_of(shard))
@@ -57,11 +60,11 @@ class Strict:
         self.controlled += int(others.sum())
         return Commands(controls, meta_actions)
 
-    def _sense(self, shard: Shard, chosen: NDArray[np.bool_]) -> None:
+    def _sense(self, shard: Shard, host: Executor, chosen: NDArray[np.bool_]) -> None:
         """Nobody's outputs but those of owned agents are written."""
         owned, outputs = agents_of(shard), shard.outputs
         before = [array.copy() for array in outputs]
-        shard.sense(chosen)
+        host.each("sense", chosen)
         others = ~np.isin(np.arange(outputs.present.shape[1]), owned)
         for array, old in zip(outputs, before, strict=True):
             assert array[:, others].tobytes() == old[:, others].tobytes()
