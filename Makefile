@@ -58,7 +58,7 @@ fuzz: $(READY) ## each file parser, FUZZ_SECONDS long; what crashes one stays in
 oldest: $(OLDEST)/.ready ## the heart of the tests with the oldest versions that are allowed
 	$(OLDEST)/bin/pytest $(OLDEST_WARNINGS) $(OLDEST_TESTS)
 
-libraries: $(LIBRARIES)/.ready ## what needs RLlib or BenchMARL, in an environment of its own (1.7 GB)
+libraries: $(LIBRARIES)/.ready ## what needs RLlib or BenchMARL, in an environment of its own (2 GB)
 	$(LIBRARIES)/bin/pytest $(LIBRARIES_TESTS)
 
 # Without the comment that netconvert and netgenerate begin with (date, version, options), the same

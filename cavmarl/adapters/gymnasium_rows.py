@@ -16,7 +16,7 @@ from cavmarl.adapters.observations import ObservationForm, Observations
 from cavmarl.config import TERMS
 from cavmarl.errors import ConfigError
 from cavmarl.registry import load_config
-from cavmarl.vector_env import make_vec
+from cavmarl.vector_env import CavVectorEnv, make_vec
 
 __all__ = ["CavAgentRows"]
 
@@ -79,6 +79,11 @@ class CavAgentRows(VectorEnv[Any, Any, Any]):
         self.single_action_space = self._vec.single_action_space
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self.action_space = batch_space(self.single_action_space, num_envs)
+
+    @property
+    def vec(self) -> CavVectorEnv:
+        """The worlds behind this view."""
+        return self._vec
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None

@@ -20,7 +20,7 @@ from cavmarl.adapters.observations import ObservationForm
 from cavmarl.config import TERMS
 from cavmarl.errors import missing
 from cavmarl.seeds import check_seed
-from cavmarl.vector_env import make_vec
+from cavmarl.vector_env import CavVectorEnv, make_vec
 
 try:
     import torch
@@ -103,7 +103,7 @@ class CavTorchRLEnv(EnvBase):  # type: ignore[misc] # TorchRL is not typed
         self._no_terms = np.zeros((*agents, len(TERMS)), dtype=np.float32)
 
     @property
-    def vec(self) -> Any:
+    def vec(self) -> CavVectorEnv:
         """The worlds behind this view."""
         return self._vec
 

@@ -43,6 +43,7 @@ def small(updates: int) -> list[object]:
 @pytest.mark.parametrize(
     ("program", "module", "extra"),
     [
+        ("ppo_gymnasium.py", "gymnasium", "torch"),
         ("ppo_sb3.py", "stable_baselines3", "sb3"),
         ("ippo_torchrl.py", "torchrl", "torchrl"),
         ("ppo_rllib.py", "ray.rllib", "rllib (make libraries)"),
@@ -53,7 +54,8 @@ def test_a_library_trains_a_driver_that_evaluate_takes(
     tmp_path: Path, program: str, module: str, extra: str
 ) -> None:
     pytest.importorskip(module, reason=f"needs the extra: {extra}")
-    done = call(program, *small(updates=2), "--runs", tmp_path, "--name", "a")
+    rows = ["--num-envs", 2 * AGENTS] if program == "ppo_gymnasium.py" else []
+    done = call(program, *small(updates=2), *rows, "--runs", tmp_path, "--name", "a")
     assert done.returncode == 0, done.stderr
     manifest = read_closed(tmp_path / "a")
     assert manifest["program"] == program
@@ -90,6 +92,8 @@ def test_benchmarl_trains(tmp_path: Path, algorithm: str) -> None:
         ("ppo_rllib.py", "ray.rllib", ["--num-runners", -1], "--num-runners -1: must be"),
         ("ippo_benchmarl.py", "benchmarl", ["--algorithm", "x"], "--algorithm x: must be one of"),
         ("ippo_torchrl.py", "torchrl", ["--env", "nowhere"], "nowhere"),
+        ("ppo_gymnasium.py", "gymnasium", ["--env", "nowhere"], "--env nowhere: no entry"),
+        ("ppo_gymnasium.py", "gymnasium", ["--num-worlds", 3], "a multiple of num_worlds = 3"),
     ],
 )
 @pytest.mark.filterwarnings("ignore")  # what the libraries warn of themselves

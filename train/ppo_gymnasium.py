@@ -1,0 +1,248 @@
+"""PPO in one loop on Gymnasium's vector form, in the manner of CleanRL.
+
+    python train/ppo_gymnasium.py --env merge --minutes 8
+
+Every agent is a row of `gymnasium.make_vec`; rows begin anew in the next step, so that what follows
+a row's last step is its last observation. The run's folder holds the driver (`model.safetensors`
+and `config.json`, which `cavmarl evaluate --policy FOLDER` takes), `progress.csv` with the columns
+of `ippo_torch.py`, and `manifest.json`, which says what it was trained with.
+"""
+
+from __future__ import annotations
+
+import argparse
+import csv
+import sys
+import time
+from collections import deque
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, fields, replace
+from pathlib import Path
+from typing import Annotated, Any, get_args, get_type_hints
+
+import gymnasium
+import numpy as np
+import torch
+from gymnasium.vector import AutoresetMode
+from gymnasium.wrappers.vector import NormalizeObservation, RecordEpisodeStatistics
+from torch import Tensor
+
+from cavmarl.errors import CavmarlError, ConfigError
+from cavmarl.evaluate.training_record import begin_training, end_training
+from cavmarl.networks import CONFIG_FILE, WEIGHTS_FILE, ActorCritic, NetworkConfig, save_network
+
+WINDOW = 400  # trips
+CURVE_FILE = "progress.csv"
+
+
+@dataclass(frozen=True)
+class Args:
+    """The settings of a run; each is an option of the command line."""
+
+    env: Annotated[str, "environment: the name of an entry"] = "merge"
+    num_envs: Annotated[int, "rows, so agents of all worlds"] = 512
+    num_worlds: Annotated[int, "worlds that they are in"] = 32
+    seed: Annotated[int, "root of all random numbers"] = 0
+    total_agent_steps: Annotated[int, "decisions to learn from"] = 4_000_000
+    minutes: Annotated[float, "stop after this time, whatever is left; 0: no limit"] = 0.0
+    num_steps: Annotated[int, "steps of every row between two updates"] = 128
+    epochs: Annotated[int, "passes over the decisions of an update"] = 4
+    minibatches: Annotated[int, "parts that a pass is cut into"] = 8
+    learning_rate: Annotated[float, "of Adam, falling to 0"] = 1e-3
+    gamma: Annotated[float, "discount a step"] = 0.99
+    gae_lambda: Annotated[float, "discount of the advantages' later terms"] = 0.95
+    clip: Annotated[float, "how far a probability may move, as a share"] = 0.2
+    hidden: Annotated[int, "width of the two hidden layers"] = 64
+    initial_std: Annotated[float, "standard deviation of continuous actions at the start"] = 0.3
+    runs: Annotated[str, "folder of all runs"] = "runs"
+    name: Annotated[str, "folder of this run; empty: ENV_gymnasium_SEED"] = ""
+
+    def __post_init__(self) -> None:
+        for name in ("total_agent_steps", "num_steps", "epochs", "minibatches"):
+            if getattr(self, name) < 1:
+                option = name.replace("_", "-")
+                raise ConfigError(f"--{option} {getattr(self, name)}: must be at least 1")
+
+    @property
+    def folder(self) -> Path:
+        """Where this run lies."""
+        return Path(self.runs) / (self.name or f"{self.env}_gymnasium_{self.seed}")
+
+
+def parse_args(words: Sequence[str] | None = None) -> Args:
+    """The settings that the command line asks for."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    hints = get_type_hints(Args, include_extras=True)
+    for field in fields(Args):
+        kind, text = get_args(hints[field.name])
+        option = f"--{field.name.replace('_', '-')}"
+        shown = f"{text} (default: {field.default!r})"
+        parser.add_argument(option, type=kind, default=field.default, help=shown)
+    return Args(**vars(parser.parse_args(words)))
+
+
+def make_rows(args: Args) -> Any:
+    """The rows, with their observations normalised and their trips recorded."""
+    name = f"cavmarl/{args.env}Agents-v0"
+    if name not in gymnasium.registry:
+        raise ConfigError(f"--env {args.env}: no entry of that name; `cavmarl list` shows them")
+    rows = gymnasium.make_vec(
+        name,
+        num_envs=args.num_envs,
+        num_worlds=args.num_worlds,
+        autoreset_mode=AutoresetMode.NEXT_STEP,
+    )
+    return NormalizeObservation(RecordEpisodeStatistics(rows))
+
+
+class Learner:
+    """Collects steps of all rows and improves the network by them.
+
+    Args:
+        rows: what `make_rows` made.
+        network: shared by all rows.
+        args: of the run.
+
+    Attributes:
+        trips: (return, arrived) of the last ones; those that the horizon cut do not count.
+        num_trips: how many there were.
+    """
+
+    def __init__(self, rows: Any, network: ActorCritic, args: Args) -> None:
+        self._rows, self._network, self._args = rows, network, args
+        self._optimizer = torch.optim.Adam(network.parameters(), eps=1e-5)
+        observations, infos = rows.reset(seed=args.seed)
+        self._observations = torch.from_numpy(observations).float()
+        self._active = torch.from_numpy(infos["active"].copy())
+        self.trips: deque[tuple[float, bool]] = deque(maxlen=WINDOW)
+        self.num_trips = 0
+
+    def update(self, left: float) -> int:
+        """Collect and learn; `left` is the share of the run to come. How many decisions."""
+        with torch.inference_mode():
+            steps = self._collect()
+        active = steps.pop("active")
+        decisions = {name: part[active].clone() for name, part in steps.items()}
+        count = len(decisions["rewards"])
+        for group in self._optimizer.param_groups:
+            group["lr"] = self._args.learning_rate * left
+        for _ in range(self._args.epochs):
+            for chosen in torch.randperm(count).chunk(self._args.minibatches):
+                self._learn({name: part[chosen] for name, part in decisions.items()})
+        return count
+
+    def _collect(self) -> dict[str, Tensor]:
+        """Arrays (steps, rows, …), with the advantages and the returns to learn."""
+        kept: list[dict[str, Tensor]] = []
+        for _ in range(self._args.num_steps):
+            actions, log_probs = self._network.sample(self._observations)
+            given = actions.clamp(-1.0, 1.0) if self._network.continuous else actions
+            observations, rewards, ended, cut, infos = self._rows.step(given.numpy())
+            before, self._observations = self._observations, torch.from_numpy(observations).float()
+            kept.append(
+                {
+                    "observations": before,
+                    "actions": actions,
+                    "log_probs": log_probs,
+                    "active": self._active,
+                    "values": self._network.value(before),
+                    # The last observation of a row that ended, so also a cut trip's to go on from.
+                    "next_values": self._network.value(self._observations),
+                    "rewards": torch.from_numpy(rewards.copy()),
+                    "ended": torch.from_numpy(ended.copy()),
+                    "over": torch.from_numpy(ended | cut),
+                }
+            )
+            self._active = torch.from_numpy(infos["active"].copy())
+            if ended.any():
+                returns = infos["episode"]["r"][ended].tolist()
+                self.trips.extend(zip(returns, infos["arrival"][ended] > 0.0, strict=True))
+                self.num_trips += len(returns)
+        steps = {name: torch.stack([step[name] for step in kept]) for name in kept[0]}
+        return self._with_advantages(steps)
+
+    def _with_advantages(self, steps: dict[str, Tensor]) -> dict[str, Tensor]:
+        """Generalised advantage estimates (Schulman et al. 2016), from the last step backwards."""
+        after = steps["next_values"] * ~steps["ended"]
+        surprises = steps["rewards"] + self._args.gamma * after - steps["values"]
+        kept = self._args.gamma * self._args.gae_lambda * ~steps["over"]
+        advantages = torch.zeros_like(surprises)
+        later = torch.zeros(surprises.shape[1])
+        for t in reversed(range(len(surprises))):
+            later = advantages[t] = surprises[t] + kept[t] * later
+        return steps | {"advantages": advantages, "returns": advantages + steps["values"]}
+
+    def _learn(self, part: dict[str, Tensor]) -> None:
+        log_probs, _ = self._network.evaluate(part["observations"], part["actions"])
+        advantages = part["advantages"]
+        advantages = (advantages - advantages.mean()) / (advantages.std(correction=0) + 1e-8)
+        ratio = (log_probs - part["log_probs"]).exp()
+        clipped = ratio.clamp(1.0 - self._args.clip, 1.0 + self._args.clip)
+        policy_loss = -torch.minimum(ratio * advantages, clipped * advantages).mean()
+        value_loss = (self._network.value(part["observations"]) - part["returns"]).square().mean()
+        self._optimizer.zero_grad()
+        loss: Tensor = policy_loss + 0.5 * value_loss
+        loss.backward()  # type: ignore[no-untyped-call]
+        torch.nn.utils.clip_grad_norm_(self._network.parameters(), max_norm=0.5)
+        self._optimizer.step()
+
+
+def save_driver(args: Args, network: ActorCritic, config: NetworkConfig, rows: Any) -> None:
+    """Save the network with the wrapper's normalisation, which it did not see, as its own."""
+    network.mean.copy_(torch.from_numpy(rows.obs_rms.mean))
+    network.deviation.copy_(torch.from_numpy(np.sqrt(rows.obs_rms.var + rows.epsilon)))
+    save_network(args.folder, network, config)
+
+
+def train(args: Args) -> Path:
+    """Run PPO until its decisions or its minutes are used up; returns the folder of the run.
+
+    Raises:
+        CavmarlError: settings or an environment that cannot work.
+    """
+    torch.set_num_threads(1)  # more cost small networks more than they bring
+    torch.manual_seed(args.seed)
+    rows = make_rows(args)
+    env = rows.unwrapped.vec.config
+    config = NetworkConfig(
+        environment=env.name,
+        observation_size=rows.single_observation_space.shape[0],
+        sensors=env.sensors,
+        action=env.action,
+        hidden=(args.hidden, args.hidden),
+        seed=args.seed,
+    )
+    network = ActorCritic(config, initial_std=(args.initial_std, args.initial_std))
+    args.folder.mkdir(parents=True, exist_ok=True)
+    begin_training(args.folder, "ppo_gymnasium.py", asdict(args), rows.unwrapped.vec.simulation)
+    learner = Learner(rows, network, args)
+    limit_s = 60.0 * args.minutes if args.minutes else float("inf")
+    began_at, updates, decisions, seconds = time.perf_counter(), 0, 0, 0.0
+    with (args.folder / CURVE_FILE).open("w", encoding="utf-8", newline="") as file:
+        writer = csv.writer(file)
+        writer.writerow(("updates", "agent_steps", "seconds", "trips", "trip_return", "success"))
+        while decisions < args.total_agent_steps and seconds < limit_s:
+            decisions += learner.update(max(1.0 - decisions / args.total_agent_steps, 0.0))
+            updates, seconds = updates + 1, time.perf_counter() - began_at
+            means = np.mean(learner.trips, axis=0) if learner.trips else (np.nan, np.nan)
+            row = (updates, decisions, seconds, learner.num_trips, *means)
+            writer.writerow([f"{value:.6g}" for value in row])
+            file.flush()
+    save_driver(args, network, replace(config, agent_steps=decisions), rows)
+    end_training(args.folder, (WEIGHTS_FILE, CONFIG_FILE, CURVE_FILE))
+    return args.folder
+
+
+def main(words: Sequence[str] | None = None) -> int:
+    """Train; 0: trained, 2: wrong use."""
+    try:
+        folder = train(parse_args(words))
+    except CavmarlError as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 2
+    print(f"driver: {folder}  (cavmarl evaluate ENV --policy {folder})")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
