@@ -18,7 +18,7 @@ from cavmarl.shard.vehicles import VEHICLE
 from cavmarl.traffic.departures import make_gate
 from tests.kernels.builders import vehicles
 from tests.kernels.traffic import network
-from tests.kernels.zoned import SIDE, exchanged, ghosts_of
+from tests.kernels.zoned import SIDE, exchanged, ghosts_of, zoned_of
 from tests.naive import zones as naive
 from tests.partitions import four, partitions, places
 
@@ -118,6 +118,32 @@ def test_other_worlds_keep_their_ghosts() -> None:
     zoned.num_rows[:] = 2
     exchange(four().arrays, halo, 1.0, 0.0, zoned, SIDE, 1, 2)
     assert zoned.num_rows.tolist() == [[2, 0, 2]] * 4
+
+
+@given(st.data(), partitions(3), st.sampled_from([0.0, 7.5, 30.0]))
+def test_rows_that_are_noted_are_enough(
+    data: st.DataObject, partition: ZonePartition, halo_m: float
+) -> None:
+    parts = spread(data, partition)
+    expected = exchanged(partition, halo_m, parts, 5.0, 3.0)
+    zoned, halo = zoned_of(parts), zone_halo(partition, halo_m)
+    for zone, rows in enumerate(parts):
+        left, low, right, high = halo.inner[zone]
+        x, y = rows["x"], rows["y"]
+        outer = np.flatnonzero(~((left < x) & (x < right) & (low < y) & (y < high)))
+        zoned.outer[zone, 0, : len(outer)] = outer
+        zoned.num_outer[zone, 0] = len(outer)
+    exchange(partition.arrays, halo, 5.0, 3.0, zoned, SIDE, 0, 1)
+    for name in ("rows", "num_rows", "num_near", "border", "num_border"):
+        assert getattr(zoned, name).tobytes() == getattr(expected, name).tobytes()
+    assert partition.count == 1 or (zoned.num_outer == -1).all(), "rows may change from here on"
+
+
+def test_others_than_those_that_are_noted_are_not_looked_at() -> None:
+    zoned = zoned_of([cars(3)] * 4)
+    zoned.num_outer[:] = 0
+    exchange(four().arrays, zone_halo(four(), 50.0), 1.0, 1.0, zoned, SIDE, 0, 1)
+    assert zoned.num_rows.tolist() == [[3]] * 4
 
 
 def world(rows: NDArray[np.void], owned: int) -> tuple[Worlds, Gate]:
