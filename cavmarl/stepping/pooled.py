@@ -12,7 +12,13 @@ import numpy as np
 
 import cavmarl.errors
 from cavmarl.config import ZonesConfig
-from cavmarl.errors import CavmarlError, ConfigError, WorkerDeathError, WorkerFailureError
+from cavmarl.errors import (
+    CavmarlError,
+    ConfigError,
+    WorkerDeathError,
+    WorkerFailureError,
+    WorkerStartError,
+)
 from cavmarl.runtime.barrier import usable_cores
 from cavmarl.runtime.compilation import compiled_before
 from cavmarl.runtime.pool import Death, Pool, Program
@@ -73,7 +79,11 @@ class PooledWorlds:
             Simulation(config, world.network, 1, world.demand, world.partition)
         layout = layout_of(config, num_worlds)
         segment = Segment.make(size_of(layout))
-        self.arrays = StepArrays(**arrays_in(segment.map(), layout))
+        try:
+            self.arrays = StepArrays(**arrays_in(segment.map(), layout))
+        except WorkerStartError:
+            segment.close()
+            raise
         bounds = [num_worlds * k // workers for k in range(workers + 1)]
         parts = list(pairwise(bounds))
         recipe = {
