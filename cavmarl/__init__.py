@@ -30,6 +30,7 @@ from cavmarl.errors import (
     RouteError,
     UnknownAgentError,
     UnknownEnvironmentError,
+    WorkerError,
 )
 from cavmarl.policies import Policy, load_policy
 from cavmarl.registration import env, raw_env, register_all
@@ -62,6 +63,7 @@ __all__ = [
     "RouteError",
     "UnknownAgentError",
     "UnknownEnvironmentError",
+    "WorkerError",
     "entries",
     "env",
     "load_policy",

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import gc
 import os
+import random
 import resource
 import select
 import signal
 import subprocess
 import sys
+import tempfile
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -16,6 +18,7 @@ from pathlib import Path
 
 import pytest
 
+import cavmarl.runtime.barrier as barrier
 from cavmarl.errors import (
     WorkerDeathError,
     WorkerError,
@@ -229,6 +232,18 @@ def gone_soon(pids: list[int]) -> bool:
     return True
 
 
+def test_no_call_to_wake_up_is_missed(make: Make, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(barrier, "SHORT_S", 0.0)
+    monkeypatch.setattr(barrier, "LONG_S", 0.0)
+    monkeypatch.setattr(barrier, "_look", lambda theirs, number, yields: False)
+    pool = make(workers=2)
+    rng = random.Random(0)
+    for _ in range(1000):
+        time.sleep(rng.uniform(0.0, 1e-4))
+        pool.ping()
+    assert pool.deaths == []
+
+
 def test_nothing_is_burnt_while_nobody_asks(make: Make) -> None:
     pool = make(workers=2)
     for _ in range(1000):
@@ -296,6 +311,17 @@ def test_memory_that_cannot_be_had() -> None:
         Segment.make(1 << 50)
 
 
+def test_memory_where_there_is_no_memfd(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.delattr(os, "memfd_create")
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    segment = Segment.make(5000)
+    memory = segment.map()
+    assert len(memory) == 5000
+    assert not any(tmp_path.iterdir())
+    segment.close()
+    memory[4999] = 7
+
+
 @pytest.mark.parametrize("room", [0, 3, 12, 16, 20])
 def test_descriptors_that_cannot_be_had(room: int) -> None:
     gc.collect()
@@ -340,6 +366,18 @@ def test_no_process_outlives_the_pools(how: signal.Signals, then: str) -> None:
     loner.wait()
     loner.stdout.close()
     assert gone_soon(pids)
+
+
+def test_a_pool_without_compiled_loops() -> None:
+    text = LONER.format(root=str(ROOT), then="print(pool.run(1, commits=False), pool.deaths)")
+    done = subprocess.run(
+        [sys.executable, "-c", text],
+        env={**os.environ, "NUMBA_DISABLE_JIT": "1"},
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    assert f"[[3.0, {MORE}], [3.0, {MORE}]] []" in done.stdout
 
 
 def test_a_fork_of_the_pools_process_leaves_the_workers_alone(make: Make) -> None:
