@@ -14,10 +14,9 @@ from cavmarl.errors import CavmarlError
 from cavmarl.ownership.endpoint import Endpoint
 from cavmarl.ownership.messages import COORDINATOR, Begin, Commit, Output, Prepare, Step
 from cavmarl.runtime.coordinator import Coordinator
-from cavmarl.runtime.executor import Phase
+from cavmarl.runtime.executor import Phase, SerialExecutor
 from cavmarl.runtime.fault_plan import PHASES, Crash, Faults
 from cavmarl.runtime.post import Parcel
-from cavmarl.shard.group import ShardGroup
 from cavmarl.shard.shard import Shard
 
 __all__ = [
@@ -113,7 +112,7 @@ class Crashes:
 
 
 class FaultyPhases:
-    """Runs the phases of a tick zone by zone; hosts die after their part of one.
+    """Runs the phases of a tick as `SerialExecutor` does; hosts die after their part of one.
 
     Args:
         shards: all of them.
@@ -121,12 +120,12 @@ class FaultyPhases:
     """
 
     def __init__(self, shards: Sequence[Shard], crashes: Crashes) -> None:
-        self._hosts = [(shard.zone, ShardGroup((shard,))) for shard in shards]
+        self._hosts = [(shard.zone, SerialExecutor((shard,))) for shard in shards]
         self._crashes = crashes
         self.on = False
 
     def each(self, phase: Phase, *arguments: Any) -> None:
-        """Run a phase on every shard, in order, while all live."""
+        """Call the method `phase` of every shard, in order, while all live."""
         watched = self.on and phase in PHASES
         for zone, host in self._hosts:
             host.each(phase, *arguments)

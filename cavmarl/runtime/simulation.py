@@ -37,11 +37,10 @@ from cavmarl.runtime.coordination import Coordination
 from cavmarl.runtime.coordinator import Coordinator
 from cavmarl.runtime.dividing import divide
 from cavmarl.runtime.division import ZoneLoads
-from cavmarl.runtime.executor import Executor
+from cavmarl.runtime.executor import Executor, SerialExecutor
 from cavmarl.runtime.recovery import Recovery, Revival
 from cavmarl.runtime.refereeing import make_refereeing
 from cavmarl.runtime.zone_view import ZoneView, view_zones
-from cavmarl.shard.group import ShardGroup
 from cavmarl.shard.shard import Commands
 from cavmarl.shard.vehicles import STATE_FIELDS, blank_vehicle
 from cavmarl.traffic.demand import DemandFile
@@ -138,7 +137,7 @@ class Simulation:
                 config, network, self.partition, traffic, self._commons.outputs, num_worlds
             )
             self._shard = self._shards[0]
-            self._executor: Executor = ShardGroup(self._shards)
+            self._executor: Executor = SerialExecutor(self._shards)
             self._coordination: Coordination | None = None
             self._recovery: Recovery | None = None
             if is_first:
