@@ -97,6 +97,11 @@ class Directory:
             directory.table.apply(record)
         return directory
 
+    def again(self, records: Sequence[Record]) -> Directory:
+        """Another coordinator of the same world, who knows what a log says; see `restore`."""
+        zones = tuple(self.table.hosts)
+        return Directory.restore(records, zones, self._store, self._limits, self._safeguards)
+
     # Episodes and hosts
 
     def reset(self) -> Output:

@@ -12,7 +12,6 @@ from cavmarl.errors import ProtocolError
 from cavmarl.kernels.arrays import Gate
 from cavmarl.kernels.zones import zones_of
 from cavmarl.ownership.messages import Record
-from cavmarl.runtime.coordinator import Coordinator
 from cavmarl.runtime.division import Division
 from cavmarl.runtime.monitor import Monitor
 from cavmarl.runtime.referee import Near, Referee
@@ -178,13 +177,8 @@ class Coordination:
         Args:
             records: of their coordinator.
             notes: what has happened since its last BEGIN.
-
-        Raises:
-            ProtocolError: its coordinator is not one that can stop.
         """
         (coordinator,) = self.coordinators
-        if not isinstance(coordinator, Coordinator):
-            raise ProtocolError("a coordinator without messages never stops in a tick")
         coordinator.take_up(records)
         coordinator.resume(*notes[0])
         self._stirred[0] = True

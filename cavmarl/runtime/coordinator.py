@@ -304,11 +304,8 @@ class Coordinator(Referee):
 
         Then `resume` tells it what the store says, and `resend` the zones what was decided.
         """
-        zones = tuple(self.directory.table.hosts)
         self._dropped += self.directory.dropped
-        self.directory = Directory.restore(
-            records, zones, self._states, self._limits, self._safeguards
-        )
+        self.directory = self.directory.again(records)
         self.resume()
 
     def take_up(self, records: Sequence[Record]) -> None:

@@ -18,7 +18,15 @@ from collections.abc import Callable, Sequence
 from cavmarl.errors import LedgerError, ProtocolError
 from cavmarl.ownership.directory import Directory
 from cavmarl.ownership.ledger import world_digest
-from cavmarl.ownership.messages import Begin, Birth, Commit, Removed, Switch, ZoneLedger
+from cavmarl.ownership.messages import (
+    Begin,
+    Birth,
+    Commit,
+    Record,
+    Removed,
+    Switch,
+    ZoneLedger,
+)
 from cavmarl.ownership.transfers import TransferLog
 from cavmarl.runtime.journal import AnyJournal
 from cavmarl.runtime.referee import Entry, Near, Referee
@@ -62,10 +70,17 @@ class DirectCoordinator(Referee):
         self.resume()
         self._is_open, self._pairs, self._has_told = False, {}, False
         directory = self.directory
-        self._record(*directory.reset().records)
+        records = directory.reset().records
+        self._transfers.logged(records)
+        self._record(*records)
         for zone, (_, incarnation) in directory.table.hosts.items():
             if incarnation == 0:
                 self._record(*directory.host(zone, worker=0).records)
+
+    def take_up(self, records: Sequence[Record]) -> None:
+        """Know what another coordinator's records say; the last tick of them is committed."""
+        self.directory = self.directory.again(records)
+        self._is_open, self._pairs, self._has_told = False, {}, False
 
     def begin(
         self, near: Sequence[Near], state: Callable[[Near], bytes], inputs: bytes = b""

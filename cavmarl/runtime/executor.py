@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any, Literal, Protocol
 
-__all__ = ["Executor", "Phase"]
+from cavmarl.shard.group import ShardGroup
+from cavmarl.shard.shard import Shard
 
-# What a tick is made of, by the names of methods of `ShardGroup` or `Shard`: a name and its
-# arguments can be sent anywhere.
+__all__ = ["Executor", "Phase", "SerialExecutor"]
+
+# What a tick is made of: a name and its arguments can be sent anywhere.
 Phase = Literal[
     "begin_step",
     "advance",
@@ -31,5 +34,16 @@ class Executor(Protocol):
     """Runs one phase on all shards and returns when all are through with it."""
 
     def each(self, phase: Phase, *arguments: Any) -> None:
-        """Call the method `phase` of every shard with the same arguments."""
+        """Run the phase on every shard with the same arguments; see `ShardGroup`."""
         ...
+
+
+class SerialExecutor:
+    """Shards in the caller's process, all of them or some, as one group."""
+
+    def __init__(self, shards: Sequence[Shard]) -> None:
+        self._group = ShardGroup(shards)
+
+    def each(self, phase: Phase, *arguments: Any) -> None:
+        """Run the phase on every shard."""
+        self._group.each(phase, *arguments)

@@ -14,10 +14,9 @@ from cavmarl.errors import CavmarlError
 from cavmarl.ownership.endpoint import Endpoint
 from cavmarl.ownership.messages import COORDINATOR, Begin, Commit, Output, Prepare, Step
 from cavmarl.runtime.coordinator import Coordinator
-from cavmarl.runtime.executor import Executor, Phase
+from cavmarl.runtime.executor import Executor, Phase, SerialExecutor
 from cavmarl.runtime.fault_plan import PHASES, Crash, Faults
 from cavmarl.runtime.post import Parcel
-from cavmarl.shard.group import ShardGroup
 from cavmarl.shard.shard import Shard
 
 __all__ = [
@@ -129,12 +128,12 @@ class FaultyPhases:
     """
 
     def __init__(self, shards: Sequence[Shard], crashes: Crashes) -> None:
-        self._hosts = [(shard.zone, ShardGroup((shard,))) for shard in shards]
+        self._hosts = [(shard.zone, SerialExecutor((shard,))) for shard in shards]
         self._crashes = crashes
         self.on = False
 
     def each(self, phase: Phase, *arguments: Any) -> None:
-        """Run a phase on every shard, in order, while all live."""
+        """Call the method `phase` of every shard, in order, while all live."""
         watched = self.on and phase in PHASES
         for zone, host in self._hosts:
             if watched:

@@ -9,8 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from cavmarl.runtime.executor import Phase
-from cavmarl.shard.group import ShardGroup
+from cavmarl.runtime.executor import Phase, SerialExecutor
 from cavmarl.shard.shard import Shard
 
 __all__ = ["ShardClock"]
@@ -28,7 +27,7 @@ class ShardClock:
     """
 
     def __init__(self, shards: Sequence[Shard]) -> None:
-        self._hosts = [ShardGroup((shard,)) for shard in shards]
+        self._hosts = [SerialExecutor((shard,)) for shard in shards]
         self._spent_ns = np.zeros(len(self._hosts), dtype=np.int64)
 
     def each(self, phase: Phase, *arguments: Any) -> None:

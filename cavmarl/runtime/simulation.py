@@ -37,7 +37,7 @@ from cavmarl.runtime.compilation import first_compilation
 from cavmarl.runtime.coordination import Coordination
 from cavmarl.runtime.dividing import divide
 from cavmarl.runtime.division import ZoneLoads
-from cavmarl.runtime.executor import Executor
+from cavmarl.runtime.executor import Executor, SerialExecutor
 from cavmarl.runtime.recovery import Recovery, Revival
 from cavmarl.runtime.referee import Referee
 from cavmarl.runtime.refereeing import make_refereeing
@@ -46,7 +46,6 @@ from cavmarl.runtime.reproducing import Keeper, Moment, sources_of
 from cavmarl.runtime.shard_clock import ShardClock
 from cavmarl.runtime.store import CommittedStore
 from cavmarl.runtime.zone_view import ZoneView, view_zones
-from cavmarl.shard.group import ShardGroup
 from cavmarl.shard.shard import Commands
 from cavmarl.shard.vehicles import STATE_FIELDS, blank_vehicle
 from cavmarl.traffic.demand import DemandFile
@@ -148,7 +147,7 @@ class Simulation:
                 config, network, self.partition, traffic, self._commons.outputs, num_worlds
             )
             self._shard = self._shards[0]
-            self._executor: Executor = ShardGroup(self._shards)
+            self._executor: Executor = SerialExecutor(self._shards)
             self._coordination: Coordination | None = None
             self._recovery: Recovery | None = None
             self._keeper: Keeper | None = None

@@ -1,7 +1,8 @@
 """`Shard`: the running sub-worlds of one zone, W of them side by side.
 
-It owns the arrays of its vehicles and runs the phases of a tick on them. It knows its part of the
-map, its sensors and its terms, and neither the coordinator nor another shard.
+It owns the arrays of its vehicles and knows its part of the map, its sensors and its terms, and
+neither the coordinator nor another shard. Its ticks are run by a `ShardGroup`, alone or with others
+of its process.
 """
 
 from __future__ import annotations
@@ -80,7 +81,10 @@ class Shard:
             one shares; None: this is it.
 
     Attributes:
+        worlds: what it has.
         sides: VEHICLE (W, C), the two memories that rows are kept in by turns.
+        side: in which of them the committed rows are.
+        next_side: where the next ones come; the same, but in ticks that put rows in order.
     """
 
     def __init__(
@@ -125,7 +129,6 @@ class Shard:
             zone,
             None if first is None else first.worlds,
         )
-        # Between ticks `next_rows` is `rows`; a tick that puts rows in order uses the other side.
         self.sides = (self.worlds.rows, zoned.rows[1, zone])
         self.side = self.next_side = 0
         self.outputs = outputs

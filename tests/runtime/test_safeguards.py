@@ -19,10 +19,9 @@ from cavmarl.ownership.endpoint import Endpoint
 from cavmarl.ownership.messages import Commit, Done, Message, Offer, Record
 from cavmarl.ownership.replicas import Replicas
 from cavmarl.ownership.safeguards import ALL_ON
-from cavmarl.ownership.transport import Rates
+from cavmarl.ownership.transport import Network, Rates
 from cavmarl.runtime.coordinator import Coordinator
 from cavmarl.runtime.fault_plan import Crash, Faults
-from cavmarl.runtime.post import DirectPost
 from cavmarl.runtime.refereeing import make_refereeing
 from tests.faulted import BUSY, NOISE, Recorded, follow, record, replay
 
@@ -97,7 +96,9 @@ def test_at08_with_all_safeguards_nobody_can(busy: Recorded, name: str) -> None:
 
 
 def divided(run: Recorded) -> CavVectorEnv:
-    return make_vec(run.env, num_envs=1, zones=ZONES, overrides=run.settings)
+    """A world whose zones are told by messages, of which none is lost."""
+    settings = {**run.settings, "zones.faults": Faults().to_json()}
+    return make_vec(run.env, num_envs=1, zones=ZONES, overrides=settings)
 
 
 # Harm that no plan of faults does: hosts that are broken, and not only dead.
@@ -171,7 +172,7 @@ class Heard:
             self.dones[message.zone, message.tick] = message
 
 
-class Crossed(DirectPost):
+class Crossed(Network):
     """Delivers what zones of another run have said before what those of this run say."""
 
     def __init__(self, heard: Heard) -> None:
@@ -189,7 +190,7 @@ def test_at08_what_zones_of_another_run_say_is_not_heard(
     busy: Recorded, monkeypatch: pytest.MonkeyPatch, without: Without
 ) -> None:
     heard = Heard()
-    replay(busy, ZONES, watchers=[heard])
+    replay(busy, ZONES, Faults(), watchers=[heard])
     make = Coordinator.__init__
 
     def crossed(coordinator: Coordinator, *arguments: Any, **named: Any) -> None:
@@ -197,11 +198,11 @@ def test_at08_what_zones_of_another_run_say_is_not_heard(
         coordinator.post = Crossed(heard)
 
     monkeypatch.setattr(Coordinator, "__init__", crossed)
-    vec = replay(busy, ZONES)
+    vec = replay(busy, ZONES, Faults())
     assert vec.simulation.coordinators[0].dropped()["Done", "run"] == 2 * STEPS * ZONES
     without("run_fence")
     with pytest.raises((AssertionError, CavmarlError)):
-        replay(busy, ZONES)
+        replay(busy, ZONES, Faults())
 
 
 class Left:

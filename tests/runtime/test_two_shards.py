@@ -15,8 +15,8 @@ from cavmarl.kernels.signals import merge_detections
 from cavmarl.roads.zone_halo import zone_halo
 from cavmarl.roads.zone_layouts import cut_map
 from cavmarl.runtime.commons import Commons
+from cavmarl.runtime.executor import SerialExecutor
 from cavmarl.runtime.simulation import Simulation
-from cavmarl.shard.group import ShardGroup
 from cavmarl.shard.shard import COMMON, Commands, Shard, make_zoned
 from tests.actuated import actuated_grid
 from tests.driving import idle, make_simulation, make_traffic, start, suggested
@@ -72,7 +72,7 @@ class Halves:
             apart = shards[1].worlds.detected_s.copy()
             shards[1].worlds = shards[1].worlds._replace(detected_s=apart)
         self.shards = shards
-        self.executor = ShardGroup(shards)
+        self.executor = SerialExecutor(shards)
         min_x, _, max_x, _ = whole.network.extent_m
         self._border = 0.5 * (min_x + max_x)
 
