@@ -10,6 +10,7 @@ from cavmarl.config import EnvConfig
 from cavmarl.config_io import validate
 from cavmarl.errors import ReproducerError
 from cavmarl.registry import find_entry
+from cavmarl.runtime.fault_plan import Faults
 from cavmarl.runtime.reproducer import Reproducer
 from cavmarl.runtime.reproducing import made_with, sources_of
 from cavmarl.runtime.simulation import Simulation
@@ -60,7 +61,7 @@ def replay_tick(kept: Reproducer, world: World, *, faults: bool = True) -> str:
     if faults:  # hosts may die as they did, wherever the folder was; nothing is written
         zones = replace(config.zones, reproducers=gettempdir())
     else:
-        zones = replace(config.zones, reproducers="", faults="")
+        zones = replace(config.zones, reproducers="", faults=Faults().to_json())  # messages alone
     simulation = Simulation(
         replace(config, zones=zones), world.network, 1, world.demand, world.partition
     )

@@ -12,6 +12,7 @@ from cavmarl.errors import ProtocolError
 from cavmarl.kernels.arrays import Gate
 from cavmarl.kernels.zones import zones_of
 from cavmarl.ownership.messages import Record
+from cavmarl.runtime.coordinator import Coordinator
 from cavmarl.runtime.division import Division
 from cavmarl.runtime.monitor import Monitor
 from cavmarl.runtime.referee import Near, Referee
@@ -177,8 +178,13 @@ class Coordination:
         Args:
             records: of their coordinator.
             notes: what has happened since its last BEGIN.
+
+        Raises:
+            ProtocolError: they sent messages, and its own coordinator sends none.
         """
         (coordinator,) = self.coordinators
+        if not isinstance(coordinator, Coordinator):
+            raise ProtocolError("a coordinator without messages cannot go on in the middle of one")
         coordinator.take_up(records)
         coordinator.resume(*notes[0])
         self._stirred[0] = True

@@ -22,7 +22,6 @@ from cavmarl.ownership.messages import (
     Begin,
     Birth,
     Commit,
-    Record,
     Removed,
     Switch,
     ZoneLedger,
@@ -76,11 +75,6 @@ class DirectCoordinator(Referee):
         for zone, (_, incarnation) in directory.table.hosts.items():
             if incarnation == 0:
                 self._record(*directory.host(zone, worker=0).records)
-
-    def take_up(self, records: Sequence[Record]) -> None:
-        """Know what another coordinator's records say; the last tick of them is committed."""
-        self.directory = self.directory.again(records)
-        self._is_open, self._pairs, self._has_told = False, {}, False
 
     def begin(
         self, near: Sequence[Near], state: Callable[[Near], bytes], inputs: bytes = b""

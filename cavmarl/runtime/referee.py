@@ -112,10 +112,6 @@ class Referee(ABC):
         """Begin an episode without vehicles."""
 
     @abstractmethod
-    def take_up(self, records: Sequence[Record]) -> None:
-        """All parties are new, and know what another coordinator's records say."""
-
-    @abstractmethod
     def begin(
         self, near: Sequence[Near], state: Callable[[Near], bytes], inputs: bytes = b""
     ) -> list[Entry]:

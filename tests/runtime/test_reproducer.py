@@ -165,7 +165,8 @@ def test_a_later_episode_of_a_long_run_is_found_again(
         whole.step(actions)
     assert kept.is_first
     kept = replace(kept, is_last=True)
-    simulation = make_vec(busy.env, num_envs=1, zones=ZONES, overrides=busy.settings).simulation
+    told = busy.settings | {"zones.faults": Faults().to_json()}
+    simulation = make_vec(busy.env, num_envs=1, zones=ZONES, overrides=told).simulation
     simulation.resume(kept)
     simulation.run_tick(kept.commands, True, False)
     simulation.run_tick(kept.commands, False, True)
