@@ -220,7 +220,6 @@ class Crew:
         os.pwrite(recipe.fd, text, 0)
         self.orders = np.frombuffer(orders.map(), dtype=np.int64).reshape(-1, WORDS)
         self._statuses = [np.frombuffer(s.map(), dtype=np.int64)[:WORDS] for s in statuses]
-        self._crowded = self._count + 1 > usable_cores()
         self._told = {
             "recipe": recipe.fd,
             "recipe_bytes": len(text),

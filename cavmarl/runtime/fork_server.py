@@ -23,7 +23,7 @@ from cavmarl.runtime.worker import MAIL, MAX_MESSAGE
 __all__ = ["ForkServer", "Process", "ServerGoneError"]
 
 ANSWER_MS = 2_000  # for a fork or a burial; who takes longer is stopped or broken
-END_S = 2.0  # for all to end by themselves
+END_S = 1.0  # for all to end by themselves
 
 # One thread a worker: the processes share the cores out among themselves.
 _ONE_THREAD = dict.fromkeys(
