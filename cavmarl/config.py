@@ -30,6 +30,7 @@ __all__ = [
     "SensorsConfig",
     "TermsConfig",
     "TrafficConfig",
+    "WorkersConfig",
     "ZonesConfig",
 ]
 
@@ -175,6 +176,29 @@ class ZonesConfig:
             "zones.approach_ticks",
             self.approach_ticks,
             "must be a whole number from 1 to 1000",
+        )
+
+
+@dataclass(frozen=True)
+class WorkersConfig:
+    """How worker processes are watched, where there are some; see docs/workers.md.
+
+    Attributes:
+        timeout_s: for so long a worker may be busy with one step or reset; then it is taken to hang
+            and replaced. One that is stopped or sleeps is noticed within a second.
+        repeats: how often a step is begun again because a worker has died.
+    """
+
+    timeout_s: float = 300.0
+    repeats: int = 3
+
+    def __post_init__(self) -> None:
+        _check_finite("workers.timeout_s", self.timeout_s, 1.0, 1e6)
+        _check(
+            0 <= self.repeats <= 1000,
+            "workers.repeats",
+            self.repeats,
+            "must be a whole number from 0 to 1000",
         )
 
 
@@ -364,6 +388,7 @@ class EnvConfig:
     version: int = 0
     clock: ClockConfig = field(default_factory=ClockConfig)
     zones: ZonesConfig = field(default_factory=ZonesConfig)
+    workers: WorkersConfig = field(default_factory=WorkersConfig)
     population: PopulationConfig = field(default_factory=PopulationConfig)
     traffic: TrafficConfig = field(default_factory=TrafficConfig)
     action: ActionConfig = field(default_factory=ActionConfig)

@@ -39,6 +39,10 @@
     │   └── JournalError          a log that cannot be written or replayed
     │       ├── TornJournalError     only its last line is cut short
     │       └── CorruptJournalError  a line is damaged, missing or out of order
+    ├── WorkerError            worker processes that cannot go on
+    │   ├── WorkerStartError      no process, or no memory for it
+    │   ├── WorkerDeathError      every process that took up a step died of it
+    │   └── WorkerFailureError    an exception in a worker, with its traceback
     ├── PolicyError            a policy that cannot be loaded or does not fit
     └── MissingExtraError      an optional dependency is not installed
 
@@ -90,6 +94,10 @@ __all__ = [
     "UnknownAgentError",
     "UnknownEnvironmentError",
     "UnknownVersionError",
+    "WorkerDeathError",
+    "WorkerError",
+    "WorkerFailureError",
+    "WorkerStartError",
     "ZoneError",
     "ZoneStepError",
     "missing",
@@ -268,6 +276,49 @@ class TornJournalError(JournalError):
 
 class CorruptJournalError(JournalError):
     """A line of the log is damaged, missing or out of order."""
+
+
+class WorkerError(CavmarlError):
+    """Worker processes that cannot go on."""
+
+
+class WorkerStartError(WorkerError):
+    """No process could be started, or there is no memory for it."""
+
+
+class WorkerDeathError(WorkerError):
+    """Every process that took up a step died of it: it is not tried for ever.
+
+    Attributes:
+        worker: number of the worker.
+        part: what it hosts, in words.
+        order: number of the worker's order that could not be carried out.
+        causes: what each process died of.
+    """
+
+    def __init__(self, worker: int, part: str, order: int, what: str, causes: list[str]) -> None:
+        super().__init__(
+            f"worker {worker} ({part}) could not do its {what} (order {order}): {len(causes)} "
+            f"processes died of it ({', '.join(causes)}). SIGKILL is sent by somebody, or by the "
+            "system when memory runs out; what a process prints stands on standard error; "
+            "workers=0 runs the same in this process"
+        )
+        self.worker, self.part, self.order, self.causes = worker, part, order, tuple(causes)
+
+
+class WorkerFailureError(WorkerError):
+    """An exception in a worker, with its traceback.
+
+    Attributes:
+        worker: number of the worker.
+        kind: name of the exception's class.
+        text: its message.
+        traceback: as the worker would have printed it.
+    """
+
+    def __init__(self, worker: int, part: str, kind: str, text: str, traceback: str) -> None:
+        super().__init__(f"worker {worker} ({part}): {kind}: {text}\n{traceback}")
+        self.worker, self.kind, self.text, self.traceback = worker, kind, text, traceback
 
 
 class PolicyError(CavmarlError):

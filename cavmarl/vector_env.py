@@ -1,13 +1,8 @@
-"""`CavVectorEnv`: many worlds in one process, arrays in and out.
-
-No Python loop runs over agents or vehicles in a step: all worlds go through the same kernels
-together.
-"""
+"""`CavVectorEnv`: many worlds, arrays in and out."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -18,16 +13,15 @@ from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
 from cavmarl.actions import ActionDecoder
-from cavmarl.config import EnvConfig
 from cavmarl.errors import ConfigError, ResetNeededError
-from cavmarl.kernels.codes import EVENTS_THAT_END
-from cavmarl.roads.network import RoadNetwork
-from cavmarl.roads.zones import ZonePartition
+from cavmarl.registry import load_config
 from cavmarl.runtime.simulation import Simulation
 from cavmarl.seeds import check_seed, first_seed
 from cavmarl.spaces import action_space, flat_observation_space
-from cavmarl.traffic.demand import DemandFile
-from cavmarl.worlds import check_agents, check_placement, load_world
+from cavmarl.stepping.arrays import SteppedWorlds
+from cavmarl.stepping.local import LocalWorlds
+from cavmarl.stepping.pooled import PooledWorlds
+from cavmarl.worlds import check_agents, check_workers, make_world
 
 __all__ = ["CavVectorEnv", "make_vec"]
 
@@ -62,7 +56,8 @@ def make_vec(
         env: name of an entry of `envs/`, a folder with an env.yaml, or a map file.
         num_envs: number of worlds.
         zones: shadows zones.count, how many shards run the world; results do not depend on it.
-        workers: processes that run the shards; this version runs them in the caller's (0).
+        workers: processes that the worlds are shared out over, whole worlds each; 0: they run in
+            the caller's. Results do not depend on it.
         agents: shadows population.agents.
         background: shadows population.background.
         seed: of the first reset, if that is given none.
@@ -75,13 +70,17 @@ def make_vec(
     Raises:
         ConfigError: a key, value or combination that cannot work.
         MapError: the map cannot be read or driven.
+        WorkerError: worker processes cannot be started, or have no memory.
     """
-    check_placement(workers)
     if isinstance(num_envs, bool) or not isinstance(num_envs, (int, np.integer)):
         raise ConfigError(f"num_envs = {num_envs!r}: must be a whole number")
     if not 1 <= num_envs <= MAX_WORLDS:
         raise ConfigError(f"num_envs = {num_envs}: must be from 1 to {MAX_WORLDS}")
-    config, network, demand, partition = load_world(
+    num_envs = int(num_envs)
+    num_workers = check_workers(workers, num_envs)
+    in_next_step = _autoreset(autoreset_mode) is AutoresetMode.NEXT_STEP
+    first_seed = None if seed is None else check_seed(seed)
+    config, base_dir = load_config(
         env,
         zones=zones,
         agents=agents,
@@ -89,16 +88,14 @@ def make_vec(
         max_cycles=max_cycles,
         overrides=overrides,
     )
-    return CavVectorEnv(
-        config,
-        network,
-        int(num_envs),
-        demand,
-        partition,
-        seed=seed,
-        autoreset_mode=autoreset_mode,
-        copy=copy,
+    check_agents(config)
+    world = make_world(config, base_dir)
+    worlds: SteppedWorlds = (
+        PooledWorlds(world, base_dir, num_envs, num_workers, in_next_step)
+        if num_workers
+        else LocalWorlds(world, num_envs, in_next_step=in_next_step)
     )
+    return CavVectorEnv(worlds, seed=first_seed, copy=copy)
 
 
 def _autoreset(mode: AutoresetMode | str) -> AutoresetMode:
@@ -129,35 +126,23 @@ class CavVectorEnv:
       that leave too; in the next step the world's actions are not read, its rewards are 0 and the
       observations are those of the new episode.
 
+    The worlds run in this process, or shared out over worker processes (docs/workers.md): what
+    comes out is the same bit for bit.
+
     Args:
-        config: the environment.
-        network: its roads.
-        num_envs: W.
-        demand: whose vehicles drive beside the generator's.
-        partition: the zones; None: cut as `config.zones` says.
+        worlds: that are stepped.
         seed: of the first reset, if that is given none.
-        autoreset_mode: when a world that is over begins anew.
         copy: False returns observations as a read-only view that the next step or reset overwrites;
             large ones are copied for longer than they are made.
     """
 
     def __init__(
-        self,
-        config: EnvConfig,
-        network: RoadNetwork,
-        num_envs: int,
-        demand: DemandFile | None = None,
-        partition: ZonePartition | None = None,
-        *,
-        seed: int | None = None,
-        autoreset_mode: AutoresetMode | str = AutoresetMode.SAME_STEP,
-        copy: bool = True,
+        self, worlds: SteppedWorlds, *, seed: int | None = None, copy: bool = True
     ) -> None:
-        check_agents(config)
-        autoreset_mode = _autoreset(autoreset_mode)
-        self.config = config
-        self.network = network
-        self.num_envs = num_envs
+        self.worlds = worlds
+        self.config = config = worlds.world.config
+        self.network = worlds.world.network
+        self.num_envs = num_envs = len(worlds.arrays.mask)
         self.possible_agents = [f"car_{k}" for k in range(config.population.num_ids)]
         self.num_agents = len(self.possible_agents)
         self.single_observation_space: spaces.Box = flat_observation_space(config)
@@ -171,13 +156,12 @@ class CavVectorEnv:
         self.max_cycles = config.max_steps
         self.metadata = {
             "name": f"cavmarl/{config.name}-v{config.version}",
-            "autoreset_mode": autoreset_mode,
+            "autoreset_mode": (
+                AutoresetMode.NEXT_STEP if worlds.in_next_step else AutoresetMode.SAME_STEP
+            ),
         }
-        self._simulation = Simulation(config, network, num_envs, demand, partition)
         self._decoder = ActionDecoder(config.action, num_envs, self.possible_agents)
-        self._steps = np.zeros(num_envs, dtype=np.int64)
         self._mask = np.zeros((num_envs, self.num_agents), dtype=np.bool_)
-        self._in_next_step = autoreset_mode is AutoresetMode.NEXT_STEP
         self._over = np.zeros(num_envs, dtype=np.bool_)  # and not begun anew yet
         self._first_seed = None if seed is None else check_seed(seed)
         self._copy = copy
@@ -190,8 +174,12 @@ class CavVectorEnv:
 
     @property
     def simulation(self) -> Simulation:
-        """The worlds behind this view, for tools that draw or measure them."""
-        return self._simulation
+        """The worlds behind this view, for tools that draw or measure them.
+
+        Raises:
+            ConfigError: they live in worker processes.
+        """
+        return self.worlds.simulation
 
     def reset(
         self, seed: int | None = None, options: dict[str, Any] | None = None
@@ -214,16 +202,15 @@ class CavVectorEnv:
         """
         options = options or {}
         chosen = self._chosen(options.get("reset_mask"), seed)
+        first_world = int(options.get("first_world", 0))
         if seed is not None or not self._ready:
-            first_world = int(options.get("first_world", 0))
-            self._simulation.seed(first_seed(seed, self._first_seed), first_world)
-        self._begin(chosen)
+            seed = first_seed(seed, self._first_seed)
+        self.worlds.reset(seed, first_world, chosen)
+        self._decoder.forget(chosen)
+        self._over[chosen] = False
+        self._mask = self.worlds.arrays.mask.copy()
         self._ready = True
-        observations = self._observations()
-        if not chosen.all():
-            absent = ~self._mask
-            (observations if self._copy else self._simulation.outputs.observations)[absent] = 0.0
-        return observations, {"mask": self._mask.copy()}
+        return self._observations(), {"mask": self._mask.copy()}
 
     def _chosen(self, reset_mask: Any, seed: int | None) -> NDArray[np.bool_]:
         """(W,) the worlds that a reset begins anew."""
@@ -242,14 +229,6 @@ class CavVectorEnv:
         if not self._ready:
             raise ResetNeededError("reset_mask before the first reset: call vec.reset(seed=…)")
         return chosen
-
-    def _begin(self, chosen: NDArray[np.bool_]) -> None:
-        """Begin an episode in the chosen worlds (W,)."""
-        self._simulation.reset(chosen)
-        self._decoder.forget(chosen)
-        self._steps[chosen] = 0
-        self._over[chosen] = False
-        self._mask[chosen] = self._simulation.outputs.present[chosen]
 
     def step(self, actions: NDArray[Any]) -> StepResult:
         """Let every agent of every world act.
@@ -273,65 +252,32 @@ class CavVectorEnv:
         """
         if not self._ready:
             raise ResetNeededError("step() before reset(): call vec.reset(seed=…) first")
-        commands = self._decoder.from_array(actions, self._mask)
-        simulation = self._simulation
-        simulation.step(commands)
-        self._steps += 1
-        if self._over.any():
-            self._begin(self._over.copy())
-        outputs = simulation.outputs
-        horizon = self._steps >= self.max_cycles
-        rewards = outputs.rewards.copy()
-        acted = outputs.acted.copy()
-        terminations = outputs.terminated.copy()
-        truncations = acted & horizon[:, None] & ~terminations
-        final_observations = self._observations()
-        infos: dict[str, NDArray[Any]] = {
-            "acted": acted,
-            "terms": outputs.terms.copy(),
-            "vehicle_done": outputs.events & EVENTS_THAT_END != 0,
-            "final_observations": final_observations,
-        }
-        simulation.retire_agents()
-        infos["arrivals"] = simulation.arrivals()
-        staying = outputs.present & ~terminations
-        over = horizon | ~(staying.any(axis=1) | simulation.agents_to_come())
-        self._mask = staying
-        observations = self._go_on(final_observations, terminations, over, infos)
-        infos["mask"] = self._mask.copy()
-        infos["episode_over"] = over
-        return observations, rewards, terminations, truncations, infos
-
-    def _go_on(
-        self,
-        final_observations: NDArray[np.float32],
-        terminations: NDArray[np.bool_],
-        over: NDArray[np.bool_],
-        infos: dict[str, NDArray[Any]],
-    ) -> NDArray[np.float32]:
-        """Begin anew what is over, now or in the next step; the observations of who goes on."""
-        if self._in_next_step:
+        self.worlds.step(self._decoder.from_array(actions, self._mask))
+        arrays = self.worlds.arrays
+        over = arrays.episode_over.copy()
+        terminations = arrays.terminations.copy()
+        observations = final_observations = self._observations()
+        if self.worlds.in_next_step:
+            self._decoder.forget(self._over)
             self._over = over.copy()
-            self._mask[over] = False
-            return final_observations
-        if not (terminations.any() or over.any()):
-            return final_observations
-        seen = self._simulation.outputs.observations
-        if self._copy:
-            observations = final_observations.copy()
-            observations[terminations] = 0.0
-        else:  # what is written from here on, a reset's too, is what the view shows
-            infos["final_observations"] = final_observations.copy()
-            observations = final_observations
-            seen[terminations] = 0.0
-        if over.any():
-            self._begin(over)
-            if self._copy:
-                observations[over] = seen[over]
-        return observations
+        elif (ended := over | terminations.any(axis=1)).any():
+            final_observations = arrays.observations.copy()
+            final_observations[ended] = arrays.final_observations[ended]
+            self._decoder.forget(over)
+        self._mask = arrays.mask.copy()
+        infos: dict[str, NDArray[Any]] = {
+            "acted": arrays.acted.copy(),
+            "terms": arrays.terms.copy(),
+            "vehicle_done": arrays.vehicle_done.copy(),
+            "final_observations": final_observations,
+            "arrivals": arrays.arrivals.copy(),
+            "mask": self._mask.copy(),
+            "episode_over": over,
+        }
+        return observations, arrays.rewards.copy(), terminations, arrays.truncations.copy(), infos
 
     def _observations(self) -> NDArray[np.float32]:
-        observations = self._simulation.outputs.observations
+        observations = self.worlds.arrays.observations
         if self._copy:
             return observations.copy()
         view = observations.view()
@@ -340,17 +286,17 @@ class CavVectorEnv:
 
     def suggest_actions(self) -> NDArray[Any]:
         """What the built-in driver (IDM, MOBIL, lane controller) would do in each agent's place."""
-        raw = np.zeros((self.num_envs, self.num_agents, 2))
-        self._simulation.suggest(raw)
-        return self._decoder.encode(raw)
+        self.worlds.suggest()
+        return self._decoder.encode(self.worlds.arrays.suggested)
 
     def state_hash(self, world: int = 0) -> str:
         """Hex digest of one world, as `CavEnv.state_hash`."""
-        return self._simulation.state_hash(world)
+        return self.worlds.state_hash(world)
 
     def traffic_stats(self, world: int = 0) -> dict[str, float]:
         """Traffic of one world since its reset, as `CavEnv.traffic_stats`."""
-        return {**asdict(self._simulation.traffic_stats(world)), **self._decoder.tolerated(world)}
+        return {**self.worlds.traffic_stats(world), **self._decoder.tolerated(world)}
 
     def close(self) -> None:
-        """Nothing to release: all worlds live in this process."""
+        """End the worker processes, if there are any; arrays that were returned stay."""
+        self.worlds.close()

@@ -6,6 +6,8 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import numpy as np
+
 from cavmarl.config import EnvConfig
 from cavmarl.errors import ConfigError
 from cavmarl.maps.netconvert import map_file
@@ -28,10 +30,12 @@ __all__ = [
     "World",
     "check_agents",
     "check_placement",
+    "check_workers",
     "find_map",
     "load_roads",
     "load_world",
     "load_zones",
+    "make_world",
 ]
 
 
@@ -78,6 +82,16 @@ def load_world(
         max_cycles=max_cycles,
         overrides=overrides,
     )
+    return make_world(config, base_dir)
+
+
+def make_world(config: EnvConfig, base_dir: Path) -> World:
+    """What a configuration describes; raises as `load_world`.
+
+    Args:
+        config: of the environment.
+        base_dir: the folder that relative files start from.
+    """
     network = load_roads(config, base_dir)
     files = resolve_demand(config, base_dir)
     demand = None
@@ -136,15 +150,34 @@ def find_map(env: str | Path) -> Path:
 
 
 def check_placement(workers: int | None) -> None:
-    """Refuse a number of workers that this version does not run.
+    """Refuse worker processes for a single world.
 
     Raises:
         ConfigError: not None or 0.
     """
     if workers not in (None, 0):
         raise ConfigError(
-            f"workers = {workers!r}: this version runs all shards in the caller's process; use 0"
+            f"workers = {workers!r}: a single world runs in the caller's process; use 0, or "
+            "cavmarl.make_vec(…, num_envs=…, workers=…) for many worlds"
         )
+
+
+def check_workers(workers: int | None, num_worlds: int) -> int:
+    """How many worker processes share some worlds out; 0: none, the caller's process runs them.
+
+    Raises:
+        ConfigError: no whole number from 0 to the number of worlds.
+    """
+    if workers is None:
+        return 0
+    if isinstance(workers, bool) or not isinstance(workers, (int, np.integer)):
+        raise ConfigError(f"workers = {workers!r}: must be a whole number")
+    if not 0 <= workers <= num_worlds:
+        raise ConfigError(
+            f"workers = {workers}: must be from 0 to num_envs = {num_worlds}, as a world stays on "
+            "one worker; use fewer workers, or more worlds"
+        )
+    return int(workers)
 
 
 def check_agents(config: EnvConfig) -> None:

@@ -57,7 +57,7 @@ CSV_FILE = "progress.csv"
 
 # Settings that a resumed run may be given anew.
 CAN_CHANGE = frozenset(
-    ("total_agent_steps", "minutes", "resume", "threads", "tensorboard", "checkpoint_updates")
+    "total_agent_steps minutes resume threads workers tensorboard checkpoint_updates".split()
 )
 
 
@@ -69,6 +69,7 @@ class Args:
     agents: Annotated[int, "agents a world; 0: as the environment says"] = 0
     background: Annotated[int, "background vehicles a world; -1: as the environment says"] = -1
     num_envs: Annotated[int, "worlds that are stepped together"] = 16
+    workers: Annotated[int, "processes that the worlds are shared out over; 0: this one"] = 0
     seed: Annotated[int, "root of all random numbers"] = 0
     total_agent_steps: Annotated[int, "decisions to learn from"] = 4_000_000
     minutes: Annotated[float, "stop after this time, whatever is left; 0: no limit"] = 0.0
@@ -99,10 +100,10 @@ class Args:
 
     def __post_init__(self) -> None:
         at_least = {
-            "agents": 0, "background": -1, "num_envs": 1, "seed": 0, "total_agent_steps": 1,
-            "minutes": 0.0, "num_steps": 1, "epochs": 1, "minibatches": 1, "entropy_weight": 0.0,
-            "value_weight": 0.0, "imitation_weight": 0.0, "hidden": 1, "threads": 1,
-            "checkpoint_updates": 1,
+            "agents": 0, "background": -1, "num_envs": 1, "workers": 0, "seed": 0,
+            "total_agent_steps": 1, "minutes": 0.0, "num_steps": 1, "epochs": 1, "minibatches": 1,
+            "entropy_weight": 0.0, "value_weight": 0.0, "imitation_weight": 0.0, "hidden": 1,
+            "threads": 1, "checkpoint_updates": 1,
         }  # fmt: skip
         for name, least in at_least.items():
             value = getattr(self, name)
@@ -492,6 +493,7 @@ def make_world(args: Args) -> CavVectorEnv:
     return make_vec(
         args.env,
         num_envs=args.num_envs,
+        workers=args.workers,
         agents=args.agents or None,
         background=None if args.background < 0 else args.background,
     )
@@ -534,7 +536,7 @@ class Run:
         self.collector = Collector(vec, self.network, args, args.seed + self.updates)
         try:
             args.folder.mkdir(parents=True, exist_ok=True)
-            begin_training(args.folder, "ippo_torch.py", asdict(args), vec.simulation)
+            begin_training(args.folder, "ippo_torch.py", asdict(args), vec.worlds.world)
             self.log = Log(args)
         except OSError as error:
             reason = error.strerror or error

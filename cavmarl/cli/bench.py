@@ -12,6 +12,7 @@ from rich.table import Table
 from cavmarl.cli.bench_libraries import libraries
 from cavmarl.cli.bench_sharding import sharding
 from cavmarl.cli.bench_traffic import traffic
+from cavmarl.cli.bench_workers import workers
 from cavmarl.cli.output import (
     Agents,
     Background,
@@ -35,6 +36,7 @@ app = typer.Typer(help="How fast it is, measured side by side.", no_args_is_help
 app.command()(traffic)
 app.command()(sharding)
 app.command()(libraries)
+app.command()(workers)
 
 _SENSORS = {"lidar": "64 rays", "kinematics": "no rays", "puffer_drive": "pufferlib's"}
 _WHO = {

@@ -25,6 +25,7 @@ from cavmarl.cli.output import (
     write_json,
 )
 from cavmarl.cli.verify_faults import check_campaign, print_campaign, print_figures
+from cavmarl.cli.verify_kills import verify_with_kills
 from cavmarl.config import ZONE_LAYOUTS
 from cavmarl.errors import ConfigError
 
@@ -60,7 +61,10 @@ def verify(
         ),
     ] = None,
     policy: PolicyName = "idm",
-    worlds: Annotated[int, typer.Option(help="Stepped together.")] = 1,
+    worlds: Annotated[
+        int | None,
+        typer.Option(help="Stepped together; default: 1, with --kill two a worker."),
+    ] = None,
     agents: Agents = None,
     background: Background = None,
     settings: Settings = None,
@@ -75,6 +79,14 @@ def verify(
     seeds: Annotated[
         int, typer.Option(help="Of a campaign: runs in which anybody dies at any time.")
     ] = 12,
+    kill: Annotated[
+        int | None,
+        typer.Option(
+            metavar="N",
+            help="Kill or stop N workers at random times instead of dividing worlds, and compare.",
+        ),
+    ] = None,
+    workers: Annotated[int, typer.Option(help="Of --kill, that the worlds are run by.")] = 2,
     check: Annotated[
         bool, typer.Option("--check", help="Watch the invariants of ownership, too.")
     ] = False,
@@ -84,10 +96,34 @@ def verify(
     ] = None,
     json_path: JsonPath = None,
 ) -> None:
-    """Drive divided worlds beside the undivided one; exit code 1 and where one first differs."""
+    """Drive divided worlds beside the undivided one; exit code 1 and where one first differs.
+
+    With --kill: worlds whose workers are killed beside some that nobody disturbs.
+    """
     overrides = parse_settings(settings)
     counts = None if zones is None else _counts(zones)
     console = Console()
+    if kill is not None:
+        _refuse_with_kill(
+            env, counts, {"--faults": faults, "--layout": layout, "--journal": journal}
+        )
+        verify_with_kills(
+            console,
+            str(env),
+            kill,
+            json_path,
+            workers=workers,
+            worlds=worlds,
+            steps=steps,
+            seed=seed,
+            policy=policy,
+            zones=None if counts is None else counts[0],
+            agents=agents,
+            background=background,
+            overrides=overrides | ({"zones.check": True} if check else {}),
+        )
+        return
+    worlds = 1 if worlds is None else worlds
     if faults == "campaign":
         check_campaign(layout, worlds, journal)
         named = {"population.agents": agents, "population.background": background}
@@ -162,6 +198,23 @@ def _campaign(
     print_campaign(console, campaign, seed)
     if not campaign.holds:
         raise typer.Exit(1)
+
+
+def _refuse_with_kill(
+    env: str | None, counts: list[int] | None, others: dict[str, str | Path | None]
+) -> None:
+    """Refuse what does not go with `--kill`.
+
+    Raises:
+        ConfigError: one of it was given, or no environment.
+    """
+    if env is None:
+        raise ConfigError("--kill: name an environment")
+    if counts is not None and len(counts) > 1:
+        raise ConfigError(f"--zones {','.join(map(str, counts))}: --kill takes one number of zones")
+    for option, value in others.items():
+        if value is not None:
+            raise ConfigError(f"{option} does not go with --kill: zones.layout is for --set")
 
 
 def _counts(text: str) -> list[int]:

@@ -18,6 +18,7 @@ from cavmarl.evaluate.recorder import Recorder
 from cavmarl.evaluate.tables import EPISODE, TRACK, TRIP
 from cavmarl.evaluate.transfer_rows import TRANSFER, TransferRecorder
 from cavmarl.policies import Policy, load_policy
+from cavmarl.stepping.local import LocalWorlds
 from cavmarl.vector_env import CavVectorEnv
 from cavmarl.worlds import load_world
 
@@ -109,16 +110,16 @@ def drive_run(job: Job, progress: Progress | None = None) -> dict[str, RunData]:
         ConfigError: a key or a value that cannot work.
         PolicyError: a policy cannot be loaded or does not fit.
     """
-    config, network, demand, partition = load_world(
+    world = load_world(
         job.env,
         agents=job.agents,
         background=job.background,
         max_cycles=job.max_cycles,
         overrides=job.overrides,
     )
-    vehicles = config.population.agents + config.population.background
-    num_envs = worlds_at_once(job.episodes, vehicles)
-    vec = CavVectorEnv(config, network, num_envs, demand, partition)
+    population = world.config.population
+    num_envs = worlds_at_once(job.episodes, population.agents + population.background)
+    vec = CavVectorEnv(LocalWorlds(world, num_envs))
     drivers = {name: load_policy(policy, vec) for name, policy in job.policies.items()}
     return {name: _drive(vec, driver, name, job, progress) for name, driver in drivers.items()}
 

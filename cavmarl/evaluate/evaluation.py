@@ -31,6 +31,7 @@ from cavmarl.evaluate.transfer_rows import TRANSFER, transfers_of
 from cavmarl.ownership.transfer_summary import TransferSummary
 from cavmarl.policies import load_policy
 from cavmarl.seeds import check_seed
+from cavmarl.stepping.local import LocalWorlds
 from cavmarl.vector_env import CavVectorEnv
 from cavmarl.worlds import load_world
 
@@ -191,7 +192,7 @@ def _named(
 
 def _prepare(folder: Path, job: Job, repeats: int) -> bool:
     """Refuse early what cannot work, then put everything on record; whether worlds have zones."""
-    config, network, demand, partition = load_world(
+    world = load_world(
         job.env,
         agents=job.agents,
         background=job.background,
@@ -199,8 +200,9 @@ def _prepare(folder: Path, job: Job, repeats: int) -> bool:
         overrides=job.overrides,
     )
     policies = describe_policies(job.policies)
+    config, network, demand, partition = world
     unlogged = replace(config, zones=replace(config.zones, journal=""))
-    one_world = CavVectorEnv(unlogged, network, 1, demand, partition)
+    one_world = CavVectorEnv(LocalWorlds(world._replace(config=unlogged), 1))
     for policy in job.policies.values():
         load_policy(policy, one_world)
     try:

@@ -24,7 +24,7 @@ LATEST = (1, 8, 64)  # phases that a message is late
 MANY = 5  # so often a tick of which every host dies is begun
 
 ELSEWHERE = (
-    ("SIGKILL or SIGSTOP of a process, slow workers, hangs", "worker processes"),
+    ("SIGKILL or SIGSTOP of a process, slow workers, hangs", "verify --kill, docs/workers.md"),
     ("memory, descriptors or /dev/shm used up; clock jumps", "worker processes"),
     ("a zone moved to another worker, LoadScore readings", "worker processes"),
     ("disk full, damaged and torn files", "tests/runtime/test_journal.py"),

@@ -17,6 +17,7 @@ import numpy as np
 from cavmarl import errors
 from cavmarl.evaluate.differences import Arrays, snapshot, step_results
 from cavmarl.policies import load_policy
+from cavmarl.stepping.local import LocalWorlds
 from cavmarl.vector_env import CavVectorEnv
 from cavmarl.worlds import load_world
 
@@ -34,8 +35,7 @@ def _main() -> None:
 
 def _steps(job: dict[str, Any]) -> Iterator[dict[str, Any]]:
     """Drive; what is told after the reset and after each step, until a dump is asked for."""
-    config, network, demand, partition = load_world(job["env"], **job["world"])
-    vec = CavVectorEnv(config, network, 1, demand, partition)
+    vec = CavVectorEnv(LocalWorlds(load_world(job["env"], **job["world"]), 1))
     driver = load_policy(job["policy"], vec)
     observations, infos = vec.reset(seed=job["seed"])
     driver.reset(job["seed"])

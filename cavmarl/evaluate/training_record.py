@@ -19,12 +19,13 @@ from cavmarl.evaluate.manifest import (
     read_closed,
 )
 from cavmarl.runtime.simulation import Simulation
+from cavmarl.worlds import World
 
 __all__ = ["begin_training", "end_training", "is_trained"]
 
 
 def begin_training(
-    folder: Path, program: str, settings: Mapping[str, Any], simulation: Simulation
+    folder: Path, program: str, settings: Mapping[str, Any], world: World | Simulation
 ) -> None:
     """Put on record what is about to be trained, in place of the record of an earlier run there.
 
@@ -32,19 +33,16 @@ def begin_training(
         folder: of the run; it exists.
         program: that trains.
         settings: its own, whole; `seed` is one of them.
-        simulation: the worlds that it learns in.
+        world: that it learns in, or many of it.
     """
     (folder / MANIFEST_FILE).unlink(missing_ok=True)
-    config = simulation.config
     open_manifest(
         folder,
         {
             "program": program,
             "settings": dict(settings),
             "seeds": [settings["seed"]],
-            "world": describe_world(
-                config, simulation.network, simulation.demand, simulation.partition
-            ),
+            "world": describe_world(world.config, world.network, world.demand, world.partition),
         },
     )
 

@@ -23,13 +23,20 @@ class Commons:
         config: the environment.
         network: the roads of the whole map.
         num_worlds: W.
+        observations: (W, A, D) where the agents' are written; None: made for them.
 
     Attributes:
         outputs: of all agents; every shard writes at the indices of its own ones.
     """
 
-    def __init__(self, config: EnvConfig, network: RoadNetwork, num_worlds: int) -> None:
-        self.outputs = make_outputs(config, num_worlds)
+    def __init__(
+        self,
+        config: EnvConfig,
+        network: RoadNetwork,
+        num_worlds: int,
+        observations: NDArray[np.float32] | None = None,
+    ) -> None:
+        self.outputs = make_outputs(config, num_worlds, observations)
         self._roads = network.arrays
         self._sim_dt_s = config.clock.sim_dt_s
         self._weights = np.array([config.terms.weights.get(name, 0.0) for name in TERMS])

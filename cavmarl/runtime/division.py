@@ -132,6 +132,26 @@ class Division:
     def _side(self, rows: NDArray[np.void]) -> int:
         return 0 if rows is self._first_side else 1
 
+    def place(self, vehicles: Sequence[NDArray[np.void]], contacts: NDArray[np.int64]) -> None:
+        """Give every vehicle to the zone that it is in, whoever has owned it before.
+
+        Args:
+            vehicles: VEHICLE (n,) of each world.
+            contacts: (W,) of each, as `contacts` counts them.
+        """
+        first = self._shards[0].worlds
+        for w, rows in enumerate(vehicles):
+            first.rows[w, : len(rows)] = rows
+            first.num_owned[w] = first.num_rows[w] = len(rows)
+            if len(self._shards) > 1:
+                first.rows["epoch"][w, : len(rows)] = 0
+        self.distribute(np.ones(len(vehicles), dtype=np.bool_))
+        first.num_contacts[:] = contacts
+
+    def contacts(self) -> NDArray[np.int64]:
+        """(W,) vehicles that began to touch another, since each world's reset."""
+        return _total([shard.worlds.num_contacts for shard in self._shards])
+
     def align(self) -> None:
         """Let all shards keep their rows on the same side, whatever a tick has come to."""
         for shard in self._shards:
@@ -287,9 +307,12 @@ class Division:
         running = self.running()
         for w, num in enumerate(running.tolist()):
             rows[w, :num] = self.vehicles(w)
-        contacts = _total([shard.worlds.num_contacts for shard in self._shards])
         return first._replace(
-            rows=rows, next_rows=rows, num_owned=running, num_rows=running, num_contacts=contacts
+            rows=rows,
+            next_rows=rows,
+            num_owned=running,
+            num_rows=running,
+            num_contacts=self.contacts(),
         )
 
 

@@ -31,6 +31,7 @@ from cavmarl.ownership.transfers import TransferLog
 from cavmarl.roads.network import RoadNetwork
 from cavmarl.roads.zone_layouts import cut_map
 from cavmarl.roads.zones import ZonePartition
+from cavmarl.runtime import snapshot
 from cavmarl.runtime.commons import Commons
 from cavmarl.runtime.compilation import first_compilation
 from cavmarl.runtime.coordination import Coordination
@@ -97,6 +98,8 @@ class Simulation:
         num_worlds: W.
         demand: whose vehicles drive beside the generator's.
         partition: the zones; None: cut as `config.zones` says.
+        observations: (W, A, D) float32, where the agents' are written; None: made for them.
+        warm: call every kernel now, so that none is loaded in a step.
     """
 
     def __init__(
@@ -106,6 +109,9 @@ class Simulation:
         num_worlds: int = 1,
         demand: DemandFile | None = None,
         partition: ZonePartition | None = None,
+        *,
+        observations: NDArray[np.float32] | None = None,
+        warm: bool = False,
     ) -> None:
         self.config = config
         self.network = network
@@ -132,7 +138,7 @@ class Simulation:
             capacity = traffic.capacity
             self._traffic = traffic
             self._gate = make_gate(num_worlds, capacity, network.arrays, blank.dtype)
-            self._commons = Commons(config, network, num_worlds)
+            self._commons = Commons(config, network, num_worlds, observations)
             self._shards, self._division = divide(
                 config, network, self.partition, traffic, self._commons.outputs, num_worlds
             )
@@ -140,7 +146,7 @@ class Simulation:
             self._executor: Executor = SerialExecutor(self._shards)
             self._coordination: Coordination | None = None
             self._recovery: Recovery | None = None
-            if is_first:
+            if is_first or warm:
                 self._call_every_kernel()
             zones = config.zones
             if self.partition.count > 1 or zones.journal or zones.check or zones.faults:
@@ -415,6 +421,29 @@ class Simulation:
             if self._coordination is not None:
                 self._coordination.save()
 
+    def save(self) -> list[NDArray[Any]]:
+        """All that the next step depends on, between two steps; views, to be copied."""
+        roots = np.array([self._seed, self._first_world], dtype=np.int64)
+        return [roots, self._episodes, *snapshot.save(self._parts())]
+
+    def load(self, saved: Sequence[NDArray[Any]]) -> None:
+        """Go on from what `save` gave, in worlds of the same environment."""
+        roots, episodes, *rest = saved
+        self.seed(*roots.tolist())
+        self._episodes[:] = episodes
+        self._gate = snapshot.load(self._parts(), rest)
+
+    def _parts(self) -> snapshot.Parts:
+        return snapshot.Parts(
+            self._shard.worlds,
+            self._division,
+            self._gate,
+            self._traffic,
+            self.outputs,
+            self._coordination,
+            self.config.sensors.stack > 1,
+        )
+
     def agents_to_come(self) -> NDArray[np.bool_]:
         """(W,) whether an agent waits to enter."""
         if not self._gate.num_queue.any():
@@ -470,7 +499,6 @@ class Simulation:
 
     def traffic_stats(self, world: int = 0) -> TrafficStats:
         """Counts and means since the world's reset."""
-        contacts = sum(int(shard.worlds.num_contacts[world]) for shard in self._shards)
         counts = self._gate.counts[world]
         sums = self._gate.sums[world]
         rows = self.vehicles(world)
@@ -481,7 +509,7 @@ class Simulation:
             waiting=int(self._gate.num_queue[world]),
             running=len(rows),
             arrived=arrived,
-            contacts=contacts,
+            contacts=int(self._division.contacts()[world]),
             removed=int(counts[COUNT_REMOVED]),
             rerouted=int(counts[COUNT_REROUTED]),
             mean_speed_mps=float(np.sort(rows["speed"]).mean()) if len(rows) else 0.0,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
 
 from cavmarl.config import TERMS, EnvConfig
 from cavmarl.kernels.arrays import Outputs
@@ -11,13 +12,23 @@ from cavmarl.shard.sensors import frame_size
 __all__ = ["make_outputs"]
 
 
-def make_outputs(config: EnvConfig, num_worlds: int) -> Outputs:
-    """Outputs of W worlds in which nobody is present."""
+def make_outputs(
+    config: EnvConfig, num_worlds: int, observations: NDArray[np.float32] | None = None
+) -> Outputs:
+    """Outputs of W worlds in which nobody is present.
+
+    Args:
+        config: the environment.
+        num_worlds: W.
+        observations: (W, A, D) to be used; None: they are made.
+    """
     agents = (num_worlds, config.population.num_ids)
-    size = config.sensors.stack * frame_size(config.sensors)
-    return Outputs(
+    if observations is None:
+        size = config.sensors.stack * frame_size(config.sensors)
         # Not `zeros`: NumPy asks for huge pages where it fills the array itself.
-        observations=np.full((*agents, size), 0.0, dtype=np.float32),
+        observations = np.full((*agents, size), 0.0, dtype=np.float32)
+    return Outputs(
+        observations=observations,
         terms=np.zeros((*agents, len(TERMS)), dtype=np.float32),
         rewards=np.zeros(agents, dtype=np.float32),
         terminated=np.zeros(agents, dtype=np.bool_),

@@ -5,10 +5,13 @@ from __future__ import annotations
 import csv
 import importlib.util
 import json
+import os
+import signal
 import subprocess
 import sys
 from pathlib import Path
 from types import ModuleType
+from typing import Any
 
 import pytest
 import yaml
@@ -93,6 +96,25 @@ def test_the_same_seed_learns_the_same(ippo: ModuleType, here: Path) -> None:
         assert ippo.main([*words, "--name", name, "--seed", seed]) == 0
     weights = [(here / "runs" / name / "model.safetensors").read_bytes() for name in "abc"]
     assert weights[0] == weights[1] != weights[2]
+
+
+def test_workers_that_are_killed_change_nothing_that_is_learnt(
+    ippo: ModuleType, here: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    words = [*TINY, "--total-agent-steps", "100"]
+    assert ippo.main([*words, "--name", "whole"]) == 0
+    collect = ippo.Collector.collect
+
+    def collect_after_a_kill(self: Any, with_suggested: bool) -> Any:
+        os.kill(self.vec.worlds.pool.pids[0], signal.SIGKILL)
+        return collect(self, with_suggested)
+
+    monkeypatch.setattr(ippo.Collector, "collect", collect_after_a_kill)
+    assert ippo.main([*words, "--name", "killed", "--workers", "2"]) == 0
+    weights = [
+        (here / "runs" / name / "model.safetensors").read_bytes() for name in ("whole", "killed")
+    ]
+    assert weights[0] == weights[1]
 
 
 @pytest.mark.parametrize("kind", ["continuous", "discrete"])

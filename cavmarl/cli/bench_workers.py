@@ -1,0 +1,101 @@
+"""`cavmarl bench workers`: how much faster worlds are over several workers."""
+
+from __future__ import annotations
+
+import math
+import statistics
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+from rich.console import Console
+from rich.markup import escape
+from rich.table import Table
+
+from cavmarl.cli.output import (
+    Agents,
+    Background,
+    JsonPath,
+    Seed,
+    Settings,
+    parse_settings,
+    write_json,
+)
+from cavmarl.errors import ConfigError
+
+if TYPE_CHECKING:
+    from cavmarl.evaluate.worker_speed import WorkerSpeed
+
+__all__ = ["workers"]
+
+
+def workers(
+    env: Annotated[
+        str, typer.Argument(metavar="[ENV]", help="Name, folder or map file of an environment.")
+    ] = "rush",
+    worlds: Annotated[int, typer.Option(help="Stepped together.")] = 16,
+    count: Annotated[int, typer.Option("--workers", help="That are compared with one.")] = 2,
+    agents: Agents = None,
+    background: Background = None,
+    steps: Annotated[int, typer.Option(help="Of a turn.")] = 20,
+    repeats: Annotated[int, typer.Option(help="Turns of each.")] = 7,
+    seed: Seed = 0,
+    settings: Settings = None,
+    at_least: Annotated[
+        float | None, typer.Option(help="Exit with 1 if several are not so many times faster.")
+    ] = None,
+    json_path: JsonPath = None,
+) -> None:
+    """The same worlds without workers, with one and with several; and what an empty order costs."""
+    from cavmarl.evaluate.worker_speed import measure_workers
+
+    if at_least is not None and not 0.0 < at_least < math.inf:
+        raise ConfigError(f"--at-least {at_least:g}: must be a number above 0")
+    console = Console()
+    with console.status("") as status:
+        found = measure_workers(
+            env,
+            worlds=worlds,
+            workers=count,
+            steps=steps,
+            repeats=repeats,
+            seed=seed,
+            agents=agents,
+            background=background,
+            overrides=parse_settings(settings),
+            say=status.update,
+        )
+    write_json(json_path, found.to_dict())
+    console.print(_table(found))
+    low, middle, high, highest = found.barrier_us
+    console.print(
+        f"{count} workers over one: [bold]{found.ratio:.2f}[/], by the busiest one's processor "
+        f"time {found.processor_ratio:.2f}; one worker costs {found.cost_of_one:.2f} times the "
+        "step without\n"
+        f"an empty order to all {count}: [bold]{middle:.1f}[/] µs "
+        f"({low:.1f} / {high:.1f} / {highest:.1f}: 5, 95, 99 %); idle workers take "
+        f"{found.idle_s:.1%} of a core",
+        highlight=False,
+    )
+    if found.is_crowded:
+        console.print("note: more workers than cores", style="yellow")
+    if at_least is not None and found.ratio < at_least:
+        raise typer.Exit(1)
+
+
+def _table(found: WorkerSpeed) -> Table:
+    hardware = found.hardware
+    table = Table(
+        "workers",
+        title=escape(
+            f"{found.env}: {found.worlds} worlds, turns of {found.steps} steps\n"
+            f"{hardware['cpu']}, {hardware['usable_cores']} cores"
+        ),
+    )
+    for column in ("made in, s", "step, ms: min", "median", "max", "busiest, ms"):
+        table.add_column(column, justify="right")
+    for row in found.rows:
+        times = (min(row.step_ms), statistics.median(row.step_ms), max(row.step_ms))
+        busiest = "-" if row.busiest_ms is None else f"{row.busiest_ms:.2f}"
+        shown = (f"{ms:.2f}" for ms in times)
+        table.add_row(str(row.workers), f"{row.made_s:.2f}", *shown, busiest)
+    return table

@@ -1,0 +1,207 @@
+"""How a process waits for another: it looks for a moment, then it sleeps.
+
+Each side has a line of 64-bit words that only itself writes. Word `NUMBER` counts what it has done;
+word `ASLEEP` says whether it has to be woken. To wait is to look at the other's number for a while
+in a compiled loop, which costs a fraction of a microsecond, and then to sleep on a socket, which
+costs no processor at all.
+
+All words are read and written sequentially consistent, so of two that write one word and read the
+other's, at least one sees what the other wrote: who is about to sleep sees the number, or who has
+written the number sees that somebody sleeps. And whoever sees a number sees all that was written
+before it.
+"""
+
+from __future__ import annotations
+
+import os
+import platform
+import socket
+import time
+from contextlib import suppress
+from typing import Any
+
+import numba.core.config
+import numpy as np
+from llvmlite import ir
+from numba.core import cgutils, types
+from numba.extending import intrinsic
+from numpy.typing import NDArray
+
+from cavmarl.kernels import kernel
+from cavmarl.kernels.repeated import repeated
+
+__all__ = ["ASLEEP", "NUMBER", "WORDS", "Meeting", "Words", "load_kernels", "usable_cores"]
+
+Words = NDArray[np.int64]
+
+WORDS = 8  # of a line; of a cache line, too
+NUMBER, ASLEEP = 0, 1  # words of either side; the others are the pool's
+
+SHORT_S = 20e-6  # that anybody looks before it sleeps
+LONG_S = 200e-6  # that it looks where the last time has not been longer
+PAUSES = 4  # looks before it lets others run
+ROUNDS = 16  # of those before it looks at the clock
+WAKE = b"!"
+
+_PAUSE = {"x86_64": "llvm.x86.sse2.pause", "AMD64": "llvm.x86.sse2.pause"}.get(platform.machine())
+_settings: Any = numba.core.config
+_IS_PYTHON = bool(_settings.DISABLE_JIT)
+
+
+def usable_cores() -> int:
+    """How many cores this process may run on."""
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
+
+
+_external: Any = types.ExternalFunction
+_intrinsic: Any = intrinsic
+_function: Any = cgutils.get_or_insert_function
+_let_others_run = _external("sched_yield", types.int32())
+
+
+@_intrinsic  # type: ignore[untyped-decorator]
+def _load(typing: Any, words: Any, at: Any) -> Any:
+    """`words[at]`, read anew, after all that this thread has written."""
+
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        array = context.make_array(signature.args[0])(context, builder, arguments[0])
+        place = builder.gep(array.data, [arguments[1]])
+        return builder.load_atomic(place, "seq_cst", 8)
+
+    return types.int64(words, types.intp), generate
+
+
+@_intrinsic  # type: ignore[untyped-decorator]
+def _store(typing: Any, words: Any, at: Any, value: Any) -> Any:
+    """`words[at] = value`, seen by others after all that was written before."""
+
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        array = context.make_array(signature.args[0])(context, builder, arguments[0])
+        place = builder.gep(array.data, [arguments[1]])
+        builder.store_atomic(arguments[2], place, "seq_cst", 8)
+        return context.get_dummy_value()
+
+    return types.void(words, types.intp, types.int64), generate
+
+
+@_intrinsic  # type: ignore[untyped-decorator]
+def _pause(typing: Any) -> Any:
+    """Tell the processor that this is a loop of waiting."""
+
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        if _PAUSE is not None:
+            nothing = ir.FunctionType(ir.VoidType(), [])
+            builder.call(_function(builder.module, nothing, _PAUSE), [])
+        return context.get_dummy_value()
+
+    return types.void(), generate
+
+
+@kernel
+def _compiled_has(theirs: Words, number: int) -> bool:
+    return _load(theirs, NUMBER) >= number  # type: ignore[no-any-return]
+
+
+@kernel
+def _compiled_set(mine: Words, at: int, value: int, theirs: Words) -> int:
+    """Write a word, then read whether the other side sleeps."""
+    _store(mine, at, value)
+    return _load(theirs, ASLEEP)  # type: ignore[no-any-return]
+
+
+@kernel
+def _compiled_look(theirs: Words, number: int, yields: bool) -> bool:
+    """Whether the other side comes to a number within some rounds."""
+    for _ in range(ROUNDS):
+        for _ in range(PAUSES):
+            if _load(theirs, NUMBER) >= number:
+                return True
+            _pause()
+        if yields:
+            _let_others_run()
+    return False
+
+
+def _plain_has(theirs: Words, number: int) -> bool:
+    return bool(theirs[NUMBER] >= number)
+
+
+def _plain_set(mine: Words, at: int, value: int, theirs: Words) -> int:
+    mine[at] = value
+    return int(theirs[ASLEEP])
+
+
+def _plain_look(theirs: Words, number: int, yields: bool) -> bool:
+    return bool(theirs[NUMBER] >= number)
+
+
+_has, _set, _look = (
+    (_plain_has, _plain_set, _plain_look)
+    if _IS_PYTHON
+    else (repeated(_compiled_has), repeated(_compiled_set), repeated(_compiled_look))
+)
+
+
+def load_kernels() -> None:
+    """Have the loops ready, for this process and those that it forks."""
+    words = np.zeros(WORDS, dtype=np.int64)
+    _set(words, NUMBER, 1, words)
+    _has(words, 1)
+    _look(words, 1, True)
+
+
+class Meeting:
+    """One side of a place where two processes wait for each other.
+
+    Args:
+        mine: (WORDS,) that this side writes.
+        theirs: (WORDS,) that the other one writes.
+        wire: socket to the other side; who sleeps is woken through it.
+        crowded: more processes take part than there are cores, so who looks lets others run.
+    """
+
+    def __init__(self, mine: Words, theirs: Words, wire: socket.socket, crowded: bool) -> None:
+        self.mine = mine
+        self.theirs = theirs
+        self.wire = wire
+        self._crowded = crowded
+        self._last_s = 0.0
+
+    def post(self, number: int) -> None:
+        """Tell the other side that this one has come to a number."""
+        if _set(self.mine, NUMBER, number, self.theirs):
+            with suppress(BrokenPipeError, ConnectionResetError):  # who is gone need not be woken
+                self.wire.send(WAKE)
+
+    def has(self, number: int) -> bool:
+        """Whether the other side has come to a number."""
+        return _has(self.theirs, number)
+
+    def watch(self, number: int) -> bool:
+        """Look for a moment whether the other side comes to a number."""
+        if _look(self.theirs, number, self._crowded):
+            return True
+        limit_s = LONG_S if self._last_s < LONG_S else SHORT_S
+        end = time.perf_counter() + limit_s
+        while time.perf_counter() < end:
+            if _look(self.theirs, number, self._crowded):
+                return True
+        return False
+
+    def lasted(self, wait_s: float) -> None:
+        """Note how long this side has had to wait: the next time it looks no longer than pays."""
+        self._last_s = wait_s
+
+    def lie_down(self, number: int) -> bool:
+        """Say that this side sleeps from here on; False: there is no need any more."""
+        _set(self.mine, ASLEEP, 1, self.theirs)
+        if self.has(number):
+            self.get_up()
+            return False
+        return True
+
+    def get_up(self) -> None:
+        """Say that this side is awake."""
+        _set(self.mine, ASLEEP, 0, self.theirs)

@@ -1,0 +1,285 @@
+"""`Crew`: the processes of a pool, one a worker, and the words that are exchanged with them."""
+
+from __future__ import annotations
+
+import json
+import os
+import select
+import signal
+from collections.abc import Callable, Mapping
+from contextlib import suppress
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from cavmarl.runtime.barrier import NUMBER, WORDS, Meeting, usable_cores
+from cavmarl.runtime.fork_server import ForkServer, Process, ServerGoneError
+from cavmarl.runtime.shared_memory import Segment
+from cavmarl.runtime.worker import ANSWER, OUT_OF_MEMORY, SILENT, TASK
+
+__all__ = ["Crew", "Program"]
+
+_LINE_BYTES = WORDS * 8
+_FIRST_IMAGE_BYTES = 1 << 12
+
+
+class Program(NamedTuple):
+    """What the workers of a pool run.
+
+    Attributes:
+        module: that is run as a program and calls `worker.serve`.
+        recipe: from which it makes the jobs, as JSON knows it.
+        parts: what each worker hosts, in words.
+        segments: that the jobs share with the pool, and the pool gives back; the recipe names their
+            descriptors.
+        tasks: what each task is called, by its number.
+    """
+
+    module: str
+    recipe: Mapping[str, Any]
+    parts: tuple[str, ...]
+    segments: tuple[Segment, ...]
+    tasks: tuple[str, ...]
+
+
+class Crew:
+    """m worker processes and the one that forks them.
+
+    Args:
+        program: what they run.
+
+    Attributes:
+        orders: (m, WORDS) the lines that this side writes.
+
+    Raises:
+        WorkerStartError: no process, or no memory.
+        WorkerFailureError: an exception while the jobs were made.
+    """
+
+    def __init__(self, program: Program) -> None:
+        self._program = program
+        self._count = len(program.parts)
+        self._crowded = self._count + 1 > usable_cores()
+        self._poll = select.poll()
+        self._held = _Held(list(program.segments))
+        self._meetings: dict[int, Meeting] = {}
+        try:
+            self._make_memory()
+            self._start()
+        except BaseException:
+            self._held.release()
+            raise
+
+    @property
+    def release(self) -> Callable[[], None]:
+        """Ends the processes and gives all back, also when the crew is forgotten."""
+        return self._held.release
+
+    @property
+    def processes(self) -> dict[int, Process]:
+        """By number of the worker; none when all have been given back."""
+        return self._held.processes
+
+    @property
+    def server_pid(self) -> int:
+        """Of the process that forks them."""
+        server = self._held.server
+        return 0 if server is None else server.pid
+
+    def order(self, k: int, head: tuple[int, ...], mail: bytes | None) -> None:
+        """Give a worker its next order; that it is dead is noticed later.
+
+        Args:
+            k: which one.
+            head: words of the order, from TASK to LOADS.
+            mail: what goes with it.
+        """
+        words = self.orders[k]
+        words[TASK : TASK + len(head)] = head
+        self._send(k, mail)
+        self._meetings[k].post(words.item(NUMBER) + 1)
+
+    def number(self, k: int) -> int:
+        """Of the last order that a worker was given."""
+        return self.orders.item(k, NUMBER)
+
+    def has(self, k: int) -> bool:
+        """Whether a worker has carried it out."""
+        return self._meetings[k].has(self.number(k))
+
+    def watch(self, k: int) -> bool:
+        """The same, but look for a moment."""
+        return self._meetings[k].watch(self.number(k))
+
+    def lasted(self, k: int, wait_s: float) -> None:
+        """Note how long it has taken."""
+        self._meetings[k].lasted(wait_s)
+
+    def sleep(self, pending: list[int], limit_s: float) -> dict[int, Process]:
+        """Sleep until one of those is done, or anybody is dead, but not for ever.
+
+        Returns:
+            the dead, by worker.
+        """
+        ready: set[int] = set()
+        lying = [self._meetings[k].lie_down(self.number(k)) for k in pending]
+        if all(lying):
+            ready = {fd for fd, _ in self._poll.poll(1000.0 * limit_s)}
+        for k in pending:
+            self._meetings[k].get_up()
+        if not ready:
+            return {}
+        for process in self.processes.values():
+            if process.wire.fileno() in ready:
+                process.collect()
+        return {k: process for k, process in self.processes.items() if process.pidfd in ready}
+
+    def settle(self, k: int, limit_s: float) -> bool:
+        """Whether a worker has carried out its order or has died of it, after a while at most."""
+        process = self.processes[k]
+        if select.select([process.pidfd], [], [], 0.0 if self.has(k) else limit_s)[0]:
+            self._statuses[k][NUMBER] = self.number(k)  # nobody else writes there any more
+        process.collect()
+        process.mail.clear()
+        return self.has(k)
+
+    def answer(self, k: int) -> tuple[int, Any]:
+        """How a worker's order ended, as its line says, and what it has answered."""
+        kind = self._statuses[k].item(ANSWER)
+        if kind == SILENT:
+            return kind, None
+        process = self.processes[k]
+        process.collect()
+        return kind, json.loads(process.mail.pop(0))
+
+    def replace(self, k: int, mail: bytes | None) -> str:
+        """Give a worker a new process, and that one the order, if it is not carried out yet.
+
+        Args:
+            k: the worker.
+            mail: that came with the order.
+
+        Returns:
+            what the old process died of, if nothing else is known.
+        """
+        old = self.processes[k]
+        self._dismiss(old)
+        assert self._held.server is not None
+        try:
+            cause = _say(self._held.server.bury(old))
+            self._fork(k)
+        except ServerGoneError:
+            cause = "the process that starts workers ended"
+            self._start_anew(k, mail)
+        self._hand_over(k, old, mail)
+        return cause
+
+    def _dismiss(self, process: Process) -> None:
+        process.kill()
+        self._poll.unregister(process.pidfd)
+        self._poll.unregister(process.wire)
+        process.collect()
+
+    def _hand_over(self, k: int, old: Process, mail: bytes | None) -> None:
+        """To a new process, what has come from the old one, or what that one was sent."""
+        if self.has(k):
+            self.processes[k].mail = old.mail
+        else:
+            self._send(k, mail)
+        old.release()
+
+    def _start_anew(self, k: int, mail: bytes | None) -> None:
+        """The process that forks is gone, or hangs: another one, and new workers for all."""
+        assert self._held.server is not None
+        self._held.server.close()
+        others = {j: process for j, process in self.processes.items() if j != k}
+        for process in others.values():
+            self._dismiss(process)
+        self._start()
+        for j, process in others.items():
+            self._hand_over(j, process, mail)
+
+    def _send(self, k: int, mail: bytes | None) -> None:
+        if mail is not None:
+            with suppress(BrokenPipeError, ConnectionResetError):
+                self.processes[k].wire.send(mail)
+
+    def _make_memory(self) -> None:
+        held = self._held
+        orders = held.hold(Segment.make(self._count * _LINE_BYTES))
+        statuses = [held.hold(Segment.make(_LINE_BYTES)) for _ in range(self._count)]
+        images = [
+            [held.hold(Segment.make(_FIRST_IMAGE_BYTES)) for _ in range(2)]
+            for _ in range(self._count)
+        ]
+        text = json.dumps(self._program.recipe).encode()
+        recipe = held.hold(Segment.make(len(text)))
+        os.pwrite(recipe.fd, text, 0)
+        self.orders = np.frombuffer(orders.map(), dtype=np.int64).reshape(-1, WORDS)
+        self._statuses = [np.frombuffer(s.map(), dtype=np.int64)[:WORDS] for s in statuses]
+        self._crowded = self._count + 1 > usable_cores()
+        self._told = {
+            "recipe": recipe.fd,
+            "recipe_bytes": len(text),
+            "orders": orders.fd,
+            "statuses": [segment.fd for segment in statuses],
+            "images": [[image.fd for image in pair] for pair in images],
+            "crowded": self._crowded,
+        }
+
+    def _start(self) -> None:
+        """Start the process that forks, and a process for every worker."""
+        fds = tuple(segment.fd for segment in self._held.segments)
+        self._held.server = ForkServer(self._program.module, self._told, fds)
+        for k in range(self._count):
+            self._fork(k)
+
+    def _fork(self, k: int) -> None:
+        assert self._held.server is not None
+        process = self._held.server.fork(k)
+        self.processes[k] = process
+        self._poll.register(process.pidfd, select.POLLIN)
+        self._poll.register(process.wire, select.POLLIN)
+        self._meetings[k] = Meeting(self.orders[k], self._statuses[k], process.wire, self._crowded)
+
+
+def _say(status: int) -> str:
+    """What an exit status means."""
+    if status == OUT_OF_MEMORY:
+        return "out of memory"
+    if status >= 0:
+        return f"exit status {status}"
+    return signal.Signals(-status).name
+
+
+class _Held:
+    """What has to be given back, whoever forgets to.
+
+    Args:
+        segments: of the program.
+    """
+
+    def __init__(self, segments: list[Segment]) -> None:
+        self.segments = segments
+        self.server: ForkServer | None = None
+        self.processes: dict[int, Process] = {}
+        self._pid = os.getpid()
+
+    def hold(self, segment: Segment) -> Segment:
+        """Give it back with the others."""
+        self.segments.append(segment)
+        return segment
+
+    def release(self) -> None:
+        """End the processes; a fork of the pool's process has no right to."""
+        if os.getpid() != self._pid:
+            return
+        for process in self.processes.values():
+            process.kill()
+        if self.server is not None:
+            self.server.close()
+        for process in self.processes.values():
+            process.release()
+        for segment in self.segments:
+            segment.close()
+        self.processes.clear()

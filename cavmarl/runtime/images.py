@@ -1,0 +1,101 @@
+"""`Image`: arrays in a segment, with a checksum; what a worker's successor begins from."""
+
+from __future__ import annotations
+
+import mmap
+import zlib
+from collections.abc import Iterator, Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cavmarl.errors import WorkerError
+from cavmarl.runtime.shared_memory import Segment
+
+__all__ = ["Arrays", "Image"]
+
+Array = NDArray[Any]
+Arrays = Sequence[Array]
+
+_WORD = 8
+_HEAD = 3  # words: of everything, checksum, how many arrays
+
+
+class Image:
+    """Arrays as they were at one moment.
+
+    Args:
+        segment: that holds it; it grows as the arrays do.
+    """
+
+    def __init__(self, segment: Segment) -> None:
+        self._segment = segment
+        self._memory: mmap.mmap | None = None
+        self._words = np.zeros(0, dtype=np.int64)
+
+    def write(self, arrays: Arrays) -> None:
+        """Copy arrays into it.
+
+        Raises:
+            OSError: there is no memory for them.
+        """
+        head = [array.ndim for array in arrays]
+        for array in arrays:
+            head.extend(array.shape)
+        begin = _HEAD + len(head)
+        size = begin + sum(-(-array.nbytes // _WORD) for array in arrays)
+        self._make_room(_WORD * size)
+        words = self._words
+        words[2] = len(arrays)
+        words[_HEAD:begin] = head
+        at = begin
+        for array in arrays:
+            end = at + -(-array.nbytes // _WORD)
+            if array.nbytes:
+                words[end - 1] = 0  # what rounds it up
+                place = words[at:end].view(np.uint8)[: array.nbytes]
+                raw = np.dtype((np.void, array.itemsize))  # NumPy copies records field by field
+                place.view(raw).reshape(array.shape)[...] = array.view(raw)
+            at = end
+        words[0] = size
+        words[1] = _checksum(words[2:size])
+
+    def read(self, dtypes: Sequence[np.dtype[Any]]) -> Iterator[Array]:
+        """The arrays, in their order, as views.
+
+        Args:
+            dtypes: of each.
+
+        Raises:
+            WorkerError: they are not what was written.
+        """
+        self._map_all()
+        words = self._words
+        size = int(words[0]) if len(words) else 0
+        if not _HEAD <= size <= len(words) or words[1] != _checksum(words[2:size]):
+            raise WorkerError("the state that a worker has left behind is not what it wrote")
+        ranks = words[_HEAD : _HEAD + len(dtypes)].tolist()
+        shape_at = _HEAD + len(ranks)
+        at = shape_at + sum(ranks)
+        for dtype, rank in zip(dtypes, ranks, strict=True):
+            shape = words[shape_at : shape_at + rank].tolist()
+            shape_at += rank
+            num_bytes = int(np.prod(shape, dtype=np.int64)) * dtype.itemsize
+            end = at + -(-num_bytes // _WORD)
+            yield words[at:end].view(np.uint8)[:num_bytes].view(dtype).reshape(shape)
+            at = end
+
+    def _make_room(self, size: int) -> None:
+        if size > _WORD * len(self._words):
+            self._segment.grow(-(-size * 5 // 4 // mmap.PAGESIZE) * mmap.PAGESIZE)
+            self._map_all()
+
+    def _map_all(self) -> None:
+        """Map the segment as large as it is by now, whoever has made it so."""
+        self._memory = self._segment.map()
+        self._words = np.frombuffer(self._memory, dtype=np.int64)
+
+
+def _checksum(words: NDArray[np.int64]) -> int:
+    return zlib.crc32(words.data)

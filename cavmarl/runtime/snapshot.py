@@ -1,0 +1,117 @@
+"""What the next tick of W worlds depends on, as a list of arrays, for whoever goes on with them.
+
+Who owns what is not part of it: that changes no result. Whoever goes on with a divided world gives
+each vehicle to the zone that it is in, as at a reset.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cavmarl.kernels.arrays import Gate, Outputs, Worlds
+from cavmarl.runtime.coordination import Coordination
+from cavmarl.runtime.division import Division
+from cavmarl.shard.shard import COMMON
+from cavmarl.traffic.native import NativeTraffic
+
+__all__ = ["Parts", "load", "save"]
+
+Array = NDArray[Any]
+
+# Fields of `Gate` that outlive a tick, beside its queue. Nobody is passing it between two steps.
+_OF_GATE = ("next_order", "num_queue", "next_id", "num_entered", "counts", "sums", "lane_taken")
+
+
+class Parts(NamedTuple):
+    """Who keeps the state of W worlds.
+
+    Attributes:
+        worlds: of the first shard.
+        division: of all shards.
+        gate: through which vehicles come and go.
+        traffic: what comes.
+        outputs: what agents have got; the frames of the next observation, too.
+        coordination: who says who owns what; None: all is one zone.
+        has_frames: an observation has frames of the ones before.
+    """
+
+    worlds: Worlds
+    division: Division
+    gate: Gate
+    traffic: NativeTraffic
+    outputs: Outputs
+    coordination: Coordination | None
+    has_frames: bool
+
+
+def save(parts: Parts) -> list[Array]:
+    """The arrays; some of them are views, to be copied before the next tick."""
+    worlds, gate = parts.worlds, parts.gate
+    waiting = int(gate.num_queue.max(initial=0))
+    return [
+        *_fixed(parts),
+        gate.queue[:, :waiting],
+        parts.division.contacts(),
+        *(
+            parts.division.owned(w, zone)
+            for w in range(len(worlds.ticks))
+            for zone in range(parts.division.count)
+        ),
+        *_of_rerouting(parts),
+    ]
+
+
+def load(parts: Parts, saved: Sequence[Array]) -> Gate:
+    """Put everything in its place.
+
+    Args:
+        parts: of worlds of the same environment, as many as there were.
+        saved: what `save` gave.
+
+    Returns:
+        the gate, or a larger one.
+    """
+    everywhere = np.ones(len(parts.worlds.ticks), dtype=np.bool_)
+    rest = iter(saved)
+    parts.division.align()
+    for array in _fixed(parts):
+        array[...] = next(rest)
+    # What is ordered follows from the keys; what has been ordered so far is in the gate.
+    gate = parts.traffic.draw_orders(parts.gate, parts.worlds, everywhere)
+    queue, contacts = next(rest), next(rest)
+    gate.queue[:, : queue.shape[1]] = queue
+    gate.num_passing[:] = 0
+    zones = range(parts.division.count)
+    vehicles = [np.concatenate([next(rest) for _ in zones]) for _ in everywhere]
+    parts.division.place(vehicles, contacts)
+    for array in _of_rerouting(parts):
+        _put(array, next(rest))
+    if parts.coordination is not None:
+        parts.coordination.reset(everywhere)
+    return gate
+
+
+def _fixed(parts: Parts) -> Iterator[Array]:
+    """The arrays whose shapes follow from the environment."""
+    for name in COMMON:
+        yield getattr(parts.worlds, name)
+    for name in _OF_GATE:
+        yield getattr(parts.gate, name)
+    for name, array in parts.outputs._asdict().items():
+        if name != "observations" or parts.has_frames:
+            yield array
+
+
+def _of_rerouting(parts: Parts) -> Iterator[Array]:
+    if parts.traffic.rerouting is not None:
+        yield from parts.traffic.rerouting.arrays()
+
+
+def _put(target: Array, saved: Array) -> None:
+    """Copy what both have: room for the orders of an episode grows as it is needed."""
+    shared = tuple(slice(min(pair)) for pair in zip(target.shape, saved.shape, strict=True))
+    target[shared] = saved[shared]

@@ -1,0 +1,1 @@
+"""Many worlds with autoreset, in this process or shared out over worker processes."""

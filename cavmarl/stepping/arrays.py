@@ -1,0 +1,113 @@
+"""`StepArrays`: what goes into a step of W worlds and what comes out, wherever they are run."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cavmarl.config import TERMS, EnvConfig
+from cavmarl.runtime.shared_memory import Layout
+from cavmarl.runtime.simulation import Simulation
+from cavmarl.shard.shard import Commands
+from cavmarl.spaces import flat_observation_space
+from cavmarl.worlds import World
+
+__all__ = ["StepArrays", "SteppedWorlds", "layout_of"]
+
+
+class StepArrays(NamedTuple):
+    """Arrays of W worlds with A agents each; the next step overwrites them.
+
+    T is the number of terms, D the size of a flat observation.
+    """
+
+    observations: NDArray[np.float32]  # (W, A, D) for the next action
+    final_observations: NDArray[np.float32]  # (W, A, D) where something ended, before that
+    rewards: NDArray[np.float32]  # (W, A)
+    terminations: NDArray[np.bool_]  # (W, A) the vehicle ended
+    truncations: NDArray[np.bool_]  # (W, A) the horizon ended it
+    acted: NDArray[np.bool_]  # (W, A) who has acted
+    vehicle_done: NDArray[np.bool_]  # (W, A)
+    mask: NDArray[np.bool_]  # (W, A) who acts next
+    terms: NDArray[np.float32]  # (W, A, T)
+    arrivals: NDArray[np.int64]  # (W,) since each world's reset
+    episode_over: NDArray[np.bool_]  # (W,) which worlds are over
+    controls: NDArray[np.float64]  # (W, A, 2) what agents do, as in `Commands`
+    meta_actions: NDArray[np.int64]  # (W, A)
+    suggested: NDArray[np.float64]  # (W, A, 2) what the built-in driver would do
+
+    def part(self, first: int, last: int) -> StepArrays:
+        """Those of some of the worlds, as views."""
+        parts: list[Any] = [array[first:last] for array in self]
+        return StepArrays(*parts)
+
+
+def layout_of(config: EnvConfig, num_worlds: int) -> Layout:
+    """Name → dtype and shape of the `StepArrays` of W worlds."""
+    agents = (num_worlds, config.population.num_ids)
+    observations = ("<f4", (*agents, flat_observation_space(config).shape[0]))
+    flags = ("|b1", agents)
+    return {
+        "observations": observations,
+        "final_observations": observations,
+        "rewards": ("<f4", agents),
+        **dict.fromkeys(("terminations", "truncations", "acted", "vehicle_done", "mask"), flags),
+        "terms": ("<f4", (*agents, len(TERMS))),
+        "arrivals": ("<i8", (num_worlds,)),
+        "episode_over": ("|b1", (num_worlds,)),
+        "controls": ("<f8", (*agents, 2)),
+        "meta_actions": ("<i8", agents),
+        "suggested": ("<f8", (*agents, 2)),
+    }
+
+
+class SteppedWorlds(Protocol):
+    """W worlds that begin a new episode in the step in which the old one ends, or in the next one.
+
+    Attributes:
+        world: what each is made of.
+        arrays: what goes into a step, and what comes out.
+        in_next_step: when new episodes begin. If so, the last observations stand where they were,
+            and nobody acts in a world that is over.
+    """
+
+    world: World
+    arrays: StepArrays
+    in_next_step: bool
+
+    @property
+    def simulation(self) -> Simulation:
+        """The worlds themselves, where they live in this process."""
+        ...
+
+    def reset(self, seed: int | None, first_world: int, chosen: NDArray[np.bool_]) -> None:
+        """Begin an episode in some of the worlds; writes `observations` and `mask`.
+
+        Args:
+            seed: root of all random numbers; None goes on with those of the last seed.
+            first_world: number of the first of these worlds among all worlds of the seed.
+            chosen: (W,) which worlds; with a seed, all of them.
+        """
+        ...
+
+    def step(self, commands: Commands) -> None:
+        """Let the agents act; writes all that comes out."""
+        ...
+
+    def suggest(self) -> None:
+        """Write `suggested`."""
+        ...
+
+    def state_hash(self, world: int) -> str:
+        """Hex digest of one world."""
+        ...
+
+    def traffic_stats(self, world: int) -> dict[str, float]:
+        """Traffic of one world since its reset."""
+        ...
+
+    def close(self) -> None:
+        """Give back what they hold."""
+        ...

@@ -1,0 +1,150 @@
+"""`LocalWorlds`: worlds of this process, with autoreset."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import asdict
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cavmarl.kernels.codes import EVENTS_THAT_END
+from cavmarl.runtime.simulation import Simulation
+from cavmarl.shard.shard import Commands
+from cavmarl.stepping.arrays import StepArrays, layout_of
+from cavmarl.worlds import World
+
+__all__ = ["LocalWorlds"]
+
+
+class LocalWorlds:
+    """W worlds of one environment; no loop of Python runs over agents or vehicles in a step.
+
+    Args:
+        world: what each is made of.
+        num_worlds: W.
+        arrays: where to write; None: arrays of its own.
+        in_next_step: begin new episodes in the step after the last one, not in the last one.
+        warm: have all kernels ready now.
+
+    Attributes:
+        world: what each is made of.
+        arrays: what goes into a step, and what comes out.
+        in_next_step: as given.
+        simulation: the worlds.
+    """
+
+    def __init__(
+        self,
+        world: World,
+        num_worlds: int,
+        arrays: StepArrays | None = None,
+        *,
+        in_next_step: bool = False,
+        warm: bool = False,
+    ) -> None:
+        self.world = world
+        self.in_next_step = in_next_step
+        self.simulation = Simulation(
+            world.config,
+            world.network,
+            num_worlds,
+            world.demand,
+            world.partition,
+            observations=None if arrays is None else arrays.observations,
+            warm=warm,
+        )
+        if arrays is None:
+            arrays = _own_arrays(self.simulation, num_worlds)
+        self.arrays = arrays
+        self._horizon = world.config.max_steps
+        self._steps = np.zeros(num_worlds, dtype=np.int64)
+        self._over = np.zeros(num_worlds, dtype=np.bool_)  # and not begun anew yet
+
+    def reset(self, seed: int | None, first_world: int, chosen: NDArray[np.bool_]) -> None:
+        """Begin an episode in the chosen worlds (W,)."""
+        if seed is not None:
+            self.simulation.seed(seed, first_world)
+        self._begin(chosen)
+        if not chosen.all():
+            self.arrays.observations[~self.arrays.mask] = 0.0
+
+    def _begin(self, chosen: NDArray[np.bool_]) -> None:
+        self.simulation.reset(chosen)
+        self._steps[chosen] = 0
+        self._over[chosen] = False
+        self.arrays.mask[chosen] = self.simulation.outputs.present[chosen]
+
+    def step(self, commands: Commands) -> None:
+        """Let the agents act, and begin anew the worlds whose episode is over."""
+        simulation, arrays = self.simulation, self.arrays
+        simulation.step(commands)
+        self._steps += 1
+        if self._over.any():
+            self._begin(self._over.copy())
+        outputs = simulation.outputs
+        at_horizon = self._steps >= self._horizon
+        terminations = outputs.terminated
+        arrays.rewards[:] = outputs.rewards
+        arrays.terms[:] = outputs.terms
+        arrays.acted[:] = outputs.acted
+        arrays.terminations[:] = terminations
+        np.not_equal(outputs.events & EVENTS_THAT_END, 0, out=arrays.vehicle_done)
+        np.logical_and(outputs.acted & at_horizon[:, None], ~terminations, out=arrays.truncations)
+        simulation.retire_agents()
+        arrays.arrivals[:] = simulation.arrivals()
+        np.logical_and(outputs.present, ~terminations, out=arrays.mask)
+        goes_on = arrays.mask.any(axis=1) | simulation.agents_to_come()
+        np.logical_or(at_horizon, ~goes_on, out=arrays.episode_over)
+        self._end(arrays.episode_over)
+
+    def _end(self, over: NDArray[np.bool_]) -> None:
+        """Keep what those saw last who have ended, and begin the new episodes."""
+        arrays = self.arrays
+        if self.in_next_step:
+            self._over[:] = over
+            arrays.mask[over] = False
+            return
+        ended = over | arrays.terminations.any(axis=1)
+        if not ended.any():
+            return
+        arrays.final_observations[ended] = arrays.observations[ended]
+        arrays.observations[arrays.terminations] = 0.0
+        if over.any():
+            self._begin(over)
+
+    def suggest(self) -> None:
+        """Write what the built-in driver would do in the agents' place."""
+        self.arrays.suggested[:] = 0.0
+        self.simulation.suggest(self.arrays.suggested)
+
+    def state_hash(self, world: int) -> str:
+        """Hex digest of one world."""
+        return self.simulation.state_hash(world)
+
+    def traffic_stats(self, world: int) -> dict[str, float]:
+        """Traffic of one world since its reset."""
+        return asdict(self.simulation.traffic_stats(world))
+
+    def save(self) -> list[NDArray[Any]]:
+        """All that the next step depends on; views, to be copied."""
+        return [self._steps, self._over, *self.simulation.save()]
+
+    def load(self, saved: Sequence[NDArray[Any]]) -> None:
+        """Go on from what `save` gave."""
+        self._steps[:], self._over[:] = saved[:2]
+        self.simulation.load(saved[2:])
+
+    def close(self) -> None:
+        """Nothing to release."""
+
+
+def _own_arrays(simulation: Simulation, num_worlds: int) -> StepArrays:
+    layout = layout_of(simulation.config, num_worlds)
+    made = {
+        name: np.zeros(shape, dtype)
+        for name, (dtype, shape) in layout.items()
+        if name != "observations"
+    }
+    return StepArrays(observations=simulation.outputs.observations, **made)

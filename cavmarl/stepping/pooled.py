@@ -1,0 +1,184 @@
+"""`PooledWorlds`: worlds shared out over worker processes, whole worlds each."""
+
+from __future__ import annotations
+
+import warnings
+from dataclasses import asdict
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+import cavmarl.errors
+from cavmarl.config import ZonesConfig
+from cavmarl.errors import CavmarlError, ConfigError, WorkerDeathError, WorkerFailureError
+from cavmarl.runtime.barrier import usable_cores
+from cavmarl.runtime.compilation import compiled_before
+from cavmarl.runtime.pool import Death, Pool, Program
+from cavmarl.runtime.shared_memory import Segment, arrays_in, size_of
+from cavmarl.runtime.simulation import Simulation
+from cavmarl.shard.shard import Commands
+from cavmarl.stepping.arrays import StepArrays, layout_of
+from cavmarl.stepping.job import Task, fingerprint
+from cavmarl.worlds import World
+
+__all__ = ["PooledWorlds"]
+
+PROGRAM = "cavmarl.stepping.worker"
+
+
+class PooledWorlds:
+    """W worlds over m worker processes.
+
+    Args:
+        world: what each is made of.
+        base_dir: the folder that its relative files start from.
+        num_worlds: W.
+        workers: m, from 1 to W.
+        in_next_step: begin new episodes in the step after the last one, not in the last one.
+
+    Attributes:
+        world: what each is made of.
+        in_next_step: as given.
+        arrays: in shared memory; each worker writes those of its worlds.
+        pool: the processes.
+
+    Raises:
+        ConfigError: a setting that worlds of several processes cannot have.
+        WorkerError: no process, or no memory.
+    """
+
+    def __init__(
+        self,
+        world: World,
+        base_dir: Path,
+        num_worlds: int,
+        workers: int,
+        in_next_step: bool = False,
+    ) -> None:
+        self.world = world
+        self.in_next_step = in_next_step
+        config = world.config
+        _check(config.zones)
+        cores = usable_cores()
+        if workers > cores:
+            warnings.warn(
+                f"workers = {workers}: there are {cores} cores; more workers than cores do not "
+                "make it faster",
+                RuntimeWarning,
+                stacklevel=3,
+            )
+        if not compiled_before():
+            Simulation(config, world.network, 1, world.demand, world.partition)
+        layout = layout_of(config, num_worlds)
+        segment = Segment.make(size_of(layout))
+        self.arrays = StepArrays(**arrays_in(segment.map(), layout))
+        bounds = [num_worlds * k // workers for k in range(workers + 1)]
+        parts = list(pairwise(bounds))
+        recipe = {
+            "config": asdict(config),
+            "base_dir": str(base_dir.resolve()),
+            "fingerprint": fingerprint(world),
+            "num_worlds": num_worlds,
+            "arrays": segment.fd,
+            "parts": parts,
+            "in_next_step": in_next_step,
+        }
+        named = tuple(_name(first, last) for first, last in parts)
+        tasks = tuple(task.name.lower().replace("_", " ") for task in Task)
+        program = Program(PROGRAM, recipe, named, (segment,), tasks)
+        try:
+            self.pool = Pool(program, config.workers.timeout_s, config.workers.repeats)
+        except WorkerFailureError as failure:
+            raise _own(failure) from failure
+        self._steps = 0
+        self._last_worlds = np.array(bounds[1:])
+
+    @property
+    def simulation(self) -> Simulation:
+        """Refused: the worlds live in other processes.
+
+        Raises:
+            ConfigError: always.
+        """
+        raise ConfigError("the worlds live in worker processes: use workers=0 to look into them")
+
+    @property
+    def deaths(self) -> list[Death]:
+        """Of worker processes, up to now."""
+        return self.pool.deaths
+
+    def reset(self, seed: int | None, first_world: int, chosen: NDArray[np.bool_]) -> None:
+        """Begin an episode in the chosen worlds (W,)."""
+        bits = np.packbits(chosen).tobytes().hex()
+        self._run(Task.RESET, {"seed": seed, "first_world": first_world, "chosen": bits})
+        if chosen.all():
+            self._steps = 0
+
+    def step(self, commands: Commands) -> None:
+        """Let the agents act, and begin anew the worlds whose episode is over."""
+        self.arrays.controls[:] = commands.controls
+        self.arrays.meta_actions[:] = commands.meta_actions
+        self._run(Task.STEP)
+        self._steps += 1
+
+    def suggest(self) -> None:
+        """Write what the built-in driver would do in the agents' place."""
+        self._run(Task.SUGGEST, commits=False)
+
+    def state_hash(self, world: int) -> str:
+        """Hex digest of one world."""
+        return str(self._ask(Task.STATE_HASH, world))
+
+    def traffic_stats(self, world: int) -> dict[str, float]:
+        """Traffic of one world since its reset."""
+        found: dict[str, float] = self._ask(Task.TRAFFIC_STATS, world)
+        return found
+
+    def close(self) -> None:
+        """End the processes."""
+        self.pool.close()
+
+    def _run(self, task: Task, letter: Any = None, commits: bool = True) -> None:
+        try:
+            self.pool.run(task, letter, commits)
+        except WorkerFailureError as failure:
+            raise _own(failure) from failure
+        except WorkerDeathError as death:
+            death.add_note(f"in step {self._steps + 1} since the reset")
+            raise
+
+    def _ask(self, task: Task, world: int) -> Any:
+        """Of the worker that hosts a world; numbers from the end count as they do for arrays."""
+        number = range(len(self.arrays.mask))[world]
+        worker = int(np.searchsorted(self._last_worlds, number, side="right"))
+        return self.pool.ask(worker, task, number)
+
+
+def _check(zones: ZonesConfig) -> None:
+    """Refuse what only worlds of one process can have.
+
+    Raises:
+        ConfigError: a journal or faults.
+    """
+    for name in ("journal", "faults"):
+        if getattr(zones, name):
+            raise ConfigError(
+                f"zones.{name} = {getattr(zones, name)!r}: of worlds of one process only; "
+                "use workers=0"
+            )
+
+
+def _name(first: int, last: int) -> str:
+    return f"world {first}" if last - first == 1 else f"worlds {first} to {last - 1}"
+
+
+def _own(failure: WorkerFailureError) -> CavmarlError:
+    """An error that the worlds raise on purpose, as they would raise it in this process."""
+    kind = getattr(cavmarl.errors, failure.kind, None)
+    if not isinstance(kind, type) or not issubclass(kind, CavmarlError):
+        return failure
+    takes_text = "__init__" not in vars(kind)
+    return kind(failure.text) if takes_text else failure

@@ -1,0 +1,322 @@
+"""Processes that are killed, stopped, interrupted and left behind: none is missed."""
+
+from __future__ import annotations
+
+import gc
+import os
+import select
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+
+from cavmarl.errors import (
+    WorkerDeathError,
+    WorkerError,
+    WorkerFailureError,
+    WorkerStartError,
+)
+from cavmarl.runtime.pool import Pool, Program
+from cavmarl.runtime.shared_memory import Segment
+from tests.runtime.toy_job import ADD, DIE, DOZE, FAIL, RUN_OUT, TASKS, TOIL, TOTAL
+
+MODULE = "tests.runtime.toy_job"
+ROOT = Path(__file__).resolve().parents[2]
+MORE = 1000  # numbers that each task adds
+
+Make = Callable[..., Pool]
+
+
+def program(workers: int = 2, **recipe: object) -> Program:
+    names = tuple(f"part {k}" for k in range(workers))
+    return Program(MODULE, {"workers": workers, **recipe}, names, (), TASKS)
+
+
+@pytest.fixture
+def make() -> Iterator[Make]:
+    pools: list[Pool] = []
+
+    def call(workers: int = 2, timeout_s: float = 60.0, repeats: int = 3) -> Pool:
+        pools.append(Pool(program(workers), timeout_s, repeats))
+        return pools[-1]
+
+    yield call
+    for pool in pools:
+        pool.close()
+
+
+def totals(pool: Pool) -> list[list[float]]:
+    return pool.run(TOTAL, commits=False)
+
+
+def alive(pids: list[int]) -> list[int]:
+    """Those that are there, and be it as a zombie of ours."""
+    return [pid for pid in pids if Path(f"/proc/{pid}").exists()]
+
+
+def gone(pids: list[int], limit_s: float = 5.0) -> bool:
+    end = time.monotonic() + limit_s
+    while alive(pids) and time.monotonic() < end:
+        time.sleep(0.01)
+    return not alive(pids)
+
+
+def test_all_work_and_answer(make: Make) -> None:
+    pool = make(workers=2)
+    for _ in range(3):
+        pool.run(ADD)
+    assert totals(pool) == [[9.0, 3 * MORE]] * 2
+    assert pool.ask(1, TOTAL) == [9.0, 3 * MORE]
+    assert pool.deaths == []
+
+
+@pytest.mark.parametrize("how", [signal.SIGKILL, signal.SIGSTOP, signal.SIGTERM])
+def test_one_that_dies_while_nobody_waits(make: Make, how: signal.Signals) -> None:
+    pool = make(workers=2)
+    pool.run(ADD)
+    os.kill(pool.pids[1], how)
+    pool.run(ADD)
+    assert totals(pool) == [[6.0, 2 * MORE]] * 2
+    assert [death.worker for death in pool.deaths] == [1]
+    assert how.name in pool.deaths[0].cause
+
+
+def test_one_that_dies_before_the_first_order(make: Make) -> None:
+    pool = make(workers=1)
+    os.kill(pool.pids[0], signal.SIGKILL)
+    pool.run(ADD)
+    assert totals(pool) == [[3.0, MORE]]
+
+
+def test_all_that_die_at_work(make: Make) -> None:
+    pool = make(workers=2)
+    pool.run(ADD)
+    pids = pool.pids
+    timer = threading.Timer(0.1, lambda: [os.kill(pid, signal.SIGKILL) for pid in pids])
+    timer.start()
+    pool.run(TOIL, 0.3)
+    timer.join()
+    assert totals(pool) == [[6.0, 2 * MORE]] * 2
+    assert sorted(death.worker for death in pool.deaths) == [0, 1]
+    assert all(0.3 < death.done_s - death.noticed_s < 3.0 for death in pool.deaths)
+
+
+def test_the_answer_of_one_that_dies_after_it_is_not_lost(make: Make) -> None:
+    pool = make(workers=2)
+    pool.run(ADD)
+    first, second = pool.pids
+    timer = threading.Timer(0.1, os.kill, (first, signal.SIGKILL))
+    timer.start()
+    pool.ask(1, TOIL, 0.3)  # it counts in the second alone, and is not committed
+    timer.join()
+    assert pool.pids[1] == second
+    assert pool.ask(0, TOTAL) == [3.0, MORE]
+
+
+def test_one_that_is_slow_is_let_be(make: Make) -> None:
+    pool = make(workers=1)
+    pool.run(TOIL, 1.5)
+    assert pool.deaths == []
+
+
+def test_one_that_hangs_is_noticed_within_a_second(make: Make) -> None:
+    pool = make(workers=2, repeats=0)
+    began = time.monotonic()
+    with pytest.raises(WorkerDeathError, match=r"worker 0 \(part 0\).*doze.*asleep"):
+        pool.run(DOZE, 60.0)
+    assert time.monotonic() - began < 2.0
+
+
+def test_one_that_toils_too_long_is_noticed(make: Make) -> None:
+    pool = make(workers=1, timeout_s=0.5, repeats=0)
+    with pytest.raises(WorkerDeathError, match=r"workers\.timeout_s = 0\.5"):
+        pool.run(TOIL, 60.0)
+
+
+@pytest.mark.parametrize(
+    ("task", "letter", "cause"),
+    [(DIE, int(signal.SIGKILL), "SIGKILL"), (RUN_OUT, None, "out of memory")],
+)
+def test_a_task_that_everybody_dies_of(
+    make: Make, task: int, letter: int | None, cause: str
+) -> None:
+    pool = make(workers=2, repeats=2)
+    pids = [*pool.pids, pool.server_pid]
+    with pytest.raises(WorkerDeathError, match=TASKS[task]) as caught:
+        pool.run(task, letter)
+    assert caught.value.causes == (cause,) * 3
+    assert gone(pids)
+    with pytest.raises(WorkerError, match="closed"):
+        pool.run(ADD)
+
+
+def test_an_exception_arrives_whole_and_changes_nothing(make: Make) -> None:
+    pool = make(workers=2)
+    pool.run(ADD)
+    with pytest.raises(WorkerFailureError, match="as told: so it goes") as caught:
+        pool.run(FAIL, "so it goes")
+    assert caught.value.kind == "ValueError"
+    assert "toy_job.py" in caught.value.traceback
+    assert totals(pool) == [[3.0, MORE]] * 2
+    pool.run(ADD)
+    assert totals(pool) == [[6.0, 2 * MORE]] * 2
+
+
+def test_an_interrupted_order_is_not_committed(make: Make) -> None:
+    pool = make(workers=2)
+    pool.run(ADD)
+    timer = threading.Timer(0.2, signal.raise_signal, (signal.SIGINT,))
+    timer.start()
+    with pytest.raises(KeyboardInterrupt):
+        pool.run(TOIL, 1.0)
+    timer.join()
+    assert totals(pool) == [[3.0, MORE]] * 2
+    assert pool.deaths == []
+
+
+def test_the_process_that_forks_may_die_or_be_stopped(make: Make) -> None:
+    pool = make(workers=2)
+    pool.run(ADD)
+    os.kill(pool.server_pid, signal.SIGKILL)
+    assert gone_soon(pool.pids)
+    pool.run(ADD)
+    assert totals(pool) == [[6.0, 2 * MORE]] * 2
+    os.kill(pool.server_pid, signal.SIGSTOP)
+    os.kill(pool.pids[0], signal.SIGKILL)
+    pool.run(ADD)
+    assert totals(pool) == [[9.0, 3 * MORE]] * 2
+
+
+def gone_soon(pids: list[int]) -> bool:
+    """Whether all have ended, buried or not."""
+    for pid in pids:
+        try:
+            pidfd = os.pidfd_open(pid)
+        except ProcessLookupError:
+            continue
+        ended = bool(select.select([pidfd], [], [], 5.0)[0])
+        os.close(pidfd)
+        if not ended:
+            return False
+    return True
+
+
+def test_nothing_is_burnt_while_nobody_asks(make: Make) -> None:
+    pool = make(workers=2)
+    for _ in range(1000):
+        pool.ping()
+    time.sleep(0.1)
+    before = [ticks(pid) for pid in pool.pids]
+    time.sleep(0.5)
+    assert [ticks(pid) for pid in pool.pids] == before
+
+
+def ticks(pid: int) -> int:
+    fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
+    return int(fields[11]) + int(fields[12])
+
+
+def maps(pid: int) -> list[str]:
+    return Path(f"/proc/{pid}/maps").read_text().splitlines()
+
+
+@pytest.mark.parametrize("way", ["close", "forget"])
+def test_nothing_is_left_behind(way: str) -> None:
+    gc.collect()  # what other tests have left
+    files = len(os.listdir("/proc/self/fd"))
+    pool = Pool(program(3), 60.0, 3)
+    pool.run(ADD)
+    pids = [*pool.pids, pool.server_pid]
+    shared = [line for pid in pids for line in maps(pid) if "rw-s" in line]
+    assert shared
+    assert all("/memfd:cavmarl (deleted)" in line for line in shared)
+    began = time.monotonic()
+    if way == "close":
+        pool.close()
+        pool.close()
+    del pool
+    gc.collect()
+    assert not alive(pids)
+    assert time.monotonic() - began < 2.0
+    assert len(os.listdir("/proc/self/fd")) == files
+
+
+def test_a_stopped_pool_is_closed() -> None:
+    pool = Pool(program(2), 60.0, 3)
+    pids = [*pool.pids, pool.server_pid]
+    for pid in pids:
+        os.kill(pid, signal.SIGSTOP)
+    pool.close()
+    assert gone(pids)
+
+
+def test_a_program_that_does_not_come_up() -> None:
+    gc.collect()
+    files = len(os.listdir("/proc/self/fd"))
+    with pytest.raises(WorkerFailureError, match="no jobs today") as caught:
+        Pool(program(2, fails="no jobs today"), 60.0, 3)
+    assert "make_jobs" in caught.value.traceback
+    with pytest.raises(WorkerStartError, match="ended with 3"):
+        Pool(program(2, ends=3), 60.0, 3)
+    del caught
+    gc.collect()
+    assert len(os.listdir("/proc/self/fd")) == files
+
+
+def test_memory_that_cannot_be_had() -> None:
+    with pytest.raises(WorkerStartError, match=r"GB of shared memory .* num_envs"):
+        Segment.make(1 << 50)
+
+
+LONER = """
+import sys, time
+sys.path.insert(0, {root!r})
+from tests.runtime.test_pool import program
+from tests.runtime.toy_job import ADD, TOIL
+from cavmarl.runtime.pool import Pool
+pool = Pool(program(2), 60.0, 3)
+pool.run(ADD)
+print(*pool.pids, pool.server_pid, flush=True)
+{then}
+"""
+
+
+@pytest.mark.parametrize("then", ["time.sleep(60)", "pool.run(TOIL, 60.0)"])
+@pytest.mark.parametrize("how", [signal.SIGKILL, signal.SIGTERM, signal.SIGINT])
+def test_no_process_outlives_the_pools(how: signal.Signals, then: str) -> None:
+    text = LONER.format(root=str(ROOT), then=then)
+    loner = subprocess.Popen(
+        [sys.executable, "-c", text], stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True
+    )
+    assert loner.stdout is not None
+    pids = [int(word) for word in loner.stdout.readline().split()]
+    assert len(pids) == 3
+    time.sleep(0.1)
+    loner.send_signal(how)
+    loner.wait()
+    loner.stdout.close()
+    assert gone_soon(pids)
+
+
+def test_a_fork_of_the_pools_process_leaves_the_workers_alone(make: Make) -> None:
+    pool = make(workers=1)
+    with pytest.MonkeyPatch.context() as patched:
+        patched.setattr(os, "getpid", lambda: 1)
+        pool._crew.release()
+    pool.run(ADD)
+    assert totals(pool) == [[3.0, MORE]]
+
+
+def test_a_thread_may_start_workers_and_end(make: Make) -> None:
+    pools: list[Pool] = []
+    thread = threading.Thread(target=lambda: pools.append(make(workers=1)))
+    thread.start()
+    thread.join()
+    time.sleep(0.1)
+    pools[0].run(ADD)
+    assert pools[0].deaths == []
