@@ -12,6 +12,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from cavmarl.errors import WorkerStartError
 from cavmarl.runtime.barrier import NUMBER, WORDS, Meeting, usable_cores
 from cavmarl.runtime.fork_server import ForkServer, Process, ServerGoneError
 from cavmarl.runtime.shared_memory import Segment
@@ -64,6 +65,8 @@ class Crew:
         self._held = _Held(list(program.segments))
         self._meetings: dict[int, Meeting] = {}
         try:
+            if not hasattr(os, "pidfd_open"):
+                raise WorkerStartError("workers need Linux 5.3 or later: use workers=0")
             self._make_memory()
             self._start()
         except BaseException:
@@ -231,8 +234,13 @@ class Crew:
         """Start the process that forks, and a process for every worker."""
         fds = tuple(segment.fd for segment in self._held.segments)
         self._held.server = ForkServer(self._program.module, self._told, fds)
-        for k in range(self._count):
-            self._fork(k)
+        try:
+            for k in range(self._count):
+                self._fork(k)
+        except ServerGoneError as error:
+            raise WorkerStartError(
+                "the process that starts workers ended before it had started all"
+            ) from error
 
     def _fork(self, k: int) -> None:
         assert self._held.server is not None

@@ -86,7 +86,7 @@ class ForkServer:
     def __init__(
         self, program: str, start: Mapping[str, Any], descriptors: tuple[int, ...]
     ) -> None:
-        ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+        ours, theirs = _wires()
         told = {
             **start,
             "pool": theirs.fileno(),
@@ -122,8 +122,9 @@ class ForkServer:
 
         Raises:
             ServerGoneError: nobody answers.
+            WorkerStartError: this process has no descriptors left.
         """
-        ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+        ours, theirs = _wires()
         try:
             pid = int(self._ask({"fork": number}, theirs.fileno())["pid"])
             return Process(pid, os.pidfd_open(pid), ours)
@@ -182,6 +183,18 @@ class ForkServer:
             raise ServerGoneError
         answer: dict[str, Any] = json.loads(message)
         return answer
+
+
+def _wires() -> tuple[socket.socket, socket.socket]:
+    """The two ends of a wire that carries messages.
+
+    Raises:
+        WorkerStartError: no descriptors are left.
+    """
+    try:
+        return socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+    except OSError as error:
+        raise WorkerStartError(f"no socket: {error}") from error
 
 
 def _python_path() -> str:

@@ -10,14 +10,13 @@ the same, so it does the same.
 from __future__ import annotations
 
 import json
-import os
 import time
 import weakref
 from dataclasses import dataclass
 from math import isnan, nan
 from typing import Any
 
-from cavmarl.errors import WorkerDeathError, WorkerError, WorkerFailureError, WorkerStartError
+from cavmarl.errors import WorkerDeathError, WorkerError, WorkerFailureError
 from cavmarl.runtime.crew import Crew, Program
 from cavmarl.runtime.watchdog import CHECK_S, Watchdog, processor_s
 from cavmarl.runtime.worker import FAILED, MAIL, MAX_MESSAGE, NOTHING, TASK
@@ -65,8 +64,6 @@ class Pool:
     """
 
     def __init__(self, program: Program, timeout_s: float, repeats: int) -> None:
-        if not hasattr(os, "pidfd_open"):
-            raise WorkerStartError("workers need Linux 5.3 or later: use workers=0")
         self.deaths: list[Death] = []
         self._program = program
         self._timeout_s = timeout_s

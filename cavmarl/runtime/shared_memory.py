@@ -50,14 +50,13 @@ class Segment:
         Raises:
             WorkerStartError: there is not so much memory.
         """
-        free = _free_bytes()
-        if free is not None and size > free:
-            raise WorkerStartError(_too_much(size, f"{free / 1e9:.1f} GB are free"))
         try:
-            fd = _anonymous()
+            free = _free_bytes()
+            if free is not None and size > free:
+                raise WorkerStartError(_too_much(size, f"{free / 1e9:.1f} GB are free"))
+            segment = cls(_anonymous(), 0)
         except OSError as error:
             raise WorkerStartError(f"no shared memory: {error}") from error
-        segment = cls(fd, 0)
         try:
             segment.grow(size)
         except OSError as error:
@@ -76,9 +75,16 @@ class Segment:
             self.size = size
 
     def map(self) -> mmap.mmap:
-        """Its bytes, as many as there are by now, as this process reads and writes them."""
+        """Its bytes, as many as there are by now, as this process reads and writes them.
+
+        Raises:
+            WorkerStartError: there is no room for them in this process.
+        """
         self.size = os.fstat(self.fd).st_size
-        return mmap.mmap(self.fd, self.size)
+        try:
+            return mmap.mmap(self.fd, self.size)
+        except OSError as error:
+            raise WorkerStartError(f"shared memory cannot be mapped: {error}") from error
 
     def close(self) -> None:
         """Give the descriptor back; what is mapped stays until nobody looks at it any more."""

@@ -13,7 +13,13 @@ from numpy.typing import NDArray
 
 import cavmarl.errors
 from cavmarl.config import ZonesConfig
-from cavmarl.errors import CavmarlError, ConfigError, WorkerDeathError, WorkerFailureError
+from cavmarl.errors import (
+    CavmarlError,
+    ConfigError,
+    WorkerDeathError,
+    WorkerFailureError,
+    WorkerStartError,
+)
 from cavmarl.runtime.barrier import usable_cores
 from cavmarl.runtime.compilation import compiled_before
 from cavmarl.runtime.pool import Death, Pool, Program
@@ -74,7 +80,11 @@ class PooledWorlds:
             Simulation(config, world.network, 1, world.demand, world.partition)
         layout = layout_of(config, num_worlds)
         segment = Segment.make(size_of(layout))
-        self.arrays = StepArrays(**arrays_in(segment.map(), layout))
+        try:
+            self.arrays = StepArrays(**arrays_in(segment.map(), layout))
+        except WorkerStartError:
+            segment.close()
+            raise
         bounds = [num_worlds * k // workers for k in range(workers + 1)]
         parts = list(pairwise(bounds))
         recipe = {

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import gc
 import os
+import resource
 import select
 import signal
 import subprocess
@@ -23,7 +24,7 @@ from cavmarl.errors import (
 )
 from cavmarl.runtime.pool import Pool, Program
 from cavmarl.runtime.shared_memory import Segment
-from tests.runtime.toy_job import ADD, DIE, DOZE, FAIL, RUN_OUT, TASKS, TOIL, TOTAL
+from tests.runtime.toy_job import ADD, DIE, DOZE, FAIL, FALL, POINTS, RUN_OUT, TASKS, TOIL, TOTAL
 
 MODULE = "tests.runtime.toy_job"
 ROOT = Path(__file__).resolve().parents[2]
@@ -104,6 +105,28 @@ def test_all_that_die_at_work(make: Make) -> None:
     assert totals(pool) == [[6.0, 2 * MORE]] * 2
     assert sorted(death.worker for death in pool.deaths) == [0, 1]
     assert all(0.3 < death.done_s - death.noticed_s < 3.0 for death in pool.deaths)
+
+
+@pytest.mark.parametrize("point", range(len(POINTS)), ids=POINTS)
+def test_one_that_dies_at_a_point_of_an_order(make: Make, point: int, tmp_path: Path) -> None:
+    pool = make(workers=2)
+    pool.run(ADD)
+    (tmp_path / "trap").touch()
+    pool.run(FALL, [point, str(tmp_path / "trap")])
+    assert totals(pool) == [[6.0, 2 * MORE]] * 2
+    assert [death.cause for death in pool.deaths] == ["SIGKILL"]
+    pool.run(ADD)
+    assert totals(pool) == [[9.0, 3 * MORE]] * 2
+
+
+def test_an_image_that_is_not_what_was_written_is_refused(make: Make) -> None:
+    pool = make(workers=1)
+    pool.run(ADD)
+    image = pool._crew._held.segments[2 + pool._truth].map()
+    image[200] ^= 1
+    os.kill(pool.pids[0], signal.SIGKILL)
+    with pytest.raises(WorkerFailureError, match="not what it wrote"):
+        pool.run(ADD)
 
 
 def test_the_answer_of_one_that_dies_after_it_is_not_lost(make: Make) -> None:
@@ -271,6 +294,22 @@ def test_a_program_that_does_not_come_up() -> None:
 def test_memory_that_cannot_be_had() -> None:
     with pytest.raises(WorkerStartError, match=r"GB of shared memory .* num_envs"):
         Segment.make(1 << 50)
+
+
+@pytest.mark.parametrize("room", [0, 3, 12, 16, 20])
+def test_descriptors_that_cannot_be_had(room: int) -> None:
+    gc.collect()
+    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+    used = {int(name) for name in os.listdir("/proc/self/fd")}
+    free = [number for number in range(len(used) + 100) if number not in used]
+    resource.setrlimit(resource.RLIMIT_NOFILE, (free[room], hard))
+    try:
+        with pytest.raises(WorkerError, match="Too many open files"):
+            Pool(program(3), 60.0, 3)
+    finally:
+        resource.setrlimit(resource.RLIMIT_NOFILE, (soft, hard))
+    gc.collect()
+    assert len(os.listdir("/proc/self/fd")) == len(used)
 
 
 LONER = """

@@ -13,19 +13,36 @@ from numpy.typing import NDArray
 
 from cavmarl.runtime.worker import serve
 
-TASKS = ("add", "total", "fail", "die", "doze", "toil", "run out")
-ADD, TOTAL, FAIL, DIE, DOZE, TOIL, RUN_OUT = range(len(TASKS))
+TASKS = ("add", "total", "fail", "die", "doze", "toil", "run out", "fall")
+ADD, TOTAL, FAIL, DIE, DOZE, TOIL, RUN_OUT, FALL = range(len(TASKS))
+
+POINTS = ("begun", "half done", "done", "image begun")
+
+
+class Fatal(np.ndarray[Any, Any]):
+    """Whoever copies it dies of it."""
+
+    def view(self, *_: Any, **__: Any) -> Any:
+        os.kill(os.getpid(), signal.SIGKILL)
 
 
 class Adder:
     def __init__(self) -> None:
         self.numbers = np.zeros(3, dtype=[("a", np.float64), ("b", np.int32)])
         self.more = np.zeros(0)  # another one each time
+        self.falls_at = ""
 
     def perform(self, task: int, letter: Any) -> Any:
         if task == TOTAL:
             return [float(self.numbers["a"].sum()), len(self.more)]
-        self.numbers["a"] += 1.0
+        if task == FALL:
+            self.falls_at = POINTS[letter[0]] if os.path.exists(letter[1]) else ""
+            if self.falls_at:
+                os.unlink(letter[1])  # whoever comes first falls, and nobody else
+        self.pass_by("begun")
+        self.numbers["a"][0] += 1.0
+        self.pass_by("half done")
+        self.numbers["a"][1:] += 1.0
         self.more = np.append(self.more, np.ones(1000))
         if task == FAIL:
             raise ValueError(f"as told: {letter}")
@@ -41,8 +58,14 @@ class Adder:
             raise MemoryError
         return None
 
+    def pass_by(self, point: str) -> None:
+        if self.falls_at == point:
+            os.kill(os.getpid(), signal.SIGKILL)
+
     def save(self) -> list[NDArray[Any]]:
-        return [self.numbers, self.more]
+        self.pass_by("done")
+        more = self.more.view(Fatal) if self.falls_at == "image begun" else self.more
+        return [self.numbers, more]
 
     def load(self, saved: Sequence[NDArray[Any]]) -> None:
         self.numbers[:] = saved[0]

@@ -112,6 +112,16 @@ def test_observations_without_a_copy(make: Make) -> None:
     assert not np.array_equal(observations, before)
 
 
+def test_a_tensor_of_the_same_memory_shows_each_step(make: Make) -> None:
+    torch = pytest.importorskip("torch")
+    vec = make("ring", num_envs=2, workers=2)
+    tensor = torch.from_numpy(vec.worlds.arrays.observations)
+    vec.reset(seed=1)
+    for _ in range(3):
+        observations, *_ = vec.step(vec.suggest_actions())
+        assert np.array_equal(tensor.numpy(), observations)
+
+
 def test_what_was_returned_outlives_the_workers(make: Make) -> None:
     vec = make("ring", num_envs=2, workers=1, copy=False)
     observations, _ = vec.reset(seed=1)
