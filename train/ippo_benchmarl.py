@@ -115,8 +115,8 @@ def train(args: Args) -> Path:
     torch.set_num_threads(1)  # more cost small networks more than they bring
     args.folder.mkdir(parents=True, exist_ok=True)
     experiment = make_experiment(args)
-    simulation = experiment.test_env.base_env.vec.simulation
-    begin_training(args.folder, "ippo_benchmarl.py", asdict(args), simulation)
+    world = experiment.test_env.base_env.vec.worlds.world
+    begin_training(args.folder, "ippo_benchmarl.py", asdict(args), world)
     experiment.run()
     torch.save(experiment.policy.state_dict(), args.folder / POLICY_FILE)
     end_training(args.folder, (POLICY_FILE,))

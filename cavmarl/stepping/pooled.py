@@ -122,7 +122,8 @@ class PooledWorlds:
     def reset(self, seed: int | None, first_world: int) -> None:
         """Begin an episode in the worlds of `chosen`."""
         self._run(Task.RESET, {"seed": seed, "first_world": first_world})
-        self._steps = 0
+        if self.arrays.chosen.all():
+            self._steps = 0
 
     def step(self, commands: Commands) -> None:
         """Let the agents act, and reset the worlds whose episode is over, now or a step later."""

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from cavmarl.spaces import flat_observation_space
 from cavmarl.vector_env import make_vec
 
-WORKERS = (0,)  # processes of our own within each worker
+WORKERS = (0, 1)  # processes of our own within each worker
 STEPS = 30
 
 

@@ -82,6 +82,26 @@ def test_workers_change_nothing(make: Make, env: str, zones: int, counts: tuple[
         assert same(drive(make(env, workers=workers, **wanted)), whole), workers
 
 
+def test_worlds_begin_anew_in_the_next_step_whoever_dies(make: Make) -> None:
+    wanted = {"num_envs": 3, "agents": 2, "max_cycles": 3, "autoreset_mode": "NextStep"}
+    whole = drive(make("merge", **wanted))
+    vec = make("merge", workers=2, **wanted)
+    pool = pool_of(vec)
+    assert same(drive(vec, before=lambda step: os.kill(pool.pids[step % 2], signal.SIGKILL)), whole)
+    assert len(pool.deaths) == STEPS
+
+
+def test_chosen_worlds_begin_anew_in_their_workers(make: Make) -> None:
+    chosen = np.array([False, True, False, True, True])
+    found = []
+    for workers in (0, 2):
+        vec = make("merge", num_envs=5, agents=2, workers=workers)
+        drive(vec, steps=3)
+        observations, infos = vec.reset(options={"reset_mask": chosen})
+        found.append([observations, infos["mask"], *(vec.state_hash(w) for w in range(5))])
+    assert same(*found)
+
+
 def test_observations_without_a_copy(make: Make) -> None:
     vec = make("ring", num_envs=2, workers=2, copy=False)
     observations, _ = vec.reset(seed=1)
