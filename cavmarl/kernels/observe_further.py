@@ -48,11 +48,14 @@ def observe_further(
         if not chosen[w]:
             continue
         rows = worlds.rows[w]
-        fill_grid(rows, worlds.num_rows[w], grid)
+        is_filled = False  # many zones have no agents
         for i in range(worlds.num_owned[w]):
             row = rows[i]
             if row["driver"] != DRIVER_AGENT:
                 continue
+            if not is_filled:
+                fill_grid(rows, worlds.num_rows[w], grid)
+                is_filled = True
             seen = observations[w, row["agent"]]
             out = seen[newest_frame(seen, stack) :]
             if kinematics.vehicles > 0:

@@ -19,15 +19,20 @@ from cavmarl.kernels.arrays import (
     Demand,
     Gate,
     LaneGrid,
+    Outputs,
     RoadArrays,
     Scratch,
+    Sensors,
     Travel,
     Worlds,
     Zoned,
 )
 from cavmarl.kernels.departures import choose_goals
 from cavmarl.kernels.neighbors import Grid
-from cavmarl.kernels.tick import advance, resolve
+from cavmarl.kernels.outputs import credit
+from cavmarl.kernels.sense import sense
+from cavmarl.kernels.signals import detect
+from cavmarl.kernels.tick import advance, begin_step, resolve
 from cavmarl.kernels.zones import Halo, ZoneArrays
 
 __all__ = [
@@ -35,10 +40,14 @@ __all__ = [
     "Members",
     "admit_each",
     "advance_each",
+    "begin_step_each",
     "choose_goals_each",
+    "credit_each",
+    "detect_each",
     "propose_each",
     "rank_lanes_each",
     "resolve_each",
+    "sense_each",
 ]
 
 FRAME = np.dtype(
@@ -153,6 +162,79 @@ def resolve_each(members: Members, side: int, next_side: int, scratch: Scratch, 
     for n in range(members.numbers.size):
         worlds = _worlds(members, members.numbers[n], side, next_side)
         resolve(worlds, scratch, _grid(members.frames[n], room))
+
+
+@kernel
+def begin_step_each(
+    members: Members,
+    side: int,
+    roads: RoadArrays,
+    discrete: bool,
+    meta_actions: NDArray[np.int64],
+    target_speeds: NDArray[np.float64],
+) -> None:
+    """`begin_step` in each zone."""
+    for zone in members.numbers:
+        worlds = _worlds(members, zone, side, side)
+        begin_step(roads, worlds, discrete, meta_actions, target_speeds)
+
+
+@kernel
+def detect_each(members: Members, side: int, roads: RoadArrays, dt: float) -> None:
+    """`detect` in each zone."""
+    for zone in members.numbers:
+        worlds = _worlds(members, zone, side, side)
+        detect(
+            roads.lane_place,
+            roads.places,
+            worlds.rows,
+            worlds.num_owned,
+            worlds.ticks,
+            dt,
+            worlds.detected_s,
+        )
+
+
+@kernel
+def sense_each(
+    members: Members,
+    side: int,
+    roads: RoadArrays,
+    plans: NDArray[np.void],
+    travel: Travel,
+    room: Grid,
+    sensors: Sensors,
+    tick_s: float,
+    ticks_per_step: int,
+    chosen: NDArray[np.bool_],
+    outputs: Outputs,
+) -> None:
+    """`sense` in each zone."""
+    for n in range(members.numbers.size):
+        worlds = _worlds(members, members.numbers[n], side, side)
+        grid = _grid(members.frames[n], room)
+        sense(
+            roads,
+            plans,
+            travel,
+            worlds,
+            grid,
+            sensors,
+            tick_s,
+            ticks_per_step,
+            chosen,
+            outputs,
+        )
+
+
+@kernel
+def credit_each(
+    members: Members, side: int, rewards: NDArray[np.float32], chosen: NDArray[np.bool_]
+) -> None:
+    """`credit` in each zone."""
+    for zone in members.numbers:
+        worlds = _worlds(members, zone, side, side)
+        credit(worlds.rows, worlds.num_owned, rewards, chosen)
 
 
 @kernel

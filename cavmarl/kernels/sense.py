@@ -59,11 +59,14 @@ def sense(
         if not chosen[w]:
             continue
         rows = worlds.rows[w]
-        fill_grid(rows, worlds.num_rows[w], grid)
+        is_filled = False  # many zones have no agents
         for i in range(worlds.num_owned[w]):
             row = rows[i]
             if row["driver"] != DRIVER_AGENT:
                 continue
+            if not is_filled:
+                fill_grid(rows, worlds.num_rows[w], grid)
+                is_filled = True
             agent = row["agent"]
             seen = outputs.observations[w, agent]
             shift_frames(seen, sensors.stack, sensors.cleared)

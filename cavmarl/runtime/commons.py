@@ -42,6 +42,8 @@ class Commons:
         self._weights = np.array([config.terms.weights.get(name, 0.0) for name in TERMS])
         self._team_share = config.terms.team_share
         self._switch_signals = repeated(switch_signals)
+        self._clear_outputs = repeated(clear_outputs)
+        self._settle_outputs = repeated(settle_outputs)
 
     def switch_signals(self, worlds: Worlds) -> None:
         """Bring the signals to the present tick, after `detect` of all shards.
@@ -61,8 +63,8 @@ class Commons:
 
     def clear_outputs(self, chosen: NDArray[np.bool_]) -> None:
         """Make all agents of the chosen worlds (W,) absent, before `sense` of all shards."""
-        clear_outputs(self.outputs, chosen)
+        self._clear_outputs(self.outputs, chosen)
 
     def settle_outputs(self, chosen: NDArray[np.bool_]) -> None:
         """Finish the outputs of the chosen worlds (W,) after `sense`, before `credit`."""
-        settle_outputs(self.outputs, self._weights, self._team_share, chosen)
+        self._settle_outputs(self.outputs, self._weights, self._team_share, chosen)

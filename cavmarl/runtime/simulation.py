@@ -298,8 +298,9 @@ class Simulation:
         Raises:
             CapacityError: the map has no room for that many agents of a closed world.
         """
-        if chosen is None:
-            chosen = self._everywhere
+        chosen = (
+            self._everywhere if chosen is None else np.ascontiguousarray(chosen, dtype=np.bool_)
+        )
         self._populate(chosen)
         agents = self.config.population.agents
         seated = self.outputs.present[chosen].sum(axis=1)

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from cavmarl.kernels.arrays import Common, Demand, Gate
 from cavmarl.kernels.phases import (
@@ -13,10 +14,14 @@ from cavmarl.kernels.phases import (
     Members,
     admit_each,
     advance_each,
+    begin_step_each,
     choose_goals_each,
+    credit_each,
+    detect_each,
     propose_each,
     rank_lanes_each,
     resolve_each,
+    sense_each,
 )
 from cavmarl.kernels.repeated import repeated
 from cavmarl.shard.shard import TICKS_IN_ORDER, Commands, Shard
@@ -61,6 +66,11 @@ class ShardGroup:
         self._rank_lanes = repeated(rank_lanes_each)
         self._propose = repeated(propose_each)
         self._admit = repeated(admit_each)
+        self._meta_actions = np.zeros(self._controls.shape[:2], dtype=np.int64)
+        self._begin_step = repeated(begin_step_each)
+        self._detect = repeated(detect_each)
+        self._sense = repeated(sense_each)
+        self._credit = repeated(credit_each)
 
     def each(self, phase: str, *arguments: Any) -> None:
         """Run a phase on every shard: a method of this class or of `Shard`, by its name."""
@@ -75,8 +85,12 @@ class ShardGroup:
         """Open the accounts of a step and take its meta-actions."""
         if self._config.population.agents == 0:
             return
-        for shard in self._shards:
-            shard.begin_step(commands)
+        first = self._first
+        np.copyto(self._meta_actions, commands.meta_actions)
+        self._begin_step(
+            self._members, first.side, self._roads,
+            first.discrete, self._meta_actions, first.target_speeds,
+        )  # fmt: skip
 
     def advance(self, commands: Commands) -> None:
         """Decide every control from the committed rows and move the owned ones into next ones."""
@@ -154,5 +168,19 @@ class ShardGroup:
         """Note when owned bodies were over the detectors of actuated signals."""
         if self._first.worlds.controllers.shape[1] == 0:
             return
+        self._detect(self._members, self._first.side, self._roads, self._config.clock.sim_dt_s)
+
+    def sense(self, chosen: NDArray[np.bool_]) -> None:
+        """Write observations and terms of the chosen worlds' owned agents into the outputs."""
+        first, clock = self._first, self._config.clock
+        self._sense(
+            self._members, first.side, self._roads, first.plans, self._travel, self._room,
+            first.sensors, clock.sim_dt_s, clock.ticks_per_step, chosen, first.outputs,
+        )  # fmt: skip
         for shard in self._shards:
-            shard.detect()
+            shard.complete_observations(chosen)
+
+    def credit(self, chosen: NDArray[np.bool_]) -> None:
+        """Add the step's rewards to the episode's of the chosen worlds' owned agents."""
+        first = self._first
+        self._credit(self._members, first.side, first.outputs.rewards, chosen)

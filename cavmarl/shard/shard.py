@@ -31,11 +31,9 @@ from cavmarl.kernels.lanes import ENTRY
 from cavmarl.kernels.leaving import drop_ghosts, leave
 from cavmarl.kernels.neighbors import make_grid
 from cavmarl.kernels.observe_further import observe_further
-from cavmarl.kernels.outputs import credit
-from cavmarl.kernels.sense import sense
-from cavmarl.kernels.signals import detect
+from cavmarl.kernels.repeated import repeated
 from cavmarl.kernels.stacking import fill_stacks
-from cavmarl.kernels.tick import begin_step, suggest
+from cavmarl.kernels.tick import suggest
 from cavmarl.kernels.zones import Halo, ZoneArrays
 from cavmarl.roads.network import RoadNetwork
 from cavmarl.roads.routing import PLAN, lane_grid
@@ -109,7 +107,7 @@ class Shard:
         self.plans = plans
         self.travel = travel
         self.lane_grid: LaneGrid = lane_grid(network)
-        self._sensors = sensor_arrays(config.sensors)
+        self.sensors = sensor_arrays(config.sensors)
         self._further = further_arrays(config.sensors, network, plans)
         num_worlds, capacity = zoned.rows.shape[2:]
         self.grid = make_grid(_seen(network, zones, zone, halo.halo_m), CELL_M, capacity)
@@ -132,31 +130,11 @@ class Shard:
         self.sides = (self.worlds.rows, zoned.rows[1, zone])
         self.side = self.next_side = 0
         self.outputs = outputs
-        self._target_speeds = np.array(config.action.target_speeds_mps)
-        self._discrete = config.action.kind == "discrete"
-
-    def detect(self) -> None:
-        """Note when owned bodies were over the detectors of actuated signals."""
-        worlds = self.worlds
-        if worlds.controllers.shape[1] == 0:
-            return
-        detect(
-            self.roads.lane_place,
-            self.roads.places,
-            worlds.rows,
-            worlds.num_owned,
-            worlds.ticks,
-            self.config.clock.sim_dt_s,
-            worlds.detected_s,
-        )
-
-    def begin_step(self, commands: Commands) -> None:
-        """Open the accounts of a step and take its meta-actions."""
-        if self.config.population.agents == 0:
-            return
-        begin_step(
-            self.roads, self.worlds, self._discrete, commands.meta_actions, self._target_speeds
-        )
+        self.target_speeds = np.array(config.action.target_speeds_mps)
+        self.discrete = config.action.kind == "discrete"
+        self._call_leave = repeated(leave)
+        self._call_observe_further = repeated(observe_further)
+        self._call_fill_stacks = repeated(fill_stacks)
 
     def turn(self) -> None:
         """Let the next rows be on the other side, for a tick that puts rows in order."""
@@ -166,12 +144,12 @@ class Shard:
         """Hand the background vehicles of `next_rows` that have arrived to the gate."""
         if not self.worlds.num_through.any():
             return
-        leave(gate, self.worlds, self.worlds.next_rows, DRIVER_BACKGROUND, 1)
+        self._call_leave(gate, self.worlds, self.worlds.next_rows, DRIVER_BACKGROUND, 1)
 
     def retire(self, gate: Gate) -> None:
         """Hand the agents' vehicles of the committed rows whose trip has ended to the gate."""
         ticks = self.config.clock.ticks_per_step
-        leave(gate, self.worlds, self.worlds.rows, DRIVER_AGENT, ticks)
+        self._call_leave(gate, self.worlds, self.worlds.rows, DRIVER_AGENT, ticks)
 
     def forget(self, gate: Gate) -> None:
         """Drop the ghosts of those who have been retired."""
@@ -189,23 +167,11 @@ class Shard:
         self.side, self.next_side = side, next_side
         self.worlds = self.worlds._replace(rows=self.sides[side], next_rows=self.sides[next_side])
 
-    def sense(self, chosen: NDArray[np.bool_]) -> None:
-        """Write observations and terms of the chosen worlds' owned agents into `outputs`."""
-        sense(
-            self.roads,
-            self.plans,
-            self.travel,
-            self.worlds,
-            self.grid,
-            self._sensors,
-            self.config.clock.sim_dt_s,
-            self.config.clock.ticks_per_step,
-            chosen,
-            self.outputs,
-        )
+    def complete_observations(self, chosen: NDArray[np.bool_]) -> None:
+        """Write what `sense` has left to others: sensors of other projects, and earlier frames."""
         observations, stack = self.outputs.observations, self.config.sensors.stack
         if self._further is not None:
-            observe_further(
+            self._call_observe_further(
                 self.roads,
                 self.lane_grid,
                 self.worlds,
@@ -217,11 +183,7 @@ class Shard:
             )
         if stack > 1:
             ticks_per_step = self.config.clock.ticks_per_step
-            fill_stacks(self.worlds, ticks_per_step, stack, chosen, observations)
-
-    def credit(self, chosen: NDArray[np.bool_]) -> None:
-        """Add the step's rewards to the episode's of the chosen worlds' owned agents."""
-        credit(self.worlds.rows, self.worlds.num_owned, self.outputs.rewards, chosen)
+            self._call_fill_stacks(self.worlds, ticks_per_step, stack, chosen, observations)
 
     def suggest(self, out: NDArray[np.float64]) -> None:
         """Write what the built-in driver would do in the agents' place into `out` (W, A, 2)."""
@@ -231,8 +193,8 @@ class Shard:
             self.travel,
             self.worlds,
             self.scratch,
-            self._discrete,
-            self._target_speeds,
+            self.discrete,
+            self.target_speeds,
             SUGGESTED_HORIZON_S,
             self.config.clock.sim_dt_s,
             out,
