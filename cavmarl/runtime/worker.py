@@ -211,9 +211,11 @@ def _obey(job: Job, meeting: Meeting, images: Sequence[Image]) -> NoReturn:
     """Carry out one order after the other."""
     mine, theirs = meeting.mine, meeting.theirs
     is_new = True
+    began = time.perf_counter()
     while True:
         order = int(mine[NUMBER]) + 1
-        _await(meeting, order)
+        _await(meeting, order, time.perf_counter() - began)
+        began = time.perf_counter()
         letter = _receive(meeting.wire) if theirs[LETTER] else None
         try:
             if (is_new or theirs[LOADS]) and theirs[TRUTH] >= 0:
@@ -237,12 +239,12 @@ def _obey(job: Job, meeting: Meeting, images: Sequence[Image]) -> NoReturn:
         meeting.post(int(theirs[NUMBER]))
 
 
-def _await(meeting: Meeting, order: int) -> None:
-    """Return when there is an order; end with the pool."""
+def _await(meeting: Meeting, order: int, work_s: float) -> None:
+    """Return when there is an order, after some work; end with the pool."""
     if meeting.has(order):
         return
     began = time.perf_counter()
-    if not meeting.watch(order):
+    if not meeting.watch(order, work_s):
         while meeting.lie_down(order):
             # A letter may come before its order: it is left where it is.
             message = meeting.wire.recv(len(WAKE), socket.MSG_PEEK)
