@@ -196,6 +196,9 @@ def _end(alive: set[int]) -> NoReturn:
 
 def _work(number: int, job: Job, wire: socket.socket, start: Mapping[str, Any]) -> NoReturn:
     """The whole life of a worker."""
+    cores = start["cores"]
+    if cores:
+        os.sched_setaffinity(0, {cores[number % len(cores)]})
     orders = np.frombuffer(Segment(start["orders"], 0).map(), dtype=np.int64)
     theirs = orders[number * WORDS : (number + 1) * WORDS]
     mine = np.frombuffer(Segment(start["statuses"][number], 0).map(), dtype=np.int64)[:WORDS]
