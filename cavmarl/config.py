@@ -208,10 +208,13 @@ class WorkersConfig:
         timeout_s: for so long a worker may be busy with one step or reset; then it is taken to hang
             and replaced. One that is stopped or sleeps is noticed within a second.
         repeats: how often a step is begun again because a worker has died.
+        pin: keep each worker on a core of its own. The system sometimes leaves two on one; but of
+            several environments with workers on one machine all take the same cores.
     """
 
     timeout_s: float = 300.0
     repeats: int = 3
+    pin: bool = False
 
     def __post_init__(self) -> None:
         _check_finite("workers.timeout_s", self.timeout_s, 1.0, 1e6)

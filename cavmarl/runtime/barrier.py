@@ -39,6 +39,7 @@ NUMBER, ASLEEP = 0, 1  # words of either side; the others are the pool's
 
 SHORT_S = 20e-6  # that anybody looks before it sleeps
 LONG_S = 200e-6  # that it looks where the last time has not been longer
+LONG_WORK_S = 500e-6  # after which nobody looks for so long
 PAUSES = 4  # looks before it lets others run
 ROUNDS = 16  # of those before it looks at the clock
 WAKE = b"!"
@@ -179,19 +180,28 @@ class Meeting:
         """Whether the other side has come to a number."""
         return _has(self.theirs, number)
 
-    def watch(self, number: int) -> bool:
-        """Look for a moment whether the other side comes to a number."""
+    def watch(self, number: int, work_s: float = 0.0) -> bool:
+        """Look for a moment whether the other side comes to a number.
+
+        Who has had to wait for long the last time does not look for long, nor who has worked for
+        long: the system puts those who wake up on free cores, and leaves those who look where they
+        are, two on one core if it comes to that.
+
+        Args:
+            number: to wait for.
+            work_s: since this side waited last.
+        """
         if _look(self.theirs, number, self._crowded):
             return True
-        limit_s = LONG_S if self._last_s < LONG_S else SHORT_S
-        end = time.perf_counter() + limit_s
+        is_short = self._last_s < LONG_S and work_s < LONG_WORK_S
+        end = time.perf_counter() + (LONG_S if is_short else SHORT_S)
         while time.perf_counter() < end:
             if _look(self.theirs, number, self._crowded):
                 return True
         return False
 
     def lasted(self, wait_s: float) -> None:
-        """Note how long this side has had to wait: the next time it looks no longer than pays."""
+        """Note how long this side has had to wait."""
         self._last_s = wait_s
 
     def lie_down(self, number: int) -> bool:

@@ -34,6 +34,7 @@ class Program(NamedTuple):
         segments: that the jobs share with the pool, and the pool gives back; the recipe names their
             descriptors.
         tasks: what each task is called, by its number.
+        pins: each worker stays on a core of its own, as far as there are so many.
     """
 
     module: str
@@ -41,6 +42,7 @@ class Program(NamedTuple):
     parts: tuple[str, ...]
     segments: tuple[Segment, ...]
     tasks: tuple[str, ...]
+    pins: bool = False
 
 
 class Crew:
@@ -227,6 +229,7 @@ class Crew:
             "statuses": [segment.fd for segment in statuses],
             "images": [[image.fd for image in pair] for pair in images],
             "crowded": self._crowded,
+            "cores": sorted(os.sched_getaffinity(0)) if self._program.pins else [],
         }
 
     def _start(self) -> None:

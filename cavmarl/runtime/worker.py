@@ -196,6 +196,9 @@ def _end(alive: set[int]) -> NoReturn:
 
 def _work(number: int, job: Job, wire: socket.socket, start: Mapping[str, Any]) -> NoReturn:
     """The whole life of a worker."""
+    cores = start["cores"]
+    if cores:
+        os.sched_setaffinity(0, {cores[number % len(cores)]})
     orders = np.frombuffer(Segment(start["orders"], 0).map(), dtype=np.int64)
     theirs = orders[number * WORDS : (number + 1) * WORDS]
     mine = np.frombuffer(Segment(start["statuses"][number], 0).map(), dtype=np.int64)[:WORDS]
@@ -211,9 +214,11 @@ def _obey(job: Job, meeting: Meeting, images: Sequence[Image]) -> NoReturn:
     """Carry out one order after the other."""
     mine, theirs = meeting.mine, meeting.theirs
     is_new = True
+    began = time.perf_counter()
     while True:
         order = int(mine[NUMBER]) + 1
-        _await(meeting, order)
+        _await(meeting, order, time.perf_counter() - began)
+        began = time.perf_counter()
         letter = _receive(meeting.wire) if theirs[LETTER] else None
         try:
             if (is_new or theirs[LOADS]) and theirs[TRUTH] >= 0:
@@ -237,12 +242,12 @@ def _obey(job: Job, meeting: Meeting, images: Sequence[Image]) -> NoReturn:
         meeting.post(int(theirs[NUMBER]))
 
 
-def _await(meeting: Meeting, order: int) -> None:
-    """Return when there is an order; end with the pool."""
+def _await(meeting: Meeting, order: int, work_s: float) -> None:
+    """Return when there is an order, after some work; end with the pool."""
     if meeting.has(order):
         return
     began = time.perf_counter()
-    if not meeting.watch(order):
+    if not meeting.watch(order, work_s):
         while meeting.lie_down(order):
             # A letter may come before its order: it is left where it is.
             message = meeting.wire.recv(len(WAKE), socket.MSG_PEEK)

@@ -97,7 +97,7 @@ class PooledWorlds:
         }
         named = tuple(_name(first, last) for first, last in parts)
         tasks = tuple(task.name.lower().replace("_", " ") for task in Task)
-        program = Program(PROGRAM, recipe, named, (segment,), tasks)
+        program = Program(PROGRAM, recipe, named, (segment,), tasks, config.workers.pin)
         try:
             self.pool = Pool(program, config.workers.timeout_s, config.workers.repeats)
         except WorkerFailureError as failure:

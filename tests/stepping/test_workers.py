@@ -221,6 +221,14 @@ def test_more_workers_than_cores_are_warned_of(make: Make) -> None:
         make("ring", num_envs=cores + 1, workers=cores + 1)
 
 
+def test_workers_may_have_cores_of_their_own(make: Make) -> None:
+    cores = sorted(os.sched_getaffinity(0))
+    vec = make("ring", num_envs=2, workers=2, overrides={"workers.pin": True})
+    vec.reset(seed=0)
+    wanted = [{cores[k % len(cores)]} for k in range(2)]
+    assert [os.sched_getaffinity(pid) for pid in pool_of(vec).pids] == wanted
+
+
 def test_a_step_that_everybody_dies_of(make: Make, monkeypatch: pytest.MonkeyPatch) -> None:
     vec = make("ring", num_envs=2, workers=2, overrides={"workers.repeats": 1})
     vec.reset(seed=0)
