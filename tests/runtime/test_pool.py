@@ -193,6 +193,15 @@ def test_an_exception_arrives_whole_and_changes_nothing(make: Make) -> None:
     assert totals(pool) == [[6.0, 2 * MORE]] * 2
 
 
+@pytest.fixture
+def interruptible() -> Iterator[None]:
+    """Ctrl-C arrives, also where these tests were started in the background of a shell."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, before)
+
+
+@pytest.mark.usefixtures("interruptible")
 def test_an_interrupted_order_is_not_committed(make: Make) -> None:
     pool = make(workers=2)
     pool.run(ADD)
@@ -339,7 +348,8 @@ def test_descriptors_that_cannot_be_had(room: int) -> None:
 
 
 LONER = """
-import sys, time
+import signal, sys, time
+signal.signal(signal.SIGINT, signal.default_int_handler)
 sys.path.insert(0, {root!r})
 from tests.runtime.test_pool import program
 from tests.runtime.toy_job import ADD, TOIL
