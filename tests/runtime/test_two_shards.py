@@ -15,7 +15,7 @@ from cavmarl.kernels.signals import merge_detections
 from cavmarl.roads.zone_halo import zone_halo
 from cavmarl.roads.zone_layouts import cut_map
 from cavmarl.runtime.commons import Commons
-from cavmarl.runtime.executor import SerialExecutor
+from cavmarl.runtime.executor import Phase, SerialExecutor
 from cavmarl.runtime.simulation import Simulation
 from cavmarl.shard.shard import COMMON, Commands, Shard, make_zoned
 from tests.actuated import actuated_grid
@@ -44,7 +44,7 @@ class Halves:
 
     Args:
         whole: the undivided worlds.
-        together: whether both shards note detections in one array.
+        together: whether both shards are called together, and note detections in one array.
     """
 
     def __init__(self, whole: Simulation, together: bool = True) -> None:
@@ -72,7 +72,8 @@ class Halves:
             apart = shards[1].worlds.detected_s.copy()
             shards[1].worlds = shards[1].worlds._replace(detected_s=apart)
         self.shards = shards
-        self.executor = SerialExecutor(shards)
+        groups = [shards] if together else [[shard] for shard in shards]
+        self._executors = [SerialExecutor(group) for group in groups]
         min_x, _, max_x, _ = whole.network.extent_m
         self._border = 0.5 * (min_x + max_x)
 
@@ -94,12 +95,17 @@ class Halves:
                 shard.worlds.num_rows[w] = num
         return all(shard.worlds.num_owned.all() for shard in self.shards)
 
+    def each(self, phase: Phase, *arguments: Any) -> None:
+        """A phase of both shards."""
+        for executor in self._executors:
+            executor.each(phase, *arguments)
+
     def sense(self, chosen: NDArray[np.bool_]) -> None:
         """What a simulation does at the end of a step."""
         self.commons.clear_outputs(chosen)
-        self.executor.each("sense", chosen)
+        self.each("sense", chosen)
         self.commons.settle_outputs(chosen)
-        self.executor.each("credit", chosen)
+        self.each("credit", chosen)
 
 
 def returns_of(*parts: Worlds) -> Returns:
@@ -166,7 +172,7 @@ def test_signals_are_the_same(together: bool, tmp_path: Path) -> None:
         elif tick > 0:
             whole.step(idle(whole))
         halves.take(whole.worlds, {})
-        halves.executor.each("detect")
+        halves.each("detect")
         if not together:
             merge_detections(*noted)
         halves.commons.switch_signals(halves.shards[0].worlds)
