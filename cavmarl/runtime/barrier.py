@@ -30,7 +30,17 @@ from numpy.typing import NDArray
 from cavmarl.kernels import kernel
 from cavmarl.kernels.repeated import repeated
 
-__all__ = ["ASLEEP", "NUMBER", "WORDS", "Meeting", "Words", "load_kernels", "usable_cores"]
+__all__ = [
+    "ASLEEP",
+    "NUMBER",
+    "WORDS",
+    "Meeting",
+    "Words",
+    "load_kernels",
+    "post",
+    "usable_cores",
+    "wait_for",
+]
 
 Words = NDArray[np.int64]
 
@@ -41,6 +51,8 @@ SHORT_S = 20e-6  # that anybody looks before it sleeps
 LONG_S = 200e-6  # that it looks where the last time has not been longer
 PAUSES = 4  # looks before it lets others run
 ROUNDS = 16  # of those before it looks at the clock
+AWAKE_S = 10e-3  # that who waits for a part of an order lets others run between two looks
+NAP_S = 100e-6  # that it sleeps between them from then on
 WAKE = b"!"
 
 _PAUSE = {"x86_64": "llvm.x86.sse2.pause", "AMD64": "llvm.x86.sse2.pause"}.get(platform.machine())
@@ -150,6 +162,21 @@ def load_kernels() -> None:
     _set(words, NUMBER, 1, words)
     _has(words, 1)
     _look(words, 1, True)
+
+
+def post(mine: Words, number: int) -> None:
+    """Come to a number, for those who never sleep until it is there."""
+    _set(mine, NUMBER, number, mine)
+
+
+def wait_for(theirs: Words, number: int) -> None:
+    """Return when the other side comes to a number, which it does soon unless it is dead."""
+    if _look(theirs, number, False):
+        return
+    end = time.perf_counter() + AWAKE_S
+    while not _look(theirs, number, True):
+        if time.perf_counter() > end:
+            time.sleep(NAP_S)
 
 
 class Meeting:

@@ -47,10 +47,11 @@ from cavmarl.runtime.shard_clock import ShardClock
 from cavmarl.runtime.store import CommittedStore
 from cavmarl.runtime.zone_view import ZoneView, view_zones
 from cavmarl.shard.group import ShardGroup
-from cavmarl.shard.shard import Commands
+from cavmarl.shard.shard import Commands, Shard
 from cavmarl.shard.vehicles import STATE_FIELDS, blank_vehicle
 from cavmarl.traffic.demand import DemandFile
 from cavmarl.traffic.departures import make_gate
+from cavmarl.traffic.memory import Zeros
 from cavmarl.traffic.native import NativeTraffic
 
 __all__ = ["Simulation", "TrafficStats"]
@@ -105,6 +106,10 @@ class Simulation:
         partition: the zones; None: cut as `config.zones` says.
         observations: (W, A, D) float32, where the agents' are written; None: made for them.
         warm: call every kernel now, so that none is loaded in a step.
+        zeros: makes the arrays that shards write.
+
+    Attributes:
+        everywhere: (W,) all of the worlds.
     """
 
     def __init__(
@@ -117,6 +122,7 @@ class Simulation:
         *,
         observations: NDArray[np.float32] | None = None,
         warm: bool = False,
+        zeros: Zeros = np.zeros,
     ) -> None:
         self.config = config
         self.network = network
@@ -126,7 +132,7 @@ class Simulation:
         self._seed = 0
         self._first_world = 0
         self._episodes = np.zeros(num_worlds, dtype=np.int64)
-        self._everywhere = np.ones(num_worlds, dtype=np.bool_)
+        self.everywhere = np.ones(num_worlds, dtype=np.bool_)
         self.transfers: tuple[TransferLog, ...] = ()
         with first_compilation() as is_first:
             blank = blank_vehicle()
@@ -139,13 +145,14 @@ class Simulation:
                 config.horizon_s,
                 demand,
                 num_worlds,
+                zeros,
             )
             capacity = traffic.capacity
             self._traffic = traffic
             self._gate = make_gate(num_worlds, capacity, network.arrays, blank.dtype)
-            self._commons = Commons(config, network, num_worlds, observations)
+            self._commons = Commons(config, network, num_worlds, observations, zeros)
             self._shards, self._division = divide(
-                config, network, self.partition, traffic, self._commons.outputs, num_worlds
+                config, network, self.partition, traffic, self._commons.outputs, num_worlds, zeros
             )
             self._shard = self._shards[0]
             self._executor: Executor = ShardGroup(self._shards)
@@ -191,7 +198,7 @@ class Simulation:
         """Run one step of a world that the first reset forgets."""
         shape = self.outputs.present.shape
         controls = np.zeros((*shape, 2))
-        self._populate(self._everywhere)
+        self._populate(self.everywhere)
         self.suggest(controls)
         self.step(Commands(controls, np.full(shape, ACTION_IDLE, dtype=np.int64)))
         # Once more what is only called when somebody leaves or waits.
@@ -300,7 +307,7 @@ class Simulation:
             CapacityError: the map has no room for that many agents of a closed world.
         """
         if chosen is None:
-            chosen = self._everywhere
+            chosen = self.everywhere
         self._populate(chosen)
         agents = self.config.population.agents
         seated = self.outputs.present[chosen].sum(axis=1)
@@ -384,6 +391,10 @@ class Simulation:
         if self._coordination is not None:
             self._coordination = wrap(self._coordination)
 
+    def host(self, make: Callable[[Sequence[Shard]], Executor]) -> None:
+        """From now on let somebody else run the phases of the shards, as `make` returns it."""
+        self._executor = make(self._shards)
+
     def time_shards(self) -> ShardClock:
         """From now on run phases zone by zone, with a clock on each.
 
@@ -404,7 +415,7 @@ class Simulation:
             self._executor.each("begin_step", commands)
         self._advance(commands)
         if is_last:
-            self._sense(self._everywhere)
+            self._sense(self.everywhere)
         if self._coordination is not None:
             self._coordination.end()
 

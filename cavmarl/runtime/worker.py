@@ -89,6 +89,13 @@ class Job(Protocol):
         """Go on from what `save` has given."""
         ...
 
+    def prepare(self) -> None:
+        """Called where workers are forked, before each fork that is to do this job.
+
+        Whoever has done it is dead; so are those that it shares memory with, if it is their first.
+        """
+        ...
+
 
 MakeJobs = Callable[[Mapping[str, Any]], Sequence[Job]]
 
@@ -170,6 +177,7 @@ def _fork_on_demand(
             pool.send(json.dumps({"status": os.waitstatus_to_exitcode(status)}).encode())
             continue
         number, (wire,) = order["fork"], descriptors
+        jobs[number].prepare()
         mother = os.getpid()
         pid = os.fork()
         if pid == 0:
