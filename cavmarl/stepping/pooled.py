@@ -18,6 +18,7 @@ from cavmarl.runtime.shared_memory import Segment, arrays_in, size_of
 from cavmarl.runtime.simulation import Simulation
 from cavmarl.shard.shard import Commands
 from cavmarl.stepping.arrays import StepArrays, layout_of
+from cavmarl.stepping.diary import make_segments
 from cavmarl.stepping.job import Task, fingerprint
 from cavmarl.stepping.parts import share_out
 from cavmarl.worlds import World
@@ -75,6 +76,7 @@ class PooledWorlds:
         layout = layout_of(config, num_worlds)
         segment = Segment.make(size_of(layout))
         self.arrays = StepArrays(**arrays_in(segment.map(), layout))
+        diaries = [make_segments(config) if len(part.zones) > 1 else [] for part in parts]
         recipe = {
             "config": asdict(config),
             "base_dir": str(base_dir.resolve()),
@@ -83,12 +85,14 @@ class PooledWorlds:
             "arrays": segment.fd,
             "in_next_step": in_next_step,
             "parts": parts,
+            "diaries": [[one.fd for one in diary] for diary in diaries],
         }
         named = tuple(name for part in parts for name in part.names)
         tasks = tuple(task.name.lower().replace("_", " ") for task in Task)
         leaders = [0, *accumulate(len(part.zones) for part in parts)]
         teams = tuple(tuple(range(*bounds)) for bounds in pairwise(leaders))
-        program = Program(PROGRAM, recipe, named, (segment,), tasks, teams)
+        segments = (segment, *(one for diary in diaries for one in diary))
+        program = Program(PROGRAM, recipe, named, segments, tasks, teams)
         try:
             self.pool = Pool(program, config.workers.timeout_s, config.workers.repeats)
         except WorkerFailureError as failure:
