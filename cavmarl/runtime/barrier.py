@@ -38,6 +38,7 @@ __all__ = [
     "Words",
     "load_kernels",
     "post",
+    "present_core",
     "usable_cores",
     "wait_for",
 ]
@@ -60,17 +61,18 @@ _settings: Any = numba.core.config
 _IS_PYTHON = bool(_settings.DISABLE_JIT)
 
 
-def usable_cores() -> int:
-    """How many cores this process may run on."""
+def usable_cores() -> set[int]:
+    """The cores that this process may run on."""
     if hasattr(os, "sched_getaffinity"):
-        return len(os.sched_getaffinity(0))
-    return os.cpu_count() or 1
+        return os.sched_getaffinity(0)
+    return set(range(os.cpu_count() or 1))
 
 
 _external: Any = types.ExternalFunction
 _intrinsic: Any = intrinsic
 _function: Any = cgutils.get_or_insert_function
 _let_others_run = _external("sched_yield", types.int32())
+_core = _external("sched_getcpu", types.int32())
 
 
 @_intrinsic  # type: ignore[untyped-decorator]
@@ -136,6 +138,15 @@ def _compiled_look(theirs: Words, number: int, yields: bool) -> bool:
     return False
 
 
+@kernel
+def _compiled_core() -> int:
+    return _core()  # type: ignore[no-any-return]
+
+
+def _plain_core() -> int:
+    return -1
+
+
 def _plain_has(theirs: Words, number: int) -> bool:
     return bool(theirs[NUMBER] >= number)
 
@@ -149,10 +160,15 @@ def _plain_look(theirs: Words, number: int, yields: bool) -> bool:
     return bool(theirs[NUMBER] >= number)
 
 
-_has, _set, _look = (
-    (_plain_has, _plain_set, _plain_look)
+_has, _set, _look, present_core = (
+    (_plain_has, _plain_set, _plain_look, _plain_core)
     if _IS_PYTHON
-    else (repeated(_compiled_has), repeated(_compiled_set), repeated(_compiled_look))
+    else (
+        repeated(_compiled_has),
+        repeated(_compiled_set),
+        repeated(_compiled_look),
+        repeated(_compiled_core),
+    )
 )
 
 
@@ -162,6 +178,7 @@ def load_kernels() -> None:
     _set(words, NUMBER, 1, words)
     _has(words, 1)
     _look(words, 1, True)
+    present_core()
 
 
 def post(mine: Words, number: int) -> None:

@@ -66,7 +66,7 @@ class Crew:
     def __init__(self, program: Program) -> None:
         self._program = program
         self._count = len(program.parts)
-        self._crowded = self._count + 1 > usable_cores()
+        self._crowded = self._count + 1 > len(usable_cores())
         self._poll = select.poll()
         self._held = _Held(list(program.segments))
         self._meetings: dict[int, Meeting] = {}
@@ -257,7 +257,7 @@ class Crew:
         os.pwrite(recipe.fd, text, 0)
         self.orders = np.frombuffer(orders.map(), dtype=np.int64).reshape(-1, WORDS)
         self._statuses = [np.frombuffer(s.map(), dtype=np.int64)[:WORDS] for s in statuses]
-        self._crowded = self._count + 1 > usable_cores()
+        self._crowded = self._count + 1 > len(usable_cores())
         self._told = {
             "recipe": recipe.fd,
             "recipe_bytes": len(text),

@@ -483,6 +483,8 @@ class Simulation:
 
     def retire_agents(self) -> None:
         """Take out the agents whose trip ended in the last step; to be called after it is read."""
+        if not self.outputs.terminated.any():
+            return
         gate = self._gate
         self._executor.each("retire", gate)
         if gate.num_passing.any():
@@ -517,10 +519,11 @@ class Simulation:
 
     def agents_to_come(self) -> NDArray[np.bool_]:
         """(W,) whether an agent waits to enter."""
-        if not self._gate.num_queue.any():
+        longest = int(self._gate.num_queue.max(initial=0))
+        if longest == 0:
             return np.zeros(self.num_worlds, dtype=np.bool_)
-        waiting = np.arange(self._gate.queue.shape[1]) < self._gate.num_queue[:, None]
-        found = np.any(waiting & (self._gate.queue["agent"] >= 0), axis=1)
+        waiting = np.arange(longest) < self._gate.num_queue[:, None]
+        found = np.any(waiting & (self._gate.queue["agent"][:, :longest] >= 0), axis=1)
         return np.asarray(found, dtype=np.bool_)
 
     def arrivals(self) -> NDArray[np.int64]:

@@ -11,13 +11,22 @@ needs to know beside the arrays stands in the leader's line.
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from typing import Any
 
 import numpy as np
 
-from cavmarl.runtime.barrier import NUMBER, WORDS, Words, post, wait_for
+from cavmarl.runtime.barrier import (
+    NUMBER,
+    WORDS,
+    Words,
+    post,
+    present_core,
+    usable_cores,
+    wait_for,
+)
 from cavmarl.runtime.executor import Phase
 from cavmarl.runtime.shared_memory import shared_zeros
 from cavmarl.shard.group import ShardGroup
@@ -29,6 +38,7 @@ __all__ = ["Follower", "Leader", "LeftAloneError", "Team"]
 CODE, SIDE, NEXT_SIDE = 2, 3, 4
 # A word of a follower's line.
 FAILED = 2
+CORE = 5  # a word of both: where the process was when it began with a phase
 
 # Methods of `ShardGroup` and `Shard` that are run together, by their code.
 TOGETHER = ("begin_step", "move", "resolve", "sense", "credit", "suggest")
@@ -127,6 +137,7 @@ class Leader:
         line = self._line
         line[CODE] = code
         line[SIDE], line[NEXT_SIDE] = self._everybody.sides
+        line[CORE] = present_core()
         post(line, line.item(NUMBER) + 1)
 
     def _wait(self) -> None:
@@ -148,6 +159,8 @@ class Follower:
         self._own = team.hosts[number]
         self._leader = team.lines[0]
         self._line = team.lines[number]
+        self._before = team.lines[:number]
+        self._cores = usable_cores()
 
     def follow(self) -> None:
         """Run all phases of one order."""
@@ -170,6 +183,19 @@ class Follower:
         if failure is not None:
             raise failure
 
+    def _get_out_of_the_way(self) -> None:
+        """Leave the core of those before in the team: they wait for this one, and it for them.
+
+        Systems put processes that are woken together on one core, and take milliseconds to notice.
+        """
+        core = present_core()
+        taken = {line.item(CORE) for line in self._before}
+        if core in taken and self._cores - taken:
+            os.sched_setaffinity(0, self._cores - taken)
+            core = present_core()
+        self._line[CORE] = core
+
     def _run(self, name: str) -> None:
+        self._get_out_of_the_way()
         self._own.face(self._leader.item(SIDE), self._leader.item(NEXT_SIDE))
         self._own.each(name, *self._known[name])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from itertools import pairwise
 from typing import NamedTuple
 
@@ -82,12 +83,13 @@ def _zones(world: World, workers: int) -> list[list[int]]:
     costs = tuple(ShardCost(0, zone, lane_km[zone] + _EMPTY_KM) for zone in everything)
     plan = make_plan(Problem(costs, partition.side_neighbors, idle_snapshot(workers)))
     hosted = [[zone for zone in everything if plan.homes[zone] == k] for k in range(workers)]
-    return _nobody_idle(hosted)
+    _let_nobody_idle(hosted)
+    # The leader has more to do: it takes the lightest part.
+    return sorted(hosted, key=lambda zones: math.fsum(costs[zone].cost_s for zone in zones))
 
 
-def _nobody_idle(hosted: list[list[int]]) -> list[list[int]]:
-    """The same, but that who has nothing takes a zone of the worker that has most."""
+def _let_nobody_idle(hosted: list[list[int]]) -> None:
+    """Who has nothing takes a zone of the worker that has most."""
     while not all(hosted):
         idle = hosted.index([])
         hosted[idle].append(max(hosted, key=len).pop())
-    return hosted

@@ -63,7 +63,7 @@ class PooledWorlds:
         config = world.config
         _check(config.zones)
         parts = share_out(world, num_worlds, workers)
-        cores = usable_cores()
+        cores = len(usable_cores())
         if workers > cores:
             warnings.warn(
                 f"workers = {workers}: there are {cores} cores; more workers than cores do not "
