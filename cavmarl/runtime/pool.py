@@ -90,6 +90,10 @@ class Pool:
         """Of the process that forks them."""
         return self._crew.server_pid
 
+    def team_of(self, worker: int) -> tuple[int, ...]:
+        """Who is replaced with a worker, itself among them."""
+        return self._program.team_of(worker)
+
     def processor_s(self) -> list[float]:
         """Processor time that each worker's process has taken."""
         return [processor_s(pid) for pid in self.pids]
@@ -188,7 +192,7 @@ class Pool:
                     self._replace(k, cause, mail)
             pending = self._pending()
             for k in pending:
-                team = self._program.team_of(k)
+                team = self.team_of(k)
                 causes = [death.cause for death in self.deaths[first:] if death.worker in team]
                 if len(causes) > self._repeats:
                     self._give_up(k, causes)
