@@ -56,8 +56,9 @@ def make_vec(
         env: name of an entry of `envs/`, a folder with an env.yaml, or a map file.
         num_envs: number of worlds.
         zones: shadows zones.count, how many shards run the world; results do not depend on it.
-        workers: processes that the worlds are shared out over, whole worlds each; 0: they run in
-            the caller's. Results do not depend on it.
+        workers: processes that the worlds are shared out over, whole worlds each; where there are
+            more of them than worlds, the zones of each world. 0: all run in the caller's process.
+            Results do not depend on it.
         agents: shadows population.agents.
         background: shadows population.background.
         seed: of the first reset, if that is given none.
@@ -77,7 +78,7 @@ def make_vec(
     if not 1 <= num_envs <= MAX_WORLDS:
         raise ConfigError(f"num_envs = {num_envs}: must be from 1 to {MAX_WORLDS}")
     num_envs = int(num_envs)
-    num_workers = check_workers(workers, num_envs)
+    num_workers = check_workers(workers)
     in_next_step = _in_next_step(autoreset_mode)
     first_seed = None if seed is None else check_seed(seed)
     config, base_dir = load_config(

@@ -165,21 +165,18 @@ def check_placement(workers: int | None) -> None:
         )
 
 
-def check_workers(workers: int | None, num_worlds: int) -> int:
+def check_workers(workers: int | None) -> int:
     """How many worker processes share some worlds out; 0: none, the caller's process runs them.
 
     Raises:
-        ConfigError: no whole number from 0 to the number of worlds.
+        ConfigError: no whole number from 0.
     """
     if workers is None:
         return 0
     if isinstance(workers, bool) or not isinstance(workers, (int, np.integer)):
         raise ConfigError(f"workers = {workers!r}: must be a whole number")
-    if not 0 <= workers <= num_worlds:
-        raise ConfigError(
-            f"workers = {workers}: must be from 0 to num_envs = {num_worlds}, as a world stays on "
-            "one worker; use fewer workers, or more worlds"
-        )
+    if workers < 0:
+        raise ConfigError(f"workers = {workers}: must be a number from 0")
     return int(workers)
 
 

@@ -23,6 +23,7 @@ from cavmarl.cli.output import (
 from cavmarl.errors import ConfigError
 
 if TYPE_CHECKING:
+    from cavmarl.evaluate.split_speed import SplitSpeed
     from cavmarl.evaluate.worker_speed import WorkerSpeed
 
 __all__ = ["workers"]
@@ -38,6 +39,16 @@ def workers(
     background: Background = None,
     steps: Annotated[int, typer.Option(help="Of a turn.")] = 20,
     repeats: Annotated[int, typer.Option(help="Turns of each.")] = 7,
+    vehicles: Annotated[
+        str,
+        typer.Option(
+            metavar="N,…",
+            help="Of one world that is split, too; default: those of the environment.",
+        ),
+    ] = "",
+    zones: Annotated[
+        int | None, typer.Option(help="Of the split world; default: one a worker.")
+    ] = None,
     seed: Seed = 0,
     settings: Settings = None,
     at_least: Annotated[
@@ -45,11 +56,17 @@ def workers(
     ] = None,
     json_path: JsonPath = None,
 ) -> None:
-    """The same worlds without workers, with one and with several; and what an empty order costs."""
+    """The same worlds without workers, with one and with several; and one world that is split.
+
+    How much faster several workers are, what an empty order costs, and for how many vehicles it
+    pays to split one world.
+    """
+    from cavmarl.evaluate.split_speed import measure_splits
     from cavmarl.evaluate.worker_speed import measure_workers
 
     if at_least is not None and not 0.0 < at_least < math.inf:
         raise ConfigError(f"--at-least {at_least:g}: must be a number above 0")
+    numbers = _numbers(vehicles)
     console = Console()
     with console.status("") as status:
         found = measure_workers(
@@ -64,7 +81,20 @@ def workers(
             overrides=parse_settings(settings),
             say=status.update,
         )
-    write_json(json_path, found.to_dict())
+        splits = measure_splits(
+            env,
+            numbers,
+            zones=zones,
+            workers=count,
+            agents=agents,
+            background=background,
+            steps=steps,
+            repeats=repeats,
+            seed=seed,
+            overrides=parse_settings(settings),
+            say=status.update,
+        )
+    write_json(json_path, found.to_dict() | {"splits": [split.to_dict() for split in splits]})
     console.print(_table(found))
     low, middle, high, highest = found.barrier_us
     console.print(
@@ -76,10 +106,34 @@ def workers(
         f"{found.idle_s:.1%} of a core",
         highlight=False,
     )
+    for split in splits:
+        console.print(_sentence(split), highlight=False)
     if found.is_crowded:
         console.print("note: more workers than cores", style="yellow")
     if at_least is not None and found.ratio < at_least:
         raise typer.Exit(1)
+
+
+def _numbers(text: str) -> list[int | None]:
+    """What `--vehicles` says."""
+    if not text:
+        return [None]
+    try:
+        return [int(word) for word in text.split(",")]
+    except ValueError:
+        raise ConfigError(f"--vehicles {text}: must be whole numbers with commas between") from None
+
+
+def _sentence(split: SplitSpeed) -> str:
+    undivided, whole, parted = (
+        statistics.median(times) for times in (split.undivided_ms, split.whole_ms, split.split_ms)
+    )
+    verdict = "faster" if split.ratio > 1.0 else "slower: leave it whole"
+    return (
+        f"one world of {split.vehicles} vehicles: {undivided:.2f} ms a step; in {split.zones} "
+        f"zones over one worker {whole:.2f}, over {split.workers} {parted:.2f}: "
+        f"[bold]{split.ratio:.2f}[/] times, {verdict}"
+    )
 
 
 def _table(found: WorkerSpeed) -> Table:

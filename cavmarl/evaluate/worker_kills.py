@@ -256,6 +256,9 @@ class _Killer:
                 )
             how, sent_s = self._sent.pop(death.worker)
             self.found.append(_kill(death, how, sent_s, step))
+            for worker in self._pool.team_of(death.worker):
+                if worker in self._sent and self._sent[worker][1] < death.replaced_s:
+                    del self._sent[worker]  # it was replaced with the other one
         self._seen = len(deaths)
 
 

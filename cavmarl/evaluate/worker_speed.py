@@ -19,7 +19,7 @@ from cavmarl.runtime.pool import Pool
 from cavmarl.stepping.pooled import PooledWorlds
 from cavmarl.vector_env import CavVectorEnv, make_vec
 
-__all__ = ["Row", "WorkerSpeed", "measure_workers"]
+__all__ = ["WARM_STEPS", "Measured", "Row", "WorkerSpeed", "measure_workers"]
 
 WARM_STEPS = 20
 PINGS = 2000  # a turn
@@ -135,7 +135,7 @@ def measure_workers(
         raise ConfigError(
             f"{workers} workers, {steps} steps, {repeats} turns: must be at least 2, 1 and 1"
         )
-    measured: list[_Measured] = []
+    measured: list[Measured] = []
     try:
         for count in (0, 1, workers):
             say(f"making worlds over {count} workers")
@@ -148,7 +148,7 @@ def measure_workers(
                 background=background,
                 overrides=overrides,
             )
-            measured.append(_Measured(vec, count, time.perf_counter() - began))
+            measured.append(Measured(vec, count, time.perf_counter() - began))
             vec.reset(seed=seed)
             measured[-1].turn(WARM_STEPS)
         pool = measured[-1].pool
@@ -169,7 +169,7 @@ def measure_workers(
     return WorkerSpeed(str(env), worlds, steps, rows, quantiles, idle_s, describe_hardware())
 
 
-class _Measured:
+class Measured:
     """Worlds over some number of workers, and what their turns have taken."""
 
     def __init__(self, vec: CavVectorEnv, workers: int, made_s: float) -> None:

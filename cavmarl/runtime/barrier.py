@@ -30,7 +30,18 @@ from numpy.typing import NDArray
 from cavmarl.kernels import kernel
 from cavmarl.kernels.repeated import repeated
 
-__all__ = ["ASLEEP", "NUMBER", "WORDS", "Meeting", "Words", "load_kernels", "usable_cores"]
+__all__ = [
+    "ASLEEP",
+    "NUMBER",
+    "WORDS",
+    "Meeting",
+    "Words",
+    "load_kernels",
+    "post",
+    "present_core",
+    "usable_cores",
+    "wait_for",
+]
 
 Words = NDArray[np.int64]
 
@@ -42,6 +53,8 @@ LONG_S = 200e-6  # that it looks where the last time has not been longer
 LONG_WORK_S = 500e-6  # after which nobody looks for so long
 PAUSES = 4  # looks before it lets others run
 ROUNDS = 16  # of those before it looks at the clock
+AWAKE_S = 10e-3  # that who waits for a part of an order lets others run between two looks
+NAP_S = 100e-6  # that it sleeps between them from then on
 WAKE = b"!"
 
 _PAUSE = {"x86_64": "llvm.x86.sse2.pause", "AMD64": "llvm.x86.sse2.pause"}.get(platform.machine())
@@ -49,17 +62,18 @@ _settings: Any = numba.core.config
 _IS_PYTHON = bool(_settings.DISABLE_JIT)
 
 
-def usable_cores() -> int:
-    """How many cores this process may run on."""
+def usable_cores() -> set[int]:
+    """The cores that this process may run on."""
     if hasattr(os, "sched_getaffinity"):
-        return len(os.sched_getaffinity(0))
-    return os.cpu_count() or 1
+        return os.sched_getaffinity(0)
+    return set(range(os.cpu_count() or 1))
 
 
 _external: Any = types.ExternalFunction
 _intrinsic: Any = intrinsic
 _function: Any = cgutils.get_or_insert_function
 _let_others_run = _external("sched_yield", types.int32())
+_core = _external("sched_getcpu", types.int32())
 
 
 @_intrinsic  # type: ignore[untyped-decorator]
@@ -125,6 +139,15 @@ def _compiled_look(theirs: Words, number: int, yields: bool) -> bool:
     return False
 
 
+@kernel
+def _compiled_core() -> int:
+    return _core()  # type: ignore[no-any-return]
+
+
+def _plain_core() -> int:
+    return -1
+
+
 def _plain_has(theirs: Words, number: int) -> bool:
     return bool(theirs[NUMBER] >= number)
 
@@ -138,10 +161,15 @@ def _plain_look(theirs: Words, number: int, yields: bool) -> bool:
     return bool(theirs[NUMBER] >= number)
 
 
-_has, _set, _look = (
-    (_plain_has, _plain_set, _plain_look)
+_has, _set, _look, present_core = (
+    (_plain_has, _plain_set, _plain_look, _plain_core)
     if _IS_PYTHON
-    else (repeated(_compiled_has), repeated(_compiled_set), repeated(_compiled_look))
+    else (
+        repeated(_compiled_has),
+        repeated(_compiled_set),
+        repeated(_compiled_look),
+        repeated(_compiled_core),
+    )
 )
 
 
@@ -151,6 +179,22 @@ def load_kernels() -> None:
     _set(words, NUMBER, 1, words)
     _has(words, 1)
     _look(words, 1, True)
+    present_core()
+
+
+def post(mine: Words, number: int) -> None:
+    """Come to a number, for those who never sleep until it is there."""
+    _set(mine, NUMBER, number, mine)
+
+
+def wait_for(theirs: Words, number: int) -> None:
+    """Return when the other side comes to a number, which it does soon unless it is dead."""
+    if _look(theirs, number, False):
+        return
+    end = time.perf_counter() + AWAKE_S
+    while not _look(theirs, number, True):
+        if time.perf_counter() > end:
+            time.sleep(NAP_S)
 
 
 class Meeting:

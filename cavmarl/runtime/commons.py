@@ -12,6 +12,7 @@ from cavmarl.kernels.repeated import repeated
 from cavmarl.kernels.signals import switch_signals
 from cavmarl.roads.network import RoadNetwork
 from cavmarl.shard.outputs import make_outputs
+from cavmarl.traffic.memory import Zeros
 
 __all__ = ["Commons"]
 
@@ -24,6 +25,7 @@ class Commons:
         network: the roads of the whole map.
         num_worlds: W.
         observations: (W, A, D) where the agents' are written; None: made for them.
+        zeros: makes all other outputs.
 
     Attributes:
         outputs: of all agents; every shard writes at the indices of its own ones.
@@ -35,8 +37,9 @@ class Commons:
         network: RoadNetwork,
         num_worlds: int,
         observations: NDArray[np.float32] | None = None,
+        zeros: Zeros = np.zeros,
     ) -> None:
-        self.outputs = make_outputs(config, num_worlds, observations)
+        self.outputs = make_outputs(config, num_worlds, observations, zeros)
         self._roads = network.arrays
         self._sim_dt_s = config.clock.sim_dt_s
         self._weights = np.array([config.terms.weights.get(name, 0.0) for name in TERMS])

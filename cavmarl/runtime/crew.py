@@ -6,7 +6,7 @@ import json
 import os
 import select
 import signal
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from contextlib import suppress
 from typing import Any, NamedTuple
 
@@ -35,6 +35,8 @@ class Program(NamedTuple):
             descriptors.
         tasks: what each task is called, by its number.
         pins: each worker stays on a core of its own, as far as there are so many.
+        teams: workers that share their state, by rising numbers: none of them can go on without the
+            others. Who is in no team is alone.
     """
 
     module: str
@@ -43,6 +45,11 @@ class Program(NamedTuple):
     segments: tuple[Segment, ...]
     tasks: tuple[str, ...]
     pins: bool = False
+    teams: tuple[tuple[int, ...], ...] = ()
+
+    def team_of(self, worker: int) -> tuple[int, ...]:
+        """Who shares its state with a worker, itself among them."""
+        return next((team for team in self.teams if worker in team), (worker,))
 
 
 class Crew:
@@ -62,7 +69,7 @@ class Crew:
     def __init__(self, program: Program) -> None:
         self._program = program
         self._count = len(program.parts)
-        self._crowded = self._count + 1 > usable_cores()
+        self._crowded = self._count + 1 > len(usable_cores())
         self._poll = select.poll()
         self._held = _Held(list(program.segments))
         self._meetings: dict[int, Meeting] = {}
@@ -148,6 +155,11 @@ class Crew:
         process.mail.clear()
         return self.has(k)
 
+    def is_left_alone(self, k: int) -> bool:
+        """Whether somebody is dead without whom a worker cannot go on."""
+        others = [self.processes[j].pidfd for j in self._program.team_of(k) if j != k]
+        return bool(select.select(others, [], [], 0.0)[0])
+
     def answer(self, k: int) -> tuple[int, Any]:
         """How a worker's order ended, as its line says, and what it has answered."""
         kind = self._statuses[k].item(ANSWER)
@@ -157,26 +169,34 @@ class Crew:
         process.collect()
         return kind, json.loads(process.mail.pop(0))
 
-    def replace(self, k: int, mail: bytes | None) -> str:
-        """Give a worker a new process, and that one the order, if it is not carried out yet.
+    def replace(self, k: int, mail: bytes | None, ordered: Collection[int]) -> str:
+        """Give a worker's team new processes, and those the order, if it is not carried out yet.
 
         Args:
             k: the worker.
             mail: that came with the order.
+            ordered: all workers that were given it.
 
         Returns:
-            what the old process died of, if nothing else is known.
+            what the old process of the worker died of, if nothing else is known.
         """
-        old = self.processes[k]
-        self._dismiss(old)
-        assert self._held.server is not None
+        team = self._program.team_of(k)
+        old = {j: self.processes[j] for j in team}
+        for process in old.values():
+            self._dismiss(process)
+        self._take_back(team, ordered)
+        server = self._held.server
+        assert server is not None
         try:
-            cause = _say(self._held.server.bury(old))
-            self._fork(k)
+            statuses = {j: server.bury(process) for j, process in old.items()}
+            cause = _say(statuses[k])
+            for j in team:
+                self._fork(j)
         except ServerGoneError:
             cause = "the process that starts workers ended"
-            self._start_anew(k, mail)
-        self._hand_over(k, old, mail)
+            old = self._start_anew(old, ordered)
+        for j, process in old.items():
+            self._hand_over(j, process, mail)
         return cause
 
     def _dismiss(self, process: Process) -> None:
@@ -184,6 +204,13 @@ class Crew:
         self._poll.unregister(process.pidfd)
         self._poll.unregister(process.wire)
         process.collect()
+
+    def _take_back(self, team: tuple[int, ...], ordered: Collection[int]) -> None:
+        """Let a team, all of it dead, do an order again together that not all have carried out."""
+        asked = [j for j in team if j in ordered]
+        if not all(self.has(j) for j in asked):
+            for j in asked:
+                self._statuses[j][NUMBER] = self.number(j) - 1  # nobody else writes there
 
     def _hand_over(self, k: int, old: Process, mail: bytes | None) -> None:
         """To a new process, what has come from the old one, or what that one was sent."""
@@ -193,16 +220,29 @@ class Crew:
             self._send(k, mail)
         old.release()
 
-    def _start_anew(self, k: int, mail: bytes | None) -> None:
-        """The process that forks is gone, or hangs: another one, and new workers for all."""
+    def _start_anew(self, dead: dict[int, Process], ordered: Collection[int]) -> dict[int, Process]:
+        """The process that forks is gone, or hangs: another one, and new workers for all.
+
+        Args:
+            dead: processes that have been dismissed.
+            ordered: all workers that were given the present order.
+
+        Returns:
+            the old processes of all workers.
+        """
         assert self._held.server is not None
         self._held.server.close()
-        others = {j: process for j, process in self.processes.items() if j != k}
-        for process in others.values():
+        for k, process in self.processes.items():
+            if process is dead.get(k):
+                continue
             self._dismiss(process)
+            if k in dead:  # its successor is of no use, either
+                process.release()
+        old = {**self.processes, **dead}
+        for team in {self._program.team_of(k) for k in old}:
+            self._take_back(team, ordered)
         self._start()
-        for j, process in others.items():
-            self._hand_over(j, process, mail)
+        return old
 
     def _send(self, k: int, mail: bytes | None) -> None:
         if mail is not None:

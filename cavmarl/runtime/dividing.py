@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import numpy as np
+
 from cavmarl.config import EnvConfig, ZonesConfig
 from cavmarl.kernels.arrays import Outputs
 from cavmarl.kernels.motion import MAX_SPEED_MPS
@@ -15,6 +17,7 @@ from cavmarl.shard.reach import driving_reach_m
 from cavmarl.shard.sensors import largest_radius_m, sensing_reach_m
 from cavmarl.shard.shard import Shard, make_zoned
 from cavmarl.shard.transfer import TransferCodec
+from cavmarl.traffic.memory import Zeros
 from cavmarl.traffic.native import NativeTraffic
 
 __all__ = ["divide", "halo_m", "limits_of"]
@@ -30,8 +33,18 @@ def divide(
     traffic: NativeTraffic,
     outputs: Outputs,
     num_worlds: int,
+    zeros: Zeros = np.zeros,
 ) -> tuple[list[Shard], Division]:
     """One shard a zone, and the division that knows them all.
+
+    Args:
+        config: the environment.
+        network: its roads.
+        partition: its zones.
+        traffic: who drives where.
+        outputs: where all agents get what they sense.
+        num_worlds: how many worlds are stepped together.
+        zeros: makes the arrays that shards write.
 
     Raises:
         CoverageError: `zones.halo_m` is less than exactness needs.
@@ -42,7 +55,7 @@ def divide(
         driving_reach_m(network, traffic.travel), sensing_reach_m(config.sensors, radius_m)
     )
     halo = zone_halo(partition, halo_m(config, reach_m, partition.count))
-    zoned = make_zoned(partition.count, num_worlds, traffic.capacity)
+    zoned = make_zoned(partition.count, num_worlds, traffic.capacity, zeros)
     shards: list[Shard] = []
     for zone in range(partition.count):
         shard = Shard(
@@ -56,6 +69,7 @@ def divide(
             partition.arrays,
             halo,
             shards[0] if shards else None,
+            zeros,
         )
         shards.append(shard)
     division = Division(

@@ -150,6 +150,8 @@ class Division:
             contacts: (W,) of each, as `contacts` counts them.
         """
         first = self._shards[0].worlds
+        # Who has died in the middle of a tick may have left a step that is not what this says.
+        self._zoned.step_at[...] = 0
         for w, rows in enumerate(vehicles):
             first.rows[w, : len(rows)] = rows
             first.num_owned[w] = first.num_rows[w] = len(rows)

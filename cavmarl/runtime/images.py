@@ -7,19 +7,23 @@ import zlib
 from collections.abc import Iterator, Sequence
 from typing import Any
 
+import numba.core.config
 import numpy as np
 from numpy.typing import NDArray
 
 from cavmarl.errors import WorkerError
+from cavmarl.kernels import kernel
 from cavmarl.runtime.shared_memory import Segment
 
-__all__ = ["Arrays", "Image"]
+__all__ = ["Arrays", "Image", "load_kernels"]
 
 Array = NDArray[Any]
 Arrays = Sequence[Array]
 
 _WORD = 8
 _HEAD = 3  # words: of everything, checksum, how many arrays
+_settings: Any = numba.core.config
+_IS_PYTHON = bool(_settings.DISABLE_JIT)
 
 
 class Image:
@@ -97,5 +101,28 @@ class Image:
         self._words = np.frombuffer(self._memory, dtype=np.int64)
 
 
+@kernel
+def _mixed(words: NDArray[np.uint64]) -> np.uint64:
+    """FNV-1a over whole words, in four rows side by side: a changed word always changes it."""
+    prime = np.uint64(0x100000001B3)
+    a = b = c = d = np.uint64(0xCBF29CE484222325)
+    fours = words.size // 4 * 4
+    for n in range(0, fours, 4):
+        a = (a ^ words[n]) * prime
+        b = (b ^ words[n + 1]) * prime
+        c = (c ^ words[n + 2]) * prime
+        d = (d ^ words[n + 3]) * prime
+    for n in range(fours, words.size):
+        a = (a ^ words[n]) * prime
+    return (((((a * prime) ^ b) * prime) ^ c) * prime) ^ d
+
+
 def _checksum(words: NDArray[np.int64]) -> int:
-    return zlib.crc32(words.data)
+    if _IS_PYTHON:
+        return zlib.crc32(words.data)
+    return int(np.uint64(_mixed(words.view(np.uint64))).view(np.int64))
+
+
+def load_kernels() -> None:
+    """Have the checksum ready, for this process and those that it forks."""
+    _checksum(np.zeros(_HEAD, dtype=np.int64))

@@ -18,6 +18,7 @@ from typing import Any
 
 from cavmarl.errors import WorkerDeathError, WorkerError, WorkerFailureError
 from cavmarl.runtime.crew import Crew, Program
+from cavmarl.runtime.team import LeftAloneError
 from cavmarl.runtime.watchdog import CHECK_S, Watchdog, processor_s
 from cavmarl.runtime.worker import FAILED, MAIL, MAX_MESSAGE, NOTHING, TASK
 
@@ -86,6 +87,10 @@ class Pool:
         """Of the process that forks them."""
         return self._crew.server_pid
 
+    def team_of(self, worker: int) -> tuple[int, ...]:
+        """Who is replaced with a worker, itself among them."""
+        return self._program.team_of(worker)
+
     def processor_s(self) -> list[float]:
         """Processor time that each worker's process has taken."""
         return [processor_s(pid) for pid in self.pids]
@@ -149,7 +154,7 @@ class Pool:
         for k in self._open:
             watchdog = Watchdog(self._crew.processes[k].pid, self._timeout_s)
             while not self._crew.settle(k, CHECK_S):
-                if watchdog.verdict() is not None:
+                if watchdog.verdict() is not None or self._crew.is_left_alone(k):
                     self._crew.processes[k].kill()
             self._stale[k] = True
         self._open = ()
@@ -173,24 +178,31 @@ class Pool:
         guard = _Guard(self._crew, self._timeout_s)
         while pending:
             dead = self._crew.sleep(pending, CHECK_S)
-            pending = [k for k in pending if not self._crew.has(k)]
+            pending = self._pending()
             for death in self.deaths[first:]:
                 if death.worker not in pending and isnan(death.done_s):
                     death.done_s = time.monotonic()
             suspects = dict.fromkeys(dead, "") or guard.hanging(pending)
+            suspected = {k: self._crew.processes[k] for k in suspects} | dead
             for k, cause in suspects.items():
-                if k not in dead or self._crew.processes[k] is dead[k]:
+                if self._crew.processes[k] is suspected[k]:  # not replaced with another one's
                     self._replace(k, cause, mail)
+            pending = self._pending()
             for k in pending:
-                causes = [death.cause for death in self.deaths[first:] if death.worker == k]
+                team = self.team_of(k)
+                causes = [death.cause for death in self.deaths[first:] if death.worker in team]
                 if len(causes) > self._repeats:
                     self._give_up(k, causes)
+
+    def _pending(self) -> list[int]:
+        """Who has not carried out the present order."""
+        return [k for k in self._open if not self._crew.has(k)]
 
     def _replace(self, k: int, cause: str, mail: bytes | None) -> None:
         """A worker's process is dead, or taken for it: another one goes on in its place."""
         noticed_s = time.monotonic()
         try:
-            found = self._crew.replace(k, mail)
+            found = self._crew.replace(k, mail, self._open)
         except BaseException:
             self.close()
             raise
@@ -209,13 +221,13 @@ class Pool:
         """What the workers have answered.
 
         Raises:
-            WorkerFailureError: of the first in which something went wrong.
+            WorkerFailureError: of the first in which something went wrong, not because of another.
         """
         answers: list[Any] = []
         failure: WorkerFailureError | None = None
         for k in workers:
             kind, answer = self._crew.answer(k)
-            if kind == FAILED and failure is None:
+            if kind == FAILED and (failure is None or failure.kind == LeftAloneError.__name__):
                 failure = WorkerFailureError(k, self._program.parts[k], **answer)
             answers.append(answer)
         if failure is not None:

@@ -15,11 +15,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import DTypeLike, NDArray
 
 from cavmarl.errors import WorkerStartError
 
-__all__ = ["Layout", "Segment", "arrays_in", "size_of"]
+__all__ = ["Layout", "Segment", "arrays_in", "shared_zeros", "size_of"]
 
 Layout = Mapping[str, tuple[str, tuple[int, ...]]]
 """Arrays of a segment: name → dtype as text, shape."""
@@ -105,6 +105,17 @@ def arrays_in(memory: mmap.mmap, layout: Layout) -> dict[str, NDArray[Any]]:
         found[name] = flat.reshape(shape)
         at += _room(dtype, shape)
     return found
+
+
+def shared_zeros(shape: int | tuple[int, ...], dtype: DTypeLike = np.float64) -> NDArray[Any]:
+    """As `numpy.zeros`, but this process shares the array with those that it forks.
+
+    Memory that is never written is never taken.
+    """
+    kind = np.dtype(dtype)
+    sides = (shape,) if isinstance(shape, int) else shape
+    memory = mmap.mmap(-1, max(1, prod(sides) * kind.itemsize))
+    return np.frombuffer(memory, dtype=kind, count=prod(sides)).reshape(sides)
 
 
 def _room(dtype: str, shape: tuple[int, ...]) -> int:

@@ -46,10 +46,11 @@ from cavmarl.runtime.reproducing import Keeper, Moment, sources_of
 from cavmarl.runtime.shard_clock import ShardClock
 from cavmarl.runtime.store import CommittedStore
 from cavmarl.runtime.zone_view import ZoneView, view_zones
-from cavmarl.shard.shard import Commands
+from cavmarl.shard.shard import Commands, Shard
 from cavmarl.shard.vehicles import STATE_FIELDS, blank_vehicle
 from cavmarl.traffic.demand import DemandFile
 from cavmarl.traffic.departures import make_gate
+from cavmarl.traffic.memory import Zeros
 from cavmarl.traffic.native import NativeTraffic
 
 __all__ = ["Simulation", "TrafficStats"]
@@ -104,6 +105,10 @@ class Simulation:
         partition: the zones; None: cut as `config.zones` says.
         observations: (W, A, D) float32, where the agents' are written; None: made for them.
         warm: call every kernel now, so that none is loaded in a step.
+        zeros: makes the arrays that shards write.
+
+    Attributes:
+        everywhere: (W,) all of the worlds.
     """
 
     def __init__(
@@ -116,6 +121,7 @@ class Simulation:
         *,
         observations: NDArray[np.float32] | None = None,
         warm: bool = False,
+        zeros: Zeros = np.zeros,
     ) -> None:
         self.config = config
         self.network = network
@@ -125,7 +131,7 @@ class Simulation:
         self._seed = 0
         self._first_world = 0
         self._episodes = np.zeros(num_worlds, dtype=np.int64)
-        self._everywhere = np.ones(num_worlds, dtype=np.bool_)
+        self.everywhere = np.ones(num_worlds, dtype=np.bool_)
         self.transfers: tuple[TransferLog, ...] = ()
         with first_compilation() as is_first:
             blank = blank_vehicle()
@@ -138,13 +144,14 @@ class Simulation:
                 config.horizon_s,
                 demand,
                 num_worlds,
+                zeros,
             )
             capacity = traffic.capacity
             self._traffic = traffic
             self._gate = make_gate(num_worlds, capacity, network.arrays, blank.dtype)
-            self._commons = Commons(config, network, num_worlds, observations)
+            self._commons = Commons(config, network, num_worlds, observations, zeros)
             self._shards, self._division = divide(
-                config, network, self.partition, traffic, self._commons.outputs, num_worlds
+                config, network, self.partition, traffic, self._commons.outputs, num_worlds, zeros
             )
             self._shard = self._shards[0]
             self._executor: Executor = SerialExecutor(self._shards)
@@ -190,7 +197,7 @@ class Simulation:
         """Run one step of a world that the first reset forgets."""
         shape = self.outputs.present.shape
         controls = np.zeros((*shape, 2))
-        self._populate(self._everywhere)
+        self._populate(self.everywhere)
         self.suggest(controls)
         self.step(Commands(controls, np.full(shape, ACTION_IDLE, dtype=np.int64)))
         # Once more what is only called when somebody leaves or waits.
@@ -298,9 +305,7 @@ class Simulation:
         Raises:
             CapacityError: the map has no room for that many agents of a closed world.
         """
-        chosen = (
-            self._everywhere if chosen is None else np.ascontiguousarray(chosen, dtype=np.bool_)
-        )
+        chosen = self.everywhere if chosen is None else np.ascontiguousarray(chosen, dtype=np.bool_)
         self._populate(chosen)
         agents = self.config.population.agents
         seated = self.outputs.present[chosen].sum(axis=1)
@@ -384,6 +389,10 @@ class Simulation:
         if self._coordination is not None:
             self._coordination = wrap(self._coordination)
 
+    def host(self, make: Callable[[Sequence[Shard]], Executor]) -> None:
+        """From now on let somebody else run the phases of the shards, as `make` returns it."""
+        self._executor = make(self._shards)
+
     def time_shards(self) -> ShardClock:
         """From now on run phases zone by zone, with a clock on each.
 
@@ -404,7 +413,7 @@ class Simulation:
             self._executor.each("begin_step", commands)
         self._advance(commands)
         if is_last:
-            self._sense(self._everywhere)
+            self._sense(self.everywhere)
         if self._coordination is not None:
             self._coordination.end()
 
@@ -472,6 +481,8 @@ class Simulation:
 
     def retire_agents(self) -> None:
         """Take out the agents whose trip ended in the last step; to be called after it is read."""
+        if not self.outputs.terminated.any():
+            return
         gate = self._gate
         self._executor.each("retire", gate)
         if gate.num_passing.any():
@@ -506,10 +517,11 @@ class Simulation:
 
     def agents_to_come(self) -> NDArray[np.bool_]:
         """(W,) whether an agent waits to enter."""
-        if not self._gate.num_queue.any():
+        longest = int(self._gate.num_queue.max(initial=0))
+        if longest == 0:
             return np.zeros(self.num_worlds, dtype=np.bool_)
-        waiting = np.arange(self._gate.queue.shape[1]) < self._gate.num_queue[:, None]
-        found = np.any(waiting & (self._gate.queue["agent"] >= 0), axis=1)
+        waiting = np.arange(longest) < self._gate.num_queue[:, None]
+        found = np.any(waiting & (self._gate.queue["agent"][:, :longest] >= 0), axis=1)
         return np.asarray(found, dtype=np.bool_)
 
     def arrivals(self) -> NDArray[np.int64]:

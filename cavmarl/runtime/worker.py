@@ -28,7 +28,8 @@ from typing import Any, NoReturn, Protocol
 
 import numpy as np
 
-from cavmarl.runtime.barrier import NUMBER, WAKE, WORDS, Meeting, load_kernels
+from cavmarl.runtime import barrier, images
+from cavmarl.runtime.barrier import NUMBER, WAKE, WORDS, Meeting
 from cavmarl.runtime.images import Arrays, Image
 from cavmarl.runtime.shared_memory import Segment
 
@@ -89,6 +90,13 @@ class Job(Protocol):
         """Go on from what `save` has given."""
         ...
 
+    def prepare(self) -> None:
+        """Called where workers are forked, before each fork that is to do this job.
+
+        Whoever has done it is dead; so are those that it shares memory with, if it is their first.
+        """
+        ...
+
 
 MakeJobs = Callable[[Mapping[str, Any]], Sequence[Job]]
 
@@ -116,7 +124,8 @@ def serve(make_jobs: MakeJobs) -> NoReturn:
     try:
         recipe = _read(start["recipe"], start["recipe_bytes"])
         jobs = make_jobs(recipe)
-        load_kernels()
+        barrier.load_kernels()
+        images.load_kernels()
         _refuse_threads()
     except Exception as error:
         pool.send(_failure(error))
@@ -171,6 +180,7 @@ def _fork_on_demand(
             pool.send(json.dumps({"status": os.waitstatus_to_exitcode(status)}).encode())
             continue
         number, (wire,) = order["fork"], descriptors
+        jobs[number].prepare()
         mother = os.getpid()
         pid = os.fork()
         if pid == 0:
@@ -202,15 +212,15 @@ def _work(number: int, job: Job, wire: socket.socket, start: Mapping[str, Any]) 
     orders = np.frombuffer(Segment(start["orders"], 0).map(), dtype=np.int64)
     theirs = orders[number * WORDS : (number + 1) * WORDS]
     mine = np.frombuffer(Segment(start["statuses"][number], 0).map(), dtype=np.int64)[:WORDS]
-    images = [Image(Segment(fd, 0)) for fd in start["images"][number]]
+    slots = [Image(Segment(fd, 0)) for fd in start["images"][number]]
     meeting = Meeting(mine, theirs, wire, start["crowded"])
     meeting.get_up()  # a predecessor may have died asleep
     with suppress(BrokenPipeError, ConnectionResetError):  # the pool is gone
-        _obey(job, meeting, images)
+        _obey(job, meeting, slots)
     os._exit(0)
 
 
-def _obey(job: Job, meeting: Meeting, images: Sequence[Image]) -> NoReturn:
+def _obey(job: Job, meeting: Meeting, slots: Sequence[Image]) -> NoReturn:
     """Carry out one order after the other."""
     mine, theirs = meeting.mine, meeting.theirs
     is_new = True
@@ -223,13 +233,13 @@ def _obey(job: Job, meeting: Meeting, images: Sequence[Image]) -> NoReturn:
         try:
             if (is_new or theirs[LOADS]) and theirs[TRUTH] >= 0:
                 dtypes = [array.dtype for array in job.save()]
-                job.load(list(images[theirs[TRUTH]].read(dtypes)))
+                job.load(list(slots[theirs[TRUTH]].read(dtypes)))
             is_new = False
             answer = None
             if theirs[TASK] != NOTHING:
                 answer = job.perform(int(theirs[TASK]), letter)
             if theirs[SLOT] >= 0:
-                images[theirs[SLOT]].write(job.save())
+                slots[theirs[SLOT]].write(job.save())
         except MemoryError:
             os._exit(OUT_OF_MEMORY)
         except Exception as error:

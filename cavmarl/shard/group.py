@@ -59,7 +59,6 @@ class ShardGroup:
             Common(*(getattr(first.worlds, name) for name in Common._fields)),
         )
         self._controls = np.zeros_like(first.worlds.pending[:, :, 0])
-        self._num_through = 0
         self._advance = repeated(advance_each)
         self._resolve = repeated(resolve_each)
         self._choose_goals = repeated(choose_goals_each)
@@ -71,6 +70,11 @@ class ShardGroup:
         self._detect = repeated(detect_each)
         self._sense = repeated(sense_each)
         self._credit = repeated(credit_each)
+
+    @property
+    def sides(self) -> tuple[int, int]:
+        """Where the rows are, and the next ones."""
+        return self._first.side, self._first.next_side
 
     def each(self, phase: str, *arguments: Any) -> None:
         """Run a phase on every shard: a method of this class or of `Shard`, by its name."""
@@ -94,14 +98,28 @@ class ShardGroup:
 
     def advance(self, commands: Commands) -> None:
         """Decide every control from the committed rows and move the owned ones into next ones."""
+        self.turn()
+        self.move(commands)
+
+    def turn(self) -> None:
+        """Let the next rows be on the other side, in a tick that puts rows in order."""
+        # Where a host may die alone, a store keeps tick t whole (docs/ownership.md).
+        if self._first.worlds.ticks[0] % TICKS_IN_ORDER == 0:
+            for shard in self._shards:
+                shard.turn()
+
+    def face(self, side: int, next_side: int) -> None:
+        """Say on which side the rows are, and the next ones."""
+        if self.sides != (side, next_side):
+            for shard in self._shards:
+                shard.face(side, next_side)
+
+    def move(self, commands: Commands) -> None:
+        """`advance`, where the rows' sides are known."""
         first, action = self._first, self._config.action
         if self._controls.size:
             np.copyto(self._controls, commands.controls)
-        # Where a host may die alone, a store keeps tick t whole (docs/ownership.md).
-        if first.worlds.ticks[0] % TICKS_IN_ORDER == 0:
-            for shard in self._shards:
-                shard.turn()
-        self._num_through = self._advance(
+        self._advance(
             self._members,
             first.side,
             first.next_side,
@@ -132,7 +150,7 @@ class ShardGroup:
 
     def leave(self, gate: Gate) -> None:
         """Hand the background vehicles of the next rows that have arrived to the gate."""
-        if self._num_through == 0:
+        if not self._first.zoned.num_through.any():
             return
         for shard in self._shards:
             shard.leave(gate)

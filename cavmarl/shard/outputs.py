@@ -8,12 +8,16 @@ from numpy.typing import NDArray
 from cavmarl.config import TERMS, EnvConfig
 from cavmarl.kernels.arrays import Outputs
 from cavmarl.shard.sensors import frame_size
+from cavmarl.traffic.memory import Zeros
 
 __all__ = ["make_outputs"]
 
 
 def make_outputs(
-    config: EnvConfig, num_worlds: int, observations: NDArray[np.float32] | None = None
+    config: EnvConfig,
+    num_worlds: int,
+    observations: NDArray[np.float32] | None = None,
+    zeros: Zeros = np.zeros,
 ) -> Outputs:
     """Outputs of W worlds in which nobody is present.
 
@@ -21,19 +25,22 @@ def make_outputs(
         config: the environment.
         num_worlds: W.
         observations: (W, A, D) to be used; None: they are made.
+        zeros: makes all others.
     """
     agents = (num_worlds, config.population.num_ids)
     if observations is None:
         size = config.sensors.stack * frame_size(config.sensors)
         # Not `zeros`: NumPy asks for huge pages where it fills the array itself.
         observations = np.full((*agents, size), 0.0, dtype=np.float32)
+    vehicle_ids = zeros(agents, dtype=np.int64)
+    vehicle_ids[...] = -1
     return Outputs(
         observations=observations,
-        terms=np.zeros((*agents, len(TERMS)), dtype=np.float32),
-        rewards=np.zeros(agents, dtype=np.float32),
-        terminated=np.zeros(agents, dtype=np.bool_),
-        present=np.zeros(agents, dtype=np.bool_),
-        acted=np.zeros(agents, dtype=np.bool_),
-        events=np.zeros(agents, dtype=np.int32),
-        vehicle_ids=np.full(agents, -1, dtype=np.int64),
+        terms=zeros((*agents, len(TERMS)), dtype=np.float32),
+        rewards=zeros(agents, dtype=np.float32),
+        terminated=zeros(agents, dtype=np.bool_),
+        present=zeros(agents, dtype=np.bool_),
+        acted=zeros(agents, dtype=np.bool_),
+        events=zeros(agents, dtype=np.int32),
+        vehicle_ids=vehicle_ids,
     )

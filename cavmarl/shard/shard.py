@@ -40,6 +40,7 @@ from cavmarl.roads.routing import PLAN, lane_grid
 from cavmarl.shard.controllers import CONTROLLER
 from cavmarl.shard.sensors import further_arrays, sensor_arrays
 from cavmarl.shard.vehicles import VEHICLE
+from cavmarl.traffic.memory import Zeros
 
 __all__ = ["Commands", "Shard", "make_worlds", "make_zoned"]
 
@@ -77,6 +78,7 @@ class Shard:
         halo: how far it sees over its borders.
         first: the first shard of this process, whose clock, keys, signals and room to work in this
             one shares; None: this is it.
+        zeros: makes what all zones have in common.
 
     Attributes:
         worlds: what it has.
@@ -97,6 +99,7 @@ class Shard:
         zones: ZoneArrays,
         halo: Halo,
         first: Shard | None = None,
+        zeros: Zeros = np.zeros,
     ) -> None:
         self.zone = zone
         self.zoned = zoned
@@ -126,6 +129,7 @@ class Shard:
             zoned,
             zone,
             None if first is None else first.worlds,
+            zeros,
         )
         self.sides = (self.worlds.rows, zoned.rows[1, zone])
         self.side = self.next_side = 0
@@ -138,7 +142,7 @@ class Shard:
 
     def turn(self) -> None:
         """Let the next rows be on the other side, for a tick that puts rows in order."""
-        self._face(self.side, 1 - self.side)
+        self.face(self.side, 1 - self.side)
 
     def leave(self, gate: Gate) -> None:
         """Hand the background vehicles of `next_rows` that have arrived to the gate."""
@@ -157,13 +161,14 @@ class Shard:
 
     def commit(self) -> None:
         """Make the next rows the committed state."""
-        self._face(self.next_side, self.next_side)
+        self.face(self.next_side, self.next_side)
 
     def align(self) -> None:
         """Keep the rows on the first side, wherever a tick that is given up has them."""
-        self._face(0, 0)
+        self.face(0, 0)
 
-    def _face(self, side: int, next_side: int) -> None:
+    def face(self, side: int, next_side: int) -> None:
+        """Say on which side the rows are, and the next ones."""
         self.side, self.next_side = side, next_side
         self.worlds = self.worlds._replace(rows=self.sides[side], next_rows=self.sides[next_side])
 
@@ -210,12 +215,13 @@ def make_worlds(
     zoned: Zoned | None = None,
     zone: int = 0,
     common: Worlds | None = None,
+    zeros: Zeros = np.zeros,
 ) -> Worlds:
     """Arrays of W worlds that hold `capacity` vehicles each, all of them empty.
 
     Agents' commands take effect `latency_ticks` later. The rows are those of a zone of `zoned`, if
     it is given. What all zones of a world have in common (ticks, keys, signals and what detectors
-    saw) are the arrays of `common`, if it is given.
+    saw) are the arrays of `common`, if it is given; if not, `zeros` makes them.
     """
     if zoned is None:
         zoned = make_zoned(1, num_worlds, capacity)
@@ -225,13 +231,13 @@ def make_worlds(
         next_rows=rows,
         num_owned=zoned.num_owned[zone],
         num_rows=zoned.num_rows[zone],
-        ticks=np.zeros(num_worlds, dtype=np.int64),
-        keys=np.zeros(num_worlds, dtype=np.uint64),
-        signal_phase=np.zeros((num_worlds, len(network.signals)), dtype=np.int32),
-        controllers=np.zeros((num_worlds, network.num_controllers), dtype=CONTROLLER),
-        detected_s=np.zeros((num_worlds, len(network.detectors)), dtype=np.float64),
+        ticks=zeros(num_worlds, dtype=np.int64),
+        keys=zeros(num_worlds, dtype=np.uint64),
+        signal_phase=zeros((num_worlds, len(network.signals)), dtype=np.int32),
+        controllers=zeros((num_worlds, network.num_controllers), dtype=CONTROLLER),
+        detected_s=zeros((num_worlds, len(network.detectors)), dtype=np.float64),
         num_through=zoned.num_through[zone],
-        pending=np.zeros((num_worlds, num_agents, latency_ticks + 1, 2)),
+        pending=zeros((num_worlds, num_agents, latency_ticks + 1, 2)),
         num_near=zoned.num_near[zone],
         num_touching=zoned.num_touching[zone],
         num_contacts=zoned.num_contacts[zone],
@@ -245,24 +251,25 @@ def make_worlds(
     return worlds._replace(**{name: getattr(common, name) for name in COMMON})
 
 
-def make_zoned(num_zones: int, num_worlds: int, capacity: int) -> Zoned:
+def make_zoned(num_zones: int, num_worlds: int, capacity: int, zeros: Zeros = np.zeros) -> Zoned:
     """Room for the rows of k zones of W worlds that hold `capacity` vehicles each."""
     # Memory that is never written is never taken.
-    numbers = np.zeros((7, num_zones, num_worlds), dtype=np.int64)
+    numbers = zeros((8, num_zones, num_worlds), dtype=np.int64)
+    numbers[7] = -1
     everybody = (num_zones, num_worlds, capacity)
     return Zoned(
-        rows=np.zeros((2, *everybody), dtype=VEHICLE),
+        rows=zeros((2, *everybody), dtype=VEHICLE),
         num_owned=numbers[0],
         num_rows=numbers[1],
         num_near=numbers[2],
         num_through=numbers[3],
         num_touching=numbers[4],
         num_contacts=numbers[5],
-        step=np.zeros(everybody, dtype=PLAN),
-        step_at=np.zeros(everybody, dtype=np.int64),
-        outer=np.zeros(everybody, dtype=np.int32),
-        num_outer=np.full((num_zones, num_worlds), -1),
-        border=np.zeros(everybody, dtype=np.int32),
+        step=zeros(everybody, dtype=PLAN),
+        step_at=zeros(everybody, dtype=np.int64),
+        outer=zeros(everybody, dtype=np.int32),
+        num_outer=numbers[7],
+        border=zeros(everybody, dtype=np.int32),
         num_border=numbers[6],
         spare=np.zeros(1, dtype=VEHICLE),
     )

@@ -2,22 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from enum import IntEnum
-from pathlib import Path
 from typing import Any
 
 from numpy.typing import NDArray
 
-from cavmarl.config import EnvConfig
-from cavmarl.errors import WorkerStartError
-from cavmarl.runtime.shared_memory import Segment, arrays_in
 from cavmarl.shard.shard import Commands
-from cavmarl.stepping.arrays import StepArrays, layout_of
 from cavmarl.stepping.local import LocalWorlds
-from cavmarl.worlds import World, make_world
+from cavmarl.worlds import World
 
-__all__ = ["Task", "WorldsJob", "fingerprint", "make_jobs"]
+__all__ = ["Task", "WorldsJob", "fingerprint"]
 
 
 class Task(IntEnum):
@@ -42,6 +37,9 @@ class WorldsJob:
         self._worlds = worlds
         self._first = first
         self._commands = Commands(worlds.arrays.controls, worlds.arrays.meta_actions)
+
+    def prepare(self) -> None:
+        """Nothing to do."""
 
     def perform(self, task: int, letter: Any) -> Any:
         """Do a task; the answer of those that have one."""
@@ -71,37 +69,3 @@ def fingerprint(world: World) -> str:
     """What tells two readings of the same files apart, if somebody has changed one between."""
     made_of = (world.network, world.demand, world.partition)
     return " ".join("none" if part is None else part.content_hash for part in made_of)
-
-
-def make_jobs(recipe: Mapping[str, Any]) -> list[WorldsJob]:
-    """The jobs of all workers, every kernel loaded.
-
-    Args:
-        recipe: what `pooled.PooledWorlds` writes.
-
-    Raises:
-        WorkerStartError: a file is not what it was.
-    """
-    from cavmarl.config_io import validate  # pydantic is slow to import
-
-    config = validate(EnvConfig, recipe["config"], "the environment")
-    world = make_world(config, Path(recipe["base_dir"]))
-    if fingerprint(world) != recipe["fingerprint"]:
-        raise WorkerStartError(
-            f"the files of '{config.name}' have changed while workers were started: try again"
-        )
-    layout = layout_of(config, recipe["num_worlds"])
-    arrays = StepArrays(**arrays_in(Segment(recipe["arrays"], 0).map(), layout))
-    LocalWorlds(world, 1, warm=True)
-    return [
-        WorldsJob(
-            LocalWorlds(
-                world,
-                last - first,
-                arrays.part(first, last),
-                in_next_step=recipe["in_next_step"],
-            ),
-            first,
-        )
-        for first, last in recipe["parts"]
-    ]

@@ -13,6 +13,7 @@ from cavmarl.kernels.codes import EVENTS_THAT_END
 from cavmarl.runtime.simulation import Simulation
 from cavmarl.shard.shard import Commands
 from cavmarl.stepping.arrays import StepArrays, layout_of
+from cavmarl.traffic.memory import Zeros
 from cavmarl.worlds import World
 
 __all__ = ["LocalWorlds"]
@@ -27,6 +28,7 @@ class LocalWorlds:
         arrays: where to write; None: arrays of its own.
         warm: have all kernels ready now.
         in_next_step: when worlds begin anew; see `SteppedWorlds`.
+        zeros: makes the arrays that shards write.
 
     Attributes:
         world: what each is made of.
@@ -42,6 +44,7 @@ class LocalWorlds:
         arrays: StepArrays | None = None,
         warm: bool = False,
         in_next_step: bool = False,
+        zeros: Zeros = np.zeros,
     ) -> None:
         self.world = world
         self.in_next_step = in_next_step
@@ -53,6 +56,7 @@ class LocalWorlds:
             world.partition,
             observations=None if arrays is None else arrays.observations,
             warm=warm,
+            zeros=zeros,
         )
         if arrays is None:
             arrays = _own_arrays(self.simulation, num_worlds)

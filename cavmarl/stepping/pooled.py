@@ -1,14 +1,12 @@
-"""`PooledWorlds`: worlds shared out over worker processes, whole worlds each."""
+"""`PooledWorlds`: worlds shared out over worker processes."""
 
 from __future__ import annotations
 
 import warnings
 from dataclasses import asdict
-from itertools import pairwise
+from itertools import accumulate, pairwise
 from pathlib import Path
 from typing import Any
-
-import numpy as np
 
 import cavmarl.errors
 from cavmarl.config import ZonesConfig
@@ -26,7 +24,9 @@ from cavmarl.runtime.shared_memory import Segment, arrays_in, size_of
 from cavmarl.runtime.simulation import Simulation
 from cavmarl.shard.shard import Commands
 from cavmarl.stepping.arrays import StepArrays, layout_of
+from cavmarl.stepping.diary import make_segments
 from cavmarl.stepping.job import Task, fingerprint
+from cavmarl.stepping.parts import share_out
 from cavmarl.worlds import World
 
 __all__ = ["PooledWorlds"]
@@ -41,7 +41,7 @@ class PooledWorlds:
         world: what each is made of.
         base_dir: the folder that its relative files start from.
         num_worlds: W.
-        workers: m, from 1 to W.
+        workers: m, from 1 to W times the zones of each; more than W divide the worlds.
         in_next_step: when worlds begin anew; see `SteppedWorlds`.
 
     Attributes:
@@ -51,7 +51,8 @@ class PooledWorlds:
         in_next_step: when worlds begin anew.
 
     Raises:
-        ConfigError: a setting that worlds of several processes cannot have.
+        ConfigError: a setting that worlds of several processes cannot have, or more of those than
+            zones.
         WorkerError: no process, or no memory.
     """
 
@@ -67,7 +68,8 @@ class PooledWorlds:
         self.in_next_step = in_next_step
         config = world.config
         _check(config.zones)
-        cores = usable_cores()
+        parts = share_out(world, num_worlds, workers)
+        cores = len(usable_cores())
         if workers > cores:
             warnings.warn(
                 f"workers = {workers}: there are {cores} cores; more workers than cores do not "
@@ -84,8 +86,7 @@ class PooledWorlds:
         except WorkerStartError:
             segment.close()
             raise
-        bounds = [num_worlds * k // workers for k in range(workers + 1)]
-        parts = list(pairwise(bounds))
+        diaries = [make_segments(config) if len(part.zones) > 1 else [] for part in parts]
         recipe = {
             "config": asdict(config),
             "base_dir": str(base_dir.resolve()),
@@ -94,16 +95,22 @@ class PooledWorlds:
             "arrays": segment.fd,
             "in_next_step": in_next_step,
             "parts": parts,
+            "diaries": [[one.fd for one in diary] for diary in diaries],
         }
-        named = tuple(_name(first, last) for first, last in parts)
+        named = tuple(name for part in parts for name in part.names)
         tasks = tuple(task.name.lower().replace("_", " ") for task in Task)
-        program = Program(PROGRAM, recipe, named, (segment,), tasks, config.workers.pin)
+        leaders = [0, *accumulate(len(part.zones) for part in parts)]
+        teams = tuple(tuple(range(*bounds)) for bounds in pairwise(leaders))
+        segments = (segment, *(one for diary in diaries for one in diary))
+        program = Program(PROGRAM, recipe, named, segments, tasks, config.workers.pin, teams)
         try:
             self.pool = Pool(program, config.workers.timeout_s, config.workers.repeats)
         except WorkerFailureError as failure:
             raise _own(failure) from failure
         self._steps = 0
-        self._last_worlds = np.array(bounds[1:])
+        self._asked = [
+            k for k, part in zip(leaders, parts, strict=False) for _ in range(part.first, part.last)
+        ]
 
     @property
     def simulation(self) -> Simulation:
@@ -161,8 +168,7 @@ class PooledWorlds:
     def _ask(self, task: Task, world: int) -> Any:
         """Of the worker that hosts a world; numbers from the end count as they do for arrays."""
         number = range(len(self.arrays.mask))[world]
-        worker = int(np.searchsorted(self._last_worlds, number, side="right"))
-        return self.pool.ask(worker, task, number)
+        return self.pool.ask(self._asked[number], task, number)
 
 
 def _check(zones: ZonesConfig) -> None:
@@ -177,10 +183,6 @@ def _check(zones: ZonesConfig) -> None:
                 f"zones.{name} = {getattr(zones, name)!r}: of worlds of one process only; "
                 "use workers=0"
             )
-
-
-def _name(first: int, last: int) -> str:
-    return f"world {first}" if last - first == 1 else f"worlds {first} to {last - 1}"
 
 
 def _own(failure: WorkerFailureError) -> CavmarlError:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from cavmarl.runtime.worker import serve
-from cavmarl.stepping.job import make_jobs
+from cavmarl.stepping.jobs import make_jobs
 
 if __name__ == "__main__":
     serve(make_jobs)

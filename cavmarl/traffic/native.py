@@ -23,6 +23,7 @@ from cavmarl.roads.network import VEHICLE_CLASSES, RoadNetwork
 from cavmarl.roads.routing import make_plans
 from cavmarl.traffic.demand import STOP, DemandFile
 from cavmarl.traffic.departures import with_room
+from cavmarl.traffic.memory import Zeros
 from cavmarl.traffic.rerouting import Rerouting
 from cavmarl.traffic.schedule import Schedule
 from cavmarl.traffic.vtypes import generated_types
@@ -52,6 +53,7 @@ class NativeTraffic:
         horizon_s: seconds an episode.
         file: the demand whose vehicles drive beside the generator's.
         num_worlds: how many worlds are stepped together.
+        zeros: makes the table of ways, where vehicles find some while the world runs.
     """
 
     network: RoadNetwork
@@ -62,6 +64,7 @@ class NativeTraffic:
     horizon_s: float
     file: DemandFile | None = None
     num_worlds: int = 1
+    zeros: Zeros = np.zeros
 
     def __post_init__(self) -> None:
         # Trips that do not exist are refused when the world is made, not at its first reset.
@@ -107,7 +110,9 @@ class NativeTraffic:
         steps = np.concatenate([steps, self.schedule.steps])
         num_fixed = len(steps)
         if self._slots is not None:
-            steps = np.concatenate([steps, self._slots.table()])
+            parts = (steps, self._slots.table())
+            steps = self.zeros(sum(map(len, parts)), dtype=steps.dtype)
+            np.concatenate(parts, out=steps)
         first_detour = self.plans.size + self.schedule.first_detour
         begin_s = self.file.begin_ms / 1000.0
         return Travel(

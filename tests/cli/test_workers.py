@@ -32,13 +32,19 @@ def test_a_successor_that_forgets_is_found_out(
 ) -> None:
     replace = Crew.replace
 
-    def without_memory(crew: Crew, k: int, mail: bytes | None) -> str:
+    def without_memory(crew: Crew, k: int, mail: bytes | None, ordered: tuple[int, ...]) -> str:
         crew.orders[k, TRUTH] = -1
-        return replace(crew, k, mail)
+        return replace(crew, k, mail, ordered)
 
     monkeypatch.setattr(Crew, "replace", without_memory)
     assert run("verify", *SMALL, "--kill", "2") == 1
     assert "different after step" in capsys.readouterr().out
+
+
+def test_the_workers_of_one_world_are_killed(capsys: pytest.CaptureFixture[str]) -> None:
+    town = ("town", "--agents", "4", "--background", "30", "--worlds", "1", "--zones", "4")
+    assert run("verify", *town, "--kill", "12", "--workers", "2") == 0
+    assert "equal in all 46 steps" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize(
@@ -52,6 +58,8 @@ def test_a_successor_that_forgets_is_found_out(
         (("verify", "ring", "--kill", "1", "--workers", "3", "--worlds", "2"), ("workers = 3",)),
         (("bench", "workers", "ring", "--workers", "1"), ("1 workers", "at least 2")),
         (("bench", "workers", "ring", "--at-least", "-1"), ("--at-least -1", "above 0")),
+        (("bench", "workers", *SMALL, "--vehicles", "many"), ("--vehicles many", "whole numbers")),
+        (("bench", "workers", *SMALL, "--vehicles", "2"), ("2 vehicles", "agents alone are 3")),
     ],
 )
 def test_what_cannot_be_is_refused(
@@ -63,7 +71,7 @@ def test_what_cannot_be_is_refused(
 
 def test_bench_workers(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     path = tmp_path / "speed.json"
-    small = ("--steps", "2", "--repeats", "2", "--json", str(path))
+    small = ("--steps", "2", "--repeats", "2", "--vehicles", "9,12", "--json", str(path))
     assert run("bench", "workers", *SMALL, *small, "--at-least", "100") == 1
     found = json.loads(path.read_text())
     assert [row["workers"] for row in found["rows"]] == [0, 1, 2]
@@ -71,4 +79,8 @@ def test_bench_workers(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> No
     assert found["ratio"] > 0.0
     assert found["barrier_us"][0] <= found["barrier_us"][1] <= found["barrier_us"][3]
     assert found["hardware"]["usable_cores"] >= 1
-    assert "an empty order to all 2" in capsys.readouterr().out
+    assert [split["vehicles"] for split in found["splits"]] == [9, 12]
+    assert all(len(split["split_ms"]) == 2 for split in found["splits"])
+    said = capsys.readouterr().out
+    assert "an empty order to all 2" in said
+    assert "one world of 12 vehicles" in said

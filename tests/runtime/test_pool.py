@@ -36,17 +36,22 @@ MORE = 1000  # numbers that each task adds
 Make = Callable[..., Pool]
 
 
-def program(workers: int = 2, **recipe: object) -> Program:
+def program(workers: int = 2, teams: tuple[tuple[int, ...], ...] = (), **recipe: object) -> Program:
     names = tuple(f"part {k}" for k in range(workers))
-    return Program(MODULE, {"workers": workers, **recipe}, names, (), TASKS)
+    return Program(MODULE, {"workers": workers, **recipe}, names, (), TASKS, teams)
 
 
 @pytest.fixture
 def make() -> Iterator[Make]:
     pools: list[Pool] = []
 
-    def call(workers: int = 2, timeout_s: float = 60.0, repeats: int = 3) -> Pool:
-        pools.append(Pool(program(workers), timeout_s, repeats))
+    def call(
+        workers: int = 2,
+        timeout_s: float = 60.0,
+        repeats: int = 3,
+        teams: tuple[tuple[int, ...], ...] = (),
+    ) -> Pool:
+        pools.append(Pool(program(workers, teams), timeout_s, repeats))
         return pools[-1]
 
     yield call
@@ -142,6 +147,43 @@ def test_the_answer_of_one_that_dies_after_it_is_not_lost(make: Make) -> None:
     timer.join()
     assert pool.pids[1] == second
     assert pool.ask(0, TOTAL) == [3.0, MORE]
+
+
+@pytest.mark.parametrize("dying", [0, 1])
+def test_a_team_is_replaced_as_a_whole(make: Make, dying: int) -> None:
+    pool = make(workers=3, teams=((0, 1),))
+    pool.run(ADD)
+    before = pool.pids
+    timer = threading.Timer(0.1, os.kill, (before[dying], signal.SIGKILL))
+    timer.start()
+    pool.run(TOIL, 0.3)
+    timer.join()
+    assert totals(pool) == [[6.0, 2 * MORE]] * 3
+    assert [pid in before for pid in pool.pids] == [False, False, True]
+    assert [death.worker for death in pool.deaths] == [dying]
+    assert alive(before[:2]) == []
+
+
+def test_who_has_no_order_gets_none_when_its_team_is_replaced(make: Make) -> None:
+    pool = make(workers=2, teams=((0, 1),))
+    pool.run(ADD)
+    os.kill(pool.pids[1], signal.SIGKILL)
+    assert pool.ask(0, TOTAL) == [3.0, MORE]
+    pool.run(ADD)
+    assert totals(pool) == [[6.0, 2 * MORE]] * 2
+
+
+def test_a_team_that_loses_somebody_while_its_order_is_given_up(make: Make) -> None:
+    pool = make(workers=2, teams=((0, 1),))
+    pool.run(ADD)
+    pids = pool.pids
+    timer = threading.Timer(0.1, signal.raise_signal, (signal.SIGINT,))
+    timer.start()
+    with pytest.raises(KeyboardInterrupt):
+        pool.run(TOIL, 0.5)
+    timer.join()
+    os.kill(pids[1], signal.SIGKILL)
+    assert totals(pool) == [[3.0, MORE]] * 2
 
 
 def test_one_that_is_slow_is_let_be(make: Make) -> None:

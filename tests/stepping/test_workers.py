@@ -4,73 +4,18 @@ from __future__ import annotations
 
 import os
 import signal
-from collections.abc import Callable, Iterator
 from typing import Any
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
-from cavmarl import CapacityError, CavVectorEnv, ConfigError, InvalidActionError, make_vec
+from cavmarl import CapacityError, ConfigError, InvalidActionError, make_vec
 from cavmarl.errors import WorkerDeathError, WorkerError
 from cavmarl.registry import entries
 from cavmarl.runtime.crew import Crew
-from cavmarl.runtime.pool import Pool
-from cavmarl.stepping.pooled import PooledWorlds
+from tests.stepping.vec_runs import STEPS, Make, drive, pool_of, same
 
 pytestmark = pytest.mark.filterwarnings("ignore:workers = 3:RuntimeWarning")
-
-Make = Callable[..., CavVectorEnv]
-STEPS = 12
-
-
-@pytest.fixture
-def make() -> Iterator[Make]:
-    """`make_vec` whose environments are closed at the end."""
-    made: list[CavVectorEnv] = []
-
-    def call(env: str, **arguments: Any) -> CavVectorEnv:
-        made.append(make_vec(env, **arguments))
-        return made[-1]
-
-    yield call
-    for vec in made:
-        vec.close()
-
-
-def pool_of(vec: CavVectorEnv) -> Pool:
-    assert isinstance(vec.worlds, PooledWorlds)
-    return vec.worlds.pool
-
-
-def drive(
-    vec: CavVectorEnv,
-    steps: int = STEPS,
-    seed: int = 5,
-    before: Callable[[int], None] = lambda step: None,
-) -> list[NDArray[Any] | str]:
-    """All that comes out of an episode's beginning in which agents do not drive well."""
-    observations, infos = vec.reset(seed=seed, options={"first_world": 3})
-    found: list[NDArray[Any] | str] = [observations, *infos.values()]
-    rng = np.random.default_rng(seed)
-    for step in range(steps):
-        actions = vec.suggest_actions()
-        if actions.dtype == np.float32:
-            noise = rng.normal(0.0, 0.5, actions.shape)
-            actions = np.clip(actions + noise, -1.0, 1.0).astype(np.float32)
-        before(step)
-        *arrays, infos = vec.step(actions)
-        found += [*arrays, *(infos[name] for name in sorted(infos))]
-    found += [vec.state_hash(w) for w in range(vec.num_envs)]
-    found += [repr(vec.traffic_stats(w)) for w in range(vec.num_envs)]
-    return found
-
-
-def same(first: list[NDArray[Any] | str], second: list[NDArray[Any] | str]) -> bool:
-    return len(first) == len(second) and all(
-        a == b if isinstance(a, str) else np.array_equal(a, b)
-        for a, b in zip(first, second, strict=True)
-    )
 
 
 @pytest.mark.parametrize(("zones", "counts"), [(1, (1, 2, 3)), (4, (2,))])
@@ -192,7 +137,7 @@ def test_errors_are_those_of_one_process(make: Make) -> None:
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
-        ({"workers": 3, "num_envs": 2}, ("workers = 3", "num_envs = 2", "fewer workers")),
+        ({"workers": 3, "num_envs": 2}, ("workers = 3", "at most 2", "more zones")),
         ({"workers": -1}, ("workers = -1", "from 0")),
         ({"workers": 1.5}, ("workers = 1.5", "whole number")),
         ({"workers": True}, ("workers = True", "whole number")),

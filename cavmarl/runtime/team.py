@@ -1,0 +1,201 @@
+"""`Team`: the worker processes of one world, which run the phases of its ticks together.
+
+The first of them leads: it runs the tick as one process would. Each phase that is mostly done zone
+by zone it announces to the others, the followers, runs it on its own zones, and goes on when they
+have run it on theirs. What is in between, ghosts, gate, signals and owners, it does alone.
+
+All arrays that shards write are shared (`shared_memory.shared_zeros`), and each row has one writer
+at a time. A follower keeps nothing from one phase to the next but room to work in: what a phase
+needs to know beside the arrays stands in the leader's line.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from typing import Any
+
+import numpy as np
+
+from cavmarl.runtime.barrier import (
+    NUMBER,
+    WORDS,
+    Words,
+    post,
+    present_core,
+    usable_cores,
+    wait_for,
+)
+from cavmarl.runtime.executor import Phase
+from cavmarl.runtime.shared_memory import shared_zeros
+from cavmarl.shard.group import ShardGroup
+from cavmarl.shard.shard import Shard
+
+__all__ = ["Follower", "Leader", "LeftAloneError", "Team"]
+
+# Words of the leader's line, behind those of `barrier`.
+CODE, SIDE, NEXT_SIDE = 2, 3, 4
+# A word of a follower's line.
+FAILED = 2
+CORE = 5  # a word of both: where the process was when it began with a phase
+
+# Methods of `ShardGroup` and `Shard` that are run together, by their code.
+TOGETHER = ("begin_step", "move", "resolve", "sense", "credit", "suggest")
+END = len(TOGETHER)
+
+
+class LeftAloneError(Exception):
+    """Another worker of the same world could not run a phase; that one says why."""
+
+
+class Team:
+    """Who hosts which zones of one world; made before the processes that it is about.
+
+    Args:
+        shards: one a zone, in the order of zones; their arrays are shared.
+        zones: of each worker, at least one each; the first leads.
+        known: what each phase is called with that is run together, by its name; the arrays among it
+            are shared.
+    """
+
+    def __init__(
+        self,
+        shards: Sequence[Shard],
+        zones: Sequence[Sequence[int]],
+        known: Mapping[str, tuple[Any, ...]],
+    ) -> None:
+        self.known = {name: known.get(name, ()) for name in TOGETHER}
+        self.everybody = ShardGroup(shards)
+        self.hosts = [ShardGroup([shards[zone] for zone in hosted]) for hosted in zones]
+        lines = shared_zeros((len(zones), WORDS), np.int64)
+        self.lines: list[Words] = list(lines)
+
+    def forget(self) -> None:
+        """Begin to count anew: whoever has counted is dead."""
+        for line in self.lines:
+            line[:] = 0
+
+
+class Leader:
+    """Runs each phase on all shards of a world, with the help of the followers; an `Executor`.
+
+    Args:
+        team: that it leads.
+    """
+
+    def __init__(self, team: Team) -> None:
+        self._known = team.known
+        self._everybody = team.everybody
+        self._own = team.hosts[0]
+        self._line, *self._others = team.lines
+        self._codes = {name: code for code, name in enumerate(TOGETHER)}
+        self._leads = False
+
+    @contextmanager
+    def order(self) -> Iterator[None]:
+        """The time of an order, in which the followers wait for phases.
+
+        Raises:
+            LeftAloneError: one of them has failed.
+        """
+        self._wait()
+        self._leads = True
+        try:
+            yield
+        finally:
+            self._leads = False
+            self._wait()
+            self._announce(END)
+
+    def each(self, phase: Phase, *arguments: Any) -> None:
+        """Run a phase on every shard.
+
+        Raises:
+            LeftAloneError: a follower has failed.
+        """
+        name: str = phase
+        if phase == "advance":
+            self._everybody.turn()
+            name = "move"
+        if not self._is_together(name, arguments):
+            self._everybody.each(name, *arguments)
+            return
+        self._announce(self._codes[name])
+        self._own.each(name, *arguments)
+        self._wait()
+        if any(line[FAILED] for line in self._others):
+            raise LeftAloneError
+
+    def _is_together(self, name: str, arguments: tuple[Any, ...]) -> bool:
+        """Whether the followers know what a phase is called with."""
+        if not self._leads or name not in self._codes:
+            return False
+        return all(a is b for a, b in zip(arguments, self._known[name], strict=True))
+
+    def _announce(self, code: int) -> None:
+        line = self._line
+        line[CODE] = code
+        line[SIDE], line[NEXT_SIDE] = self._everybody.sides
+        line[CORE] = present_core()
+        post(line, line.item(NUMBER) + 1)
+
+    def _wait(self) -> None:
+        number = self._line.item(NUMBER)
+        for line in self._others:
+            wait_for(line, number)
+
+
+class Follower:
+    """Runs the phases that the leader announces on its own shards.
+
+    Args:
+        team: that it belongs to.
+        number: in the team, from 1.
+    """
+
+    def __init__(self, team: Team, number: int) -> None:
+        self._known = team.known
+        self._own = team.hosts[number]
+        self._leader = team.lines[0]
+        self._line = team.lines[number]
+        self._before = team.lines[:number]
+        self._cores = usable_cores()
+
+    def follow(self) -> None:
+        """Run all phases of one order."""
+        line, leader = self._line, self._leader
+        line[FAILED] = 0
+        failure: Exception | None = None
+        while True:
+            number = line.item(NUMBER) + 1
+            wait_for(leader, number)
+            code = leader.item(CODE)
+            if code != END:
+                try:
+                    self._run(TOGETHER[code])
+                except Exception as error:
+                    failure = error
+                    line[FAILED] = 1
+            post(line, number)
+            if code == END:
+                break
+        if failure is not None:
+            raise failure
+
+    def _get_out_of_the_way(self) -> None:
+        """Leave the core of those before in the team: they wait for this one, and it for them.
+
+        Systems put processes that are woken together on one core, and take milliseconds to notice.
+        """
+        core = present_core()
+        taken = {line.item(CORE) for line in self._before}
+        if core in taken and self._cores - taken:
+            os.sched_setaffinity(0, self._cores - taken)
+            core = present_core()
+        self._line[CORE] = core
+
+    def _run(self, name: str) -> None:
+        self._get_out_of_the_way()
+        self._own.face(self._leader.item(SIDE), self._leader.item(NEXT_SIDE))
+        self._own.each(name, *self._known[name])

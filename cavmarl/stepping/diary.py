@@ -1,0 +1,90 @@
+"""`Diary`: an image of one large world now and then, and what its agents have done since.
+
+An image of ten thousand vehicles takes as long to write as half a tick that several workers share.
+What a step does follows from the state and the actions, so a successor may as well begin from an
+older image and go through the same steps again.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from cavmarl.config import EnvConfig
+from cavmarl.runtime.images import Arrays, Image
+from cavmarl.runtime.shared_memory import Layout, Segment, arrays_in, size_of
+from cavmarl.shard.shard import Commands
+
+__all__ = ["Diary", "make_segments"]
+
+STEPS = 8  # from one image to the next: a successor repeats that many at most
+_FIRST_IMAGE_BYTES = 1 << 12
+
+
+def make_segments(config: EnvConfig) -> list[Segment]:
+    """Memory for the diary of one world, which outlives those who write it.
+
+    Raises:
+        WorkerStartError: there is none.
+    """
+    images = [Segment.make(_FIRST_IMAGE_BYTES) for _ in range(2)]
+    return [*images, Segment.make(size_of(_layout(config)))]
+
+
+class Diary:
+    """What there is in it between two orders is the state of one world.
+
+    There are two images: while one is written, the other one is the state's that was committed.
+
+    Args:
+        config: the environment.
+        descriptors: of what `make_segments` has made.
+
+    Attributes:
+        place: (2,) which image it begins with, and how many steps follow; to be committed.
+    """
+
+    def __init__(self, config: EnvConfig, descriptors: list[int]) -> None:
+        *images, steps = (Segment(fd, 0) for fd in descriptors)
+        self.place = np.zeros(2, dtype=np.int64)
+        self._images = [Image(segment) for segment in images]
+        arrays = arrays_in(steps.map(), _layout(config))
+        self._controls, self._meta_actions = arrays["controls"], arrays["meta_actions"]
+
+    @property
+    def is_full(self) -> bool:
+        """Whether the next entry has to be an image."""
+        return self.place.item(1) == STEPS
+
+    def note(self, commands: Commands) -> None:
+        """Write down what the agents do in one more step."""
+        n = self.place.item(1)
+        self._controls[n] = commands.controls
+        self._meta_actions[n] = commands.meta_actions
+        self.place[1] += 1
+
+    def begin(self, state: Arrays) -> None:
+        """Begin anew with an image of the state."""
+        image = 1 - self.place.item(0)
+        self._images[image].write(state)
+        self.place[:] = image, 0
+
+    def state(self, like: Arrays) -> Arrays:
+        """The state it begins with, in arrays of the same dtypes as those.
+
+        Raises:
+            WorkerError: it is not what was written.
+        """
+        dtypes = [array.dtype for array in like]
+        return list(self._images[self.place.item(0)].read(dtypes))
+
+    def steps(self) -> Iterator[Commands]:
+        """What the agents have done since."""
+        for n in range(self.place.item(1)):
+            yield Commands(self._controls[n], self._meta_actions[n])
+
+
+def _layout(config: EnvConfig) -> Layout:
+    agents: tuple[int, ...] = (STEPS, 1, config.population.num_ids)
+    return {"controls": ("<f8", (*agents, 2)), "meta_actions": ("<i8", agents)}

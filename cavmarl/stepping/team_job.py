@@ -1,0 +1,111 @@
+"""What the workers of one world do: `LeaderJob` runs it, `FollowerJob` helps."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from typing import Any
+
+from numpy.typing import NDArray
+
+from cavmarl.runtime.team import Follower, Leader, Team
+from cavmarl.shard.shard import Shard
+from cavmarl.stepping.diary import Diary
+from cavmarl.stepping.job import Task, WorldsJob
+from cavmarl.stepping.local import LocalWorlds
+
+__all__ = ["FollowerJob", "LeaderJob"]
+
+ALONE = (Task.STATE_HASH, Task.TRAFFIC_STATS)  # tasks of the leader, of which no follower hears
+
+
+class LeaderJob(WorldsJob):
+    """One world that several workers run, of whom this one leads.
+
+    Args:
+        worlds: the one; what its shards write is shared.
+        first: its number among all.
+        zones: that each worker hosts; the leader's first.
+        diary: in which it leaves the state behind.
+    """
+
+    def __init__(
+        self, worlds: LocalWorlds, first: int, zones: Sequence[Sequence[int]], diary: Diary
+    ) -> None:
+        super().__init__(worlds, first)
+        self._zones = zones
+        self._diary = diary
+        worlds.simulation.host(self._gather)
+
+    def _gather(self, shards: Sequence[Shard]) -> Leader:
+        """Let a team run the phases."""
+        commands, chosen = (self._commands,), (self._worlds.simulation.everywhere,)
+        known = {
+            "begin_step": commands,
+            "move": commands,
+            "sense": chosen,
+            "credit": chosen,
+            "suggest": (self._worlds.arrays.suggested,),
+        }
+        self._team = Team(shards, self._zones, known)
+        self._leader = Leader(self._team)
+        return self._leader
+
+    def followers(self) -> Iterator[FollowerJob]:
+        """The jobs of the other workers."""
+        for number in range(1, len(self._zones)):
+            yield FollowerJob(Follower(self._team, number))
+
+    def prepare(self) -> None:
+        """Whoever has led is dead, and so are those who followed."""
+        self._team.forget()
+
+    def perform(self, task: int, letter: Any) -> Any:
+        """Do a task; the answer of those that have one."""
+        if task in ALONE:
+            return super().perform(task, letter)
+        diary = self._diary
+        begins_anew = task == Task.RESET or (task == Task.STEP and diary.is_full)
+        if task == Task.STEP and not begins_anew:
+            diary.note(self._commands)
+        with self._leader.order():
+            super().perform(task, letter)
+        if begins_anew:
+            diary.begin(self._worlds.save())
+        return None
+
+    def save(self) -> list[NDArray[Any]]:
+        """Where to begin in the diary."""
+        return [self._diary.place]
+
+    def load(self, saved: Sequence[NDArray[Any]]) -> None:
+        """Go on from what `save` gave."""
+        diary, worlds = self._diary, self._worlds
+        diary.place[:] = saved[0]
+        worlds.load(diary.state(worlds.save()))
+        for commands in diary.steps():
+            worlds.step(commands)
+
+
+class FollowerJob:
+    """Some zones of one world, of which another worker has the rest.
+
+    Args:
+        follower: that runs their phases.
+    """
+
+    def __init__(self, follower: Follower) -> None:
+        self._follower = follower
+
+    def prepare(self) -> None:
+        """Nothing to do."""
+
+    def perform(self, task: int, letter: Any) -> None:
+        """Help the leader with a task."""
+        self._follower.follow()
+
+    def save(self) -> list[NDArray[Any]]:
+        """Nothing: the leader keeps the state."""
+        return []
+
+    def load(self, saved: Sequence[NDArray[Any]]) -> None:
+        """Nothing to do."""
