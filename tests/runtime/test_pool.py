@@ -38,7 +38,7 @@ Make = Callable[..., Pool]
 
 def program(workers: int = 2, teams: tuple[tuple[int, ...], ...] = (), **recipe: object) -> Program:
     names = tuple(f"part {k}" for k in range(workers))
-    return Program(MODULE, {"workers": workers, **recipe}, names, (), TASKS, teams)
+    return Program(MODULE, {"workers": workers, **recipe}, names, (), TASKS, teams=teams)
 
 
 @pytest.fixture
