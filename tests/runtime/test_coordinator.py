@@ -107,8 +107,8 @@ def test_a_vehicle_that_is_lost_is_missed(busy: Recorded) -> None:
     vec.reset(seed=1)
     lost = vec.simulation._shards[1].worlds.num_owned
     with pytest.raises(LedgerError, match=r"zones own \[.*\] vehicles, not \["):  # noqa: PT012
-        for _ in range(STEPS):
-            lost[0] -= 1
+        for step in range(STEPS):
+            lost[0] -= step == 0
             vec.step(vec.suggest_actions())
 
 
@@ -197,6 +197,7 @@ def test_all_rows_are_looked_at_where_the_list_of_those_near_a_border_is_stale(
             rows = simulation._shards[0].worlds.rows
             rows[0, 0]["driver"], rows[0, 0]["events"] = DRIVER_AGENT, EVENT_COLLIDED
             rows[0, 0]["departed"] = -9
+            simulation.outputs.terminated[0, 0] = True
             simulation.retire_agents()
         simulation.step(idle(simulation))
     assert looked == [(1, True), (2, False), (3, False), (3, True), (4, False), (5, True)]
