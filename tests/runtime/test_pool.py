@@ -42,6 +42,14 @@ def program(workers: int = 2, teams: tuple[tuple[int, ...], ...] = (), **recipe:
 
 
 @pytest.fixture
+def interruptible() -> Iterator[None]:
+    """Ctrl-C arrives, also where these tests were started in the background of a shell."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, before)
+
+
+@pytest.fixture
 def make() -> Iterator[Make]:
     pools: list[Pool] = []
 
@@ -173,6 +181,7 @@ def test_who_has_no_order_gets_none_when_its_team_is_replaced(make: Make) -> Non
     assert totals(pool) == [[6.0, 2 * MORE]] * 2
 
 
+@pytest.mark.usefixtures("interruptible")
 def test_a_team_that_loses_somebody_while_its_order_is_given_up(make: Make) -> None:
     pool = make(workers=2, teams=((0, 1),))
     pool.run(ADD)
@@ -233,14 +242,6 @@ def test_an_exception_arrives_whole_and_changes_nothing(make: Make) -> None:
     assert totals(pool) == [[3.0, MORE]] * 2
     pool.run(ADD)
     assert totals(pool) == [[6.0, 2 * MORE]] * 2
-
-
-@pytest.fixture
-def interruptible() -> Iterator[None]:
-    """Ctrl-C arrives, also where these tests were started in the background of a shell."""
-    before = signal.signal(signal.SIGINT, signal.default_int_handler)
-    yield
-    signal.signal(signal.SIGINT, before)
 
 
 @pytest.mark.usefixtures("interruptible")

@@ -6,6 +6,7 @@ import os
 import signal
 import time
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from typing import Any
 
 import numpy as np
@@ -39,9 +40,10 @@ class Adder:
         if task == TOTAL:
             return [float(self.numbers["a"].sum()), len(self.more)]
         if task == FALL:
-            self.falls_at = POINTS[letter[0]] if os.path.exists(letter[1]) else ""
-            if self.falls_at:
-                os.unlink(letter[1])  # whoever comes first falls, and nobody else
+            self.falls_at = ""
+            with suppress(FileNotFoundError):  # whoever comes first falls, and nobody else
+                os.unlink(letter[1])
+                self.falls_at = POINTS[letter[0]]
         self.pass_by("begun")
         self.numbers["a"][0] += 1.0
         self.pass_by("half done")
