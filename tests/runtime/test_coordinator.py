@@ -102,6 +102,14 @@ def test_without_messages_the_same_is_put_on_record_as_with_them(env: str, tmp_p
     assert kept == [row._replace(ms=None, state_bytes=0) for row in theirs.rows]
 
 
+def test_whoever_turns_away_from_a_border_is_forgotten() -> None:
+    run = record("grid4x4", {**BUSY, "zones.approach_ticks": 30}, 2 * STEPS)
+    simulation = replay(run, ZONES).simulation
+    (log,), (coordinator,) = simulation.transfers, simulation.coordinators
+    assert log.counts["aborted"] > 0
+    assert len(log._approaches) == len(coordinator.in_flight())
+
+
 def test_a_vehicle_that_is_lost_is_missed(busy: Recorded) -> None:
     vec = make_vec("grid4x4", zones=4, overrides=BUSY)
     vec.reset(seed=1)
