@@ -25,6 +25,7 @@ from cavmarl.roads.zone_file import zones_for
 from cavmarl.roads.zone_layouts import cut_map
 from cavmarl.roads.zones import ZonePartition
 from cavmarl.traffic.demand import DemandFile, read_demand
+from cavmarl.traffic.native import capacity_of
 
 __all__ = [
     "World",
@@ -53,6 +54,13 @@ class World(NamedTuple):
     network: RoadNetwork
     demand: DemandFile | None
     partition: ZonePartition
+
+    @property
+    def capacity(self) -> int:
+        """How many vehicles it can hold."""
+        config = self.config
+        dt, horizon_s = config.clock.sim_dt_s, config.horizon_s
+        return capacity_of(self.network, config.population, self.demand, dt, horizon_s)
 
 
 def load_world(

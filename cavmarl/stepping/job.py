@@ -23,6 +23,7 @@ class Task(IntEnum):
     SUGGEST = 2
     STATE_HASH = 3
     TRAFFIC_STATS = 4
+    WRITE_STATES = 5
 
 
 class WorldsJob:
@@ -50,6 +51,8 @@ class WorldsJob:
             worlds.reset(letter["seed"], letter["first_world"] + self._first)
         elif task == Task.SUGGEST:
             worlds.suggest()
+        elif task == Task.WRITE_STATES:
+            worlds.write_states()
         elif task == Task.STATE_HASH:
             return worlds.state_hash(letter - self._first)
         else:

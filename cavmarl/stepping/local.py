@@ -12,6 +12,8 @@ from numpy.typing import NDArray
 from cavmarl.kernels.codes import EVENTS_THAT_END
 from cavmarl.runtime.simulation import Simulation
 from cavmarl.shard.shard import Commands
+from cavmarl.spaces import state_space
+from cavmarl.state import global_state
 from cavmarl.stepping.arrays import StepArrays, layout_of
 from cavmarl.traffic.memory import Zeros
 from cavmarl.worlds import World
@@ -124,6 +126,12 @@ class LocalWorlds:
         self.arrays.suggested[:] = 0.0
         self.simulation.suggest(self.arrays.suggested)
 
+    def write_states(self) -> None:
+        """Write what `CavEnv.state` is of each world."""
+        simulation, space = self.simulation, state_space(self.simulation.capacity)
+        for world, state in enumerate(self.arrays.states):
+            state[:] = global_state(self.world.network, simulation.vehicles(world), space)
+
     def state_hash(self, world: int) -> str:
         """Hex digest of one world."""
         return self.simulation.state_hash(world)
@@ -146,7 +154,7 @@ class LocalWorlds:
 
 
 def _own_arrays(simulation: Simulation, num_worlds: int) -> StepArrays:
-    layout = layout_of(simulation.config, num_worlds)
+    layout = layout_of(simulation.config, simulation.capacity, num_worlds)
     made = {
         name: np.zeros(shape, dtype)
         for name, (dtype, shape) in layout.items()

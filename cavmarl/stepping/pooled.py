@@ -79,7 +79,8 @@ class PooledWorlds:
             )
         if not compiled_before():
             Simulation(config, world.network, 1, world.demand, world.partition)
-        layout = layout_of(config, num_worlds)
+        capacity = world.capacity
+        layout = layout_of(config, capacity, num_worlds)
         segment = Segment.make(size_of(layout))
         try:
             self.arrays = StepArrays(**arrays_in(segment.map(), layout))
@@ -92,6 +93,7 @@ class PooledWorlds:
             "base_dir": str(base_dir.resolve()),
             "fingerprint": fingerprint(world),
             "num_worlds": num_worlds,
+            "capacity": capacity,
             "arrays": segment.fd,
             "in_next_step": in_next_step,
             "parts": parts,
@@ -142,6 +144,10 @@ class PooledWorlds:
     def suggest(self) -> None:
         """Write what the built-in driver would do in the agents' place."""
         self._run(Task.SUGGEST, commits=False)
+
+    def write_states(self) -> None:
+        """Write the global state of each world."""
+        self._run(Task.WRITE_STATES, commits=False)
 
     def state_hash(self, world: int) -> str:
         """Hex digest of one world."""
