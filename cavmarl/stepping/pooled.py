@@ -43,6 +43,7 @@ class PooledWorlds:
         num_worlds: W.
         workers: m, from 1 to W times the zones of each; more than W divide the worlds.
         in_next_step: when worlds begin anew; see `SteppedWorlds`.
+        program: that the processes run.
 
     Attributes:
         world: what each is made of.
@@ -63,6 +64,7 @@ class PooledWorlds:
         num_worlds: int,
         workers: int,
         in_next_step: bool = False,
+        program: str = PROGRAM,
     ) -> None:
         self.world = world
         self.in_next_step = in_next_step
@@ -104,9 +106,9 @@ class PooledWorlds:
         leaders = [0, *accumulate(len(part.zones) for part in parts)]
         teams = tuple(tuple(range(*bounds)) for bounds in pairwise(leaders))
         segments = (segment, *(one for diary in diaries for one in diary))
-        program = Program(PROGRAM, recipe, named, segments, tasks, config.workers.pin, teams)
+        what = Program(program, recipe, named, segments, tasks, config.workers.pin, teams)
         try:
-            self.pool = Pool(program, config.workers.timeout_s, config.workers.repeats)
+            self.pool = Pool(what, config.workers.timeout_s, config.workers.repeats)
         except WorkerFailureError as failure:
             raise _own(failure) from failure
         self._steps = 0
