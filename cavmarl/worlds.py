@@ -30,7 +30,6 @@ from cavmarl.traffic.native import capacity_of
 __all__ = [
     "World",
     "check_agents",
-    "check_placement",
     "check_workers",
     "find_map",
     "load_roads",
@@ -158,19 +157,6 @@ def find_map(env: str | Path) -> Path:
         MapError: the map cannot be read.
     """
     return map_file(resolve_map(*load_config(env))).resolve()
-
-
-def check_placement(workers: int | None) -> None:
-    """Refuse worker processes for a single world.
-
-    Raises:
-        ConfigError: not None or 0.
-    """
-    if workers not in (None, 0):
-        raise ConfigError(
-            f"workers = {workers!r}: a single world runs in the caller's process; use 0, or "
-            "cavmarl.make_vec(…, num_envs=…, workers=…) for many worlds"
-        )
 
 
 def check_workers(workers: int | None) -> int:

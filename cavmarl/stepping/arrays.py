@@ -30,6 +30,7 @@ class StepArrays(NamedTuple):
     truncations: NDArray[np.bool_]  # (W, A) the horizon ended it
     acted: NDArray[np.bool_]  # (W, A) who has acted
     vehicle_done: NDArray[np.bool_]  # (W, A)
+    vehicle_ids: NDArray[np.int64]  # (W, A) of the vehicle at the end of the step; -1: it had none
     mask: NDArray[np.bool_]  # (W, A) who acts next
     terms: NDArray[np.float32]  # (W, A, T)
     arrivals: NDArray[np.int64]  # (W,) since each world's reset
@@ -56,6 +57,7 @@ def layout_of(config: EnvConfig, capacity: int, num_worlds: int) -> Layout:
         "final_observations": observations,
         "rewards": ("<f4", agents),
         **dict.fromkeys(("terminations", "truncations", "acted", "vehicle_done", "mask"), flags),
+        "vehicle_ids": ("<i8", agents),
         "terms": ("<f4", (*agents, len(TERMS))),
         "arrivals": ("<i8", (num_worlds,)),
         "episode_over": ("|b1", (num_worlds,)),

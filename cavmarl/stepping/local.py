@@ -73,7 +73,13 @@ class LocalWorlds:
         if seed is not None:
             self.simulation.seed(seed, first_world)
         self._begin(chosen)
-        arrays.mask[chosen] = self.simulation.outputs.present[chosen]
+        outputs = self.simulation.outputs
+        arrays.mask[chosen] = outputs.present[chosen]
+        arrays.vehicle_ids[chosen] = outputs.vehicle_ids[chosen]
+        arrays.vehicle_done[chosen] = False
+        arrays.terms[chosen] = outputs.terms[chosen]
+        goes_on = arrays.mask.any(axis=1) | self.simulation.agents_to_come()
+        arrays.episode_over[chosen] = ~goes_on[chosen]
         if not chosen.all():
             arrays.observations[~arrays.mask] = 0.0
 
@@ -89,6 +95,7 @@ class LocalWorlds:
         terminations = outputs.terminated
         arrays.rewards[:] = outputs.rewards
         arrays.terms[:] = outputs.terms
+        arrays.vehicle_ids[:] = outputs.vehicle_ids
         arrays.acted[:] = outputs.acted
         arrays.terminations[:] = terminations
         np.not_equal(outputs.events & EVENTS_THAT_END, 0, out=arrays.vehicle_done)
