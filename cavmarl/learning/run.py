@@ -37,6 +37,7 @@ def make_worlds(settings: PpoSettings) -> CavVectorEnv:
     return make_vec(
         settings.env,
         num_envs=settings.num_envs,
+        zones=settings.zones or None,
         workers=settings.workers,
         agents=settings.agents or None,
         background=None if settings.background < 0 else settings.background,

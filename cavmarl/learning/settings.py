@@ -22,7 +22,7 @@ __all__ = ["PpoSettings", "parse_ppo"]
 
 # Settings that a resumed run may be given anew.
 CAN_CHANGE = frozenset(
-    "total_agent_steps minutes resume threads workers tensorboard checkpoint_updates".split()
+    "total_agent_steps minutes resume threads zones workers tensorboard checkpoint_updates".split()
 )
 
 
@@ -41,6 +41,7 @@ class PpoSettings:
     agents: Annotated[int, "agents a world; 0: as the environment says"] = 0
     background: Annotated[int, "background vehicles a world; -1: as the environment says"] = -1
     num_envs: Annotated[int, "worlds that are stepped together"] = 16
+    zones: Annotated[int, "zones a world; 0: as the environment says"] = 0
     workers: Annotated[int, "processes that the worlds are shared out over; 0: this one"] = 0
     overlap: Annotated[bool, "collect while learning, with the network of one update before"] = (
         False
@@ -75,7 +76,7 @@ class PpoSettings:
 
     def __post_init__(self) -> None:
         at_least = {
-            "agents": 0, "background": -1, "num_envs": 1, "workers": 0, "seed": 0,
+            "agents": 0, "background": -1, "num_envs": 1, "zones": 0, "workers": 0, "seed": 0,
             "total_agent_steps": 1, "minutes": 0.0, "num_steps": 1, "epochs": 1, "minibatches": 1,
             "entropy_weight": 0.0, "value_weight": 0.0, "imitation_weight": 0.0, "hidden": 1,
             "threads": 1, "checkpoint_updates": 1,

@@ -147,6 +147,14 @@ def test_workers_that_are_killed_change_nothing_that_is_learnt(
     assert learnt(here / "runs" / "whole") == learnt(here / "runs" / "killed")
 
 
+def test_zones_over_workers_change_nothing_that_is_learnt(here: Path) -> None:
+    mappo = load("mappo_torch")
+    words = [*TINY, "--num-envs", "1", "--total-agent-steps", "40"]
+    assert mappo.main([*words, "--name", "whole"]) == 0
+    assert mappo.main([*words, "--name", "split", "--zones", "2", "--workers", "2"]) == 0
+    assert learnt(here / "runs" / "whole") == learnt(here / "runs" / "split")
+
+
 def test_a_central_critic_is_no_part_of_what_drives(here: Path) -> None:
     words = [*TINY, "--total-agent-steps", "20", "--name", "run"]
     assert load("mappo_torch").main(words) == 0
