@@ -179,9 +179,10 @@ def _vectorization(found: VectorizationSpeed) -> str:
             continue
         took = f"  {name}: [bold]{statistics.median(row.step_us):,.0f}[/] µs"
         if row.library == "cavmarl":
-            lines.append(f"{took}, of which the order to the workers takes {order:.0f}")
+            lines.append(f"{took}, of which the workers take [bold]{order:.0f}[/]")
         else:
-            lines.append(f"{took}, [bold]{found.ratio(row.library):.1f}[/] times as much")
+            ratio, order_ratio = found.ratio(row.library), found.order_ratio(row.library)
+            lines.append(f"{took}, {ratio:.1f} times that, [bold]{order_ratio:.1f}[/] times this")
     return "\n".join(lines)
 
 

@@ -23,6 +23,7 @@ from gymnasium.vector import AsyncVectorEnv
 from pettingzoo import ParallelEnv
 
 from cavmarl.errors import ConfigError, MissingExtraError, require
+from cavmarl.shard.shard import Commands
 from cavmarl.spaces import flat_observation_space
 from cavmarl.stepping.pooled import PooledWorlds
 from cavmarl.vector_env import CavVectorEnv
@@ -61,8 +62,9 @@ class VectorizationSpeed:
         agents: of all worlds.
         workers: one world each.
         numbers: in an observation.
-        order_us: of `cavmarl`'s, what the order to the workers takes without checking actions and
-            copying results; median of each turn.
+        order_us: what the workers add to ours: actions into shared memory, the order, until results
+            are in shared memory and committed; without checking actions and copying results, which
+            worlds of one process take, too. Median of each turn.
         rows: the libraries.
     """
 
@@ -73,16 +75,29 @@ class VectorizationSpeed:
     rows: tuple[VectorizationRow, ...]
 
     def ratio(self, library: str) -> float | None:
-        """How many times longer a library takes than ours: median of the turns; None: missing."""
-        found = {row.library: row.step_us for row in self.rows}
-        if not found[library]:
+        """How many times longer a step of a library takes than ours; None: missing."""
+        ours = next(row.step_us for row in self.rows if row.library == "cavmarl")
+        return self._over(library, ours)
+
+    def order_ratio(self, library: str) -> float | None:
+        """How many times longer it takes than our order to the workers; None: missing."""
+        return self._over(library, self.order_us)
+
+    def _over(self, library: str, ours: tuple[float, ...]) -> float | None:
+        """Median of the turns, each beside the other."""
+        theirs = next(row.step_us for row in self.rows if row.library == library)
+        if not theirs:
             return None
-        return median(b / a for a, b in zip(found["cavmarl"], found[library], strict=True))
+        return median(b / a for a, b in zip(ours, theirs, strict=True))
 
     def to_dict(self) -> dict[str, Any]:
         """Plain values, for JSON."""
-        ratios = {row.library: self.ratio(row.library) for row in self.rows}
-        return {**asdict(self), "ratios": ratios}
+        libraries = [row.library for row in self.rows]
+        return {
+            **asdict(self),
+            "ratios": {library: self.ratio(library) for library in libraries},
+            "order_ratios": {library: self.order_ratio(library) for library in libraries},
+        }
 
 
 def measure_vectorization(
@@ -125,15 +140,14 @@ def measure_vectorization(
         vec.reset(seed=0)
         actions = np.zeros((workers, each, 2), dtype=np.float32)
         steps["cavmarl"] = partial(vec.step, actions)
+        idle = Commands(np.zeros(actions.shape), np.zeros(actions.shape[:2], dtype=np.int64))
         orders: list[float] = []
         turns: dict[str, list[float]] = {library: [] for library in steps}
         for turn in range(repeats):
             say(f"nothing happens: turn {turn + 1} of {repeats}")
             for library, step in steps.items():
                 turns[library].append(_microseconds(step))
-            before = vec.simulated_s
-            _microseconds(steps["cavmarl"])
-            orders.append(1e6 * (vec.simulated_s - before) / (WARM_STEPS + STEPS))
+            orders.append(_microseconds(partial(worlds.step, idle)))
     rows = tuple(
         VectorizationRow(library, tuple(turns.get(library, ())), missing.get(library, ""))
         for library in ("cavmarl", "gymnasium", "supersuit")

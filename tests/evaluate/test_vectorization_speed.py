@@ -20,6 +20,8 @@ def test_each_library_steps_the_same_agents() -> None:
     assert all(len(row.step_us) == 1 and row.step_us[0] > 0.0 for row in found.rows)
     assert found.to_dict()["ratios"]["cavmarl"] == 1.0
     assert 0.0 < found.order_us[0]
+    gymnasium = found.rows[1].step_us[0]
+    assert found.order_ratio("gymnasium") == gymnasium / found.order_us[0]
 
 
 def test_a_library_that_is_missing_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
