@@ -10,6 +10,8 @@ from numpy.typing import NDArray
 
 from cavmarl.kernels import inlined_kernel, kernel
 from cavmarl.kernels.arrays import Zoned
+from cavmarl.kernels.borders import Borders
+from cavmarl.kernels.handing_over import Book, look_on
 from cavmarl.kernels.zones import Halo, ZoneArrays, is_inside, squared_distance, zone_of
 
 __all__ = ["exchange", "take_own"]
@@ -20,11 +22,12 @@ def exchange(
     zones: ZoneArrays,
     halo: Halo,
     touching_m: float,
-    border_m: float,
+    borders: Borders,
     zoned: Zoned,
     side: int,
     first: int,
     last: int,
+    book: Book,
 ) -> None:
     """Renew all ghosts of some worlds from the owned rows, and note who is near a border.
 
@@ -36,13 +39,16 @@ def exchange(
         zones: of the partition.
         halo: from `roads.zone_halo.zone_halo`, for the same partition.
         touching_m: no ghost further outside of a zone can touch one of its vehicles.
-        border_m: who is so near another zone is noted; 0: who lies in one.
+        borders: when a vehicle is near one.
         zoned: the ghosts and how many there are, border and num_border are written. Of the owned
             rows those in `outer` are looked at, where they are noted.
         side: whose rows, 0 or 1.
         first: the first world.
         last: the one after the last.
+        book: who is near a border is written.
     """
+    # Nobody else can be behind a border by then.
+    border_m = borders.max_speed_mps * borders.ahead_s
     count = zones.rects.shape[0]
     for w in range(first, last):
         for zone in range(count):
@@ -52,6 +58,7 @@ def exchange(
         if count > 1:
             for zone in range(count):
                 _publish(zones, halo, touching_m, border_m, zoned, side, zone, w)
+        look_on(zones, borders, zoned, side, w, book)
 
 
 @inlined_kernel

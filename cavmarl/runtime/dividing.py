@@ -6,6 +6,7 @@ import numpy as np
 
 from cavmarl.config import EnvConfig, ZonesConfig
 from cavmarl.kernels.arrays import Outputs
+from cavmarl.kernels.borders import Borders
 from cavmarl.kernels.motion import MAX_SPEED_MPS
 from cavmarl.ownership.distances import Distances, check_coverage, needed_overlap_m
 from cavmarl.ownership.limits import DeadlinePolicy, Limits
@@ -78,8 +79,7 @@ def divide(
         partition.arrays,
         halo,
         _needed_m(config, 2.0 * radius_m),
-        settings.hysteresis_m,
-        settings.approach_ticks * dt,
+        Borders(settings.hysteresis_m, settings.approach_ticks * dt, MAX_SPEED_MPS),
         TransferCodec.of(shards[0].worlds, outputs, config.sensors.stack),
     )
     return shards, division

@@ -32,6 +32,7 @@ from cavmarl.roads.network import RoadNetwork
 from cavmarl.roads.zone_layouts import cut_map
 from cavmarl.roads.zones import ZonePartition
 from cavmarl.runtime import snapshot
+from cavmarl.runtime.border_book import BorderBook
 from cavmarl.runtime.commons import Commons
 from cavmarl.runtime.compilation import first_compilation
 from cavmarl.runtime.coordination import Coordination
@@ -208,6 +209,9 @@ class Simulation:
         self._division.near(0, everybody=True)
         with suppress(ZoneError):
             self._division.hand_over(0, Switch(-1, 0, 0, 0, False), None)
+        book = BorderBook(self._division, 0)
+        book.release(book.hand_over(True, 0, sum(self._division.counts(0)), ()))
+        book.reset(0)
         self._episodes[:] = 0
 
     @property
