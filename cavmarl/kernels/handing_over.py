@@ -80,8 +80,8 @@ class Book(NamedTuple):
     known: NDArray[np.int64]  # (W,) of the present ones, who was so before
     acknowledged: NDArray[np.int64]  # (W,) entries of `coming`, in all ticks before this one
     aborted: NDArray[np.int64]  # (W,) of them that have turned away or left
-    tick: NDArray[np.int64]  # (W,) in which who is near now has come
-    ms: NDArray[np.float64]  # (W,) of a clock, then
+    tick: NDArray[np.int64]  # (W,) whose rows have been looked at
+    ms: NDArray[np.float64]  # (W,) of a clock, when it began
     newborn: NDArray[np.int64]  # (W, C) ids that have entered since the last tick began
     changes: NDArray[np.void]  # CHANGE (W, 3 C) those that nobody has read yet
     num_changes: NDArray[np.int64]  # (W,)
@@ -162,8 +162,9 @@ def look(
 def look_on(
     zones: ZoneArrays, borders: Borders, zoned: Zoned, side: int, w: int, book: Book
 ) -> None:
-    """`look` at the rows of another tick than the last time."""
+    """`look` at the rows of the next tick."""
     now = book.turn[w]
+    book.tick[w] += 1
     book.acknowledged[w] += book.num_near[w]
     book.aborted[w] += book.num_coming[w, 1 - now] - book.known[w]
     book.turn[w] = 1 - now

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Sequence
+from time import perf_counter
 from typing import NamedTuple
 
 from cavmarl.errors import LedgerError, ZoneError
@@ -46,12 +46,11 @@ class BorderBook:
         self._hand_over = repeated(hand_over)
         self._release = repeated(release)
 
-    def hand_over(self, everybody: bool, tick: int, vehicles: int, newborn: Sequence[Birth]) -> int:
+    def hand_over(self, everybody: bool, vehicles: int, newborn: Sequence[Birth]) -> int:
         """Let vehicles change their owner, by the committed rows.
 
         Args:
             everybody: look at all rows: they have changed since the ghosts were renewed.
-            tick: the committed one.
             vehicles: how many there have to be.
             newborn: who of them has entered since the last tick began; they stay where they are.
 
@@ -76,13 +75,8 @@ class BorderBook:
         # Who entered after the ghosts were renewed has not been looked at.
         if book.owned.item(w) != (vehicles if everybody else vehicles - len(newborn)):
             raise LedgerError(f"zones own {division.counts(w)} vehicles, not {vehicles}")
-        self._begin(tick + 1)
+        book.ms[w] = 1e3 * perf_counter()
         return changed
-
-    def _begin(self, tick: int) -> None:
-        """The tick that the vehicles are about to reach."""
-        self._book.tick[self._world] = tick
-        self._book.ms[self._world] = _now_ms()
 
     def _refuse(self, why: int) -> None:
         change = Change(*self._book.changes[self._world, len(self)].item())
@@ -95,7 +89,7 @@ class BorderBook:
         division = self._division
         self._release(
             division.zones, division.zoned, division.side,
-            self._world, changed, _now_ms(), self._book,
+            self._world, changed, 1e3 * perf_counter(), self._book,
         )  # fmt: skip
 
     def __len__(self) -> int:
@@ -134,8 +128,4 @@ class BorderBook:
     def reset(self, tick: int) -> None:
         """Another episode begins at a tick."""
         self._book.num_changes[self._world] = 0
-        self._begin(tick)
-
-
-def _now_ms() -> float:
-    return 1e3 * time.perf_counter()
+        self._book.tick[self._world] = tick

@@ -70,6 +70,7 @@ class DirectCoordinator(Referee):
         self._tick = 0
         self._vehicles = 0
         self._changed = 0  # in the tick in progress
+        self._late = 0  # changes that the table does not know
         self._new: tuple[Birth, ...] = ()
         self._news: dict[int, _News] = {}  # by ticks, of those that the table does not know
 
@@ -116,23 +117,29 @@ class DirectCoordinator(Referee):
 
     def begin(self, everybody: bool, inputs: bytes = b"") -> None:
         """Hand over whoever is in another zone than its owner's, as `Referee.begin` says."""
-        self._is_open, self._removed = True, []
-        births, self._births = self._births, []
+        births = self._births
         try:
-            self._changed = self._book.hand_over(everybody, self._tick, self._vehicles, births)
+            changed = self._book.hand_over(everybody, self._vehicles, births)
         except LedgerError:
             self._check(births)
             raise
-        self.switched += self._changed
-        self._new = tuple(sorted(births)) if births else ()
+        self._is_open, self._changed = True, changed
+        self.switched += changed
+        self._new = ()
+        if births:
+            self._new, self._births = tuple(sorted(births)), []
+        if self._removed:
+            self._removed = []
         if self.journal is not None:
             self._record(self._begun(self._tick + 1, self._changed, inputs))
 
     def end(self, rows: Callable[[int], int], stored: Callable[[int], int] | None = None) -> None:
         """Commit, if the zones own what they should, as `Referee.end` says."""
-        changed, self._changed, self._is_open = self._changed, 0, False
+        changed, self._is_open = self._changed, False
         self._tick += 1
         if changed:
+            self._changed = 0
+            self._late += changed
             self._book.release(changed)
         removed: tuple[Removed, ...] = ()
         if self._gone or self._removed:
@@ -146,7 +153,7 @@ class DirectCoordinator(Referee):
             self.catch_up()
             self._check(self._births)
             self._record(*begun, self._committed(removed, rows))
-        elif len(self._news) >= LATE or len(self._book) >= LATE:
+        elif self._late >= LATE or len(self._news) >= LATE:
             self.catch_up()
             self._check(self._births)
 
@@ -158,7 +165,7 @@ class DirectCoordinator(Referee):
         changes: defaultdict[int, list[Change]] = defaultdict(list)
         for change in self._book.take(but=self._changed):
             changes[change.tick].append(change)
-        news, self._news = self._news, {}
+        news, self._news, self._late = self._news, {}, 0
         for tick in sorted({*changes, *news}):
             self._settle(tick, changes[tick], news.get(tick, _NO_NEWS))
         table.settle(self._tick)

@@ -210,7 +210,7 @@ class Simulation:
         with suppress(ZoneError):
             self._division.hand_over(0, Switch(-1, 0, 0, 0, False), None)
         book = BorderBook(self._division, 0)
-        book.release(book.hand_over(True, 0, sum(self._division.counts(0)), ()))
+        book.release(book.hand_over(True, sum(self._division.counts(0)), ()))
         book.reset(0)
         self._episodes[:] = 0
 

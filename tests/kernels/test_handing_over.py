@@ -31,7 +31,7 @@ def world(
     """Vehicles of zone 0 at (x, y, heading), seen by all zones at tick 7."""
     rows = vehicles(list(places), speed=speed, id=np.array(ids), epoch=4)
     book = make_book(1, 16)
-    book.tick[0] = 7
+    book.tick[0] = 6
     parts = [rows, *[rows[:0]] * 3]
     return exchanged(PARTITION, 60.0, parts, borders=BORDERS, book=book), book
 
@@ -43,7 +43,6 @@ def call(zoned: Zoned, book: Book, everybody: bool = False, newborn: int = 0) ->
 
 def next_tick(zoned: Zoned, book: Book) -> None:
     """Look on, after rows have moved."""
-    book.tick[0] += 1
     book.ms[0] += 1.0
     owned = zoned.num_owned[0, 0]
     zoned.num_border[:, 0] = [owned, 0, 0, 0]
