@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cavmarl.config import EnvConfig
-from cavmarl.errors import CapacityError, ConfigError, ZoneError, ZoneStepError
+from cavmarl.errors import CapacityError, ConfigError, LostTickError, ZoneError
 from cavmarl.kernels.arrays import Outputs, Worlds
 from cavmarl.kernels.codes import (
     ACTION_IDLE,
@@ -352,14 +352,14 @@ class Simulation:
             is_last: whether it ends it.
 
         Raises:
-            ZoneStepError: every host of a zone died of it.
+            LostTickError: every host of a zone, or every coordinator, died of it.
         """
         if self._recovery is None:
             self._tick(commands, is_first, is_last)
             return
         try:
             self._recovery.run(partial(self._tick, commands, is_first, is_last))
-        except ZoneStepError as error:
+        except LostTickError as error:
             if self._keeper is not None:
                 episode = int(self._episodes[0])
                 moment = (self._seed, self._first_world, episode, commands, is_first, is_last)
