@@ -216,9 +216,17 @@ class Meeting:
 
     def post(self, number: int) -> None:
         """Tell the other side that this one has come to a number."""
-        if _set(self.mine, NUMBER, number, self.theirs):
-            with suppress(BrokenPipeError, ConnectionResetError):  # who is gone need not be woken
-                self.wire.send(WAKE)
+        if self.announce(number):
+            self.wake()
+
+    def announce(self, number: int) -> bool:
+        """Come to a number; whether the other side sleeps, and has to be woken."""
+        return bool(_set(self.mine, NUMBER, number, self.theirs))
+
+    def wake(self) -> None:
+        """Wake the other side."""
+        with suppress(BrokenPipeError, ConnectionResetError):  # who is gone need not be woken
+            self.wire.send(WAKE)
 
     def has(self, number: int) -> bool:
         """Whether the other side has come to a number."""

@@ -137,9 +137,8 @@ class Pool:
         slot = 1 - max(self._truth, 0) if commits else -1
         self._open = workers
         self._ordered_s = time.monotonic()
-        for k in workers:
-            head = (task, mail is not None, slot, self._truth, self._stale[k])
-            self._crew.order(k, head, mail)
+        head = (task, mail is not None, slot, self._truth)
+        self._crew.order({k: (*head, self._stale[k]) for k in workers}, mail)
         self._await(workers, mail)
         answers = self._read(workers)
         for k in workers:
@@ -172,6 +171,8 @@ class Pool:
         lasted_s = time.perf_counter() - began
         for k in workers:
             self._crew.lasted(k, lasted_s)
+        if workers == self._all:
+            self._crew.keep_apart()
 
     def _await_asleep(self, pending: list[int], mail: bytes | None) -> None:
         first = len(self.deaths)
