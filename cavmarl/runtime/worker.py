@@ -84,7 +84,7 @@ class Job(Protocol):
         ...
 
     def save(self) -> Arrays:
-        """All that a successor needs to go on from here."""
+        """All that a successor needs to go on from here; nothing if there is no such thing."""
         ...
 
     def load(self, arrays: Sequence[Any]) -> None:
@@ -235,13 +235,14 @@ def _obey(job: Job, meeting: Meeting, slots: Sequence[Image]) -> NoReturn:
         try:
             if (is_new or theirs[LOADS]) and theirs[TRUTH] >= 0:
                 dtypes = [array.dtype for array in job.save()]
-                job.load(list(slots[theirs[TRUTH]].read(dtypes)))
+                if dtypes:
+                    job.load(list(slots[theirs[TRUTH]].read(dtypes)))
             is_new = False
             answer = None
             if theirs[TASK] != NOTHING:
                 answer = job.perform(int(theirs[TASK]), letter)
-            if theirs[SLOT] >= 0:
-                slots[theirs[SLOT]].write(job.save())
+            if theirs[SLOT] >= 0 and (saved := job.save()):
+                slots[theirs[SLOT]].write(saved)
         except MemoryError:
             os._exit(OUT_OF_MEMORY)
         except Exception as error:
