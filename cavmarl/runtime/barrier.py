@@ -232,7 +232,7 @@ class Meeting:
         """Whether the other side has come to a number."""
         return _has(self.theirs, number)
 
-    def watch(self, number: int, work_s: float = 0.0) -> bool:
+    def watch(self, number: int, work_s: float = 0.0, is_soon: bool = False) -> bool:
         """Look for a moment whether the other side comes to a number.
 
         Who has had to wait for long the last time does not look for long, nor who has worked for
@@ -242,11 +242,12 @@ class Meeting:
         Args:
             number: to wait for.
             work_s: since this side waited last.
+            is_soon: it is known that it does not take long.
         """
         if _look(self.theirs, number, self._crowded):
             return True
-        is_short = self._last_s < LONG_S and work_s < LONG_WORK_S
-        end = time.perf_counter() + (LONG_S if is_short else SHORT_S)
+        is_soon |= self._last_s < LONG_S and work_s < LONG_WORK_S
+        end = time.perf_counter() + (LONG_S if is_soon else SHORT_S)
         while time.perf_counter() < end:
             if _look(self.theirs, number, self._crowded):
                 return True

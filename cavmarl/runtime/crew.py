@@ -130,9 +130,9 @@ class Crew:
         """Whether a worker has carried it out."""
         return self._meetings[k].has(self.number(k))
 
-    def watch(self, k: int) -> bool:
-        """The same, but look for a moment."""
-        return self._meetings[k].watch(self.number(k))
+    def watch(self, k: int, is_soon: bool = False) -> bool:
+        """The same, but look for a moment; a longer one if it cannot take long."""
+        return self._meetings[k].watch(self.number(k), is_soon=is_soon)
 
     def lasted(self, k: int, wait_s: float) -> None:
         """Note how long it has taken."""

@@ -178,8 +178,11 @@ class Pool:
         first = len(self.deaths)
         guard = _Guard(self._crew, self._timeout_s)
         while pending:
+            asked = pending
             dead = self._crew.sleep(pending, CHECK_S)
             pending = self._pending()
+            if len(pending) < len(asked):  # orders are shared out so that all end together
+                pending = [k for k in pending if not self._crew.watch(k, is_soon=True)]
             for death in self.deaths[first:]:
                 if death.worker not in pending and isnan(death.done_s):
                     death.done_s = time.monotonic()

@@ -95,6 +95,7 @@ class Leader:
         self._line, *self._others = team.lines
         self._codes = {name: code for code, name in enumerate(TOGETHER)}
         self._leads = False
+        self._last = ""
 
     @contextmanager
     def order(self) -> Iterator[None]:
@@ -104,13 +105,22 @@ class Leader:
             LeftAloneError: one of them has failed.
         """
         self._wait()
-        self._leads = True
+        self._leads, self._last = True, ""
         try:
             yield
         finally:
+            self._dismiss()
+
+    def end_after(self, phase: Phase | str) -> None:
+        """Let the followers end the order with the next phase of that name that they run."""
+        self._last = phase
+
+    def _dismiss(self) -> None:
+        """The followers need not wait any more."""
+        if self._leads:
+            self._leads = False
             self._wait()
             self._announce(END)
-            self._leads = False
 
     def each(self, phase: Phase, *arguments: Any) -> None:
         """Run a phase on every shard.
@@ -133,6 +143,8 @@ class Leader:
         self._wait()
         if any(line[FAILED] for line in self._others):
             raise LeftAloneError
+        if name == self._last:
+            self._dismiss()
 
     def _which(self, name: str, arguments: tuple[Any, ...]) -> int:
         """Which of what the followers know a phase is called with; -1: none, or nobody follows."""

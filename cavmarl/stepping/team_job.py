@@ -15,6 +15,8 @@ from cavmarl.stepping.local import LocalWorlds
 
 __all__ = ["FollowerJob", "LeaderJob"]
 
+# Phases that end a task for the followers; what comes after them the leader does alone.
+LAST = {Task.STEP: "credit", Task.SUGGEST: "suggest"}
 ALONE = (Task.STATE_HASH, Task.TRAFFIC_STATS)  # tasks of the leader, of which no follower hears
 
 
@@ -72,6 +74,7 @@ class LeaderJob(WorldsJob):
             begins_anew = task == Task.RESET or (task == Task.STEP and diary.is_full)
             if task == Task.STEP and not begins_anew:
                 diary.note(self._commands)
+            self._leader.end_after(LAST.get(Task(task), ""))
             super().perform(task, letter)
         if begins_anew:
             diary.begin(self._worlds.save())
