@@ -168,11 +168,11 @@ class Pool:
         pending = [k for k in workers if not self._crew.watch(k)]
         if pending:
             self._await_asleep(pending, mail)
+            if workers == self._all:
+                self._crew.keep_apart()
         lasted_s = time.perf_counter() - began
         for k in workers:
             self._crew.lasted(k, lasted_s)
-        if workers == self._all:
-            self._crew.keep_apart()
 
     def _await_asleep(self, pending: list[int], mail: bytes | None) -> None:
         first = len(self.deaths)

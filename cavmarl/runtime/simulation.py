@@ -425,7 +425,8 @@ class Simulation:
         self._executor.each("resolve")
         self._enter()
         self._executor.each("commit")
-        self._shard.worlds.ticks[:] += 1
+        ticks = self._shard.worlds.ticks
+        ticks += 1
         self._switch_signals()
 
     def _switch_signals(self) -> None:
