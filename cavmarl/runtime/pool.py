@@ -183,9 +183,7 @@ class Pool:
             pending = self._pending()
             if len(pending) < len(asked):  # orders are shared out so that all end together
                 pending = [k for k in pending if not self._crew.watch(k, is_soon=True)]
-            for death in self.deaths[first:]:
-                if death.worker not in pending and isnan(death.done_s):
-                    death.done_s = time.monotonic()
+            self._note_done(first, pending)
             suspects = dict.fromkeys(dead, "") or guard.hanging(pending)
             suspected = {k: self._crew.processes[k] for k in suspects} | dead
             for k, cause in suspects.items():
@@ -197,6 +195,13 @@ class Pool:
                 causes = [death.cause for death in self.deaths[first:] if death.worker in team]
                 if len(causes) > self._repeats:
                     self._give_up(k, causes)
+        self._note_done(first, pending)
+
+    def _note_done(self, first: int, pending: list[int]) -> None:
+        """Of deaths from a number on: when the successors are through."""
+        for death in self.deaths[first:]:
+            if death.worker not in pending and isnan(death.done_s):
+                death.done_s = time.monotonic()
 
     def _pending(self) -> list[int]:
         """Who has not carried out the present order."""

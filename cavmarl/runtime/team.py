@@ -35,8 +35,8 @@ from cavmarl.shard.shard import Shard
 
 __all__ = ["Follower", "Leader", "LeftAloneError", "Team"]
 
-# Words of the leader's line, behind those of `barrier`: what a phase of an even number, or of an odd
-# one, is called with.
+# Words of the leader's line, behind those of `barrier`: what is called with even numbers, and what
+# with odd ones.
 CALLS = (2, 3)
 # A word of a follower's line.
 FAILED = 2

@@ -43,7 +43,7 @@ class LeaderJob(WorldsJob):
         """Let a team run the phases."""
         commands = [(self._commands,), *((entry,) for entry in self._diary.entries)]
         chosen = [(self._worlds.simulation.everywhere,)]
-        known = {
+        known: dict[str, Sequence[tuple[Any, ...]]] = {
             "begin_step": commands,
             "move": commands,
             "sense": chosen,
