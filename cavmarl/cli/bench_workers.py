@@ -61,6 +61,7 @@ def workers(
     How much faster several workers are, what an empty order costs, and for how many vehicles it
     pays to split one world.
     """
+    from cavmarl.evaluate.core_ceiling import measure_ceiling
     from cavmarl.evaluate.split_speed import measure_splits
     from cavmarl.evaluate.worker_speed import measure_workers
 
@@ -81,6 +82,18 @@ def workers(
             overrides=parse_settings(settings),
             say=status.update,
         )
+        status.update("stepping worlds in programs of their own")
+        ceiling = measure_ceiling(
+            env,
+            worlds=worlds,
+            programs=count,
+            steps=steps,
+            repeats=repeats,
+            seed=seed,
+            agents=agents,
+            background=background,
+            overrides=parse_settings(settings),
+        )
         splits = measure_splits(
             env,
             numbers,
@@ -94,7 +107,8 @@ def workers(
             overrides=parse_settings(settings),
             say=status.update,
         )
-    write_json(json_path, found.to_dict() | {"splits": [split.to_dict() for split in splits]})
+    more = {"ceiling": ceiling.to_dict(), "splits": [split.to_dict() for split in splits]}
+    write_json(json_path, found.to_dict() | more)
     console.print(_table(found))
     low, middle, high, highest = found.barrier_us
     console.print(
@@ -104,6 +118,11 @@ def workers(
         f"an empty order to all {count}: [bold]{middle:.1f}[/] µs "
         f"({low:.1f} / {high:.1f} / {highest:.1f}: 5, 95, 99 %); idle workers take "
         f"{found.idle_s:.1%} of a core",
+        highlight=False,
+    )
+    console.print(
+        f"{count} programs that share nothing, side by side: [bold]{ceiling.ratio:.2f}[/] times "
+        "one after the other: more this machine does not give",
         highlight=False,
     )
     for split in splits:

@@ -429,7 +429,8 @@ class Simulation:
         self._executor.each("resolve")
         self._enter()
         self._executor.each("commit")
-        self._shard.worlds.ticks[:] += 1
+        ticks = self._shard.worlds.ticks
+        ticks += 1
         self._switch_signals()
 
     def _switch_signals(self) -> None:
@@ -449,11 +450,12 @@ class Simulation:
     def _leave(self) -> None:
         """Who needs it picks another goal, who has arrived leaves, who looks for a way finds it."""
         traffic, gate, worlds = self._traffic, self._gate, self._shard.worlds
-        begins_second = (worlds.ticks % traffic.ticks_per_s == 0).any()
+        per_s = traffic.ticks_per_s
+        begins_second = any(tick % per_s == 0 for tick in worlds.ticks.tolist())
         if begins_second:
             self._executor.each("choose_goals", traffic.demand, len(traffic.plans), gate)
         self._executor.each("leave", gate)
-        if gate.num_passing.any():
+        if any(gate.num_passing.tolist()):
             self._note_left()
             traffic.settle(gate, worlds)
         if begins_second and traffic.rerouting is not None:
@@ -468,7 +470,7 @@ class Simulation:
         """Those who wait and find a gap enter `next_rows`."""
         traffic, gate, worlds = self._traffic, self._gate, self._shard.worlds
         traffic.call_orders(gate, worlds)
-        if gate.num_queue.any():
+        if any(gate.num_queue.tolist()):
             self._let_in()
 
     def _let_in(self) -> None:
@@ -489,7 +491,7 @@ class Simulation:
             return
         gate = self._gate
         self._executor.each("retire", gate)
-        if gate.num_passing.any():
+        if any(gate.num_passing.tolist()):
             self._note_left()
             self._executor.each("forget", gate)
             self._traffic.settle(gate, self._shard.worlds)

@@ -29,13 +29,14 @@ from typing import Any, NoReturn, Protocol
 import numpy as np
 
 from cavmarl.runtime import barrier, images
-from cavmarl.runtime.barrier import NUMBER, WAKE, WORDS, Meeting
+from cavmarl.runtime.barrier import NUMBER, WAKE, WORDS, Meeting, present_core
 from cavmarl.runtime.images import Arrays, Image
 from cavmarl.runtime.shared_memory import Segment
 
 __all__ = [
     "ANSWER",
     "ANSWERED",
+    "CORE",
     "FAILED",
     "LETTER",
     "LOADS",
@@ -54,8 +55,8 @@ __all__ = [
 
 # Words of the pool's line, behind those of `barrier`.
 TASK, LETTER, SLOT, TRUTH, LOADS = 2, 3, 4, 5, 6
-# A word of the worker's line, and what it says.
-ANSWER = 2
+# Words of the worker's line: how its order ended, and on which core it has begun with it.
+ANSWER, CORE = 2, 3
 SILENT, ANSWERED, FAILED = 0, 1, 2
 
 NOTHING = -1  # a task: to be there
@@ -83,7 +84,7 @@ class Job(Protocol):
         ...
 
     def save(self) -> Arrays:
-        """All that a successor needs to go on from here."""
+        """All that a successor needs to go on from here; nothing if there is no such thing."""
         ...
 
     def load(self, arrays: Sequence[Any]) -> None:
@@ -229,17 +230,19 @@ def _obey(job: Job, meeting: Meeting, slots: Sequence[Image]) -> NoReturn:
         order = int(mine[NUMBER]) + 1
         _await(meeting, order, time.perf_counter() - began)
         began = time.perf_counter()
+        mine[CORE] = present_core()
         letter = _receive(meeting.wire) if theirs[LETTER] else None
         try:
             if (is_new or theirs[LOADS]) and theirs[TRUTH] >= 0:
                 dtypes = [array.dtype for array in job.save()]
-                job.load(list(slots[theirs[TRUTH]].read(dtypes)))
+                if dtypes:
+                    job.load(list(slots[theirs[TRUTH]].read(dtypes)))
             is_new = False
             answer = None
             if theirs[TASK] != NOTHING:
                 answer = job.perform(int(theirs[TASK]), letter)
-            if theirs[SLOT] >= 0:
-                slots[theirs[SLOT]].write(job.save())
+            if theirs[SLOT] >= 0 and (saved := job.save()):
+                slots[theirs[SLOT]].write(saved)
         except MemoryError:
             os._exit(OUT_OF_MEMORY)
         except Exception as error:

@@ -15,6 +15,8 @@ from cavmarl.stepping.local import LocalWorlds
 
 __all__ = ["FollowerJob", "LeaderJob"]
 
+# Phases that end a task for the followers; what comes after them the leader does alone.
+LAST = {Task.STEP: "credit", Task.SUGGEST: "suggest"}
 ALONE = (Task.STATE_HASH, Task.TRAFFIC_STATS)  # tasks of the leader, of which no follower hears
 
 
@@ -34,17 +36,19 @@ class LeaderJob(WorldsJob):
         super().__init__(worlds, first)
         self._zones = zones
         self._diary = diary
+        self._is_behind = False  # it is where the diary begins, and not where that ends
         worlds.simulation.host(self._gather)
 
     def _gather(self, shards: Sequence[Shard]) -> Leader:
         """Let a team run the phases."""
-        commands, chosen = (self._commands,), (self._worlds.simulation.everywhere,)
-        known = {
+        commands = [(self._commands,), *((entry,) for entry in self._diary.entries)]
+        chosen = [(self._worlds.simulation.everywhere,)]
+        known: dict[str, Sequence[tuple[Any, ...]]] = {
             "begin_step": commands,
             "move": commands,
             "sense": chosen,
             "credit": chosen,
-            "suggest": (self._worlds.arrays.suggested,),
+            "suggest": [(self._worlds.arrays.suggested,)],
         }
         self._team = Team(shards, self._zones, known)
         self._leader = Leader(self._team)
@@ -62,28 +66,37 @@ class LeaderJob(WorldsJob):
     def perform(self, task: int, letter: Any) -> Any:
         """Do a task; the answer of those that have one."""
         if task in ALONE:
+            self._catch_up()
             return super().perform(task, letter)
         diary = self._diary
-        begins_anew = task == Task.RESET or (task == Task.STEP and diary.is_full)
-        if task == Task.STEP and not begins_anew:
-            diary.note(self._commands)
         with self._leader.order():
+            self._catch_up()
+            begins_anew = task == Task.RESET or (task == Task.STEP and diary.is_full)
+            if task == Task.STEP and not begins_anew:
+                diary.note(self._commands)
+            self._leader.end_after(LAST.get(Task(task), ""))
             super().perform(task, letter)
         if begins_anew:
             diary.begin(self._worlds.save())
         return None
+
+    def _catch_up(self) -> None:
+        """Go through the steps of the diary, if they are not behind it."""
+        if self._is_behind:
+            self._is_behind = False
+            for commands in self._diary.steps():
+                self._worlds.step(commands)
 
     def save(self) -> list[NDArray[Any]]:
         """Where to begin in the diary."""
         return [self._diary.place]
 
     def load(self, saved: Sequence[NDArray[Any]]) -> None:
-        """Go on from what `save` gave."""
+        """Go on from what `save` gave; the steps since the last image wait for a task."""
         diary, worlds = self._diary, self._worlds
         diary.place[:] = saved[0]
         worlds.load(diary.state(worlds.save()))
-        for commands in diary.steps():
-            worlds.step(commands)
+        self._is_behind = True
 
 
 class FollowerJob:
