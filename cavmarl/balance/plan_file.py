@@ -9,7 +9,7 @@ from typing import Any
 
 from cavmarl.balance.load_score import RESOURCES, Candidate, LoadRule, Utilisation
 from cavmarl.balance.plan import SCHEMA, VERSION, Plan
-from cavmarl.balance.problem import BalanceRule, Problem, ShardCost
+from cavmarl.balance.problem import MEASURED_COSTS, BalanceRule, Problem, ShardCost
 from cavmarl.balance.snapshot import Snapshot
 from cavmarl.errors import PlacementError
 
@@ -63,6 +63,8 @@ def plan_from_dict(document: Mapping[str, Any]) -> Plan:
         snapshot=snapshot_from_dict(_table(get("snapshot"), "snapshot")),
         rule=_rule(_table(get("rule"), "rule")),
         present=None if present is None else _wholes(present, "present"),
+        in_row=_truth(get("in_row", False), "in_row"),
+        cost_source=_text(get("cost_source", MEASURED_COSTS), "cost_source"),
     )
     homes = tuple(_whole(row.get("worker"), "worker") for row in shards)
     return Plan(problem, homes, _text(get("method"), "method"))
@@ -83,15 +85,13 @@ def snapshot_from_dict(document: Mapping[str, Any]) -> Snapshot:
 
 
 def _candidate(row: Mapping[str, Any]) -> Candidate:
-    use, available = _table(row.get("use"), "use"), row.get("available")
-    if not isinstance(available, bool):
-        raise _none("available", available, "true or false")
+    use = _table(row.get("use"), "use")
     cpu, ram, gpu = (_real(use.get(name), name) for name in RESOURCES)
     return Candidate(
         worker=_whole(row.get("worker"), "worker"),
         use=Utilisation(cpu, ram, gpu),
         hosted=_whole(row.get("hosted"), "hosted"),
-        available=available,
+        available=_truth(row.get("available"), "available"),
     )
 
 
@@ -133,6 +133,12 @@ def _list(value: object, name: str) -> Sequence[Any]:
 def _text(value: object, name: str) -> str:
     if not isinstance(value, str):
         raise _none(name, value, "text")
+    return value
+
+
+def _truth(value: object, name: str) -> bool:
+    if not isinstance(value, bool):
+        raise _none(name, value, "true or false")
     return value
 
 

@@ -247,6 +247,10 @@ class Simulation:
         transfers = () if coordination is None else coordination.in_flight(world)
         return view_zones(self._shards, self.partition, halo_m, world, transfers)
 
+    def running(self) -> NDArray[np.int64]:
+        """(W,) vehicles of each world."""
+        return self._division.running()
+
     def ghosts(self, zone: int, world: int = 0) -> NDArray[np.void]:
         """What a zone sees of other zones' vehicles: VEHICLE (n,), a view that cannot be written.
 
@@ -503,6 +507,23 @@ class Simulation:
         self.seed(*roots.tolist())
         self._episodes[:] = episodes
         self._gate = snapshot.load(self._parts(), rest)
+
+    def share_of(self, world: int) -> list[NDArray[Any]]:
+        """What `save` would give if there were no world but one; views, to be copied."""
+        roots = np.array([self._seed, self._first_world + world], dtype=np.int64)
+        episodes = self._episodes[world : world + 1]
+        return [roots, episodes, *snapshot.share_of(self._parts(), world)]
+
+    def join(self, shares: Sequence[Sequence[NDArray[Any]]]) -> list[NDArray[Any]]:
+        """What `load` takes, of worlds of which each share has been one by itself.
+
+        Args:
+            shares: what `share_of` gave, of worlds that follow each other.
+        """
+        episodes = np.concatenate([share[1] for share in shares])
+        return [
+            shares[0][0], episodes, *snapshot.join(self._parts(), [share[2:] for share in shares])
+        ]  # fmt: skip
 
     def _parts(self) -> snapshot.Parts:
         return snapshot.Parts(

@@ -23,6 +23,9 @@ class Task(IntEnum):
     SUGGEST = 2
     STATE_HASH = 3
     TRAFFIC_STATS = 4
+    PACK = 5
+    UNPACK = 6
+    HOST = 7
 
 
 class WorldsJob:
@@ -34,6 +37,9 @@ class WorldsJob:
     """
 
     def __init__(self, worlds: LocalWorlds, first: int) -> None:
+        self._take(worlds, first)
+
+    def _take(self, worlds: LocalWorlds, first: int) -> None:
         self._worlds = worlds
         self._first = first
         self._commands = Commands(worlds.arrays.controls, worlds.arrays.meta_actions)
