@@ -13,7 +13,17 @@ from cavmarl.balance.problem import MEASURED_COSTS, BalanceRule, Problem, ShardC
 from cavmarl.balance.snapshot import Snapshot
 from cavmarl.errors import PlacementError
 
-__all__ = ["plan_from_dict", "read_plan", "snapshot_from_dict"]
+__all__ = [
+    "PLACEMENT",
+    "PLACEMENT_AT_END",
+    "plan_from_dict",
+    "read_plan",
+    "read_plans",
+    "snapshot_from_dict",
+]
+
+# Of a manifest: the plans when the run began, and those when it ended.
+PLACEMENT, PLACEMENT_AT_END = "placement", "placement_at_end"
 
 LARGEST = 1 << 53  # whole numbers beyond it are not whole in every reader of JSON
 LONGEST = 40  # letters of a wrong value in a message
@@ -23,6 +33,18 @@ def read_plan(path: Path) -> Plan:
     """The plan of a file.
 
     Raises:
+        PlacementError: it cannot be read, or holds no plan of this version, or more than one.
+    """
+    plans = read_plans(path)
+    if len(plans) != 1:
+        raise PlacementError(f"{path}: {len(plans)} plans, of which one is needed")
+    return plans[0]
+
+
+def read_plans(path: Path) -> list[Plan]:
+    """The plan of a file, or those of a manifest: when the run began, then when it ended.
+
+    Raises:
         PlacementError: it cannot be read, or holds no plan of this version.
     """
     try:
@@ -30,7 +52,16 @@ def read_plan(path: Path) -> Plan:
     except (OSError, ValueError, RecursionError) as error:
         raise PlacementError(f"{path}: cannot be read ({error}); make the plan anew") from error
     try:
-        return plan_from_dict(document)
+        if not isinstance(document, dict) or PLACEMENT not in document:
+            return [plan_from_dict(document)]
+        rows = [
+            row
+            for name in (PLACEMENT, PLACEMENT_AT_END)
+            for row in _list(document.get(name, []), name)
+        ]
+        if not rows:
+            raise PlacementError("a manifest of a run without workers: there is no plan")
+        return [plan_from_dict(row) for row in rows]
     except PlacementError as error:
         raise PlacementError(f"{path}: {error}") from error
 

@@ -58,7 +58,7 @@ class WorldsJob:
             worlds.suggest()
         elif task == Task.STATE_HASH:
             return worlds.state_hash(letter - self._first)
-        else:
+        elif task == Task.TRAFFIC_STATS:
             return worlds.traffic_stats(letter - self._first)
         return None
 

@@ -84,6 +84,8 @@ class Placement:
         for balancer in self._balancers:
             problem = balancer.plan.problem
             numbers = {candidate.worker for candidate in problem.snapshot.workers}
+            if len(numbers) == 1:
+                continue
             balancer.measure(
                 ShardCost(shard.world, shard.zone, cost_s.item(shard.world, shard.zone))
                 for shard in problem.shards
