@@ -397,15 +397,18 @@ class Simulation:
         """From now on let somebody else run the phases of the shards, as `make` returns it."""
         self._executor = make(self._shards)
 
-    def time_shards(self) -> ShardClock:
+    def time_shards(self, every: int = 1) -> ShardClock:
         """From now on run phases zone by zone, with a clock on each.
+
+        Args:
+            every: one tick of so many; the others as ever.
 
         Raises:
             ConfigError: hosts die by plan, and what is repeated would be counted, too.
         """
         if self._recovery is not None:
             raise ConfigError("zones.faults: shards are timed where no host dies; leave it out")
-        clock = ShardClock(self._shards)
+        clock = ShardClock(self._shards, every)
         self._executor = clock
         return clock
 
