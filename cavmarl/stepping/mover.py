@@ -32,6 +32,8 @@ class Mover:
     Attributes:
         segments: memory for the workers.
         recipe: what they are told about it.
+        moves: of shards, up to now.
+        moved_s: how long they have taken together.
 
     Raises:
         WorkerStartError: there is no memory.
@@ -44,6 +46,8 @@ class Mover:
         self._num_zones = num_zones
         self._every = every
         self._steps = 0
+        self.moves = 0
+        self.moved_s = 0.0
         layout = {"spent_s": ("<f8", (num_worlds, 1 if placement.in_row else num_zones))}
         self.segments = [Segment.make(size_of(layout))]
         try:
@@ -82,7 +86,9 @@ class Mover:
         except BaseException:
             self._placement.take_back(before)
             raise
-        self._placement.moved(time.perf_counter() - began)
+        lasted_s = time.perf_counter() - began
+        self.moves += self._placement.moved(lasted_s)
+        self.moved_s += lasted_s
         return parts
 
     def _order(self, run: Run, parts: list[Part]) -> None:

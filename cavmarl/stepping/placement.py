@@ -13,7 +13,6 @@ from cavmarl.balance.plan import Plan
 from cavmarl.balance.probe import Watch, take_snapshot
 from cavmarl.balance.problem import BalanceRule, ShardCost
 from cavmarl.balance.snapshot import Snapshot, idle_snapshot
-from cavmarl.roads.zone_statistics import imbalance
 from cavmarl.stepping.parts import share_out
 from cavmarl.worlds import World
 
@@ -99,14 +98,15 @@ class Placement:
         for balancer, plan in zip(self._balancers, plans, strict=True):
             balancer.plan = plan
 
-    def moved(self, lasted_s: float) -> None:
-        """Note how long it took to make the present plans true: later moves are worth that."""
+    def moved(self, lasted_s: float) -> int:
+        """Note how long it took to make the present plans true: later moves have to be worth that.
+
+        Returns:
+            how many shards have moved.
+        """
         moves = sum(len(plan.moves) for plan in self.plans)
         self._rule = replace(self._rule, move_s=lasted_s / moves)
-
-    def imbalance(self) -> float:
-        """Maximum over mean of workers' costs, as planned; the worst of all plans."""
-        return max(imbalance([worker.load_s for worker in plan.workers()]) for plan in self.plans)
+        return moves
 
     def _snapshot(self, pids: Mapping[int, int]) -> Snapshot:
         """How busy workers are; idle where nobody looks, and where one was replaced meanwhile."""

@@ -53,6 +53,7 @@ class PooledWorlds:
         pool: the processes.
         in_next_step: when worlds begin anew.
         placement: who hosts what.
+        mover: has that changed; None: it does not change.
 
     Raises:
         ConfigError: a setting that worlds of several processes cannot have, or more of those than
@@ -92,7 +93,7 @@ class PooledWorlds:
             segment.close()
             raise
         diaries = [make_segments(config) if len(part.zones) > 1 else [] for part in parts]
-        self._mover = self._make_mover(num_worlds, workers)
+        self.mover = self._make_mover(num_worlds, workers)
         recipe = {
             "config": asdict(config),
             "base_dir": str(base_dir.resolve()),
@@ -102,12 +103,12 @@ class PooledWorlds:
             "in_next_step": in_next_step,
             "parts": parts,
             "diaries": [[one.fd for one in diary] for diary in diaries],
-            "mover": None if self._mover is None else self._mover.recipe,
+            "mover": None if self.mover is None else self.mover.recipe,
         }
         tasks = tuple(task.name.lower().replace("_", " ") for task in Task)
         leaders = [0, *accumulate(len(part.zones) for part in parts)]
         teams = tuple(tuple(range(*bounds)) for bounds in pairwise(leaders))
-        moving = () if self._mover is None else self._mover.segments
+        moving = () if self.mover is None else self.mover.segments
         segments = (segment, *(one for diary in diaries for one in diary), *moving)
         pins = config.workers.pin
         program = Program(PROGRAM, recipe, _names(parts), segments, tasks, pins, teams)
@@ -177,9 +178,9 @@ class PooledWorlds:
 
     def _move(self) -> None:
         """Let worlds or zones change their worker, if it is time."""
-        if self._mover is None:
+        if self.mover is None:
             return
-        parts = self._mover.before_step(self._run, self._pids)
+        parts = self.mover.before_step(self._run, self._pids)
         if parts is not None:
             self._asked = _leaders(parts)
             self.pool.rename(_names(parts))
