@@ -106,6 +106,7 @@ class Simulation:
         observations: (W, A, D) float32, where the agents' are written; None: made for them.
         warm: call every kernel now, so that none is loaded in a step.
         zeros: makes the arrays that shards write.
+        like: worlds of the same environment, whose tables are used; None: they are made.
 
     Attributes:
         everywhere: (W,) all of the worlds.
@@ -122,6 +123,7 @@ class Simulation:
         observations: NDArray[np.float32] | None = None,
         warm: bool = False,
         zeros: Zeros = np.zeros,
+        like: Simulation | None = None,
     ) -> None:
         self.config = config
         self.network = network
@@ -135,19 +137,23 @@ class Simulation:
         self.transfers: tuple[TransferLog, ...] = ()
         with first_compilation() as is_first:
             blank = blank_vehicle()
-            traffic = NativeTraffic(
-                network,
-                config.traffic,
-                config.population,
-                blank,
-                config.clock.sim_dt_s,
-                config.horizon_s,
-                demand,
-                num_worlds,
-                zeros,
+            traffic = (
+                NativeTraffic(
+                    network,
+                    config.traffic,
+                    config.population,
+                    blank,
+                    config.clock.sim_dt_s,
+                    config.horizon_s,
+                    demand,
+                    num_worlds,
+                    zeros,
+                )
+                if like is None
+                else like._traffic.for_worlds(num_worlds)
             )
             capacity = traffic.capacity
-            self._traffic = traffic
+            self._traffic: NativeTraffic = traffic
             self._gate = make_gate(num_worlds, capacity, network.arrays, blank.dtype)
             self._commons = Commons(config, network, num_worlds, observations, zeros)
             self._shards, self._division = divide(

@@ -6,8 +6,6 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from cavmarl.config import EnvConfig
 from cavmarl.errors import WorkerStartError
 from cavmarl.runtime.images import Image
@@ -20,7 +18,6 @@ from cavmarl.stepping.local import LocalWorlds
 from cavmarl.stepping.moving_job import MovingJob
 from cavmarl.stepping.parts import Part
 from cavmarl.stepping.team_job import LeaderJob
-from cavmarl.traffic.memory import Zeros
 from cavmarl.worlds import make_world
 
 __all__ = ["make_jobs"]
@@ -45,12 +42,12 @@ def make_jobs(recipe: Mapping[str, Any]) -> list[Job]:
         )
     layout = layout_of(config, recipe["num_worlds"])
     arrays = StepArrays(**arrays_in(Segment(recipe["arrays"], 0).map(), layout))
-    LocalWorlds(world, 1, warm=True)
+    one = LocalWorlds(world, 1, warm=True)
     parts = [Part(*given) for given in recipe["parts"]]
 
-    def make(first: int, last: int, zeros: Zeros = np.zeros) -> LocalWorlds:
+    def make(first: int, last: int) -> LocalWorlds:
         part, in_next_step = arrays.part(first, last), recipe["in_next_step"]
-        return LocalWorlds(world, last - first, part, in_next_step=in_next_step, zeros=zeros)
+        return LocalWorlds(world, last - first, part, in_next_step=in_next_step, like=one)
 
     mover = recipe["mover"]
     spent_s = None
@@ -64,7 +61,13 @@ def make_jobs(recipe: Mapping[str, Any]) -> list[Job]:
     jobs: list[Job] = []
     for part, descriptors in zip(parts, recipe["diaries"], strict=True):
         if len(part.zones) > 1:
-            worlds = make(part.first, part.last, shared_zeros)
+            worlds = LocalWorlds(
+                world,
+                1,
+                arrays.part(part.first, part.last),
+                in_next_step=recipe["in_next_step"],
+                zeros=shared_zeros,
+            )
             diary, theirs = Diary(config, descriptors), None
             if spent_s is not None:
                 theirs = spent_s[part.first]

@@ -30,6 +30,7 @@ class LocalWorlds:
         warm: have all kernels ready now.
         in_next_step: when worlds begin anew; see `SteppedWorlds`.
         zeros: makes the arrays that shards write.
+        like: worlds of the same environment, whose tables are used; None: they are made.
 
     Attributes:
         world: what each is made of.
@@ -46,10 +47,11 @@ class LocalWorlds:
         warm: bool = False,
         in_next_step: bool = False,
         zeros: Zeros = np.zeros,
+        like: LocalWorlds | None = None,
     ) -> None:
         self.world = world
         self.in_next_step = in_next_step
-        self.simulation = Simulation(
+        self.simulation: Simulation = Simulation(
             world.config,
             world.network,
             num_worlds,
@@ -58,6 +60,7 @@ class LocalWorlds:
             observations=None if arrays is None else arrays.observations,
             warm=warm,
             zeros=zeros,
+            like=None if like is None else like.simulation,
         )
         if arrays is None:
             arrays = _own_arrays(self.simulation, num_worlds)
