@@ -41,23 +41,18 @@ class HostedZones:
         self._shards = [self._all[zone] for zone in sorted(zones)]
         self._together = [ShardGroup(self._shards)] if self._shards else []
         self._alone: list[ShardGroup] = []
+        self._sides: tuple[int, int] | None = None  # as far as they have been told here
 
-    def take(self, zones: Sequence[int], side: int, next_side: int) -> None:
-        """Run these zones from now on.
-
-        Args:
-            zones: all of them.
-            side: where the rows are.
-            next_side: where the next ones are.
-        """
+    def take(self, zones: Sequence[int]) -> None:
+        """Run these zones from now on, and no others."""
         self._collect(zones)
-        for shard in self._shards:
-            shard.face(side, next_side)
 
     def face(self, side: int, next_side: int) -> None:
-        """Say on which side the rows are, and the next ones."""
-        for group in self._together:
-            group.face(side, next_side)
+        """Say on which side the rows are, and the next ones; where others call the phases."""
+        if self._sides != (side, next_side):
+            self._sides = side, next_side
+            for shard in self._shards:
+                shard.face(side, next_side)
 
     def each(self, name: str, *arguments: Any) -> None:
         """Run a phase on all shards."""

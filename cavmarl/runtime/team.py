@@ -114,7 +114,7 @@ class Leader:
 
     def take(self, zones: Sequence[int]) -> None:
         """From now on these zones are its own; the others are the followers'."""
-        self._own.take(zones, *self._everybody.sides)
+        self._own.take(zones)
 
     def each(self, phase: Phase, *arguments: Any) -> None:
         """Run a phase on every shard.
@@ -193,7 +193,7 @@ class Follower:
 
     def take(self, zones: Sequence[int]) -> None:
         """From now on these zones are its own."""
-        self._own.take(zones, self._leader.item(SIDE), self._leader.item(NEXT_SIDE))
+        self._own.take(zones)
 
     def _get_out_of_the_way(self) -> None:
         """Leave the core of those before in the team: they wait for this one, and it for them.

@@ -15,7 +15,7 @@ from cavmarl.errors import ConfigError
 from cavmarl.roads.zone_statistics import zone_statistics
 from cavmarl.worlds import World
 
-__all__ = ["Part", "parts_of", "share_out"]
+__all__ = ["Part", "make_plans", "parts_of", "share_out"]
 
 # Of a zone in which no lane lies, as a length of lanes: it is looked at in every tick.
 _EMPTY_KM = 0.01
@@ -50,7 +50,7 @@ class Part(NamedTuple):
         ]
 
 
-def share_out(
+def make_plans(
     world: World,
     num_worlds: int,
     workers: int,
@@ -91,11 +91,16 @@ def share_out(
     ]
 
 
+def share_out(world: World, num_worlds: int, workers: int) -> list[Part]:
+    """What idle workers run; arguments and errors as of `make_plans`."""
+    return parts_of(make_plans(world, num_worlds, workers), world.partition.count)
+
+
 def parts_of(plans: Sequence[Plan], num_zones: int) -> list[Part]:
     """What the workers of each team run.
 
     Args:
-        plans: of all worlds; see `share_out`.
+        plans: of all worlds; see `make_plans`.
         num_zones: of each world.
     """
     parts = []

@@ -13,7 +13,7 @@ from cavmarl.balance.plan import Plan
 from cavmarl.balance.probe import Watch, take_snapshot
 from cavmarl.balance.problem import BalanceRule, ShardCost
 from cavmarl.balance.snapshot import Snapshot, idle_snapshot
-from cavmarl.stepping.parts import share_out
+from cavmarl.stepping.parts import make_plans
 from cavmarl.worlds import World
 
 __all__ = ["Placement"]
@@ -40,7 +40,7 @@ class Placement:
         self._ticks_per_step = world.config.clock.ticks_per_step
         self._watches = settings.watch
         seen = take_snapshot(dict.fromkeys(range(workers))) if settings.watch else None
-        plans = share_out(world, num_worlds, workers, seen, self._rule)
+        plans = make_plans(world, num_worlds, workers, seen, self._rule)
         self._balancers = [Balancer(plan.problem) for plan in plans]
         self._watch: Watch | None = None
         self._pids: Mapping[int, int] = {}

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from cavmarl import ConfigError, make_vec
-from cavmarl.stepping.parts import parts_of, share_out
+from cavmarl.stepping.parts import share_out
 from cavmarl.worlds import load_world
 from tests.runtime.test_pool import alive
 from tests.stepping.vec_runs import STEPS, Make, drive, pool_of, same
@@ -130,7 +130,7 @@ def test_what_only_one_process_can(name: str) -> None:
 @pytest.mark.parametrize(("worlds", "workers"), [(1, 2), (2, 3), (3, 7), (4, 2), (5, 5), (1, 9)])
 def test_everything_has_one_worker(worlds: int, workers: int) -> None:
     world = load_world("town", zones=9)
-    parts = parts_of(share_out(world, worlds, workers), 9)
+    parts = share_out(world, worlds, workers)
     assert [w for part in parts for w in range(part.first, part.last)] == list(range(worlds))
     assert sum(len(part.zones) for part in parts) == workers
     assert sum(len(part.names) for part in parts) == workers
