@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -13,6 +14,8 @@ from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
 from cavmarl.actions import ActionDecoder
+from cavmarl.balance.plan import Plan
+from cavmarl.balance.plan_text import describe_plan
 from cavmarl.errors import ConfigError, ResetNeededError
 from cavmarl.registry import load_config
 from cavmarl.runtime.simulation import Simulation
@@ -26,6 +29,8 @@ from cavmarl.worlds import check_agents, check_workers, make_world
 __all__ = ["CavVectorEnv", "make_vec"]
 
 MAX_WORLDS = 65_536
+
+log = logging.getLogger("cavmarl.workers")
 
 StepResult = tuple[
     NDArray[np.float32],
@@ -173,6 +178,18 @@ class CavVectorEnv:
         return self.config.clock.ctrl_dt_s
 
     @property
+    def plans(self) -> tuple[Plan, ...]:
+        """Which worker hosts which worlds, or zones of each world; empty without workers.
+
+        See docs/balance.md; where worlds or zones move, it is the present plan.
+        """
+        return self.worlds.plans
+
+    def plan_text(self) -> str:
+        """The plans as tables; each full reset logs them (`cavmarl.workers`, INFO)."""
+        return "\n\n".join(map(describe_plan, self.plans))
+
+    @property
     def simulation(self) -> Simulation:
         """The worlds behind this view, for tools that draw or measure them.
 
@@ -207,6 +224,8 @@ class CavVectorEnv:
             seed = first_seed(seed, self._first_seed)
         self.worlds.arrays.chosen[:] = chosen
         self.worlds.reset(seed, first_world)
+        if chosen.all() and self.plans:
+            log.info("%s", self.plan_text())
         self._decoder.forget(chosen)
         self._mask = self.worlds.arrays.mask.copy()
         self._ready = True

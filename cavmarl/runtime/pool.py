@@ -120,6 +120,10 @@ class Pool:
         """Let all workers do nothing: an empty barrier."""
         self.run(NOTHING, commits=False)
 
+    def rename(self, parts: tuple[str, ...]) -> None:
+        """Say anew what each worker hosts, in words."""
+        self._program = self._program._replace(parts=parts)
+
     def close(self) -> None:
         """End all processes and give the memory back; what is mapped stays readable."""
         self._finalizer()

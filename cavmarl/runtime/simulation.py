@@ -107,6 +107,7 @@ class Simulation:
         observations: (W, A, D) float32, where the agents' are written; None: made for them.
         warm: call every kernel now, so that none is loaded in a step.
         zeros: makes the arrays that shards write.
+        like: worlds of the same environment, whose tables are used; None: they are made.
 
     Attributes:
         everywhere: (W,) all of the worlds.
@@ -123,6 +124,7 @@ class Simulation:
         observations: NDArray[np.float32] | None = None,
         warm: bool = False,
         zeros: Zeros = np.zeros,
+        like: Simulation | None = None,
     ) -> None:
         self.config = config
         self.network = network
@@ -136,19 +138,23 @@ class Simulation:
         self.transfers: tuple[TransferLog, ...] = ()
         with first_compilation() as is_first:
             blank = blank_vehicle()
-            traffic = NativeTraffic(
-                network,
-                config.traffic,
-                config.population,
-                blank,
-                config.clock.sim_dt_s,
-                config.horizon_s,
-                demand,
-                num_worlds,
-                zeros,
+            traffic = (
+                NativeTraffic(
+                    network,
+                    config.traffic,
+                    config.population,
+                    blank,
+                    config.clock.sim_dt_s,
+                    config.horizon_s,
+                    demand,
+                    num_worlds,
+                    zeros,
+                )
+                if like is None
+                else like._traffic.for_worlds(num_worlds)
             )
             capacity = traffic.capacity
-            self._traffic = traffic
+            self._traffic: NativeTraffic = traffic
             self._gate = make_gate(num_worlds, capacity, network.arrays, blank.dtype)
             self._commons = Commons(config, network, num_worlds, observations, zeros)
             self._shards, self._division = divide(
@@ -250,6 +256,10 @@ class Simulation:
         halo_m, coordination = self.zone_loads().halo_m, self._coordination
         transfers = () if coordination is None else coordination.in_flight(world)
         return view_zones(self._shards, self.partition, halo_m, world, transfers)
+
+    def running(self) -> NDArray[np.int64]:
+        """(W,) vehicles of each world."""
+        return self._division.running()
 
     def ghosts(self, zone: int, world: int = 0) -> NDArray[np.void]:
         """What a zone sees of other zones' vehicles: VEHICLE (n,), a view that cannot be written.
@@ -397,15 +407,18 @@ class Simulation:
         """From now on let somebody else run the phases of the shards, as `make` returns it."""
         self._executor = make(self._shards)
 
-    def time_shards(self) -> ShardClock:
+    def time_shards(self, every: int = 1) -> ShardClock:
         """From now on run phases zone by zone, with a clock on each.
+
+        Args:
+            every: one tick of so many; the others as ever.
 
         Raises:
             ConfigError: hosts die by plan, and what is repeated would be counted, too.
         """
         if self._recovery is not None:
             raise ConfigError("zones.faults: shards are timed where no host dies; leave it out")
-        clock = ShardClock(self._shards)
+        clock = ShardClock(self._shards, every)
         self._executor = clock
         return clock
 
@@ -509,6 +522,23 @@ class Simulation:
         self.seed(*roots.tolist())
         self._episodes[:] = episodes
         self._gate = snapshot.load(self._parts(), rest)
+
+    def share_of(self, world: int) -> list[NDArray[Any]]:
+        """What `save` would give if there were no world but one; views, to be copied."""
+        roots = np.array([self._seed, self._first_world + world], dtype=np.int64)
+        episodes = self._episodes[world : world + 1]
+        return [roots, episodes, *snapshot.share_of(self._parts(), world)]
+
+    def join(self, shares: Sequence[Sequence[NDArray[Any]]]) -> list[NDArray[Any]]:
+        """What `load` takes, of worlds of which each share has been one by itself.
+
+        Args:
+            shares: what `share_of` gave, of worlds that follow each other.
+        """
+        episodes = np.concatenate([share[1] for share in shares])
+        return [
+            shares[0][0], episodes, *snapshot.join(self._parts(), [share[2:] for share in shares])
+        ]  # fmt: skip
 
     def _parts(self) -> snapshot.Parts:
         return snapshot.Parts(

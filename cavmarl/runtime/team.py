@@ -18,6 +18,7 @@ from operator import is_
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from cavmarl.runtime.barrier import (
     NUMBER,
@@ -29,6 +30,7 @@ from cavmarl.runtime.barrier import (
     wait_for,
 )
 from cavmarl.runtime.executor import Phase
+from cavmarl.runtime.hosted import HostedZones
 from cavmarl.runtime.shared_memory import shared_zeros
 from cavmarl.shard.group import ShardGroup
 from cavmarl.shard.shard import Shard
@@ -58,9 +60,10 @@ class Team:
 
     Args:
         shards: one a zone, in the order of zones; their arrays are shared.
-        zones: of each worker, at least one each; the first leads.
+        zones: of each worker, to begin with; the first leads.
         known: what phases are called with that are run together, by their names: for each phase all
             that there is to choose from; the arrays among it are shared.
+        spent_s: (k,) where the processor time of each zone is added up; None: nobody asks for it.
     """
 
     def __init__(
@@ -68,10 +71,11 @@ class Team:
         shards: Sequence[Shard],
         zones: Sequence[Sequence[int]],
         known: Mapping[str, Sequence[tuple[Any, ...]]],
+        spent_s: NDArray[np.float64] | None = None,
     ) -> None:
         self.known = {name: tuple(known.get(name, ((),))) for name in TOGETHER}
         self.everybody = ShardGroup(shards)
-        self.hosts = [ShardGroup([shards[zone] for zone in hosted]) for hosted in zones]
+        self.hosts = [HostedZones(shards, hosted, spent_s) for hosted in zones]
         lines = shared_zeros((len(zones), WORDS), np.int64)
         self.lines: list[Words] = list(lines)
 
@@ -121,6 +125,10 @@ class Leader:
             self._leads = False
             self._wait()
             self._announce(END)
+
+    def take(self, zones: Sequence[int]) -> None:
+        """From now on these zones are its own; the others are the followers'."""
+        self._own.take(zones)
 
     def each(self, phase: Phase, *arguments: Any) -> None:
         """Run a phase on every shard.
@@ -205,6 +213,10 @@ class Follower:
                 break
         if failure is not None:
             raise failure
+
+    def take(self, zones: Sequence[int]) -> None:
+        """From now on these zones are its own."""
+        self._own.take(zones)
 
     def _get_out_of_the_way(self) -> None:
         """Leave the core of those before in the team: they wait for this one, and it for them.

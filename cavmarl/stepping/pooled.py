@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import cavmarl.errors
+from cavmarl.balance.plan import Plan
 from cavmarl.config import ZonesConfig
 from cavmarl.errors import (
     CavmarlError,
@@ -26,7 +27,9 @@ from cavmarl.shard.shard import Commands
 from cavmarl.stepping.arrays import StepArrays, layout_of
 from cavmarl.stepping.diary import make_segments
 from cavmarl.stepping.job import Task, fingerprint
-from cavmarl.stepping.parts import share_out
+from cavmarl.stepping.mover import Mover
+from cavmarl.stepping.parts import Part, parts_of
+from cavmarl.stepping.placement import Placement
 from cavmarl.worlds import World
 
 __all__ = ["PooledWorlds"]
@@ -49,6 +52,8 @@ class PooledWorlds:
         arrays: in shared memory; each worker writes those of its worlds.
         pool: the processes.
         in_next_step: when worlds begin anew.
+        placement: who hosts what.
+        mover: has that changed; None: it does not change.
 
     Raises:
         ConfigError: a setting that worlds of several processes cannot have, or more of those than
@@ -68,7 +73,8 @@ class PooledWorlds:
         self.in_next_step = in_next_step
         config = world.config
         _check(config.zones)
-        parts = share_out(world, num_worlds, workers)
+        self.placement = Placement(world, num_worlds, workers)
+        parts = parts_of(self.placement.plans, world.partition.count)
         cores = len(usable_cores())
         if workers > cores:
             warnings.warn(
@@ -87,6 +93,7 @@ class PooledWorlds:
             segment.close()
             raise
         diaries = [make_segments(config) if len(part.zones) > 1 else [] for part in parts]
+        self.mover = self._make_mover(num_worlds, workers)
         recipe = {
             "config": asdict(config),
             "base_dir": str(base_dir.resolve()),
@@ -96,21 +103,33 @@ class PooledWorlds:
             "in_next_step": in_next_step,
             "parts": parts,
             "diaries": [[one.fd for one in diary] for diary in diaries],
+            "mover": None if self.mover is None else self.mover.recipe,
         }
-        named = tuple(name for part in parts for name in part.names)
         tasks = tuple(task.name.lower().replace("_", " ") for task in Task)
         leaders = [0, *accumulate(len(part.zones) for part in parts)]
         teams = tuple(tuple(range(*bounds)) for bounds in pairwise(leaders))
-        segments = (segment, *(one for diary in diaries for one in diary))
-        program = Program(PROGRAM, recipe, named, segments, tasks, config.workers.pin, teams)
+        moving = () if self.mover is None else self.mover.segments
+        segments = (segment, *(one for diary in diaries for one in diary), *moving)
+        pins = config.workers.pin
+        program = Program(PROGRAM, recipe, _names(parts), segments, tasks, pins, teams)
         try:
             self.pool = Pool(program, config.workers.timeout_s, config.workers.repeats)
         except WorkerFailureError as failure:
             raise _own(failure) from failure
         self._steps = 0
-        self._asked = [
-            k for k, part in zip(leaders, parts, strict=False) for _ in range(part.first, part.last)
-        ]
+        self._asked = _leaders(parts)
+        self.placement.watch(self._pids())
+
+    def _make_mover(self, num_worlds: int, workers: int) -> Mover | None:
+        every = self.world.config.workers.balance_steps
+        if not every or workers == 1:
+            return None
+        return Mover(self.placement, num_worlds, self.world.partition.count, workers, every)
+
+    @property
+    def plans(self) -> tuple[Plan, ...]:
+        """Who hosts what now."""
+        return self.placement.plans
 
     @property
     def simulation(self) -> Simulation:
@@ -134,6 +153,7 @@ class PooledWorlds:
 
     def step(self, commands: Commands) -> None:
         """Let the agents act, and reset the worlds whose episode is over, now or a step later."""
+        self._move()
         self.arrays.controls[:] = commands.controls
         self.arrays.meta_actions[:] = commands.meta_actions
         self._run(Task.STEP)
@@ -156,6 +176,18 @@ class PooledWorlds:
         """End the processes."""
         self.pool.close()
 
+    def _move(self) -> None:
+        """Let worlds or zones change their worker, if it is time."""
+        if self.mover is None:
+            return
+        parts = self.mover.before_step(self._run, self._pids)
+        if parts is not None:
+            self._asked = _leaders(parts)
+            self.pool.rename(_names(parts))
+
+    def _pids(self) -> dict[int, int]:
+        return dict(enumerate(self.pool.pids))
+
     def _run(self, task: Task, letter: Any = None, commits: bool = True) -> None:
         try:
             self.pool.run(task, letter, commits)
@@ -169,6 +201,17 @@ class PooledWorlds:
         """Of the worker that hosts a world; numbers from the end count as they do for arrays."""
         number = range(len(self.arrays.mask))[world]
         return self.pool.ask(self._asked[number], task, number)
+
+
+def _names(parts: list[Part]) -> tuple[str, ...]:
+    """What each worker runs, in words."""
+    return tuple(name for part in parts for name in part.names)
+
+
+def _leaders(parts: list[Part]) -> list[int]:
+    """Who answers for each world."""
+    firsts = [0, *accumulate(len(part.zones) for part in parts)]
+    return [k for k, part in zip(firsts, parts, strict=False) for _ in range(part.first, part.last)]
 
 
 def _check(zones: ZonesConfig) -> None:

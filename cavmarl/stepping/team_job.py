@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from typing import Any
 
+import numpy as np
 from numpy.typing import NDArray
 
 from cavmarl.runtime.team import Follower, Leader, Team
@@ -26,15 +27,23 @@ class LeaderJob(WorldsJob):
     Args:
         worlds: the one; what its shards write is shared.
         first: its number among all.
-        zones: that each worker hosts; the leader's first.
+        zones: that each worker hosts, to begin with; the leader's first.
         diary: in which it leaves the state behind.
+        spent_s: (k,) where the processor time of each zone is added up; None: nobody asks for it.
     """
 
     def __init__(
-        self, worlds: LocalWorlds, first: int, zones: Sequence[Sequence[int]], diary: Diary
+        self,
+        worlds: LocalWorlds,
+        first: int,
+        zones: Sequence[Sequence[int]],
+        diary: Diary,
+        spent_s: NDArray[np.float64] | None = None,
     ) -> None:
         super().__init__(worlds, first)
         self._zones = zones
+        self._hosts = _hosts(zones)
+        self._spent_s = spent_s
         self._diary = diary
         self._is_behind = False  # it is where the diary begins, and not where that ends
         worlds.simulation.host(self._gather)
@@ -50,14 +59,15 @@ class LeaderJob(WorldsJob):
             "credit": chosen,
             "suggest": [(self._worlds.arrays.suggested,)],
         }
-        self._team = Team(shards, self._zones, known)
+        self._team = Team(shards, self._zones, known, self._spent_s)
         self._leader = Leader(self._team)
         return self._leader
 
     def followers(self) -> Iterator[FollowerJob]:
         """The jobs of the other workers."""
         for number in range(1, len(self._zones)):
-            yield FollowerJob(Follower(self._team, number))
+            follower = Follower(self._team, number)
+            yield FollowerJob(follower, self._first, number, self._hosts.copy())
 
     def prepare(self) -> None:
         """Whoever has led is dead, and so are those who followed."""
@@ -68,6 +78,9 @@ class LeaderJob(WorldsJob):
         if task in ALONE:
             self._catch_up()
             return super().perform(task, letter)
+        if task == Task.HOST:
+            self._host(_hosts(letter[self._first]))
+            return None
         diary = self._diary
         with self._leader.order():
             self._catch_up()
@@ -87,38 +100,72 @@ class LeaderJob(WorldsJob):
             for commands in self._diary.steps():
                 self._worlds.step(commands)
 
+    def _host(self, hosts: NDArray[np.int64]) -> None:
+        """Let zones be run by these workers from now on."""
+        self._hosts[:] = hosts
+        self._leader.take(np.flatnonzero(hosts == 0).tolist())
+
     def save(self) -> list[NDArray[Any]]:
-        """Where to begin in the diary."""
-        return [self._diary.place]
+        """Where to begin in the diary, and who hosts which zone."""
+        return [self._diary.place, self._hosts]
 
     def load(self, saved: Sequence[NDArray[Any]]) -> None:
         """Go on from what `save` gave; the steps since the last image wait for a task."""
         diary, worlds = self._diary, self._worlds
         diary.place[:] = saved[0]
+        self._host(saved[1])
         worlds.load(diary.state(worlds.save()))
         self._is_behind = True
 
 
 class FollowerJob:
-    """Some zones of one world, of which another worker has the rest.
+    """Some zones of one world, of which other workers have the rest.
 
     Args:
         follower: that runs their phases.
+        world: the world's number among all.
+        number: in the team, from 1.
+        hosts: (k,) number in the team of each zone's worker.
     """
 
-    def __init__(self, follower: Follower) -> None:
+    def __init__(
+        self, follower: Follower, world: int, number: int, hosts: NDArray[np.int64]
+    ) -> None:
         self._follower = follower
+        self._world = world
+        self._number = number
+        self._hosts = hosts
 
     def prepare(self) -> None:
         """Nothing to do."""
 
     def perform(self, task: int, letter: Any) -> None:
         """Help the leader with a task."""
-        self._follower.follow()
+        if task == Task.HOST:
+            self._host(_hosts(letter[self._world]))
+        else:
+            self._follower.follow()
+
+    def _host(self, hosts: NDArray[np.int64]) -> None:
+        self._hosts[:] = hosts
+        self._follower.take(np.flatnonzero(hosts == self._number).tolist())
 
     def save(self) -> list[NDArray[Any]]:
-        """Nothing: the leader keeps the state."""
-        return []
+        """Who hosts which zone; the leader keeps the rest of the state."""
+        return [self._hosts]
 
     def load(self, saved: Sequence[NDArray[Any]]) -> None:
-        """Nothing to do."""
+        """Go on from what `save` gave."""
+        self._host(saved[0])
+
+
+def _hosts(zones: Sequence[Sequence[int]]) -> NDArray[np.int64]:
+    """(k,) number in the team of each zone's worker.
+
+    Args:
+        zones: of each worker.
+    """
+    hosts = np.zeros(sum(map(len, zones)), dtype=np.int64)
+    for number, hosted in enumerate(zones):
+        hosts[list(hosted)] = number
+    return hosts

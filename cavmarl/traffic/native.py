@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from copy import copy
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -80,6 +81,15 @@ class NativeTraffic:
         # Trips that do not exist are refused when the world is made, not at its first reset.
         _ = self.demand
         self._check_room()
+
+    def for_worlds(self, num_worlds: int) -> NativeTraffic:
+        """The same for another number of worlds, with the tables that all worlds share."""
+        other = copy(self)
+        object.__setattr__(other, "num_worlds", num_worlds)
+        for name in ("travel", "_slots", "rerouting"):  # each world has its part of them
+            vars(other).pop(name, None)
+        other._check_room()
+        return other
 
     @cached_property
     def goal_edges(self) -> NDArray[np.int32]:

@@ -73,6 +73,7 @@ def test_zones_change_nothing_else(folder: Path) -> None:
     whole = evaluate("grid4x4", "idm", seed=2, repeats=2, **SMALL)
     assert whole["idm"].transfers is None
     assert whole["idm"]["zone_imbalance"].mean is None
+    assert [run.zone_time_imbalance for run in whole["idm"].speed] == [None, None]
     divided = load_report(folder)["idm"].metrics
     alike = [name for name in divided if name != "zone_imbalance"]
     assert [divided[name] for name in alike] == [whole["idm"][name] for name in alike]
@@ -96,6 +97,9 @@ def test_each_episode_tells_how_unevenly_vehicles_are_shared_out(
     one = {"zones.count": 4, "zones.layout": str(tmp_path / "zones.json")}
     crowded = evaluate("grid4x4", "idm", overrides=one, **{**SMALL, "episodes": 1})
     assert crowded["idm"]["zone_imbalance"].mean == 4.0
+    (speed,) = crowded["idm"].speed
+    assert speed.zone_time_imbalance is not None
+    assert 2.0 < speed.zone_time_imbalance <= 4.0
 
 
 def test_an_undivided_world_leaves_no_file(tmp_path: Path) -> None:
