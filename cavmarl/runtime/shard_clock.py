@@ -24,8 +24,8 @@ class ShardClock:
 
     Args:
         shards: one a zone, in the order of zones.
-        every: one tick of so many is run zone by zone, and its time stands for the others. The first
-            one of them is not counted: it makes ready what the others use.
+        every: one tick of so many is run zone by zone, and its time stands for the others. The
+            first one of them is not counted: it makes ready what the others use.
     """
 
     def __init__(self, shards: Sequence[Shard], every: int = 1) -> None:
