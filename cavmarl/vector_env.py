@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -29,8 +28,6 @@ from cavmarl.worlds import check_agents, check_workers, make_world
 __all__ = ["CavVectorEnv", "make_vec"]
 
 MAX_WORLDS = 65_536
-
-log = logging.getLogger("cavmarl.workers")
 
 StepResult = tuple[
     NDArray[np.float32],
@@ -178,6 +175,15 @@ class CavVectorEnv:
         return self.config.clock.ctrl_dt_s
 
     @property
+    def simulation(self) -> Simulation:
+        """The worlds behind this view, for tools that draw or measure them.
+
+        Raises:
+            ConfigError: they live in worker processes.
+        """
+        return self.worlds.simulation
+
+    @property
     def plans(self) -> tuple[Plan, ...]:
         """Which worker hosts which worlds, or zones of each world; empty without workers.
 
@@ -188,15 +194,6 @@ class CavVectorEnv:
     def plan_text(self) -> str:
         """The plans as tables; each full reset logs them (`cavmarl.workers`, INFO)."""
         return "\n\n".join(map(describe_plan, self.plans))
-
-    @property
-    def simulation(self) -> Simulation:
-        """The worlds behind this view, for tools that draw or measure them.
-
-        Raises:
-            ConfigError: they live in worker processes.
-        """
-        return self.worlds.simulation
 
     def reset(
         self, seed: int | None = None, options: dict[str, Any] | None = None
@@ -224,8 +221,6 @@ class CavVectorEnv:
             seed = first_seed(seed, self._first_seed)
         self.worlds.arrays.chosen[:] = chosen
         self.worlds.reset(seed, first_world)
-        if chosen.all() and self.plans:
-            log.info("%s", self.plan_text())
         self._decoder.forget(chosen)
         self._mask = self.worlds.arrays.mask.copy()
         self._ready = True

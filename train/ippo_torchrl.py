@@ -275,8 +275,7 @@ def train(args: Args) -> Path:
     worlds = make_worlds(args)
     network, config = make_network(args, worlds)
     args.folder.mkdir(parents=True, exist_ok=True)
-    vec = worlds.vec
-    begin_training(args.folder, "ippo_torchrl.py", asdict(args), vec.worlds.world, vec.plans)
+    begin_training(args.folder, "ippo_torchrl.py", asdict(args), worlds.vec.worlds.world)
     learner, curve = Learner(network, args), Curve(args.folder / CURVE_FILE)
     frames = args.num_worlds * args.num_steps
     collector = Collector(worlds, learner.actor, frames_per_batch=frames, total_frames=-1)

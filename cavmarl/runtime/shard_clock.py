@@ -24,7 +24,8 @@ class ShardClock:
 
     Args:
         shards: one a zone, in the order of zones.
-        every: one tick of so many is run zone by zone, and its time stands for the others.
+        every: one tick of so many is run zone by zone, and its time stands for the others. The
+            first one of them is not counted: it makes ready what the others use.
     """
 
     def __init__(self, shards: Sequence[Shard], every: int = 1) -> None:
@@ -43,7 +44,7 @@ class ShardClock:
         for zone, host in enumerate(self._hosts):
             began = time.thread_time_ns()
             host.each(phase, *arguments)
-            if phase not in NOT_OF_A_TICK:
+            if phase not in NOT_OF_A_TICK and self._ticks > self._every:
                 self._spent_ns[zone] += time.thread_time_ns() - began
 
     def take_s(self) -> NDArray[np.float64]:

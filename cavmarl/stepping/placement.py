@@ -4,17 +4,20 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from cavmarl.balance.balancer import Balancer
 from cavmarl.balance.plan import Plan
-from cavmarl.balance.probe import Watch, take_snapshot
 from cavmarl.balance.problem import BalanceRule, ShardCost
 from cavmarl.balance.snapshot import Snapshot, idle_snapshot
 from cavmarl.stepping.parts import make_plans
 from cavmarl.worlds import World
+
+if TYPE_CHECKING:
+    from cavmarl.balance.probe import Watch
 
 __all__ = ["Placement"]
 
@@ -39,7 +42,7 @@ class Placement:
         self._rule = BalanceRule(tolerance=settings.tolerance, max_moves=settings.max_moves)
         self._ticks_per_step = world.config.clock.ticks_per_step
         self._watches = settings.watch
-        seen = take_snapshot(dict.fromkeys(range(workers))) if settings.watch else None
+        seen = _present_snapshot(workers) if settings.watch else None
         plans = make_plans(world, num_worlds, workers, seen, self._rule)
         self._balancers = [Balancer(plan.problem) for plan in plans]
         self._watch: Watch | None = None
@@ -63,6 +66,8 @@ class Placement:
             pids: of the workers' processes.
         """
         if self._watches:
+            from cavmarl.balance.probe import Watch  # psutil is only needed here
+
             self._watch, self._pids = Watch(pids), dict(pids)
 
     def round(self, spent_s: Floats, steps: int, pids: Mapping[int, int]) -> bool:
@@ -115,3 +120,10 @@ class Placement:
         if watch is None or before != pids:
             return idle_snapshot(len(pids))
         return watch.snapshot()
+
+
+def _present_snapshot(workers: int) -> Snapshot:
+    """How busy this machine is before the workers are started."""
+    from cavmarl.balance.probe import take_snapshot
+
+    return take_snapshot(dict.fromkeys(range(workers)))

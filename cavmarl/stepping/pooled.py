@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import warnings
 from dataclasses import asdict
 from itertools import accumulate, pairwise
@@ -10,6 +11,7 @@ from typing import Any
 
 import cavmarl.errors
 from cavmarl.balance.plan import Plan
+from cavmarl.balance.plan_text import describe_plan
 from cavmarl.config import ZonesConfig
 from cavmarl.errors import (
     CavmarlError,
@@ -35,6 +37,8 @@ from cavmarl.worlds import World
 __all__ = ["PooledWorlds"]
 
 PROGRAM = "cavmarl.stepping.worker"
+
+log = logging.getLogger("cavmarl.workers")
 
 
 class PooledWorlds:
@@ -150,6 +154,7 @@ class PooledWorlds:
         self._run(Task.RESET, {"seed": seed, "first_world": first_world})
         if self.arrays.chosen.all():
             self._steps = 0
+            log.info("%s", "\n\n".join(map(describe_plan, self.plans)))
 
     def step(self, commands: Commands) -> None:
         """Let the agents act, and reset the worlds whose episode is over, now or a step later."""
@@ -203,17 +208,6 @@ class PooledWorlds:
         return self.pool.ask(self._asked[number], task, number)
 
 
-def _names(parts: list[Part]) -> tuple[str, ...]:
-    """What each worker runs, in words."""
-    return tuple(name for part in parts for name in part.names)
-
-
-def _leaders(parts: list[Part]) -> list[int]:
-    """Who answers for each world."""
-    firsts = [0, *accumulate(len(part.zones) for part in parts)]
-    return [k for k, part in zip(firsts, parts, strict=False) for _ in range(part.first, part.last)]
-
-
 def _check(zones: ZonesConfig) -> None:
     """Refuse what only worlds of one process can have.
 
@@ -235,3 +229,14 @@ def _own(failure: WorkerFailureError) -> CavmarlError:
         return failure
     takes_text = "__init__" not in vars(kind)
     return kind(failure.text) if takes_text else failure
+
+
+def _names(parts: list[Part]) -> tuple[str, ...]:
+    """What each worker runs, in words."""
+    return tuple(name for part in parts for name in part.names)
+
+
+def _leaders(parts: list[Part]) -> list[int]:
+    """Who answers for each world."""
+    firsts = [0, *accumulate(len(part.zones) for part in parts)]
+    return [k for k, part in zip(firsts, parts, strict=False) for _ in range(part.first, part.last)]

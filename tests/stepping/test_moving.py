@@ -225,7 +225,7 @@ def test_workers_that_others_keep_busy(monkeypatch: pytest.MonkeyPatch) -> None:
     busy = Snapshot(
         (Candidate(0, Utilisation(0.1, 0.1)), Candidate(1, Utilisation(0.9, 0.1))), "none", ""
     )
-    monkeypatch.setattr("cavmarl.stepping.placement.take_snapshot", lambda workers: busy)
+    monkeypatch.setattr("cavmarl.balance.probe.take_snapshot", lambda workers: busy)
     with pytest.raises(NoAdmissibleWorkerError, match=r"worker 1.*cpu.*fewer workers"):
         make_vec("ring", num_envs=4, workers=2, overrides={"workers.watch": True})
 
