@@ -219,9 +219,9 @@ class Meeting:
         if self.announce(number):
             self.wake()
 
-    def announce(self, number: int) -> bool:
-        """Come to a number; whether the other side sleeps, and has to be woken."""
-        return bool(_set(self.mine, NUMBER, number, self.theirs))
+    def announce(self, number: int) -> int:
+        """Come to a number; not 0: the other side sleeps, and has to be woken."""
+        return _set(self.mine, NUMBER, number, self.theirs)
 
     def wake(self) -> None:
         """Wake the other side."""

@@ -6,7 +6,7 @@ import json
 import os
 import select
 import signal
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Collection, Mapping, Sequence
 from contextlib import suppress
 from typing import Any, NamedTuple
 
@@ -17,7 +17,7 @@ from cavmarl.runtime.barrier import NUMBER, WORDS, Meeting, present_core, usable
 from cavmarl.runtime.fork_server import ForkServer, Process, ServerGoneError
 from cavmarl.runtime.placement import keep_apart
 from cavmarl.runtime.shared_memory import Segment
-from cavmarl.runtime.worker import ANSWER, CORE, OUT_OF_MEMORY, SILENT, TASK
+from cavmarl.runtime.worker import ANSWER, CORE, LOADS, OUT_OF_MEMORY, SILENT, TASK
 
 __all__ = ["Crew", "Program"]
 
@@ -99,21 +99,30 @@ class Crew:
         server = self._held.server
         return 0 if server is None else server.pid
 
-    def order(self, heads: Mapping[int, tuple[int, ...]], mail: bytes | None) -> None:
+    def order(
+        self,
+        workers: Sequence[int],
+        head: tuple[int, ...],
+        stale: Sequence[bool],
+        mail: bytes | None,
+    ) -> None:
         """Give workers their next order; that one is dead is noticed later.
 
         Those who look for it have it before anybody is woken, and whoever may take the core that
         this process is on is woken last.
 
         Args:
-            heads: words of each one's order, from TASK to LOADS.
+            workers: which ones.
+            head: words of the order, from TASK to TRUTH.
+            stale: of all workers, whose memory is not what is committed.
             mail: what goes with it.
         """
         asleep = []
-        for k, head in heads.items():
+        for k in workers:
             words = self.orders[k]
-            words[TASK : TASK + len(head)] = head
-            self._send(k, mail)
+            words[TASK : LOADS + 1] = (*head, stale[k])
+            if mail is not None:
+                self._send(k, mail)
             if self._meetings[k].announce(words.item(NUMBER) + 1):
                 asleep.append(k)
         if len(asleep) > 1:

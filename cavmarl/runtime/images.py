@@ -52,6 +52,7 @@ class Image:
         self._segment = segment
         self._memory: mmap.mmap | None = None
         self._words = np.zeros(0, dtype=np.int64)
+        self._begin = 0  # of the first array
         self._places: list[_Place] = []
 
     def write(self, arrays: Arrays) -> None:
@@ -81,8 +82,9 @@ class Image:
             head.extend(array.shape)
         begin = _HEAD + len(head)
         size = begin + sum(map(_num_words, arrays))
-        if self._make_room(_WORD * size):
+        if self._make_room(_WORD * size) or begin != self._begin:
             same = 0
+        self._begin = begin
         words = self._words
         words[0], words[2] = size, len(arrays)
         words[_HEAD:begin] = head

@@ -15,6 +15,8 @@ from cavmarl.runtime.barrier import usable_cores
 
 __all__ = ["homes", "keep_apart"]
 
+UNKNOWN = -1  # as `barrier.present_core` says it where nothing is compiled
+
 
 def homes(cores: Sequence[int], usable: set[int]) -> list[int]:
     """A core for each process, where it has been if nobody before it has been there, too.
@@ -43,12 +45,13 @@ def keep_apart(pids: Sequence[int], cores: Sequence[int]) -> None:
 
     Args:
         pids: of processes that work at the same time.
-        cores: where each has been found.
+        cores: where each has been found; -1: nobody knows.
     """
-    if len(set(cores)) == len(cores):
+    if len(set(cores)) == len(cores) or UNKNOWN in cores:
         return
     usable = usable_cores()
     found = homes(cores, usable)
     for pid, home in zip(pids, found, strict=False):
-        with suppress(ProcessLookupError):  # others notice that it is dead
+        # Others notice that it is dead; where this is forbidden it goes where the system puts it.
+        with suppress(ProcessLookupError, PermissionError):
             os.sched_setaffinity(pid, usable - set(found) | {home})

@@ -142,7 +142,7 @@ class Pool:
         self._open = workers
         self._ordered_s = time.monotonic()
         head = (task, mail is not None, slot, self._truth)
-        self._crew.order({k: (*head, self._stale[k]) for k in workers}, mail)
+        self._crew.order(workers, head, self._stale, mail)
         self._await(workers, mail)
         answers = self._read(workers)
         for k in workers:

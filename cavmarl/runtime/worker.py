@@ -230,7 +230,7 @@ def _obey(job: Job, meeting: Meeting, slots: Sequence[Image]) -> NoReturn:
         order = int(mine[NUMBER]) + 1
         _await(meeting, order, time.perf_counter() - began)
         began = time.perf_counter()
-        mine[CORE] = present_core()
+        core = present_core()
         letter = _receive(meeting.wire) if theirs[LETTER] else None
         try:
             if (is_new or theirs[LOADS]) and theirs[TRUTH] >= 0:
@@ -252,6 +252,7 @@ def _obey(job: Job, meeting: Meeting, slots: Sequence[Image]) -> NoReturn:
             mine[ANSWER] = SILENT if answer is None else ANSWERED
             if answer is not None:
                 meeting.wire.send(MAIL + json.dumps(answer).encode())
+        mine[CORE] = core  # now, and not before: the pool looks at this line all the time
         meeting.post(int(theirs[NUMBER]))
 
 

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
@@ -33,6 +33,7 @@ def arrays(lengths: list[int], seed: int) -> list[NDArray[Any]]:
     return found
 
 
+@settings(deadline=None)
 @given(
     st.integers(1, 6).flatmap(
         lambda count: st.lists(
@@ -60,6 +61,18 @@ def test_more_arrays_or_fewer() -> None:
         image.write(written)
         read = list(image.read([array.dtype for array in written]))
         assert all((a == b).all() for a, b in zip(read, written, strict=True))
+    segment.close()
+
+
+def test_an_array_of_more_dimensions() -> None:
+    segment = Segment.make(64)
+    image = Image(segment)
+    first = np.arange(5)
+    for last in (np.arange(4.0), np.arange(8.0).reshape(2, 2, 2)):
+        image.write([first, last])
+        read = list(image.read([first.dtype, last.dtype]))
+        assert (read[0] == first).all()
+        assert (read[1] == last).all()
     segment.close()
 
 

@@ -43,6 +43,7 @@ def test_those_on_one_core_leave_it_to_each_other(sleepers: list[int]) -> None:
     usable = usable_cores()
     first, second, *_ = sorted(usable)
     keep_apart(sleepers, [first, second])
+    keep_apart(sleepers, [-1, -1])
     assert [os.sched_getaffinity(pid) for pid in sleepers] == [usable, usable]
     keep_apart(sleepers, [second, second])
     assert [os.sched_getaffinity(pid) for pid in sleepers] == [usable - {first}, usable - {second}]
