@@ -90,6 +90,19 @@ class Image:
             yield words[at:end].view(np.uint8)[:num_bytes].view(dtype).reshape(shape)
             at = end
 
+    def content(self) -> NDArray[np.uint8]:
+        """(n,) What has been written, as bytes; a view."""
+        return self._words[: self._words[0]].view(np.uint8)
+
+    def put(self, content: NDArray[np.uint8]) -> None:
+        """Take over the content of another image, perhaps from another machine.
+
+        Raises:
+            OSError: there is no memory for it.
+        """
+        self._make_room(content.size)
+        self._words.view(np.uint8)[: content.size] = content
+
     def _make_room(self, size: int) -> None:
         if size > _WORD * len(self._words):
             self._segment.grow(-(-size * 5 // 4 // mmap.PAGESIZE) * mmap.PAGESIZE)

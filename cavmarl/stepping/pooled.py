@@ -29,7 +29,7 @@ from cavmarl.stepping.job import Task, fingerprint
 from cavmarl.stepping.parts import share_out
 from cavmarl.worlds import World
 
-__all__ = ["PooledWorlds"]
+__all__ = ["PooledWorlds", "check_zones", "own_error"]
 
 PROGRAM = "cavmarl.stepping.worker"
 
@@ -67,7 +67,7 @@ class PooledWorlds:
         self.world = world
         self.in_next_step = in_next_step
         config = world.config
-        _check(config.zones)
+        check_zones(config.zones)
         parts = share_out(world, num_worlds, workers)
         cores = len(usable_cores())
         if workers > cores:
@@ -106,7 +106,7 @@ class PooledWorlds:
         try:
             self.pool = Pool(program, config.workers.timeout_s, config.workers.repeats)
         except WorkerFailureError as failure:
-            raise _own(failure) from failure
+            raise own_error(failure) from failure
         self._steps = 0
         self._asked = [
             k for k, part in zip(leaders, parts, strict=False) for _ in range(part.first, part.last)
@@ -160,7 +160,7 @@ class PooledWorlds:
         try:
             self.pool.run(task, letter, commits)
         except WorkerFailureError as failure:
-            raise _own(failure) from failure
+            raise own_error(failure) from failure
         except WorkerDeathError as death:
             death.add_note(f"in step {self._steps + 1} since the reset")
             raise
@@ -171,7 +171,7 @@ class PooledWorlds:
         return self.pool.ask(self._asked[number], task, number)
 
 
-def _check(zones: ZonesConfig) -> None:
+def check_zones(zones: ZonesConfig) -> None:
     """Refuse what only worlds of one process can have.
 
     Raises:
@@ -185,7 +185,7 @@ def _check(zones: ZonesConfig) -> None:
             )
 
 
-def _own(failure: WorkerFailureError) -> CavmarlError:
+def own_error(failure: WorkerFailureError) -> CavmarlError:
     """An error that the worlds raise on purpose, as they would raise it in this process."""
     kind = getattr(cavmarl.errors, failure.kind, None)
     if not isinstance(kind, type) or not issubclass(kind, CavmarlError):
