@@ -88,6 +88,13 @@ def verify(
         ),
     ] = None,
     workers: Annotated[int, typer.Option(help="Of --kill, that the worlds are run by.")] = 2,
+    hosts: Annotated[
+        str | None,
+        typer.Option(
+            metavar="ray",
+            help="Of --kill: the workers are actors of a Ray cluster on this machine.",
+        ),
+    ] = None,
     check: Annotated[
         bool, typer.Option("--check", help="Watch the invariants of ownership, too.")
     ] = False,
@@ -110,7 +117,9 @@ def verify(
     With --kill: worlds whose workers are killed beside some that nobody disturbs.
     """
     if replay is not None:
-        given = (zones, steps, layout, agents, background, settings, faults, journal, kill, worlds)
+        given = (
+            zones, steps, layout, agents, background, settings, faults, journal, kill, worlds, hosts,
+        )  # fmt: skip
         if check or any(value is not None for value in given):
             raise ConfigError("--replay: all else stands in the file; beside it goes ENV only")
         run_again(replay, env, json_path)
@@ -128,6 +137,7 @@ def verify(
             kill,
             json_path,
             workers=workers,
+            hosts=hosts,
             worlds=worlds,
             steps=steps,
             seed=seed,
@@ -138,6 +148,8 @@ def verify(
             overrides=overrides | ({"zones.check": True} if check else {}),
         )
         return
+    if hosts is not None:
+        raise ConfigError("--hosts: goes with --kill only")
     worlds = 1 if worlds is None else worlds
     if faults == "campaign":
         check_campaign(layout, worlds, journal)

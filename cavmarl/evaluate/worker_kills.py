@@ -11,15 +11,17 @@ from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from threading import Timer
-from typing import Any
+from typing import Any, Literal
 
 from cavmarl.errors import ConfigError, EvaluationError
 from cavmarl.evaluate.differences import same_bytes, step_results
 from cavmarl.evaluate.machine import describe_hardware
+from cavmarl.hosts.pool import HostPool
 from cavmarl.policies import Policy, load_policy
 from cavmarl.runtime.pool import Death, Pool
 from cavmarl.seeds import check_seed
 from cavmarl.stepping.pooled import PooledWorlds
+from cavmarl.stepping.remote import RemoteWorlds
 from cavmarl.vector_env import CavVectorEnv, make_vec
 
 __all__ = ["Kill", "KillReport", "verify_kills"]
@@ -96,6 +98,7 @@ def verify_kills(
     kills: int,
     *,
     workers: int = 2,
+    hosts: Literal["ray"] | None = None,
     worlds: int | None = None,
     steps: int | None = None,
     seed: int = 0,
@@ -112,6 +115,7 @@ def verify_kills(
         env: as in `make_vec`.
         kills: how many signals; three in four are SIGKILL, the others SIGSTOP.
         workers: over which the worlds are shared out.
+        hosts: "ray": they are actors of a Ray cluster, all on this machine.
         worlds: stepped together; default: two a worker.
         steps: how many; default: three a kill.
         seed: root of all random numbers, those of the kills, too.
@@ -140,7 +144,7 @@ def verify_kills(
         "background": background,
         "overrides": overrides,
     }
-    whole, parted = make_vec(env, **wanted), make_vec(env, workers=workers, **wanted)
+    whole, parted = make_vec(env, **wanted), make_vec(env, workers=workers, hosts=hosts, **wanted)
     try:
         killer = _Killer(_pool(parted), random.Random(seed))
         runs = [_Run(vec, load_policy(policy, vec), seed) for vec in (whole, parted)]
@@ -168,8 +172,8 @@ def verify_kills(
     )  # fmt: skip
 
 
-def _pool(vec: CavVectorEnv) -> Pool:
-    assert isinstance(vec.worlds, PooledWorlds)
+def _pool(vec: CavVectorEnv) -> Pool | HostPool:
+    assert isinstance(vec.worlds, PooledWorlds | RemoteWorlds)
     return vec.worlds.pool
 
 
@@ -199,7 +203,7 @@ class _Killer:
         random: says whose and when.
     """
 
-    def __init__(self, pool: Pool, random: random.Random) -> None:
+    def __init__(self, pool: Pool | HostPool, random: random.Random) -> None:
         self.random = random
         self.found: list[Kill] = []
         self._pool = pool

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import socket
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -14,6 +15,7 @@ from cavmarl.errors import ConfigError, WorkerStartError, require
 __all__ = ["Node", "choose_nodes", "join", "leave", "nodes", "nodes_with"]
 
 ADDRESS = "RAY_ADDRESS"  # the environment's variable that Ray itself reads
+CALL_S = 5.0
 RELEASE_S = 2.0  # Ray hears of an actor's end by and by
 _RESOURCES = ("CPU", "memory", "GPU")
 _joined = 0  # how many have joined by `join`, where the program itself had not
@@ -63,14 +65,26 @@ def join() -> bool:
         return False
     if not ray.is_initialized():
         try:
+            _call(address)
             ray.init(include_dashboard=False, log_to_driver=False, logging_level="ERROR")
-        except (ConnectionError, RuntimeError, ValueError) as error:
+        except (OSError, RuntimeError, ValueError) as error:
             raise WorkerStartError(
                 f"no Ray cluster at {address or 'the address that ray start has left'}: {error}. "
                 f"Start one (ray start --head), or unset {ADDRESS} for one on this machine"
             ) from error
     _joined += 1
     return True
+
+
+def _call(address: str) -> None:
+    """See whether somebody listens there: Ray would try for minutes.
+
+    Raises:
+        OSError: nobody does.
+    """
+    host, colon, port = address.rpartition(":")
+    if colon and port.isdigit():
+        socket.create_connection((host, int(port)), CALL_S).close()
 
 
 def leave() -> None:

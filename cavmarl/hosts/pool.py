@@ -38,6 +38,7 @@ __all__ = ["HostPool", "HostProgram"]
 Array = NDArray[Any]
 Arrays = Sequence[Array]
 
+COMES_S = 300.0  # a machine that has never run cavmarl compiles it first
 IMAGE_EVERY = 8  # orders that are noted: a successor repeats as many at most
 
 
@@ -93,7 +94,7 @@ class HostPool:
     Args:
         launcher: starts the hosts.
         program: what they run.
-        timeout_s: for so long a host may be busy with one order, or be waited for.
+        timeout_s: for so long a host may be busy with one order.
         repeats: how often an order is begun again because a host has died.
 
     Attributes:
@@ -302,7 +303,8 @@ class HostPool:
 
     def _fail(self, order: _Open, k: int, frame: Frame) -> None:
         order.pending.discard(k)
-        if frame.kind == Kind.FAILED and order.failure is None:
+        first = order.failure is None or k < order.failure.worker
+        if frame.kind == Kind.FAILED and first:
             order.failure = WorkerFailureError(k, self._program.parts[k], **frame.letter)
 
     def _lose(self, order: _Open, k: int, cause: str, restart: bool) -> None:
@@ -346,11 +348,13 @@ class HostPool:
                 self._lose(order, k, why, restart=True)
 
     def _await_first(self) -> None:
-        """Return when there is a host for each part."""
+        """Return when those are there that were started for the parts."""
         began = time.monotonic()
-        while len(self._company.free) < len(self._all):
+        missing = set(self._all)
+        while missing:
             self._company.look(CHECK_S)
-            there = f"{len(self._company.free)} of {len(self._all)} are there"
+            missing = set(self._all) - {host.number for host in self._company.free}
+            there = f"{len(self._all) - len(missing)} of {len(self._all)} are there"
             self._complain(time.monotonic() - began, there)
 
     def _complain(self, waited_s: float, where: str) -> None:
@@ -360,8 +364,8 @@ class HostPool:
             WorkerStartError: so it is.
         """
         trouble = self._launcher.trouble()
-        if trouble is None and waited_s > self._timeout_s:
-            trouble = f"none within workers.timeout_s = {self._timeout_s:g}"
+        if trouble is None and waited_s > COMES_S:
+            trouble = f"none has come within {COMES_S:g} s; ray status tells what Ray waits for"
         if trouble is not None:
             self.close()
             raise WorkerStartError(f"no host ({where}): {trouble}")

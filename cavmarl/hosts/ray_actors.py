@@ -9,14 +9,14 @@ from typing import Any, NoReturn
 from cavmarl.errors import WorkerStartError, require
 from cavmarl.hosts.cluster import choose_nodes, join, leave, nodes_with
 
-__all__ = ["SPARES", "Main", "RayActors"]
+__all__ = ["SPARES", "Main", "RayActors", "RayHost"]
 
 SPARES = 1  # hosts that wait for another one's death: a new actor takes seconds
 
 Main = Callable[[str, tuple[str, int], bytes, int], NoReturn]
 
 
-class _Host:
+class RayHost:
     """The actor: its one call lasts as long as it lives."""
 
     def run(
@@ -84,7 +84,7 @@ class RayActors:
 
     def _start(self, number: int, node: str, place: tuple[str, int], secret: bytes) -> None:
         strategies = self._ray.util.scheduling_strategies
-        actor = self._ray.remote(_Host).options(
+        actor = self._ray.remote(RayHost).options(
             num_cpus=1 if number < self.workers else 0,
             max_restarts=-1,
             max_task_retries=-1,
