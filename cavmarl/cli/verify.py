@@ -116,10 +116,10 @@ def verify(
 
     With --kill: worlds whose workers are killed beside some that nobody disturbs.
     """
+    if hosts is not None and kill is None:
+        raise ConfigError(f"--hosts {hosts}: goes with --kill only")
     if replay is not None:
-        given = (
-            zones, steps, layout, agents, background, settings, faults, journal, kill, worlds, hosts,
-        )  # fmt: skip
+        given = (zones, steps, layout, agents, background, settings, faults, journal, kill, worlds)
         if check or any(value is not None for value in given):
             raise ConfigError("--replay: all else stands in the file; beside it goes ENV only")
         run_again(replay, env, json_path)
@@ -148,8 +148,6 @@ def verify(
             overrides=overrides | ({"zones.check": True} if check else {}),
         )
         return
-    if hosts is not None:
-        raise ConfigError("--hosts: goes with --kill only")
     worlds = 1 if worlds is None else worlds
     if faults == "campaign":
         check_campaign(layout, worlds, journal)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import random
 import signal
+import socket
 import statistics
 import time
 from collections.abc import Callable, Mapping
@@ -148,6 +149,7 @@ def verify_kills(
     try:
         killer = _Killer(_pool(parted), random.Random(seed))
         runs = [_Run(vec, load_policy(policy, vec), seed) for vec in (whole, parted)]
+        _refuse_elsewhere(killer.pool)
         struck = set(killer.random.sample(range(FIRST_STEPS, steps), kills))
         different = None
         for step in range(steps):
@@ -175,6 +177,19 @@ def verify_kills(
 def _pool(vec: CavVectorEnv) -> Pool | HostPool:
     assert isinstance(vec.worlds, PooledWorlds | RemoteWorlds)
     return vec.worlds.pool
+
+
+def _refuse_elsewhere(pool: Pool | HostPool) -> None:
+    """Only processes of this machine can be killed.
+
+    Raises:
+        ConfigError: one is elsewhere.
+    """
+    if isinstance(pool, HostPool) and {*pool.machines} != {socket.gethostname()}:
+        raise ConfigError(
+            f"hosts on {', '.join(sorted({*pool.machines}))}: processes are killed on this machine "
+            "only; unset RAY_ADDRESS for a cluster of its own"
+        )
 
 
 class _Run:
@@ -206,7 +221,7 @@ class _Killer:
     def __init__(self, pool: Pool | HostPool, random: random.Random) -> None:
         self.random = random
         self.found: list[Kill] = []
-        self._pool = pool
+        self.pool = pool
         self._sent: dict[int, tuple[signal.Signals, float]] = {}  # worker → what and when
         self._seen = 0
         self._calm_s: list[float] = []
@@ -219,6 +234,8 @@ class _Killer:
         """One step, with a signal in it or soon after."""
         timer = None
         if strikes:
+            if isinstance(self.pool, HostPool):  # one death at a time: Ray takes seconds for a host
+                self.pool.await_spare()
             delay_s = self.random.uniform(0.0, LATEST * statistics.median(self._calm_s))
             timer = Timer(delay_s, self._strike, (self._choose(),))
             timer.start()
@@ -233,18 +250,21 @@ class _Killer:
 
     def finish(self, step: int) -> None:
         """Let those be missed that were struck last."""
-        self._pool.ping()
+        self.pool.ping()
         self._match(step)
 
     def _choose(self) -> tuple[int, signal.Signals]:
-        alive = [k for k in range(len(self._pool.pids)) if k not in self._sent]
+        alive = [k for k in range(len(self.pool.pids)) if k not in self._sent]
         how = signal.SIGSTOP if self.random.random() < STOPS else signal.SIGKILL
         return self.random.choice(alive or [0]), how
 
     def _strike(self, target: tuple[int, signal.Signals]) -> None:
         worker, how = target
         self._sent[worker] = how, time.monotonic()
-        os.kill(self._pool.pids[worker], how)
+        if isinstance(self.pool, Pool):
+            os.kill(self.pool.pids[worker], how)
+        elif not self.pool.signal(worker, how):  # it is being replaced
+            del self._sent[worker]
 
     def _match(self, step: int) -> None:
         """Say of each new death what it was.
@@ -252,7 +272,7 @@ class _Killer:
         Raises:
             EvaluationError: somebody died that nobody had killed.
         """
-        deaths = self._pool.deaths
+        deaths = self.pool.deaths
         for death in deaths[self._seen :]:
             if death.worker not in self._sent:
                 raise EvaluationError(
@@ -260,7 +280,7 @@ class _Killer:
                 )
             how, sent_s = self._sent.pop(death.worker)
             self.found.append(_kill(death, how, sent_s, step))
-            for worker in self._pool.team_of(death.worker):
+            for worker in self.pool.team_of(death.worker):
                 if worker in self._sent and self._sent[worker][1] < death.replaced_s:
                     del self._sent[worker]  # it was replaced with the other one
         self._seen = len(deaths)

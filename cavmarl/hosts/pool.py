@@ -9,6 +9,8 @@ the same.
 
 from __future__ import annotations
 
+import os
+import signal
 import time
 import weakref
 from collections.abc import Callable, Sequence
@@ -131,6 +133,22 @@ class HostPool:
         """Of the processes of all parts, each on its machine."""
         return [self._hosts[k].pid for k in self._all]
 
+    @property
+    def machines(self) -> list[str]:
+        """Names of those that the parts are on."""
+        return [self._hosts[k].machine for k in self._all]
+
+    def signal(self, part: int, how: signal.Signals) -> bool:
+        """Send a signal to the process of a part, which has to be on this machine.
+
+        Returns:
+            whether there is one at the moment.
+        """
+        host = self._hosts.get(part)
+        if host is not None:
+            os.kill(host.pid, how)
+        return host is not None
+
     def team_of(self, worker: int) -> tuple[int, ...]:
         """Who is replaced with a worker, itself among them."""
         return (worker,)
@@ -172,6 +190,22 @@ class HostPool:
         """Let all hosts do nothing: an empty barrier."""
         nothing: list[Arrays] = [()] * len(self._all)
         self.run(NOTHING, [None] * len(self._all), nothing, lambda k, answer: (), False)
+
+    def await_spare(self) -> None:
+        """Return when there is a host that would take up a part at once.
+
+        Raises:
+            WorkerStartError: none comes; the pool is closed.
+        """
+        began = time.monotonic()
+        nothing = _Open(
+            self._number, NOTHING, (), (), lambda k, answer: (), saves=False, ordered_s=began,
+            first_death=len(self.deaths), pending=set(), is_void=True,
+        )  # fmt: skip
+        while not self._company.free:
+            for host in self._look():
+                self._hear(nothing, host)
+            self._complain(time.monotonic() - began, "to spare")
 
     def close(self) -> None:
         """End all hosts."""
