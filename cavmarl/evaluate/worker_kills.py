@@ -28,6 +28,7 @@ from cavmarl.vector_env import CavVectorEnv, make_vec
 __all__ = ["Kill", "KillReport", "verify_kills"]
 
 FIRST_STEPS = 10  # before anybody is killed, to know how long a step takes
+PINGS = 500
 LATEST = 1.5  # of a step's time: some are killed when they are already waiting for the next one
 STOPS = 0.25  # share of those that are not killed but stopped
 
@@ -70,6 +71,7 @@ class KillReport:
         different: the first step after which anything differed; None: none.
         kills: all of them.
         step_ms: median of the steps in which nobody died.
+        ping_us: median of an empty order to all workers, before the first death.
         state_hashes: of the undisturbed worlds at the end.
         hardware: that it ran on.
     """
@@ -81,6 +83,7 @@ class KillReport:
     different: int | None
     kills: tuple[Kill, ...]
     step_ms: float
+    ping_us: float
     state_hashes: tuple[str, ...]
     hardware: dict[str, Any]
 
@@ -150,6 +153,7 @@ def verify_kills(
         killer = _Killer(_pool(parted), random.Random(seed))
         runs = [_Run(vec, load_policy(policy, vec), seed) for vec in (whole, parted)]
         _refuse_elsewhere(killer.pool)
+        ping_us = _ping_us(killer.pool)
         struck = set(killer.random.sample(range(FIRST_STEPS, steps), kills))
         different = None
         for step in range(steps):
@@ -169,14 +173,24 @@ def verify_kills(
     finally:
         parted.close()
     return KillReport(
-        str(env), worlds, workers, steps, different, tuple(killer.found), killer.step_ms(), hashes,
-        describe_hardware(),
+        str(env), worlds, workers, steps, different, tuple(killer.found), killer.step_ms(), ping_us,
+        hashes, describe_hardware(),
     )  # fmt: skip
 
 
 def _pool(vec: CavVectorEnv) -> Pool | HostPool:
     assert isinstance(vec.worlds, PooledWorlds | RemoteWorlds)
     return vec.worlds.pool
+
+
+def _ping_us(pool: Pool | HostPool) -> float:
+    """What an empty order to all workers takes, at the median."""
+    found = []
+    for _ in range(PINGS):
+        began = time.perf_counter()
+        pool.ping()
+        found.append(time.perf_counter() - began)
+    return 1e6 * statistics.median(found)
 
 
 def _refuse_elsewhere(pool: Pool | HostPool) -> None:

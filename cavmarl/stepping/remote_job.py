@@ -141,3 +141,15 @@ class HostedWorlds:
     def _make(self, size: int) -> None:
         self._worlds = LocalWorlds(self._world, size, in_next_step=self._in_next_step)
         self._job = WorldsJob(self._worlds, 0)
+        self._rehearse()
+
+    def _rehearse(self) -> None:
+        """Begin and step once: the first time takes longer, and is none of a death's business.
+
+        Nothing of it stays, since whoever has these worlds begins with a seed, or loads.
+        """
+        self._worlds.arrays.chosen[:] = True
+        self._job.perform(Task.RESET, {"seed": 0, "first_world": 0})
+        self._job.perform(Task.STEP, None)
+        self._job.perform(Task.SUGGEST, None)
+        self.load([array.copy() for array in self.save()])

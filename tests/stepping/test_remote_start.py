@@ -7,6 +7,7 @@ import sys
 from pathlib import Path
 
 import pytest
+import yaml
 
 from cavmarl import ConfigError, make_vec
 from cavmarl.errors import WorkerStartError
@@ -46,6 +47,16 @@ def test_a_cluster_that_is_not_there(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("RAY_ADDRESS", "127.0.0.1:1")
     with pytest.raises(WorkerStartError, match=r"no Ray cluster at 127.0.0.1:1.*ray start --head"):
         make_vec("ring", workers=1, hosts="ray")
+
+
+def test_ray_understands_the_file_of_machines() -> None:
+    from ray.autoscaler._private.util import prepare_config, validate_config
+
+    path = ROOT / "configs/cluster/machines.yaml"
+    settings = prepare_config(yaml.safe_load(path.read_text(encoding="utf-8")))
+    validate_config(settings)
+    (kind,) = settings["available_node_types"].values()
+    assert kind["max_workers"] == len(settings["provider"]["worker_ips"])
 
 
 def test_a_client_is_no_member(monkeypatch: pytest.MonkeyPatch) -> None:
