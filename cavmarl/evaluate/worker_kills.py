@@ -249,6 +249,7 @@ class _Killer:
         timer = None
         if strikes:
             if isinstance(self.pool, HostPool):  # one death at a time: Ray takes seconds for a host
+                self.finish(step)
                 self.pool.await_spare()
             delay_s = self.random.uniform(0.0, LATEST * statistics.median(self._calm_s))
             timer = Timer(delay_s, self._strike, (self._choose(),))

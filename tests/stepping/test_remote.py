@@ -4,8 +4,11 @@ from __future__ import annotations
 
 import os
 import signal
+import subprocess
+import sys
 import time
 from collections.abc import Callable, Iterator
+from pathlib import Path
 from threading import Timer
 from typing import Any
 
@@ -22,6 +25,7 @@ ray = pytest.importorskip("ray", reason="needs the extra: ray (make libraries)")
 
 pytestmark = pytest.mark.filterwarnings("ignore")  # Ray's warnings of itself are many
 
+ROOT = Path(__file__).resolve().parents[2]
 WANTED = {"num_envs": 5, "agents": 4, "background": 12, "max_cycles": 8}
 
 
@@ -162,6 +166,34 @@ def test_a_node_that_dies_is_not_missed(make: Make, cluster: Any, whole: Any) ->
 def nodes_of_first_step(vec: CavVectorEnv) -> list[int]:
     vec.reset(seed=0)
     return nodes_of(remote(vec).pool.pids)
+
+
+KILLED = """
+import os, signal, sys
+import ray
+from cavmarl import make_vec
+
+if __name__ == "__main__":
+    vec = make_vec("ring", num_envs=2, workers=2, hosts="ray")
+    vec.reset(seed=0)
+    print(*vec.worlds.pool.pids, flush=True)
+    os.kill(os.getpid(), signal.SIGKILL)
+"""
+
+
+def test_nothing_is_left_behind_by_a_program_that_is_killed(cluster: Any) -> None:
+    done = subprocess.run(
+        [sys.executable, "-c", KILLED],
+        cwd=ROOT,
+        env={**os.environ, "RAY_ADDRESS": cluster.address},
+        capture_output=True,
+        text=True,
+        timeout=120,
+    )
+    pids = [int(word) for word in done.stdout.split()]
+    assert len(pids) == 2, done.stderr
+    await_true(lambda: not any(psutil.pid_exists(pid) for pid in pids))
+    await_true(lambda: ray.available_resources().get("CPU") == 3.0)
 
 
 def await_true(holds: Callable[[], bool], for_s: float = 10.0) -> None:
