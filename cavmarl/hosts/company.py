@@ -13,7 +13,9 @@ from cavmarl.errors import MessageError, WorkerFailureError, WorkerStartError
 from cavmarl.hosts.door import Door, Guest
 from cavmarl.hosts.wire import Kind, Wire
 
-__all__ = ["SILENCE_S", "Company", "Host", "Launcher"]
+__all__ = ["ENDED", "SILENCE_S", "Company", "Host", "Launcher"]
+
+ENDED = (EOFError, ConnectionError)  # of a connection, as it does when the process at its end dies
 
 SILENCE_S = 0.8  # of a host that is at work, and tells so every `host.BEAT_S`
 
@@ -204,8 +206,8 @@ class Company:
         try:
             frame = host.wire.receive()
             host.wire.skip()
-        except (EOFError, OSError, MessageError):
-            self.drop(host, restart=not host.is_ready)
+        except (EOFError, OSError, MessageError) as error:
+            self.drop(host, restart=not isinstance(error, ENDED))
             return
         if frame.kind == Kind.FAILED:
             raise WorkerFailureError(host.number, str(host), **frame.letter)

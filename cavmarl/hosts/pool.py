@@ -14,12 +14,10 @@ import signal
 import time
 import weakref
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
 from math import isnan, nan
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from cavmarl.errors import (
     MessageError,
@@ -28,66 +26,18 @@ from cavmarl.errors import (
     WorkerFailureError,
     WorkerStartError,
 )
-from cavmarl.hosts.company import SILENCE_S, Company, Host, Launcher
+from cavmarl.hosts.company import ENDED, SILENCE_S, Company, Host, Launcher
 from cavmarl.hosts.host import Order
+from cavmarl.hosts.orders import Arrays, HostProgram, OpenOrder, Truth, bytes_of
 from cavmarl.hosts.wire import Frame, Kind
 from cavmarl.runtime.pool import Death
 from cavmarl.runtime.watchdog import CHECK_S
 from cavmarl.runtime.worker import NOTHING
 
-__all__ = ["HostPool", "HostProgram"]
-
-Array = NDArray[Any]
-Arrays = Sequence[Array]
+__all__ = ["HostPool"]
 
 COMES_S = 300.0  # a machine that has never run cavmarl compiles it first
 IMAGE_EVERY = 8  # orders that are noted: a successor repeats as many at most
-
-
-@dataclass(frozen=True)
-class HostProgram:
-    """What hosts run.
-
-    Attributes:
-        parts: of the job, in words.
-        sizes: of each part, as the job counts.
-        tasks: names of the job's tasks.
-        noted: the task whose inputs are noted, in the place of an image.
-        code: what all machines have to have in common.
-    """
-
-    parts: tuple[str, ...]
-    sizes: tuple[int, ...]
-    tasks: tuple[str, ...]
-    noted: int
-    code: str
-
-
-@dataclass
-class _Truth:
-    """What is committed of one part."""
-
-    image: Array = field(default_factory=lambda: np.zeros(0, dtype=np.uint8))
-    since: list[Array] = field(default_factory=list)  # bytes of the inputs of each order
-
-
-@dataclass
-class _Open:
-    """An order that is being carried out."""
-
-    number: int
-    task: int
-    letters: Sequence[Any]
-    inputs: Sequence[Arrays]
-    outputs: Callable[[int, Any], Arrays]
-    saves: bool
-    ordered_s: float
-    first_death: int
-    pending: set[int]
-    is_void: bool = False  # it was interrupted, and only has to come to its end
-    answers: dict[int, Any] = field(default_factory=dict)
-    images: dict[int, Array] = field(default_factory=dict)
-    failure: WorkerFailureError | None = None
 
 
 class HostPool:
@@ -116,10 +66,10 @@ class HostPool:
         self._timeout_s = timeout_s
         self._repeats = repeats
         self._all = tuple(range(len(program.parts)))
-        self._truths = [_Truth() for _ in self._all]
+        self._truths = [Truth() for _ in self._all]
         self._hosts: dict[int, Host] = {}
         self._number = 0
-        self._open: _Open | None = None
+        self._open: OpenOrder | None = None
         self._company = Company(launcher, program.code)
         self._finalizer = weakref.finalize(self, self._company.close)
         try:
@@ -198,7 +148,7 @@ class HostPool:
             WorkerStartError: none comes; the pool is closed.
         """
         began = time.monotonic()
-        nothing = _Open(
+        nothing = OpenOrder(
             self._number, NOTHING, (), (), lambda k, answer: (), saves=False, ordered_s=began,
             first_death=len(self.deaths), pending=set(), is_void=True,
         )  # fmt: skip
@@ -226,7 +176,7 @@ class HostPool:
             self._settle(self._open)
         is_full = len(self._truths[0].since) == IMAGE_EVERY
         self._number += 1
-        order = self._open = _Open(
+        order = self._open = OpenOrder(
             self._number, task, letters, inputs, outputs,
             saves=commits and (task != self._program.noted or is_full),
             ordered_s=time.monotonic(), first_death=len(self.deaths), pending=set(parts),
@@ -241,12 +191,12 @@ class HostPool:
         for k in parts:
             self._hosts[k].knows = not self._hosts[k].is_gone
             if order.saves:
-                self._truths[k] = _Truth(order.images[k])
+                self._truths[k] = Truth(order.images[k])
             elif commits:
-                self._truths[k].since.append(_bytes_of(inputs[k]))
+                self._truths[k].since.append(bytes_of(inputs[k]))
         return [order.answers[k] for k in parts]
 
-    def _settle(self, order: _Open) -> None:
+    def _settle(self, order: OpenOrder) -> None:
         """Let an order come to its end that was interrupted; it is not committed."""
         order.is_void = True
         order.pending &= self._hosts.keys()
@@ -256,7 +206,7 @@ class HostPool:
         self._await(order)
         self._open = None
 
-    def _await(self, order: _Open) -> None:
+    def _await(self, order: OpenOrder) -> None:
         """Return when the order has been carried out everywhere."""
         next_s = order.ordered_s + CHECK_S
         while order.pending:
@@ -284,7 +234,7 @@ class HostPool:
         self._hosts[part] = host
         return host
 
-    def _give(self, order: _Open, k: int, host: Host) -> None:
+    def _give(self, order: OpenOrder, k: int, host: Host) -> None:
         """Give a host the order, and what is committed if it does not know it."""
         program, truth = self._program, self._truths[k]
         before = [] if host.knows or not truth.image.size else [truth.image, *truth.since]
@@ -306,7 +256,7 @@ class HostPool:
             if death.worker == k and isnan(death.replaced_s):
                 death.replaced_s = host.given_s
 
-    def _hear(self, order: _Open, host: Host) -> None:
+    def _hear(self, order: OpenOrder, host: Host) -> None:
         """Take what a host says."""
         k = host.part
         try:
@@ -320,13 +270,12 @@ class HostPool:
             else:
                 self._take(order, k, host, frame)
         except (EOFError, OSError, MessageError) as error:
-            restart = not isinstance(error, (EOFError, ConnectionError))
             if k in order.pending:
-                self._lose(order, k, _words(error), restart)
+                self._lose(order, k, _words(error), restart=not isinstance(error, ENDED))
             else:
                 self._company.mute(host)  # it is missed with the next order
 
-    def _take(self, order: _Open, k: int, host: Host, frame: Frame) -> None:
+    def _take(self, order: OpenOrder, k: int, host: Host, frame: Frame) -> None:
         answer, saved = frame.letter["answer"], np.empty(frame.letter["image"], dtype=np.uint8)
         host.wire.take([*order.outputs(k, answer), saved])
         order.answers[k], order.images[k] = answer, saved
@@ -335,13 +284,13 @@ class HostPool:
             if death.worker == k and isnan(death.done_s):
                 death.done_s = host.heard_s
 
-    def _fail(self, order: _Open, k: int, frame: Frame) -> None:
+    def _fail(self, order: OpenOrder, k: int, frame: Frame) -> None:
         order.pending.discard(k)
         first = order.failure is None or k < order.failure.worker
         if frame.kind == Kind.FAILED and first:
             order.failure = WorkerFailureError(k, self._program.parts[k], **frame.letter)
 
-    def _lose(self, order: _Open, k: int, cause: str, restart: bool) -> None:
+    def _lose(self, order: OpenOrder, k: int, cause: str, restart: bool) -> None:
         """A host is gone, or taken for it: another one goes on in its place.
 
         Raises:
@@ -361,7 +310,7 @@ class HostPool:
             what = "nothing" if order.task == NOTHING else self._program.tasks[order.task]
             raise WorkerDeathError(k, self._program.parts[k], order.number, what, causes)
 
-    def _check(self, order: _Open) -> None:
+    def _check(self, order: OpenOrder) -> None:
         """Look after those who are waited for.
 
         Raises:
@@ -407,10 +356,3 @@ class HostPool:
 
 def _words(error: Exception) -> str:
     return str(error) or "its connection has ended"
-
-
-def _bytes_of(arrays: Arrays) -> Array:
-    """(n,) A copy of the bytes of arrays, one behind the other."""
-    return np.concatenate(
-        [np.zeros(0, dtype=np.uint8), *(array.reshape(-1).view(np.uint8) for array in arrays)]
-    )

@@ -11,7 +11,8 @@ from typing import Any
 import numpy as np
 
 from cavmarl.errors import ConfigError, WorkerDeathError, WorkerFailureError
-from cavmarl.hosts.pool import Arrays, HostPool, HostProgram
+from cavmarl.hosts.orders import Arrays, HostProgram
+from cavmarl.hosts.pool import HostPool
 from cavmarl.hosts.ray_actors import RayActors
 from cavmarl.runtime.compilation import compiled_before
 from cavmarl.runtime.pool import Death

@@ -62,7 +62,8 @@ def code_stamp() -> str:
     digest = hashlib.sha256()
     for source in sorted(package.rglob("*.py")):
         name = source.relative_to(package).as_posix()
-        digest.update(name.encode() + b"\0" + source.read_bytes())
+        if not name.startswith("data/"):  # which only a wheel has
+            digest.update(name.encode() + b"\0" + source.read_bytes())
     sources = digest.hexdigest()[:12]
     return f"cavmarl of sources {sources}, numpy {np.__version__}, numba {numba.__version__}"
 

@@ -16,7 +16,8 @@ import pytest
 
 import cavmarl.hosts.pool as pool_module
 from cavmarl.errors import WorkerDeathError, WorkerError, WorkerFailureError, WorkerStartError
-from cavmarl.hosts.pool import HostPool, HostProgram
+from cavmarl.hosts.orders import HostProgram
+from cavmarl.hosts.pool import HostPool
 from tests.hosts.toy_hosts import ADD, DOZE, FAIL, FALL, TASKS, TOIL, TOTAL, WRITE, Processes
 
 SIZES = (3, 2)

@@ -43,6 +43,16 @@ def test_a_cluster_that_was_started_for_them_ends_with_the_last_of_them() -> Non
     assert done.stdout.strip().endswith("left: []")
 
 
+def test_hosts_are_killed_and_nobody_can_tell() -> None:
+    command = ["verify", "ring", "--agents", "3", "--background", "4", "--kill", "2"]
+    done = subprocess.run(
+        [sys.executable, "-m", "cavmarl", *command, "--hosts", "ray"],
+        cwd=ROOT, capture_output=True, text=True, timeout=200,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    assert "equal in all 16 steps" in done.stdout
+
+
 def test_a_cluster_that_is_not_there(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("RAY_ADDRESS", "127.0.0.1:1")
     with pytest.raises(WorkerStartError, match=r"no Ray cluster at 127.0.0.1:1.*ray start --head"):
