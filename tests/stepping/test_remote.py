@@ -100,14 +100,17 @@ def test_an_actor_that_dies_is_not_missed(
     make: Make, cluster: Any, whole: Any, how: signal.Signals
 ) -> None:
     vec = make("grid4x4", workers=2, hosts="ray", **WANTED)
+    struck: list[int] = []
 
     def strike(step: int) -> None:
         if step % 6 == 3:
-            os.kill(remote(vec).pool.pids[step // 6], how)
+            struck.append(remote(vec).pool.pids[step // 6])
+            os.kill(struck[-1], how)
 
     assert same(drive(vec, before=strike), whole)
     assert [death.worker for death in remote(vec).deaths] == [0, 1]
     assert remote(vec).deaths[0].done_s - remote(vec).deaths[0].noticed_s < 1.0  # by the spare one
+    await_true(lambda: not any(psutil.pid_exists(pid) for pid in struck), for_s=20.0)
 
 
 def test_an_actor_that_dies_in_the_middle_of_a_step(make: Make, cluster: Any, whole: Any) -> None:
@@ -152,20 +155,18 @@ def test_a_node_that_dies_is_not_missed(make: Make, cluster: Any, whole: Any) ->
     node = cluster.add_node(num_cpus=1)
     vec = make("grid4x4", workers=4, hosts="ray", **WANTED)
     raylet = node.all_processes["raylet"][0].process.pid
-    victim = nodes_of_first_step(vec).index(raylet)
+    vec.reset(seed=0)
+    pids = remote(vec).pool.pids
+    victim = nodes_of(pids).index(raylet)
 
     def strike(step: int) -> None:
         if step == STEPS // 2:
             cluster.remove_node(node, allow_graceful=False)
+            await_true(lambda: not psutil.pid_exists(pids[victim]))  # it ends with its raylet
 
     assert same(drive(vec, before=strike), whole)
     assert victim in {death.worker for death in remote(vec).deaths}
     assert raylet not in nodes_of(remote(vec).pool.pids)
-
-
-def nodes_of_first_step(vec: CavVectorEnv) -> list[int]:
-    vec.reset(seed=0)
-    return nodes_of(remote(vec).pool.pids)
 
 
 KILLED = """
