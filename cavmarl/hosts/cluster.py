@@ -118,16 +118,15 @@ def nodes_with(cpus: int) -> list[Node]:
         time.sleep(0.1)
 
 
-def choose_nodes(known: Sequence[Node], workers: int, spares: int) -> list[str]:
+def choose_nodes(known: Sequence[Node], workers: int) -> list[str]:
     """A node for each host: admissible, of the lowest LoadScore, with the fewest hosts so far.
 
     Args:
         known: all nodes.
         workers: hosts with a CPU of their own.
-        spares: hosts without one, that wait for another one's death.
 
     Returns:
-        names of nodes, those of the workers first.
+        names of nodes.
 
     Raises:
         ConfigError: more workers than free CPUs.
@@ -141,14 +140,13 @@ def choose_nodes(known: Sequence[Node], workers: int, spares: int) -> list[str]:
         )
     left = list(known)
     chosen: list[str] = []
-    for n in range(workers + spares):
-        takes = 1 if n < workers else 0
+    for _ in range(workers):
         candidates = [
-            Candidate(k, node.use, node.hosted, available=node.cpus >= takes)
+            Candidate(k, node.use, node.hosted, available=node.cpus > 0)
             for k, node in enumerate(left)
         ]
         k = select(candidates).worker
-        left[k] = replace(left[k], cpus=left[k].cpus - takes, hosted=left[k].hosted + 1)
+        left[k] = replace(left[k], cpus=left[k].cpus - 1, hosted=left[k].hosted + 1)
         chosen.append(left[k].name)
     return chosen
 

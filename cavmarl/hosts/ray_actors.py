@@ -63,7 +63,8 @@ class RayActors:
             known = nodes_with(at_most if workers is None else workers)
             free = sum(node.cpus for node in known)
             self.workers = max(1, min(free, at_most)) if workers is None else workers
-            self._nodes = choose_nodes(known, self.workers, SPARES)
+            # A spare one here does not die with the node of another one.
+            self._nodes = [*choose_nodes(known, self.workers), *[known[0].name] * SPARES]
             self.address: str = self._ray.util.get_node_ip_address()
         except BaseException:
             self.close()

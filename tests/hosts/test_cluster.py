@@ -14,24 +14,24 @@ IDLE = Utilisation(0.0, 0.0)
 
 def test_hosts_go_to_the_nodes_in_turn() -> None:
     known = [Node("a", 2, IDLE), Node("b", 4, IDLE)]
-    assert choose_nodes(known, 5, 1) == ["a", "b", "a", "b", "b", "a"]
+    assert choose_nodes(known, 5) == ["a", "b", "a", "b", "b"]
 
 
 def test_hosts_go_where_the_score_is_lowest() -> None:
     known = [Node("a", 2, Utilisation(0.5, 0.1)), Node("b", 2, Utilisation(0.2, 0.1))]
-    assert choose_nodes(known, 3, 0) == ["b", "b", "a"]
+    assert choose_nodes(known, 3) == ["b", "b", "a"]
 
 
 def test_nodes_that_are_too_busy_are_given_none() -> None:
     known = [Node("a", 2, Utilisation(0.9, 0.1)), Node("b", 1, IDLE)]
-    assert choose_nodes(known, 1, 1) == ["b", "b"]
+    assert choose_nodes(known, 1) == ["b"]
     with pytest.raises(NoAdmissibleWorkerError, match=r"worker 0: cpu 0\.9"):
-        choose_nodes(known, 2, 1)
+        choose_nodes(known, 2)
 
 
 def test_more_workers_than_cpus() -> None:
     with pytest.raises(ConfigError, match=r"workers = 4.*3 free CPUs on 2 nodes.*ray start"):
-        choose_nodes([Node("a", 2, IDLE), Node("b", 1, IDLE)], 4, 1)
+        choose_nodes([Node("a", 2, IDLE), Node("b", 1, IDLE)], 4)
 
 
 @pytest.mark.parametrize(
