@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from typing import Protocol
 
 from cavmarl.errors import MessageError, WorkerFailureError, WorkerStartError
-from cavmarl.hosts.door import Door, Guest
+from cavmarl.hosts.door import MAX_GUESTS, Door, Guest
 from cavmarl.hosts.wire import Kind, Wire
 
 __all__ = ["ENDED", "SILENCE_S", "Company", "Host", "Launcher"]
@@ -174,7 +174,9 @@ class Company:
 
     def _welcome(self) -> None:
         guest = self._door.open()
-        if guest is not None:
+        if guest is not None and len(self._guests) == MAX_GUESTS:
+            guest.close()
+        elif guest is not None:
             self._guests.append(guest)
             self._selector.register(guest, selectors.EVENT_READ, guest)
 

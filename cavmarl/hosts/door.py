@@ -20,12 +20,13 @@ import time
 from cavmarl.errors import ForeignRunError, UnknownVersionError, WorkerStartError
 from cavmarl.hosts.wire import MAGIC, VERSION, Wire
 
-__all__ = ["Door", "Guest", "knock"]
+__all__ = ["MAX_GUESTS", "Door", "Guest", "knock"]
 
 NONCE = 16  # bytes of a random number
 PROOF = 32  # of an HMAC
 SECRET = 32
-GREETING_S = 5.0  # for all that comes before the first frame
+GREETING_S = 5.0  # for a guest to prove who it is
+CALL_S = 5.0  # for the system to connect
 MAX_GUESTS = 64  # who are not known yet
 _HELLO = struct.Struct(f"<4sHI{NONCE}s")
 
@@ -137,7 +138,7 @@ class Door:
 
 
 def knock(place: tuple[str, int], secret: bytes, number: int) -> Wire:
-    """Call as a host.
+    """Call as a host; the caller may be busy for long before it answers.
 
     Args:
         place: address and port of the door.
@@ -145,12 +146,13 @@ def knock(place: tuple[str, int], secret: bytes, number: int) -> Wire:
         number: of the host.
 
     Raises:
-        OSError: nobody listens there, or answers.
+        OSError: nobody listens there.
         EOFError: whoever listens there does not want us.
         ForeignRunError: it does not know the secret.
     """
-    connection = socket.create_connection(place, GREETING_S)
+    connection = socket.create_connection(place, CALL_S)
     try:
+        connection.settimeout(None)
         hello = _HELLO.pack(MAGIC, VERSION, number, secrets.token_bytes(NONCE))
         connection.sendall(hello)
         heard = b""
@@ -163,7 +165,6 @@ def knock(place: tuple[str, int], secret: bytes, number: int) -> Wire:
         if not hmac.compare_digest(proof, _proof(secret, b"caller", hello + nonce)):
             raise ForeignRunError(f"who listens at {place} does not know the secret")
         connection.sendall(_proof(secret, b"host", hello + nonce))
-        connection.settimeout(None)
     except BaseException:
         connection.close()
         raise

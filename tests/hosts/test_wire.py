@@ -130,14 +130,16 @@ def test_other_versions_and_sizes() -> None:
 class Caller:
     """The caller's end: lets in whoever comes, in a thread."""
 
-    def __init__(self) -> None:
+    def __init__(self, busy_s: float = 0.0) -> None:
         self.door = Door("127.0.0.1")
         self.found: list[Any] = []
+        self._busy_s = busy_s
         self._thread = threading.Thread(target=self._run)
         self._thread.start()
 
     def _run(self) -> None:
         guest: Guest | None = None
+        time.sleep(self._busy_s)
         until_s = time.monotonic() + 5.0
         while not self.found and time.monotonic() < until_s:
             time.sleep(0.005)
@@ -159,8 +161,10 @@ class Caller:
         return self.found[0] if self.found else None
 
 
-def test_who_knows_the_secret_comes_in() -> None:
-    caller = Caller()
+@pytest.mark.parametrize("busy_s", [0.0, 0.5])
+def test_who_knows_the_secret_comes_in(monkeypatch: pytest.MonkeyPatch, busy_s: float) -> None:
+    monkeypatch.setattr(door_module, "CALL_S", 0.1)
+    caller = Caller(busy_s)
     wire = knock(caller.door.place, caller.door.secret, 5)
     number, connection = caller.join()
     assert number == 5
