@@ -49,6 +49,7 @@ __all__ = [
     "TASK",
     "TRUTH",
     "Job",
+    "describe",
     "die_with_parent",
     "serve",
 ]
@@ -153,10 +154,15 @@ def _read(fd: int, size: int) -> Any:
     return json.loads(os.pread(fd, size, 0))
 
 
-def _failure(error: BaseException) -> bytes:
+def describe(error: BaseException) -> dict[str, str]:
+    """An exception in words, not too many: its class, its message, its traceback."""
     text = "".join(traceback.format_exception(error))[-MAX_TRACEBACK:]
     message = str(error)[: MAX_TRACEBACK // 4]
-    return json.dumps({"kind": type(error).__name__, "text": message, "traceback": text}).encode()
+    return {"kind": type(error).__name__, "text": message, "traceback": text}
+
+
+def _failure(error: BaseException) -> bytes:
+    return json.dumps(describe(error)).encode()
 
 
 def _fork_on_demand(

@@ -34,7 +34,7 @@ from cavmarl.stepping.parts import Part, parts_of
 from cavmarl.stepping.placement import Placement
 from cavmarl.worlds import World
 
-__all__ = ["PooledWorlds"]
+__all__ = ["PooledWorlds", "check_zones", "own_error"]
 
 PROGRAM = "cavmarl.stepping.worker"
 
@@ -76,7 +76,7 @@ class PooledWorlds:
         self.world = world
         self.in_next_step = in_next_step
         config = world.config
-        _check(config.zones)
+        check_zones(config.zones)
         self.placement = Placement(world, num_worlds, workers)
         parts = parts_of(self.placement.plans, world.partition.count)
         cores = len(usable_cores())
@@ -119,7 +119,7 @@ class PooledWorlds:
         try:
             self.pool = Pool(program, config.workers.timeout_s, config.workers.repeats)
         except WorkerFailureError as failure:
-            raise _own(failure) from failure
+            raise own_error(failure) from failure
         self._steps = 0
         self._asked = _leaders(parts)
         self.placement.watch(self._pids())
@@ -197,7 +197,7 @@ class PooledWorlds:
         try:
             self.pool.run(task, letter, commits)
         except WorkerFailureError as failure:
-            raise _own(failure) from failure
+            raise own_error(failure) from failure
         except WorkerDeathError as death:
             death.add_note(f"in step {self._steps + 1} since the reset")
             raise
@@ -208,7 +208,7 @@ class PooledWorlds:
         return self.pool.ask(self._asked[number], task, number)
 
 
-def _check(zones: ZonesConfig) -> None:
+def check_zones(zones: ZonesConfig) -> None:
     """Refuse what only worlds of one process can have.
 
     Raises:
@@ -222,7 +222,7 @@ def _check(zones: ZonesConfig) -> None:
             )
 
 
-def _own(failure: WorkerFailureError) -> CavmarlError:
+def own_error(failure: WorkerFailureError) -> CavmarlError:
     """An error that the worlds raise on purpose, as they would raise it in this process."""
     kind = getattr(cavmarl.errors, failure.kind, None)
     if not isinstance(kind, type) or not issubclass(kind, CavmarlError):
