@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import asdict
 from itertools import compress
 from pathlib import Path
 from typing import Any
@@ -14,24 +13,24 @@ from numpy.typing import NDArray
 from pettingzoo import ParallelEnv
 
 from cavmarl.actions import ActionDecoder
-from cavmarl.config import TERMS, EnvConfig
+from cavmarl.config import TERMS
 from cavmarl.errors import ConfigError, EpisodeEndedError, ResetNeededError
-from cavmarl.kernels.codes import EVENTS_THAT_END
+from cavmarl.registry import load_config
 from cavmarl.render.view import WorldView
-from cavmarl.roads.network import RoadNetwork
-from cavmarl.roads.zones import ZonePartition
 from cavmarl.runtime.simulation import Simulation
 from cavmarl.seeds import check_seed, first_seed
 from cavmarl.spaces import (
+    STATE_FEATURES,
     action_space,
     named_observation,
     observation_parts,
     observation_space,
     state_space,
 )
-from cavmarl.state import global_state
-from cavmarl.traffic.demand import DemandFile
-from cavmarl.worlds import check_agents, check_placement, load_world
+from cavmarl.stepping.arrays import SteppedWorlds
+from cavmarl.stepping.local import LocalWorlds
+from cavmarl.stepping.pooled import PooledWorlds
+from cavmarl.worlds import check_agents, check_workers, make_world
 
 __all__ = ["CavEnv", "parallel_env"]
 
@@ -61,7 +60,8 @@ def parallel_env(
     Args:
         env: name of an entry of `envs/`, a folder with an env.yaml, or a map file.
         zones: shadows zones.count, how many shards run the world; results do not depend on it.
-        workers: processes that run the shards; this version runs them in the caller's (0).
+        workers: processes that the zones are shared out over; 0: the caller's process runs them.
+            Results do not depend on it.
         agents: shadows population.agents.
         background: shadows population.background.
         seed: of the first reset, if that is given none.
@@ -72,9 +72,13 @@ def parallel_env(
     Raises:
         ConfigError: a key, value or combination that cannot work.
         MapError: the map cannot be read or driven.
+        WorkerError: worker processes cannot be started, or have no memory.
     """
-    check_placement(workers)
-    config, network, demand, partition = load_world(
+    num_workers = check_workers(workers)
+    first_seed = None if seed is None else check_seed(seed)
+    if render_mode is not None:
+        _check_rendering(render_mode, num_workers)
+    config, base_dir = load_config(
         env,
         zones=zones,
         agents=agents,
@@ -82,7 +86,31 @@ def parallel_env(
         max_cycles=max_cycles,
         overrides=overrides,
     )
-    return CavEnv(config, network, demand, partition, seed=seed, render_mode=render_mode)
+    check_agents(config)
+    world = make_world(config, base_dir)
+    worlds: SteppedWorlds = (
+        PooledWorlds(world, base_dir, 1, num_workers, in_next_step=True)
+        if num_workers
+        else LocalWorlds(world, 1, in_next_step=True)
+    )
+    return CavEnv(worlds, seed=first_seed, render_mode=render_mode)
+
+
+def _check_rendering(render_mode: str, workers: int) -> None:
+    """Refuse what cannot be drawn.
+
+    Raises:
+        ConfigError: an unknown mode, or a world of other processes.
+    """
+    if render_mode not in RENDER_MODES:
+        raise ConfigError(
+            f"render_mode = {render_mode!r}: must be {' or '.join(RENDER_MODES)}, or None"
+        )
+    if workers:
+        raise ConfigError(
+            f"render_mode = {render_mode!r} with workers = {workers}: only a world of the "
+            "caller's process can be drawn; use workers=0"
+        )
 
 
 def _flags(agents: list[str], flags: NDArray[np.bool_]) -> dict[str, bool]:
@@ -99,11 +127,11 @@ class CavEnv(ParallelEnv[str, Any, Any]):  # type: ignore[misc] # PettingZoo is 
     hold every term by its name, and `active` (it has a vehicle), `vehicle_done` (that vehicle's
     trip ended in this step) and `vehicle_id`; all are plain numbers.
 
+    The world runs in this process, or its zones are shared out over worker processes
+    (docs/workers.md): what comes out is the same bit for bit.
+
     Args:
-        config: the environment.
-        network: its roads.
-        demand: whose vehicles drive beside the generator's.
-        partition: the zones; None: cut as `config.zones` says.
+        worlds: the one world; it begins anew in the next step, which never comes: a reset does.
         seed: of the first reset, if that is given none.
         render_mode: `human`, `rgb_array` or None.
     """
@@ -116,22 +144,11 @@ class CavEnv(ParallelEnv[str, Any, Any]):  # type: ignore[misc] # PettingZoo is 
     }
 
     def __init__(
-        self,
-        config: EnvConfig,
-        network: RoadNetwork,
-        demand: DemandFile | None = None,
-        partition: ZonePartition | None = None,
-        *,
-        seed: int | None = None,
-        render_mode: str | None = None,
+        self, worlds: SteppedWorlds, *, seed: int | None = None, render_mode: str | None = None
     ) -> None:
-        if render_mode is not None and render_mode not in RENDER_MODES:
-            raise ConfigError(
-                f"render_mode = {render_mode!r}: must be {' or '.join(RENDER_MODES)}, or None"
-            )
-        check_agents(config)
-        self.config = config
-        self.network = network
+        self.worlds = worlds
+        self.config = config = worlds.world.config
+        self.network = worlds.world.network
         self.render_mode = render_mode
         self.ghosts_of: int | None = None
         self.metadata = {
@@ -152,10 +169,9 @@ class CavEnv(ParallelEnv[str, Any, Any]):  # type: ignore[misc] # PettingZoo is 
         self._parts = (
             observation_parts(config.sensors) if config.observation.kind == "dict" else None
         )
-        self._simulation = Simulation(config, network, demand=demand, partition=partition)
-        self.state_space = state_space(self._simulation.capacity)
+        self.state_space = state_space(worlds.arrays.states.shape[1] // STATE_FEATURES)
         self._decoder = ActionDecoder(config.action, 1, self.possible_agents)
-        self._first_seed = None if seed is None else check_seed(seed)
+        self._first_seed = seed
         self._steps = -1
         self._view: WorldView | None = None
 
@@ -166,8 +182,12 @@ class CavEnv(ParallelEnv[str, Any, Any]):  # type: ignore[misc] # PettingZoo is 
 
     @property
     def simulation(self) -> Simulation:
-        """The world behind this view, for tools that draw or measure it."""
-        return self._simulation
+        """The world behind this view, for tools that draw or measure it.
+
+        Raises:
+            ConfigError: it lives in worker processes.
+        """
+        return self.worlds.simulation
 
     def observation_space(self, agent: str) -> spaces.Space[Any]:
         """The same object at each call and for each agent."""
@@ -187,12 +207,13 @@ class CavEnv(ParallelEnv[str, Any, Any]):  # type: ignore[misc] # PettingZoo is 
             options: not used; accepted because the API has it.
         """
         if seed is not None or self._steps < 0:
-            self._simulation.seed(first_seed(seed, self._first_seed))
-        self._simulation.reset()
-        self._decoder.forget(np.ones(1, dtype=np.bool_))
+            seed = first_seed(seed, self._first_seed)
+        arrays = self.worlds.arrays
+        arrays.chosen[:] = True
+        self.worlds.reset(seed, 0)
+        self._decoder.forget(arrays.chosen)
         self._steps = 0
-        present = self._simulation.outputs.present[0]
-        self._list(np.flatnonzero(present | self._seats))
+        self._list(np.flatnonzero(arrays.mask[0] | self._seats))
         if not self.agents:
             self._wait_for_agents()
         return self._observations(), self._infos()
@@ -222,11 +243,10 @@ class CavEnv(ParallelEnv[str, Any, Any]):  # type: ignore[misc] # PettingZoo is 
             if actions:
                 raise EpisodeEndedError("the episode is over: call env.reset()")
             return {}, {}, {}, {}, {}
-        outputs = self._simulation.outputs
-        active = (outputs.present[0] & ~outputs.terminated[0])[self._listed]
+        active = self.worlds.arrays.mask[0, self._listed]
         needed = self.agents if active.all() else list(compress(self.agents, active.tolist()))
         commands = self._decoder.from_dict(actions, self.agents, needed)
-        self._simulation.step(commands)
+        self.worlds.step(commands)
         self._steps += 1
         return self._report()
 
@@ -240,20 +260,19 @@ class CavEnv(ParallelEnv[str, Any, Any]):  # type: ignore[misc] # PettingZoo is 
         dict[str, dict[str, float]],
     ]:
         """What the agents get after a step; decides who stays."""
-        outputs = self._simulation.outputs
+        arrays = self.worlds.arrays
         truncated = self._steps >= self.max_cycles
         if not truncated:
-            entered = outputs.present[0].copy()
+            entered = arrays.vehicle_ids[0] >= 0
             entered[self._listed] = False
             if entered.any():
                 self._list(np.concatenate([self._rows, np.flatnonzero(entered)]))
         shown = self.agents
-        ended = outputs.terminated[0, self._listed] & (not self._seats)
+        ended = arrays.terminations[0, self._listed] & (not self._seats)
         observations, infos = self._observations(), self._infos()
-        rewards = dict(zip(shown, outputs.rewards[0, self._listed].tolist(), strict=True))
+        rewards = dict(zip(shown, arrays.rewards[0, self._listed].tolist(), strict=True))
         terminations = _flags(shown, ended)
         truncations = _flags(shown, ~ended & truncated)
-        self._simulation.retire_agents()
         if truncated:
             self._list(self._rows[:0])
         elif ended.any():
@@ -279,16 +298,16 @@ class CavEnv(ParallelEnv[str, Any, Any]):  # type: ignore[misc] # PettingZoo is 
 
     def _wait_for_agents(self) -> None:
         """Let an empty world go on until an agent enters; ends without one at the horizon."""
-        while self._steps < self.max_cycles and self._simulation.agents_to_come()[0]:
-            self._simulation.step(self._decoder.idle())
+        arrays = self.worlds.arrays
+        while not arrays.episode_over[0]:
+            self.worlds.step(self._decoder.idle())
             self._steps += 1
-            present = self._simulation.outputs.present[0]
-            if present.any() and self._steps < self.max_cycles:
-                self._list(np.flatnonzero(present))
+            if arrays.mask.any():
+                self._list(np.flatnonzero(arrays.mask[0]))
                 break
 
     def _observations(self) -> dict[str, Observation]:
-        found = self._simulation.outputs.observations[0].copy()[self._listed]
+        found = self.worlds.arrays.observations[0].copy()[self._listed]
         if self._parts is None:
             return dict(zip(self.agents, found, strict=True))
         named = named_observation(
@@ -300,13 +319,13 @@ class CavEnv(ParallelEnv[str, Any, Any]):  # type: ignore[misc] # PettingZoo is 
         }
 
     def _infos(self) -> dict[str, dict[str, float]]:
-        outputs, listed = self._simulation.outputs, self._listed
-        done = outputs.events[0, listed] & EVENTS_THAT_END != 0
-        active = outputs.present[0, listed] & ~done
-        terms = outputs.terms[0, listed].T
+        arrays, listed = self.worlds.arrays, self._listed
+        done, ids = arrays.vehicle_done[0, listed], arrays.vehicle_ids[0, listed]
+        active = (ids >= 0) & ~done
+        terms = arrays.terms[0, listed].T
         # Most are 0 for everybody: no accident, no red light.
         columns = [(TERMS[k], terms[k]) for k in np.flatnonzero(terms.any(axis=1)).tolist()]
-        columns.append(("vehicle_id", outputs.vehicle_ids[0, listed]))
+        columns.append(("vehicle_id", ids))
         usual = _ACTIVE
         if not active.all():
             usual = _ABSENT
@@ -328,11 +347,13 @@ class CavEnv(ParallelEnv[str, Any, Any]):  # type: ignore[misc] # PettingZoo is 
 
     def state(self) -> NDArray[np.float32]:
         """The global state, within `state_space`: see `cavmarl.state.global_state`."""
-        return global_state(self.network, self._simulation.vehicles(), self.state_space)
+        self.worlds.write_states()
+        state: NDArray[np.float32] = self.worlds.arrays.states[0].copy()
+        return state
 
     def state_hash(self) -> str:
         """Hex digest over all live vehicles in id order, signals, queue and random keys."""
-        return self._simulation.state_hash()
+        return self.worlds.state_hash(0)
 
     def traffic_stats(self) -> dict[str, float]:
         """Traffic since reset: departed, waiting, running, arrived, contacts, mean speed and more.
@@ -340,13 +361,12 @@ class CavEnv(ParallelEnv[str, Any, Any]):  # type: ignore[misc] # PettingZoo is 
         All fields of `runtime.simulation.TrafficStats`, and how many actions were clipped, held and
         ignored.
         """
-        return {**asdict(self._simulation.traffic_stats()), **self._decoder.tolerated()}
+        return {**self.worlds.traffic_stats(0), **self._decoder.tolerated()}
 
     def suggest_actions(self) -> dict[str, Any]:
         """What the built-in driver (IDM, MOBIL, lane controller) would do in each agent's place."""
-        raw = np.zeros((1, len(self.possible_agents), 2))
-        self._simulation.suggest(raw)
-        batch = self._decoder.encode(raw)[0]
+        self.worlds.suggest()
+        batch = self._decoder.encode(self.worlds.arrays.suggested)[0]
         return dict(zip(self.agents, batch[self._rows], strict=True))
 
     def render(self) -> NDArray[np.uint8] | None:
@@ -365,7 +385,7 @@ class CavEnv(ParallelEnv[str, Any, Any]):  # type: ignore[misc] # PettingZoo is 
             raise ResetNeededError("render() before reset(): call env.reset(seed=…) first")
         if self._view is None:
             self._view = WorldView(
-                self._simulation,
+                self.simulation,
                 self.render_mode,
                 self.metadata["name"],
                 self.metadata["render_fps"],
@@ -373,7 +393,11 @@ class CavEnv(ParallelEnv[str, Any, Any]):  # type: ignore[misc] # PettingZoo is 
         return self._view.show(self.ghosts_of)
 
     def close(self) -> None:
-        """Close the window, if there is one; the environment can be used on."""
+        """Close the window and end the worker processes, if there are any.
+
+        Without workers the environment can be used on.
+        """
         if self._view is not None:
             self._view.close()
             self._view = None
+        self.worlds.close()

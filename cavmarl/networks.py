@@ -42,6 +42,7 @@ META_ACTIONS = 5
 MAX_LAYERS = 8
 MAX_WIDTH = 4096
 MAX_OBSERVATION_SIZE = 65_536
+MAX_STATE_SIZE = 1_048_576
 MAX_DEVIATIONS = 5.0  # observations further from the mean are cut
 LOG_2_PI = math.log(2.0 * math.pi)
 
@@ -58,6 +59,8 @@ class NetworkConfig:
         hidden: widths of the hidden layers, of the actor and of the critic.
         seed: of its training.
         agent_steps: decisions that it learned from.
+        state_size: numbers of the world's state that its critic sees beside the observation. The
+            driver itself never does.
     """
 
     environment: str
@@ -67,6 +70,7 @@ class NetworkConfig:
     hidden: tuple[int, ...] = (128, 128)
     seed: int = 0
     agent_steps: int = 0
+    state_size: int = 0
 
     def __post_init__(self) -> None:
         if not 1 <= self.observation_size <= MAX_OBSERVATION_SIZE:
@@ -74,6 +78,8 @@ class NetworkConfig:
                 f"observation_size = {self.observation_size}: must be from 1 to "
                 f"{MAX_OBSERVATION_SIZE}"
             )
+        if not 0 <= self.state_size <= MAX_STATE_SIZE:
+            raise ConfigError(f"state_size = {self.state_size}: must be from 0 to {MAX_STATE_SIZE}")
         if not 1 <= len(self.hidden) <= MAX_LAYERS or not all(
             1 <= width <= MAX_WIDTH for width in self.hidden
         ):
@@ -94,8 +100,11 @@ class NetworkConfig:
             + deviations
             + sum(
                 (inputs + 1) * outputs
-                for last in (actions, 1)
-                for inputs, outputs in pairwise((self.observation_size, *self.hidden, last))
+                for sizes in (
+                    (self.observation_size, *self.hidden, actions),
+                    (self.observation_size + self.state_size, *self.hidden, 1),
+                )
+                for inputs, outputs in pairwise(sizes)
             )
         )
 
@@ -104,7 +113,8 @@ class ActorCritic(nn.Module):
     """A policy and a value function, each a small tanh network of its own.
 
     Both see observations less their `mean`, over their `deviation`: buffers that training fills and
-    a checkpoint keeps.
+    a checkpoint keeps. With a `state_size` the value function is a central critic, which also sees
+    the state of the whole world (Yu et al. 2022).
 
     Continuous actions are normal around the actor's output, with one learned deviation an action:
     the environment gets them clipped to [-1, 1], learning the raw ones. Discrete actions are
@@ -123,14 +133,15 @@ class ActorCritic(nn.Module):
     ) -> None:
         super().__init__()
         self.continuous = config.action.kind == "continuous"
+        self.state_size = config.state_size
         actions = CONTINUOUS_ACTIONS if self.continuous else META_ACTIONS
-        sizes = (config.observation_size, *config.hidden)
         self.register_buffer("mean", torch.zeros(config.observation_size))
         self.register_buffer("deviation", torch.ones(config.observation_size))
         # Small last weights: the first policy does nothing in particular (Andrychowicz et al.
         # 2021).
-        self.actor = _perceptron((*sizes, actions), last_gain=0.01)
-        self.critic = _perceptron((*sizes, 1), last_gain=1.0)
+        size = config.observation_size
+        self.actor = _perceptron((size, *config.hidden, actions), last_gain=0.01)
+        self.critic = _perceptron((size + config.state_size, *config.hidden, 1), last_gain=1.0)
         if self.continuous:
             self.log_std = nn.Parameter(torch.tensor(initial_std).log())
 
@@ -139,9 +150,12 @@ class ActorCritic(nn.Module):
         output: Tensor = self.actor(self._normal(observations))
         return output
 
-    def value(self, observations: Tensor) -> Tensor:
-        """Expected return (N,) of observations (N, D)."""
-        values: Tensor = self.critic(self._normal(observations)).squeeze(-1)
+    def value(self, observations: Tensor, states: Tensor | None = None) -> Tensor:
+        """Expected return (N,) of observations (N, D), for a central critic in states (N, S)."""
+        seen = self._normal(observations)
+        if self.state_size and states is not None:
+            seen = torch.cat([seen, states], dim=-1)
+        values: Tensor = self.critic(seen).squeeze(-1)
         return values
 
     def best(self, observations: Tensor) -> Tensor:
@@ -149,14 +163,17 @@ class ActorCritic(nn.Module):
         output = self.forward(observations)
         return output.clamp(-1.0, 1.0) if self.continuous else output.argmax(-1)
 
-    def sample(self, observations: Tensor) -> tuple[Tensor, Tensor]:
+    def sample(
+        self, observations: Tensor, generator: torch.Generator | None = None
+    ) -> tuple[Tensor, Tensor]:
         """Random actions, continuous ones not clipped, and their log probabilities (N,)."""
         output = self.forward(observations)
+        noise = torch.empty_like(output)
         if self.continuous:
-            actions = output + torch.randn_like(output) * self.log_std.exp()
+            actions = output + noise.normal_(generator=generator) * self.log_std.exp()
         else:
             # The largest of log-weights plus Gumbel noise is a draw by these weights.
-            noise = torch.empty_like(output).exponential_().log()
+            noise = noise.exponential_(generator=generator).log()
             actions = (output - noise).argmax(-1)
         return actions, self._log_prob(output, actions)
 

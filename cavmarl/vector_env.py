@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Literal
@@ -145,6 +146,10 @@ class CavVectorEnv:
         seed: of the first reset, if that is given none.
         copy: False returns observations as a read-only view that the next step or reset overwrites;
             large ones are copied for longer than they are made.
+
+    Attributes:
+        simulated_s: time that all steps have taken up to now, without that for checking actions and
+            copying what comes out.
     """
 
     def __init__(
@@ -176,11 +181,17 @@ class CavVectorEnv:
         self._first_seed = None if seed is None else check_seed(seed)
         self._copy = copy
         self._ready = False
+        self.simulated_s = 0.0
 
     @property
     def step_s(self) -> float:
         """Seconds a step."""
         return self.config.clock.ctrl_dt_s
+
+    @property
+    def state_size(self) -> int:
+        """Numbers in the global state of a world."""
+        return int(self.worlds.arrays.states.shape[1])
 
     @property
     def simulation(self) -> Simulation:
@@ -274,7 +285,10 @@ class CavVectorEnv:
         """
         if not self._ready:
             raise ResetNeededError("step() before reset(): call vec.reset(seed=…) first")
-        self.worlds.step(self._decoder.from_array(actions, self._mask))
+        commands = self._decoder.from_array(actions, self._mask)
+        began = time.perf_counter()
+        self.worlds.step(commands)
+        self.simulated_s += time.perf_counter() - began
         arrays = self.worlds.arrays
         over = arrays.episode_over.copy()
         terminations = arrays.terminations.copy()
@@ -308,6 +322,14 @@ class CavVectorEnv:
         """What the built-in driver (IDM, MOBIL, lane controller) would do in each agent's place."""
         self.worlds.suggest()
         return self._decoder.encode(self.worlds.arrays.suggested)
+
+    def state(self) -> NDArray[np.float32]:
+        """The global states (W, S), each as `CavEnv.state`; what a central critic may see.
+
+        Of a world that begins anew in the same step it is the new episode's.
+        """
+        self.worlds.write_states()
+        return self.worlds.arrays.states.copy()
 
     def state_hash(self, world: int = 0) -> str:
         """Hex digest of one world, as `CavEnv.state_hash`."""

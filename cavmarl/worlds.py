@@ -25,12 +25,12 @@ from cavmarl.roads.zone_file import zones_for
 from cavmarl.roads.zone_layouts import cut_map
 from cavmarl.roads.zones import ZonePartition
 from cavmarl.traffic.demand import DemandFile, read_demand
+from cavmarl.traffic.native import capacity_of
 
 __all__ = [
     "World",
     "check_agents",
     "check_hosts",
-    "check_placement",
     "check_workers",
     "find_map",
     "load_roads",
@@ -54,6 +54,13 @@ class World(NamedTuple):
     network: RoadNetwork
     demand: DemandFile | None
     partition: ZonePartition
+
+    @property
+    def capacity(self) -> int:
+        """How many vehicles it can hold."""
+        config = self.config
+        dt, horizon_s = config.clock.sim_dt_s, config.horizon_s
+        return capacity_of(self.network, config.population, self.demand, dt, horizon_s)
 
 
 def load_world(
@@ -151,19 +158,6 @@ def find_map(env: str | Path) -> Path:
         MapError: the map cannot be read.
     """
     return map_file(resolve_map(*load_config(env))).resolve()
-
-
-def check_placement(workers: int | None) -> None:
-    """Refuse worker processes for a single world.
-
-    Raises:
-        ConfigError: not None or 0.
-    """
-    if workers not in (None, 0):
-        raise ConfigError(
-            f"workers = {workers!r}: a single world runs in the caller's process; use 0, or "
-            "cavmarl.make_vec(…, num_envs=…, workers=…) for many worlds"
-        )
 
 
 def check_workers(workers: int | None) -> int:

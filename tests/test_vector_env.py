@@ -91,6 +91,7 @@ def test_a_world_of_arrays_is_the_parallel_environment(mode: str) -> None:
         if not infos["mask"][0].any():
             break
         assert vec.state_hash(0) == env.state_hash()
+        np.testing.assert_array_equal(vec.state()[0], env.state())
 
 
 def test_worlds_do_not_touch_each_other() -> None:

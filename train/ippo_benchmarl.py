@@ -11,12 +11,11 @@ programs of ours do not read them.
 
 from __future__ import annotations
 
-import argparse
 import sys
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Annotated, get_args, get_type_hints
+from typing import Annotated
 
 import torch
 from benchmarl.algorithms import algorithm_config_registry
@@ -24,8 +23,14 @@ from benchmarl.experiment import Experiment, ExperimentConfig
 from benchmarl.models.mlp import MlpConfig
 
 from cavmarl.adapters.benchmarl_task import CavTaskClass
-from cavmarl.errors import CavmarlError, ConfigError
+from cavmarl.errors import ConfigError
 from cavmarl.evaluate.training_record import begin_training, end_training
+from cavmarl.learning.options import (
+    check_at_least,
+    parse_settings,
+    run_folder,
+    run_program,
+)
 
 POLICY_FILE = "policy.pt"
 
@@ -49,10 +54,8 @@ class Args:
     name: Annotated[str, "folder of this run; empty: ENV_benchmarl_SEED"] = ""
 
     def __post_init__(self) -> None:
-        for name in ("num_worlds", "updates", "num_steps", "epochs", "minibatches"):
-            if getattr(self, name) < 1:
-                option = name.replace("_", "-")
-                raise ConfigError(f"--{option} {getattr(self, name)}: must be at least 1")
+        least_one = ("num_worlds", "updates", "num_steps", "epochs", "minibatches")
+        check_at_least(self, dict.fromkeys(least_one, 1))
         if self.algorithm not in algorithm_config_registry:
             known = ", ".join(algorithm_config_registry)
             raise ConfigError(f"--algorithm {self.algorithm}: must be one of {known}")
@@ -60,20 +63,7 @@ class Args:
     @property
     def folder(self) -> Path:
         """Where this run lies."""
-        stem = Path(self.env).name.split(".")[0]
-        return Path(self.runs) / (self.name or f"{stem}_benchmarl_{self.seed}")
-
-
-def parse_args(words: Sequence[str] | None = None) -> Args:
-    """The settings that the command line asks for."""
-    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    hints = get_type_hints(Args, include_extras=True)
-    for field in fields(Args):
-        kind, text = get_args(hints[field.name])
-        option = f"--{field.name.replace('_', '-')}"
-        shown = f"{text} (default: {field.default!r})"
-        parser.add_argument(option, type=kind, default=field.default, help=shown)
-    return Args(**vars(parser.parse_args(words)))
+        return run_folder(self.runs, self.name, self.env, "benchmarl", self.seed)
 
 
 def make_experiment(args: Args) -> Experiment:
@@ -125,13 +115,7 @@ def train(args: Args) -> Path:
 
 def main(words: Sequence[str] | None = None) -> int:
     """Train; 0: trained, 2: wrong use."""
-    try:
-        folder = train(parse_args(words))
-    except CavmarlError as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 2
-    print(f"run: {folder}")
-    return 0
+    return run_program(lambda: train(parse_settings(Args, words, __doc__)), "run: {folder}")
 
 
 if __name__ == "__main__":

@@ -10,17 +10,14 @@ ours. The run's folder holds it as `model.safetensors` and `config.json`, which
 
 from __future__ import annotations
 
-import argparse
-import csv
 import sys
 import time
 from collections import deque
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Annotated, Any, get_args, get_type_hints
+from typing import Annotated, Any
 
-import numpy as np
 import torch
 from tensordict import TensorDict
 from tensordict.nn import TensorDictModule
@@ -31,14 +28,18 @@ from torchrl.objectives import ClipPPOLoss
 from torchrl.objectives.value import GAE
 
 from cavmarl.adapters.torchrl_env import GROUP, CavTorchRLEnv
-from cavmarl.errors import CavmarlError, ConfigError
 from cavmarl.evaluate.training_record import begin_training, end_training
+from cavmarl.learning.log import CSV_FILE, WINDOW, Log, curve_row
+from cavmarl.learning.options import (
+    check_at_least,
+    parse_settings,
+    run_folder,
+    run_program,
+)
 from cavmarl.networks import CONFIG_FILE, WEIGHTS_FILE, ActorCritic, NetworkConfig, save_network
 from cavmarl.registry import load_config
 
-WINDOW = 400  # trips
 LEAST_DEVIATION = 0.02  # of an observation; those that hardly change are not blown up
-CURVE_FILE = "progress.csv"
 OBSERVATION, MASK, ACTION, LOG_PROB, VALUE = (
     (GROUP, name) for name in ("observation", "mask", "action", "log_prob", "state_value")
 )
@@ -65,28 +66,13 @@ class Args:
     name: Annotated[str, "folder of this run; empty: ENV_torchrl_SEED"] = ""
 
     def __post_init__(self) -> None:
-        for name in ("num_worlds", "total_agent_steps", "num_steps", "epochs", "minibatches"):
-            if getattr(self, name) < 1:
-                option = name.replace("_", "-")
-                raise ConfigError(f"--{option} {getattr(self, name)}: must be at least 1")
+        least_one = ("num_worlds", "total_agent_steps", "num_steps", "epochs", "minibatches")
+        check_at_least(self, dict.fromkeys(least_one, 1))
 
     @property
     def folder(self) -> Path:
         """Where this run lies."""
-        stem = Path(self.env).name.split(".")[0]
-        return Path(self.runs) / (self.name or f"{stem}_torchrl_{self.seed}")
-
-
-def parse_args(words: Sequence[str] | None = None) -> Args:
-    """The settings that the command line asks for."""
-    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    hints = get_type_hints(Args, include_extras=True)
-    for field in fields(Args):
-        kind, text = get_args(hints[field.name])
-        option = f"--{field.name.replace('_', '-')}"
-        shown = f"{text} (default: {field.default!r})"
-        parser.add_argument(option, type=kind, default=field.default, help=shown)
-    return Args(**vars(parser.parse_args(words)))
+        return run_folder(self.runs, self.name, self.env, "torchrl", self.seed)
 
 
 class Policy(nn.Module):
@@ -192,15 +178,11 @@ class Curve:
     """Writes a line for every update. Trips that the horizon cut do not count.
 
     Args:
-        path: of the table.
+        folder: of the run.
     """
 
-    def __init__(self, path: Path) -> None:
-        self._file = path.open("w", encoding="utf-8", newline="")
-        self._writer = csv.writer(self._file)
-        self._writer.writerow(
-            ("updates", "agent_steps", "seconds", "trips", "trip_return", "success")
-        )
+    def __init__(self, folder: Path) -> None:
+        self._log = Log(folder)
         self._ended: deque[tuple[float, bool]] = deque(maxlen=WINDOW)
         self._returns: Any = 0.0
         self._trips = self._updates = 0
@@ -219,14 +201,11 @@ class Curve:
             self._trips += int(ended.sum())
             self._returns[after["done"][:, step]] = 0.0
         self._updates += 1
-        returns, success = np.array(self._ended).mean(axis=0) if self._ended else (np.nan, np.nan)
-        row = (self._updates, decisions, seconds, self._trips, returns, success)
-        self._writer.writerow([f"{value:.6g}" for value in row])
-        self._file.flush()
+        self._log.write(curve_row(self._updates, decisions, seconds, self._trips, self._ended))
 
     def close(self) -> None:
         """Close the table."""
-        self._file.close()
+        self._log.close()
 
 
 def make_worlds(args: Args) -> CavTorchRLEnv:
@@ -276,7 +255,7 @@ def train(args: Args) -> Path:
     network, config = make_network(args, worlds)
     args.folder.mkdir(parents=True, exist_ok=True)
     begin_training(args.folder, "ippo_torchrl.py", asdict(args), worlds.vec.worlds.world)
-    learner, curve = Learner(network, args), Curve(args.folder / CURVE_FILE)
+    learner, curve = Learner(network, args), Curve(args.folder)
     frames = args.num_worlds * args.num_steps
     collector = Collector(worlds, learner.actor, frames_per_batch=frames, total_frames=-1)
     limit_s = 60.0 * args.minutes if args.minutes else float("inf")
@@ -290,19 +269,13 @@ def train(args: Args) -> Path:
     collector.shutdown()
     curve.close()
     save_network(args.folder, network, NetworkConfig(**{**vars(config), "agent_steps": decisions}))
-    end_training(args.folder, (WEIGHTS_FILE, CONFIG_FILE, CURVE_FILE))
+    end_training(args.folder, (WEIGHTS_FILE, CONFIG_FILE, CSV_FILE))
     return args.folder
 
 
 def main(words: Sequence[str] | None = None) -> int:
     """Train; 0: trained, 2: wrong use."""
-    try:
-        folder = train(parse_args(words))
-    except CavmarlError as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 2
-    print(f"driver: {folder}  (cavmarl evaluate ENV --policy {folder})")
-    return 0
+    return run_program(lambda: train(parse_settings(Args, words, __doc__)))
 
 
 if __name__ == "__main__":

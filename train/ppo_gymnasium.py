@@ -10,15 +10,13 @@ of `ippo_torch.py`, and `manifest.json`, which says what it was trained with.
 
 from __future__ import annotations
 
-import argparse
-import csv
 import sys
 import time
 from collections import deque
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, fields, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Annotated, Any, get_args, get_type_hints
+from typing import Annotated, Any
 
 import gymnasium
 import numpy as np
@@ -27,12 +25,16 @@ from gymnasium.vector import AutoresetMode
 from gymnasium.wrappers.vector import NormalizeObservation, RecordEpisodeStatistics
 from torch import Tensor
 
-from cavmarl.errors import CavmarlError, ConfigError
+from cavmarl.errors import ConfigError
 from cavmarl.evaluate.training_record import begin_training, end_training
+from cavmarl.learning.log import CSV_FILE, WINDOW, Log, curve_row
+from cavmarl.learning.options import (
+    check_at_least,
+    parse_settings,
+    run_folder,
+    run_program,
+)
 from cavmarl.networks import CONFIG_FILE, WEIGHTS_FILE, ActorCritic, NetworkConfig, save_network
-
-WINDOW = 400  # trips
-CURVE_FILE = "progress.csv"
 
 
 @dataclass(frozen=True)
@@ -58,27 +60,13 @@ class Args:
     name: Annotated[str, "folder of this run; empty: ENV_gymnasium_SEED"] = ""
 
     def __post_init__(self) -> None:
-        for name in ("total_agent_steps", "num_steps", "epochs", "minibatches"):
-            if getattr(self, name) < 1:
-                option = name.replace("_", "-")
-                raise ConfigError(f"--{option} {getattr(self, name)}: must be at least 1")
+        least_one = ("total_agent_steps", "num_steps", "epochs", "minibatches")
+        check_at_least(self, dict.fromkeys(least_one, 1))
 
     @property
     def folder(self) -> Path:
         """Where this run lies."""
-        return Path(self.runs) / (self.name or f"{self.env}_gymnasium_{self.seed}")
-
-
-def parse_args(words: Sequence[str] | None = None) -> Args:
-    """The settings that the command line asks for."""
-    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    hints = get_type_hints(Args, include_extras=True)
-    for field in fields(Args):
-        kind, text = get_args(hints[field.name])
-        option = f"--{field.name.replace('_', '-')}"
-        shown = f"{text} (default: {field.default!r})"
-        parser.add_argument(option, type=kind, default=field.default, help=shown)
-    return Args(**vars(parser.parse_args(words)))
+        return run_folder(self.runs, self.name, self.env, "gymnasium", self.seed)
 
 
 def make_rows(args: Args) -> Any:
@@ -219,30 +207,20 @@ def train(args: Args) -> Path:
     learner = Learner(rows, network, args)
     limit_s = 60.0 * args.minutes if args.minutes else float("inf")
     began_at, updates, decisions, seconds = time.perf_counter(), 0, 0, 0.0
-    with (args.folder / CURVE_FILE).open("w", encoding="utf-8", newline="") as file:
-        writer = csv.writer(file)
-        writer.writerow(("updates", "agent_steps", "seconds", "trips", "trip_return", "success"))
-        while decisions < args.total_agent_steps and seconds < limit_s:
-            decisions += learner.update(max(1.0 - decisions / args.total_agent_steps, 0.0))
-            updates, seconds = updates + 1, time.perf_counter() - began_at
-            means = np.mean(learner.trips, axis=0) if learner.trips else (np.nan, np.nan)
-            row = (updates, decisions, seconds, learner.num_trips, *means)
-            writer.writerow([f"{value:.6g}" for value in row])
-            file.flush()
+    log = Log(args.folder)
+    while decisions < args.total_agent_steps and seconds < limit_s:
+        decisions += learner.update(max(1.0 - decisions / args.total_agent_steps, 0.0))
+        updates, seconds = updates + 1, time.perf_counter() - began_at
+        log.write(curve_row(updates, decisions, seconds, learner.num_trips, learner.trips))
+    log.close()
     save_driver(args, network, replace(config, agent_steps=decisions), rows)
-    end_training(args.folder, (WEIGHTS_FILE, CONFIG_FILE, CURVE_FILE))
+    end_training(args.folder, (WEIGHTS_FILE, CONFIG_FILE, CSV_FILE))
     return args.folder
 
 
 def main(words: Sequence[str] | None = None) -> int:
     """Train; 0: trained, 2: wrong use."""
-    try:
-        folder = train(parse_args(words))
-    except CavmarlError as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 2
-    print(f"driver: {folder}  (cavmarl evaluate ENV --policy {folder})")
-    return 0
+    return run_program(lambda: train(parse_settings(Args, words, __doc__)))
 
 
 if __name__ == "__main__":

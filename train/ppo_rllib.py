@@ -10,15 +10,13 @@ an `RLModule`. The run's folder holds it as `model.safetensors` and `config.json
 
 from __future__ import annotations
 
-import argparse
-import csv
 import sys
 import time
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, fields, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Annotated, Any, get_args, get_type_hints
+from typing import Annotated, Any
 
 import ray
 import torch
@@ -32,12 +30,16 @@ from torch import Tensor
 
 from cavmarl.adapters.rllib_env import CavRllibEnv
 from cavmarl.cav_env import parallel_env
-from cavmarl.errors import CavmarlError, ConfigError
 from cavmarl.evaluate.training_record import begin_training, end_training
+from cavmarl.learning.log import CSV_FILE, WINDOW, Log, curve_row
+from cavmarl.learning.options import (
+    check_at_least,
+    parse_settings,
+    run_folder,
+    run_program,
+)
 from cavmarl.networks import CONFIG_FILE, WEIGHTS_FILE, ActorCritic, NetworkConfig, save_network
 
-WINDOW = 400  # trips
-CURVE_FILE = "progress.csv"
 DRIVER = "driver"  # the policy that all agents share
 
 
@@ -62,31 +64,13 @@ class Args:
     name: Annotated[str, "folder of this run; empty: ENV_rllib_SEED"] = ""
 
     def __post_init__(self) -> None:
-        least = {"num_runners": 0}
-        for name in ("num_worlds", "total_agent_steps", "num_steps", "epochs", "minibatches"):
-            least[name] = 1
-        for name, bound in least.items():
-            if getattr(self, name) < bound:
-                option = name.replace("_", "-")
-                raise ConfigError(f"--{option} {getattr(self, name)}: must be at least {bound}")
+        least_one = ("num_worlds", "total_agent_steps", "num_steps", "epochs", "minibatches")
+        check_at_least(self, {"num_runners": 0, **dict.fromkeys(least_one, 1)})
 
     @property
     def folder(self) -> Path:
         """Where this run lies."""
-        stem = Path(self.env).name.split(".")[0]
-        return Path(self.runs) / (self.name or f"{stem}_rllib_{self.seed}")
-
-
-def parse_args(words: Sequence[str] | None = None) -> Args:
-    """The settings that the command line asks for."""
-    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    hints = get_type_hints(Args, include_extras=True)
-    for field in fields(Args):
-        kind, text = get_args(hints[field.name])
-        option = f"--{field.name.replace('_', '-')}"
-        shown = f"{text} (default: {field.default!r})"
-        parser.add_argument(option, type=kind, default=field.default, help=shown)
-    return Args(**vars(parser.parse_args(words)))
+        return run_folder(self.runs, self.name, self.env, "rllib", self.seed)
 
 
 class Driver(TorchRLModule, ValueFunctionAPI):  # type: ignore[misc] # RLlib is not typed
@@ -191,17 +175,14 @@ def train(args: Args) -> Path:
     algorithm = make_algorithm(args, network)
     limit_s = 60.0 * args.minutes if args.minutes else float("inf")
     began_at, updates, decisions, seconds = time.perf_counter(), 0, 0, 0.0
-    with (args.folder / CURVE_FILE).open("w", encoding="utf-8", newline="") as file:
-        writer = csv.writer(file)
-        writer.writerow(("updates", "agent_steps", "seconds", "trips", "trip_return", "success"))
-        while decisions < args.total_agent_steps and seconds < limit_s:
-            found = algorithm.train()["env_runners"]
-            updates, seconds = updates + 1, time.perf_counter() - began_at
-            decisions = int(found["num_module_steps_sampled_lifetime"][DRIVER])
-            trips = [found.get(name, float("nan")) for name in ("trip_return", "success")]
-            row = (updates, decisions, seconds, found.get("trips", 0), *trips)
-            writer.writerow([f"{value:.6g}" for value in row])
-            file.flush()
+    log = Log(args.folder)
+    while decisions < args.total_agent_steps and seconds < limit_s:
+        found = algorithm.train()["env_runners"]
+        updates, seconds = updates + 1, time.perf_counter() - began_at
+        decisions = int(found["num_module_steps_sampled_lifetime"][DRIVER])
+        means = tuple(found.get(name, float("nan")) for name in ("trip_return", "success"))
+        log.write(curve_row(updates, decisions, seconds, found.get("trips", 0), [means]))
+    log.close()
     algorithm.learner_group.foreach_learner(
         lambda learner: save_network(
             args.folder.absolute(),
@@ -211,19 +192,13 @@ def train(args: Args) -> Path:
     )
     algorithm.stop()
     ray.shutdown()
-    end_training(args.folder, (WEIGHTS_FILE, CONFIG_FILE, CURVE_FILE))
+    end_training(args.folder, (WEIGHTS_FILE, CONFIG_FILE, CSV_FILE))
     return args.folder
 
 
 def main(words: Sequence[str] | None = None) -> int:
     """Train; 0: trained, 2: wrong use."""
-    try:
-        folder = train(parse_args(words))
-    except CavmarlError as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 2
-    print(f"driver: {folder}  (cavmarl evaluate ENV --policy {folder})")
-    return 0
+    return run_program(lambda: train(parse_settings(Args, words, __doc__)))
 
 
 if __name__ == "__main__":

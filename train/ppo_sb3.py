@@ -11,15 +11,13 @@ trained with.
 
 from __future__ import annotations
 
-import argparse
-import csv
 import sys
 import time
 from collections import deque
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Annotated, Any, get_args, get_type_hints
+from typing import Annotated, Any
 
 import numpy as np
 import torch
@@ -29,8 +27,14 @@ from stable_baselines3.common.running_mean_std import RunningMeanStd
 from stable_baselines3.common.vec_env import VecMonitor, VecNormalize
 
 from cavmarl.adapters.sb3_vec_env import CavSb3VecEnv
-from cavmarl.errors import CavmarlError, ConfigError
 from cavmarl.evaluate.training_record import begin_training, end_training
+from cavmarl.learning.log import CSV_FILE, WINDOW, Log, curve_row
+from cavmarl.learning.options import (
+    check_at_least,
+    parse_settings,
+    run_folder,
+    run_program,
+)
 from cavmarl.networks import (
     CONFIG_FILE,
     MAX_DEVIATIONS,
@@ -41,8 +45,6 @@ from cavmarl.networks import (
 )
 from cavmarl.registry import load_config
 
-WINDOW = 400  # trips
-CURVE_FILE = "progress.csv"
 MODEL_FILE = "model.zip"
 
 
@@ -66,28 +68,13 @@ class Args:
     name: Annotated[str, "folder of this run; empty: ENV_sb3_SEED"] = ""
 
     def __post_init__(self) -> None:
-        for name in ("num_worlds", "total_agent_steps", "num_steps", "epochs", "minibatches"):
-            if getattr(self, name) < 1:
-                option = name.replace("_", "-")
-                raise ConfigError(f"--{option} {getattr(self, name)}: must be at least 1")
+        least_one = ("num_worlds", "total_agent_steps", "num_steps", "epochs", "minibatches")
+        check_at_least(self, dict.fromkeys(least_one, 1))
 
     @property
     def folder(self) -> Path:
         """Where this run lies."""
-        stem = Path(self.env).name.split(".")[0]
-        return Path(self.runs) / (self.name or f"{stem}_sb3_{self.seed}")
-
-
-def parse_args(words: Sequence[str] | None = None) -> Args:
-    """The settings that the command line asks for."""
-    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    hints = get_type_hints(Args, include_extras=True)
-    for field in fields(Args):
-        kind, text = get_args(hints[field.name])
-        option = f"--{field.name.replace('_', '-')}"
-        shown = f"{text} (default: {field.default!r})"
-        parser.add_argument(option, type=kind, default=field.default, help=shown)
-    return Args(**vars(parser.parse_args(words)))
+        return run_folder(self.runs, self.name, self.env, "sb3", self.seed)
 
 
 class Curve(BaseCallback):
@@ -96,19 +83,16 @@ class Curve(BaseCallback):
     Trips that the horizon cut count neither here nor in `ippo_torch.py`.
     """
 
-    def __init__(self, path: Path, minutes: float) -> None:
+    def __init__(self, folder: Path, minutes: float) -> None:
         super().__init__()
-        self._path = path
+        self._folder = folder
         self._limit_s = 60.0 * minutes if minutes else float("inf")
         self._ended: deque[tuple[float, bool]] = deque(maxlen=WINDOW)
         self._decisions = self._trips = self._updates = 0
 
     def _on_training_start(self) -> None:
         self._began_at = time.perf_counter()
-        self._file = self._path.open("w", encoding="utf-8", newline="")
-        names = ("updates", "agent_steps", "seconds", "trips", "trip_return", "success")
-        self._writer = csv.writer(self._file)
-        self._writer.writerow(names)
+        self._log = Log(self._folder)
 
     def _on_step(self) -> bool:
         infos: list[dict[str, Any]] = self.locals["infos"]
@@ -122,13 +106,11 @@ class Curve(BaseCallback):
     def _on_rollout_end(self) -> None:
         self._updates += 1
         seconds = time.perf_counter() - self._began_at
-        returns, arrived = np.array(self._ended).mean(axis=0) if self._ended else (np.nan, np.nan)
-        row = (self._updates, self._decisions, seconds, self._trips, returns, arrived)
-        self._writer.writerow([f"{value:.6g}" for value in row])
-        self._file.flush()
+        counts = (self._updates, self._decisions, seconds, self._trips)
+        self._log.write(curve_row(*counts, self._ended))
 
     def _on_training_end(self) -> None:
-        self._file.close()
+        self._log.close()
 
 
 def make_model(args: Args) -> tuple[PPO, VecNormalize]:
@@ -196,22 +178,16 @@ def train(args: Args) -> Path:
     model, worlds = make_model(args)
     args.folder.mkdir(parents=True, exist_ok=True)
     begin_training(args.folder, "ppo_sb3.py", asdict(args), worlds.get_attr("worlds")[0].world)
-    model.learn(args.total_agent_steps, Curve(args.folder / CURVE_FILE, args.minutes))
+    model.learn(args.total_agent_steps, Curve(args.folder, args.minutes))
     model.save(args.folder / MODEL_FILE)
     save_driver(args, model, worlds)
-    end_training(args.folder, (WEIGHTS_FILE, CONFIG_FILE, CURVE_FILE, MODEL_FILE))
+    end_training(args.folder, (WEIGHTS_FILE, CONFIG_FILE, CSV_FILE, MODEL_FILE))
     return args.folder
 
 
 def main(words: Sequence[str] | None = None) -> int:
     """Train; 0: trained, 2: wrong use."""
-    try:
-        folder = train(parse_args(words))
-    except CavmarlError as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 2
-    print(f"driver: {folder}  (cavmarl evaluate ENV --policy {folder})")
-    return 0
+    return run_program(lambda: train(parse_settings(Args, words, __doc__)))
 
 
 if __name__ == "__main__":

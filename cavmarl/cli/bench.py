@@ -14,6 +14,7 @@ from cavmarl.cli.bench_libraries import libraries
 from cavmarl.cli.bench_moving import moving
 from cavmarl.cli.bench_sharding import sharding
 from cavmarl.cli.bench_traffic import traffic
+from cavmarl.cli.bench_train import train
 from cavmarl.cli.bench_workers import workers
 from cavmarl.cli.output import (
     Agents,
@@ -40,6 +41,7 @@ app.command()(sharding)
 app.command()(balance)
 app.command()(moving)
 app.command()(workers)
+app.command()(train)
 app.command()(libraries)
 
 _SENSORS = {"lidar": "64 rays", "kinematics": "no rays", "puffer_drive": "pufferlib's"}

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import statistics
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Annotated
 
 import typer
@@ -24,9 +25,17 @@ from cavmarl.errors import ConfigError
 
 if TYPE_CHECKING:
     from cavmarl.evaluate.split_speed import SplitSpeed
+    from cavmarl.evaluate.vectorization_speed import VectorizationSpeed
     from cavmarl.evaluate.worker_speed import WorkerSpeed
 
 __all__ = ["workers"]
+
+AGENTS = 100  # in whose worlds nothing happens
+_LIBRARIES = {
+    "cavmarl": "cavmarl",
+    "gymnasium": "Gymnasium's AsyncVectorEnv",
+    "supersuit": "SuperSuit's concat_vec_envs_v1",
+}
 
 
 def workers(
@@ -58,11 +67,13 @@ def workers(
 ) -> None:
     """The same worlds without workers, with one and with several; and one world that is split.
 
-    How much faster several workers are, what an empty order costs, and for how many vehicles it
-    pays to split one world.
+    How much faster several workers are, what an empty order costs, from how many vehicles on it
+    pays to split one world, and what 100 agents in whose worlds nothing happens cost in our
+    workers, Gymnasium's and SuperSuit's.
     """
     from cavmarl.evaluate.core_ceiling import measure_ceiling
-    from cavmarl.evaluate.split_speed import measure_splits
+    from cavmarl.evaluate.split_speed import measure_splits, split_line
+    from cavmarl.evaluate.vectorization_speed import measure_vectorization
     from cavmarl.evaluate.worker_speed import measure_workers
 
     if at_least is not None and not 0.0 < at_least < math.inf:
@@ -107,7 +118,16 @@ def workers(
             overrides=parse_settings(settings),
             say=status.update,
         )
-    more = {"ceiling": ceiling.to_dict(), "splits": [split.to_dict() for split in splits]}
+        vectorization = measure_vectorization(
+            workers=count, agents=AGENTS // count * count, repeats=repeats, say=status.update
+        )
+    line = split_line(splits)
+    more = {
+        "ceiling": ceiling.to_dict(),
+        "splits": [split.to_dict() for split in splits],
+        "split_pays_from": line,
+        "vectorization": vectorization.to_dict(),
+    }
     write_json(json_path, found.to_dict() | more)
     console.print(_table(found))
     low, middle, high, highest = found.barrier_us
@@ -127,6 +147,8 @@ def workers(
     )
     for split in splits:
         console.print(_sentence(split), highlight=False)
+    console.print(_line(line, splits), highlight=False)
+    console.print(_vectorization(vectorization), highlight=False)
     if found.is_crowded:
         console.print("note: more workers than cores", style="yellow")
     if at_least is not None and found.ratio < at_least:
@@ -153,6 +175,34 @@ def _sentence(split: SplitSpeed) -> str:
         f"zones over one worker {whole:.2f}, over {split.workers} {parted:.2f}: "
         f"[bold]{split.ratio:.2f}[/] times, {verdict}"
     )
+
+
+def _line(line: int | None, splits: Sequence[SplitSpeed]) -> str:
+    """From where on a world is better split, as far as it was asked."""
+    numbers = ", ".join(str(split.vehicles) for split in splits)
+    if line is None:
+        return f"splitting one world does not pay at {numbers} vehicles here"
+    return f"splitting one world pays from {line} vehicles on here (of {numbers})"
+
+
+def _vectorization(found: VectorizationSpeed) -> str:
+    order = statistics.median(found.order_us)
+    lines = [
+        f"a step of {found.agents} agents over {found.workers} workers in whose worlds nothing "
+        f"happens, {found.numbers} numbers each:"
+    ]
+    for row in found.rows:
+        name = _LIBRARIES[row.library]
+        if not row.step_us:
+            lines.append(f"  {name}: not measured: {row.missing}")
+            continue
+        took = f"  {name}: [bold]{statistics.median(row.step_us):,.0f}[/] µs"
+        if row.library == "cavmarl":
+            lines.append(f"{took}, of which the workers take [bold]{order:.0f}[/]")
+        else:
+            ratio, order_ratio = found.ratio(row.library), found.order_ratio(row.library)
+            lines.append(f"{took}, {ratio:.1f} times that, [bold]{order_ratio:.1f}[/] times this")
+    return "\n".join(lines)
 
 
 def _table(found: WorkerSpeed) -> Table:

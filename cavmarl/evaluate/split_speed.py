@@ -14,7 +14,7 @@ from cavmarl.evaluate.worker_speed import WARM_STEPS, Measured
 from cavmarl.registry import load_config
 from cavmarl.vector_env import make_vec
 
-__all__ = ["SplitSpeed", "measure_splits"]
+__all__ = ["SplitSpeed", "measure_splits", "split_line"]
 
 
 @dataclass(frozen=True)
@@ -46,6 +46,16 @@ class SplitSpeed:
     def to_dict(self) -> dict[str, Any]:
         """Plain values, for JSON."""
         return {**asdict(self), "ratio": self.ratio}
+
+
+def split_line(splits: Sequence[SplitSpeed]) -> int | None:
+    """The least number of vehicles from which on every split world was the faster one, if any."""
+    line = None
+    for split in sorted(splits, key=lambda split: split.vehicles, reverse=True):
+        if split.ratio <= 1.0:
+            break
+        line = split.vehicles
+    return line
 
 
 def measure_splits(

@@ -12,7 +12,7 @@ from cavmarl.config import TERMS, EnvConfig
 from cavmarl.runtime.shared_memory import Layout
 from cavmarl.runtime.simulation import Simulation
 from cavmarl.shard.shard import Commands
-from cavmarl.spaces import flat_observation_space
+from cavmarl.spaces import flat_observation_space, state_space
 from cavmarl.worlds import World
 
 __all__ = ["StepArrays", "SteppedWorlds", "layout_of"]
@@ -21,7 +21,7 @@ __all__ = ["StepArrays", "SteppedWorlds", "layout_of"]
 class StepArrays(NamedTuple):
     """Arrays of W worlds with A agents each; the next step overwrites them.
 
-    T is the number of terms, D the size of a flat observation.
+    T is the number of terms, D the size of a flat observation, S that of a global state.
     """
 
     observations: NDArray[np.float32]  # (W, A, D) for the next action
@@ -31,6 +31,7 @@ class StepArrays(NamedTuple):
     truncations: NDArray[np.bool_]  # (W, A) the horizon ended it
     acted: NDArray[np.bool_]  # (W, A) who has acted
     vehicle_done: NDArray[np.bool_]  # (W, A)
+    vehicle_ids: NDArray[np.int64]  # (W, A) of the vehicle at the end of the step; -1: it had none
     mask: NDArray[np.bool_]  # (W, A) who acts next
     terms: NDArray[np.float32]  # (W, A, T)
     arrivals: NDArray[np.int64]  # (W,) since each world's reset
@@ -39,6 +40,7 @@ class StepArrays(NamedTuple):
     controls: NDArray[np.float64]  # (W, A, 2) what agents do, as in `Commands`
     meta_actions: NDArray[np.int64]  # (W, A)
     suggested: NDArray[np.float64]  # (W, A, 2) what the built-in driver would do
+    states: NDArray[np.float32]  # (W, S) global states, of when they were last asked for
 
     def part(self, first: int, last: int) -> StepArrays:
         """Those of some of the worlds, as views."""
@@ -46,8 +48,8 @@ class StepArrays(NamedTuple):
         return StepArrays(*parts)
 
 
-def layout_of(config: EnvConfig, num_worlds: int) -> Layout:
-    """Name → dtype and shape of the `StepArrays` of W worlds."""
+def layout_of(config: EnvConfig, capacity: int, num_worlds: int) -> Layout:
+    """Name → dtype and shape of the `StepArrays` of W worlds that hold so many vehicles each."""
     agents = (num_worlds, config.population.num_ids)
     observations = ("<f4", (*agents, flat_observation_space(config).shape[0]))
     flags = ("|b1", agents)
@@ -56,6 +58,7 @@ def layout_of(config: EnvConfig, num_worlds: int) -> Layout:
         "final_observations": observations,
         "rewards": ("<f4", agents),
         **dict.fromkeys(("terminations", "truncations", "acted", "vehicle_done", "mask"), flags),
+        "vehicle_ids": ("<i8", agents),
         "terms": ("<f4", (*agents, len(TERMS))),
         "arrivals": ("<i8", (num_worlds,)),
         "episode_over": ("|b1", (num_worlds,)),
@@ -63,6 +66,7 @@ def layout_of(config: EnvConfig, num_worlds: int) -> Layout:
         "controls": ("<f8", (*agents, 2)),
         "meta_actions": ("<i8", agents),
         "suggested": ("<f8", (*agents, 2)),
+        "states": ("<f4", (num_worlds, *state_space(capacity).shape)),
     }
 
 
@@ -104,6 +108,10 @@ class SteppedWorlds(Protocol):
 
     def suggest(self) -> None:
         """Write `suggested`."""
+        ...
+
+    def write_states(self) -> None:
+        """Write `states`."""
         ...
 
     def state_hash(self, world: int) -> str:

@@ -26,6 +26,7 @@ class Task(IntEnum):
     PACK = 5
     UNPACK = 6
     HOST = 7
+    WRITE_STATES = 8
 
 
 class WorldsJob:
@@ -56,6 +57,8 @@ class WorldsJob:
             worlds.reset(letter["seed"], letter["first_world"] + self._first)
         elif task == Task.SUGGEST:
             worlds.suggest()
+        elif task == Task.WRITE_STATES:
+            worlds.write_states()
         elif task == Task.STATE_HASH:
             return worlds.state_hash(letter - self._first)
         elif task == Task.TRAFFIC_STATS:

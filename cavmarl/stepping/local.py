@@ -13,6 +13,8 @@ from cavmarl.balance.plan import Plan
 from cavmarl.kernels.codes import EVENTS_THAT_END
 from cavmarl.runtime.simulation import Simulation
 from cavmarl.shard.shard import Commands
+from cavmarl.spaces import state_space
+from cavmarl.state import global_state
 from cavmarl.stepping.arrays import StepArrays, layout_of
 from cavmarl.traffic.memory import Zeros
 from cavmarl.worlds import World
@@ -75,7 +77,13 @@ class LocalWorlds:
         if seed is not None:
             self.simulation.seed(seed, first_world)
         self._begin(chosen)
-        arrays.mask[chosen] = self.simulation.outputs.present[chosen]
+        outputs = self.simulation.outputs
+        arrays.mask[chosen] = outputs.present[chosen]
+        arrays.vehicle_ids[chosen] = outputs.vehicle_ids[chosen]
+        arrays.vehicle_done[chosen] = False
+        arrays.terms[chosen] = outputs.terms[chosen]
+        goes_on = arrays.mask.any(axis=1) | self.simulation.agents_to_come()
+        arrays.episode_over[chosen] = ~goes_on[chosen]
         if not chosen.all():
             arrays.observations[~arrays.mask] = 0.0
 
@@ -91,6 +99,7 @@ class LocalWorlds:
         terminations = outputs.terminated
         arrays.rewards[:] = outputs.rewards
         arrays.terms[:] = outputs.terms
+        arrays.vehicle_ids[:] = outputs.vehicle_ids
         arrays.acted[:] = outputs.acted
         arrays.terminations[:] = terminations
         np.not_equal(outputs.events & EVENTS_THAT_END, 0, out=arrays.vehicle_done)
@@ -127,6 +136,12 @@ class LocalWorlds:
         """Write what the built-in driver would do in the agents' place."""
         self.arrays.suggested[:] = 0.0
         self.simulation.suggest(self.arrays.suggested)
+
+    def write_states(self) -> None:
+        """Write what `CavEnv.state` is of each world."""
+        simulation, space = self.simulation, state_space(self.simulation.capacity)
+        for world, state in enumerate(self.arrays.states):
+            state[:] = global_state(self.world.network, simulation.vehicles(world), space)
 
     def state_hash(self, world: int) -> str:
         """Hex digest of one world."""
@@ -170,7 +185,7 @@ class LocalWorlds:
 
 
 def _own_arrays(simulation: Simulation, num_worlds: int) -> StepArrays:
-    layout = layout_of(simulation.config, num_worlds)
+    layout = layout_of(simulation.config, simulation.capacity, num_worlds)
     made = {
         name: np.zeros(shape, dtype)
         for name, (dtype, shape) in layout.items()

@@ -50,6 +50,7 @@ class PooledWorlds:
         num_worlds: W.
         workers: m, from 1 to W times the zones of each; more than W divide the worlds.
         in_next_step: when worlds begin anew; see `SteppedWorlds`.
+        program: that the processes run.
 
     Attributes:
         world: what each is made of.
@@ -72,6 +73,7 @@ class PooledWorlds:
         num_worlds: int,
         workers: int,
         in_next_step: bool = False,
+        program: str = PROGRAM,
     ) -> None:
         self.world = world
         self.in_next_step = in_next_step
@@ -89,7 +91,8 @@ class PooledWorlds:
             )
         if not compiled_before():
             Simulation(config, world.network, 1, world.demand, world.partition)
-        layout = layout_of(config, num_worlds)
+        capacity = world.capacity
+        layout = layout_of(config, capacity, num_worlds)
         segment = Segment.make(size_of(layout))
         try:
             self.arrays = StepArrays(**arrays_in(segment.map(), layout))
@@ -103,6 +106,7 @@ class PooledWorlds:
             "base_dir": str(base_dir.resolve()),
             "fingerprint": fingerprint(world),
             "num_worlds": num_worlds,
+            "capacity": capacity,
             "arrays": segment.fd,
             "in_next_step": in_next_step,
             "parts": parts,
@@ -115,9 +119,9 @@ class PooledWorlds:
         moving = () if self.mover is None else self.mover.segments
         segments = (segment, *(one for diary in diaries for one in diary), *moving)
         pins = config.workers.pin
-        program = Program(PROGRAM, recipe, _names(parts), segments, tasks, pins, teams)
+        what = Program(program, recipe, _names(parts), segments, tasks, pins, teams)
         try:
-            self.pool = Pool(program, config.workers.timeout_s, config.workers.repeats)
+            self.pool = Pool(what, config.workers.timeout_s, config.workers.repeats)
         except WorkerFailureError as failure:
             raise own_error(failure) from failure
         self._steps = 0
@@ -167,6 +171,10 @@ class PooledWorlds:
     def suggest(self) -> None:
         """Write what the built-in driver would do in the agents' place."""
         self._run(Task.SUGGEST, commits=False)
+
+    def write_states(self) -> None:
+        """Write the global state of each world."""
+        self._run(Task.WRITE_STATES, commits=False)
 
     def state_hash(self, world: int) -> str:
         """Hex digest of one world."""

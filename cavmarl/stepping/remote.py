@@ -76,7 +76,7 @@ class RemoteWorlds:
             )
         if not compiled_before():
             Simulation(config, world.network, 1, world.demand, world.partition)
-        layout = layout_of(config, num_worlds).items()
+        layout = layout_of(config, world.capacity, num_worlds).items()
         zeros: dict[str, Any] = {name: np.zeros(shape, kind) for name, (kind, shape) in layout}
         self.arrays = StepArrays(**zeros)
         recipe = {
@@ -137,6 +137,10 @@ class RemoteWorlds:
     def suggest(self) -> None:
         """Write what the built-in driver would do in the agents' place."""
         self._run(Task.SUGGEST, commits=False)
+
+    def write_states(self) -> None:
+        """Write the global state of each world."""
+        self._run(Task.WRITE_STATES, commits=False)
 
     def state_hash(self, world: int) -> str:
         """Hex digest of one world."""

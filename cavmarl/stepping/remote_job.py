@@ -28,8 +28,10 @@ Array = NDArray[Any]
 # Fields of `StepArrays` that every step writes.
 _STEPPED = (
     "observations", "rewards", "terminations", "truncations", "acted", "vehicle_done", "mask",
-    "terms", "arrivals", "episode_over",
+    "vehicle_ids", "terms", "arrivals", "episode_over",
 )  # fmt: skip
+# Those that a reset writes, of the worlds that it is about.
+_BEGUN = ("observations", "mask", "vehicle_ids", "vehicle_done", "terms", "episode_over")
 
 
 def inputs_of(task: int, arrays: StepArrays) -> list[Array]:
@@ -51,7 +53,9 @@ def results_of(task: int, arrays: StepArrays, ended: Sequence[int] | None) -> li
         finals = [arrays.final_observations[w] for w in ended or ()]
         return [*(getattr(arrays, name) for name in _STEPPED), *finals]
     if task == Task.RESET:
-        return [arrays.observations, arrays.mask]
+        return [getattr(arrays, name) for name in _BEGUN]
+    if task == Task.WRITE_STATES:
+        return [arrays.states]
     return [arrays.suggested] if task == Task.SUGGEST else []
 
 
@@ -130,14 +134,14 @@ class HostedWorlds:
 
     def save(self) -> list[Array]:
         """All that the next task depends on."""
-        arrays = self._worlds.arrays
-        return [arrays.observations, arrays.mask, *self._worlds.save()]
+        return [*results_of(Task.RESET, self._worlds.arrays, None), *self._worlds.save()]
 
     def load(self, saved: Sequence[Array]) -> None:
         """Go on from what `save` gave."""
-        arrays, (observations, mask, *rest) = self._worlds.arrays, saved
-        self._worlds.load(rest)
-        arrays.observations[:], arrays.mask[:] = observations, mask
+        begun = results_of(Task.RESET, self._worlds.arrays, None)
+        self._worlds.load(saved[len(begun) :])
+        for array, kept in zip(begun, saved, strict=False):
+            array[:] = kept
 
     def _make(self, size: int) -> None:
         self._worlds = LocalWorlds(self._world, size, in_next_step=self._in_next_step)

@@ -30,7 +30,7 @@ from cavmarl.traffic.schedule import Schedule
 from cavmarl.traffic.vtypes import generated_types
 from cavmarl.traffic.way_slots import WaySlots, way_slots
 
-__all__ = ["NativeTraffic"]
+__all__ = ["NativeTraffic", "capacity_of"]
 
 PASSENGER = 1 << VEHICLE_CLASSES.index("passenger")
 FAST_FACTOR = 1.5  # a speed over the limit that hardly any driver of the demand wants
@@ -187,15 +187,8 @@ class NativeTraffic:
 
     @cached_property
     def capacity(self) -> int:
-        """Rows that one world needs: no more vehicles than are ordered, or fit on the map."""
-        own = self.population.agents + self.population.background
-        if self.file is None or self.schedule is None or not len(self.file.types):
-            return own
-        shortest = float(self.file.types["length"].min())
-        metres = float(self.network.lanes["length_m"].sum())
-        ordered = len(self.schedule.draw(0, self.horizon_s, self.dt))
-        spread = 6 * math.isqrt(ordered) + 16
-        return own + min(ordered + spread, int(metres / (shortest + JAM_GAP_M)) + 1)
+        """Rows that one world needs."""
+        return _capacity(self.network, self.population, self.schedule, self.dt, self.horizon_s)
 
     @cached_property
     def demand(self) -> Demand:
@@ -361,6 +354,36 @@ class NativeTraffic:
         if len(trips) > MAX_TRIPS:
             trips = trips[:: -(-len(trips) // MAX_TRIPS)]
         return np.ascontiguousarray(trips)
+
+
+def capacity_of(
+    network: RoadNetwork,
+    population: PopulationConfig,
+    file: DemandFile | None,
+    dt: float,
+    horizon_s: float,
+) -> int:
+    """How many vehicles a world can hold, as `NativeTraffic` will say when it is made of these."""
+    schedule = None if file is None else Schedule(file, 0, 0)
+    return _capacity(network, population, schedule, dt, horizon_s)
+
+
+def _capacity(
+    network: RoadNetwork,
+    population: PopulationConfig,
+    schedule: Schedule | None,
+    dt: float,
+    horizon_s: float,
+) -> int:
+    """No more vehicles than are ordered, or fit on the map."""
+    own = population.agents + population.background
+    if schedule is None or not len(schedule.demand.types):
+        return own
+    shortest = float(schedule.demand.types["length"].min())
+    metres = float(network.lanes["length_m"].sum())
+    ordered = len(schedule.draw(0, horizon_s, dt))
+    spread = 6 * math.isqrt(ordered) + 16
+    return own + min(ordered + spread, int(metres / (shortest + JAM_GAP_M)) + 1)
 
 
 def _centre_sees_line_m(kind: np.void, speed: float) -> float:

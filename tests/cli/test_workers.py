@@ -86,3 +86,6 @@ def test_bench_workers(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> No
     said = capsys.readouterr().out
     assert "an empty order to all 2" in said
     assert "one world of 12 vehicles" in said
+    assert "splitting one world" in said
+    assert "in whose worlds nothing happens" in said
+    assert found["vectorization"]["ratios"]["gymnasium"] > 0.0

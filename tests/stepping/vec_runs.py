@@ -41,7 +41,7 @@ def drive(
             actions = np.clip(actions + noise, -1.0, 1.0).astype(np.float32)
         before(step)
         *arrays, infos = vec.step(actions)
-        found += [*arrays, *(infos[name] for name in sorted(infos))]
+        found += [*arrays, *(infos[name] for name in sorted(infos)), vec.state()]
     found += [vec.state_hash(w) for w in range(vec.num_envs)]
     found += [repr(vec.traffic_stats(w)) for w in range(vec.num_envs)]
     return found

@@ -1,4 +1,4 @@
-"""The training program by its command line, with tiny numbers; and its arithmetic."""
+"""Our PPO programs by their command line, with tiny numbers."""
 
 from __future__ import annotations
 
@@ -11,35 +11,51 @@ import subprocess
 import sys
 from pathlib import Path
 from types import ModuleType
-from typing import Any
 
 import pytest
+import torch
 import yaml
 
 from cavmarl.errors import ConfigError
 from cavmarl.evaluate.manifest import read_closed
+from cavmarl.learning.batch import Batch
+from cavmarl.learning.collector import Collector
+from cavmarl.learning.settings import parse_ppo
+from cavmarl.networks import load_network
+from cavmarl.policies import load_policy
 from cavmarl.registry import entries
+from cavmarl.stepping.pooled import PooledWorlds
+from cavmarl.vector_env import make_vec
 
-torch = pytest.importorskip("torch")
-
-SCRIPT = Path(__file__).resolve().parents[2] / "train" / "ippo_torch.py"
-CONFIGS = sorted((SCRIPT.parent.parent / "configs" / "train").glob("*.yaml"))
+TRAIN = Path(__file__).resolve().parents[2] / "train"
+CONFIGS = sorted((TRAIN.parent / "configs" / "train").glob("*.yaml"))
+PROGRAMS = ("ippo_torch", "mappo_torch")
+TIMES = {"seconds", "agent_steps_per_s", "simulation_s", "transfer_s", "inference_s", "learning_s"}
 TINY = [
     "--env", "merge", "--num-envs", "2", "--agents", "2", "--background", "2", "--hidden", "8",
     "--num-steps", "8", "--epochs", "1", "--minibatches", "2", "--threads", "1",
 ]  # fmt: skip
 
 
-@pytest.fixture(scope="module")
-def ippo() -> ModuleType:
+def load(name: str) -> ModuleType:
     """The program as a module: a file that is read, for `train` is no package."""
-    spec = importlib.util.spec_from_file_location("ippo_torch", SCRIPT)
+    spec = importlib.util.spec_from_file_location(name, TRAIN / f"{name}.py")
     assert spec
     assert spec.loader
     module = importlib.util.module_from_spec(spec)
     sys.modules[spec.name] = module  # dataclasses look their module up
     spec.loader.exec_module(module)
     return module
+
+
+@pytest.fixture(scope="module")
+def ippo() -> ModuleType:
+    return load("ippo_torch")
+
+
+@pytest.fixture(scope="module", params=PROGRAMS)
+def program(request: pytest.FixtureRequest) -> ModuleType:
+    return load(request.param)
 
 
 @pytest.fixture
@@ -50,7 +66,7 @@ def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 @pytest.mark.parametrize("config", CONFIGS, ids=lambda path: path.stem)
 def test_every_config_loads_and_options_shadow_it(ippo: ModuleType, config: Path) -> None:
-    args = ippo.parse_args(["--config", str(config), "--seed", "77"])
+    args = parse_ppo(ippo.Args, ["--config", str(config), "--seed", "77"], "")
     assert args.env in entries()
     bounds = {"total_agent_steps", "minutes"} & yaml.safe_load(config.read_text()).keys()
     assert bounds, "how long it trains is left to a default"
@@ -65,7 +81,7 @@ def test_every_config_loads_and_options_shadow_it(ippo: ModuleType, config: Path
 def test_a_wrong_config_is_refused(ippo: ModuleType, here: Path, text: str, said: str) -> None:
     (here / "wrong.yaml").write_text(text)
     with pytest.raises(ConfigError, match=said):
-        ippo.parse_args(["--config", "wrong.yaml"])
+        parse_ppo(ippo.Args, ["--config", "wrong.yaml"], "")
 
 
 def log(folder: Path) -> list[dict[str, str]]:
@@ -73,10 +89,14 @@ def log(folder: Path) -> list[dict[str, str]]:
         return list(csv.DictReader(file))
 
 
-def test_two_updates_by_command_line(tmp_path: Path) -> None:
+@pytest.mark.parametrize("name", PROGRAMS)
+def test_two_updates_by_command_line(tmp_path: Path, name: str) -> None:
     words = [*TINY, "--total-agent-steps", "60", "--runs", str(tmp_path), "--name", "one"]
     done = subprocess.run(
-        [sys.executable, str(SCRIPT), *words], capture_output=True, text=True, check=False
+        [sys.executable, str(TRAIN / f"{name}.py"), *words],
+        capture_output=True,
+        text=True,
+        check=False,
     )
     assert done.returncode == 0, done.stderr
     assert "one" in done.stdout
@@ -85,46 +105,73 @@ def test_two_updates_by_command_line(tmp_path: Path) -> None:
     assert int(rows[-1]["agent_steps"]) >= 60
     assert (tmp_path / "one" / "model.safetensors").stat().st_size < 1_000_000
     manifest = read_closed(tmp_path / "one")
+    assert manifest["program"] == f"{name}.py"
     assert manifest["settings"]["total_agent_steps"] == 60
     assert manifest["world"]["map"]
     assert "model.safetensors" in manifest["results_sha256"]
 
 
-def test_the_same_seed_learns_the_same(ippo: ModuleType, here: Path) -> None:
+def test_the_same_seed_learns_the_same(program: ModuleType, here: Path) -> None:
     words = [*TINY, "--total-agent-steps", "100"]
     for name, seed in (("a", "1"), ("b", "1"), ("c", "2")):
-        assert ippo.main([*words, "--name", name, "--seed", seed]) == 0
+        assert program.main([*words, "--name", name, "--seed", seed]) == 0
     weights = [(here / "runs" / name / "model.safetensors").read_bytes() for name in "abc"]
     assert weights[0] == weights[1] != weights[2]
 
 
-def test_workers_that_are_killed_change_nothing_that_is_learnt(
-    ippo: ModuleType, here: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    words = [*TINY, "--total-agent-steps", "100"]
-    assert ippo.main([*words, "--name", "whole"]) == 0
-    collect = ippo.Collector.collect
+def learnt(folder: Path) -> tuple[bytes, list[dict[str, str]]]:
+    """The weights, and the curve without what it took."""
+    rows = [{key: row[key] for key in row.keys() - TIMES} for row in log(folder)]
+    return (folder / "model.safetensors").read_bytes(), rows
 
-    def collect_after_a_kill(self: Any, with_suggested: bool) -> Any:
-        os.kill(self.vec.worlds.pool.pids[0], signal.SIGKILL)
+
+@pytest.mark.parametrize("overlap", ["--no-overlap", "--overlap"])
+def test_workers_that_are_killed_change_nothing_that_is_learnt(
+    program: ModuleType, here: Path, monkeypatch: pytest.MonkeyPatch, overlap: str
+) -> None:
+    words = [*TINY, "--total-agent-steps", "100", overlap]
+    assert program.main([*words, "--name", "whole"]) == 0
+    collect = Collector.collect
+    killed: list[int] = []
+
+    def collect_after_a_kill(self: Collector, with_suggested: bool) -> Batch:
+        worlds = self.vec.worlds
+        assert isinstance(worlds, PooledWorlds)
+        killed.append(worlds.pool.pids[0])
+        os.kill(killed[-1], signal.SIGKILL)
         return collect(self, with_suggested)
 
-    monkeypatch.setattr(ippo.Collector, "collect", collect_after_a_kill)
-    assert ippo.main([*words, "--name", "killed", "--workers", "2"]) == 0
-    weights = [
-        (here / "runs" / name / "model.safetensors").read_bytes() for name in ("whole", "killed")
-    ]
-    assert weights[0] == weights[1]
+    monkeypatch.setattr(Collector, "collect", collect_after_a_kill)
+    assert program.main([*words, "--name", "killed", "--workers", "2"]) == 0
+    assert len(set(killed)) >= 2
+    assert learnt(here / "runs" / "whole") == learnt(here / "runs" / "killed")
+
+
+def test_zones_over_workers_change_nothing_that_is_learnt(here: Path) -> None:
+    mappo = load("mappo_torch")
+    words = [*TINY, "--num-envs", "1", "--total-agent-steps", "40"]
+    assert mappo.main([*words, "--name", "whole"]) == 0
+    assert mappo.main([*words, "--name", "split", "--zones", "2", "--workers", "2"]) == 0
+    assert learnt(here / "runs" / "whole") == learnt(here / "runs" / "split")
+
+
+def test_a_central_critic_is_no_part_of_what_drives(here: Path) -> None:
+    words = [*TINY, "--total-agent-steps", "20", "--name", "run"]
+    assert load("mappo_torch").main(words) == 0
+    network, config = load_network(here / "runs" / "run")
+    vec = make_vec("merge", agents=2, background=2)
+    observations, infos = vec.reset(seed=0)
+    assert config.state_size == vec.state_size == vec.state().shape[1] > 0
+    assert network.critic[0].in_features == config.observation_size + config.state_size
+    driver = load_policy(here / "runs" / "run", vec)
+    vec.step(driver.act_batch(observations, infos["mask"]))
 
 
 @pytest.mark.parametrize("kind", ["continuous", "discrete"])
 def test_a_run_goes_on_where_it_stopped_and_drives(ippo: ModuleType, here: Path, kind: str) -> None:
-    from cavmarl.policies import load_policy
-    from cavmarl.vector_env import make_vec
-
     entry = here / "envs" / "small"
     entry.mkdir(parents=True)
-    source = SCRIPT.parents[1] / "envs" / "merge" / "map" / "map.net.xml"
+    source = TRAIN.parent / "envs" / "merge" / "map" / "map.net.xml"
     (entry / "env.yaml").write_text(
         f"name: small\nmap: {{source: {source}}}\naction: {{kind: {kind}}}\n"
         "population: {mode: seats, agents: 2, background: 2}\n"
@@ -218,64 +265,3 @@ def test_a_pickle_is_not_run(ippo: ModuleType, here: Path) -> None:
     folder = here / "runs" / "run"
     torch.save({"state": Path("anything")}, folder / "optimizer.pt")
     assert ippo.main(["--resume", str(folder), "--total-agent-steps", "100"]) == 2
-
-
-def batch_of_one_seat(
-    ippo: ModuleType, rewards: list[float], acted: list[bool], goes_on: list[bool], cut_value: float
-) -> object:
-    steps = len(rewards)
-
-    def column(values: list[float] | list[bool]) -> object:
-        return torch.tensor(values).reshape(steps, 1, 1)
-
-    values = column([0.5] * steps)
-    next_values = torch.where(column(goes_on), 0.5, 0.0)
-    next_values[-1] = cut_value
-    return ippo.Batch(
-        observations=torch.zeros(steps, 1, 1, 1),
-        actions=torch.zeros(steps, 1, 1, 2),
-        log_probs=torch.zeros(steps, 1, 1),
-        values=values,
-        rewards=column(rewards),
-        acted=column(acted),
-        next_values=next_values,
-        goes_on=column(goes_on),
-    )
-
-
-def test_advantages_by_hand(ippo: ModuleType) -> None:
-    # A vehicle ends after step 1; the seat waits in step 2; the next vehicle is cut after step 4.
-    batch = batch_of_one_seat(
-        ippo,
-        rewards=[1.0, 2.0, 9.0, 3.0, 4.0],
-        acted=[True, True, False, True, True],
-        goes_on=[True, False, False, True, False],
-        cut_value=2.0,
-    )
-    found = batch.advantages(0.9, 0.5).flatten().tolist()  # type: ignore[attr-defined]
-    ends = 2.0 - 0.5
-    cut = 4.0 + 0.9 * 2.0 - 0.5
-    first = 1.0 + 0.9 * 0.5 - 0.5 + 0.45 * ends
-    fourth = 3.0 + 0.9 * 0.5 - 0.5 + 0.45 * cut
-    assert found == pytest.approx([first, ends, 0.0, fourth, cut])
-
-
-def test_what_is_collected_is_cut_at_ends_and_at_the_horizon(ippo: ModuleType) -> None:
-    from cavmarl.networks import ActorCritic, NetworkConfig
-    from cavmarl.vector_env import make_vec
-
-    torch.manual_seed(0)
-    vec = make_vec("merge", num_envs=3, agents=3, background=0, max_cycles=25)
-    size = vec.single_observation_space.shape[0]
-    config = NetworkConfig("merge", size, vec.config.sensors, vec.config.action, (8,))
-    args = ippo.Args(num_steps=60)
-    batch = ippo.Collector(vec, ActorCritic(config, 2.0), args, 0).collect(with_suggested=False)
-    boundary = batch.acted & ~batch.goes_on
-    bootstrapped = boundary & (batch.next_values != 0.0)
-    assert bootstrapped[24].any()
-    assert not bootstrapped[:24].any()
-    ended = boundary & ~bootstrapped
-    assert ended.any()
-    assert not (batch.goes_on & ~batch.acted).any()
-    # Where the vehicle goes on, the next decision is the same vehicle's.
-    assert batch.acted[1:][batch.goes_on[:-1]].all()

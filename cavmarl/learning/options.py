@@ -1,0 +1,126 @@
+"""The settings of a training program as options of its command line.
+
+A program's settings are one frozen dataclass; each field is an option, typed and described by its
+`Annotated[type, "text"]`.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import fields, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, TypeVar, get_args, get_type_hints
+
+from cavmarl.config_io import read_yaml, validate
+from cavmarl.errors import CavmarlError, ConfigError
+
+if TYPE_CHECKING:
+    from _typeshed import DataclassInstance
+
+__all__ = [
+    "check_above_zero",
+    "check_at_least",
+    "check_shares",
+    "given_options",
+    "parse_settings",
+    "run_folder",
+    "run_program",
+    "settings_of",
+]
+
+DRIVER = "driver: {folder}  (cavmarl evaluate ENV --policy {folder})"
+
+S = TypeVar("S", bound="DataclassInstance")
+
+
+def parse_settings(kind: type[S], words: Sequence[str] | None, text: str | None) -> S:
+    """The settings that the command line asks for.
+
+    `--config FILE` is a YAML file of the same settings, which options shadow.
+
+    Args:
+        kind: the dataclass of the settings.
+        words: of the command line; None: this process's.
+        text: what the program is; its first line is shown.
+
+    Raises:
+        ConfigError: a file or a value that cannot be.
+    """
+    return settings_of(kind, given_options(kind, words, text))
+
+
+def given_options(
+    kind: type[DataclassInstance], words: Sequence[str] | None, text: str | None
+) -> dict[str, Any]:
+    """Only what the command line says, by name; `config` is a file. Arguments as above."""
+    parser = argparse.ArgumentParser(
+        description=(text or "").partition("\n")[0], argument_default=argparse.SUPPRESS
+    )
+    hints = get_type_hints(kind, include_extras=True)
+    for field in fields(kind):
+        of, meaning = get_args(hints[field.name])
+        action: Any = argparse.BooleanOptionalAction if of is bool else "store"
+        extra = {} if of is bool else {"type": of, "metavar": of.__name__.upper()}
+        shown = f"{meaning} (default: {field.default!r})"
+        parser.add_argument(_option(field.name), action=action, help=shown, **extra)
+    parser.add_argument("--config", metavar="FILE", type=Path, help="YAML file of these settings")
+    return vars(parser.parse_args(words))
+
+
+def settings_of(kind: type[S], given: Mapping[str, Any]) -> S:
+    """Whole settings from those that are given; raises as `parse_settings`."""
+    options = dict(given)
+    path = options.pop("config", None)
+    settings = validate(kind, read_yaml(path), str(path)) if path else kind()
+    return replace(settings, **options)
+
+
+def check_at_least(settings: object, least: Mapping[str, float]) -> None:
+    """Refuse settings below the given numbers, and infinite ones.
+
+    Raises:
+        ConfigError: names the option.
+    """
+    for name, bound in least.items():
+        value = getattr(settings, name)
+        if not bound <= value < float("inf"):
+            raise ConfigError(f"{_option(name)} {value}: must be at least {bound}")
+
+
+def check_above_zero(settings: object, names: Iterable[str]) -> None:
+    """Refuse settings of these names that are not positive numbers; raises as above."""
+    for name in names:
+        value = getattr(settings, name)
+        if not 0.0 < value < float("inf"):
+            raise ConfigError(f"{_option(name)} {value}: must be above 0")
+
+
+def check_shares(settings: object, names: Iterable[str]) -> None:
+    """Refuse settings of these names that are not from 0 to 1; raises as above."""
+    for name in names:
+        value = getattr(settings, name)
+        if not 0.0 <= value <= 1.0:
+            raise ConfigError(f"{_option(name)} {value}: must be from 0 to 1")
+
+
+def run_folder(runs: str, name: str, env: str, program: str, seed: int) -> Path:
+    """Where a run lies: RUNS/NAME, without a name RUNS/ENV_PROGRAM_SEED."""
+    stem = Path(env).name.split(".")[0]
+    return Path(runs) / (name or f"{stem}_{program}_{seed}")
+
+
+def run_program(train: Callable[[], Path], said: str = DRIVER) -> int:
+    """Train, and say where that lies which `train` has made; 0: trained, 2: wrong use."""
+    try:
+        folder = train()
+    except CavmarlError as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 2
+    print(said.format(folder=folder))
+    return 0
+
+
+def _option(name: str) -> str:
+    return f"--{name.replace('_', '-')}"

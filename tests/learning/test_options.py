@@ -1,0 +1,65 @@
+"""Settings as options of a command line."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+import pytest
+
+from cavmarl.errors import ConfigError
+from cavmarl.learning.options import check_at_least, parse_settings, run_folder, run_program
+
+
+@dataclass(frozen=True)
+class Few:
+    steps: Annotated[int, "of a run"] = 5
+    rate: Annotated[float, "of learning"] = 0.5
+    anneal: Annotated[bool, "the rate"] = True
+    runs: Annotated[str, "folder"] = "runs"
+
+    def __post_init__(self) -> None:
+        check_at_least(self, {"steps": 1})
+
+
+def test_options_shadow_a_file_and_a_file_the_defaults(tmp_path: Path) -> None:
+    file = tmp_path / "few.yaml"
+    file.write_text("steps: 7\nrate: 0.25\n")
+    assert parse_settings(Few, [], "") == Few()
+    found = parse_settings(Few, ["--config", str(file), "--rate", "2", "--no-anneal"], "")
+    assert found == Few(steps=7, rate=2.0, anneal=False)
+
+
+@pytest.mark.parametrize(
+    ("text", "said"), [("step: 1", "step: .*steps"), ("steps: 0", "--steps 0")]
+)
+def test_a_wrong_file_is_refused(tmp_path: Path, text: str, said: str) -> None:
+    file = tmp_path / "few.yaml"
+    file.write_text(text)
+    with pytest.raises(ConfigError, match=said):
+        parse_settings(Few, ["--config", str(file)], "")
+
+
+def test_the_first_line_of_the_text_is_the_help(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit, match="0"):
+        parse_settings(Few, ["--help"], "Learns little.\n\nMore.")
+    shown = capsys.readouterr().out
+    assert "Learns little." in shown
+    assert "More." not in shown
+    assert "of a run (default: 5)" in shown
+
+
+def test_a_run_lies_where_its_name_says() -> None:
+    assert run_folder("runs", "mine", "merge", "ippo", 3) == Path("runs/mine")
+    assert run_folder("runs", "", "maps/town.net.xml", "ippo", 3) == Path("runs/town_ippo_3")
+
+
+def test_wrong_use_is_said_without_a_traceback(capsys: pytest.CaptureFixture[str]) -> None:
+    def train() -> Path:
+        raise ConfigError("no such world")
+
+    assert run_program(train) == 2
+    assert capsys.readouterr().err == "error: no such world\n"
+    assert run_program(lambda: Path("here"), "run: {folder}") == 0
+    assert capsys.readouterr().out == "run: here\n"

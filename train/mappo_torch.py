@@ -1,0 +1,39 @@
+"""PPO with one network shared by all agents and a central critic (MAPPO), on batched worlds.
+
+    python train/mappo_torch.py --env merge --minutes 2
+    python train/mappo_torch.py --config configs/train/merge.yaml --workers 2
+
+While it learns, the critic sees the state of the whole world (`vec.state()`) beside what the agent
+itself observes (Yu et al. 2022); the driver never does, so it drives wherever one of
+`ippo_torch.py` does. Options, files and what repeats itself are the same as there.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import ClassVar
+
+from rich.console import Console
+
+from cavmarl.learning.options import run_program
+from cavmarl.learning.run import train
+from cavmarl.learning.settings import PpoSettings, parse_ppo
+
+
+@dataclass(frozen=True)
+class Args(PpoSettings):
+    """The critic sees the whole world."""
+
+    algorithm: ClassVar[str] = "mappo"
+    central_critic: ClassVar[bool] = True
+
+
+def main(words: Sequence[str] | None = None) -> int:
+    """Train; 0: trained, 2: wrong use."""
+    return run_program(lambda: train(parse_ppo(Args, words, __doc__), Console()))
+
+
+if __name__ == "__main__":
+    sys.exit(main())
