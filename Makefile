@@ -12,7 +12,8 @@ OLDEST_WARNINGS := -W default::DeprecationWarning -W default::PendingDeprecation
 OLDEST_TESTS := tests/kernels tests/roads tests/runtime tests/traffic tests/test_config.py \
     tests/test_registry.py tests/test_registration.py tests/test_env.py tests/test_vector_env.py \
     tests/test_bad_input.py tests/test_public_api.py tests/adapters
-LIBRARIES_TESTS := tests/adapters tests/train/test_programs.py
+LIBRARIES_TESTS := tests/adapters tests/train/test_programs.py tests/hosts \
+    tests/stepping/test_remote.py tests/stepping/test_remote_start.py
 FUZZ_SECONDS ?= 60
 FUZZ_TARGETS ?= network programs map cached zones demand sumocfg entry overrides driver manifest \
     plan message log
@@ -58,7 +59,7 @@ fuzz: $(READY) ## each file parser, FUZZ_SECONDS long; what crashes one stays in
 oldest: $(OLDEST)/.ready ## the heart of the tests with the oldest versions that are allowed
 	$(OLDEST)/bin/pytest $(OLDEST_WARNINGS) $(OLDEST_TESTS)
 
-libraries: $(LIBRARIES)/.ready ## what needs RLlib or BenchMARL, in an environment of its own (2 GB)
+libraries: $(LIBRARIES)/.ready ## what needs Ray or BenchMARL, in an environment of its own (2 GB)
 	$(LIBRARIES)/bin/pytest $(LIBRARIES_TESTS)
 
 # Without the comment that netconvert and netgenerate begin with (date, version, options), the same

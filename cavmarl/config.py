@@ -202,7 +202,7 @@ class ZonesConfig:
 
 @dataclass(frozen=True)
 class WorkersConfig:
-    """How worker processes are watched, where there are some; see docs/workers.md.
+    """How worker processes are watched and given work, where there are some; see docs/workers.md.
 
     Attributes:
         timeout_s: for so long a worker may be busy with one step or reset; then it is taken to hang
@@ -210,11 +210,23 @@ class WorkersConfig:
         repeats: how often a step is begun again because a worker has died.
         pin: keep each worker on a core of its own. The system sometimes leaves two on one; but of
             several environments with workers on one machine all take the same cores.
+        balance_steps: so many steps from one round to the next, in which worlds, or zones of a
+            split world, may change their worker by what they have cost; 0: they stay where they
+            are. Results do not depend on it.
+        tolerance: while the slowest worker takes at most this share longer than a perfect division
+            would, nothing moves.
+        max_moves: worlds or zones that change their worker in one round.
+        watch: see how busy others keep the workers' cores, and give nothing more to workers above
+            a threshold; without it nobody else is supposed to use them.
     """
 
     timeout_s: float = 300.0
     repeats: int = 3
     pin: bool = False
+    balance_steps: int = 0
+    tolerance: float = 0.1
+    max_moves: int = 4
+    watch: bool = False
 
     def __post_init__(self) -> None:
         _check_finite("workers.timeout_s", self.timeout_s, 1.0, 1e6)
@@ -223,6 +235,19 @@ class WorkersConfig:
             "workers.repeats",
             self.repeats,
             "must be a whole number from 0 to 1000",
+        )
+        _check(
+            0 <= self.balance_steps <= 1_000_000,
+            "workers.balance_steps",
+            self.balance_steps,
+            "must be a whole number from 0 to 1000000",
+        )
+        _check_finite("workers.tolerance", self.tolerance, 0.0, 100.0)
+        _check(
+            1 <= self.max_moves <= 65_536,
+            "workers.max_moves",
+            self.max_moves,
+            "must be a whole number from 1 to 65536",
         )
 
 

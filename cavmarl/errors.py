@@ -220,25 +220,21 @@ class StoreError(ProtocolError):
         self.zones = zones
 
 
-class ZoneStepError(ProtocolError):
-    """A tick that every host of a zone died of: it is not tried for ever.
+class LostTickError(ProtocolError):
+    """A tick that everybody died of who tried to reach it: it is not tried for ever.
 
     Attributes:
-        zone: the zone.
-        tick: the tick that could not be computed.
-        cause: what the last host died of; nothing if nobody knows.
+        tick: the tick.
+        zone: whose hosts died; None: the coordinators.
         reproducer: the file from which `cavmarl verify --replay` runs that tick again, or why there
             is none; nothing if none was asked for.
     """
 
     reproducer: Path | str = ""
 
-    def __init__(self, zone: int, tick: int, hosts: int, cause: str = "") -> None:
-        of = f", the last one {cause}" if cause else ""
-        super().__init__(
-            f"zone {zone} could not reach tick {tick}: {hosts} hosts in a row died{of}"
-        )
-        self.zone, self.tick, self.cause = zone, tick, cause
+    def __init__(self, tick: int, zone: int | None, words: str) -> None:
+        super().__init__(words)
+        self.tick, self.zone = tick, zone
 
     def __str__(self) -> str:
         """With the way to see it again."""
@@ -250,6 +246,30 @@ class ZoneStepError(ProtocolError):
             case why:
                 again = f"; it cannot be run again: {why}"
         return super().__str__() + again
+
+
+class ZoneStepError(LostTickError):
+    """Every host of a zone died of a tick.
+
+    Attributes:
+        cause: what the last one died of; nothing if nobody knows.
+    """
+
+    def __init__(self, zone: int, tick: int, hosts: int, cause: str = "") -> None:
+        of = f", the last one {cause}" if cause else ""
+        words = f"zone {zone} could not reach tick {tick}: {hosts} hosts in a row died{of}"
+        super().__init__(tick, zone, words)
+        self.cause = cause
+
+
+class CoordinatorStepError(LostTickError):
+    """Every coordinator died of a tick, at the same point."""
+
+    def __init__(self, tick: int, coordinators: int, point: str) -> None:
+        words = (
+            f"the coordinator could not reach tick {tick}: {coordinators} of them died at '{point}'"
+        )
+        super().__init__(tick, None, words)
 
 
 class ReproducerError(ProtocolError):

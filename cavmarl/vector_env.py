@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from gymnasium import spaces
@@ -14,6 +14,8 @@ from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
 from cavmarl.actions import ActionDecoder
+from cavmarl.balance.plan import Plan
+from cavmarl.balance.plan_text import describe_plan
 from cavmarl.errors import ConfigError, ResetNeededError
 from cavmarl.registry import load_config
 from cavmarl.runtime.simulation import Simulation
@@ -22,7 +24,8 @@ from cavmarl.spaces import action_space, flat_observation_space
 from cavmarl.stepping.arrays import SteppedWorlds
 from cavmarl.stepping.local import LocalWorlds
 from cavmarl.stepping.pooled import PooledWorlds
-from cavmarl.worlds import check_agents, check_workers, make_world
+from cavmarl.stepping.remote import RemoteWorlds
+from cavmarl.worlds import check_agents, check_hosts, check_workers, make_world
 
 __all__ = ["CavVectorEnv", "make_vec"]
 
@@ -42,7 +45,8 @@ def make_vec(
     *,
     num_envs: int = 1,
     zones: int | None = None,
-    workers: int | None = None,
+    workers: int | Literal["ray"] | None = None,
+    hosts: Literal["ray"] | None = None,
     agents: int | None = None,
     background: int | None = None,
     seed: int | None = None,
@@ -59,7 +63,9 @@ def make_vec(
         zones: shadows zones.count, how many shards run the world; results do not depend on it.
         workers: processes that the worlds are shared out over, whole worlds each; where there are
             more of them than worlds, the zones of each world. 0: all run in the caller's process.
-            Results do not depend on it.
+            Results do not depend on it. "ray": as with hosts="ray", as many as CPUs and worlds.
+        hosts: "ray" runs the workers on the machines of a Ray cluster (docs/cluster.md), whole
+            worlds each. None: on this one.
         agents: shadows population.agents.
         background: shadows population.background.
         seed: of the first reset, if that is given none.
@@ -73,13 +79,15 @@ def make_vec(
         ConfigError: a key, value or combination that cannot work.
         MapError: the map cannot be read or driven.
         WorkerError: worker processes cannot be started, or have no memory.
+        MissingExtraError: hosts on Ray without Ray.
     """
     if isinstance(num_envs, bool) or not isinstance(num_envs, (int, np.integer)):
         raise ConfigError(f"num_envs = {num_envs!r}: must be a whole number")
     if not 1 <= num_envs <= MAX_WORLDS:
         raise ConfigError(f"num_envs = {num_envs}: must be from 1 to {MAX_WORLDS}")
     num_envs = int(num_envs)
-    num_workers = check_workers(workers)
+    on_ray = check_hosts(workers, hosts)
+    num_workers = None if workers == "ray" else check_workers(workers)
     in_next_step = _in_next_step(autoreset_mode)
     first_seed = None if seed is None else check_seed(seed)
     config, base_dir = load_config(
@@ -92,11 +100,13 @@ def make_vec(
     )
     check_agents(config)
     world = make_world(config, base_dir)
-    worlds: SteppedWorlds = (
-        PooledWorlds(world, base_dir, num_envs, num_workers, in_next_step)
-        if num_workers
-        else LocalWorlds(world, num_envs, in_next_step=in_next_step)
-    )
+    worlds: SteppedWorlds
+    if on_ray:
+        worlds = RemoteWorlds(world, base_dir, num_envs, num_workers, in_next_step)
+    elif num_workers:
+        worlds = PooledWorlds(world, base_dir, num_envs, num_workers, in_next_step)
+    else:
+        worlds = LocalWorlds(world, num_envs, in_next_step=in_next_step)
     return CavVectorEnv(worlds, seed=first_seed, copy=copy)
 
 
@@ -191,6 +201,18 @@ class CavVectorEnv:
             ConfigError: they live in worker processes.
         """
         return self.worlds.simulation
+
+    @property
+    def plans(self) -> tuple[Plan, ...]:
+        """Which worker hosts which worlds, or zones of each world; empty without workers.
+
+        See docs/balance.md; where worlds or zones move, it is the present plan.
+        """
+        return self.worlds.plans
+
+    def plan_text(self) -> str:
+        """The plans as tables; each full reset logs them (`cavmarl.workers`, INFO)."""
+        return "\n\n".join(map(describe_plan, self.plans))
 
     def reset(
         self, seed: int | None = None, options: dict[str, Any] | None = None

@@ -30,6 +30,7 @@ from cavmarl.traffic.native import capacity_of
 __all__ = [
     "World",
     "check_agents",
+    "check_hosts",
     "check_workers",
     "find_map",
     "load_roads",
@@ -172,6 +173,21 @@ def check_workers(workers: int | None) -> int:
     if workers < 0:
         raise ConfigError(f"workers = {workers}: must be a number from 0")
     return int(workers)
+
+
+def check_hosts(workers: int | str | None, hosts: str | None) -> bool:
+    """Whether workers run on the machines of a Ray cluster.
+
+    Raises:
+        ConfigError: another name, or no workers to be hosted.
+    """
+    if hosts not in (None, "ray"):
+        raise ConfigError(f"hosts = {hosts!r}: must be 'ray', or None for this machine")
+    if isinstance(workers, str) and workers != "ray":
+        raise ConfigError(f"workers = {workers!r}: must be a whole number, or 'ray'")
+    if hosts and workers in (None, 0):
+        raise ConfigError("hosts = 'ray' without workers: say how many, or workers='ray'")
+    return "ray" in (workers, hosts)
 
 
 def check_agents(config: EnvConfig) -> None:

@@ -202,7 +202,8 @@ def train(args: Args) -> Path:
     )
     network = ActorCritic(config, initial_std=(args.initial_std, args.initial_std))
     args.folder.mkdir(parents=True, exist_ok=True)
-    begin_training(args.folder, "ppo_gymnasium.py", asdict(args), rows.unwrapped.vec.worlds.world)
+    vec = rows.unwrapped.vec
+    begin_training(args.folder, "ppo_gymnasium.py", asdict(args), vec.worlds.world, vec.plans)
     learner = Learner(rows, network, args)
     limit_s = 60.0 * args.minutes if args.minutes else float("inf")
     began_at, updates, decisions, seconds = time.perf_counter(), 0, 0, 0.0

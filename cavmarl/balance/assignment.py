@@ -9,6 +9,7 @@ from cavmarl.balance.load_score import Candidate, Rejection, admissible, find_re
 from cavmarl.balance.placement import Placement, Workers
 from cavmarl.balance.problem import Problem
 from cavmarl.balance.refining import refine
+from cavmarl.balance.sliding import divide_row, slide
 from cavmarl.balance.spreading import spread, string
 
 __all__ = ["assign", "workers_of"]
@@ -43,6 +44,8 @@ def assign(problem: Problem) -> tuple[Placement, str]:
     lost = [shard for shard, home in enumerate(placement.homes) if home < 0]
     if lost:
         admissible(problem.snapshot.workers, rejections)
+        if problem.in_row:
+            return _place(problem, workers)
         spread(placement, [[shard] for shard in lost])
     return _rebalance(placement, "those of lost workers" if lost else "as it was")
 
@@ -51,6 +54,8 @@ def _place(problem: Problem, workers: Workers) -> tuple[Placement, str]:
     """Of several ways the one that keeps most neighbours together and is about as fast as any."""
     shards = range(len(problem.shards))
     nowhere = Placement(problem, workers, [-1 for _ in shards])
+    if problem.in_row:
+        return divide_row(nowhere), "all in a row"
     worlds = [list(part) for _, part in groupby(shards, lambda n: problem.shards[n].world)]
     longest = refine(spread(nowhere.copy(), [[shard] for shard in shards]))
     if not longest.fair_s:
@@ -81,12 +86,11 @@ def _rebalance(placement: Placement, method: str) -> tuple[Placement, str]:
     if placement.imbalance <= 1.0 + rule.tolerance:
         return placement, method
     slack_s = _slack_s(placement)
-    moved = refine(
-        placement.copy(),
-        until_s=placement.fair_s + slack_s,
-        slack_s=slack_s,
-        max_moves=rule.max_moves,
-    )
+    until_s = placement.fair_s + slack_s
+    if placement.problem.in_row:
+        moved = slide(placement.copy(), until_s=until_s, max_moves=rule.max_moves)
+    else:
+        moved = refine(placement.copy(), until_s=until_s, slack_s=slack_s, max_moves=rule.max_moves)
     gain_s = placement.excess_s() - moved.excess_s()
     moves = sum(one != other for one, other in zip(placement.homes, moved.homes, strict=True))
     price_s = max(rule.tolerance * placement.fair_s, moves * rule.move_s / rule.payback_ticks)

@@ -6,7 +6,7 @@ from collections.abc import Iterable
 from dataclasses import replace
 
 from cavmarl.balance.plan import Plan, make_plan
-from cavmarl.balance.problem import BalanceRule, Problem, ShardCost
+from cavmarl.balance.problem import MEASURED_COSTS, BalanceRule, Problem, ShardCost
 from cavmarl.balance.smoothing import SmoothCosts
 from cavmarl.balance.snapshot import Snapshot
 from cavmarl.errors import PlacementError
@@ -75,6 +75,7 @@ class Balancer:
                 snapshot=snapshot,
                 rule=rule or before.problem.rule,
                 present=before.homes,
+                cost_source=MEASURED_COSTS,
             )
         )
         return self.plan

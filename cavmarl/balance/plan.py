@@ -135,6 +135,8 @@ class Plan:
             "snapshot": problem.snapshot.to_dict(),
             "rule": asdict(problem.rule),
             "present": None if problem.present is None else list(problem.present),
+            "in_row": problem.in_row,
+            "cost_source": problem.cost_source,
             "method": self.method,
             "workers": [worker._asdict() for worker in self.workers()],
             "rejections": [rejection._asdict() for rejection in self.rejections],

@@ -9,11 +9,21 @@ from typing import Any
 
 from cavmarl.balance.load_score import RESOURCES, Candidate, LoadRule, Utilisation
 from cavmarl.balance.plan import SCHEMA, VERSION, Plan
-from cavmarl.balance.problem import BalanceRule, Problem, ShardCost
+from cavmarl.balance.problem import MEASURED_COSTS, BalanceRule, Problem, ShardCost
 from cavmarl.balance.snapshot import Snapshot
 from cavmarl.errors import PlacementError
 
-__all__ = ["plan_from_dict", "read_plan", "snapshot_from_dict"]
+__all__ = [
+    "PLACEMENT",
+    "PLACEMENT_AT_END",
+    "plan_from_dict",
+    "read_plan",
+    "read_plans",
+    "snapshot_from_dict",
+]
+
+# Of a manifest: the plans when the run began, and those when it ended.
+PLACEMENT, PLACEMENT_AT_END = "placement", "placement_at_end"
 
 LARGEST = 1 << 53  # whole numbers beyond it are not whole in every reader of JSON
 LONGEST = 40  # letters of a wrong value in a message
@@ -23,6 +33,18 @@ def read_plan(path: Path) -> Plan:
     """The plan of a file.
 
     Raises:
+        PlacementError: it cannot be read, or holds no plan of this version, or more than one.
+    """
+    plans = read_plans(path)
+    if len(plans) != 1:
+        raise PlacementError(f"{path}: {len(plans)} plans, of which one is needed")
+    return plans[0]
+
+
+def read_plans(path: Path) -> list[Plan]:
+    """The plan of a file, or those of a manifest: when the run began, then when it ended.
+
+    Raises:
         PlacementError: it cannot be read, or holds no plan of this version.
     """
     try:
@@ -30,7 +52,16 @@ def read_plan(path: Path) -> Plan:
     except (OSError, ValueError, RecursionError) as error:
         raise PlacementError(f"{path}: cannot be read ({error}); make the plan anew") from error
     try:
-        return plan_from_dict(document)
+        if not isinstance(document, dict) or PLACEMENT not in document:
+            return [plan_from_dict(document)]
+        rows = [
+            row
+            for name in (PLACEMENT, PLACEMENT_AT_END)
+            for row in _list(document.get(name, []), name)
+        ]
+        if not rows:
+            raise PlacementError("a manifest of a run without workers: there is no plan")
+        return [plan_from_dict(row) for row in rows]
     except PlacementError as error:
         raise PlacementError(f"{path}: {error}") from error
 
@@ -63,6 +94,8 @@ def plan_from_dict(document: Mapping[str, Any]) -> Plan:
         snapshot=snapshot_from_dict(_table(get("snapshot"), "snapshot")),
         rule=_rule(_table(get("rule"), "rule")),
         present=None if present is None else _wholes(present, "present"),
+        in_row=_truth(get("in_row", False), "in_row"),
+        cost_source=_text(get("cost_source", MEASURED_COSTS), "cost_source"),
     )
     homes = tuple(_whole(row.get("worker"), "worker") for row in shards)
     return Plan(problem, homes, _text(get("method"), "method"))
@@ -83,15 +116,13 @@ def snapshot_from_dict(document: Mapping[str, Any]) -> Snapshot:
 
 
 def _candidate(row: Mapping[str, Any]) -> Candidate:
-    use, available = _table(row.get("use"), "use"), row.get("available")
-    if not isinstance(available, bool):
-        raise _none("available", available, "true or false")
+    use = _table(row.get("use"), "use")
     cpu, ram, gpu = (_real(use.get(name), name) for name in RESOURCES)
     return Candidate(
         worker=_whole(row.get("worker"), "worker"),
         use=Utilisation(cpu, ram, gpu),
         hosted=_whole(row.get("hosted"), "hosted"),
-        available=available,
+        available=_truth(row.get("available"), "available"),
     )
 
 
@@ -133,6 +164,12 @@ def _list(value: object, name: str) -> Sequence[Any]:
 def _text(value: object, name: str) -> str:
     if not isinstance(value, str):
         raise _none(name, value, "text")
+    return value
+
+
+def _truth(value: object, name: str) -> bool:
+    if not isinstance(value, bool):
+        raise _none(name, value, "true or false")
     return value
 
 

@@ -7,6 +7,7 @@ from collections.abc import Iterable, Sequence
 from itertools import groupby
 
 from cavmarl.balance.plan import Plan
+from cavmarl.balance.problem import MEASURED_COSTS
 
 __all__ = ["describe_plan"]
 
@@ -17,9 +18,9 @@ HEADINGS = (
     "gpu",
     "score",
     "shards",
-    "load, ms",
-    "tick, ms",
-    "world: zones",
+    "load",
+    "tick",
+    "hosts",
 )
 LEFT = len(HEADINGS) - 1  # the last column is text
 
@@ -33,24 +34,43 @@ def describe_plan(plan: Plan) -> str:
         f"{weight:g} {name}"
         for weight, name in zip(problem.rule.load.weights, ("CPU", "RAM", "GPU"), strict=True)
     )
+    what = "worlds" if problem.in_row else "shards"
+    unit = " ms a tick" if _is_measured(plan) else ""
+    headings = [
+        {"shards": what, "hosts": what if problem.in_row else "world: zones"}.get(name, name)
+        + (", ms" if unit and name in ("load", "tick") else "")
+        for name in HEADINGS
+    ]
     lines = [
-        f"{len(problem.shards)} shards on {len(snapshot.workers)} workers, {plan.method}",
-        f"slowest worker {1e3 * placement.makespan_s:.3f} ms a tick, "
+        f"{len(problem.shards)} {what} on {len(snapshot.workers)} workers, {plan.method}"
+        + ("" if unit else f"; costs by {problem.cost_source}"),
+        f"slowest worker {_cost(plan, placement.makespan_s)}{unit}, "
         f"{plan.imbalance:.3f} times a perfect division; "
         f"neighbours apart: {placement.cut_pairs} of {len(problem.pairs)}",
-        f"costliest shard {1e3 * max(costs):.3f} ms a tick, {_over_mean(costs):.3f} times the mean",
+        f"costliest {what[:-1]} {_cost(plan, max(costs))}{unit}, "
+        f"{_over_mean(costs):.3f} times the mean",
         f"score = {weights}; workers {snapshot.origin}, GPU: {snapshot.gpu_source}",
         "",
-        *_table(HEADINGS, _rows(plan)),
+        *_table(headings, _rows(plan)),
         *(f"excluded: {rejection}" for rejection in plan.rejections),
     ]
     if problem.present is not None:
         lines.append(f"moves: {len(plan.moves)}")
         lines += [
-            f"  world {move.world}, zone {move.zone}: worker {move.source} → {move.target}"
+            f"  world {move.world}{'' if problem.in_row else f', zone {move.zone}'}: "
+            f"worker {move.source} → {move.target}"
             for move in plan.moves
         ]
     return "\n".join(lines)
+
+
+def _is_measured(plan: Plan) -> bool:
+    return plan.problem.cost_source == MEASURED_COSTS
+
+
+def _cost(plan: Plan, cost_s: float) -> str:
+    """In ms where it was measured; of supposed costs only their ratios mean something."""
+    return f"{1e3 * cost_s if _is_measured(plan) else cost_s:.3f}"
 
 
 def _over_mean(costs: Sequence[float]) -> float:
@@ -73,9 +93,9 @@ def _rows(plan: Plan) -> Iterable[tuple[str, ...]]:
             *(f"{share:.2f}" for share in (use.cpu, use.ram, use.gpu)),
             f"{worker.score:.3f}",
             str(worker.shards),
-            f"{1e3 * worker.load_s:.3f}",
-            f"{1e3 * worker.tick_s:.3f}",
-            _named(names),
+            _cost(plan, worker.load_s),
+            _cost(plan, worker.tick_s),
+            _runs([world for world, _ in names]) if plan.problem.in_row else _named(names),
         )
 
 
@@ -83,14 +103,17 @@ def _named(names: Sequence[tuple[int, int]]) -> str:
     """`0: 0-3 5; 1: 0`: zones of each world, runs as ranges."""
     worlds = []
     for world, members in groupby(names, lambda name: name[0]):
-        zones = [zone for _, zone in members]
-        runs = [
-            [zone for _, zone in run]
-            for _, run in groupby(enumerate(zones), lambda entry: entry[1] - entry[0])
-        ]
-        said = " ".join(f"{run[0]}-{run[-1]}" if len(run) > 1 else f"{run[0]}" for run in runs)
-        worlds.append(f"{world}: {said}")
+        worlds.append(f"{world}: {_runs([zone for _, zone in members])}")
     return "; ".join(worlds)
+
+
+def _runs(numbers: Sequence[int]) -> str:
+    """`0-3 5`: numbers that follow each other as ranges."""
+    runs = [
+        [number for _, number in run]
+        for _, run in groupby(enumerate(numbers), lambda entry: entry[1] - entry[0])
+    ]
+    return " ".join(f"{run[0]}-{run[-1]}" if len(run) > 1 else f"{run[0]}" for run in runs)
 
 
 def _table(headings: Sequence[str], rows: Iterable[Sequence[str]]) -> list[str]:

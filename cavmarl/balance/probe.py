@@ -6,7 +6,7 @@ import os
 import shutil
 import subprocess
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 
 import psutil
 
@@ -14,20 +14,17 @@ from cavmarl.balance.load_score import Candidate, Utilisation
 from cavmarl.balance.snapshot import NO_GPU, Snapshot
 from cavmarl.errors import PlacementError
 
-__all__ = ["MEASURED", "take_snapshot"]
+__all__ = ["MEASURED", "Watch", "take_snapshot"]
 
 MEASURED = "measured"
 INTERVAL_S = 0.2
+SHORTEST_S = 0.01  # a tick of the system's clocks
 GPU_TOOL = "nvidia-smi"
 GPU_QUERY = ("--query-gpu=utilization.gpu", "--format=csv,noheader,nounits")
 
 
 def take_snapshot(workers: Mapping[int, int | None], interval_s: float = INTERVAL_S) -> Snapshot:
     """Watch the machine for `interval_s` and say how busy each worker's part of it is.
-
-    A worker's CPU is the mean use of the cores that its process may run on, less its own: what it
-    computes for its shards is no reason to take them away. RAM is the machine's, and GPU that of
-    its busiest one by `nvidia-smi`; without that it is 0 and `gpu_source` is `none`.
 
     Args:
         workers: number → process id; None: not started yet, it will run where this process may.
@@ -38,38 +35,71 @@ def take_snapshot(workers: Mapping[int, int | None], interval_s: float = INTERVA
     """
     if not interval_s > 0.0:
         raise PlacementError(f"interval_s = {interval_s}: must be above 0")
-    watched = {number: _Watched(pid) for number, pid in workers.items()}
-    began = time.perf_counter()
-    percents = psutil.cpu_percent(interval=interval_s, percpu=True)
-    elapsed_s = time.perf_counter() - began
-    ram = psutil.virtual_memory().percent / 100.0
-    gpu, source = _busiest_gpu()
-    states = []
-    for number, process in watched.items():
-        foreign = process.foreign_use(percents, elapsed_s)
-        if foreign is None:
-            states.append(Candidate(number, Utilisation(1.0, ram, gpu), available=False))
-        else:
-            states.append(Candidate(number, Utilisation(foreign, ram, gpu)))
-    return Snapshot(tuple(states), source, MEASURED)
+    watch = Watch(workers)
+    time.sleep(interval_s)
+    return watch.snapshot()
+
+
+class Watch:
+    """The machine from now on, until somebody asks.
+
+    A worker's CPU is the mean use of the cores that its process may run on, less what it, the
+    other workers and this process have used there: what a run computes for itself is no reason to
+    take shards away. RAM is the machine's, and GPU that of its busiest one by `nvidia-smi`;
+    without that it is 0 and `gpu_source` is `none`.
+
+    Args:
+        workers: number → process id, as for `take_snapshot`.
+    """
+
+    def __init__(self, workers: Mapping[int, int | None]) -> None:
+        self._watched = {number: _Watched(pid) for number, pid in workers.items()}
+        self._caller = _Watched(os.getpid())
+        self._began_s = time.perf_counter()
+        self._before = _busy_s()
+
+    def snapshot(self) -> Snapshot:
+        """How busy others kept each worker's part of the machine.
+
+        Raises:
+            PlacementError: no worker.
+        """
+        elapsed_s = max(time.perf_counter() - self._began_s, SHORTEST_S)
+        foreign = [
+            (after - before) / elapsed_s
+            for before, after in zip(self._before, _busy_s(), strict=True)
+        ]
+        for process in (*self._watched.values(), self._caller):
+            share = (process.used_s() or 0.0) / elapsed_s / len(process.cores)
+            for core in process.cores:
+                foreign[core] -= share
+        ram = psutil.virtual_memory().percent / 100.0
+        gpu, source = _busiest_gpu()
+        states = []
+        for number, process in self._watched.items():
+            available = process.used_s() is not None
+            cpu = sum(foreign[core] for core in process.cores) / len(process.cores)
+            use = Utilisation(min(max(cpu, 0.0), 1.0) if available else 1.0, ram, gpu)
+            states.append(Candidate(number, use, available=available))
+        return Snapshot(tuple(states), source, MEASURED)
 
 
 class _Watched:
-    """A worker's process, or the room for one, from before the interval to its end."""
+    """A process, or the room for one, from now on.
+
+    Attributes:
+        cores: that it may run on.
+    """
 
     def __init__(self, pid: int | None) -> None:
         self._pid = pid
         self._began_s = self._own_s()
-        self._cores = _cores(0 if pid is None or self._began_s is None else pid)
+        self.cores = _cores(0 if pid is None or self._began_s is None else pid)
 
-    def foreign_use(self, percents: Sequence[float], elapsed_s: float) -> float | None:
-        """What others used of its cores; None: it is gone."""
+    def used_s(self) -> float | None:
+        """Processor time since then; None: it is gone."""
         ended_s = self._own_s()
-        if ended_s is None or self._began_s is None:
-            return None
-        busy = sum(percents[core] for core in self._cores) / 100.0
-        own = (ended_s - self._began_s) / elapsed_s
-        return min(max((busy - own) / len(self._cores), 0.0), 1.0)
+        return None if ended_s is None or self._began_s is None else ended_s - self._began_s
 
     def _own_s(self) -> float | None:
         """Processor time up to now; None: there is no such process."""
@@ -80,6 +110,14 @@ class _Watched:
         except psutil.NoSuchProcess:
             return None
         return float(times.user + times.system)
+
+
+def _busy_s() -> list[float]:
+    """Seconds that each core was in use, up to now."""
+    return [
+        sum(core) - core.idle - getattr(core, "iowait", 0.0) - getattr(core, "guest", 0.0)
+        for core in psutil.cpu_times(percpu=True)
+    ]
 
 
 def _cores(pid: int) -> list[int]:

@@ -12,7 +12,9 @@ from cavmarl.balance.load_score import LoadRule
 from cavmarl.balance.snapshot import Snapshot
 from cavmarl.errors import PlacementError
 
-__all__ = ["BalanceRule", "Problem", "ShardCost", "equal_costs"]
+__all__ = ["MEASURED_COSTS", "BalanceRule", "Problem", "ShardCost", "equal_costs"]
+
+MEASURED_COSTS = "measured"
 
 MAX_COST_S = 1e6  # of a tick: sums stay finite
 
@@ -80,11 +82,14 @@ class Problem:
         snapshot: of the workers.
         rule: when shards move.
         present: worker of each shard now, in the order of `shards`; None: nobody hosts any yet.
+        in_row: the shards of a worker follow each other, workers by their numbers, each with one at
+            least; so it is for worlds whose results lie in one array.
+        cost_source: where costs come from; if it is not `measured`, they only compare shards.
 
     Raises:
         PlacementError: no shard, one twice, a cost below 0 or none, a zone without a row in
             `neighbors`, neighbours that are not each other's, more workers than shards, not one
-            present worker a shard.
+            present worker a shard, present workers that are not in a row though they have to be.
     """
 
     shards: tuple[ShardCost, ...]
@@ -92,6 +97,8 @@ class Problem:
     snapshot: Snapshot
     rule: BalanceRule = field(default_factory=BalanceRule)
     present: tuple[int, ...] | None = None
+    in_row: bool = False
+    cost_source: str = MEASURED_COSTS
 
     def __post_init__(self) -> None:
         _check_shards(self.shards, len(self.neighbors))
@@ -110,6 +117,8 @@ class Problem:
         object.__setattr__(self, "shards", tuple(self.shards[n] for n in order))
         if self.present is not None:
             object.__setattr__(self, "present", tuple(self.present[n] for n in order))
+        if self.in_row and list(self.present or ()) != sorted(self.present or ()):
+            raise PlacementError(f"present workers {self.present}: must be in a row, by number")
 
     @cached_property
     def pairs(self) -> tuple[tuple[int, int], ...]:

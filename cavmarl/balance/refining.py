@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from cavmarl.balance.placement import Placement
 from cavmarl.balance.problem import Problem
 
-__all__ = ["refine"]
+__all__ = ["LEAST_GAIN", "refine"]
 
 Floats = NDArray[np.float64]
 LEAST_GAIN = 1e-9  # of a tick: below it sums may differ by rounding

@@ -11,6 +11,7 @@ from rich.table import Table
 
 from cavmarl.cli.bench_balance import balance
 from cavmarl.cli.bench_libraries import libraries
+from cavmarl.cli.bench_moving import moving
 from cavmarl.cli.bench_sharding import sharding
 from cavmarl.cli.bench_traffic import traffic
 from cavmarl.cli.bench_train import train
@@ -38,6 +39,7 @@ app = typer.Typer(help="How fast it is, measured side by side.", no_args_is_help
 app.command()(traffic)
 app.command()(sharding)
 app.command()(balance)
+app.command()(moving)
 app.command()(workers)
 app.command()(train)
 app.command()(libraries)

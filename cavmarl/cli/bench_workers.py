@@ -71,6 +71,7 @@ def workers(
     pays to split one world, and what 100 agents in whose worlds nothing happens cost in our
     workers, Gymnasium's and SuperSuit's.
     """
+    from cavmarl.evaluate.core_ceiling import measure_ceiling
     from cavmarl.evaluate.split_speed import measure_splits, split_line
     from cavmarl.evaluate.vectorization_speed import measure_vectorization
     from cavmarl.evaluate.worker_speed import measure_workers
@@ -92,6 +93,18 @@ def workers(
             overrides=parse_settings(settings),
             say=status.update,
         )
+        status.update("stepping worlds in programs of their own")
+        ceiling = measure_ceiling(
+            env,
+            worlds=worlds,
+            programs=count,
+            steps=steps,
+            repeats=repeats,
+            seed=seed,
+            agents=agents,
+            background=background,
+            overrides=parse_settings(settings),
+        )
         splits = measure_splits(
             env,
             numbers,
@@ -110,6 +123,7 @@ def workers(
         )
     line = split_line(splits)
     more = {
+        "ceiling": ceiling.to_dict(),
         "splits": [split.to_dict() for split in splits],
         "split_pays_from": line,
         "vectorization": vectorization.to_dict(),
@@ -124,6 +138,11 @@ def workers(
         f"an empty order to all {count}: [bold]{middle:.1f}[/] µs "
         f"({low:.1f} / {high:.1f} / {highest:.1f}: 5, 95, 99 %); idle workers take "
         f"{found.idle_s:.1%} of a core",
+        highlight=False,
+    )
+    console.print(
+        f"{count} programs that share nothing, side by side: [bold]{ceiling.ratio:.2f}[/] times "
+        "one after the other: more this machine does not give",
         highlight=False,
     )
     for split in splits:

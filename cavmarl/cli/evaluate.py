@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import statistics
 from collections.abc import Iterator, Sequence
 from datetime import datetime
 from pathlib import Path
@@ -159,6 +160,13 @@ def report_table(found: EvaluationReport) -> Table:
         table.add_row(title, *cells)
     table.add_row("world step, ms", *(_least(driver, "step_ms") for driver in drivers))
     table.add_row("policy, ms", *(_least(driver, "policy_ms") for driver in drivers))
+    uneven = [
+        [run.zone_time_imbalance for run in driver.speed if run.zone_time_imbalance is not None]
+        for driver in drivers
+    ]
+    if all(uneven):
+        means = (f"{statistics.fmean(runs):.2f}" for runs in uneven)
+        table.add_row("time of zones, max / mean", *means)
     return table
 
 

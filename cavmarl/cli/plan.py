@@ -57,7 +57,8 @@ def plan(
         Path | None,
         typer.Option(
             metavar="FILE",
-            help="Make a stored plan once more from what it says; exit code 1 if it is another.",
+            help="Make a stored plan, or those of a run's manifest, once more from what they say; "
+            "exit code 1 if one is another.",
         ),
     ] = None,
     cut: Annotated[
@@ -157,12 +158,13 @@ def _snapshot(said: str, workers: int) -> Snapshot:
 
 def _make_again(path: Path) -> None:
     from cavmarl.balance.plan import replan
-    from cavmarl.balance.plan_file import read_plan
+    from cavmarl.balance.plan_file import read_plans
     from cavmarl.balance.plan_text import describe_plan
 
-    stored = read_plan(path)
-    made = replan(stored, stored.problem.snapshot)
-    Console().print(describe_plan(made), markup=False, highlight=False, soft_wrap=True)
+    stored = read_plans(path)
+    made = [replan(plan, plan.problem.snapshot) for plan in stored]
+    text = "\n\n".join(map(describe_plan, made))
+    Console().print(text, markup=False, highlight=False, soft_wrap=True)
     if made != stored:
         print_error(f"{path}: its shards do not stand where its own figures put them")
         raise typer.Exit(1)

@@ -88,6 +88,13 @@ def verify(
         ),
     ] = None,
     workers: Annotated[int, typer.Option(help="Of --kill, that the worlds are run by.")] = 2,
+    hosts: Annotated[
+        str | None,
+        typer.Option(
+            metavar="ray",
+            help="Of --kill: the workers are actors of a Ray cluster on this machine.",
+        ),
+    ] = None,
     check: Annotated[
         bool, typer.Option("--check", help="Watch the invariants of ownership, too.")
     ] = False,
@@ -109,6 +116,8 @@ def verify(
 
     With --kill: worlds whose workers are killed beside some that nobody disturbs.
     """
+    if hosts is not None and kill is None:
+        raise ConfigError(f"--hosts {hosts}: goes with --kill only")
     if replay is not None:
         given = (zones, steps, layout, agents, background, settings, faults, journal, kill, worlds)
         if check or any(value is not None for value in given):
@@ -128,6 +137,7 @@ def verify(
             kill,
             json_path,
             workers=workers,
+            hosts=hosts,
             worlds=worlds,
             steps=steps,
             seed=seed,

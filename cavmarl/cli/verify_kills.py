@@ -49,6 +49,7 @@ def _print(console: Console, found: KillReport) -> None:
     console.print(
         f"{escape(Path(found.env).name)}: {found.worlds} worlds over {found.workers} workers, "
         f"{found.steps} steps of {found.step_ms:.3g} ms; {len(found.kills)} deaths\n"
+        f"an empty order to all workers: {found.ping_us:.3g} µs\n"
         f"{hardware['cpu']}, {hardware['usable_cores']} cores",
         highlight=False,
     )

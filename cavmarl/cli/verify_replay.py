@@ -8,7 +8,7 @@ import typer
 from rich.console import Console
 
 from cavmarl.cli.output import write_json
-from cavmarl.errors import ZoneStepError
+from cavmarl.errors import LostTickError
 
 __all__ = ["run_again"]
 
@@ -31,7 +31,7 @@ def run_again(path: Path, env: str | None, json_path: Path | None) -> None:
     try:
         found["state_hash"] = replay_tick(kept, world)
         console.print(f"as it was: reached, state {found['state_hash']}")
-    except ZoneStepError as error:
+    except LostTickError as error:
         found["failure"] = str(error)
         console.print(f"as it was: {error}")
     write_json(json_path, found)

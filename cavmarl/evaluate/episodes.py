@@ -18,6 +18,8 @@ from cavmarl.evaluate.recorder import Recorder
 from cavmarl.evaluate.tables import EPISODE, TRACK, TRIP
 from cavmarl.evaluate.transfer_rows import TRANSFER, TransferRecorder
 from cavmarl.policies import Policy, load_policy
+from cavmarl.roads.zone_statistics import imbalance
+from cavmarl.runtime.shard_clock import ShardClock
 from cavmarl.stepping.local import LocalWorlds
 from cavmarl.vector_env import CavVectorEnv
 from cavmarl.worlds import load_world
@@ -27,6 +29,7 @@ __all__ = ["Job", "RunData", "Speed", "drive_run", "worlds_at_once"]
 MAX_VEHICLES = 100_000  # of the worlds that are stepped together
 MAX_WORLDS = 128
 TRACK_S = 0.5  # between the points of a track
+TIMED_TICKS = 16  # of so many ticks one is timed, zone by zone
 _HALF = np.uint64(1)  # a seed has 63 bits
 
 Progress = Callable[[str, int, int], None]  # policy, steps done, most steps there can be
@@ -68,12 +71,15 @@ class Speed:
         policy_ms: milliseconds of the policy for one step of one world.
         agent_steps_per_s: decisions a second, simulation and policy.
         worlds: how many were stepped together.
+        zone_time_imbalance: of divided worlds: the slowest zone's part of a tick over the mean of
+            all zones, by the processor's time, all worlds together; None: not measured.
     """
 
     step_ms: float
     policy_ms: float
     agent_steps_per_s: float
     worlds: int
+    zone_time_imbalance: float | None = None
 
 
 @dataclass(frozen=True)
@@ -129,6 +135,7 @@ def _drive(
 ) -> RunData:
     """All episodes of one policy, part after part."""
     parts: list[_Part] = []
+    clock = _zone_clock(vec)
     count = math.ceil(job.episodes / vec.num_envs)
     for k in range(count):
         first = k * vec.num_envs
@@ -148,7 +155,7 @@ def _drive(
         counts.update(part.transfer_counts)
     for table in (trips, episodes, transfers):
         table["run"] = job.run
-    speed = _speed(parts, vec.num_envs)
+    speed = _speed(parts, vec.num_envs, clock)
     return RunData(trips, episodes, parts[0].tracks, speed, transfers, dict(counts))
 
 
@@ -276,13 +283,23 @@ class _Imbalance:
         return np.where(self._steps > 0, self._sums / np.maximum(self._steps, 1), np.nan)
 
 
-def _speed(parts: list[_Part], worlds: int) -> Speed:
+def _zone_clock(vec: CavVectorEnv) -> ShardClock | None:
+    """Times the zones of divided worlds; None where hosts die, whose ticks are begun again."""
+    zones = vec.config.zones
+    if vec.simulation.partition.count == 1 or zones.faults or zones.reproducers:
+        return None
+    return vec.simulation.time_shards(TIMED_TICKS)
+
+
+def _speed(parts: list[_Part], worlds: int, clock: ShardClock | None) -> Speed:
     timed = max(sum(part.timed_steps for part in parts) * worlds, 1)
     policy_s = sum(part.policy_s for part in parts)
     simulation_s = sum(part.simulation_s for part in parts)
+    zones_s = np.zeros(0) if clock is None else clock.take_s()
     return Speed(
         step_ms=1e3 * simulation_s / timed,
         policy_ms=1e3 * policy_s / timed,
         agent_steps_per_s=sum(p.decisions for p in parts) / max(policy_s + simulation_s, 1e-9),
         worlds=worlds,
+        zone_time_imbalance=None if not zones_s.any() else imbalance(zones_s.tolist()),
     )

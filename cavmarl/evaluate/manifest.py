@@ -108,11 +108,20 @@ def open_manifest(folder: Path, document: Mapping[str, Any]) -> Document:
     return opened
 
 
-def close_manifest(folder: Path, files: list[str]) -> Document:
-    """Mark the manifest as closed, with the hashes of the result `files` that lie beside it."""
+def close_manifest(
+    folder: Path, files: list[str], document: Mapping[str, Any] | None = None
+) -> Document:
+    """Mark the manifest as closed.
+
+    Args:
+        folder: of the results.
+        files: that lie beside it; their hashes are put down.
+        document: what is only known now.
+    """
     path = folder / MANIFEST_FILE
     closed: Document = {
         **_read(path),
+        **(document or {}),
         "status": "closed",
         "ended": _now(),
         "results_sha256": {name: hash_of_file(folder / name) for name in files},

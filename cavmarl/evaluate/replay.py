@@ -53,7 +53,7 @@ def replay_tick(kept: Reproducer, world: World, *, faults: bool = True) -> str:
         faults: with those of its plan, if it had one.
 
     Raises:
-        ZoneStepError: every host of a zone dies of it again.
+        LostTickError: every host of a zone, or every coordinator, dies of it again.
         ReproducerError: it is of another layout.
         Exception: without faults whatever a zone's code raises, from where it does.
     """

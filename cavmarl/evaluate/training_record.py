@@ -10,6 +10,8 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from cavmarl.balance.plan import Plan
+from cavmarl.balance.plan_file import PLACEMENT, PLACEMENT_AT_END
 from cavmarl.errors import ManifestError
 from cavmarl.evaluate.manifest import (
     MANIFEST_FILE,
@@ -25,7 +27,11 @@ __all__ = ["begin_training", "end_training", "is_trained"]
 
 
 def begin_training(
-    folder: Path, program: str, settings: Mapping[str, Any], world: World | Simulation
+    folder: Path,
+    program: str,
+    settings: Mapping[str, Any],
+    world: World | Simulation,
+    plans: Sequence[Plan] = (),
 ) -> None:
     """Put on record what is about to be trained, in place of the record of an earlier run there.
 
@@ -34,6 +40,8 @@ def begin_training(
         program: that trains.
         settings: its own, whole; `seed` is one of them.
         world: that it learns in, or many of it.
+        plans: which worker hosts what; `cavmarl plan --again FOLDER/manifest.json` makes them
+            again.
     """
     (folder / MANIFEST_FILE).unlink(missing_ok=True)
     open_manifest(
@@ -43,13 +51,21 @@ def begin_training(
             "settings": dict(settings),
             "seeds": [settings["seed"]],
             "world": describe_world(world.config, world.network, world.demand, world.partition),
+            PLACEMENT: [plan.to_dict() for plan in plans],
         },
     )
 
 
-def end_training(folder: Path, files: Sequence[str]) -> None:
-    """Close the record with the hashes of the `files` that the run left beside it."""
-    close_manifest(folder, list(files))
+def end_training(folder: Path, files: Sequence[str], plans: Sequence[Plan] = ()) -> None:
+    """Close the record.
+
+    Args:
+        folder: of the run.
+        files: that the run left there; their hashes are put down.
+        plans: which worker hosted what at the end.
+    """
+    placement = {PLACEMENT_AT_END: [plan.to_dict() for plan in plans]}
+    close_manifest(folder, list(files), placement)
 
 
 def is_trained(folder: Path) -> bool:

@@ -5,26 +5,30 @@ from __future__ import annotations
 import os
 import random
 import signal
+import socket
 import statistics
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from threading import Timer
-from typing import Any
+from typing import Any, Literal
 
 from cavmarl.errors import ConfigError, EvaluationError
 from cavmarl.evaluate.differences import same_bytes, step_results
 from cavmarl.evaluate.machine import describe_hardware
+from cavmarl.hosts.pool import HostPool
 from cavmarl.policies import Policy, load_policy
 from cavmarl.runtime.pool import Death, Pool
 from cavmarl.seeds import check_seed
 from cavmarl.stepping.pooled import PooledWorlds
+from cavmarl.stepping.remote import RemoteWorlds
 from cavmarl.vector_env import CavVectorEnv, make_vec
 
 __all__ = ["Kill", "KillReport", "verify_kills"]
 
 FIRST_STEPS = 10  # before anybody is killed, to know how long a step takes
+PINGS = 500
 LATEST = 1.5  # of a step's time: some are killed when they are already waiting for the next one
 STOPS = 0.25  # share of those that are not killed but stopped
 
@@ -67,6 +71,7 @@ class KillReport:
         different: the first step after which anything differed; None: none.
         kills: all of them.
         step_ms: median of the steps in which nobody died.
+        ping_us: median of an empty order to all workers, before the first death.
         state_hashes: of the undisturbed worlds at the end.
         hardware: that it ran on.
     """
@@ -78,6 +83,7 @@ class KillReport:
     different: int | None
     kills: tuple[Kill, ...]
     step_ms: float
+    ping_us: float
     state_hashes: tuple[str, ...]
     hardware: dict[str, Any]
 
@@ -96,6 +102,7 @@ def verify_kills(
     kills: int,
     *,
     workers: int = 2,
+    hosts: Literal["ray"] | None = None,
     worlds: int | None = None,
     steps: int | None = None,
     seed: int = 0,
@@ -112,6 +119,7 @@ def verify_kills(
         env: as in `make_vec`.
         kills: how many signals; three in four are SIGKILL, the others SIGSTOP.
         workers: over which the worlds are shared out.
+        hosts: "ray": they are actors of a Ray cluster, all on this machine.
         worlds: stepped together; default: two a worker.
         steps: how many; default: three a kill.
         seed: root of all random numbers, those of the kills, too.
@@ -140,10 +148,12 @@ def verify_kills(
         "background": background,
         "overrides": overrides,
     }
-    whole, parted = make_vec(env, **wanted), make_vec(env, workers=workers, **wanted)
+    whole, parted = make_vec(env, **wanted), make_vec(env, workers=workers, hosts=hosts, **wanted)
     try:
         killer = _Killer(_pool(parted), random.Random(seed))
         runs = [_Run(vec, load_policy(policy, vec), seed) for vec in (whole, parted)]
+        _refuse_elsewhere(killer.pool)
+        ping_us = _ping_us(killer.pool)
         struck = set(killer.random.sample(range(FIRST_STEPS, steps), kills))
         different = None
         for step in range(steps):
@@ -163,14 +173,37 @@ def verify_kills(
     finally:
         parted.close()
     return KillReport(
-        str(env), worlds, workers, steps, different, tuple(killer.found), killer.step_ms(), hashes,
-        describe_hardware(),
+        str(env), worlds, workers, steps, different, tuple(killer.found), killer.step_ms(), ping_us,
+        hashes, describe_hardware(),
     )  # fmt: skip
 
 
-def _pool(vec: CavVectorEnv) -> Pool:
-    assert isinstance(vec.worlds, PooledWorlds)
+def _pool(vec: CavVectorEnv) -> Pool | HostPool:
+    assert isinstance(vec.worlds, PooledWorlds | RemoteWorlds)
     return vec.worlds.pool
+
+
+def _ping_us(pool: Pool | HostPool) -> float:
+    """What an empty order to all workers takes, at the median."""
+    found = []
+    for _ in range(PINGS):
+        began = time.perf_counter()
+        pool.ping()
+        found.append(time.perf_counter() - began)
+    return 1e6 * statistics.median(found)
+
+
+def _refuse_elsewhere(pool: Pool | HostPool) -> None:
+    """Only processes of this machine can be killed.
+
+    Raises:
+        ConfigError: one is elsewhere.
+    """
+    if isinstance(pool, HostPool) and {*pool.machines} != {socket.gethostname()}:
+        raise ConfigError(
+            f"hosts on {', '.join(sorted({*pool.machines}))}: processes are killed on this machine "
+            "only; unset RAY_ADDRESS for a cluster of its own"
+        )
 
 
 class _Run:
@@ -199,10 +232,10 @@ class _Killer:
         random: says whose and when.
     """
 
-    def __init__(self, pool: Pool, random: random.Random) -> None:
+    def __init__(self, pool: Pool | HostPool, random: random.Random) -> None:
         self.random = random
         self.found: list[Kill] = []
-        self._pool = pool
+        self.pool = pool
         self._sent: dict[int, tuple[signal.Signals, float]] = {}  # worker → what and when
         self._seen = 0
         self._calm_s: list[float] = []
@@ -215,6 +248,9 @@ class _Killer:
         """One step, with a signal in it or soon after."""
         timer = None
         if strikes:
+            if isinstance(self.pool, HostPool):  # one death at a time: Ray takes seconds for a host
+                self.finish(step)
+                self.pool.await_spare()
             delay_s = self.random.uniform(0.0, LATEST * statistics.median(self._calm_s))
             timer = Timer(delay_s, self._strike, (self._choose(),))
             timer.start()
@@ -229,18 +265,21 @@ class _Killer:
 
     def finish(self, step: int) -> None:
         """Let those be missed that were struck last."""
-        self._pool.ping()
+        self.pool.ping()
         self._match(step)
 
     def _choose(self) -> tuple[int, signal.Signals]:
-        alive = [k for k in range(len(self._pool.pids)) if k not in self._sent]
+        alive = [k for k in range(len(self.pool.pids)) if k not in self._sent]
         how = signal.SIGSTOP if self.random.random() < STOPS else signal.SIGKILL
         return self.random.choice(alive or [0]), how
 
     def _strike(self, target: tuple[int, signal.Signals]) -> None:
         worker, how = target
         self._sent[worker] = how, time.monotonic()
-        os.kill(self._pool.pids[worker], how)
+        if isinstance(self.pool, Pool):
+            os.kill(self.pool.pids[worker], how)
+        elif not self.pool.signal(worker, how):  # it is being replaced
+            del self._sent[worker]
 
     def _match(self, step: int) -> None:
         """Say of each new death what it was.
@@ -248,7 +287,7 @@ class _Killer:
         Raises:
             EvaluationError: somebody died that nobody had killed.
         """
-        deaths = self._pool.deaths
+        deaths = self.pool.deaths
         for death in deaths[self._seen :]:
             if death.worker not in self._sent:
                 raise EvaluationError(
@@ -256,7 +295,7 @@ class _Killer:
                 )
             how, sent_s = self._sent.pop(death.worker)
             self.found.append(_kill(death, how, sent_s, step))
-            for worker in self._pool.team_of(death.worker):
+            for worker in self.pool.team_of(death.worker):
                 if worker in self._sent and self._sent[worker][1] < death.replaced_s:
                     del self._sent[worker]  # it was replaced with the other one
         self._seen = len(deaths)

@@ -113,7 +113,8 @@ def measure_workers(
 ) -> WorkerSpeed:
     """Step the same worlds without workers, with one, and with several, by turns.
 
-    The agents do what the built-in driver would; that is not timed.
+    The agents do what the built-in driver would; that is not timed. Observations are read where
+    they lie, as a trainer with tensors of the same memory does.
 
     Args:
         env: as in `make_vec`.
@@ -147,6 +148,7 @@ def measure_workers(
                 agents=agents,
                 background=background,
                 overrides=overrides,
+                copy=False,
             )
             measured.append(Measured(vec, count, time.perf_counter() - began))
             vec.reset(seed=seed)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,7 +12,7 @@ from cavmarl.kernels import inlined_kernel, kernel
 from cavmarl.kernels.arrays import Zoned
 from cavmarl.kernels.zones import ZoneArrays, squared_distance, zone_of
 
-__all__ = ["NEAR", "find_near", "pass_on"]
+__all__ = ["NEAR", "Borders", "find_near", "pass_on"]
 
 NEAR = np.dtype(
     [
@@ -27,12 +28,18 @@ NEAR = np.dtype(
 )
 
 
+class Borders(NamedTuple):
+    """When a vehicle is near a border, and when behind it."""
+
+    hysteresis_m: float  # so far outside of its zone a vehicle still stays with it
+    ahead_s: float  # who will be behind one after this time, at its velocity, is near it
+    max_speed_mps: float  # which no vehicle exceeds
+
+
 @kernel
 def find_near(
     zones: ZoneArrays,
-    hysteresis_m: float,
-    ahead_s: float,
-    max_speed_mps: float,
+    borders: Borders,
     zoned: Zoned,
     side: int,
     w: int,
@@ -46,9 +53,7 @@ def find_near(
 
     Args:
         zones: of the partition.
-        hysteresis_m: so far behind the border a vehicle still stays.
-        ahead_s: how far ahead to look, s.
-        max_speed_mps: which no vehicle exceeds.
+        borders: when a vehicle is near one.
         zoned: the rows of all zones.
         side: whose rows, 0 or 1.
         w: in which world.
@@ -63,18 +68,14 @@ def find_near(
             i = n if everybody else zoned.border[zone, w, n]
             if i < owned:
                 row = zoned.rows[side, zone, w, i]
-                found = _tell_of(
-                    zones, hysteresis_m, ahead_s, max_speed_mps, row, zone, i, out, found
-                )
+                found = _tell_of(zones, borders, row, zone, i, out, found)
     return found
 
 
 @inlined_kernel
 def _tell_of(
     zones: ZoneArrays,
-    hysteresis_m: float,
-    ahead_s: float,
-    max_speed_mps: float,
+    borders: Borders,
     row: np.void,
     zone: int,
     i: int,
@@ -86,7 +87,7 @@ def _tell_of(
     x = row["x"]
     y = row["y"]
     # Whoever lies further inside cannot come out in that time. Infinite rims stay infinite.
-    margin = max_speed_mps * ahead_s
+    margin = borders.max_speed_mps * borders.ahead_s
     if (
         rects[zone, 0] + margin < x
         and x < rects[zone, 2] - margin
@@ -94,14 +95,14 @@ def _tell_of(
         and y < rects[zone, 3] - margin
     ):
         return found
-    limit = hysteresis_m * hysteresis_m
+    limit = borders.hysteresis_m * borders.hysteresis_m
     squared = squared_distance(rects, zone, x, y)
     here = zone
     if squared > limit:
         here = zone_of(zones, x, y)
         _note(out[found], row["id"], zone, i, here, True, squared)
         found += 1
-    way = row["speed"] * ahead_s
+    way = row["speed"] * borders.ahead_s
     then_x = x + math.cos(row["heading"]) * way
     then_y = y + math.sin(row["heading"]) * way
     if squared_distance(rects, zone, then_x, then_y) > limit:

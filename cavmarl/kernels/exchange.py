@@ -10,6 +10,8 @@ from numpy.typing import NDArray
 
 from cavmarl.kernels import inlined_kernel, kernel
 from cavmarl.kernels.arrays import Zoned
+from cavmarl.kernels.borders import Borders
+from cavmarl.kernels.handing_over import Book, look_on
 from cavmarl.kernels.zones import Halo, ZoneArrays, is_inside, squared_distance, zone_of
 
 __all__ = ["exchange", "take_own"]
@@ -20,11 +22,12 @@ def exchange(
     zones: ZoneArrays,
     halo: Halo,
     touching_m: float,
-    border_m: float,
+    borders: Borders,
     zoned: Zoned,
     side: int,
     first: int,
     last: int,
+    book: Book,
 ) -> None:
     """Renew all ghosts of some worlds from the owned rows, and note who is near a border.
 
@@ -36,13 +39,16 @@ def exchange(
         zones: of the partition.
         halo: from `roads.zone_halo.zone_halo`, for the same partition.
         touching_m: no ghost further outside of a zone can touch one of its vehicles.
-        border_m: who is so near another zone is noted; 0: who lies in one.
+        borders: when a vehicle is near one.
         zoned: the ghosts and how many there are, border and num_border are written. Of the owned
             rows those in `outer` are looked at, where they are noted.
         side: whose rows, 0 or 1.
         first: the first world.
         last: the one after the last.
+        book: who is near a border is written.
     """
+    # Nobody else can be behind a border by then.
+    border_m = borders.max_speed_mps * borders.ahead_s
     count = zones.rects.shape[0]
     for w in range(first, last):
         for zone in range(count):
@@ -52,6 +58,7 @@ def exchange(
         if count > 1:
             for zone in range(count):
                 _publish(zones, halo, touching_m, border_m, zoned, side, zone, w)
+        look_on(zones, borders, zoned, side, w, book)
 
 
 @inlined_kernel
@@ -76,17 +83,19 @@ def _publish(
         row = zoned.rows[side, zone, w, i]
         x = row["x"]
         y = row["y"]
-        if is_inside(halo.inner[zone], x, y):
+        if noted < 0 and is_inside(halo.inner[zone], x, y):
             continue
         at_border = False
-        here = zone_of(zones, x, y)
+        here = zone
+        if squared_distance(zones.rects, zone, x, y) > 0.0:
+            here = zone_of(zones, x, y)
         for n in range(halo.near_start[here], halo.near_start[here + 1]):
             other = halo.near[n]
             if other == zone:
                 continue
             squared = squared_distance(zones.rects, other, x, y)
             if squared <= limit:
-                _take_ghost(row, zoned, side, other, w, squared <= near_limit)
+                _take_ghost(zoned, side, zone, i, other, w, squared <= near_limit)
                 at_border |= squared <= border_limit
         if at_border:
             zoned.border[zone, w, found] = i
@@ -96,15 +105,27 @@ def _publish(
 
 
 @inlined_kernel
-def _take_ghost(row: np.void, zoned: Zoned, side: int, zone: int, w: int, near: bool) -> None:
-    """Put a row behind those of a zone, before the ghosts that can touch nobody if it can."""
+def _take_ghost(
+    zoned: Zoned, side: int, source: int, i: int, zone: int, w: int, near: bool
+) -> None:
+    """Put row i of a zone behind those of another, before ghosts that can touch nobody if it can.
+
+    What its owner knows of its way goes with it: the table of ways is far away in memory.
+    """
+    rows = zoned.rows[side, zone, w]
+    step = zoned.step[zone, w]
+    step_at = zoned.step_at[zone, w]
     place = zoned.num_rows[zone, w]
     if near:
         first_far = zoned.num_near[zone, w]
-        zoned.rows[side, zone, w, place] = zoned.rows[side, zone, w, first_far]
+        rows[place] = rows[first_far]
+        step[place] = step[first_far]
+        step_at[place] = step_at[first_far]
         place = first_far
         zoned.num_near[zone, w] += 1
-    zoned.rows[side, zone, w, place] = row
+    rows[place] = zoned.rows[side, source, w, i]
+    step[place] = zoned.step[source, w, i]
+    step_at[place] = zoned.step_at[source, w, i]
     zoned.num_rows[zone, w] += 1
 
 

@@ -21,7 +21,6 @@ from cavmarl.kernels.arrays import RoadArrays
 __all__ = [
     "DETECTOR_REACH_M",
     "detect",
-    "merge_detections",
     "program_at",
     "switch_signals",
 ]
@@ -68,12 +67,6 @@ def detect(
                 if abs(ahead) < DETECTOR_REACH_M:
                     _note(row, ahead, ticks[w] * dt, dt, at["detector"], detected_s[w])
                 place = at["next"]
-
-
-@kernel
-def merge_detections(into: NDArray[np.float64], others: NDArray[np.float64]) -> None:
-    """Keep the latest of what two shards have noted, `detected_s` (W, D) of each."""
-    np.maximum(into, others, into)
 
 
 @kernel

@@ -91,21 +91,14 @@ def is_inside(rect: NDArray[np.float64], x: float, y: float) -> bool:
     return inside
 
 
-@kernel
+@inlined_kernel
 def squared_distance(rects: NDArray[np.float64], zone: int, x: float, y: float) -> float:
     """From a place to the nearest point of a zone, squared, in m²; 0 inside.
 
     Rounding grows with what is rounded. So the squared distance from (x, y) to a vehicle inside the
     zone, taken by the same operations, is never the smaller of the two: not by one bit.
     """
-    dx = 0.0
-    if x < rects[zone, 0]:
-        dx = rects[zone, 0] - x
-    elif x > rects[zone, 2]:
-        dx = x - rects[zone, 2]
-    dy = 0.0
-    if y < rects[zone, 1]:
-        dy = rects[zone, 1] - y
-    elif y > rects[zone, 3]:
-        dy = y - rects[zone, 3]
-    return dx * dx + dy * dy
+    # One of the two is negative, and both are inside: no branch has to be guessed.
+    dx = max(rects[zone, 0] - x, x - rects[zone, 2], 0.0)
+    dy = max(rects[zone, 1] - y, y - rects[zone, 3], 0.0)
+    return float(dx * dx + dy * dy)

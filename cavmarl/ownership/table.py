@@ -97,15 +97,17 @@ class Table:
 
     def settle(
         self,
+        tick: int,
         switches: Iterable[Switch] = (),
         births: Iterable[Birth] = (),
         removed: Iterable[Removed] = (),
     ) -> None:
-        """Reach the next tick at once, as a BEGIN and a COMMIT with the same contents would.
+        """Reach a later tick at once, as a BEGIN and a COMMIT with the same contents would.
 
         For a coordinator who has looked at them itself, and whose log, if there is one, has them.
 
         Args:
+            tick: which one; in those before nothing has changed.
             switches: who changes owner.
             births: who is new.
             removed: who has left the world, of those before and of these.
@@ -136,7 +138,7 @@ class Table:
             moves.append((vehicle, zone, epoch, False))
         if len(moves) > MOVES_AT_ONCE:
             _ = self.tallies
-        self.tick += 1
+        self.tick = tick
 
     def alive(self, zone: int, incarnation: int) -> bool:
         """Whether that process hosts the zone now."""

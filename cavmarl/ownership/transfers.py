@@ -6,7 +6,7 @@ A `TransferLog` is told what a `Trace` is told, and keeps what is under way and 
 from __future__ import annotations
 
 from collections import Counter, deque
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from typing import NamedTuple, Protocol
 
@@ -21,7 +21,6 @@ from cavmarl.ownership.messages import (
     Nack,
     Prepare,
     Record,
-    Removed,
     Reset,
     Switch,
 )
@@ -102,7 +101,6 @@ class _Approach:
     state_bytes: int
     depth_m: float | None = None
     began_ms: float | None = None
-    depth_now_m: float | None = None
 
 
 @dataclass(slots=True)
@@ -124,16 +122,15 @@ class TransferLog:
         surroundings: tells depths and times; None: they are left out.
 
     Attributes:
-        rows: the newest KEPT_ROWS transfers that have been committed; `take` takes them away.
-        counts: `aborted`, `acknowledged`, `deferred`, `expired`, `forced`, `refused`, `removed`,
-            `switched`.
         episode: of the newest record.
+        ask: called before anybody reads: lets whoever tells late catch up.
     """
 
     def __init__(self, lifetime: int, surroundings: Surroundings | None = None) -> None:
-        self.rows: deque[Transfer] = deque(maxlen=KEPT_ROWS)
-        self.counts: Counter[str] = Counter()
         self.episode = -1
+        self.ask: Callable[[], None] = lambda: None
+        self._rows: deque[Transfer] = deque(maxlen=KEPT_ROWS)
+        self._counts: Counter[str] = Counter()
         self._lifetime = lifetime
         self._surroundings = surroundings
         self._approaches: dict[tuple[int, int, int], _Approach] = {}  # vehicle, target, epoch
@@ -141,10 +138,22 @@ class TransferLog:
         self._begun: Begin | None = None
         self._switching: dict[int, _Switching] = {}
 
+    @property
+    def rows(self) -> deque[Transfer]:
+        """The newest KEPT_ROWS transfers that have been committed; `take` takes them away."""
+        self.ask()
+        return self._rows
+
+    @property
+    def counts(self) -> Counter[str]:
+        """`aborted`, `acknowledged`, `deferred`, `expired`, `forced`, `removed`, `switched`."""
+        self.ask()
+        return self._counts
+
     def take(self) -> list[Transfer]:
         """The rows, which are not kept any longer."""
         rows = list(self.rows)
-        self.rows.clear()
+        self._rows.clear()
         return rows
 
     def logged(self, records: Iterable[Record]) -> None:
@@ -179,59 +188,29 @@ class TransferLog:
             case Abort():
                 for vehicle, epoch in message.entries:
                     if self._approaches.pop((vehicle, message.target, epoch), None) is not None:
-                        self.counts["aborted"] += 1
+                        self._counts["aborted"] += 1
             case Done() if message.confirmed:
                 self._confirmed(message)
             case Ack() if destination == COORDINATOR:
-                self.counts["acknowledged"] += len(message.entries)
+                self._counts["acknowledged"] += len(message.entries)
             case Nack() if destination == COORDINATOR:
-                self.counts["refused"] += len(message.entries)
+                self._counts["refused"] += len(message.entries)
 
-    def approached(self, tick: int, states: Mapping[tuple[int, int, int], float]) -> None:
-        """Note who comes near, where targets know it without messages.
+    def add(self, rows: Iterable[Transfer]) -> None:
+        """Note changes of owner that no message tells of."""
+        for row in rows:
+            self._counts["forced" if row.forced else "switched"] += 1
+            if row.removed:
+                self._counts["removed"] += 1
+            self._rows.append(row)
 
-        Args:
-            tick: of the states.
-            states: (vehicle, target, epoch) of all of them → how far it is outside of its owner's
-                zone; the approaches of others are over.
-        """
-        known, around = self._approaches, self._surroundings
-        for key, depth_m in states.items():
-            found = known.get(key)
-            if found is None:
-                began_ms = None if around is None else around.now_ms()
-                known[key] = _Approach(tick, tick, 1, 0, depth_m, began_ms, depth_m)
-            else:
-                found.last, found.depth_now_m = tick, depth_m
-                found.offers += 1
-        if len(known) > len(states):
-            for key in [key for key in known if key not in states]:
-                del known[key]
-                self.counts["aborted"] += 1
-        self.counts["acknowledged"] += len(states)
-
-    def settled(
-        self, episode: int, tick: int, switches: Iterable[Switch], removed: Iterable[Removed]
-    ) -> None:
-        """Note who has changed owner in a tick, where no message tells of it.
-
-        Args:
-            episode: of the tick.
-            tick: that is about to be committed.
-            switches: who.
-            removed: who has left the world in it.
-        """
-        around, gone = self._surroundings, {entry.vehicle for entry in removed}
-        now_ms = None if around is None else around.now_ms()
-        for switch in switches:
-            vehicle, _, target, epoch, _ = switch
-            depth_m = self._approaches[vehicle, target, epoch - 1].depth_now_m
-            switching = _Switching(depth_m, now_ms, now_ms)
-            self._note(episode, tick, switch, switching, vehicle in gone)
+    def count(self, **numbers: int) -> None:
+        """Note so many of `counts` that no message tells of."""
+        self._counts.update({name: number for name, number in numbers.items() if number})
 
     def _begin(self, record: Begin) -> None:
         self._begun = record
-        self.counts["deferred"] += len(record.deferred)
+        self._counts["deferred"] += len(record.deferred)
         self._switching = {}
         around = self._surroundings
         if around is not None:
@@ -260,25 +239,21 @@ class TransferLog:
         oldest = record.tick - self._lifetime
         for key in [key for key, known in self._approaches.items() if known.last < oldest]:
             del self._approaches[key]
-            self.counts["expired"] += 1
+            self._counts["expired"] += 1
 
     def _note(
         self, episode: int, tick: int, switch: Switch, switching: _Switching, removed: bool
     ) -> None:
         """Write a row."""
         vehicle, source, target, epoch, forced = switch
-        self.counts["forced" if forced else "switched"] += 1
-        if removed:
-            self.counts["removed"] += 1
         found = self._approaches.pop((vehicle, target, epoch - 1), _NEVER)
         began_ms = switching.began_ms if found.began_ms is None else found.began_ms
         ended_ms, around = switching.ended_ms, self._surroundings
         release_m = None if around is None else around.release_depth_m(vehicle, source, target)
-        self.rows.append(
-            Transfer(
-                episode, tick, vehicle, source, target, epoch, forced, removed, found.first,
-                self._waited.get(vehicle, 0), found.offers, found.state_bytes, found.depth_m,
-                switching.depth_m, release_m,
-                None if began_ms is None or ended_ms is None else ended_ms - began_ms,
-            )
+        row = Transfer(
+            episode, tick, vehicle, source, target, epoch, forced, removed, found.first,
+            self._waited.get(vehicle, 0), found.offers, found.state_bytes, found.depth_m,
+            switching.depth_m, release_m,
+            None if began_ms is None or ended_ms is None else ended_ms - began_ms,
         )  # fmt: skip
+        self.add([row])

@@ -216,15 +216,23 @@ class Meeting:
 
     def post(self, number: int) -> None:
         """Tell the other side that this one has come to a number."""
-        if _set(self.mine, NUMBER, number, self.theirs):
-            with suppress(BrokenPipeError, ConnectionResetError):  # who is gone need not be woken
-                self.wire.send(WAKE)
+        if self.announce(number):
+            self.wake()
+
+    def announce(self, number: int) -> int:
+        """Come to a number; not 0: the other side sleeps, and has to be woken."""
+        return _set(self.mine, NUMBER, number, self.theirs)
+
+    def wake(self) -> None:
+        """Wake the other side."""
+        with suppress(BrokenPipeError, ConnectionResetError):  # who is gone need not be woken
+            self.wire.send(WAKE)
 
     def has(self, number: int) -> bool:
         """Whether the other side has come to a number."""
         return _has(self.theirs, number)
 
-    def watch(self, number: int, work_s: float = 0.0) -> bool:
+    def watch(self, number: int, work_s: float = 0.0, is_soon: bool = False) -> bool:
         """Look for a moment whether the other side comes to a number.
 
         Who has had to wait for long the last time does not look for long, nor who has worked for
@@ -234,11 +242,12 @@ class Meeting:
         Args:
             number: to wait for.
             work_s: since this side waited last.
+            is_soon: it is known that it does not take long.
         """
         if _look(self.theirs, number, self._crowded):
             return True
-        is_short = self._last_s < LONG_S and work_s < LONG_WORK_S
-        end = time.perf_counter() + (LONG_S if is_short else SHORT_S)
+        is_soon |= self._last_s < LONG_S and work_s < LONG_WORK_S
+        end = time.perf_counter() + (LONG_S if is_soon else SHORT_S)
         while time.perf_counter() < end:
             if _look(self.theirs, number, self._crowded):
                 return True

@@ -15,7 +15,7 @@ from cavmarl.ownership.messages import Record
 from cavmarl.runtime.coordinator import Coordinator
 from cavmarl.runtime.division import Division
 from cavmarl.runtime.monitor import Monitor
-from cavmarl.runtime.referee import Near, Referee
+from cavmarl.runtime.referee import Entry, Near, Referee
 from cavmarl.runtime.row_digests import RowDigests
 from cavmarl.runtime.store import CommittedStore, Notes
 from cavmarl.runtime.surroundings import NearBorders
@@ -45,6 +45,23 @@ class RowStates:
     def forget(self) -> None:
         """Another tick is committed."""
         self._known.clear()
+
+    def look(self, everybody: bool) -> list[Near]:
+        """Who is near a border; see `Division.near`."""
+        found = self._division.near(self._world, everybody)
+        self.borders.near = found
+        return found
+
+    def change(self, entries: Sequence[Entry]) -> None:
+        """Let rows change hands, of vehicles that `look` has found."""
+        if entries:
+            rows = {entry.vehicle: entry.row for entry in self.borders.near}
+            self.borders.places = {
+                switch.vehicle: self._division.hand_over(
+                    self._world, switch, state, rows.get(switch.vehicle, 0)
+                )
+                for switch, state in entries
+            }
 
     def near(self, entry: Near) -> bytes:
         """Of a vehicle near a border, whose row is known."""
@@ -112,21 +129,10 @@ class Coordination:
             commands: what the agents do in it; a journal keeps their digest.
         """
         for w, coordinator in enumerate(self.coordinators):
-            if not coordinator.is_open:
-                self._states[w].forget()
-            near = self._division.near(w, self._stirred[w])
-            self._stirred[w] = False
-            self._states[w].borders.near = near
-            inputs = b"" if coordinator.journal is None else _digest(commands, w)
-            entries = coordinator.begin(near, self._states[w].near, inputs)
-            if entries:
-                rows = {entry.vehicle: entry.row for entry in near}
-                self._states[w].borders.places = {
-                    switch.vehicle: self._division.hand_over(
-                        w, switch, state, rows.get(switch.vehicle, 0)
-                    )
-                    for switch, state in entries
-                }
+            everybody, self._stirred[w] = self._stirred[w], False
+            coordinator.begin(
+                everybody, b"" if coordinator.journal is None else _digest(commands, w)
+            )
 
     def end(self) -> None:
         """Commit the tick that all zones have computed."""

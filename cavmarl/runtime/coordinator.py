@@ -32,10 +32,26 @@ PATIENCE = 10_000
 
 
 class States(Protocol):
-    """States of vehicles at the committed tick."""
+    """Rows of vehicles at the committed tick."""
+
+    def forget(self) -> None:
+        """Another tick is committed."""
+        ...
+
+    def look(self, everybody: bool) -> Sequence[Near]:
+        """Who is near a border; see `Division.near`."""
+        ...
+
+    def near(self, entry: Near) -> bytes:
+        """The whole state of a vehicle near a border, whose row is known."""
+        ...
 
     def state(self, vehicle: int) -> bytes:
-        """The vehicle's whole state."""
+        """The whole state of any vehicle."""
+        ...
+
+    def change(self, entries: Sequence[Entry]) -> None:
+        """Let rows change hands."""
         ...
 
 
@@ -119,28 +135,18 @@ class Coordinator(Referee):
 
     # A tick
 
-    def begin(
-        self, near: Sequence[Near], state: Callable[[Near], bytes], inputs: bytes = b""
-    ) -> list[Entry]:
+    def begin(self, everybody: bool, inputs: bytes = b"") -> None:
         """Offer who comes near, decide the way to the next tick, and lease it to every zone.
 
-        Called again in the same tick, it goes on with what was decided.
-
-        Args:
-            near: who is near a border in the committed tick.
-            state: of such a vehicle.
-            inputs: digest of the actions.
-
-        Returns:
-            the vehicles that change their owner now.
-
-        Raises:
-            ProtocolError: a zone does not answer.
+        Called again in the same tick, it goes on with what was decided; see `Referee.begin`.
         """
-        directory = self.directory
+        directory, states = self.directory, self._states
         births, self._births, self._removed = self._births, [], []
         if not self.is_open:
-            self._offer(near, state)
+            states.forget()
+        near = states.look(everybody)
+        if not self.is_open:
+            self._offer(near)
             owners = directory.table.owners
             movers = [(v.vehicle, v.target) for v in near if v.crossed and v.vehicle in owners]
             self._leases = {}
@@ -148,8 +154,8 @@ class Coordinator(Referee):
         self._until("STEP", self._unleased, lambda: directory.resend(self._unleased()))
         entries = self._entries()
         for switch, _ in entries:
-            self._states.state(switch.vehicle)  # a STEP may be repeated after rows moved
-        return entries
+            states.state(switch.vehicle)  # a STEP may be repeated after rows moved
+        states.change(entries)
 
     def end(self, rows: Callable[[int], int], stored: Callable[[int], int] | None = None) -> None:
         """Every zone is through: DONE and COMMIT.
@@ -185,12 +191,13 @@ class Coordinator(Referee):
             if endpoint.lease is not None
         )
 
-    def _offer(self, near: Sequence[Near], state: Callable[[Near], bytes]) -> None:
+    def _offer(self, near: Sequence[Near]) -> None:
         """Tell the zones who comes near; what is not answered after A attempts stays so."""
         approaches: defaultdict[int, list[Approach]] = defaultdict(list)
         for entry in near:
             if entry.vehicle in self.endpoints[entry.source].owned:
-                approaches[entry.source].append(Approach(entry.vehicle, entry.target, state(entry)))
+                state = self._states.near(entry)
+                approaches[entry.source].append(Approach(entry.vehicle, entry.target, state))
         for zone, endpoint in self.endpoints.items():
             if approaches[zone] or endpoint.offers.open:
                 self.post.send(endpoint.offer(approaches[zone]))
@@ -305,7 +312,7 @@ class Coordinator(Referee):
         Then `resume` tells it what the store says, and `resend` the zones what was decided.
         """
         self._dropped += self.directory.dropped
-        self.directory = self.directory.again(records)
+        self._directory = self.directory.again(records)
         self.resume()
 
     def take_up(self, records: Sequence[Record]) -> None:

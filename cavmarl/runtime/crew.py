@@ -6,17 +6,18 @@ import json
 import os
 import select
 import signal
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Collection, Mapping, Sequence
 from contextlib import suppress
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from cavmarl.errors import WorkerStartError
-from cavmarl.runtime.barrier import NUMBER, WORDS, Meeting, usable_cores
+from cavmarl.runtime.barrier import NUMBER, WORDS, Meeting, present_core, usable_cores
 from cavmarl.runtime.fork_server import ForkServer, Process, ServerGoneError
+from cavmarl.runtime.placement import keep_apart
 from cavmarl.runtime.shared_memory import Segment
-from cavmarl.runtime.worker import ANSWER, OUT_OF_MEMORY, SILENT, TASK
+from cavmarl.runtime.worker import ANSWER, CORE, LOADS, OUT_OF_MEMORY, SILENT, TASK
 
 __all__ = ["Crew", "Program"]
 
@@ -98,18 +99,37 @@ class Crew:
         server = self._held.server
         return 0 if server is None else server.pid
 
-    def order(self, k: int, head: tuple[int, ...], mail: bytes | None) -> None:
-        """Give a worker its next order; that it is dead is noticed later.
+    def order(
+        self,
+        workers: Sequence[int],
+        head: tuple[int, ...],
+        stale: Sequence[bool],
+        mail: bytes | None,
+    ) -> None:
+        """Give workers their next order; that one is dead is noticed later.
+
+        Those who look for it have it before anybody is woken, and whoever may take the core that
+        this process is on is woken last.
 
         Args:
-            k: which one.
-            head: words of the order, from TASK to LOADS.
+            workers: which ones.
+            head: words of the order, from TASK to TRUTH.
+            stale: of all workers, whose memory is not what is committed.
             mail: what goes with it.
         """
-        words = self.orders[k]
-        words[TASK : TASK + len(head)] = head
-        self._send(k, mail)
-        self._meetings[k].post(words.item(NUMBER) + 1)
+        asleep = []
+        for k in workers:
+            words = self.orders[k]
+            words[TASK : LOADS + 1] = (*head, stale[k])
+            if mail is not None:
+                self._send(k, mail)
+            if self._meetings[k].announce(words.item(NUMBER) + 1):
+                asleep.append(k)
+        if len(asleep) > 1:
+            here = present_core()
+            asleep.sort(key=lambda k: self._statuses[k].item(CORE) == here)
+        for k in asleep:
+            self._meetings[k].wake()
 
     def number(self, k: int) -> int:
         """Of the last order that a worker was given."""
@@ -119,9 +139,9 @@ class Crew:
         """Whether a worker has carried it out."""
         return self._meetings[k].has(self.number(k))
 
-    def watch(self, k: int) -> bool:
-        """The same, but look for a moment."""
-        return self._meetings[k].watch(self.number(k))
+    def watch(self, k: int, is_soon: bool = False) -> bool:
+        """The same, but look for a moment; a longer one if it cannot take long."""
+        return self._meetings[k].watch(self.number(k), is_soon=is_soon)
 
     def lasted(self, k: int, wait_s: float) -> None:
         """Note how long it has taken."""
@@ -159,6 +179,12 @@ class Crew:
         """Whether somebody is dead without whom a worker cannot go on."""
         others = [self.processes[j].pidfd for j in self._program.team_of(k) if j != k]
         return bool(select.select(others, [], [], 0.0)[0])
+
+    def keep_apart(self) -> None:
+        """Give those who have been on one core different ones, unless each has its own for good."""
+        if not self._program.pins:
+            pids = [process.pid for process in self.processes.values()]
+            keep_apart(pids, [status.item(CORE) for status in self._statuses])
 
     def answer(self, k: int) -> tuple[int, Any]:
         """How a worker's order ended, as its line says, and what it has answered."""

@@ -7,30 +7,39 @@ as it is, and a lease is the call that advances a shard. What is decided and wri
 same, record by record, as over messages of which none is lost.
 
 Records are made only where somebody reads them: all of them for a journal, and for watchers those
-of ticks in which a vehicle has entered, left, or changed its owner.
+of ticks in which a vehicle has entered, left, or changed its owner. For nobody the table of owners
+is brought up to date every now and then, and when somebody asks.
 """
 
 from __future__ import annotations
 
-from collections import Counter
-from collections.abc import Callable, Sequence
+from collections import Counter, defaultdict
+from collections.abc import Callable, Iterable
+from typing import NamedTuple
 
-from cavmarl.errors import LedgerError, ProtocolError
+from cavmarl.errors import LedgerError
 from cavmarl.ownership.directory import Directory
 from cavmarl.ownership.ledger import world_digest
-from cavmarl.ownership.messages import (
-    Begin,
-    Birth,
-    Commit,
-    Removed,
-    Switch,
-    ZoneLedger,
-)
-from cavmarl.ownership.transfers import TransferLog
+from cavmarl.ownership.messages import Begin, Birth, Commit, Removed, Switch, ZoneLedger
+from cavmarl.ownership.transfers import Transfer, TransferLog
+from cavmarl.runtime.border_book import BorderBook, Change
 from cavmarl.runtime.journal import AnyJournal
-from cavmarl.runtime.referee import Entry, Near, Referee
+from cavmarl.runtime.referee import Referee
 
 __all__ = ["DirectCoordinator"]
+
+LATE = 32
+"""So many changes of owner, or ticks with news, are put into the table together."""
+
+
+class _News(NamedTuple):
+    """Who has entered and who has left by the end of a tick."""
+
+    births: tuple[Birth, ...] = ()
+    removed: tuple[Removed, ...] = ()
+
+
+_NO_NEWS = _News()
 
 
 class DirectCoordinator(Referee):
@@ -39,6 +48,7 @@ class DirectCoordinator(Referee):
     Args:
         directory: who owns what.
         journal: takes the records; None: nobody keeps them.
+        book: hands rows over.
         counts: how many vehicles each zone owns now, by its rows.
         transfers: told of all that goes on.
     """
@@ -47,28 +57,57 @@ class DirectCoordinator(Referee):
         self,
         directory: Directory,
         journal: AnyJournal | None,
+        book: BorderBook,
         counts: Callable[[], list[int]],
         transfers: TransferLog,
     ) -> None:
         super().__init__(directory, journal)
+        self._book = book
         self._counts = counts
         self._transfers = transfers
+        transfers.ask = self.catch_up
         self._is_open = False
-        self._pairs: dict[tuple[int, int, int], float] = {}  # vehicle, target, epoch → depth, m
-        self._has_told = False  # of somebody near, whose approach may be over
-        self._switches: list[Switch] = []
+        self._tick = 0
+        self._vehicles = 0
+        self._changed = 0  # in the tick in progress
+        self._late = 0  # changes that the table does not know
         self._new: tuple[Birth, ...] = ()
+        self._news: dict[int, _News] = {}  # by ticks, of those that the table does not know
+
+    @property
+    def directory(self) -> Directory:
+        """Who owns what, as of the committed tick."""
+        self.catch_up()
+        return self._directory
+
+    @property
+    def tick(self) -> int:
+        """The committed tick, of the run."""
+        return self._tick
 
     @property
     def is_open(self) -> bool:
         """Whether a tick has been begun and is not committed."""
         return self._is_open
 
+    def entered(self, vehicles: Iterable[tuple[int, int]]) -> None:
+        """(id, zone) of vehicles that are new since the last BEGIN."""
+        known = len(self._births)
+        super().entered(vehicles)
+        self._vehicles += len(self._births) - known
+
+    def left(self, vehicles: Iterable[tuple[int, int]]) -> None:
+        """(id, reason) of vehicles that have left the world."""
+        gone = list(vehicles)
+        super().left(gone)
+        self._vehicles -= len(gone)
+
     def reset(self) -> None:
         """Begin an episode without vehicles."""
-        self.resume()
-        self._is_open, self._pairs, self._has_told = False, {}, False
         directory = self.directory
+        self.resume()
+        self._is_open, self._changed, self._vehicles = False, 0, 0
+        self._book.reset(self._tick)
         records = directory.reset().records
         self._transfers.logged(records)
         self._record(*records)
@@ -76,52 +115,91 @@ class DirectCoordinator(Referee):
             if incarnation == 0:
                 self._record(*directory.host(zone, worker=0).records)
 
-    def begin(
-        self, near: Sequence[Near], state: Callable[[Near], bytes], inputs: bytes = b""
-    ) -> list[Entry]:
+    def begin(self, everybody: bool, inputs: bytes = b"") -> None:
         """Hand over whoever is in another zone than its owner's, as `Referee.begin` says."""
-        self._is_open, self._removed = True, []
-        self._switches = self._approach(near) if near or self._has_told else []
+        births = self._births
+        try:
+            changed = self._book.hand_over(everybody, self._vehicles, births)
+        except LedgerError:
+            self._check(births)
+            raise
+        self._is_open, self._changed = True, changed
+        self.switched += changed
         self._new = ()
-        if self._births:
-            self._new, self._births = tuple(sorted(self._births)), []
-            self.directory.check_births(self._new)
+        if births:
+            self._new, self._births = tuple(sorted(births)), []
+        if self._removed:
+            self._removed = []
         if self.journal is not None:
-            self._record(self._begun(inputs))
-        return [Entry(switch, None) for switch in self._switches]
+            self._record(self._begun(self._tick + 1, self._changed, inputs))
 
     def end(self, rows: Callable[[int], int], stored: Callable[[int], int] | None = None) -> None:
         """Commit, if the zones own what they should, as `Referee.end` says."""
-        table = self.directory.table
-        self._is_open = False
-        if self._switches or self._new or self._gone or self._removed:
-            self._settle(rows)
-            return
-        table.settle()
-        if self.journal is not None:
-            self._record(self._committed((), rows))
-
-    def _settle(self, rows: Callable[[int], int]) -> None:
-        """Commit a tick in which somebody has entered, left, or changed its owner."""
-        table, switches = self.directory.table, self._switches
-        removed = tuple(sorted((*self._gone, *self._removed)))
-        self._gone = []
-        is_watched = self.journal is None and self._watchers
-        begun = (self._begun(),) if is_watched else ()
-        table.settle(switches, self._new, removed)
-        self._check()
-        if switches:
-            self.switched += len(switches)
-            self._transfers.settled(table.episode, table.tick, switches, removed)
-        if self.journal is not None or is_watched:
+        changed, self._is_open = self._changed, False
+        self._tick += 1
+        if changed:
+            self._changed = 0
+            self._late += changed
+            self._book.release(changed)
+        removed: tuple[Removed, ...] = ()
+        if self._gone or self._removed:
+            removed = tuple(sorted((*self._gone, *self._removed)))
+            self._gone = []
+        has_news = bool(self._new or removed)
+        if has_news:
+            self._news[self._tick] = _News(self._new, removed)
+        if self.journal is not None or (self._watchers and (has_news or changed)):
+            begun = (self._begun(self._tick, changed),) if self.journal is None else ()
+            self.catch_up()
+            self._check(self._births)
             self._record(*begun, self._committed(removed, rows))
+        elif self._late >= LATE or len(self._news) >= LATE:
+            self.catch_up()
+            self._check(self._births)
 
-    def _begun(self, inputs: bytes = b"") -> Begin:
-        table = self.directory.table
-        return Begin(table.episode, table.tick + 1, tuple(self._switches), (), self._new, inputs)
+    def catch_up(self) -> None:
+        """Let the table and the rows of transfers say what has come of the ticks up to now."""
+        table = self._directory.table
+        if table.tick == self._tick:
+            return
+        changes: defaultdict[int, list[Change]] = defaultdict(list)
+        for change in self._book.take(but=self._changed):
+            changes[change.tick].append(change)
+        news, self._news, self._late = self._news, {}, 0
+        for tick in sorted({*changes, *news}):
+            self._settle(tick, changes[tick], news.get(tick, _NO_NEWS))
+        table.settle(self._tick)
+        acknowledged, aborted = self._book.take_counts()
+        self._transfers.count(acknowledged=acknowledged, aborted=aborted)
+
+    def _settle(self, tick: int, changes: list[Change], news: _News) -> None:
+        """Put what came of one tick on the table.
+
+        Raises:
+            LedgerError: a vehicle changed its owner that belonged to somebody else.
+            SpawnError: a vehicle entered that has been there.
+        """
+        table = self._directory.table
+        for change in changes:
+            owner = table.owners.get(change.vehicle)
+            if owner != (change.source, change.epoch - 1):
+                raise LedgerError(
+                    f"vehicle {change.vehicle} changed from zone {change.source} to "
+                    f"{change.target} at tick {tick}, and its owner on record was {owner}"
+                )
+        if news.births:
+            self._directory.check_births(news.births)
+        table.settle(tick, map(_switch, changes), news.births, news.removed)
+        gone = {entry.vehicle for entry in news.removed}
+        self._transfers.add(_row(change, table.episode, gone) for change in changes)
+
+    def _begun(self, tick: int, changed: int, inputs: bytes = b"") -> Begin:
+        """Of a tick with so many changes, the newest ones."""
+        switches = tuple(map(_switch, self._book.newest(changed)))
+        return Begin(self._directory.table.episode, tick, switches, (), self._new, inputs)
 
     def _committed(self, removed: tuple[Removed, ...], rows: Callable[[int], int]) -> Commit:
-        table = self.directory.table
+        table = self._directory.table
         zones = tuple(
             ZoneLedger(zone, table.hosts[zone][1], tally, rows(zone))
             for zone, tally in table.tallies.items()
@@ -134,7 +212,7 @@ class DirectCoordinator(Referee):
         owners = self.directory.table.owners
         return sorted(
             (vehicle, owners[vehicle][0], target, "prepared")
-            for vehicle, target, _ in self._pairs
+            for vehicle, target in self._book.coming()
             if vehicle in owners
         )
 
@@ -142,38 +220,44 @@ class DirectCoordinator(Referee):
         """Nothing: there are no messages."""
         return Counter()
 
-    def _approach(self, near: Sequence[Near]) -> list[Switch]:
-        """Let targets know who comes; who is there already changes its owner."""
-        owners = self.directory.table.owners
-        pairs: dict[tuple[int, int, int], float] = {}
-        switches = []
-        for vehicle, source, _, target, crossed, depth_m in near:
-            if vehicle not in owners:  # it has entered since the last BEGIN
-                continue
-            owner, epoch = owners[vehicle]
-            if owner != source:
-                raise ProtocolError(f"vehicle {vehicle} is in the rows of {source}, not of {owner}")
-            pairs[vehicle, target, epoch] = depth_m
-            if crossed:
-                switches.append(Switch(vehicle, source, target, epoch + 1, False))
-        self._transfers.approached(self.tick, pairs)
-        self._has_told = bool(pairs)
-        self._pairs = pairs
-        if switches:
-            switches.sort()
-            for switch in switches:
-                del pairs[switch.vehicle, switch.target, switch.epoch - 1]
-        return switches
+    def _check(self, births: Iterable[Birth]) -> None:
+        """Compare what zones should own with their rows, where all that have left are on record.
 
-    def _check(self) -> None:
-        """Compare what zones should own with their rows.
+        Args:
+            births: who is in the rows, and will be on record in the next tick.
 
         Raises:
             LedgerError: a zone has more or fewer.
         """
         owned = list(self.directory.table.counts.values())
-        for birth in self._births:  # they are in the rows, and will be on record in the next tick
+        for birth in births:
             owned[birth.zone] += 1
         counts = self._counts()
         if counts != owned:
             raise LedgerError(f"at tick {self.tick} zones own {counts} vehicles, not {owned}")
+
+
+def _switch(change: Change) -> Switch:
+    return Switch(change.vehicle, change.source, change.target, change.epoch, False)
+
+
+def _row(change: Change, episode: int, gone: set[int]) -> Transfer:
+    release_m = change.release_depth_m
+    return Transfer(
+        episode=episode,
+        tick=change.tick,
+        vehicle=change.vehicle,
+        source=change.source,
+        target=change.target,
+        epoch=change.epoch,
+        forced=False,
+        removed=change.vehicle in gone,
+        approached=change.approached,
+        waited=0,
+        offers=change.tick - change.approached,
+        state_bytes=0,
+        prepare_depth_m=change.prepare_depth_m,
+        switch_depth_m=change.switch_depth_m,
+        release_depth_m=None if release_m != release_m else release_m,
+        ms=change.ms,
+    )

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from cavmarl.config import EnvConfig, ZonesConfig
 from cavmarl.kernels.arrays import Outputs
+from cavmarl.kernels.borders import Borders
 from cavmarl.kernels.motion import MAX_SPEED_MPS
 from cavmarl.ownership.distances import Distances, check_coverage, needed_overlap_m
 from cavmarl.ownership.limits import DeadlinePolicy, Limits
@@ -78,8 +81,7 @@ def divide(
         partition.arrays,
         halo,
         _needed_m(config, 2.0 * radius_m),
-        settings.hysteresis_m,
-        settings.approach_ticks * dt,
+        Borders(settings.hysteresis_m, settings.approach_ticks * dt, MAX_SPEED_MPS),
         TransferCodec.of(shards[0].worlds, outputs, config.sensors.stack),
     )
     return shards, division
@@ -102,7 +104,7 @@ def halo_m(config: EnvConfig, reach_m: float, zones: int) -> float:
         approach_m = settings.approach_ticks * MAX_SPEED_MPS * dt
         check_coverage(
             Distances(approach_m, settings.hysteresis_m, wide_m),
-            limits_of(settings),
+            _limits_at_borders(settings),
             reach_m=reach_m,
             v_max_mps=MAX_SPEED_MPS,
             dt_s=dt,
@@ -121,8 +123,17 @@ def limits_of(settings: ZonesConfig, schema: int = 1) -> Limits:
     )
 
 
+def _limits_at_borders(settings: ZonesConfig) -> Limits:
+    """Deadlines of hand-overs; where nothing is lost nobody is late (decision 013)."""
+    limits = limits_of(settings)
+    may_be_late = settings.faults or settings.reproducers
+    if may_be_late:
+        return limits
+    return replace(limits, deferral=0, policy=DeadlinePolicy.FORCE, grace=0)
+
+
 def _needed_m(config: EnvConfig, reach_m: float) -> float:
-    limits = limits_of(config.zones)
+    limits = _limits_at_borders(config.zones)
     needed_m = needed_overlap_m(
         reach_m, config.zones.hysteresis_m, limits, MAX_SPEED_MPS, config.clock.sim_dt_s
     )

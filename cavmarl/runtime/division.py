@@ -8,7 +8,7 @@ had it as a ghost already, and goes on with the state that it was sent.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from typing import NamedTuple
 
@@ -17,9 +17,9 @@ from numpy.typing import NDArray
 
 from cavmarl.errors import ZoneError
 from cavmarl.kernels.arrays import Worlds, Zoned
-from cavmarl.kernels.borders import NEAR, find_near, pass_on
+from cavmarl.kernels.borders import Borders, pass_on
 from cavmarl.kernels.exchange import exchange, take_own
-from cavmarl.kernels.motion import MAX_SPEED_MPS
+from cavmarl.kernels.handing_over import look, make_book
 from cavmarl.kernels.repeated import repeated
 from cavmarl.kernels.zones import Halo, ZoneArrays
 from cavmarl.ownership.messages import Switch
@@ -58,13 +58,14 @@ class Division:
         zones: of the partition.
         halo: how far each zone sees over its borders.
         touching_m: no ghost further outside of a zone can touch one of its vehicles.
-        hysteresis_m: so far behind its border a vehicle changes its zone.
-        ahead_s: so long before it does, its next zone is told.
+        borders: when a vehicle is near one.
         codec: of vehicles' states.
 
     Attributes:
         zones: of the partition.
+        borders: when a vehicle is near one.
         codec: of vehicles' states.
+        book: who is near a border.
     """
 
     def __init__(
@@ -74,25 +75,22 @@ class Division:
         zones: ZoneArrays,
         halo: Halo,
         touching_m: float,
-        hysteresis_m: float,
-        ahead_s: float,
+        borders: Borders,
         codec: TransferCodec,
     ) -> None:
         self.zones = zones
+        self.borders = borders
         self.codec = codec
+        self.book = make_book(*shards[0].worlds.rows.shape)
         self._shards = tuple(shards)
         self._zoned = zoned
         self._first_side = shards[0].worlds.rows
         self._halo = halo
         self._touching_m = touching_m
-        self._hysteresis_m = hysteresis_m
-        self._ahead_s = ahead_s
-        self._border_m = MAX_SPEED_MPS * ahead_s  # nobody else can be behind it by then
         self._ids, self._x, self._y = (zoned.rows[name] for name in ("id", "x", "y"))
         self._rects: list[list[float]] = zones.rects.tolist()
-        self._near = np.zeros(2 * shards[0].worlds.rows.shape[1], dtype=NEAR)
         self._call_exchange = repeated(exchange)
-        self._find_near = repeated(find_near)
+        self._look = repeated(look)
         self._pass_on = repeated(pass_on)
 
     @property
@@ -119,6 +117,9 @@ class Division:
                 )
                 worlds.num_contacts[w] = 0
                 worlds.num_outer[w] = -1
+            # Whoever was near a border before is not to be counted again.
+            for known in (self.book.num_near, self.book.num_coming, self.book.known):
+                known[w] = 0
             self._exchange(first.rows, w, w + 1)
 
     def exchange(self) -> None:
@@ -132,11 +133,12 @@ class Division:
             self.zones,
             self._halo,
             self._touching_m,
-            self._border_m,
+            self.borders,
             self._zoned,
             self._side(rows),
             first,
             last,
+            self.book,
         )
 
     def _side(self, rows: NDArray[np.void]) -> int:
@@ -176,14 +178,12 @@ class Division:
             w: which world.
             everybody: look at all of them: rows have changed since the ghosts were renewed.
         """
-        side = self._side(self._shards[0].worlds.rows)
-        num = self._find_near(
-            self.zones, self._hysteresis_m, self._ahead_s, MAX_SPEED_MPS,
-            self._zoned, side, w, everybody, self._near,
-        )  # fmt: skip
+        if everybody:
+            self._look(self.zones, self.borders, self._zoned, self.side, w, True, 0, self.book)
+        num = self.book.num_near.item(w)
         if num == 0:
             return []
-        return [Near(*entry) for entry in self._near[:num].tolist()]
+        return [Near(*entry) for entry in self.book.near[w, :num].tolist()]
 
     def find(self, w: int, vehicle: int) -> tuple[int, int]:
         """The zone that owns a vehicle, and its committed row there.
@@ -225,10 +225,7 @@ class Division:
         if place == -1:
             raise ZoneError(f"zone {switch.source} does not own vehicle {switch.vehicle}")
         if place == -2:
-            raise ZoneError(
-                f"vehicle {switch.vehicle} entered zone {switch.target}, which has not seen it "
-                "come: the halo is too narrow"
-            )
+            raise self.unseen(switch.vehicle, switch.target)
         if state is not None:
             target = self._shards[switch.target].worlds
             tick = int(target.ticks[w])
@@ -236,6 +233,14 @@ class Division:
             row = target.rows[w, place]
             row["owner"], row["epoch"] = switch.target, switch.epoch
         return place
+
+    @staticmethod
+    def unseen(vehicle: int, zone: int) -> ZoneError:
+        """What is wrong where a zone has no ghost of a vehicle that enters it."""
+        return ZoneError(
+            f"vehicle {vehicle} entered zone {zone}, which has not seen it come: the halo is too "
+            "narrow"
+        )
 
     def depth_m(self, w: int, vehicle: int, zone: int, outside: int, hint: int) -> float | None:
         """How far outside of a zone a vehicle is, by its committed row.
@@ -259,7 +264,8 @@ class Division:
             place = (self.side, zone, w, int(found[0]))
         x, y = self._x.item(place), self._y.item(place)
         min_x, min_y, max_x, max_y = self._rects[outside]
-        return math.hypot(max(min_x - x, 0.0, x - max_x), max(min_y - y, 0.0, y - max_y))
+        dx, dy = max(min_x - x, 0.0, x - max_x), max(min_y - y, 0.0, y - max_y)
+        return math.sqrt(dx * dx + dy * dy)  # as `kernels.handing_over.release` does
 
     def owned(self, w: int, zone: int) -> NDArray[np.void]:
         """VEHICLE (n,), the committed rows that a zone owns; a view."""
@@ -304,9 +310,9 @@ class Division:
             for vehicle in shard.worlds.rows["id"][w, : shard.worlds.num_owned[w]].tolist()
         ]
 
-    def counter(self, w: int) -> Callable[[], list[int]]:
-        """Tells how many vehicles of a world each zone owns."""
-        counts: Callable[[], list[int]] = self._zoned.num_owned[:, w].tolist
+    def counts(self, w: int) -> list[int]:
+        """How many vehicles of a world each zone owns."""
+        counts: list[int] = self._zoned.num_owned[:, w].tolist()
         return counts
 
     def running(self) -> NDArray[np.int64]:

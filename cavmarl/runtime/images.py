@@ -5,7 +5,7 @@ from __future__ import annotations
 import mmap
 import zlib
 from collections.abc import Iterator, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import numba.core.config
 import numpy as np
@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from cavmarl.errors import WorkerError
 from cavmarl.kernels import kernel
+from cavmarl.kernels.repeated import repeated
 from cavmarl.runtime.shared_memory import Segment
 
 __all__ = ["Arrays", "Image", "load_kernels"]
@@ -26,6 +27,20 @@ _settings: Any = numba.core.config
 _IS_PYTHON = bool(_settings.DISABLE_JIT)
 
 
+class _Place(NamedTuple):
+    """Where an array goes in an image.
+
+    Attributes:
+        shape: of the array.
+        end: of it, in words from the image's begin.
+        target: the place itself, as raw items.
+    """
+
+    shape: tuple[int, ...]
+    end: int
+    target: Array
+
+
 class Image:
     """Arrays as they were at one moment.
 
@@ -37,33 +52,53 @@ class Image:
         self._segment = segment
         self._memory: mmap.mmap | None = None
         self._words = np.zeros(0, dtype=np.int64)
+        self._begin = 0  # of the first array
+        self._places: list[_Place] = []
 
     def write(self, arrays: Arrays) -> None:
-        """Copy arrays into it.
+        """Copy arrays into it, of the same dtypes as the last time.
 
         Raises:
             OSError: there is no memory for them.
+        """
+        shapes = [array.shape for array in arrays]
+        same = _num_same(shapes, self._places)
+        if len(arrays) != len(self._places):
+            self._lay_out(arrays, 0)
+        elif same < len(arrays):
+            self._lay_out(arrays, same)
+        for array, place in zip(arrays, self._places, strict=True):
+            place.target[...] = array.view(place.target.dtype)
+        words = self._words
+        words[1] = _checksum(words[2 : words.item(0)])
+
+    def _lay_out(self, arrays: Arrays, same: int) -> None:
+        """Say where each array goes; the first ones go where they went the last time.
+
+        Most arrays have the same shape every time, and are saved before those that have not.
         """
         head = [array.ndim for array in arrays]
         for array in arrays:
             head.extend(array.shape)
         begin = _HEAD + len(head)
-        size = begin + sum(-(-array.nbytes // _WORD) for array in arrays)
-        self._make_room(_WORD * size)
+        size = begin + sum(map(_num_words, arrays))
+        if self._make_room(_WORD * size) or begin != self._begin:
+            same = 0
+        self._begin = begin
         words = self._words
-        words[2] = len(arrays)
+        words[0], words[2] = size, len(arrays)
         words[_HEAD:begin] = head
-        at = begin
-        for array in arrays:
-            end = at + -(-array.nbytes // _WORD)
+        del self._places[same:]
+        at = self._places[-1].end if same else begin
+        for array in arrays[same:]:
+            end = at + _num_words(array)
             if array.nbytes:
                 words[end - 1] = 0  # what rounds it up
-                place = words[at:end].view(np.uint8)[: array.nbytes]
-                raw = np.dtype((np.void, array.itemsize))  # NumPy copies records field by field
-                place.view(raw).reshape(array.shape)[...] = array.view(raw)
+            raw = np.dtype((np.void, array.itemsize))  # NumPy copies records field by field
+            place = words[at:end].view(np.uint8)[: array.nbytes]
+            target = place.view(raw).reshape(array.shape)
+            self._places.append(_Place(array.shape, end, target))
             at = end
-        words[0] = size
-        words[1] = _checksum(words[2:size])
 
     def read(self, dtypes: Sequence[np.dtype[Any]]) -> Iterator[Array]:
         """The arrays, in their order, as views.
@@ -90,10 +125,27 @@ class Image:
             yield words[at:end].view(np.uint8)[:num_bytes].view(dtype).reshape(shape)
             at = end
 
-    def _make_room(self, size: int) -> None:
-        if size > _WORD * len(self._words):
-            self._segment.grow(-(-size * 5 // 4 // mmap.PAGESIZE) * mmap.PAGESIZE)
-            self._map_all()
+    def content(self) -> NDArray[np.uint8]:
+        """(n,) What has been written, as bytes; a view."""
+        return self._words[: self._words[0]].view(np.uint8)
+
+    def put(self, content: NDArray[np.uint8]) -> None:
+        """Take over the content of another image, perhaps from another machine.
+
+        Raises:
+            OSError: there is no memory for it.
+        """
+        self._make_room(content.size)
+        self._places.clear()  # its arrays may lie elsewhere
+        self._words.view(np.uint8)[: content.size] = content
+
+    def _make_room(self, size: int) -> bool:
+        """Whether it lies elsewhere from here on, because it was too small."""
+        if size <= _WORD * len(self._words):
+            return False
+        self._segment.grow(-(-size * 5 // 4 // mmap.PAGESIZE) * mmap.PAGESIZE)
+        self._map_all()
+        return True
 
     def _map_all(self) -> None:
         """Map the segment as large as it is by now, whoever has made it so."""
@@ -117,10 +169,25 @@ def _mixed(words: NDArray[np.uint64]) -> np.uint64:
     return (((((a * prime) ^ b) * prime) ^ c) * prime) ^ d
 
 
+_mix = repeated(_mixed)
+
+
+def _num_words(array: Array) -> int:
+    return -(-array.nbytes // _WORD)
+
+
+def _num_same(shapes: Sequence[tuple[int, ...]], places: Sequence[_Place]) -> int:
+    """How many of the first arrays have the shapes that they had before."""
+    for n, (shape, place) in enumerate(zip(shapes, places, strict=False)):
+        if shape != place.shape:
+            return n
+    return min(len(shapes), len(places))
+
+
 def _checksum(words: NDArray[np.int64]) -> int:
     if _IS_PYTHON:
         return zlib.crc32(words.data)
-    return int(np.uint64(_mixed(words.view(np.uint64))).view(np.int64))
+    return int(np.uint64(_mix(words.view(np.uint64))).view(np.int64))
 
 
 def load_kernels() -> None:

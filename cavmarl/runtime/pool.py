@@ -120,6 +120,10 @@ class Pool:
         """Let all workers do nothing: an empty barrier."""
         self.run(NOTHING, commits=False)
 
+    def rename(self, parts: tuple[str, ...]) -> None:
+        """Say anew what each worker hosts, in words."""
+        self._program = self._program._replace(parts=parts)
+
     def close(self) -> None:
         """End all processes and give the memory back; what is mapped stays readable."""
         self._finalizer()
@@ -137,9 +141,8 @@ class Pool:
         slot = 1 - max(self._truth, 0) if commits else -1
         self._open = workers
         self._ordered_s = time.monotonic()
-        for k in workers:
-            head = (task, mail is not None, slot, self._truth, self._stale[k])
-            self._crew.order(k, head, mail)
+        head = (task, mail is not None, slot, self._truth)
+        self._crew.order(workers, head, self._stale, mail)
         self._await(workers, mail)
         answers = self._read(workers)
         for k in workers:
@@ -169,6 +172,8 @@ class Pool:
         pending = [k for k in workers if not self._crew.watch(k)]
         if pending:
             self._await_asleep(pending, mail)
+            if workers == self._all:
+                self._crew.keep_apart()
         lasted_s = time.perf_counter() - began
         for k in workers:
             self._crew.lasted(k, lasted_s)
@@ -177,11 +182,12 @@ class Pool:
         first = len(self.deaths)
         guard = _Guard(self._crew, self._timeout_s)
         while pending:
+            asked = pending
             dead = self._crew.sleep(pending, CHECK_S)
             pending = self._pending()
-            for death in self.deaths[first:]:
-                if death.worker not in pending and isnan(death.done_s):
-                    death.done_s = time.monotonic()
+            if len(pending) < len(asked):  # orders are shared out so that all end together
+                pending = [k for k in pending if not self._crew.watch(k, is_soon=True)]
+            self._note_done(first, pending)
             suspects = dict.fromkeys(dead, "") or guard.hanging(pending)
             suspected = {k: self._crew.processes[k] for k in suspects} | dead
             for k, cause in suspects.items():
@@ -193,6 +199,13 @@ class Pool:
                 causes = [death.cause for death in self.deaths[first:] if death.worker in team]
                 if len(causes) > self._repeats:
                     self._give_up(k, causes)
+        self._note_done(first, pending)
+
+    def _note_done(self, first: int, pending: list[int]) -> None:
+        """Of deaths from a number on: when the successors are through."""
+        for death in self.deaths[first:]:
+            if death.worker not in pending and isnan(death.done_s):
+                death.done_s = time.monotonic()
 
     def _pending(self) -> list[int]:
         """Who has not carried out the present order."""

@@ -14,7 +14,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from cavmarl.errors import JournalError, ProtocolError, StoreError, ZoneStepError
+from cavmarl.errors import CoordinatorStepError, JournalError, StoreError, ZoneStepError
 from cavmarl.runtime.coordination import Coordination
 from cavmarl.runtime.coordinator import Coordinator
 from cavmarl.runtime.faults import (
@@ -90,7 +90,7 @@ class Recovery:
 
         Raises:
             ZoneStepError: every host of a zone dies of it.
-            ProtocolError: every coordinator dies of it.
+            CoordinatorStepError: every coordinator dies of it.
         """
         self._deaths.clear()
         self._crashes.tick = self._coordinator.tick + 1
@@ -139,9 +139,7 @@ class Recovery:
         tick, times = self._crashes.tick, self._deaths[dead]
         if isinstance(dead, int):
             raise ZoneStepError(dead, tick, times, cause)
-        raise ProtocolError(
-            f"the coordinator could not reach tick {tick}: {times} of them died at '{dead}'"
-        )
+        raise CoordinatorStepError(tick, times, dead)
 
     def _restart(self) -> bool:
         """A new coordinator reads the journal; whether the tick stands in it as committed."""

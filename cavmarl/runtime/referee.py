@@ -1,7 +1,7 @@
 """`Referee`: what a coordinator of one world is, however it reaches its zones.
 
-It says who advances which vehicle to the next tick, and sees it done. Rows are not its affair: what
-is near a border, what stands in a row and how rows change hands is told and done by the division.
+It says who advances which vehicle to the next tick, and sees it done. How rows change hands is done
+by the division.
 
 There are two: `coordinator.Coordinator` sends messages, which may be lost, to hosts that may die;
 `direct.DirectCoordinator` lives in the process of all of its zones.
@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections import Counter
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable
 from typing import NamedTuple, Protocol
 
 from cavmarl.ownership.directory import Directory
@@ -62,13 +62,12 @@ class Referee(ABC):
         journal: takes the records; None: nobody keeps them.
 
     Attributes:
-        directory: who owns what.
         journal: what takes the records.
         switched: vehicles that have changed their owner.
     """
 
     def __init__(self, directory: Directory, journal: AnyJournal | None) -> None:
-        self.directory = directory
+        self._directory = directory
         self.journal = journal
         self.switched = 0
         self._watchers: tuple[Watcher, ...] = ()
@@ -77,9 +76,14 @@ class Referee(ABC):
         self._removed: list[Removed] = []  # in the tick
 
     @property
+    def directory(self) -> Directory:
+        """Who owns what."""
+        return self._directory
+
+    @property
     def tick(self) -> int:
         """The committed tick, of the run."""
-        return self.directory.table.tick
+        return self._directory.table.tick
 
     @property
     @abstractmethod
@@ -112,21 +116,17 @@ class Referee(ABC):
         """Begin an episode without vehicles."""
 
     @abstractmethod
-    def begin(
-        self, near: Sequence[Near], state: Callable[[Near], bytes], inputs: bytes = b""
-    ) -> list[Entry]:
-        """Decide the way to the next tick.
+    def begin(self, everybody: bool, inputs: bytes = b"") -> None:
+        """Decide the way to the next tick, and let rows change hands.
 
         Args:
-            near: who is near a border in the committed tick.
-            state: of such a vehicle.
+            everybody: look at all rows: they have changed since the ghosts were renewed.
             inputs: digest of the actions.
 
-        Returns:
-            the vehicles that change their owner now.
-
         Raises:
+            LedgerError: a vehicle was lost or doubled.
             ProtocolError: it cannot be decided, or a zone does not answer.
+            ZoneError: a zone has not seen who enters it.
         """
 
     @abstractmethod

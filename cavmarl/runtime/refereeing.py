@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import secrets
 from collections.abc import Callable, Iterable, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -17,6 +18,7 @@ from cavmarl.ownership.messages import RUN_BYTES
 from cavmarl.ownership.safeguards import ALL_ON, Safeguards
 from cavmarl.ownership.transfers import TransferLog
 from cavmarl.ownership.transport import Network
+from cavmarl.runtime.border_book import BorderBook
 from cavmarl.runtime.coordination import Coordination, RowStates
 from cavmarl.runtime.coordinator import Coordinator
 from cavmarl.runtime.direct import DirectCoordinator
@@ -132,7 +134,9 @@ def _referee(
         journal = MemoryJournal()
     if faults is None:
         directory = Directory(run, range(zones), states, limits, safeguards)
-        return DirectCoordinator(directory, journal, division.counter(w), transfers)
+        counts = partial(division.counts, w)
+        book = BorderBook(division, w)
+        return DirectCoordinator(directory, journal, book, counts, transfers)
     arguments = (run, zones, states, limits, Network(faults.plan()), journal, safeguards)
     coordinator = (
         Coordinator(*arguments)

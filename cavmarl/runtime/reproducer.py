@@ -46,7 +46,7 @@ class Reproducer:
         first_world: number of the world among all worlds of the seed.
         episode: number of the world's episode since the seed, from 1 on.
         tick: of the run, that could not be reached.
-        zone: whose hosts died.
+        zone: whose hosts died; None: the coordinators.
         cause: what the error said.
         is_first: whether the tick begins a step.
         is_last: whether it ends one.
@@ -63,7 +63,7 @@ class Reproducer:
     first_world: int
     episode: int
     tick: int
-    zone: int
+    zone: int | None
     cause: str
     is_first: bool
     is_last: bool

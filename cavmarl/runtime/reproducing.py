@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from cavmarl.config import EnvConfig
-from cavmarl.errors import ProtocolError, ZoneStepError
+from cavmarl.errors import LostTickError, ProtocolError
 from cavmarl.kernels import kernel_cache_dir
 from cavmarl.roads.network import RoadNetwork
 from cavmarl.roads.zones import ZonePartition
@@ -68,7 +68,7 @@ class Keeper:
         self._store = store
         self._coordinator = coordinator
 
-    def keep(self, error: ZoneStepError, moment: Moment) -> Path | str:
+    def keep(self, error: LostTickError, moment: Moment) -> Path | str:
         """Write a file from which the tick can be run again.
 
         Args:
@@ -93,7 +93,8 @@ class Keeper:
             image=self._store.truth(),
         )
         place = Path(self._config.zones.reproducers or tempfile.gettempdir())
-        path = place / f"cavmarl-tick-{error.tick}-zone-{error.zone}-{secrets.token_hex(4)}.json"
+        of = "coordinator" if error.zone is None else f"zone-{error.zone}"
+        path = place / f"cavmarl-tick-{error.tick}-{of}-{secrets.token_hex(4)}.json"
         try:
             reproducer.write(path)
         except OSError as failure:

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cavmarl.config import EnvConfig
-from cavmarl.errors import CapacityError, ConfigError, ZoneError, ZoneStepError
+from cavmarl.errors import CapacityError, ConfigError, LostTickError, ZoneError
 from cavmarl.kernels.arrays import Outputs, Worlds
 from cavmarl.kernels.codes import (
     ACTION_IDLE,
@@ -32,6 +32,7 @@ from cavmarl.roads.network import RoadNetwork
 from cavmarl.roads.zone_layouts import cut_map
 from cavmarl.roads.zones import ZonePartition
 from cavmarl.runtime import snapshot
+from cavmarl.runtime.border_book import BorderBook
 from cavmarl.runtime.commons import Commons
 from cavmarl.runtime.compilation import first_compilation
 from cavmarl.runtime.coordination import Coordination
@@ -106,6 +107,7 @@ class Simulation:
         observations: (W, A, D) float32, where the agents' are written; None: made for them.
         warm: call every kernel now, so that none is loaded in a step.
         zeros: makes the arrays that shards write.
+        like: worlds of the same environment, whose tables are used; None: they are made.
 
     Attributes:
         everywhere: (W,) all of the worlds.
@@ -122,6 +124,7 @@ class Simulation:
         observations: NDArray[np.float32] | None = None,
         warm: bool = False,
         zeros: Zeros = np.zeros,
+        like: Simulation | None = None,
     ) -> None:
         self.config = config
         self.network = network
@@ -135,19 +138,23 @@ class Simulation:
         self.transfers: tuple[TransferLog, ...] = ()
         with first_compilation() as is_first:
             blank = blank_vehicle()
-            traffic = NativeTraffic(
-                network,
-                config.traffic,
-                config.population,
-                blank,
-                config.clock.sim_dt_s,
-                config.horizon_s,
-                demand,
-                num_worlds,
-                zeros,
+            traffic = (
+                NativeTraffic(
+                    network,
+                    config.traffic,
+                    config.population,
+                    blank,
+                    config.clock.sim_dt_s,
+                    config.horizon_s,
+                    demand,
+                    num_worlds,
+                    zeros,
+                )
+                if like is None
+                else like._traffic.for_worlds(num_worlds)
             )
             capacity = traffic.capacity
-            self._traffic = traffic
+            self._traffic: NativeTraffic = traffic
             self._gate = make_gate(num_worlds, capacity, network.arrays, blank.dtype)
             self._commons = Commons(config, network, num_worlds, observations, zeros)
             self._shards, self._division = divide(
@@ -208,6 +215,9 @@ class Simulation:
         self._division.near(0, everybody=True)
         with suppress(ZoneError):
             self._division.hand_over(0, Switch(-1, 0, 0, 0, False), None)
+        book = BorderBook(self._division, 0)
+        book.release(book.hand_over(True, sum(self._division.counts(0)), ()))
+        book.reset(0)
         self._episodes[:] = 0
 
     @property
@@ -246,6 +256,10 @@ class Simulation:
         halo_m, coordination = self.zone_loads().halo_m, self._coordination
         transfers = () if coordination is None else coordination.in_flight(world)
         return view_zones(self._shards, self.partition, halo_m, world, transfers)
+
+    def running(self) -> NDArray[np.int64]:
+        """(W,) vehicles of each world."""
+        return self._division.running()
 
     def ghosts(self, zone: int, world: int = 0) -> NDArray[np.void]:
         """What a zone sees of other zones' vehicles: VEHICLE (n,), a view that cannot be written.
@@ -348,14 +362,14 @@ class Simulation:
             is_last: whether it ends it.
 
         Raises:
-            ZoneStepError: every host of a zone died of it.
+            LostTickError: every host of a zone, or every coordinator, died of it.
         """
         if self._recovery is None:
             self._tick(commands, is_first, is_last)
             return
         try:
             self._recovery.run(partial(self._tick, commands, is_first, is_last))
-        except ZoneStepError as error:
+        except LostTickError as error:
             if self._keeper is not None:
                 episode = int(self._episodes[0])
                 moment = (self._seed, self._first_world, episode, commands, is_first, is_last)
@@ -393,15 +407,18 @@ class Simulation:
         """From now on let somebody else run the phases of the shards, as `make` returns it."""
         self._executor = make(self._shards)
 
-    def time_shards(self) -> ShardClock:
+    def time_shards(self, every: int = 1) -> ShardClock:
         """From now on run phases zone by zone, with a clock on each.
+
+        Args:
+            every: one tick of so many; the others as ever.
 
         Raises:
             ConfigError: hosts die by plan, and what is repeated would be counted, too.
         """
         if self._recovery is not None:
             raise ConfigError("zones.faults: shards are timed where no host dies; leave it out")
-        clock = ShardClock(self._shards)
+        clock = ShardClock(self._shards, every)
         self._executor = clock
         return clock
 
@@ -425,7 +442,8 @@ class Simulation:
         self._executor.each("resolve")
         self._enter()
         self._executor.each("commit")
-        self._shard.worlds.ticks[:] += 1
+        ticks = self._shard.worlds.ticks
+        ticks += 1
         self._switch_signals()
 
     def _switch_signals(self) -> None:
@@ -445,11 +463,12 @@ class Simulation:
     def _leave(self) -> None:
         """Who needs it picks another goal, who has arrived leaves, who looks for a way finds it."""
         traffic, gate, worlds = self._traffic, self._gate, self._shard.worlds
-        begins_second = (worlds.ticks % traffic.ticks_per_s == 0).any()
+        per_s = traffic.ticks_per_s
+        begins_second = any(tick % per_s == 0 for tick in worlds.ticks.tolist())
         if begins_second:
             self._executor.each("choose_goals", traffic.demand, len(traffic.plans), gate)
         self._executor.each("leave", gate)
-        if gate.num_passing.any():
+        if any(gate.num_passing.tolist()):
             self._note_left()
             traffic.settle(gate, worlds)
         if begins_second and traffic.rerouting is not None:
@@ -464,7 +483,7 @@ class Simulation:
         """Those who wait and find a gap enter `next_rows`."""
         traffic, gate, worlds = self._traffic, self._gate, self._shard.worlds
         traffic.call_orders(gate, worlds)
-        if gate.num_queue.any():
+        if any(gate.num_queue.tolist()):
             self._let_in()
 
     def _let_in(self) -> None:
@@ -485,7 +504,7 @@ class Simulation:
             return
         gate = self._gate
         self._executor.each("retire", gate)
-        if gate.num_passing.any():
+        if any(gate.num_passing.tolist()):
             self._note_left()
             self._executor.each("forget", gate)
             self._traffic.settle(gate, self._shard.worlds)
@@ -503,6 +522,23 @@ class Simulation:
         self.seed(*roots.tolist())
         self._episodes[:] = episodes
         self._gate = snapshot.load(self._parts(), rest)
+
+    def share_of(self, world: int) -> list[NDArray[Any]]:
+        """What `save` would give if there were no world but one; views, to be copied."""
+        roots = np.array([self._seed, self._first_world + world], dtype=np.int64)
+        episodes = self._episodes[world : world + 1]
+        return [roots, episodes, *snapshot.share_of(self._parts(), world)]
+
+    def join(self, shares: Sequence[Sequence[NDArray[Any]]]) -> list[NDArray[Any]]:
+        """What `load` takes, of worlds of which each share has been one by itself.
+
+        Args:
+            shares: what `share_of` gave, of worlds that follow each other.
+        """
+        episodes = np.concatenate([share[1] for share in shares])
+        return [
+            shares[0][0], episodes, *snapshot.join(self._parts(), [share[2:] for share in shares])
+        ]  # fmt: skip
 
     def _parts(self) -> snapshot.Parts:
         return snapshot.Parts(

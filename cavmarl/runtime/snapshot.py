@@ -18,12 +18,12 @@ from cavmarl.runtime.division import Division
 from cavmarl.shard.shard import COMMON
 from cavmarl.traffic.native import NativeTraffic
 
-__all__ = ["Parts", "load", "save"]
+__all__ = ["Parts", "join", "load", "save", "share_of"]
 
 Array = NDArray[Any]
 
-# Fields of `Gate` that outlive a tick, beside its queue. Nobody is passing it between two steps.
-_OF_GATE = ("next_order", "num_queue", "next_id", "num_entered", "counts", "sums", "lane_taken")
+# Fields of `Gate` that outlive a tick, beside its queue. Between two steps nobody is passing it.
+_OF_GATE = ("next_order", "num_queue", "next_id", "num_entered", "counts", "sums")
 
 
 class Parts(NamedTuple):
@@ -56,12 +56,12 @@ def save(parts: Parts) -> list[Array]:
         *_fixed(parts),
         gate.queue[:, :waiting],
         parts.division.contacts(),
+        *_of_rerouting(parts),
         *(
             parts.division.owned(w, zone)
             for w in range(len(worlds.ticks))
             for zone in range(parts.division.count)
         ),
-        *_of_rerouting(parts),
     ]
 
 
@@ -85,18 +85,66 @@ def load(parts: Parts, saved: Sequence[Array]) -> Gate:
     queue, contacts = next(rest), next(rest)
     gate.queue[:, : queue.shape[1]] = queue
     gate.num_passing[:] = 0
+    for array in _of_rerouting(parts):
+        _put(array, next(rest))
     zones = range(parts.division.count)
     vehicles = [np.concatenate([next(rest) for _ in zones]) for _ in everywhere]
     parts.division.place(vehicles, contacts)
-    for array in _of_rerouting(parts):
-        _put(array, next(rest))
     if parts.coordination is not None:
         parts.coordination.reset(everywhere)
     return gate
 
 
+def share_of(parts: Parts, w: int) -> list[Array]:
+    """What `save` would give if there were no world but one; some are views, to be copied."""
+    gate, rerouting = parts.gate, parts.traffic.rerouting
+    waiting = gate.num_queue.item(w)
+    owned = [parts.division.owned(w, zone) for zone in range(parts.division.count)]
+    if rerouting is not None:
+        owned = [rows.copy() for rows in owned]
+        for rows in owned:
+            rows["way"] = rerouting.ways_of_first_world(rows["way"], w)
+    return [
+        *(array[w : w + 1] for array in _fixed(parts)),
+        gate.queue[w : w + 1, :waiting],
+        parts.division.contacts()[w : w + 1],
+        *(() if rerouting is None else rerouting.arrays_of(w)),
+        *owned,
+    ]
+
+
+def join(parts: Parts, shares: Sequence[Sequence[Array]]) -> list[Array]:
+    """What `save` would give of worlds of which each share has been one.
+
+    Args:
+        parts: of as many worlds.
+        shares: what `share_of` gave, in the order in which the worlds are to be.
+    """
+    zones, rerouting = parts.division.count, parts.traffic.rerouting
+    fields = zip(*(share[:-zones] for share in shares), strict=True)
+    joined = [_stacked(arrays) for arrays in fields]
+    for w, share in enumerate(shares):
+        for owned in share[-zones:]:
+            rows = owned.copy()
+            if rerouting is not None:
+                rows["way"] = rerouting.ways_of_world(rows["way"], w)
+            joined.append(rows)
+    return joined
+
+
+def _stacked(arrays: Sequence[Array]) -> Array:
+    """Rows of one world each below one another, shorter ones with zeros behind."""
+    if arrays[0].ndim < 2:
+        return np.concatenate(arrays)
+    longest = max(array.shape[1] for array in arrays)
+    stacked = np.zeros((len(arrays), longest, *arrays[0].shape[2:]), dtype=arrays[0].dtype)
+    for row, array in zip(stacked, arrays, strict=True):
+        row[: array.shape[1]] = array[0]
+    return stacked
+
+
 def _fixed(parts: Parts) -> Iterator[Array]:
-    """The arrays whose shapes follow from the environment."""
+    """The arrays whose shapes follow from the environment, (W, …)."""
     for name in COMMON:
         yield getattr(parts.worlds, name)
     for name in _OF_GATE:

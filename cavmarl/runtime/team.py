@@ -14,9 +14,11 @@ from __future__ import annotations
 import os
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from operator import is_
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from cavmarl.runtime.barrier import (
     NUMBER,
@@ -28,14 +30,16 @@ from cavmarl.runtime.barrier import (
     wait_for,
 )
 from cavmarl.runtime.executor import Phase
+from cavmarl.runtime.hosted import HostedZones
 from cavmarl.runtime.shared_memory import shared_zeros
 from cavmarl.shard.group import ShardGroup
 from cavmarl.shard.shard import Shard
 
 __all__ = ["Follower", "Leader", "LeftAloneError", "Team"]
 
-# Words of the leader's line, behind those of `barrier`.
-CODE, SIDE, NEXT_SIDE = 2, 3, 4
+# Words of the leader's line, behind those of `barrier`: what is called with even numbers, and what
+# with odd ones.
+CALLS = (2, 3)
 # A word of a follower's line.
 FAILED = 2
 CORE = 5  # a word of both: where the process was when it began with a phase
@@ -43,6 +47,8 @@ CORE = 5  # a word of both: where the process was when it began with a phase
 # Methods of `ShardGroup` and `Shard` that are run together, by their code.
 TOGETHER = ("begin_step", "move", "resolve", "sense", "credit", "suggest")
 END = len(TOGETHER)
+# After which nobody waits: the next phase only asks that it has been run on the same zone.
+UNSEEN_BY_OTHERS = "begin_step"
 
 
 class LeftAloneError(Exception):
@@ -54,20 +60,22 @@ class Team:
 
     Args:
         shards: one a zone, in the order of zones; their arrays are shared.
-        zones: of each worker, at least one each; the first leads.
-        known: what each phase is called with that is run together, by its name; the arrays among it
-            are shared.
+        zones: of each worker, to begin with; the first leads.
+        known: what phases are called with that are run together, by their names: for each phase all
+            that there is to choose from; the arrays among it are shared.
+        spent_s: (k,) where the processor time of each zone is added up; None: nobody asks for it.
     """
 
     def __init__(
         self,
         shards: Sequence[Shard],
         zones: Sequence[Sequence[int]],
-        known: Mapping[str, tuple[Any, ...]],
+        known: Mapping[str, Sequence[tuple[Any, ...]]],
+        spent_s: NDArray[np.float64] | None = None,
     ) -> None:
-        self.known = {name: known.get(name, ()) for name in TOGETHER}
+        self.known = {name: tuple(known.get(name, ((),))) for name in TOGETHER}
         self.everybody = ShardGroup(shards)
-        self.hosts = [ShardGroup([shards[zone] for zone in hosted]) for hosted in zones]
+        self.hosts = [HostedZones(shards, hosted, spent_s) for hosted in zones]
         lines = shared_zeros((len(zones), WORDS), np.int64)
         self.lines: list[Words] = list(lines)
 
@@ -91,6 +99,7 @@ class Leader:
         self._line, *self._others = team.lines
         self._codes = {name: code for code, name in enumerate(TOGETHER)}
         self._leads = False
+        self._last = ""
 
     @contextmanager
     def order(self) -> Iterator[None]:
@@ -100,13 +109,26 @@ class Leader:
             LeftAloneError: one of them has failed.
         """
         self._wait()
-        self._leads = True
+        self._leads, self._last = True, ""
         try:
             yield
         finally:
+            self._dismiss()
+
+    def end_after(self, phase: Phase | str) -> None:
+        """Let the followers end the order with the next phase of that name that they run."""
+        self._last = phase
+
+    def _dismiss(self) -> None:
+        """The followers need not wait any more."""
+        if self._leads:
             self._leads = False
             self._wait()
             self._announce(END)
+
+    def take(self, zones: Sequence[int]) -> None:
+        """From now on these zones are its own; the others are the followers'."""
+        self._own.take(zones)
 
     def each(self, phase: Phase, *arguments: Any) -> None:
         """Run a phase on every shard.
@@ -118,27 +140,35 @@ class Leader:
         if phase == "advance":
             self._everybody.turn()
             name = "move"
-        if not self._is_together(name, arguments):
+        which = self._which(name, arguments)
+        if which < 0:
             self._everybody.each(name, *arguments)
             return
-        self._announce(self._codes[name])
+        self._announce(self._codes[name], which)
         self._own.each(name, *arguments)
+        if name == UNSEEN_BY_OTHERS:
+            return
         self._wait()
         if any(line[FAILED] for line in self._others):
             raise LeftAloneError
+        if name == self._last:
+            self._dismiss()
 
-    def _is_together(self, name: str, arguments: tuple[Any, ...]) -> bool:
-        """Whether the followers know what a phase is called with."""
-        if not self._leads or name not in self._codes:
-            return False
-        return all(a is b for a, b in zip(arguments, self._known[name], strict=True))
+    def _which(self, name: str, arguments: tuple[Any, ...]) -> int:
+        """Which of what the followers know a phase is called with; -1: none, or nobody follows."""
+        if self._leads and name in self._codes:
+            for number, known in enumerate(self._known[name]):
+                if all(map(is_, arguments, known)):
+                    return number
+        return -1
 
-    def _announce(self, code: int) -> None:
+    def _announce(self, code: int, which: int = 0) -> None:
         line = self._line
-        line[CODE] = code
-        line[SIDE], line[NEXT_SIDE] = self._everybody.sides
+        number = line.item(NUMBER) + 1
+        side, next_side = self._everybody.sides
+        line[CALLS[number % 2]] = which << 16 | code << 2 | side << 1 | next_side
         line[CORE] = present_core()
-        post(line, line.item(NUMBER) + 1)
+        post(line, number)
 
     def _wait(self) -> None:
         number = self._line.item(NUMBER)
@@ -170,10 +200,11 @@ class Follower:
         while True:
             number = line.item(NUMBER) + 1
             wait_for(leader, number)
-            code = leader.item(CODE)
+            call = leader.item(CALLS[number % 2])
+            code = call >> 2 & 0xFF
             if code != END:
                 try:
-                    self._run(TOGETHER[code])
+                    self._run(TOGETHER[code], call)
                 except Exception as error:
                     failure = error
                     line[FAILED] = 1
@@ -182,6 +213,10 @@ class Follower:
                 break
         if failure is not None:
             raise failure
+
+    def take(self, zones: Sequence[int]) -> None:
+        """From now on these zones are its own."""
+        self._own.take(zones)
 
     def _get_out_of_the_way(self) -> None:
         """Leave the core of those before in the team: they wait for this one, and it for them.
@@ -195,7 +230,7 @@ class Follower:
             core = present_core()
         self._line[CORE] = core
 
-    def _run(self, name: str) -> None:
+    def _run(self, name: str, call: int) -> None:
         self._get_out_of_the_way()
-        self._own.face(self._leader.item(SIDE), self._leader.item(NEXT_SIDE))
-        self._own.each(name, *self._known[name])
+        self._own.face(call >> 1 & 1, call & 1)
+        self._own.each(name, *self._known[name][call >> 16])

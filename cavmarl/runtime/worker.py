@@ -29,13 +29,14 @@ from typing import Any, NoReturn, Protocol
 import numpy as np
 
 from cavmarl.runtime import barrier, images
-from cavmarl.runtime.barrier import NUMBER, WAKE, WORDS, Meeting
+from cavmarl.runtime.barrier import NUMBER, WAKE, WORDS, Meeting, present_core
 from cavmarl.runtime.images import Arrays, Image
 from cavmarl.runtime.shared_memory import Segment
 
 __all__ = [
     "ANSWER",
     "ANSWERED",
+    "CORE",
     "FAILED",
     "LETTER",
     "LOADS",
@@ -48,14 +49,15 @@ __all__ = [
     "TASK",
     "TRUTH",
     "Job",
+    "describe",
     "die_with_parent",
     "serve",
 ]
 
 # Words of the pool's line, behind those of `barrier`.
 TASK, LETTER, SLOT, TRUTH, LOADS = 2, 3, 4, 5, 6
-# A word of the worker's line, and what it says.
-ANSWER = 2
+# Words of the worker's line: how its order ended, and on which core it has begun with it.
+ANSWER, CORE = 2, 3
 SILENT, ANSWERED, FAILED = 0, 1, 2
 
 NOTHING = -1  # a task: to be there
@@ -83,7 +85,7 @@ class Job(Protocol):
         ...
 
     def save(self) -> Arrays:
-        """All that a successor needs to go on from here."""
+        """All that a successor needs to go on from here; nothing if there is no such thing."""
         ...
 
     def load(self, arrays: Sequence[Any]) -> None:
@@ -152,10 +154,15 @@ def _read(fd: int, size: int) -> Any:
     return json.loads(os.pread(fd, size, 0))
 
 
-def _failure(error: BaseException) -> bytes:
+def describe(error: BaseException) -> dict[str, str]:
+    """An exception in words, not too many: its class, its message, its traceback."""
     text = "".join(traceback.format_exception(error))[-MAX_TRACEBACK:]
     message = str(error)[: MAX_TRACEBACK // 4]
-    return json.dumps({"kind": type(error).__name__, "text": message, "traceback": text}).encode()
+    return {"kind": type(error).__name__, "text": message, "traceback": text}
+
+
+def _failure(error: BaseException) -> bytes:
+    return json.dumps(describe(error)).encode()
 
 
 def _fork_on_demand(
@@ -229,17 +236,19 @@ def _obey(job: Job, meeting: Meeting, slots: Sequence[Image]) -> NoReturn:
         order = int(mine[NUMBER]) + 1
         _await(meeting, order, time.perf_counter() - began)
         began = time.perf_counter()
+        core = present_core()
         letter = _receive(meeting.wire) if theirs[LETTER] else None
         try:
             if (is_new or theirs[LOADS]) and theirs[TRUTH] >= 0:
                 dtypes = [array.dtype for array in job.save()]
-                job.load(list(slots[theirs[TRUTH]].read(dtypes)))
+                if dtypes:
+                    job.load(list(slots[theirs[TRUTH]].read(dtypes)))
             is_new = False
             answer = None
             if theirs[TASK] != NOTHING:
                 answer = job.perform(int(theirs[TASK]), letter)
-            if theirs[SLOT] >= 0:
-                slots[theirs[SLOT]].write(job.save())
+            if theirs[SLOT] >= 0 and (saved := job.save()):
+                slots[theirs[SLOT]].write(saved)
         except MemoryError:
             os._exit(OUT_OF_MEMORY)
         except Exception as error:
@@ -249,6 +258,7 @@ def _obey(job: Job, meeting: Meeting, slots: Sequence[Image]) -> NoReturn:
             mine[ANSWER] = SILENT if answer is None else ANSWERED
             if answer is not None:
                 meeting.wire.send(MAIL + json.dumps(answer).encode())
+        mine[CORE] = core  # now, and not before: the pool looks at this line all the time
         meeting.post(int(theirs[NUMBER]))
 
 

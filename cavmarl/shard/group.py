@@ -150,7 +150,7 @@ class ShardGroup:
 
     def leave(self, gate: Gate) -> None:
         """Hand the background vehicles of the next rows that have arrived to the gate."""
-        if not self._first.zoned.num_through.any():
+        if not any(map(any, self._first.zoned.num_through.tolist())):
             return
         for shard in self._shards:
             shard.leave(gate)

@@ -7,6 +7,7 @@ from typing import Any, NamedTuple, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from cavmarl.balance.plan import Plan
 from cavmarl.config import TERMS, EnvConfig
 from cavmarl.runtime.shared_memory import Layout
 from cavmarl.runtime.simulation import Simulation
@@ -85,6 +86,11 @@ class SteppedWorlds(Protocol):
     @property
     def simulation(self) -> Simulation:
         """The worlds themselves, where they live in this process."""
+        ...
+
+    @property
+    def plans(self) -> tuple[Plan, ...]:
+        """Which worker hosts what, one plan of all worlds, or one a world; none without workers."""
         ...
 
     def reset(self, seed: int | None, first_world: int) -> None:

@@ -7,8 +7,6 @@ older image and go through the same steps again.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-
 import numpy as np
 
 from cavmarl.config import EnvConfig
@@ -18,7 +16,7 @@ from cavmarl.shard.shard import Commands
 
 __all__ = ["Diary", "make_segments"]
 
-STEPS = 8  # from one image to the next: a successor repeats that many at most
+STEPS = 16  # from one image to the next: a successor repeats that many at most
 _FIRST_IMAGE_BYTES = 1 << 12
 
 
@@ -43,6 +41,7 @@ class Diary:
 
     Attributes:
         place: (2,) which image it begins with, and how many steps follow; to be committed.
+        entries: what the agents do in each of the steps that there is room for.
     """
 
     def __init__(self, config: EnvConfig, descriptors: list[int]) -> None:
@@ -50,7 +49,7 @@ class Diary:
         self.place = np.zeros(2, dtype=np.int64)
         self._images = [Image(segment) for segment in images]
         arrays = arrays_in(steps.map(), _layout(config))
-        self._controls, self._meta_actions = arrays["controls"], arrays["meta_actions"]
+        self.entries = tuple(map(Commands, arrays["controls"], arrays["meta_actions"]))
 
     @property
     def is_full(self) -> bool:
@@ -59,9 +58,9 @@ class Diary:
 
     def note(self, commands: Commands) -> None:
         """Write down what the agents do in one more step."""
-        n = self.place.item(1)
-        self._controls[n] = commands.controls
-        self._meta_actions[n] = commands.meta_actions
+        entry = self.entries[self.place.item(1)]
+        entry.controls[:] = commands.controls
+        entry.meta_actions[:] = commands.meta_actions
         self.place[1] += 1
 
     def begin(self, state: Arrays) -> None:
@@ -79,10 +78,9 @@ class Diary:
         dtypes = [array.dtype for array in like]
         return list(self._images[self.place.item(0)].read(dtypes))
 
-    def steps(self) -> Iterator[Commands]:
+    def steps(self) -> tuple[Commands, ...]:
         """What the agents have done since."""
-        for n in range(self.place.item(1)):
-            yield Commands(self._controls[n], self._meta_actions[n])
+        return self.entries[: self.place.item(1)]
 
 
 def _layout(config: EnvConfig) -> Layout:

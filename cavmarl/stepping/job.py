@@ -23,7 +23,10 @@ class Task(IntEnum):
     SUGGEST = 2
     STATE_HASH = 3
     TRAFFIC_STATS = 4
-    WRITE_STATES = 5
+    PACK = 5
+    UNPACK = 6
+    HOST = 7
+    WRITE_STATES = 8
 
 
 class WorldsJob:
@@ -35,6 +38,9 @@ class WorldsJob:
     """
 
     def __init__(self, worlds: LocalWorlds, first: int) -> None:
+        self._take(worlds, first)
+
+    def _take(self, worlds: LocalWorlds, first: int) -> None:
         self._worlds = worlds
         self._first = first
         self._commands = Commands(worlds.arrays.controls, worlds.arrays.meta_actions)
@@ -55,7 +61,7 @@ class WorldsJob:
             worlds.write_states()
         elif task == Task.STATE_HASH:
             return worlds.state_hash(letter - self._first)
-        else:
+        elif task == Task.TRAFFIC_STATS:
             return worlds.traffic_stats(letter - self._first)
         return None
 

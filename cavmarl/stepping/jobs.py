@@ -6,16 +6,16 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from cavmarl.config import EnvConfig
 from cavmarl.errors import WorkerStartError
+from cavmarl.runtime.images import Image
 from cavmarl.runtime.shared_memory import Segment, arrays_in, shared_zeros
 from cavmarl.runtime.worker import Job
 from cavmarl.stepping.arrays import StepArrays, layout_of
 from cavmarl.stepping.diary import Diary
 from cavmarl.stepping.job import WorldsJob, fingerprint
 from cavmarl.stepping.local import LocalWorlds
+from cavmarl.stepping.moving_job import MovingJob
 from cavmarl.stepping.parts import Part
 from cavmarl.stepping.team_job import LeaderJob
 from cavmarl.worlds import make_world
@@ -42,21 +42,37 @@ def make_jobs(recipe: Mapping[str, Any]) -> list[Job]:
         )
     layout = layout_of(config, recipe["capacity"], recipe["num_worlds"])
     arrays = StepArrays(**arrays_in(Segment(recipe["arrays"], 0).map(), layout))
-    LocalWorlds(world, 1, warm=True)
+    one = LocalWorlds(world, 1, warm=True)
+    parts = [Part(*given) for given in recipe["parts"]]
+
+    def make(first: int, last: int) -> LocalWorlds:
+        part, in_next_step = arrays.part(first, last), recipe["in_next_step"]
+        return LocalWorlds(world, last - first, part, in_next_step=in_next_step, like=one)
+
+    mover = recipe["mover"]
+    spent_s = None
+    if mover is not None:
+        spent_s = arrays_in(Segment(mover["spent"], 0).map(), mover["layout"])["spent_s"]
+        cases = [Image(Segment(fd, 0)) for fd in mover["cases"]]
+        if cases:
+            bounds = [part.first for part in parts] + [parts[-1].last]
+            whole_s = spent_s[:, 0]
+            return [MovingJob(make, bounds, k, cases, whole_s) for k in range(len(parts))]
     jobs: list[Job] = []
-    for given, descriptors in zip(recipe["parts"], recipe["diaries"], strict=True):
-        part = Part(*given)
-        is_split = len(part.zones) > 1
-        worlds = LocalWorlds(
-            world,
-            part.last - part.first,
-            arrays.part(part.first, part.last),
-            in_next_step=recipe["in_next_step"],
-            zeros=shared_zeros if is_split else np.zeros,
-        )
-        if is_split:
-            leader = LeaderJob(worlds, part.first, part.zones, Diary(config, descriptors))
+    for part, descriptors in zip(parts, recipe["diaries"], strict=True):
+        if len(part.zones) > 1:
+            worlds = LocalWorlds(
+                world,
+                1,
+                arrays.part(part.first, part.last),
+                in_next_step=recipe["in_next_step"],
+                zeros=shared_zeros,
+            )
+            diary, theirs = Diary(config, descriptors), None
+            if spent_s is not None:
+                theirs = spent_s[part.first]
+            leader = LeaderJob(worlds, part.first, part.zones, diary, theirs)
             jobs += [leader, *leader.followers()]
         else:
-            jobs.append(WorldsJob(worlds, part.first))
+            jobs.append(WorldsJob(make(part.first, part.last), part.first))
     return jobs

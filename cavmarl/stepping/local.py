@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from cavmarl.balance.plan import Plan
 from cavmarl.kernels.codes import EVENTS_THAT_END
 from cavmarl.runtime.simulation import Simulation
 from cavmarl.shard.shard import Commands
@@ -31,6 +32,7 @@ class LocalWorlds:
         warm: have all kernels ready now.
         in_next_step: when worlds begin anew; see `SteppedWorlds`.
         zeros: makes the arrays that shards write.
+        like: worlds of the same environment, whose tables are used; None: they are made.
 
     Attributes:
         world: what each is made of.
@@ -47,10 +49,11 @@ class LocalWorlds:
         warm: bool = False,
         in_next_step: bool = False,
         zeros: Zeros = np.zeros,
+        like: LocalWorlds | None = None,
     ) -> None:
         self.world = world
         self.in_next_step = in_next_step
-        self.simulation = Simulation(
+        self.simulation: Simulation = Simulation(
             world.config,
             world.network,
             num_worlds,
@@ -59,6 +62,7 @@ class LocalWorlds:
             observations=None if arrays is None else arrays.observations,
             warm=warm,
             zeros=zeros,
+            like=None if like is None else like.simulation,
         )
         if arrays is None:
             arrays = _own_arrays(self.simulation, num_worlds)
@@ -155,6 +159,26 @@ class LocalWorlds:
         """Go on from what `save` gave."""
         self._steps[:], self._waiting[:] = saved[:2]
         self.simulation.load(saved[2:])
+
+    def share_of(self, world: int) -> list[NDArray[Any]]:
+        """What `save` would give if there were no world but one; views, to be copied."""
+        only = slice(world, world + 1)
+        return [self._steps[only], self._waiting[only], *self.simulation.share_of(world)]
+
+    def join(self, shares: Sequence[Sequence[NDArray[Any]]]) -> list[NDArray[Any]]:
+        """What `load` takes, of worlds of which each share has been one by itself."""
+        ended = [np.concatenate([share[n] for share in shares]) for n in range(2)]
+        return [*ended, *self.simulation.join([share[2:] for share in shares])]
+
+    @property
+    def num_parts(self) -> int:
+        """Arrays at the end of `save` that are there once a zone of each world."""
+        return len(self._steps) * self.world.partition.count
+
+    @property
+    def plans(self) -> tuple[Plan, ...]:
+        """None: there are no workers."""
+        return ()
 
     def close(self) -> None:
         """Nothing to release."""

@@ -2,21 +2,25 @@
 
 from __future__ import annotations
 
-import math
+from bisect import bisect_left
+from collections.abc import Sequence
+from dataclasses import replace
 from itertools import pairwise
 from typing import NamedTuple
 
-from cavmarl.balance.plan import make_plan
-from cavmarl.balance.problem import Problem, ShardCost
-from cavmarl.balance.snapshot import idle_snapshot
+from cavmarl.balance.plan import Plan, make_plan
+from cavmarl.balance.problem import BalanceRule, Problem, ShardCost, equal_costs
+from cavmarl.balance.snapshot import Snapshot, idle_snapshot
 from cavmarl.errors import ConfigError
 from cavmarl.roads.zone_statistics import zone_statistics
 from cavmarl.worlds import World
 
-__all__ = ["Part", "share_out"]
+__all__ = ["Part", "make_plans", "parts_of", "share_out"]
 
 # Of a zone in which no lane lies, as a length of lanes: it is looked at in every tick.
 _EMPTY_KM = 0.01
+_EQUAL = "number"
+_LANES = "length of lanes"
 
 
 class Part(NamedTuple):
@@ -46,16 +50,28 @@ class Part(NamedTuple):
         ]
 
 
-def share_out(world: World, num_worlds: int, workers: int) -> list[Part]:
+def make_plans(
+    world: World,
+    num_worlds: int,
+    workers: int,
+    snapshot: Snapshot | None = None,
+    rule: BalanceRule | None = None,
+) -> list[Plan]:
     """Worlds to workers as evenly as may be; those are divided of which there are too few.
 
     Args:
         world: what each is made of.
         num_worlds: how many there are.
         workers: how many, at least 1.
+        snapshot: how busy they are; None: they are idle.
+        rule: of the plans.
+
+    Returns:
+        one plan of all worlds, or one of the zones of each world.
 
     Raises:
-        ConfigError: more of them than zones of all worlds.
+        ConfigError: more workers than zones of all worlds.
+        NoAdmissibleWorkerError: workers are too busy.
     """
     count = world.partition.count
     if workers > count * num_worlds:
@@ -63,33 +79,55 @@ def share_out(world: World, num_worlds: int, workers: int) -> list[Part]:
             f"workers = {workers}: {num_worlds} world(s) of {count} zone(s) each can be shared out "
             f"over at most {count * num_worlds}; use fewer workers, more zones or more worlds"
         )
-    parts = min(workers, num_worlds)
-    worlds = [num_worlds * n // parts for n in range(parts + 1)]
-    sizes = [workers * (n + 1) // parts - workers * n // parts for n in range(parts)]
-    zones = {size: _zones(world, size) for size in set(sizes)}
+    seen, rule = snapshot or idle_snapshot(workers), rule or BalanceRule()
+    if workers <= num_worlds:
+        whole = equal_costs(num_worlds, 1)
+        problem = Problem(whole, ((),), seen, rule, in_row=True, cost_source=_EQUAL)
+        return [make_plan(problem)]
+    firsts = [workers * n // num_worlds for n in range(num_worlds + 1)]
     return [
-        Part(first, last, zones[size])
-        for (first, last), size in zip(pairwise(worlds), sizes, strict=True)
+        _of_zones(world, number, replace(seen, workers=seen.workers[first:last]), rule)
+        for number, (first, last) in enumerate(pairwise(firsts))
     ]
 
 
-def _zones(world: World, workers: int) -> list[list[int]]:
+def share_out(world: World, num_worlds: int, workers: int) -> list[Part]:
+    """What idle workers run; arguments and errors as of `make_plans`."""
+    return parts_of(make_plans(world, num_worlds, workers), world.partition.count)
+
+
+def parts_of(plans: Sequence[Plan], num_zones: int) -> list[Part]:
+    """What the workers of each team run.
+
+    Args:
+        plans: of all worlds; see `make_plans`.
+        num_zones: of each world.
+    """
+    parts = []
+    for plan in plans:
+        numbers = [candidate.worker for candidate in plan.problem.snapshot.workers]
+        if plan.problem.in_row:
+            ends = [bisect_left(plan.homes, number) for number in (*numbers, numbers[-1] + 1)]
+            zones = list(range(num_zones))
+            parts += [Part(first, last, [zones]) for first, last in pairwise(ends)]
+            continue
+        world = plan.problem.shards[0].world
+        hosted = [[z for z, home in enumerate(plan.homes) if home == k] for k in numbers]
+        parts.append(Part(world, world + 1, hosted))
+    return parts
+
+
+def _of_zones(world: World, number: int, seen: Snapshot, rule: BalanceRule) -> Plan:
     """The zones of one world to some workers, neighbours together; by length of lanes."""
     partition = world.partition
-    everything = list(range(partition.count))
-    if workers == 1:
-        return [everything]
     lane_km = zone_statistics(partition, world.network).lane_km
-    costs = tuple(ShardCost(0, zone, lane_km[zone] + _EMPTY_KM) for zone in everything)
-    plan = make_plan(Problem(costs, partition.side_neighbors, idle_snapshot(workers)))
-    hosted = [[zone for zone in everything if plan.homes[zone] == k] for k in range(workers)]
-    _let_nobody_idle(hosted)
-    # The leader has more to do: it takes the lightest part.
-    return sorted(hosted, key=lambda zones: math.fsum(costs[zone].cost_s for zone in zones))
-
-
-def _let_nobody_idle(hosted: list[list[int]]) -> None:
-    """Who has nothing takes a zone of the worker that has most."""
-    while not all(hosted):
-        idle = hosted.index([])
-        hosted[idle].append(max(hosted, key=len).pop())
+    costs = tuple(ShardCost(number, zone, km + _EMPTY_KM) for zone, km in enumerate(lane_km))
+    problem = Problem(costs, partition.side_neighbors, seen, rule, cost_source=_LANES)
+    plan = make_plan(problem)
+    hosted = list(plan.homes)
+    excluded = {rejection.worker for rejection in plan.rejections}
+    for worker in (candidate.worker for candidate in seen.workers):
+        if worker not in hosted and worker not in excluded:  # nobody is to be idle
+            fullest = max(hosted, key=hosted.count)
+            hosted[len(hosted) - 1 - hosted[::-1].index(fullest)] = worker
+    return make_plan(replace(problem, present=tuple(hosted))) if hosted != [*plan.homes] else plan

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import warnings
 from dataclasses import asdict
 from itertools import accumulate, pairwise
@@ -9,6 +10,8 @@ from pathlib import Path
 from typing import Any
 
 import cavmarl.errors
+from cavmarl.balance.plan import Plan
+from cavmarl.balance.plan_text import describe_plan
 from cavmarl.config import ZonesConfig
 from cavmarl.errors import (
     CavmarlError,
@@ -26,12 +29,16 @@ from cavmarl.shard.shard import Commands
 from cavmarl.stepping.arrays import StepArrays, layout_of
 from cavmarl.stepping.diary import make_segments
 from cavmarl.stepping.job import Task, fingerprint
-from cavmarl.stepping.parts import share_out
+from cavmarl.stepping.mover import Mover
+from cavmarl.stepping.parts import Part, parts_of
+from cavmarl.stepping.placement import Placement
 from cavmarl.worlds import World
 
-__all__ = ["PooledWorlds"]
+__all__ = ["PooledWorlds", "check_zones", "own_error"]
 
 PROGRAM = "cavmarl.stepping.worker"
+
+log = logging.getLogger("cavmarl.workers")
 
 
 class PooledWorlds:
@@ -50,6 +57,8 @@ class PooledWorlds:
         arrays: in shared memory; each worker writes those of its worlds.
         pool: the processes.
         in_next_step: when worlds begin anew.
+        placement: who hosts what.
+        mover: has that changed; None: it does not change.
 
     Raises:
         ConfigError: a setting that worlds of several processes cannot have, or more of those than
@@ -69,8 +78,9 @@ class PooledWorlds:
         self.world = world
         self.in_next_step = in_next_step
         config = world.config
-        _check(config.zones)
-        parts = share_out(world, num_worlds, workers)
+        check_zones(config.zones)
+        self.placement = Placement(world, num_worlds, workers)
+        parts = parts_of(self.placement.plans, world.partition.count)
         cores = len(usable_cores())
         if workers > cores:
             warnings.warn(
@@ -90,6 +100,7 @@ class PooledWorlds:
             segment.close()
             raise
         diaries = [make_segments(config) if len(part.zones) > 1 else [] for part in parts]
+        self.mover = self._make_mover(num_worlds, workers)
         recipe = {
             "config": asdict(config),
             "base_dir": str(base_dir.resolve()),
@@ -100,21 +111,33 @@ class PooledWorlds:
             "in_next_step": in_next_step,
             "parts": parts,
             "diaries": [[one.fd for one in diary] for diary in diaries],
+            "mover": None if self.mover is None else self.mover.recipe,
         }
-        named = tuple(name for part in parts for name in part.names)
         tasks = tuple(task.name.lower().replace("_", " ") for task in Task)
         leaders = [0, *accumulate(len(part.zones) for part in parts)]
         teams = tuple(tuple(range(*bounds)) for bounds in pairwise(leaders))
-        segments = (segment, *(one for diary in diaries for one in diary))
-        what = Program(program, recipe, named, segments, tasks, config.workers.pin, teams)
+        moving = () if self.mover is None else self.mover.segments
+        segments = (segment, *(one for diary in diaries for one in diary), *moving)
+        pins = config.workers.pin
+        what = Program(program, recipe, _names(parts), segments, tasks, pins, teams)
         try:
             self.pool = Pool(what, config.workers.timeout_s, config.workers.repeats)
         except WorkerFailureError as failure:
-            raise _own(failure) from failure
+            raise own_error(failure) from failure
         self._steps = 0
-        self._asked = [
-            k for k, part in zip(leaders, parts, strict=False) for _ in range(part.first, part.last)
-        ]
+        self._asked = _leaders(parts)
+        self.placement.watch(self._pids())
+
+    def _make_mover(self, num_worlds: int, workers: int) -> Mover | None:
+        every = self.world.config.workers.balance_steps
+        if not every or workers == 1:
+            return None
+        return Mover(self.placement, num_worlds, self.world.partition.count, workers, every)
+
+    @property
+    def plans(self) -> tuple[Plan, ...]:
+        """Who hosts what now."""
+        return self.placement.plans
 
     @property
     def simulation(self) -> Simulation:
@@ -135,9 +158,11 @@ class PooledWorlds:
         self._run(Task.RESET, {"seed": seed, "first_world": first_world})
         if self.arrays.chosen.all():
             self._steps = 0
+            log.info("%s", "\n\n".join(map(describe_plan, self.plans)))
 
     def step(self, commands: Commands) -> None:
         """Let the agents act, and reset the worlds whose episode is over, now or a step later."""
+        self._move()
         self.arrays.controls[:] = commands.controls
         self.arrays.meta_actions[:] = commands.meta_actions
         self._run(Task.STEP)
@@ -164,11 +189,23 @@ class PooledWorlds:
         """End the processes."""
         self.pool.close()
 
+    def _move(self) -> None:
+        """Let worlds or zones change their worker, if it is time."""
+        if self.mover is None:
+            return
+        parts = self.mover.before_step(self._run, self._pids)
+        if parts is not None:
+            self._asked = _leaders(parts)
+            self.pool.rename(_names(parts))
+
+    def _pids(self) -> dict[int, int]:
+        return dict(enumerate(self.pool.pids))
+
     def _run(self, task: Task, letter: Any = None, commits: bool = True) -> None:
         try:
             self.pool.run(task, letter, commits)
         except WorkerFailureError as failure:
-            raise _own(failure) from failure
+            raise own_error(failure) from failure
         except WorkerDeathError as death:
             death.add_note(f"in step {self._steps + 1} since the reset")
             raise
@@ -179,7 +216,7 @@ class PooledWorlds:
         return self.pool.ask(self._asked[number], task, number)
 
 
-def _check(zones: ZonesConfig) -> None:
+def check_zones(zones: ZonesConfig) -> None:
     """Refuse what only worlds of one process can have.
 
     Raises:
@@ -193,10 +230,21 @@ def _check(zones: ZonesConfig) -> None:
             )
 
 
-def _own(failure: WorkerFailureError) -> CavmarlError:
+def own_error(failure: WorkerFailureError) -> CavmarlError:
     """An error that the worlds raise on purpose, as they would raise it in this process."""
     kind = getattr(cavmarl.errors, failure.kind, None)
     if not isinstance(kind, type) or not issubclass(kind, CavmarlError):
         return failure
     takes_text = "__init__" not in vars(kind)
     return kind(failure.text) if takes_text else failure
+
+
+def _names(parts: list[Part]) -> tuple[str, ...]:
+    """What each worker runs, in words."""
+    return tuple(name for part in parts for name in part.names)
+
+
+def _leaders(parts: list[Part]) -> list[int]:
+    """Who answers for each world."""
+    firsts = [0, *accumulate(len(part.zones) for part in parts)]
+    return [k for k, part in zip(firsts, parts, strict=False) for _ in range(part.first, part.last)]

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from typing import Any
 
+import numpy as np
 from numpy.typing import NDArray
 
 from cavmarl.runtime.team import Follower, Leader, Team
@@ -15,6 +16,8 @@ from cavmarl.stepping.local import LocalWorlds
 
 __all__ = ["FollowerJob", "LeaderJob"]
 
+# Phases that end a task for the followers; what comes after them the leader does alone.
+LAST = {Task.STEP: "credit", Task.SUGGEST: "suggest"}
 ALONE = (Task.STATE_HASH, Task.TRAFFIC_STATS)  # tasks of the leader, of which no follower hears
 
 
@@ -24,36 +27,47 @@ class LeaderJob(WorldsJob):
     Args:
         worlds: the one; what its shards write is shared.
         first: its number among all.
-        zones: that each worker hosts; the leader's first.
+        zones: that each worker hosts, to begin with; the leader's first.
         diary: in which it leaves the state behind.
+        spent_s: (k,) where the processor time of each zone is added up; None: nobody asks for it.
     """
 
     def __init__(
-        self, worlds: LocalWorlds, first: int, zones: Sequence[Sequence[int]], diary: Diary
+        self,
+        worlds: LocalWorlds,
+        first: int,
+        zones: Sequence[Sequence[int]],
+        diary: Diary,
+        spent_s: NDArray[np.float64] | None = None,
     ) -> None:
         super().__init__(worlds, first)
         self._zones = zones
+        self._hosts = _hosts(zones)
+        self._spent_s = spent_s
         self._diary = diary
+        self._is_behind = False  # it is where the diary begins, and not where that ends
         worlds.simulation.host(self._gather)
 
     def _gather(self, shards: Sequence[Shard]) -> Leader:
         """Let a team run the phases."""
-        commands, chosen = (self._commands,), (self._worlds.simulation.everywhere,)
-        known = {
+        commands = [(self._commands,), *((entry,) for entry in self._diary.entries)]
+        chosen = [(self._worlds.simulation.everywhere,)]
+        known: dict[str, Sequence[tuple[Any, ...]]] = {
             "begin_step": commands,
             "move": commands,
             "sense": chosen,
             "credit": chosen,
-            "suggest": (self._worlds.arrays.suggested,),
+            "suggest": [(self._worlds.arrays.suggested,)],
         }
-        self._team = Team(shards, self._zones, known)
+        self._team = Team(shards, self._zones, known, self._spent_s)
         self._leader = Leader(self._team)
         return self._leader
 
     def followers(self) -> Iterator[FollowerJob]:
         """The jobs of the other workers."""
         for number in range(1, len(self._zones)):
-            yield FollowerJob(Follower(self._team, number))
+            follower = Follower(self._team, number)
+            yield FollowerJob(follower, self._first, number, self._hosts.copy())
 
     def prepare(self) -> None:
         """Whoever has led is dead, and so are those who followed."""
@@ -62,50 +76,96 @@ class LeaderJob(WorldsJob):
     def perform(self, task: int, letter: Any) -> Any:
         """Do a task; the answer of those that have one."""
         if task in ALONE:
+            self._catch_up()
             return super().perform(task, letter)
+        if task == Task.HOST:
+            self._host(_hosts(letter[self._first]))
+            return None
         diary = self._diary
-        begins_anew = task == Task.RESET or (task == Task.STEP and diary.is_full)
-        if task == Task.STEP and not begins_anew:
-            diary.note(self._commands)
         with self._leader.order():
+            self._catch_up()
+            begins_anew = task == Task.RESET or (task == Task.STEP and diary.is_full)
+            if task == Task.STEP and not begins_anew:
+                diary.note(self._commands)
+            self._leader.end_after(LAST.get(Task(task), ""))
             super().perform(task, letter)
         if begins_anew:
             diary.begin(self._worlds.save())
         return None
 
+    def _catch_up(self) -> None:
+        """Go through the steps of the diary, if they are not behind it."""
+        if self._is_behind:
+            self._is_behind = False
+            for commands in self._diary.steps():
+                self._worlds.step(commands)
+
+    def _host(self, hosts: NDArray[np.int64]) -> None:
+        """Let zones be run by these workers from now on."""
+        self._hosts[:] = hosts
+        self._leader.take(np.flatnonzero(hosts == 0).tolist())
+
     def save(self) -> list[NDArray[Any]]:
-        """Where to begin in the diary."""
-        return [self._diary.place]
+        """Where to begin in the diary, and who hosts which zone."""
+        return [self._diary.place, self._hosts]
 
     def load(self, saved: Sequence[NDArray[Any]]) -> None:
-        """Go on from what `save` gave."""
+        """Go on from what `save` gave; the steps since the last image wait for a task."""
         diary, worlds = self._diary, self._worlds
         diary.place[:] = saved[0]
+        self._host(saved[1])
         worlds.load(diary.state(worlds.save()))
-        for commands in diary.steps():
-            worlds.step(commands)
+        self._is_behind = True
 
 
 class FollowerJob:
-    """Some zones of one world, of which another worker has the rest.
+    """Some zones of one world, of which other workers have the rest.
 
     Args:
         follower: that runs their phases.
+        world: the world's number among all.
+        number: in the team, from 1.
+        hosts: (k,) number in the team of each zone's worker.
     """
 
-    def __init__(self, follower: Follower) -> None:
+    def __init__(
+        self, follower: Follower, world: int, number: int, hosts: NDArray[np.int64]
+    ) -> None:
         self._follower = follower
+        self._world = world
+        self._number = number
+        self._hosts = hosts
 
     def prepare(self) -> None:
         """Nothing to do."""
 
     def perform(self, task: int, letter: Any) -> None:
         """Help the leader with a task."""
-        self._follower.follow()
+        if task == Task.HOST:
+            self._host(_hosts(letter[self._world]))
+        else:
+            self._follower.follow()
+
+    def _host(self, hosts: NDArray[np.int64]) -> None:
+        self._hosts[:] = hosts
+        self._follower.take(np.flatnonzero(hosts == self._number).tolist())
 
     def save(self) -> list[NDArray[Any]]:
-        """Nothing: the leader keeps the state."""
-        return []
+        """Who hosts which zone; the leader keeps the rest of the state."""
+        return [self._hosts]
 
     def load(self, saved: Sequence[NDArray[Any]]) -> None:
-        """Nothing to do."""
+        """Go on from what `save` gave."""
+        self._host(saved[0])
+
+
+def _hosts(zones: Sequence[Sequence[int]]) -> NDArray[np.int64]:
+    """(k,) number in the team of each zone's worker.
+
+    Args:
+        zones: of each worker.
+    """
+    hosts = np.zeros(sum(map(len, zones)), dtype=np.int64)
+    for number, hosted in enumerate(zones):
+        hosts[list(hosted)] = number
+    return hosts

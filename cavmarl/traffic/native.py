@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from copy import copy
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -40,6 +41,16 @@ DENSITY_M = 25.0  # a lane is drawn at reset once for each such length
 MAX_TRIPS = 200_000  # of a table; longer ones are thinned evenly
 
 
+class _Calls:
+    """Kernels that ticks call."""
+
+    def __init__(self) -> None:
+        self.call_orders = repeated(call_orders)
+        self.settle = repeated(settle)
+        self.assign_lanes = repeated(assign_lanes)
+        self.accept = repeated(accept)
+
+
 @dataclass(frozen=True)
 class NativeTraffic:
     """Departures on one map for one population; a TrafficSource.
@@ -70,6 +81,15 @@ class NativeTraffic:
         # Trips that do not exist are refused when the world is made, not at its first reset.
         _ = self.demand
         self._check_room()
+
+    def for_worlds(self, num_worlds: int) -> NativeTraffic:
+        """The same for another number of worlds, with the tables that all worlds share."""
+        other = copy(self)
+        object.__setattr__(other, "num_worlds", num_worlds)
+        for name in ("travel", "_slots", "rerouting"):  # each world has its part of them
+            vars(other).pop(name, None)
+        other._check_room()
+        return other
 
     @cached_property
     def goal_edges(self) -> NDArray[np.int32]:
@@ -227,23 +247,23 @@ class NativeTraffic:
 
     def settle(self, gate: Gate, worlds: Worlds) -> None:
         """Count who has left, and order those that follow."""
-        settle(self.demand, self.network.arrays, gate, worlds, self.dt)
+        self._calls.settle(self.demand, self.network.arrays, gate, worlds, self.dt)
 
     def assign_lanes(self, gate: Gate, worlds: Worlds) -> None:
         """Say who of the queue tries to enter on which lane."""
-        assign_lanes(self.network.arrays, self.travel, gate, worlds)
+        self._calls.assign_lanes(self.network.arrays, self.travel, gate, worlds)
 
     def call_orders(self, gate: Gate, worlds: Worlds) -> None:
         """Put the orders that are due by the coming tick into the queue."""
-        self._call_orders(gate, worlds)
-
-    @cached_property
-    def _call_orders(self) -> Callable[[Gate, Worlds], None]:
-        return repeated(call_orders)
+        self._calls.call_orders(gate, worlds)
 
     def accept(self, gate: Gate, running: NDArray[np.int64]) -> None:
         """Choose among those who could enter; `running` (W,) are in the worlds already."""
-        accept(gate, running, self.capacity)
+        self._calls.accept(gate, running, self.capacity)
+
+    @cached_property
+    def _calls(self) -> _Calls:
+        return _Calls()
 
     def _check_room(self) -> None:
         """Refuse a population that cannot stand on the map, bumper to bumper.

@@ -121,6 +121,10 @@ class Rerouting:
         """VEHICLE["way"] (n,) of a world as it would be in the first one."""
         return self._slots.ways_of_first_world(ways, world)
 
+    def ways_of_world(self, ways: NDArray[np.int64], world: int) -> NDArray[np.int64]:
+        """VEHICLE["way"] (n,) in a world, of ways as they are in the first one."""
+        return self._slots.ways_of_first_world(ways, -world)
+
     def state(self, world: int, rows: NDArray[np.void]) -> Iterator[NDArray[np.generic]]:
         """What of a world's state is kept here, as arrays without padding.
 
@@ -144,6 +148,13 @@ class Rerouting:
         """What a tick changes here, of all worlds; to be copied and put back."""
         yield from (self._past, self._speed_sums, self._looks)
         yield self._travel.steps[self._slots.first :]
+
+    def arrays_of(self, world: int) -> Iterator[NDArray[np.generic]]:
+        """`arrays` as they would be if there were no world but one."""
+        for array in (self._past, self._speed_sums, self._looks):
+            yield array[world : world + 1]
+        first = self._slots.first_of(world)
+        yield self._travel.steps[first : first + self._slots.of_world]
 
     def _sample(self, worlds: Worlds, w: int, tick: int) -> None:
         interval_ms = self._schedule.demand.device.adaptation_interval_ms

@@ -7,13 +7,14 @@ import os
 import stat
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import pytest
 
 from cavmarl.balance.load_score import Candidate, Utilisation
 from cavmarl.balance.plan_file import snapshot_from_dict
-from cavmarl.balance.probe import take_snapshot
+from cavmarl.balance.probe import Watch, take_snapshot
 from cavmarl.balance.snapshot import Snapshot, idle_snapshot
 from cavmarl.errors import PlacementError
 
@@ -59,15 +60,17 @@ def test_a_worker_that_has_died_is_not_available() -> None:
     assert [worker.available for worker in found.workers] == [False, True]
 
 
-def test_a_worker_is_not_charged_for_its_own_work() -> None:
+def test_workers_are_not_charged_for_their_own_work() -> None:
     endless = "while True: pass"
     with subprocess.Popen([sys.executable, "-c", endless]) as process:
         try:
-            found = take_snapshot({0: process.pid, 1: None}, interval_s=1.0)
+            watches = [Watch({0: process.pid, 1: None}), Watch({0: None, 1: None})]
+            time.sleep(1.0)
+            found = [watch.snapshot() for watch in watches]
         finally:
             process.kill()
-    own, other = (worker.use.cpu for worker in found.workers)
-    assert own < other
+    own, other = ([worker.use.cpu for worker in one.workers] for one in found)
+    assert all(mine < theirs for mine, theirs in zip(own, other, strict=True))
 
 
 def test_a_snapshot_goes_to_json_and_back() -> None:

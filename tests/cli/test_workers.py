@@ -51,6 +51,8 @@ def test_the_workers_of_one_world_are_killed(capsys: pytest.CaptureFixture[str])
     ("words", "told"),
     [
         (("verify", "--kill", "3"), ("--kill", "name an environment")),
+        (("verify", "ring", "--hosts", "ray"), ("--hosts ray", "--kill")),
+        (("verify", "ring", "--kill", "1", "--hosts", "slurm"), ("hosts = 'slurm'", "'ray'")),
         (("verify", "ring", "--kill", "0"), ("0 kills", "at least 1")),
         (("verify", "ring", "--kill", "5", "--steps", "7"), ("7 steps", "at least 15")),
         (("verify", "ring", "--kill", "1", "--zones", "1,2"), ("--zones 1,2", "one number")),

@@ -73,6 +73,7 @@ def test_zones_change_nothing_else(folder: Path) -> None:
     whole = evaluate("grid4x4", "idm", seed=2, repeats=2, **SMALL)
     assert whole["idm"].transfers is None
     assert whole["idm"]["zone_imbalance"].mean is None
+    assert [run.zone_time_imbalance for run in whole["idm"].speed] == [None, None]
     divided = load_report(folder)["idm"].metrics
     alike = [name for name in divided if name != "zone_imbalance"]
     assert [divided[name] for name in alike] == [whole["idm"][name] for name in alike]
@@ -94,8 +95,12 @@ def test_each_episode_tells_how_unevenly_vehicles_are_shared_out(
     bounds = (cuts[0], low_y - 9.0, cuts[-1], high_y + 9.0)
     write_zones(tmp_path / "zones.json", ZonePartition(bounds, np.array(rects)))
     one = {"zones.count": 4, "zones.layout": str(tmp_path / "zones.json")}
-    crowded = evaluate("grid4x4", "idm", overrides=one, **{**SMALL, "episodes": 1})
+    crowd = {**SMALL, "episodes": 1, "background": 150}
+    crowded = evaluate("grid4x4", "idm", overrides=one, **crowd)
     assert crowded["idm"]["zone_imbalance"].mean == 4.0
+    (speed,) = crowded["idm"].speed
+    assert speed.zone_time_imbalance is not None
+    assert 1.3 < speed.zone_time_imbalance <= 4.0
 
 
 def test_an_undivided_world_leaves_no_file(tmp_path: Path) -> None:

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from cavmarl.kernels.arrays import Zoned
-from cavmarl.kernels.borders import NEAR, find_near, pass_on
+from cavmarl.kernels.borders import NEAR, Borders, find_near, pass_on
 from cavmarl.roads.zones import ZonePartition
 from cavmarl.shard.shard import make_zoned
 from tests.kernels.builders import vehicles
@@ -20,6 +20,7 @@ from tests.naive import zones as naive
 from tests.partitions import four, partitions, places
 
 MAX_SPEED_MPS = 60.0
+BORDERS = Borders(2.0, 1.0, MAX_SPEED_MPS)
 
 
 @given(
@@ -48,13 +49,12 @@ def test_who_has_crossed_or_soon_will_is_told_of(
         )
         parts.append(rows)
     reach_m = MAX_SPEED_MPS * ahead_s  # as far as anybody can drive by then
-    zoned = exchanged(partition, reach_m, parts, border_m=reach_m)
+    borders = Borders(hysteresis_m, ahead_s, MAX_SPEED_MPS)
+    zoned = exchanged(partition, reach_m, parts, borders=borders)
     if everybody:
         zoned.num_border[:] = 0
     out = np.zeros(2 * zoned.rows.shape[-1] * partition.count, dtype=NEAR)
-    found = find_near(
-        partition.arrays, hysteresis_m, ahead_s, MAX_SPEED_MPS, zoned, SIDE, 0, everybody, out
-    )
+    found = find_near(partition.arrays, borders, zoned, SIDE, 0, everybody, out)
     for zone, rows in enumerate(parts):
         told = [
             (int(e["row"]), int(e["target"]), bool(e["crossed"]))
@@ -69,7 +69,7 @@ def test_who_has_crossed_or_soon_will_is_told_of(
         row = parts[entry["source"]][entry["row"]]
         assert entry["vehicle"] == row["id"]
         depth_m = naive.distance(partition.reaching[entry["source"]], row["x"], row["y"])
-        if depth_m == 0.0:
+        if depth_m * depth_m == 0.0:  # so small a distance has no square
             target = partition.reaching[entry["target"]]
             depth_m = -naive.distance(target, row["x"], row["y"])
         assert entry["depth_m"] == pytest.approx(depth_m)
@@ -101,9 +101,9 @@ def test_who_drives_over_a_corner_is_told_to_both_zones() -> None:
     partition = four()
     row = vehicles([(13.0, 12.0, math.pi / 2)], speed=10.0)  # of zone 0, 3 m to the east of it
     none = row[:0]
-    zoned = exchanged(partition, 60.0, [row, none, none, none], border_m=60.0)
+    zoned = exchanged(partition, 60.0, [row, none, none, none], borders=BORDERS)
     out = np.zeros(2, dtype=NEAR)
-    found = find_near(partition.arrays, 2.0, 1.0, MAX_SPEED_MPS, zoned, SIDE, 0, False, out)
+    found = find_near(partition.arrays, BORDERS, zoned, SIDE, 0, False, out)
     assert found == 2
     assert out["target"].tolist() == [1, 3]
     assert out["crossed"].tolist() == [True, False]
@@ -113,10 +113,10 @@ def test_rows_that_are_not_there_any_more_are_not_looked_at() -> None:
     partition = four()
     rows = vehicles([(13.0, 12.0, 0.0), (13.0, 12.0, 0.0)])
     none = rows[:0]
-    zoned = exchanged(partition, 60.0, [rows, none, none, none], border_m=60.0)
+    zoned = exchanged(partition, 60.0, [rows, none, none, none], borders=BORDERS)
     zoned.num_owned[0, 0] = 1
     out = np.zeros(4, dtype=NEAR)
-    found = find_near(partition.arrays, 2.0, 1.0, MAX_SPEED_MPS, zoned, SIDE, 0, False, out)
+    found = find_near(partition.arrays, BORDERS, zoned, SIDE, 0, False, out)
     assert out["row"][:found].tolist() == [0]
 
 

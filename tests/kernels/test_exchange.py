@@ -9,7 +9,9 @@ from numpy.typing import NDArray
 
 from cavmarl.kernels import codes
 from cavmarl.kernels.arrays import Gate, Worlds
+from cavmarl.kernels.borders import Borders
 from cavmarl.kernels.exchange import exchange, take_own
+from cavmarl.kernels.handing_over import make_book
 from cavmarl.kernels.leaving import drop_ghosts, leave
 from cavmarl.roads.zone_halo import zone_halo
 from cavmarl.roads.zones import ZonePartition
@@ -18,7 +20,7 @@ from cavmarl.shard.vehicles import VEHICLE
 from cavmarl.traffic.departures import make_gate
 from tests.kernels.builders import vehicles
 from tests.kernels.traffic import network
-from tests.kernels.zoned import SIDE, exchanged, ghosts_of, zoned_of
+from tests.kernels.zoned import NO_BORDERS, SIDE, exchanged, ghosts_of, zoned_of
 from tests.naive import zones as naive
 from tests.partitions import four, partitions, places
 
@@ -83,7 +85,7 @@ def test_exchange_equals_twin(
     border_m: float,
 ) -> None:
     parts = spread(data, partition)
-    zoned = exchanged(partition, halo_m, parts, touching_m, border_m)
+    zoned = exchanged(partition, halo_m, parts, touching_m, Borders(2.0, 1.0, border_m))
     rects = partition.reaching
     for zone, own in enumerate(parts):
         others = [row for other, part in enumerate(parts) for row in part if other != zone]
@@ -116,7 +118,7 @@ def test_other_worlds_keep_their_ghosts() -> None:
     halo = zone_halo(four(), 5.0)
     zoned = make_zoned(4, 3, 2)
     zoned.num_rows[:] = 2
-    exchange(four().arrays, halo, 1.0, 0.0, zoned, SIDE, 1, 2)
+    exchange(four().arrays, halo, 1.0, NO_BORDERS, zoned, SIDE, 1, 2, make_book(3, 2))
     assert zoned.num_rows.tolist() == [[2, 0, 2]] * 4
 
 
@@ -125,7 +127,8 @@ def test_rows_that_are_noted_are_enough(
     data: st.DataObject, partition: ZonePartition, halo_m: float
 ) -> None:
     parts = spread(data, partition)
-    expected = exchanged(partition, halo_m, parts, 5.0, 3.0)
+    borders = Borders(2.0, 1.0, 3.0)
+    expected = exchanged(partition, halo_m, parts, 5.0, borders)
     zoned, halo = zoned_of(parts), zone_halo(partition, halo_m)
     for zone, rows in enumerate(parts):
         left, low, right, high = halo.inner[zone]
@@ -133,7 +136,8 @@ def test_rows_that_are_noted_are_enough(
         outer = np.flatnonzero(~((left < x) & (x < right) & (low < y) & (y < high)))
         zoned.outer[zone, 0, : len(outer)] = outer
         zoned.num_outer[zone, 0] = len(outer)
-    exchange(partition.arrays, halo, 5.0, 3.0, zoned, SIDE, 0, 1)
+    book = make_book(1, zoned.rows.shape[-1] * partition.count)
+    exchange(partition.arrays, halo, 5.0, borders, zoned, SIDE, 0, 1, book)
     for name in ("rows", "num_rows", "num_near", "border", "num_border"):
         assert getattr(zoned, name).tobytes() == getattr(expected, name).tobytes()
     assert partition.count == 1 or (zoned.num_outer == -1).all(), "rows may change from here on"
@@ -142,7 +146,8 @@ def test_rows_that_are_noted_are_enough(
 def test_others_than_those_that_are_noted_are_not_looked_at() -> None:
     zoned = zoned_of([cars(3)] * 4)
     zoned.num_outer[:] = 0
-    exchange(four().arrays, zone_halo(four(), 50.0), 1.0, 1.0, zoned, SIDE, 0, 1)
+    halo, book = zone_halo(four(), 50.0), make_book(1, 12)
+    exchange(four().arrays, halo, 1.0, NO_BORDERS, zoned, SIDE, 0, 1, book)
     assert zoned.num_rows.tolist() == [[3]] * 4
 
 

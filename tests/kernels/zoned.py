@@ -8,12 +8,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cavmarl.kernels.arrays import Zoned
+from cavmarl.kernels.borders import Borders
 from cavmarl.kernels.exchange import exchange
+from cavmarl.kernels.handing_over import Book, make_book
 from cavmarl.roads.zone_halo import zone_halo
 from cavmarl.roads.zones import ZonePartition
 from cavmarl.shard.shard import make_zoned
 
 SIDE = 1
+NO_BORDERS = Borders(0.0, 0.0, 0.0)
 
 
 def zoned_of(parts: Sequence[NDArray[np.void]], room: int = 0) -> Zoned:
@@ -38,12 +41,15 @@ def exchanged(
     halo_m: float,
     parts: Sequence[NDArray[np.void]],
     touching_m: float = 0.0,
-    border_m: float = 0.0,
+    borders: Borders = NO_BORDERS,
+    book: Book | None = None,
 ) -> Zoned:
     """The same after the zones have exchanged their ghosts."""
     zoned = zoned_of(parts)
+    if book is None:
+        book = make_book(1, zoned.rows.shape[-1] * partition.count)
     halo = zone_halo(partition, halo_m)
-    exchange(partition.arrays, halo, touching_m, border_m, zoned, SIDE, 0, 1)
+    exchange(partition.arrays, halo, touching_m, borders, zoned, SIDE, 0, 1, book)
     return zoned
 
 

@@ -16,7 +16,7 @@ from cavmarl.ownership.records import replay as replay_records
 from cavmarl.ownership.trace import LOG, Trace
 from cavmarl.ownership.transport import Rates
 from cavmarl.runtime.coordinator import Coordinator
-from cavmarl.runtime.direct import DirectCoordinator
+from cavmarl.runtime.direct import LATE, DirectCoordinator
 from cavmarl.runtime.fault_plan import Crash, Faults
 from cavmarl.runtime.journal import JournalReader
 from cavmarl.runtime.journal_summary import owners_at
@@ -104,10 +104,31 @@ def test_without_messages_the_same_is_put_on_record_as_with_them(env: str, tmp_p
 
 def test_whoever_turns_away_from_a_border_is_forgotten() -> None:
     run = record("grid4x4", {**BUSY, "zones.approach_ticks": 30}, 2 * STEPS)
-    simulation = replay(run, ZONES).simulation
-    (log,), (coordinator,) = simulation.transfers, simulation.coordinators
-    assert log.counts["aborted"] > 0
-    assert len(log._approaches) == len(coordinator.in_flight())
+    direct, sent = replay(run, ZONES).simulation, replay(run, ZONES, Faults()).simulation
+    assert direct.transfers[0].counts["aborted"] > 0
+    on_their_way = [entry[:3] for entry in direct.coordinators[0].in_flight()]
+    assert on_their_way == [entry[:3] for entry in sent.coordinators[0].in_flight()]
+    assert len(on_their_way) > 5
+
+
+def test_the_table_is_brought_up_to_date_when_somebody_asks_or_it_is_late() -> None:
+    vec = make_vec("grid4x4", zones=ZONES, overrides=BUSY)
+    vec.reset(seed=1)
+    for _ in range(3 * STEPS):
+        vec.step(vec.suggest_actions())
+    simulation = vec.simulation
+    (coordinator,), (log,) = simulation.coordinators, simulation.transfers
+    assert isinstance(coordinator, DirectCoordinator)
+    assert 0 < len(coordinator._book) < LATE
+    assert coordinator._directory.table.tick < coordinator.tick == 6 * STEPS
+    assert len(log.rows) == simulation.migrations > LATE
+    assert coordinator._directory.table.tick == coordinator.tick
+    assert len(coordinator._book) == 0
+    owners = {v: zone for v, (zone, _) in coordinator.directory.table.owners.items()}
+    born = dict(entry[:2] for entry in coordinator.notes()[0])
+    gone = {entry.vehicle for entry in coordinator.notes()[1]}
+    on_record = {v: zone for v, zone in (owners | born).items() if v not in gone}
+    assert on_record == dict(simulation._division.owners(0))
 
 
 def test_a_vehicle_that_is_lost_is_missed(busy: Recorded) -> None:

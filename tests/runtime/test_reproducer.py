@@ -15,7 +15,14 @@ import pytest
 from numpy.typing import NDArray
 
 from cavmarl import CavVectorEnv, make_vec
-from cavmarl.errors import ConfigError, MapError, ReproducerError, ZoneStepError
+from cavmarl.errors import (
+    ConfigError,
+    CoordinatorStepError,
+    LostTickError,
+    MapError,
+    ReproducerError,
+    ZoneStepError,
+)
 from cavmarl.evaluate.replay import changed_versions, replay_tick, world_of
 from cavmarl.ownership.transport import Rates
 from cavmarl.runtime.fault_plan import Crash, Faults
@@ -42,7 +49,7 @@ def worlds(run: Recorded, faults: Faults | None, folder: Path) -> CavVectorEnv:
 
 def poisoned(run: Recorded, faults: Faults | None, folder: Path) -> Reproducer:
     """What is left of a run that ends in a tick which no host survives."""
-    with pytest.raises(ZoneStepError, match="to run that tick again: cavmarl verify --rep") as died:
+    with pytest.raises(LostTickError, match="to run that tick again: cavmarl verify --rep") as died:
         follow(run, worlds(run, faults, folder))
     path = died.value.reproducer
     assert isinstance(path, Path)
@@ -67,6 +74,19 @@ def test_the_tick_fails_as_it_did_and_without_its_faults_is_the_undivided_one(
     found = replay_tick(kept, world, faults=False)
     if kept.is_last:
         assert found == busy.hashes[kept.tick // 2][0]
+
+
+@pytest.mark.parametrize("point", ["BEGIN torn", "STEP sent", "all done", "COMMIT torn"])
+def test_a_tick_that_kills_every_coordinator_is_kept_as_well(
+    busy: Recorded, point: str, tmp_path: Path
+) -> None:
+    deaths = (Crash(10, point, None, times=10**6),)
+    kept = poisoned(busy, Faults(crashes=deaths), tmp_path)
+    assert (kept.zone, kept.tick) == (None, 10)
+    world = world_of(kept)
+    with pytest.raises(CoordinatorStepError, match=f"could not reach tick 10: 4 .* at '{point}'"):
+        replay_tick(kept, world)
+    assert replay_tick(kept, world, faults=False) == busy.hashes[5][0]
 
 
 class Poison:

@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 
 from cavmarl.kernels.arrays import Worlds
 from cavmarl.kernels.codes import DRIVER_AGENT
-from cavmarl.kernels.signals import merge_detections
 from cavmarl.roads.zone_halo import zone_halo
 from cavmarl.roads.zone_layouts import cut_map
 from cavmarl.runtime.commons import Commons
@@ -44,10 +43,9 @@ class Halves:
 
     Args:
         whole: the undivided worlds.
-        together: whether both shards are called together, and note detections in one array.
     """
 
-    def __init__(self, whole: Simulation, together: bool = True) -> None:
+    def __init__(self, whole: Simulation) -> None:
         self.commons = Commons(whole.config, whole.network, whole.num_worlds)
         traffic = whole._traffic
         shards = []
@@ -68,12 +66,8 @@ class Halves:
                 shards[0] if shards else None,
             )
             shards.append(shard)
-        if not together:
-            apart = shards[1].worlds.detected_s.copy()
-            shards[1].worlds = shards[1].worlds._replace(detected_s=apart)
         self.shards = shards
-        groups = [shards] if together else [[shard] for shard in shards]
-        self._executors = [SerialExecutor(group) for group in groups]
+        self._executor = SerialExecutor(shards)
         min_x, _, max_x, _ = whole.network.extent_m
         self._border = 0.5 * (min_x + max_x)
 
@@ -97,8 +91,7 @@ class Halves:
 
     def each(self, phase: Phase, *arguments: Any) -> None:
         """A phase of both shards."""
-        for executor in self._executors:
-            executor.each(phase, *arguments)
+        self._executor.each(phase, *arguments)
 
     def sense(self, chosen: NDArray[np.bool_]) -> None:
         """What a simulation does at the end of a step."""
@@ -158,12 +151,10 @@ def test_agents_get_the_same(env: str, mode: str, agents: int, background: int) 
     assert both > STEPS // 2, "hardly ever vehicles in both shards"
 
 
-@pytest.mark.parametrize("together", [True, False])
-def test_signals_are_the_same(together: bool, tmp_path: Path) -> None:
+def test_signals_are_the_same(tmp_path: Path) -> None:
     clock = {"clock.sim_dt_s": 0.1, "clock.ctrl_dt_s": 0.1}
     whole = make_traffic(actuated_grid(tmp_path), background=30, num_worlds=2, overrides=clock)
-    halves = Halves(whole, together)
-    noted = [shard.worlds.detected_s for shard in halves.shards]
+    halves = Halves(whole)
     start(whole, seed=5)
     seen = set()
     for tick in range(TICKS):
@@ -173,17 +164,13 @@ def test_signals_are_the_same(together: bool, tmp_path: Path) -> None:
             whole.step(idle(whole))
         halves.take(whole.worlds, {})
         halves.each("detect")
-        if not together:
-            merge_detections(*noted)
         halves.commons.switch_signals(halves.shards[0].worlds)
         for name in ("signal_phase", "controllers", "detected_s"):
             expected = getattr(whole.worlds, name)
             assert getattr(halves.shards[0].worlds, name).tobytes() == expected.tobytes()
-            if together:
-                assert getattr(halves.shards[1].worlds, name).tobytes() == expected.tobytes()
         seen.add(whole.worlds.signal_phase.tobytes())
     assert len(seen) > 3
-    assert all(times.any() for times in noted)
+    assert halves.shards[0].worlds.detected_s.any()
 
 
 def test_shards_of_one_world_share_its_clock_and_signals() -> None:

@@ -5,15 +5,21 @@ from __future__ import annotations
 import os
 import random
 import signal
+from pathlib import Path
 from threading import Timer
 from typing import Any
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from cavmarl import ConfigError, make_vec
+from cavmarl.errors import WorkerFailureError
+from cavmarl.stepping import pooled
 from cavmarl.stepping.parts import share_out
 from cavmarl.worlds import load_world
+from tests.actuated import actuated_grid
+from tests.rerouting import CARS, DEVICE, FLOW, make_map, write_demand
 from tests.runtime.test_pool import alive
 from tests.stepping.vec_runs import STEPS, Make, drive, pool_of, same
 
@@ -112,6 +118,71 @@ def test_the_process_that_forks_may_die(make: Make) -> None:
             os.kill(pool_of(vec).server_pid, signal.SIGKILL)
 
     assert same(drive(vec, before=strike), whole)
+
+
+def test_a_follower_that_fails(make: Make, monkeypatch: pytest.MonkeyPatch) -> None:
+    wanted = {"agents": 5, "background": 20}
+    whole = drive(make("grid4x4", **wanted))
+    monkeypatch.setattr(pooled, "PROGRAM", "tests.stepping.failing_worker")
+    vec = make("grid4x4", zones=4, workers=2, **wanted)
+    failures: list[WorkerFailureError] = []
+    step = vec.step
+
+    def step_again(actions: NDArray[Any]) -> Any:
+        try:
+            return step(actions)
+        except WorkerFailureError as failure:
+            failures.append(failure)
+        return step(actions)
+
+    monkeypatch.setattr(vec, "step", step_again)
+    assert same(drive(vec), whole), "all are as they were before"
+    (failure,) = failures
+    assert (failure.kind, failure.worker) == ("ZeroDivisionError", 1)
+    assert "world 0, zone" in str(failure)
+    assert failure.text == "a follower's own"
+    trace = failure.traceback
+    assert trace.startswith("Traceback (most recent call last)")
+    assert "in perform" in trace
+    assert "failing_worker.py" in trace
+    assert pool_of(vec).deaths == []
+    left = [*pool_of(vec).pids, pool_of(vec).server_pid]
+    vec.close()
+    assert alive(left) == []
+
+
+def test_actuated_signals(make: Make, tmp_path: Path) -> None:
+    wanted = {"agents": 4, "background": 30, "max_cycles": 25}
+    net = actuated_grid(tmp_path)
+    whole = drive(make(net, **wanted), steps=40)
+    assert same(drive(make(net, zones=4, workers=2, **wanted), steps=40), whole)
+
+
+def test_vehicles_that_look_for_another_way(make: Make, tmp_path: Path) -> None:
+    net = make_map(tmp_path)
+    files = write_demand(tmp_path, CARS.format(device=DEVICE) + FLOW)
+    wanted = {
+        "agents": 2,
+        "background": 0,
+        "max_cycles": 500,
+        "overrides": {
+            "population.mode": "seats",
+            "traffic.demand": [str(path) for path in files],
+            "clock.sim_dt_s": 0.2,
+            "clock.ctrl_dt_s": 1.0,
+        },
+    }
+    one = make(net, **wanted)
+    whole = drive(one, steps=300)
+    vec = make(net, zones=3, workers=2, **wanted)
+
+    def strike(step: int) -> None:
+        if step in (140, 221):
+            os.kill(pool_of(vec).pids[step % 2], signal.SIGKILL)
+
+    assert same(drive(vec, steps=300, before=strike), whole)
+    assert len(pool_of(vec).deaths) == 2
+    assert one.traffic_stats()["rerouted"] > 0, "nobody has taken another way"
 
 
 def test_more_workers_than_zones() -> None:

@@ -1,0 +1,175 @@
+"""`RemoteWorlds`: worlds shared out over the machines of a Ray cluster."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from cavmarl.errors import ConfigError, WorkerDeathError, WorkerFailureError
+from cavmarl.hosts.orders import Arrays, HostProgram
+from cavmarl.hosts.pool import HostPool
+from cavmarl.hosts.ray_actors import RayActors
+from cavmarl.runtime.compilation import compiled_before
+from cavmarl.runtime.pool import Death
+from cavmarl.runtime.simulation import Simulation
+from cavmarl.shard.shard import Commands
+from cavmarl.stepping.arrays import StepArrays, layout_of
+from cavmarl.stepping.job import Task, fingerprint
+from cavmarl.stepping.parts import make_plans, parts_of
+from cavmarl.stepping.pooled import check_zones, own_error
+from cavmarl.stepping.remote_job import code_stamp, host_worlds, inputs_of, results_of
+from cavmarl.worlds import World
+
+__all__ = ["RemoteWorlds"]
+
+
+class RemoteWorlds:
+    """W worlds over m hosts, whole worlds each.
+
+    Args:
+        world: what each is made of.
+        base_dir: the folder that its relative files start from, on every machine.
+        num_worlds: W.
+        workers: m, from 1 to W; None: as many as the cluster has free CPUs.
+        in_next_step: when worlds begin anew; see `SteppedWorlds`.
+
+    Attributes:
+        world: what each is made of.
+        arrays: of this process; what hosts send is written to them.
+        pool: the hosts.
+        in_next_step: when worlds begin anew.
+
+    Raises:
+        MissingExtraError: Ray is not installed.
+        ConfigError: a setting that worlds elsewhere cannot have, more hosts than worlds, or than
+            CPUs.
+        WorkerError: no cluster, or no host comes.
+    """
+
+    def __init__(
+        self,
+        world: World,
+        base_dir: Path,
+        num_worlds: int,
+        workers: int | None,
+        in_next_step: bool = False,
+    ) -> None:
+        self.world = world
+        self.in_next_step = in_next_step
+        config = world.config
+        check_zones(config.zones)
+        if workers is not None and workers > num_worlds:
+            raise ConfigError(
+                f"workers = {workers}, hosts = 'ray': a world lives on one host, so {num_worlds} "
+                "world(s) need at most as many; use fewer workers, more worlds, or no hosts to "
+                "divide a world over processes of this machine"
+            )
+        if config.workers.balance_steps:
+            raise ConfigError(
+                f"workers.balance_steps = {config.workers.balance_steps}, hosts = 'ray': worlds "
+                "stay on their host; leave it 0, or leave out the hosts"
+            )
+        if not compiled_before():
+            Simulation(config, world.network, 1, world.demand, world.partition)
+        layout = layout_of(config, world.capacity, num_worlds).items()
+        zeros: dict[str, Any] = {name: np.zeros(shape, kind) for name, (kind, shape) in layout}
+        self.arrays = StepArrays(**zeros)
+        recipe = {
+            "config": asdict(config),
+            "base_dir": str(base_dir.resolve()),
+            "fingerprint": fingerprint(world),
+            "in_next_step": in_next_step,
+        }
+
+        def told(count: int) -> str:
+            return json.dumps({**recipe, "size": -(-num_worlds // count)})
+
+        actors = RayActors(host_worlds, told, workers, num_worlds)
+        self.plans = tuple(make_plans(world, num_worlds, actors.workers))
+        self._parts = parts_of(self.plans, world.partition.count)
+        program = HostProgram(
+            tuple(part.names[0] for part in self._parts),
+            tuple(part.last - part.first for part in self._parts),
+            tuple(task.name.lower().replace("_", " ") for task in Task),
+            Task.STEP,
+            code_stamp(),
+        )
+        try:
+            self.pool = HostPool(actors, program, config.workers.timeout_s, config.workers.repeats)
+        except WorkerFailureError as failure:
+            raise own_error(failure) from failure
+        self._mine = [self.arrays.part(part.first, part.last) for part in self._parts]
+        self._steps = 0
+
+    @property
+    def simulation(self) -> Simulation:
+        """Refused: the worlds live elsewhere.
+
+        Raises:
+            ConfigError: always.
+        """
+        raise ConfigError("the worlds live on other machines: use workers=0 to look into them")
+
+    @property
+    def deaths(self) -> list[Death]:
+        """Of hosts, up to now."""
+        return self.pool.deaths
+
+    def reset(self, seed: int | None, first_world: int) -> None:
+        """Begin an episode in the worlds of `chosen`."""
+        firsts = [first_world + part.first for part in self._parts]
+        self._run(Task.RESET, [{"seed": seed, "first_world": first} for first in firsts])
+        if self.arrays.chosen.all():
+            self._steps = 0
+
+    def step(self, commands: Commands) -> None:
+        """Let the agents act, and reset the worlds whose episode is over, now or a step later."""
+        self.arrays.controls[:] = commands.controls
+        self.arrays.meta_actions[:] = commands.meta_actions
+        self._run(Task.STEP)
+        self._steps += 1
+
+    def suggest(self) -> None:
+        """Write what the built-in driver would do in the agents' place."""
+        self._run(Task.SUGGEST, commits=False)
+
+    def write_states(self) -> None:
+        """Write the global state of each world."""
+        self._run(Task.WRITE_STATES, commits=False)
+
+    def state_hash(self, world: int) -> str:
+        """Hex digest of one world."""
+        return str(self._ask(Task.STATE_HASH, world))
+
+    def traffic_stats(self, world: int) -> dict[str, float]:
+        """Traffic of one world since its reset."""
+        found: dict[str, float] = self._ask(Task.TRAFFIC_STATS, world)
+        return found
+
+    def close(self) -> None:
+        """End the hosts, and the cluster if it was started for them."""
+        self.pool.close()
+
+    def _run(self, task: Task, letters: Sequence[Any] | None = None, commits: bool = True) -> None:
+        def outputs(k: int, ended: Any) -> Arrays:
+            return results_of(task, self._mine[k], ended)
+
+        inputs = [inputs_of(task, arrays) for arrays in self._mine]
+        try:
+            self.pool.run(task, letters or [None] * len(self._mine), inputs, outputs, commits)
+        except WorkerFailureError as failure:
+            raise own_error(failure) from failure
+        except WorkerDeathError as death:
+            death.add_note(f"in step {self._steps + 1} since the reset")
+            raise
+
+    def _ask(self, task: Task, world: int) -> Any:
+        """Of the host of a world; numbers from the end count as they do for arrays."""
+        number = range(len(self.arrays.mask))[world]
+        k = next(k for k, part in enumerate(self._parts) if number < part.last)
+        return self.pool.ask(k, task, number - self._parts[k].first)
