@@ -50,7 +50,7 @@ class PooledWorlds:
         num_worlds: W.
         workers: m, from 1 to W times the zones of each; more than W divide the worlds.
         in_next_step: when worlds begin anew; see `SteppedWorlds`.
-        program: that the processes run.
+        program: that the processes run; None: the one that runs worlds.
 
     Attributes:
         world: what each is made of.
@@ -73,7 +73,7 @@ class PooledWorlds:
         num_worlds: int,
         workers: int,
         in_next_step: bool = False,
-        program: str = PROGRAM,
+        program: str | None = None,
     ) -> None:
         self.world = world
         self.in_next_step = in_next_step
@@ -119,7 +119,7 @@ class PooledWorlds:
         moving = () if self.mover is None else self.mover.segments
         segments = (segment, *(one for diary in diaries for one in diary), *moving)
         pins = config.workers.pin
-        what = Program(program, recipe, _names(parts), segments, tasks, pins, teams)
+        what = Program(program or PROGRAM, recipe, _names(parts), segments, tasks, pins, teams)
         try:
             self.pool = Pool(what, config.workers.timeout_s, config.workers.repeats)
         except WorkerFailureError as failure:
