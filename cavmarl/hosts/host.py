@@ -117,11 +117,11 @@ def serve(
         else:
             told = {"pid": os.getpid(), "machine": socket.gethostname(), "code": job.code}
             line.reply(Kind.READY, told)
-        image = Image(Segment.make(_FIRST_IMAGE_BYTES))
+        taken, given = (Image(Segment.make(_FIRST_IMAGE_BYTES)) for _ in range(2))
         while True:
             frame, data = line.hear()
             try:
-                letter, arrays = _carry_out(job, Order(*frame.letter), data, image)
+                letter, arrays = _carry_out(job, Order(*frame.letter), data, taken, given)
             except MemoryError:
                 os._exit(OUT_OF_MEMORY)
             except Exception as error:
@@ -132,15 +132,15 @@ def serve(
 
 
 def _carry_out(
-    job: RemoteJob, order: Order, data: Array, image: Image
+    job: RemoteJob, order: Order, data: Array, taken: Image, given: Image
 ) -> tuple[dict[str, Any], Sequence[Array]]:
     """Do what an order asks for, from where it says that one should begin."""
     if order.task == NOTHING:
         return {"answer": None, "image": 0}, []
     job.fit(order.size)
     if order.image:
-        image.put(data[: order.image])
-        job.load(list(image.read([array.dtype for array in job.save()])))
+        taken.put(data[: order.image])
+        job.load(list(taken.read([array.dtype for array in job.save()])))
     at = order.image
     for _ in range(order.repeats):
         at = _fill(job.inputs(order.repeated), data, at)
@@ -149,8 +149,8 @@ def _carry_out(
     answer, arrays = job.perform(order.task, order.letter)
     if not order.saves:
         return {"answer": answer, "image": 0}, arrays
-    image.write(job.save())
-    saved = image.content()
+    given.write(job.save())
+    saved = given.content()
     return {"answer": answer, "image": saved.nbytes}, [*arrays, saved]
 
 

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from cavmarl.errors import WorkerFailureError
 
-__all__ = ["Arrays", "HostProgram", "OpenOrder", "Truth", "bytes_of"]
+__all__ = ["Arrays", "HostProgram", "OpenOrder", "Truth"]
 
 Array = NDArray[Any]
 Arrays = Sequence[Array]
@@ -34,19 +34,6 @@ class HostProgram:
     tasks: tuple[str, ...]
     noted: int
     code: str
-
-
-@dataclass
-class Truth:
-    """What is committed of one part.
-
-    Attributes:
-        image: (n,) bytes of an image of its state; none: it has not begun yet.
-        since: (n,) bytes of the inputs of each order since.
-    """
-
-    image: Array = field(default_factory=lambda: np.zeros(0, dtype=np.uint8))
-    since: list[Array] = field(default_factory=list)
 
 
 @dataclass
@@ -84,7 +71,26 @@ class OpenOrder:
     failure: WorkerFailureError | None = None
 
 
-def bytes_of(arrays: Arrays) -> Array:
+@dataclass
+class Truth:
+    """What is committed of one part.
+
+    Attributes:
+        image: (n,) bytes of an image of its state; none: it has not begun yet.
+        since: (n,) bytes of the inputs of each order since.
+    """
+
+    image: Array = field(default_factory=lambda: np.zeros(0, dtype=np.uint8))
+    since: list[Array] = field(default_factory=list)
+
+    def after(self, order: OpenOrder, part: int) -> Truth:
+        """What is committed of a part once an order has been carried out."""
+        if order.saves:
+            return Truth(order.images[part])
+        return Truth(self.image, [*self.since, _bytes_of(order.inputs[part])])
+
+
+def _bytes_of(arrays: Arrays) -> Array:
     """(n,) A copy of the bytes of arrays, one behind the other."""
     return np.concatenate(
         [np.zeros(0, dtype=np.uint8), *(array.reshape(-1).view(np.uint8) for array in arrays)]

@@ -28,7 +28,7 @@ from cavmarl.errors import (
 )
 from cavmarl.hosts.company import ENDED, SILENCE_S, Company, Host, Launcher
 from cavmarl.hosts.host import Order
-from cavmarl.hosts.orders import Arrays, HostProgram, OpenOrder, Truth, bytes_of
+from cavmarl.hosts.orders import Arrays, HostProgram, OpenOrder, Truth
 from cavmarl.hosts.wire import Frame, Kind
 from cavmarl.runtime.pool import Death
 from cavmarl.runtime.watchdog import CHECK_S
@@ -185,15 +185,14 @@ class HostPool:
             if k in self._hosts:
                 self._give(order, k, self._hosts[k])
         self._await(order)
-        self._open = None
         if order.failure is not None:
+            self._open = None
             raise order.failure
+        if commits:  # at once: an interruption finds the one truth or the other
+            self._truths = [self._truths[k].after(order, k) for k in parts]
+        self._open = None
         for k in parts:
             self._hosts[k].knows = not self._hosts[k].is_gone
-            if order.saves:
-                self._truths[k] = Truth(order.images[k])
-            elif commits:
-                self._truths[k].since.append(bytes_of(inputs[k]))
         return [order.answers[k] for k in parts]
 
     def _settle(self, order: OpenOrder) -> None:

