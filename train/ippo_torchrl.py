@@ -254,7 +254,8 @@ def train(args: Args) -> Path:
     worlds = make_worlds(args)
     network, config = make_network(args, worlds)
     args.folder.mkdir(parents=True, exist_ok=True)
-    begin_training(args.folder, "ippo_torchrl.py", asdict(args), worlds.vec.worlds.world)
+    stepped = worlds.vec.worlds
+    begin_training(args.folder, "ippo_torchrl.py", asdict(args), stepped.world, stepped.plans)
     learner, curve = Learner(network, args), Curve(args.folder)
     frames = args.num_worlds * args.num_steps
     collector = Collector(worlds, learner.actor, frames_per_batch=frames, total_frames=-1)

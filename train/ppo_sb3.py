@@ -177,7 +177,8 @@ def train(args: Args) -> Path:
     torch.set_num_threads(1)  # more cost small networks more than they bring
     model, worlds = make_model(args)
     args.folder.mkdir(parents=True, exist_ok=True)
-    begin_training(args.folder, "ppo_sb3.py", asdict(args), worlds.get_attr("worlds")[0].world)
+    stepped = worlds.get_attr("worlds")[0]
+    begin_training(args.folder, "ppo_sb3.py", asdict(args), stepped.world, stepped.plans)
     model.learn(args.total_agent_steps, Curve(args.folder, args.minutes))
     model.save(args.folder / MODEL_FILE)
     save_driver(args, model, worlds)

@@ -84,7 +84,7 @@ class Run:
         try:
             folder.mkdir(parents=True, exist_ok=True)
             program = f"{settings.algorithm}_torch.py"
-            begin_training(folder, program, asdict(settings), vec.worlds.world)
+            begin_training(folder, program, asdict(settings), vec.worlds.world, vec.plans)
             self.log = Log(folder, bool(settings.resume), settings.tensorboard)
         except OSError as error:
             reason = error.strerror or error
@@ -173,6 +173,8 @@ def train(settings: PpoSettings, console: Console) -> Path:
         CavmarlError: settings, environment or checkpoint that cannot work.
     """
     run = Run(settings)
+    if run.vec.plans:
+        console.print(run.vec.plan_text(), highlight=False)
     try:
         with progress_bar(console) as bar:
             task = bar.add_task("", total=1.0)
@@ -185,5 +187,6 @@ def train(settings: PpoSettings, console: Console) -> Path:
                 bar.update(task, completed=done, description=describe(row))
     finally:
         run.close()
-    end_training(settings.folder, (WEIGHTS_FILE, CONFIG_FILE, CSV_FILE))
+    files = (WEIGHTS_FILE, CONFIG_FILE, CSV_FILE)
+    end_training(settings.folder, files, run.vec.plans)
     return settings.folder
