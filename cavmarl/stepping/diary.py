@@ -1,8 +1,8 @@
-"""`Diary`: an image of one large world now and then, and what its agents have done since.
+"""`Diary`: an image of worlds now and then, and what their agents have done since.
 
-An image of ten thousand vehicles takes as long to write as half a tick that several workers share.
-What a step does follows from the state and the actions, so a successor may as well begin from an
-older image and go through the same steps again.
+An image takes a tenth of a step to write, and of ten thousand vehicles as long as half a tick that
+several workers share. What a step does follows from the state and the actions, so a successor may
+as well begin from an older image and go through the same steps again.
 """
 
 from __future__ import annotations
@@ -20,23 +20,24 @@ STEPS = 16  # from one image to the next: a successor repeats that many at most
 _FIRST_IMAGE_BYTES = 1 << 12
 
 
-def make_segments(config: EnvConfig) -> list[Segment]:
-    """Memory for the diary of one world, which outlives those who write it.
+def make_segments(config: EnvConfig, num_worlds: int) -> list[Segment]:
+    """Memory for the diary of some worlds, which outlives those who write it.
 
     Raises:
         WorkerStartError: there is none.
     """
     images = [Segment.make(_FIRST_IMAGE_BYTES) for _ in range(2)]
-    return [*images, Segment.make(size_of(_layout(config)))]
+    return [*images, Segment.make(size_of(_layout(config, num_worlds)))]
 
 
 class Diary:
-    """What there is in it between two orders is the state of one world.
+    """What there is in it between two orders is the state of some worlds.
 
     There are two images: while one is written, the other one is the state's that was committed.
 
     Args:
         config: the environment.
+        num_worlds: how many.
         descriptors: of what `make_segments` has made.
 
     Attributes:
@@ -44,11 +45,11 @@ class Diary:
         entries: what the agents do in each of the steps that there is room for.
     """
 
-    def __init__(self, config: EnvConfig, descriptors: list[int]) -> None:
+    def __init__(self, config: EnvConfig, num_worlds: int, descriptors: list[int]) -> None:
         *images, steps = (Segment(fd, 0) for fd in descriptors)
         self.place = np.zeros(2, dtype=np.int64)
         self._images = [Image(segment) for segment in images]
-        arrays = arrays_in(steps.map(), _layout(config))
+        arrays = arrays_in(steps.map(), _layout(config, num_worlds))
         self.entries = tuple(map(Commands, arrays["controls"], arrays["meta_actions"]))
 
     @property
@@ -83,6 +84,6 @@ class Diary:
         return self.entries[: self.place.item(1)]
 
 
-def _layout(config: EnvConfig) -> Layout:
-    agents: tuple[int, ...] = (STEPS, 1, config.population.num_ids)
+def _layout(config: EnvConfig, num_worlds: int) -> Layout:
+    agents: tuple[int, ...] = (STEPS, num_worlds, config.population.num_ids)
     return {"controls": ("<f8", (*agents, 2)), "meta_actions": ("<i8", agents)}

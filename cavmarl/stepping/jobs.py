@@ -13,7 +13,8 @@ from cavmarl.runtime.shared_memory import Segment, arrays_in, shared_zeros
 from cavmarl.runtime.worker import Job
 from cavmarl.stepping.arrays import StepArrays, layout_of
 from cavmarl.stepping.diary import Diary
-from cavmarl.stepping.job import WorldsJob, fingerprint
+from cavmarl.stepping.diary_job import DiaryJob
+from cavmarl.stepping.job import fingerprint
 from cavmarl.stepping.local import LocalWorlds
 from cavmarl.stepping.moving_job import MovingJob
 from cavmarl.stepping.parts import Part
@@ -60,6 +61,7 @@ def make_jobs(recipe: Mapping[str, Any]) -> list[Job]:
             return [MovingJob(make, bounds, k, cases, whole_s) for k in range(len(parts))]
     jobs: list[Job] = []
     for part, descriptors in zip(parts, recipe["diaries"], strict=True):
+        diary = Diary(config, part.last - part.first, descriptors)
         if len(part.zones) > 1:
             worlds = LocalWorlds(
                 world,
@@ -68,11 +70,9 @@ def make_jobs(recipe: Mapping[str, Any]) -> list[Job]:
                 in_next_step=recipe["in_next_step"],
                 zeros=shared_zeros,
             )
-            diary, theirs = Diary(config, descriptors), None
-            if spent_s is not None:
-                theirs = spent_s[part.first]
+            theirs = None if spent_s is None else spent_s[part.first]
             leader = LeaderJob(worlds, part.first, part.zones, diary, theirs)
             jobs += [leader, *leader.followers()]
         else:
-            jobs.append(WorldsJob(make(part.first, part.last), part.first))
+            jobs.append(DiaryJob(make(part.first, part.last), part.first, diary))
     return jobs

@@ -99,8 +99,11 @@ class PooledWorlds:
         except WorkerStartError:
             segment.close()
             raise
-        diaries = [make_segments(config) if len(part.zones) > 1 else [] for part in parts]
         self.mover = self._make_mover(num_worlds, workers)
+        may_change = self.mover is not None and self.placement.in_row
+        diaries = [
+            [] if may_change else make_segments(config, part.last - part.first) for part in parts
+        ]
         recipe = {
             "config": asdict(config),
             "base_dir": str(base_dir.resolve()),

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from cavmarl.runtime.team import Follower, Leader, Team
 from cavmarl.shard.shard import Shard
 from cavmarl.stepping.diary import Diary
+from cavmarl.stepping.diary_job import DiaryJob
 from cavmarl.stepping.job import Task, WorldsJob
 from cavmarl.stepping.local import LocalWorlds
 
@@ -21,7 +22,7 @@ LAST = {Task.STEP: "credit", Task.SUGGEST: "suggest"}
 ALONE = (Task.STATE_HASH, Task.TRAFFIC_STATS)  # tasks of the leader, of which no follower hears
 
 
-class LeaderJob(WorldsJob):
+class LeaderJob(DiaryJob):
     """One world that several workers run, of whom this one leads.
 
     Args:
@@ -40,12 +41,10 @@ class LeaderJob(WorldsJob):
         diary: Diary,
         spent_s: NDArray[np.float64] | None = None,
     ) -> None:
-        super().__init__(worlds, first)
+        super().__init__(worlds, first, diary)
         self._zones = zones
         self._hosts = _hosts(zones)
         self._spent_s = spent_s
-        self._diary = diary
-        self._is_behind = False  # it is where the diary begins, and not where that ends
         worlds.simulation.host(self._gather)
 
     def _gather(self, shards: Sequence[Shard]) -> Leader:
@@ -76,7 +75,6 @@ class LeaderJob(WorldsJob):
     def perform(self, task: int, letter: Any) -> Any:
         """Do a task; the answer of those that have one."""
         if task in ALONE:
-            self._catch_up()
             return super().perform(task, letter)
         if task == Task.HOST:
             self._host(_hosts(letter[self._first]))
@@ -88,17 +86,10 @@ class LeaderJob(WorldsJob):
             if task == Task.STEP and not begins_anew:
                 diary.note(self._commands)
             self._leader.end_after(LAST.get(Task(task), ""))
-            super().perform(task, letter)
+            WorldsJob.perform(self, task, letter)
         if begins_anew:
             diary.begin(self._worlds.save())
         return None
-
-    def _catch_up(self) -> None:
-        """Go through the steps of the diary, if they are not behind it."""
-        if self._is_behind:
-            self._is_behind = False
-            for commands in self._diary.steps():
-                self._worlds.step(commands)
 
     def _host(self, hosts: NDArray[np.int64]) -> None:
         """Let zones be run by these workers from now on."""
@@ -107,15 +98,13 @@ class LeaderJob(WorldsJob):
 
     def save(self) -> list[NDArray[Any]]:
         """Where to begin in the diary, and who hosts which zone."""
-        return [self._diary.place, self._hosts]
+        return [*super().save(), self._hosts]
 
     def load(self, saved: Sequence[NDArray[Any]]) -> None:
         """Go on from what `save` gave; the steps since the last image wait for a task."""
-        diary, worlds = self._diary, self._worlds
-        diary.place[:] = saved[0]
-        self._host(saved[1])
-        worlds.load(diary.state(worlds.save()))
-        self._is_behind = True
+        place, hosts = saved
+        self._host(hosts)
+        super().load([place])
 
 
 class FollowerJob:
