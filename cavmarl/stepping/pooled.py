@@ -2,24 +2,14 @@
 
 from __future__ import annotations
 
-import logging
 import warnings
 from dataclasses import asdict
 from itertools import accumulate, pairwise
 from pathlib import Path
 from typing import Any
 
-import cavmarl.errors
 from cavmarl.balance.plan import Plan
-from cavmarl.balance.plan_text import describe_plan
-from cavmarl.config import ZonesConfig
-from cavmarl.errors import (
-    CavmarlError,
-    ConfigError,
-    WorkerDeathError,
-    WorkerFailureError,
-    WorkerStartError,
-)
+from cavmarl.errors import ConfigError, WorkerFailureError, WorkerStartError
 from cavmarl.runtime.barrier import usable_cores
 from cavmarl.runtime.compilation import compiled_before
 from cavmarl.runtime.pool import Death, Pool, Program
@@ -30,18 +20,17 @@ from cavmarl.stepping.arrays import StepArrays, layout_of
 from cavmarl.stepping.diary import make_segments
 from cavmarl.stepping.job import Task, fingerprint
 from cavmarl.stepping.mover import Mover
+from cavmarl.stepping.ordered import OrderedWorlds, check_zones, own_error
 from cavmarl.stepping.parts import Part, parts_of
 from cavmarl.stepping.placement import Placement
 from cavmarl.worlds import World
 
-__all__ = ["PooledWorlds", "check_zones", "own_error"]
+__all__ = ["PooledWorlds"]
 
 PROGRAM = "cavmarl.stepping.worker"
 
-log = logging.getLogger("cavmarl.workers")
 
-
-class PooledWorlds:
+class PooledWorlds(OrderedWorlds):
     """W worlds over m worker processes.
 
     Args:
@@ -127,7 +116,6 @@ class PooledWorlds:
             self.pool = Pool(what, config.workers.timeout_s, config.workers.repeats)
         except WorkerFailureError as failure:
             raise own_error(failure) from failure
-        self._steps = 0
         self._asked = _leaders(parts)
         self.placement.watch(self._pids())
 
@@ -156,47 +144,20 @@ class PooledWorlds:
         """Of worker processes, up to now."""
         return self.pool.deaths
 
-    def reset(self, seed: int | None, first_world: int) -> None:
-        """Begin an episode in the worlds of `chosen`."""
-        self._run(Task.RESET, {"seed": seed, "first_world": first_world})
-        if self.arrays.chosen.all():
-            self._steps = 0
-            log.info("%s", "\n\n".join(map(describe_plan, self.plans)))
-
     def step(self, commands: Commands) -> None:
-        """Let the agents act, and reset the worlds whose episode is over, now or a step later."""
+        """Let worlds or zones change their worker, if it is time, and step as `OrderedWorlds`."""
         self._move()
-        self.arrays.controls[:] = commands.controls
-        self.arrays.meta_actions[:] = commands.meta_actions
-        self._run(Task.STEP)
-        self._steps += 1
-
-    def suggest(self) -> None:
-        """Write what the built-in driver would do in the agents' place."""
-        self._run(Task.SUGGEST, commits=False)
-
-    def write_states(self) -> None:
-        """Write the global state of each world."""
-        self._run(Task.WRITE_STATES, commits=False)
-
-    def state_hash(self, world: int) -> str:
-        """Hex digest of one world."""
-        return str(self._ask(Task.STATE_HASH, world))
-
-    def traffic_stats(self, world: int) -> dict[str, float]:
-        """Traffic of one world since its reset."""
-        found: dict[str, float] = self._ask(Task.TRAFFIC_STATS, world)
-        return found
+        super().step(commands)
 
     def close(self) -> None:
         """End the processes."""
         self.pool.close()
 
     def _move(self) -> None:
-        """Let worlds or zones change their worker, if it is time."""
+        """Give the orders of a round, if it is time."""
         if self.mover is None:
             return
-        parts = self.mover.before_step(self._run, self._pids)
+        parts = self.mover.before_step(self._order, self._pids)
         if parts is not None:
             self._asked = _leaders(parts)
             self.pool.rename(_names(parts))
@@ -204,42 +165,12 @@ class PooledWorlds:
     def _pids(self) -> dict[int, int]:
         return dict(enumerate(self.pool.pids))
 
-    def _run(self, task: Task, letter: Any = None, commits: bool = True) -> None:
-        try:
-            self.pool.run(task, letter, commits)
-        except WorkerFailureError as failure:
-            raise own_error(failure) from failure
-        except WorkerDeathError as death:
-            death.add_note(f"in step {self._steps + 1} since the reset")
-            raise
+    def _send(self, task: Task, letter: Any, commits: bool) -> None:
+        self.pool.run(task, letter, commits)
 
     def _ask(self, task: Task, world: int) -> Any:
-        """Of the worker that hosts a world; numbers from the end count as they do for arrays."""
         number = range(len(self.arrays.mask))[world]
         return self.pool.ask(self._asked[number], task, number)
-
-
-def check_zones(zones: ZonesConfig) -> None:
-    """Refuse what only worlds of one process can have.
-
-    Raises:
-        ConfigError: a journal or faults.
-    """
-    for name in ("journal", "faults"):
-        if getattr(zones, name):
-            raise ConfigError(
-                f"zones.{name} = {getattr(zones, name)!r}: of worlds of one process only; "
-                "use workers=0"
-            )
-
-
-def own_error(failure: WorkerFailureError) -> CavmarlError:
-    """An error that the worlds raise on purpose, as they would raise it in this process."""
-    kind = getattr(cavmarl.errors, failure.kind, None)
-    if not isinstance(kind, type) or not issubclass(kind, CavmarlError):
-        return failure
-    takes_text = "__init__" not in vars(kind)
-    return kind(failure.text) if takes_text else failure
 
 
 def _names(parts: list[Part]) -> tuple[str, ...]:

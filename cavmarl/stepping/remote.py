@@ -3,32 +3,31 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from cavmarl.errors import ConfigError, WorkerDeathError, WorkerFailureError
+from cavmarl.balance.plan import Plan
+from cavmarl.errors import ConfigError, WorkerFailureError
 from cavmarl.hosts.orders import Arrays, HostProgram
 from cavmarl.hosts.pool import HostPool
 from cavmarl.hosts.ray_actors import RayActors
 from cavmarl.runtime.compilation import compiled_before
 from cavmarl.runtime.pool import Death
 from cavmarl.runtime.simulation import Simulation
-from cavmarl.shard.shard import Commands
 from cavmarl.stepping.arrays import StepArrays, layout_of
 from cavmarl.stepping.job import Task, fingerprint
+from cavmarl.stepping.ordered import OrderedWorlds, check_zones, own_error
 from cavmarl.stepping.parts import make_plans, parts_of
-from cavmarl.stepping.pooled import check_zones, own_error
 from cavmarl.stepping.remote_job import code_stamp, host_worlds, inputs_of, results_of
 from cavmarl.worlds import World
 
 __all__ = ["RemoteWorlds"]
 
 
-class RemoteWorlds:
+class RemoteWorlds(OrderedWorlds):
     """W worlds over m hosts, whole worlds each.
 
     Args:
@@ -90,8 +89,8 @@ class RemoteWorlds:
             return json.dumps({**recipe, "size": -(-num_worlds // count)})
 
         actors = RayActors(host_worlds, told, workers, num_worlds)
-        self.plans = tuple(make_plans(world, num_worlds, actors.workers))
-        self._parts = parts_of(self.plans, world.partition.count)
+        self._plans = tuple(make_plans(world, num_worlds, actors.workers))
+        self._parts = parts_of(self._plans, world.partition.count)
         program = HostProgram(
             tuple(part.names[0] for part in self._parts),
             tuple(part.last - part.first for part in self._parts),
@@ -104,7 +103,11 @@ class RemoteWorlds:
         except WorkerFailureError as failure:
             raise own_error(failure) from failure
         self._mine = [self.arrays.part(part.first, part.last) for part in self._parts]
-        self._steps = 0
+
+    @property
+    def plans(self) -> tuple[Plan, ...]:
+        """Who hosts what."""
+        return self._plans
 
     @property
     def simulation(self) -> Simulation:
@@ -120,56 +123,22 @@ class RemoteWorlds:
         """Of hosts, up to now."""
         return self.pool.deaths
 
-    def reset(self, seed: int | None, first_world: int) -> None:
-        """Begin an episode in the worlds of `chosen`."""
-        firsts = [first_world + part.first for part in self._parts]
-        self._run(Task.RESET, [{"seed": seed, "first_world": first} for first in firsts])
-        if self.arrays.chosen.all():
-            self._steps = 0
-
-    def step(self, commands: Commands) -> None:
-        """Let the agents act, and reset the worlds whose episode is over, now or a step later."""
-        self.arrays.controls[:] = commands.controls
-        self.arrays.meta_actions[:] = commands.meta_actions
-        self._run(Task.STEP)
-        self._steps += 1
-
-    def suggest(self) -> None:
-        """Write what the built-in driver would do in the agents' place."""
-        self._run(Task.SUGGEST, commits=False)
-
-    def write_states(self) -> None:
-        """Write the global state of each world."""
-        self._run(Task.WRITE_STATES, commits=False)
-
-    def state_hash(self, world: int) -> str:
-        """Hex digest of one world."""
-        return str(self._ask(Task.STATE_HASH, world))
-
-    def traffic_stats(self, world: int) -> dict[str, float]:
-        """Traffic of one world since its reset."""
-        found: dict[str, float] = self._ask(Task.TRAFFIC_STATS, world)
-        return found
-
     def close(self) -> None:
         """End the hosts, and the cluster if it was started for them."""
         self.pool.close()
 
-    def _run(self, task: Task, letters: Sequence[Any] | None = None, commits: bool = True) -> None:
+    def _send(self, task: Task, letter: Any, commits: bool) -> None:
         def outputs(k: int, ended: Any) -> Arrays:
             return results_of(task, self._mine[k], ended)
 
+        letters = [letter] * len(self._mine)
+        if task == Task.RESET:  # a host counts its worlds from 0
+            firsts = [letter["first_world"] + part.first for part in self._parts]
+            letters = [{**letter, "first_world": first} for first in firsts]
         inputs = [inputs_of(task, arrays) for arrays in self._mine]
-        try:
-            self.pool.run(task, letters or [None] * len(self._mine), inputs, outputs, commits)
-        except WorkerFailureError as failure:
-            raise own_error(failure) from failure
-        except WorkerDeathError as death:
-            death.add_note(f"in step {self._steps + 1} since the reset")
-            raise
+        self.pool.run(task, letters, inputs, outputs, commits)
 
     def _ask(self, task: Task, world: int) -> Any:
-        """Of the host of a world; numbers from the end count as they do for arrays."""
         number = range(len(self.arrays.mask))[world]
         k = next(k for k, part in enumerate(self._parts) if number < part.last)
         return self.pool.ask(k, task, number - self._parts[k].first)

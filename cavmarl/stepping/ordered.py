@@ -1,0 +1,118 @@
+"""`OrderedWorlds`: worlds that live elsewhere, and do what they are told."""
+
+from __future__ import annotations
+
+import logging
+from abc import ABC, abstractmethod
+from typing import Any
+
+import cavmarl.errors
+from cavmarl.balance.plan import Plan
+from cavmarl.balance.plan_text import describe_plan
+from cavmarl.config import ZonesConfig
+from cavmarl.errors import CavmarlError, ConfigError, WorkerDeathError, WorkerFailureError
+from cavmarl.shard.shard import Commands
+from cavmarl.stepping.arrays import StepArrays
+from cavmarl.stepping.job import Task
+
+__all__ = ["OrderedWorlds", "check_zones", "own_error"]
+
+log = logging.getLogger("cavmarl.workers")
+
+
+class OrderedWorlds(ABC):
+    """What is the same wherever the worlds live; see `arrays.SteppedWorlds`.
+
+    Attributes:
+        arrays: what goes in and comes out.
+    """
+
+    arrays: StepArrays
+    _steps = 0  # since the last reset of all
+
+    @property
+    @abstractmethod
+    def plans(self) -> tuple[Plan, ...]:
+        """Who hosts what now."""
+
+    @abstractmethod
+    def _send(self, task: Task, letter: Any, commits: bool) -> None:
+        """Let all workers do a task.
+
+        Args:
+            task: which.
+            letter: what it needs to know.
+            commits: whether it changes the worlds.
+
+        Raises:
+            WorkerFailureError: one has raised an error.
+            WorkerDeathError: one has died of it too often.
+        """
+
+    @abstractmethod
+    def _ask(self, task: Task, world: int) -> Any:
+        """Let the worker of a world answer; numbers from the end count as they do for arrays."""
+
+    def reset(self, seed: int | None, first_world: int) -> None:
+        """Begin an episode in the worlds of `chosen`."""
+        self._order(Task.RESET, {"seed": seed, "first_world": first_world})
+        if self.arrays.chosen.all():
+            self._steps = 0
+            log.info("%s", "\n\n".join(map(describe_plan, self.plans)))
+
+    def step(self, commands: Commands) -> None:
+        """Let the agents act, and reset the worlds whose episode is over, now or a step later."""
+        self.arrays.controls[:] = commands.controls
+        self.arrays.meta_actions[:] = commands.meta_actions
+        self._order(Task.STEP)
+        self._steps += 1
+
+    def suggest(self) -> None:
+        """Write what the built-in driver would do in the agents' place."""
+        self._order(Task.SUGGEST, commits=False)
+
+    def write_states(self) -> None:
+        """Write the global state of each world."""
+        self._order(Task.WRITE_STATES, commits=False)
+
+    def state_hash(self, world: int) -> str:
+        """Hex digest of one world."""
+        return str(self._ask(Task.STATE_HASH, world))
+
+    def traffic_stats(self, world: int) -> dict[str, float]:
+        """Traffic of one world since its reset."""
+        found: dict[str, float] = self._ask(Task.TRAFFIC_STATS, world)
+        return found
+
+    def _order(self, task: Task, letter: Any = None, commits: bool = True) -> None:
+        """`_send`, with the errors that the worlds would raise in this process."""
+        try:
+            self._send(task, letter, commits)
+        except WorkerFailureError as failure:
+            raise own_error(failure) from failure
+        except WorkerDeathError as death:
+            death.add_note(f"in step {self._steps + 1} since the reset")
+            raise
+
+
+def check_zones(zones: ZonesConfig) -> None:
+    """Refuse what only worlds of one process can have.
+
+    Raises:
+        ConfigError: a journal or faults.
+    """
+    for name in ("journal", "faults"):
+        if getattr(zones, name):
+            raise ConfigError(
+                f"zones.{name} = {getattr(zones, name)!r}: of worlds of one process only; "
+                "use workers=0"
+            )
+
+
+def own_error(failure: WorkerFailureError) -> CavmarlError:
+    """An error that the worlds raise on purpose, as they would raise it in this process."""
+    kind = getattr(cavmarl.errors, failure.kind, None)
+    if not isinstance(kind, type) or not issubclass(kind, CavmarlError):
+        return failure
+    takes_text = "__init__" not in vars(kind)
+    return kind(failure.text) if takes_text else failure
