@@ -5,7 +5,9 @@ from __future__ import annotations
 import json
 import types
 from collections.abc import Mapping
+from contextlib import chdir
 from dataclasses import fields, is_dataclass
+from tempfile import TemporaryDirectory
 from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
 
 import numpy as np
@@ -86,16 +88,17 @@ SMALL = {"population.agents": 2, "population.background": 2}
 @settings(max_examples=150, deadline=None, suppress_health_check=list(HealthCheck))
 @given(pairs=st.lists(NEAR | NEAR | NEAR | STRANGE, min_size=1, max_size=3))
 def test_any_configuration_is_a_world_or_is_refused(pairs: list[tuple[str, Any]]) -> None:
-    try:
-        env = parallel_env("ring", seed=0, overrides=SMALL | dict(pairs))
-        observations, _ = env.reset()
-    except CavmarlError:
-        return
-    for _ in range(2):
-        for agent, seen in observations.items():
-            assert env.observation_space(agent).contains(seen)
-        if env.agents:
-            observations, *_ = env.step(env.suggest_actions())
+    with TemporaryDirectory() as room, chdir(room):  # a journal may be written there
+        try:
+            env = parallel_env("ring", seed=0, overrides=SMALL | dict(pairs))
+            observations, _ = env.reset()
+        except CavmarlError:
+            return
+        for _ in range(2):
+            for agent, seen in observations.items():
+                assert env.observation_space(agent).contains(seen)
+            if env.agents:
+                observations, *_ = env.step(env.suggest_actions())
 
 
 # Actions
