@@ -53,8 +53,10 @@ class DiaryJob(WorldsJob):
         """Go through the steps of the diary, if they are not behind it."""
         if self._is_behind:
             self._is_behind = False
+            began_s = perf_counter()
             for commands in self._diary.steps():
                 self._worlds.step(commands)
+            self._again_s = perf_counter() - began_s
 
     def save(self) -> list[NDArray[Any]]:
         """Where to begin in the diary."""

@@ -131,6 +131,21 @@ def test_the_table_is_brought_up_to_date_when_somebody_asks_or_it_is_late() -> N
     assert on_record == dict(simulation._division.owners(0))
 
 
+def test_a_change_from_somebody_who_is_not_the_owner_on_record_is_noticed() -> None:
+    vec = make_vec("grid4x4", zones=ZONES, overrides=BUSY)
+    vec.reset(seed=1)
+    (coordinator,) = vec.simulation.coordinators
+    assert isinstance(coordinator, DirectCoordinator)
+    vec.step(vec.suggest_actions())
+    assert coordinator.directory.table.owners, "who is there at the start is on record"
+    while not len(coordinator._book):
+        vec.step(vec.suggest_actions())
+    (change, *_) = coordinator._book.newest(len(coordinator._book))
+    coordinator._directory.table.owners[change.vehicle] = (change.target, change.epoch - 1)
+    with pytest.raises(LedgerError, match=f"vehicle {change.vehicle} changed .* owner on record"):
+        _ = coordinator.directory
+
+
 def test_a_vehicle_that_is_lost_is_missed(busy: Recorded) -> None:
     vec = make_vec("grid4x4", zones=4, overrides=BUSY)
     vec.reset(seed=1)
