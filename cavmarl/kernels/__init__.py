@@ -3,16 +3,17 @@
 `kernel` is the one place for compiler flags: no fastmath (results must not depend on how a world is
 divided), serial (processes give the parallelism), GIL released, cached on disk.
 
-The cache lives in a folder named after the content of all kernel sources: Numba itself only watches
-the file that defines a function, not the functions which that one calls, and would hand out stale
-code. Set `CAVMARL_CACHE_DIR` to move it (default: `~/.cache/cavmarl`). With `NUMBA_DISABLE_JIT=1`
-every kernel is plain Python.
+The cache has a folder for each file of kernels, named after its content and that of the files that
+it imports: Numba itself only watches the file that defines a function, not the functions which that
+one calls, and would hand out stale code. Set `CAVMARL_CACHE_DIR` to move it (default:
+`~/.cache/cavmarl`). With `NUMBA_DISABLE_JIT=1` every kernel is plain Python.
 """
 
 from __future__ import annotations
 
 import hashlib
 import os
+import re
 from collections.abc import Callable
 from functools import cache
 from pathlib import Path
@@ -24,6 +25,9 @@ import numba.core.config
 from cavmarl.kernels.compiler import KernelCompiler
 
 __all__ = ["allocating_kernel", "cache_dir", "inlined_kernel", "kernel", "kernel_cache_dir"]
+
+# Every import of one file of kernels by another; a test holds that there is no other form of it.
+_IMPORT = re.compile(rb"^from cavmarl\.kernels\.(\w+) import ", re.MULTILINE)
 
 P = ParamSpec("P")
 R = TypeVar("R")
@@ -37,22 +41,47 @@ def cache_dir() -> Path:
 
 @cache
 def kernel_cache_dir() -> Path:
-    """The folder of this version's compiled kernels: one per content of the kernel sources.
+    """The folder that stands for this version: one per content of all kernel sources.
 
     And one for those that check their indices (`NUMBA_BOUNDSCHECK=1`).
     """
+    return _folder_of(_sources())
+
+
+@cache
+def _sources() -> dict[str, bytes]:
+    """The content of each file of kernels, by name without suffix."""
+    return {path.stem: path.read_bytes() for path in sorted(Path(__file__).parent.glob("*.py"))}
+
+
+@cache
+def _cache_dir_of(module: str) -> Path:
+    """Where the kernels of a module are kept; those of a module outside of this package, too."""
+    sources = _sources()
+    name = module.removeprefix(f"{__name__}.")
+    if name not in sources:
+        return kernel_cache_dir()
+    found, to_read = {"__init__", "compiler"}, [name]
+    while to_read:
+        name = to_read.pop()
+        if name not in found:
+            found.add(name)
+            to_read += [other.decode() for other in _IMPORT.findall(sources[name])]
+    return _folder_of({name: sources[name] for name in sorted(found)})
+
+
+def _folder_of(sources: dict[str, bytes]) -> Path:
     settings: Any = numba.core.config
     digest = hashlib.sha256(f"{numba.__version__} {settings.BOUNDSCHECK}".encode())
-    package = Path(__file__).parent
-    for source in sorted(package.glob("*.py")):
-        digest.update(source.name.encode() + b"\0" + source.read_bytes())
+    for name, content in sources.items():
+        digest.update(f"{name}.py".encode() + b"\0" + content)
     return cache_dir() / "kernels" / digest.hexdigest()[:16]
 
 
 def _compile(function: Callable[P, R], **options: Any) -> Callable[P, R]:
     settings: Any = numba.core.config
     before = settings.CACHE_DIR
-    settings.CACHE_DIR = str(kernel_cache_dir())
+    settings.CACHE_DIR = str(_cache_dir_of(function.__module__))
     try:
         njit: Any = numba.njit
         compiled: Callable[P, R] = njit(
