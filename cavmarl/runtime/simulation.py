@@ -32,6 +32,7 @@ from cavmarl.roads.network import RoadNetwork
 from cavmarl.roads.zone_layouts import cut_map
 from cavmarl.roads.zones import ZonePartition
 from cavmarl.runtime import snapshot
+from cavmarl.runtime.attached import Attached, Host, attach
 from cavmarl.runtime.border_book import BorderBook
 from cavmarl.runtime.commons import Commons
 from cavmarl.runtime.compilation import first_compilation
@@ -162,6 +163,18 @@ class Simulation:
             )
             self._shard = self._shards[0]
             self._executor: Executor = SerialExecutor(self._shards)
+            self._attached: tuple[Attached, ...] = attach(
+                Host(
+                    config,
+                    network,
+                    num_worlds,
+                    self._shards,
+                    self._division,
+                    self._shard.travel,
+                    self.outputs,
+                    zeros,
+                )
+            )
             self._coordination: Coordination | None = None
             self._recovery: Recovery | None = None
             self._keeper: Keeper | None = None
@@ -199,6 +212,8 @@ class Simulation:
         yield from self.outputs
         if self._traffic.rerouting is not None:
             yield from self._traffic.rerouting.arrays()
+        for part in self._attached:
+            yield from part.arrays()
 
     def _call_every_kernel(self) -> None:
         """Run one step of a world that the first reset forgets."""
@@ -343,6 +358,8 @@ class Simulation:
         if self._coordination is not None:
             self._coordination.reset(chosen)
         self._switch_signals()
+        for part in self._attached:
+            part.reset(chosen)
         self._sense(chosen)
         if self._coordination is not None:
             self._coordination.save()
@@ -423,12 +440,16 @@ class Simulation:
         return clock
 
     def _tick(self, commands: Commands, is_first: bool, is_last: bool) -> None:
-        """Begin → begin the step → advance … signals → sense → end."""
+        """Begin → attached → begin the step → advance … signals → attached → sense → end."""
         if self._coordination is not None:
             self._coordination.begin(commands)
+        for part in self._attached:
+            part.begin(commands)
         if is_first:
             self._executor.each("begin_step", commands)
         self._advance(commands)
+        for part in self._attached:
+            part.end()
         if is_last:
             self._sense(self.everywhere)
         if self._coordination is not None:
@@ -549,6 +570,7 @@ class Simulation:
             self.outputs,
             self._coordination,
             self.config.sensors.stack > 1,
+            self._attached,
         )
 
     def agents_to_come(self) -> NDArray[np.bool_]:
@@ -603,6 +625,9 @@ class Simulation:
         if rerouting is not None:
             for array in rerouting.state(world, self.vehicles(world)):
                 digest.update(array.tobytes())
+        for part in self._attached:
+            for array in part.arrays():
+                digest.update(array[world].tobytes())
         return digest.hexdigest()
 
     def traffic_stats(self, world: int = 0) -> TrafficStats:

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cavmarl.kernels.arrays import Gate, Outputs, Worlds
+from cavmarl.runtime.attached import Attached
 from cavmarl.runtime.coordination import Coordination
 from cavmarl.runtime.division import Division
 from cavmarl.shard.shard import COMMON
@@ -37,6 +38,7 @@ class Parts(NamedTuple):
         outputs: what agents have got; the frames of the next observation, too.
         coordination: who says who owns what; None: all is one zone.
         has_frames: an observation has frames of the ones before.
+        attached: what acts in each tick beside the traffic.
     """
 
     worlds: Worlds
@@ -46,6 +48,7 @@ class Parts(NamedTuple):
     outputs: Outputs
     coordination: Coordination | None
     has_frames: bool
+    attached: tuple[Attached, ...]
 
 
 def save(parts: Parts) -> list[Array]:
@@ -152,6 +155,8 @@ def _fixed(parts: Parts) -> Iterator[Array]:
     for name, array in parts.outputs._asdict().items():
         if name != "observations" or parts.has_frames:
             yield array
+    for part in parts.attached:
+        yield from part.arrays()
 
 
 def _of_rerouting(parts: Parts) -> Iterator[Array]:
