@@ -12,10 +12,24 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cavmarl.config import EnvConfig
-from cavmarl.config_rig import MountedConfig, OdometryConfig, samples_per_step
+from cavmarl.config_rig import (
+    BevGridConfig,
+    DepthCameraConfig,
+    LidarRigConfig,
+    MountedConfig,
+    OdometryConfig,
+    RadarConfig,
+    RgbCameraConfig,
+    SemanticCameraConfig,
+    samples_per_step,
+)
 from cavmarl.errors import ConfigError
+from cavmarl.rig.bev_grid import BevGrid
+from cavmarl.rig.cameras import DepthCamera, RgbCamera, SemanticCamera
 from cavmarl.rig.frames import SensorFrames
+from cavmarl.rig.lidar import Lidar
 from cavmarl.rig.odometry import Odometry
+from cavmarl.rig.radar import Radar
 from cavmarl.rig.sensor import MountedSensor, Platform
 
 __all__ = ["TYPES", "frame_layout", "frames_in", "mount", "rig_reach_m", "type_of"]
@@ -23,6 +37,12 @@ __all__ = ["TYPES", "frame_layout", "frames_in", "mount", "rig_reach_m", "type_o
 Shape = tuple[int, ...]
 
 TYPES: dict[type[MountedConfig], type[MountedSensor[Any]]] = {
+    LidarRigConfig: Lidar,
+    RadarConfig: Radar,
+    DepthCameraConfig: DepthCamera,
+    SemanticCameraConfig: SemanticCamera,
+    RgbCameraConfig: RgbCamera,
+    BevGridConfig: BevGrid,
     OdometryConfig: Odometry,
 }
 

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from cavmarl.rig.backdrop import make_backdrop
 from cavmarl.rig.rig import Rig
 from cavmarl.rig.sensor import Platform, Scene
 from cavmarl.runtime.attached import Host
@@ -26,7 +27,12 @@ class MountedSensors:
     def __init__(self, host: Host) -> None:
         config = host.config
         platform = Platform(
-            host.network, host.num_worlds, config.clock.sim_dt_s, config.clock.ticks_per_step
+            host.network,
+            host.num_worlds,
+            config.clock.sim_dt_s,
+            config.clock.ticks_per_step,
+            host.shards[0].worlds.rows.shape[1],
+            make_backdrop(host.network, host.travel.types),
         )
         ids = host.zeros((host.num_worlds, config.population.num_ids), dtype=np.int64)
         ids[...] = -1
