@@ -12,6 +12,7 @@ from cavmarl.rig.rig import Rig
 from cavmarl.rig.sensor import Platform, Scene
 from cavmarl.runtime.attached import Host
 from cavmarl.shard.shard import Commands
+from cavmarl.traffic.vtypes import generated_types
 
 __all__ = ["MountedSensors"]
 
@@ -26,7 +27,11 @@ class MountedSensors:
     def __init__(self, host: Host) -> None:
         config = host.config
         platform = Platform(
-            host.network, host.num_worlds, config.clock.sim_dt_s, config.clock.ticks_per_step
+            host.network,
+            generated_types()[0],
+            host.num_worlds,
+            config.clock.sim_dt_s,
+            config.clock.ticks_per_step,
         )
         ids = host.zeros((host.num_worlds, config.population.num_ids), dtype=np.int64)
         ids[...] = -1
