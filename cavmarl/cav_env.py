@@ -357,10 +357,7 @@ class CavEnv(ParallelEnv[str, Any, Any]):  # type: ignore[misc] # PettingZoo is 
                 f"{self.possible_agents[-1]}"
             )
         k = self.possible_agents.index(agent)
-        return {
-            name: SensorFrames(*(array[0, k].copy() for array in sensor))
-            for name, sensor in self.worlds.arrays.frames.items()
-        }
+        return {name: sensor.of(0, k) for name, sensor in self.worlds.arrays.frames.items()}
 
     def check_action(self, agent: str, action: Any) -> None:
         """Refuse an action that `step` would refuse, before anything is kept of it.

@@ -37,7 +37,7 @@ def measure_odometry(
         data: (W, A, S, 3) speed in m/s, yaw rate in rad/s, distance in m since departure.
     """
     for w in range(worlds.ticks.size):
-        count = due.count[w]
+        count = due.num[w]
         if count == 0:
             continue
         for i in range(worlds.num_owned[w]):

@@ -73,7 +73,7 @@ def deliver(
     dropout: float,
     stamp_s: NDArray[np.float64],
     lost: NDArray[np.bool_],
-    count: NDArray[np.int64],
+    fresh: NDArray[np.int64],
     data: NDArray[np.uint8],
 ) -> None:
     """Stamp and count the samples that owned agents have got in this tick; lose some of them.
@@ -87,11 +87,11 @@ def deliver(
         dropout: chance that a sample is lost.
         stamp_s: (W, A, S) in s since the reset.
         lost: (W, A, S) which ones are lost.
-        count: (W, A) in this step, up to now.
+        fresh: (W, A) samples of this step, up to now.
         data: (W, A, S, bytes); of lost samples all zeros.
     """
     for w in range(worlds.ticks.size):
-        if due.count[w] == 0:
+        if due.num[w] == 0:
             continue
         tick = worlds.ticks[w]
         for i in range(worlds.num_owned[w]):
@@ -99,8 +99,8 @@ def deliver(
             if row["driver"] != DRIVER_AGENT:
                 continue
             agent = row["agent"]
-            count[w, agent] += due.count[w]
-            for k in range(due.count[w]):
+            fresh[w, agent] += due.num[w]
+            for k in range(due.num[w]):
                 slot = due.slot[w] + k
                 stamp_s[w, agent, slot] = stamp_of(schedule, due.first[w] + k, tick, tick_s)
                 lost[w, agent, slot] = is_lost(row, stream, tick, k, dropout)

@@ -29,7 +29,7 @@ class Schedule(NamedTuple):
 class Due(NamedTuple):
     """What one sensor has to deliver in the present tick of each world."""
 
-    count: NDArray[np.int64]  # (W,) samples
+    num: NDArray[np.int64]  # (W,) samples
     first: NDArray[np.int64]  # (W,) number of the first one, since the reset
     slot: NDArray[np.int64]  # (W,) where it is written; the last of a step lies in the last slot
 
@@ -72,7 +72,7 @@ def call_due(
     """
     found = False
     for w in range(ticks.size):
-        due.count[w] = 0
+        due.num[w] = 0
         if not chosen[w]:
             continue
         tick = ticks[w]
@@ -80,7 +80,7 @@ def call_due(
         count = taken(schedule, tick) - before
         if count > 0:
             step_end = -(-tick // schedule.ticks_per_step) * schedule.ticks_per_step
-            due.count[w] = count
+            due.num[w] = count
             due.first[w] = before
             due.slot[w] = schedule.slots - (taken(schedule, step_end) - before)
             found = True

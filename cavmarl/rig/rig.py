@@ -72,7 +72,7 @@ class Rig:
         begins = (ticks - 1) % self._platform.ticks_per_step == 0
         if begins.any():
             for mounted in self._mounted:
-                mounted.frames.count[begins] = 0
+                mounted.frames.fresh[begins] = 0
         self._take(scenes, self._everywhere)
 
     def _take(self, scenes: Sequence[Scene], chosen: NDArray[np.bool_]) -> None:
@@ -132,7 +132,7 @@ class _Mounted:
                     self._sensor.config.dropout,
                     frames.stamp_s,
                     frames.lost,
-                    frames.count,
+                    frames.fresh,
                     self._bytes,
                 )
 

@@ -17,6 +17,7 @@ from cavmarl.kernels.panorama import Backdrop
 from cavmarl.kernels.rig_noise import Noise
 from cavmarl.kernels.rig_schedule import Due
 from cavmarl.rig.frames import SensorFrames
+from cavmarl.rig.mounting import SENSOR_FRAME, check_place, mount_of
 from cavmarl.roads.network import RoadNetwork
 
 __all__ = ["Bounds", "MountedSensor", "Platform", "Scene", "noise_of", "stream_of"]
@@ -50,6 +51,7 @@ class Platform(NamedTuple):
 
     Attributes:
         network: the roads.
+        body: VTYPE of agents' vehicles.
         num_worlds: W.
         sim_dt_s: seconds a tick.
         ticks_per_step: ticks a step.
@@ -58,6 +60,7 @@ class Platform(NamedTuple):
     """
 
     network: RoadNetwork
+    body: np.void
     num_worlds: int
     sim_dt_s: float
     ticks_per_step: int
@@ -76,6 +79,8 @@ class MountedSensor(ABC, Generic[C]):
     Attributes:
         name: in the rig.
         config: its settings.
+        mount: where on the vehicle.
+        frame: name of the frame that its directions are in.
     """
 
     dtype: ClassVar[DTypeLike]
@@ -84,6 +89,9 @@ class MountedSensor(ABC, Generic[C]):
     def __init__(self, name: str, config: C, platform: Platform) -> None:
         self.name = name
         self.config = config
+        self.mount = mount_of(config)
+        self.frame = SENSOR_FRAME.format(name=name)
+        check_place(name, config, platform.body)
 
     @staticmethod
     @abstractmethod

@@ -13,6 +13,7 @@ from cavmarl.rig.rig import Rig
 from cavmarl.rig.sensor import Platform, Scene
 from cavmarl.runtime.attached import Host
 from cavmarl.shard.shard import Commands
+from cavmarl.traffic.vtypes import generated_types
 
 __all__ = ["MountedSensors"]
 
@@ -28,6 +29,7 @@ class MountedSensors:
         config = host.config
         platform = Platform(
             host.network,
+            generated_types()[0],
             host.num_worlds,
             config.clock.sim_dt_s,
             config.clock.ticks_per_step,

@@ -54,11 +54,9 @@ class StepArrays(NamedTuple):
 
     def part(self, first: int, last: int) -> StepArrays:
         """Those of some of the worlds, as views."""
-        *arrays, frames = self
-        parts: list[Any] = [array[first:last] for array in arrays]
-        return StepArrays(
-            *parts, {name: sensor.part(first, last) for name, sensor in frames.items()}
-        )
+        parts: list[Any] = [array[first:last] for array in self[:-1]]
+        parts.append({name: sensor.part(first, last) for name, sensor in self.frames.items()})
+        return StepArrays(*parts)
 
 
 def layout_of(config: EnvConfig, capacity: int, num_worlds: int) -> Layout:

@@ -53,7 +53,7 @@ def test_a_minute_has_as_many_samples_as_the_rate_says() -> None:
     vec = make_vec("merge", agents=1, background=0, overrides={"rig": RIG, "horizon_s": 60.0})
     vec.reset(seed=0)
     rates = {"wheels": 20, "slow": 4, "fast": 100, "odd": 3}
-    counts = {name: int(frames.count[0, 0]) for name, frames in vec.frames().items()}
+    counts = {name: int(frames.fresh[0, 0]) for name, frames in vec.frames().items()}
     stamps = dict.fromkeys(rates, -1.0)
     over = False
     while not over:
@@ -62,7 +62,7 @@ def test_a_minute_has_as_many_samples_as_the_rate_says() -> None:
         if over:
             break
         for name, frames in vec.frames().items():
-            count = int(frames.count[0, 0])
+            count = int(frames.fresh[0, 0])
             counts[name] += count
             if count:
                 new = frames.stamp_s[0, 0, -count:]
