@@ -1,4 +1,4 @@
-"""A pinhole camera: what each pixel shows of bodies, walls, roofs, roads and the ground.
+"""A pinhole camera: what each pixel shows of bodies, walls, roads and the ground.
 
 Everything that it can see is a flat convex face. Seen by a pinhole, one over the depth of a face is
 linear over the picture, and so are the sides of its edges: a face is drawn row by row, from the
@@ -79,7 +79,7 @@ def make_camera(
 
 def make_picture(width: int, height: int, panorama: Panorama) -> Picture:
     """Room for a picture of such a panorama."""
-    faces = FIRST_FACE + _FACES_OF_PRISM * len(panorama.prisms) + len(panorama.walls) + len(panorama.roofs)
+    faces = FIRST_FACE + _FACES_OF_PRISM * len(panorama.prisms) + len(panorama.walls)
     semantic = np.zeros(faces, np.uint8)
     semantic[:FIRST_FACE] = NOTHING, GROUND, ROAD
     light = np.ones(faces)
@@ -337,11 +337,3 @@ def look(
     first = FIRST_FACE + _FACES_OF_PRISM * panorama.prisms.size
     for k in range(counts.walls):
         _draw_wall(camera, picture, panorama.walls[k], first + k)
-    first += panorama.walls.size
-    for k in range(counts.roofs):
-        if panorama.roof_height[k] < camera.mount[2, 3]:
-            for c in range(4):
-                x, y = panorama.roofs[k, c, 0], panorama.roofs[k, c, 1]
-                _set_corner(camera, c, x, y, panorama.roof_height[k])
-            picture.semantic[first + k] = BUILDING
-            _draw(camera, picture, first + k)

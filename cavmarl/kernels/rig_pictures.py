@@ -40,6 +40,15 @@ def camera_reach_m(camera: Camera, width: int, height: int) -> float:
 
 
 @kernel
+def _is_noisy(noise: Noise) -> bool:
+    """Whether any channel is wrong at all."""
+    for channel in range(noise.noise.size):
+        if noise.noise[channel] > 0.0 or noise.bias[channel] > 0.0:
+            return True
+    return False
+
+
+@kernel
 def take_depths(
     worlds: Worlds,
     grid: Grid,
@@ -70,9 +79,9 @@ def take_depths(
     """
     height, width = picture.face.shape
     reach_m = camera_reach_m(camera, width, height)
-    noisy = noise.noise[0] > 0.0 or noise.bias[0] > 0.0
+    noisy = _is_noisy(noise)
     for w in range(worlds.ticks.size):
-        if due.count[w] == 0:
+        if due.num[w] == 0:
             continue
         rows = worlds.rows[w]
         fill_grid(rows, worlds.num_rows[w], grid)
@@ -117,7 +126,7 @@ def take_classes(
     height, width = picture.face.shape
     reach_m = camera_reach_m(camera, width, height)
     for w in range(worlds.ticks.size):
-        if due.count[w] == 0:
+        if due.num[w] == 0:
             continue
         rows = worlds.rows[w]
         fill_grid(rows, worlds.num_rows[w], grid)
@@ -146,9 +155,9 @@ def take_colours(
     """Write the coloured pictures (W, agents, S, H, W, 3) that are due; see `take_depths`."""
     height, width = picture.face.shape
     reach_m = camera_reach_m(camera, width, height)
-    noisy = np.any(noise.noise > 0.0) or np.any(noise.bias > 0.0)
+    noisy = _is_noisy(noise)
     for w in range(worlds.ticks.size):
-        if due.count[w] == 0:
+        if due.num[w] == 0:
             continue
         rows = worlds.rows[w]
         fill_grid(rows, worlds.num_rows[w], grid)
@@ -193,7 +202,7 @@ def fill_grids(
     `reach_m` is the distance from the vehicle's place to the farthest corner of the grid.
     """
     for w in range(worlds.ticks.size):
-        if due.count[w] == 0:
+        if due.num[w] == 0:
             continue
         rows = worlds.rows[w]
         fill_grid(rows, worlds.num_rows[w], grid)

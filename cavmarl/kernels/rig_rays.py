@@ -54,7 +54,7 @@ def measure_lidar(
     reach_m = reach_of(fan)
     noisy = noise.noise[0] > 0.0 or noise.bias[0] > 0.0
     for w in range(worlds.ticks.size):
-        if due.count[w] == 0:
+        if due.num[w] == 0:
             continue
         rows = worlds.rows[w]
         fill_grid(rows, worlds.num_rows[w], grid)
@@ -117,7 +117,7 @@ def measure_radar(
     """
     reach_m = reach_of(fan)
     for w in range(worlds.ticks.size):
-        if due.count[w] == 0:
+        if due.num[w] == 0:
             continue
         rows = worlds.rows[w]
         fill_grid(rows, worlds.num_rows[w], grid)
