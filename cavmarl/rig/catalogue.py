@@ -14,7 +14,11 @@ from numpy.typing import NDArray
 from cavmarl.config import EnvConfig
 from cavmarl.config_rig import (
     BevGridConfig,
+    CollisionConfig,
     DepthCameraConfig,
+    GnssConfig,
+    ImuConfig,
+    LaneBoundaryConfig,
     LidarRigConfig,
     MountedConfig,
     OdometryConfig,
@@ -26,7 +30,11 @@ from cavmarl.config_rig import (
 from cavmarl.errors import ConfigError
 from cavmarl.rig.bev_grid import BevGrid
 from cavmarl.rig.cameras import DepthCamera, RgbCamera, SemanticCamera
+from cavmarl.rig.collision import Collision
 from cavmarl.rig.frames import SensorFrames
+from cavmarl.rig.gnss import Gnss
+from cavmarl.rig.imu import Imu
+from cavmarl.rig.lane_boundary import LaneBoundary
 from cavmarl.rig.lidar import Lidar
 from cavmarl.rig.odometry import Odometry
 from cavmarl.rig.radar import Radar
@@ -43,7 +51,11 @@ TYPES: dict[type[MountedConfig], type[MountedSensor[Any]]] = {
     SemanticCameraConfig: SemanticCamera,
     RgbCameraConfig: RgbCamera,
     BevGridConfig: BevGrid,
+    GnssConfig: Gnss,
+    ImuConfig: Imu,
     OdometryConfig: Odometry,
+    LaneBoundaryConfig: LaneBoundary,
+    CollisionConfig: Collision,
 }
 
 _PREFIX = "rig."

@@ -31,6 +31,7 @@ class MountedSensors:
             host.network,
             generated_types()[0],
             host.num_worlds,
+            config.population.num_ids,
             config.clock.sim_dt_s,
             config.clock.ticks_per_step,
             host.shards[0].worlds.rows.shape[1],
@@ -62,6 +63,7 @@ class MountedSensors:
             Scene(
                 shard.roads,
                 shard.lane_grid,
+                shard.plans,
                 shard.travel,
                 shard.worlds,
                 shard.grid,
