@@ -19,6 +19,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cavmarl.kernels import kernel
+from cavmarl.kernels.bearings import ANGLE_ERROR_RAD, rough_atan2
+from cavmarl.kernels.geometry import PI, TWO_PI
 
 __all__ = ["HIT", "WALL_HIT", "Fan", "cast", "make_fan"]
 
@@ -35,10 +37,6 @@ NO_HIT = -1
 GROUND_HIT = -2
 WALL_HIT = -3  # WALL row k of the scene is WALL_HIT - k
 
-PI = math.pi
-TWO_PI = 2.0 * math.pi
-# Added to every angle that bounds something: larger than any rounding of it.
-_MARGIN_RAD = 1e-9
 # A ray that closes in on a slab by less than this each metre does not reach it within any range.
 _PARALLEL = 1e-200
 
@@ -51,8 +49,10 @@ class Fan(NamedTuple):
     mount: NDArray[np.float64]  # (3, 4)
     first_rad: float  # azimuth of the first column, in [-pi, pi]
     step_rad: float  # between columns, positive: counter-clockwise
+    per_rad: float  # columns
     range_m: float
     tilted: bool  # whether the sensor's z axis is another than the vehicle's
+    looks_down: bool  # whether any ray meets the ground within the range
 
 
 def make_fan(
@@ -86,27 +86,30 @@ def make_fan(
     ground_m = np.full(down.shape, np.inf)
     np.divide(mount[2, 3], down, out=ground_m, where=down > 0.0)
     tilted = bool(mount[2, 0] != 0.0 or mount[2, 1] != 0.0)
-    return Fan(rays, ground_m, mount, first_rad, step_rad, range_m, tilted)
+    looks_down = bool((ground_m < range_m).any())
+    return Fan(rays, ground_m, mount, first_rad, step_rad, 1.0 / step_rad, range_m, tilted, looks_down)
 
 
 @kernel
-def _columns(
-    fan: Fan, middle_rad: float, spread_rad: float
-) -> tuple[int, int, int]:
+def _columns(fan: Fan, middle_rad: float, spread_rad: float) -> tuple[int, int, int]:
     """The columns within `spread_rad` of an azimuth: [begin, end), and those before the third."""
     count = fan.rays.shape[0]
-    spread_rad += _MARGIN_RAD
+    spread_rad += ANGLE_ERROR_RAD
     if spread_rad >= PI:
         return 0, count, 0
-    low = middle_rad - spread_rad - fan.first_rad
-    while low < 0.0:
-        low += TWO_PI
-    while low >= TWO_PI:
-        low -= TWO_PI
-    high = low + 2.0 * spread_rad
-    begin = min(math.ceil(low / fan.step_rad), count)
-    end = min(math.floor(high / fan.step_rad) + 1, count)
-    wrapped = min(math.floor((high - TWO_PI) / fan.step_rad) + 1, begin)
+    # From here on in columns.
+    turn = TWO_PI * fan.per_rad
+    low = (middle_rad - spread_rad - fan.first_rad) * fan.per_rad
+    if low < 0.0:
+        low += turn
+    if low < 0.0:
+        low += turn
+    if low >= turn:
+        low -= turn
+    high = low + 2.0 * spread_rad * fan.per_rad
+    begin = min(math.ceil(low), count)
+    end = min(math.floor(high) + 1, count)
+    wrapped = min(math.floor(high - turn) + 1, begin)
     return begin, max(begin, end), max(wrapped, 0)
 
 
@@ -126,7 +129,7 @@ def _columns_of_ball(
         return 0, fan.rays.shape[0], 0
     sine = radius / math.sqrt(squared)
     # asin(s) <= s + (pi / 2 - 1) s^3 in [0, 1].
-    return _columns(fan, math.atan2(left, ahead), sine + 0.5708 * sine * sine * sine)
+    return _columns(fan, rough_atan2(left, ahead), sine + 0.5708 * sine * sine * sine)
 
 
 @kernel
@@ -255,10 +258,13 @@ def _columns_of_wall(
         )
     yaw_cos = fan.mount[0, 0]
     yaw_sin = fan.mount[1, 0]
-    from_a = math.atan2(ay * yaw_cos - ax * yaw_sin, ax * yaw_cos + ay * yaw_sin)
+    from_a = rough_atan2(ay * yaw_cos - ax * yaw_sin, ax * yaw_cos + ay * yaw_sin)
     # From a to b the short way round.
-    turn = math.atan2(ax * by - ay * bx, ax * bx + ay * by)
-    return _columns(fan, from_a + 0.5 * turn, 0.5 * abs(turn))
+    turn = rough_atan2(ax * by - ay * bx, ax * bx + ay * by)
+    if abs(turn) > PI - 2.0 * ANGLE_ERROR_RAD:
+        return 0, fan.rays.shape[0], 0  # it may be the other way round
+    # Two angles are wrong, and not one.
+    return _columns(fan, from_a + 0.5 * turn, 0.5 * abs(turn) + ANGLE_ERROR_RAD)
 
 
 @kernel
@@ -290,6 +296,8 @@ def cast(
         _cast_at_prism(fan, prisms, k, hits)
     for k in range(num_walls):
         _cast_at_wall(fan, walls, k, hits)
+    if not fan.looks_down:
+        return
     for a in range(hits.shape[0]):
         for e in range(hits.shape[1]):
             hit = hits[a, e]
