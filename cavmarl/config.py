@@ -381,12 +381,15 @@ class ActionConfig:
 
 @dataclass(frozen=True)
 class ObservationConfig:
-    """The form of an observation.
+    """What an observation is made of, and its form.
 
     Attributes:
-        kind: `flat`: one Box. `dict`: one Box a sensor.
+        mode: `ground_truth`: what `sensors` says, taken from the world itself. `sensors`: the
+            latest samples of the `rig`.
+        kind: `flat`: one Box of float32. `dict`: one Box a sensor.
     """
 
+    mode: Literal["ground_truth", "sensors"] = "ground_truth"
     kind: Literal["flat", "dict"] = "flat"
 
 
@@ -453,6 +456,12 @@ class EnvConfig:
         _check(self.version >= 0, "version", self.version, "must be 0 or more")
         _check_finite("horizon_s", self.horizon_s, self.clock.ctrl_dt_s, 1e6)
         check_rig(self.rig, self.clock.sim_dt_s, self.clock.ticks_per_step)
+        _check(
+            self.observation.mode != "sensors" or bool(self.rig),
+            "observation.mode",
+            self.observation.mode,
+            "there is no sensor under rig; mount one",
+        )
         steps = self.horizon_s / self.clock.ctrl_dt_s
         _check(
             abs(steps - round(steps)) < 1e-6 * steps,
