@@ -6,9 +6,10 @@ border is offered, acknowledged and handed over in one call, the new owner takes
 as it is, and a lease is the call that advances a shard. What is decided and written down is the
 same, record by record, as over messages of which none is lost.
 
-Records are made only where somebody reads them: all of them for a journal, and for watchers those
-of ticks in which a vehicle has entered, left, or changed its owner. For nobody the table of owners
-is brought up to date every now and then, and when somebody asks.
+The table of owners is brought up to date every now and then, and when somebody asks. Records are
+made only where somebody reads them: all of them, at once, for a journal, and for watchers those of
+ticks in which a vehicle has entered, left, or changed its owner, as the table comes to know of it.
+Whoever has to know of changes in their own tick gives himself to `foretell`.
 """
 
 from __future__ import annotations
@@ -51,6 +52,9 @@ class DirectCoordinator(Referee):
         book: hands rows over.
         counts: how many vehicles each zone owns now, by its rows.
         transfers: told of all that goes on.
+
+    Attributes:
+        foretell: told at once of changes of owner that records tell of later.
     """
 
     def __init__(
@@ -66,6 +70,7 @@ class DirectCoordinator(Referee):
         self._counts = counts
         self._transfers = transfers
         transfers.ask = self.catch_up
+        self.foretell: Callable[[Iterable[Change]], None] | None = None
         self._is_open = False
         self._tick = 0
         self._vehicles = 0
@@ -131,7 +136,9 @@ class DirectCoordinator(Referee):
         if self._removed:
             self._removed = []
         if self.journal is not None:
-            self._record(self._begun(self._tick + 1, self._changed, inputs))
+            switches = tuple(map(_switch, self._book.newest(changed)))
+            episode = self._directory.table.episode
+            self._record(Begin(episode, self._tick + 1, switches, (), self._new, inputs))
 
     def end(self, rows: Callable[[int], int], stored: Callable[[int], int] | None = None) -> None:
         """Commit, if the zones own what they should, as `Referee.end` says."""
@@ -148,14 +155,14 @@ class DirectCoordinator(Referee):
         has_news = bool(self._new or removed)
         if has_news:
             self._news[self._tick] = _News(self._new, removed)
-        if self.journal is not None or (self._watchers and (has_news or changed)):
-            begun = (self._begun(self._tick, changed),) if self.journal is None else ()
+        is_late = self._late >= LATE or len(self._news) >= LATE
+        if self.journal is not None or is_late or (has_news and self._watchers):
             self.catch_up()
             self._check(self._births)
-            self._record(*begun, self._committed(removed, rows))
-        elif self._late >= LATE or len(self._news) >= LATE:
-            self.catch_up()
-            self._check(self._births)
+            if self.journal is not None:
+                self._record(self._committed(removed, rows))
+        elif changed and self.foretell is not None:
+            self.foretell(self._book.newest(changed))
 
     def catch_up(self) -> None:
         """Let the table and the rows of transfers say what has come of the ticks up to now."""
@@ -180,6 +187,9 @@ class DirectCoordinator(Referee):
             SpawnError: a vehicle entered that has been there.
         """
         table = self._directory.table
+        switches = tuple(map(_switch, changes))
+        if self.journal is None and self._watchers:
+            self._record(Begin(table.episode, tick, switches, (), news.births))
         for change in changes:
             owner = table.owners.get(change.vehicle)
             if owner != (change.source, change.epoch - 1):
@@ -189,14 +199,11 @@ class DirectCoordinator(Referee):
                 )
         if news.births:
             self._directory.check_births(news.births)
-        table.settle(tick, map(_switch, changes), news.births, news.removed)
+        table.settle(tick, switches, news.births, news.removed)
+        if self.journal is None and self._watchers:
+            self._record(self._committed(news.removed, _no_digest))
         gone = {entry.vehicle for entry in news.removed}
         self._transfers.add(_row(change, table.episode, gone) for change in changes)
-
-    def _begun(self, tick: int, changed: int, inputs: bytes = b"") -> Begin:
-        """Of a tick with so many changes, the newest ones."""
-        switches = tuple(map(_switch, self._book.newest(changed)))
-        return Begin(self._directory.table.episode, tick, switches, (), self._new, inputs)
 
     def _committed(self, removed: tuple[Removed, ...], rows: Callable[[int], int]) -> Commit:
         table = self._directory.table
@@ -235,6 +242,11 @@ class DirectCoordinator(Referee):
         counts = self._counts()
         if counts != owned:
             raise LedgerError(f"at tick {self.tick} zones own {counts} vehicles, not {owned}")
+
+
+def _no_digest(zone: int) -> int:
+    """Of a zone's rows, where nobody takes one."""
+    return 0
 
 
 def _switch(change: Change) -> Switch:
