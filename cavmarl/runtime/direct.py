@@ -169,18 +169,29 @@ class DirectCoordinator(Referee):
         table = self._directory.table
         if table.tick == self._tick:
             return
-        changes: defaultdict[int, list[Change]] = defaultdict(list)
-        for change in self._book.take(but=self._changed):
-            changes[change.tick].append(change)
+        changes = self._book.take(but=self._changed)
         news, self._news, self._late = self._news, {}, 0
-        for tick in sorted({*changes, *news}):
-            self._settle(tick, changes[tick], news.get(tick, _NO_NEWS))
+        if self.journal is None and self._watchers:
+            by_tick: defaultdict[int, list[Change]] = defaultdict(list)
+            for change in changes:
+                by_tick[change.tick].append(change)
+            for tick in sorted({*by_tick, *news}):
+                self._settle(tick, by_tick[tick], news.get(tick, _NO_NEWS), is_told=True)
+        elif changes or news:
+            births = tuple(birth for tick in news.values() for birth in tick.births)
+            removed = tuple(entry for tick in news.values() for entry in tick.removed)
+            self._settle(self._tick, changes, _News(births, removed), is_told=False)
         table.settle(self._tick)
+        left = {entry.vehicle: tick for tick, those in news.items() for entry in those.removed}
+        self._transfers.add(
+            _row(change, table.episode, left.get(change.vehicle) == change.tick)
+            for change in changes
+        )
         acknowledged, aborted = self._book.take_counts()
         self._transfers.count(acknowledged=acknowledged, aborted=aborted)
 
-    def _settle(self, tick: int, changes: list[Change], news: _News) -> None:
-        """Put what came of one tick on the table.
+    def _settle(self, tick: int, changes: list[Change], news: _News, is_told: bool) -> None:
+        """Put what came of one tick, or of all up to one, on the table, and tell watchers of it.
 
         Raises:
             LedgerError: a vehicle changed its owner that belonged to somebody else.
@@ -188,22 +199,13 @@ class DirectCoordinator(Referee):
         """
         table = self._directory.table
         switches = tuple(map(_switch, changes))
-        if self.journal is None and self._watchers:
+        if is_told:
             self._record(Begin(table.episode, tick, switches, (), news.births))
-        for change in changes:
-            owner = table.owners.get(change.vehicle)
-            if owner != (change.source, change.epoch - 1):
-                raise LedgerError(
-                    f"vehicle {change.vehicle} changed from zone {change.source} to "
-                    f"{change.target} at tick {tick}, and its owner on record was {owner}"
-                )
         if news.births:
             self._directory.check_births(news.births)
         table.settle(tick, switches, news.births, news.removed)
-        if self.journal is None and self._watchers:
+        if is_told:
             self._record(self._committed(news.removed, _no_digest))
-        gone = {entry.vehicle for entry in news.removed}
-        self._transfers.add(_row(change, table.episode, gone) for change in changes)
 
     def _committed(self, removed: tuple[Removed, ...], rows: Callable[[int], int]) -> Commit:
         table = self._directory.table
@@ -253,23 +255,11 @@ def _switch(change: Change) -> Switch:
     return Switch(change.vehicle, change.source, change.target, change.epoch, False)
 
 
-def _row(change: Change, episode: int, gone: set[int]) -> Transfer:
+def _row(change: Change, episode: int, removed: bool) -> Transfer:
     release_m = change.release_depth_m
     return Transfer(
-        episode=episode,
-        tick=change.tick,
-        vehicle=change.vehicle,
-        source=change.source,
-        target=change.target,
-        epoch=change.epoch,
-        forced=False,
-        removed=change.vehicle in gone,
-        approached=change.approached,
-        waited=0,
-        offers=change.tick - change.approached,
-        state_bytes=0,
-        prepare_depth_m=change.prepare_depth_m,
-        switch_depth_m=change.switch_depth_m,
-        release_depth_m=None if release_m != release_m else release_m,
-        ms=change.ms,
-    )
+        episode, change.tick, change.vehicle, change.source, change.target, change.epoch,
+        False, removed, change.approached, 0, change.tick - change.approached, 0,
+        change.prepare_depth_m, change.switch_depth_m,
+        None if release_m != release_m else release_m, change.ms,
+    )  # fmt: skip
