@@ -172,7 +172,9 @@ class Monitor:
         )
         # Half empty, so that places are found at once.
         size = 1 << max(2 * capacity - 1, 1).bit_length()
-        self._kept = [tuple(np.zeros((2, size), dtype=KEPT)) for _ in range(num_worlds)]
+        # What two looks in a row say of a vehicle lies side by side.
+        tables = np.zeros((num_worlds, size, 2), dtype=KEPT)
+        self._kept = [(table[:, 0], table[:, 1]) for table in tables]
         self._tallies = np.zeros(division.count, dtype=TALLY)
         self._found = np.zeros(1, dtype=FINDING)
         self._watch = repeated(watch)
