@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from cavmarl.config import EnvConfig
 from cavmarl.kernels.arrays import Outputs, Travel
+from cavmarl.rig.frames import Frames
 from cavmarl.roads.network import RoadNetwork
 from cavmarl.runtime.division import Division
 from cavmarl.shard.shard import Commands, Shard
@@ -35,6 +36,7 @@ class Host(NamedTuple):
         travel: types and ways.
         outputs: what the agents get.
         zeros: makes the arrays that outlive a tick.
+        frames: what the rigs of the agents get.
     """
 
     config: EnvConfig
@@ -45,6 +47,7 @@ class Host(NamedTuple):
     travel: Travel
     outputs: Outputs
     zeros: Zeros
+    frames: Frames
 
 
 class Attached(Protocol):
@@ -75,4 +78,9 @@ class Attached(Protocol):
 
 def attach(host: Host) -> tuple[Attached, ...]:
     """The parts that the environment asks for, in the order in which they act."""
-    return ()
+    from cavmarl.runtime.mounted import MountedSensors
+
+    parts: list[Attached] = []
+    if host.config.rig:
+        parts.append(MountedSensors(host))
+    return tuple(parts)
