@@ -146,6 +146,9 @@ class ZonesConfig:
         reproducers: folder for ticks that every host of a zone died of, from which they can be run
             again. With it, what a zone's code raises is the death of its host. Empty: only where
             faults kill hosts, and then the system's folder for temporary files.
+        recut_steps: every so many steps zones become others by bisection of where the vehicles are,
+            if that shares them out better; results do not depend on it. 0: they stay.
+        recut_tolerance: by which share of the mean the fullest zone has to become emptier.
     """
 
     layout: str = "bisection"
@@ -163,6 +166,8 @@ class ZonesConfig:
     check: bool = False
     faults: str = ""
     reproducers: str = ""
+    recut_steps: int = 0
+    recut_tolerance: float = 0.1
 
     def __post_init__(self) -> None:
         _check(
@@ -201,6 +206,20 @@ class ZonesConfig:
             "zones.approach_ticks",
             self.approach_ticks,
             "must be a whole number from 1 to 1000",
+        )
+        _check(
+            0 <= self.recut_steps <= 1_000_000,
+            "zones.recut_steps",
+            self.recut_steps,
+            "must be a whole number from 0 to 1000000",
+        )
+        _check_finite("zones.recut_tolerance", self.recut_tolerance, 0.0, 100.0)
+        _check(
+            not (self.recut_steps and (self.faults or self.reproducers)),
+            "zones.recut_steps",
+            self.recut_steps,
+            "vehicles that change their zone must not be late: leave out zones.faults and "
+            "zones.reproducers, or let zones stay",
         )
 
 
@@ -384,12 +403,15 @@ class ActionConfig:
 
 @dataclass(frozen=True)
 class ObservationConfig:
-    """The form of an observation.
+    """What an observation is made of, and its form.
 
     Attributes:
-        kind: `flat`: one Box. `dict`: one Box a sensor.
+        mode: `ground_truth`: what `sensors` says, taken from the world itself. `sensors`: the
+            latest samples of the `rig`.
+        kind: `flat`: one Box of float32. `dict`: one Box a sensor.
     """
 
+    mode: Literal["ground_truth", "sensors"] = "ground_truth"
     kind: Literal["flat", "dict"] = "flat"
 
 
@@ -456,6 +478,12 @@ class EnvConfig:
         _check(self.version >= 0, "version", self.version, "must be 0 or more")
         _check_finite("horizon_s", self.horizon_s, self.clock.ctrl_dt_s, 1e6)
         check_rig(self.rig, self.clock.sim_dt_s, self.clock.ticks_per_step)
+        _check(
+            self.observation.mode != "sensors" or bool(self.rig),
+            "observation.mode",
+            self.observation.mode,
+            "there is no sensor under rig; mount one",
+        )
         steps = self.horizon_s / self.clock.ctrl_dt_s
         _check(
             abs(steps - round(steps)) < 1e-6 * steps,
