@@ -43,6 +43,7 @@ class Rig:
         self._mounted = [
             _Mounted(sensor, frames[sensor.name], platform) for sensor in mount(settings, platform)
         ]
+        self._is_new = True
         self._everywhere = np.ones(len(ids), dtype=np.bool_)
         self._call_roll = repeated(call_roll)
         self._note_poses = repeated(note_poses)
@@ -60,6 +61,10 @@ class Rig:
 
     def reset(self, scenes: Sequence[Scene], chosen: NDArray[np.bool_]) -> None:
         """Forget what there was in the chosen worlds (W,), and take what is due at the reset."""
+        if self._is_new:  # kernels are loaded now, and not in the first tick that asks for them
+            self._is_new = False
+            for mounted in self._mounted:
+                mounted.rehearse(scenes)
         self._before["id"][chosen] = -1
         for mounted in self._mounted:
             mounted.clear(chosen)
@@ -117,16 +122,26 @@ class _Mounted:
 
     def take(self, scenes: Sequence[Scene], chosen: NDArray[np.bool_]) -> None:
         """Take what is due in the chosen worlds (W,)."""
-        schedule, due, frames = self._schedule, self._due, self.frames
-        if not self._call_due(schedule, scenes[0].worlds.ticks, chosen, due):
-            return
-        self._sensor.sense(scenes, due, frames)
+        ticks = scenes[0].worlds.ticks
+        if self._call_due(self._schedule, ticks, chosen, self._due):
+            self._take_due(scenes)
+
+    def rehearse(self, scenes: Sequence[Scene]) -> None:
+        """Take a sample in every world, and forget it."""
+        for array, value in zip(self._due, (1, 0, 0), strict=True):
+            array[:] = value
+        self._take_due(scenes)
+        self.clear(self._due.num == 1)
+
+    def _take_due(self, scenes: Sequence[Scene]) -> None:
+        frames = self.frames
+        self._sensor.sense(scenes, self._due, frames)
         if not self._sensor.stamps_itself:
             for scene in scenes:
                 self._deliver(
                     scene.worlds,
-                    schedule,
-                    due,
+                    self._schedule,
+                    self._due,
                     self._sim_dt_s,
                     self._stream,
                     self._sensor.config.dropout,
