@@ -14,6 +14,7 @@ from typing import Literal
 
 from cavmarl.config_checks import check as _check
 from cavmarl.config_checks import check_finite as _check_finite
+from cavmarl.config_scenario import ScenarioConfig
 from cavmarl.config_sensors import SensorsConfig
 
 __all__ = [
@@ -27,6 +28,7 @@ __all__ = [
     "MapConfig",
     "ObservationConfig",
     "PopulationConfig",
+    "ScenarioConfig",
     "SensorsConfig",
     "TermsConfig",
     "TrafficConfig",
@@ -444,11 +446,18 @@ class EnvConfig:
     observation: ObservationConfig = field(default_factory=ObservationConfig)
     sensors: SensorsConfig = field(default_factory=SensorsConfig)
     terms: TermsConfig = field(default_factory=TermsConfig)
+    scenario: ScenarioConfig = field(default_factory=ScenarioConfig)
     horizon_s: float = 60.0
 
     def __post_init__(self) -> None:
         _check(self.version >= 0, "version", self.version, "must be 0 or more")
         _check_finite("horizon_s", self.horizon_s, self.clock.ctrl_dt_s, 1e6)
+        _check(
+            not self.scenario.name or self.population.agents == 1,
+            "population.agents",
+            self.population.agents,
+            "must be 1 where there is a scenario: it is played to one agent",
+        )
         steps = self.horizon_s / self.clock.ctrl_dt_s
         _check(
             abs(steps - round(steps)) < 1e-6 * steps,

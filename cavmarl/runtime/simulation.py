@@ -54,6 +54,8 @@ from cavmarl.traffic.demand import DemandFile
 from cavmarl.traffic.departures import make_gate
 from cavmarl.traffic.memory import Zeros
 from cavmarl.traffic.native import NativeTraffic
+from cavmarl.traffic.scenarios import plan_scene
+from cavmarl.traffic.scene import Scene
 
 __all__ = ["Simulation", "TrafficStats"]
 
@@ -150,6 +152,7 @@ class Simulation:
                     demand,
                     num_worlds,
                     zeros,
+                    plan_scene(config.scenario, network),
                 )
                 if like is None
                 else like._traffic.for_worlds(num_worlds)
@@ -249,6 +252,11 @@ class Simulation:
     def goal_edges(self) -> NDArray[np.int32]:
         """EDGE rows of the goals, by `VEHICLE["goal"]`."""
         return self._traffic.goal_edges
+
+    @property
+    def scene(self) -> Scene | None:
+        """What is played to the agent of each world."""
+        return self._traffic.scene
 
     @property
     def plans(self) -> NDArray[np.void]:
@@ -617,6 +625,7 @@ class Simulation:
             worlds.detected_s[world],
             worlds.ticks[world],
             worlds.keys[world],
+            worlds.cues[world],
             self._gate.next_id[world],
             self._gate.next_order[world],
             self._gate.num_entered[world],
