@@ -13,11 +13,13 @@ from __future__ import annotations
 import importlib
 import importlib.util
 from difflib import get_close_matches
-from functools import cache
+from functools import cache, lru_cache
 from pathlib import Path
 from pkgutil import iter_modules
 from types import ModuleType
 from typing import Any
+
+import numpy as np
 
 from cavmarl.config_scenario import ScenarioConfig
 from cavmarl.errors import ScenarioError
@@ -91,8 +93,7 @@ def plan_scene(config: ScenarioConfig, network: RoadNetwork) -> Scene | None:
         return None
     scenario = load_scenario(config.name)
     parameters = checked(scenario.Parameters, config.params, config.name)
-    streets = Streets(network)
-    places = scenario.places(streets, parameters)
+    places = _places(config.name, network, parameters)
     if not places:
         raise ScenarioError(
             f"scenario '{config.name}': the map '{network.name}' has no place for it; it needs "
@@ -100,7 +101,7 @@ def plan_scene(config: ScenarioConfig, network: RoadNetwork) -> Scene | None:
         )
     name = config.place
     if not name:
-        key = world_key(config.seed, 0, 0)
+        key = np.uint64(world_key(config.seed, 0, 0))
         name = sorted(places)[below(key, 0, 0, STREAM_PLACE, len(places))]
     if name not in places:
         close = get_close_matches(name, places, n=1)
@@ -109,5 +110,12 @@ def plan_scene(config: ScenarioConfig, network: RoadNetwork) -> Scene | None:
             f"scenario.place = {name!r}: not one of the {len(places)} places that the map "
             f"'{network.name}' has for '{config.name}', such as {some}"
         )
-    scene: Scene = scenario.stage(streets, places[name], parameters)
+    scene: Scene = scenario.stage(Streets(network), places[name], parameters)
     return scene
+
+
+@lru_cache(maxsize=16)  # several worlds of an environment ask one after the other
+def _places(name: str, network: RoadNetwork, parameters: Any) -> dict[str, Any]:
+    """Where on a map a scenario can be played, by name."""
+    found: dict[str, Any] = load_scenario(name).places(Streets(network), parameters)
+    return found
