@@ -127,11 +127,11 @@ class Streets:
             yields: whether it has to give way to the other.
             merges: whether both lead into one lane.
         """
-        links, lanes = self.network.links, self.network.lanes
+        links = self.network.links
         for link, row in enumerate(links):
             if chr(row["direction"]) not in directions:
                 continue
-            if not lanes["permissions"][row["from_lane"]] & CAR:
+            if not self._for_cars(row):
                 continue
             for c in range(row["first_conflict"], row["first_conflict"] + row["num_conflicts"]):
                 conflict = self.network.conflicts[c]
@@ -140,7 +140,7 @@ class Streets:
                     continue
                 if bool(conflict["must_yield"]) is not yields or foe["first_internal"] < 0:
                     continue
-                if not lanes["permissions"][foe["from_lane"]] & CAR:
+                if not self._for_cars(foe):
                     continue
                 yield Crossing(
                     link,
@@ -175,6 +175,10 @@ class Streets:
     def name(self, lane: int) -> str:
         """Of a lane."""
         return self.network.lane_ids[lane]
+
+    def _for_cars(self, link: np.void) -> bool:
+        ends = self.network.lanes["permissions"][[link["from_lane"], link["to_lane"]]]
+        return bool((ends & CAR != 0).all())
 
     def _bend(self, lane: int) -> float:
         row = self.network.lanes[lane]
