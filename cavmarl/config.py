@@ -15,6 +15,7 @@ from typing import Literal
 from cavmarl.config_checks import check as _check
 from cavmarl.config_checks import check_finite as _check_finite
 from cavmarl.config_rig import Rig, check_rig
+from cavmarl.config_scenario import ScenarioConfig
 from cavmarl.config_sensors import SensorsConfig
 
 __all__ = [
@@ -28,6 +29,7 @@ __all__ = [
     "MapConfig",
     "ObservationConfig",
     "PopulationConfig",
+    "ScenarioConfig",
     "SensorsConfig",
     "TermsConfig",
     "TrafficConfig",
@@ -469,6 +471,7 @@ class EnvConfig:
     sensors: SensorsConfig = field(default_factory=SensorsConfig)
     terms: TermsConfig = field(default_factory=TermsConfig)
     rig: Rig = field(default_factory=dict)
+    scenario: ScenarioConfig = field(default_factory=ScenarioConfig)
     horizon_s: float = 60.0
 
     def __post_init__(self) -> None:
@@ -480,6 +483,12 @@ class EnvConfig:
             "observation.mode",
             self.observation.mode,
             "there is no sensor under rig; mount one",
+        )
+        _check(
+            not self.scenario.name or self.population.agents == 1,
+            "population.agents",
+            self.population.agents,
+            "must be 1 where there is a scenario: it is played to one agent",
         )
         steps = self.horizon_s / self.clock.ctrl_dt_s
         _check(

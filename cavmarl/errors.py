@@ -9,6 +9,7 @@
     ├── MapError               a map that cannot be read, built or driven
     │   └── RouteError         no way from here to there
     ├── DemandError            a file of traffic that cannot be read or does not fit its map
+    ├── ScenarioError          a scenario that is none, or has no place on the map
     ├── ActionError            refused before any state has changed
     │   ├── InvalidActionError    wrong shape, dtype or value
     │   ├── MissingActionError    a live agent without an action
@@ -134,6 +135,10 @@ class CoverageError(ConfigError):
 
 class PlacementError(ConfigError):
     """Loads, weights or workers by which no shard can be placed."""
+
+
+class ScenarioError(CavmarlError):
+    """No scenario of that name, a broken file of one, or a map without a place for it."""
 
 
 class MapError(CavmarlError):

@@ -26,6 +26,7 @@ from cavmarl.roads.zone_layouts import cut_map
 from cavmarl.roads.zones import ZonePartition
 from cavmarl.traffic.demand import DemandFile, read_demand
 from cavmarl.traffic.native import capacity_of
+from cavmarl.traffic.scenarios import plan_scene
 
 __all__ = [
     "World",
@@ -60,7 +61,9 @@ class World(NamedTuple):
         """How many vehicles it can hold."""
         config = self.config
         dt, horizon_s = config.clock.sim_dt_s, config.horizon_s
-        return capacity_of(self.network, config.population, self.demand, dt, horizon_s)
+        room = capacity_of(self.network, config.population, self.demand, dt, horizon_s)
+        scene = plan_scene(config.scenario, self.network)
+        return room + (0 if scene is None else len(scene.actors))
 
 
 def load_world(

@@ -35,6 +35,7 @@ __all__ = [
     "LATERAL_MPS",
     "MAX_SPEED_MPS",
     "Before",
+    "account",
     "before_tick",
     "move_agent",
     "move_background",
@@ -147,8 +148,8 @@ def place_on_lane(roads: RoadArrays, travel: Travel, row: np.void) -> float:
 
 
 @inlined_kernel
-def _account(row: np.void, before: Before, roads: RoadArrays, pace: float, dt: float) -> None:
-    """What motion of both kinds leaves in the record: rates, ways, waiting time.
+def account(row: np.void, before: Before, roads: RoadArrays, pace: float, dt: float) -> None:
+    """What motion of every kind leaves in the record: rates, ways, waiting time.
 
     `pace` is the speed over the limit with which the way would have been driven freely.
     """
@@ -260,7 +261,7 @@ def move_background(
         row["to_go"] = way_left(roads, row, travel.steps[own_step(roads, row)])
     if row["to_go"] <= ARRIVE_M:
         row["events"] |= EVENT_ARRIVED
-    _account(row, before, roads, row["speed_factor"], dt)
+    account(row, before, roads, row["speed_factor"], dt)
     make_stop(roads, travel, row, before.lane, dt)
 
 
@@ -315,4 +316,4 @@ def move_agent(
     row["to_go"] = step["to_go"] - row["s"]
     if row["to_go"] <= ARRIVE_M:
         row["events"] |= EVENT_ARRIVED
-    _account(row, before, roads, 1.0, dt)
+    account(row, before, roads, 1.0, dt)

@@ -34,7 +34,8 @@ from cavmarl.roads.network import RoadNetwork
 from cavmarl.roads.zone_layouts import cut_map
 from cavmarl.roads.zones import ZonePartition
 from cavmarl.runtime import snapshot
-from cavmarl.runtime.attached import Attached, Host, attach
+from cavmarl.runtime.attached import Attached, Host
+from cavmarl.runtime.attaching import attach
 from cavmarl.runtime.border_book import BorderBook
 from cavmarl.runtime.commons import Commons
 from cavmarl.runtime.compilation import first_compilation
@@ -57,6 +58,8 @@ from cavmarl.traffic.demand import DemandFile
 from cavmarl.traffic.departures import make_gate
 from cavmarl.traffic.memory import Zeros
 from cavmarl.traffic.native import NativeTraffic
+from cavmarl.traffic.scenarios import plan_scene
+from cavmarl.traffic.scene import Scene
 
 __all__ = ["Simulation", "TrafficStats"]
 
@@ -157,6 +160,7 @@ class Simulation:
                     demand,
                     num_worlds,
                     zeros,
+                    plan_scene(config.scenario, network),
                 )
                 if like is None
                 else like._traffic.for_worlds(num_worlds)
@@ -266,6 +270,11 @@ class Simulation:
     def goal_edges(self) -> NDArray[np.int32]:
         """EDGE rows of the goals, by `VEHICLE["goal"]`."""
         return self._traffic.goal_edges
+
+    @property
+    def scene(self) -> Scene | None:
+        """What is played to the agent of each world."""
+        return self._traffic.scene
 
     @property
     def plans(self) -> NDArray[np.void]:
@@ -655,6 +664,7 @@ class Simulation:
             worlds.detected_s[world],
             worlds.ticks[world],
             worlds.keys[world],
+            worlds.cues[world],
             self._gate.next_id[world],
             self._gate.next_order[world],
             self._gate.num_entered[world],

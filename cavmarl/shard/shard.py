@@ -115,7 +115,7 @@ class Shard:
         self.cut(zones, halo)
         # One after the other works in it: what the last one has left is still near in memory.
         self.scratch: Scratch = (
-            _make_scratch(len(network.lanes), len(network.links), capacity)
+            _make_scratch(len(network.lanes), len(network.links), capacity, travel.scripts.room)
             if first is None
             else first.scratch
         )
@@ -129,6 +129,7 @@ class Shard:
             zone,
             None if first is None else first.worlds,
             zeros,
+            len(travel.scripts.cues),
         )
         self.sides = (self.worlds.rows, zoned.rows[1, zone])
         self.side = self.next_side = 0
@@ -222,10 +223,11 @@ def make_worlds(
     zone: int = 0,
     common: Worlds | None = None,
     zeros: Zeros = np.zeros,
+    num_cues: int = 0,
 ) -> Worlds:
     """Arrays of W worlds that hold `capacity` vehicles each, all of them empty.
 
-    Agents' commands take effect `latency_ticks` later. The rows are those of a zone of `zoned`, if
+    Agents' commands take effect `latency_ticks` later, scripts wait for `num_cues` cues. The rows are those of a zone of `zoned`, if
     it is given. What all zones of a world have in common (ticks, keys, signals and what detectors
     saw) are the arrays of `common`, if it is given; if not, `zeros` makes them.
     """
@@ -251,6 +253,7 @@ def make_worlds(
         step_at=zoned.step_at[zone],
         outer=zoned.outer[zone],
         num_outer=zoned.num_outer[zone],
+        cues=zeros((num_worlds, num_cues), dtype=np.int64),
     )
     if common is None:
         return worlds
@@ -295,7 +298,7 @@ def _seen(
     )
 
 
-def _make_scratch(num_lanes: int, num_links: int, capacity: int) -> Scratch:
+def _make_scratch(num_lanes: int, num_links: int, capacity: int, covers: int = 0) -> Scratch:
     def integers(size: int) -> NDArray[np.int32]:
         return np.zeros(size, dtype=np.int32)
 
@@ -307,7 +310,7 @@ def _make_scratch(num_lanes: int, num_links: int, capacity: int) -> Scratch:
         lanes=lanes,
         lane_start=lanes.bounds[:, 0],
         lane_end=lanes.bounds[:, 1],
-        entries=np.zeros(2 * capacity, dtype=ENTRY),
+        entries=np.zeros(2 * capacity + covers, dtype=ENTRY),
         links=links,
         link_start=links.bounds[:, 0],
         link_end=links.bounds[:, 1],
