@@ -6,7 +6,6 @@ matter in which order, or in which zone, anybody asks.
 
 from __future__ import annotations
 
-import math
 from typing import NamedTuple
 
 import numpy as np
@@ -18,9 +17,9 @@ from cavmarl.kernels.walls import Walls, is_cut
 
 __all__ = [
     "Channel",
+    "busy_level",
     "draw",
     "gets_access",
-    "hidden_share",
     "is_equipped",
     "is_heard",
     "packet_word",
@@ -38,14 +37,17 @@ _ULP = 1.0 / (1 << 53)
 
 
 class Channel(NamedTuple):
-    """The air; see `v2x.channel.make_channel`."""
+    """The air; see `v2x.channel.make_channel`.
+
+    Chances of reception are tables of B levels of busy air by whole metres, from 0 m on; in between
+    they change evenly, and the last but one and the last hold for all that is further away.
+    """
 
     reach_m: float  # nobody further away receives anything; inf: no limit
     sure: bool  # who is within reach receives
     external: bool  # somebody else says who receives
-    loss: float  # share of packets that is lost, whatever else
-    clear: NDArray[np.float64]  # (K,) chance of reception at 0, 1, 2 … m in the line of sight
-    blocked: NDArray[np.float64]  # (K,) behind a building; (1,): buildings do not matter
+    clear: NDArray[np.float64]  # (B, K) in the line of sight
+    blocked: NDArray[np.float64]  # (B, K) behind a building; (0, K): buildings do not matter
     sensing_m: float  # up to where one hears that somebody sends
     load: float  # share of a tick that a packet takes; 0: the air takes any number
     walls: Walls
@@ -92,31 +94,24 @@ def gets_access(key: np.uint64, sender: int, tick: int, kind: int, busy: float) 
 
 
 @kernel
-def hidden_share(distance_m: float, sensing_m: float) -> float:
-    """Of those whom a receiver hears the share that the sender does not: part of a circle.
-
-    Both hear what is within `sensing_m` of themselves; traffic is taken to be as dense everywhere.
-    """
-    half = 0.5 * distance_m / sensing_m
-    if half >= 1.0:
-        return 1.0
-    return 1.0 - (math.acos(half) - half * math.sqrt(1.0 - half * half)) * 2.0 / math.pi
+def busy_level(channel: Channel, busy: float) -> int:
+    """The row of the tables for a share of the time in which the air is busy, from 0 to 1."""
+    return int(busy * (channel.clear.shape[0] - 1) + 0.5)
 
 
 @kernel
-def _at(table: NDArray[np.float64], distance_m: float) -> float:
-    """A table's value at a distance, between those of whole metres; 0 beyond its end."""
-    below = int(distance_m)
-    if below + 1 >= table.size:
-        return 0.0
-    return float(table[below] + (table[below + 1] - table[below]) * (distance_m - below))
+def _at(chances: NDArray[np.float64], distance_m: float) -> float:
+    """A table's value at a distance."""
+    below = min(int(distance_m), chances.size - 2)
+    low = chances[below]
+    return float(low + (chances[below + 1] - low) * (distance_m - below))
 
 
 @kernel
 def is_heard(
     channel: Channel,
+    level: int,
     number: float,
-    busy: float,
     x: float,
     y: float,
     from_x: float,
@@ -125,31 +120,19 @@ def is_heard(
 ) -> bool:
     """Whether a packet within reach is received.
 
-    The chance is (1 - loss) · P(distance) · exp(-2 · busy · hidden). P is that of the path-loss
-    model. The last factor is that of packets of stations which the sender cannot hear and so does
-    not wait for, if they send at random: two packet times in which nobody else may begin
-    (Tobagi, Kleinrock: "Packet switching in radio channels: part II", IEEE Trans. Commun., 1975).
-
     Args:
         channel: the air.
+        level: of `busy_level`.
         number: of `draw`.
-        busy: share of the time in which the receiver hears others.
         x: m, the receiver's place.
         y: likewise.
         from_x: m, the sender's.
         from_y: likewise.
         distance_m: between them.
     """
-    chance = 1.0 - channel.loss
-    if channel.load == 0.0 and channel.clear.size == 1:
-        return number < chance
-    if channel.load > 0.0 and channel.sensing_m != math.inf:
-        hidden = hidden_share(distance_m, channel.sensing_m)
-        chance *= math.exp(-2.0 * min(busy, 1.0) * hidden)
-    if channel.clear.size == 1:
-        return number < chance
-    if number >= chance * _at(channel.clear, distance_m):
+    if number >= _at(channel.clear[level], distance_m):
         return False
-    if channel.blocked.size == 1 or number < chance * _at(channel.blocked, distance_m):
+    # What is received even behind a building needs no look whether one is there.
+    if channel.blocked.shape[0] == 0 or number < _at(channel.blocked[level], distance_m):
         return True
     return not is_cut(channel.walls, x, y, from_x, from_y)

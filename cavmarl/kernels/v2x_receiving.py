@@ -13,10 +13,11 @@ from numpy.typing import NDArray
 
 from cavmarl.kernels import kernel
 from cavmarl.kernels.neighbors import cell_at, cell_columns, cell_rows
-from cavmarl.kernels.v2x_channel import Channel, draw, gets_access, is_heard
+from cavmarl.kernels.rng import mix
+from cavmarl.kernels.v2x_channel import Channel, busy_level, draw, gets_access, is_heard
 from cavmarl.kernels.v2x_inbox import empty, find, forget, insert, is_better, sort_by_distance
 from cavmarl.kernels.v2x_records import (
-    BAND_M,
+    BANDS_PER_M,
     COUNT_NO_ACCESS,
     COUNT_REACHABLE,
     COUNT_RECEIVED,
@@ -30,7 +31,7 @@ from cavmarl.kernels.v2x_records import (
     Room,
 )
 
-__all__ = ["age", "deliver", "find_cam", "learn"]
+__all__ = ["age", "deliver", "learn"]
 
 
 @kernel
@@ -54,6 +55,8 @@ def _fill_air(
             place = start[cell[p]]
             air.x[place] = packets[p]["x"]
             air.y[place] = packets[p]["y"]
+            air.sender[place] = packets[p]["sender"]
+            air.word[place] = packets[p]["word"]
             air.which[place] = p
 
 
@@ -86,74 +89,108 @@ def _load_around(channel: Channel, room: Room, x: float, y: float) -> float:
 
 
 @kernel
-def find_cam(packets: NDArray[np.void], num: int, sender: int) -> int:
-    """The CAM of a sender among packets in order, or -1."""
-    low = 0
-    high = num
-    while low < high:
-        middle = (low + high) // 2
-        if packets[middle]["sender"] < sender:
-            low = middle + 1
-        else:
-            high = middle
-    if low < num and packets[low]["sender"] == sender and packets[low]["kind"] == KIND_CAM:
-        return low
-    return -1
+def _place_of(sender: int, slots: int) -> int:
+    """Where the search for a sender begins in a table of `slots` places, a power of 2."""
+    return np.int64(mix(np.uint64(sender)) & np.uint64(slots - 1))
 
 
 @kernel
-def _hears(channel: Channel, me: np.void, busy: float, packet: np.void, squared: float) -> bool:
-    """Whether a receiver receives a packet that is within reach."""
-    return channel.sure or is_heard(
-        channel,
-        draw(me["word"], packet["word"]),
-        busy,
-        me["x"],
-        me["y"],
-        packet["x"],
-        packet["y"],
-        math.sqrt(squared),
-    )
+def _list_cams(room: Room, packets: NDArray[np.void], num: int) -> None:
+    """Make `room.cam_of` the table of the CAMs that are on the air, by sender."""
+    table = room.cam_of
+    table[:] = -1
+    for p in range(num):
+        if room.access[p] and packets[p]["kind"] == KIND_CAM:
+            place = _place_of(packets[p]["sender"], table.size)
+            while table[place] >= 0:
+                place = (place + 1) & (table.size - 1)
+            table[place] = p
 
 
 @kernel
-def _note(
-    channel: Channel, mail: Mail, w: int, squared: float, received: bool
-) -> None:
-    """Count a packet that could be received."""
-    mail.counts[w, COUNT_REACHABLE] += 1
-    mail.counts[w, COUNT_RECEIVED] += received
-    if not channel.sure:
-        band = min(int(math.sqrt(squared) / BAND_M), NUM_BANDS - 1)
-        mail.bands[w, band, 0] += 1
-        mail.bands[w, band, 1] += received
+def _find_cam(room: Room, packets: NDArray[np.void], sender: int) -> int:
+    """The CAM of a sender, or -1."""
+    table = room.cam_of
+    place = _place_of(sender, table.size)
+    while table[place] >= 0 and packets[table[place]]["sender"] != sender:
+        place = (place + 1) & (table.size - 1)
+    return int(table[place])
+
+
+@kernel
+def _hears(
+    channel: Channel, me: np.void, level: int, word: np.uint64, x: float, y: float, squared: float
+) -> bool:
+    """Whether a receiver receives a packet with that word that is sent within reach, from (x, y)."""
+    if channel.sure:
+        return True
+    number = draw(me["word"], word)
+    return is_heard(channel, level, number, me["x"], me["y"], x, y, math.sqrt(squared))
+
+
+@kernel
+def _note_band(bands: NDArray[np.int64], distance_m: float, received: bool) -> None:
+    """Count a packet that could be received by the distance of its sender."""
+    band = min(int(distance_m * BANDS_PER_M), NUM_BANDS - 1)
+    bands[band, 0] += 1
+    bands[band, 1] += received
 
 
 @kernel
 def _refresh_by_cams(
     channel: Channel,
     me: np.void,
-    busy: float,
+    level: int,
     packets: NDArray[np.void],
-    num_packets: int,
     reports: NDArray[np.void],
-    access: NDArray[np.bool_],
+    room: Room,
     box: NDArray[np.void],
     num: int,
 ) -> None:
     """Let those that a receiver knows tell the newest of themselves."""
     limit = channel.reach_m * channel.reach_m
     for k in range(num):
-        p = find_cam(packets, num_packets, box[k]["subject"])
-        if p < 0 or not access[p]:
+        p = _find_cam(room, packets, box[k]["subject"])
+        if p < 0:
             continue
-        dx = packets[p]["x"] - me["x"]
-        dy = packets[p]["y"] - me["y"]
+        packet = packets[p]
+        dx = packet["x"] - me["x"]
+        dy = packet["y"] - me["y"]
         squared = dx * dx + dy * dy
-        if squared <= limit and _hears(channel, me, busy, packets[p], squared):
-            report = reports[packets[p]["first"]]
+        if squared <= limit and _hears(
+            channel, me, level, packet["word"], packet["x"], packet["y"], squared
+        ):
+            report = reports[packet["first"]]
             if is_better(report, box[k]):
                 box[k] = report
+
+
+@kernel
+def _drop_lost(
+    channel: Channel,
+    me: np.void,
+    level: int,
+    air: Air,
+    num: int,
+    bands: NDArray[np.int64],
+    heard: NDArray[np.int32],
+) -> int:
+    """Of the packets `heard[:num]` within reach keep those that are received; returns how many."""
+    x = me["x"]
+    y = me["y"]
+    word = me["word"]
+    kept = 0
+    for k in range(num):
+        b = heard[k]
+        dx = air.x[b] - x
+        dy = air.y[b] - y
+        distance_m = math.sqrt(dx * dx + dy * dy)
+        number = draw(word, air.word[b])
+        is_received = is_heard(channel, level, number, x, y, air.x[b], air.y[b], distance_m)
+        _note_band(bands, distance_m, is_received)
+        heard[kept] = b
+        kept += is_received
+    return kept
 
 
 @kernel
@@ -162,9 +199,8 @@ def _let_in_cams(
     mail: Mail,
     w: int,
     me: np.void,
-    busy: float,
+    level: int,
     packets: NDArray[np.void],
-    num_packets: int,
     reports: NDArray[np.void],
     room: Room,
     box: NDArray[np.void],
@@ -174,39 +210,47 @@ def _let_in_cams(
     air = room.cams
     cells = air.cells
     reach_m = channel.reach_m
-    everybody = channel.sure and reach_m == math.inf
-    if everybody:
+    limit = reach_m * reach_m
+    counts = mail.counts[w]
+    hears_all = channel.sure and reach_m == math.inf
+    if hears_all:
         heard = cells.start[cells.start.size - 1]
-        own = find_cam(packets, num_packets, me["id"])
-        heard -= own >= 0
-        mail.counts[w, COUNT_REACHABLE] += heard
-        mail.counts[w, COUNT_RECEIVED] += heard
+        heard -= _find_cam(room, packets, me["id"]) >= 0
+        counts[COUNT_REACHABLE] += heard
+        counts[COUNT_RECEIVED] += heard
         if num == box.size:
             # Whoever is further away than all that it knows is not let in.
-            reach_m = math.sqrt(room.squared[num - 1])
-    limit = reach_m * reach_m
-    first_column, last_column = cell_columns(cells, me["x"], reach_m)
-    first_row, last_row = cell_rows(cells, me["y"], reach_m)
+            limit = room.squared[num - 1]
+            reach_m = math.sqrt(limit)
+    x = me["x"]
+    y = me["y"]
+    own = me["id"]
+    near = 0
+    first_column, last_column = cell_columns(cells, x, reach_m)
+    first_row, last_row = cell_rows(cells, y, reach_m)
     for j in range(first_row, last_row + 1):
         begin = cells.start[j * cells.num_x + first_column]
         end = cells.start[j * cells.num_x + last_column + 1]
+        # Here and below a place is written in any case: who is in and who is not cannot be guessed.
         for b in range(begin, end):
-            dx = air.x[b] - me["x"]
-            dy = air.y[b] - me["y"]
-            squared = dx * dx + dy * dy
-            if not squared <= limit:
-                continue
-            packet = packets[air.which[b]]
-            if packet["sender"] == me["id"]:
-                continue
-            is_received = _hears(channel, me, busy, packet, squared)
-            if not everybody:
-                _note(channel, mail, w, squared, is_received)
-            if not is_received or (num == box.size and squared > room.squared[num - 1]):
-                continue
-            report = reports[packet["first"]]
+            dx = air.x[b] - x
+            dy = air.y[b] - y
+            room.heard[near] = b
+            near += dx * dx + dy * dy <= limit and air.sender[b] != own
+    heard = near
+    if not channel.sure:
+        heard = _drop_lost(channel, me, level, air, near, mail.bands[w], room.heard)
+    if not hears_all:
+        counts[COUNT_REACHABLE] += near
+        counts[COUNT_RECEIVED] += heard
+    for k in range(heard):
+        b = room.heard[k]
+        dx = air.x[b] - x
+        dy = air.y[b] - y
+        if num < box.size or dx * dx + dy * dy <= room.squared[num - 1]:
+            report = reports[packets[air.which[b]]["first"]]
             if find(box, num, report["subject"]) < 0:
-                num = insert(box, num, room.squared, report, me["x"], me["y"])
+                num = insert(box, num, room.squared, report, x, y)
     return num
 
 
@@ -216,7 +260,7 @@ def _take_others(
     mail: Mail,
     w: int,
     me: np.void,
-    busy: float,
+    level: int,
     packets: NDArray[np.void],
     reports: NDArray[np.void],
     room: Room,
@@ -235,17 +279,20 @@ def _take_others(
         begin = cells.start[j * cells.num_x + first_column]
         end = cells.start[j * cells.num_x + last_column + 1]
         for b in range(begin, end):
-            packet = packets[air.which[b]]
-            if packet["kind"] != kind or packet["sender"] == me["id"]:
-                continue
             dx = air.x[b] - me["x"]
             dy = air.y[b] - me["y"]
             squared = dx * dx + dy * dy
-            if not squared <= limit:
+            if not squared <= limit or air.sender[b] == me["id"]:
                 continue
-            is_received = _hears(channel, me, busy, packet, squared)
+            packet = packets[air.which[b]]
+            if packet["kind"] != kind:
+                continue
+            is_received = _hears(channel, me, level, air.word[b], air.x[b], air.y[b], squared)
             if new:
-                _note(channel, mail, w, squared, is_received)
+                mail.counts[w, COUNT_REACHABLE] += 1
+                mail.counts[w, COUNT_RECEIVED] += is_received
+                if not channel.sure:
+                    _note_band(mail.bands[w], math.sqrt(squared), is_received)
             if not is_received:
                 continue
             for k in range(packet["first"], packet["first"] + packet["count"]):
@@ -267,7 +314,7 @@ def _receive_objects(
     w: int,
     slot: int,
     me: np.void,
-    busy: float,
+    level: int,
     with_seen: bool,
     room: Room,
     box: NDArray[np.void],
@@ -275,18 +322,17 @@ def _receive_objects(
 ) -> int:
     """Take what is told of vehicles, by themselves and by those who see them."""
     packets = mail.packets[w, slot]
-    sent = mail.num_packets[w, slot]
     reports = mail.reports[w, slot]
-    _refresh_by_cams(channel, me, busy, packets, sent, reports, room.access, box, num)
+    _refresh_by_cams(channel, me, level, packets, reports, room, box, num)
     if with_seen:
         _take_others(
-            channel, mail, w, me, busy, packets, reports, room, KIND_CPM, box, num, False
+            channel, mail, w, me, level, packets, reports, room, KIND_CPM, box, num, False
         )
     sort_by_distance(box, num, room.squared, me["x"], me["y"])
-    num = _let_in_cams(channel, mail, w, me, busy, packets, sent, reports, room, box, num)
+    num = _let_in_cams(channel, mail, w, me, level, packets, reports, room, box, num)
     if with_seen:
         num = _take_others(
-            channel, mail, w, me, busy, packets, reports, room, KIND_CPM, box, num, True
+            channel, mail, w, me, level, packets, reports, room, KIND_CPM, box, num, True
         )
     return num
 
@@ -298,7 +344,7 @@ def _receive_others(
     w: int,
     slot: int,
     me: np.void,
-    busy: float,
+    level: int,
     kind: int,
     room: Room,
     box: NDArray[np.void],
@@ -307,9 +353,9 @@ def _receive_others(
     """Take what is told of events, or of signals."""
     packets = mail.packets[w, slot]
     reports = mail.reports[w, slot]
-    _take_others(channel, mail, w, me, busy, packets, reports, room, kind, box, num, False)
+    _take_others(channel, mail, w, me, level, packets, reports, room, kind, box, num, False)
     sort_by_distance(box, num, room.squared, me["x"], me["y"])
-    return _take_others(channel, mail, w, me, busy, packets, reports, room, kind, box, num, True)
+    return _take_others(channel, mail, w, me, level, packets, reports, room, kind, box, num, True)
 
 
 @kernel
@@ -325,26 +371,27 @@ def _receive(
 ) -> None:
     """Bring the inboxes of one receiver to the present tick."""
     me = room.receivers[r]
-    busy = 0.0
+    level = 0
     if channel.load > 0.0:
         busy = min(_load_around(channel, room, me["x"], me["y"]), 1.0)
         mail.busy[w, 0] += busy
         mail.busy[w, 1] += 1.0
         mail.busy[w, 2] = max(mail.busy[w, 2], busy)
+        level = busy_level(channel, busy)
     objects = mail.objects[w, r]
     num = forget(objects, tick)
     with_seen = kinds[KIND_CPM] > 0
-    num = _receive_objects(channel, mail, w, slot, me, busy, with_seen, room, objects, num)
+    num = _receive_objects(channel, mail, w, slot, me, level, with_seen, room, objects, num)
     empty(objects, num)
     events = mail.events[w, r]
     num = forget(events, tick)
     if num > 0 or kinds[KIND_DENM] > 0:
-        num = _receive_others(channel, mail, w, slot, me, busy, KIND_DENM, room, events, num)
+        num = _receive_others(channel, mail, w, slot, me, level, KIND_DENM, room, events, num)
     empty(events, num)
     signals = mail.signals[w, r]
     num = forget(signals, tick)
     if num > 0 or kinds[KIND_SPAT] > 0:
-        num = _receive_others(channel, mail, w, slot, me, busy, KIND_SPAT, room, signals, num)
+        num = _receive_others(channel, mail, w, slot, me, level, KIND_SPAT, room, signals, num)
     empty(signals, num)
 
 
@@ -401,6 +448,7 @@ def deliver(
     for p in range(mail.num_packets[w, slot]):
         kinds[mail.packets[w, slot, p]["kind"]] += 1
     _let_on_the_air(channel, mail, w, slot, key, room)
+    _list_cams(room, mail.packets[w, slot], mail.num_packets[w, slot])
     before = mail.counts[w, COUNT_RECEIVED]
     for r in range(room.receivers.size):
         if room.receivers[r]["id"] >= 0:

@@ -32,6 +32,7 @@ __all__ = [
     "LAST_CAM",
     "MAX_DELAYS",
     "MAX_NEAR",
+    "BANDS_PER_M",
     "BAND_M",
     "NUM_BANDS",
     "NUM_COUNTS",
@@ -74,6 +75,7 @@ NUM_COUNTS = 8
 MAX_DELAYS = 65  # ticks of delay that are told apart
 NUM_BANDS = 40  # bands of distance that receptions are counted by; the last one has no end
 BAND_M = 25.0
+BANDS_PER_M = 1.0 / BAND_M
 MAX_NEAR = 64  # bodies that a station looks at, the nearest ones
 
 REPORT = np.dtype(
@@ -207,7 +209,9 @@ class Air(NamedTuple):
     cells: Grid  # of which the bodies are not used
     x: NDArray[np.float64]  # (P,) in the order of the cells
     y: NDArray[np.float64]
-    which: NDArray[np.int32]  # (P,) the packet
+    sender: NDArray[np.int64]
+    word: NDArray[np.uint64]  # see PACKET
+    which: NDArray[np.int32]  # the packet
 
 
 class Room(NamedTuple):
@@ -226,4 +230,6 @@ class Room(NamedTuple):
     others: Air  # all else
     kinds: NDArray[np.int64]  # (NUM_KINDS,) packets that are received now
     access: NDArray[np.bool_]  # (P,) whether a packet gets on the air
+    cam_of: NDArray[np.int32]  # (a power of 2,) the CAM of a sender, or -1; a hash table
+    heard: NDArray[np.int32]  # (P + 1,) places of `cams` that a receiver hears
     squared: NDArray[np.float64]  # (largest inbox,)

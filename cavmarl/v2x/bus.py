@@ -261,7 +261,14 @@ def _make_room(network: RoadNetwork, mail: Mail, zoned: Zoned, num_receivers: in
 
     def air() -> Air:
         cells = make_grid(network.extent_m, CELL_M, 0)._replace(cell=np.zeros(most, np.int32))
-        return Air(cells, np.zeros(most), np.zeros(most), np.zeros(most, np.int32))
+        return Air(
+            cells,
+            x=np.zeros(most),
+            y=np.zeros(most),
+            sender=np.zeros(most, np.int64),
+            word=np.zeros(most, np.uint64),
+            which=np.zeros(most, np.int32),
+        )
 
     return Room(
         stations=np.zeros(capacity, STATION),
@@ -277,5 +284,7 @@ def _make_room(network: RoadNetwork, mail: Mail, zoned: Zoned, num_receivers: in
         others=air(),
         kinds=np.zeros(NUM_KINDS, np.int64),
         access=np.zeros(most, np.bool_),
+        cam_of=np.zeros(1 << (2 * capacity).bit_length(), np.int32),
+        heard=np.zeros(most + 1, np.int32),
         squared=np.zeros(largest),
     )

@@ -12,13 +12,24 @@ from cavmarl.config_v2x import ChannelConfig
 from cavmarl.kernels.v2x_channel import Channel
 from cavmarl.kernels.walls import Walls
 
-__all__ = ["airtime_s", "chance_of_reception", "make_channel", "median_range_m", "reference_loss_db"]
+__all__ = [
+    "BUSY_LEVELS",
+    "airtime_s",
+    "chance_among_others",
+    "chance_of_reception",
+    "hidden_share",
+    "make_channel",
+    "median_range_m",
+    "reference_loss_db",
+]
 
 CARRIER_HZ = 5.9e9
 LIGHT_MPS = 299_792_458.0
 PREAMBLE_S = 40e-6  # of IEEE 802.11p in a channel of 10 MHz
 # Beyond the distance where fewer packets than this are received nobody asks.
 LEAST_CHANCE = 1e-3
+MAX_REACH_M = 20_000
+BUSY_LEVELS = 65  # steps in which chances of reception depend on how busy the air is
 
 
 def reference_loss_db() -> float:
@@ -59,44 +70,84 @@ def airtime_s(config: ChannelConfig) -> float:
     return PREAMBLE_S + 8.0 * config.packet_bytes / (1e6 * config.data_rate_mbps)
 
 
-def _table(config: ChannelConfig, extra_db: float, end_m: float) -> NDArray[np.float64]:
-    """Chances at 0, 1, 2 … m, up to `end_m` or where nothing is received any more."""
-    chances = []
-    distance_m = 0.0
-    while True:
-        chance = chance_of_reception(config, distance_m, extra_db)
-        chances.append(chance)
-        if chance < LEAST_CHANCE or distance_m > end_m:
-            return np.array(chances)
-        distance_m += 1.0
+def hidden_share(distance_m: float, sensing_m: float) -> float:
+    """Of those whom a receiver hears the share that the sender does not: part of a circle.
+
+    Both hear what is within `sensing_m` of themselves; traffic is taken to be as dense everywhere.
+    """
+    half = 0.5 * distance_m / sensing_m
+    if half >= 1.0:
+        return 1.0
+    return 1.0 - (math.acos(half) - half * math.sqrt(1.0 - half * half)) * 2.0 / math.pi
+
+
+def chance_among_others(busy: float, hidden: float) -> float:
+    """Chance that nobody whom the sender does not hear, and so does not wait for, disturbs it.
+
+    They send at random, and a packet is lost if one of them begins within two packet times: e^(-2G),
+    where G is their share of the air (Abramson: "The ALOHA system", 1970; Tobagi, Kleinrock:
+    "Packet switching in radio channels: part II, the hidden terminal problem", 1975).
+
+    Args:
+        busy: share of the time in which the receiver hears somebody.
+        hidden: share of those whom the sender does not hear.
+    """
+    return math.exp(-2.0 * busy * hidden)
+
+
+def _distances_m(config: ChannelConfig, sensing_m: float) -> int:
+    """How many whole metres a table has."""
+    end_m = config.range_m or math.inf
+    if config.path_loss_exponent > 0.0:
+        metre = 1
+        while chance_of_reception(config, metre) >= LEAST_CHANCE and metre < min(end_m, MAX_REACH_M):
+            metre += 1
+        return metre + 1
+    if config.data_rate_mbps > 0.0 and sensing_m < math.inf:
+        return math.ceil(min(end_m, 2.0 * sensing_m)) + 1
+    return 2
+
+
+def _table(config: ChannelConfig, sensing_m: float, extra_db: float) -> NDArray[np.float64]:
+    """Chances of reception (B, K), see `Channel`."""
+    metres = range(_distances_m(config, sensing_m))
+    levels = BUSY_LEVELS if config.data_rate_mbps > 0.0 else 1
+    chances = np.full((levels, len(metres)), 1.0 - config.loss)
+    if config.path_loss_exponent > 0.0:
+        chances *= [chance_of_reception(config, metre, extra_db) for metre in metres]
+    if levels > 1 and sensing_m < math.inf:
+        hidden = [hidden_share(metre, sensing_m) for metre in metres]
+        for level in range(levels):
+            busy = level / (levels - 1)
+            chances[level] *= [chance_among_others(busy, share) for share in hidden]
+    return chances
 
 
 def make_channel(config: ChannelConfig, tick_s: float, walls: Walls) -> Channel:
     """What kernels take of a channel.
+
+    The chance of reception is (1 - loss) · `chance_of_reception` · `chance_among_others`.
 
     Args:
         config: the channel.
         tick_s: seconds a tick.
         walls: of buildings.
     """
-    end_m = config.range_m or math.inf
-    nothing = np.ones(1)
-    clear = blocked = nothing
+    reach_m = config.range_m or math.inf
+    sensing_m = min(median_range_m(config), reach_m)
+    clear = _table(config, sensing_m, 0.0)
+    blocked = clear[:0]
+    if config.building_db > 0.0:
+        blocked = _table(config, sensing_m, config.building_db)
     if config.path_loss_exponent > 0.0:
-        clear = _table(config, 0.0, min(end_m, 1e5))
-        if config.building_db > 0.0:
-            blocked = _table(config, config.building_db, min(end_m, 1e5))
-            blocked = np.append(blocked, 0.0)  # never of size 1
-        end_m = min(end_m, len(clear) - 1.0)
-    load = airtime_s(config) / tick_s
+        reach_m = min(reach_m, clear.shape[1] - 1.0)
     return Channel(
-        reach_m=end_m,
-        sure=config.loss == 0.0 and clear is nothing and load == 0.0,
+        reach_m=reach_m,
+        sure=bool((clear == 1.0).all()),
         external=config.external,
-        loss=config.loss,
         clear=clear,
         blocked=blocked,
-        sensing_m=min(median_range_m(config), config.range_m or math.inf),
-        load=load,
+        sensing_m=sensing_m,
+        load=airtime_s(config) / tick_s,
         walls=walls,
     )
