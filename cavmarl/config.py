@@ -17,6 +17,7 @@ from cavmarl.config_checks import check_finite as _check_finite
 from cavmarl.config_rig import Rig, check_rig
 from cavmarl.config_scenario import ScenarioConfig
 from cavmarl.config_sensors import SensorsConfig
+from cavmarl.config_v2x import V2xConfig
 
 __all__ = [
     "MAX_ZONES",
@@ -469,6 +470,7 @@ class EnvConfig:
     action: ActionConfig = field(default_factory=ActionConfig)
     observation: ObservationConfig = field(default_factory=ObservationConfig)
     sensors: SensorsConfig = field(default_factory=SensorsConfig)
+    v2x: V2xConfig = field(default_factory=V2xConfig)
     terms: TermsConfig = field(default_factory=TermsConfig)
     rig: Rig = field(default_factory=dict)
     scenario: ScenarioConfig = field(default_factory=ScenarioConfig)
@@ -497,6 +499,28 @@ class EnvConfig:
             self.horizon_s,
             f"must be a whole number of steps of clock.ctrl_dt_s = {self.clock.ctrl_dt_s:g}; "
             f"try {max(1, round(steps)) * self.clock.ctrl_dt_s:g}",
+        )
+        if self.v2x.enabled:
+            self.v2x.check_clock(self.clock.sim_dt_s)
+        self._check_messages()
+
+    def _check_messages(self) -> None:
+        """Refuse to observe messages that nobody keeps."""
+        kept = {"objects": self.v2x.inbox.objects, "events": self.v2x.inbox.events}
+        for name, most in kept.items():
+            key, count = f"sensors.messages.{name}", getattr(self.sensors.messages, name)
+            _check(
+                count == 0 or self.v2x.enabled,
+                key,
+                count,
+                "there are no messages: set v2x.enabled to true, or this to 0",
+            )
+            _check(count <= most, key, count, f"v2x.inbox.{name} = {most} keeps fewer")
+        _check(
+            self.v2x.enabled or not self.sensors.messages.signal,
+            "sensors.messages.signal",
+            True,
+            "there are no messages: set v2x.enabled to true, or this to false",
         )
 
     @property

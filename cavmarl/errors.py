@@ -47,6 +47,7 @@
     │   ├── WorkerStartError      no process, or no memory for it
     │   ├── WorkerDeathError      every process that took up a step died of it
     │   └── WorkerFailureError    an exception in a worker, with its traceback
+    ├── V2xError               a message that cannot be read, or an impossible reception
     ├── PolicyError            a policy that cannot be loaded or does not fit
     └── MissingExtraError      an optional dependency is not installed
 
@@ -102,6 +103,7 @@ __all__ = [
     "UnknownAgentError",
     "UnknownEnvironmentError",
     "UnknownVersionError",
+    "V2xError",
     "WorkerDeathError",
     "WorkerError",
     "WorkerFailureError",
@@ -183,6 +185,10 @@ class EpisodeEndedError(EpisodeError):
 
 class CapacityError(CavmarlError):
     """More vehicles, agents or points than this world can take."""
+
+
+class V2xError(CavmarlError):
+    """Bytes that are no message, a network simulator that answers nonsense, or none where one is due."""
 
 
 class EvaluationError(CavmarlError):

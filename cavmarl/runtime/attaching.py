@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from cavmarl.runtime.attached import Attached, Host
 from cavmarl.runtime.cues import Cues
+from cavmarl.runtime.messaging import Messaging
 from cavmarl.runtime.mounted import MountedSensors
 
 __all__ = ["attach"]
@@ -16,4 +17,6 @@ def attach(host: Host) -> tuple[Attached, ...]:
         parts.append(Cues(host.travel.scripts.cues, host.shards, host.division))
     if host.config.rig:
         parts.append(MountedSensors(host))
+    if host.config.v2x.enabled:
+        parts.append(Messaging(host))
     return tuple(parts)

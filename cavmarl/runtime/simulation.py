@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cavmarl.config import EnvConfig
-from cavmarl.errors import CapacityError, ConfigError, LostTickError, ZoneError
+from cavmarl.errors import CapacityError, ConfigError, LostTickError, V2xError, ZoneError
 from cavmarl.kernels.arrays import Outputs, Worlds
 from cavmarl.kernels.codes import (
     ACTION_IDLE,
@@ -43,6 +43,7 @@ from cavmarl.runtime.coordination import Coordination
 from cavmarl.runtime.dividing import divide
 from cavmarl.runtime.division import ZoneLoads
 from cavmarl.runtime.executor import Executor, SerialExecutor
+from cavmarl.runtime.messaging import Messaging
 from cavmarl.runtime.recovery import Recovery, Revival
 from cavmarl.runtime.recutting import Recut, Recutter
 from cavmarl.runtime.referee import Referee
@@ -60,6 +61,7 @@ from cavmarl.traffic.memory import Zeros
 from cavmarl.traffic.native import NativeTraffic
 from cavmarl.traffic.scenarios import plan_scene
 from cavmarl.traffic.scene import Scene
+from cavmarl.v2x.bus import Bus
 
 __all__ = ["Simulation", "TrafficStats"]
 
@@ -265,6 +267,18 @@ class Simulation:
     def outputs(self) -> Outputs:
         """What the agents got at the end of the last step; arrays that the next step overwrites."""
         return self._commons.outputs
+
+    @property
+    def messages(self) -> Bus:
+        """What vehicles and roadside units tell each other.
+
+        Raises:
+            V2xError: they tell each other nothing.
+        """
+        for part in self._attached:
+            if isinstance(part, Messaging):
+                return part.bus
+        raise V2xError("nobody says anything here: set v2x.enabled to true")
 
     @property
     def goal_edges(self) -> NDArray[np.int32]:

@@ -31,14 +31,16 @@ from cavmarl.kernels.lanes import ENTRY
 from cavmarl.kernels.leaving import drop_ghosts, leave
 from cavmarl.kernels.neighbors import make_grid
 from cavmarl.kernels.observe_further import observe_further
+from cavmarl.kernels.observing_messages import observe_messages
 from cavmarl.kernels.repeated import repeated
 from cavmarl.kernels.stacking import fill_stacks
 from cavmarl.kernels.tick import suggest
+from cavmarl.kernels.v2x_records import Mail
 from cavmarl.kernels.zones import Halo, ZoneArrays
 from cavmarl.roads.network import RoadNetwork
 from cavmarl.roads.routing import PLAN, lane_grid
 from cavmarl.shard.controllers import CONTROLLER
-from cavmarl.shard.sensors import further_arrays, sensor_arrays
+from cavmarl.shard.sensors import further_arrays, layout, sensor_arrays
 from cavmarl.shard.vehicles import VEHICLE
 from cavmarl.traffic.memory import Zeros
 
@@ -85,6 +87,7 @@ class Shard:
         sides: VEHICLE (W, C), the two memories that rows are kept in by turns.
         side: in which of them the committed rows are.
         next_side: where the next ones come; the same, but in ticks that put rows in order.
+        mail: what agents have been told over the air; None: nobody says anything.
     """
 
     def __init__(
@@ -134,10 +137,13 @@ class Shard:
         self.sides = (self.worlds.rows, zoned.rows[1, zone])
         self.side = self.next_side = 0
         self.outputs = outputs
+        self.mail: Mail | None = None
+        self._messages_at = layout(config.sensors).get("messages")
         self.target_speeds = np.array(config.action.target_speeds_mps)
         self.discrete = config.action.kind == "discrete"
         self._call_leave = repeated(leave)
         self._call_observe_further = repeated(observe_further)
+        self._call_observe_messages = repeated(observe_messages)
         self._call_fill_stacks = repeated(fill_stacks)
 
     def cut(self, zones: ZoneArrays, halo: Halo) -> None:
@@ -180,7 +186,7 @@ class Shard:
         self.worlds = self.worlds._replace(rows=self.sides[side], next_rows=self.sides[next_side])
 
     def complete_observations(self, chosen: NDArray[np.bool_]) -> None:
-        """Write what `sense` has left to others: sensors of other projects, and earlier frames."""
+        """Write what `sense` has left to others: messages, other projects' sensors, earlier frames."""
         observations, stack = self.outputs.observations, self.config.sensors.stack
         if self._further is not None:
             self._call_observe_further(
@@ -193,6 +199,13 @@ class Shard:
                 chosen,
                 observations,
             )
+        if self.mail is not None and self._messages_at is not None:
+            messages = self.config.sensors.messages
+            self._call_observe_messages(
+                self.roads, self.plans, self.worlds, self.mail, self._messages_at.start,
+                messages.objects, messages.events, messages.signal, messages.range_m,
+                self.config.clock.sim_dt_s, stack, chosen, observations,
+            )  # fmt: skip
         if stack > 1:
             ticks_per_step = self.config.clock.ticks_per_step
             self._call_fill_stacks(self.worlds, ticks_per_step, stack, chosen, observations)
