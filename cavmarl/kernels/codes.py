@@ -5,6 +5,7 @@ from __future__ import annotations
 # VEHICLE["driver"]
 DRIVER_BACKGROUND = 0  # moves along lanes, driven by the models of kernels/drivers.py
 DRIVER_AGENT = 1  # kinematic bicycle, driven by actions
+DRIVER_SUMO = 2  # moved by SUMO, mirrored here
 
 # VTYPE["model"]: how a background driver follows its leader
 MODEL_KRAUSS = 0

@@ -222,7 +222,7 @@ def advance(
                 accel, change = scratch.accel[i], scratch.lane_change[i]
                 move_background(roads, travel, row, step[i], accel, change, dt)
                 through += row["events"] & EVENT_ARRIVED
-            else:
+            elif row["driver"] == DRIVER_AGENT:
                 _drive_agent(
                     roads,
                     plans,

@@ -27,6 +27,8 @@ from cavmarl.traffic.departures import with_room
 from cavmarl.traffic.memory import Zeros
 from cavmarl.traffic.rerouting import Rerouting
 from cavmarl.traffic.schedule import Schedule
+from cavmarl.traffic.sumo.demand import SumoDemand
+from cavmarl.traffic.sumo.route_book import RouteBook
 from cavmarl.traffic.vtypes import generated_types
 from cavmarl.traffic.way_slots import WaySlots, way_slots
 
@@ -65,6 +67,7 @@ class NativeTraffic:
         file: the demand whose vehicles drive beside the generator's.
         num_worlds: how many worlds are stepped together.
         zeros: makes the table of ways, where vehicles find some while the world runs.
+        sumo: in the place of a file: what SUMO runs beside these worlds.
     """
 
     network: RoadNetwork
@@ -76,6 +79,7 @@ class NativeTraffic:
     file: DemandFile | None = None
     num_worlds: int = 1
     zeros: Zeros = np.zeros
+    sumo: SumoDemand | None = None
 
     def __post_init__(self) -> None:
         # Trips that do not exist are refused when the world is made, not at its first reset.
@@ -123,6 +127,8 @@ class NativeTraffic:
     def travel(self) -> Travel:
         """Types and ways of all vehicles: the generator's first, then the demand file's."""
         types, steps = generated_types(), self.plans.reshape(-1)
+        if self.sumo is not None:
+            return self._travel_of_sumo(self.sumo, types, steps)
         if self.file is None or self.schedule is None:
             none = np.zeros(0, dtype=STOP)
             return Travel(types, steps, none, 0, 0.0, VIEW_M, VIEW_M, num_fixed=len(steps))
@@ -144,6 +150,25 @@ class NativeTraffic:
             view_m=self._farthest_m(look_ahead_m),
             see_m=self._farthest_m(_centre_sees_line_m),
             num_fixed=num_fixed,
+        )
+
+    def _travel_of_sumo(
+        self, sumo: SumoDemand, types: NDArray[np.void], fixed: NDArray[np.void]
+    ) -> Travel:
+        """The same with SUMO's types, and room for its routes behind the fixed ways."""
+        steps = self.zeros(
+            len(fixed) + RouteBook.room(self.network, self.num_worlds), dtype=fixed.dtype
+        )
+        steps[: len(fixed)] = fixed
+        return Travel(
+            np.concatenate([types, sumo.types]),
+            steps,
+            np.zeros(0, dtype=STOP),
+            0,
+            sumo.given.begin_s,
+            VIEW_M,
+            VIEW_M,
+            num_fixed=len(fixed),
         )
 
     def _farthest_m(self, look_m: Callable[[np.void, float], float]) -> float:
@@ -188,6 +213,8 @@ class NativeTraffic:
     @cached_property
     def capacity(self) -> int:
         """Rows that one world needs."""
+        if self.sumo is not None:
+            return _capacity_of_sumo(self.population, self.sumo)
         return _capacity(self.network, self.population, self.schedule, self.dt, self.horizon_s)
 
     @cached_property
@@ -359,13 +386,19 @@ class NativeTraffic:
 def capacity_of(
     network: RoadNetwork,
     population: PopulationConfig,
-    file: DemandFile | None,
+    file: DemandFile | SumoDemand | None,
     dt: float,
     horizon_s: float,
 ) -> int:
     """How many vehicles a world can hold, as `NativeTraffic` will say when it is made of these."""
+    if isinstance(file, SumoDemand):
+        return _capacity_of_sumo(population, file)
     schedule = None if file is None else Schedule(file, 0, 0)
     return _capacity(network, population, schedule, dt, horizon_s)
+
+
+def _capacity_of_sumo(population: PopulationConfig, sumo: SumoDemand) -> int:
+    return population.agents + population.background + sumo.max_vehicles
 
 
 def _capacity(
