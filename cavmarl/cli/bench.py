@@ -12,6 +12,7 @@ from rich.table import Table
 from cavmarl.cli.bench_balance import balance
 from cavmarl.cli.bench_libraries import libraries
 from cavmarl.cli.bench_moving import moving
+from cavmarl.cli.bench_recut import recut
 from cavmarl.cli.bench_sharding import sharding
 from cavmarl.cli.bench_traffic import traffic
 from cavmarl.cli.bench_train import train
@@ -40,6 +41,7 @@ app.command()(traffic)
 app.command()(sharding)
 app.command()(balance)
 app.command()(moving)
+app.command()(recut)
 app.command()(workers)
 app.command()(train)
 app.command()(libraries)

@@ -16,7 +16,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from cavmarl.errors import CapacityError
+from cavmarl.errors import CapacityError, SumoStateError
 from cavmarl.kernels.arrays import Gate, RoadArrays, Travel, Worlds, Zoned
 from cavmarl.kernels.codes import (
     COUNT_REROUTED,
@@ -81,6 +81,22 @@ class SumoTraffic:
         """Start SUMO anew in the chosen worlds (W,); errors as of `SumoWorlds.begin`."""
         for w in np.flatnonzero(chosen).tolist():
             self.worlds.begin(w, int(worlds.keys[w]))
+
+    def catch_up(self, worlds: Worlds) -> None:
+        """Bring SUMO to the worlds' ticks, from the beginning of their episodes.
+
+        Raises:
+            SumoStateError: it moves its vehicles, and what it has seen of ours is not on record.
+        """
+        if self.drives:
+            raise SumoStateError(
+                "traffic.source = sumo-traffic: a worker process died, and its successor cannot "
+                "take up SUMO in the middle of an episode: reset the worlds"
+            )
+        for w, (key, tick) in enumerate(zip(worlds.keys, worlds.ticks.tolist(), strict=True)):
+            self.worlds.begin(w, int(key))
+            for passed in range(tick):
+                self.worlds.step_one(w, passed, np.zeros(0, dtype=MOVED))
 
     def step(self, worlds: Worlds, side: int) -> int:
         """Let SUMO take its step, and bring its vehicles to where they are then.
