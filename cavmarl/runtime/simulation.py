@@ -549,6 +549,11 @@ class Simulation:
         if not sumo.drives:
             sumo.send_on(gate, worlds, side)
 
+    @property
+    def sumo(self) -> SumoTraffic | None:
+        """SUMO beside these worlds; None where `traffic.source` is native."""
+        return self._sumo
+
     def _switch_signals(self) -> None:
         """Detect → switch."""
         if self._sumo is not None:

@@ -25,6 +25,7 @@ from cavmarl.kernels.codes import (
     SPEED_MAX,
 )
 from cavmarl.kernels.mirroring import greet, list_others, mirror, send_on
+from cavmarl.kernels.repeated import repeated
 from cavmarl.roads.network import RoadNetwork
 from cavmarl.traffic.sumo.demand import SumoDemand
 from cavmarl.traffic.sumo.records import MOVED
@@ -70,6 +71,10 @@ class SumoTraffic:
         self._blank = blank
         self._dt = demand.dt_s
         self._shown = ShownSignals(network, num_worlds)
+        self._mirror = repeated(mirror)
+        self._greet = repeated(greet)
+        self._list_others = repeated(list_others)
+        self._send_on = repeated(send_on)
         self._others = np.zeros(capacity, dtype=zoned.rows.dtype)
         lanes, links = network.lanes, network.links
         leads_to = np.where(lanes["internal"], links["to_lane"][lanes["link"]], -1)
@@ -113,7 +118,7 @@ class SumoTraffic:
         if not self.drives:
             return 0
         return sum(
-            mirror(
+            self._mirror(
                 self._roads,
                 self._travel,
                 self.worlds.paths(w),
@@ -145,7 +150,7 @@ class SumoTraffic:
                 continue
             running = int(self._zoned.num_owned[:, w].sum())
             self._check_room(running + len(now.departed))
-            greet(
+            self._greet(
                 self._roads,
                 self._travel,
                 self.worlds.paths(w),
@@ -187,7 +192,7 @@ class SumoTraffic:
                 continue
             places = np.searchsorted(now.seen["number"], now.rerouted)
             chosen = now.seen["route"][places].astype(np.int64)
-            gate.counts[w, COUNT_REROUTED] += send_on(
+            gate.counts[w, COUNT_REROUTED] += self._send_on(
                 self._roads, paths, now.rerouted, chosen, self._zoned, side, w
             )
             waiting = gate.queue[w, : gate.num_queue[w]]
@@ -213,7 +218,7 @@ class SumoTraffic:
         """MOVED (n,) by rising ids: our vehicles as SUMO is to see them."""
         if not self.drives:
             return np.zeros(0, dtype=MOVED)
-        num = list_others(self._zoned, side, w, self._others)
+        num = self._list_others(self._zoned, side, w, self._others)
         ours = self._others[:num]
         ours = ours[np.argsort(ours["id"])]
         moved = np.zeros(num, dtype=MOVED)
