@@ -48,6 +48,10 @@
     │   ├── WorkerDeathError      every process that took up a step died of it
     │   └── WorkerFailureError    an exception in a worker, with its traceback
     ├── V2xError               a message that cannot be read, or an impossible reception
+    ├── SumoError              SUMO as global traffic that cannot go on
+    │   ├── SumoBusyError         a second simulation in one process
+    │   ├── SumoDiedError         its process ended, or hangs
+    │   └── SumoStateError        it says what does not fit the world
     ├── PolicyError            a policy that cannot be loaded or does not fit
     └── MissingExtraError      an optional dependency is not installed
 
@@ -92,6 +96,10 @@ __all__ = [
     "RouteError",
     "SpawnError",
     "StoreError",
+    "SumoBusyError",
+    "SumoDiedError",
+    "SumoError",
+    "SumoStateError",
     "TornJournalError",
     "TransferError",
     "TransferLayoutError",
@@ -398,6 +406,22 @@ class WorkerFailureError(WorkerError):
     def __init__(self, worker: int, part: str, kind: str, text: str, traceback: str) -> None:
         super().__init__(f"worker {worker} ({part}): {kind}: {text}\n{traceback}")
         self.worker, self.kind, self.text, self.traceback = worker, kind, text, traceback
+
+
+class SumoError(CavmarlError):
+    """SUMO as global traffic cannot go on."""
+
+
+class SumoBusyError(SumoError):
+    """A second simulation in a process that holds one already."""
+
+
+class SumoDiedError(SumoError):
+    """The process of SUMO ended, or does not answer; the message ends with its last output."""
+
+
+class SumoStateError(SumoError):
+    """SUMO says what does not fit the world: another time, an unknown signal state."""
 
 
 class PolicyError(CavmarlError):

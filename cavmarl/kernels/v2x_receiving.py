@@ -325,9 +325,7 @@ def _receive_objects(
     reports = mail.reports[w, slot]
     _refresh_by_cams(channel, me, level, packets, reports, room, box, num)
     if with_seen:
-        _take_others(
-            channel, mail, w, me, level, packets, reports, room, KIND_CPM, box, num, False
-        )
+        _take_others(channel, mail, w, me, level, packets, reports, room, KIND_CPM, box, num, False)
     sort_by_distance(box, num, room.squared, me["x"], me["y"])
     num = _let_in_cams(channel, mail, w, me, level, packets, reports, room, box, num)
     if with_seen:

@@ -26,7 +26,7 @@ from cavmarl.kernels.arrays import (
     Zoned,
 )
 from cavmarl.kernels.buckets import make_lists
-from cavmarl.kernels.codes import DRIVER_AGENT, DRIVER_BACKGROUND
+from cavmarl.kernels.codes import DRIVER_AGENT, DRIVER_BACKGROUND, DRIVER_SUMO
 from cavmarl.kernels.lanes import ENTRY
 from cavmarl.kernels.leaving import drop_ghosts, leave
 from cavmarl.kernels.neighbors import make_grid
@@ -162,6 +162,10 @@ class Shard:
         if not self.worlds.num_through.any():
             return
         self._call_leave(gate, self.worlds, self.worlds.next_rows, DRIVER_BACKGROUND, 1)
+
+    def dismiss(self, gate: Gate) -> None:
+        """Hand SUMO's vehicles of `next_rows` that it has no more to the gate."""
+        self._call_leave(gate, self.worlds, self.worlds.next_rows, DRIVER_SUMO, 0)
 
     def retire(self, gate: Gate) -> None:
         """Hand the agents' vehicles of the committed rows whose trip has ended to the gate."""

@@ -198,7 +198,8 @@ class LocalWorlds:
         return ()
 
     def close(self) -> None:
-        """Nothing to release."""
+        """End the processes that the worlds have."""
+        self.simulation.close()
 
 
 def _own_arrays(simulation: Simulation, num_worlds: int) -> StepArrays:

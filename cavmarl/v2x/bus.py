@@ -136,7 +136,9 @@ class Bus:
             self._run(side, 0, num_worlds)
             return
         if self._network is None:
-            raise V2xError("v2x.channel.external: connect a network simulator before the first step")
+            raise V2xError(
+                "v2x.channel.external: connect a network simulator before the first step"
+            )
         for world in range(num_worlds):
             self._run(side, world, world + 1)
             self._receive_from(self._network, world)

@@ -16,7 +16,6 @@ from cavmarl.v2x.messages import MAP
 __all__ = ["make_units", "map_of"]
 
 
-
 def make_units(config: RoadsideConfig, network: RoadNetwork) -> NDArray[np.void]:
     """UNIT (n,): one at each signal that has one, in the middle of its stop lines.
 
