@@ -42,6 +42,15 @@
     │   └── JournalError          a log that cannot be written or replayed
     │       ├── TornJournalError     only its last line is cut short
     │       └── CorruptJournalError  a line is damaged, missing or out of order
+    ├── ClockError             time that somebody else than its master advances, or wants to
+    │   ├── SecondMasterError     there is a time master already
+    │   ├── TickRefusedError      who follows does not tick
+    │   └── ClockDriftError       a world is not where its master has left it
+    ├── FollowerError          an external stack with which it cannot go on
+    │   ├── FollowerLostError     it, or the connection to it, has ended
+    │   │   └── FollowerTimeoutError   it has not answered in time
+    │   ├── FollowerMessageError  what it says cannot be understood
+    │   └── ControlError          controls that cannot be carried out
     ├── NoAdmissibleWorkerError   every worker is too busy to be given a shard
     ├── WorkerError            worker processes that cannot go on
     │   ├── WorkerStartError      no process, or no memory for it
@@ -68,7 +77,10 @@ __all__ = [
     "ActionError",
     "CapacityError",
     "CavmarlError",
+    "ClockDriftError",
+    "ClockError",
     "ConfigError",
+    "ControlError",
     "CorruptJournalError",
     "CorruptMessageError",
     "CoverageError",
@@ -76,6 +88,10 @@ __all__ = [
     "EpisodeEndedError",
     "EpisodeError",
     "EvaluationError",
+    "FollowerError",
+    "FollowerLostError",
+    "FollowerMessageError",
+    "FollowerTimeoutError",
     "ForeignRunError",
     "ForeignTransferError",
     "InvalidActionError",
@@ -94,12 +110,14 @@ __all__ = [
     "ReproducerError",
     "ResetNeededError",
     "RouteError",
+    "SecondMasterError",
     "SpawnError",
     "StoreError",
     "SumoBusyError",
     "SumoDiedError",
     "SumoError",
     "SumoStateError",
+    "TickRefusedError",
     "TornJournalError",
     "TransferError",
     "TransferLayoutError",
@@ -349,6 +367,42 @@ class TornJournalError(JournalError):
 
 class CorruptJournalError(JournalError):
     """A line of the log is damaged, missing or out of order."""
+
+
+class ClockError(CavmarlError):
+    """Time that somebody else than its master advances, or wants to."""
+
+
+class SecondMasterError(ClockError):
+    """An environment that has a time master was given another."""
+
+
+class TickRefusedError(ClockError):
+    """Somebody who is not the time master wanted to advance the world."""
+
+
+class ClockDriftError(ClockError):
+    """A world is not at the tick at which its time master has left it."""
+
+
+class FollowerError(CavmarlError):
+    """An external stack with which it cannot go on; the world is whole and can be stepped on."""
+
+
+class FollowerLostError(FollowerError):
+    """A follower, or the connection to it, has ended."""
+
+
+class FollowerTimeoutError(FollowerLostError):
+    """A follower has not answered in time."""
+
+
+class FollowerMessageError(FollowerError):
+    """A follower has sent what cannot be understood, or is not due."""
+
+
+class ControlError(FollowerError):
+    """Controls of a follower that cannot be carried out: not numbers, out of range, missing."""
 
 
 class NoAdmissibleWorkerError(CavmarlError):

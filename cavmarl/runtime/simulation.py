@@ -59,6 +59,7 @@ from cavmarl.runtime.refereeing import make_refereeing
 from cavmarl.runtime.reproducer import Reproducer
 from cavmarl.runtime.reproducing import Keeper, Moment, sources_of
 from cavmarl.runtime.shard_clock import ShardClock
+from cavmarl.runtime.step_trace import Traced
 from cavmarl.runtime.store import CommittedStore
 from cavmarl.runtime.zone_view import ZoneView, view_zones
 from cavmarl.shard.shard import Commands, Shard
@@ -508,6 +509,16 @@ class Simulation:
         self._commons = wrap(self._commons)
         if self._coordination is not None:
             self._coordination = wrap(self._coordination)
+
+    def trace(self, wrap: Callable[[Any], Any], note: Callable[[str], None]) -> None:
+        """Let `wrap(executor)` note the phases of a tick, and attached parts name theirs to `note`.
+
+        A part that has phases of its own (another simulator's step, say) has a method `trace`.
+        """
+        self._executor = wrap(self._executor)
+        for part in self._attached:
+            if isinstance(part, Traced):
+                part.trace(note)
 
     def host(self, make: Callable[[Sequence[Shard]], Executor]) -> None:
         """From now on let somebody else run the phases of the shards, as `make` returns it.

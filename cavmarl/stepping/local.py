@@ -89,6 +89,7 @@ class LocalWorlds:
         arrays.vehicle_ids[chosen] = outputs.vehicle_ids[chosen]
         arrays.vehicle_done[chosen] = False
         arrays.terms[chosen] = outputs.terms[chosen]
+        arrays.ticks[:] = self.simulation.ticks()
         goes_on = arrays.mask.any(axis=1) | self.simulation.agents_to_come()
         arrays.episode_over[chosen] = ~goes_on[chosen]
         if not chosen.all():
@@ -118,6 +119,7 @@ class LocalWorlds:
         goes_on = arrays.mask.any(axis=1) | simulation.agents_to_come()
         np.logical_or(at_horizon, ~goes_on, out=arrays.episode_over)
         self._end(arrays.episode_over)
+        arrays.ticks[:] = simulation.ticks()
 
     def _end(self, over: NDArray[np.bool_]) -> None:
         """Keep what those saw last who have ended, and begin the new episodes."""
@@ -159,6 +161,10 @@ class LocalWorlds:
         simulation, space = self.simulation, state_space(self.simulation.capacity)
         for world, state in enumerate(self.arrays.states):
             state[:] = global_state(self.world.network, simulation.vehicles(world), space)
+
+    def ticks(self) -> NDArray[np.int64]:
+        """(W,) ticks since each world's reset."""
+        return self.simulation.ticks().copy()
 
     def state_hash(self, world: int) -> str:
         """Hex digest of one world."""
