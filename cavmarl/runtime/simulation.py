@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from cavmarl.config import EnvConfig
 from cavmarl.errors import CapacityError, ConfigError, LostTickError, ZoneError
-from cavmarl.kernels.arrays import Outputs, Worlds
+from cavmarl.kernels.arrays import Gate, Outputs, Worlds
 from cavmarl.kernels.codes import (
     ACTION_IDLE,
     COUNT_ARRIVED,
@@ -244,6 +244,11 @@ class Simulation:
     def outputs(self) -> Outputs:
         """What the agents got at the end of the last step; arrays that the next step overwrites."""
         return self._commons.outputs
+
+    @property
+    def gate(self) -> Gate:
+        """Who waits to enter each world, and counts since its reset; a reset may replace it."""
+        return self._gate
 
     @property
     def goal_edges(self) -> NDArray[np.int32]:
@@ -581,10 +586,6 @@ class Simulation:
         waiting = np.arange(longest) < self._gate.num_queue[:, None]
         found = np.any(waiting & (self._gate.queue["agent"][:, :longest] >= 0), axis=1)
         return np.asarray(found, dtype=np.bool_)
-
-    def arrivals(self) -> NDArray[np.int64]:
-        """(W,) vehicles that reached their goal since each world's reset, agents included."""
-        return self._gate.counts[:, COUNT_ARRIVED].copy()
 
     def suggest(self, out: NDArray[np.float64]) -> None:
         """Write what the built-in driver would do in the agents' place into `out` (W, A, 2)."""
