@@ -22,7 +22,7 @@ from cavmarl.errors import (
     V2xError,
     ZoneError,
 )
-from cavmarl.kernels.arrays import Outputs, Worlds
+from cavmarl.kernels.arrays import Gate, Outputs, Worlds
 from cavmarl.kernels.codes import (
     ACTION_IDLE,
     COUNT_ARRIVED,
@@ -298,6 +298,11 @@ class Simulation:
             if isinstance(part, Messaging):
                 return part.bus
         raise V2xError("nobody says anything here: set v2x.enabled to true")
+
+    @property
+    def gate(self) -> Gate:
+        """Who waits to enter each world, and counts since its reset; a reset may replace it."""
+        return self._gate
 
     @property
     def goal_edges(self) -> NDArray[np.int32]:
@@ -736,10 +741,6 @@ class Simulation:
         waiting = np.arange(longest) < self._gate.num_queue[:, None]
         found = np.any(waiting & (self._gate.queue["agent"][:, :longest] >= 0), axis=1)
         return np.asarray(found, dtype=np.bool_)
-
-    def arrivals(self) -> NDArray[np.int64]:
-        """(W,) vehicles that reached their goal since each world's reset, agents included."""
-        return self._gate.counts[:, COUNT_ARRIVED].copy()
 
     def suggest(self, out: NDArray[np.float64]) -> None:
         """Write what the built-in driver would do in the agents' place into `out` (W, A, 2)."""
