@@ -14,9 +14,15 @@ from pettingzoo import ParallelEnv
 
 from cavmarl.actions import ActionDecoder
 from cavmarl.config import TERMS
-from cavmarl.errors import ConfigError, EpisodeEndedError, ResetNeededError
+from cavmarl.errors import (
+    ConfigError,
+    EpisodeEndedError,
+    ResetNeededError,
+    UnknownAgentError,
+)
 from cavmarl.registry import load_config
 from cavmarl.render.view import WorldView
+from cavmarl.rig.frames import SensorFrames
 from cavmarl.runtime.simulation import Simulation
 from cavmarl.seeds import check_seed, first_seed
 from cavmarl.spaces import (
@@ -336,6 +342,22 @@ class CavEnv(ParallelEnv[str, Any, Any]):  # type: ignore[misc] # PettingZoo is 
             for info, number in zip(infos, column.tolist(), strict=True):
                 info[name] = number
         return dict(zip(self.agents, infos, strict=True))
+
+    def frames(self, agent: str) -> dict[str, SensorFrames]:
+        """What the sensors of an agent's `rig` have got in the last step, by name.
+
+        The arrays are those of `SensorFrames` without the axes of worlds and agents.
+
+        Raises:
+            UnknownAgentError: there is no such agent.
+        """
+        if agent not in self.possible_agents:
+            raise UnknownAgentError(
+                f"no agent {agent!r}: there are {self.possible_agents[0]} to "
+                f"{self.possible_agents[-1]}"
+            )
+        k = self.possible_agents.index(agent)
+        return {name: sensor.of(0, k) for name, sensor in self.worlds.arrays.frames.items()}
 
     def check_action(self, agent: str, action: Any) -> None:
         """Refuse an action that `step` would refuse, before anything is kept of it.

@@ -14,6 +14,7 @@ from typing import Literal
 
 from cavmarl.config_checks import check as _check
 from cavmarl.config_checks import check_finite as _check_finite
+from cavmarl.config_rig import Rig, check_rig
 from cavmarl.config_sensors import SensorsConfig
 
 __all__ = [
@@ -429,6 +430,7 @@ class EnvConfig:
     Attributes:
         name: of the entry, as its folder.
         version: goes up whenever results change that others may have reported.
+        rig: sensors that are mounted on every agent's vehicle, by name; see docs/sensors.md.
         horizon_s: when an episode is truncated.
     """
 
@@ -444,11 +446,13 @@ class EnvConfig:
     observation: ObservationConfig = field(default_factory=ObservationConfig)
     sensors: SensorsConfig = field(default_factory=SensorsConfig)
     terms: TermsConfig = field(default_factory=TermsConfig)
+    rig: Rig = field(default_factory=dict)
     horizon_s: float = 60.0
 
     def __post_init__(self) -> None:
         _check(self.version >= 0, "version", self.version, "must be 0 or more")
         _check_finite("horizon_s", self.horizon_s, self.clock.ctrl_dt_s, 1e6)
+        check_rig(self.rig, self.clock.sim_dt_s, self.clock.ticks_per_step)
         steps = self.horizon_s / self.clock.ctrl_dt_s
         _check(
             abs(steps - round(steps)) < 1e-6 * steps,

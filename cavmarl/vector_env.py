@@ -18,6 +18,7 @@ from cavmarl.balance.plan import Plan
 from cavmarl.balance.plan_text import describe_plan
 from cavmarl.errors import ConfigError, ResetNeededError
 from cavmarl.registry import load_config
+from cavmarl.rig.frames import SensorFrames
 from cavmarl.runtime.simulation import Simulation
 from cavmarl.seeds import check_seed, first_seed
 from cavmarl.spaces import action_space, flat_observation_space
@@ -317,6 +318,14 @@ class CavVectorEnv:
         view = observations.view()
         view.flags.writeable = False
         return view
+
+    def frames(self) -> dict[str, SensorFrames]:
+        """What the sensors of `rig` have got in the last step, by name; see docs/sensors.md.
+
+        Of a world that begins anew in the same step it is what the new episode begins with.
+        """
+        frames = self.worlds.arrays.frames
+        return {name: sensor.copy() if self._copy else sensor for name, sensor in frames.items()}
 
     def suggest_actions(self) -> NDArray[Any]:
         """What the built-in driver (IDM, MOBIL, lane controller) would do in each agent's place."""

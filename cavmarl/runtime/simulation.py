@@ -28,6 +28,8 @@ from cavmarl.kernels.codes import (
 from cavmarl.kernels.rng import world_key
 from cavmarl.ownership.messages import Switch
 from cavmarl.ownership.transfers import TransferLog
+from cavmarl.rig.catalogue import frame_layout, frames_in
+from cavmarl.rig.frames import Frames
 from cavmarl.roads.network import RoadNetwork
 from cavmarl.roads.zone_layouts import cut_map
 from cavmarl.roads.zones import ZonePartition
@@ -106,12 +108,14 @@ class Simulation:
         demand: whose vehicles drive beside the generator's.
         partition: the zones; None: cut as `config.zones` says.
         observations: (W, A, D) float32, where the agents' are written; None: made for them.
+        frames: where the samples of their rigs are written; None: made for them.
         warm: call every kernel now, so that none is loaded in a step.
         zeros: makes the arrays that shards write.
         like: worlds of the same environment, whose tables are used; None: they are made.
 
     Attributes:
         everywhere: (W,) all of the worlds.
+        frames: what the rigs of the agents have sensed; arrays that the next step overwrites.
     """
 
     def __init__(
@@ -123,6 +127,7 @@ class Simulation:
         partition: ZonePartition | None = None,
         *,
         observations: NDArray[np.float32] | None = None,
+        frames: Frames | None = None,
         warm: bool = False,
         zeros: Zeros = np.zeros,
         like: Simulation | None = None,
@@ -136,6 +141,7 @@ class Simulation:
         self._first_world = 0
         self._episodes = np.zeros(num_worlds, dtype=np.int64)
         self.everywhere = np.ones(num_worlds, dtype=np.bool_)
+        self.frames: Frames = _frames(config, num_worlds, zeros) if frames is None else frames
         self.transfers: tuple[TransferLog, ...] = ()
         with first_compilation() as is_first:
             blank = blank_vehicle()
@@ -173,6 +179,7 @@ class Simulation:
                     self._shard.travel,
                     self.outputs,
                     zeros,
+                    self.frames,
                 )
             )
             self._coordination: Coordination | None = None
@@ -650,6 +657,11 @@ class Simulation:
             mean_trip_s=float(sums[SUM_TIME_S]) / trips,
             mean_delay_s=float(sums[SUM_DELAY_S]) / trips,
         )
+
+
+def _frames(config: EnvConfig, num_worlds: int, zeros: Zeros) -> Frames:
+    layout = frame_layout(config, num_worlds)
+    return frames_in({name: zeros(shape, dtype=kind) for name, (kind, shape) in layout.items()})
 
 
 def _cut(config: EnvConfig, network: RoadNetwork) -> ZonePartition:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any, NamedTuple, Protocol
 
 import numpy as np
@@ -9,6 +10,8 @@ from numpy.typing import NDArray
 
 from cavmarl.balance.plan import Plan
 from cavmarl.config import TERMS, EnvConfig
+from cavmarl.rig.catalogue import frame_layout, frames_in
+from cavmarl.rig.frames import Frames
 from cavmarl.runtime.shared_memory import Layout
 from cavmarl.runtime.simulation import Simulation
 from cavmarl.shard.shard import Commands
@@ -41,10 +44,18 @@ class StepArrays(NamedTuple):
     meta_actions: NDArray[np.int64]  # (W, A)
     suggested: NDArray[np.float64]  # (W, A, 2) what the built-in driver would do
     states: NDArray[np.float32]  # (W, S) global states, of when they were last asked for
+    frames: Frames  # what the rigs have sensed
+
+    @classmethod
+    def of(cls, arrays: Mapping[str, NDArray[Any]]) -> StepArrays:
+        """Made of arrays that are named as by `layout_of`."""
+        fields: dict[str, Any] = {name: arrays[name] for name in cls._fields if name in arrays}
+        return cls(**fields, frames=frames_in(arrays))
 
     def part(self, first: int, last: int) -> StepArrays:
         """Those of some of the worlds, as views."""
-        parts: list[Any] = [array[first:last] for array in self]
+        parts: list[Any] = [array[first:last] for array in self[:-1]]
+        parts.append({name: sensor.part(first, last) for name, sensor in self.frames.items()})
         return StepArrays(*parts)
 
 
@@ -67,6 +78,7 @@ def layout_of(config: EnvConfig, capacity: int, num_worlds: int) -> Layout:
         "meta_actions": ("<i8", agents),
         "suggested": ("<f8", (*agents, 2)),
         "states": ("<f4", (num_worlds, *state_space(capacity).shape)),
+        **frame_layout(config, num_worlds),
     }
 
 

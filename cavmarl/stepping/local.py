@@ -60,6 +60,7 @@ class LocalWorlds:
             world.demand,
             world.partition,
             observations=None if arrays is None else arrays.observations,
+            frames=None if arrays is None else arrays.frames,
             warm=warm,
             zeros=zeros,
             like=None if like is None else like.simulation,
@@ -189,6 +190,8 @@ def _own_arrays(simulation: Simulation, num_worlds: int) -> StepArrays:
     made = {
         name: np.zeros(shape, dtype)
         for name, (dtype, shape) in layout.items()
-        if name != "observations"
+        if name != "observations" and name in StepArrays._fields
     }
-    return StepArrays(observations=simulation.outputs.observations, **made)
+    return StepArrays(
+        observations=simulation.outputs.observations, **made, frames=simulation.frames
+    )

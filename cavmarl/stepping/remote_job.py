@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from functools import cache, partial
 from pathlib import Path
 from typing import Any, NoReturn
@@ -51,12 +51,17 @@ def results_of(task: int, arrays: StepArrays, ended: Sequence[int] | None) -> li
     """
     if task == Task.STEP:
         finals = [arrays.final_observations[w] for w in ended or ()]
-        return [*(getattr(arrays, name) for name in _STEPPED), *finals]
+        return [*(getattr(arrays, name) for name in _STEPPED), *_sensed(arrays), *finals]
     if task == Task.RESET:
-        return [getattr(arrays, name) for name in _BEGUN]
+        return [*(getattr(arrays, name) for name in _BEGUN), *_sensed(arrays)]
     if task == Task.WRITE_STATES:
         return [arrays.states]
     return [arrays.suggested] if task == Task.SUGGEST else []
+
+
+def _sensed(arrays: StepArrays) -> Iterator[Array]:
+    for frames in arrays.frames.values():
+        yield from frames
 
 
 @cache
