@@ -427,11 +427,11 @@ class OdometryConfig(SampledConfig):
 class LaneBoundaryConfig(SampledConfig):
     """The lane that the sensor is on.
 
-    To its left and its right boundary and its width in m, the vehicle's direction from the lane's
-    in rad, and the lane's curvature in 1/m, positive to the left.
+    To its left and its right boundary, and its width, in m; the sensor's direction from the lane's
+    in rad; and the curvature of the way in 1/m, positive to the left.
 
     Attributes:
-        lookahead_m: length of lane that its curvature is measured over.
+        lookahead_m: length of the way that the curvature is measured over.
     """
 
     type: Literal["lane_boundary"] = "lane_boundary"

@@ -24,6 +24,7 @@ POSE = np.dtype(
         ("speed", np.float64),
         ("accel", np.float64),
         ("yaw_rate", np.float64),
+        ("steering", np.float64),
         ("distance_m", np.float64),
         ("events", np.int32),
     ],
@@ -59,6 +60,7 @@ def note_poses(worlds: Worlds, poses: NDArray[np.void]) -> None:
             pose["speed"] = row["speed"]
             pose["accel"] = row["accel"]
             pose["yaw_rate"] = row["yaw_rate"]
+            pose["steering"] = row["steering"]
             pose["distance_m"] = row["distance_m"]
             pose["events"] = row["events"]
 

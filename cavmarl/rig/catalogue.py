@@ -12,9 +12,21 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cavmarl.config import EnvConfig
-from cavmarl.config_rig import MountedConfig, OdometryConfig, samples_per_step
+from cavmarl.config_rig import (
+    CollisionConfig,
+    GnssConfig,
+    ImuConfig,
+    LaneBoundaryConfig,
+    MountedConfig,
+    OdometryConfig,
+    samples_per_step,
+)
 from cavmarl.errors import ConfigError
+from cavmarl.rig.collision import Collision
 from cavmarl.rig.frames import SensorFrames
+from cavmarl.rig.gnss import Gnss
+from cavmarl.rig.imu import Imu
+from cavmarl.rig.lane_boundary import LaneBoundary
 from cavmarl.rig.odometry import Odometry
 from cavmarl.rig.sensor import MountedSensor, Platform
 
@@ -23,7 +35,11 @@ __all__ = ["TYPES", "frame_layout", "frames_in", "mount", "rig_reach_m", "type_o
 Shape = tuple[int, ...]
 
 TYPES: dict[type[MountedConfig], type[MountedSensor[Any]]] = {
+    GnssConfig: Gnss,
+    ImuConfig: Imu,
     OdometryConfig: Odometry,
+    LaneBoundaryConfig: LaneBoundary,
+    CollisionConfig: Collision,
 }
 
 _PREFIX = "rig."

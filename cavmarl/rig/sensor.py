@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
-from typing import ClassVar, Generic, NamedTuple, TypeVar
+from typing import Any, ClassVar, Generic, NamedTuple, TypeVar
 
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
@@ -21,7 +21,7 @@ from cavmarl.roads.network import RoadNetwork
 
 __all__ = ["Bounds", "MountedSensor", "Platform", "Scene", "noise_of", "stream_of"]
 
-Bounds = tuple[NDArray[np.float64], NDArray[np.float64]]
+Bounds = tuple[NDArray[Any], NDArray[Any]]
 C = TypeVar("C", bound=MountedConfig)
 
 
@@ -31,6 +31,7 @@ class Scene(NamedTuple):
     Attributes:
         roads: of the whole map.
         lane_grid: which lanes lie near a place.
+        plans: PLAN (G, L), the ways of agents.
         travel: types of vehicles.
         worlds: the committed rows: first the zone's own, then ghosts.
         grid: room for the spatial index of one world; whoever asks it fills it.
@@ -39,6 +40,7 @@ class Scene(NamedTuple):
 
     roads: RoadArrays
     lane_grid: LaneGrid
+    plans: NDArray[np.void]
     travel: Travel
     worlds: Worlds
     grid: Grid
@@ -52,6 +54,7 @@ class Platform(NamedTuple):
         network: the roads.
         body: VTYPE of agents' vehicles.
         num_worlds: W.
+        num_agents: A.
         sim_dt_s: seconds a tick.
         ticks_per_step: ticks a step.
     """
@@ -59,6 +62,7 @@ class Platform(NamedTuple):
     network: RoadNetwork
     body: np.void
     num_worlds: int
+    num_agents: int
     sim_dt_s: float
     ticks_per_step: int
 
@@ -91,7 +95,7 @@ class MountedSensor(ABC, Generic[C]):
     @staticmethod
     @abstractmethod
     def bounds(config: C) -> Bounds:
-        """The least and the largest value of each number, broadcast to `config.shape`."""
+        """The least and the largest value of the numbers of a sample, broadcast to its shape."""
 
     @staticmethod
     def reach_m(config: C, largest_radius_m: float) -> float:

@@ -30,6 +30,7 @@ class MountedSensors:
             host.network,
             generated_types()[0],
             host.num_worlds,
+            config.population.num_ids,
             config.clock.sim_dt_s,
             config.clock.ticks_per_step,
         )
@@ -59,6 +60,7 @@ class MountedSensors:
             Scene(
                 shard.roads,
                 shard.lane_grid,
+                shard.plans,
                 shard.travel,
                 shard.worlds,
                 shard.grid,
