@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from cavmarl.balance.plan import Plan
 from cavmarl.kernels.codes import EVENTS_THAT_END
+from cavmarl.runtime.sensor_farm import SensorFarm
 from cavmarl.runtime.simulation import Simulation
 from cavmarl.shard.shard import Commands
 from cavmarl.spaces import state_space
@@ -39,6 +40,7 @@ class LocalWorlds:
         arrays: what goes into a step, and what comes out.
         simulation: the worlds.
         in_next_step: when worlds begin anew.
+        farm: its sensor workers; None: there are none.
     """
 
     def __init__(
@@ -53,6 +55,7 @@ class LocalWorlds:
     ) -> None:
         self.world = world
         self.in_next_step = in_next_step
+        self.farm: SensorFarm | None = None
         self.simulation: Simulation = Simulation(
             world.config,
             world.network,
@@ -181,8 +184,17 @@ class LocalWorlds:
         """None: there are no workers."""
         return ()
 
+    def hire(self, farm: SensorFarm) -> None:
+        """From now on let others sense for the rigs; what they write is in `arrays`."""
+        mounted = self.simulation.mounted
+        assert mounted is not None
+        mounted.rig.sense = farm
+        self.farm = farm
+
     def close(self) -> None:
-        """Nothing to release."""
+        """End the sensor workers, if there are any."""
+        if self.farm is not None:
+            self.farm.close()
 
 
 def _own_arrays(simulation: Simulation, num_worlds: int) -> StepArrays:
