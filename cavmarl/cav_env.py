@@ -31,6 +31,7 @@ from cavmarl.spaces import (
     named_observation,
     observation_parts,
     observation_space,
+    sensed_observation,
     state_space,
 )
 from cavmarl.stepping.arrays import SteppedWorlds
@@ -177,7 +178,9 @@ class CavEnv(ParallelEnv[str, Any, Any]):  # type: ignore[misc] # PettingZoo is 
         self._seats = config.population.mode == "seats"
         self._stack = config.sensors.stack
         self._parts = (
-            observation_parts(config.sensors) if config.observation.kind == "dict" else None
+            observation_parts(config.sensors)
+            if config.observation.kind == "dict" and config.observation.mode == "ground_truth"
+            else None
         )
         self.state_space = state_space(worlds.arrays.states.shape[1] // STATE_FEATURES)
         self._decoder = ActionDecoder(config.action, 1, self.possible_agents)
@@ -317,6 +320,16 @@ class CavEnv(ParallelEnv[str, Any, Any]):  # type: ignore[misc] # PettingZoo is 
                 break
 
     def _observations(self) -> dict[str, Observation]:
+        form = self.config.observation
+        if form.mode == "sensors" and form.kind == "dict":
+            sensed = {
+                name: data[0, self._listed].copy()
+                for name, data in sensed_observation(self.worlds.arrays.frames).items()
+            }
+            return {
+                agent: {name: data[k] for name, data in sensed.items()}
+                for k, agent in enumerate(self.agents)
+            }
         found = self.worlds.arrays.observations[0].copy()[self._listed]
         if self._parts is None:
             return dict(zip(self.agents, found, strict=True))

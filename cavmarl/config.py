@@ -394,12 +394,15 @@ class ActionConfig:
 
 @dataclass(frozen=True)
 class ObservationConfig:
-    """The form of an observation.
+    """What an observation is made of, and its form.
 
     Attributes:
-        kind: `flat`: one Box. `dict`: one Box a sensor.
+        mode: `ground_truth`: what `sensors` says, taken from the world itself. `sensors`: the
+            latest samples of the `rig`.
+        kind: `flat`: one Box of float32. `dict`: one Box a sensor.
     """
 
+    mode: Literal["ground_truth", "sensors"] = "ground_truth"
     kind: Literal["flat", "dict"] = "flat"
 
 
@@ -471,6 +474,12 @@ class EnvConfig:
             "workers.sensors",
             self.workers.sensors,
             "there is no rig whose sensors they could share; name some under rig, or leave it 0",
+        )
+        _check(
+            self.observation.mode != "sensors" or bool(self.rig),
+            "observation.mode",
+            self.observation.mode,
+            "there is no sensor under rig; mount one",
         )
         steps = self.horizon_s / self.clock.ctrl_dt_s
         _check(

@@ -181,7 +181,7 @@ def _explain(kind: type[Any], details: ErrorDetails) -> str:
             return f"{path}: unknown key; {_nearest(kind, location)}"
         case "missing":
             return f"{path}: missing; it has no default"
-        case "dataclass_type":
+        case "dataclass_type" | "dict_type":
             return f"{path} = {details['input']!r}: must be a mapping of keys"
         case "union_tag_not_found":
             return f"{path}: must be a mapping of keys with a type, one of {_types(kind, location)}"

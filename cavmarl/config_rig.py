@@ -192,7 +192,7 @@ def _other_rates(rate: Fraction, sim_dt_s: float, in_batches: bool) -> str:
         )
         way_out = ""
     rates = " or ".join(f"{hz:.6g}" for hz in near)
-    return f"does not fit ticks of clock.sim_dt_s = {sim_dt_s:g}; the nearest are {rates}{way_out}"
+    return f"does not fit ticks of clock.sim_dt_s = {sim_dt_s:g}; try {rates}{way_out}"
 
 
 def _check_count(key: str, value: int, low: int, high: int) -> None:

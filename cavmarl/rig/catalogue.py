@@ -42,8 +42,6 @@ TYPES: dict[type[MountedConfig], type[MountedSensor[Any]]] = {
     CollisionConfig: Collision,
 }
 
-_PREFIX = "rig."
-
 
 def type_of(name: str, config: MountedConfig) -> type[MountedSensor[Any]]:
     """The class of a sensor.
@@ -75,8 +73,16 @@ def rig_reach_m(rig: Mapping[str, MountedConfig], largest_radius_m: float) -> fl
     return max(reaches, default=0.0)
 
 
-def frame_layout(config: EnvConfig, num_worlds: int) -> dict[str, tuple[str, Shape]]:
-    """Dtype as text, and shape, of all arrays of the frames of W worlds; see `frames_in`."""
+def frame_layout(
+    config: EnvConfig, num_worlds: int, prefix: str = "rig."
+) -> dict[str, tuple[str, Shape]]:
+    """Dtype as text, and shape, of all arrays of the frames of W worlds; see `frames_in`.
+
+    Args:
+        config: the environment.
+        num_worlds: W.
+        prefix: begins their names.
+    """
     clock, layout = config.clock, {}
     agents = (num_worlds, config.population.num_ids)
     for name, sensor in config.rig.items():
@@ -85,15 +91,15 @@ def frame_layout(config: EnvConfig, num_worlds: int) -> dict[str, tuple[str, Sha
         data = (np.dtype(type_of(name, sensor).dtype).str, (*samples, *sensor.shape))
         fields = (data, ("<f8", samples), ("|b1", samples), ("<i8", agents))
         for field, array in zip(SensorFrames._fields, fields, strict=True):
-            layout[f"{_PREFIX}{name}.{field}"] = array
+            layout[f"{prefix}{name}.{field}"] = array
     return layout
 
 
-def frames_in(arrays: Mapping[str, NDArray[Any]]) -> dict[str, SensorFrames]:
+def frames_in(arrays: Mapping[str, NDArray[Any]], prefix: str = "rig.") -> dict[str, SensorFrames]:
     """The frames among arrays that are named as by `frame_layout`, by sensor."""
     found: dict[str, dict[str, NDArray[Any]]] = {}
     for key, array in arrays.items():
-        if key.startswith(_PREFIX):
-            name, field = key.removeprefix(_PREFIX).split(".")
+        if key.startswith(prefix):
+            name, field = key.removeprefix(prefix).split(".")
             found.setdefault(name, {})[field] = array
     return {name: SensorFrames(**fields) for name, fields in found.items()}

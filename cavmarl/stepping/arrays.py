@@ -21,6 +21,9 @@ from cavmarl.worlds import World
 __all__ = ["StepArrays", "SteppedWorlds", "layout_of"]
 
 
+FINAL_FRAMES = "final_rig."  # begins their names in a layout
+
+
 class StepArrays(NamedTuple):
     """Arrays of W worlds with A agents each; the next step overwrites them.
 
@@ -45,17 +48,20 @@ class StepArrays(NamedTuple):
     suggested: NDArray[np.float64]  # (W, A, 2) what the built-in driver would do
     states: NDArray[np.float32]  # (W, S) global states, of when they were last asked for
     frames: Frames  # what the rigs have sensed
+    final_frames: Frames  # the same where something ended, before that
 
     @classmethod
     def of(cls, arrays: Mapping[str, NDArray[Any]]) -> StepArrays:
         """Made of arrays that are named as by `layout_of`."""
         fields: dict[str, Any] = {name: arrays[name] for name in cls._fields if name in arrays}
-        return cls(**fields, frames=frames_in(arrays))
+        return cls(**fields, frames=frames_in(arrays), final_frames=frames_in(arrays, FINAL_FRAMES))
 
     def part(self, first: int, last: int) -> StepArrays:
         """Those of some of the worlds, as views."""
-        parts: list[Any] = [array[first:last] for array in self[:-1]]
-        parts.append({name: sensor.part(first, last) for name, sensor in self.frames.items()})
+        *arrays, frames, final_frames = self
+        parts: list[Any] = [array[first:last] for array in arrays]
+        for rig in (frames, final_frames):
+            parts.append({name: sensor.part(first, last) for name, sensor in rig.items()})
         return StepArrays(*parts)
 
 
@@ -79,6 +85,7 @@ def layout_of(config: EnvConfig, capacity: int, num_worlds: int) -> Layout:
         "suggested": ("<f8", (*agents, 2)),
         "states": ("<f4", (num_worlds, *state_space(capacity).shape)),
         **frame_layout(config, num_worlds),
+        **frame_layout(config, num_worlds, FINAL_FRAMES),
     }
 
 

@@ -11,10 +11,11 @@ from numpy.typing import NDArray
 
 from cavmarl.balance.plan import Plan
 from cavmarl.kernels.codes import EVENTS_THAT_END
+from cavmarl.rig.catalogue import frame_layout
 from cavmarl.runtime.sensor_farm import SensorFarm
 from cavmarl.runtime.simulation import Simulation
 from cavmarl.shard.shard import Commands
-from cavmarl.spaces import state_space
+from cavmarl.spaces import state_space, write_sensed
 from cavmarl.state import global_state
 from cavmarl.stepping.arrays import StepArrays, layout_of
 from cavmarl.traffic.memory import Zeros
@@ -56,13 +57,16 @@ class LocalWorlds:
         self.world = world
         self.in_next_step = in_next_step
         self.farm: SensorFarm | None = None
+        form = world.config.observation
+        self._senses = form.mode == "sensors"
+        self._is_flat = form.kind == "flat"
         self.simulation: Simulation = Simulation(
             world.config,
             world.network,
             num_worlds,
             world.demand,
             world.partition,
-            observations=None if arrays is None else arrays.observations,
+            observations=None if arrays is None or self._senses else arrays.observations,
             frames=None if arrays is None else arrays.frames,
             warm=warm,
             zeros=zeros,
@@ -70,6 +74,8 @@ class LocalWorlds:
         )
         if arrays is None:
             arrays = _own_arrays(self.simulation, num_worlds)
+            if not self._senses:
+                arrays = arrays._replace(observations=self.simulation.outputs.observations)
         self.arrays = arrays
         self._horizon = world.config.max_steps
         self._steps = np.zeros(num_worlds, dtype=np.int64)
@@ -95,6 +101,7 @@ class LocalWorlds:
         """Let the agents act, and reset the worlds whose episode is over, now or a step later."""
         simulation, arrays = self.simulation, self.arrays
         simulation.step(commands)
+        self._show(simulation.everywhere)
         self._steps += 1
         if self._waiting.any():  # what they have done in this step counts for nothing
             self._begin(self._waiting.copy())
@@ -122,6 +129,9 @@ class LocalWorlds:
         if not ended.any():
             return
         arrays.final_observations[ended] = arrays.observations[ended]
+        for name, frames in arrays.frames.items():
+            for final, array in zip(arrays.final_frames[name], frames, strict=True):
+                final[ended] = array[ended]
         if self.in_next_step:
             self._waiting[over] = True
             arrays.mask[over] = False
@@ -133,8 +143,14 @@ class LocalWorlds:
 
     def _begin(self, chosen: NDArray[np.bool_]) -> None:
         self.simulation.reset(chosen)
+        self._show(chosen)
         self._steps[chosen] = 0
         self._waiting[chosen] = False
+
+    def _show(self, chosen: NDArray[np.bool_]) -> None:
+        """Make what sensors have got in the chosen worlds (W,) what the agents observe."""
+        if self._senses and self._is_flat:
+            write_sensed(self.arrays.frames, chosen, self.arrays.observations)
 
     def suggest(self) -> None:
         """Write what the built-in driver would do in the agents' place."""
@@ -199,11 +215,8 @@ class LocalWorlds:
 
 def _own_arrays(simulation: Simulation, num_worlds: int) -> StepArrays:
     layout = layout_of(simulation.config, simulation.capacity, num_worlds)
+    there = frame_layout(simulation.config, num_worlds)
     made = {
-        name: np.zeros(shape, dtype)
-        for name, (dtype, shape) in layout.items()
-        if name != "observations" and name in StepArrays._fields
+        name: np.zeros(shape, dtype) for name, (dtype, shape) in layout.items() if name not in there
     }
-    return StepArrays(
-        observations=simulation.outputs.observations, **made, frames=simulation.frames
-    )
+    return StepArrays.of(made)._replace(frames=simulation.frames)
