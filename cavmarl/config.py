@@ -67,11 +67,14 @@ class MapConfig:
         programs: additional files with more signal programs, named as the source is; of several
             programs of a signal the last is on.
         program: the program of each signal named here, whatever was loaded; `off` is one, too.
+        buildings: `osm`: those of the OpenStreetMap file that `source` is; or a file of buildings
+            (OpenStreetMap or SUMO's polygons), named as the source is; empty: none.
     """
 
     source: str
     programs: tuple[str, ...] = ()
     program: dict[str, str] = field(default_factory=dict)
+    buildings: str = ""
 
     def __post_init__(self) -> None:
         _check(bool(self.source), "map.source", self.source, "must name a map file")

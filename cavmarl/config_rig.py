@@ -22,6 +22,7 @@ from cavmarl.config_checks import check, check_finite
 
 __all__ = [
     "BevGridConfig",
+    "CameraConfig",
     "CollisionConfig",
     "DepthCameraConfig",
     "GnssConfig",
@@ -270,7 +271,7 @@ class RadarConfig(SampledConfig):
 
 
 @dataclass(frozen=True, kw_only=True)
-class _CameraConfig(SampledConfig):
+class CameraConfig(SampledConfig):
     """A pinhole camera.
 
     Attributes:
@@ -300,7 +301,7 @@ class _CameraConfig(SampledConfig):
 
 
 @dataclass(frozen=True, kw_only=True)
-class DepthCameraConfig(_CameraConfig):
+class DepthCameraConfig(CameraConfig):
     """Depth along the axis in m; `range_m` where nothing is."""
 
     type: Literal["depth_camera"] = "depth_camera"
@@ -308,7 +309,7 @@ class DepthCameraConfig(_CameraConfig):
 
 
 @dataclass(frozen=True, kw_only=True)
-class SemanticCameraConfig(_CameraConfig):
+class SemanticCameraConfig(CameraConfig):
     """The class of what each pixel shows."""
 
     type: Literal["semantic_camera"] = "semantic_camera"
@@ -316,7 +317,7 @@ class SemanticCameraConfig(_CameraConfig):
 
 
 @dataclass(frozen=True, kw_only=True)
-class RgbCameraConfig(_CameraConfig):
+class RgbCameraConfig(CameraConfig):
     """A shaded picture, red, green and blue from 0 to 255."""
 
     type: Literal["rgb_camera"] = "rgb_camera"

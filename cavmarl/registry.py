@@ -33,6 +33,7 @@ __all__ = [
     "find_entry",
     "load_config",
     "places",
+    "resolve_buildings",
     "resolve_demand",
     "resolve_map",
     "resolve_programs",
@@ -184,6 +185,17 @@ def resolve_demand(config: EnvConfig, base_dir: Path) -> list[Path]:
 def resolve_programs(config: EnvConfig, base_dir: Path) -> list[Path]:
     """The files that `map.programs` means; arguments and errors as for `resolve_map`."""
     return [_resolve("map.programs", source, base_dir, MapError) for source in config.map.programs]
+
+
+def resolve_buildings(config: EnvConfig, base_dir: Path) -> Path | None:
+    """The file that `map.buildings` means; None: no buildings. Else as `resolve_map`."""
+    match config.map.buildings:
+        case "":
+            return None
+        case "osm":
+            return resolve_map(config, base_dir)
+        case source:
+            return _resolve("map.buildings", source, base_dir, MapError)
 
 
 def resolve_zones(config: EnvConfig, base_dir: Path) -> Path | None:

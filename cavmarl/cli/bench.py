@@ -12,6 +12,7 @@ from rich.table import Table
 from cavmarl.cli.bench_balance import balance
 from cavmarl.cli.bench_libraries import libraries
 from cavmarl.cli.bench_moving import moving
+from cavmarl.cli.bench_rays import rays
 from cavmarl.cli.bench_sharding import sharding
 from cavmarl.cli.bench_traffic import traffic
 from cavmarl.cli.bench_train import train
@@ -42,6 +43,7 @@ app.command()(balance)
 app.command()(moving)
 app.command()(workers)
 app.command()(train)
+app.command()(rays)
 app.command()(libraries)
 
 _SENSORS = {"lidar": "64 rays", "kinematics": "no rays", "puffer_drive": "pufferlib's"}

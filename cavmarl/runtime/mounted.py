@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from cavmarl.rig.backdrop import make_backdrop
 from cavmarl.rig.rig import Rig
 from cavmarl.rig.sensor import Platform, Scene
 from cavmarl.runtime.attached import Host
@@ -25,22 +26,25 @@ class MountedSensors:
 
     Attributes:
         rig: all of its sensors.
+        platform: what the sensors are mounted on.
     """
 
     def __init__(self, host: Host) -> None:
         config = host.config
-        platform = Platform(
+        self.platform = Platform(
             host.network,
             generated_types()[0],
             host.num_worlds,
             config.population.num_ids,
             config.clock.sim_dt_s,
             config.clock.ticks_per_step,
+            host.shards[0].worlds.rows.shape[1],
+            make_backdrop(host.network, host.travel.types),
         )
         ids = host.zeros((host.num_worlds, config.population.num_ids), dtype=np.int64)
         ids[...] = -1
         self._host = host
-        self.rig = Rig(config.rig, platform, host.frames, ids)
+        self.rig = Rig(config.rig, self.platform, host.frames, ids)
 
     def reset(self, chosen: NDArray[np.bool_]) -> None:
         """Take the samples that are due at the reset of the chosen worlds (W,)."""

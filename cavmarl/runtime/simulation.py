@@ -302,6 +302,11 @@ class Simulation:
         return () if self._coordination is None else self._coordination.coordinators
 
     @property
+    def attached(self) -> tuple[Attached, ...]:
+        """What acts in each tick beside the traffic."""
+        return self._attached
+
+    @property
     def worlds(self) -> Worlds:
         """The vehicles and signals of all worlds, for tools that measure; each tick swaps them.
 
