@@ -147,6 +147,9 @@ class ZonesConfig:
         reproducers: folder for ticks that every host of a zone died of, from which they can be run
             again. With it, what a zone's code raises is the death of its host. Empty: only where
             faults kill hosts, and then the system's folder for temporary files.
+        recut_steps: every so many steps zones become others by bisection of where the vehicles are,
+            if that shares them out better; results do not depend on it. 0: they stay.
+        recut_tolerance: by which share of the mean the fullest zone has to become emptier.
     """
 
     layout: str = "bisection"
@@ -164,6 +167,8 @@ class ZonesConfig:
     check: bool = False
     faults: str = ""
     reproducers: str = ""
+    recut_steps: int = 0
+    recut_tolerance: float = 0.1
 
     def __post_init__(self) -> None:
         _check(
@@ -202,6 +207,20 @@ class ZonesConfig:
             "zones.approach_ticks",
             self.approach_ticks,
             "must be a whole number from 1 to 1000",
+        )
+        _check(
+            0 <= self.recut_steps <= 1_000_000,
+            "zones.recut_steps",
+            self.recut_steps,
+            "must be a whole number from 0 to 1000000",
+        )
+        _check_finite("zones.recut_tolerance", self.recut_tolerance, 0.0, 100.0)
+        _check(
+            not (self.recut_steps and (self.faults or self.reproducers)),
+            "zones.recut_steps",
+            self.recut_steps,
+            "vehicles that change their zone must not be late: leave out zones.faults and "
+            "zones.reproducers, or let zones stay",
         )
 
 

@@ -13,6 +13,7 @@ from cavmarl.cli.bench_balance import balance
 from cavmarl.cli.bench_libraries import libraries
 from cavmarl.cli.bench_moving import moving
 from cavmarl.cli.bench_rays import rays
+from cavmarl.cli.bench_recut import recut
 from cavmarl.cli.bench_sharding import sharding
 from cavmarl.cli.bench_traffic import traffic
 from cavmarl.cli.bench_train import train
@@ -41,6 +42,7 @@ app.command()(traffic)
 app.command()(sharding)
 app.command()(balance)
 app.command()(moving)
+app.command()(recut)
 app.command()(workers)
 app.command()(train)
 app.command()(rays)

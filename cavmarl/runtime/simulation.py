@@ -44,6 +44,7 @@ from cavmarl.runtime.division import ZoneLoads
 from cavmarl.runtime.executor import Executor, SerialExecutor
 from cavmarl.runtime.mounted import MountedSensors
 from cavmarl.runtime.recovery import Recovery, Revival
+from cavmarl.runtime.recutting import Recut, Recutter
 from cavmarl.runtime.referee import Referee
 from cavmarl.runtime.refereeing import make_refereeing
 from cavmarl.runtime.reproducer import Reproducer
@@ -186,12 +187,21 @@ class Simulation:
             self._coordination: Coordination | None = None
             self._recovery: Recovery | None = None
             self._keeper: Keeper | None = None
+            self._recutter: Recutter | None = None
             if is_first or warm:
                 self._call_every_kernel()
             zones = config.zones
             watched = zones.journal or zones.check or zones.faults or zones.reproducers
             if self.partition.count > 1 or watched:
                 self._let_coordinate()
+            if zones.recut_steps and self.partition.count > 1 and self._coordination is not None:
+                self._recutter = Recutter(
+                    network,
+                    self._division,
+                    self._coordination,
+                    zones.recut_steps,
+                    zones.recut_tolerance,
+                )
 
     def _let_coordinate(self) -> None:
         """Let coordinators say who owns what; nobody asks where all is one zone."""
@@ -388,6 +398,16 @@ class Simulation:
         ticks = self.config.clock.ticks_per_step
         for number in range(ticks):
             self.run_tick(commands, number == 0, number == ticks - 1)
+        if self._recutter is not None:
+            partition = self._recutter.after_step(self.partition)
+            if partition is not None:
+                self.partition = partition
+                self._executor = SerialExecutor(self._shards)
+
+    @property
+    def recuts(self) -> Sequence[Recut]:
+        """When other zones have been made while the worlds ran; see `zones.recut_steps`."""
+        return () if self._recutter is None else self._recutter.recuts
 
     def run_tick(self, commands: Commands, is_first: bool, is_last: bool) -> None:
         """One tick of a step, begun again as often as it takes where hosts may die.
@@ -432,6 +452,7 @@ class Simulation:
 
     def instrument(self, wrap: Callable[[Any], Any]) -> None:
         """Put `wrap(part)` in the place of each part that phases are calls of, to time them."""
+        self._refuse_recutting("measuring the phases of a tick")
         self._executor = wrap(self._executor)
         self._division = wrap(self._division)
         self._traffic = wrap(self._traffic)
@@ -440,7 +461,12 @@ class Simulation:
             self._coordination = wrap(self._coordination)
 
     def host(self, make: Callable[[Sequence[Shard]], Executor]) -> None:
-        """From now on let somebody else run the phases of the shards, as `make` returns it."""
+        """From now on let somebody else run the phases of the shards, as `make` returns it.
+
+        Raises:
+            ConfigError: zones become others, and nobody would tell him.
+        """
+        self._refuse_recutting("the zones of one world over workers")
         self._executor = make(self._shards)
 
     def time_shards(self, every: int = 1) -> ShardClock:
@@ -454,9 +480,14 @@ class Simulation:
         """
         if self._recovery is not None:
             raise ConfigError("zones.faults: shards are timed where no host dies; leave it out")
+        self._refuse_recutting("measuring what each zone costs")
         clock = ShardClock(self._shards, every)
         self._executor = clock
         return clock
+
+    def _refuse_recutting(self, what: str) -> None:
+        if self._recutter is not None:
+            raise ConfigError(f"zones.recut_steps: {what} needs zones that stay; leave one out")
 
     def _tick(self, commands: Commands, is_first: bool, is_last: bool) -> None:
         """Begin → attached → begin the step → advance … signals → attached → sense → end."""

@@ -103,8 +103,6 @@ class Shard:
     ) -> None:
         self.zone = zone
         self.zoned = zoned
-        self.zones = zones
-        self.halo = halo
         self.config = config
         self.roads: RoadArrays = network.arrays
         self.plans = plans
@@ -113,7 +111,8 @@ class Shard:
         self.sensors = sensor_arrays(config.sensors)
         self._further = further_arrays(config.sensors, network, plans)
         num_worlds, capacity = zoned.rows.shape[2:]
-        self.grid = make_grid(_seen(network, zones, zone, halo.halo_m), CELL_M, capacity)
+        self._extent_m = network.extent_m
+        self.cut(zones, halo)
         # One after the other works in it: what the last one has left is still near in memory.
         self.scratch: Scratch = (
             _make_scratch(len(network.lanes), len(network.links), capacity)
@@ -139,6 +138,13 @@ class Shard:
         self._call_leave = repeated(leave)
         self._call_observe_further = repeated(observe_further)
         self._call_fill_stacks = repeated(fill_stacks)
+
+    def cut(self, zones: ZoneArrays, halo: Halo) -> None:
+        """Say where its zone and the others are; a group has to be made anew after it."""
+        self.zones = zones
+        self.halo = halo
+        seen = _seen(self._extent_m, zones, self.zone, halo.halo_m)
+        self.grid = make_grid(seen, CELL_M, self.zoned.rows.shape[3])
 
     def turn(self) -> None:
         """Let the next rows be on the other side, for a tick that puts rows in order."""
@@ -276,10 +282,10 @@ def make_zoned(num_zones: int, num_worlds: int, capacity: int, zeros: Zeros = np
 
 
 def _seen(
-    network: RoadNetwork, zones: ZoneArrays, zone: int, halo_m: float
+    extent_m: tuple[float, float, float, float], zones: ZoneArrays, zone: int, halo_m: float
 ) -> tuple[float, float, float, float]:
     """The part of the map where a zone has vehicles or ghosts."""
-    min_x, min_y, max_x, max_y = network.extent_m
+    min_x, min_y, max_x, max_y = extent_m
     left, low, right, high = zones.rects[zone].tolist()
     return (
         max(min_x, left - halo_m),
