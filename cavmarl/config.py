@@ -58,6 +58,7 @@ MAX_ZONES = 256  # of one map
 ZONE_LAYOUTS = ("grid", "strips", "bisection")
 ZONE_FILE_SUFFIXES = (".json", ".yaml", ".yml")
 
+MAX_SENSOR_WORKERS = 256  # of one process
 MAX_IDS = 1_000_000  # of agents in one episode: each has its space and its rows in every output
 
 
@@ -246,6 +247,10 @@ class WorkersConfig:
         max_moves: worlds or zones that change their worker in one round.
         watch: see how busy others keep the workers' cores, and give nothing more to workers above
             a threshold; without it nobody else is supposed to use them.
+        sensors: processes that the sensors of `rig` are shared out over, for each process that
+            keeps the state of worlds; 0: it senses itself. Results do not depend on it. See
+            docs/sensor_workers.md.
+        sensor_placement: who of them senses what: by what it `cost` of late, or `in_turn`.
     """
 
     timeout_s: float = 300.0
@@ -255,8 +260,16 @@ class WorkersConfig:
     tolerance: float = 0.1
     max_moves: int = 4
     watch: bool = False
+    sensors: int = 0
+    sensor_placement: Literal["cost", "in_turn"] = "cost"
 
     def __post_init__(self) -> None:
+        _check(
+            0 <= self.sensors <= MAX_SENSOR_WORKERS,
+            "workers.sensors",
+            self.sensors,
+            f"must be a whole number from 0 to {MAX_SENSOR_WORKERS}",
+        )
         _check_finite("workers.timeout_s", self.timeout_s, 1.0, 1e6)
         _check(
             0 <= self.repeats <= 1000,
@@ -494,6 +507,12 @@ class EnvConfig:
         _check(self.version >= 0, "version", self.version, "must be 0 or more")
         _check_finite("horizon_s", self.horizon_s, self.clock.ctrl_dt_s, 1e6)
         check_rig(self.rig, self.clock.sim_dt_s, self.clock.ticks_per_step)
+        _check(
+            not self.workers.sensors or bool(self.rig),
+            "workers.sensors",
+            self.workers.sensors,
+            "there is no rig whose sensors they could share; name some under rig, or leave it 0",
+        )
         _check(
             self.observation.mode != "sensors" or bool(self.rig),
             "observation.mode",

@@ -52,6 +52,7 @@ from cavmarl.runtime.dividing import divide
 from cavmarl.runtime.division import ZoneLoads
 from cavmarl.runtime.executor import Executor, SerialExecutor
 from cavmarl.runtime.messaging import Messaging
+from cavmarl.runtime.mounted import MountedSensors
 from cavmarl.runtime.recovery import Recovery, Revival
 from cavmarl.runtime.recutting import Recut, Recutter
 from cavmarl.runtime.referee import Referee
@@ -369,6 +370,12 @@ class Simulation:
         A copy where worlds are divided.
         """
         return self._division.whole()
+
+    @property
+    def mounted(self) -> MountedSensors | None:
+        """The rigs of the agents; None: they have none."""
+        rigs = (part for part in self._attached if isinstance(part, MountedSensors))
+        return next(rigs, None)
 
     def signal_phases(self, world: int = 0) -> NDArray[np.int32]:
         """PHASE rows that are on, (num_signals,)."""

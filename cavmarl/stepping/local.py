@@ -13,6 +13,7 @@ from cavmarl.balance.plan import Plan
 from cavmarl.kernels.repeated import repeated
 from cavmarl.kernels.step_results import Results, report, report_who_goes_on
 from cavmarl.rig.catalogue import frame_layout
+from cavmarl.runtime.sensor_farm import SensorFarm
 from cavmarl.runtime.simulation import Simulation
 from cavmarl.shard.shard import Commands
 from cavmarl.spaces import state_space, write_sensed
@@ -41,6 +42,7 @@ class LocalWorlds:
         arrays: what goes into a step, and what comes out.
         simulation: the worlds.
         in_next_step: when worlds begin anew.
+        farm: its sensor workers; None: there are none.
     """
 
     def __init__(
@@ -55,6 +57,7 @@ class LocalWorlds:
     ) -> None:
         self.world = world
         self.in_next_step = in_next_step
+        self.farm: SensorFarm | None = None
         form = world.config.observation
         self._senses = form.mode == "sensors"
         self._is_flat = form.kind == "flat"
@@ -209,8 +212,17 @@ class LocalWorlds:
         """None: there are no workers."""
         return ()
 
+    def hire(self, farm: SensorFarm) -> None:
+        """From now on let others sense for the rigs; what they write is in `arrays`."""
+        mounted = self.simulation.mounted
+        assert mounted is not None
+        mounted.rig.sense = farm
+        self.farm = farm
+
     def close(self) -> None:
         """End the processes that the worlds have."""
+        if self.farm is not None:
+            self.farm.close()
         self.simulation.close()
 
 
