@@ -35,8 +35,8 @@ from cavmarl.spaces import (
     state_space,
 )
 from cavmarl.stepping.arrays import SteppedWorlds
-from cavmarl.stepping.local import LocalWorlds
 from cavmarl.stepping.pooled import PooledWorlds
+from cavmarl.stepping.sensing import local_worlds
 from cavmarl.worlds import check_agents, check_workers, make_world
 
 __all__ = ["CavEnv", "parallel_env"]
@@ -55,6 +55,7 @@ def parallel_env(
     *,
     zones: int | None = None,
     workers: int | None = None,
+    sensor_workers: int | None = None,
     agents: int | None = None,
     background: int | None = None,
     seed: int | None = None,
@@ -69,6 +70,8 @@ def parallel_env(
         zones: shadows zones.count, how many shards run the world; results do not depend on it.
         workers: processes that the zones are shared out over; 0: the caller's process runs them.
             Results do not depend on it.
+        sensor_workers: shadows workers.sensors, how many processes the sensors of `rig` are shared
+            out over (docs/sensor_workers.md). Results do not depend on it.
         agents: shadows population.agents.
         background: shadows population.background.
         seed: of the first reset, if that is given none.
@@ -88,6 +91,7 @@ def parallel_env(
     config, base_dir = load_config(
         env,
         zones=zones,
+        sensor_workers=sensor_workers,
         agents=agents,
         background=background,
         max_cycles=max_cycles,
@@ -98,7 +102,7 @@ def parallel_env(
     worlds: SteppedWorlds = (
         PooledWorlds(world, base_dir, 1, num_workers, in_next_step=True)
         if num_workers
-        else LocalWorlds(world, 1, in_next_step=True)
+        else local_worlds(world, base_dir, 1, in_next_step=True)
     )
     return CavEnv(worlds, seed=first_seed, render_mode=render_mode)
 

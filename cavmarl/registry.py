@@ -99,6 +99,7 @@ def load_config(
     env: str | Path,
     *,
     zones: int | None = None,
+    sensor_workers: int | None = None,
     agents: int | None = None,
     background: int | None = None,
     max_cycles: int | None = None,
@@ -109,6 +110,7 @@ def load_config(
     Args:
         env: what `find_entry` takes; a map file gets a default environment.
         zones: shadows `zones.count`.
+        sensor_workers: shadows `workers.sensors`.
         agents: shadows `population.agents`.
         background: shadows `population.background`.
         max_cycles: shadows `horizon_s`, in steps: exactly that many.
@@ -129,6 +131,7 @@ def load_config(
         config = EnvConfig(name=_map_name(found), map=MapConfig(source=found.name))
     keywords = {
         "zones.count": zones,
+        "workers.sensors": sensor_workers,
         "population.agents": agents,
         "population.background": background,
         "horizon_s": max_cycles,

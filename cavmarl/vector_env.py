@@ -27,9 +27,9 @@ from cavmarl.spaces import (
     sensed_observation,
 )
 from cavmarl.stepping.arrays import SteppedWorlds
-from cavmarl.stepping.local import LocalWorlds
 from cavmarl.stepping.pooled import PooledWorlds
 from cavmarl.stepping.remote import RemoteWorlds
+from cavmarl.stepping.sensing import local_worlds
 from cavmarl.worlds import check_agents, check_hosts, check_workers, make_world
 
 __all__ = ["CavVectorEnv", "make_vec"]
@@ -55,6 +55,7 @@ def make_vec(
     zones: int | None = None,
     workers: int | Literal["ray"] | None = None,
     hosts: Literal["ray"] | None = None,
+    sensor_workers: int | None = None,
     agents: int | None = None,
     background: int | None = None,
     seed: int | None = None,
@@ -74,6 +75,8 @@ def make_vec(
             Results do not depend on it. "ray": as with hosts="ray", as many as CPUs and worlds.
         hosts: "ray" runs the workers on the machines of a Ray cluster (docs/cluster.md), whole
             worlds each. None: on this one.
+        sensor_workers: shadows workers.sensors, how many processes the sensors of `rig` are shared
+            out over (docs/sensor_workers.md). Results do not depend on it.
         agents: shadows population.agents.
         background: shadows population.background.
         seed: of the first reset, if that is given none.
@@ -101,6 +104,7 @@ def make_vec(
     config, base_dir = load_config(
         env,
         zones=zones,
+        sensor_workers=sensor_workers,
         agents=agents,
         background=background,
         max_cycles=max_cycles,
@@ -114,7 +118,7 @@ def make_vec(
     elif num_workers:
         worlds = PooledWorlds(world, base_dir, num_envs, num_workers, in_next_step)
     else:
-        worlds = LocalWorlds(world, num_envs, in_next_step=in_next_step)
+        worlds = local_worlds(world, base_dir, num_envs, in_next_step)
     return CavVectorEnv(worlds, seed=first_seed, copy=copy)
 
 

@@ -15,6 +15,7 @@ from cavmarl.cli.bench_moving import moving
 from cavmarl.cli.bench_rays import rays
 from cavmarl.cli.bench_recut import recut
 from cavmarl.cli.bench_sharding import sharding
+from cavmarl.cli.bench_sumo import sumo
 from cavmarl.cli.bench_traffic import traffic
 from cavmarl.cli.bench_train import train
 from cavmarl.cli.bench_workers import workers
@@ -39,6 +40,7 @@ __all__ = ["app"]
 
 app = typer.Typer(help="How fast it is, measured side by side.", no_args_is_help=True)
 app.command()(traffic)
+app.command()(sumo)
 app.command()(sharding)
 app.command()(balance)
 app.command()(moving)

@@ -25,6 +25,7 @@ class MountedSensors:
         host: what it is attached to.
 
     Attributes:
+        rig: all of its sensors.
         platform: what the sensors are mounted on.
     """
 
@@ -43,23 +44,23 @@ class MountedSensors:
         ids = host.zeros((host.num_worlds, config.population.num_ids), dtype=np.int64)
         ids[...] = -1
         self._host = host
-        self._rig = Rig(config.rig, self.platform, host.frames, ids)
+        self.rig = Rig(config.rig, self.platform, host.frames, ids)
 
     def reset(self, chosen: NDArray[np.bool_]) -> None:
         """Take the samples that are due at the reset of the chosen worlds (W,)."""
-        self._rig.reset(self.scenes(), chosen)
+        self.rig.reset(self.scenes(), chosen)
 
     def begin(self, commands: Commands) -> None:
         """Note how everybody moves before the tick."""
-        self._rig.begin(self.scenes())
+        self.rig.begin(self.scenes())
 
     def end(self) -> None:
         """Take the samples of the tick."""
-        self._rig.end(self.scenes())
+        self.rig.end(self.scenes())
 
     def arrays(self) -> Iterator[NDArray[Any]]:
         """The samples."""
-        return self._rig.arrays()
+        return self.rig.arrays()
 
     def scenes(self) -> list[Scene]:
         """What the agents of each zone can see now."""
@@ -71,7 +72,7 @@ class MountedSensors:
                 shard.travel,
                 shard.worlds,
                 shard.grid,
-                self._rig.before,
+                self.rig.before,
             )
             for shard in self._host.shards
         ]
