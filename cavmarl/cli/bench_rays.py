@@ -27,14 +27,15 @@ def rays(
     for row in found.rows:
         table.add_row(
             row.name,
-            " × ".join(map(str, row.shape)),
+            ", ".join(map(str, row.shape)),
             f"{row.median_us:.1f} ({row.low_us:.1f} to {row.high_us:.1f})",
             f"{1e3 * row.median_us / row.numbers:.1f}",
         )
     console.print(table)
     console.print(
-        f"{found.cars_per_km2:.0f} cars/km²: the plane lidar takes [bold]{found.lidar_ns:.1f} ns[/] "
-        f"a ray, a depth and a semantic picture [bold]{found.cameras_ms:.3f} ms[/],\n"
+        f"{found.cars_per_km2:.0f} cars/km²: the plane lidar takes "
+        f"[bold]{found.lidar_ns:.1f} ns[/] a ray, a depth and a semantic picture "
+        f"[bold]{found.cameras_ms:.3f} ms[/],\n"
         f"all ten sensors of one vehicle [bold]{found.tick_ms:.2f} ms[/] a tick"
     )
     write_json(json_path, found.to_dict())

@@ -62,9 +62,7 @@ class Picture(NamedTuple):
     light: NDArray[np.float64]  # (F,) how bright each face is, in [0, 1]
 
 
-def make_camera(
-    mount: NDArray[np.float64], width: int, fov_rad: float, range_m: float
-) -> Camera:
+def make_camera(mount: NDArray[np.float64], width: int, fov_rad: float, range_m: float) -> Camera:
     """A camera.
 
     Args:
@@ -83,9 +81,7 @@ def make_picture(width: int, height: int, panorama: Panorama) -> Picture:
     semantic = np.zeros(faces, np.uint8)
     semantic[:FIRST_FACE] = NOTHING, GROUND, ROAD
     light = np.ones(faces)
-    return Picture(
-        np.zeros((height, width)), np.zeros((height, width), np.int32), semantic, light
-    )
+    return Picture(np.zeros((height, width)), np.zeros((height, width), np.int32), semantic, light)
 
 
 @kernel
@@ -130,9 +126,7 @@ def _is_aside(camera: Camera, width: int, height: int) -> bool:
 
 
 @kernel
-def _set_face(
-    camera: Camera, width: int, height: int
-) -> tuple[int, int, float, float, float]:
+def _set_face(camera: Camera, width: int, height: int) -> tuple[int, int, float, float, float]:
     """Set the edges of the face whose corners are set, the fifth being the range.
 
     Returns:
@@ -285,9 +279,7 @@ def _draw_prism(camera: Camera, picture: Picture, prism: np.void, first: int) ->
 
 @kernel
 def _light(x: float, y: float) -> float:
-    """How bright an upright face is that looks towards (x, y), a unit vector in the vehicle's
-    frame: the light comes from ahead on the left.
-    """
+    """How bright an upright face is that looks to (x, y); light comes from ahead on the left."""
     return 0.7 + 0.15 * (x + y)
 
 

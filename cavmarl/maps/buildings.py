@@ -82,9 +82,7 @@ def convex_parts(rings: tuple[NDArray[np.float64], ...]) -> NDArray[np.float64]:
     right, bound the inside by pairs. Where sides cross each other between corners, which footprints
     do not, the parts overlap a little.
     """
-    sides = np.concatenate(
-        [np.stack([ring, np.roll(ring, -1, axis=0)], axis=1) for ring in rings]
-    )
+    sides = np.concatenate([np.stack([ring, np.roll(ring, -1, axis=0)], axis=1) for ring in rings])
     low = sides[:, :, 1].min(axis=1)
     high = sides[:, :, 1].max(axis=1)
     parts: list[NDArray[np.float64]] = []

@@ -65,8 +65,8 @@ def read_footprints(path: Path, geo: GeoReference | None) -> list[Footprint]:
     if reader.root in ("additional", "polygons", "shapes"):
         return reader.polygons
     raise MapError(
-        f"{path}: <{reader.root}> is the root of no file of buildings: give an OpenStreetMap extract "
-        "(<osm>) or SUMO polygons (<additional>, .poly.xml)"
+        f"{path}: <{reader.root}> is the root of no file of buildings: give an OpenStreetMap "
+        "extract (<osm>) or SUMO polygons (<additional>, .poly.xml)"
     )
 
 
@@ -137,7 +137,9 @@ class _Reader(ContentHandler):
             self.polygons.append(self._polygon(attrs))
 
     def _polygon(self, attrs: Mapping[str, str]) -> Footprint:
-        corners = [_finite(tuple(map(float, word.split(",")[:2]))) for word in attrs["shape"].split()]
+        corners = [
+            _finite(tuple(map(float, word.split(",")[:2]))) for word in attrs["shape"].split()
+        ]
         ring = np.array(corners, dtype=np.float64).reshape(-1, 2)
         if attrs.get("geo", "false") in ("1", "true"):
             ring = _project(self._path, ring, self._geo)
@@ -174,7 +176,7 @@ def _finite(place: tuple[float, ...]) -> tuple[float, float]:
 
 def _osm_buildings(path: Path, osm: _Reader, geo: GeoReference | None) -> Iterator[Footprint]:
     """Closed ways and multipolygons that are buildings; those that leave the extract are not."""
-    for element in (*osm.ways.values(), *osm.relations):
+    for element in [*osm.ways.values(), *osm.relations]:
         if not element.is_building:
             continue
         ways = [element.nodes] if element.nodes else [
@@ -213,7 +215,9 @@ def _closed(ways: list[list[str]]) -> list[list[str]]:
 
 def _rings(rings: list[Ring]) -> tuple[Ring, ...]:
     """Those with at least three corners, without the first one again at the end."""
-    open_rings = [ring[:-1] if len(ring) and (ring[0] == ring[-1]).all() else ring for ring in rings]
+    open_rings = [
+        ring[:-1] if len(ring) and (ring[0] == ring[-1]).all() else ring for ring in rings
+    ]
     return tuple(ring for ring in open_rings if len(ring) >= 3)
 
 
@@ -235,4 +239,5 @@ def _project(path: Path, ring: Ring, geo: GeoReference | None) -> Ring:
         )
     pyproj: Any = require("pyproj", "maps")
     x, y = pyproj.Proj(projparams=geo.projection)(ring[:, 0], ring[:, 1])
-    return np.stack([x, y], axis=1) + [geo.offset_x_m, geo.offset_y_m]
+    placed: Ring = np.stack([x + geo.offset_x_m, y + geo.offset_y_m], axis=1)
+    return placed
