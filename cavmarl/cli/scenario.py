@@ -63,7 +63,9 @@ def run(
     ] = None,
     driver: Annotated[str, typer.Option(help="Of the agent: a name, or a path.")] = "idm",
     density: Annotated[str, typer.Option(help="Other traffic: none, low or high.")] = "none",
-    zones: Annotated[int, typer.Option(help="Into which the world is divided.")] = 1,
+    zones: Annotated[
+        int | None, typer.Option(help="How many; default: as the environment says.")
+    ] = None,
     seed: Seed = 0,
     settings: Settings = None,
     picture: Annotated[

@@ -31,7 +31,8 @@ class ScenarioCamera:
 
     Args:
         vec: the worlds, run in this process, after `make_scenario`.
-        picture: where the moment goes in which the agent was closest to an actor that has moved; None: nowhere.
+        picture: where the moment goes in which the agent was closest to an actor that has moved;
+            None: nowhere.
         video: where everything goes; None: nowhere.
 
     Raises:
