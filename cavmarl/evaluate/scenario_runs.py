@@ -37,6 +37,7 @@ DENSITIES = {"none": 0.0, "low": 2.0, "high": 8.0}
 
 HORIZON_S = 180.0
 
+
 @dataclass(frozen=True)
 class ScenarioRun:
     """What became of one run.

@@ -9,6 +9,7 @@ DRIVER_SCRIPTED = 2  # goes where its script says: pedestrians, vehicles of scen
 
 # VTYPE["vclass"] of who walks; the classes that drive are positions in network.VEHICLE_CLASSES
 CLASS_PEDESTRIAN = 9
+DRIVER_SUMO = 3  # moved by SUMO, mirrored here
 
 # VTYPE["model"]: how a background driver follows its leader
 MODEL_KRAUSS = 0

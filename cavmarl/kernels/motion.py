@@ -37,6 +37,7 @@ __all__ = [
     "Before",
     "account",
     "before_tick",
+    "lane_before",
     "move_agent",
     "move_background",
     "place_on_lane",
@@ -87,7 +88,7 @@ def _way_point(roads: RoadArrays, travel: Travel, row: np.void, s: float) -> tup
     for _ in range(MAX_BODY_LANES):
         if s >= 0.0:
             break
-        before = _lane_before(roads, lane, row["link"])
+        before = lane_before(roads, lane, row["link"])
         if before < 0:
             break
         lane = before
@@ -98,7 +99,7 @@ def _way_point(roads: RoadArrays, travel: Travel, row: np.void, s: float) -> tup
 
 
 @kernel
-def _lane_before(roads: RoadArrays, lane: int, link: int) -> int:
+def lane_before(roads: RoadArrays, lane: int, link: int) -> int:
     """The lane that a vehicle has come from which has entered `link` last, or -1."""
     here = roads.lanes[lane]
     if here["internal"]:

@@ -85,9 +85,7 @@ def _keep_order(owned: int, scratch: Scratch) -> None:
 
 
 @kernel
-def _order_by_lane(
-    roads: RoadArrays, rows: NDArray[np.void], owned: int, scratch: Scratch
-) -> None:
+def _order_by_lane(roads: RoadArrays, rows: NDArray[np.void], owned: int, scratch: Scratch) -> None:
     """The owned rows in the order of the index: neighbours on the road become so in memory."""
     found = 0
     for i in range(owned):
@@ -233,7 +231,7 @@ def advance(
             elif row["driver"] == DRIVER_SCRIPTED:
                 row["events"] = 0
                 follow_script(roads, travel, worlds.cues[w], row, dt)
-            else:
+            elif row["driver"] == DRIVER_AGENT:
                 _drive_agent(
                     roads,
                     plans,

@@ -27,9 +27,7 @@ class Cues:
         division: all of them together.
     """
 
-    def __init__(
-        self, cues: NDArray[np.void], shards: Sequence[Shard], division: Division
-    ) -> None:
+    def __init__(self, cues: NDArray[np.void], shards: Sequence[Shard], division: Division) -> None:
         self._cues = cues
         self._worlds = shards[0].worlds
         self._division = division

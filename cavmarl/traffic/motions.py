@@ -234,8 +234,9 @@ def arc(
     # Going forwards the centre of the circle lies on the side that the heading turns to.
     side = math.copysign(1.0, turn_rad) * (-1.0 if backwards else 1.0)
     headings = heading + np.linspace(0.0, turn_rad, max(2, int(abs(turn_rad) / 0.05) + 1))
-    middle_x, middle_y = x - side * radius_m * math.sin(heading), y + side * radius_m * math.cos(
-        heading
+    middle_x, middle_y = (
+        x - side * radius_m * math.sin(heading),
+        y + side * radius_m * math.cos(heading),
     )
     return np.stack(
         [

@@ -30,6 +30,8 @@ from cavmarl.traffic.rerouting import Rerouting
 from cavmarl.traffic.scene import Scene
 from cavmarl.traffic.schedule import Schedule
 from cavmarl.traffic.scripts import NO_SCRIPTS
+from cavmarl.traffic.sumo.demand import SumoDemand
+from cavmarl.traffic.sumo.route_book import RouteBook
 from cavmarl.traffic.vtypes import generated_types
 from cavmarl.traffic.way_slots import WaySlots, way_slots
 
@@ -69,6 +71,7 @@ class NativeTraffic:
         num_worlds: how many worlds are stepped together.
         zeros: makes the table of ways, where vehicles find some while the world runs.
         scene: what is played to the agent of each world.
+        sumo: in the place of a file: what SUMO runs beside these worlds.
     """
 
     network: RoadNetwork
@@ -81,6 +84,7 @@ class NativeTraffic:
     num_worlds: int = 1
     zeros: Zeros = np.zeros
     scene: Scene | None = None
+    sumo: SumoDemand | None = None
 
     def __post_init__(self) -> None:
         # Trips that do not exist are refused when the world is made, not at its first reset.
@@ -139,6 +143,8 @@ class NativeTraffic:
     def travel(self) -> Travel:
         """Types and ways of all vehicles: the generator's, the demand file's, then the actors'."""
         types, steps = generated_types(), self.plans.reshape(-1)
+        if self.sumo is not None:
+            return self._travel_of_sumo(self.sumo, types, steps)
         scripts = NO_SCRIPTS if self.cast is None else self.cast.scripts
         actors = types[:0] if self.cast is None else self.cast.types
         if self.file is None or self.schedule is None:
@@ -164,6 +170,26 @@ class NativeTraffic:
             see_m=self._farthest_m(_centre_sees_line_m),
             num_fixed=num_fixed,
             scripts=scripts,
+        )
+
+    def _travel_of_sumo(
+        self, sumo: SumoDemand, types: NDArray[np.void], fixed: NDArray[np.void]
+    ) -> Travel:
+        """The same with SUMO's types, and room for its routes behind the fixed ways."""
+        steps = self.zeros(
+            len(fixed) + RouteBook.room(self.network, self.num_worlds), dtype=fixed.dtype
+        )
+        steps[: len(fixed)] = fixed
+        return Travel(
+            np.concatenate([types, sumo.types]),
+            steps,
+            np.zeros(0, dtype=STOP),
+            0,
+            sumo.given.begin_s,
+            VIEW_M,
+            VIEW_M,
+            num_fixed=len(fixed),
+            scripts=NO_SCRIPTS,
         )
 
     def _farthest_m(self, look_m: Callable[[np.void, float], float]) -> float:
@@ -208,6 +234,8 @@ class NativeTraffic:
     @cached_property
     def capacity(self) -> int:
         """Rows that one world needs."""
+        if self.sumo is not None:
+            return _capacity_of_sumo(self.population, self.sumo)
         actors = 0 if self.scene is None else len(self.scene.actors)
         args = (self.network, self.population, self.schedule, self.dt, self.horizon_s)
         return _capacity(*args) + actors
@@ -385,13 +413,19 @@ class NativeTraffic:
 def capacity_of(
     network: RoadNetwork,
     population: PopulationConfig,
-    file: DemandFile | None,
+    file: DemandFile | SumoDemand | None,
     dt: float,
     horizon_s: float,
 ) -> int:
     """How many vehicles a world can hold, as `NativeTraffic` will say when it is made of these."""
+    if isinstance(file, SumoDemand):
+        return _capacity_of_sumo(population, file)
     schedule = None if file is None else Schedule(file, 0, 0)
     return _capacity(network, population, schedule, dt, horizon_s)
+
+
+def _capacity_of_sumo(population: PopulationConfig, sumo: SumoDemand) -> int:
+    return population.agents + population.background + sumo.max_vehicles
 
 
 def _capacity(

@@ -42,9 +42,7 @@ def places(streets: Streets, parameters: Parameters) -> dict[str, int]:
     """The rightmost lanes of straight roads."""
     lanes = streets.network.lanes
     return {
-        streets.name(lane): lane
-        for lane in streets.straights(ROAD_M)
-        if lanes["right"][lane] < 0
+        streets.name(lane): lane for lane in streets.straights(ROAD_M) if lanes["right"][lane] < 0
     }
 
 
@@ -59,9 +57,7 @@ def stage(streets: Streets, place: int, parameters: Parameters) -> Scene:
     start, end = streets.point(lane, s, -side), streets.point(lane, s, left + KERB_M)
     heading = start[2] + 0.5 * np.pi
     line = np.array([[*start[:2], heading], [*end[:2], heading]])
-    actors = [
-        Actor("pedestrian", [Move(line[:1], lane), Await(0), Move(line, lane, walk)])
-    ]
+    actors = [Actor("pedestrian", [Move(line[:1], lane), Await(0), Move(line, lane, walk)])]
     if parameters.occluded:
         d = right + VAN_GAP_M + 0.5 * VAN_M[1]
         van = streets.point(lane, s - STEP_M - 0.5 * VAN_M[0], -d)
