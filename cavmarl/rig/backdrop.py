@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cavmarl.errors import ConfigError
+from cavmarl.kernels.codes import CLASS_PEDESTRIAN
 from cavmarl.kernels.neighbors import Grid, cell_at, make_grid
 from cavmarl.kernels.panorama import Backdrop
 from cavmarl.kernels.semantics import SEMANTIC_OF_CLASS
@@ -53,7 +54,8 @@ def make_backdrop(network: RoadNetwork, types: NDArray[np.void]) -> Backdrop:
 
 def _semantics(types: NDArray[np.void]) -> NDArray[np.uint8]:
     """(num_types,) the semantic class of each type."""
-    names = [VEHICLE_CLASSES[vclass] for vclass in types["vclass"]]
+    known = dict(enumerate(VEHICLE_CLASSES)) | {CLASS_PEDESTRIAN: "pedestrian"}
+    names = [known[vclass] for vclass in types["vclass"].tolist()]
     unknown = sorted(set(names) - set(SEMANTIC_OF_CLASS))
     if unknown:
         raise ConfigError(f"vehicle class {', '.join(unknown)}: cameras have no class for it")
