@@ -22,6 +22,8 @@ OVERLAP_M = 0.05
 # A sharp bend is not carried farther out than this many half widths.
 LONGEST_MITRE = 2.0
 
+_CLASS_NAMES = {**dict(enumerate(VEHICLE_CLASSES)), CLASS_PEDESTRIAN: "pedestrian"}
+
 
 def make_backdrop(network: RoadNetwork, types: NDArray[np.void]) -> Backdrop:
     """The backdrop of a map.
@@ -54,8 +56,7 @@ def make_backdrop(network: RoadNetwork, types: NDArray[np.void]) -> Backdrop:
 
 def _semantics(types: NDArray[np.void]) -> NDArray[np.uint8]:
     """(num_types,) the semantic class of each type."""
-    known = dict(enumerate(VEHICLE_CLASSES)) | {CLASS_PEDESTRIAN: "pedestrian"}
-    names = [known[vclass] for vclass in types["vclass"].tolist()]
+    names = [_CLASS_NAMES.get(vclass, f"number {vclass}") for vclass in types["vclass"].tolist()]
     unknown = sorted(set(names) - set(SEMANTIC_OF_CLASS))
     if unknown:
         raise ConfigError(f"vehicle class {', '.join(unknown)}: cameras have no class for it")
