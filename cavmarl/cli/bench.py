@@ -16,6 +16,7 @@ from cavmarl.cli.bench_rays import rays
 from cavmarl.cli.bench_recut import recut
 from cavmarl.cli.bench_sensors import sensors
 from cavmarl.cli.bench_sharding import sharding
+from cavmarl.cli.bench_sumo import sumo
 from cavmarl.cli.bench_traffic import traffic
 from cavmarl.cli.bench_train import train
 from cavmarl.cli.bench_workers import workers
@@ -40,6 +41,7 @@ __all__ = ["app"]
 
 app = typer.Typer(help="How fast it is, measured side by side.", no_args_is_help=True)
 app.command()(traffic)
+app.command()(sumo)
 app.command()(sharding)
 app.command()(balance)
 app.command()(moving)

@@ -16,6 +16,8 @@ __all__ = ["lane_strips", "make_backdrop"]
 CELL_M = 32.0
 # Long straight strips are cut, so that what is near a vehicle is found by the middles of strips.
 STRIP_M = 24.0
+# Neighbour lanes of a map are not as close as its widths say: without this, ground shows in between.
+OVERLAP_M = 0.05
 # A sharp bend is not carried farther out than this many half widths.
 LONGEST_MITRE = 2.0
 
@@ -95,7 +97,7 @@ def lane_strips(network: RoadNetwork) -> tuple[NDArray[np.float64], NDArray[np.f
     along = np.where(size[:, np.newaxis] > 1e-6, along / np.maximum(size, 1e-6)[:, np.newaxis], after)
     bend = np.abs(along[:, 0] * after[:, 0] + along[:, 1] * after[:, 1])
     mitre = np.minimum(1.0 / np.maximum(bend, 1e-6), LONGEST_MITRE)
-    aside = (0.5 * lanes["width_m"][of] * mitre)[:, np.newaxis] * along[:, ::-1] * [-1.0, 1.0]
+    aside = ((0.5 * lanes["width_m"][of] + OVERLAP_M) * mitre)[:, np.newaxis] * along[:, ::-1] * [-1.0, 1.0]
     sides = np.stack([here - aside, here + aside], axis=1)
     start = np.flatnonzero(~last)
     length = points["s"][start + 1] - points["s"][start]

@@ -1,6 +1,6 @@
 """What acts in each tick beside the traffic: mounted sensors, messages, scripts, other simulators.
 
-Each part is made in `attach`, keeps its state in arrays (W, …) and is asked at fixed points of a
+Each part is made in `attaching`, keeps its state in arrays (W, …) and is asked at fixed points of a
 tick. It reads the rows of all shards and writes only what is its own, so that nothing depends on
 how a world is divided.
 """
@@ -21,7 +21,7 @@ from cavmarl.runtime.division import Division
 from cavmarl.shard.shard import Commands, Shard
 from cavmarl.traffic.memory import Zeros
 
-__all__ = ["Attached", "Host", "attach"]
+__all__ = ["Attached", "Host"]
 
 
 class Host(NamedTuple):
@@ -74,13 +74,3 @@ class Attached(Protocol):
         An item of one world must not say how it is divided or where its rows lie.
         """
         ...
-
-
-def attach(host: Host) -> tuple[Attached, ...]:
-    """The parts that the environment asks for, in the order in which they act."""
-    from cavmarl.runtime.mounted import MountedSensors
-
-    parts: list[Attached] = []
-    if host.config.rig:
-        parts.append(MountedSensors(host))
-    return tuple(parts)

@@ -337,6 +337,11 @@ class Division:
         """On which side of `zoned.rows` the committed rows are."""
         return self._side(self._shards[0].worlds.rows)
 
+    @property
+    def next_side(self) -> int:
+        """On which side the next rows are."""
+        return self._side(self._shards[0].worlds.next_rows)
+
     def owners(self, w: int) -> list[tuple[int, int]]:
         """(id, zone) of all vehicles of a world."""
         return [

@@ -41,6 +41,7 @@ class StepArrays(NamedTuple):
     mask: NDArray[np.bool_]  # (W, A) who acts next
     terms: NDArray[np.float32]  # (W, A, T)
     arrivals: NDArray[np.int64]  # (W,) since each world's reset
+    ticks: NDArray[np.int64]  # (W,) the same
     episode_over: NDArray[np.bool_]  # (W,) which worlds were reset, or will be in the next step
     chosen: NDArray[np.bool_]  # (W,) which worlds are to be reset
     controls: NDArray[np.float64]  # (W, A, 2) what agents do, as in `Commands`
@@ -78,6 +79,7 @@ def layout_of(config: EnvConfig, capacity: int, num_worlds: int) -> Layout:
         "vehicle_ids": ("<i8", agents),
         "terms": ("<f4", (*agents, len(TERMS))),
         "arrivals": ("<i8", (num_worlds,)),
+        "ticks": ("<i8", (num_worlds,)),
         "episode_over": ("|b1", (num_worlds,)),
         "chosen": ("|b1", (num_worlds,)),
         "controls": ("<f8", (*agents, 2)),
@@ -131,6 +133,10 @@ class SteppedWorlds(Protocol):
 
     def write_states(self) -> None:
         """Write `states`."""
+        ...
+
+    def ticks(self) -> NDArray[np.int64]:
+        """(W,) ticks since each world's reset."""
         ...
 
     def state_hash(self, world: int) -> str:

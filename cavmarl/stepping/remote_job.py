@@ -29,10 +29,10 @@ Array = NDArray[Any]
 # Fields of `StepArrays` that every step writes.
 _STEPPED = (
     "observations", "rewards", "terminations", "truncations", "acted", "vehicle_done", "mask",
-    "vehicle_ids", "terms", "arrivals", "episode_over",
+    "vehicle_ids", "terms", "arrivals", "ticks", "episode_over",
 )  # fmt: skip
 # Those that a reset writes, of the worlds that it is about.
-_BEGUN = ("observations", "mask", "vehicle_ids", "vehicle_done", "terms", "episode_over")
+_BEGUN = ("observations", "mask", "vehicle_ids", "vehicle_done", "terms", "ticks", "episode_over")
 
 
 def inputs_of(task: int, arrays: StepArrays) -> list[Array]:
