@@ -14,6 +14,7 @@ from cavmarl.cli.bench_libraries import libraries
 from cavmarl.cli.bench_moving import moving
 from cavmarl.cli.bench_rays import rays
 from cavmarl.cli.bench_recut import recut
+from cavmarl.cli.bench_sensors import sensors
 from cavmarl.cli.bench_sharding import sharding
 from cavmarl.cli.bench_sumo import sumo
 from cavmarl.cli.bench_traffic import traffic
@@ -48,6 +49,7 @@ app.command()(recut)
 app.command()(workers)
 app.command()(train)
 app.command()(rays)
+app.command()(sensors)
 app.command()(libraries)
 
 _SENSORS = {"lidar": "64 rays", "kinematics": "no rays", "puffer_drive": "pufferlib's"}
