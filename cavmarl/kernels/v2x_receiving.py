@@ -91,7 +91,8 @@ def _load_around(channel: Channel, room: Room, x: float, y: float) -> float:
 @kernel
 def _place_of(sender: int, slots: int) -> int:
     """Where the search for a sender begins in a table of `slots` places, a power of 2."""
-    return np.int64(mix(np.uint64(sender)) & np.uint64(slots - 1))
+    place: int = np.int64(mix(np.uint64(sender)) & np.uint64(slots - 1))  # type: ignore[assignment]
+    return place
 
 
 @kernel
@@ -121,7 +122,7 @@ def _find_cam(room: Room, packets: NDArray[np.void], sender: int) -> int:
 def _hears(
     channel: Channel, me: np.void, level: int, word: np.uint64, x: float, y: float, squared: float
 ) -> bool:
-    """Whether a receiver receives a packet with that word that is sent within reach, from (x, y)."""
+    """Whether a receiver receives the packet of that word, sent within reach from (x, y)."""
     if channel.sure:
         return True
     number = draw(me["word"], word)
@@ -325,9 +326,7 @@ def _receive_objects(
     reports = mail.reports[w, slot]
     _refresh_by_cams(channel, me, level, packets, reports, room, box, num)
     if with_seen:
-        _take_others(
-            channel, mail, w, me, level, packets, reports, room, KIND_CPM, box, num, False
-        )
+        _take_others(channel, mail, w, me, level, packets, reports, room, KIND_CPM, box, num, False)
     sort_by_distance(box, num, room.squared, me["x"], me["y"])
     num = _let_in_cams(channel, mail, w, me, level, packets, reports, room, box, num)
     if with_seen:

@@ -14,6 +14,8 @@ from numpy.typing import NDArray
 from cavmarl.kernels.neighbors import Grid
 
 __all__ = [
+    "BANDS_PER_M",
+    "BAND_M",
     "CAUSE_COLLISION",
     "CAUSE_HARD_BRAKING",
     "CAUSE_NONE",
@@ -32,8 +34,6 @@ __all__ = [
     "LAST_CAM",
     "MAX_DELAYS",
     "MAX_NEAR",
-    "BANDS_PER_M",
-    "BAND_M",
     "NUM_BANDS",
     "NUM_COUNTS",
     "NUM_KINDS",

@@ -44,7 +44,9 @@ STANDS_MPS = 0.1
 
 
 @kernel
-def gather(zoned: Zoned, side: int, w: int, stations: NDArray[np.void], spare: NDArray[np.void]) -> int:
+def gather(
+    zoned: Zoned, side: int, w: int, stations: NDArray[np.void], spare: NDArray[np.void]
+) -> int:
     """List the vehicles of all zones of a world by id; returns how many.
 
     Args:
@@ -186,7 +188,7 @@ def _has_changed(row: np.void, last: np.void, tick: int, dt: float) -> bool:
     """Whether a CAM is worth while, by the last one."""
     dx = row["x"] - last["x"]
     dy = row["y"] - last["y"]
-    return (
+    return bool(
         dx * dx + dy * dy > CAM_DISTANCE_M * CAM_DISTANCE_M
         or abs(wrap_angle(row["heading"] - last["heading"])) > CAM_HEADING_RAD
         or abs(row["speed"] - last["speed"]) > CAM_SPEED_MPS
@@ -346,7 +348,9 @@ def send_from_units(
                 room, -1, unit["x"], unit["y"], unit["z"],
                 sending.unit_range_m, sending.cpm_objects, walls, True,
             )  # fmt: skip
-            _send_seen(sending, mail, w, slot, sender, unit["x"], unit["y"], seen, types, room, tick)
+            _send_seen(
+                sending, mail, w, slot, sender, unit["x"], unit["y"], seen, types, room, tick
+            )
         if _is_due(tick, k, sending.spat_period):
             first = _open(mail, w, slot, sender, tick, unit["x"], unit["y"], KIND_SPAT, 1)
             if first >= 0:

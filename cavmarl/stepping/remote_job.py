@@ -37,7 +37,7 @@ _BEGUN = ("observations", "mask", "vehicle_ids", "vehicle_done", "terms", "episo
 def inputs_of(task: int, arrays: StepArrays) -> list[Array]:
     """What goes into a task, at both ends."""
     if task == Task.STEP:
-        return [arrays.controls, arrays.meta_actions]
+        return [arrays.controls, arrays.meta_actions, arrays.declared]
     return [arrays.chosen] if task == Task.RESET else []
 
 

@@ -99,8 +99,8 @@ def _distances_m(config: ChannelConfig, sensing_m: float) -> int:
     """How many whole metres a table has."""
     end_m = config.range_m or math.inf
     if config.path_loss_exponent > 0.0:
-        metre = 1
-        while chance_of_reception(config, metre) >= LEAST_CHANCE and metre < min(end_m, MAX_REACH_M):
+        metre, last = 1, min(end_m, MAX_REACH_M)
+        while metre < last and chance_of_reception(config, metre) >= LEAST_CHANCE:
             metre += 1
         return metre + 1
     if config.data_rate_mbps > 0.0 and sensing_m < math.inf:
