@@ -84,9 +84,9 @@ def hidden_share(distance_m: float, sensing_m: float) -> float:
 def chance_among_others(busy: float, hidden: float) -> float:
     """Chance that nobody whom the sender does not hear, and so does not wait for, disturbs it.
 
-    They send at random, and a packet is lost if one of them begins within two packet times: e^(-2G),
-    where G is their share of the air (Abramson: "The ALOHA system", 1970; Tobagi, Kleinrock:
-    "Packet switching in radio channels: part II, the hidden terminal problem", 1975).
+    They send at random, and a packet is lost if one of them begins within two packet times:
+    exp(-2 G), where G is their share of the air (Abramson: "The ALOHA system", 1970; Tobagi,
+    Kleinrock: "Packet switching in radio channels: part II, the hidden terminal problem", 1975).
 
     Args:
         busy: share of the time in which the receiver hears somebody.
