@@ -33,6 +33,7 @@ __all__ = [
     "find_entry",
     "load_config",
     "places",
+    "resolve_buildings",
     "resolve_demand",
     "resolve_map",
     "resolve_programs",
@@ -98,6 +99,7 @@ def load_config(
     env: str | Path,
     *,
     zones: int | None = None,
+    sensor_workers: int | None = None,
     agents: int | None = None,
     background: int | None = None,
     max_cycles: int | None = None,
@@ -108,6 +110,7 @@ def load_config(
     Args:
         env: what `find_entry` takes; a map file gets a default environment.
         zones: shadows `zones.count`.
+        sensor_workers: shadows `workers.sensors`.
         agents: shadows `population.agents`.
         background: shadows `population.background`.
         max_cycles: shadows `horizon_s`, in steps: exactly that many.
@@ -128,6 +131,7 @@ def load_config(
         config = EnvConfig(name=_map_name(found), map=MapConfig(source=found.name))
     keywords = {
         "zones.count": zones,
+        "workers.sensors": sensor_workers,
         "population.agents": agents,
         "population.background": background,
         "horizon_s": max_cycles,
@@ -181,6 +185,17 @@ def resolve_demand(config: EnvConfig, base_dir: Path) -> list[Path]:
 def resolve_programs(config: EnvConfig, base_dir: Path) -> list[Path]:
     """The files that `map.programs` means; arguments and errors as for `resolve_map`."""
     return [_resolve("map.programs", source, base_dir, MapError) for source in config.map.programs]
+
+
+def resolve_buildings(config: EnvConfig, base_dir: Path) -> Path | None:
+    """The file that `map.buildings` means; None: no buildings. Else as `resolve_map`."""
+    match config.map.buildings:
+        case "":
+            return None
+        case "osm":
+            return resolve_map(config, base_dir)
+        case source:
+            return _resolve("map.buildings", source, base_dir, MapError)
 
 
 def resolve_zones(config: EnvConfig, base_dir: Path) -> Path | None:

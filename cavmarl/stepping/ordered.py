@@ -6,6 +6,9 @@ import logging
 from abc import ABC, abstractmethod
 from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
+
 import cavmarl.errors
 from cavmarl.balance.plan import Plan
 from cavmarl.balance.plan_text import describe_plan
@@ -75,6 +78,10 @@ class OrderedWorlds(ABC):
     def write_states(self) -> None:
         """Write the global state of each world."""
         self._order(Task.WRITE_STATES, commits=False)
+
+    def ticks(self) -> NDArray[np.int64]:
+        """(W,) ticks since each world's reset."""
+        return self.arrays.ticks.copy()
 
     def state_hash(self, world: int) -> str:
         """Hex digest of one world."""
