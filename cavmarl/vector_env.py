@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from cavmarl.actions import ActionDecoder
 from cavmarl.balance.plan import Plan
 from cavmarl.balance.plan_text import describe_plan
+from cavmarl.declared_events import DeclaredEvents
 from cavmarl.errors import ConfigError, ResetNeededError
 from cavmarl.registry import load_config
 from cavmarl.rig.frames import SensorFrames
@@ -197,6 +198,7 @@ class CavVectorEnv:
         }
         self._decoder = ActionDecoder(config.action, num_envs, self.possible_agents)
         self._mask = np.zeros((num_envs, self.num_agents), dtype=np.bool_)
+        self._events = DeclaredEvents(config, num_envs)
         self._first_seed = None if seed is None else check_seed(seed)
         self._copy = copy
         self._ready = False
@@ -306,7 +308,7 @@ class CavVectorEnv:
             raise ResetNeededError("step() before reset(): call vec.reset(seed=…) first")
         commands = self._decoder.from_array(actions, self._mask)
         began = time.perf_counter()
-        self.worlds.step(commands)
+        self.worlds.step(self._events.add_to(commands))
         self.simulated_s += time.perf_counter() - began
         arrays = self.worlds.arrays
         over = arrays.episode_over.copy()
@@ -348,6 +350,20 @@ class CavVectorEnv:
         view = array.view()
         view.flags.writeable = False
         return view
+
+    def declare_event(self, world: int, agent: int, cause: str) -> None:
+        """Let the vehicle of an agent, by index, tell others of an event in the next step.
+
+        Args:
+            world: in which it drives.
+            agent: index in `possible_agents`.
+            cause: as of `CavEnv.declare_event`.
+
+        Raises:
+            UnknownAgentError: no such agent.
+            V2xError: no such cause, or nobody says anything in this environment.
+        """
+        self._events.declare(world, agent, cause)
 
     def _final_observations(self, ended: NDArray[np.bool_]) -> Observations:
         """The observations, and of the worlds (W,) where something ended those before that."""

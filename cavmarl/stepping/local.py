@@ -181,7 +181,10 @@ class LocalWorlds:
 
     def traffic_stats(self, world: int) -> dict[str, float]:
         """Traffic of one world since its reset."""
-        return asdict(self.simulation.traffic_stats(world))
+        stats = asdict(self.simulation.traffic_stats(world))
+        if self.world.config.v2x.enabled:
+            stats |= self.simulation.messages.statistics(world).to_dict()
+        return stats
 
     def save(self) -> list[NDArray[Any]]:
         """All that the next step depends on; views, to be copied."""

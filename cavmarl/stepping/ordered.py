@@ -67,6 +67,7 @@ class OrderedWorlds(ABC):
         """Let the agents act, and reset the worlds whose episode is over, now or a step later."""
         self.arrays.controls[:] = commands.controls
         self.arrays.meta_actions[:] = commands.meta_actions
+        self.arrays.declared[:] = commands.declared if commands.declared.size else 0
         self._order(Task.STEP)
         self._steps += 1
 
