@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
 from pathlib import Path
 
 __all__ = ["CHECK_S", "Watchdog", "processor_s"]
@@ -14,8 +15,9 @@ STOPPED_CHECKS = 2  # for so long it may be stopped
 class Watchdog:
     """Looks at one process again and again while something is expected of it.
 
-    A process that has work to do uses the processor, or waits for it or for a disk. If it is
-    stopped, or sleeps, it does not go on by itself.
+    A process that has work to do uses the processor, or waits for it or for a disk, or for a
+    process that it has started itself and that does so. If it is stopped, or sleeps, it does not go
+    on by itself.
 
     Args:
         pid: of the process.
@@ -55,7 +57,23 @@ def processor_s(pid: int) -> float:
 
 
 def _look(pid: int) -> tuple[str, int]:
-    """State of a process, a letter, and its processor time in ticks of the system."""
+    """State of a process, a letter, and its processor time in ticks of the system.
+
+    Of one that sleeps, together with those that it has started.
+    """
     text = Path(f"/proc/{pid}/stat").read_text(encoding="utf-8", errors="replace")
     fields = text.rpartition(")")[2].split()
-    return fields[0], int(fields[11]) + int(fields[12])
+    state, spent = fields[0], int(fields[11]) + int(fields[12])
+    if state != "S":
+        return state, spent
+    for child in _children(pid):
+        with suppress(OSError):  # it has ended
+            its_state, its_spent = _look(child)
+            state = its_state if its_state in "RD" else state
+            spent += its_spent
+    return state, spent
+
+
+def _children(pid: int) -> list[int]:
+    path = Path(f"/proc/{pid}/task/{pid}/children")
+    return [int(word) for word in path.read_text(encoding="ascii").split()] if path.exists() else []
