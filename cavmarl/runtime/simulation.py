@@ -252,6 +252,11 @@ class Simulation:
         return self._traffic.goal_edges
 
     @property
+    def types(self) -> NDArray[np.void]:
+        """VTYPE (num_types,), by `VEHICLE["vtype"]`."""
+        return self._shard.travel.types
+
+    @property
     def plans(self) -> NDArray[np.void]:
         """PLAN (G, L): the ways of agents, by `VEHICLE["goal"]`."""
         return self._traffic.plans
