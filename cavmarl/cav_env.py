@@ -14,9 +14,15 @@ from pettingzoo import ParallelEnv
 
 from cavmarl.actions import ActionDecoder
 from cavmarl.config import TERMS
-from cavmarl.errors import ConfigError, EpisodeEndedError, ResetNeededError
+from cavmarl.errors import (
+    ConfigError,
+    EpisodeEndedError,
+    ResetNeededError,
+    UnknownAgentError,
+)
 from cavmarl.registry import load_config
 from cavmarl.render.view import WorldView
+from cavmarl.rig.frames import SensorFrames
 from cavmarl.runtime.simulation import Simulation
 from cavmarl.seeds import check_seed, first_seed
 from cavmarl.spaces import (
@@ -25,6 +31,7 @@ from cavmarl.spaces import (
     named_observation,
     observation_parts,
     observation_space,
+    sensed_observation,
     state_space,
 )
 from cavmarl.stepping.arrays import SteppedWorlds
@@ -167,7 +174,9 @@ class CavEnv(ParallelEnv[str, Any, Any]):  # type: ignore[misc] # PettingZoo is 
         self._seats = config.population.mode == "seats"
         self._stack = config.sensors.stack
         self._parts = (
-            observation_parts(config.sensors) if config.observation.kind == "dict" else None
+            observation_parts(config.sensors)
+            if config.observation.kind == "dict" and config.observation.mode == "ground_truth"
+            else None
         )
         self.state_space = state_space(worlds.arrays.states.shape[1] // STATE_FEATURES)
         self._decoder = ActionDecoder(config.action, 1, self.possible_agents)
@@ -307,6 +316,16 @@ class CavEnv(ParallelEnv[str, Any, Any]):  # type: ignore[misc] # PettingZoo is 
                 break
 
     def _observations(self) -> dict[str, Observation]:
+        form = self.config.observation
+        if form.mode == "sensors" and form.kind == "dict":
+            sensed = {
+                name: data[0, self._listed].copy()
+                for name, data in sensed_observation(self.worlds.arrays.frames).items()
+            }
+            return {
+                agent: {name: data[k] for name, data in sensed.items()}
+                for k, agent in enumerate(self.agents)
+            }
         found = self.worlds.arrays.observations[0].copy()[self._listed]
         if self._parts is None:
             return dict(zip(self.agents, found, strict=True))
@@ -336,6 +355,22 @@ class CavEnv(ParallelEnv[str, Any, Any]):  # type: ignore[misc] # PettingZoo is 
             for info, number in zip(infos, column.tolist(), strict=True):
                 info[name] = number
         return dict(zip(self.agents, infos, strict=True))
+
+    def frames(self, agent: str) -> dict[str, SensorFrames]:
+        """What the sensors of an agent's `rig` have got in the last step, by name.
+
+        The arrays are those of `SensorFrames` without the axes of worlds and agents.
+
+        Raises:
+            UnknownAgentError: there is no such agent.
+        """
+        if agent not in self.possible_agents:
+            raise UnknownAgentError(
+                f"no agent {agent!r}: there are {self.possible_agents[0]} to "
+                f"{self.possible_agents[-1]}"
+            )
+        k = self.possible_agents.index(agent)
+        return {name: sensor.of(0, k) for name, sensor in self.worlds.arrays.frames.items()}
 
     def check_action(self, agent: str, action: Any) -> None:
         """Refuse an action that `step` would refuse, before anything is kept of it.

@@ -14,7 +14,11 @@ from typing import Literal
 
 from cavmarl.config_checks import check as _check
 from cavmarl.config_checks import check_finite as _check_finite
+from cavmarl.config_rig import Rig, check_rig
+from cavmarl.config_scenario import ScenarioConfig
 from cavmarl.config_sensors import SensorsConfig
+from cavmarl.config_sumo import SumoConfig
+from cavmarl.config_v2x import V2xConfig
 
 __all__ = [
     "MAX_ZONES",
@@ -27,7 +31,9 @@ __all__ = [
     "MapConfig",
     "ObservationConfig",
     "PopulationConfig",
+    "ScenarioConfig",
     "SensorsConfig",
+    "SumoConfig",
     "TermsConfig",
     "TrafficConfig",
     "WorkersConfig",
@@ -142,6 +148,9 @@ class ZonesConfig:
         reproducers: folder for ticks that every host of a zone died of, from which they can be run
             again. With it, what a zone's code raises is the death of its host. Empty: only where
             faults kill hosts, and then the system's folder for temporary files.
+        recut_steps: every so many steps zones become others by bisection of where the vehicles are,
+            if that shares them out better; results do not depend on it. 0: they stay.
+        recut_tolerance: by which share of the mean the fullest zone has to become emptier.
     """
 
     layout: str = "bisection"
@@ -159,6 +168,8 @@ class ZonesConfig:
     check: bool = False
     faults: str = ""
     reproducers: str = ""
+    recut_steps: int = 0
+    recut_tolerance: float = 0.1
 
     def __post_init__(self) -> None:
         _check(
@@ -197,6 +208,20 @@ class ZonesConfig:
             "zones.approach_ticks",
             self.approach_ticks,
             "must be a whole number from 1 to 1000",
+        )
+        _check(
+            0 <= self.recut_steps <= 1_000_000,
+            "zones.recut_steps",
+            self.recut_steps,
+            "must be a whole number from 0 to 1000000",
+        )
+        _check_finite("zones.recut_tolerance", self.recut_tolerance, 0.0, 100.0)
+        _check(
+            not (self.recut_steps and (self.faults or self.reproducers)),
+            "zones.recut_steps",
+            self.recut_steps,
+            "vehicles that change their zone must not be late: leave out zones.faults and "
+            "zones.reproducers, or let zones stay",
         )
 
 
@@ -305,7 +330,9 @@ class TrafficConfig:
     """Where departures come from.
 
     Attributes:
-        source: `native`: the seeded generator, and the demand files.
+        source: who the demand files are for. `native`: they are read here. `sumo-demand`: SUMO says
+            who departs when and on which route, and what signals show; our drivers drive.
+            `sumo-traffic`: SUMO moves its vehicles, too. The generator's drive beside them.
         demand: SUMO files of vehicles, flows, routes and types (`.rou.xml`, `.add.xml`,
             `.sumocfg`): named as `map.source`; their vehicles drive beside the generator's.
         on_bad_route: what to do with vehicles of the demand that cannot drive their route, and with
@@ -318,7 +345,7 @@ class TrafficConfig:
         speed_factor_spread: half width of the drivers' uniform spread of desired speed over limit.
     """
 
-    source: Literal["native"] = "native"
+    source: Literal["native", "sumo-demand", "sumo-traffic"] = "native"
     demand: tuple[str, ...] = ()
     on_bad_route: Literal["error", "skip"] = "error"
     goals: int = 32
@@ -329,6 +356,12 @@ class TrafficConfig:
     speed_factor_spread: float = 0.1
 
     def __post_init__(self) -> None:
+        _check(
+            self.source == "native" or bool(self.demand),
+            "traffic.source",
+            self.source,
+            "needs traffic.demand: a .sumocfg, or files of routes",
+        )
         _check(1 <= self.goals <= 1024, "traffic.goals", self.goals, "must be from 1 to 1024")
         _check_finite("traffic.min_trip_m", self.min_trip_m, 0.0, 1e6)
         _check_finite("traffic.max_trip_m", self.max_trip_m, 0.0, 1e6)
@@ -380,12 +413,15 @@ class ActionConfig:
 
 @dataclass(frozen=True)
 class ObservationConfig:
-    """The form of an observation.
+    """What an observation is made of, and its form.
 
     Attributes:
-        kind: `flat`: one Box. `dict`: one Box a sensor.
+        mode: `ground_truth`: what `sensors` says, taken from the world itself. `sensors`: the
+            latest samples of the `rig`.
+        kind: `flat`: one Box of float32. `dict`: one Box a sensor.
     """
 
+    mode: Literal["ground_truth", "sensors"] = "ground_truth"
     kind: Literal["flat", "dict"] = "flat"
 
 
@@ -429,6 +465,7 @@ class EnvConfig:
     Attributes:
         name: of the entry, as its folder.
         version: goes up whenever results change that others may have reported.
+        rig: sensors that are mounted on every agent's vehicle, by name; see docs/sensors.md.
         horizon_s: when an episode is truncated.
     """
 
@@ -440,15 +477,32 @@ class EnvConfig:
     workers: WorkersConfig = field(default_factory=WorkersConfig)
     population: PopulationConfig = field(default_factory=PopulationConfig)
     traffic: TrafficConfig = field(default_factory=TrafficConfig)
+    sumo: SumoConfig = field(default_factory=SumoConfig)
     action: ActionConfig = field(default_factory=ActionConfig)
     observation: ObservationConfig = field(default_factory=ObservationConfig)
     sensors: SensorsConfig = field(default_factory=SensorsConfig)
+    v2x: V2xConfig = field(default_factory=V2xConfig)
     terms: TermsConfig = field(default_factory=TermsConfig)
+    rig: Rig = field(default_factory=dict)
+    scenario: ScenarioConfig = field(default_factory=ScenarioConfig)
     horizon_s: float = 60.0
 
     def __post_init__(self) -> None:
         _check(self.version >= 0, "version", self.version, "must be 0 or more")
         _check_finite("horizon_s", self.horizon_s, self.clock.ctrl_dt_s, 1e6)
+        check_rig(self.rig, self.clock.sim_dt_s, self.clock.ticks_per_step)
+        _check(
+            self.observation.mode != "sensors" or bool(self.rig),
+            "observation.mode",
+            self.observation.mode,
+            "there is no sensor under rig; mount one",
+        )
+        _check(
+            not self.scenario.name or self.population.agents == 1,
+            "population.agents",
+            self.population.agents,
+            "must be 1 where there is a scenario: it is played to one agent",
+        )
         steps = self.horizon_s / self.clock.ctrl_dt_s
         _check(
             abs(steps - round(steps)) < 1e-6 * steps,
@@ -456,6 +510,58 @@ class EnvConfig:
             self.horizon_s,
             f"must be a whole number of steps of clock.ctrl_dt_s = {self.clock.ctrl_dt_s:g}; "
             f"try {max(1, round(steps)) * self.clock.ctrl_dt_s:g}",
+        )
+        if self.v2x.enabled:
+            self.v2x.check_clock(self.clock.sim_dt_s)
+        self._check_messages()
+        if self.traffic.source != "native":
+            self._check_sumo()
+
+    def _check_messages(self) -> None:
+        """Refuse to observe messages that nobody keeps."""
+        kept = {"objects": self.v2x.inbox.objects, "events": self.v2x.inbox.events}
+        for name, most in kept.items():
+            key, count = f"sensors.messages.{name}", getattr(self.sensors.messages, name)
+            _check(
+                count == 0 or self.v2x.enabled,
+                key,
+                count,
+                "there are no messages: set v2x.enabled to true, or this to 0",
+            )
+            _check(count <= most, key, count, f"v2x.inbox.{name} = {most} keeps fewer")
+        _check(
+            self.v2x.enabled or not self.sensors.messages.signal,
+            "sensors.messages.signal",
+            True,
+            "there are no messages: set v2x.enabled to true, or this to false",
+        )
+
+    def _check_sumo(self) -> None:
+        """Refuse what cannot be together with SUMO as global traffic."""
+        source, tick_ms = self.traffic.source, self.clock.sim_dt_s * 1000.0
+        _check(
+            abs(tick_ms - round(tick_ms)) < 1e-9,
+            "clock.sim_dt_s",
+            self.clock.sim_dt_s,
+            f"must be whole milliseconds with traffic.source = {source}: SUMO counts in them",
+        )
+        _check(
+            not self.map.programs and not self.map.program,
+            "map.programs",
+            self.map.programs or self.map.program,
+            f"traffic.source = {source}: SUMO has the signals; name such files in its .sumocfg",
+        )
+        _check(
+            not self.sensors.signal.timing,
+            "sensors.signal.timing",
+            True,
+            f"traffic.source = {source}: nobody knows when SUMO's signals change; leave it out",
+        )
+        _check(
+            not self.scenario.name,
+            "scenario.name",
+            self.scenario.name,
+            f"traffic.source = {source}: scenes are played in native traffic; leave one of them out",
         )
 
     @property

@@ -9,6 +9,7 @@
     ├── MapError               a map that cannot be read, built or driven
     │   └── RouteError         no way from here to there
     ├── DemandError            a file of traffic that cannot be read or does not fit its map
+    ├── ScenarioError          a scenario that is none, or has no place on the map
     ├── ActionError            refused before any state has changed
     │   ├── InvalidActionError    wrong shape, dtype or value
     │   ├── MissingActionError    a live agent without an action
@@ -55,6 +56,11 @@
     │   ├── WorkerStartError      no process, or no memory for it
     │   ├── WorkerDeathError      every process that took up a step died of it
     │   └── WorkerFailureError    an exception in a worker, with its traceback
+    ├── V2xError               a message that cannot be read, or an impossible reception
+    ├── SumoError              SUMO as global traffic that cannot go on
+    │   ├── SumoBusyError         a second simulation in one process
+    │   ├── SumoDiedError         its process ended, or hangs
+    │   └── SumoStateError        it says what does not fit the world
     ├── PolicyError            a policy that cannot be loaded or does not fit
     └── MissingExtraError      an optional dependency is not installed
 
@@ -107,6 +113,10 @@ __all__ = [
     "SecondMasterError",
     "SpawnError",
     "StoreError",
+    "SumoBusyError",
+    "SumoDiedError",
+    "SumoError",
+    "SumoStateError",
     "TickRefusedError",
     "TornJournalError",
     "TransferError",
@@ -119,6 +129,7 @@ __all__ = [
     "UnknownAgentError",
     "UnknownEnvironmentError",
     "UnknownVersionError",
+    "V2xError",
     "WorkerDeathError",
     "WorkerError",
     "WorkerFailureError",
@@ -152,6 +163,10 @@ class CoverageError(ConfigError):
 
 class PlacementError(ConfigError):
     """Loads, weights or workers by which no shard can be placed."""
+
+
+class ScenarioError(CavmarlError):
+    """No scenario of that name, a broken file of one, or a map without a place for it."""
 
 
 class MapError(CavmarlError):
@@ -196,6 +211,10 @@ class EpisodeEndedError(EpisodeError):
 
 class CapacityError(CavmarlError):
     """More vehicles, agents or points than this world can take."""
+
+
+class V2xError(CavmarlError):
+    """Bytes that are no message, a network simulator that answers nonsense, or none where one is due."""
 
 
 class EvaluationError(CavmarlError):
@@ -441,6 +460,22 @@ class WorkerFailureError(WorkerError):
     def __init__(self, worker: int, part: str, kind: str, text: str, traceback: str) -> None:
         super().__init__(f"worker {worker} ({part}): {kind}: {text}\n{traceback}")
         self.worker, self.kind, self.text, self.traceback = worker, kind, text, traceback
+
+
+class SumoError(CavmarlError):
+    """SUMO as global traffic cannot go on."""
+
+
+class SumoBusyError(SumoError):
+    """A second simulation in a process that holds one already."""
+
+
+class SumoDiedError(SumoError):
+    """The process of SUMO ended, or does not answer; the message ends with its last output."""
+
+
+class SumoStateError(SumoError):
+    """SUMO says what does not fit the world: another time, an unknown signal state."""
 
 
 class PolicyError(CavmarlError):

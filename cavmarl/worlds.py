@@ -26,6 +26,9 @@ from cavmarl.roads.zone_layouts import cut_map
 from cavmarl.roads.zones import ZonePartition
 from cavmarl.traffic.demand import DemandFile, read_demand
 from cavmarl.traffic.native import capacity_of
+from cavmarl.traffic.scenarios import plan_scene
+from cavmarl.traffic.sumo.demand import SumoDemand, read_sumo_demand
+from cavmarl.traffic.sumo.input import read_input
 
 __all__ = [
     "World",
@@ -46,13 +49,13 @@ class World(NamedTuple):
     Attributes:
         config: the environment.
         network: its roads.
-        demand: whose vehicles drive beside the generator's.
+        demand: whose vehicles drive beside the generator's; of a file, or SUMO's.
         partition: its zones.
     """
 
     config: EnvConfig
     network: RoadNetwork
-    demand: DemandFile | None
+    demand: DemandFile | SumoDemand | None
     partition: ZonePartition
 
     @property
@@ -60,7 +63,9 @@ class World(NamedTuple):
         """How many vehicles it can hold."""
         config = self.config
         dt, horizon_s = config.clock.sim_dt_s, config.horizon_s
-        return capacity_of(self.network, config.population, self.demand, dt, horizon_s)
+        room = capacity_of(self.network, config.population, self.demand, dt, horizon_s)
+        scene = plan_scene(config.scenario, self.network)
+        return room + (0 if scene is None else len(scene.actors))
 
 
 def load_world(
@@ -105,8 +110,12 @@ def make_world(config: EnvConfig, base_dir: Path) -> World:
     """
     network = load_roads(config, base_dir)
     files = resolve_demand(config, base_dir)
-    demand = None
-    if files:
+    demand: DemandFile | SumoDemand | None = None
+    if config.traffic.source != "native":
+        network = with_programs(network, read_input(files).additional_files)
+        path = map_file(resolve_map(config, base_dir)).resolve()
+        demand = read_sumo_demand(config, network, path, files)
+    elif files:
         demand = read_demand(files, network, on_bad_route=config.traffic.on_bad_route)
     return World(config, network, demand, load_zones(config, base_dir, network))
 

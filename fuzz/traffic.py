@@ -5,10 +5,10 @@ from __future__ import annotations
 from contextlib import suppress
 
 from cavmarl.errors import CavmarlError
-from cavmarl.evaluate.sumo_input import read_input
 from cavmarl.traffic.demand import read_demand
 from cavmarl.traffic.demand.sumo_config import read_sumo_config
 from cavmarl.traffic.schedule import Schedule
+from cavmarl.traffic.sumo.input import read_input
 from fuzz.files import Target, scratch, seed
 from fuzz.roads import grid
 

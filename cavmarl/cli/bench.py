@@ -13,7 +13,9 @@ from cavmarl.cli.bench_balance import balance
 from cavmarl.cli.bench_clock import clock
 from cavmarl.cli.bench_libraries import libraries
 from cavmarl.cli.bench_moving import moving
+from cavmarl.cli.bench_recut import recut
 from cavmarl.cli.bench_sharding import sharding
+from cavmarl.cli.bench_sumo import sumo
 from cavmarl.cli.bench_traffic import traffic
 from cavmarl.cli.bench_train import train
 from cavmarl.cli.bench_workers import workers
@@ -38,9 +40,11 @@ __all__ = ["app"]
 
 app = typer.Typer(help="How fast it is, measured side by side.", no_args_is_help=True)
 app.command()(traffic)
+app.command()(sumo)
 app.command()(sharding)
 app.command()(balance)
 app.command()(moving)
+app.command()(recut)
 app.command()(workers)
 app.command()(train)
 app.command()(libraries)

@@ -26,6 +26,7 @@ from cavmarl.policies import policy_files
 from cavmarl.roads.network import RoadNetwork
 from cavmarl.roads.zones import ZonePartition
 from cavmarl.traffic.demand import DemandFile
+from cavmarl.traffic.sumo.demand import SumoDemand
 
 __all__ = [
     "MANIFEST_FILE",
@@ -47,7 +48,7 @@ Document = dict[str, Any]
 def describe_world(
     config: EnvConfig,
     network: RoadNetwork,
-    demand: DemandFile | None,
+    demand: DemandFile | SumoDemand | None,
     partition: ZonePartition,
 ) -> Document:
     """The environment whole; its roads, its demand, its zones and the kernels by their hashes."""
@@ -61,6 +62,7 @@ def describe_world(
         "map_source_sha256": network.source_hash,
         "map_content_sha256": network.content_hash,
         "demand_content_sha256": None if demand is None else demand.content_hash,
+        "sumo": demand.version if isinstance(demand, SumoDemand) else None,
         "kernels": kernel_cache_dir().name,
         "zones": partition.count,
         "zones_content_sha256": partition.content_hash,

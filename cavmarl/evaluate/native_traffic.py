@@ -8,12 +8,12 @@ from typing import Any
 
 import numpy as np
 
-from cavmarl.evaluate.sumo_input import read_input
 from cavmarl.evaluate.traffic_metrics import TrafficCounts, TrafficMeter, TrafficRun
 from cavmarl.kernels.codes import ACTION_IDLE
 from cavmarl.render.ground import signal_codes
 from cavmarl.runtime.simulation import Simulation
 from cavmarl.shard.shard import Commands
+from cavmarl.traffic.sumo.input import read_input
 from cavmarl.worlds import World, load_world
 
 __all__ = ["advance", "idle_commands", "load_demand", "make_world", "run_native"]

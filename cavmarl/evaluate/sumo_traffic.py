@@ -22,12 +22,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cavmarl.errors import ConfigError, require
-from cavmarl.evaluate.sumo_input import SumoInput, without_outputs
 from cavmarl.evaluate.traffic_metrics import TrafficCounts, TrafficMeter, TrafficRun
 from cavmarl.kernels.codes import SIGNAL_NONE
 from cavmarl.roads.cache import load_network
 from cavmarl.roads.network import SIGNAL_STATES, RoadNetwork
 from cavmarl.shard.vehicles import VEHICLE, blank_vehicle
+from cavmarl.traffic.sumo.input import SumoInput
+from cavmarl.traffic.sumo.options import command_words, free_libsumo
 
 __all__ = ["SumoJob", "run_sumo", "start_sumo", "sumo_process"]
 
@@ -91,28 +92,14 @@ def start_sumo(job: SumoJob, folder: Path, *more: str) -> Any:
 
     Raises:
         ConfigError: SUMO refuses it.
+        SumoBusyError: a simulation runs in this process.
     """
-    libsumo = require("libsumo", "sumo")
+    libsumo: Any = free_libsumo()
     log = folder / "errors.log"
-    copies = folder / "additional"
-    copies.mkdir()
-    additional = [str(without_outputs(path, copies)) for path in job.demand.additional_files]
-    options = job.demand.options | {
-        "net-file": str(job.map_file),
-        "route-files": ",".join(map(str, job.demand.route_files)),
-        "additional-files": ",".join(additional),
-        "begin": str(job.demand.begin_s),
-        "step-length": repr(job.dt_s),
-        "seed": str(job.seed),
-        "no-step-log": "true",
-        "no-warnings": "true",
-        "duration-log.disable": "true",
-        "xml-validation": "never",
-        "error-log": str(log),
-    }
+    options = {"error-log": str(log)}
     if not job.teleports:
         options["time-to-teleport"] = "-1"
-    words = [f"--{name}={value}" for name, value in options.items() if value]
+    words = command_words(job.map_file, job.demand, folder, job.dt_s, job.seed, options)
     try:
         libsumo.start(["sumo", *words, *more])
     except libsumo.TraCIException as error:

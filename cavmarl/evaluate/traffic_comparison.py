@@ -9,9 +9,10 @@ from typing import Any
 
 from cavmarl.errors import ConfigError
 from cavmarl.evaluate.native_traffic import make_world, run_native
-from cavmarl.evaluate.sumo_input import read_input
 from cavmarl.evaluate.sumo_traffic import SumoJob, run_sumo
 from cavmarl.evaluate.traffic_metrics import EDGE_MINUTE, TrafficRun
+from cavmarl.traffic.demand import DemandFile
+from cavmarl.traffic.sumo.input import read_input
 from cavmarl.worlds import find_map
 
 __all__ = ["TrafficComparison", "compare_traffic"]
@@ -105,5 +106,5 @@ def compare_traffic(
     progress("our run")
     ours = run_native(world, seconds)
     name = path.name.removesuffix(".gz").removesuffix(".net.xml")
-    tolerated = world.demand.report.lines() if world.demand else []
+    tolerated = world.demand.report.lines() if isinstance(world.demand, DemandFile) else []
     return TrafficComparison(name, seconds, dt_s, seed, ours, sumo, tuple(tolerated))

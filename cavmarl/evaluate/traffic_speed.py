@@ -17,9 +17,9 @@ from typing import Any
 from cavmarl.errors import ConfigError, require
 from cavmarl.evaluate.native_traffic import advance, idle_commands, make_world
 from cavmarl.evaluate.step_speed import one_core
-from cavmarl.evaluate.sumo_input import read_input
 from cavmarl.evaluate.sumo_traffic import SumoJob, start_sumo, sumo_process
 from cavmarl.runtime.simulation import Simulation
+from cavmarl.traffic.sumo.input import read_input
 from cavmarl.worlds import find_map
 
 __all__ = ["Rates", "TrafficSpeed", "measure_traffic_speed"]

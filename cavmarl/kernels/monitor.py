@@ -23,6 +23,7 @@ __all__ = [
     "KIND_FAR",
     "KIND_FULL",
     "KIND_NONE",
+    "KIND_SUMS",
     "KIND_TICK",
     "TALLY",
     "Clock",
@@ -75,6 +76,7 @@ KIND_DOUBLED = 1  # two zones own it, or one does twice
 KIND_TICK = 2  # it was not advanced once
 KIND_FAR = 3  # it is too far from where it was
 KIND_FULL = 4  # there are more vehicles than a world can hold
+KIND_SUMS = 5  # zones own others, or see others, than they should
 
 
 @kernel
@@ -87,9 +89,10 @@ def owner_hash(vehicle: int, epoch: int) -> np.uint64:
 def _digest(
     words: NDArray[np.uint64], i: int, masks: NDArray[np.uint64], factors: NDArray[np.uint64]
 ) -> np.uint64:
+    row = words[i]  # so that several words are multiplied at once
     total = np.uint64(0)
-    for n in range(words.shape[1]):
-        total += (words[i, n] & masks[n]) * factors[n]
+    for n in range(row.shape[0]):
+        total += (row[n] & masks[n]) * factors[n]
     return mix(total)
 
 
@@ -161,6 +164,8 @@ def watch(
     factors: NDArray[np.uint64],
     before: NDArray[np.void],
     now: NDArray[np.void],
+    live: int,
+    expected: NDArray[np.uint64],
     tallies: NDArray[np.void],
     found: NDArray[np.void],
 ) -> int:
@@ -178,6 +183,8 @@ def watch(
         factors: (n,) odd random numbers.
         before: KEPT (a power of two,), what the last look wrote.
         now: KEPT, of the same size; what the last look but one wrote counts as blank.
+        live: vehicles that there should be.
+        expected: (k,) what `TALLY["owned"]` should be of each zone.
         tallies: TALLY (k,) overwritten.
         found: FINDING (1,) overwritten: the one about the smallest id, if there is any.
     """
@@ -207,6 +214,13 @@ def watch(
         for i in range(num_owned, zoned.num_rows[zone, w]):
             seen += _digest(words[side, zone, w], i, masks, factors)
         tallies[zone]["seen"] = seen
+    if found[0]["kind"] == KIND_NONE:
+        for zone in range(count):
+            tally = tallies[zone]
+            live -= tally["vehicles"]
+            if tally["owned"] != expected[zone] or tally["due"] != tally["seen"]:
+                return KIND_SUMS
+        return KIND_NONE if live == 0 else KIND_SUMS
     return int(found[0]["kind"])
 
 

@@ -35,7 +35,9 @@ __all__ = [
     "LATERAL_MPS",
     "MAX_SPEED_MPS",
     "Before",
+    "account",
     "before_tick",
+    "lane_before",
     "move_agent",
     "move_background",
     "place_on_lane",
@@ -86,7 +88,7 @@ def _way_point(roads: RoadArrays, travel: Travel, row: np.void, s: float) -> tup
     for _ in range(MAX_BODY_LANES):
         if s >= 0.0:
             break
-        before = _lane_before(roads, lane, row["link"])
+        before = lane_before(roads, lane, row["link"])
         if before < 0:
             break
         lane = before
@@ -97,7 +99,7 @@ def _way_point(roads: RoadArrays, travel: Travel, row: np.void, s: float) -> tup
 
 
 @kernel
-def _lane_before(roads: RoadArrays, lane: int, link: int) -> int:
+def lane_before(roads: RoadArrays, lane: int, link: int) -> int:
     """The lane that a vehicle has come from which has entered `link` last, or -1."""
     here = roads.lanes[lane]
     if here["internal"]:
@@ -147,8 +149,8 @@ def place_on_lane(roads: RoadArrays, travel: Travel, row: np.void) -> float:
 
 
 @inlined_kernel
-def _account(row: np.void, before: Before, roads: RoadArrays, pace: float, dt: float) -> None:
-    """What motion of both kinds leaves in the record: rates, ways, waiting time.
+def account(row: np.void, before: Before, roads: RoadArrays, pace: float, dt: float) -> None:
+    """What motion of every kind leaves in the record: rates, ways, waiting time.
 
     `pace` is the speed over the limit with which the way would have been driven freely.
     """
@@ -260,7 +262,7 @@ def move_background(
         row["to_go"] = way_left(roads, row, travel.steps[own_step(roads, row)])
     if row["to_go"] <= ARRIVE_M:
         row["events"] |= EVENT_ARRIVED
-    _account(row, before, roads, row["speed_factor"], dt)
+    account(row, before, roads, row["speed_factor"], dt)
     make_stop(roads, travel, row, before.lane, dt)
 
 
@@ -315,4 +317,4 @@ def move_agent(
     row["to_go"] = step["to_go"] - row["s"]
     if row["to_go"] <= ARRIVE_M:
         row["events"] |= EVENT_ARRIVED
-    _account(row, before, roads, 1.0, dt)
+    account(row, before, roads, 1.0, dt)

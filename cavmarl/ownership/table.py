@@ -28,9 +28,6 @@ from cavmarl.ownership.planning import Plan, make_plan
 from cavmarl.ownership.safeguards import ALL_ON, Safeguards
 from cavmarl.ownership.transitions import Event, Party, State, after
 
-MOVES_AT_ONCE = 256
-"""So many changes are put into the tallies together, unless somebody asks before."""
-
 _Move: TypeAlias = tuple[int, int, int, bool]
 """(vehicle, zone, epoch, whether it comes or goes)."""
 
@@ -70,6 +67,9 @@ class Table:
     def tallies(self) -> dict[int, Tally]:
         """Zone → what it owned at the committed tick."""
         tallies, run = self._tallies, self.run
+        if len(self._moves) > len(self.owners):
+            tallies.update(dict.fromkeys(self.hosts, Tally()))
+            self._moves = [(v, zone, epoch, True) for v, (zone, epoch) in self.owners.items()]
         for vehicle, zone, epoch, comes in self._moves:
             tally = tallies[zone]
             change = tally.plus if comes else tally.minus
@@ -114,7 +114,8 @@ class Table:
 
         Raises:
             ProtocolError: a tick is in progress, or vehicles wait for their transfer.
-            LedgerError: nobody owned one of those who have left.
+            LedgerError: nobody owned one of those who have left, or somebody else one of those who
+                have changed.
         """
         if self.plan is not None or self.deferred:
             raise ProtocolError(f"tick {self.tick + 1} is in progress")
@@ -125,6 +126,12 @@ class Table:
             counts[zone] += 1
             moves.append((vehicle, zone, 0, True))
         for vehicle, source, target, epoch, _ in switches:
+            owner = owners.get(vehicle)
+            if owner != (source, epoch - 1):
+                raise LedgerError(
+                    f"vehicle {vehicle} changed from zone {source} to {target} by tick {tick}, "
+                    f"and its owner on record was {owner}"
+                )
             owners[vehicle] = (target, epoch)
             counts[source] -= 1
             counts[target] += 1
@@ -136,8 +143,9 @@ class Table:
             zone, epoch = owners.pop(vehicle)
             counts[zone] -= 1
             moves.append((vehicle, zone, epoch, False))
-        if len(moves) > MOVES_AT_ONCE:
-            _ = self.tallies
+        # More moves than vehicles: whoever asks counts anew, and needs to know no more than that.
+        # It stays so, since with every new vehicle comes a move.
+        del moves[len(owners) + 1 :]
         self.tick = tick
 
     def alive(self, zone: int, incarnation: int) -> bool:

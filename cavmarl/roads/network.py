@@ -39,6 +39,7 @@ __all__ = [
     "SIGNAL_STATES",
     "SWITCH",
     "VEHICLE_CLASSES",
+    "GeoReference",
     "RoadNetwork",
     "content_of",
 ]
@@ -250,6 +251,21 @@ PLACE = np.dtype(
 )
 
 
+@dataclass(frozen=True)
+class GeoReference:
+    """Where a map lies on the earth: a place projected, plus the offset, is its x and y.
+
+    Attributes:
+        projection: parameters of PROJ.
+        offset_x_m: added to the east of the projection.
+        offset_y_m: added to its north.
+    """
+
+    projection: str
+    offset_x_m: float
+    offset_y_m: float
+
+
 @dataclass(frozen=True, eq=False)
 class RoadNetwork:
     """An immutable road map; see the module's docstring for frames and the dtypes for fields.
@@ -264,6 +280,7 @@ class RoadNetwork:
         phase_detectors: DETECTOR rows, see PHASE["first_detector"].
         lane_ids, edge_ids, junction_ids, signal_ids, program_ids: the source's names, by row.
         junction_kinds: SUMO's junction types that occur, by `JUNCTION["kind"]`.
+        geo: where it lies on the earth; None: the map does not say.
     """
 
     name: str
@@ -288,6 +305,7 @@ class RoadNetwork:
     signal_ids: tuple[str, ...]
     program_ids: tuple[str, ...]
     junction_kinds: tuple[str, ...]
+    geo: GeoReference | None = None
 
     def __post_init__(self) -> None:
         for field in fields(self):
@@ -377,6 +395,8 @@ class RoadNetwork:
                 digest.update(content_of(value))
             elif isinstance(value, tuple):
                 digest.update("\0".join(value).encode())
+            elif isinstance(value, GeoReference):
+                digest.update(repr(value).encode())
         return digest.hexdigest()
 
 

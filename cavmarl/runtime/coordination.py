@@ -122,6 +122,13 @@ class Coordination:
                 if self._monitor is not None:
                     self._monitor.begin(w, coordinator.notes()[0])
 
+    def cut(self) -> None:
+        """Zones are others, between two ticks: at the next one everybody is looked at."""
+        for w, coordinator in enumerate(self.coordinators):
+            births, gone = coordinator.notes()
+            coordinator.resume(self._division.settle_newborn(w, births), gone)
+            self._stirred[w] = True
+
     def begin(self, commands: Commands) -> None:
         """Lease the next tick, and hand over whose owner changes.
 

@@ -6,9 +6,10 @@ border is offered, acknowledged and handed over in one call, the new owner takes
 as it is, and a lease is the call that advances a shard. What is decided and written down is the
 same, record by record, as over messages of which none is lost.
 
-Records are made only where somebody reads them: all of them for a journal, and for watchers those
-of ticks in which a vehicle has entered, left, or changed its owner. For nobody the table of owners
-is brought up to date every now and then, and when somebody asks.
+The table of owners is brought up to date every now and then, and when somebody asks. Records are
+made only where somebody reads them: all of them, at once, for a journal, and for watchers those of
+ticks in which a vehicle has entered, left, or changed its owner, as the table comes to know of it.
+Whoever has to know of changes in their own tick gives himself to `foretell`.
 """
 
 from __future__ import annotations
@@ -51,6 +52,9 @@ class DirectCoordinator(Referee):
         book: hands rows over.
         counts: how many vehicles each zone owns now, by its rows.
         transfers: told of all that goes on.
+
+    Attributes:
+        foretell: told at once of changes of owner that records tell of later.
     """
 
     def __init__(
@@ -66,6 +70,7 @@ class DirectCoordinator(Referee):
         self._counts = counts
         self._transfers = transfers
         transfers.ask = self.catch_up
+        self.foretell: Callable[[Iterable[Change]], None] | None = None
         self._is_open = False
         self._tick = 0
         self._vehicles = 0
@@ -131,7 +136,9 @@ class DirectCoordinator(Referee):
         if self._removed:
             self._removed = []
         if self.journal is not None:
-            self._record(self._begun(self._tick + 1, self._changed, inputs))
+            switches = tuple(map(_switch, self._book.newest(changed)))
+            episode = self._directory.table.episode
+            self._record(Begin(episode, self._tick + 1, switches, (), self._new, inputs))
 
     def end(self, rows: Callable[[int], int], stored: Callable[[int], int] | None = None) -> None:
         """Commit, if the zones own what they should, as `Referee.end` says."""
@@ -148,55 +155,57 @@ class DirectCoordinator(Referee):
         has_news = bool(self._new or removed)
         if has_news:
             self._news[self._tick] = _News(self._new, removed)
-        if self.journal is not None or (self._watchers and (has_news or changed)):
-            begun = (self._begun(self._tick, changed),) if self.journal is None else ()
+        is_late = self._late >= LATE or len(self._news) >= LATE
+        if self.journal is not None or is_late or (has_news and self._watchers):
             self.catch_up()
             self._check(self._births)
-            self._record(*begun, self._committed(removed, rows))
-        elif self._late >= LATE or len(self._news) >= LATE:
-            self.catch_up()
-            self._check(self._births)
+            if self.journal is not None:
+                self._record(self._committed(removed, rows))
+        elif changed and self.foretell is not None:
+            self.foretell(self._book.newest(changed))
 
     def catch_up(self) -> None:
         """Let the table and the rows of transfers say what has come of the ticks up to now."""
         table = self._directory.table
         if table.tick == self._tick:
             return
-        changes: defaultdict[int, list[Change]] = defaultdict(list)
-        for change in self._book.take(but=self._changed):
-            changes[change.tick].append(change)
+        changes = self._book.take(but=self._changed)
         news, self._news, self._late = self._news, {}, 0
-        for tick in sorted({*changes, *news}):
-            self._settle(tick, changes[tick], news.get(tick, _NO_NEWS))
+        if self.journal is None and self._watchers:
+            by_tick: defaultdict[int, list[Change]] = defaultdict(list)
+            for change in changes:
+                by_tick[change.tick].append(change)
+            for tick in sorted({*by_tick, *news}):
+                self._settle(tick, by_tick[tick], news.get(tick, _NO_NEWS), is_told=True)
+        elif changes or news:
+            births = tuple(birth for tick in news.values() for birth in tick.births)
+            removed = tuple(entry for tick in news.values() for entry in tick.removed)
+            self._settle(self._tick, changes, _News(births, removed), is_told=False)
         table.settle(self._tick)
+        left = {entry.vehicle: tick for tick, those in news.items() for entry in those.removed}
+        self._transfers.add(
+            _row(change, table.episode, left.get(change.vehicle) == change.tick)
+            for change in changes
+        )
         acknowledged, aborted = self._book.take_counts()
         self._transfers.count(acknowledged=acknowledged, aborted=aborted)
 
-    def _settle(self, tick: int, changes: list[Change], news: _News) -> None:
-        """Put what came of one tick on the table.
+    def _settle(self, tick: int, changes: list[Change], news: _News, is_told: bool) -> None:
+        """Put what came of one tick, or of all up to one, on the table, and tell watchers of it.
 
         Raises:
             LedgerError: a vehicle changed its owner that belonged to somebody else.
             SpawnError: a vehicle entered that has been there.
         """
         table = self._directory.table
-        for change in changes:
-            owner = table.owners.get(change.vehicle)
-            if owner != (change.source, change.epoch - 1):
-                raise LedgerError(
-                    f"vehicle {change.vehicle} changed from zone {change.source} to "
-                    f"{change.target} at tick {tick}, and its owner on record was {owner}"
-                )
+        switches = tuple(map(_switch, changes))
+        if is_told:
+            self._record(Begin(table.episode, tick, switches, (), news.births))
         if news.births:
             self._directory.check_births(news.births)
-        table.settle(tick, map(_switch, changes), news.births, news.removed)
-        gone = {entry.vehicle for entry in news.removed}
-        self._transfers.add(_row(change, table.episode, gone) for change in changes)
-
-    def _begun(self, tick: int, changed: int, inputs: bytes = b"") -> Begin:
-        """Of a tick with so many changes, the newest ones."""
-        switches = tuple(map(_switch, self._book.newest(changed)))
-        return Begin(self._directory.table.episode, tick, switches, (), self._new, inputs)
+        table.settle(tick, switches, news.births, news.removed)
+        if is_told:
+            self._record(self._committed(news.removed, _no_digest))
 
     def _committed(self, removed: tuple[Removed, ...], rows: Callable[[int], int]) -> Commit:
         table = self._directory.table
@@ -237,27 +246,20 @@ class DirectCoordinator(Referee):
             raise LedgerError(f"at tick {self.tick} zones own {counts} vehicles, not {owned}")
 
 
+def _no_digest(zone: int) -> int:
+    """Of a zone's rows, where nobody takes one."""
+    return 0
+
+
 def _switch(change: Change) -> Switch:
     return Switch(change.vehicle, change.source, change.target, change.epoch, False)
 
 
-def _row(change: Change, episode: int, gone: set[int]) -> Transfer:
+def _row(change: Change, episode: int, removed: bool) -> Transfer:
     release_m = change.release_depth_m
     return Transfer(
-        episode=episode,
-        tick=change.tick,
-        vehicle=change.vehicle,
-        source=change.source,
-        target=change.target,
-        epoch=change.epoch,
-        forced=False,
-        removed=change.vehicle in gone,
-        approached=change.approached,
-        waited=0,
-        offers=change.tick - change.approached,
-        state_bytes=0,
-        prepare_depth_m=change.prepare_depth_m,
-        switch_depth_m=change.switch_depth_m,
-        release_depth_m=None if release_m != release_m else release_m,
-        ms=change.ms,
-    )
+        episode, change.tick, change.vehicle, change.source, change.target, change.epoch,
+        False, removed, change.approached, 0, change.tick - change.approached, 0,
+        change.prepare_depth_m, change.switch_depth_m,
+        None if release_m != release_m else release_m, change.ms,
+    )  # fmt: skip

@@ -21,8 +21,8 @@ from cavmarl.kernels.borders import Borders, pass_on
 from cavmarl.kernels.exchange import exchange, take_own
 from cavmarl.kernels.handing_over import look, make_book
 from cavmarl.kernels.repeated import repeated
-from cavmarl.kernels.zones import Halo, ZoneArrays
-from cavmarl.ownership.messages import Switch
+from cavmarl.kernels.zones import Halo, ZoneArrays, zone_of
+from cavmarl.ownership.messages import Birth, Switch
 from cavmarl.roads.zone_statistics import imbalance
 from cavmarl.runtime.referee import Near
 from cavmarl.shard.shard import Shard
@@ -117,10 +117,45 @@ class Division:
                 )
                 worlds.num_contacts[w] = 0
                 worlds.num_outer[w] = -1
-            # Whoever was near a border before is not to be counted again.
-            for known in (self.book.num_near, self.book.num_coming, self.book.known):
-                known[w] = 0
+            self._forget_offers(w)
             self._exchange(first.rows, w, w + 1)
+
+    def cut(self, zones: ZoneArrays, halo: Halo) -> None:
+        """Divide the plane otherwise, between two ticks: owners stay, ghosts are those of now.
+
+        Whoever is in another zone than its owner's changes its owner as at any border.
+
+        Args:
+            zones: as many as before.
+            halo: of them.
+        """
+        self.zones, self._halo, self._rects = zones, halo, zones.rects.tolist()
+        for shard in self._shards:
+            shard.cut(zones, halo)
+        self._zoned.num_outer[...] = -1
+        book = self.book
+        tick = book.tick.copy()
+        for w in range(self.num_worlds):
+            self._forget_offers(w)
+        self._exchange(self._shards[0].worlds.rows, 0, self.num_worlds)
+        book.tick[:] = tick  # of the rows that have been looked at once more
+
+    def settle_newborn(self, w: int, births: Sequence[Birth]) -> list[Birth]:
+        """Give vehicles that nobody has on record yet to the zones that they are in now."""
+        settled = []
+        for vehicle, zone, state in births:
+            _, row = self.find(w, vehicle)
+            place = self.owned(w, zone)[row]
+            target = zone_of(self.zones, place["x"], place["y"])
+            if target != zone:
+                self.hand_over(w, Switch(vehicle, zone, target, 0, False), None, row)
+            settled.append(Birth(vehicle, target, state))
+        return settled
+
+    def _forget_offers(self, w: int) -> None:
+        """Whoever was near a border before is not to be counted again."""
+        for known in (self.book.num_near, self.book.num_coming, self.book.known):
+            known[w] = 0
 
     def exchange(self) -> None:
         """Renew all ghosts from the owned `next_rows`."""
@@ -301,6 +336,11 @@ class Division:
     def side(self) -> int:
         """On which side of `zoned.rows` the committed rows are."""
         return self._side(self._shards[0].worlds.rows)
+
+    @property
+    def next_side(self) -> int:
+        """On which side the next rows are."""
+        return self._side(self._shards[0].worlds.next_rows)
 
     def owners(self, w: int) -> list[tuple[int, int]]:
         """(id, zone) of all vehicles of a world."""

@@ -155,6 +155,8 @@ def _monitor(
     records = [OwnersOnRecord(division.count, limits, is_direct) for _ in coordinators]
     for coordinator, record in zip(coordinators, records, strict=True):
         coordinator.watch(record)
+        if isinstance(coordinator, DirectCoordinator):
+            coordinator.foretell, record.ask = record.foretold, coordinator.catch_up
     return Monitor(division, records, dt)
 
 

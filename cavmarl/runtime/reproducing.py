@@ -22,6 +22,7 @@ from cavmarl.runtime.reproducer import Reproducer, needed_records
 from cavmarl.runtime.store import CommittedStore
 from cavmarl.shard.shard import Commands
 from cavmarl.traffic.demand import DemandFile
+from cavmarl.traffic.sumo.demand import SumoDemand
 
 __all__ = ["Keeper", "Moment", "made_with", "sources_of"]
 
@@ -113,7 +114,7 @@ def made_with() -> dict[str, str | None]:
 
 
 def sources_of(
-    network: RoadNetwork, demand: DemandFile | None, partition: ZonePartition
+    network: RoadNetwork, demand: DemandFile | SumoDemand | None, partition: ZonePartition
 ) -> dict[str, str | None]:
     """Hashes of what a configuration names and does not hold."""
     return {

@@ -13,7 +13,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cavmarl.config import EnvConfig
-from cavmarl.errors import CapacityError, ConfigError, LostTickError, ZoneError
+from cavmarl.errors import (
+    CapacityError,
+    ConfigError,
+    LostTickError,
+    ReproducerError,
+    SumoError,
+    V2xError,
+    ZoneError,
+)
 from cavmarl.kernels.arrays import Outputs, Worlds
 from cavmarl.kernels.codes import (
     ACTION_IDLE,
@@ -28,11 +36,14 @@ from cavmarl.kernels.codes import (
 from cavmarl.kernels.rng import world_key
 from cavmarl.ownership.messages import Switch
 from cavmarl.ownership.transfers import TransferLog
+from cavmarl.rig.catalogue import frame_layout, frames_in
+from cavmarl.rig.frames import Frames
 from cavmarl.roads.network import RoadNetwork
 from cavmarl.roads.zone_layouts import cut_map
 from cavmarl.roads.zones import ZonePartition
 from cavmarl.runtime import snapshot
-from cavmarl.runtime.attached import Attached, Host, attach
+from cavmarl.runtime.attached import Attached, Host
+from cavmarl.runtime.attaching import attach
 from cavmarl.runtime.border_book import BorderBook
 from cavmarl.runtime.commons import Commons
 from cavmarl.runtime.compilation import first_compilation
@@ -40,7 +51,9 @@ from cavmarl.runtime.coordination import Coordination
 from cavmarl.runtime.dividing import divide
 from cavmarl.runtime.division import ZoneLoads
 from cavmarl.runtime.executor import Executor, SerialExecutor
+from cavmarl.runtime.messaging import Messaging
 from cavmarl.runtime.recovery import Recovery, Revival
+from cavmarl.runtime.recutting import Recut, Recutter
 from cavmarl.runtime.referee import Referee
 from cavmarl.runtime.refereeing import make_refereeing
 from cavmarl.runtime.reproducer import Reproducer
@@ -55,6 +68,11 @@ from cavmarl.traffic.demand import DemandFile
 from cavmarl.traffic.departures import make_gate
 from cavmarl.traffic.memory import Zeros
 from cavmarl.traffic.native import NativeTraffic
+from cavmarl.traffic.scenarios import plan_scene
+from cavmarl.traffic.scene import Scene
+from cavmarl.traffic.sumo.demand import SumoDemand
+from cavmarl.traffic.sumo.traffic import SumoTraffic
+from cavmarl.v2x.bus import Bus
 
 __all__ = ["Simulation", "TrafficStats"]
 
@@ -104,15 +122,17 @@ class Simulation:
         config: the environment.
         network: its roads.
         num_worlds: W.
-        demand: whose vehicles drive beside the generator's.
+        demand: whose vehicles drive beside the generator's; of a file, or SUMO's.
         partition: the zones; None: cut as `config.zones` says.
         observations: (W, A, D) float32, where the agents' are written; None: made for them.
+        frames: where the samples of their rigs are written; None: made for them.
         warm: call every kernel now, so that none is loaded in a step.
         zeros: makes the arrays that shards write.
         like: worlds of the same environment, whose tables are used; None: they are made.
 
     Attributes:
         everywhere: (W,) all of the worlds.
+        frames: what the rigs of the agents have sensed; arrays that the next step overwrites.
     """
 
     def __init__(
@@ -120,10 +140,11 @@ class Simulation:
         config: EnvConfig,
         network: RoadNetwork,
         num_worlds: int = 1,
-        demand: DemandFile | None = None,
+        demand: DemandFile | SumoDemand | None = None,
         partition: ZonePartition | None = None,
         *,
         observations: NDArray[np.float32] | None = None,
+        frames: Frames | None = None,
         warm: bool = False,
         zeros: Zeros = np.zeros,
         like: Simulation | None = None,
@@ -137,9 +158,11 @@ class Simulation:
         self._first_world = 0
         self._episodes = np.zeros(num_worlds, dtype=np.int64)
         self.everywhere = np.ones(num_worlds, dtype=np.bool_)
+        self.frames: Frames = _frames(config, num_worlds, zeros) if frames is None else frames
         self.transfers: tuple[TransferLog, ...] = ()
         with first_compilation() as is_first:
             blank = blank_vehicle()
+            sumo = demand if isinstance(demand, SumoDemand) else None
             traffic = (
                 NativeTraffic(
                     network,
@@ -148,9 +171,11 @@ class Simulation:
                     blank,
                     config.clock.sim_dt_s,
                     config.horizon_s,
-                    demand,
+                    None if isinstance(demand, SumoDemand) else demand,
                     num_worlds,
                     zeros,
+                    plan_scene(config.scenario, network),
+                    sumo,
                 )
                 if like is None
                 else like._traffic.for_worlds(num_worlds)
@@ -174,17 +199,33 @@ class Simulation:
                     self._shard.travel,
                     self.outputs,
                     zeros,
+                    self.frames,
                 )
             )
             self._coordination: Coordination | None = None
             self._recovery: Recovery | None = None
             self._keeper: Keeper | None = None
+            self._recutter: Recutter | None = None
+            self._sumo: SumoTraffic | None = None
             if is_first or warm:
                 self._call_every_kernel()
+            if sumo is not None:
+                travel = traffic.travel
+                self._sumo = SumoTraffic(
+                    sumo, network, travel, travel.num_fixed, self._division.zoned, blank
+                )
             zones = config.zones
             watched = zones.journal or zones.check or zones.faults or zones.reproducers
             if self.partition.count > 1 or watched:
                 self._let_coordinate()
+            if zones.recut_steps and self.partition.count > 1 and self._coordination is not None:
+                self._recutter = Recutter(
+                    network,
+                    self._division,
+                    self._coordination,
+                    zones.recut_steps,
+                    zones.recut_tolerance,
+                )
 
     def _let_coordinate(self) -> None:
         """Let coordinators say who owns what; nobody asks where all is one zone."""
@@ -247,6 +288,18 @@ class Simulation:
         return self._commons.outputs
 
     @property
+    def messages(self) -> Bus:
+        """What vehicles and roadside units tell each other.
+
+        Raises:
+            V2xError: they tell each other nothing.
+        """
+        for part in self._attached:
+            if isinstance(part, Messaging):
+                return part.bus
+        raise V2xError("nobody says anything here: set v2x.enabled to true")
+
+    @property
     def goal_edges(self) -> NDArray[np.int32]:
         """EDGE rows of the goals, by `VEHICLE["goal"]`."""
         return self._traffic.goal_edges
@@ -255,6 +308,11 @@ class Simulation:
     def types(self) -> NDArray[np.void]:
         """VTYPE (num_types,), by `VEHICLE["vtype"]`."""
         return self._shard.travel.types
+
+    @property
+    def scene(self) -> Scene | None:
+        """What is played to the agent of each world."""
+        return self._traffic.scene
 
     @property
     def plans(self) -> NDArray[np.void]:
@@ -360,6 +418,8 @@ class Simulation:
         self._episodes[chosen] += 1
         self._gate = self._traffic.draw_orders(self._gate, worlds, chosen)
         self._traffic.populate(self._gate, worlds, chosen)
+        if self._sumo is not None:
+            self._sumo.reset(chosen, worlds)
         self._division.distribute(chosen)
         if self._coordination is not None:
             self._coordination.reset(chosen)
@@ -371,10 +431,36 @@ class Simulation:
             self._coordination.save()
 
     def step(self, commands: Commands) -> None:
-        """One agent step: its ticks, then what the agents sense."""
+        """One agent step: its ticks, then what the agents sense.
+
+        Raises:
+            LostTickError: as of `run_tick`.
+            SumoError: SUMO cannot go on; the worlds are as they were before the step.
+        """
+        if self._sumo is None:
+            self._run_ticks(commands)
+            return
+        before = [array.copy() for array in self.save()]
+        try:
+            self._run_ticks(commands)
+        except SumoError:
+            self._put_back(before)
+            raise
+
+    def _run_ticks(self, commands: Commands) -> None:
         ticks = self.config.clock.ticks_per_step
         for number in range(ticks):
             self.run_tick(commands, number == 0, number == ticks - 1)
+        if self._recutter is not None:
+            partition = self._recutter.after_step(self.partition)
+            if partition is not None:
+                self.partition = partition
+                self._executor = SerialExecutor(self._shards)
+
+    @property
+    def recuts(self) -> Sequence[Recut]:
+        """When other zones have been made while the worlds ran; see `zones.recut_steps`."""
+        return () if self._recutter is None else self._recutter.recuts
 
     def run_tick(self, commands: Commands, is_first: bool, is_last: bool) -> None:
         """One tick of a step, begun again as often as it takes where hosts may die.
@@ -407,6 +493,8 @@ class Simulation:
         Raises:
             ReproducerError: it is of other worlds.
         """
+        if self._sumo is not None:
+            raise ReproducerError("a world with SUMO beside it cannot be taken up in its middle")
         self._keeper = None
         self.seed(kept.seed, kept.first_world)
         self._episodes[:] = kept.episode - 1
@@ -419,6 +507,7 @@ class Simulation:
 
     def instrument(self, wrap: Callable[[Any], Any]) -> None:
         """Put `wrap(part)` in the place of each part that phases are calls of, to time them."""
+        self._refuse_recutting("measuring the phases of a tick")
         self._executor = wrap(self._executor)
         self._division = wrap(self._division)
         self._traffic = wrap(self._traffic)
@@ -437,7 +526,12 @@ class Simulation:
                 part.trace(note)
 
     def host(self, make: Callable[[Sequence[Shard]], Executor]) -> None:
-        """From now on let somebody else run the phases of the shards, as `make` returns it."""
+        """From now on let somebody else run the phases of the shards, as `make` returns it.
+
+        Raises:
+            ConfigError: zones become others, and nobody would tell him.
+        """
+        self._refuse_recutting("the zones of one world over workers")
         self._executor = make(self._shards)
 
     def time_shards(self, every: int = 1) -> ShardClock:
@@ -451,9 +545,14 @@ class Simulation:
         """
         if self._recovery is not None:
             raise ConfigError("zones.faults: shards are timed where no host dies; leave it out")
+        self._refuse_recutting("measuring what each zone costs")
         clock = ShardClock(self._shards, every)
         self._executor = clock
         return clock
+
+    def _refuse_recutting(self, what: str) -> None:
+        if self._recutter is not None:
+            raise ConfigError(f"zones.recut_steps: {what} needs zones that stay; leave one out")
 
     def _tick(self, commands: Commands, is_first: bool, is_last: bool) -> None:
         """Begin → attached → begin the step → advance … signals → attached → sense → end."""
@@ -474,6 +573,8 @@ class Simulation:
     def _advance(self, commands: Commands) -> None:
         """Advance → leave → exchange → resolve → enter → commit → signals."""
         self._executor.each("advance", commands)
+        if self._sumo is not None:
+            self._follow_sumo(self._sumo)
         self._leave()
         self._division.exchange()
         self._executor.each("resolve")
@@ -483,8 +584,28 @@ class Simulation:
         ticks += 1
         self._switch_signals()
 
+    def _follow_sumo(self, sumo: SumoTraffic) -> None:
+        """SUMO takes its step; who is its own stands where it is then, or leaves."""
+        gate, worlds, side = self._gate, self._shard.worlds, self._division.next_side
+        if sumo.step(worlds, side):
+            for shard in self._shards:
+                shard.dismiss(gate)
+            self._note_left()
+            sumo.forgive(gate)
+            self._traffic.settle(gate, worlds)
+        if not sumo.drives:
+            sumo.send_on(gate, worlds, side)
+
+    @property
+    def sumo(self) -> SumoTraffic | None:
+        """SUMO beside these worlds; None where `traffic.source` is native."""
+        return self._sumo
+
     def _switch_signals(self) -> None:
         """Detect → switch."""
+        if self._sumo is not None:
+            self._sumo.show(self._shard.worlds)
+            return
         self._executor.each("detect")
         self._commons.switch_signals(self._shard.worlds)
 
@@ -519,6 +640,11 @@ class Simulation:
     def _enter(self) -> None:
         """Those who wait and find a gap enter `next_rows`."""
         traffic, gate, worlds = self._traffic, self._gate, self._shard.worlds
+        if self._sumo is not None:
+            if not self._sumo.drives:
+                self._sumo.order(gate, worlds)
+            elif self._sumo.let_in(gate, worlds):
+                self._admit()
         traffic.call_orders(gate, worlds)
         if any(gate.num_queue.tolist()):
             self._let_in()
@@ -530,10 +656,19 @@ class Simulation:
         traffic.assign_lanes(gate, worlds)
         self._executor.each("propose", traffic.demand, gate)
         traffic.accept(gate, self._division.running())
-        self._executor.each("admit", gate)
+        self._admit()
+
+    def _admit(self) -> None:
+        """Those who have been let in become rows of the zones that they are in."""
+        self._executor.each("admit", self._gate)
         if self._coordination is not None:
-            self._coordination.entered(gate)
-        gate.num_passing[:] = 0
+            self._coordination.entered(self._gate)
+        self._gate.num_passing[:] = 0
+
+    def close(self) -> None:
+        """End the processes that the worlds have."""
+        if self._sumo is not None:
+            self._sumo.close()
 
     def retire_agents(self) -> None:
         """Take out the agents whose trip ended in the last step; to be called after it is read."""
@@ -554,7 +689,16 @@ class Simulation:
         return [roots, self._episodes, *snapshot.save(self._parts())]
 
     def load(self, saved: Sequence[NDArray[Any]]) -> None:
-        """Go on from what `save` gave, in worlds of the same environment."""
+        """Go on from what `save` gave, in worlds of the same environment.
+
+        Raises:
+            SumoStateError: SUMO moves vehicles there, and cannot begin in the middle.
+        """
+        self._put_back(saved)
+        if self._sumo is not None:
+            self._sumo.catch_up(self._shard.worlds)
+
+    def _put_back(self, saved: Sequence[NDArray[Any]]) -> None:
         roots, episodes, *rest = saved
         self.seed(*roots.tolist())
         self._episodes[:] = episodes
@@ -619,6 +763,8 @@ class Simulation:
         rerouting = self._traffic.rerouting
         if rerouting is not None:
             rows["way"] = rerouting.ways_of_first_world(rows["way"], world)
+        if self._sumo is not None:
+            rows["way"] = self._sumo.ways_of_first_world(rows["way"], world)
         digest = hashlib.blake2b(digest_size=16)
         for name in STATE_FIELDS:
             digest.update(np.ascontiguousarray(rows[name]).tobytes())
@@ -633,6 +779,7 @@ class Simulation:
             worlds.detected_s[world],
             worlds.ticks[world],
             worlds.keys[world],
+            worlds.cues[world],
             self._gate.next_id[world],
             self._gate.next_order[world],
             self._gate.num_entered[world],
@@ -666,6 +813,11 @@ class Simulation:
             mean_trip_s=float(sums[SUM_TIME_S]) / trips,
             mean_delay_s=float(sums[SUM_DELAY_S]) / trips,
         )
+
+
+def _frames(config: EnvConfig, num_worlds: int, zeros: Zeros) -> Frames:
+    layout = frame_layout(config, num_worlds)
+    return frames_in({name: zeros(shape, dtype=kind) for name, (kind, shape) in layout.items()})
 
 
 def _cut(config: EnvConfig, network: RoadNetwork) -> ZonePartition:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any, NamedTuple, Protocol
 
 import numpy as np
@@ -9,6 +10,8 @@ from numpy.typing import NDArray
 
 from cavmarl.balance.plan import Plan
 from cavmarl.config import TERMS, EnvConfig
+from cavmarl.rig.catalogue import frame_layout, frames_in
+from cavmarl.rig.frames import Frames
 from cavmarl.runtime.shared_memory import Layout
 from cavmarl.runtime.simulation import Simulation
 from cavmarl.shard.shard import Commands
@@ -16,6 +19,9 @@ from cavmarl.spaces import flat_observation_space, state_space
 from cavmarl.worlds import World
 
 __all__ = ["StepArrays", "SteppedWorlds", "layout_of"]
+
+
+FINAL_FRAMES = "final_rig."  # begins their names in a layout
 
 
 class StepArrays(NamedTuple):
@@ -42,10 +48,21 @@ class StepArrays(NamedTuple):
     meta_actions: NDArray[np.int64]  # (W, A)
     suggested: NDArray[np.float64]  # (W, A, 2) what the built-in driver would do
     states: NDArray[np.float32]  # (W, S) global states, of when they were last asked for
+    frames: Frames  # what the rigs have sensed
+    final_frames: Frames  # the same where something ended, before that
+
+    @classmethod
+    def of(cls, arrays: Mapping[str, NDArray[Any]]) -> StepArrays:
+        """Made of arrays that are named as by `layout_of`."""
+        fields: dict[str, Any] = {name: arrays[name] for name in cls._fields if name in arrays}
+        return cls(**fields, frames=frames_in(arrays), final_frames=frames_in(arrays, FINAL_FRAMES))
 
     def part(self, first: int, last: int) -> StepArrays:
         """Those of some of the worlds, as views."""
-        parts: list[Any] = [array[first:last] for array in self]
+        *arrays, frames, final_frames = self
+        parts: list[Any] = [array[first:last] for array in arrays]
+        for rig in (frames, final_frames):
+            parts.append({name: sensor.part(first, last) for name, sensor in rig.items()})
         return StepArrays(*parts)
 
 
@@ -69,6 +86,8 @@ def layout_of(config: EnvConfig, capacity: int, num_worlds: int) -> Layout:
         "meta_actions": ("<i8", agents),
         "suggested": ("<f8", (*agents, 2)),
         "states": ("<f4", (num_worlds, *state_space(capacity).shape)),
+        **frame_layout(config, num_worlds),
+        **frame_layout(config, num_worlds, FINAL_FRAMES),
     }
 
 

@@ -42,7 +42,7 @@ def make_jobs(recipe: Mapping[str, Any]) -> list[Job]:
             f"the files of '{config.name}' have changed while workers were started: try again"
         )
     layout = layout_of(config, recipe["capacity"], recipe["num_worlds"])
-    arrays = StepArrays(**arrays_in(Segment(recipe["arrays"], 0).map(), layout))
+    arrays = StepArrays.of(arrays_in(Segment(recipe["arrays"], 0).map(), layout))
     one = LocalWorlds(world, 1, warm=True)
     parts = [Part(*given) for given in recipe["parts"]]
 

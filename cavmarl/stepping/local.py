@@ -11,9 +11,10 @@ from numpy.typing import NDArray
 
 from cavmarl.balance.plan import Plan
 from cavmarl.kernels.codes import EVENTS_THAT_END
+from cavmarl.rig.catalogue import frame_layout
 from cavmarl.runtime.simulation import Simulation
 from cavmarl.shard.shard import Commands
-from cavmarl.spaces import state_space
+from cavmarl.spaces import state_space, write_sensed
 from cavmarl.state import global_state
 from cavmarl.stepping.arrays import StepArrays, layout_of
 from cavmarl.traffic.memory import Zeros
@@ -53,19 +54,25 @@ class LocalWorlds:
     ) -> None:
         self.world = world
         self.in_next_step = in_next_step
+        form = world.config.observation
+        self._senses = form.mode == "sensors"
+        self._is_flat = form.kind == "flat"
         self.simulation: Simulation = Simulation(
             world.config,
             world.network,
             num_worlds,
             world.demand,
             world.partition,
-            observations=None if arrays is None else arrays.observations,
+            observations=None if arrays is None or self._senses else arrays.observations,
+            frames=None if arrays is None else arrays.frames,
             warm=warm,
             zeros=zeros,
             like=None if like is None else like.simulation,
         )
         if arrays is None:
             arrays = _own_arrays(self.simulation, num_worlds)
+            if not self._senses:
+                arrays = arrays._replace(observations=self.simulation.outputs.observations)
         self.arrays = arrays
         self._horizon = world.config.max_steps
         self._steps = np.zeros(num_worlds, dtype=np.int64)
@@ -92,6 +99,7 @@ class LocalWorlds:
         """Let the agents act, and reset the worlds whose episode is over, now or a step later."""
         simulation, arrays = self.simulation, self.arrays
         simulation.step(commands)
+        self._show(simulation.everywhere)
         self._steps += 1
         if self._waiting.any():  # what they have done in this step counts for nothing
             self._begin(self._waiting.copy())
@@ -120,6 +128,9 @@ class LocalWorlds:
         if not ended.any():
             return
         arrays.final_observations[ended] = arrays.observations[ended]
+        for name, frames in arrays.frames.items():
+            for final, array in zip(arrays.final_frames[name], frames, strict=True):
+                final[ended] = array[ended]
         if self.in_next_step:
             self._waiting[over] = True
             arrays.mask[over] = False
@@ -131,8 +142,14 @@ class LocalWorlds:
 
     def _begin(self, chosen: NDArray[np.bool_]) -> None:
         self.simulation.reset(chosen)
+        self._show(chosen)
         self._steps[chosen] = 0
         self._waiting[chosen] = False
+
+    def _show(self, chosen: NDArray[np.bool_]) -> None:
+        """Make what sensors have got in the chosen worlds (W,) what the agents observe."""
+        if self._senses and self._is_flat:
+            write_sensed(self.arrays.frames, chosen, self.arrays.observations)
 
     def suggest(self) -> None:
         """Write what the built-in driver would do in the agents' place."""
@@ -187,14 +204,14 @@ class LocalWorlds:
         return ()
 
     def close(self) -> None:
-        """Nothing to release."""
+        """End the processes that the worlds have."""
+        self.simulation.close()
 
 
 def _own_arrays(simulation: Simulation, num_worlds: int) -> StepArrays:
     layout = layout_of(simulation.config, simulation.capacity, num_worlds)
+    there = frame_layout(simulation.config, num_worlds)
     made = {
-        name: np.zeros(shape, dtype)
-        for name, (dtype, shape) in layout.items()
-        if name != "observations"
+        name: np.zeros(shape, dtype) for name, (dtype, shape) in layout.items() if name not in there
     }
-    return StepArrays(observations=simulation.outputs.observations, **made)
+    return StepArrays.of(made)._replace(frames=simulation.frames)

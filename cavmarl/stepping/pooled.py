@@ -84,7 +84,7 @@ class PooledWorlds(OrderedWorlds):
         layout = layout_of(config, capacity, num_worlds)
         segment = Segment.make(size_of(layout))
         try:
-            self.arrays = StepArrays(**arrays_in(segment.map(), layout))
+            self.arrays = StepArrays.of(arrays_in(segment.map(), layout))
         except WorkerStartError:
             segment.close()
             raise

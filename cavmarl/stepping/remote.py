@@ -76,8 +76,7 @@ class RemoteWorlds(OrderedWorlds):
         if not compiled_before():
             Simulation(config, world.network, 1, world.demand, world.partition)
         layout = layout_of(config, world.capacity, num_worlds).items()
-        zeros: dict[str, Any] = {name: np.zeros(shape, kind) for name, (kind, shape) in layout}
-        self.arrays = StepArrays(**zeros)
+        self.arrays = StepArrays.of({name: np.zeros(shape, kind) for name, (kind, shape) in layout})
         recipe = {
             "config": asdict(config),
             "base_dir": str(base_dir.resolve()),

@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 
 from cavmarl.errors import ConfigError, MissingExtraError
-from cavmarl.evaluate.sumo_input import SumoInput, read_input, without_outputs
 from cavmarl.evaluate.sumo_traffic import (
     SumoJob,
     _VehicleReader,
@@ -18,6 +17,7 @@ from cavmarl.evaluate.sumo_traffic import (
     sumo_process,
 )
 from cavmarl.roads.reader import read_network
+from cavmarl.traffic.sumo.input import SumoInput, read_input, without_outputs
 
 sumo = pytest.importorskip("sumo", reason="needs the extra 'sumo'")
 pytest.importorskip("libsumo", reason="needs the extra 'sumo'")

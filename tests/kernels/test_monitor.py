@@ -17,6 +17,7 @@ from cavmarl.kernels.monitor import (
     KIND_FAR,
     KIND_FULL,
     KIND_NONE,
+    KIND_SUMS,
     KIND_TICK,
     TALLY,
     Clock,
@@ -55,6 +56,7 @@ class Looks:
         self.kept = np.zeros((2, 128), dtype=KEPT)
         self.found = np.zeros(1, dtype=FINDING)
         self.tallies = np.zeros(PARTITION.count, dtype=TALLY)
+        self.foreign = np.zeros(PARTITION.count, dtype=np.uint64)  # what nobody has, but should
         self.before: dict[int, naive.Kept] = {}
         self.look = 1
 
@@ -64,24 +66,32 @@ class Looks:
             self.zoned.rows[0, z, 0, : len(rows)] = rows
             self.zoned.num_owned[z, 0], self.zoned.num_rows[z, 0] = len(zone.owned), len(rows)
 
-    def compare(self, zones: list[naive.Zone], tick: int, new_late: int = 1) -> dict[int, set[str]]:
-        """Both look; what they find is the same."""
+    def compare(
+        self, zones: list[naive.Zone], tick: int, new_late: int = 1, missing: int = 0
+    ) -> dict[int, set[str]]:
+        """Both look; what they find is the same. So many more vehicles are expected."""
         self.put(zones)
         self.look += 1
-        watch(
+        masks, factors = MASKS.tolist(), FACTORS.tolist()
+        tallies = naive.tallies(zones, PARTITION.reaching, HALO_M, masks, factors)
+        expected = np.array([owned for _, owned, _, _ in tallies], dtype=np.uint64)
+        told = watch(
             PARTITION.arrays, HALO, self.zoned, self.words, 0, 0,
             Clock(tick, self.look, new_late, LIMIT_M), MASKS, FACTORS,
-            self.kept[(self.look + 1) & 1], self.kept[self.look & 1], self.tallies, self.found,
+            self.kept[(self.look + 1) & 1], self.kept[self.look & 1],
+            sum(len(zone.owned) for zone in zones) + missing, expected + self.foreign,
+            self.tallies, self.found,
         )  # fmt: skip
         wrong = naive.findings(zones, self.before, tick, new_late, LIMIT_M)
         kind, vehicle = self.found[0].tolist()
         assert (kind == KIND_NONE) == (not wrong)
+        sums_hold = not missing and not self.foreign.any()
+        sums_hold = sums_hold and all(due == seen for _, _, due, seen in tallies)
+        assert told == (kind if wrong or sums_hold else KIND_SUMS)
         if wrong:
             assert vehicle == min(wrong)
             assert kind in {NAMES[name] for name in wrong[vehicle]}
-        masks, factors = MASKS.tolist(), FACTORS.tolist()
-        rects = PARTITION.reaching
-        assert self.tallies.tolist() == naive.tallies(zones, rects, HALO_M, masks, factors)
+        assert self.tallies.tolist() == tallies
         self.before = {
             int(row["id"]): naive.Kept(row["x"], row["y"], int(tick - row["tick"]))
             for zone in zones
@@ -151,6 +161,17 @@ def test_sums_tell_that_all_is_well() -> None:
         assert sum(hashes) % (1 << 64) == int(looks.tallies["owned"][z])
 
 
+def test_a_zone_that_owns_others_than_it_should_is_found() -> None:
+    looks, rng, rows = started(7)
+    looks.foreign[2] = 1
+    assert not looks.compare(dealt(moved(rng, rows, 1.0)), 11)
+
+
+def test_a_vehicle_too_few_is_found() -> None:
+    looks, rng, rows = started(7)
+    assert not looks.compare(dealt(moved(rng, rows, 1.0)), 11, missing=1)
+
+
 def test_a_vehicle_that_two_zones_own_is_found() -> None:
     looks, rng, rows = started(8)
     zones = dealt(moved(rng, rows, 1.0))
@@ -184,6 +205,7 @@ def test_more_vehicles_than_there_are_places_are_found() -> None:
     looks.put(dealt(rows))
     watch(
         PARTITION.arrays, HALO, looks.zoned, looks.words, 0, 0, Clock(10, 5, 0, LIMIT_M),
-        MASKS, FACTORS, looks.kept[0], looks.kept[1], looks.tallies, looks.found,
+        MASKS, FACTORS, looks.kept[0], looks.kept[1], len(rows),
+        looks.foreign, looks.tallies, looks.found,
     )  # fmt: skip
     assert looks.found["kind"] == KIND_FULL

@@ -1,0 +1,32 @@
+"""How SUMO is run where it is global traffic: the keys under `sumo` of `env.yaml`."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+from cavmarl.config_checks import check as _check
+
+__all__ = ["SumoConfig"]
+
+
+@dataclass(frozen=True)
+class SumoConfig:
+    """Read where `traffic.source` is `sumo-demand` or `sumo-traffic`; see docs/sumo.md.
+
+    Attributes:
+        interface: `libsumo`, `traci` (slower, the same results), or `auto`: the first of them that
+            is installed.
+        max_vehicles: of SUMO's that one world can hold; SUMO keeps others waiting.
+    """
+
+    interface: Literal["auto", "libsumo", "traci"] = "auto"
+    max_vehicles: int = 5000
+
+    def __post_init__(self) -> None:
+        _check(
+            1 <= self.max_vehicles <= 1_000_000,
+            "sumo.max_vehicles",
+            self.max_vehicles,
+            "must be a whole number from 1 to 1000000",
+        )

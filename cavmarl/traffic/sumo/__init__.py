@@ -1,0 +1,1 @@
+"""SUMO as global traffic: a process of its own for each world, and what is taken from it."""

@@ -1,0 +1,279 @@
+"""What runs in the process of one SUMO: libsumo, or TraCI where there is none.
+
+It is run by its file name and imports nothing of this package, so that it is up as soon as libsumo
+is. It is told the layout of all records when it is started. Its messages are a head of 32-bit
+numbers and then bytes: records, signal letters, and a line of JSON for what seldom happens.
+
+SUMO holds one simulation a process: a second start would silently replace the first one. Here one
+is closed before the next is started.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import importlib
+import json
+import os
+import signal
+import socket
+import sys
+from typing import Any, NoReturn
+
+import numpy as np
+from numpy.typing import NDArray
+
+HEAD = np.dtype([("kind", "<i4"), ("records", "<i4"), ("letters", "<i4"), ("line", "<i4")])
+START, STEP, LOOK_UP = 0, 1, 2  # kinds of orders
+DONE, REFUSED = 0, 1  # kinds of answers
+
+NOWHERE = ""  # the lane of who is on none: it waits, it is being teleported
+PUPPET = "cavmarl."  # begins the names of vehicles that are moved from outside
+FREE = 2  # moveToXY: wherever it is told, on a road or not
+BY_ITSELF = 0  # speed and lane change modes: SUMO decides nothing for it
+
+_PR_SET_PDEATHSIG = 1
+
+
+class Simulation:
+    """The one simulation of this process.
+
+    Args:
+        told: what it is told once: names of lanes, edges, signals and types, layouts of records.
+    """
+
+    def __init__(self, told: dict[str, Any]) -> None:
+        self._sumo: Any = None
+        self._runs = False
+        self._interface = told["interface"]
+        self._seen = np.dtype([tuple(field) for field in told["seen"]])
+        self.moved = np.dtype([tuple(field) for field in told["moved"]])
+        self._lane_row = {name: row for row, name in enumerate(told["lanes"])}
+        self._lane_row[NOWHERE] = -1
+        self._edge_row = {name: row for row, name in enumerate(told["edges"])}
+        self._edges: list[str] = told["edges"]
+        self._signals: list[str] = told["signals"]
+        self._type_row: dict[str, int] = told["types"]
+        self._forget()
+
+    def _forget(self) -> None:
+        self._number: dict[str, int] = {}  # of vehicles on the road, by name
+        self._type: dict[str, int] = {}
+        self._given = 0  # numbers
+        self._route_row: dict[str, int] = {}
+        self._puppets: dict[int, str] = {}
+
+    def start(self, words: list[str]) -> dict[str, Any]:
+        """Begin anew; which SUMO it is."""
+        self._stop()
+        self._forget()
+        if self._sumo is None:
+            self._sumo = importlib.import_module(self._interface)
+        self._sumo.start([_binary(self._interface), *words])
+        self._runs = True
+        self._vehicle = self._sumo.vehicle
+        return {"version": str(self._sumo.getVersion()[1]), "time_ms": self._time_ms()}
+
+    def _stop(self) -> None:
+        if self._runs:
+            self._runs = False
+            self._sumo.close()
+
+    def look_up(self) -> dict[str, Any]:
+        """What the files have: types by name, and how many letters each signal has."""
+        kinds, lights = self._sumo.vehicletype, self._sumo.trafficlight
+        letters = {name: lights.getRedYellowGreenState(name) for name in lights.getIDList()}
+        return {
+            "types": {name: _describe(kinds, name) for name in sorted(kinds.getIDList())},
+            "signals": {name: len(state) for name, state in letters.items()},
+        }
+
+    def step(self, moved: NDArray[np.void]) -> tuple[NDArray[np.void], bytes, dict[str, Any]]:
+        """One step: puppets to their places, everybody else by SUMO."""
+        self._place(moved)
+        self._sumo.simulationStep()
+        return self.look()
+
+    def look(self) -> tuple[NDArray[np.void], bytes, dict[str, Any]]:
+        """Who is where now, what signals show, and what is new."""
+        line: dict[str, Any] = {"time_ms": self._time_ms()}
+        lifted = [
+            [self._number.pop(name), name]
+            for name in self._sumo.simulation.getStartingTeleportIDList()
+            if name in self._number
+        ]
+        names, lanes = self._on_road()
+        for name in self._number.keys() - set(names):
+            del self._number[name]
+        fresh = [self._register(name) for name in names if name not in self._number]
+        for key, news in (("teleported", lifted), ("departed", fresh)):
+            if news:
+                line[key] = news
+        vehicle = self._vehicle
+        seen = np.zeros(len(names), dtype=self._seen)
+        if names:
+            places = np.array([*map(vehicle.getPosition3D, names)])
+            seen["x"], seen["y"], seen["z"] = places.T
+            seen["number"] = [*map(self._number.__getitem__, names)]
+            seen["vtype"] = [*map(self._type.__getitem__, names)]
+            seen["lane"] = lanes
+            for field, get in (
+                ("angle", vehicle.getAngle),
+                ("speed", vehicle.getSpeed),
+                ("pos", vehicle.getLanePosition),
+                ("lat", vehicle.getLateralLanePosition),
+                ("signals", vehicle.getSignals),
+                ("at", vehicle.getRouteIndex),
+            ):
+                seen[field] = [*map(get, names)]
+            seen["route"] = self._routes(names, line)
+        get_state = self._sumo.trafficlight.getRedYellowGreenState
+        letters = "".join(map(get_state, self._signals)).encode()
+        return seen[np.argsort(seen["number"])], letters, line
+
+    def _on_road(self) -> tuple[list[str], list[int]]:
+        """Names of the vehicles that stand or drive on the map's lanes, and LANE rows."""
+        vehicle = self._vehicle
+        own = set(self._puppets.values())
+        names = [name for name in vehicle.getIDList() if name not in own]
+        rows = [self._lane_row.get(lane, -1) for lane in map(vehicle.getLaneID, names)]
+        found = [(name, row) for name, row in zip(names, rows, strict=True) if row >= 0]
+        for name, _ in found:
+            if name not in self._type:
+                self._type[name] = self._type_row[vehicle.getTypeID(name)]
+        found = [pair for pair in found if self._type[pair[0]] >= 0]
+        return [name for name, _ in found], [row for _, row in found]
+
+    def _register(self, name: str) -> list[Any]:
+        """A number for a vehicle that has come, or has come back."""
+        self._number[name] = self._given
+        self._given += 1
+        return [self._number[name], name, self._vehicle.getSpeedFactor(name)]
+
+    def _routes(self, names: list[str], line: dict[str, Any]) -> list[int]:
+        """Numbers of their routes; the edges of new ones go into the line."""
+        known = self._route_row
+        ids = [*map(self._vehicle.getRouteID, names)]
+        for name, route in zip(names, ids, strict=True):
+            if route not in known:
+                known[route] = len(known)
+                edges = [self._edge_row.get(edge, -1) for edge in self._vehicle.getRoute(name)]
+                line.setdefault("routes", []).append(edges)
+        return [known[route] for route in ids]
+
+    def _place(self, moved: NDArray[np.void]) -> None:
+        """Bring the puppets to their places; new ones come, others go."""
+        vehicle = self._vehicle
+        present = set(vehicle.getIDList()) if len(moved) or self._puppets else set()
+        wanted = {int(row["id"]) for row in moved}
+        for number in [number for number in self._puppets if number not in wanted]:
+            name = self._puppets.pop(number)
+            if name in present:
+                vehicle.remove(name)
+        for row in moved.tolist():
+            number, x, y, angle, edge, kind = row
+            name = f"{PUPPET}{number}"
+            if name not in present:
+                self._add(name, self._edges[edge], kind)
+                self._puppets[number] = name
+            vehicle.moveToXY(name, "", -1, x, y, angle, FREE)
+
+    def _add(self, name: str, edge: str, kind: int) -> None:
+        route = f"{PUPPET}{edge}"
+        if route not in self._sumo.route.getIDList():
+            self._sumo.route.add(route, [edge])
+        self._vehicle.add(name, route, typeID=f"{PUPPET}{kind}")
+        self._vehicle.setSpeedMode(name, BY_ITSELF)
+        self._vehicle.setLaneChangeMode(name, BY_ITSELF)
+
+    def _time_ms(self) -> int:
+        time_s: float = self._sumo.simulation.getTime()
+        return round(1000.0 * time_s)
+
+
+def _describe(kinds: Any, name: str) -> dict[str, Any]:
+    """A type, in SUMO's units."""
+    return {
+        "vclass": kinds.getVehicleClass(name),
+        "length": kinds.getLength(name),
+        "width": kinds.getWidth(name),
+        "height": kinds.getHeight(name),
+        "min_gap": kinds.getMinGap(name),
+        "accel": kinds.getAccel(name),
+        "decel": kinds.getDecel(name),
+        "emergency_decel": kinds.getEmergencyDecel(name),
+        "tau": kinds.getTau(name),
+        "sigma": kinds.getImperfection(name),
+        "max_speed": kinds.getMaxSpeed(name),
+        "speed_factor": kinds.getSpeedFactor(name),
+        "speed_dev": kinds.getSpeedDeviation(name),
+    }
+
+
+def _binary(interface: str) -> str:
+    """The first word of SUMO's command line; libsumo only looks that there is one."""
+    if interface == "libsumo":
+        return "sumo"
+    return str(importlib.import_module("sumolib").checkBinary("sumo"))
+
+
+def _read(wire: socket.socket, size: int) -> bytes:
+    """So many bytes; where the other side has gone this process ends."""
+    parts = []
+    while size:
+        part = wire.recv(size)
+        if not part:
+            os._exit(0)
+        parts.append(part)
+        size -= len(part)
+    return b"".join(parts)
+
+
+def _order(wire: socket.socket) -> tuple[int, bytes, dict[str, Any]]:
+    head = np.frombuffer(_read(wire, HEAD.itemsize), HEAD)[0]
+    records = _read(wire, int(head["records"]))
+    line = _read(wire, int(head["line"]))
+    return int(head["kind"]), records, json.loads(line) if line else {}
+
+
+def _answer(
+    wire: socket.socket, kind: int, line: dict[str, Any], records: bytes = b"", letters: bytes = b""
+) -> None:
+    text = json.dumps(line).encode()
+    head = np.array([(kind, len(records), len(letters), len(text))], dtype=HEAD)
+    wire.sendall(head.tobytes() + records + letters + text)
+
+
+def _serve(wire: socket.socket) -> NoReturn:
+    _, _, told = _order(wire)
+    simulation = Simulation(told)
+    while True:
+        kind, records, line = _order(wire)
+        try:
+            if kind == LOOK_UP:
+                started = simulation.start(line["words"])
+                _answer(wire, DONE, {**started, **simulation.look_up()})
+                continue
+            if kind == START:
+                simulation.start(line["words"])
+                found = simulation.look()
+            else:
+                found = simulation.step(np.frombuffer(records, simulation.moved))
+        except Exception as error:  # of SUMO's own kind, which the other side does not know
+            _answer(wire, REFUSED, {"error": f"{type(error).__name__}: {error}"})
+            continue
+        seen, letters, news = found
+        _answer(wire, DONE, news, seen.tobytes(), letters)
+
+
+def main() -> None:
+    """Live as long as the process that has started this one."""
+    number, parent, dies_with_thread = map(int, sys.argv[1:])
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the other side, which closes
+    if dies_with_thread:
+        ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, int(signal.SIGKILL), 0, 0, 0)
+    if os.getppid() == parent:
+        _serve(socket.socket(fileno=number))
+
+
+if __name__ == "__main__":
+    main()

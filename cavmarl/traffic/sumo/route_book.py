@@ -1,0 +1,154 @@
+"""`RouteBook`: SUMO's routes as ways, written behind the table of all ways while worlds run."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cavmarl.errors import CapacityError
+from cavmarl.kernels.mirroring import Paths
+from cavmarl.kernels.routes import plan_route
+from cavmarl.roads.network import RoadNetwork
+
+__all__ = ["MAX_WAY_STEPS", "RouteBook"]
+
+MAX_WAY_STEPS = 8_000_000  # of all worlds; memory that is never written is never taken
+
+
+class RouteBook:
+    """The paths of W worlds, each a route as vehicles with certain permissions can drive it.
+
+    Args:
+        network: the roads.
+        steps: PLAN, the table of all ways.
+        first: where in it these worlds' room begins; behind it is nothing else.
+        num_worlds: W.
+        permissions: (num_types,) of VTYPE rows.
+    """
+
+    def __init__(
+        self,
+        network: RoadNetwork,
+        steps: NDArray[np.void],
+        first: int,
+        num_worlds: int,
+        permissions: NDArray[np.uint32],
+    ) -> None:
+        self._network = network
+        self._steps = steps
+        lanes = len(network.lanes)
+        nowhere = steps[first : first + lanes]
+        nowhere["next"] = nowhere["link"] = -1
+        nowhere["to_go"] = np.inf
+        self._nowhere = first
+        # So many unused steps keep the ways of each world above all others: a way is a step's row
+        # minus that of a lane.
+        self._first = first + 2 * lanes
+        self._of_world = (len(steps) - self._first) // num_worlds
+        self._masks, self._class_of_type = np.unique(permissions, return_inverse=True)
+        self._worlds = [_Pages(self._first + w * self._of_world) for w in range(num_worlds)]
+
+    @staticmethod
+    def room(network: RoadNetwork, num_worlds: int) -> int:
+        """How many steps all worlds get."""
+        lanes = len(network.lanes)
+        return 2 * lanes + min(num_worlds * (64 * lanes + 100_000), MAX_WAY_STEPS)
+
+    def begin(self, w: int) -> None:
+        """Forget an episode of a world."""
+        self._worlds[w] = _Pages(self._first + w * self._of_world)
+
+    def paths(self, w: int) -> Paths:
+        """What a world has."""
+        return self._worlds[w].arrays(self._nowhere)
+
+    def ways_of_first_world(self, ways: NDArray[np.int64], w: int) -> NDArray[np.int64]:
+        """VEHICLE["way"] (n,) of a world as it would be in the first one."""
+        own = ways >= self._first - len(self._network.lanes)
+        return ways - own * (w * self._of_world)
+
+    def enter(self, w: int, routes: list[list[int]]) -> None:
+        """Take up routes that SUMO has told of, EDGE rows of each, numbered in this order."""
+        self._worlds[w].routes += [np.array(edges, dtype=np.int32) for edges in routes]
+
+    def look_up(
+        self, w: int, routes: NDArray[np.int32], vtypes: NDArray[np.int32]
+    ) -> NDArray[np.int32]:
+        """The paths (n,) of vehicles of VTYPE rows (n,) on routes (n,).
+
+        Raises:
+            CapacityError: there is no room for more.
+        """
+        pages, classes = self._worlds[w], len(self._masks)
+        pairs = routes.astype(np.int64) * classes + self._class_of_type[vtypes]
+        missing = len(pages.routes) * classes - len(pages.path_of)
+        if missing > 0:
+            pages.path_of = np.append(pages.path_of, np.full(missing, -1, dtype=np.int32))
+        for pair in np.unique(pairs[pages.path_of[pairs] < 0]).tolist():
+            route, mask = divmod(pair, classes)
+            pages.path_of[pair] = self._plan(pages, pages.routes[route], int(self._masks[mask]))
+        found: NDArray[np.int32] = pages.path_of[pairs]
+        return found
+
+    def _plan(self, pages: _Pages, edges: NDArray[np.int32], mask: int) -> int:
+        """The number of a path, planned if nobody has driven it."""
+        known = pages.known.get((edges.tobytes(), mask))
+        if known is not None:
+            return known
+        rows = self._network.edges
+        # A route over edges that this map has left out is driven where it is on the map.
+        num_lanes = np.where(edges >= 0, rows["num_lanes"][edges], 0)
+        first_lane = np.where(edges >= 0, rows["first_lane"][edges], 0)
+        begin = pages.end
+        offsets = np.cumsum(num_lanes) - num_lanes
+        pages.end += int(num_lanes.sum())
+        if pages.end > pages.begin + self._of_world:
+            raise CapacityError(
+                f"SUMO's routes have over {self._of_world} steps in one world: fewer worlds, or "
+                "demand with fewer different routes"
+            )
+        for piece in np.split(np.arange(len(edges)), np.flatnonzero(edges < 0)):
+            part = edges[piece][edges[piece] >= 0]
+            if len(part):
+                place = begin + int(offsets[piece[edges[piece] >= 0][0]])
+                steps = self._steps[place : place + int(rows["num_lanes"][part].sum())]
+                plan_route(self._network.arrays, part, mask, 0, steps, np.zeros(len(steps)))
+        return pages.add(edges, mask, begin + offsets - first_lane)
+
+
+class _Pages:
+    """What is known of one world's routes.
+
+    Attributes:
+        begin: of its steps.
+        end: of those in use.
+        routes: EDGE rows of each, by SUMO's number.
+        path_of: by route and class, or -1.
+        known: paths by edges and permissions.
+    """
+
+    def __init__(self, begin: int) -> None:
+        self.begin = self.end = begin
+        self.routes: list[NDArray[np.int32]] = []
+        self.path_of = np.zeros(0, dtype=np.int32)
+        self.known: dict[tuple[bytes, int], int] = {}
+        self._edges: list[NDArray[np.int32]] = []
+        self._ways: list[NDArray[np.int64]] = []
+        self._arrays: Paths | None = None
+
+    def add(self, edges: NDArray[np.int32], mask: int, ways: NDArray[np.int64]) -> int:
+        """A new path's number."""
+        number = self.known[edges.tobytes(), mask] = len(self._edges)
+        self._edges.append(edges)
+        self._ways.append(ways)
+        self._arrays = None
+        return number
+
+    def arrays(self, nowhere: int) -> Paths:
+        """All paths, for kernels."""
+        if self._arrays is None:
+            sizes = np.array([0, *map(len, self._edges)], dtype=np.int64)
+            edges = np.concatenate([*self._edges, np.zeros(0, dtype=np.int32)])
+            ways = np.concatenate([*self._ways, np.zeros(0, dtype=np.int64)])
+            self._arrays = Paths(np.cumsum(sizes), edges, ways, nowhere)
+        return self._arrays
