@@ -311,6 +311,11 @@ class Simulation:
         return self._traffic.goal_edges
 
     @property
+    def types(self) -> NDArray[np.void]:
+        """VTYPE (num_types,), by `VEHICLE["vtype"]`."""
+        return self._shard.travel.types
+
+    @property
     def scene(self) -> Scene | None:
         """What is played to the agent of each world."""
         return self._traffic.scene
