@@ -20,6 +20,7 @@ from cavmarl.errors import ConfigError, ResetNeededError
 from cavmarl.registry import load_config
 from cavmarl.runtime.simulation import Simulation
 from cavmarl.seeds import check_seed, first_seed
+from cavmarl.shard.shard import Commands
 from cavmarl.spaces import action_space, flat_observation_space
 from cavmarl.stepping.arrays import SteppedWorlds
 from cavmarl.stepping.local import LocalWorlds
@@ -176,7 +177,11 @@ class CavVectorEnv:
                 AutoresetMode.NEXT_STEP if worlds.in_next_step else AutoresetMode.SAME_STEP
             ),
         }
-        self._decoder = ActionDecoder(config.action, num_envs, self.possible_agents)
+        arrays = worlds.arrays
+        commands = Commands(arrays.controls, arrays.meta_actions)
+        self._decoder = ActionDecoder(config.action, num_envs, self.possible_agents, commands)
+        self._view = arrays.observations.view()
+        self._view.flags.writeable = False
         self._mask = np.zeros((num_envs, self.num_agents), dtype=np.bool_)
         self._first_seed = None if seed is None else check_seed(seed)
         self._copy = copy
@@ -293,8 +298,8 @@ class CavVectorEnv:
         over = arrays.episode_over.copy()
         terminations = arrays.terminations.copy()
         observations = final_observations = self._observations()
-        ended = over | terminations.any(axis=1)
-        if ended.any():
+        if np.count_nonzero(over) or np.count_nonzero(terminations):
+            ended = over | terminations.any(axis=1)
             final_observations = arrays.observations.copy()
             final_observations[ended] = arrays.final_observations[ended]
             self._decoder.forget(over)
@@ -311,12 +316,7 @@ class CavVectorEnv:
         return observations, arrays.rewards.copy(), terminations, arrays.truncations.copy(), infos
 
     def _observations(self) -> NDArray[np.float32]:
-        observations = self.worlds.arrays.observations
-        if self._copy:
-            return observations.copy()
-        view = observations.view()
-        view.flags.writeable = False
-        return view
+        return self.worlds.arrays.observations.copy() if self._copy else self._view
 
     def suggest_actions(self) -> NDArray[Any]:
         """What the built-in driver (IDM, MOBIL, lane controller) would do in each agent's place."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 import mmap
 import zlib
 from collections.abc import Iterator, Sequence
+from operator import is_
 from typing import Any, NamedTuple
 
 import numba.core.config
@@ -54,6 +55,8 @@ class Image:
         self._words = np.zeros(0, dtype=np.int64)
         self._begin = 0  # of the first array
         self._places: list[_Place] = []
+        self._written: Arrays = ()  # the last time
+        self._copies: list[tuple[Array, Array]] = []  # to where, from where
 
     def write(self, arrays: Arrays) -> None:
         """Copy arrays into it, of the same dtypes as the last time.
@@ -61,16 +64,25 @@ class Image:
         Raises:
             OSError: there is no memory for them.
         """
+        if len(arrays) != len(self._written) or not all(map(is_, arrays, self._written)):
+            self._find_places(arrays)
+        for target, source in self._copies:
+            target[...] = source
+        _seal(self._words)
+
+    def _find_places(self, arrays: Arrays) -> None:
+        """Say what has to be copied where."""
         shapes = [array.shape for array in arrays]
         same = _num_same(shapes, self._places)
         if len(arrays) != len(self._places):
             self._lay_out(arrays, 0)
         elif same < len(arrays):
             self._lay_out(arrays, same)
-        for array, place in zip(arrays, self._places, strict=True):
-            place.target[...] = array.view(place.target.dtype)
-        words = self._words
-        words[1] = _checksum(words[2 : words.item(0)])
+        self._written = tuple(arrays)
+        self._copies = [
+            (place.target, array.view(place.target.dtype))
+            for array, place in zip(arrays, self._places, strict=True)
+        ]
 
     def _lay_out(self, arrays: Arrays, same: int) -> None:
         """Say where each array goes; the first ones go where they went the last time.
@@ -137,6 +149,7 @@ class Image:
         """
         self._make_room(content.size)
         self._places.clear()  # its arrays may lie elsewhere
+        self._written = ()
         self._words.view(np.uint8)[: content.size] = content
 
     def _make_room(self, size: int) -> bool:
@@ -169,7 +182,13 @@ def _mixed(words: NDArray[np.uint64]) -> np.uint64:
     return (((((a * prime) ^ b) * prime) ^ c) * prime) ^ d
 
 
-_mix = repeated(_mixed)
+@kernel
+def _sealed(words: NDArray[np.uint64]) -> None:
+    """Write the checksum of an image into it."""
+    words[1] = _mixed(words[2 : int(words[0])])
+
+
+_mix, _compiled_seal = repeated(_mixed), repeated(_sealed)
 
 
 def _num_words(array: Array) -> int:
@@ -190,6 +209,16 @@ def _checksum(words: NDArray[np.int64]) -> int:
     return int(np.uint64(_mix(words.view(np.uint64))).view(np.int64))
 
 
+def _seal(words: NDArray[np.int64]) -> None:
+    """Write the checksum of an image into it."""
+    if _IS_PYTHON:
+        words[1] = _checksum(words[2 : words.item(0)])
+    else:
+        _compiled_seal(words.view(np.uint64))
+
+
 def load_kernels() -> None:
     """Have the checksum ready, for this process and those that it forks."""
-    _checksum(np.zeros(_HEAD, dtype=np.int64))
+    words = np.full(_HEAD, _HEAD, dtype=np.int64)
+    _seal(words)
+    _checksum(words)

@@ -172,8 +172,8 @@ class Pool:
         pending = [k for k in workers if not self._crew.watch(k)]
         if pending:
             self._await_asleep(pending, mail)
-            if workers == self._all:
-                self._crew.keep_apart()
+        if workers == self._all:
+            self._crew.keep_apart()
         lasted_s = time.perf_counter() - began
         for k in workers:
             self._crew.lasted(k, lasted_s)
