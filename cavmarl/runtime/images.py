@@ -52,7 +52,7 @@ class Image:
     def __init__(self, segment: Segment) -> None:
         self._segment = segment
         self._memory: mmap.mmap | None = None
-        self._words = np.zeros(0, dtype=np.int64)
+        self._map_words(np.zeros(0, dtype=np.int64))
         self._begin = 0  # of the first array
         self._places: list[_Place] = []
         self._written: Arrays = ()  # the last time
@@ -68,7 +68,10 @@ class Image:
             self._find_places(arrays)
         for target, source in self._copies:
             target[...] = source
-        _seal(self._words)
+        if _IS_PYTHON:
+            self._words[1] = _checksum(self._words[2 : self._words.item(0)])
+        else:
+            _seal(self._unsigned)
 
     def _find_places(self, arrays: Arrays) -> None:
         """Say what has to be copied where."""
@@ -163,7 +166,11 @@ class Image:
     def _map_all(self) -> None:
         """Map the segment as large as it is by now, whoever has made it so."""
         self._memory = self._segment.map()
-        self._words = np.frombuffer(self._memory, dtype=np.int64)
+        self._map_words(np.frombuffer(self._memory, dtype=np.int64))
+
+    def _map_words(self, words: NDArray[np.int64]) -> None:
+        self._words = words
+        self._unsigned = words.view(np.uint64)
 
 
 @kernel
@@ -188,7 +195,7 @@ def _sealed(words: NDArray[np.uint64]) -> None:
     words[1] = _mixed(words[2 : int(words[0])])
 
 
-_mix, _compiled_seal = repeated(_mixed), repeated(_sealed)
+_mix, _seal = repeated(_mixed), repeated(_sealed)
 
 
 def _num_words(array: Array) -> int:
@@ -209,16 +216,8 @@ def _checksum(words: NDArray[np.int64]) -> int:
     return int(np.uint64(_mix(words.view(np.uint64))).view(np.int64))
 
 
-def _seal(words: NDArray[np.int64]) -> None:
-    """Write the checksum of an image into it."""
-    if _IS_PYTHON:
-        words[1] = _checksum(words[2 : words.item(0)])
-    else:
-        _compiled_seal(words.view(np.uint64))
-
-
 def load_kernels() -> None:
     """Have the checksum ready, for this process and those that it forks."""
     words = np.full(_HEAD, _HEAD, dtype=np.int64)
-    _seal(words)
     _checksum(words)
+    _seal(words.view(np.uint64))

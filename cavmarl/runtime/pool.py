@@ -188,6 +188,8 @@ class Pool:
             if len(pending) < len(asked):  # orders are shared out so that all end together
                 pending = [k for k in pending if not self._crew.watch(k, is_soon=True)]
             self._note_done(first, pending)
+            if not (pending or dead):
+                break
             suspects = dict.fromkeys(dead, "") or guard.hanging(pending)
             suspected = {k: self._crew.processes[k] for k in suspects} | dead
             for k, cause in suspects.items():
