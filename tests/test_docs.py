@@ -6,6 +6,7 @@ import inspect
 import re
 from dataclasses import MISSING, fields, is_dataclass
 from pathlib import Path
+from types import UnionType
 from typing import Any, Literal, get_args, get_origin, get_type_hints
 
 import pytest
@@ -67,6 +68,8 @@ def type_text(hint: Any) -> str:
     if get_origin(hint) is None:
         return {int: "whole number", float: "number", bool: "bool", str: "text"}[hint]
     inner = [type_text(part) for part in get_args(hint) if part not in (..., type(None))]
+    if get_origin(hint) is UnionType:
+        return " or ".join(inner)
     return {tuple: "list of ", dict: "mapping of "}.get(get_origin(hint), "") + " to ".join(inner)
 
 

@@ -127,7 +127,7 @@ def test_drivers_see_a_body_on_every_lane_that_it_covers_or_soon_will() -> None:
     row = rows[0]
     assert entries(tables, rows) == {}  # beside the road, waiting
     soon = round(FORESIGHT_S / DT)
-    for ticks in (1, 20, 40, 40, 60):
+    for ticks in (2, 20, 40, 40, 60):
         follow(tables, row, True, ticks)
         ahead = row.copy()
         places = [(float(row["x"]), float(row["y"])), *follow(tables, ahead, True, soon)]
@@ -176,7 +176,7 @@ def test_who_rides_announces_itself_to_junctions_as_a_driver_does() -> None:
     tables, rows = scripted(actor, goals=goals)
     tables = tables._replace(steps=make_plans(ROADS, [actor.released_to]).reshape(-1))
     row = rows[0]
-    for _ in range(40):
+    for _ in range(80):
         follow(tables, row, True, 5)
         if row["driver"] != DRIVER_SCRIPTED:
             break
