@@ -29,9 +29,7 @@ def test_the_list_names_all_with_their_parameters(
         assert {"name", "default", "range", "what"} == set(about["parameters"][0])
 
 
-def test_a_run_says_what_became_of_it(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_run_says_what_became_of_it(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     pytest.importorskip("pygame")
     words = ["scenario", "run", "pedestrian_crossing", "--param", "occluded=true"]
     kept, seen = tmp_path / "run.json", tmp_path / "closest.png"
@@ -57,8 +55,6 @@ def test_a_run_says_what_became_of_it(
         (["pedestrian_crossing", "--picture", "crossing.jpg"], "ends in .png"),
     ],
 )
-def test_wrong_use_is_said(
-    words: list[str], says: str, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_wrong_use_is_said(words: list[str], says: str, capsys: pytest.CaptureFixture[str]) -> None:
     assert code("scenario", "run", *words) == 2
     assert says in " ".join(capsys.readouterr().err.split())

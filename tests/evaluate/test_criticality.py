@@ -37,9 +37,7 @@ def test_times_that_one_can_reckon() -> None:
 
 
 places = st.floats(-30.0, 30.0)
-bodies = st.builds(
-    body, places, places, st.floats(-math.pi, math.pi), st.floats(-5.0, 15.0)
-)
+bodies = st.builds(body, places, places, st.floats(-math.pi, math.pi), st.floats(-5.0, 15.0))
 
 
 @given(bodies, bodies)

@@ -40,12 +40,16 @@ WALK_MPS = 1.25
 def crossing() -> Actor:
     """Over the road, 40 m from the start of a lane."""
     right, left = STREETS.kerbs_m(LANE, 40.0)
-    ends = np.array([STREETS.point(LANE, 40.0, -right - 1.4), STREETS.point(LANE, 40.0, left + 1.4)])
+    ends = np.array(
+        [STREETS.point(LANE, 40.0, -right - 1.4), STREETS.point(LANE, 40.0, left + 1.4)]
+    )
     ends[:, 2] += 0.5 * math.pi
     return Actor("pedestrian", [Move(ends[:1], LANE), Await(0), Move(ends, LANE, WALK_MPS)])
 
 
-def scripted(*actors: Actor, goals: dict[int, int] | None = None) -> tuple[Travel, NDArray[np.void]]:
+def scripted(
+    *actors: Actor, goals: dict[int, int] | None = None
+) -> tuple[Travel, NDArray[np.void]]:
     """What kernels take, and VEHICLE (n,) of the actors in their first places."""
     scripts, firsts = compile_scripts(ROADS, actors, [Cue(0.0, 0.0, 5.0)], goals or {}, DT)
     base = travel("grid4x4")
@@ -100,9 +104,7 @@ def covered(row: np.void, at: tuple[float, float]) -> dict[int, tuple[float, flo
             for number, lane in enumerate(ROADS.lanes):
                 if not (lane["min_x"] - 3.0 < x < lane["max_x"] + 3.0):
                     continue
-                s, d, _, _ = project(
-                    ROADS.points, lane["first_point"], lane["num_points"], x, y
-                )
+                s, d, _, _ = project(ROADS.points, lane["first_point"], lane["num_points"], x, y)
                 if abs(d) < 0.5 * lane["width_m"] and 0.0 <= s <= lane["length_m"]:
                     found.setdefault(number, []).append(s)
     return {lane: (min(places), max(places)) for lane, places in found.items()}
@@ -132,7 +134,7 @@ def test_drivers_see_a_body_on_every_lane_that_it_covers_or_soon_will() -> None:
         ahead = row.copy()
         places = [(float(row["x"]), float(row["y"])), *follow(tables, ahead, True, soon)]
         expected: dict[int, tuple[float, float]] = {}
-        for place in places[:: 4]:
+        for place in places[::4]:
             for lane, (start, end) in covered(row, place).items():
                 old = expected.get(lane, (start, end))
                 expected[lane] = (min(start, old[0]), max(end, old[1]))
@@ -171,7 +173,8 @@ def test_who_rides_announces_itself_to_junctions_as_a_driver_does() -> None:
     """The twin is a background car in the same place, with a way over the same link."""
     actor = riding()
     ride = actor.acts[0]
-    assert isinstance(ride, Ride) and actor.released_to is not None
+    assert isinstance(ride, Ride)
+    assert actor.released_to is not None
     goals = {actor.released_to: 0}
     tables, rows = scripted(actor, goals=goals)
     tables = tables._replace(steps=make_plans(ROADS, [actor.released_to]).reshape(-1))
@@ -186,9 +189,7 @@ def test_who_rides_announces_itself_to_junctions_as_a_driver_does() -> None:
         assert announced(tables, rows) == announced(tables, twin)
         assert entries(tables, rows).keys() >= entries(tables, twin).keys()
     assert row["driver"] == DRIVER_BACKGROUND
-    assert row["to_go"] == pytest.approx(
-        STREETS.length_m(int(row["lane"])) - row["s"], abs=1e-6
-    )
+    assert row["to_go"] == pytest.approx(STREETS.length_m(int(row["lane"])) - row["s"], abs=1e-6)
 
 
 def announced(tables: Travel, rows: NDArray[np.void]) -> list[tuple[int, float]]:
