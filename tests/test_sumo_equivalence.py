@@ -27,17 +27,16 @@ def test_zones_change_nothing(tmp_path: Path, source: str) -> None:
     found = verify_zones(
         "grid4x4",
         (1, 2, 4, 9),
-        steps=150,
+        steps=100,
         seed=2,
         agents=4,
         background=4,
-        worlds=2,
         overrides=overrides(source, tiny_file(tmp_path)),
         check=True,
     )
     for result in found.results:
         assert result.difference is None, result
-        assert result.steps == 150
+        assert result.steps == 100
     assert [result.crossings > 0 for result in found.results] == [False, True, True, True]
 
 
