@@ -14,8 +14,11 @@ from typing import Literal
 
 from cavmarl.config_checks import check as _check
 from cavmarl.config_checks import check_finite as _check_finite
+from cavmarl.config_rig import Rig, check_rig
+from cavmarl.config_scenario import ScenarioConfig
 from cavmarl.config_sensors import SensorsConfig
 from cavmarl.config_sumo import SumoConfig
+from cavmarl.config_v2x import V2xConfig
 
 __all__ = [
     "MAX_ZONES",
@@ -28,6 +31,7 @@ __all__ = [
     "MapConfig",
     "ObservationConfig",
     "PopulationConfig",
+    "ScenarioConfig",
     "SensorsConfig",
     "SumoConfig",
     "TermsConfig",
@@ -54,6 +58,7 @@ MAX_ZONES = 256  # of one map
 ZONE_LAYOUTS = ("grid", "strips", "bisection")
 ZONE_FILE_SUFFIXES = (".json", ".yaml", ".yml")
 
+MAX_SENSOR_WORKERS = 256  # of one process
 MAX_IDS = 1_000_000  # of agents in one episode: each has its space and its rows in every output
 
 
@@ -67,11 +72,14 @@ class MapConfig:
         programs: additional files with more signal programs, named as the source is; of several
             programs of a signal the last is on.
         program: the program of each signal named here, whatever was loaded; `off` is one, too.
+        buildings: `osm`: those of the OpenStreetMap file that `source` is; or a file of buildings
+            (OpenStreetMap or SUMO's polygons), named as the source is; empty: none.
     """
 
     source: str
     programs: tuple[str, ...] = ()
     program: dict[str, str] = field(default_factory=dict)
+    buildings: str = ""
 
     def __post_init__(self) -> None:
         _check(bool(self.source), "map.source", self.source, "must name a map file")
@@ -239,6 +247,10 @@ class WorkersConfig:
         max_moves: worlds or zones that change their worker in one round.
         watch: see how busy others keep the workers' cores, and give nothing more to workers above
             a threshold; without it nobody else is supposed to use them.
+        sensors: processes that the sensors of `rig` are shared out over, for each process that
+            keeps the state of worlds; 0: it senses itself. Results do not depend on it. See
+            docs/sensor_workers.md.
+        sensor_placement: who of them senses what: by what it `cost` of late, or `in_turn`.
     """
 
     timeout_s: float = 300.0
@@ -248,8 +260,16 @@ class WorkersConfig:
     tolerance: float = 0.1
     max_moves: int = 4
     watch: bool = False
+    sensors: int = 0
+    sensor_placement: Literal["cost", "in_turn"] = "cost"
 
     def __post_init__(self) -> None:
+        _check(
+            0 <= self.sensors <= MAX_SENSOR_WORKERS,
+            "workers.sensors",
+            self.sensors,
+            f"must be a whole number from 0 to {MAX_SENSOR_WORKERS}",
+        )
         _check_finite("workers.timeout_s", self.timeout_s, 1.0, 1e6)
         _check(
             0 <= self.repeats <= 1000,
@@ -409,12 +429,16 @@ class ActionConfig:
 
 @dataclass(frozen=True)
 class ObservationConfig:
-    """The form of an observation.
+    """What an observation is made of, and its form.
 
     Attributes:
-        kind: `flat`: one Box. `dict`: one Box a sensor.
+        mode: `ground_truth`: what `sensors` says, taken from the world itself. `sensors`: the
+            latest samples of the `rig`. `messages`: of `sensors` only what the vehicle knows of
+            itself and its route, and what it is told over the air.
+        kind: `flat`: one Box of float32. `dict`: one Box a sensor.
     """
 
+    mode: Literal["ground_truth", "sensors", "messages"] = "ground_truth"
     kind: Literal["flat", "dict"] = "flat"
 
 
@@ -458,6 +482,7 @@ class EnvConfig:
     Attributes:
         name: of the entry, as its folder.
         version: goes up whenever results change that others may have reported.
+        rig: sensors that are mounted on every agent's vehicle, by name; see docs/sensors.md.
         horizon_s: when an episode is truncated.
     """
 
@@ -473,12 +498,34 @@ class EnvConfig:
     action: ActionConfig = field(default_factory=ActionConfig)
     observation: ObservationConfig = field(default_factory=ObservationConfig)
     sensors: SensorsConfig = field(default_factory=SensorsConfig)
+    v2x: V2xConfig = field(default_factory=V2xConfig)
     terms: TermsConfig = field(default_factory=TermsConfig)
+    rig: Rig = field(default_factory=dict)
+    scenario: ScenarioConfig = field(default_factory=ScenarioConfig)
     horizon_s: float = 60.0
 
     def __post_init__(self) -> None:
         _check(self.version >= 0, "version", self.version, "must be 0 or more")
         _check_finite("horizon_s", self.horizon_s, self.clock.ctrl_dt_s, 1e6)
+        check_rig(self.rig, self.clock.sim_dt_s, self.clock.ticks_per_step)
+        _check(
+            not self.workers.sensors or bool(self.rig),
+            "workers.sensors",
+            self.workers.sensors,
+            "there is no rig whose sensors they could share; name some under rig, or leave it 0",
+        )
+        _check(
+            self.observation.mode != "sensors" or bool(self.rig),
+            "observation.mode",
+            self.observation.mode,
+            "there is no sensor under rig; mount one",
+        )
+        _check(
+            not self.scenario.name or self.population.agents == 1,
+            "population.agents",
+            self.population.agents,
+            "must be 1 where there is a scenario: it is played to one agent",
+        )
         steps = self.horizon_s / self.clock.ctrl_dt_s
         _check(
             abs(steps - round(steps)) < 1e-6 * steps,
@@ -487,8 +534,43 @@ class EnvConfig:
             f"must be a whole number of steps of clock.ctrl_dt_s = {self.clock.ctrl_dt_s:g}; "
             f"try {max(1, round(steps)) * self.clock.ctrl_dt_s:g}",
         )
+        if self.v2x.enabled:
+            self.v2x.check_clock(self.clock.sim_dt_s)
+        self._check_messages()
+        if self.observation.mode == "messages":
+            self._keep_what_is_told()
         if self.traffic.source != "native":
             self._check_sumo()
+
+    def _keep_what_is_told(self) -> None:
+        """Switch the sensors off that look at others."""
+        told = self.sensors.messages
+        _check(
+            bool(told.objects or told.events or told.signal),
+            "observation.mode",
+            self.observation.mode,
+            "no messages are observed: set sensors.messages.objects",
+        )
+        object.__setattr__(self, "sensors", self.sensors.without_sight())
+
+    def _check_messages(self) -> None:
+        """Refuse to observe messages that nobody keeps."""
+        kept = {"objects": self.v2x.inbox.objects, "events": self.v2x.inbox.events}
+        for name, most in kept.items():
+            key, count = f"sensors.messages.{name}", getattr(self.sensors.messages, name)
+            _check(
+                count == 0 or self.v2x.enabled,
+                key,
+                count,
+                "there are no messages: set v2x.enabled to true, or this to 0",
+            )
+            _check(count <= most, key, count, f"v2x.inbox.{name} = {most} keeps fewer")
+        _check(
+            self.v2x.enabled or not self.sensors.messages.signal,
+            "sensors.messages.signal",
+            True,
+            "there are no messages: set v2x.enabled to true, or this to false",
+        )
 
     def _check_sumo(self) -> None:
         """Refuse what cannot be together with SUMO as global traffic."""
@@ -517,6 +599,12 @@ class EnvConfig:
             "sensors.signal.timing",
             True,
             f"traffic.source = {source}: nobody knows when SUMO's signals change; leave it out",
+        )
+        _check(
+            not self.scenario.name,
+            "scenario.name",
+            self.scenario.name,
+            f"traffic.source = {source}: scenes are played in native traffic; leave one of them out",
         )
 
     @property

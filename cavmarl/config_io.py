@@ -13,7 +13,7 @@ import re
 from collections.abc import Hashable, Mapping
 from dataclasses import fields, is_dataclass
 from pathlib import Path
-from typing import Any, TypeVar, get_args, get_type_hints
+from typing import Any, TypeVar, get_args, get_origin, get_type_hints
 
 import numpy as np
 import yaml
@@ -174,14 +174,20 @@ def _fields(kind: type[Any]) -> dict[str, Any]:
 def _explain(kind: type[Any], details: ErrorDetails) -> str:
     """One line about one of pydantic's findings, in the words of the configuration."""
     location = [str(part) for part in details["loc"]]
-    path = ".".join(location)
+    keys, _ = _walk(kind, location)
+    path = ".".join(keys)
     match details["type"]:
         case "unexpected_keyword_argument":
             return f"{path}: unknown key; {_nearest(kind, location)}"
         case "missing":
             return f"{path}: missing; it has no default"
-        case "dataclass_type":
+        case "dataclass_type" | "dict_type":
             return f"{path} = {details['input']!r}: must be a mapping of keys"
+        case "union_tag_not_found":
+            return f"{path}: must be a mapping of keys with a type, one of {_types(kind, location)}"
+        case "union_tag_invalid":
+            tag = details["ctx"]["tag"]
+            return f"{path}.type = {tag!r}: no such type; there are {_types(kind, location)}"
         case "json_invalid":
             return f"holds what no configuration can hold ({details['msg']})"
         case "tuple_type":
@@ -189,12 +195,36 @@ def _explain(kind: type[Any], details: ErrorDetails) -> str:
     return f"{path} = {details['input']!r}: {details['msg'].replace('Input should', 'must')}"
 
 
+def _walk(kind: type[Any], location: list[str]) -> tuple[list[str], Any]:
+    """The keys of a location, and the type of what stands there.
+
+    Pydantic names the member of a union between two keys; those are left out.
+    """
+    keys: list[str] = []
+    inner: Any = kind
+    for part in location:
+        members = [one for one in get_args(inner) if getattr(one, "type", None) == part]
+        if members:
+            inner = members[0]
+            continue
+        keys.append(part)
+        if isinstance(inner, type) and is_dataclass(inner):
+            inner = _fields(inner).get(part)
+        else:  # the values of a mapping, or the items of a list
+            arguments = get_args(inner)
+            inner = arguments[get_origin(inner) is dict] if arguments else None
+    return keys, inner
+
+
+def _types(kind: type[Any], location: list[str]) -> str:
+    """The types of the members of a union."""
+    return ", ".join(one.type for one in get_args(_walk(kind, location)[1]))
+
+
 def _nearest(kind: type[Any], location: list[str]) -> str:
     """The advice for an unknown key: what was probably meant, else what there is."""
-    *parents, key = location
-    inner = kind
-    for parent in parents:
-        inner = get_args(inner)[0] if parent.isdecimal() else _fields(inner)[parent]
+    parents, inner = _walk(kind, location[:-1])
+    key = location[-1]
     known = list(_fields(inner))
     for name in known:
         if name != key and _stem(name) == _stem(key):

@@ -9,7 +9,7 @@ those can be used here.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Literal
 
 from cavmarl.config_checks import check, check_finite
@@ -22,6 +22,7 @@ __all__ = [
     "LanesConfig",
     "LidarConfig",
     "LidarObservationConfig",
+    "MessagesConfig",
     "NeighborsConfig",
     "OccupancyGridConfig",
     "PufferDriveConfig",
@@ -307,6 +308,29 @@ class RoadgraphConfig:
 
 
 @dataclass(frozen=True)
+class MessagesConfig:
+    """What the vehicle has been told over the air, see `v2x`.
+
+    Attributes:
+        objects: vehicles that it has heard of, the nearest ones; 0: none.
+        events: that it has heard of, the nearest ones; 0: none.
+        signal: adds what the roadside unit of the next signal on the route says.
+        range_m: distance that a place of 1 stands for; what is further away has 1, too.
+    """
+
+    objects: int = 0
+    events: int = 0
+    signal: bool = False
+    range_m: float = 100.0
+
+    def __post_init__(self) -> None:
+        key = "sensors.messages"
+        check(0 <= self.objects <= 64, f"{key}.objects", self.objects, "must be from 0 to 64")
+        check(0 <= self.events <= 64, f"{key}.events", self.events, "must be from 0 to 64")
+        check_finite(f"{key}.range_m", self.range_m, 1.0, 10_000.0)
+
+
+@dataclass(frozen=True)
 class PufferDriveConfig:
     """The observation of pufferlib's `drive`: 1,847 numbers with its own settings.
 
@@ -351,6 +375,7 @@ class SensorsConfig:
     occupancy_grid: OccupancyGridConfig = field(default_factory=OccupancyGridConfig)
     lidar_observation: LidarObservationConfig = field(default_factory=LidarObservationConfig)
     roadgraph: RoadgraphConfig = field(default_factory=RoadgraphConfig)
+    messages: MessagesConfig = field(default_factory=MessagesConfig)
     puffer_drive: PufferDriveConfig = field(default_factory=PufferDriveConfig)
 
     def __post_init__(self) -> None:
@@ -366,9 +391,26 @@ class SensorsConfig:
             len(self.occupancy_grid.features),
             self.lidar_observation.cells,
             self.roadgraph.points,
+            self.messages.objects,
+            self.messages.events,
+            self.messages.signal,
             self.puffer_drive.enabled,
         )
         check(any(counts), "sensors", "all off", "an agent must observe something; switch one on")
+
+    def without_sight(self) -> SensorsConfig:
+        """The same without those that look at others or at signals."""
+        return replace(
+            self,
+            neighbors=replace(self.neighbors, count=0),
+            signal=replace(self.signal, enabled=False),
+            lanes=replace(self.lanes, range_m=0.0),
+            lidar=replace(self.lidar, rays=0),
+            kinematics=replace(self.kinematics, vehicles_count=0),
+            occupancy_grid=replace(self.occupancy_grid, features=()),
+            lidar_observation=replace(self.lidar_observation, cells=0),
+            puffer_drive=replace(self.puffer_drive, enabled=False),
+        )
 
 
 def _is_range(bounds: tuple[float, ...]) -> bool:

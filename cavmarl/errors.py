@@ -9,6 +9,7 @@
     ├── MapError               a map that cannot be read, built or driven
     │   └── RouteError         no way from here to there
     ├── DemandError            a file of traffic that cannot be read or does not fit its map
+    ├── ScenarioError          a scenario that is none, or has no place on the map
     ├── ActionError            refused before any state has changed
     │   ├── InvalidActionError    wrong shape, dtype or value
     │   ├── MissingActionError    a live agent without an action
@@ -41,11 +42,22 @@
     │   └── JournalError          a log that cannot be written or replayed
     │       ├── TornJournalError     only its last line is cut short
     │       └── CorruptJournalError  a line is damaged, missing or out of order
+    ├── ClockError             time that somebody else than its master advances, or wants to
+    │   ├── SecondMasterError     there is a time master already
+    │   ├── TickRefusedError      who follows does not tick
+    │   └── ClockDriftError       a world is not where its master has left it
+    ├── FollowerError          an external stack with which it cannot go on
+    │   ├── FollowerLostError     it, or the connection to it, has ended
+    │   │   └── FollowerTimeoutError   it has not answered in time
+    │   ├── FollowerMessageError  what it says cannot be understood
+    │   └── ControlError          controls that cannot be carried out
     ├── NoAdmissibleWorkerError   every worker is too busy to be given a shard
     ├── WorkerError            worker processes that cannot go on
     │   ├── WorkerStartError      no process, or no memory for it
     │   ├── WorkerDeathError      every process that took up a step died of it
+    │   ├── SensorFrameError      a frame that is not of the present tick
     │   └── WorkerFailureError    an exception in a worker, with its traceback
+    ├── V2xError               a message that cannot be read, or an impossible reception
     ├── SumoError              SUMO as global traffic that cannot go on
     │   ├── SumoBusyError         a second simulation in one process
     │   ├── SumoDiedError         its process ended, or hangs
@@ -66,7 +78,10 @@ __all__ = [
     "ActionError",
     "CapacityError",
     "CavmarlError",
+    "ClockDriftError",
+    "ClockError",
     "ConfigError",
+    "ControlError",
     "CorruptJournalError",
     "CorruptMessageError",
     "CoverageError",
@@ -74,6 +89,10 @@ __all__ = [
     "EpisodeEndedError",
     "EpisodeError",
     "EvaluationError",
+    "FollowerError",
+    "FollowerLostError",
+    "FollowerMessageError",
+    "FollowerTimeoutError",
     "ForeignRunError",
     "ForeignTransferError",
     "InvalidActionError",
@@ -92,12 +111,15 @@ __all__ = [
     "ReproducerError",
     "ResetNeededError",
     "RouteError",
+    "SecondMasterError",
+    "SensorFrameError",
     "SpawnError",
     "StoreError",
     "SumoBusyError",
     "SumoDiedError",
     "SumoError",
     "SumoStateError",
+    "TickRefusedError",
     "TornJournalError",
     "TransferError",
     "TransferLayoutError",
@@ -109,6 +131,7 @@ __all__ = [
     "UnknownAgentError",
     "UnknownEnvironmentError",
     "UnknownVersionError",
+    "V2xError",
     "WorkerDeathError",
     "WorkerError",
     "WorkerFailureError",
@@ -142,6 +165,10 @@ class CoverageError(ConfigError):
 
 class PlacementError(ConfigError):
     """Loads, weights or workers by which no shard can be placed."""
+
+
+class ScenarioError(CavmarlError):
+    """No scenario of that name, a broken file of one, or a map without a place for it."""
 
 
 class MapError(CavmarlError):
@@ -186,6 +213,10 @@ class EpisodeEndedError(EpisodeError):
 
 class CapacityError(CavmarlError):
     """More vehicles, agents or points than this world can take."""
+
+
+class V2xError(CavmarlError):
+    """Bytes that are no message, an unknown cause, or a network simulator that answers nonsense."""
 
 
 class EvaluationError(CavmarlError):
@@ -340,6 +371,42 @@ class CorruptJournalError(JournalError):
     """A line of the log is damaged, missing or out of order."""
 
 
+class ClockError(CavmarlError):
+    """Time that somebody else than its master advances, or wants to."""
+
+
+class SecondMasterError(ClockError):
+    """An environment that has a time master was given another."""
+
+
+class TickRefusedError(ClockError):
+    """Somebody who is not the time master wanted to advance the world."""
+
+
+class ClockDriftError(ClockError):
+    """A world is not at the tick at which its time master has left it."""
+
+
+class FollowerError(CavmarlError):
+    """An external stack with which it cannot go on; the world is whole and can be stepped on."""
+
+
+class FollowerLostError(FollowerError):
+    """A follower, or the connection to it, has ended."""
+
+
+class FollowerTimeoutError(FollowerLostError):
+    """A follower has not answered in time."""
+
+
+class FollowerMessageError(FollowerError):
+    """A follower has sent what cannot be understood, or is not due."""
+
+
+class ControlError(FollowerError):
+    """Controls of a follower that cannot be carried out: not numbers, out of range, missing."""
+
+
 class NoAdmissibleWorkerError(CavmarlError):
     """Every worker is too busy, or does not answer.
 
@@ -380,6 +447,23 @@ class WorkerDeathError(WorkerError):
             "workers=0 runs the same in this process"
         )
         self.worker, self.part, self.order, self.causes = worker, part, order, tuple(causes)
+
+
+class SensorFrameError(WorkerError):
+    """A sensor worker has delivered a frame that is not of the present tick.
+
+    Attributes:
+        sensor: its name in the rig.
+        tick: that was to be sensed.
+        found: tick of the frame; -1: there is none.
+    """
+
+    def __init__(self, sensor: str, tick: int, found: int) -> None:
+        super().__init__(
+            f"rig.{sensor}: the frame of tick {tick} is not there, but one of tick {found}; "
+            "sensor_workers=0 senses in this process"
+        )
+        self.sensor, self.tick, self.found = sensor, tick, found
 
 
 class WorkerFailureError(WorkerError):

@@ -10,7 +10,7 @@ import difflib
 import importlib.util
 import inspect
 from abc import ABC, abstractmethod
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from operator import attrgetter
 from os.path import isdir, isfile
 from pathlib import Path
@@ -74,15 +74,16 @@ class Policy(ABC):
         index = {agent: k for k, agent in enumerate(env.possible_agents)}
         live = [agent for agent in env.agents if agent in observations]
         size = flat_observation_space(env.config).shape[0]
-        parts = observation_parts(env.config.sensors)
+        names: Iterable[str] = observation_parts(env.config.sensors)
+        stack = env.config.sensors.stack
+        if env.config.observation.mode == "sensors":
+            names, stack = env.config.rig, 1
         batch = np.zeros((1, len(index), size), dtype=np.float32)
         mask = np.zeros((1, len(index)), dtype=np.bool_)
         for agent in live:
             seen = observations[agent]
             batch[0, index[agent]] = (
-                flat_observation(parts, seen, env.config.sensors.stack)
-                if isinstance(seen, Mapping)
-                else seen
+                flat_observation(names, seen, stack) if isinstance(seen, Mapping) else seen
             )
             mask[0, index[agent]] = True
         actions = self.act_batch(batch, mask)[0]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -12,6 +12,9 @@ from gymnasium import spaces
 from numpy.typing import DTypeLike, NDArray
 
 from cavmarl.config import ActionConfig, EnvConfig, SensorsConfig
+from cavmarl.config_rig import samples_per_step
+from cavmarl.rig.catalogue import type_of
+from cavmarl.rig.frames import Frames
 from cavmarl.shard.sensors import SENSORS, Feature, layout
 
 __all__ = [
@@ -20,11 +23,14 @@ __all__ = [
     "action_space",
     "flat_observation",
     "flat_observation_space",
+    "frames_space",
     "named_observation",
     "observation_parts",
     "observation_space",
     "observation_table",
+    "sensed_observation",
     "state_space",
+    "write_sensed",
 ]
 
 # Features of one vehicle in the global state: present, x, y, cos, sin, speed.
@@ -40,11 +46,34 @@ def flat_observation_space(config: EnvConfig) -> spaces.Box:
     """All features of all sensors in one Box, whatever `observation.kind` says.
 
     Within [-1, 1], but for features that are left unscaled. With `sensors.stack` the frames follow
-    one another, oldest first.
+    one another, oldest first. In the mode `sensors`, the samples of the rig in its order.
     """
+    if config.observation.mode == "sensors":
+        boxes = [_frame_box(config, name) for name in config.rig]
+        low = np.concatenate([box.low.ravel() for box in boxes]).astype(np.float32)
+        high = np.concatenate([box.high.ravel() for box in boxes]).astype(np.float32)
+        return spaces.Box(low, high, dtype=np.float32)
     features = [feature for sensor in SENSORS for feature in sensor.features(config.sensors)]
     stack = config.sensors.stack
     return _feature_box(features * stack, (stack * len(features),), np.float32)
+
+
+def frames_space(config: EnvConfig) -> spaces.Dict:
+    """The latest samples of each sensor of the rig, one Box each.
+
+    A sensor that takes several samples in a step has them as the first axis.
+    """
+    return spaces.Dict({name: _frame_box(config, name) for name in config.rig})
+
+
+def _frame_box(config: EnvConfig, name: str) -> spaces.Box:
+    sensor, clock = config.rig[name], config.clock
+    kind = type_of(name, sensor)
+    slots = samples_per_step(sensor, clock.sim_dt_s, clock.ticks_per_step)
+    shape = (slots, *sensor.shape) if slots > 1 else sensor.shape
+    dtype = np.dtype(kind.dtype).type
+    low, high = (np.broadcast_to(bound, shape).astype(dtype) for bound in kind.bounds(sensor))
+    return spaces.Box(low, high, shape, dtype)
 
 
 def observation_space(config: EnvConfig) -> spaces.Box | spaces.Dict:
@@ -52,6 +81,8 @@ def observation_space(config: EnvConfig) -> spaces.Box | spaces.Dict:
 
     With `sensors.stack` the Boxes of a Dict have the frames as their first axis.
     """
+    if config.observation.kind == "dict" and config.observation.mode == "sensors":
+        return frames_space(config)
     if config.observation.kind == "flat":
         return flat_observation_space(config)
     sensors = {sensor.name: sensor for sensor in SENSORS}
@@ -106,6 +137,14 @@ def observation_parts(config: SensorsConfig) -> dict[str, ObservationPart]:
     return parts
 
 
+def sensed_observation(frames: Frames) -> dict[str, NDArray[Any]]:
+    """The frames of W worlds as observations of mode `sensors`: views (W, A, …) by sensor."""
+    return {
+        name: sensor.data if sensor.data.shape[2] > 1 else sensor.data[:, :, 0]
+        for name, sensor in frames.items()
+    }
+
+
 def named_observation(
     parts: Mapping[str, ObservationPart], frames: NDArray[np.float32]
 ) -> dict[str, NDArray[Any]]:
@@ -126,17 +165,28 @@ def named_observation(
 
 
 def flat_observation(
-    parts: Mapping[str, ObservationPart], named: Mapping[str, NDArray[Any]], stack: int
+    names: Iterable[str], named: Mapping[str, NDArray[Any]], stack: int
 ) -> NDArray[np.float32]:
     """The flat observation (stack · frame size,) of one that is named by sensor.
 
     Args:
-        parts: of `observation_parts`.
+        names: of the sensors in the order of the flat observation.
         named: an array a sensor, in any order.
         stack: frames in an observation.
     """
-    frames = [np.asarray(named[name], np.float32).reshape(stack, -1) for name in parts]
+    frames = [np.asarray(named[name], np.float32).reshape(stack, -1) for name in names]
     return np.concatenate(frames, axis=1).ravel()
+
+
+def write_sensed(
+    frames: Frames, chosen: NDArray[np.bool_], observations: NDArray[np.float32]
+) -> None:
+    """Write the frames of the chosen worlds (W,) into flat observations (W, A, D)."""
+    start = 0
+    for sensor in frames.values():
+        flat = sensor.data.reshape(*sensor.fresh.shape, -1)
+        observations[chosen, :, start : start + flat.shape[2]] = flat[chosen]
+        start += flat.shape[2]
 
 
 def action_space(config: ActionConfig) -> spaces.Box | spaces.Discrete:

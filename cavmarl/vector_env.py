@@ -5,10 +5,9 @@ from __future__ import annotations
 import time
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, TypeAlias
 
 import numpy as np
-from gymnasium import spaces
 from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
@@ -16,23 +15,34 @@ from numpy.typing import NDArray
 from cavmarl.actions import ActionDecoder
 from cavmarl.balance.plan import Plan
 from cavmarl.balance.plan_text import describe_plan
+from cavmarl.declared_events import DeclaredEvents
 from cavmarl.errors import ConfigError, ResetNeededError
 from cavmarl.registry import load_config
+from cavmarl.rig.frames import SensorFrames
 from cavmarl.runtime.simulation import Simulation
 from cavmarl.seeds import check_seed, first_seed
-from cavmarl.spaces import action_space, flat_observation_space
+from cavmarl.shard.shard import Commands
+from cavmarl.spaces import (
+    action_space,
+    flat_observation_space,
+    frames_space,
+    sensed_observation,
+)
 from cavmarl.stepping.arrays import SteppedWorlds
-from cavmarl.stepping.local import LocalWorlds
 from cavmarl.stepping.pooled import PooledWorlds
 from cavmarl.stepping.remote import RemoteWorlds
+from cavmarl.stepping.sensing import local_worlds
 from cavmarl.worlds import check_agents, check_hosts, check_workers, make_world
 
 __all__ = ["CavVectorEnv", "make_vec"]
 
 MAX_WORLDS = 65_536
 
+Observations: TypeAlias = Any
+"""(W, A, D) float32, or an array (W, A, …) a sensor of the rig."""
+
 StepResult = tuple[
-    NDArray[np.float32],
+    Observations,
     NDArray[np.float32],
     NDArray[np.bool_],
     NDArray[np.bool_],
@@ -47,6 +57,7 @@ def make_vec(
     zones: int | None = None,
     workers: int | Literal["ray"] | None = None,
     hosts: Literal["ray"] | None = None,
+    sensor_workers: int | None = None,
     agents: int | None = None,
     background: int | None = None,
     seed: int | None = None,
@@ -66,6 +77,8 @@ def make_vec(
             Results do not depend on it. "ray": as with hosts="ray", as many as CPUs and worlds.
         hosts: "ray" runs the workers on the machines of a Ray cluster (docs/cluster.md), whole
             worlds each. None: on this one.
+        sensor_workers: shadows workers.sensors, how many processes the sensors of `rig` are shared
+            out over (docs/sensor_workers.md). Results do not depend on it.
         agents: shadows population.agents.
         background: shadows population.background.
         seed: of the first reset, if that is given none.
@@ -93,6 +106,7 @@ def make_vec(
     config, base_dir = load_config(
         env,
         zones=zones,
+        sensor_workers=sensor_workers,
         agents=agents,
         background=background,
         max_cycles=max_cycles,
@@ -106,7 +120,7 @@ def make_vec(
     elif num_workers:
         worlds = PooledWorlds(world, base_dir, num_envs, num_workers, in_next_step)
     else:
-        worlds = LocalWorlds(world, num_envs, in_next_step=in_next_step)
+        worlds = local_worlds(world, base_dir, num_envs, in_next_step)
     return CavVectorEnv(worlds, seed=first_seed, copy=copy)
 
 
@@ -125,7 +139,10 @@ def _in_next_step(mode: AutoresetMode | str) -> bool:
 
 
 class CavVectorEnv:
-    """W worlds with A agent seats each; observations are flat, whatever `observation.kind` says.
+    """W worlds with A agent seats each; ground truth is flat, whatever `observation.kind` says.
+
+    With `observation.mode: sensors` and `observation.kind: dict`, observations are dicts: an array
+    (num_envs, num_agents, …) a sensor of the rig.
 
     Arrays have the shape (num_envs, num_agents, …). `infos["mask"]` says which agents have a
     vehicle and will be asked for the next action; the others' observations are 0 and their actions
@@ -161,7 +178,11 @@ class CavVectorEnv:
         self.num_envs = num_envs = len(worlds.arrays.mask)
         self.possible_agents = [f"car_{k}" for k in range(config.population.num_ids)]
         self.num_agents = len(self.possible_agents)
-        self.single_observation_space: spaces.Box = flat_observation_space(config)
+        form = config.observation
+        self._senses = form.mode == "sensors" and form.kind == "dict"
+        self.single_observation_space: Any = (
+            frames_space(config) if self._senses else flat_observation_space(config)
+        )
         self.single_action_space = action_space(config.action)
         self.observation_space = batch_space(
             batch_space(self.single_observation_space, self.num_agents), num_envs
@@ -176,8 +197,13 @@ class CavVectorEnv:
                 AutoresetMode.NEXT_STEP if worlds.in_next_step else AutoresetMode.SAME_STEP
             ),
         }
-        self._decoder = ActionDecoder(config.action, num_envs, self.possible_agents)
+        arrays = worlds.arrays
+        commands = Commands(arrays.controls, arrays.meta_actions)
+        self._decoder = ActionDecoder(config.action, num_envs, self.possible_agents, commands)
+        self._view = arrays.observations.view()
+        self._view.flags.writeable = False
         self._mask = np.zeros((num_envs, self.num_agents), dtype=np.bool_)
+        self._events = DeclaredEvents(config, num_envs)
         self._first_seed = None if seed is None else check_seed(seed)
         self._copy = copy
         self._ready = False
@@ -216,7 +242,7 @@ class CavVectorEnv:
 
     def reset(
         self, seed: int | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[NDArray[np.float32], dict[str, NDArray[Any]]]:
+    ) -> tuple[Observations, dict[str, NDArray[Any]]]:
         """Begin an episode in every world, or in some.
 
         Args:
@@ -287,16 +313,14 @@ class CavVectorEnv:
             raise ResetNeededError("step() before reset(): call vec.reset(seed=…) first")
         commands = self._decoder.from_array(actions, self._mask)
         began = time.perf_counter()
-        self.worlds.step(commands)
+        self.worlds.step(self._events.add_to(commands))
         self.simulated_s += time.perf_counter() - began
         arrays = self.worlds.arrays
         over = arrays.episode_over.copy()
         terminations = arrays.terminations.copy()
         observations = final_observations = self._observations()
-        ended = over | terminations.any(axis=1)
-        if ended.any():
-            final_observations = arrays.observations.copy()
-            final_observations[ended] = arrays.final_observations[ended]
+        if np.count_nonzero(over) or np.count_nonzero(terminations):
+            final_observations = self._final_observations(over | terminations.any(axis=1))
             self._decoder.forget(over)
         self._mask = arrays.mask.copy()
         infos: dict[str, NDArray[Any]] = {
@@ -310,13 +334,69 @@ class CavVectorEnv:
         }
         return observations, arrays.rewards.copy(), terminations, arrays.truncations.copy(), infos
 
-    def _observations(self) -> NDArray[np.float32]:
-        observations = self.worlds.arrays.observations
+    def _observations(self) -> Observations:
+        arrays = self.worlds.arrays
+        if not self._senses:
+            return arrays.observations.copy() if self._copy else self._view
+        left = arrays.terminations & ~arrays.episode_over[:, None]
+        if self.worlds.in_next_step or not left.any():
+            sensed = sensed_observation(arrays.frames)
+            return {name: self._given(data) for name, data in sensed.items()}
+        found = {name: data.copy() for name, data in sensed_observation(arrays.frames).items()}
+        for data in found.values():
+            data[left] = 0
+        return found
+
+    def _given(self, array: NDArray[Any]) -> NDArray[Any]:
+        """A copy, or a view that cannot be written."""
         if self._copy:
-            return observations.copy()
-        view = observations.view()
+            return array.copy()
+        view = array.view()
         view.flags.writeable = False
         return view
+
+    def declare_event(self, world: int, agent: int, cause: str) -> None:
+        """Let the vehicle of an agent, by index, tell others of an event in the next step.
+
+        Args:
+            world: in which it drives.
+            agent: index in `possible_agents`.
+            cause: as of `CavEnv.declare_event`.
+
+        Raises:
+            UnknownAgentError: no such agent.
+            V2xError: no such cause, or nobody says anything in this environment.
+        """
+        self._events.declare(world, agent, cause)
+
+    def _final_observations(self, ended: NDArray[np.bool_]) -> Observations:
+        """The observations, and of the worlds (W,) where something ended those before that."""
+        arrays = self.worlds.arrays
+        if not self._senses:
+            return _with_rows(arrays.observations, arrays.final_observations, ended)
+        last = sensed_observation(arrays.final_frames)
+        return {
+            name: _with_rows(data, last[name], ended)
+            for name, data in sensed_observation(arrays.frames).items()
+        }
+
+    def frames(self) -> dict[str, SensorFrames]:
+        """What the sensors of `rig` have got in the last step, by name; see docs/sensors.md.
+
+        Agents whose vehicle ended in the step have its last samples. Of a world that begins anew in
+        the same step it is what the new episode begins with. With `copy=False` they are arrays that
+        the next step overwrites.
+        """
+        frames = self.worlds.arrays.frames
+        return {name: sensor.copy() if self._copy else sensor for name, sensor in frames.items()}
+
+    def final_frames(self) -> dict[str, SensorFrames]:
+        """As `frames`, of the worlds where something ended in the last step, before the reset.
+
+        Those of other worlds are older, or zeros.
+        """
+        frames = self.worlds.arrays.final_frames
+        return {name: sensor.copy() for name, sensor in frames.items()}
 
     def suggest_actions(self) -> NDArray[Any]:
         """What the built-in driver (IDM, MOBIL, lane controller) would do in each agent's place."""
@@ -342,3 +422,12 @@ class CavVectorEnv:
     def close(self) -> None:
         """End the worker processes, if there are any; arrays that were returned stay."""
         self.worlds.close()
+
+
+def _with_rows(
+    array: NDArray[Any], others: NDArray[Any], chosen: NDArray[np.bool_]
+) -> NDArray[Any]:
+    """A copy of an array (W, …) with the chosen rows (W,) of another one."""
+    found = array.copy()
+    found[chosen] = others[chosen]
+    return found

@@ -10,9 +10,11 @@ import numpy as np
 
 from cavmarl.config import EnvConfig
 from cavmarl.errors import ConfigError
+from cavmarl.maps.buildings import with_buildings
 from cavmarl.maps.netconvert import map_file
 from cavmarl.registry import (
     load_config,
+    resolve_buildings,
     resolve_demand,
     resolve_map,
     resolve_programs,
@@ -26,6 +28,7 @@ from cavmarl.roads.zone_layouts import cut_map
 from cavmarl.roads.zones import ZonePartition
 from cavmarl.traffic.demand import DemandFile, read_demand
 from cavmarl.traffic.native import capacity_of
+from cavmarl.traffic.scenarios import plan_scene
 from cavmarl.traffic.sumo.demand import SumoDemand, read_sumo_demand
 from cavmarl.traffic.sumo.input import read_input
 
@@ -62,7 +65,9 @@ class World(NamedTuple):
         """How many vehicles it can hold."""
         config = self.config
         dt, horizon_s = config.clock.sim_dt_s, config.horizon_s
-        return capacity_of(self.network, config.population, self.demand, dt, horizon_s)
+        room = capacity_of(self.network, config.population, self.demand, dt, horizon_s)
+        scene = plan_scene(config.scenario, self.network)
+        return room + (0 if scene is None else len(scene.actors))
 
 
 def load_world(
@@ -118,16 +123,19 @@ def make_world(config: EnvConfig, base_dir: Path) -> World:
 
 
 def load_roads(config: EnvConfig, base_dir: Path) -> RoadNetwork:
-    """The roads of a configuration, with the signal programs that it names.
+    """The roads of a configuration, with the buildings and the signal programs that it names.
 
     Args:
         config: of the environment.
         base_dir: the folder that relative files start from.
 
     Raises:
-        MapError: the map or a file of programs cannot be read, or they do not fit.
+        MapError: the map or a file of buildings or programs cannot be read, or they do not fit.
     """
     network = load_network(map_file(resolve_map(config, base_dir)))
+    buildings = resolve_buildings(config, base_dir)
+    if buildings is not None:
+        network = with_buildings(network, buildings)
     return with_programs(network, resolve_programs(config, base_dir), config.map.program)
 
 

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cavmarl.config import EnvConfig
+from cavmarl.errors import ConfigError
 from cavmarl.spaces import named_observation, observation_parts, observation_space
 
 __all__ = ["ObservationForm"]
@@ -23,14 +24,21 @@ class ObservationForm:
 
     Attributes:
         space: of one agent: a flat Box, or a Dict with one Box a sensor.
+
+    Raises:
+        ConfigError: samples of sensors in a form that this cannot give.
     """
 
     def __init__(self, config: EnvConfig) -> None:
+        form = config.observation
+        if form.mode != "ground_truth" and form.kind != "flat":
+            raise ConfigError(
+                f"observation.mode = {form.mode!r}, observation.kind = {form.kind!r}: this adapter "
+                "gives flat numbers; use observation.kind = flat, or make_vec or parallel_env"
+            )
         self.space = observation_space(config)
         self._stack = config.sensors.stack
-        self._parts = (
-            observation_parts(config.sensors) if config.observation.kind == "dict" else None
-        )
+        self._parts = observation_parts(config.sensors) if form.kind == "dict" else None
 
     def __call__(self, flat: NDArray[np.float32]) -> Observations:
         """Observations of any number of agents: (…, D) as they are, or (…, *shape) a sensor."""

@@ -55,7 +55,7 @@ def make_jobs(recipe: Mapping[str, Any]) -> list[Job]:
     """
     config = validate(EnvConfig, recipe["config"], "the environment")
     layout = layout_of(config, recipe["capacity"], recipe["num_worlds"])
-    arrays = StepArrays(**arrays_in(Segment(recipe["arrays"], 0).map(), layout))
+    arrays = StepArrays.of(arrays_in(Segment(recipe["arrays"], 0).map(), layout))
     return [TrivialJob(arrays.part(first, last)) for first, last, _ in recipe["parts"]]
 
 

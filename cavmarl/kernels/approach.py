@@ -11,9 +11,18 @@ from numpy.typing import NDArray
 from cavmarl.kernels import inlined_kernel, kernel
 from cavmarl.kernels.arrays import RoadArrays, Scratch, Travel
 from cavmarl.kernels.buckets import add, forget, lay_out
+from cavmarl.kernels.codes import DRIVER_SCRIPTED
 from cavmarl.kernels.ways import leave, next_step, own_step
 
-__all__ = ["APPROACH", "APPROACH_M", "FORK_BEYOND_M", "register_links"]
+__all__ = [
+    "APPROACH",
+    "APPROACH_M",
+    "APPROACH_S",
+    "APPROACH_STANDING_M",
+    "FORK_BEYOND_M",
+    "MAX_LINKS_AHEAD",
+    "register_links",
+]
 
 APPROACH_M = 150.0  # how far ahead a vehicle announces itself at most,
 APPROACH_S = 8.0  # which it does this time before it arrives,
@@ -65,11 +74,16 @@ def register_links(
         # and a loop that does nothing else has many of them under way at once. And most rows are
         # where they were a tick before, with the same vehicle on the same lane.
         for i in range(first, last):
+            if rows[i]["driver"] == DRIVER_SCRIPTED:
+                continue
             at = own_step(roads, rows[i])
             if at + 1 != step_at[i] or at >= travel.num_fixed:
                 step[i] = travel.steps[at]
                 step_at[i] = at + 1
         for i in range(first, last):
+            if rows[i]["driver"] == DRIVER_SCRIPTED:
+                pairs = _announce_claims(travel, rows[i], i, pairs, scratch)
+                continue
             pairs = _announce(roads, travel, rows[i], i, step[i], pairs, scratch)
     end = scratch.link_end
     forget(scratch.links)
@@ -92,6 +106,16 @@ def _note(scratch: Scratch, pairs: int, link: int, row: np.void, i: int, dist: f
     pair["half"] = 0.5 * row["length"]
     pair["id"] = row["id"]
     return pairs + 1
+
+
+@kernel
+def _announce_claims(travel: Travel, row: np.void, i: int, pairs: int, scratch: Scratch) -> int:
+    """`_announce` for a row that follows a script, which says where it will be."""
+    frame = travel.scripts.frames[row["goal"]]
+    for c in range(frame["first_claim"], frame["first_claim"] + frame["num_claims"]):
+        claim = travel.scripts.claims[c]
+        pairs = _note(scratch, pairs, claim["link"], row, i, claim["dist"])
+    return pairs
 
 
 @inlined_kernel

@@ -22,6 +22,7 @@ __all__ = [
     "Outputs",
     "RoadArrays",
     "Scratch",
+    "Scripts",
     "Sensors",
     "Travel",
     "Worlds",
@@ -61,6 +62,17 @@ class LaneGrid(NamedTuple):
     cell_lanes: NDArray[np.int32]
 
 
+class Scripts(NamedTuple):
+    """Where scripted vehicles and pedestrians are, tick by tick; see `traffic.scripts`."""
+
+    frames: NDArray[np.void]  # FRAME (num_frames,), by VEHICLE["goal"] of a scripted row
+    covers: NDArray[np.void]  # COVER (num_covers,) of lanes by bodies
+    claims: NDArray[np.void]  # CLAIM (num_claims,) of links by who will be there soon
+    cues: NDArray[np.void]  # CUE (T,) what scripts wait for
+    room: int  # lanes that all of them can cover at the same time
+    reach_m: float  # the farthest from a body to the middle of a stretch that it covers
+
+
 class Travel(NamedTuple):
     """What vehicles are and which ways there are; the same for all worlds of an environment."""
 
@@ -72,6 +84,7 @@ class Travel(NamedTuple):
     view_m: float  # how far anybody looks for others along the road, at most VIEW_M
     see_m: float  # how far before a line its centre is when anybody first asks about the junction
     num_fixed: int  # steps from here on are written while the world runs
+    scripts: Scripts
 
 
 class Common(NamedTuple):
@@ -83,6 +96,7 @@ class Common(NamedTuple):
     controllers: NDArray[np.void]
     detected_s: NDArray[np.float64]
     pending: NDArray[np.float64]
+    cues: NDArray[np.int64]
 
 
 class Worlds(NamedTuple):
@@ -112,6 +126,7 @@ class Worlds(NamedTuple):
     step_at: NDArray[np.int64]  # (W, C) 1 + which of `Travel.steps` that is, 0: none yet
     outer: NDArray[np.int32]  # (W, C) owned next rows that other zones may see, rising
     num_outer: NDArray[np.int64]  # (W,) -1: nobody has noted them since rows have changed
+    cues: NDArray[np.int64]  # (W, T) the tick in which each cue of the script came, -1: not yet
 
 
 class Zoned(NamedTuple):
@@ -177,7 +192,7 @@ class Scratch(NamedTuple):
     lanes: Lists  # by lane, lists of entries
     lane_start: NDArray[np.int32]  # entries of lane l: [lane_start[l], lane_end[l]); at L: of all.
     lane_end: NDArray[np.int32]  # Both are views of `lanes.bounds`: one look into memory
-    entries: NDArray[np.void]  # ENTRY (2 C,) vehicles by (lane, s, id), side lanes included
+    entries: NDArray[np.void]  # ENTRY (2 C + Scripts.room,) by (lane, s, id), with side lanes
     links: Lists  # by link, lists of approach
     link_start: NDArray[np.int32]  # approach of link k: [link_start[k], link_end[k])
     link_end: NDArray[np.int32]

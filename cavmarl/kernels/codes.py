@@ -5,7 +5,11 @@ from __future__ import annotations
 # VEHICLE["driver"]
 DRIVER_BACKGROUND = 0  # moves along lanes, driven by the models of kernels/drivers.py
 DRIVER_AGENT = 1  # kinematic bicycle, driven by actions
-DRIVER_SUMO = 2  # moved by SUMO, mirrored here
+DRIVER_SCRIPTED = 2  # goes where its script says: pedestrians, vehicles of scenarios
+
+# VTYPE["vclass"] of who walks; the classes that drive are positions in network.VEHICLE_CLASSES
+CLASS_PEDESTRIAN = 9
+DRIVER_SUMO = 3  # moved by SUMO, mirrored here
 
 # VTYPE["model"]: how a background driver follows its leader
 MODEL_KRAUSS = 0

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from cavmarl.kernels import kernel
 from cavmarl.kernels.arrays import RoadArrays
+from cavmarl.kernels.codes import DRIVER_SCRIPTED
 
 __all__ = ["CLOSED_S", "limit_speeds", "sample_speeds", "slow_lanes"]
 
@@ -57,7 +58,8 @@ def sample_speeds(
 ) -> None:
     """Sample the mean speed of every edge; the sample takes the place of the oldest one.
 
-    A lane without vehicles counts as one vehicle at its limit; who makes a stop does not count.
+    A lane without vehicles counts as one vehicle at its limit; who makes a stop or follows a
+    script does not count.
 
     Args:
         roads: the road arrays.
@@ -72,7 +74,7 @@ def sample_speeds(
     lane_counts[:] = 0
     lane_sums[:] = 0
     for i in range(num):
-        if rows[i]["stopped_s"] > 0.0:
+        if rows[i]["stopped_s"] > 0.0 or rows[i]["driver"] == DRIVER_SCRIPTED:
             continue
         lane_counts[rows[i]["lane"]] += 1
         lane_sums[rows[i]["lane"]] += _millimetres(rows[i]["speed"])

@@ -1,8 +1,9 @@
 """Who is where on which lane: an index over the vehicles of one world, and searches along it.
 
 The index lists, lane by lane, the vehicles on it by rising (s, id). A vehicle whose body also
-covers a neighbour lane stands in both lists. What others look at is copied into the entries, which
-lie together in memory. Nothing here depends on the order of rows.
+covers a neighbour lane stands in both lists, who follows a script in those of all lanes that it
+covers or is about to cover. What others look at is copied into the entries, which lie together in
+memory. Nothing here depends on the order of rows.
 """
 
 from __future__ import annotations
@@ -15,6 +16,7 @@ from numpy.typing import NDArray
 from cavmarl.kernels import inlined_kernel, kernel
 from cavmarl.kernels.arrays import RoadArrays, Scratch, Travel
 from cavmarl.kernels.buckets import add, forget, lay_out
+from cavmarl.kernels.codes import DRIVER_SCRIPTED
 from cavmarl.kernels.geometry import segment_at
 
 __all__ = [
@@ -24,11 +26,13 @@ __all__ = [
     "behind_on",
     "beside_s",
     "index_lanes",
+    "is_off_lanes",
     "last_on",
     "neighbor_behind",
 ]
 
 MAX_LOOK_BACK_LANES = 4
+OFF_LANES_M = 1.5  # from the middle of the nearest lane
 VIEW_M = 250.0  # the farthest view along the road that a world can have
 
 ENTRY = np.dtype(
@@ -57,6 +61,13 @@ def beside_s(roads: RoadArrays, lane: int, neighbor: int, s: float) -> float:
     if neighbor == row["left"]:
         return float(point["left_s"] + share * (after["left_s"] - point["left_s"]))
     return float(point["right_s"] + share * (after["right_s"] - point["right_s"]))
+
+
+@inlined_kernel
+def is_off_lanes(row: np.void) -> bool:
+    """Whether a script has led a row off the lanes, so that its lane is only the nearest one."""
+    off: bool = row["driver"] == DRIVER_SCRIPTED and abs(row["d"]) > OFF_LANES_M
+    return off
 
 
 @inlined_kernel
@@ -89,12 +100,18 @@ def index_lanes(
     forget(scratch.lanes)
     for i in range(num):
         row = rows[i]
+        if row["driver"] == DRIVER_SCRIPTED:
+            _count_covers(travel, row, scratch)
+            continue
         add(scratch.lanes, row["lane"])
         if row["side_lane"] >= 0:
             add(scratch.lanes, row["side_lane"])
     scratch.lane_start[roads.lanes.shape[0]] = lay_out(scratch.lanes)
     for i in range(num):
         row = rows[i]
+        if row["driver"] == DRIVER_SCRIPTED:
+            _insert_covers(travel, row, i, scratch)
+            continue
         lane = row["lane"]
         _insert(scratch, travel.types, lane, row, i, row["s"], False)
         side = row["side_lane"]
@@ -114,17 +131,45 @@ def _insert(
     side: bool,
 ) -> None:
     """Put an entry among those of its lane that are there already, by (s, id)."""
+    k = _make_place(scratch, lane, s, row["id"])
+    _fill(scratch.entries[k], types, row, i, s, side)
+
+
+@inlined_kernel
+def _make_place(scratch: Scratch, lane: int, s: float, own_id: int) -> int:
+    """Where in the index the next entry of a lane comes, by (s, id); those behind it move up."""
     first = scratch.lane_start[lane]
     k = scratch.lane_end[lane]
     scratch.lane_end[lane] = k + 1
     entries = scratch.entries
     while k > first:
         before = entries[k - 1]
-        if before["s"] < s or (before["s"] == s and before["id"] < row["id"]):
+        if before["s"] < s or (before["s"] == s and before["id"] < own_id):
             break
         entries[k] = before
         k -= 1
-    _fill(entries[k], types, row, i, s, side)
+    return int(k)
+
+
+@kernel
+def _count_covers(travel: Travel, row: np.void, scratch: Scratch) -> None:
+    """Ask for the entries of a row that follows a script."""
+    frame = travel.scripts.frames[row["goal"]]
+    for c in range(frame["first_cover"], frame["first_cover"] + frame["num_covers"]):
+        add(scratch.lanes, travel.scripts.covers[c]["lane"])
+
+
+@kernel
+def _insert_covers(travel: Travel, row: np.void, i: int, scratch: Scratch) -> None:
+    """Put a row that follows a script onto all lanes that it covers, or is about to cover."""
+    frame = travel.scripts.frames[row["goal"]]
+    for c in range(frame["first_cover"], frame["first_cover"] + frame["num_covers"]):
+        cover = travel.scripts.covers[c]
+        k = _make_place(scratch, cover["lane"], cover["s"], row["id"])
+        entry = scratch.entries[k]
+        _fill(entry, travel.types, row, i, cover["s"], True)
+        entry["half"] = cover["half"]
+        entry["speed"] = cover["speed"]
 
 
 @kernel

@@ -150,7 +150,7 @@ def place_on_lane(roads: RoadArrays, travel: Travel, row: np.void) -> float:
 
 @inlined_kernel
 def account(row: np.void, before: Before, roads: RoadArrays, pace: float, dt: float) -> None:
-    """What motion of both kinds leaves in the record: rates, ways, waiting time.
+    """What motion of every kind leaves in the record: rates, ways, waiting time.
 
     `pace` is the speed over the limit with which the way would have been driven freely.
     """

@@ -16,6 +16,7 @@ from cavmarl.kernels import kernel
 from cavmarl.kernels.arrays import RoadArrays, Sensors, Travel
 from cavmarl.kernels.codes import SIGNAL_RED, SIGNAL_RED_YELLOW
 from cavmarl.kernels.junctions import link_signal
+from cavmarl.kernels.lanes import is_off_lanes
 from cavmarl.kernels.neighbors import LEVEL_HEIGHT_M, Grid, cell_columns, cell_rows
 from cavmarl.kernels.scalars import clamp
 from cavmarl.kernels.ways import next_step
@@ -224,6 +225,8 @@ def observe_lanes(
             if abs(body["z"] - row["z"]) > LEVEL_HEIGHT_M:
                 continue
             other = rows[body["row"]]
+            if is_off_lanes(other):
+                continue
             _observe_gap(roads, travel, row, other, row["lane"], OWN, range_m, out)
             if here["left"] >= 0:
                 _observe_gap(roads, travel, row, other, here["left"], LEFT, range_m, out)

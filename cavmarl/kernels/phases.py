@@ -97,6 +97,7 @@ def _worlds(members: Members, zone: int, side: int, next_side: int) -> Worlds:
         zoned.step_at[zone],
         zoned.outer[zone],
         zoned.num_outer[zone],
+        common.cues,
     )
 
 

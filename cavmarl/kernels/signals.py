@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from cavmarl.kernels import kernel
 from cavmarl.kernels.arrays import RoadArrays
+from cavmarl.kernels.lanes import is_off_lanes
 
 __all__ = [
     "DETECTOR_REACH_M",
@@ -60,6 +61,8 @@ def detect(
             detected_s[w] = 0.0
         for i in range(num_owned[w]):
             row = rows[w, i]
+            if is_off_lanes(row):
+                continue
             place = lane_place[row["lane"]]
             while place >= 0:
                 at = places[place]

@@ -20,6 +20,7 @@ from cavmarl.kernels.codes import (
     ACTION_SLOWER,
     DRIVER_AGENT,
     DRIVER_BACKGROUND,
+    DRIVER_SCRIPTED,
     EVENT_ARRIVED,
     EVENT_COLLIDED,
     EVENTS_THAT_END,
@@ -33,6 +34,7 @@ from cavmarl.kernels.lanes import index_lanes
 from cavmarl.kernels.motion import move_agent, move_background
 from cavmarl.kernels.neighbors import Grid
 from cavmarl.kernels.scalars import clamp
+from cavmarl.kernels.scripts import follow_script
 from cavmarl.kernels.steering import nearest_speed, steer_to_lane, take_meta_action
 from cavmarl.kernels.ways import own_step
 from cavmarl.kernels.zones import is_inside
@@ -83,9 +85,13 @@ def _keep_order(owned: int, scratch: Scratch) -> None:
 
 
 @kernel
-def _order_by_lane(roads: RoadArrays, owned: int, scratch: Scratch) -> None:
+def _order_by_lane(roads: RoadArrays, rows: NDArray[np.void], owned: int, scratch: Scratch) -> None:
     """The owned rows in the order of the index: neighbours on the road become so in memory."""
     found = 0
+    for i in range(owned):
+        if rows[i]["driver"] == DRIVER_SCRIPTED:  # it may stand in many lists, or in none
+            scratch.order[found] = i
+            found += 1
     for k in range(scratch.lane_start[roads.lanes.shape[0]]):
         entry = scratch.entries[k]
         if not entry["side"] and entry["row"] < owned:
@@ -201,7 +207,7 @@ def advance(
                 scratch,
             )
         if drivers and not in_place:
-            _order_by_lane(roads, owned, scratch)
+            _order_by_lane(roads, rows, owned, scratch)
         else:
             _keep_order(owned, scratch)
         through = 0
@@ -222,6 +228,9 @@ def advance(
                 accel, change = scratch.accel[i], scratch.lane_change[i]
                 move_background(roads, travel, row, step[i], accel, change, dt)
                 through += row["events"] & EVENT_ARRIVED
+            elif row["driver"] == DRIVER_SCRIPTED:
+                row["events"] = 0
+                follow_script(roads, travel, worlds.cues[w], row, dt)
             elif row["driver"] == DRIVER_AGENT:
                 _drive_agent(
                     roads,

@@ -7,7 +7,7 @@ import io
 import json
 import os
 import tempfile
-from dataclasses import fields
+from dataclasses import asdict, fields
 from pathlib import Path
 from typing import Any
 
@@ -27,6 +27,7 @@ from cavmarl.roads.network import (
     PROGRAM,
     SIGNAL,
     SWITCH,
+    GeoReference,
     RoadNetwork,
 )
 from cavmarl.roads.reader import map_name, read_network, source_hash
@@ -34,7 +35,7 @@ from cavmarl.roads.reader import map_name, read_network, source_hash
 __all__ = ["load_network"]
 
 # Raise this when the reader gives other rows for the same file; record types count by themselves.
-FORMAT = 15
+FORMAT = 16
 
 _DIGEST_BYTES = 32  # SHA-256 of the rest begins an entry: NumPy would stumble over a broken one
 
@@ -89,6 +90,8 @@ def _restore(entry: Path, name: str, digest: str) -> RoadNetwork | None:
     with np.load(io.BytesIO(content[_DIGEST_BYTES:]), allow_pickle=False) as stored:
         values: dict[str, Any] = {key: _thaw(stored[key], kind) for key, kind in _DTYPES.items()}
         values |= {key: tuple(json.loads(stored[key].tobytes())) for key in _IDS}
+        geo = json.loads(stored["geo"].tobytes())
+        values["geo"] = None if geo is None else GeoReference(**geo)
     return RoadNetwork(name=name, source_hash=digest, **values)
 
 
@@ -100,7 +103,8 @@ def _store(entry: Path, network: RoadNetwork) -> None:
         if field.name in _DTYPES:
             stored[field.name] = np.frombuffer(value.tobytes(), dtype=np.uint8)
         elif field.name in _IDS:
-            stored[field.name] = np.frombuffer(json.dumps(value).encode(), dtype=np.uint8)
+            stored[field.name] = _text(value)
+    stored["geo"] = _text(None if network.geo is None else asdict(network.geo))
     buffer = io.BytesIO()
     np.savez(buffer, allow_pickle=False, **stored)
     content = buffer.getvalue()
@@ -108,6 +112,10 @@ def _store(entry: Path, network: RoadNetwork) -> None:
     with tempfile.NamedTemporaryFile(dir=entry.parent, suffix=".tmp", delete=False) as target:
         target.write(hashlib.sha256(content).digest() + content)
     os.replace(target.name, entry)
+
+
+def _text(value: object) -> NDArray[np.uint8]:
+    return np.frombuffer(json.dumps(value).encode(), dtype=np.uint8)
 
 
 def _thaw(raw: NDArray[np.uint8], dtype: np.dtype[np.generic]) -> NDArray[np.void]:

@@ -14,7 +14,7 @@ Indices that point at nothing are -1.
 from __future__ import annotations
 
 import hashlib
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, field, fields
 from functools import cached_property
 from typing import Any
 
@@ -22,6 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cavmarl.kernels.arrays import RoadArrays
+from cavmarl.kernels.panorama import WALL
 from cavmarl.kernels.signals import DETECTOR_REACH_M
 
 __all__ = [
@@ -39,6 +40,7 @@ __all__ = [
     "SIGNAL_STATES",
     "SWITCH",
     "VEHICLE_CLASSES",
+    "GeoReference",
     "RoadNetwork",
     "content_of",
 ]
@@ -250,6 +252,21 @@ PLACE = np.dtype(
 )
 
 
+@dataclass(frozen=True)
+class GeoReference:
+    """Where a map lies on the earth: a place projected, plus the offset, is its x and y.
+
+    Attributes:
+        projection: parameters of PROJ.
+        offset_x_m: added to the east of the projection.
+        offset_y_m: added to its north.
+    """
+
+    projection: str
+    offset_x_m: float
+    offset_y_m: float
+
+
 @dataclass(frozen=True, eq=False)
 class RoadNetwork:
     """An immutable road map; see the module's docstring for frames and the dtypes for fields.
@@ -264,6 +281,10 @@ class RoadNetwork:
         phase_detectors: DETECTOR rows, see PHASE["first_detector"].
         lane_ids, edge_ids, junction_ids, signal_ids, program_ids: the source's names, by row.
         junction_kinds: SUMO's junction types that occur, by `JUNCTION["kind"]`.
+        geo: where it lies on the earth; None: the map does not say.
+        walls: WALL (num_walls,) of the buildings, if they were asked for; see `maps.buildings`.
+        roofs: (num_roofs, 4, 2) corners in m of the convex parts of their footprints.
+        roof_height: (num_roofs,) m over the ground.
     """
 
     name: str
@@ -288,10 +309,14 @@ class RoadNetwork:
     signal_ids: tuple[str, ...]
     program_ids: tuple[str, ...]
     junction_kinds: tuple[str, ...]
+    geo: GeoReference | None = None
+    walls: NDArray[np.void] = field(default_factory=lambda: np.zeros(0, WALL))
+    roofs: NDArray[np.float64] = field(default_factory=lambda: np.zeros((0, 4, 2)))
+    roof_height: NDArray[np.float64] = field(default_factory=lambda: np.zeros(0))
 
     def __post_init__(self) -> None:
-        for field in fields(self):
-            value = getattr(self, field.name)
+        for item in fields(self):
+            value = getattr(self, item.name)
             if isinstance(value, np.ndarray):
                 value.setflags(write=False)
 
@@ -371,12 +396,14 @@ class RoadNetwork:
     def content_hash(self) -> str:
         """SHA-256 over all arrays and ids, hex: two equal networks have equal hashes."""
         digest = hashlib.sha256()
-        for field in fields(self):
-            value = getattr(self, field.name)
+        for item in fields(self):
+            value = getattr(self, item.name)
             if isinstance(value, np.ndarray):
                 digest.update(content_of(value))
             elif isinstance(value, tuple):
                 digest.update("\0".join(value).encode())
+            elif isinstance(value, GeoReference):
+                digest.update(repr(value).encode())
         return digest.hexdigest()
 
 

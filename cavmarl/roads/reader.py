@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import math
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -16,7 +17,7 @@ from cavmarl.kernels.geometry import project
 from cavmarl.roads.conflicts import LinkPath, sample_path
 from cavmarl.roads.detectors import DetectorRoads, place_detectors
 from cavmarl.roads.forks import fork_lengths
-from cavmarl.roads.network import EDGE, JUNCTION, LANE, LINK, RoadNetwork
+from cavmarl.roads.network import EDGE, JUNCTION, LANE, LINK, GeoReference, RoadNetwork
 from cavmarl.roads.polylines import clean_shape, extend_stubs, point_rows
 from cavmarl.roads.programs import Program
 from cavmarl.roads.right_of_way import conflict_rows
@@ -132,7 +133,24 @@ def _assemble(net: Any, programs: list[Program], name: str, digest: str) -> Road
         junction_ids=tuple(node.getID() for node in nodes),
         signal_ids=tuple(signal_rows.ids),
         junction_kinds=kinds,
+        geo=_geo_reference(net),
     )
+
+
+def _geo_reference(net: Any) -> GeoReference | None:
+    """Where the map lies on the earth, if its `location` says it."""
+    try:
+        if not net.hasGeoProj():
+            return None
+    except KeyError:  # there is no location
+        return None
+    try:
+        offset_x_m, offset_y_m = net.getLocationOffset()
+    except ValueError:
+        offset_x_m = offset_y_m = math.nan
+    if not (math.isfinite(offset_x_m) and math.isfinite(offset_y_m)):
+        raise MapError("netOffset of its location: must be two numbers, x,y in m")
+    return GeoReference(net._location["projParameter"], offset_x_m, offset_y_m)
 
 
 def _before(chosen: Selection, lane_row: dict[int, int]) -> dict[int, int]:

@@ -1,6 +1,6 @@
 """What acts in each tick beside the traffic: mounted sensors, messages, scripts, other simulators.
 
-Each part is made in `attach`, keeps its state in arrays (W, …) and is asked at fixed points of a
+Each part is made in `attaching`, keeps its state in arrays (W, …) and is asked at fixed points of a
 tick. It reads the rows of all shards and writes only what is its own, so that nothing depends on
 how a world is divided.
 """
@@ -15,12 +15,13 @@ from numpy.typing import NDArray
 
 from cavmarl.config import EnvConfig
 from cavmarl.kernels.arrays import Outputs, Travel
+from cavmarl.rig.frames import Frames
 from cavmarl.roads.network import RoadNetwork
 from cavmarl.runtime.division import Division
 from cavmarl.shard.shard import Commands, Shard
 from cavmarl.traffic.memory import Zeros
 
-__all__ = ["Attached", "Host", "attach"]
+__all__ = ["Attached", "Host"]
 
 
 class Host(NamedTuple):
@@ -35,6 +36,7 @@ class Host(NamedTuple):
         travel: types and ways.
         outputs: what the agents get.
         zeros: makes the arrays that outlive a tick.
+        frames: what the rigs of the agents get.
     """
 
     config: EnvConfig
@@ -45,6 +47,7 @@ class Host(NamedTuple):
     travel: Travel
     outputs: Outputs
     zeros: Zeros
+    frames: Frames
 
 
 class Attached(Protocol):
@@ -68,11 +71,7 @@ class Attached(Protocol):
     def arrays(self) -> Iterator[NDArray[Any]]:
         """All that outlives a tick, always the same arrays (W, …); the state's hash is over them.
 
-        An item of one world must not say how it is divided or where its rows lie.
+        An item of one world must not say how it is divided or where its rows lie, and records have
+        no gaps between their fields: what stands there is not kept.
         """
         ...
-
-
-def attach(host: Host) -> tuple[Attached, ...]:
-    """The parts that the environment asks for, in the order in which they act."""
-    return ()

@@ -12,6 +12,7 @@ from cavmarl.kernels.borders import Borders
 from cavmarl.kernels.motion import MAX_SPEED_MPS
 from cavmarl.ownership.distances import Distances, check_coverage, needed_overlap_m
 from cavmarl.ownership.limits import DeadlinePolicy, Limits
+from cavmarl.rig.catalogue import rig_reach_m
 from cavmarl.roads.network import RoadNetwork
 from cavmarl.roads.zone_halo import zone_halo
 from cavmarl.roads.zones import ZonePartition
@@ -55,7 +56,9 @@ def divide(
     settings, dt = config.zones, config.clock.sim_dt_s
     radius_m = largest_radius_m(traffic.travel.types)
     reach_m = max(
-        driving_reach_m(network, traffic.travel), sensing_reach_m(config.sensors, radius_m)
+        driving_reach_m(network, traffic.travel),
+        sensing_reach_m(config.sensors, radius_m),
+        rig_reach_m(config.rig, radius_m),
     )
     halo = zone_halo(partition, halo_m(config, reach_m, partition.count))
     zoned = make_zoned(partition.count, num_worlds, traffic.capacity, zeros)

@@ -19,9 +19,10 @@ from cavmarl.errors import (
     LostTickError,
     ReproducerError,
     SumoError,
+    V2xError,
     ZoneError,
 )
-from cavmarl.kernels.arrays import Outputs, Worlds
+from cavmarl.kernels.arrays import Gate, Outputs, Worlds
 from cavmarl.kernels.codes import (
     ACTION_IDLE,
     COUNT_ARRIVED,
@@ -32,14 +33,19 @@ from cavmarl.kernels.codes import (
     SUM_DISTANCE_M,
     SUM_TIME_S,
 )
+from cavmarl.kernels.repeated import repeated
 from cavmarl.kernels.rng import world_key
+from cavmarl.kernels.tallies import begins_second, count_tick
 from cavmarl.ownership.messages import Switch
 from cavmarl.ownership.transfers import TransferLog
+from cavmarl.rig.catalogue import frame_layout, frames_in
+from cavmarl.rig.frames import Frames
 from cavmarl.roads.network import RoadNetwork
 from cavmarl.roads.zone_layouts import cut_map
 from cavmarl.roads.zones import ZonePartition
 from cavmarl.runtime import snapshot
-from cavmarl.runtime.attached import Attached, Host, attach
+from cavmarl.runtime.attached import Attached, Host
+from cavmarl.runtime.attaching import attach
 from cavmarl.runtime.border_book import BorderBook
 from cavmarl.runtime.commons import Commons
 from cavmarl.runtime.compilation import first_compilation
@@ -47,6 +53,8 @@ from cavmarl.runtime.coordination import Coordination
 from cavmarl.runtime.dividing import divide
 from cavmarl.runtime.division import ZoneLoads
 from cavmarl.runtime.executor import Executor, SerialExecutor
+from cavmarl.runtime.messaging import Messaging
+from cavmarl.runtime.mounted import MountedSensors
 from cavmarl.runtime.recovery import Recovery, Revival
 from cavmarl.runtime.recutting import Recut, Recutter
 from cavmarl.runtime.referee import Referee
@@ -54,6 +62,7 @@ from cavmarl.runtime.refereeing import make_refereeing
 from cavmarl.runtime.reproducer import Reproducer
 from cavmarl.runtime.reproducing import Keeper, Moment, sources_of
 from cavmarl.runtime.shard_clock import ShardClock
+from cavmarl.runtime.step_trace import MIRROR, SUMO, Traced
 from cavmarl.runtime.store import CommittedStore
 from cavmarl.runtime.zone_view import ZoneView, view_zones
 from cavmarl.shard.shard import Commands, Shard
@@ -62,8 +71,11 @@ from cavmarl.traffic.demand import DemandFile
 from cavmarl.traffic.departures import make_gate
 from cavmarl.traffic.memory import Zeros
 from cavmarl.traffic.native import NativeTraffic
+from cavmarl.traffic.scenarios import plan_scene
+from cavmarl.traffic.scene import Scene
 from cavmarl.traffic.sumo.demand import SumoDemand
 from cavmarl.traffic.sumo.traffic import SumoTraffic
+from cavmarl.v2x.bus import Bus
 
 __all__ = ["Simulation", "TrafficStats"]
 
@@ -116,12 +128,14 @@ class Simulation:
         demand: whose vehicles drive beside the generator's; of a file, or SUMO's.
         partition: the zones; None: cut as `config.zones` says.
         observations: (W, A, D) float32, where the agents' are written; None: made for them.
+        frames: where the samples of their rigs are written; None: made for them.
         warm: call every kernel now, so that none is loaded in a step.
         zeros: makes the arrays that shards write.
         like: worlds of the same environment, whose tables are used; None: they are made.
 
     Attributes:
         everywhere: (W,) all of the worlds.
+        frames: what the rigs of the agents have sensed; arrays that the next step overwrites.
     """
 
     def __init__(
@@ -133,6 +147,7 @@ class Simulation:
         partition: ZonePartition | None = None,
         *,
         observations: NDArray[np.float32] | None = None,
+        frames: Frames | None = None,
         warm: bool = False,
         zeros: Zeros = np.zeros,
         like: Simulation | None = None,
@@ -146,6 +161,7 @@ class Simulation:
         self._first_world = 0
         self._episodes = np.zeros(num_worlds, dtype=np.int64)
         self.everywhere = np.ones(num_worlds, dtype=np.bool_)
+        self.frames: Frames = _frames(config, num_worlds, zeros) if frames is None else frames
         self.transfers: tuple[TransferLog, ...] = ()
         with first_compilation() as is_first:
             blank = blank_vehicle()
@@ -161,6 +177,7 @@ class Simulation:
                     None if isinstance(demand, SumoDemand) else demand,
                     num_worlds,
                     zeros,
+                    plan_scene(config.scenario, network),
                     sumo,
                 )
                 if like is None
@@ -175,6 +192,8 @@ class Simulation:
             )
             self._shard = self._shards[0]
             self._executor: Executor = SerialExecutor(self._shards)
+            self._count_tick = repeated(count_tick)
+            self._begins_second = repeated(begins_second)
             self._attached: tuple[Attached, ...] = attach(
                 Host(
                     config,
@@ -185,6 +204,7 @@ class Simulation:
                     self._shard.travel,
                     self.outputs,
                     zeros,
+                    self.frames,
                 )
             )
             self._coordination: Coordination | None = None
@@ -192,6 +212,7 @@ class Simulation:
             self._keeper: Keeper | None = None
             self._recutter: Recutter | None = None
             self._sumo: SumoTraffic | None = None
+            self._note_phase: Callable[[str], None] = _pass_over
             if is_first or warm:
                 self._call_every_kernel()
             if sumo is not None:
@@ -273,9 +294,36 @@ class Simulation:
         return self._commons.outputs
 
     @property
+    def messages(self) -> Bus:
+        """What vehicles and roadside units tell each other.
+
+        Raises:
+            V2xError: they tell each other nothing.
+        """
+        for part in self._attached:
+            if isinstance(part, Messaging):
+                return part.bus
+        raise V2xError("nobody says anything here: set v2x.enabled to true")
+
+    @property
+    def gate(self) -> Gate:
+        """Who waits to enter each world, and counts since its reset; a reset may replace it."""
+        return self._gate
+
+    @property
     def goal_edges(self) -> NDArray[np.int32]:
         """EDGE rows of the goals, by `VEHICLE["goal"]`."""
         return self._traffic.goal_edges
+
+    @property
+    def types(self) -> NDArray[np.void]:
+        """VTYPE (num_types,), by `VEHICLE["vtype"]`."""
+        return self._shard.travel.types
+
+    @property
+    def scene(self) -> Scene | None:
+        """What is played to the agent of each world."""
+        return self._traffic.scene
 
     @property
     def plans(self) -> NDArray[np.void]:
@@ -321,12 +369,23 @@ class Simulation:
         return () if self._coordination is None else self._coordination.coordinators
 
     @property
+    def attached(self) -> tuple[Attached, ...]:
+        """What acts in each tick beside the traffic."""
+        return self._attached
+
+    @property
     def worlds(self) -> Worlds:
         """The vehicles and signals of all worlds, for tools that measure; each tick swaps them.
 
         A copy where worlds are divided.
         """
         return self._division.whole()
+
+    @property
+    def mounted(self) -> MountedSensors | None:
+        """The rigs of the agents; None: they have none."""
+        rigs = (part for part in self._attached if isinstance(part, MountedSensors))
+        return next(rigs, None)
 
     def signal_phases(self, world: int = 0) -> NDArray[np.int32]:
         """PHASE rows that are on, (num_signals,)."""
@@ -478,6 +537,17 @@ class Simulation:
         if self._coordination is not None:
             self._coordination = wrap(self._coordination)
 
+    def trace(self, wrap: Callable[[Any], Any], note: Callable[[str], None]) -> None:
+        """Let `wrap(executor)` note the phases of a tick, and attached parts name theirs to `note`.
+
+        A part that has phases of its own (another simulator's step, say) has a method `trace`.
+        """
+        self._executor = wrap(self._executor)
+        self._note_phase = note
+        for part in self._attached:
+            if isinstance(part, Traced):
+                part.trace(note)
+
     def host(self, make: Callable[[Sequence[Shard]], Executor]) -> None:
         """From now on let somebody else run the phases of the shards, as `make` returns it.
 
@@ -533,21 +603,24 @@ class Simulation:
         self._executor.each("resolve")
         self._enter()
         self._executor.each("commit")
-        ticks = self._shard.worlds.ticks
-        ticks += 1
+        self._count_tick(self._shard.worlds.ticks)
         self._switch_signals()
 
     def _follow_sumo(self, sumo: SumoTraffic) -> None:
         """SUMO takes its step; who is its own stands where it is then, or leaves."""
         gate, worlds, side = self._gate, self._shard.worlds, self._division.next_side
-        if sumo.step(worlds, side):
+        self._note_phase(SUMO)
+        sumo.step(worlds, side)
+        if not sumo.drives:
+            sumo.send_on(gate, worlds, side)
+            return
+        self._note_phase(MIRROR)
+        if sumo.mirror(worlds, side):
             for shard in self._shards:
                 shard.dismiss(gate)
             self._note_left()
             sumo.forgive(gate)
             self._traffic.settle(gate, worlds)
-        if not sumo.drives:
-            sumo.send_on(gate, worlds, side)
 
     @property
     def sumo(self) -> SumoTraffic | None:
@@ -574,8 +647,7 @@ class Simulation:
     def _leave(self) -> None:
         """Who needs it picks another goal, who has arrived leaves, who looks for a way finds it."""
         traffic, gate, worlds = self._traffic, self._gate, self._shard.worlds
-        per_s = traffic.ticks_per_s
-        begins_second = any(tick % per_s == 0 for tick in worlds.ticks.tolist())
+        begins_second = self._begins_second(worlds.ticks, traffic.ticks_per_s)
         if begins_second:
             self._executor.each("choose_goals", traffic.demand, len(traffic.plans), gate)
         self._executor.each("leave", gate)
@@ -695,10 +767,6 @@ class Simulation:
         found = np.any(waiting & (self._gate.queue["agent"][:, :longest] >= 0), axis=1)
         return np.asarray(found, dtype=np.bool_)
 
-    def arrivals(self) -> NDArray[np.int64]:
-        """(W,) vehicles that reached their goal since each world's reset, agents included."""
-        return self._gate.counts[:, COUNT_ARRIVED].copy()
-
     def suggest(self, out: NDArray[np.float64]) -> None:
         """Write what the built-in driver would do in the agents' place into `out` (W, A, 2)."""
         self._executor.each("suggest", out)
@@ -732,6 +800,7 @@ class Simulation:
             worlds.detected_s[world],
             worlds.ticks[world],
             worlds.keys[world],
+            worlds.cues[world],
             self._gate.next_id[world],
             self._gate.next_order[world],
             self._gate.num_entered[world],
@@ -765,6 +834,15 @@ class Simulation:
             mean_trip_s=float(sums[SUM_TIME_S]) / trips,
             mean_delay_s=float(sums[SUM_DELAY_S]) / trips,
         )
+
+
+def _frames(config: EnvConfig, num_worlds: int, zeros: Zeros) -> Frames:
+    layout = frame_layout(config, num_worlds)
+    return frames_in({name: zeros(shape, dtype=kind) for name, (kind, shape) in layout.items()})
+
+
+def _pass_over(phase: str) -> None:
+    """What is done with the names of phases where nobody asks for them."""
 
 
 def _cut(config: EnvConfig, network: RoadNetwork) -> ZonePartition:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from contextlib import suppress
 from pathlib import Path
 
 __all__ = ["CHECK_S", "Watchdog", "processor_s"]
@@ -15,9 +14,8 @@ STOPPED_CHECKS = 2  # for so long it may be stopped
 class Watchdog:
     """Looks at one process again and again while something is expected of it.
 
-    A process that has work to do uses the processor, or waits for it or for a disk, or for a
-    process that it has started itself and that does so. If it is stopped, or sleeps, it does not go
-    on by itself.
+    A process that has work to do uses the processor, or waits for it or for a disk. If it is
+    stopped, or sleeps, it does not go on by itself, unless processes that it has started do.
 
     Args:
         pid: of the process.
@@ -40,6 +38,8 @@ class Watchdog:
             return None  # it has ended, which others notice
         self._checks += 1
         self._stopped = self._stopped + 1 if state in "Tt" else 0
+        if state == "S":
+            spent += sum(_spent_by(child) for child in _started_by(self._pid))
         self._still = self._still + 1 if state == "S" and spent == self._spent else 0
         self._spent = spent
         if self._stopped >= STOPPED_CHECKS:
@@ -56,24 +56,26 @@ def processor_s(pid: int) -> float:
     return int(Path(f"/proc/{pid}/schedstat").read_text(encoding="ascii").split()[0]) / 1e9
 
 
-def _look(pid: int) -> tuple[str, int]:
-    """State of a process, a letter, and its processor time in ticks of the system.
+def _started_by(pid: int) -> list[int]:
+    """The processes that one has started, and those that they have."""
+    try:
+        text = Path(f"/proc/{pid}/task/{pid}/children").read_text(encoding="ascii")
+    except OSError:  # it has ended, or the system does not tell
+        return []
+    children = [int(word) for word in text.split()]
+    return children + [one for child in children for one in _started_by(child)]
 
-    Of one that sleeps, together with those that it has started.
-    """
+
+def _spent_by(pid: int) -> int:
+    """Processor time of a process that may have ended, in ticks of the system."""
+    try:
+        return _look(pid)[1]
+    except OSError:
+        return 0
+
+
+def _look(pid: int) -> tuple[str, int]:
+    """State of a process, a letter, and its processor time in ticks of the system."""
     text = Path(f"/proc/{pid}/stat").read_text(encoding="utf-8", errors="replace")
     fields = text.rpartition(")")[2].split()
-    state, spent = fields[0], int(fields[11]) + int(fields[12])
-    if state != "S":
-        return state, spent
-    for child in _children(pid):
-        with suppress(OSError):  # it has ended
-            its_state, its_spent = _look(child)
-            state = its_state if its_state in "RD" else state
-            spent += its_spent
-    return state, spent
-
-
-def _children(pid: int) -> list[int]:
-    path = Path(f"/proc/{pid}/task/{pid}/children")
-    return [int(word) for word in path.read_text(encoding="ascii").split()] if path.exists() else []
+    return fields[0], int(fields[11]) + int(fields[12])

@@ -36,7 +36,7 @@ def driving_reach_m(network: RoadNetwork, travel: Travel) -> float:
     stretch, jump_m = _jumps(network)
     bodies_m = 2.0 * float(travel.types["length"].max())
     roads_m = stretch * max(travel.view_m, junction_m + beyond_m) + 2.0 * jump_m
-    return roads_m + _across_m(network) + bodies_m + ASIDE_M
+    return roads_m + _across_m(network) + bodies_m + ASIDE_M + travel.scripts.reach_m
 
 
 def _ends(network: RoadNetwork) -> tuple[NDArray[np.float64], NDArray[np.float64]]:

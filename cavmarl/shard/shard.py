@@ -7,7 +7,7 @@ of its process.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
@@ -31,14 +31,16 @@ from cavmarl.kernels.lanes import ENTRY
 from cavmarl.kernels.leaving import drop_ghosts, leave
 from cavmarl.kernels.neighbors import make_grid
 from cavmarl.kernels.observe_further import observe_further
+from cavmarl.kernels.observing_messages import observe_messages
 from cavmarl.kernels.repeated import repeated
 from cavmarl.kernels.stacking import fill_stacks
 from cavmarl.kernels.tick import suggest
+from cavmarl.kernels.v2x_records import Mail
 from cavmarl.kernels.zones import Halo, ZoneArrays
 from cavmarl.roads.network import RoadNetwork
 from cavmarl.roads.routing import PLAN, lane_grid
 from cavmarl.shard.controllers import CONTROLLER
-from cavmarl.shard.sensors import further_arrays, sensor_arrays
+from cavmarl.shard.sensors import further_arrays, layout, sensor_arrays
 from cavmarl.shard.vehicles import VEHICLE
 from cavmarl.traffic.memory import Zeros
 
@@ -57,10 +59,12 @@ class Commands:
     Attributes:
         controls: (W, A, 2) throttle in m/s² and steering in rad; continuous actions.
         meta_actions: (W, A) ACTION_* codes; discrete actions.
+        declared: (W, A) CAUSE_* of events that agents tell others of, 0: none; (0, 0): nobody does.
     """
 
     controls: NDArray[np.float64]
     meta_actions: NDArray[np.int64]
+    declared: NDArray[np.int32] = field(default_factory=lambda: np.zeros((0, 0), np.int32))
 
 
 class Shard:
@@ -85,6 +89,7 @@ class Shard:
         sides: VEHICLE (W, C), the two memories that rows are kept in by turns.
         side: in which of them the committed rows are.
         next_side: where the next ones come; the same, but in ticks that put rows in order.
+        mail: what agents have been told over the air; None: nobody says anything.
     """
 
     def __init__(
@@ -115,7 +120,7 @@ class Shard:
         self.cut(zones, halo)
         # One after the other works in it: what the last one has left is still near in memory.
         self.scratch: Scratch = (
-            _make_scratch(len(network.lanes), len(network.links), capacity)
+            _make_scratch(len(network.lanes), len(network.links), capacity, travel.scripts.room)
             if first is None
             else first.scratch
         )
@@ -129,14 +134,18 @@ class Shard:
             zone,
             None if first is None else first.worlds,
             zeros,
+            len(travel.scripts.cues),
         )
         self.sides = (self.worlds.rows, zoned.rows[1, zone])
         self.side = self.next_side = 0
         self.outputs = outputs
+        self.mail: Mail | None = None
+        self._messages_at = layout(config.sensors).get("messages")
         self.target_speeds = np.array(config.action.target_speeds_mps)
         self.discrete = config.action.kind == "discrete"
         self._call_leave = repeated(leave)
         self._call_observe_further = repeated(observe_further)
+        self._call_observe_messages = repeated(observe_messages)
         self._call_fill_stacks = repeated(fill_stacks)
 
     def cut(self, zones: ZoneArrays, halo: Halo) -> None:
@@ -183,7 +192,7 @@ class Shard:
         self.worlds = self.worlds._replace(rows=self.sides[side], next_rows=self.sides[next_side])
 
     def complete_observations(self, chosen: NDArray[np.bool_]) -> None:
-        """Write what `sense` has left to others: sensors of other projects, and earlier frames."""
+        """Write what `sense` has left: messages, sensors of other projects, and earlier frames."""
         observations, stack = self.outputs.observations, self.config.sensors.stack
         if self._further is not None:
             self._call_observe_further(
@@ -196,6 +205,13 @@ class Shard:
                 chosen,
                 observations,
             )
+        if self.mail is not None and self._messages_at is not None:
+            messages = self.config.sensors.messages
+            self._call_observe_messages(
+                self.roads, self.plans, self.worlds, self.mail, self._messages_at.start,
+                messages.objects, messages.events, messages.signal, messages.range_m,
+                self.config.clock.sim_dt_s, stack, chosen, observations,
+            )  # fmt: skip
         if stack > 1:
             ticks_per_step = self.config.clock.ticks_per_step
             self._call_fill_stacks(self.worlds, ticks_per_step, stack, chosen, observations)
@@ -226,11 +242,12 @@ def make_worlds(
     zone: int = 0,
     common: Worlds | None = None,
     zeros: Zeros = np.zeros,
+    num_cues: int = 0,
 ) -> Worlds:
     """Arrays of W worlds that hold `capacity` vehicles each, all of them empty.
 
-    Agents' commands take effect `latency_ticks` later. The rows are those of a zone of `zoned`, if
-    it is given. What all zones of a world have in common (ticks, keys, signals and what detectors
+    Agents' commands take effect `latency_ticks` later, scripts wait for `num_cues` cues. The rows
+    are those of a zone of `zoned`, if it is given. What all zones of a world have in common (ticks, keys, signals and what detectors
     saw) are the arrays of `common`, if it is given; if not, `zeros` makes them.
     """
     if zoned is None:
@@ -255,6 +272,7 @@ def make_worlds(
         step_at=zoned.step_at[zone],
         outer=zoned.outer[zone],
         num_outer=zoned.num_outer[zone],
+        cues=zeros((num_worlds, num_cues), dtype=np.int64),
     )
     if common is None:
         return worlds
@@ -299,7 +317,7 @@ def _seen(
     )
 
 
-def _make_scratch(num_lanes: int, num_links: int, capacity: int) -> Scratch:
+def _make_scratch(num_lanes: int, num_links: int, capacity: int, covers: int = 0) -> Scratch:
     def integers(size: int) -> NDArray[np.int32]:
         return np.zeros(size, dtype=np.int32)
 
@@ -311,7 +329,7 @@ def _make_scratch(num_lanes: int, num_links: int, capacity: int) -> Scratch:
         lanes=lanes,
         lane_start=lanes.bounds[:, 0],
         lane_end=lanes.bounds[:, 1],
-        entries=np.zeros(2 * capacity, dtype=ENTRY),
+        entries=np.zeros(2 * capacity + covers, dtype=ENTRY),
         links=links,
         link_start=links.bounds[:, 0],
         link_end=links.bounds[:, 1],

@@ -83,7 +83,8 @@ VEHICLE = np.dtype(
         ("target_lane", np.int32),  # of the lane controller or lane change in progress
         # where it comes from and goes to
         ("agent", np.int32),  # index of the PettingZoo agent that drives it
-        ("goal", np.int32),  # row of the plans' table; of demand vehicles that of their detours
+        ("goal", np.int32),  # row of the plans' table; of demand vehicles that of their detours; of
+        # who follows a script the FRAME that it is at
         ("leg", np.int32),  # how many ways it has had before
         ("order", np.int32),  # DEPARTURE row of the demand file's orders; -1: of the generator
         ("departed", np.int64),  # tick of insertion

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any, NamedTuple, Protocol
 
 import numpy as np
@@ -9,6 +10,8 @@ from numpy.typing import NDArray
 
 from cavmarl.balance.plan import Plan
 from cavmarl.config import TERMS, EnvConfig
+from cavmarl.rig.catalogue import frame_layout, frames_in
+from cavmarl.rig.frames import Frames
 from cavmarl.runtime.shared_memory import Layout
 from cavmarl.runtime.simulation import Simulation
 from cavmarl.shard.shard import Commands
@@ -16,6 +19,9 @@ from cavmarl.spaces import flat_observation_space, state_space
 from cavmarl.worlds import World
 
 __all__ = ["StepArrays", "SteppedWorlds", "layout_of"]
+
+
+FINAL_FRAMES = "final_rig."  # begins their names in a layout
 
 
 class StepArrays(NamedTuple):
@@ -35,16 +41,29 @@ class StepArrays(NamedTuple):
     mask: NDArray[np.bool_]  # (W, A) who acts next
     terms: NDArray[np.float32]  # (W, A, T)
     arrivals: NDArray[np.int64]  # (W,) since each world's reset
+    ticks: NDArray[np.int64]  # (W,) the same
     episode_over: NDArray[np.bool_]  # (W,) which worlds were reset, or will be in the next step
     chosen: NDArray[np.bool_]  # (W,) which worlds are to be reset
     controls: NDArray[np.float64]  # (W, A, 2) what agents do, as in `Commands`
     meta_actions: NDArray[np.int64]  # (W, A)
+    declared: NDArray[np.int32]  # (W, A)
     suggested: NDArray[np.float64]  # (W, A, 2) what the built-in driver would do
     states: NDArray[np.float32]  # (W, S) global states, of when they were last asked for
+    frames: Frames  # what the rigs have sensed
+    final_frames: Frames  # the same where something ended, before that
+
+    @classmethod
+    def of(cls, arrays: Mapping[str, NDArray[Any]]) -> StepArrays:
+        """Made of arrays that are named as by `layout_of`."""
+        fields: dict[str, Any] = {name: arrays[name] for name in cls._fields if name in arrays}
+        return cls(**fields, frames=frames_in(arrays), final_frames=frames_in(arrays, FINAL_FRAMES))
 
     def part(self, first: int, last: int) -> StepArrays:
         """Those of some of the worlds, as views."""
-        parts: list[Any] = [array[first:last] for array in self]
+        *arrays, frames, final_frames = self
+        parts: list[Any] = [array[first:last] for array in arrays]
+        for rig in (frames, final_frames):
+            parts.append({name: sensor.part(first, last) for name, sensor in rig.items()})
         return StepArrays(*parts)
 
 
@@ -61,12 +80,16 @@ def layout_of(config: EnvConfig, capacity: int, num_worlds: int) -> Layout:
         "vehicle_ids": ("<i8", agents),
         "terms": ("<f4", (*agents, len(TERMS))),
         "arrivals": ("<i8", (num_worlds,)),
+        "ticks": ("<i8", (num_worlds,)),
         "episode_over": ("|b1", (num_worlds,)),
         "chosen": ("|b1", (num_worlds,)),
         "controls": ("<f8", (*agents, 2)),
         "meta_actions": ("<i8", agents),
+        "declared": ("<i4", agents),
         "suggested": ("<f8", (*agents, 2)),
         "states": ("<f4", (num_worlds, *state_space(capacity).shape)),
+        **frame_layout(config, num_worlds),
+        **frame_layout(config, num_worlds, FINAL_FRAMES),
     }
 
 
@@ -112,6 +135,10 @@ class SteppedWorlds(Protocol):
 
     def write_states(self) -> None:
         """Write `states`."""
+        ...
+
+    def ticks(self) -> NDArray[np.int64]:
+        """(W,) ticks since each world's reset."""
         ...
 
     def state_hash(self, world: int) -> str:

@@ -10,10 +10,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cavmarl.balance.plan import Plan
-from cavmarl.kernels.codes import EVENTS_THAT_END
+from cavmarl.kernels.repeated import repeated
+from cavmarl.kernels.step_results import Results, report, report_who_goes_on
+from cavmarl.rig.catalogue import frame_layout
+from cavmarl.runtime.sensor_farm import SensorFarm
 from cavmarl.runtime.simulation import Simulation
 from cavmarl.shard.shard import Commands
-from cavmarl.spaces import state_space
+from cavmarl.spaces import state_space, write_sensed
 from cavmarl.state import global_state
 from cavmarl.stepping.arrays import StepArrays, layout_of
 from cavmarl.traffic.memory import Zeros
@@ -39,6 +42,7 @@ class LocalWorlds:
         arrays: what goes into a step, and what comes out.
         simulation: the worlds.
         in_next_step: when worlds begin anew.
+        farm: its sensor workers; None: there are none.
     """
 
     def __init__(
@@ -53,23 +57,37 @@ class LocalWorlds:
     ) -> None:
         self.world = world
         self.in_next_step = in_next_step
+        self.farm: SensorFarm | None = None
+        form = world.config.observation
+        self._senses = form.mode == "sensors"
+        self._is_flat = form.kind == "flat"
         self.simulation: Simulation = Simulation(
             world.config,
             world.network,
             num_worlds,
             world.demand,
             world.partition,
-            observations=None if arrays is None else arrays.observations,
+            observations=None if arrays is None or self._senses else arrays.observations,
+            frames=None if arrays is None else arrays.frames,
             warm=warm,
             zeros=zeros,
             like=None if like is None else like.simulation,
         )
         if arrays is None:
             arrays = _own_arrays(self.simulation, num_worlds)
+            if not self._senses:
+                arrays = arrays._replace(observations=self.simulation.outputs.observations)
         self.arrays = arrays
         self._horizon = world.config.max_steps
         self._steps = np.zeros(num_worlds, dtype=np.int64)
         self._waiting = np.zeros(num_worlds, dtype=np.bool_)  # over, and not begun anew yet
+        self._results = Results(*(getattr(arrays, name) for name in Results._fields))
+        self._report = repeated(report)
+        self._report_who_goes_on = repeated(report_who_goes_on)
+        if warm:
+            self._write_results()
+            self._write_who_goes_on()
+            self._steps[:] = 0
 
     def reset(self, seed: int | None, first_world: int) -> None:
         """Begin an episode in the worlds of `chosen`."""
@@ -82,6 +100,7 @@ class LocalWorlds:
         arrays.vehicle_ids[chosen] = outputs.vehicle_ids[chosen]
         arrays.vehicle_done[chosen] = False
         arrays.terms[chosen] = outputs.terms[chosen]
+        arrays.ticks[:] = self.simulation.ticks()
         goes_on = arrays.mask.any(axis=1) | self.simulation.agents_to_come()
         arrays.episode_over[chosen] = ~goes_on[chosen]
         if not chosen.all():
@@ -91,33 +110,38 @@ class LocalWorlds:
         """Let the agents act, and reset the worlds whose episode is over, now or a step later."""
         simulation, arrays = self.simulation, self.arrays
         simulation.step(commands)
-        self._steps += 1
-        if self._waiting.any():  # what they have done in this step counts for nothing
-            self._begin(self._waiting.copy())
-        outputs = simulation.outputs
-        at_horizon = self._steps >= self._horizon
-        terminations = outputs.terminated
-        arrays.rewards[:] = outputs.rewards
-        arrays.terms[:] = outputs.terms
-        arrays.vehicle_ids[:] = outputs.vehicle_ids
-        arrays.acted[:] = outputs.acted
-        arrays.terminations[:] = terminations
-        np.not_equal(outputs.events & EVENTS_THAT_END, 0, out=arrays.vehicle_done)
-        np.logical_and(outputs.acted & at_horizon[:, None], ~terminations, out=arrays.truncations)
-        simulation.retire_agents()
-        arrays.arrivals[:] = simulation.arrivals()
-        np.logical_and(outputs.present, ~terminations, out=arrays.mask)
-        goes_on = arrays.mask.any(axis=1) | simulation.agents_to_come()
-        np.logical_or(at_horizon, ~goes_on, out=arrays.episode_over)
-        self._end(arrays.episode_over)
+        self._show(simulation.everywhere)
+        if self.in_next_step and self._waiting.any():
+            waiting = self._waiting.copy()
+            self._begin(waiting)
+            self._steps[waiting] = -1  # what they have done in this step counts for nothing
+        some_ended = self._write_results()
+        if some_ended:
+            simulation.retire_agents()
+        if self._write_who_goes_on() or some_ended:
+            self._end(arrays.episode_over)
+        arrays.ticks[:] = simulation.ticks()
+
+    def _write_results(self) -> bool:
+        """Write what the agents have got; whether the trip of some vehicle has ended."""
+        outputs = self.simulation.outputs
+        return self._report(outputs, self._steps, self._horizon, self._results)
+
+    def _write_who_goes_on(self) -> bool:
+        """Write who acts next and what is over; whether an episode is."""
+        simulation = self.simulation
+        return self._report_who_goes_on(
+            simulation.outputs, simulation.gate, self._steps, self._horizon, self._results
+        )
 
     def _end(self, over: NDArray[np.bool_]) -> None:
         """Keep what those saw last who have ended, and begin the new episodes."""
         simulation, arrays = self.simulation, self.arrays
         ended = over | arrays.terminations.any(axis=1)
-        if not ended.any():
-            return
         arrays.final_observations[ended] = arrays.observations[ended]
+        for name, frames in arrays.frames.items():
+            for final, array in zip(arrays.final_frames[name], frames, strict=True):
+                final[ended] = array[ended]
         if self.in_next_step:
             self._waiting[over] = True
             arrays.mask[over] = False
@@ -129,8 +153,14 @@ class LocalWorlds:
 
     def _begin(self, chosen: NDArray[np.bool_]) -> None:
         self.simulation.reset(chosen)
+        self._show(chosen)
         self._steps[chosen] = 0
         self._waiting[chosen] = False
+
+    def _show(self, chosen: NDArray[np.bool_]) -> None:
+        """Make what sensors have got in the chosen worlds (W,) what the agents observe."""
+        if self._senses and self._is_flat:
+            write_sensed(self.arrays.frames, chosen, self.arrays.observations)
 
     def suggest(self) -> None:
         """Write what the built-in driver would do in the agents' place."""
@@ -143,13 +173,20 @@ class LocalWorlds:
         for world, state in enumerate(self.arrays.states):
             state[:] = global_state(self.world.network, simulation.vehicles(world), space)
 
+    def ticks(self) -> NDArray[np.int64]:
+        """(W,) ticks since each world's reset."""
+        return self.simulation.ticks().copy()
+
     def state_hash(self, world: int) -> str:
         """Hex digest of one world."""
         return self.simulation.state_hash(world)
 
     def traffic_stats(self, world: int) -> dict[str, float]:
         """Traffic of one world since its reset."""
-        return asdict(self.simulation.traffic_stats(world))
+        stats = asdict(self.simulation.traffic_stats(world))
+        if self.world.config.v2x.enabled:
+            stats |= self.simulation.messages.statistics(world).to_dict()
+        return stats
 
     def save(self) -> list[NDArray[Any]]:
         """All that the next step depends on; views, to be copied."""
@@ -180,16 +217,24 @@ class LocalWorlds:
         """None: there are no workers."""
         return ()
 
+    def hire(self, farm: SensorFarm) -> None:
+        """From now on let others sense for the rigs; what they write is in `arrays`."""
+        mounted = self.simulation.mounted
+        assert mounted is not None
+        mounted.rig.sense = farm
+        self.farm = farm
+
     def close(self) -> None:
         """End the processes that the worlds have."""
+        if self.farm is not None:
+            self.farm.close()
         self.simulation.close()
 
 
 def _own_arrays(simulation: Simulation, num_worlds: int) -> StepArrays:
     layout = layout_of(simulation.config, simulation.capacity, num_worlds)
+    there = frame_layout(simulation.config, num_worlds)
     made = {
-        name: np.zeros(shape, dtype)
-        for name, (dtype, shape) in layout.items()
-        if name != "observations"
+        name: np.zeros(shape, dtype) for name, (dtype, shape) in layout.items() if name not in there
     }
-    return StepArrays(observations=simulation.outputs.observations, **made)
+    return StepArrays.of(made)._replace(frames=simulation.frames)

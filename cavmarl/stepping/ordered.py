@@ -6,6 +6,9 @@ import logging
 from abc import ABC, abstractmethod
 from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
+
 import cavmarl.errors
 from cavmarl.balance.plan import Plan
 from cavmarl.balance.plan_text import describe_plan
@@ -62,8 +65,11 @@ class OrderedWorlds(ABC):
 
     def step(self, commands: Commands) -> None:
         """Let the agents act, and reset the worlds whose episode is over, now or a step later."""
-        self.arrays.controls[:] = commands.controls
-        self.arrays.meta_actions[:] = commands.meta_actions
+        arrays = self.arrays
+        if commands.controls is not arrays.controls:  # where `CavVectorEnv` decodes them
+            arrays.controls[:] = commands.controls
+            arrays.meta_actions[:] = commands.meta_actions
+        arrays.declared[:] = commands.declared if commands.declared.size else 0
         self._order(Task.STEP)
         self._steps += 1
 
@@ -74,6 +80,10 @@ class OrderedWorlds(ABC):
     def write_states(self) -> None:
         """Write the global state of each world."""
         self._order(Task.WRITE_STATES, commits=False)
+
+    def ticks(self) -> NDArray[np.int64]:
+        """(W,) ticks since each world's reset."""
+        return self.arrays.ticks.copy()
 
     def state_hash(self, world: int) -> str:
         """Hex digest of one world."""

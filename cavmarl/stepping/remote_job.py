@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from functools import cache, partial
 from pathlib import Path
 from typing import Any, NoReturn
@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from cavmarl.config import EnvConfig
 from cavmarl.errors import WorkerStartError
 from cavmarl.hosts.host import Outcome, serve
+from cavmarl.rig.frames import Frames
 from cavmarl.stepping.arrays import StepArrays
 from cavmarl.stepping.job import Task, WorldsJob, fingerprint
 from cavmarl.stepping.local import LocalWorlds
@@ -28,16 +29,16 @@ Array = NDArray[Any]
 # Fields of `StepArrays` that every step writes.
 _STEPPED = (
     "observations", "rewards", "terminations", "truncations", "acted", "vehicle_done", "mask",
-    "vehicle_ids", "terms", "arrivals", "episode_over",
+    "vehicle_ids", "terms", "arrivals", "ticks", "episode_over",
 )  # fmt: skip
 # Those that a reset writes, of the worlds that it is about.
-_BEGUN = ("observations", "mask", "vehicle_ids", "vehicle_done", "terms", "episode_over")
+_BEGUN = ("observations", "mask", "vehicle_ids", "vehicle_done", "terms", "ticks", "episode_over")
 
 
 def inputs_of(task: int, arrays: StepArrays) -> list[Array]:
     """What goes into a task, at both ends."""
     if task == Task.STEP:
-        return [arrays.controls, arrays.meta_actions]
+        return [arrays.controls, arrays.meta_actions, arrays.declared]
     return [arrays.chosen] if task == Task.RESET else []
 
 
@@ -50,13 +51,19 @@ def results_of(task: int, arrays: StepArrays, ended: Sequence[int] | None) -> li
         ended: worlds in which something ended; None: none.
     """
     if task == Task.STEP:
-        finals = [arrays.final_observations[w] for w in ended or ()]
-        return [*(getattr(arrays, name) for name in _STEPPED), *finals]
+        finals = [arrays.final_observations, *_sensed(arrays.final_frames)]
+        last = [array[w] for w in ended or () for array in finals]
+        return [*(getattr(arrays, name) for name in _STEPPED), *_sensed(arrays.frames), *last]
     if task == Task.RESET:
-        return [getattr(arrays, name) for name in _BEGUN]
+        return [*(getattr(arrays, name) for name in _BEGUN), *_sensed(arrays.frames)]
     if task == Task.WRITE_STATES:
         return [arrays.states]
     return [arrays.suggested] if task == Task.SUGGEST else []
+
+
+def _sensed(frames: Frames) -> Iterator[Array]:
+    for sensor in frames.values():
+        yield from sensor
 
 
 @cache

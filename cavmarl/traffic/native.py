@@ -22,11 +22,14 @@ from cavmarl.kernels.lanes import VIEW_M
 from cavmarl.kernels.repeated import repeated
 from cavmarl.roads.network import VEHICLE_CLASSES, RoadNetwork
 from cavmarl.roads.routing import make_plans
+from cavmarl.traffic.cast import Cast
 from cavmarl.traffic.demand import STOP, DemandFile
 from cavmarl.traffic.departures import with_room
 from cavmarl.traffic.memory import Zeros
 from cavmarl.traffic.rerouting import Rerouting
+from cavmarl.traffic.scene import Scene
 from cavmarl.traffic.schedule import Schedule
+from cavmarl.traffic.scripts import NO_SCRIPTS
 from cavmarl.traffic.sumo.demand import SumoDemand
 from cavmarl.traffic.sumo.route_book import RouteBook
 from cavmarl.traffic.vtypes import generated_types
@@ -67,6 +70,7 @@ class NativeTraffic:
         file: the demand whose vehicles drive beside the generator's.
         num_worlds: how many worlds are stepped together.
         zeros: makes the table of ways, where vehicles find some while the world runs.
+        scene: what is played to the agent of each world.
         sumo: in the place of a file: what SUMO runs beside these worlds.
     """
 
@@ -79,6 +83,7 @@ class NativeTraffic:
     file: DemandFile | None = None
     num_worlds: int = 1
     zeros: Zeros = np.zeros
+    scene: Scene | None = None
     sumo: SumoDemand | None = None
 
     def __post_init__(self) -> None:
@@ -104,6 +109,8 @@ class NativeTraffic:
         rest = [e for e in edges if e not in set(leaves)]
         # Ways out of the map first; the others evenly over the rows, whatever the seed.
         candidates = leaves + rest
+        if self.scene is not None:
+            named += self.scene.goal_edges
         wanted = max(self.traffic.goals, len(named))
         if len(leaves) < wanted and rest:
             picks = np.linspace(0, len(rest) - 1, min(wanted - len(leaves), len(rest)))
@@ -124,15 +131,27 @@ class NativeTraffic:
         return Schedule(self.file, len(generated_types()), self.plans.size)
 
     @cached_property
+    def cast(self) -> Cast | None:
+        """The actors of the scene."""
+        if self.scene is None:
+            return None
+        first_type = len(generated_types()) + (0 if self.file is None else len(self.file.types))
+        goals = {edge: goal for goal, edge in enumerate(self.goal_edges.tolist())}
+        return Cast.of(self.scene, self.network, goals, first_type, self.dt)
+
+    @cached_property
     def travel(self) -> Travel:
-        """Types and ways of all vehicles: the generator's first, then the demand file's."""
+        """Types and ways of all vehicles: the generator's, the demand file's, then the actors'."""
         types, steps = generated_types(), self.plans.reshape(-1)
         if self.sumo is not None:
             return self._travel_of_sumo(self.sumo, types, steps)
+        scripts = NO_SCRIPTS if self.cast is None else self.cast.scripts
+        actors = types[:0] if self.cast is None else self.cast.types
         if self.file is None or self.schedule is None:
             none = np.zeros(0, dtype=STOP)
-            return Travel(types, steps, none, 0, 0.0, VIEW_M, VIEW_M, num_fixed=len(steps))
-        types = np.concatenate([types, self.file.types])
+            types = np.concatenate([types, actors])
+            return Travel(types, steps, none, 0, 0.0, VIEW_M, VIEW_M, len(steps), scripts)
+        types = np.concatenate([types, self.file.types, actors])
         steps = np.concatenate([steps, self.schedule.steps])
         num_fixed = len(steps)
         if self._slots is not None:
@@ -150,6 +169,7 @@ class NativeTraffic:
             view_m=self._farthest_m(look_ahead_m),
             see_m=self._farthest_m(_centre_sees_line_m),
             num_fixed=num_fixed,
+            scripts=scripts,
         )
 
     def _travel_of_sumo(
@@ -169,6 +189,7 @@ class NativeTraffic:
             VIEW_M,
             VIEW_M,
             num_fixed=len(fixed),
+            scripts=NO_SCRIPTS,
         )
 
     def _farthest_m(self, look_m: Callable[[np.void, float], float]) -> float:
@@ -215,7 +236,9 @@ class NativeTraffic:
         """Rows that one world needs."""
         if self.sumo is not None:
             return _capacity_of_sumo(self.population, self.sumo)
-        return _capacity(self.network, self.population, self.schedule, self.dt, self.horizon_s)
+        actors = 0 if self.scene is None else len(self.scene.actors)
+        args = (self.network, self.population, self.schedule, self.dt, self.horizon_s)
+        return _capacity(*args) + actors
 
     @cached_property
     def demand(self) -> Demand:
@@ -271,6 +294,10 @@ class NativeTraffic:
     def populate(self, gate: Gate, worlds: Worlds, chosen: NDArray[np.bool_]) -> None:
         """Fill the chosen worlds (W,) for a new episode."""
         populate(self.demand, self.network.arrays, self.travel, gate, worlds, chosen)
+        worlds.cues[chosen] = -1
+        if self.cast is not None:
+            for w in np.flatnonzero(chosen).tolist():
+                self.cast.enter(self.network.arrays, self.travel, gate, worlds, w, self.blank)
 
     def settle(self, gate: Gate, worlds: Worlds) -> None:
         """Count who has left, and order those that follow."""

@@ -13,6 +13,7 @@ from cavmarl.roads.routing import PLAN
 from cavmarl.shard.shard import make_zoned
 from cavmarl.shard.vehicles import blank_vehicle
 from cavmarl.traffic.demand import STOP
+from cavmarl.traffic.scripts import NO_SCRIPTS
 from cavmarl.traffic.sumo.records import SEEN
 from cavmarl.traffic.vtypes import generated_types
 from cavmarl.worlds import load_world
@@ -48,7 +49,7 @@ def nowhere(network: RoadNetwork) -> tuple[Travel, Paths]:
     steps = np.zeros(2 * len(network.lanes), dtype=PLAN)
     steps["next"] = -1
     stops = np.zeros(0, dtype=STOP)
-    travel = Travel(generated_types(), steps, stops, 0, 0.0, 100.0, 100.0, len(steps))
+    travel = Travel(generated_types(), steps, stops, 0, 0.0, 100.0, 100.0, len(steps), NO_SCRIPTS)
     first = np.array([0, 1], dtype=np.int64)
     return travel, Paths(first, np.array([-1], dtype=np.int32), np.zeros(1, dtype=np.int64), 0)
 

@@ -18,6 +18,7 @@ from cavmarl.roads.routing import PLAN, make_plans
 from cavmarl.shard.shard import _make_scratch
 from cavmarl.shard.vehicles import VEHICLE, blank_vehicle
 from cavmarl.traffic.demand import STOP
+from cavmarl.traffic.scripts import NO_SCRIPTS
 from cavmarl.traffic.vtypes import generated_types
 
 NAMES = ("ring", "merge", "grid4x4")
@@ -53,6 +54,7 @@ def travel_by(
         view_m=VIEW_M,
         see_m=VIEW_M,
         num_fixed=steps.size,
+        scripts=NO_SCRIPTS,
     )
 
 

@@ -20,6 +20,7 @@ from cavmarl.shard.sensors import (
     lanes,
     lidar,
     lidar_observation,
+    messages,
     neighbors,
     occupancy_grid,
     puffer_drive,
@@ -65,6 +66,7 @@ SENSORS: tuple[Sensor, ...] = (
         lidar_observation.shape,
     ),
     Sensor("roadgraph", roadgraph.features, roadgraph.reach_m, roadgraph.shape),
+    Sensor("messages", messages.features, messages.reach_m),
     Sensor("puffer_drive", puffer_drive.features, puffer_drive.reach_m),
 )
 

@@ -1,0 +1,61 @@
+"""Keeps its lane and its speed, whatever comes: what scenarios must not let pass."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cavmarl.cav_env import CavEnv
+from cavmarl.errors import PolicyError
+from cavmarl.kernels.steering import steer_to_lane
+from cavmarl.policies import Policy
+from cavmarl.vector_env import CavVectorEnv
+
+
+class NeverYieldPolicy(Policy):
+    """Follows the middle of its lanes, and neither brakes nor speeds up.
+
+    It reads the world and not observations, so the worlds have to run in this process.
+    """
+
+    def __init__(self, env: CavEnv | CavVectorEnv) -> None:
+        super().__init__(env)
+        if env.config.action.kind != "continuous":
+            raise PolicyError("never_yield steers: it needs action.kind = continuous")
+
+    def act_batch(self, observations: NDArray[np.float32], mask: NDArray[np.bool_]) -> NDArray[Any]:
+        """(W, A, 2): no throttle, and steering along the lanes."""
+        actions = np.zeros((*mask.shape, 2), dtype=np.float32)
+        for world in range(len(mask)):
+            for agent, steering in self._steerings(world).items():
+                actions[world, agent, 1] = steering
+        return actions
+
+    def act(self, observations: Mapping[str, Any]) -> dict[str, Any]:
+        """The same by agent."""
+        if isinstance(self.env, CavVectorEnv):
+            raise PolicyError("act() drives a parallel_env; a make_vec is driven by act_batch()")
+        steerings = self._steerings(0)
+        index = {agent: k for k, agent in enumerate(self.env.possible_agents)}
+        return {
+            agent: np.array([0.0, steerings[index[agent]]], dtype=np.float32)
+            for agent in self.env.agents
+        }
+
+    def _steerings(self, world: int) -> dict[int, float]:
+        """By agent, from -1 to 1."""
+        simulation, limit = self.env.simulation, self.env.config.action.steering_rad
+        rows = simulation.vehicles(world)
+        found = {}
+        for row in rows[rows["agent"] >= 0]:
+            angle = steer_to_lane(self.env.network.arrays, simulation.plans, row, int(row["lane"]))
+            found[int(row["agent"])] = min(max(angle / limit, -1.0), 1.0)
+        return found
+
+
+def make_policy(env: CavEnv | CavVectorEnv) -> Policy:
+    """Seat a driver that never yields."""
+    return NeverYieldPolicy(env)

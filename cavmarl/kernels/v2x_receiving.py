@@ -1,0 +1,511 @@
+"""Who receives what of the packets of one tick, and what receivers keep of it.
+
+What a receiver keeps does not depend on the order of packets: first the subjects that it knows get
+their newest reports, then the nearest others are let in.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cavmarl.kernels import kernel
+from cavmarl.kernels.neighbors import cell_at, cell_columns, cell_rows
+from cavmarl.kernels.rng import mix
+from cavmarl.kernels.v2x_channel import Channel, busy_level, draw, gets_access, is_heard
+from cavmarl.kernels.v2x_inbox import empty, find, forget, insert, is_better, sort_by_distance
+from cavmarl.kernels.v2x_records import (
+    BANDS_PER_M,
+    COUNT_NO_ACCESS,
+    COUNT_REACHABLE,
+    COUNT_RECEIVED,
+    KIND_CAM,
+    KIND_CPM,
+    KIND_DENM,
+    KIND_SPAT,
+    NUM_BANDS,
+    Air,
+    Mail,
+    Room,
+)
+
+__all__ = ["age", "deliver", "learn"]
+
+
+@kernel
+def _fill_air(
+    air: Air, packets: NDArray[np.void], num: int, cams: bool, access: NDArray[np.bool_]
+) -> None:
+    """Sort the packets that are on the air into cells: CAMs, or all others."""
+    start = air.cells.start
+    cell = air.cells.cell
+    start[:] = 0
+    for p in range(num):
+        if access[p] and (packets[p]["kind"] == KIND_CAM) == cams:
+            c = cell_at(air.cells, packets[p]["x"], packets[p]["y"])
+            cell[p] = c
+            start[c] += 1
+    for c in range(1, start.size):
+        start[c] += start[c - 1]
+    for p in range(num - 1, -1, -1):
+        if access[p] and (packets[p]["kind"] == KIND_CAM) == cams:
+            start[cell[p]] -= 1
+            place = start[cell[p]]
+            air.x[place] = packets[p]["x"]
+            air.y[place] = packets[p]["y"]
+            air.sender[place] = packets[p]["sender"]
+            air.word[place] = packets[p]["word"]
+            air.which[place] = p
+
+
+@kernel
+def _count_within(air: Air, x: float, y: float, radius_m: float) -> int:
+    """How many packets are sent within a distance."""
+    cells = air.cells
+    if radius_m == math.inf:
+        return int(cells.start[cells.start.size - 1])
+    limit = radius_m * radius_m
+    first_column, last_column = cell_columns(cells, x, radius_m)
+    first_row, last_row = cell_rows(cells, y, radius_m)
+    count = 0
+    for j in range(first_row, last_row + 1):
+        begin = cells.start[j * cells.num_x + first_column]
+        end = cells.start[j * cells.num_x + last_column + 1]
+        for b in range(begin, end):
+            dx = air.x[b] - x
+            dy = air.y[b] - y
+            count += dx * dx + dy * dy <= limit
+    return count
+
+
+@kernel
+def _load_around(channel: Channel, room: Room, x: float, y: float) -> float:
+    """Share of the tick that all packets take that one hears there; above 1, they do not fit."""
+    count = _count_within(room.cams, x, y, channel.sensing_m)
+    count += _count_within(room.others, x, y, channel.sensing_m)
+    return channel.load * count
+
+
+@kernel
+def _place_of(sender: int, slots: int) -> int:
+    """Where the search for a sender begins in a table of `slots` places, a power of 2."""
+    place: int = np.int64(mix(np.uint64(sender)) & np.uint64(slots - 1))  # type: ignore[assignment]
+    return place
+
+
+@kernel
+def _list_cams(room: Room, packets: NDArray[np.void], num: int) -> None:
+    """Make `room.cam_of` the table of the CAMs that are on the air, by sender."""
+    table = room.cam_of
+    table[:] = -1
+    for p in range(num):
+        if room.access[p] and packets[p]["kind"] == KIND_CAM:
+            place = _place_of(packets[p]["sender"], table.size)
+            while table[place] >= 0:
+                place = (place + 1) & (table.size - 1)
+            table[place] = p
+
+
+@kernel
+def _find_cam(room: Room, packets: NDArray[np.void], sender: int) -> int:
+    """The CAM of a sender, or -1."""
+    table = room.cam_of
+    place = _place_of(sender, table.size)
+    while table[place] >= 0 and packets[table[place]]["sender"] != sender:
+        place = (place + 1) & (table.size - 1)
+    return int(table[place])
+
+
+@kernel
+def _hears(
+    channel: Channel, me: np.void, level: int, word: np.uint64, x: float, y: float, squared: float
+) -> bool:
+    """Whether a receiver receives the packet of that word, sent within reach from (x, y)."""
+    if channel.sure:
+        return True
+    number = draw(me["word"], word)
+    return is_heard(channel, level, number, me["x"], me["y"], x, y, math.sqrt(squared))
+
+
+@kernel
+def _note_band(bands: NDArray[np.int64], distance_m: float, received: bool) -> None:
+    """Count a packet that could be received by the distance of its sender."""
+    band = min(int(distance_m * BANDS_PER_M), NUM_BANDS - 1)
+    bands[band, 0] += 1
+    bands[band, 1] += received
+
+
+@kernel
+def _refresh_by_cams(
+    channel: Channel,
+    me: np.void,
+    level: int,
+    packets: NDArray[np.void],
+    reports: NDArray[np.void],
+    room: Room,
+    box: NDArray[np.void],
+    num: int,
+) -> None:
+    """Let those that a receiver knows tell the newest of themselves."""
+    limit = channel.reach_m * channel.reach_m
+    for k in range(num):
+        p = _find_cam(room, packets, box[k]["subject"])
+        if p < 0:
+            continue
+        packet = packets[p]
+        dx = packet["x"] - me["x"]
+        dy = packet["y"] - me["y"]
+        squared = dx * dx + dy * dy
+        if squared <= limit and _hears(
+            channel, me, level, packet["word"], packet["x"], packet["y"], squared
+        ):
+            report = reports[packet["first"]]
+            if is_better(report, box[k]):
+                box[k] = report
+
+
+@kernel
+def _drop_lost(
+    channel: Channel,
+    me: np.void,
+    level: int,
+    air: Air,
+    num: int,
+    bands: NDArray[np.int64],
+    heard: NDArray[np.int32],
+) -> int:
+    """Of the packets `heard[:num]` within reach keep those that are received; returns how many."""
+    x = me["x"]
+    y = me["y"]
+    word = me["word"]
+    kept = 0
+    for k in range(num):
+        b = heard[k]
+        dx = air.x[b] - x
+        dy = air.y[b] - y
+        distance_m = math.sqrt(dx * dx + dy * dy)
+        number = draw(word, air.word[b])
+        is_received = is_heard(channel, level, number, x, y, air.x[b], air.y[b], distance_m)
+        _note_band(bands, distance_m, is_received)
+        heard[kept] = b
+        kept += is_received
+    return kept
+
+
+@kernel
+def _let_in_cams(
+    channel: Channel,
+    mail: Mail,
+    w: int,
+    me: np.void,
+    level: int,
+    packets: NDArray[np.void],
+    reports: NDArray[np.void],
+    room: Room,
+    box: NDArray[np.void],
+    num: int,
+) -> int:
+    """Let the nearest of those in that a receiver did not know; returns how many it knows then."""
+    air = room.cams
+    cells = air.cells
+    reach_m = channel.reach_m
+    limit = reach_m * reach_m
+    counts = mail.counts[w]
+    hears_all = channel.sure and reach_m == math.inf
+    if hears_all:
+        heard = cells.start[cells.start.size - 1]
+        heard -= _find_cam(room, packets, me["id"]) >= 0
+        counts[COUNT_REACHABLE] += heard
+        counts[COUNT_RECEIVED] += heard
+        if num == box.size:
+            # Whoever is further away than all that it knows is not let in.
+            limit = room.squared[num - 1]
+            reach_m = math.sqrt(limit)
+    x = me["x"]
+    y = me["y"]
+    own = me["id"]
+    near = 0
+    first_column, last_column = cell_columns(cells, x, reach_m)
+    first_row, last_row = cell_rows(cells, y, reach_m)
+    for j in range(first_row, last_row + 1):
+        begin = cells.start[j * cells.num_x + first_column]
+        end = cells.start[j * cells.num_x + last_column + 1]
+        # Here and below a place is written in any case: who is in and who is not cannot be guessed.
+        for b in range(begin, end):
+            dx = air.x[b] - x
+            dy = air.y[b] - y
+            room.heard[near] = b
+            near += dx * dx + dy * dy <= limit and air.sender[b] != own
+    heard = near
+    if not channel.sure:
+        heard = _drop_lost(channel, me, level, air, near, mail.bands[w], room.heard)
+    if not hears_all:
+        counts[COUNT_REACHABLE] += near
+        counts[COUNT_RECEIVED] += heard
+    for k in range(heard):
+        b = room.heard[k]
+        dx = air.x[b] - x
+        dy = air.y[b] - y
+        if num < box.size or dx * dx + dy * dy <= room.squared[num - 1]:
+            report = reports[packets[air.which[b]]["first"]]
+            if find(box, num, report["subject"]) < 0:
+                num = insert(box, num, room.squared, report, x, y)
+    return num
+
+
+@kernel
+def _take_others(
+    channel: Channel,
+    mail: Mail,
+    w: int,
+    me: np.void,
+    level: int,
+    packets: NDArray[np.void],
+    reports: NDArray[np.void],
+    room: Room,
+    kind: int,
+    box: NDArray[np.void],
+    num: int,
+    new: bool,
+) -> int:
+    """Take the reports of packets of one kind: of subjects that are known, or of new ones."""
+    air = room.others
+    cells = air.cells
+    limit = channel.reach_m * channel.reach_m
+    first_column, last_column = cell_columns(cells, me["x"], channel.reach_m)
+    first_row, last_row = cell_rows(cells, me["y"], channel.reach_m)
+    for j in range(first_row, last_row + 1):
+        begin = cells.start[j * cells.num_x + first_column]
+        end = cells.start[j * cells.num_x + last_column + 1]
+        for b in range(begin, end):
+            dx = air.x[b] - me["x"]
+            dy = air.y[b] - me["y"]
+            squared = dx * dx + dy * dy
+            if not squared <= limit or air.sender[b] == me["id"]:
+                continue
+            packet = packets[air.which[b]]
+            if packet["kind"] != kind:
+                continue
+            is_received = _hears(channel, me, level, air.word[b], air.x[b], air.y[b], squared)
+            if new:
+                mail.counts[w, COUNT_REACHABLE] += 1
+                mail.counts[w, COUNT_RECEIVED] += is_received
+                if not channel.sure:
+                    _note_band(mail.bands[w], math.sqrt(squared), is_received)
+            if not is_received:
+                continue
+            for k in range(packet["first"], packet["first"] + packet["count"]):
+                report = reports[k]
+                if report["subject"] == me["id"]:
+                    continue
+                place = find(box, num, report["subject"])
+                if place < 0 and new:
+                    num = insert(box, num, room.squared, report, me["x"], me["y"])
+                elif place >= 0 and is_better(report, box[place]):
+                    box[place] = report
+    return num
+
+
+@kernel
+def _receive_objects(
+    channel: Channel,
+    mail: Mail,
+    w: int,
+    slot: int,
+    me: np.void,
+    level: int,
+    with_seen: bool,
+    room: Room,
+    box: NDArray[np.void],
+    num: int,
+) -> int:
+    """Take what is told of vehicles, by themselves and by those who see them."""
+    packets = mail.packets[w, slot]
+    reports = mail.reports[w, slot]
+    _refresh_by_cams(channel, me, level, packets, reports, room, box, num)
+    if with_seen:
+        _take_others(channel, mail, w, me, level, packets, reports, room, KIND_CPM, box, num, False)
+    sort_by_distance(box, num, room.squared, me["x"], me["y"])
+    num = _let_in_cams(channel, mail, w, me, level, packets, reports, room, box, num)
+    if with_seen:
+        num = _take_others(
+            channel, mail, w, me, level, packets, reports, room, KIND_CPM, box, num, True
+        )
+    return num
+
+
+@kernel
+def _receive_others(
+    channel: Channel,
+    mail: Mail,
+    w: int,
+    slot: int,
+    me: np.void,
+    level: int,
+    kind: int,
+    room: Room,
+    box: NDArray[np.void],
+    num: int,
+) -> int:
+    """Take what is told of events, or of signals."""
+    packets = mail.packets[w, slot]
+    reports = mail.reports[w, slot]
+    _take_others(channel, mail, w, me, level, packets, reports, room, kind, box, num, False)
+    sort_by_distance(box, num, room.squared, me["x"], me["y"])
+    return _take_others(channel, mail, w, me, level, packets, reports, room, kind, box, num, True)
+
+
+@kernel
+def _receive(
+    channel: Channel,
+    mail: Mail,
+    w: int,
+    slot: int,
+    r: int,
+    tick: int,
+    kinds: NDArray[np.int64],
+    room: Room,
+) -> None:
+    """Bring the inboxes of one receiver to the present tick."""
+    me = room.receivers[r]
+    level = 0
+    if channel.load > 0.0:
+        busy = min(_load_around(channel, room, me["x"], me["y"]), 1.0)
+        mail.busy[w, 0] += busy
+        mail.busy[w, 1] += 1.0
+        mail.busy[w, 2] = max(mail.busy[w, 2], busy)
+        level = busy_level(channel, busy)
+    objects = mail.objects[w, r]
+    num = forget(objects, tick)
+    with_seen = kinds[KIND_CPM] > 0
+    num = _receive_objects(channel, mail, w, slot, me, level, with_seen, room, objects, num)
+    empty(objects, num)
+    events = mail.events[w, r]
+    num = forget(events, tick)
+    if num > 0 or kinds[KIND_DENM] > 0:
+        num = _receive_others(channel, mail, w, slot, me, level, KIND_DENM, room, events, num)
+    empty(events, num)
+    signals = mail.signals[w, r]
+    num = forget(signals, tick)
+    if num > 0 or kinds[KIND_SPAT] > 0:
+        num = _receive_others(channel, mail, w, slot, me, level, KIND_SPAT, room, signals, num)
+    empty(signals, num)
+
+
+@kernel
+def _let_on_the_air(
+    channel: Channel, mail: Mail, w: int, slot: int, key: np.uint64, room: Room
+) -> None:
+    """Sort the packets of a tick by place; where the air is too busy, not all of them get on it."""
+    packets = mail.packets[w, slot]
+    num = mail.num_packets[w, slot]
+    room.access[:num] = True
+    _fill_air(room.cams, packets, num, True, room.access)
+    _fill_air(room.others, packets, num, False, room.access)
+    if channel.load == 0.0:
+        return
+    are_all_on = True
+    for p in range(num):
+        packet = packets[p]
+        load = _load_around(channel, room, packet["x"], packet["y"])
+        if not gets_access(key, packet["sender"], packet["tick"], packet["kind"], load):
+            room.access[p] = False
+            are_all_on = False
+            mail.counts[w, COUNT_NO_ACCESS] += 1
+    if not are_all_on:
+        _fill_air(room.cams, packets, num, True, room.access)
+        _fill_air(room.others, packets, num, False, room.access)
+
+
+@kernel
+def deliver(
+    channel: Channel,
+    mail: Mail,
+    w: int,
+    slot: int,
+    key: np.uint64,
+    tick: int,
+    latency: int,
+    room: Room,
+) -> None:
+    """Let all receivers of a world receive the packets of one slot.
+
+    Args:
+        channel: the air.
+        mail: inboxes and counts are written.
+        w: which world.
+        slot: of the packets that are received now.
+        key: of the world.
+        tick: of the world.
+        latency: how many ticks ago they were sent.
+        room: `receivers` filled.
+    """
+    kinds = room.kinds
+    kinds[:] = 0
+    for p in range(mail.num_packets[w, slot]):
+        kinds[mail.packets[w, slot, p]["kind"]] += 1
+    _let_on_the_air(channel, mail, w, slot, key, room)
+    _list_cams(room, mail.packets[w, slot], mail.num_packets[w, slot])
+    before = mail.counts[w, COUNT_RECEIVED]
+    for r in range(room.receivers.size):
+        if room.receivers[r]["id"] >= 0:
+            _receive(channel, mail, w, slot, r, tick, kinds, room)
+    mail.delays[w, latency] += mail.counts[w, COUNT_RECEIVED] - before
+
+
+@kernel
+def _put_in_order(
+    box: NDArray[np.void], tick: int, squared: NDArray[np.float64], x: float, y: float
+) -> int:
+    num = forget(box, tick)
+    empty(box, num)
+    sort_by_distance(box, num, squared, x, y)
+    return num
+
+
+@kernel
+def age(mail: Mail, w: int, r: int, tick: int, room: Room) -> None:
+    """Take out of a receiver's inboxes what is too old, and put the rest in order."""
+    me = room.receivers[r]
+    _put_in_order(mail.objects[w, r], tick, room.squared, me["x"], me["y"])
+    _put_in_order(mail.events[w, r], tick, room.squared, me["x"], me["y"])
+    _put_in_order(mail.signals[w, r], tick, room.squared, me["x"], me["y"])
+
+
+@kernel
+def learn(mail: Mail, w: int, slot: int, p: int, r: int, delay: int, room: Room) -> None:
+    """Let one receiver have one packet: somebody else has said that it receives it.
+
+    Args:
+        mail: inboxes and counts are written.
+        w: which world.
+        slot: of the packet.
+        p: the packet.
+        r: the receiver, which is there.
+        delay: ticks since it was sent.
+        room: `receivers` filled.
+    """
+    me = room.receivers[r]
+    packet = mail.packets[w, slot, p]
+    if packet["kind"] == KIND_CAM or packet["kind"] == KIND_CPM:
+        box = mail.objects[w, r]
+    elif packet["kind"] == KIND_DENM:
+        box = mail.events[w, r]
+    else:
+        box = mail.signals[w, r]
+    tick = packet["tick"] + delay
+    num = _put_in_order(box, tick, room.squared, me["x"], me["y"])
+    for k in range(packet["first"], packet["first"] + packet["count"]):
+        report = mail.reports[w, slot, k]
+        if report["subject"] == me["id"] or report["expires"] < tick:
+            continue
+        place = find(box, num, report["subject"])
+        if place < 0:
+            num = insert(box, num, room.squared, report, me["x"], me["y"])
+        elif is_better(report, box[place]):
+            box[place] = report
+            sort_by_distance(box, num, room.squared, me["x"], me["y"])
+    mail.counts[w, COUNT_RECEIVED] += 1
+    mail.delays[w, delay] += 1

@@ -1,0 +1,124 @@
+"""`Cast`: the actors of a scene as rows of a world."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cavmarl.kernels.arrays import Gate, RoadArrays, Scripts, Travel, Worlds
+from cavmarl.kernels.codes import COUNT_DEPARTED, DRIVER_SCRIPTED
+from cavmarl.kernels.departures import enter
+from cavmarl.kernels.scripts import stand_at
+from cavmarl.roads.network import RoadNetwork
+from cavmarl.traffic.departures import DEPARTURE
+from cavmarl.traffic.scene import Scene
+from cavmarl.traffic.scripts import actor_types, bodies_of, compile_scripts
+
+__all__ = ["Cast"]
+
+AGENT = 0  # to whom scenes are played
+
+
+@dataclass(frozen=True)
+class Cast:
+    """The actors of a scene, ready to enter worlds.
+
+    Attributes:
+        scene: what is played.
+        scripts: its tables.
+        firsts: FRAME of each actor at the beginning.
+        types: VTYPE rows of all bodies.
+        vtypes: (n,) VTYPE row of each actor, among all types of a world.
+        goal: of the agent, a row of the plans' table.
+    """
+
+    scene: Scene
+    scripts: Scripts
+    firsts: list[int]
+    types: NDArray[np.void]
+    vtypes: list[int]
+    goal: int
+
+    @staticmethod
+    def of(
+        scene: Scene, network: RoadNetwork, goals: Mapping[int, int], first_type: int, dt: float
+    ) -> Cast:
+        """The cast of a scene.
+
+        Args:
+            scene: what is played.
+            network: the roads.
+            goals: row of the plans' table by EDGE.
+            first_type: how many types of vehicles there are without the actors'.
+            dt: seconds a tick.
+        """
+        scripts, firsts = compile_scripts(network, scene.actors, scene.cues, goals, dt)
+        vtypes = [first_type + number for number in bodies_of(scene.actors)]
+        goal = goals[scene.seat.goal_edge]
+        return Cast(scene, scripts, firsts, actor_types(), vtypes, goal)
+
+    def enter(
+        self,
+        roads: RoadArrays,
+        travel: Travel,
+        gate: Gate,
+        worlds: Worlds,
+        w: int,
+        blank: NDArray[np.void],
+    ) -> None:
+        """Put the agent and the actors into a world that has just been populated.
+
+        Whoever else stands in the scene is left out. The agent keeps its id, actors get the next
+        ones.
+
+        Args:
+            roads: the road arrays.
+            travel: types and ways.
+            gate: written.
+            worlds: the rows of world w are written; nobody has divided it yet.
+            w: which world.
+            blank: VEHICLE (1,), the record that every vehicle starts from.
+        """
+        seat, rows = self.scene.seat, worlds.rows[w]
+        others = rows[: worlds.num_owned[w]]
+        off_m = np.hypot(others["x"] - self.scene.x, others["y"] - self.scene.y)
+        others = others[(others["agent"] < 0) & (off_m > self.scene.clear_m)].copy()
+        queue = gate.queue[w, : gate.num_queue[w]]
+        queue = queue[queue["agent"] < 0].copy()
+        gate.queue[w, : len(queue)] = queue
+        gate.num_queue[w] = len(queue)
+        rows[0] = blank[0]
+        departure = self._departure(roads)
+        enter(roads, travel, worlds, w, departure, seat.lane, seat.s, seat.speed_mps, rows[0])
+        rows[1 : 1 + len(others)] = others
+        num = 1 + len(others)
+        for first, vtype in zip(self.firsts, self.vtypes, strict=True):
+            row = rows[num]
+            rows[num] = blank[0]
+            row["id"] = gate.next_id[w]
+            row["driver"] = DRIVER_SCRIPTED
+            row["vtype"], row["goal"] = vtype, first
+            for name in ("length", "width", "height"):
+                row[name] = travel.types[name][vtype]
+            row["rng_key"], row["departed"], row["tick"] = (
+                worlds.keys[w], worlds.ticks[w], worlds.ticks[w],
+            )  # fmt: skip
+            stand_at(self.scripts.frames[first], row)
+            gate.next_id[w] += 1
+            num += 1
+        gate.counts[w, COUNT_DEPARTED] = num
+        worlds.num_owned[w] = worlds.num_rows[w] = num
+
+    def _departure(self, roads: RoadArrays) -> np.void:
+        """What the agent's entry takes of a DEPARTURE."""
+        seat = self.scene.seat
+        departure = np.zeros(1, DEPARTURE)[0]
+        for name in ("order", "stop", "stops_end"):
+            departure[name] = -1
+        departure["goal"] = self.goal
+        departure["way"] = self.goal * len(roads.lanes)
+        departure["speed_factor"] = seat.speed_mps / roads.lanes["speed_mps"][seat.lane]
+        return departure

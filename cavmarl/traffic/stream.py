@@ -1,0 +1,57 @@
+"""Streams of scripted vehicles that cross or join the agent's way, and where agents come from."""
+
+from __future__ import annotations
+
+from cavmarl.traffic.motions import Ride, path_of
+from cavmarl.traffic.scene import Seat
+from cavmarl.traffic.scripts import Actor
+from cavmarl.traffic.streets import Streets
+
+__all__ = ["approach", "stream"]
+
+FREE_M = 20.0  # beyond the junction a built-in driver takes over
+
+
+def approach(streets: Streets, link: int, far_m: float, speed_mps: float) -> Seat | None:
+    """A seat on the lane that a link leaves, `far_m` before its end; None where that is shorter.
+
+    Args:
+        streets: of the map.
+        link: LINK row that the agent is to drive over.
+        far_m: of its centre to the end of the lane.
+        speed_mps: of the agent.
+    """
+    row = streets.network.links[link]
+    lane, beyond = int(row["from_lane"]), int(row["to_lane"])
+    s = streets.length_m(lane) - far_m
+    if s < 5.0 or streets.length_m(beyond) < FREE_M:
+        return None
+    return Seat(lane, s, speed_mps, streets.edge(beyond))
+
+
+def stream(
+    streets: Streets, link: int, middle_m: float, speed_mps: float, times_s: list[float]
+) -> list[Actor] | None:
+    """Cars that drive over a link without heeding anybody; None where there is no room for them.
+
+    Args:
+        streets: of the map.
+        link: LINK row.
+        middle_m: a place on its path, from the stop line.
+        speed_mps: of all of them, all the time.
+        times_s: when each one's centre is at that place, rising.
+    """
+    path = path_of(streets.network, link)
+    far_m = times_s[-1] * speed_mps - middle_m
+    way = streets.upstream(path[0], far_m + 5.0)
+    if way is None or streets.length_m(path[-1]) < FREE_M + 5.0:
+        return None
+    lanes, to_line_m = way
+    through_m = float(streets.network.links["length_m"][link])
+    riders = []
+    for time_s in times_s:
+        start_m = to_line_m + middle_m - time_s * speed_mps
+        end_m = to_line_m + through_m + FREE_M
+        ride = Ride((*lanes, *path[1:]), start_m, end_m, speed_mps, speed_mps, speed_mps)
+        riders.append(Actor("car", [ride], streets.edge(path[-1])))
+    return riders

@@ -1,0 +1,297 @@
+"""`Bus`: the messages of W worlds, one bus for all zones of each.
+
+It reads the rows of all shards in the order of ids, and all that it keeps is by world: how far
+messages reach has nothing to do with how far a zone sees, and nobody can tell how a world is
+divided.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cavmarl.config import EnvConfig
+from cavmarl.config_v2x import V2xConfig, period_ticks
+from cavmarl.errors import V2xError
+from cavmarl.kernels.arrays import Common, RoadArrays, Zoned
+from cavmarl.kernels.neighbors import make_grid
+from cavmarl.kernels.repeated import repeated
+from cavmarl.kernels.v2x_exchange import exchange_messages, hand_out
+from cavmarl.kernels.v2x_records import (
+    LAST_CAM,
+    MAX_DELAYS,
+    MAX_NEAR,
+    NUM_BANDS,
+    NUM_COUNTS,
+    NUM_KINDS,
+    PACKET,
+    RECEIVER,
+    REPORT,
+    STATION,
+    Air,
+    Mail,
+    Room,
+    Sending,
+)
+from cavmarl.kernels.walls import Walls, make_walls
+from cavmarl.roads.network import RoadNetwork
+from cavmarl.v2x.channel import make_channel
+from cavmarl.v2x.messages import cause_code
+from cavmarl.v2x.network import Exchange, NetworkSimulator, check_receptions
+from cavmarl.v2x.roadside import make_units
+from cavmarl.v2x.statistics import V2xStatistics, statistics_of
+
+__all__ = ["Bus"]
+
+Zeros = Callable[..., NDArray[Any]]
+
+CELL_M = 100.0  # of the packets of a tick
+BODY_CELL_M = 25.0  # of the vehicles that others see
+
+
+class Bus:
+    """Sends, carries and keeps the messages of W worlds.
+
+    Args:
+        config: the environment; `v2x.enabled`.
+        network: its roads.
+        types: VTYPE (num_types,).
+        zoned: the vehicles of all zones.
+        common: clocks, keys and signals.
+        zeros: makes the arrays that outlive a tick.
+        walls: (n, 4) the sides of buildings, x, y, x, y in m; None: there are none.
+
+    Attributes:
+        units: UNIT (num_units,), the roadside units.
+        mail: inboxes, counts and packets in flight.
+    """
+
+    def __init__(
+        self,
+        config: EnvConfig,
+        network: RoadNetwork,
+        types: NDArray[np.void],
+        zoned: Zoned,
+        common: Common,
+        zeros: Zeros = np.zeros,
+        walls: NDArray[np.float64] | None = None,
+    ) -> None:
+        v2x, dt = config.v2x, config.clock.sim_dt_s
+        self._config = v2x
+        self._dt_s = dt
+        self._num_agents = config.population.num_ids
+        self._zoned = zoned
+        self._common = common
+        self._types = types
+        self._roads: RoadArrays = network.arrays
+        self.units = make_units(v2x.roadside, network)
+        self._sending = _make_sending(v2x, dt)
+        built: Walls = make_walls(np.zeros((0, 4)) if walls is None else walls)
+        self._channel = make_channel(v2x.channel, dt, built)
+        num_worlds, capacity = zoned.rows.shape[2:]
+        num_receivers = self._num_agents + len(self.units)
+        self.mail = _make_mail(v2x, num_worlds, capacity, num_receivers, len(self.units), zeros)
+        self._room = _make_room(network, self.mail, zoned, num_receivers)
+        self._network: NetworkSimulator | None = None
+        self._exchange = repeated(exchange_messages)
+        self._hand_out = repeated(hand_out)
+        self.mail.owner[:] = -1
+        self._empty(np.ones(num_worlds, dtype=np.bool_))
+
+    def connect(self, network: NetworkSimulator) -> None:
+        """From now on let a network simulator say who receives what.
+
+        Raises:
+            V2xError: the channel is one of our own.
+        """
+        if not self._config.channel.external:
+            raise V2xError("the channel is our own: set v2x.channel.external to connect another")
+        self._network = network
+
+    def reset(self, chosen: NDArray[np.bool_]) -> None:
+        """Forget all that was said in the chosen worlds (W,)."""
+        for array in self.mail:
+            array[chosen] = np.zeros((), array.dtype)
+        self.mail.owner[chosen] = -1
+        self._empty(chosen)
+
+    def _empty(self, chosen: NDArray[np.bool_]) -> None:
+        for box in (self.mail.objects, self.mail.events, self.mail.signals):
+            for name in ("subject", "sender"):
+                box[name][chosen] = -1
+
+    def exchange(self, side: int) -> None:
+        """Send what is due in the present tick, and receive what arrives in it.
+
+        Args:
+            side: on which side of the zones' rows the committed ones are.
+
+        Raises:
+            V2xError: no network simulator is connected where one is due, or it answers nonsense.
+        """
+        num_worlds = len(self._common.ticks)
+        if not self._config.channel.external:
+            self._run(side, 0, num_worlds)
+            return
+        if self._network is None:
+            raise V2xError(
+                "v2x.channel.external: connect a network simulator before the first step"
+            )
+        for world in range(num_worlds):
+            self._run(side, world, world + 1)
+            self._receive_from(self._network, world)
+
+    def _run(self, side: int, first: int, last: int) -> None:
+        self._exchange(
+            self._sending, self._channel, self._roads, self._types, self.units, self._common,
+            self._zoned, side, first, last, self.mail, self._room,
+        )  # fmt: skip
+
+    def _receive_from(self, network: NetworkSimulator, world: int) -> None:
+        mail, latency = self.mail, self._sending.latency
+        tick = self._common.ticks.item(world)
+        slot = tick % (latency + 1)
+        packets = mail.packets[world, slot, : mail.num_packets[world, slot]]
+        sent = Exchange(world, tick, packets, self._room.receivers)
+        answer = network.exchange(sent)
+        receptions = check_receptions(answer, sent, latency, mail.num_packets[world])
+        self._hand_out(receptions, tick, latency, mail, world, self._room)
+
+    def arrays(self) -> Iterator[NDArray[Any]]:
+        """All that outlives a tick, (W, …)."""
+        mail = self.mail
+        yield from (mail.objects, mail.events, mail.signals, mail.owner, mail.declared)
+        yield from (mail.counts, mail.delays, mail.bands, mail.busy)
+        if self._sending.latency > 0:
+            yield from (mail.packets, mail.num_packets, mail.reports, mail.num_reports)
+        if self._sending.cam_triggered:
+            yield from (mail.last_cams, mail.num_last)
+
+    def declare(self, causes: NDArray[np.int32]) -> None:
+        """Let agents tell of events in the next tick.
+
+        Args:
+            causes: (W, A) ETSI's cause codes; 0: nothing to tell.
+        """
+        declared = self.mail.declared[:, : self._num_agents]
+        np.copyto(declared, causes, where=causes != 0)
+
+    def receiver_of_unit(self, unit: int) -> int:
+        """The row of `mail.objects[world]` and the like that are a roadside unit's.
+
+        Raises:
+            V2xError: there is no such unit.
+        """
+        if not 0 <= unit < len(self.units):
+            raise V2xError(f"roadside unit {unit}: there are {len(self.units)}")
+        return self._num_agents + unit
+
+    def declare_of_unit(self, world: int, unit: int, cause: str) -> None:
+        """Let a roadside unit tell of an event in the next tick.
+
+        Raises:
+            V2xError: there is no such unit, or no such cause.
+        """
+        self.mail.declared[world, self.receiver_of_unit(unit)] = cause_code(cause)
+
+    def statistics(self, world: int = 0) -> V2xStatistics:
+        """What has become of the messages of a world since its reset."""
+        return statistics_of(self.mail, world, self._dt_s)
+
+
+def _make_sending(v2x: V2xConfig, dt: float) -> Sending:
+    def ticks(seconds: float) -> int:
+        return max(1, round(seconds / dt))
+
+    has_units = bool(v2x.roadside.signals)
+    return Sending(
+        dt_s=dt,
+        equipped=v2x.equipped,
+        cam_period=period_ticks(v2x.cam.rate_hz, dt),
+        cam_triggered=v2x.cam.triggered,
+        denm_period=period_ticks(v2x.denm.rate_hz, dt),
+        hard_braking_mps2=v2x.denm.hard_braking_mps2,
+        stationary_s=v2x.denm.stationary_s,
+        denm_ticks=ticks(v2x.denm.validity_s),
+        cpm_period=period_ticks(v2x.perception.rate_hz, dt),
+        cpm_range_m=v2x.perception.range_m,
+        cpm_objects=v2x.perception.objects,
+        spat_period=period_ticks(v2x.roadside.rate_hz, dt) if has_units else 0,
+        unit_cpm_period=period_ticks(v2x.roadside.perception_hz, dt) if has_units else 0,
+        unit_range_m=v2x.roadside.range_m,
+        memory_ticks=ticks(v2x.inbox.memory_s),
+        latency=v2x.channel.latency_ticks,
+    )
+
+
+def _make_mail(
+    v2x: V2xConfig,
+    num_worlds: int,
+    capacity: int,
+    num_receivers: int,
+    num_units: int,
+    zeros: Zeros,
+) -> Mail:
+    stations = capacity + num_units
+    most = v2x.capacity or 3 * stations
+    # A CAM, a DENM or SPAT is one report, a CPM as many as it tells of.
+    sees = v2x.perception.rate_hz > 0.0 or v2x.roadside.perception_hz > 0.0
+    most_reports = most + (min(most, stations) * (v2x.perception.objects - 1) if sees else 0)
+    slots = v2x.channel.latency_ticks + 1
+    memory = capacity if v2x.cam.triggered else 0
+    boxes = (num_worlds, num_receivers)
+    return Mail(
+        objects=zeros((*boxes, v2x.inbox.objects), dtype=REPORT),
+        events=zeros((*boxes, v2x.inbox.events), dtype=REPORT),
+        signals=zeros((*boxes, v2x.inbox.signals), dtype=REPORT),
+        owner=zeros(boxes, dtype=np.int64),
+        declared=zeros(boxes, dtype=np.int32),
+        packets=zeros((num_worlds, slots, most), dtype=PACKET),
+        num_packets=zeros((num_worlds, slots), dtype=np.int64),
+        reports=zeros((num_worlds, slots, most_reports), dtype=REPORT),
+        num_reports=zeros((num_worlds, slots), dtype=np.int64),
+        last_cams=zeros((num_worlds, memory), dtype=LAST_CAM),
+        num_last=zeros(num_worlds, dtype=np.int64),
+        counts=zeros((num_worlds, NUM_COUNTS), dtype=np.int64),
+        delays=zeros((num_worlds, MAX_DELAYS), dtype=np.int64),
+        bands=zeros((num_worlds, NUM_BANDS, 2), dtype=np.int64),
+        busy=zeros((num_worlds, 3), dtype=np.float64),
+    )
+
+
+def _make_room(network: RoadNetwork, mail: Mail, zoned: Zoned, num_receivers: int) -> Room:
+    capacity, most = zoned.rows.shape[3], mail.packets.shape[2]
+    largest = max(box.shape[2] for box in (mail.objects, mail.events, mail.signals))
+
+    def air() -> Air:
+        cells = make_grid(network.extent_m, CELL_M, 0)._replace(cell=np.zeros(most, np.int32))
+        return Air(
+            cells,
+            x=np.zeros(most),
+            y=np.zeros(most),
+            sender=np.zeros(most, np.int64),
+            word=np.zeros(most, np.uint64),
+            which=np.zeros(most, np.int32),
+        )
+
+    return Room(
+        stations=np.zeros(capacity, STATION),
+        spare=np.zeros(capacity, STATION),
+        receivers=np.zeros(num_receivers, RECEIVER),
+        bodies=make_grid(network.extent_m, BODY_CELL_M, capacity),
+        everybody=np.zeros(capacity, zoned.rows.dtype),
+        next_cams=np.zeros(mail.last_cams.shape[1], mail.last_cams.dtype),
+        near=np.zeros(MAX_NEAR, np.int32),
+        near_squared=np.zeros(MAX_NEAR),
+        seen=np.zeros(MAX_NEAR, np.int32),
+        cams=air(),
+        others=air(),
+        kinds=np.zeros(NUM_KINDS, np.int64),
+        access=np.zeros(most, np.bool_),
+        cam_of=np.zeros(1 << (2 * capacity).bit_length(), np.int32),
+        heard=np.zeros(most + 1, np.int32),
+        squared=np.zeros(largest),
+    )

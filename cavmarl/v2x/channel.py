@@ -1,0 +1,153 @@
+"""The air, made of the configuration: tables of the path-loss model and what packets take."""
+
+from __future__ import annotations
+
+import math
+from statistics import NormalDist
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cavmarl.config_v2x import ChannelConfig
+from cavmarl.kernels.v2x_channel import Channel
+from cavmarl.kernels.walls import Walls
+
+__all__ = [
+    "BUSY_LEVELS",
+    "airtime_s",
+    "chance_among_others",
+    "chance_of_reception",
+    "hidden_share",
+    "make_channel",
+    "median_range_m",
+    "reference_loss_db",
+]
+
+CARRIER_HZ = 5.9e9
+LIGHT_MPS = 299_792_458.0
+PREAMBLE_S = 40e-6  # of IEEE 802.11p in a channel of 10 MHz
+# Beyond the distance where fewer packets than this are received nobody asks.
+LEAST_CHANCE = 1e-3
+MAX_REACH_M = 20_000
+BUSY_LEVELS = 65  # steps in which chances of reception depend on how busy the air is
+
+
+def reference_loss_db() -> float:
+    """Free-space loss at 1 m (Friis), 47.9 dB at 5.9 GHz."""
+    return 20.0 * math.log10(4.0 * math.pi * CARRIER_HZ / LIGHT_MPS)
+
+
+def chance_of_reception(config: ChannelConfig, distance_m: float, extra_db: float = 0.0) -> float:
+    """Chance that the received power is high enough.
+
+    The log-distance model with log-normal shadowing (Rappaport: "Wireless communications", 4.9;
+    fitted to 5.9 GHz between cars by Cheng et al., IEEE JSAC 25 (8), 2007): the power is normally
+    distributed, in dB, around P = tx - loss(1 m) - 10 n log10(d), so that the chance is
+    Φ((P - sensitivity) / σ).
+
+    Args:
+        config: of which `path_loss_exponent` is not 0.
+        distance_m: between the antennas; below 1 m it counts as 1 m.
+        extra_db: lost besides, in a building.
+    """
+    lost_db = 10.0 * config.path_loss_exponent * math.log10(max(distance_m, 1.0))
+    power_dbm = config.tx_power_dbm - reference_loss_db() - lost_db - extra_db
+    return NormalDist().cdf((power_dbm - config.sensitivity_dbm) / config.shadowing_db)
+
+
+def median_range_m(config: ChannelConfig) -> float:
+    """Distance at which half of the packets are received; inf without path loss."""
+    if config.path_loss_exponent == 0.0:
+        return math.inf
+    margin_db = config.tx_power_dbm - reference_loss_db() - config.sensitivity_dbm
+    return float(10.0 ** (margin_db / (10.0 * config.path_loss_exponent)))
+
+
+def airtime_s(config: ChannelConfig) -> float:
+    """For how long a packet takes the air; 0: it does not matter."""
+    if config.data_rate_mbps == 0.0:
+        return 0.0
+    return PREAMBLE_S + 8.0 * config.packet_bytes / (1e6 * config.data_rate_mbps)
+
+
+def hidden_share(distance_m: float, sensing_m: float) -> float:
+    """Of those whom a receiver hears the share that the sender does not: part of a circle.
+
+    Both hear what is within `sensing_m` of themselves; traffic is taken to be as dense everywhere.
+    """
+    half = 0.5 * distance_m / sensing_m
+    if half >= 1.0:
+        return 1.0
+    return 1.0 - (math.acos(half) - half * math.sqrt(1.0 - half * half)) * 2.0 / math.pi
+
+
+def chance_among_others(busy: float, hidden: float) -> float:
+    """Chance that nobody whom the sender does not hear, and so does not wait for, disturbs it.
+
+    They send at random, and a packet is lost if one of them begins within two packet times:
+    exp(-2 G), where G is their share of the air (Abramson: "The ALOHA system", 1970; Tobagi,
+    Kleinrock: "Packet switching in radio channels: part II, the hidden terminal problem", 1975).
+
+    Args:
+        busy: share of the time in which the receiver hears somebody.
+        hidden: share of those whom the sender does not hear.
+    """
+    return math.exp(-2.0 * busy * hidden)
+
+
+def _distances_m(config: ChannelConfig, sensing_m: float) -> int:
+    """How many whole metres a table has."""
+    end_m = config.range_m or math.inf
+    if config.path_loss_exponent > 0.0:
+        metre, last = 1, min(end_m, MAX_REACH_M)
+        while metre < last and chance_of_reception(config, metre) >= LEAST_CHANCE:
+            metre += 1
+        return metre + 1
+    if config.data_rate_mbps > 0.0 and sensing_m < math.inf:
+        return math.ceil(min(end_m, 2.0 * sensing_m)) + 1
+    return 2
+
+
+def _table(config: ChannelConfig, sensing_m: float, extra_db: float) -> NDArray[np.float64]:
+    """Chances of reception (B, K), see `Channel`."""
+    metres = range(_distances_m(config, sensing_m))
+    levels = BUSY_LEVELS if config.data_rate_mbps > 0.0 else 1
+    chances = np.full((levels, len(metres)), 1.0 - config.loss)
+    if config.path_loss_exponent > 0.0:
+        chances *= [chance_of_reception(config, metre, extra_db) for metre in metres]
+    if levels > 1 and sensing_m < math.inf:
+        hidden = [hidden_share(metre, sensing_m) for metre in metres]
+        for level in range(levels):
+            busy = level / (levels - 1)
+            chances[level] *= [chance_among_others(busy, share) for share in hidden]
+    return chances
+
+
+def make_channel(config: ChannelConfig, tick_s: float, walls: Walls) -> Channel:
+    """What kernels take of a channel.
+
+    The chance of reception is (1 - loss) · `chance_of_reception` · `chance_among_others`.
+
+    Args:
+        config: the channel.
+        tick_s: seconds a tick.
+        walls: of buildings.
+    """
+    reach_m = config.range_m or math.inf
+    sensing_m = min(median_range_m(config), reach_m)
+    clear = _table(config, sensing_m, 0.0)
+    blocked = clear[:0]
+    if config.building_db > 0.0:
+        blocked = _table(config, sensing_m, config.building_db)
+    if config.path_loss_exponent > 0.0:
+        reach_m = min(reach_m, clear.shape[1] - 1.0)
+    return Channel(
+        reach_m=reach_m,
+        sure=bool((clear == 1.0).all()),
+        external=config.external,
+        clear=clear,
+        blocked=blocked,
+        sensing_m=sensing_m,
+        load=airtime_s(config) / tick_s,
+        walls=walls,
+    )

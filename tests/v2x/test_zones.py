@@ -1,0 +1,65 @@
+"""Who receives what does not depend on how a world is divided, although messages reach further."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+
+from cavmarl import make_vec
+from cavmarl.evaluate.equivalence import verify_zones
+
+FAST = {"clock.sim_dt_s": 0.1, "clock.ctrl_dt_s": 0.2}
+OBSERVED = {
+    "v2x.enabled": True,
+    "sensors.messages.objects": 6,
+    "sensors.messages.events": 2,
+    "sensors.messages.signal": True,
+}
+LOSSY = {
+    "v2x.equipped": 0.7,
+    "v2x.cam.triggered": True,
+    "v2x.perception.rate_hz": 5.0,
+    "v2x.roadside.signals": ["all"],
+    "v2x.roadside.perception_hz": 5.0,
+    "v2x.denm.hard_braking_mps2": 1.0,
+    "v2x.channel.range_m": 250.0,
+    "v2x.channel.path_loss_exponent": 2.75,
+    "v2x.channel.latency_ticks": 2,
+    "v2x.channel.loss": 0.1,
+    "v2x.channel.data_rate_mbps": 0.3,
+}
+
+
+@pytest.mark.parametrize("channel", [{}, LOSSY], ids=["ideal", "lossy"])
+@pytest.mark.parametrize("stack", [1, 3])
+def test_what_agents_are_told_does_not_depend_on_zones(channel: dict[str, Any], stack: int) -> None:
+    settings = FAST | OBSERVED | channel | {"sensors.stack": stack, "population.background": 60}
+    found = verify_zones("grid4x4", (2, 4, 9), steps=30, overrides=settings)
+    for result in found.results:
+        assert result.difference is None, result
+    assert sum(result.crossings for result in found.results) >= 10
+
+
+def everything_said(zones: int, workers: int = 0, **more: Any) -> list[bytes]:
+    """All inboxes and counts after each step, in the order of the receivers."""
+    overrides = FAST | OBSERVED | LOSSY | {"population.mode": "seats"} | more
+    env = make_vec("grid4x4", num_envs=2, zones=zones, workers=workers, overrides=overrides)
+    said = []
+    observations, _ = env.reset(seed=4)
+    for _ in range(20):
+        said.append(observations.tobytes())
+        if workers:
+            said.append(env.state_hash(1).encode())
+        else:
+            said += [array.tobytes() for array in env.simulation.messages.mail]
+            said.append(env.state_hash(1).encode())
+        observations, *_ = env.step(env.suggest_actions())
+    env.close()
+    return said
+
+
+def test_inboxes_are_the_same_byte_for_byte() -> None:
+    whole = everything_said(1)
+    for zones in (2, 4, 9):
+        assert everything_said(zones) == whole
