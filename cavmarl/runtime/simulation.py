@@ -62,7 +62,7 @@ from cavmarl.runtime.refereeing import make_refereeing
 from cavmarl.runtime.reproducer import Reproducer
 from cavmarl.runtime.reproducing import Keeper, Moment, sources_of
 from cavmarl.runtime.shard_clock import ShardClock
-from cavmarl.runtime.step_trace import Traced
+from cavmarl.runtime.step_trace import MIRROR, SUMO, Traced
 from cavmarl.runtime.store import CommittedStore
 from cavmarl.runtime.zone_view import ZoneView, view_zones
 from cavmarl.shard.shard import Commands, Shard
@@ -212,6 +212,7 @@ class Simulation:
             self._keeper: Keeper | None = None
             self._recutter: Recutter | None = None
             self._sumo: SumoTraffic | None = None
+            self._note_phase: Callable[[str], None] = _pass_over
             if is_first or warm:
                 self._call_every_kernel()
             if sumo is not None:
@@ -542,6 +543,7 @@ class Simulation:
         A part that has phases of its own (another simulator's step, say) has a method `trace`.
         """
         self._executor = wrap(self._executor)
+        self._note_phase = note
         for part in self._attached:
             if isinstance(part, Traced):
                 part.trace(note)
@@ -607,14 +609,18 @@ class Simulation:
     def _follow_sumo(self, sumo: SumoTraffic) -> None:
         """SUMO takes its step; who is its own stands where it is then, or leaves."""
         gate, worlds, side = self._gate, self._shard.worlds, self._division.next_side
-        if sumo.step(worlds, side):
+        self._note_phase(SUMO)
+        sumo.step(worlds, side)
+        if not sumo.drives:
+            sumo.send_on(gate, worlds, side)
+            return
+        self._note_phase(MIRROR)
+        if sumo.mirror(worlds, side):
             for shard in self._shards:
                 shard.dismiss(gate)
             self._note_left()
             sumo.forgive(gate)
             self._traffic.settle(gate, worlds)
-        if not sumo.drives:
-            sumo.send_on(gate, worlds, side)
 
     @property
     def sumo(self) -> SumoTraffic | None:
@@ -833,6 +839,10 @@ class Simulation:
 def _frames(config: EnvConfig, num_worlds: int, zeros: Zeros) -> Frames:
     layout = frame_layout(config, num_worlds)
     return frames_in({name: zeros(shape, dtype=kind) for name, (kind, shape) in layout.items()})
+
+
+def _pass_over(phase: str) -> None:
+    """What is done with the names of phases where nobody asks for them."""
 
 
 def _cut(config: EnvConfig, network: RoadNetwork) -> ZonePartition:
