@@ -33,12 +33,14 @@ class Samples:
     """What one sensor has since the last snapshot.
 
     Attributes:
-        values: (n, …) one sample a row.
-        ticks: (n,) of the world, when each was taken.
+        values: (n, …) one sample a row, the newest last.
+        stamps_s: (n,) when each was taken, in simulated time since the reset.
+        lost: (n,) which were lost: zeros.
     """
 
     values: NDArray[Any]
-    ticks: NDArray[np.int64]
+    stamps_s: NDArray[np.float64]
+    lost: NDArray[np.bool_]
 
 
 @dataclass(frozen=True)
@@ -133,8 +135,8 @@ class Follower:
         self._frame = snapshot.frame
         sensors: dict[str, dict[str, Samples]] = {vehicle: {} for vehicle in snapshot.vehicles}
         for view, array in zip(snapshot.arrays, arrays, strict=True):
-            ticks = np.asarray(view.ticks, dtype=np.int64)
-            sensors.setdefault(view.vehicle, {})[view.name] = Samples(array, ticks)
+            samples = Samples(array, np.array(view.stamps_s), np.array(view.lost, dtype=np.bool_))
+            sensors.setdefault(view.vehicle, {})[view.name] = samples
         return Sight(snapshot, sensors)
 
     def answer(self, controls: Mapping[str, Any]) -> None:

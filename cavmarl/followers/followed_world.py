@@ -14,6 +14,7 @@ from __future__ import annotations
 import time
 from collections.abc import Iterable, Sequence
 from contextlib import suppress
+from dataclasses import asdict
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Literal, Self
@@ -28,7 +29,7 @@ from cavmarl.errors import (
 )
 from cavmarl.followers.barrier import BadControls, Barrier, Seat
 from cavmarl.followers.line import Address, Line
-from cavmarl.followers.messages import Hello, Say, Welcome
+from cavmarl.followers.messages import Hello, Say, SensorView, Welcome
 from cavmarl.followers.reception import Reception, refuse
 from cavmarl.followers.snapshots import Moment
 from cavmarl.runtime.clock import OwnTicks, TimeMaster
@@ -233,6 +234,10 @@ class FollowedWorld:
                 action=action.kind,
                 acceleration_mps2=action.acceleration_mps2,
                 steering_rad=action.steering_rad,
+                sensors=[
+                    SensorView(name, list(sensor.units), asdict(sensor))
+                    for name, sensor in env.config.rig.items()
+                ],
             ),
             within_s=self._timeout_s,
         )

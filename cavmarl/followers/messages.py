@@ -33,6 +33,7 @@ __all__ = [
     "Hello",
     "Refusal",
     "Say",
+    "SensorView",
     "Snapshot",
     "Ticked",
     "VehicleView",
@@ -94,6 +95,22 @@ class Hello:
 
 @with_config(_CLOSED)
 @dataclass(frozen=True)
+class SensorView:
+    """One sensor of every vehicle.
+
+    Attributes:
+        name: in the rig.
+        units: of its channels.
+        settings: its keys in `env.yaml`: type, place on the vehicle, rate, range and so on.
+    """
+
+    name: StrictStr
+    units: list[StrictStr]
+    settings: dict[StrictStr, Any]
+
+
+@with_config(_CLOSED)
+@dataclass(frozen=True)
 class Welcome:
     """The answer.
 
@@ -108,6 +125,7 @@ class Welcome:
         action: `continuous` or `discrete`.
         acceleration_mps2: what 1 means as the first number of a control.
         steering_rad: what 1 means as the second.
+        sensors: of every vehicle; none: a snapshot has the `observation` of the environment.
     """
 
     environment: StrictStr
@@ -119,6 +137,7 @@ class Welcome:
     action: StrictStr
     acceleration_mps2: StrictFloat
     steering_rad: StrictFloat
+    sensors: list[SensorView]
 
 
 @with_config(_CLOSED)
@@ -131,14 +150,16 @@ class ArrayView:
         name: of the sensor.
         dtype: as NumPy writes it, little-endian.
         shape: of the array; the first axis are samples.
-        ticks: of the world at which each sample was taken.
+        stamps_s: when each was taken, in simulated time since the reset.
+        lost: which of them were lost: zeros.
     """
 
     vehicle: StrictStr
     name: StrictStr
     dtype: StrictStr
     shape: list[StrictInt]
-    ticks: list[StrictInt]
+    stamps_s: list[StrictFloat]
+    lost: list[StrictBool]
 
 
 @with_config(_CLOSED)

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from cavmarl.cav_env import CavEnv
 from cavmarl.followers.messages import ArrayView, Snapshot, VehicleView
+from cavmarl.rig.frames import SensorFrames
 from cavmarl.roads.network import VEHICLE_CLASSES
 
 __all__ = ["Moment", "take_snapshot"]
@@ -49,23 +50,44 @@ def take_snapshot(
     vehicles: dict[str, VehicleView] = {}
     views: list[ArrayView] = []
     arrays: list[NDArray[Any]] = []
+    time_s = moment.tick * env.config.clock.sim_dt_s
     if due:
         rows = env.simulation.vehicles()
         by_agent = {int(row["agent"]): row for row in rows[np.isin(rows["agent"], due)]}
         for k in due:
             name = env.possible_agents[k]
             vehicles[name] = _view(env, by_agent[k])
-            seen = worlds.observations[0, k : k + 1]
-            views.append(_array_view(name, "observation", seen, [moment.tick]))
-            arrays.append(np.ascontiguousarray(seen))
-    time_s = moment.tick * env.config.clock.sim_dt_s
+            for sensor, seen in _due(env, k, time_s).items():
+                data = np.ascontiguousarray(seen.data)
+                views.append(
+                    ArrayView(
+                        vehicle=name,
+                        name=sensor,
+                        dtype=data.dtype.str,
+                        shape=list(data.shape),
+                        stamps_s=seen.stamp_s.tolist(),
+                        lost=seen.lost.tolist(),
+                    )
+                )
+                arrays.append(data)
     return Snapshot(
         moment.frame, moment.episode, moment.tick, time_s, moment.is_over, vehicles, views
     ), arrays
 
 
-def _array_view(vehicle: str, name: str, array: NDArray[Any], ticks: list[int]) -> ArrayView:
-    return ArrayView(vehicle, name, array.dtype.str, list(array.shape), ticks)
+def _due(env: CavEnv, agent: int, time_s: float) -> dict[str, SensorFrames]:
+    """What an agent's sensors have taken in the last step; without a rig, its observation."""
+    arrays = env.worlds.arrays
+    if not arrays.frames:
+        seen = arrays.observations[0, agent : agent + 1]
+        now, lost = np.array([time_s]), np.zeros(1, dtype=np.bool_)
+        return {"observation": SensorFrames(seen, now, lost, np.ones((), dtype=np.int64))}
+    found = {}
+    for name, frames in arrays.frames.items():
+        data, stamp_s, lost, fresh = (array[0, agent] for array in frames)
+        if fresh:
+            found[name] = SensorFrames(data[-fresh:], stamp_s[-fresh:], lost[-fresh:], fresh)
+    return found
 
 
 def _view(env: CavEnv, row: np.void) -> VehicleView:

@@ -57,7 +57,7 @@ def test_a_follower_drives_as_a_policy_would(address: Path, start: Start) -> Non
     for frame, sight in enumerate(seen):
         snapshot = sight.snapshot
         assert (snapshot.frame, snapshot.tick, snapshot.time_s) == (frame, frame, frame * 0.05)
-        assert sight.sensors["car_1"]["observation"].ticks.tolist() == [frame]
+        assert sight.sensors["car_1"]["observation"].stamps_s.tolist() == [frame * 0.05]
         assert list(snapshot.vehicles) == ["car_1"]
         assert snapshot.vehicles["car_1"].vclass == "passenger"
     assert len(seen) == 11
