@@ -14,12 +14,8 @@ from pettingzoo import ParallelEnv
 
 from cavmarl.actions import ActionDecoder
 from cavmarl.config import TERMS
-from cavmarl.errors import (
-    ConfigError,
-    EpisodeEndedError,
-    ResetNeededError,
-    UnknownAgentError,
-)
+from cavmarl.declared_events import DeclaredEvents
+from cavmarl.errors import ConfigError, EpisodeEndedError, ResetNeededError, UnknownAgentError
 from cavmarl.registry import load_config
 from cavmarl.render.view import WorldView
 from cavmarl.rig.frames import SensorFrames
@@ -35,8 +31,8 @@ from cavmarl.spaces import (
     state_space,
 )
 from cavmarl.stepping.arrays import SteppedWorlds
-from cavmarl.stepping.local import LocalWorlds
 from cavmarl.stepping.pooled import PooledWorlds
+from cavmarl.stepping.sensing import local_worlds
 from cavmarl.worlds import check_agents, check_workers, make_world
 
 __all__ = ["CavEnv", "parallel_env"]
@@ -55,6 +51,7 @@ def parallel_env(
     *,
     zones: int | None = None,
     workers: int | None = None,
+    sensor_workers: int | None = None,
     agents: int | None = None,
     background: int | None = None,
     seed: int | None = None,
@@ -69,6 +66,8 @@ def parallel_env(
         zones: shadows zones.count, how many shards run the world; results do not depend on it.
         workers: processes that the zones are shared out over; 0: the caller's process runs them.
             Results do not depend on it.
+        sensor_workers: shadows workers.sensors, how many processes the sensors of `rig` are shared
+            out over (docs/sensor_workers.md). Results do not depend on it.
         agents: shadows population.agents.
         background: shadows population.background.
         seed: of the first reset, if that is given none.
@@ -88,6 +87,7 @@ def parallel_env(
     config, base_dir = load_config(
         env,
         zones=zones,
+        sensor_workers=sensor_workers,
         agents=agents,
         background=background,
         max_cycles=max_cycles,
@@ -98,7 +98,7 @@ def parallel_env(
     worlds: SteppedWorlds = (
         PooledWorlds(world, base_dir, 1, num_workers, in_next_step=True)
         if num_workers
-        else LocalWorlds(world, 1, in_next_step=True)
+        else local_worlds(world, base_dir, 1, in_next_step=True)
     )
     return CavEnv(worlds, seed=first_seed, render_mode=render_mode)
 
@@ -180,6 +180,7 @@ class CavEnv(ParallelEnv[str, Any, Any]):  # type: ignore[misc] # PettingZoo is 
         )
         self.state_space = state_space(worlds.arrays.states.shape[1] // STATE_FEATURES)
         self._decoder = ActionDecoder(config.action, 1, self.possible_agents)
+        self._events = DeclaredEvents(config, 1)
         self._first_seed = seed
         self._steps = -1
         self._view: WorldView | None = None
@@ -255,7 +256,7 @@ class CavEnv(ParallelEnv[str, Any, Any]):  # type: ignore[misc] # PettingZoo is 
         active = self.worlds.arrays.mask[0, self._listed]
         needed = self.agents if active.all() else list(compress(self.agents, active.tolist()))
         commands = self._decoder.from_dict(actions, self.agents, needed)
-        self.worlds.step(commands)
+        self.worlds.step(self._events.add_to(commands))
         self._steps += 1
         return self._report()
 
@@ -355,6 +356,21 @@ class CavEnv(ParallelEnv[str, Any, Any]):  # type: ignore[misc] # PettingZoo is 
             for info, number in zip(infos, column.tolist(), strict=True):
                 info[name] = number
         return dict(zip(self.agents, infos, strict=True))
+
+    def declare_event(self, agent: str, cause: str) -> None:
+        """Let an agent's vehicle tell others of an event in the next step (docs/v2x.md).
+
+        Args:
+            agent: which has a vehicle.
+            cause: `collision`, `obstacle`, `stationary` or `hard_braking`.
+
+        Raises:
+            UnknownAgentError: no such agent, or it has left.
+            V2xError: no such cause, or nobody says anything in this environment.
+        """
+        if agent not in self.agents:
+            raise UnknownAgentError(f"declare_event('{agent}', …): it is not in the episode")
+        self._events.declare(0, self.possible_agents.index(agent), cause)
 
     def frames(self, agent: str) -> dict[str, SensorFrames]:
         """What the sensors of an agent's `rig` have got in the last step, by name.

@@ -58,6 +58,7 @@ MAX_ZONES = 256  # of one map
 ZONE_LAYOUTS = ("grid", "strips", "bisection")
 ZONE_FILE_SUFFIXES = (".json", ".yaml", ".yml")
 
+MAX_SENSOR_WORKERS = 256  # of one process
 MAX_IDS = 1_000_000  # of agents in one episode: each has its space and its rows in every output
 
 
@@ -71,11 +72,14 @@ class MapConfig:
         programs: additional files with more signal programs, named as the source is; of several
             programs of a signal the last is on.
         program: the program of each signal named here, whatever was loaded; `off` is one, too.
+        buildings: `osm`: those of the OpenStreetMap file that `source` is; or a file of buildings
+            (OpenStreetMap or SUMO's polygons), named as the source is; empty: none.
     """
 
     source: str
     programs: tuple[str, ...] = ()
     program: dict[str, str] = field(default_factory=dict)
+    buildings: str = ""
 
     def __post_init__(self) -> None:
         _check(bool(self.source), "map.source", self.source, "must name a map file")
@@ -243,6 +247,10 @@ class WorkersConfig:
         max_moves: worlds or zones that change their worker in one round.
         watch: see how busy others keep the workers' cores, and give nothing more to workers above
             a threshold; without it nobody else is supposed to use them.
+        sensors: processes that the sensors of `rig` are shared out over, for each process that
+            keeps the state of worlds; 0: it senses itself. Results do not depend on it. See
+            docs/sensor_workers.md.
+        sensor_placement: who of them senses what: by what it `cost` of late, or `in_turn`.
     """
 
     timeout_s: float = 300.0
@@ -252,8 +260,16 @@ class WorkersConfig:
     tolerance: float = 0.1
     max_moves: int = 4
     watch: bool = False
+    sensors: int = 0
+    sensor_placement: Literal["cost", "in_turn"] = "cost"
 
     def __post_init__(self) -> None:
+        _check(
+            0 <= self.sensors <= MAX_SENSOR_WORKERS,
+            "workers.sensors",
+            self.sensors,
+            f"must be a whole number from 0 to {MAX_SENSOR_WORKERS}",
+        )
         _check_finite("workers.timeout_s", self.timeout_s, 1.0, 1e6)
         _check(
             0 <= self.repeats <= 1000,
@@ -417,11 +433,12 @@ class ObservationConfig:
 
     Attributes:
         mode: `ground_truth`: what `sensors` says, taken from the world itself. `sensors`: the
-            latest samples of the `rig`.
+            latest samples of the `rig`. `messages`: of `sensors` only what the vehicle knows of
+            itself and its route, and what it is told over the air.
         kind: `flat`: one Box of float32. `dict`: one Box a sensor.
     """
 
-    mode: Literal["ground_truth", "sensors"] = "ground_truth"
+    mode: Literal["ground_truth", "sensors", "messages"] = "ground_truth"
     kind: Literal["flat", "dict"] = "flat"
 
 
@@ -492,6 +509,12 @@ class EnvConfig:
         _check_finite("horizon_s", self.horizon_s, self.clock.ctrl_dt_s, 1e6)
         check_rig(self.rig, self.clock.sim_dt_s, self.clock.ticks_per_step)
         _check(
+            not self.workers.sensors or bool(self.rig),
+            "workers.sensors",
+            self.workers.sensors,
+            "there is no rig whose sensors they could share; name some under rig, or leave it 0",
+        )
+        _check(
             self.observation.mode != "sensors" or bool(self.rig),
             "observation.mode",
             self.observation.mode,
@@ -514,8 +537,21 @@ class EnvConfig:
         if self.v2x.enabled:
             self.v2x.check_clock(self.clock.sim_dt_s)
         self._check_messages()
+        if self.observation.mode == "messages":
+            self._keep_what_is_told()
         if self.traffic.source != "native":
             self._check_sumo()
+
+    def _keep_what_is_told(self) -> None:
+        """Switch the sensors off that look at others."""
+        told = self.sensors.messages
+        _check(
+            bool(told.objects or told.events or told.signal),
+            "observation.mode",
+            self.observation.mode,
+            "no messages are observed: set sensors.messages.objects",
+        )
+        object.__setattr__(self, "sensors", self.sensors.without_sight())
 
     def _check_messages(self) -> None:
         """Refuse to observe messages that nobody keeps."""

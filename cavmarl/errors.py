@@ -55,6 +55,7 @@
     ├── WorkerError            worker processes that cannot go on
     │   ├── WorkerStartError      no process, or no memory for it
     │   ├── WorkerDeathError      every process that took up a step died of it
+    │   ├── SensorFrameError      a frame that is not of the present tick
     │   └── WorkerFailureError    an exception in a worker, with its traceback
     ├── V2xError               a message that cannot be read, or an impossible reception
     ├── SumoError              SUMO as global traffic that cannot go on
@@ -111,6 +112,7 @@ __all__ = [
     "ResetNeededError",
     "RouteError",
     "SecondMasterError",
+    "SensorFrameError",
     "SpawnError",
     "StoreError",
     "SumoBusyError",
@@ -214,7 +216,7 @@ class CapacityError(CavmarlError):
 
 
 class V2xError(CavmarlError):
-    """Bytes that are no message, a network simulator that answers nonsense, or none where one is due."""
+    """Bytes that are no message, an unknown cause, or a network simulator that answers nonsense."""
 
 
 class EvaluationError(CavmarlError):
@@ -445,6 +447,23 @@ class WorkerDeathError(WorkerError):
             "workers=0 runs the same in this process"
         )
         self.worker, self.part, self.order, self.causes = worker, part, order, tuple(causes)
+
+
+class SensorFrameError(WorkerError):
+    """A sensor worker has delivered a frame that is not of the present tick.
+
+    Attributes:
+        sensor: its name in the rig.
+        tick: that was to be sensed.
+        found: tick of the frame; -1: there is none.
+    """
+
+    def __init__(self, sensor: str, tick: int, found: int) -> None:
+        super().__init__(
+            f"rig.{sensor}: the frame of tick {tick} is not there, but one of tick {found}; "
+            "sensor_workers=0 senses in this process"
+        )
+        self.sensor, self.tick, self.found = sensor, tick, found
 
 
 class WorkerFailureError(WorkerError):

@@ -15,11 +15,13 @@ from numpy.typing import NDArray
 from cavmarl.actions import ActionDecoder
 from cavmarl.balance.plan import Plan
 from cavmarl.balance.plan_text import describe_plan
+from cavmarl.declared_events import DeclaredEvents
 from cavmarl.errors import ConfigError, ResetNeededError
 from cavmarl.registry import load_config
 from cavmarl.rig.frames import SensorFrames
 from cavmarl.runtime.simulation import Simulation
 from cavmarl.seeds import check_seed, first_seed
+from cavmarl.shard.shard import Commands
 from cavmarl.spaces import (
     action_space,
     flat_observation_space,
@@ -27,9 +29,9 @@ from cavmarl.spaces import (
     sensed_observation,
 )
 from cavmarl.stepping.arrays import SteppedWorlds
-from cavmarl.stepping.local import LocalWorlds
 from cavmarl.stepping.pooled import PooledWorlds
 from cavmarl.stepping.remote import RemoteWorlds
+from cavmarl.stepping.sensing import local_worlds
 from cavmarl.worlds import check_agents, check_hosts, check_workers, make_world
 
 __all__ = ["CavVectorEnv", "make_vec"]
@@ -55,6 +57,7 @@ def make_vec(
     zones: int | None = None,
     workers: int | Literal["ray"] | None = None,
     hosts: Literal["ray"] | None = None,
+    sensor_workers: int | None = None,
     agents: int | None = None,
     background: int | None = None,
     seed: int | None = None,
@@ -74,6 +77,8 @@ def make_vec(
             Results do not depend on it. "ray": as with hosts="ray", as many as CPUs and worlds.
         hosts: "ray" runs the workers on the machines of a Ray cluster (docs/cluster.md), whole
             worlds each. None: on this one.
+        sensor_workers: shadows workers.sensors, how many processes the sensors of `rig` are shared
+            out over (docs/sensor_workers.md). Results do not depend on it.
         agents: shadows population.agents.
         background: shadows population.background.
         seed: of the first reset, if that is given none.
@@ -101,6 +106,7 @@ def make_vec(
     config, base_dir = load_config(
         env,
         zones=zones,
+        sensor_workers=sensor_workers,
         agents=agents,
         background=background,
         max_cycles=max_cycles,
@@ -114,7 +120,7 @@ def make_vec(
     elif num_workers:
         worlds = PooledWorlds(world, base_dir, num_envs, num_workers, in_next_step)
     else:
-        worlds = LocalWorlds(world, num_envs, in_next_step=in_next_step)
+        worlds = local_worlds(world, base_dir, num_envs, in_next_step)
     return CavVectorEnv(worlds, seed=first_seed, copy=copy)
 
 
@@ -191,8 +197,13 @@ class CavVectorEnv:
                 AutoresetMode.NEXT_STEP if worlds.in_next_step else AutoresetMode.SAME_STEP
             ),
         }
-        self._decoder = ActionDecoder(config.action, num_envs, self.possible_agents)
+        arrays = worlds.arrays
+        commands = Commands(arrays.controls, arrays.meta_actions)
+        self._decoder = ActionDecoder(config.action, num_envs, self.possible_agents, commands)
+        self._view = arrays.observations.view()
+        self._view.flags.writeable = False
         self._mask = np.zeros((num_envs, self.num_agents), dtype=np.bool_)
+        self._events = DeclaredEvents(config, num_envs)
         self._first_seed = None if seed is None else check_seed(seed)
         self._copy = copy
         self._ready = False
@@ -302,15 +313,14 @@ class CavVectorEnv:
             raise ResetNeededError("step() before reset(): call vec.reset(seed=…) first")
         commands = self._decoder.from_array(actions, self._mask)
         began = time.perf_counter()
-        self.worlds.step(commands)
+        self.worlds.step(self._events.add_to(commands))
         self.simulated_s += time.perf_counter() - began
         arrays = self.worlds.arrays
         over = arrays.episode_over.copy()
         terminations = arrays.terminations.copy()
         observations = final_observations = self._observations()
-        ended = over | terminations.any(axis=1)
-        if ended.any():
-            final_observations = self._final_observations(ended)
+        if np.count_nonzero(over) or np.count_nonzero(terminations):
+            final_observations = self._final_observations(over | terminations.any(axis=1))
             self._decoder.forget(over)
         self._mask = arrays.mask.copy()
         infos: dict[str, NDArray[Any]] = {
@@ -327,7 +337,7 @@ class CavVectorEnv:
     def _observations(self) -> Observations:
         arrays = self.worlds.arrays
         if not self._senses:
-            return self._given(arrays.observations)
+            return arrays.observations.copy() if self._copy else self._view
         left = arrays.terminations & ~arrays.episode_over[:, None]
         if self.worlds.in_next_step or not left.any():
             sensed = sensed_observation(arrays.frames)
@@ -344,6 +354,20 @@ class CavVectorEnv:
         view = array.view()
         view.flags.writeable = False
         return view
+
+    def declare_event(self, world: int, agent: int, cause: str) -> None:
+        """Let the vehicle of an agent, by index, tell others of an event in the next step.
+
+        Args:
+            world: in which it drives.
+            agent: index in `possible_agents`.
+            cause: as of `CavEnv.declare_event`.
+
+        Raises:
+            UnknownAgentError: no such agent.
+            V2xError: no such cause, or nobody says anything in this environment.
+        """
+        self._events.declare(world, agent, cause)
 
     def _final_observations(self, ended: NDArray[np.bool_]) -> Observations:
         """The observations, and of the worlds (W,) where something ended those before that."""

@@ -10,9 +10,11 @@ import numpy as np
 
 from cavmarl.config import EnvConfig
 from cavmarl.errors import ConfigError
+from cavmarl.maps.buildings import with_buildings
 from cavmarl.maps.netconvert import map_file
 from cavmarl.registry import (
     load_config,
+    resolve_buildings,
     resolve_demand,
     resolve_map,
     resolve_programs,
@@ -121,16 +123,19 @@ def make_world(config: EnvConfig, base_dir: Path) -> World:
 
 
 def load_roads(config: EnvConfig, base_dir: Path) -> RoadNetwork:
-    """The roads of a configuration, with the signal programs that it names.
+    """The roads of a configuration, with the buildings and the signal programs that it names.
 
     Args:
         config: of the environment.
         base_dir: the folder that relative files start from.
 
     Raises:
-        MapError: the map or a file of programs cannot be read, or they do not fit.
+        MapError: the map or a file of buildings or programs cannot be read, or they do not fit.
     """
     network = load_network(map_file(resolve_map(config, base_dir)))
+    buildings = resolve_buildings(config, base_dir)
+    if buildings is not None:
+        network = with_buildings(network, buildings)
     return with_programs(network, resolve_programs(config, base_dir), config.map.program)
 
 

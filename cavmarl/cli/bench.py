@@ -13,7 +13,9 @@ from cavmarl.cli.bench_balance import balance
 from cavmarl.cli.bench_clock import clock
 from cavmarl.cli.bench_libraries import libraries
 from cavmarl.cli.bench_moving import moving
+from cavmarl.cli.bench_rays import rays
 from cavmarl.cli.bench_recut import recut
+from cavmarl.cli.bench_sensors import sensors
 from cavmarl.cli.bench_sharding import sharding
 from cavmarl.cli.bench_sumo import sumo
 from cavmarl.cli.bench_traffic import traffic
@@ -47,6 +49,8 @@ app.command()(moving)
 app.command()(recut)
 app.command()(workers)
 app.command()(train)
+app.command()(rays)
+app.command()(sensors)
 app.command()(libraries)
 app.command()(clock)
 

@@ -5,7 +5,7 @@ What agents got is compared as bytes and not as numbers: -0.0 is not 0.0 here, a
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -15,7 +15,15 @@ from numpy.typing import NDArray
 from cavmarl.shard.vehicles import STATE_FIELDS
 from cavmarl.vector_env import CavVectorEnv, StepResult
 
-__all__ = ["Arrays", "Difference", "find_difference", "same_bytes", "snapshot", "step_results"]
+__all__ = [
+    "Arrays",
+    "Difference",
+    "find_difference",
+    "same_bytes",
+    "single_arrays",
+    "snapshot",
+    "step_results",
+]
 
 Arrays = dict[str, NDArray[Any]]
 
@@ -55,19 +63,34 @@ def step_results(result: StepResult, actions: NDArray[Any]) -> Arrays:
     }
 
 
+def single_arrays(results: Mapping[str, Any]) -> Iterator[tuple[str, NDArray[Any]]]:
+    """The arrays of results, by name; observations that are named by sensor, one by one."""
+    for name, found in results.items():
+        if isinstance(found, Mapping):
+            yield from ((f"{name} {sensor}", array) for sensor, array in found.items())
+        else:
+            yield name, found
+
+
 def snapshot(vec: CavVectorEnv, results: Mapping[str, NDArray[Any]], world: int = 0) -> Arrays:
-    """One world's vehicles by rising id, its signals, and its part of what a step returned."""
+    """One world's vehicles by rising id, its signals, and its part of what agents got in a step."""
     vehicles = vec.simulation.vehicles(world)
     return {
         "vehicles": vehicles[np.argsort(vehicles["id"])],
         "signals": vec.simulation.signal_phases(world),
-        **{name: np.atleast_1d(array[world]) for name, array in results.items()},
+        **{
+            f"frames {name} {field}": array[world]
+            for name, frames in vec.frames().items()
+            for field, array in frames._asdict().items()
+        },
+        **{name: np.atleast_1d(array[world]) for name, array in single_arrays(results)},
     }
 
 
 def same_bytes(one: Mapping[str, NDArray[Any]], other: Mapping[str, NDArray[Any]]) -> bool:
     """Whether all arrays of two results are the same."""
-    return all(array.tobytes() == other[name].tobytes() for name, array in one.items())
+    others = dict(single_arrays(other))
+    return all(array.tobytes() == others[name].tobytes() for name, array in single_arrays(one))
 
 
 def find_difference(step: int, tick: int, one: Arrays, other: Arrays) -> Difference:

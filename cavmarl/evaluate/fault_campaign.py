@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from cavmarl.errors import ConfigError, ProtocolError, UnequalWorldsError, ZoneStepError
 from cavmarl.evaluate.determinism import check_steps
-from cavmarl.evaluate.differences import Arrays, step_results
+from cavmarl.evaluate.differences import Arrays, single_arrays, step_results
 from cavmarl.evaluate.fault_figures import FaultFigures, HandOverClock, spread
 from cavmarl.evaluate.fault_matrix import Line, Rehearsal, matrix
 from cavmarl.evaluate.replay import replay_tick, world_of
@@ -353,7 +353,7 @@ class _Healing:
 def _fingerprint(vec: CavVectorEnv, results: Arrays) -> bytes:
     """Digest of the world's state and of all that its agents got."""
     digest = blake2b(vec.state_hash(0).encode(), digest_size=16)
-    for name, array in results.items():
+    for name, array in single_arrays(results):
         digest.update(name.encode())
         digest.update(np.ascontiguousarray(array).tobytes())
     return digest.digest()

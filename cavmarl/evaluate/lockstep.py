@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from cavmarl import errors
-from cavmarl.evaluate.differences import Arrays, snapshot, step_results
+from cavmarl.evaluate.differences import Arrays, single_arrays, snapshot, step_results
 from cavmarl.policies import load_policy
 from cavmarl.stepping.local import LocalWorlds
 from cavmarl.vector_env import CavVectorEnv
@@ -59,7 +59,7 @@ def _steps(job: dict[str, Any]) -> Iterator[dict[str, Any]]:
 
 def _digest(arrays: Arrays) -> str:
     digest = hashlib.blake2b(digest_size=16)
-    for array in arrays.values():
+    for _, array in single_arrays(arrays):
         digest.update(np.ascontiguousarray(array).tobytes())
     return digest.hexdigest()
 

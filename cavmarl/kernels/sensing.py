@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cavmarl.kernels import kernel
+from cavmarl.kernels.bearings import ANGLE_ERROR_RAD, rough_atan2
 from cavmarl.kernels.neighbors import LEVEL_HEIGHT_M, Grid, cell_columns, cell_rows
 
 __all__ = ["ECHO", "lidar", "ray_directions"]
@@ -36,9 +37,6 @@ ECHO = np.dtype(
 PI = math.pi
 TWO_PI = 2.0 * math.pi
 
-# `_rough_atan2` is off by less than this.
-_ANGLE_ERROR_RAD = 0.005
-
 # A ray that closes in on a strip by less than this each metre does not reach it within any range.
 _PARALLEL = 1e-200
 
@@ -47,26 +45,6 @@ def ray_directions(num_rays: int) -> NDArray[np.float64]:
     """Directions (num_rays, 2), cosine and sine: equally spaced, counter-clockwise from ahead."""
     angles = 2.0 * np.pi * np.arange(num_rays) / num_rays
     return np.stack([np.cos(angles), np.sin(angles)], axis=1)
-
-
-@kernel
-def _rough_atan2(y: float, x: float) -> float:
-    """The angle of (x, y), not both zero, with an error below `_ANGLE_ERROR_RAD`.
-
-    Rajan, Wang, Inkol, Joyal: "Efficient approximations for the arctangent function", IEEE Signal
-    Processing Magazine 23(3), 2006, their equation for 0.0038 rad.
-    """
-    across = abs(y)
-    along = abs(x)
-    small = min(across, along)
-    large = max(across, along)
-    ratio = small / large
-    angle = ratio * (0.25 * PI + 0.273 * (1.0 - ratio))
-    if across > along:
-        angle = 0.5 * PI - angle
-    if x < 0.0:
-        angle = PI - angle
-    return -angle if y < 0.0 else angle
 
 
 @kernel
@@ -131,10 +109,10 @@ def _rays_over(
     # Both times the distance to the centre, which cancels out.
     ahead = x * x + y * y - (half_length * along + half_width * beside)
     across = half_length * beside + half_width * along
-    if across >= (PI - _ANGLE_ERROR_RAD) * ahead:
+    if across >= (PI - ANGLE_ERROR_RAD) * ahead:
         return 0, rays
-    spread = across / ahead + _ANGLE_ERROR_RAD
-    angle = _rough_atan2(y, x)
+    spread = across / ahead + ANGLE_ERROR_RAD
+    angle = rough_atan2(y, x)
     per_rad = rays / TWO_PI
     first = math.ceil((angle - spread) * per_rad)
     last = math.floor((angle + spread) * per_rad)

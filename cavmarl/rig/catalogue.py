@@ -13,21 +13,31 @@ from numpy.typing import NDArray
 
 from cavmarl.config import EnvConfig
 from cavmarl.config_rig import (
+    BevGridConfig,
     CollisionConfig,
+    DepthCameraConfig,
     GnssConfig,
     ImuConfig,
     LaneBoundaryConfig,
+    LidarRigConfig,
     MountedConfig,
     OdometryConfig,
+    RadarConfig,
+    RgbCameraConfig,
+    SemanticCameraConfig,
     samples_per_step,
 )
 from cavmarl.errors import ConfigError
+from cavmarl.rig.bev_grid import BevGrid
+from cavmarl.rig.cameras import DepthCamera, RgbCamera, SemanticCamera
 from cavmarl.rig.collision import Collision
 from cavmarl.rig.frames import SensorFrames
 from cavmarl.rig.gnss import Gnss
 from cavmarl.rig.imu import Imu
 from cavmarl.rig.lane_boundary import LaneBoundary
+from cavmarl.rig.lidar import Lidar
 from cavmarl.rig.odometry import Odometry
+from cavmarl.rig.radar import Radar
 from cavmarl.rig.sensor import MountedSensor, Platform
 
 __all__ = ["TYPES", "frame_layout", "frames_in", "mount", "rig_reach_m", "type_of"]
@@ -35,6 +45,12 @@ __all__ = ["TYPES", "frame_layout", "frames_in", "mount", "rig_reach_m", "type_o
 Shape = tuple[int, ...]
 
 TYPES: dict[type[MountedConfig], type[MountedSensor[Any]]] = {
+    LidarRigConfig: Lidar,
+    RadarConfig: Radar,
+    DepthCameraConfig: DepthCamera,
+    SemanticCameraConfig: SemanticCamera,
+    RgbCameraConfig: RgbCamera,
+    BevGridConfig: BevGrid,
     GnssConfig: Gnss,
     ImuConfig: Imu,
     OdometryConfig: Odometry,

@@ -24,6 +24,7 @@ Points = NDArray[np.float64]
 _AXIS_M = 6_378_137.0
 _FLATTENING = 1.0 / 298.257223563
 _SQUARED_ECCENTRICITY = _FLATTENING * (2.0 - _FLATTENING)
+_OF_HEIGHTS = ("+geoidgrids=", "+geoid_crs=", "+vunits=", "+vto_meter=")
 _ROUNDS = 6  # of the height's fixed point, each good for two digits and more
 
 
@@ -62,8 +63,8 @@ class ProjectedMap:
     def __init__(self, geo: GeoReference, height_m: float) -> None:
         pyproj: Any = require("pyproj", "maps")
         try:
-            self._project = pyproj.Proj(projparams=geo.projection)
-        except pyproj.exceptions.CRSError as error:
+            self._project = pyproj.Proj(projparams=_in_the_plane(geo.projection))
+        except pyproj.exceptions.ProjError as error:
             raise MapError(f"projection {geo.projection!r}: {error}") from error
         self._offset_m = np.array([geo.offset_x_m, geo.offset_y_m, -height_m])
 
@@ -114,6 +115,12 @@ class TangentPlane:
         """See `Geodesy`."""
         found: Points = (_to_centred(places) - self._origin_m) @ self._axes.T
         return found
+
+
+def _in_the_plane(projection: str) -> str:
+    """A PROJ string without what it says of heights, for which PROJ may need files of its own."""
+    words = projection.split()
+    return " ".join(word for word in words if not word.startswith(_OF_HEIGHTS))
 
 
 def _sin_cos(angle_deg: float) -> tuple[float, float]:

@@ -16,6 +16,7 @@ __all__ = [
     "VEHICLE_FRAME",
     "WORLD_FRAME",
     "check_place",
+    "mount_matrix",
     "mount_of",
     "sensor_to_vehicle",
     "transform",
@@ -39,6 +40,15 @@ def mount_of(config: MountedConfig) -> Mount:
     yaw, pitch, roll = map(math.radians, (config.yaw_deg, config.pitch_deg, config.roll_deg))
     rotation(yaw, pitch, roll, turn)
     return Mount(np.array([config.x_m, config.y_m, config.z_m]), turn)
+
+
+def mount_matrix(config: MountedConfig) -> NDArray[np.float64]:
+    """(3, 4): the sensor's axes (ahead, left, up) as columns and its place, in the vehicle's frame.
+
+    What rays and cameras take of a mount.
+    """
+    mount = mount_of(config)
+    return np.column_stack([mount.turn, mount.place])
 
 
 def check_place(name: str, config: MountedConfig, body: np.void) -> None:

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
-from typing import Any
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,7 +16,33 @@ from cavmarl.rig.catalogue import mount
 from cavmarl.rig.frames import Frames, SensorFrames
 from cavmarl.rig.sensor import MountedSensor, Platform, Scene, stream_of
 
-__all__ = ["Rig"]
+__all__ = ["Rig", "Sense", "Turn", "sense_here"]
+
+
+class Turn(NamedTuple):
+    """What a sensor has to do in the present tick.
+
+    Attributes:
+        place: its number in the rig.
+        sensor: itself.
+        due: how many samples, and to which slots.
+        frames: where they go.
+    """
+
+    place: int
+    sensor: MountedSensor[Any]
+    due: Due
+    frames: SensorFrames
+
+
+Sense: TypeAlias = Callable[[Sequence[Scene], Sequence[Turn]], None]
+"""Writes the samples of all turns, as `MountedSensor.sense` does, before it returns."""
+
+
+def sense_here(scenes: Sequence[Scene], turns: Sequence[Turn]) -> None:
+    """One sensor after the other, in this process."""
+    for turn in turns:
+        turn.sensor.sense(scenes, turn.due, turn.frames)
 
 
 class Rig:
@@ -27,6 +53,9 @@ class Rig:
         platform: what they are mounted on.
         frames: where their samples go.
         ids: (W, A) int64, the vehicle whose samples each agent's are; kept from tick to tick.
+
+    Attributes:
+        sense: who senses what is due.
     """
 
     def __init__(
@@ -41,11 +70,19 @@ class Rig:
         self._now = ids.copy()
         self._before = np.zeros(ids.shape, dtype=POSE)
         self._mounted = [
-            _Mounted(sensor, frames[sensor.name], platform) for sensor in mount(settings, platform)
+            _Mounted(place, sensor, frames[sensor.name], platform)
+            for place, sensor in enumerate(mount(settings, platform))
         ]
+        self.sense: Sense = sense_here
+        self._is_new = True
         self._everywhere = np.ones(len(ids), dtype=np.bool_)
         self._call_roll = repeated(call_roll)
         self._note_poses = repeated(note_poses)
+
+    @property
+    def sensors(self) -> list[MountedSensor[Any]]:
+        """All of them, in the order of the rig."""
+        return [mounted.turn.sensor for mounted in self._mounted]
 
     @property
     def before(self) -> NDArray[np.void]:
@@ -60,6 +97,10 @@ class Rig:
 
     def reset(self, scenes: Sequence[Scene], chosen: NDArray[np.bool_]) -> None:
         """Forget what there was in the chosen worlds (W,), and take what is due at the reset."""
+        if self._is_new:  # kernels are loaded now, and not in the first tick that asks for them
+            self._is_new = False
+            for mounted in self._mounted:
+                mounted.rehearse(scenes)
         self._before["id"][chosen] = -1
         for mounted in self._mounted:
             mounted.clear(chosen)
@@ -84,8 +125,11 @@ class Rig:
             self._ids[:] = self._now
             for mounted in self._mounted:
                 mounted.clear(changed)
-        for mounted in self._mounted:
-            mounted.take(scenes, chosen)
+        ticks = scenes[0].worlds.ticks
+        due = [mounted for mounted in self._mounted if mounted.is_due(ticks, chosen)]
+        self.sense(scenes, [mounted.turn for mounted in due])
+        for mounted in due:
+            mounted.deliver(scenes)
 
     def arrays(self) -> Iterator[NDArray[Any]]:
         """All that outlives a tick."""
@@ -98,14 +142,14 @@ class _Mounted:
     """A sensor, its schedule and its frames."""
 
     def __init__(
-        self, sensor: MountedSensor[Any], frames: SensorFrames, platform: Platform
+        self, place: int, sensor: MountedSensor[Any], frames: SensorFrames, platform: Platform
     ) -> None:
         self.frames = frames
-        self._sensor = sensor
+        due = Due(*(np.zeros(platform.num_worlds, dtype=np.int64) for _ in Due._fields))
+        self.turn = Turn(place, sensor, due, frames)
         self._schedule = _schedule_of(sensor.config, platform, frames.lost.shape[2])
         self._sim_dt_s = platform.sim_dt_s
         self._stream = stream_of(sensor.name)
-        self._due = Due(*(np.zeros(platform.num_worlds, dtype=np.int64) for _ in Due._fields))
         self._bytes = frames.data.reshape((*frames.lost.shape, -1)).view(np.uint8)
         self._call_due = repeated(call_due)
         self._deliver = repeated(deliver)
@@ -115,26 +159,36 @@ class _Mounted:
         for array in self.frames:
             array[chosen] = 0
 
-    def take(self, scenes: Sequence[Scene], chosen: NDArray[np.bool_]) -> None:
-        """Take what is due in the chosen worlds (W,)."""
-        schedule, due, frames = self._schedule, self._due, self.frames
-        if not self._call_due(schedule, scenes[0].worlds.ticks, chosen, due):
+    def rehearse(self, scenes: Sequence[Scene]) -> None:
+        """Take a sample in every world, and forget it."""
+        for array, value in zip(self.turn.due, (1, 0, 0), strict=True):
+            array[:] = value
+        sense_here(scenes, [self.turn])
+        self.deliver(scenes)
+        self.clear(self.turn.due.num == 1)
+
+    def is_due(self, ticks: NDArray[np.int64], chosen: NDArray[np.bool_]) -> bool:
+        """Whether anything is, in the chosen worlds (W,); how much is noted in its turn."""
+        return self._call_due(self._schedule, ticks, chosen, self.turn.due)
+
+    def deliver(self, scenes: Sequence[Scene]) -> None:
+        """Stamp and count what it has sensed, and lose some of it."""
+        sensor, frames = self.turn.sensor, self.frames
+        if sensor.stamps_itself:
             return
-        self._sensor.sense(scenes, due, frames)
-        if not self._sensor.stamps_itself:
-            for scene in scenes:
-                self._deliver(
-                    scene.worlds,
-                    schedule,
-                    due,
-                    self._sim_dt_s,
-                    self._stream,
-                    self._sensor.config.dropout,
-                    frames.stamp_s,
-                    frames.lost,
-                    frames.fresh,
-                    self._bytes,
-                )
+        for scene in scenes:
+            self._deliver(
+                scene.worlds,
+                self._schedule,
+                self.turn.due,
+                self._sim_dt_s,
+                self._stream,
+                sensor.config.dropout,
+                frames.stamp_s,
+                frames.lost,
+                frames.fresh,
+                self._bytes,
+            )
 
 
 def _schedule_of(config: MountedConfig, platform: Platform, slots: int) -> Schedule:

@@ -13,6 +13,7 @@ from numpy.typing import DTypeLike, NDArray
 from cavmarl.config_rig import MountedConfig, SampledConfig
 from cavmarl.kernels.arrays import LaneGrid, RoadArrays, Travel, Worlds
 from cavmarl.kernels.neighbors import Grid
+from cavmarl.kernels.panorama import Backdrop
 from cavmarl.kernels.rig_noise import Noise
 from cavmarl.kernels.rig_schedule import Due
 from cavmarl.rig.frames import SensorFrames
@@ -57,6 +58,8 @@ class Platform(NamedTuple):
         num_agents: A.
         sim_dt_s: seconds a tick.
         ticks_per_step: ticks a step.
+        capacity: the most rows of a world.
+        backdrop: what cameras and rays meet of the map.
     """
 
     network: RoadNetwork
@@ -65,6 +68,8 @@ class Platform(NamedTuple):
     num_agents: int
     sim_dt_s: float
     ticks_per_step: int
+    capacity: int
+    backdrop: Backdrop
 
 
 class MountedSensor(ABC, Generic[C]):

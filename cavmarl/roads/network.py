@@ -14,7 +14,7 @@ Indices that point at nothing are -1.
 from __future__ import annotations
 
 import hashlib
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, field, fields
 from functools import cached_property
 from typing import Any
 
@@ -22,6 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cavmarl.kernels.arrays import RoadArrays
+from cavmarl.kernels.panorama import WALL
 from cavmarl.kernels.signals import DETECTOR_REACH_M
 
 __all__ = [
@@ -281,6 +282,9 @@ class RoadNetwork:
         lane_ids, edge_ids, junction_ids, signal_ids, program_ids: the source's names, by row.
         junction_kinds: SUMO's junction types that occur, by `JUNCTION["kind"]`.
         geo: where it lies on the earth; None: the map does not say.
+        walls: WALL (num_walls,) of the buildings, if they were asked for; see `maps.buildings`.
+        roofs: (num_roofs, 4, 2) corners in m of the convex parts of their footprints.
+        roof_height: (num_roofs,) m over the ground.
     """
 
     name: str
@@ -306,10 +310,13 @@ class RoadNetwork:
     program_ids: tuple[str, ...]
     junction_kinds: tuple[str, ...]
     geo: GeoReference | None = None
+    walls: NDArray[np.void] = field(default_factory=lambda: np.zeros(0, WALL))
+    roofs: NDArray[np.float64] = field(default_factory=lambda: np.zeros((0, 4, 2)))
+    roof_height: NDArray[np.float64] = field(default_factory=lambda: np.zeros(0))
 
     def __post_init__(self) -> None:
-        for field in fields(self):
-            value = getattr(self, field.name)
+        for item in fields(self):
+            value = getattr(self, item.name)
             if isinstance(value, np.ndarray):
                 value.setflags(write=False)
 
@@ -389,8 +396,8 @@ class RoadNetwork:
     def content_hash(self) -> str:
         """SHA-256 over all arrays and ids, hex: two equal networks have equal hashes."""
         digest = hashlib.sha256()
-        for field in fields(self):
-            value = getattr(self, field.name)
+        for item in fields(self):
+            value = getattr(self, item.name)
             if isinstance(value, np.ndarray):
                 digest.update(content_of(value))
             elif isinstance(value, tuple):

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from cavmarl.rig.backdrop import make_backdrop
 from cavmarl.rig.rig import Rig
 from cavmarl.rig.sensor import Platform, Scene
 from cavmarl.runtime.attached import Host
@@ -22,40 +23,47 @@ class MountedSensors:
 
     Args:
         host: what it is attached to.
+
+    Attributes:
+        rig: all of its sensors.
+        platform: what the sensors are mounted on.
     """
 
     def __init__(self, host: Host) -> None:
         config = host.config
-        platform = Platform(
+        self.platform = Platform(
             host.network,
             generated_types()[0],
             host.num_worlds,
             config.population.num_ids,
             config.clock.sim_dt_s,
             config.clock.ticks_per_step,
+            host.shards[0].worlds.rows.shape[1],
+            make_backdrop(host.network, host.travel.types),
         )
         ids = host.zeros((host.num_worlds, config.population.num_ids), dtype=np.int64)
         ids[...] = -1
         self._host = host
-        self._rig = Rig(config.rig, platform, host.frames, ids)
+        self.rig = Rig(config.rig, self.platform, host.frames, ids)
 
     def reset(self, chosen: NDArray[np.bool_]) -> None:
         """Take the samples that are due at the reset of the chosen worlds (W,)."""
-        self._rig.reset(self._scenes(), chosen)
+        self.rig.reset(self.scenes(), chosen)
 
     def begin(self, commands: Commands) -> None:
         """Note how everybody moves before the tick."""
-        self._rig.begin(self._scenes())
+        self.rig.begin(self.scenes())
 
     def end(self) -> None:
         """Take the samples of the tick."""
-        self._rig.end(self._scenes())
+        self.rig.end(self.scenes())
 
     def arrays(self) -> Iterator[NDArray[Any]]:
         """The samples."""
-        return self._rig.arrays()
+        return self.rig.arrays()
 
-    def _scenes(self) -> list[Scene]:
+    def scenes(self) -> list[Scene]:
+        """What the agents of each zone can see now."""
         return [
             Scene(
                 shard.roads,
@@ -64,7 +72,7 @@ class MountedSensors:
                 shard.travel,
                 shard.worlds,
                 shard.grid,
-                self._rig.before,
+                self.rig.before,
             )
             for shard in self._host.shards
         ]

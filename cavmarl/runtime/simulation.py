@@ -22,7 +22,7 @@ from cavmarl.errors import (
     V2xError,
     ZoneError,
 )
-from cavmarl.kernels.arrays import Outputs, Worlds
+from cavmarl.kernels.arrays import Gate, Outputs, Worlds
 from cavmarl.kernels.codes import (
     ACTION_IDLE,
     COUNT_ARRIVED,
@@ -33,7 +33,9 @@ from cavmarl.kernels.codes import (
     SUM_DISTANCE_M,
     SUM_TIME_S,
 )
+from cavmarl.kernels.repeated import repeated
 from cavmarl.kernels.rng import world_key
+from cavmarl.kernels.tallies import begins_second, count_tick
 from cavmarl.ownership.messages import Switch
 from cavmarl.ownership.transfers import TransferLog
 from cavmarl.rig.catalogue import frame_layout, frames_in
@@ -52,6 +54,7 @@ from cavmarl.runtime.dividing import divide
 from cavmarl.runtime.division import ZoneLoads
 from cavmarl.runtime.executor import Executor, SerialExecutor
 from cavmarl.runtime.messaging import Messaging
+from cavmarl.runtime.mounted import MountedSensors
 from cavmarl.runtime.recovery import Recovery, Revival
 from cavmarl.runtime.recutting import Recut, Recutter
 from cavmarl.runtime.referee import Referee
@@ -189,6 +192,8 @@ class Simulation:
             )
             self._shard = self._shards[0]
             self._executor: Executor = SerialExecutor(self._shards)
+            self._count_tick = repeated(count_tick)
+            self._begins_second = repeated(begins_second)
             self._attached: tuple[Attached, ...] = attach(
                 Host(
                     config,
@@ -300,6 +305,11 @@ class Simulation:
         raise V2xError("nobody says anything here: set v2x.enabled to true")
 
     @property
+    def gate(self) -> Gate:
+        """Who waits to enter each world, and counts since its reset; a reset may replace it."""
+        return self._gate
+
+    @property
     def goal_edges(self) -> NDArray[np.int32]:
         """EDGE rows of the goals, by `VEHICLE["goal"]`."""
         return self._traffic.goal_edges
@@ -358,12 +368,23 @@ class Simulation:
         return () if self._coordination is None else self._coordination.coordinators
 
     @property
+    def attached(self) -> tuple[Attached, ...]:
+        """What acts in each tick beside the traffic."""
+        return self._attached
+
+    @property
     def worlds(self) -> Worlds:
         """The vehicles and signals of all worlds, for tools that measure; each tick swaps them.
 
         A copy where worlds are divided.
         """
         return self._division.whole()
+
+    @property
+    def mounted(self) -> MountedSensors | None:
+        """The rigs of the agents; None: they have none."""
+        rigs = (part for part in self._attached if isinstance(part, MountedSensors))
+        return next(rigs, None)
 
     def signal_phases(self, world: int = 0) -> NDArray[np.int32]:
         """PHASE rows that are on, (num_signals,)."""
@@ -580,8 +601,7 @@ class Simulation:
         self._executor.each("resolve")
         self._enter()
         self._executor.each("commit")
-        ticks = self._shard.worlds.ticks
-        ticks += 1
+        self._count_tick(self._shard.worlds.ticks)
         self._switch_signals()
 
     def _follow_sumo(self, sumo: SumoTraffic) -> None:
@@ -621,8 +641,7 @@ class Simulation:
     def _leave(self) -> None:
         """Who needs it picks another goal, who has arrived leaves, who looks for a way finds it."""
         traffic, gate, worlds = self._traffic, self._gate, self._shard.worlds
-        per_s = traffic.ticks_per_s
-        begins_second = any(tick % per_s == 0 for tick in worlds.ticks.tolist())
+        begins_second = self._begins_second(worlds.ticks, traffic.ticks_per_s)
         if begins_second:
             self._executor.each("choose_goals", traffic.demand, len(traffic.plans), gate)
         self._executor.each("leave", gate)
@@ -741,10 +760,6 @@ class Simulation:
         waiting = np.arange(longest) < self._gate.num_queue[:, None]
         found = np.any(waiting & (self._gate.queue["agent"][:, :longest] >= 0), axis=1)
         return np.asarray(found, dtype=np.bool_)
-
-    def arrivals(self) -> NDArray[np.int64]:
-        """(W,) vehicles that reached their goal since each world's reset, agents included."""
-        return self._gate.counts[:, COUNT_ARRIVED].copy()
 
     def suggest(self, out: NDArray[np.float64]) -> None:
         """Write what the built-in driver would do in the agents' place into `out` (W, A, 2)."""

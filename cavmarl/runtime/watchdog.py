@@ -15,7 +15,7 @@ class Watchdog:
     """Looks at one process again and again while something is expected of it.
 
     A process that has work to do uses the processor, or waits for it or for a disk. If it is
-    stopped, or sleeps, it does not go on by itself.
+    stopped, or sleeps, it does not go on by itself, unless processes that it has started do.
 
     Args:
         pid: of the process.
@@ -38,6 +38,8 @@ class Watchdog:
             return None  # it has ended, which others notice
         self._checks += 1
         self._stopped = self._stopped + 1 if state in "Tt" else 0
+        if state == "S":
+            spent += sum(_spent_by(child) for child in _started_by(self._pid))
         self._still = self._still + 1 if state == "S" and spent == self._spent else 0
         self._spent = spent
         if self._stopped >= STOPPED_CHECKS:
@@ -52,6 +54,24 @@ class Watchdog:
 def processor_s(pid: int) -> float:
     """Processor time that a process has taken, s."""
     return int(Path(f"/proc/{pid}/schedstat").read_text(encoding="ascii").split()[0]) / 1e9
+
+
+def _started_by(pid: int) -> list[int]:
+    """The processes that one has started, and those that they have."""
+    try:
+        text = Path(f"/proc/{pid}/task/{pid}/children").read_text(encoding="ascii")
+    except OSError:  # it has ended, or the system does not tell
+        return []
+    children = [int(word) for word in text.split()]
+    return children + [one for child in children for one in _started_by(child)]
+
+
+def _spent_by(pid: int) -> int:
+    """Processor time of a process that may have ended, in ticks of the system."""
+    try:
+        return _look(pid)[1]
+    except OSError:
+        return 0
 
 
 def _look(pid: int) -> tuple[str, int]:

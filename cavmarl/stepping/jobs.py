@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -18,6 +19,7 @@ from cavmarl.stepping.job import fingerprint
 from cavmarl.stepping.local import LocalWorlds
 from cavmarl.stepping.moving_job import MovingJob
 from cavmarl.stepping.parts import Part
+from cavmarl.stepping.sensing import farm_of
 from cavmarl.stepping.team_job import LeaderJob
 from cavmarl.worlds import make_world
 
@@ -50,6 +52,14 @@ def make_jobs(recipe: Mapping[str, Any]) -> list[Job]:
         part, in_next_step = arrays.part(first, last), recipe["in_next_step"]
         return LocalWorlds(world, last - first, part, in_next_step=in_next_step, like=one)
 
+    def hire(worlds: LocalWorlds, part: Part) -> LocalWorlds:
+        if config.workers.sensors:
+            memory = Segment(os.dup(recipe["arrays"]), 0)
+            bounds = (part.first, part.last)
+            base_dir, num_worlds = Path(recipe["base_dir"]), recipe["num_worlds"]
+            worlds.hire(farm_of(world, base_dir, memory, bounds, num_worlds))
+        return worlds
+
     mover = recipe["mover"]
     spent_s = None
     if mover is not None:
@@ -71,8 +81,8 @@ def make_jobs(recipe: Mapping[str, Any]) -> list[Job]:
                 zeros=shared_zeros,
             )
             theirs = None if spent_s is None else spent_s[part.first]
-            leader = LeaderJob(worlds, part.first, part.zones, diary, theirs)
+            leader = LeaderJob(hire(worlds, part), part.first, part.zones, diary, theirs)
             jobs += [leader, *leader.followers()]
         else:
-            jobs.append(DiaryJob(make(part.first, part.last), part.first, diary))
+            jobs.append(DiaryJob(hire(make(part.first, part.last), part), part.first, diary))
     return jobs

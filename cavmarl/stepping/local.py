@@ -10,8 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cavmarl.balance.plan import Plan
-from cavmarl.kernels.codes import EVENTS_THAT_END
+from cavmarl.kernels.repeated import repeated
+from cavmarl.kernels.step_results import Results, report, report_who_goes_on
 from cavmarl.rig.catalogue import frame_layout
+from cavmarl.runtime.sensor_farm import SensorFarm
 from cavmarl.runtime.simulation import Simulation
 from cavmarl.shard.shard import Commands
 from cavmarl.spaces import state_space, write_sensed
@@ -40,6 +42,7 @@ class LocalWorlds:
         arrays: what goes into a step, and what comes out.
         simulation: the worlds.
         in_next_step: when worlds begin anew.
+        farm: its sensor workers; None: there are none.
     """
 
     def __init__(
@@ -54,6 +57,7 @@ class LocalWorlds:
     ) -> None:
         self.world = world
         self.in_next_step = in_next_step
+        self.farm: SensorFarm | None = None
         form = world.config.observation
         self._senses = form.mode == "sensors"
         self._is_flat = form.kind == "flat"
@@ -77,6 +81,13 @@ class LocalWorlds:
         self._horizon = world.config.max_steps
         self._steps = np.zeros(num_worlds, dtype=np.int64)
         self._waiting = np.zeros(num_worlds, dtype=np.bool_)  # over, and not begun anew yet
+        self._results = Results(*(getattr(arrays, name) for name in Results._fields))
+        self._report = repeated(report)
+        self._report_who_goes_on = repeated(report_who_goes_on)
+        if warm:
+            self._write_results()
+            self._write_who_goes_on()
+            self._steps[:] = 0
 
     def reset(self, seed: int | None, first_world: int) -> None:
         """Begin an episode in the worlds of `chosen`."""
@@ -100,33 +111,33 @@ class LocalWorlds:
         simulation, arrays = self.simulation, self.arrays
         simulation.step(commands)
         self._show(simulation.everywhere)
-        self._steps += 1
-        if self._waiting.any():  # what they have done in this step counts for nothing
-            self._begin(self._waiting.copy())
-        outputs = simulation.outputs
-        at_horizon = self._steps >= self._horizon
-        terminations = outputs.terminated
-        arrays.rewards[:] = outputs.rewards
-        arrays.terms[:] = outputs.terms
-        arrays.vehicle_ids[:] = outputs.vehicle_ids
-        arrays.acted[:] = outputs.acted
-        arrays.terminations[:] = terminations
-        np.not_equal(outputs.events & EVENTS_THAT_END, 0, out=arrays.vehicle_done)
-        np.logical_and(outputs.acted & at_horizon[:, None], ~terminations, out=arrays.truncations)
-        simulation.retire_agents()
-        arrays.arrivals[:] = simulation.arrivals()
-        np.logical_and(outputs.present, ~terminations, out=arrays.mask)
-        goes_on = arrays.mask.any(axis=1) | simulation.agents_to_come()
-        np.logical_or(at_horizon, ~goes_on, out=arrays.episode_over)
-        self._end(arrays.episode_over)
+        if self.in_next_step and self._waiting.any():
+            waiting = self._waiting.copy()
+            self._begin(waiting)
+            self._steps[waiting] = -1  # what they have done in this step counts for nothing
+        some_ended = self._write_results()
+        if some_ended:
+            simulation.retire_agents()
+        if self._write_who_goes_on() or some_ended:
+            self._end(arrays.episode_over)
         arrays.ticks[:] = simulation.ticks()
+
+    def _write_results(self) -> bool:
+        """Write what the agents have got; whether the trip of some vehicle has ended."""
+        outputs = self.simulation.outputs
+        return self._report(outputs, self._steps, self._horizon, self._results)
+
+    def _write_who_goes_on(self) -> bool:
+        """Write who acts next and what is over; whether an episode is."""
+        simulation = self.simulation
+        return self._report_who_goes_on(
+            simulation.outputs, simulation.gate, self._steps, self._horizon, self._results
+        )
 
     def _end(self, over: NDArray[np.bool_]) -> None:
         """Keep what those saw last who have ended, and begin the new episodes."""
         simulation, arrays = self.simulation, self.arrays
         ended = over | arrays.terminations.any(axis=1)
-        if not ended.any():
-            return
         arrays.final_observations[ended] = arrays.observations[ended]
         for name, frames in arrays.frames.items():
             for final, array in zip(arrays.final_frames[name], frames, strict=True):
@@ -172,7 +183,10 @@ class LocalWorlds:
 
     def traffic_stats(self, world: int) -> dict[str, float]:
         """Traffic of one world since its reset."""
-        return asdict(self.simulation.traffic_stats(world))
+        stats = asdict(self.simulation.traffic_stats(world))
+        if self.world.config.v2x.enabled:
+            stats |= self.simulation.messages.statistics(world).to_dict()
+        return stats
 
     def save(self) -> list[NDArray[Any]]:
         """All that the next step depends on; views, to be copied."""
@@ -203,8 +217,17 @@ class LocalWorlds:
         """None: there are no workers."""
         return ()
 
+    def hire(self, farm: SensorFarm) -> None:
+        """From now on let others sense for the rigs; what they write is in `arrays`."""
+        mounted = self.simulation.mounted
+        assert mounted is not None
+        mounted.rig.sense = farm
+        self.farm = farm
+
     def close(self) -> None:
         """End the processes that the worlds have."""
+        if self.farm is not None:
+            self.farm.close()
         self.simulation.close()
 
 

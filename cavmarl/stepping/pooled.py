@@ -23,6 +23,7 @@ from cavmarl.stepping.mover import Mover
 from cavmarl.stepping.ordered import OrderedWorlds, check_zones, own_error
 from cavmarl.stepping.parts import Part, parts_of
 from cavmarl.stepping.placement import Placement
+from cavmarl.stepping.sensing import warn_if_crowded
 from cavmarl.worlds import World
 
 __all__ = ["PooledWorlds"]
@@ -90,6 +91,14 @@ class PooledWorlds(OrderedWorlds):
             raise
         self.mover = self._make_mover(num_worlds, workers)
         may_change = self.mover is not None and self.placement.in_row
+        if may_change and config.workers.sensors:
+            segment.close()
+            raise ConfigError(
+                f"workers.balance_steps = {config.workers.balance_steps} with workers.sensors = "
+                f"{config.workers.sensors}: sensor workers belong to the worlds of one worker, "
+                "which would change; leave one of the two 0"
+            )
+        warn_if_crowded(config.workers.sensors, len(parts))
         diaries = [
             [] if may_change else make_segments(config, part.last - part.first) for part in parts
         ]

@@ -73,6 +73,11 @@ class RemoteWorlds(OrderedWorlds):
                 f"workers.balance_steps = {config.workers.balance_steps}, hosts = 'ray': worlds "
                 "stay on their host; leave it 0, or leave out the hosts"
             )
+        if config.workers.sensors:
+            raise ConfigError(
+                f"workers.sensors = {config.workers.sensors}, hosts = 'ray': sensor workers are on "
+                "the machine of the worlds; leave it 0, or leave out the hosts"
+            )
         if not compiled_before():
             Simulation(config, world.network, 1, world.demand, world.partition)
         layout = layout_of(config, world.capacity, num_worlds).items()

@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from cavmarl.kernels import sensing
+from cavmarl.kernels import bearings, sensing
 from cavmarl.kernels.neighbors import fill_grid, make_grid
 from tests.kernels.builders import crowds, vehicles
 from tests.naive import sensing as naive
@@ -107,5 +107,5 @@ def test_the_end_of_a_truck_is_seen_when_its_centre_is_out_of_range() -> None:
 def test_the_rough_angle_is_as_good_as_it_claims(y: float, x: float) -> None:
     if x == 0.0 and y == 0.0:
         return
-    error = math.remainder(sensing._rough_atan2(y, x) - math.atan2(y, x), 2.0 * math.pi)
-    assert abs(error) < sensing._ANGLE_ERROR_RAD
+    error = math.remainder(bearings.rough_atan2(y, x) - math.atan2(y, x), 2.0 * math.pi)
+    assert abs(error) < bearings.ANGLE_ERROR_RAD

@@ -1,0 +1,214 @@
+"""What cameras and bird's-eye grids on agents' vehicles see."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cavmarl.kernels import kernel
+from cavmarl.kernels.arrays import Worlds
+from cavmarl.kernels.birds_eye import BirdsEye, look_down
+from cavmarl.kernels.camera import Camera, Picture, look
+from cavmarl.kernels.codes import DRIVER_AGENT
+from cavmarl.kernels.neighbors import Grid, fill_grid
+from cavmarl.kernels.panorama import Backdrop, Panorama, gather
+from cavmarl.kernels.pixels import (
+    LEAST_DEPTH_M,
+    measure_depths,
+    write_classes,
+    write_colours,
+    write_halves,
+)
+from cavmarl.kernels.rig_noise import Noise, error_of, sensor_key
+from cavmarl.kernels.rig_schedule import Due
+
+__all__ = ["camera_reach_m", "fill_grids", "take_classes", "take_colours", "take_depths"]
+
+
+@kernel
+def camera_reach_m(camera: Camera, width: int, height: int) -> float:
+    """How far from the vehicle's place something can be that a pixel shows, m.
+
+    The range is a depth along the axis; corners of the picture see farther.
+    """
+    across = 0.5 * width / camera.focal
+    up = 0.5 * height / camera.focal
+    farthest_m = camera.range_m * math.sqrt(1.0 + across * across + up * up)
+    return farthest_m + math.hypot(camera.mount[0, 3], camera.mount[1, 3])
+
+
+@kernel
+def _is_noisy(noise: Noise) -> bool:
+    """Whether any channel is wrong at all."""
+    for channel in range(noise.noise.size):
+        if noise.noise[channel] > 0.0 or noise.bias[channel] > 0.0:
+            return True
+    return False
+
+
+@kernel
+def take_depths(
+    worlds: Worlds,
+    grid: Grid,
+    backdrop: Backdrop,
+    due: Due,
+    noise: Noise,
+    camera: Camera,
+    panorama: Panorama,
+    picture: Picture,
+    room: NDArray[np.float32],
+    room_bits: NDArray[np.uint32],
+    data: NDArray[np.uint16],
+) -> None:
+    """Write the depth pictures that are due of the owned agents.
+
+    Args:
+        worlds: committed rows.
+        grid: room for the index of one world.
+        backdrop: of the map.
+        due: in this tick.
+        noise: of the sensor; what is as far as the range has none.
+        camera: the camera.
+        panorama: room.
+        picture: room.
+        room: (H, W) room.
+        room_bits: the same memory.
+        data: (W, agents, S, H, W) float16 as bits, m.
+    """
+    height, width = picture.face.shape
+    reach_m = camera_reach_m(camera, width, height)
+    noisy = _is_noisy(noise)
+    for w in range(worlds.ticks.size):
+        if due.num[w] == 0:
+            continue
+        rows = worlds.rows[w]
+        fill_grid(rows, worlds.num_rows[w], grid)
+        for i in range(worlds.num_owned[w]):
+            row = rows[i]
+            if row["driver"] != DRIVER_AGENT:
+                continue
+            counts = gather(rows, i, grid, backdrop, reach_m, True, panorama)
+            look(camera, panorama, counts, picture)
+            measure_depths(camera, picture, room)
+            if noisy:
+                _add_noise(noise, row, worlds.ticks[w], camera.range_m, room)
+            write_halves(room_bits, data[w, row["agent"], due.slot[w]])
+
+
+@kernel
+def _add_noise(
+    noise: Noise, row: np.void, tick: int, range_m: float, depths: NDArray[np.float32]
+) -> None:
+    """Make depths (H, W) that are less than the range wrong, from a centimetre to the range."""
+    key = sensor_key(row, noise.stream)
+    height, width = depths.shape
+    for j in range(height):
+        for i in range(width):
+            if depths[j, i] < range_m:
+                error = error_of(noise, key, row["id"], tick, j * width + i, 0)
+                depths[j, i] = min(max(depths[j, i] + error, LEAST_DEPTH_M), range_m)
+
+
+@kernel
+def take_classes(
+    worlds: Worlds,
+    grid: Grid,
+    backdrop: Backdrop,
+    due: Due,
+    camera: Camera,
+    panorama: Panorama,
+    picture: Picture,
+    data: NDArray[np.uint8],
+) -> None:
+    """Write the semantic pictures (W, agents, S, H, W) that are due; see `take_depths`."""
+    height, width = picture.face.shape
+    reach_m = camera_reach_m(camera, width, height)
+    for w in range(worlds.ticks.size):
+        if due.num[w] == 0:
+            continue
+        rows = worlds.rows[w]
+        fill_grid(rows, worlds.num_rows[w], grid)
+        for i in range(worlds.num_owned[w]):
+            row = rows[i]
+            if row["driver"] != DRIVER_AGENT:
+                continue
+            counts = gather(rows, i, grid, backdrop, reach_m, True, panorama)
+            look(camera, panorama, counts, picture)
+            write_classes(picture, data[w, row["agent"], due.slot[w]])
+
+
+@kernel
+def take_colours(
+    worlds: Worlds,
+    grid: Grid,
+    backdrop: Backdrop,
+    due: Due,
+    noise: Noise,
+    camera: Camera,
+    panorama: Panorama,
+    picture: Picture,
+    palette: NDArray[np.float64],
+    data: NDArray[np.uint8],
+) -> None:
+    """Write the coloured pictures (W, agents, S, H, W, 3) that are due; see `take_depths`."""
+    height, width = picture.face.shape
+    reach_m = camera_reach_m(camera, width, height)
+    noisy = _is_noisy(noise)
+    for w in range(worlds.ticks.size):
+        if due.num[w] == 0:
+            continue
+        rows = worlds.rows[w]
+        fill_grid(rows, worlds.num_rows[w], grid)
+        for i in range(worlds.num_owned[w]):
+            row = rows[i]
+            if row["driver"] != DRIVER_AGENT:
+                continue
+            counts = gather(rows, i, grid, backdrop, reach_m, True, panorama)
+            look(camera, panorama, counts, picture)
+            out = data[w, row["agent"], due.slot[w]]
+            write_colours(camera, picture, palette, out)
+            if noisy:
+                _add_colour_noise(noise, row, worlds.ticks[w], out)
+
+
+@kernel
+def _add_colour_noise(noise: Noise, row: np.void, tick: int, out: NDArray[np.uint8]) -> None:
+    """Make each colour (H, W, 3) wrong, from 0 to 255."""
+    key = sensor_key(row, noise.stream)
+    height, width, _ = out.shape
+    for j in range(height):
+        for i in range(width):
+            for c in range(3):
+                draw = (j * width + i) * 3 + c
+                error = error_of(noise, key, row["id"], tick, draw, c)
+                out[j, i, c] = np.uint8(min(max(out[j, i, c] + error + 0.5, 0.0), 255.0))
+
+
+@kernel
+def fill_grids(
+    worlds: Worlds,
+    grid: Grid,
+    backdrop: Backdrop,
+    due: Due,
+    view: BirdsEye,
+    reach_m: float,
+    panorama: Panorama,
+    data: NDArray[np.uint8],
+) -> None:
+    """Write the bird's-eye grids (W, agents, S, rows, columns) that are due; see `take_depths`.
+
+    `reach_m` is the distance from the vehicle's place to the farthest corner of the grid.
+    """
+    for w in range(worlds.ticks.size):
+        if due.num[w] == 0:
+            continue
+        rows = worlds.rows[w]
+        fill_grid(rows, worlds.num_rows[w], grid)
+        for i in range(worlds.num_owned[w]):
+            row = rows[i]
+            if row["driver"] != DRIVER_AGENT:
+                continue
+            counts = gather(rows, i, grid, backdrop, reach_m, True, panorama)
+            look_down(view, panorama, counts, data[w, row["agent"], due.slot[w]])

@@ -1,0 +1,143 @@
+"""What lidars and radars on agents' vehicles sense."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cavmarl.kernels import kernel
+from cavmarl.kernels.arrays import Worlds
+from cavmarl.kernels.codes import DRIVER_AGENT
+from cavmarl.kernels.neighbors import Grid, fill_grid
+from cavmarl.kernels.panorama import Backdrop, Panorama, gather
+from cavmarl.kernels.radar import detect
+from cavmarl.kernels.ray_fan import Fan, cast
+from cavmarl.kernels.rig_noise import Noise, error_of, sensor_key
+from cavmarl.kernels.rig_schedule import Due
+
+__all__ = ["measure_lidar", "measure_radar", "reach_of"]
+
+
+@kernel
+def reach_of(fan: Fan) -> float:
+    """How far from the vehicle's place something can be that a ray meets, m."""
+    return fan.range_m + math.hypot(fan.mount[0, 3], fan.mount[1, 3])
+
+
+@kernel
+def measure_lidar(
+    worlds: Worlds,
+    grid: Grid,
+    backdrop: Backdrop,
+    due: Due,
+    noise: Noise,
+    fan: Fan,
+    panorama: Panorama,
+    hits: NDArray[np.void],
+    data: NDArray[np.float32],
+) -> None:
+    """Write what is due of the owned agents.
+
+    Args:
+        worlds: committed rows.
+        grid: room for the index of one world.
+        backdrop: of the map.
+        due: in this tick.
+        noise: of the sensor; what meets nothing has none.
+        fan: its rays.
+        panorama: room.
+        hits: HIT (A, E), room.
+        data: (W, agents, S, E, A) distances in m.
+    """
+    reach_m = reach_of(fan)
+    noisy = noise.noise[0] > 0.0 or noise.bias[0] > 0.0
+    for w in range(worlds.ticks.size):
+        if due.num[w] == 0:
+            continue
+        rows = worlds.rows[w]
+        fill_grid(rows, worlds.num_rows[w], grid)
+        for i in range(worlds.num_owned[w]):
+            row = rows[i]
+            if row["driver"] != DRIVER_AGENT:
+                continue
+            counts = gather(rows, i, grid, backdrop, reach_m, False, panorama)
+            cast(fan, panorama.prisms, counts.prisms, panorama.walls, counts.walls, hits)
+            out = data[w, row["agent"], due.slot[w]]
+            for a in range(hits.shape[0]):
+                for e in range(hits.shape[1]):
+                    out[e, a] = hits[a, e]["distance"]
+            if noisy:
+                _add_noise(noise, row, worlds.ticks[w], fan.range_m, out)
+
+
+@kernel
+def _add_noise(
+    noise: Noise, row: np.void, tick: int, range_m: float, out: NDArray[np.float32]
+) -> None:
+    """Make the distances (E, A) that are less than the range wrong, from 0 to the range."""
+    key = sensor_key(row, noise.stream)
+    layers, rays = out.shape
+    for e in range(layers):
+        for a in range(rays):
+            if out[e, a] < range_m:
+                error = error_of(noise, key, row["id"], tick, e * rays + a, 0)
+                out[e, a] = min(max(out[e, a] + error, 0.0), range_m)
+
+
+@kernel
+def measure_radar(
+    worlds: Worlds,
+    grid: Grid,
+    backdrop: Backdrop,
+    due: Due,
+    noise: Noise,
+    fan: Fan,
+    panorama: Panorama,
+    hits: NDArray[np.void],
+    targets: NDArray[np.void],
+    order: NDArray[np.int32],
+    data: NDArray[np.float32],
+) -> None:
+    """Write what is due of the owned agents.
+
+    Args:
+        worlds: committed rows.
+        grid: room for the index of one world.
+        backdrop: of the map.
+        due: in this tick.
+        noise: of the sensor.
+        fan: its rays, of one channel.
+        panorama: room.
+        hits: HIT (A, 1), room.
+        targets: TARGET (A,), room.
+        order: (A,), room.
+        data: (W, agents, S, targets, 3) range in m, azimuth in rad, radial speed in m/s.
+    """
+    reach_m = reach_of(fan)
+    for w in range(worlds.ticks.size):
+        if due.num[w] == 0:
+            continue
+        rows = worlds.rows[w]
+        fill_grid(rows, worlds.num_rows[w], grid)
+        for i in range(worlds.num_owned[w]):
+            row = rows[i]
+            if row["driver"] != DRIVER_AGENT:
+                continue
+            counts = gather(rows, i, grid, backdrop, reach_m, False, panorama)
+            cast(fan, panorama.prisms, counts.prisms, panorama.walls, counts.walls, hits)
+            found = detect(fan, panorama, row, hits, targets, order)
+            out = data[w, row["agent"], due.slot[w]]
+            out[:] = 0.0
+            key = sensor_key(row, noise.stream)
+            for n in range(min(found, out.shape[0])):
+                target = targets[order[n]]
+                out[n, 0] = target["range"]
+                out[n, 1] = target["azimuth"]
+                out[n, 2] = target["speed"]
+                for channel in range(3):
+                    draw = 3 * n + channel
+                    out[n, channel] += error_of(
+                        noise, key, row["id"], worlds.ticks[w], draw, channel
+                    )

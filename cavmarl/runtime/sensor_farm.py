@@ -1,0 +1,257 @@
+"""`SensorFarm`: processes that sense for the worlds of this one, whose state stays where it is."""
+
+from __future__ import annotations
+
+import weakref
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, fields
+from time import perf_counter
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cavmarl.config import WorkersConfig
+from cavmarl.errors import SensorFrameError
+from cavmarl.kernels.repeated import repeated
+from cavmarl.kernels.sensor_share import gather_rows
+from cavmarl.rig.rig import Turn, sense_here
+from cavmarl.rig.sensor import Scene
+from cavmarl.runtime.pool import Death, Pool, Program
+from cavmarl.runtime.sensor_job import SensorTask
+from cavmarl.runtime.sensor_scene import NEVER, SceneArrays, SceneShape
+from cavmarl.runtime.sensor_shares import Shares, cut, share_by_cost, share_in_turn
+from cavmarl.runtime.shared_memory import Segment, size_of
+
+__all__ = ["FarmPlan", "FarmTimes", "SensorFarm"]
+
+SHARED_ANEW = 32  # ticks from one sharing out to the next of the same sensors
+SHARED_EARLY = 4  # so many at first, until costs are known
+NEW_COST = 0.2  # weight of the latest cost in the mean
+
+
+class FarmPlan(NamedTuple):
+    """What processes are made of.
+
+    Attributes:
+        module: that they run.
+        recipe: from which it makes its jobs; `shape` and `scene` are added.
+        frames: memory that samples are written to; it goes with the farm.
+        shape: of what is shared.
+        workers: how they are watched, and how sensing is shared out.
+    """
+
+    module: str
+    recipe: Mapping[str, Any]
+    frames: Segment
+    shape: SceneShape
+    workers: WorkersConfig
+
+
+@dataclass
+class FarmTimes:
+    """Sums over all ticks in which sensors were due.
+
+    Attributes:
+        publish_s: writing down what there is to see, and who senses what.
+        own_s: sensing what stays here.
+        wait_s: from the order until all frames were there.
+        busy_s: of that, while the busiest worker sensed.
+        ticks: how many.
+        sent_bytes: that the workers were given to read.
+        got_bytes: of frames that they have written.
+        messages: orders and answers.
+    """
+
+    publish_s: float = 0.0
+    own_s: float = 0.0
+    wait_s: float = 0.0
+    busy_s: float = 0.0
+    ticks: int = 0
+    sent_bytes: int = 0
+    got_bytes: int = 0
+    messages: int = 0
+
+    def since(self, before: FarmTimes) -> FarmTimes:
+        """What has come to it since it was a copy of `before`."""
+        return FarmTimes(
+            *(getattr(self, field.name) - getattr(before, field.name) for field in fields(self))
+        )
+
+
+class SensorFarm:
+    """n sensor workers; it lets them sense as `rig.Sense` describes.
+
+    It starts them when it is called for the first time, so it may be made before a fork. A call
+    returns when each sensor that is due has delivered the frame of this tick. Who is late is waited
+    for; who dies is replaced, and its successor senses the same again.
+
+    Args:
+        plan: what the processes are made of.
+
+    Attributes:
+        times: where the time has gone.
+    """
+
+    def __init__(self, plan: FarmPlan) -> None:
+        self.times = FarmTimes()
+        self._plan = plan
+        self._pool: Pool | None = None
+        self._unused = weakref.finalize(self, plan.frames.close)
+        self._shared: SceneArrays
+        self._costs_s = np.zeros(plan.shape.sensors)
+        self._shares: dict[tuple[int, ...], tuple[Shares, int]] = {}
+        self._written: Shares | None = None
+        self._gather = repeated(gather_rows)
+
+    @property
+    def pool(self) -> Pool | None:
+        """The processes, if they have been started."""
+        return self._pool
+
+    @property
+    def deaths(self) -> list[Death]:
+        """Of sensor workers, up to now."""
+        return [] if self._pool is None else self._pool.deaths
+
+    @property
+    def costs_s(self) -> NDArray[np.float64]:
+        """(S,) processor time of one agent's frame of each sensor, as it is of late."""
+        return self._costs_s.copy()
+
+    def __call__(self, scenes: Sequence[Scene], turns: Sequence[Turn]) -> None:
+        """Write the samples of all turns.
+
+        Raises:
+            SensorFrameError: a frame is not that of the tick.
+            WorkerError: workers cannot be started, or die again and again.
+        """
+        theirs = [turn for turn in turns if not turn.sensor.stamps_itself]
+        if not theirs:
+            sense_here(scenes, turns)
+            return
+        pool = self._started()
+        began = perf_counter()
+        shares = self._share(tuple(turn.place for turn in theirs))
+        self._publish(scenes, theirs)
+        published = perf_counter()
+        sense_here(scenes, [turn for turn in turns if turn.sensor.stamps_itself])
+        sensed = perf_counter()
+        pool.run(SensorTask.SENSE, commits=False)
+        self._check(theirs)
+        ended = perf_counter()
+        self._note_costs(theirs, shares)
+        self._note(began, published, sensed, ended, theirs)
+
+    def close(self) -> None:
+        """End the processes."""
+        self._unused()
+        if self._pool is not None:
+            self._pool.close()
+
+    def _started(self) -> Pool:
+        if self._pool is None:
+            self._pool = self._start()
+            self._unused.detach()  # the pool gives the memory back
+        return self._pool
+
+    def _start(self) -> Pool:
+        plan = self._plan
+        scene = Segment.make(size_of(plan.shape.layout))
+        self._shared = SceneArrays.of(scene, plan.shape)
+        told = {"shape": plan.shape, "scene": scene.fd, "frames": plan.frames.fd}
+        recipe = {**plan.recipe, **told}
+        names = tuple(f"sensor worker {k}" for k in range(plan.shape.workers))
+        tasks = tuple(task.name.lower() for task in SensorTask)
+        program = Program(plan.module, recipe, names, (scene, plan.frames), tasks, plan.workers.pin)
+        return Pool(program, plan.workers.timeout_s, plan.workers.repeats)
+
+    def _publish(self, scenes: Sequence[Scene], turns: Sequence[Turn]) -> None:
+        """Write down what there is to see; the rows of all zones, each once."""
+        shared, worlds = self._shared, scenes[0].worlds
+        shared.num_rows[:] = 0
+        for scene in scenes:
+            self._gather(scene.worlds, True, shared.rows, shared.num_rows)
+        shared.num_agents[:] = shared.num_rows
+        for scene in scenes:
+            self._gather(scene.worlds, False, shared.rows, shared.num_rows)
+        shared.ticks[:] = worlds.ticks
+        shared.keys[:] = worlds.keys
+        shared.signal_phase[:] = worlds.signal_phase
+        shared.before[:] = scenes[0].before
+        shared.due[:, 0] = 0
+        for turn in turns:
+            shared.due[turn.place] = turn.due
+        shared.delivered[:] = NEVER
+
+    def _check(self, turns: Sequence[Turn]) -> None:
+        """See that every worker has delivered every frame that is due, of this tick.
+
+        Raises:
+            SensorFrameError: the first that is not.
+        """
+        shared = self._shared
+        for turn in turns:
+            wrong = (shared.delivered[:, turn.place] != shared.ticks) & (turn.due.num > 0)
+            if wrong.any():
+                worker, world = np.argwhere(wrong)[0]
+                found = shared.delivered[worker, turn.place, world]
+                raise SensorFrameError(turn.sensor.name, int(shared.ticks[world]), int(found))
+
+    def _share(self, sensors: tuple[int, ...]) -> Shares:
+        """Who senses what of some sensors, written for the workers."""
+        shares, uses = self._shares.get(sensors, (None, 0))
+        if shares is None or (self._by_cost and (uses < SHARED_EARLY or uses % SHARED_ANEW == 0)):
+            shares = self._share_anew(sensors)
+        self._shares[sensors] = (shares, uses + 1)
+        if shares is not self._written:
+            self._written = shares
+            shares.write(self._shared.share.reshape(len(self._shared.share), -1))
+        return shares
+
+    @property
+    def _by_cost(self) -> bool:
+        return self._plan.workers.sensor_placement == "cost"
+
+    def _share_anew(self, sensors: tuple[int, ...]) -> Shares:
+        shape = self._plan.shape
+        units = cut(sensors, shape.worlds * shape.agents, shape.workers)
+        unknown = not self._costs_s[list(sensors)].all()
+        costs = [
+            float(unknown or self._costs_s[unit.sensor]) * (unit.last - unit.first)
+            for unit in units
+        ]
+        share_out = share_by_cost if self._by_cost else share_in_turn
+        return share_out(units, costs, shape.workers)
+
+    def _note_costs(self, turns: Sequence[Turn], shares: Shares) -> None:
+        """What an agent's frame of each sensor costs."""
+        spent_s = self._shared.spent_s.sum(axis=0)
+        agents = max(1, int(self._shared.num_agents.sum()))
+        for turn in turns:
+            cost_s = spent_s[turn.place] / agents
+            known = self._costs_s[turn.place]
+            self._costs_s[turn.place] = known + NEW_COST * (cost_s - known) if known else cost_s
+
+    def _note(
+        self,
+        began: float,
+        published: float,
+        sensed: float,
+        ended: float,
+        turns: Sequence[Turn],
+    ) -> None:
+        """Add up what a tick has taken; times are those of `time.perf_counter`."""
+        times, shared = self.times, self._shared
+        times.publish_s += published - began
+        times.own_s += sensed - published
+        times.wait_s += ended - sensed
+        times.busy_s += float(shared.busy_s.max())
+        times.ticks += 1
+        times.sent_bytes += int(shared.num_rows.sum()) * shared.rows.itemsize + sum(
+            array.nbytes for array in (shared.before, shared.due, shared.signal_phase)
+        )
+        times.got_bytes += sum(
+            int(turn.due.num.sum()) * turn.frames.data[0, :, 0].nbytes for turn in turns
+        )
+        times.messages += 2 * self._plan.shape.workers

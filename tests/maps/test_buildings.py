@@ -1,0 +1,165 @@
+from __future__ import annotations
+
+import gzip
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from cavmarl.errors import MapError
+from cavmarl.maps.buildings import convex_parts, walls_of, with_buildings
+from cavmarl.maps.footprints import DEFAULT_HEIGHT_M, LEVEL_M, Footprint, read_footprints
+from cavmarl.roads.network import GeoReference
+from cavmarl.roads.reader import read_network
+from cavmarl.worlds import load_world
+
+GEO = GeoReference("+proj=utm +zone=32 +ellps=WGS84", -655629.53, -5481164.76)
+SQUARE = np.array([(0.0, 0.0), (10.0, 0.0), (10.0, 8.0), (0.0, 8.0)])
+HOLE = np.array([(4.0, 2.0), (6.0, 2.0), (6.0, 6.0), (4.0, 6.0)])
+BEND = np.array([(0.0, 0.0), (9.0, 0.0), (9.0, 3.0), (3.0, 3.0), (3.0, 9.0), (0.0, 9.0)])
+
+
+def area(parts: np.ndarray) -> float:
+    x, y = parts[..., 0], parts[..., 1]
+    return float(0.5 * (x * np.roll(y, -1, 1) - np.roll(x, -1, 1) * y).sum())
+
+
+@pytest.mark.parametrize(
+    ("rings", "expected"), [((SQUARE,), 80.0), ((SQUARE, HOLE), 72.0), ((BEND,), 45.0)]
+)
+def test_the_parts_of_a_footprint_have_its_area(
+    rings: tuple[np.ndarray, ...], expected: float
+) -> None:
+    turned = [ring @ np.array([[0.8, 0.6], [-0.6, 0.8]]) for ring in rings]
+    assert area(convex_parts(rings)) == pytest.approx(expected)
+    assert area(convex_parts(tuple(turned))) == pytest.approx(expected)
+
+
+def test_a_courtyard_has_walls_and_no_roof() -> None:
+    yard = Footprint("yard", (SQUARE, HOLE), 12.0)
+    assert len(walls_of([yard])) == 8
+    middle = np.array([5.0, 4.0])
+    for part in convex_parts(yard.rings):
+        (x0, y0), (x1, y1) = part.min(axis=0), part.max(axis=0)
+        assert not (x0 < middle[0] < x1 and y0 < middle[1] < y1)
+
+
+OSM = """<osm version="0.6">
+ <node id="1" lat="49.4640" lon="11.1500"/><node id="2" lat="49.4640" lon="11.1502"/>
+ <node id="3" lat="49.4641" lon="11.1502"/><node id="4" lat="49.4641" lon="11.1500"/>
+ <way id="10"><nd ref="1"/><nd ref="2"/><nd ref="3"/><nd ref="4"/><nd ref="1"/>
+  <tag k="building" v="yes"/><tag k="height" v="12.5 m"/></way>
+ <way id="11"><nd ref="1"/><nd ref="2"/><nd ref="3"/><nd ref="1"/>
+  <tag k="building" v="yes"/><tag k="building:levels" v="4"/></way>
+ <way id="12"><nd ref="1"/><nd ref="2"/><nd ref="3"/><nd ref="1"/>
+  <tag k="building" v="yes"/><tag k="height" v="tall"/></way>
+ <way id="13"><nd ref="1"/><nd ref="2"/><nd ref="3"/><nd ref="1"/>
+  <tag k="building" v="roof"/></way>
+ <way id="14"><nd ref="1"/><nd ref="2"/><nd ref="99"/><nd ref="1"/>
+  <tag k="building" v="yes"/></way>
+ <way id="15"><nd ref="1"/><nd ref="2"/><nd ref="3"/></way>
+ <way id="16"><nd ref="1"/><nd ref="4"/><nd ref="3"/></way>
+ <relation id="20"><member type="way" ref="15" role="outer"/>
+  <member type="way" ref="16" role="outer"/><tag k="building" v="yes"/></relation>
+</osm>
+"""
+
+
+def written(folder: Path, text: str, name: str = "some.osm.gz") -> Path:
+    path = folder / name
+    path.write_bytes(gzip.compress(text.encode()) if name.endswith(".gz") else text.encode())
+    return path
+
+
+def test_heights_and_rings_are_read_from_openstreetmap(tmp_path: Path) -> None:
+    found = {f.name: f for f in read_footprints(written(tmp_path, OSM), GEO)}
+    assert {name: f.height_m for name, f in found.items()} == {
+        "way 10": 12.5,
+        "way 11": 4 * LEVEL_M,
+        "way 12": DEFAULT_HEIGHT_M,
+        "relation 20": DEFAULT_HEIGHT_M,
+    }
+    (ring,) = found["way 10"].rings
+    (joined,) = found["relation 20"].rings
+    assert len(ring) == len(joined) == 4
+    # A degree of longitude is 111.32 km times the cosine of the latitude, one of latitude 111.2 km.
+    assert np.ptp(ring[:, 0]) == pytest.approx(0.0002 * 111_320 * np.cos(np.radians(49.464)), 0.03)
+    assert np.ptp(ring[:, 1]) == pytest.approx(0.0001 * 111_200, abs=0.6)
+
+
+POLYGONS = """<additional>
+ <location netOffset="0.00,0.00" convBoundary="0,0,1,1" origBoundary="0,0,1,1" projParameter="!"/>
+ <poly id="hall" type="building.hall" color="red" shape="0,0 10,0 10,8 0,8 0,0"/>
+ <poly id="wood" type="forest" color="green" shape="0,0 10,0 10,8"/>
+</additional>
+"""
+
+
+def test_polygons_of_sumo_are_read_in_the_frame_of_the_map(tmp_path: Path) -> None:
+    (hall,) = read_footprints(written(tmp_path, POLYGONS, "a.poly.xml"), None)
+    assert hall.rings[0].tolist() == SQUARE.tolist()
+    assert hall.height_m == DEFAULT_HEIGHT_M
+
+
+@pytest.mark.parametrize(
+    ("text", "geo", "words"),
+    [
+        (OSM, None, "does not say where it lies"),
+        (POLYGONS, GEO, "line 2: <location> has the offset 0.00,0.00"),
+        (POLYGONS.replace("0,0 10,0", "0,nan 10,0"), None, "line 3: <poly> holds no numbers"),
+        (POLYGONS.replace("10,8 0,8 0,0", "10"), None, "line 3: <poly> holds no numbers"),
+        (OSM.replace(' lon="11.1500"', ""), GEO, "line 2: <node> has no attribute 'lon'"),
+        ("<net/>", None, "<net> is the root of no file of buildings"),
+        (OSM[:-20], GEO, "broken XML"),
+    ],
+)
+def test_a_file_that_cannot_work_is_refused(
+    tmp_path: Path, text: str, geo: GeoReference | None, words: str
+) -> None:
+    with pytest.raises(MapError, match=words):
+        read_footprints(written(tmp_path, text), geo)
+
+
+def test_buildings_of_another_place_are_refused(tmp_path: Path) -> None:
+    network = read_network(Path("envs/merge/map/map.net.xml"))
+    far = tmp_path / "b.poly.xml"
+    far.write_text(POLYGONS.replace("0,0 10,0 10,8 0,8 0,0", "9e4,0 9.1e4,0 9.1e4,8"))
+    with pytest.raises(MapError, match="none of its 1 buildings"):
+        with_buildings(network, far)
+    none = written(tmp_path, POLYGONS.replace("building.hall", "forest"), "c.xml")
+    with pytest.raises(MapError, match="none of its 0 buildings"):
+        with_buildings(network, none)
+
+
+def test_buildings_change_the_hash_and_nothing_else(tmp_path: Path) -> None:
+    network = read_network(Path("envs/merge/map/map.net.xml"))
+    built = with_buildings(network, written(tmp_path, POLYGONS, "a.poly.xml"))
+    assert len(built.walls) == 4
+    assert len(built.roofs) == 1
+    assert built.source_hash != network.source_hash
+    assert built.content_hash != network.content_hash
+    assert built.lanes.tobytes() == network.lanes.tobytes()
+
+
+@pytest.mark.parametrize(
+    ("name", "buildings"),
+    [("monaco.osm.gz", 500), ("laufamholz.osm.xml", 50), ("berlin_siegessaeule.osm.gz", 1)],
+)
+def test_buildings_of_real_maps_do_not_stand_on_roads(
+    shared_maps: Path, name: str, buildings: int
+) -> None:
+    source = shared_maps / "osm" / name
+    network = load_world(source, overrides={"map.buildings": "osm"}).network
+    assert len(set(network.walls["building"].tolist())) >= buildings
+    # Roads meet buildings where they lead through; a wrong frame would let them do it anywhere.
+    middles = np.stack([network.points["x"], network.points["y"]], axis=1)
+    built_over = np.zeros(len(middles), dtype=bool)
+    for part in network.roofs:
+        (x0, y0), (x1, y1) = part.min(axis=0), part.max(axis=0)
+        near = ((middles > [x0, y0]) & (middles < [x1, y1])).all(axis=1)
+        edges = np.roll(part, -1, axis=0) - part
+        for point in np.flatnonzero(near):
+            apart = middles[point] - part
+            side = edges[:, 0] * apart[:, 1] - edges[:, 1] * apart[:, 0]
+            built_over[point] |= bool((side >= 0).all() or (side <= 0).all())
+    assert built_over.mean() < 0.02
