@@ -1,4 +1,4 @@
-"""`cavmarl lead` and `cavmarl follow`: a world as time master, and a stack that follows it."""
+"""`cavmarl lead`: a world as time master, for followers that join over a socket."""
 
 from __future__ import annotations
 
@@ -23,11 +23,12 @@ from cavmarl.errors import ConfigError
 if TYPE_CHECKING:
     from cavmarl.followers.followed_world import FollowedWorld
 
-__all__ = ["follow", "lead"]
+__all__ = ["DEFAULT_PLACE", "address_of", "lead"]
+
+DEFAULT_PLACE = "cavmarl.sock"
 
 Place = Annotated[
-    str,
-    typer.Option("--at", metavar="ADDRESS", help="Path of a socket, or a port of this machine."),
+    str, typer.Option("--at", metavar="ADDRESS", help="A socket's path, or a port of this machine.")
 ]
 
 
@@ -38,7 +39,7 @@ def address_of(text: str) -> str | int:
 
 def lead(
     env: Environment,
-    at: Place = "/tmp/cavmarl.sock",
+    at: Place = DEFAULT_PLACE,
     followers: Annotated[int, typer.Option(help="That have to join before the first step.")] = 1,
     steps: Annotated[int | None, typer.Option(help="At most; default: one episode.")] = None,
     timeout_s: Annotated[float, typer.Option(help="That a step waits for its followers.")] = 10.0,
@@ -52,24 +53,30 @@ def lead(
     pace: Annotated[
         float | None, typer.Option(help="Simulated seconds a second; default: as fast as it goes.")
     ] = None,
+    rig: Annotated[
+        Literal["none", "reference"],
+        typer.Option(help="Mount the sensors that the reference stack drives with."),
+    ] = "none",
     agents: Agents = None,
     background: Background = None,
     seed: Seed = 0,
     settings: Settings = None,
     json_path: JsonPath = None,
 ) -> None:
-    """Run a world as its time master; its agents are driven by followers that join over a socket."""
+    """Run a world as its time master; followers that join over a socket drive its agents."""
     from cavmarl.cav_env import parallel_env
     from cavmarl.followers.followed_world import FollowedWorld
     from cavmarl.runtime.pacing import RealTime
+    from cavmarl.stack.reference_rig import REFERENCE_RIG
 
     if followers < 0 or (steps is not None and steps < 1):
         raise ConfigError("--followers must be 0 or more, --steps 1 or more")
     console = Console()
     pacer = None if pace is None else RealTime(pace)
-    made = parallel_env(
-        env, agents=agents, background=background, overrides=parse_settings(settings)
-    )
+    overrides = parse_settings(settings)
+    if rig == "reference":
+        overrides = {"clock.ctrl_dt_s": 0.05, "rig": REFERENCE_RIG} | overrides
+    made = parallel_env(env, agents=agents, background=background, overrides=overrides)
     with FollowedWorld(
         made,
         address_of(at),

@@ -23,7 +23,7 @@ from cavmarl.followers.messages import (
     read_letter,
 )
 
-__all__ = ["Follower", "Samples", "Sight"]
+__all__ = ["Follower", "Samples", "Sight", "sight_of"]
 
 CALL_S = 10.0
 
@@ -49,7 +49,8 @@ class Sight:
 
     Attributes:
         snapshot: the clock, and the vehicles that have to be driven.
-        sensors: by vehicle and name of the sensor; those that are due.
+        sensors: by vehicle and name of the sensor; those that are due. What is of the whole map
+            stands under no name.
     """
 
     snapshot: Snapshot
@@ -133,11 +134,7 @@ class Follower:
                 f"frame {snapshot.frame} follows {self._frame}: one was left out"
             )
         self._frame = snapshot.frame
-        sensors: dict[str, dict[str, Samples]] = {vehicle: {} for vehicle in snapshot.vehicles}
-        for view, array in zip(snapshot.arrays, arrays, strict=True):
-            samples = Samples(array, np.array(view.stamps_s), np.array(view.lost, dtype=np.bool_))
-            sensors.setdefault(view.vehicle, {})[view.name] = samples
-        return Sight(snapshot, sensors)
+        return sight_of(snapshot, arrays)
 
     def answer(self, controls: Mapping[str, Any]) -> None:
         """Say what the vehicles of the last snapshot do in the next step.
@@ -185,6 +182,15 @@ class Follower:
             self._line.skip(heard)
             raise FollowerError(read_letter(Refusal, heard.letter).reason)
         raise FollowerMessageError(f"{self._line.name} says {heard.kind.name}, which is not due")
+
+
+def sight_of(snapshot: Snapshot, arrays: Sequence[NDArray[Any]]) -> Sight:
+    """A snapshot with its arrays where they belong."""
+    sensors: dict[str, dict[str, Samples]] = {vehicle: {} for vehicle in snapshot.vehicles}
+    for view, array in zip(snapshot.arrays, arrays, strict=True):
+        samples = Samples(array, np.array(view.stamps_s), np.array(view.lost, dtype=np.bool_))
+        sensors.setdefault(view.vehicle, {})[view.name] = samples
+    return Sight(snapshot, sensors)
 
 
 def _plain(given: Any) -> list[float] | int:

@@ -116,6 +116,7 @@ class Welcome:
 
     Attributes:
         environment: name and version.
+        map_hash: of the roads' source: a stack needs the same map.
         vehicles: those that the follower has been given.
         tick: the master's, now.
         dt_s: seconds a tick.
@@ -129,6 +130,7 @@ class Welcome:
     """
 
     environment: StrictStr
+    map_hash: StrictStr
     vehicles: list[StrictStr]
     tick: StrictInt
     dt_s: StrictFloat
@@ -146,7 +148,8 @@ class ArrayView:
     """One array of a snapshot; its bytes lie in the frame's data, in the order of the list.
 
     Attributes:
-        vehicle: whose.
+        vehicle: whose; nothing: it is of the whole map, as `signals`: (1, links) what the signal of
+            each link shows, as a SIGNAL_* code (255: it has none).
         name: of the sensor.
         dtype: as NumPy writes it, little-endian.
         shape: of the array; the first axis are samples.

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
@@ -11,6 +12,8 @@ from numpy.typing import NDArray
 from cavmarl.roads.network import RoadNetwork
 
 __all__ = ["HdMap", "OnLane", "wrap"]
+
+_CELL_M = 20.0
 
 
 def wrap(angle: float) -> float:
@@ -54,40 +57,63 @@ class HdMap:
         self._x, self._y, self._s = (points[name][starts] for name in ("x", "y", "s"))
         self._cos, self._sin = points["cos"][starts], points["sin"][starts]
         self._length = points["s"][starts + 1] - self._s
+        self._first = np.searchsorted(self._lane, np.arange(len(lanes) + 1))
+        self._cells = self._by_cell()
+
+    def _by_cell(self) -> dict[tuple[int, int], NDArray[np.intp]]:
+        """Segments by the cell of the map that they may be near to."""
+        members: dict[tuple[int, int], list[int]] = {}
+        for k, length in enumerate(self._length.tolist()):
+            at = np.arange(0.0, length + _CELL_M, 0.5 * _CELL_M).clip(max=length)
+            xs = self._x[k] + at * self._cos[k]
+            ys = self._y[k] + at * self._sin[k]
+            around = {
+                (int(x // _CELL_M) + i, int(y // _CELL_M) + j)
+                for x, y in zip(xs, ys, strict=True)
+                for i in (-1, 0, 1)
+                for j in (-1, 0, 1)
+            }
+            for cell in around:
+                members.setdefault(cell, []).append(k)
+        return {cell: np.array(found) for cell, found in members.items()}
 
     def near(self, x_m: float, y_m: float, within_m: float) -> list[OnLane]:
-        """Lanes whose centre is at most that far away, nearest first."""
-        from_x, from_y = x_m - self._x, y_m - self._y
-        along = np.clip(from_x * self._cos + from_y * self._sin, 0.0, self._length)
-        off = np.hypot(from_x - along * self._cos, from_y - along * self._sin)
+        """Lanes whose centre is at most `within_m` away, up to 20 m; nearest first."""
+        rows = self._cells.get((int(x_m // _CELL_M), int(y_m // _CELL_M)))
+        if rows is None:
+            return []
+        places, off = self._project(rows, x_m, y_m)
         found: dict[int, OnLane] = {}
-        (close,) = np.nonzero(off <= within_m)
-        for k in close[np.argsort(off[close], kind="stable")].tolist():
-            lane = int(self._lane[k])
-            if lane not in found:
-                cos, sin = float(self._cos[k]), float(self._sin[k])
-                found[lane] = OnLane(
-                    lane,
-                    float(self._s[k] + along[k]),
-                    float(from_y[k] * cos - from_x[k] * sin),
-                    math.atan2(sin, cos),
-                )
+        for k in np.argsort(off, kind="stable").tolist():
+            if off[k] > within_m:
+                break
+            found.setdefault(int(self._lane[rows[k]]), places(k))
         return list(found.values())
 
     def on_lane(self, lane: int, x_m: float, y_m: float) -> OnLane:
         """A place beside one lane, however far away."""
-        (rows,) = np.nonzero(self._lane == lane)
+        rows = np.arange(self._first[lane], self._first[lane + 1])
+        places, off = self._project(rows, x_m, y_m)
+        return places(int(np.argmin(off)))
+
+    def _project(
+        self, rows: NDArray[np.intp], x_m: float, y_m: float
+    ) -> tuple[Callable[[int], OnLane], NDArray[np.float64]]:
+        """The place beside each of some segments, by its position among them, and how far away."""
         from_x, from_y = x_m - self._x[rows], y_m - self._y[rows]
         cos, sin = self._cos[rows], self._sin[rows]
         along = np.clip(from_x * cos + from_y * sin, 0.0, self._length[rows])
         off = np.hypot(from_x - along * cos, from_y - along * sin)
-        k = int(np.argmin(off))
-        return OnLane(
-            lane,
-            float(self._s[rows[k]] + along[k]),
-            float(from_y[k] * cos[k] - from_x[k] * sin[k]),
-            math.atan2(float(sin[k]), float(cos[k])),
-        )
+
+        def place(k: int) -> OnLane:
+            return OnLane(
+                int(self._lane[rows[k]]),
+                float(self._s[rows[k]] + along[k]),
+                float(from_y[k] * cos[k] - from_x[k] * sin[k]),
+                math.atan2(float(sin[k]), float(cos[k])),
+            )
+
+        return place, off
 
     def polyline(self, lane: int, from_m: float) -> NDArray[np.float64]:
         """(n, 2) the centre of a lane from a place on to its end."""

@@ -38,8 +38,7 @@ def reference(steps: int, drivers: dict[str, Any]) -> list[str]:
     for _ in range(steps):
         actions = env.suggest_actions()
         for agent in drivers:
-            numbers = np.tanh(observations[agent][:2]).astype(float)
-            actions[agent] = numbers.astype(np.float32)
+            actions[agent] = np.tanh(observations[agent][:2])
         observations, *_ = env.step(actions)
         found.append(env.state_hash())
     return found
