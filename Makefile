@@ -70,8 +70,9 @@ maps: $(READY) ## make the maps of ring, merge and grid4x4 anew from the options
 	cd envs/grid4x4/map && ../../../$(BIN)/netgenerate --configuration-file map.netgcfg
 	sed --in-place '2,/^-->$$/d' $(MAPS)
 
-pictures: $(READY) ## draw the pictures of the README and the cards anew
+pictures: $(READY) ## draw the pictures of the README, the cards and the pages anew
 	$(BIN)/python -m cavmarl.render.pictures docs/images
+	$(BIN)/python -m cavmarl.render.sensor_pictures docs/images
 
 clean: ## remove .venv, builds and caches; runs/ stays
 	rm -rf .venv $(OLDEST) $(LIBRARIES) fuzz/corpus build dist .mypy_cache .ruff_cache .pytest_cache .hypothesis .import_linter_cache

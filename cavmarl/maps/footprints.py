@@ -63,7 +63,11 @@ def read_footprints(path: Path, geo: GeoReference | None) -> list[Footprint]:
     if reader.root == "osm":
         return list(_osm_buildings(path, reader, geo))
     if reader.root in ("additional", "polygons", "shapes"):
-        return reader.polygons
+        found = [
+            Footprint(element.name, _rings([ring]), _height_m(element.tags))
+            for element, ring in reader.polygons
+        ]
+        return [footprint for footprint in found if footprint.rings]
     raise MapError(
         f"{path}: <{reader.root}> is the root of no file of buildings: give an OpenStreetMap "
         "extract (<osm>) or SUMO polygons (<additional>, .poly.xml)"
@@ -72,7 +76,7 @@ def read_footprints(path: Path, geo: GeoReference | None) -> list[Footprint]:
 
 @dataclass
 class _Element:
-    """An OSM way or relation while it is read."""
+    """A way or relation of OSM, or a polygon of SUMO, with what is said of it."""
 
     name: str
     line: int
@@ -95,7 +99,7 @@ class _Reader(ContentHandler):
         self.places: dict[str, tuple[float, float]] = {}
         self.ways: dict[str, _Element] = {}
         self.relations: list[_Element] = []
-        self.polygons: list[Footprint] = []
+        self.polygons: list[tuple[_Element, Ring]] = []
         self._open: _Element | None = None
         self._path = path
         self._geo = geo
@@ -111,7 +115,7 @@ class _Reader(ContentHandler):
             raise self._error(name, f"holds no numbers ({error})") from error
 
     def endElement(self, name: str) -> None:
-        if name in ("way", "relation"):
+        if name in ("way", "relation", "poly"):
             self._open = None
 
     def _take(self, name: str, attrs: Mapping[str, str]) -> None:
@@ -134,19 +138,17 @@ class _Reader(ContentHandler):
         elif name == "location":
             self._check_location(attrs)
         elif name == "poly" and attrs.get("type", "").startswith("building"):
-            self.polygons.append(self._polygon(attrs))
+            self._open = _Element(f"poly {attrs['id']}", self._locator.getLineNumber())
+            self.polygons.append((self._open, self._ring(attrs)))
+        elif name == "param" and self._open is not None:
+            self._open.tags[attrs["key"]] = attrs["value"]
 
-    def _polygon(self, attrs: Mapping[str, str]) -> Footprint:
-        corners = [
-            _finite(tuple(map(float, word.split(",")[:2]))) for word in attrs["shape"].split()
-        ]
-        ring = np.array(corners, dtype=np.float64).reshape(-1, 2)
+    def _ring(self, attrs: Mapping[str, str]) -> Ring:
+        places = [_finite(tuple(map(float, word.split(",")[:2]))) for word in attrs["shape"].split()]
+        ring = np.array(places, dtype=np.float64).reshape(-1, 2)
         if attrs.get("geo", "false") in ("1", "true"):
             ring = _project(self._path, ring, self._geo)
-        height_m = float(attrs["height"]) if "height" in attrs else DEFAULT_HEIGHT_M
-        if not 0.0 < height_m <= _MOST_HEIGHT_M:
-            raise ValueError(f"height {height_m!r}")
-        return Footprint(f"poly {attrs['id']}", _rings([ring]), height_m)
+        return ring
 
     def _check_location(self, attrs: Mapping[str, str]) -> None:
         """Refuse polygons that were made for a network at another place."""

@@ -89,7 +89,9 @@ def test_heights_and_rings_are_read_from_openstreetmap(tmp_path: Path) -> None:
 
 POLYGONS = """<additional>
  <location netOffset="0.00,0.00" convBoundary="0,0,1,1" origBoundary="0,0,1,1" projParameter="!"/>
- <poly id="hall" type="building.hall" color="red" shape="0,0 10,0 10,8 0,8 0,0"/>
+ <poly id="hall" type="building.hall" color="red" shape="0,0 10,0 10,8 0,8 0,0">
+  <param key="height" value="21"/></poly>
+ <poly id="line" type="building" color="red" shape="0,0 10,0"/>
  <poly id="wood" type="forest" color="green" shape="0,0 10,0 10,8"/>
 </additional>
 """
@@ -98,7 +100,7 @@ POLYGONS = """<additional>
 def test_polygons_of_sumo_are_read_in_the_frame_of_the_map(tmp_path: Path) -> None:
     (hall,) = read_footprints(written(tmp_path, POLYGONS, "a.poly.xml"), None)
     assert hall.rings[0].tolist() == SQUARE.tolist()
-    assert hall.height_m == DEFAULT_HEIGHT_M
+    assert hall.height_m == 21.0
 
 
 @pytest.mark.parametrize(
