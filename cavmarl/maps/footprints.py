@@ -144,7 +144,9 @@ class _Reader(ContentHandler):
             self._open.tags[attrs["key"]] = attrs["value"]
 
     def _ring(self, attrs: Mapping[str, str]) -> Ring:
-        places = [_finite(tuple(map(float, word.split(",")[:2]))) for word in attrs["shape"].split()]
+        places = [
+            _finite(tuple(map(float, word.split(",")[:2]))) for word in attrs["shape"].split()
+        ]
         ring = np.array(places, dtype=np.float64).reshape(-1, 2)
         if attrs.get("geo", "false") in ("1", "true"):
             ring = _project(self._path, ring, self._geo)
