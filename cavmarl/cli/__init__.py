@@ -16,6 +16,7 @@ from cavmarl.cli import (
     listing,
     map,
     plan,
+    scenario,
     suite,
     verify,
     verify_determinism,
@@ -44,6 +45,7 @@ app.command("list")(listing.list_entries)
 app.add_typer(map.app, name="map")
 app.add_typer(demand.app, name="demand")
 app.add_typer(bench.app, name="bench")
+app.add_typer(scenario.app, name="scenario")
 
 
 @app.callback()

@@ -33,7 +33,9 @@ from cavmarl.kernels.codes import (
     SUM_DISTANCE_M,
     SUM_TIME_S,
 )
+from cavmarl.kernels.repeated import repeated
 from cavmarl.kernels.rng import world_key
+from cavmarl.kernels.tallies import begins_second, count_tick
 from cavmarl.ownership.messages import Switch
 from cavmarl.ownership.transfers import TransferLog
 from cavmarl.rig.catalogue import frame_layout, frames_in
@@ -190,6 +192,8 @@ class Simulation:
             )
             self._shard = self._shards[0]
             self._executor: Executor = SerialExecutor(self._shards)
+            self._count_tick = repeated(count_tick)
+            self._begins_second = repeated(begins_second)
             self._attached: tuple[Attached, ...] = attach(
                 Host(
                     config,
@@ -309,6 +313,11 @@ class Simulation:
     def goal_edges(self) -> NDArray[np.int32]:
         """EDGE rows of the goals, by `VEHICLE["goal"]`."""
         return self._traffic.goal_edges
+
+    @property
+    def types(self) -> NDArray[np.void]:
+        """VTYPE (num_types,), by `VEHICLE["vtype"]`."""
+        return self._shard.travel.types
 
     @property
     def scene(self) -> Scene | None:
@@ -592,8 +601,7 @@ class Simulation:
         self._executor.each("resolve")
         self._enter()
         self._executor.each("commit")
-        ticks = self._shard.worlds.ticks
-        ticks += 1
+        self._count_tick(self._shard.worlds.ticks)
         self._switch_signals()
 
     def _follow_sumo(self, sumo: SumoTraffic) -> None:
@@ -633,8 +641,7 @@ class Simulation:
     def _leave(self) -> None:
         """Who needs it picks another goal, who has arrived leaves, who looks for a way finds it."""
         traffic, gate, worlds = self._traffic, self._gate, self._shard.worlds
-        per_s = traffic.ticks_per_s
-        begins_second = any(tick % per_s == 0 for tick in worlds.ticks.tolist())
+        begins_second = self._begins_second(worlds.ticks, traffic.ticks_per_s)
         if begins_second:
             self._executor.each("choose_goals", traffic.demand, len(traffic.plans), gate)
         self._executor.each("leave", gate)

@@ -39,6 +39,7 @@ from cavmarl.kernels.v2x_records import (
 from cavmarl.kernels.walls import Walls, make_walls
 from cavmarl.roads.network import RoadNetwork
 from cavmarl.v2x.channel import make_channel
+from cavmarl.v2x.messages import cause_code
 from cavmarl.v2x.network import Exchange, NetworkSimulator, check_receptions
 from cavmarl.v2x.roadside import make_units
 from cavmarl.v2x.statistics import V2xStatistics, statistics_of
@@ -188,9 +189,13 @@ class Bus:
             raise V2xError(f"roadside unit {unit}: there are {len(self.units)}")
         return self._num_agents + unit
 
-    def declare_of_unit(self, world: int, unit: int, cause: int) -> None:
-        """Let a roadside unit tell of an event in the next tick."""
-        self.mail.declared[world, self.receiver_of_unit(unit)] = cause
+    def declare_of_unit(self, world: int, unit: int, cause: str) -> None:
+        """Let a roadside unit tell of an event in the next tick.
+
+        Raises:
+            V2xError: there is no such unit, or no such cause.
+        """
+        self.mail.declared[world, self.receiver_of_unit(unit)] = cause_code(cause)
 
     def statistics(self, world: int = 0) -> V2xStatistics:
         """What has become of the messages of a world since its reset."""

@@ -70,7 +70,7 @@ class SumoTraffic:
         self._zoned = zoned
         self._blank = blank
         self._dt = demand.dt_s
-        self._shown = ShownSignals(network, num_worlds)
+        self._shown = ShownSignals(network)
         self._mirror = repeated(mirror)
         self._greet = repeated(greet)
         self._list_others = repeated(list_others)
@@ -204,7 +204,7 @@ class SumoTraffic:
     def show(self, worlds: Worlds) -> None:
         """Let the signals of all worlds show what SUMO's do."""
         for w, phase in enumerate(worlds.signal_phase):
-            self._shown.show(w, self.worlds.at(w).letters, phase)
+            self._shown.show(self.worlds.at(w).letters, phase)
 
     def ways_of_first_world(self, ways: NDArray[np.int64], world: int) -> NDArray[np.int64]:
         """VEHICLE["way"] (n,) of a world as it would be in the first one."""
