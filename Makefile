@@ -15,7 +15,7 @@ OLDEST_TESTS := tests/kernels tests/roads tests/runtime tests/traffic tests/test
 LIBRARIES_TESTS := tests/adapters tests/train/test_programs.py tests/hosts \
     tests/stepping/test_remote.py tests/stepping/test_remote_start.py
 FUZZ_SECONDS ?= 60
-FUZZ_TARGETS ?= network programs map cached zones demand sumocfg entry overrides driver manifest \
+FUZZ_TARGETS ?= network programs buildings map cached zones demand sumocfg entry overrides driver manifest \
     plan message log
 MAPS := envs/ring/map/map.net.xml envs/merge/map/map.net.xml envs/grid4x4/map/map.net.xml
 

@@ -28,6 +28,7 @@ LEVEL_M = 3.0  # of a building of which only the levels are known
 _NO_WALLS = frozenset(("no", "roof", "carport", "canopy", "demolished", "ruins"))
 _METRES = re.compile(r"\s*([0-9]+(?:\.[0-9]+)?)\s*(?:m|metres?)?\s*")
 _MOST_HEIGHT_M = 1000.0
+_DIGITS = 6  # of a metre; sides that are nearly level would have endless slopes
 
 
 @dataclass(frozen=True)
@@ -218,11 +219,10 @@ def _closed(ways: list[list[str]]) -> list[list[str]]:
 
 
 def _rings(rings: list[Ring]) -> tuple[Ring, ...]:
-    """Those with at least three corners, without the first one again at the end."""
-    open_rings = [
-        ring[:-1] if len(ring) and (ring[0] == ring[-1]).all() else ring for ring in rings
-    ]
-    return tuple(ring for ring in open_rings if len(ring) >= 3)
+    """Those with at least three corners, to the micrometre, without the first one at the end."""
+    rounded = [np.round(ring, _DIGITS) for ring in rings]
+    opened = [ring[:-1] if len(ring) and (ring[0] == ring[-1]).all() else ring for ring in rounded]
+    return tuple(ring for ring in opened if len(ring) >= 3)
 
 
 def _height_m(tags: Mapping[str, str]) -> float:
@@ -244,4 +244,9 @@ def _project(path: Path, ring: Ring, geo: GeoReference | None) -> Ring:
     pyproj: Any = require("pyproj", "maps")
     x, y = pyproj.Proj(projparams=geo.projection)(ring[:, 0], ring[:, 1])
     placed: Ring = np.stack([x + geo.offset_x_m, y + geo.offset_y_m], axis=1)
+    if not np.isfinite(placed).all():
+        raise MapError(
+            f"{path}: a building near longitude {ring[0, 0]:g}, latitude {ring[0, 1]:g} cannot be "
+            "projected as the map is: export the file again for this map"
+        )
     return placed
