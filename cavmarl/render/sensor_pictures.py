@@ -85,7 +85,8 @@ def _palette() -> Image:
 
 
 def _classes(frames: Frames) -> Image:
-    return _palette()[_latest(frames, "classes")]
+    image: Image = _palette()[_latest(frames, "classes")]
+    return image
 
 
 def _depths(frames: Frames) -> Image:
@@ -119,7 +120,8 @@ def _grid(frames: Frames, tall: int) -> Image:
     cells = _palette()[_latest(frames, "grid")]
     rows = np.arange(tall) * cells.shape[0] // tall
     columns = np.arange(tall * cells.shape[1] // cells.shape[0]) * cells.shape[0] // tall
-    return cells[rows][:, columns]
+    image: Image = cells[rows][:, columns]
+    return image
 
 
 if __name__ == "__main__":
