@@ -271,7 +271,7 @@ class Simulation:
         self.suggest(controls)
         self.step(Commands(controls, np.full(shape, ACTION_IDLE, dtype=np.int64)))
         # Once more what is only called when somebody leaves or waits.
-        self._let_in()
+        self._let_in(all_phases=True)
         self._executor.each("retire", self._gate)
         self._executor.each("forget", self._gate)
         self._traffic.settle(self._gate, self._shard.worlds)
@@ -672,14 +672,20 @@ class Simulation:
                 self._admit()
         traffic.call_orders(gate, worlds)
         if any(gate.num_queue.tolist()):
-            self._let_in()
+            self._let_in(all_phases=self._recovery is not None)
 
-    def _let_in(self) -> None:
-        """Rank → assign → propose → accept → admit."""
+    def _let_in(self, all_phases: bool) -> None:
+        """Rank → assign → propose, and if anybody has found a gap, accept → admit.
+
+        Args:
+            all_phases: go through the last two in any case: hosts may die in each of them.
+        """
         traffic, gate, worlds = self._traffic, self._gate, self._shard.worlds
         self._executor.each("rank_lanes", gate)
         traffic.assign_lanes(gate, worlds)
         self._executor.each("propose", traffic.demand, gate)
+        if not (all_phases or any(gate.num_passing.tolist())):
+            return
         traffic.accept(gate, self._division.running())
         self._admit()
 
