@@ -114,9 +114,7 @@ class CaccPolicy(Policy):
             gap: NDArray[np.float64] = HALF_M / closeness - HALF_M
         return gap
 
-    def _follow(
-        self, newest: NDArray[np.float64]
-    ) -> tuple[NDArray[np.bool_], NDArray[np.float64]]:
+    def _follow(self, newest: NDArray[np.float64]) -> tuple[NDArray[np.bool_], NDArray[np.float64]]:
         """(W, A) whether the vehicle ahead says what it does, and the acceleration behind it."""
         ego, lanes = self._part(newest, "ego"), self._part(newest, "lanes")
         gap_m = self._gap_m(newest)
