@@ -79,7 +79,7 @@ class CaccPolicy(Policy):
         actions: NDArray[Any] = self._suggested(mask.shape).copy()
         follows, accel = self._follow(newest)
         followed = np.clip(accel / self._accel_mps2, -1.0, 1.0)
-        # Where a line may have to be kept, or the lane is to be changed, the more careful one counts.
+        # Where a line may have to be kept, or the lane changed, the more careful one counts.
         careful = np.minimum(followed, actions[..., 0])
         throttle = np.where(self._may_stop(newest), careful, followed)
         actions[..., 0] = np.where(follows, throttle, actions[..., 0])
@@ -114,9 +114,7 @@ class CaccPolicy(Policy):
             gap: NDArray[np.float64] = HALF_M / closeness - HALF_M
         return gap
 
-    def _follow(
-        self, newest: NDArray[np.float64]
-    ) -> tuple[NDArray[np.bool_], NDArray[np.float64]]:
+    def _follow(self, newest: NDArray[np.float64]) -> tuple[NDArray[np.bool_], NDArray[np.float64]]:
         """(W, A) whether the vehicle ahead says what it does, and the acceleration behind it."""
         ego, lanes = self._part(newest, "ego"), self._part(newest, "lanes")
         gap_m = self._gap_m(newest)

@@ -89,6 +89,7 @@ def inbox(
         known = best.get(said.subject)
         if known is None or said.rank < known.rank:
             best[said.subject] = said
+
     # One that was known stays, wherever it is now, until nearer ones push it out.
     def key(said: Said) -> tuple[float, int]:
         return ((said.x - x) ** 2 + (said.y - y) ** 2, said.subject)

@@ -114,8 +114,9 @@ def test_what_is_seen_is_told(units: bool) -> None:
         }
     world = Standing(1, cam__rate_hz=0.0, denm__rate_hz=0.0, **settings)
     random = np.random.default_rng(8)
-    places = random.uniform(0.0, 330.0, (60, 2))
-    rows = world.put(places, heading=random.uniform(-3.0, 3.0, 60), length=12.0)
+    cells = np.stack(np.meshgrid(np.arange(9), np.arange(8)), -1).reshape(-1, 2)
+    places = 210.0 + 14.0 * cells + random.uniform(-3.0, 3.0, (72, 2))  # nobody in another one
+    rows = world.put(places, heading=random.uniform(-3.0, 3.0, 72))
     world.tick()
     told: dict[int, list[int]] = {}
     for report in sent(world, KIND_CPM):
@@ -128,7 +129,7 @@ def test_what_is_seen_is_told(units: bool) -> None:
     else:
         for k, (x, y) in enumerate(places):
             assert told.get(k, []) == naive.seen(rows, k, x, y, 60.0, 5, bodies=True), k
-    assert sum(map(len, told.values())) > 20
+    assert sum(map(len, told.values())) > 10
 
 
 def test_roadside_units_tell_the_phase_that_is_on() -> None:
