@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass
+from functools import partial
 from statistics import median
 from time import perf_counter
 from typing import Any
@@ -135,7 +136,7 @@ def measure_v2x(
             if tick == warmup:
                 say("measuring")
             commands = world.commands()
-            world_ms.append(_timed_ms(lambda commands=commands: world.step(commands)))
+            world_ms.append(_timed_ms(partial(world.step, commands)))
             running.append(int(simulation.running()[0]))
             for name, (_, exchange) in buses.items():
                 bus_ms[name].append(_timed_ms(exchange))
