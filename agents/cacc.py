@@ -3,8 +3,9 @@
 It steers, stops and gives way as the built-in driver does, and near junctions it is as careful.
 Behind a vehicle whose messages it receives it takes its acceleration from van Arem, van Driel,
 Visser: "The impact of cooperative adaptive cruise control on traffic-flow characteristics", IEEE
-Trans. ITS 7 (4), 2006: a radar measures gap and relative speed (the sensor `lanes`), and the acceleration of the
-vehicle ahead, which no radar can measure in time, comes over the air (the sensor `messages`).
+Trans. ITS 7 (4), 2006: a radar measures gap and relative speed (the sensor `lanes`), and the
+acceleration of the vehicle ahead, which no radar can measure in time, comes over the air (the
+sensor `messages`).
 """
 
 from __future__ import annotations
@@ -88,13 +89,12 @@ class CaccPolicy(Policy):
 
     def _suggested(self, shape: tuple[int, ...]) -> NDArray[Any]:
         """What the built-in driver would do, (W, A, 2)."""
-        env = self.env
-        if isinstance(env, CavVectorEnv):
-            batch: NDArray[Any] = env.suggest_actions()
-            return batch
+        suggested = self.env.suggest_actions()
+        if not isinstance(suggested, dict):
+            return suggested
         actions = np.zeros((*shape, 2), dtype=np.float32)
-        for agent, action in env.suggest_actions().items():
-            actions[0, env.possible_agents.index(agent)] = action
+        for agent, action in suggested.items():
+            actions[0, self.env.possible_agents.index(agent)] = action
         return actions
 
     def _part(self, newest: NDArray[np.float64], name: str) -> NDArray[np.float64]:

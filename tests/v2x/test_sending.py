@@ -14,6 +14,9 @@ from cavmarl.kernels.v2x_records import (
     KIND_CPM,
     KIND_DENM,
     KIND_SPAT,
+    LAST_CAM,
+    PACKET,
+    REPORT,
 )
 from cavmarl.v2x.messages import messages_of
 from tests.naive import v2x as naive
@@ -26,6 +29,11 @@ def sent(world: Standing, kind: int) -> Any:
     """What all have just sent, as records of the schema."""
     mail, slot = world.bus.mail, 0
     return messages_of(kind, mail.reports[0, slot, : mail.num_reports[0, slot]])
+
+
+@pytest.mark.parametrize("dtype", [REPORT, PACKET, LAST_CAM])
+def test_records_of_the_state_have_no_gaps(dtype: np.dtype[Any]) -> None:
+    assert dtype.itemsize == sum(dtype[name].itemsize for name in dtype.names or ())
 
 
 def test_stations_take_turns_by_id() -> None:

@@ -81,7 +81,8 @@ def test_worker_processes_say_the_same() -> None:
 
 @pytest.mark.parametrize("channel", [{}, LOSSY], ids=["ideal", "lossy"])
 def test_ticks_that_are_begun_again_say_the_same(channel: dict[str, Any]) -> None:
-    overrides = dict(BUSY) | OBSERVED | channel | {"v2x.perception.rate_hz": 5.0}
+    rates = ("cam.rate_hz", "denm.rate_hz", "perception.rate_hz", "roadside.rate_hz")
+    overrides = dict(BUSY) | OBSERVED | channel | {f"v2x.{rate}": 5.0 for rate in rates}
     whole = make_vec("grid4x4", overrides=overrides)
     faults = {"zones.faults": ROUGH.to_json()}
     harmed = make_vec("grid4x4", zones=4, overrides=overrides | faults)
