@@ -248,7 +248,7 @@ def make_worlds(
 
     Agents' commands take effect `latency_ticks` later, scripts wait for `num_cues` cues. The rows
     are those of a zone of `zoned`, if it is given. What all zones of a world have in common (ticks,
-    keys, signals and what detectors saw) are the arrays of `common`, if it is given; if not,
+    keys, signals, what detectors saw, cues) are the arrays of `common`, if it is given; if not,
     `zeros` makes them.
     """
     if zoned is None:
