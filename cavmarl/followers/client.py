@@ -23,7 +23,7 @@ from cavmarl.followers.messages import (
     read_letter,
 )
 
-__all__ = ["Follower", "Samples", "Sight"]
+__all__ = ["Follower", "Samples", "Sight", "sight_of"]
 
 CALL_S = 10.0
 
@@ -33,12 +33,14 @@ class Samples:
     """What one sensor has since the last snapshot.
 
     Attributes:
-        values: (n, …) one sample a row.
-        ticks: (n,) of the world, when each was taken.
+        values: (n, …) one sample a row, the newest last.
+        stamps_s: (n,) when each was taken, in simulated time since the reset.
+        lost: (n,) which were lost: zeros.
     """
 
     values: NDArray[Any]
-    ticks: NDArray[np.int64]
+    stamps_s: NDArray[np.float64]
+    lost: NDArray[np.bool_]
 
 
 @dataclass(frozen=True)
@@ -47,7 +49,8 @@ class Sight:
 
     Attributes:
         snapshot: the clock, and the vehicles that have to be driven.
-        sensors: by vehicle and name of the sensor; those that are due.
+        sensors: by vehicle and name of the sensor; those that are due. What is of the whole map
+            stands under no name.
     """
 
     snapshot: Snapshot
@@ -131,11 +134,7 @@ class Follower:
                 f"frame {snapshot.frame} follows {self._frame}: one was left out"
             )
         self._frame = snapshot.frame
-        sensors: dict[str, dict[str, Samples]] = {vehicle: {} for vehicle in snapshot.vehicles}
-        for view, array in zip(snapshot.arrays, arrays, strict=True):
-            ticks = np.asarray(view.ticks, dtype=np.int64)
-            sensors.setdefault(view.vehicle, {})[view.name] = Samples(array, ticks)
-        return Sight(snapshot, sensors)
+        return sight_of(snapshot, arrays)
 
     def answer(self, controls: Mapping[str, Any]) -> None:
         """Say what the vehicles of the last snapshot do in the next step.
@@ -183,6 +182,15 @@ class Follower:
             self._line.skip(heard)
             raise FollowerError(read_letter(Refusal, heard.letter).reason)
         raise FollowerMessageError(f"{self._line.name} says {heard.kind.name}, which is not due")
+
+
+def sight_of(snapshot: Snapshot, arrays: Sequence[NDArray[Any]]) -> Sight:
+    """A snapshot with its arrays where they belong."""
+    sensors: dict[str, dict[str, Samples]] = {vehicle: {} for vehicle in snapshot.vehicles}
+    for view, array in zip(snapshot.arrays, arrays, strict=True):
+        samples = Samples(array, np.array(view.stamps_s), np.array(view.lost, dtype=np.bool_))
+        sensors.setdefault(view.vehicle, {})[view.name] = samples
+    return Sight(snapshot, sensors)
 
 
 def _plain(given: Any) -> list[float] | int:

@@ -28,9 +28,9 @@ from cavmarl.errors import (
 )
 from cavmarl.followers.barrier import BadControls, Barrier, Seat
 from cavmarl.followers.line import Address, Line
-from cavmarl.followers.messages import Hello, Say, Welcome
+from cavmarl.followers.messages import Hello, Say
 from cavmarl.followers.reception import Reception, refuse
-from cavmarl.followers.snapshots import Moment
+from cavmarl.followers.snapshots import Moment, welcome_to
 from cavmarl.runtime.clock import OwnTicks, TimeMaster
 from cavmarl.runtime.pacing import Pacer
 from cavmarl.runtime.step_trace import QUEUE, STACK, StepTrace
@@ -218,24 +218,9 @@ class FollowedWorld:
                 self._reception.turn_away(line, str(error))
 
     def _seat(self, line: Line, hello: Hello) -> None:
-        env = self.env
         agents = self._indices(hello.vehicles)
-        action, clock = env.config.action, env.config.clock
-        line.say(
-            Say.WELCOME,
-            Welcome(
-                environment=f"{env.config.name}-v{env.config.version}",
-                vehicles=self._names(agents),
-                tick=self.master.tick,
-                dt_s=clock.sim_dt_s,
-                ticks_per_step=clock.ticks_per_step,
-                control_latency_ticks=clock.control_latency_ticks,
-                action=action.kind,
-                acceleration_mps2=action.acceleration_mps2,
-                steering_rad=action.steering_rad,
-            ),
-            within_s=self._timeout_s,
-        )
+        welcome = welcome_to(self.env, self._names(agents), self.master.tick)
+        line.say(Say.WELCOME, welcome, within_s=self._timeout_s)
         self._seats.append(Seat(line, self.master.follow(hello.name), agents))
         self._seats.sort(key=lambda each: each.rank)
 

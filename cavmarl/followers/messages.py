@@ -33,6 +33,7 @@ __all__ = [
     "Hello",
     "Refusal",
     "Say",
+    "SensorView",
     "Snapshot",
     "Ticked",
     "VehicleView",
@@ -94,11 +95,28 @@ class Hello:
 
 @with_config(_CLOSED)
 @dataclass(frozen=True)
+class SensorView:
+    """One sensor of every vehicle.
+
+    Attributes:
+        name: in the rig.
+        units: of its channels.
+        settings: its keys in `env.yaml`: type, place on the vehicle, rate, range and so on.
+    """
+
+    name: StrictStr
+    units: list[StrictStr]
+    settings: dict[StrictStr, Any]
+
+
+@with_config(_CLOSED)
+@dataclass(frozen=True)
 class Welcome:
     """The answer.
 
     Attributes:
         environment: name and version.
+        map_hash: of the roads' source: a stack needs the same map.
         vehicles: those that the follower has been given.
         tick: the master's, now.
         dt_s: seconds a tick.
@@ -108,9 +126,11 @@ class Welcome:
         action: `continuous` or `discrete`.
         acceleration_mps2: what 1 means as the first number of a control.
         steering_rad: what 1 means as the second.
+        sensors: of every vehicle; none: a snapshot has the `observation` of the environment.
     """
 
     environment: StrictStr
+    map_hash: StrictStr
     vehicles: list[StrictStr]
     tick: StrictInt
     dt_s: StrictFloat
@@ -119,6 +139,7 @@ class Welcome:
     action: StrictStr
     acceleration_mps2: StrictFloat
     steering_rad: StrictFloat
+    sensors: list[SensorView]
 
 
 @with_config(_CLOSED)
@@ -127,18 +148,21 @@ class ArrayView:
     """One array of a snapshot; its bytes lie in the frame's data, in the order of the list.
 
     Attributes:
-        vehicle: whose.
+        vehicle: whose; nothing: it is of the whole map, as `signals`: (1, links) what the signal of
+            each link shows, as a SIGNAL_* code (255: it has none).
         name: of the sensor.
         dtype: as NumPy writes it, little-endian.
         shape: of the array; the first axis are samples.
-        ticks: of the world at which each sample was taken.
+        stamps_s: when each was taken, in simulated time since the reset.
+        lost: which of them were lost: zeros.
     """
 
     vehicle: StrictStr
     name: StrictStr
     dtype: StrictStr
     shape: list[StrictInt]
-    ticks: list[StrictInt]
+    stamps_s: list[StrictFloat]
+    lost: list[StrictBool]
 
 
 @with_config(_CLOSED)

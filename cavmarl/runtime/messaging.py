@@ -31,7 +31,7 @@ class Messaging:
     """
 
     def __init__(self, host: Host) -> None:
-        worlds, walls = host.shards[0].worlds, host.network.walls
+        worlds = host.shards[0].worlds
         self._division = host.division
         self._ticks = worlds.ticks
         self._ticks_per_step = host.config.clock.ticks_per_step
@@ -42,7 +42,6 @@ class Messaging:
             host.division.zoned,
             Common(*(getattr(worlds, name) for name in Common._fields)),
             host.zeros,
-            np.stack([walls[name] for name in ("ax", "ay", "bx", "by")], axis=1),
         )
         for shard in host.shards:
             shard.mail = self.bus.mail

@@ -24,6 +24,8 @@ COMMANDS = (
     "verify-determinism",
     "journal",
     "plan",
+    "lead",
+    "follow",
     "view",
     "demo",
     "list",

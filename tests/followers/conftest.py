@@ -33,8 +33,8 @@ def address(tmp_path: Path) -> Path:
 def steer(sight: Sight) -> dict[str, Any]:
     """Some driver: a function of what it sees and of nothing else."""
     return {
-        vehicle: np.tanh(seen["observation"].values[0, :2]).astype(float).tolist()
-        for vehicle, seen in sight.sensors.items()
+        vehicle: np.tanh(sight.sensors[vehicle]["observation"].values[0, :2]).tolist()
+        for vehicle in sight.snapshot.vehicles
     }
 
 

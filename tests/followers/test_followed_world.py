@@ -38,8 +38,7 @@ def reference(steps: int, drivers: dict[str, Any]) -> list[str]:
     for _ in range(steps):
         actions = env.suggest_actions()
         for agent in drivers:
-            numbers = np.tanh(observations[agent][:2]).astype(float)
-            actions[agent] = numbers.astype(np.float32)
+            actions[agent] = np.tanh(observations[agent][:2])
         observations, *_ = env.step(actions)
         found.append(env.state_hash())
     return found
@@ -57,7 +56,7 @@ def test_a_follower_drives_as_a_policy_would(address: Path, start: Start) -> Non
     for frame, sight in enumerate(seen):
         snapshot = sight.snapshot
         assert (snapshot.frame, snapshot.tick, snapshot.time_s) == (frame, frame, frame * 0.05)
-        assert sight.sensors["car_1"]["observation"].ticks.tolist() == [frame]
+        assert sight.sensors["car_1"]["observation"].stamps_s.tolist() == [frame * 0.05]
         assert list(snapshot.vehicles) == ["car_1"]
         assert snapshot.vehicles["car_1"].vclass == "passenger"
     assert len(seen) == 11
