@@ -14,12 +14,8 @@ from pettingzoo import ParallelEnv
 
 from cavmarl.actions import ActionDecoder
 from cavmarl.config import TERMS
-from cavmarl.errors import (
-    ConfigError,
-    EpisodeEndedError,
-    ResetNeededError,
-    UnknownAgentError,
-)
+from cavmarl.declared_events import DeclaredEvents
+from cavmarl.errors import ConfigError, EpisodeEndedError, ResetNeededError, UnknownAgentError
 from cavmarl.registry import load_config
 from cavmarl.render.view import WorldView
 from cavmarl.rig.frames import SensorFrames
@@ -184,6 +180,7 @@ class CavEnv(ParallelEnv[str, Any, Any]):  # type: ignore[misc] # PettingZoo is 
         )
         self.state_space = state_space(worlds.arrays.states.shape[1] // STATE_FEATURES)
         self._decoder = ActionDecoder(config.action, 1, self.possible_agents)
+        self._events = DeclaredEvents(config, 1)
         self._first_seed = seed
         self._steps = -1
         self._view: WorldView | None = None
@@ -259,7 +256,7 @@ class CavEnv(ParallelEnv[str, Any, Any]):  # type: ignore[misc] # PettingZoo is 
         active = self.worlds.arrays.mask[0, self._listed]
         needed = self.agents if active.all() else list(compress(self.agents, active.tolist()))
         commands = self._decoder.from_dict(actions, self.agents, needed)
-        self.worlds.step(commands)
+        self.worlds.step(self._events.add_to(commands))
         self._steps += 1
         return self._report()
 
@@ -359,6 +356,21 @@ class CavEnv(ParallelEnv[str, Any, Any]):  # type: ignore[misc] # PettingZoo is 
             for info, number in zip(infos, column.tolist(), strict=True):
                 info[name] = number
         return dict(zip(self.agents, infos, strict=True))
+
+    def declare_event(self, agent: str, cause: str) -> None:
+        """Let an agent's vehicle tell others of an event in the next step (docs/v2x.md).
+
+        Args:
+            agent: which has a vehicle.
+            cause: `collision`, `obstacle`, `stationary` or `hard_braking`.
+
+        Raises:
+            UnknownAgentError: no such agent, or it has left.
+            V2xError: no such cause, or nobody says anything in this environment.
+        """
+        if agent not in self.agents:
+            raise UnknownAgentError(f"declare_event('{agent}', …): it is not in the episode")
+        self._events.declare(0, self.possible_agents.index(agent), cause)
 
     def frames(self, agent: str) -> dict[str, SensorFrames]:
         """What the sensors of an agent's `rig` have got in the last step, by name.

@@ -433,11 +433,12 @@ class ObservationConfig:
 
     Attributes:
         mode: `ground_truth`: what `sensors` says, taken from the world itself. `sensors`: the
-            latest samples of the `rig`.
+            latest samples of the `rig`. `messages`: of `sensors` only what the vehicle knows of
+            itself and its route, and what it is told over the air.
         kind: `flat`: one Box of float32. `dict`: one Box a sensor.
     """
 
-    mode: Literal["ground_truth", "sensors"] = "ground_truth"
+    mode: Literal["ground_truth", "sensors", "messages"] = "ground_truth"
     kind: Literal["flat", "dict"] = "flat"
 
 
@@ -536,8 +537,21 @@ class EnvConfig:
         if self.v2x.enabled:
             self.v2x.check_clock(self.clock.sim_dt_s)
         self._check_messages()
+        if self.observation.mode == "messages":
+            self._keep_what_is_told()
         if self.traffic.source != "native":
             self._check_sumo()
+
+    def _keep_what_is_told(self) -> None:
+        """Switch the sensors off that look at others."""
+        told = self.sensors.messages
+        _check(
+            bool(told.objects or told.events or told.signal),
+            "observation.mode",
+            self.observation.mode,
+            "no messages are observed: set sensors.messages.objects",
+        )
+        object.__setattr__(self, "sensors", self.sensors.without_sight())
 
     def _check_messages(self) -> None:
         """Refuse to observe messages that nobody keeps."""
@@ -572,6 +586,13 @@ class EnvConfig:
             "map.programs",
             self.map.programs or self.map.program,
             f"traffic.source = {source}: SUMO has the signals; name such files in its .sumocfg",
+        )
+        _check(
+            source == "sumo-demand" or self.workers.balance_steps == 0,
+            "workers.balance_steps",
+            self.workers.balance_steps,
+            f"traffic.source = {source}: no other process can take up SUMO in the middle of an "
+            "episode; leave it 0",
         )
         _check(
             not self.sensors.signal.timing,

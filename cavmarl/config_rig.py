@@ -200,6 +200,13 @@ def _check_count(key: str, value: int, low: int, high: int) -> None:
     check(low <= value <= high, key, value, f"must be from {low} to {high}")
 
 
+def _check_exact(key: str, config: SampledConfig) -> None:
+    """Refuse errors of classes, which are names and no quantities."""
+    for name in ("noise", "bias"):
+        values = getattr(config, name)
+        check(not any(values), f"{key}.{name}", values, "must be 0: a class has no errors")
+
+
 @dataclass(frozen=True, kw_only=True)
 class LidarRigConfig(SampledConfig):
     """Distances along rays, in m; `range_m` where nothing is.
@@ -315,6 +322,11 @@ class SemanticCameraConfig(CameraConfig):
     type: Literal["semantic_camera"] = "semantic_camera"
     units: ClassVar[tuple[str, ...]] = ("class",)
 
+    def check(self, key: str) -> None:
+        """As `MountedConfig.check`."""
+        super().check(key)
+        _check_exact(key, self)
+
 
 @dataclass(frozen=True, kw_only=True)
 class RgbCameraConfig(CameraConfig):
@@ -356,6 +368,10 @@ class BevGridConfig(SampledConfig):
     def check(self, key: str) -> None:
         """As `MountedConfig.check`."""
         super().check(key)
+        _check_exact(key, self)
+        for name in ("pitch_deg", "roll_deg"):
+            value = getattr(self, name)
+            check(value == 0.0, f"{key}.{name}", value, "must be 0: it looks straight down")
         check_finite(f"{key}.cell_m", self.cell_m, 0.05, 50.0)
         for name in ("ahead_m", "behind_m", "aside_m"):
             check_finite(f"{key}.{name}", getattr(self, name), 0.0, MAX_REACH_M)

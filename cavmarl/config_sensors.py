@@ -9,7 +9,7 @@ those can be used here.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Literal
 
 from cavmarl.config_checks import check, check_finite
@@ -397,6 +397,20 @@ class SensorsConfig:
             self.puffer_drive.enabled,
         )
         check(any(counts), "sensors", "all off", "an agent must observe something; switch one on")
+
+    def without_sight(self) -> SensorsConfig:
+        """The same without those that look at others or at signals."""
+        return replace(
+            self,
+            neighbors=replace(self.neighbors, count=0),
+            signal=replace(self.signal, enabled=False),
+            lanes=replace(self.lanes, range_m=0.0),
+            lidar=replace(self.lidar, rays=0),
+            kinematics=replace(self.kinematics, vehicles_count=0),
+            occupancy_grid=replace(self.occupancy_grid, features=()),
+            lidar_observation=replace(self.lidar_observation, cells=0),
+            puffer_drive=replace(self.puffer_drive, enabled=False),
+        )
 
 
 def _is_range(bounds: tuple[float, ...]) -> bool:

@@ -216,7 +216,7 @@ class CapacityError(CavmarlError):
 
 
 class V2xError(CavmarlError):
-    """Bytes that are no message, a network simulator that answers nonsense, or none where one is due."""
+    """Bytes that are no message, an unknown cause, or a network simulator that answers nonsense."""
 
 
 class EvaluationError(CavmarlError):

@@ -15,11 +15,13 @@ from numpy.typing import NDArray
 from cavmarl.actions import ActionDecoder
 from cavmarl.balance.plan import Plan
 from cavmarl.balance.plan_text import describe_plan
+from cavmarl.declared_events import DeclaredEvents
 from cavmarl.errors import ConfigError, ResetNeededError
 from cavmarl.registry import load_config
 from cavmarl.rig.frames import SensorFrames
 from cavmarl.runtime.simulation import Simulation
 from cavmarl.seeds import check_seed, first_seed
+from cavmarl.shard.shard import Commands
 from cavmarl.spaces import (
     action_space,
     flat_observation_space,
@@ -195,8 +197,13 @@ class CavVectorEnv:
                 AutoresetMode.NEXT_STEP if worlds.in_next_step else AutoresetMode.SAME_STEP
             ),
         }
-        self._decoder = ActionDecoder(config.action, num_envs, self.possible_agents)
+        arrays = worlds.arrays
+        commands = Commands(arrays.controls, arrays.meta_actions)
+        self._decoder = ActionDecoder(config.action, num_envs, self.possible_agents, commands)
+        self._view = arrays.observations.view()
+        self._view.flags.writeable = False
         self._mask = np.zeros((num_envs, self.num_agents), dtype=np.bool_)
+        self._events = DeclaredEvents(config, num_envs)
         self._first_seed = None if seed is None else check_seed(seed)
         self._copy = copy
         self._ready = False
@@ -306,15 +313,14 @@ class CavVectorEnv:
             raise ResetNeededError("step() before reset(): call vec.reset(seed=…) first")
         commands = self._decoder.from_array(actions, self._mask)
         began = time.perf_counter()
-        self.worlds.step(commands)
+        self.worlds.step(self._events.add_to(commands))
         self.simulated_s += time.perf_counter() - began
         arrays = self.worlds.arrays
         over = arrays.episode_over.copy()
         terminations = arrays.terminations.copy()
         observations = final_observations = self._observations()
-        ended = over | terminations.any(axis=1)
-        if ended.any():
-            final_observations = self._final_observations(ended)
+        if np.count_nonzero(over) or np.count_nonzero(terminations):
+            final_observations = self._final_observations(over | terminations.any(axis=1))
             self._decoder.forget(over)
         self._mask = arrays.mask.copy()
         infos: dict[str, NDArray[Any]] = {
@@ -331,7 +337,7 @@ class CavVectorEnv:
     def _observations(self) -> Observations:
         arrays = self.worlds.arrays
         if not self._senses:
-            return self._given(arrays.observations)
+            return arrays.observations.copy() if self._copy else self._view
         left = arrays.terminations & ~arrays.episode_over[:, None]
         if self.worlds.in_next_step or not left.any():
             sensed = sensed_observation(arrays.frames)
@@ -348,6 +354,20 @@ class CavVectorEnv:
         view = array.view()
         view.flags.writeable = False
         return view
+
+    def declare_event(self, world: int, agent: int, cause: str) -> None:
+        """Let the vehicle of an agent, by index, tell others of an event in the next step.
+
+        Args:
+            world: in which it drives.
+            agent: index in `possible_agents`.
+            cause: as of `CavEnv.declare_event`.
+
+        Raises:
+            UnknownAgentError: no such agent.
+            V2xError: no such cause, or nobody says anything in this environment.
+        """
+        self._events.declare(world, agent, cause)
 
     def _final_observations(self, ended: NDArray[np.bool_]) -> Observations:
         """The observations, and of the worlds (W,) where something ended those before that."""

@@ -12,10 +12,13 @@ from cavmarl.cli import (
     demand,
     demo,
     evaluate,
+    follow,
     journal,
+    lead,
     listing,
     map,
     plan,
+    scenario,
     suite,
     verify,
     verify_determinism,
@@ -38,12 +41,15 @@ app.command()(verify.verify)
 app.command()(verify_determinism.verify_determinism)
 app.command()(journal.journal)
 app.command()(plan.plan)
+app.command()(lead.lead)
+app.command()(follow.follow)
 app.command()(view.view)
 app.command()(demo.demo)
 app.command("list")(listing.list_entries)
 app.add_typer(map.app, name="map")
 app.add_typer(demand.app, name="demand")
 app.add_typer(bench.app, name="bench")
+app.add_typer(scenario.app, name="scenario")
 
 
 @app.callback()

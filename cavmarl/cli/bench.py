@@ -10,6 +10,7 @@ from rich.console import Console
 from rich.table import Table
 
 from cavmarl.cli.bench_balance import balance
+from cavmarl.cli.bench_clock import clock
 from cavmarl.cli.bench_libraries import libraries
 from cavmarl.cli.bench_moving import moving
 from cavmarl.cli.bench_rays import rays
@@ -51,6 +52,7 @@ app.command()(train)
 app.command()(rays)
 app.command()(sensors)
 app.command()(libraries)
+app.command()(clock)
 
 _SENSORS = {"lidar": "64 rays", "kinematics": "no rays", "puffer_drive": "pufferlib's"}
 _WHO = {

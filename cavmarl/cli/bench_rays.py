@@ -17,7 +17,7 @@ def rays(
     repeats: Annotated[int, typer.Option(help="Measurements of each, by turns.")] = 5,
     json_path: JsonPath = None,
 ) -> None:
-    """Time of each mounted sensor, and of all ten of one vehicle, at 400 cars/km² on one core."""
+    """Time of each sensor of the rig `ten_sensors`, and of all, at 400 cars/km² on one core."""
     from cavmarl.evaluate.sensor_speed import measure_sensor_speed
 
     console = Console()
@@ -27,14 +27,15 @@ def rays(
     for row in found.rows:
         table.add_row(
             row.name,
-            " × ".join(map(str, row.shape)),
+            ", ".join(map(str, row.shape)),
             f"{row.median_us:.1f} ({row.low_us:.1f} to {row.high_us:.1f})",
             f"{1e3 * row.median_us / row.numbers:.1f}",
         )
     console.print(table)
     console.print(
-        f"{found.cars_per_km2:.0f} cars/km²: the plane lidar takes [bold]{found.lidar_ns:.1f} ns[/] "
-        f"a ray, a depth and a semantic picture [bold]{found.cameras_ms:.3f} ms[/],\n"
+        f"{found.cars_per_km2:.0f} cars/km²: the plane lidar takes "
+        f"[bold]{found.lidar_ns:.1f} ns[/] a ray, a depth and a semantic picture "
+        f"[bold]{found.cameras_ms:.3f} ms[/],\n"
         f"all ten sensors of one vehicle [bold]{found.tick_ms:.2f} ms[/] a tick"
     )
     write_json(json_path, found.to_dict())

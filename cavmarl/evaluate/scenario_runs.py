@@ -35,7 +35,7 @@ __all__ = ["DENSITIES", "ScenarioRun", "make_scenario", "run_scenario"]
 DENSITIES = {"none": 0.0, "low": 2.0, "high": 8.0}
 """Background vehicles a kilometre of lane."""
 
-HORIZON_S = 90.0
+HORIZON_S = 180.0
 
 
 @dataclass(frozen=True)
@@ -98,7 +98,7 @@ def make_scenario(
     place: str = "",
     density: str = "none",
     seed: int = 0,
-    zones: int = 1,
+    zones: int | None = None,
     overrides: Mapping[str, Any] | None = None,
 ) -> CavVectorEnv:
     """One world in which a scenario is played to its only agent, who steers and accelerates.
@@ -110,7 +110,7 @@ def make_scenario(
         place: where; empty: drawn by the seed.
         density: of the other traffic, of `DENSITIES`.
         seed: draws the place, and is that of the first reset.
-        zones: into which the world is divided.
+        zones: into which the world is divided; None: as the environment says.
         overrides: values for any other key.
 
     Raises:

@@ -90,7 +90,7 @@ def _fill(grid: BirdsEye, semantic: int, out: NDArray[np.uint8]) -> None:
         grid.edges[c, 0] = sign * (face[c, 0] * face[d, 1] - face[d, 0] * face[c, 1])
         grid.edges[c, 1] = by_column
         grid.edges[c, 2] = sign * (face[d, 0] - face[c, 0])
-        grid.edges[c, 3] = 1.0 / by_column
+        grid.edges[c, 3] = 1.0 / by_column if by_column != 0.0 else 0.0
     for j in range(max(math.floor(top), 0), min(math.ceil(bottom), height)):
         begin, end = row_span(grid.edges, 4, j, width)
         out[j, begin:end] = semantic
@@ -98,7 +98,12 @@ def _fill(grid: BirdsEye, semantic: int, out: NDArray[np.uint8]) -> None:
 
 @kernel
 def _fill_line(
-    grid: BirdsEye, strip: NDArray[np.float64], a: int, b: int, half_m: float, out: NDArray[np.uint8]
+    grid: BirdsEye,
+    strip: NDArray[np.float64],
+    a: int,
+    b: int,
+    half_m: float,
+    out: NDArray[np.uint8],
 ) -> None:
     """Fill a lane line between two corners of a strip."""
     dx = strip[b, 0] - strip[a, 0]
@@ -152,7 +157,5 @@ def look_down(
             y = prism["half_width"] if c in (0, 1) else -prism["half_width"]
             cos = prism["cos"]
             sin = prism["sin"]
-            _set_corner(
-                grid, c, prism["x"] + x * cos - y * sin, prism["y"] + x * sin + y * cos
-            )
+            _set_corner(grid, c, prism["x"] + x * cos - y * sin, prism["y"] + x * sin + y * cos)
         _fill(grid, prism["semantic"], out)

@@ -42,6 +42,9 @@ FIRST_FACE = 3
 
 _FACES_OF_PRISM = 6
 
+# Of a face with a corner nearer than this, or behind the camera, all rows are tried.
+NEAR_M = 0.01
+
 
 class Camera(NamedTuple):
     """Where a camera looks from and how."""
@@ -62,9 +65,7 @@ class Picture(NamedTuple):
     light: NDArray[np.float64]  # (F,) how bright each face is, in [0, 1]
 
 
-def make_camera(
-    mount: NDArray[np.float64], width: int, fov_rad: float, range_m: float
-) -> Camera:
+def make_camera(mount: NDArray[np.float64], width: int, fov_rad: float, range_m: float) -> Camera:
     """A camera.
 
     Args:
@@ -83,9 +84,7 @@ def make_picture(width: int, height: int, panorama: Panorama) -> Picture:
     semantic = np.zeros(faces, np.uint8)
     semantic[:FIRST_FACE] = NOTHING, GROUND, ROAD
     light = np.ones(faces)
-    return Picture(
-        np.zeros((height, width)), np.zeros((height, width), np.int32), semantic, light
-    )
+    return Picture(np.zeros((height, width)), np.zeros((height, width), np.int32), semantic, light)
 
 
 @kernel
@@ -110,7 +109,7 @@ def _set_edge(
     edges[k, 0] = x - 0.5 * width * by_column - 0.5 * height * by_row
     edges[k, 1] = by_column
     edges[k, 2] = by_row
-    edges[k, 3] = 1.0 / by_column
+    edges[k, 3] = 1.0 / by_column if by_column != 0.0 else 0.0
 
 
 @kernel
@@ -130,9 +129,7 @@ def _is_aside(camera: Camera, width: int, height: int) -> bool:
 
 
 @kernel
-def _set_face(
-    camera: Camera, width: int, height: int
-) -> tuple[int, int, float, float, float]:
+def _set_face(camera: Camera, width: int, height: int) -> tuple[int, int, float, float, float]:
     """Set the edges of the face whose corners are set, the fifth being the range.
 
     Returns:
@@ -165,9 +162,11 @@ def _set_face(
             width,
             height,
         )
-        in_front &= px > 0.01
-        low = min(low, -pz / px)
-        high = max(high, -pz / px)
+        if px > NEAR_M:
+            low = min(low, -pz / px)
+            high = max(high, -pz / px)
+        else:
+            in_front = False
     _set_edge(camera, 4, nx / volume, ny / volume, nz / volume, width, height)
     edges = camera.edges
     constant, by_column, by_row = edges[4, 0], edges[4, 1], edges[4, 2]
@@ -225,9 +224,14 @@ def _clear(camera: Camera, picture: Picture) -> None:
 
 @kernel
 def ground_at(camera: Camera, width: int, height: int) -> tuple[float, float, float]:
-    """The closeness of the ground: constant, by column, by row. Overwrites edge 4."""
+    """The closeness of the ground: constant, by column, by row. Overwrites edge 4.
+
+    A camera on the ground does not see it.
+    """
     mount = camera.mount
     z = -mount[2, 3]
+    if z >= 0.0:
+        return 0.0, 0.0, 0.0
     _set_edge(camera, 4, mount[2, 0] / z, mount[2, 1] / z, mount[2, 2] / z, width, height)
     return camera.edges[4, 0], camera.edges[4, 1], camera.edges[4, 2]
 
@@ -285,9 +289,7 @@ def _draw_prism(camera: Camera, picture: Picture, prism: np.void, first: int) ->
 
 @kernel
 def _light(x: float, y: float) -> float:
-    """How bright an upright face is that looks towards (x, y), a unit vector in the vehicle's
-    frame: the light comes from ahead on the left.
-    """
+    """How bright an upright face is that looks to (x, y); light comes from ahead on the left."""
     return 0.7 + 0.15 * (x + y)
 
 

@@ -11,8 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cavmarl.kernels import kernel
-from cavmarl.kernels.ray_fan import WALL_HIT, Fan
 from cavmarl.kernels.panorama import Panorama
+from cavmarl.kernels.ray_fan import WALL_HIT, Fan
 
 __all__ = ["TARGET", "detect"]
 

@@ -80,14 +80,16 @@ def make_fan(
         ],
         axis=2,
     )
-    # By sums and not by `@`: what a matrix product gives can depend on the machine's threads.
-    rays = sum(own[:, :, k, np.newaxis] * mount[:, k] for k in range(3))
+    # Not by `@`: what a matrix product gives can depend on the machine's threads.
+    rays = own[..., :1] * mount[:, 0] + own[..., 1:2] * mount[:, 1] + own[..., 2:] * mount[:, 2]
     down = -rays[:, :, 2]
     ground_m = np.full(down.shape, np.inf)
     np.divide(mount[2, 3], down, out=ground_m, where=down > 0.0)
     tilted = bool(mount[2, 0] != 0.0 or mount[2, 1] != 0.0)
     looks_down = bool((ground_m < range_m).any())
-    return Fan(rays, ground_m, mount, first_rad, step_rad, 1.0 / step_rad, range_m, tilted, looks_down)
+    return Fan(
+        rays, ground_m, mount, first_rad, step_rad, 1.0 / step_rad, range_m, tilted, looks_down
+    )
 
 
 @kernel
@@ -114,9 +116,7 @@ def _columns(fan: Fan, middle_rad: float, spread_rad: float) -> tuple[int, int, 
 
 
 @kernel
-def _columns_of_ball(
-    fan: Fan, x: float, y: float, z: float, radius: float
-) -> tuple[int, int, int]:
+def _columns_of_ball(fan: Fan, x: float, y: float, z: float, radius: float) -> tuple[int, int, int]:
     """The columns that can meet a ball at a place in the vehicle's frame."""
     mount = fan.mount
     dx = x - mount[0, 3]

@@ -59,7 +59,7 @@ def is_better(report: np.void, other: np.void) -> bool:
 def _squared(report: np.void, x: float, y: float) -> float:
     dx = report["x"] - x
     dy = report["y"] - y
-    return dx * dx + dy * dy
+    return float(dx * dx + dy * dy)
 
 
 @kernel
@@ -96,7 +96,8 @@ def sort_by_distance(
 def _is_before(
     squared: NDArray[np.float64], box: NDArray[np.void], k: int, other: float, subject: int
 ) -> bool:
-    return squared[k] < other or (squared[k] == other and box[k]["subject"] < subject)
+    is_nearer = squared[k] < other
+    return bool(is_nearer or (squared[k] == other and box[k]["subject"] < subject))
 
 
 @kernel

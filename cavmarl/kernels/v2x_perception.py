@@ -26,7 +26,7 @@ def _stands_between(body: np.void, x: float, y: float, cos: float, sin: float, f
     turned_cos = body["cos"] * cos + body["sin"] * sin
     turned_sin = body["sin"] * cos - body["cos"] * sin
     half = body["half_length"] * abs(turned_sin) + body["half_width"] * abs(turned_cos)
-    return across < half
+    return bool(across < half)
 
 
 @kernel

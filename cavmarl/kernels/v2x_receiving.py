@@ -91,7 +91,8 @@ def _load_around(channel: Channel, room: Room, x: float, y: float) -> float:
 @kernel
 def _place_of(sender: int, slots: int) -> int:
     """Where the search for a sender begins in a table of `slots` places, a power of 2."""
-    return np.int64(mix(np.uint64(sender)) & np.uint64(slots - 1))
+    place: int = np.int64(mix(np.uint64(sender)) & np.uint64(slots - 1))  # type: ignore[assignment]
+    return place
 
 
 @kernel
@@ -121,7 +122,7 @@ def _find_cam(room: Room, packets: NDArray[np.void], sender: int) -> int:
 def _hears(
     channel: Channel, me: np.void, level: int, word: np.uint64, x: float, y: float, squared: float
 ) -> bool:
-    """Whether a receiver receives a packet with that word that is sent within reach, from (x, y)."""
+    """Whether a receiver receives the packet of that word, sent within reach from (x, y)."""
     if channel.sure:
         return True
     number = draw(me["word"], word)

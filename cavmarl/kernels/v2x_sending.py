@@ -188,7 +188,7 @@ def _has_changed(row: np.void, last: np.void, tick: int, dt: float) -> bool:
     """Whether a CAM is worth while, by the last one."""
     dx = row["x"] - last["x"]
     dy = row["y"] - last["y"]
-    return (
+    return bool(
         dx * dx + dy * dy > CAM_DISTANCE_M * CAM_DISTANCE_M
         or abs(wrap_angle(row["heading"] - last["heading"])) > CAM_HEADING_RAD
         or abs(row["speed"] - last["speed"]) > CAM_SPEED_MPS

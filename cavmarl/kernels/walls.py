@@ -75,7 +75,7 @@ def _crosses(wall: NDArray[np.float64], x: float, y: float, to_x: float, to_y: f
     wall_dy = wall[3] - wall[1]
     side_from = wall_dx * (y - wall[1]) - wall_dy * (x - wall[0])
     side_to = wall_dx * (to_y - wall[1]) - wall_dy * (to_x - wall[0])
-    return side_from * side_to <= 0.0 and (side_a != side_b or side_from != side_to)
+    return bool(side_from * side_to <= 0.0 and (side_a != side_b or side_from != side_to))
 
 
 @kernel

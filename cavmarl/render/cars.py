@@ -8,11 +8,12 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from cavmarl.kernels.codes import EVENT_COLLIDED
+from cavmarl.kernels.codes import DRIVER_SCRIPTED, EVENT_COLLIDED
 from cavmarl.render.camera import Camera
 from cavmarl.render.canvas import Part, stamp
 from cavmarl.render.marks import opaque
 from cavmarl.render.palette import (
+    ACTOR,
     BACKGROUND_CAR,
     BLINKER,
     BRAKE,
@@ -22,6 +23,7 @@ from cavmarl.render.palette import (
     Color,
     agent_color,
 )
+from cavmarl.render.walkers import draw_walker, is_walker
 
 if TYPE_CHECKING:
     from pygame import Surface
@@ -96,14 +98,19 @@ def draw_cars(
         paints: of each; by default agents have the colours of `palette.agent_color`.
     """
     if paints is None:
-        paints = [_paint_of_driver(agent) for agent in vehicles["agent"].tolist()]
+        paints = [_paint_of_driver(row) for row in vehicles]
     centers = camera.to_pixels(np.stack([vehicles["x"], vehicles["y"]], axis=1)).tolist()
     for row, center, paint in zip(vehicles, centers, paints, strict=True):
+        if is_walker(row):
+            draw_walker(surface, row, center, camera.scale)
+            continue
         _draw_car(surface, row, center, camera.scale, paint)
 
 
-def _paint_of_driver(agent: int) -> Paint:
-    return Paint(agent_color(agent), lined=True) if agent >= 0 else Paint(BACKGROUND_CAR)
+def _paint_of_driver(row: np.void) -> Paint:
+    if row["agent"] >= 0:
+        return Paint(agent_color(int(row["agent"])), lined=True)
+    return Paint(ACTOR if row["driver"] == DRIVER_SCRIPTED else BACKGROUND_CAR)
 
 
 def _draw_car(

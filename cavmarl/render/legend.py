@@ -8,6 +8,7 @@ from typing import NamedTuple
 from cavmarl.render.canvas import Part
 from cavmarl.render.marks import bar, opaque, ring, target
 from cavmarl.render.palette import (
+    ACTOR,
     BACKGROUND_CAR,
     COLLIDED,
     INK,
@@ -34,13 +35,20 @@ class Sample(NamedTuple):
     draw: Callable[[float, float], list[Part]]
 
 
-def samples_of_drivers(*, destinations: bool) -> list[Sample]:
-    """Of a picture in which agents have colours of their own."""
+def samples_of_drivers(*, destinations: bool, actors: bool = False) -> list[Sample]:
+    """Of a picture in which agents have colours of their own.
+
+    Args:
+        destinations: whether those of agents are shown.
+        actors: whether somebody follows a script.
+    """
     samples = [Sample("agents", lambda x, y: _stripes([agent_color(k) for k in range(4)], x, y))]
     if destinations:
         samples.append(
             Sample("destination", lambda x, y: target(x + SWATCH_PX / 2.0, y, agent_color(0)))
         )
+    if actors:
+        samples.append(Sample("script", lambda x, y: _stripes([ACTOR], x, y)))
     samples.append(Sample("background", lambda x, y: _stripes([BACKGROUND_CAR], x, y)))
     samples.append(Sample("collided", lambda x, y: _nested([COLLIDED, BACKGROUND_CAR], x, y)))
     return samples

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from cavmarl.kernels.codes import DRIVER_SCRIPTED
 from cavmarl.render.camera import Bounds, Camera, suitable_size
 from cavmarl.render.canvas import load_pygame, pixels
 from cavmarl.render.cars import draw_cars, in_view
@@ -128,7 +129,8 @@ class TopDownRenderer:
             )
         draw_cars(surface, seen, camera)
         self._overlay.agents(surface, seen, camera)
-        return samples_of_drivers(destinations=self._goals is not None)
+        actors = bool((vehicles["driver"] == DRIVER_SCRIPTED).any())
+        return samples_of_drivers(destinations=self._goals is not None, actors=actors)
 
     def _draw_owners(
         self, surface: Surface, vehicles: NDArray[np.void], zones: ZoneView, ghosts_of: int | None

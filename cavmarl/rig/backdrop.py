@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cavmarl.errors import ConfigError
+from cavmarl.kernels.codes import CLASS_PEDESTRIAN
 from cavmarl.kernels.neighbors import Grid, cell_at, make_grid
 from cavmarl.kernels.panorama import Backdrop
 from cavmarl.kernels.semantics import SEMANTIC_OF_CLASS
@@ -16,10 +17,12 @@ __all__ = ["lane_strips", "make_backdrop"]
 CELL_M = 32.0
 # Long straight strips are cut, so that what is near a vehicle is found by the middles of strips.
 STRIP_M = 24.0
-# Neighbour lanes of a map are not as close as its widths say: without this, ground shows in between.
+# Neighbour lanes are not quite as close as their widths say: else ground would show in between.
 OVERLAP_M = 0.05
 # A sharp bend is not carried farther out than this many half widths.
 LONGEST_MITRE = 2.0
+
+_CLASS_NAMES = {**dict(enumerate(VEHICLE_CLASSES)), CLASS_PEDESTRIAN: "pedestrian"}
 
 
 def make_backdrop(network: RoadNetwork, types: NDArray[np.void]) -> Backdrop:
@@ -53,7 +56,7 @@ def make_backdrop(network: RoadNetwork, types: NDArray[np.void]) -> Backdrop:
 
 def _semantics(types: NDArray[np.void]) -> NDArray[np.uint8]:
     """(num_types,) the semantic class of each type."""
-    names = [VEHICLE_CLASSES[vclass] for vclass in types["vclass"]]
+    names = [_CLASS_NAMES.get(vclass, f"number {vclass}") for vclass in types["vclass"].tolist()]
     unknown = sorted(set(names) - set(SEMANTIC_OF_CLASS))
     if unknown:
         raise ConfigError(f"vehicle class {', '.join(unknown)}: cameras have no class for it")
@@ -61,7 +64,7 @@ def _semantics(types: NDArray[np.void]) -> NDArray[np.uint8]:
 
 
 def _index(corners: NDArray[np.float64]) -> tuple[Grid, NDArray[np.intp]]:
-    """An index of shapes (n, corners, 2) by their middles, and the order in which it counts them."""
+    """An index of shapes (n, corners, 2) by their middles, and the order that it counts them in."""
     if len(corners) == 0:
         return make_grid((0.0, 0.0, 1.0, 1.0), CELL_M, 0), np.zeros(0, np.intp)
     middles = corners.mean(axis=1)
@@ -94,10 +97,16 @@ def lane_strips(network: RoadNetwork) -> tuple[NDArray[np.float64], NDArray[np.f
     along = before + after
     size = np.hypot(along[:, 0], along[:, 1])
     # Of a lane that turns back on the spot, which has no middle direction, the one after counts.
-    along = np.where(size[:, np.newaxis] > 1e-6, along / np.maximum(size, 1e-6)[:, np.newaxis], after)
+    along = np.where(
+        size[:, np.newaxis] > 1e-6, along / np.maximum(size, 1e-6)[:, np.newaxis], after
+    )
     bend = np.abs(along[:, 0] * after[:, 0] + along[:, 1] * after[:, 1])
     mitre = np.minimum(1.0 / np.maximum(bend, 1e-6), LONGEST_MITRE)
-    aside = ((0.5 * lanes["width_m"][of] + OVERLAP_M) * mitre)[:, np.newaxis] * along[:, ::-1] * [-1.0, 1.0]
+    aside = (
+        ((0.5 * lanes["width_m"][of] + OVERLAP_M) * mitre)[:, np.newaxis]
+        * along[:, ::-1]
+        * [-1.0, 1.0]
+    )
     sides = np.stack([here - aside, here + aside], axis=1)
     start = np.flatnonzero(~last)
     length = points["s"][start + 1] - points["s"][start]

@@ -236,4 +236,6 @@ def _digest(commands: Commands, w: int) -> bytes:
     """Digest of what the agents of a world do, 16 bytes."""
     digest = blake2b(commands.controls[w].tobytes(), digest_size=16)
     digest.update(commands.meta_actions[w].tobytes())
+    if commands.declared.any():
+        digest.update(commands.declared[w].tobytes())
     return digest.digest()

@@ -21,6 +21,7 @@ from cavmarl.kernels.borders import Borders, pass_on
 from cavmarl.kernels.exchange import exchange, take_own
 from cavmarl.kernels.handing_over import look, make_book
 from cavmarl.kernels.repeated import repeated
+from cavmarl.kernels.tallies import totals
 from cavmarl.kernels.zones import Halo, ZoneArrays, zone_of
 from cavmarl.ownership.messages import Birth, Switch
 from cavmarl.roads.zone_statistics import imbalance
@@ -92,6 +93,7 @@ class Division:
         self._call_exchange = repeated(exchange)
         self._look = repeated(look)
         self._pass_on = repeated(pass_on)
+        self._totals = repeated(totals)
 
     @property
     def count(self) -> int:
@@ -357,7 +359,9 @@ class Division:
 
     def running(self) -> NDArray[np.int64]:
         """(W,) vehicles of each world."""
-        return np.asarray(self._zoned.num_owned.sum(axis=0))
+        running = np.empty(self.num_worlds, dtype=np.int64)
+        self._totals(self._zoned.num_owned, running)
+        return running
 
     def loads(self) -> ZoneLoads:
         """What each zone holds."""

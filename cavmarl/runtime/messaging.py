@@ -33,6 +33,8 @@ class Messaging:
     def __init__(self, host: Host) -> None:
         worlds = host.shards[0].worlds
         self._division = host.division
+        self._ticks = worlds.ticks
+        self._ticks_per_step = host.config.clock.ticks_per_step
         self.bus = Bus(
             host.config,
             host.network,
@@ -49,7 +51,9 @@ class Messaging:
         self.bus.reset(chosen)
 
     def begin(self, commands: Commands) -> None:
-        """Nothing to do: stations send what is so at the end of a tick."""
+        """Take what agents tell others of in this step; they say it once, in its first tick."""
+        if commands.declared.size and self._ticks.item(0) % self._ticks_per_step == 0:
+            self.bus.declare(commands.declared)
 
     def end(self) -> None:
         """Send and receive."""

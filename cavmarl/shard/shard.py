@@ -7,7 +7,7 @@ of its process.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
@@ -59,10 +59,12 @@ class Commands:
     Attributes:
         controls: (W, A, 2) throttle in m/s² and steering in rad; continuous actions.
         meta_actions: (W, A) ACTION_* codes; discrete actions.
+        declared: (W, A) CAUSE_* of events that agents tell others of, 0: none; (0, 0): nobody does.
     """
 
     controls: NDArray[np.float64]
     meta_actions: NDArray[np.int64]
+    declared: NDArray[np.int32] = field(default_factory=lambda: np.zeros((0, 0), np.int32))
 
 
 class Shard:
@@ -190,7 +192,7 @@ class Shard:
         self.worlds = self.worlds._replace(rows=self.sides[side], next_rows=self.sides[next_side])
 
     def complete_observations(self, chosen: NDArray[np.bool_]) -> None:
-        """Write what `sense` has left to others: messages, other projects' sensors, earlier frames."""
+        """Write what `sense` has left: messages, sensors of other projects, and earlier frames."""
         observations, stack = self.outputs.observations, self.config.sensors.stack
         if self._further is not None:
             self._call_observe_further(
@@ -244,9 +246,10 @@ def make_worlds(
 ) -> Worlds:
     """Arrays of W worlds that hold `capacity` vehicles each, all of them empty.
 
-    Agents' commands take effect `latency_ticks` later, scripts wait for `num_cues` cues. The rows are those of a zone of `zoned`, if
-    it is given. What all zones of a world have in common (ticks, keys, signals and what detectors
-    saw) are the arrays of `common`, if it is given; if not, `zeros` makes them.
+    Agents' commands take effect `latency_ticks` later, scripts wait for `num_cues` cues. The rows
+    are those of a zone of `zoned`, if it is given. What all zones of a world have in common (ticks,
+    keys, signals and what detectors saw) are the arrays of `common`, if it is given; if not,
+    `zeros` makes them.
     """
     if zoned is None:
         zoned = make_zoned(1, num_worlds, capacity)

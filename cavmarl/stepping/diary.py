@@ -18,6 +18,7 @@ __all__ = ["Diary", "make_segments"]
 
 STEPS = 16  # from one image to the next: a successor repeats that many at most
 _FIRST_IMAGE_BYTES = 1 << 12
+_COMMANDS = ("controls", "meta_actions", "declared")
 
 
 def make_segments(config: EnvConfig, num_worlds: int) -> list[Segment]:
@@ -50,7 +51,7 @@ class Diary:
         self.place = np.zeros(2, dtype=np.int64)
         self._images = [Image(segment) for segment in images]
         arrays = arrays_in(steps.map(), _layout(config, num_worlds))
-        self.entries = tuple(map(Commands, arrays["controls"], arrays["meta_actions"]))
+        self.entries = tuple(map(Commands, *(arrays[name] for name in _COMMANDS)))
 
     @property
     def is_full(self) -> bool:
@@ -62,6 +63,7 @@ class Diary:
         entry = self.entries[self.place.item(1)]
         entry.controls[:] = commands.controls
         entry.meta_actions[:] = commands.meta_actions
+        entry.declared[:] = commands.declared
         self.place[1] += 1
 
     def begin(self, state: Arrays) -> None:
@@ -86,4 +88,6 @@ class Diary:
 
 def _layout(config: EnvConfig, num_worlds: int) -> Layout:
     agents: tuple[int, ...] = (STEPS, num_worlds, config.population.num_ids)
-    return {"controls": ("<f8", (*agents, 2)), "meta_actions": ("<i8", agents)}
+    return dict(
+        zip(_COMMANDS, (("<f8", (*agents, 2)), ("<i8", agents), ("<i4", agents)), strict=True)
+    )

@@ -43,7 +43,9 @@ class WorldsJob:
     def _take(self, worlds: LocalWorlds, first: int) -> None:
         self._worlds = worlds
         self._first = first
-        self._commands = Commands(worlds.arrays.controls, worlds.arrays.meta_actions)
+        self._commands = Commands(
+            worlds.arrays.controls, worlds.arrays.meta_actions, worlds.arrays.declared
+        )
 
     def prepare(self) -> None:
         """Nothing to do."""

@@ -127,27 +127,23 @@ class Streets:
             yields: whether it has to give way to the other.
             merges: whether both lead into one lane.
         """
-        links = self.network.links
-        for link, row in enumerate(links):
-            if chr(row["direction"]) not in directions:
-                continue
-            if not self._for_cars(row):
-                continue
-            for c in range(row["first_conflict"], row["first_conflict"] + row["num_conflicts"]):
-                conflict = self.network.conflicts[c]
-                foe = links[conflict["foe"]]
-                if bool(conflict["merging"]) is not merges or foe["direction"] != ord("s"):
-                    continue
-                if bool(conflict["must_yield"]) is not yields or foe["first_internal"] < 0:
-                    continue
-                if not self._for_cars(foe):
-                    continue
-                yield Crossing(
-                    link,
-                    int(conflict["foe"]),
-                    0.5 * float(conflict["enter_m"] + conflict["leave_m"]),
-                    0.5 * float(conflict["foe_enter_m"] + conflict["foe_leave_m"]),
-                )
+        links, conflicts, lanes = self.network.links, self.network.conflicts, self.network.lanes
+        ends = lanes["permissions"][links["from_lane"]] & lanes["permissions"][links["to_lane"]]
+        for_cars = ends & CAR != 0
+        own = np.repeat(np.arange(len(links)), links["num_conflicts"])
+        foe = conflicts["foe"]
+        good = for_cars[own] & for_cars[foe] & (links["first_internal"][foe] >= 0)
+        good &= np.isin(links["direction"][own], [ord(letter) for letter in directions])
+        good &= links["direction"][foe] == ord("s")
+        good &= (conflicts["merging"] == merges) & (conflicts["must_yield"] == yields)
+        for c in np.flatnonzero(good):
+            row = conflicts[c]
+            yield Crossing(
+                int(own[c]),
+                int(foe[c]),
+                0.5 * float(row["enter_m"] + row["leave_m"]),
+                0.5 * float(row["foe_enter_m"] + row["foe_leave_m"]),
+            )
 
     def turn_rad(self, one: int, other: int) -> float:
         """Between the directions of the ends of the lanes that two links leave, unsigned."""
@@ -175,10 +171,6 @@ class Streets:
     def name(self, lane: int) -> str:
         """Of a lane."""
         return self.network.lane_ids[lane]
-
-    def _for_cars(self, link: np.void) -> bool:
-        ends = self.network.lanes["permissions"][[link["from_lane"], link["to_lane"]]]
-        return bool((ends & CAR != 0).all())
 
     def _bend(self, lane: int) -> float:
         row = self.network.lanes[lane]

@@ -84,9 +84,9 @@ def hidden_share(distance_m: float, sensing_m: float) -> float:
 def chance_among_others(busy: float, hidden: float) -> float:
     """Chance that nobody whom the sender does not hear, and so does not wait for, disturbs it.
 
-    They send at random, and a packet is lost if one of them begins within two packet times: e^(-2G),
-    where G is their share of the air (Abramson: "The ALOHA system", 1970; Tobagi, Kleinrock:
-    "Packet switching in radio channels: part II, the hidden terminal problem", 1975).
+    They send at random, and a packet is lost if one of them begins within two packet times:
+    exp(-2 G), where G is their share of the air (Abramson: "The ALOHA system", 1970; Tobagi,
+    Kleinrock: "Packet switching in radio channels: part II, the hidden terminal problem", 1975).
 
     Args:
         busy: share of the time in which the receiver hears somebody.
@@ -99,10 +99,8 @@ def _distances_m(config: ChannelConfig, sensing_m: float) -> int:
     """How many whole metres a table has."""
     end_m = config.range_m or math.inf
     if config.path_loss_exponent > 0.0:
-        metre = 1
-        while chance_of_reception(config, metre) >= LEAST_CHANCE and metre < min(
-            end_m, MAX_REACH_M
-        ):
+        metre, last = 1, min(end_m, MAX_REACH_M)
+        while metre < last and chance_of_reception(config, metre) >= LEAST_CHANCE:
             metre += 1
         return metre + 1
     if config.data_rate_mbps > 0.0 and sensing_m < math.inf:

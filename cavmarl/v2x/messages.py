@@ -24,10 +24,20 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cavmarl.errors import V2xError
-from cavmarl.kernels.v2x_records import KIND_CAM, KIND_CPM, KIND_DENM, KIND_SPAT
+from cavmarl.kernels.v2x_records import (
+    CAUSE_COLLISION,
+    CAUSE_HARD_BRAKING,
+    CAUSE_OBSTACLE,
+    CAUSE_STATIONARY,
+    KIND_CAM,
+    KIND_CPM,
+    KIND_DENM,
+    KIND_SPAT,
+)
 
 __all__ = [
     "CAM",
+    "CAUSES",
     "CPM_OBJECT",
     "DENM",
     "HEADER",
@@ -35,6 +45,7 @@ __all__ = [
     "MAP",
     "SCHEMA_VERSION",
     "SPAT",
+    "cause_code",
     "decode",
     "encode",
     "messages_of",
@@ -129,6 +140,14 @@ KINDS: dict[int, np.dtype[Any]] = {
     KIND_SPAT: SPAT,
 }
 
+# What an event can be, with ETSI's cause codes.
+CAUSES = {
+    "collision": CAUSE_COLLISION,
+    "obstacle": CAUSE_OBSTACLE,
+    "stationary": CAUSE_STATIONARY,
+    "hard_braking": CAUSE_HARD_BRAKING,
+}
+
 # Where a record's field stands in the bus's own REPORT, if it has another name there.
 _OWN_NAMES = {
     "vclass": "code",
@@ -137,6 +156,17 @@ _OWN_NAMES = {
     "object": "subject",
     "signal": "subject",
 }
+
+
+def cause_code(cause: str) -> int:
+    """ETSI's code of a cause.
+
+    Raises:
+        V2xError: no cause of that name.
+    """
+    if cause not in CAUSES:
+        raise V2xError(f"cause = {cause!r}: there are {', '.join(CAUSES)}")
+    return CAUSES[cause]
 
 
 def messages_of(kind: int, reports: NDArray[np.void]) -> NDArray[np.void]:

@@ -54,7 +54,8 @@ def _links(network: RoadNetwork, signal: int) -> NDArray[np.intp]:
 def _stop_lines(network: RoadNetwork, signal: int) -> NDArray[np.void]:
     """POINT of the end of the lane before each link of a signal."""
     lanes = network.lanes[network.links["from_lane"][_links(network, signal)]]
-    return network.points[lanes["first_point"] + lanes["num_points"] - 1]
+    ends: NDArray[np.void] = network.points[lanes["first_point"] + lanes["num_points"] - 1]
+    return ends
 
 
 def map_of(network: RoadNetwork, units: NDArray[np.void], unit: int) -> NDArray[np.void]:

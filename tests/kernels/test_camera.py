@@ -171,7 +171,9 @@ def test_halves_are_those_of_numpy() -> None:
 
 
 def test_colours_are_those_of_the_classes_and_pale_with_the_distance() -> None:
-    rows = vehicles([(0.0, 0.0, 0.0), (6.0, 0.0, RIGHT), (40.0, 0.0, RIGHT)], length=[5, 3, 120], height=6.0)
+    rows = vehicles(
+        [(0.0, 0.0, 0.0), (6.0, 0.0, RIGHT), (40.0, 0.0, RIGHT)], length=[5, 3, 120], height=6.0
+    )
     camera = forward()
     _, classes, picture = shoot(rows, camera)
     out = np.zeros((HEIGHT, WIDTH, 3), np.uint8)
@@ -180,4 +182,4 @@ def test_colours_are_those_of_the_classes_and_pale_with_the_distance() -> None:
     near, far = out[middle, WIDTH // 2].astype(int), out[middle, 0].astype(int)
     assert classes[middle, 0] == classes[middle, WIDTH // 2] == CAR
     assert near[0] - near[2] > far[0] - far[2] > 0
-    assert (out[0] == colours()[NOTHING]).all()
+    assert (out[0, 0] == colours()[NOTHING]).all()

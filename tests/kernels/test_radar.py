@@ -46,8 +46,7 @@ def test_targets_equal_twin(
     unsure: set[tuple[str, int]] = set()
     for ray in rays:
         large, small = (
-            naive.trace(rows, 0, walls, matrix[:, 3], ray, 60.0, margin)
-            for margin in (1e-6, -1e-6)
+            naive.trace(rows, 0, walls, matrix[:, 3], ray, 60.0, margin) for margin in (1e-6, -1e-6)
         )
         if large.what != small.what or abs(large.distance - small.distance) > 1e-3:
             unsure |= {large.what, small.what}

@@ -132,9 +132,7 @@ def test_rays_pass_over_low_bodies_and_walls() -> None:
 
 
 def test_nothing_slips_through_the_corner_of_a_building() -> None:
-    corner = np.array(
-        [(10.0, 0.0, 15.0, 5.0, 8.0, 0), (15.0, -5.0, 10.0, 0.0, 8.0, 0)], WALL
-    )
+    corner = np.array([(10.0, 0.0, 15.0, 5.0, 8.0, 0), (15.0, -5.0, 10.0, 0.0, 8.0, 0)], WALL)
     hits = scan(vehicles([(0.0, 0.0, 0.0)]), full_circle(mount()), walls=corner)
     assert hits["distance"][0, 0] == pytest.approx(10.0)
     assert hits["what"][0, 0] <= WALL_HIT

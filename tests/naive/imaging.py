@@ -127,8 +127,7 @@ def fan_rays(axes: Vector, azimuths: Vector, elevations: Vector) -> Vector:
     return np.array(
         [
             [
-                axes
-                @ np.array([math.cos(a) * math.cos(e), math.sin(a) * math.cos(e), math.sin(e)])
+                axes @ np.array([math.cos(a) * math.cos(e), math.sin(a) * math.cos(e), math.sin(e)])
                 for e in elevations
             ]
             for a in azimuths

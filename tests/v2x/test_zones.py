@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 
 from cavmarl import make_vec
@@ -35,9 +33,7 @@ LOSSY = {
 
 @pytest.mark.parametrize("channel", [{}, LOSSY], ids=["ideal", "lossy"])
 @pytest.mark.parametrize("stack", [1, 3])
-def test_what_agents_are_told_does_not_depend_on_zones(
-    channel: dict[str, Any], stack: int
-) -> None:
+def test_what_agents_are_told_does_not_depend_on_zones(channel: dict[str, Any], stack: int) -> None:
     settings = FAST | OBSERVED | channel | {"sensors.stack": stack, "population.background": 60}
     found = verify_zones("grid4x4", (2, 4, 9), steps=30, overrides=settings)
     for result in found.results:

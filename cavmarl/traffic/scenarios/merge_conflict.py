@@ -33,8 +33,9 @@ def places(streets: Streets, parameters: Parameters) -> dict[str, Crossing]:
     found: dict[str, Crossing] = {}
     for crossing in streets.crossings("slLrR", yields=True, merges=True):
         lane = int(streets.network.links["from_lane"][crossing.link])
-        if _staged(streets, crossing, parameters) is not None:
-            found.setdefault(streets.name(lane), crossing)
+        name = streets.name(lane)
+        if name not in found and _staged(streets, crossing, parameters) is not None:
+            found[name] = crossing
     return found
 
 

@@ -38,8 +38,9 @@ def places(streets: Streets, parameters: Parameters) -> dict[str, Crossing]:
     for crossing in streets.crossings("lL", yields=True, merges=False):
         if streets.turn_rad(crossing.link, crossing.foe) > OPPOSITE_RAD:
             lane = int(streets.network.links["from_lane"][crossing.link])
-            if _staged(streets, crossing, parameters) is not None:
-                found.setdefault(streets.name(lane), crossing)
+            name = streets.name(lane)
+            if name not in found and _staged(streets, crossing, parameters) is not None:
+                found[name] = crossing
     return found
 
 

@@ -1,0 +1,142 @@
+"""`cavmarl scenario`: which scenarios there are, and what a driver makes of one."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+from rich import box
+from rich.console import Console
+from rich.markup import escape
+from rich.table import Table
+
+from cavmarl.cli.output import JsonPath, Seed, Settings, number, parse_settings, write_json
+from cavmarl.errors import ConfigError
+
+if TYPE_CHECKING:
+    from cavmarl.evaluate.scenario_runs import ScenarioRun
+
+__all__ = ["app"]
+
+app = typer.Typer(help="Scripted conflicts for one agent.", no_args_is_help=True)
+
+
+@app.command("list")
+def list_scenarios(json_path: JsonPath = None) -> None:
+    """Show the scenarios, what each needs of a map, and its parameters."""
+    from cavmarl.traffic.scenarios import load_scenario, scenario_names, summary_of
+    from cavmarl.traffic.settings import describe
+
+    console = Console()
+    document: dict[str, Any] = {}
+    for name in scenario_names():
+        scenario = load_scenario(name)
+        table = Table("parameter", "default", "range", "what it is", box=box.SIMPLE_HEAD)
+        rows = describe(scenario.Parameters)
+        for row in rows:
+            table.add_row(*map(escape, row))
+        console.print(f"[bold]{name}[/bold]: {escape(summary_of(name))}")
+        console.print(f"It needs {escape(scenario.NEEDS)}.")
+        console.print(table)
+        heads = ("name", "default", "range", "what")
+        document[name] = {
+            "summary": summary_of(name),
+            "needs": scenario.NEEDS,
+            "parameters": [dict(zip(heads, row, strict=True)) for row in rows],
+        }
+    write_json(json_path, document)
+
+
+@app.command("run")
+def run(
+    name: Annotated[str, typer.Argument(metavar="NAME", help="A scenario, or a .py file.")],
+    map_name: Annotated[
+        str, typer.Option("--map", help="Name, folder or map file of an environment.")
+    ] = "grid4x4",
+    place: Annotated[str, typer.Option(help="Where on it; default: drawn by the seed.")] = "",
+    param: Annotated[
+        list[str] | None,
+        typer.Option("--param", metavar="KEY=VALUE", help="Of the scenario; may be repeated."),
+    ] = None,
+    driver: Annotated[str, typer.Option(help="Of the agent: a name, or a path.")] = "idm",
+    density: Annotated[str, typer.Option(help="Other traffic: none, low or high.")] = "none",
+    zones: Annotated[
+        int | None, typer.Option(help="How many; default: as the environment says.")
+    ] = None,
+    seed: Seed = 0,
+    settings: Settings = None,
+    picture: Annotated[
+        Path | None, typer.Option(help="Write a .png of the closest moment here.")
+    ] = None,
+    video: Annotated[Path | None, typer.Option(help="Write an .mp4 of the run here.")] = None,
+    json_path: JsonPath = None,
+) -> None:
+    """Play a scenario to a driver; exit code 1 unless it comes through and hurts nobody."""
+    from contextlib import ExitStack
+
+    from cavmarl.evaluate.scenario_films import ScenarioCamera
+    from cavmarl.evaluate.scenario_runs import make_scenario, run_scenario
+
+    with ExitStack() as stack:
+        vec = make_scenario(
+            name,
+            map_name,
+            params=_params(param),
+            place=place,
+            density=density,
+            seed=seed,
+            zones=zones,
+            overrides=parse_settings(settings),
+        )
+        stack.callback(vec.close)
+        look: Callable[[], None] | None = None
+        if picture is not None or video is not None:
+            look = stack.enter_context(ScenarioCamera(vec, picture, video)).look
+        found = run_scenario(vec, driver, seed, look)
+    Console().print(_table(found))
+    write_json(json_path, found.to_dict())
+    if not found.passed:
+        raise typer.Exit(1)
+
+
+def _params(given: list[str] | None) -> dict[str, bool | float]:
+    """`walk_mps=2` and the like.
+
+    Raises:
+        ConfigError: no `=`, or a value that is neither a number nor true or false.
+    """
+    params: dict[str, bool | float] = {}
+    for text in given or ():
+        key, _, value = text.partition("=")
+        try:
+            read = json.loads(value)
+        except ValueError:
+            read = None
+        if not key or not isinstance(read, bool | int | float):
+            raise ConfigError(f"--param {text}: must be KEY=VALUE, a number, true or false")
+        params[key] = read
+    return params
+
+
+def _table(found: ScenarioRun) -> Table:
+    table = Table(show_header=False, box=box.SIMPLE)
+    rows = {
+        "scenario": f"{found.scenario} on {found.environment}, {found.place}",
+        "driver": f"{found.driver}, seed {found.seed}, {found.background} others, "
+        f"{found.zones} zones",
+        "verdict": found.verdict,
+        "least time to collision, s": number(found.min_ttc_s),
+        "post-encroachment time, s": number(found.pet_s),
+        "collisions": str(found.collisions),
+        "junctions entered at red": str(found.red_lights),
+        "delay, s": number(found.delay_s),
+        "longest wait of others, s": number(found.longest_wait_s),
+        "time, s": number(found.time_s),
+        "state hash": found.state_hash,
+    }
+    for row in rows.items():
+        table.add_row(*map(escape, row))
+    return table

@@ -1,0 +1,95 @@
+"""Agents and roadside units tell others of events, also where worlds live in other processes."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from cavmarl import make_vec, parallel_env
+from cavmarl.errors import UnknownAgentError, V2xError
+from cavmarl.kernels.v2x_records import CAUSE_OBSTACLE, KIND_DENM
+from cavmarl.spaces import observation_parts
+from cavmarl.v2x.messages import messages_of
+
+TOLD = {
+    "v2x.enabled": True,
+    "v2x.denm.rate_hz": 0.0,
+    "v2x.roadside.signals": ["all"],
+    "sensors.messages.events": 1,
+    "population.mode": "seats",
+}
+PRESENT, OTHER = 0, 7  # of the features of an event
+
+
+def run(workers: int, zones: int = 1, steps: int = 6) -> np.ndarray[Any, Any]:
+    """What agents observe of events while one of them tells of an obstacle in the third step."""
+    env = make_vec("grid4x4", agents=4, workers=workers, zones=zones, overrides=TOLD)
+    part = observation_parts(env.config.sensors)["messages"].place
+    env.reset(seed=3)
+    seen = []
+    for step in range(steps):
+        if step == 2:
+            env.declare_event(0, 1, "obstacle")
+        observations, *_ = env.step(env.suggest_actions())
+        seen.append(observations[0, :, part])
+    env.close()
+    return np.array(seen)
+
+
+def test_what_one_declares_all_others_are_told() -> None:
+    seen = run(workers=0)
+    assert (seen[:2] == 0.0).all()
+    assert seen[2:, [0, 2, 3], PRESENT].all()
+    assert seen[2:, [0, 2, 3], OTHER].all()
+    assert not seen[:, 1].any()  # whoever tells it knows
+
+
+def test_workers_and_zones_are_told_the_same() -> None:
+    whole = run(workers=0)
+    assert (run(workers=2, zones=2) == whole).all()
+    assert (run(workers=1) == whole).all()
+
+
+def test_it_is_sent_once_a_step_and_kept_for_its_validity() -> None:
+    overrides = TOLD | {"v2x.denm.validity_s": 0.4}
+    env = make_vec("grid4x4", agents=2, overrides=overrides)
+    env.reset(seed=3)
+    env.declare_event(0, 0, "obstacle")
+    bus = env.simulation.messages
+    known = []
+    for _ in range(4):
+        env.step(env.suggest_actions())
+        known.append(len(messages_of(KIND_DENM, bus.mail.events[0, 1])))
+    assert bus.statistics().sent[KIND_DENM] == 1
+    assert known == [1, 1, 0, 0]  # said in tick 1, kept up to tick 9; a step has four ticks
+
+
+def test_a_roadside_unit_tells_and_is_told() -> None:
+    env = make_vec("grid4x4", agents=2, overrides=TOLD)
+    env.reset(seed=3)
+    bus = env.simulation.messages
+    bus.declare_of_unit(0, 5, "obstacle")
+    env.declare_event(0, 1, "hard_braking")
+    env.step(env.suggest_actions())
+    (heard,) = messages_of(KIND_DENM, bus.mail.events[0, 0, :1])
+    assert heard["cause"] in (CAUSE_OBSTACLE, 99)
+    at_unit = messages_of(KIND_DENM, bus.mail.events[0, bus.receiver_of_unit(5)])
+    assert [event["cause"] for event in at_unit] == [99]
+    with pytest.raises(V2xError, match="roadside unit 16"):
+        bus.declare_of_unit(0, 16, "obstacle")
+
+
+def test_wrong_events_are_refused() -> None:
+    env = parallel_env("grid4x4", overrides=TOLD)
+    env.reset(seed=0)
+    with pytest.raises(UnknownAgentError, match="car_99"):
+        env.declare_event("car_99", "obstacle")
+    with pytest.raises(V2xError, match=r"'earthquake'.*obstacle"):
+        env.declare_event(env.agents[0], "earthquake")
+    silent = make_vec("ring")
+    with pytest.raises(V2xError, match=r"v2x\.enabled"):
+        silent.declare_event(0, 0, "obstacle")
+    with pytest.raises(UnknownAgentError, match="agent 99"):
+        make_vec("grid4x4", overrides=TOLD).declare_event(0, 99, "obstacle")
