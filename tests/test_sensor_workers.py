@@ -135,6 +135,7 @@ def test_ticks_that_are_begun_again() -> None:
     assert _drive(zones=4, overrides=settings, sensor_workers=2) == _drive()
 
 
+@pytest.mark.slow
 def test_ten_thousand_steps_without_a_frame_of_another_tick() -> None:
     settings = {"horizon_s": 2000.0, "clock.ctrl_dt_s": 0.05}
     vec = _make(SMALL, sensor_workers=1, overrides=settings)
@@ -252,7 +253,8 @@ def test_closing_and_forgetting_leave_nobody_behind() -> None:
 def test_nobody_outlives_the_process_that_keeps_the_state(how: signal.Signals) -> None:
     text = (
         "import sys, cavmarl\n"
-        f"vec = cavmarl.make_vec('grid4x4', agents=2, sensor_workers=2, overrides={{'rig': {SMALL}}})\n"
+        f"settings = {{'rig': {SMALL}}}\n"
+        "vec = cavmarl.make_vec('grid4x4', agents=2, sensor_workers=2, overrides=settings)\n"
         "vec.reset(seed=0)\n"
         "pool = vec.worlds.farm.pool\n"
         "print(pool.server_pid, *pool.pids, flush=True)\n"

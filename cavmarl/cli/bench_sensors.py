@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
+from rich import box
 from rich.console import Console
 from rich.table import Table
 
@@ -146,27 +147,26 @@ def _sensors(found: SensorBench) -> Table:
 
 
 def _scaling(found: SensorBench, rows: list[ScalingRow]) -> Table:
-    columns = (
-        "sensor\nworkers", "FPS", "tick + sensors,\nms", "SD in\na run", "95 % CI\nbetween runs",
-        "wait,\nms", "speedup", "efficiency\n%", "CV\n%", "wait\n%", "rest,\nms",
-    )  # fmt: skip
     table = Table(
         title=(
-            f"{found.env}, {found.agents} vehicle{'s' if found.agents > 1 else ''} with sensors, "
-            f"{found.warmup} + {found.steps} steps, placed by {found.placement}"
+            f"{Path(found.env).stem}, {found.agents} vehicle{'s' if found.agents > 1 else ''} with "
+            f"sensors, {found.warmup} + {found.steps} steps, placed by {found.placement}"
         ),
-        caption="bold: the best of those measured",
+        caption="bold: the best of those measured; SD: of the steps of a run",
+        box=box.SIMPLE_HEAD,
+        pad_edge=False,
     )
-    for column in columns:
+    for column in (
+        "sensor\nworkers", "FPS", "tick +\nsensors\nms", "SD\nms", "wait\nms", "speedup",
+        "effi-\nciency\n%", "CV\n%", "wait\n%", "rest\nms",
+    ):  # fmt: skip
         table.add_column(column, justify="right", no_wrap=True)
     for row in rows:
-        interval = row.ci95_between_runs
         table.add_row(
             str(row.workers),
             f"{row.fps:.2f}",
             f"{row.step_ms:.2f}",
             f"{row.sd_within_run:.2f}",
-            "" if interval is None else f"{interval.low:.2f} to {interval.high:.2f}",
             f"{row.wait_ms:.2f}",
             f"{row.speedup:.2f}",
             f"{row.efficiency_pct:.1f}",
@@ -215,11 +215,22 @@ def _resources(found: SensorBench) -> Table:
 
 
 def _say(console: Console, found: SensorBench, rows: list[ScalingRow]) -> None:
+    from cavmarl.evaluate.sensor_scaling import MIN_RUNS
+
     best = next(row for row in rows if row.is_best)
     console.print(
         f"the best of those measured: [bold]{best.workers}[/] sensor workers, {best.speedup:.2f} "
         f"times {rows[0].workers}; sensing takes {found.sensing_ms:.2f} ms a tick on "
         f"{rows[0].workers}",
+        highlight=False,
+    )
+    intervals = (
+        f"{row.workers}: {row.ci95_between_runs.low:.2f} to {row.ci95_between_runs.high:.2f} ms"
+        for row in rows
+        if row.ci95_between_runs is not None
+    )
+    console.print(
+        f"95 % between runs: {'; '.join(intervals) or f'none, it takes {MIN_RUNS} runs'}",
         highlight=False,
     )
     same = "the same" if found.is_same else "[red]not the same[/]"

@@ -68,18 +68,18 @@ def describe_rig(config: EnvConfig) -> list[dict[str, Any]]:
     ]
 
 
-def scaled(config: EnvConfig, factor: float, rate_hz: float) -> Rig:
-    """The rig of an environment with `factor` times as many pixels, rays and cells.
+def scaled(config: EnvConfig, factors: Mapping[str, float], rate_hz: float) -> Rig:
+    """The rig of an environment with more pixels, rays and cells.
 
     As far as may be: there is a most of each. Pictures keep the proportions of their sides. Sensors
     that have none of them stay as they are.
 
     Args:
         config: of the environment.
-        factor: above 0.
+        factors: how many times as many each sensor gets.
         rate_hz: of all that are scaled.
     """
-    return {name: _scaled(sensor, factor, rate_hz) for name, sensor in config.rig.items()}
+    return {name: _scaled(sensor, factors[name], rate_hz) for name, sensor in config.rig.items()}
 
 
 def _scaled(sensor: MountedConfig, factor: float, rate_hz: float) -> dict[str, Any]:
