@@ -17,6 +17,7 @@ from cavmarl.cav_env import CavEnv, parallel_env
 from cavmarl.errors import MissingExtraError, PolicyError
 from cavmarl.policies import Policy, load_policy
 from cavmarl.registry import agent_entries
+from cavmarl.stack.reference_rig import REFERENCE_RIG
 from cavmarl.vector_env import CavVectorEnv, make_vec
 
 SCRIPTED = ("idm", "random_actions")
@@ -127,7 +128,8 @@ def test_every_driver_of_the_folder_loads_where_it_belongs() -> None:
     for name, path in agent_entries().items():
         config = path / "config.json"
         home = json.loads(config.read_text())["environment"] if path.is_dir() else "merge"
-        policy = load_policy(name, make_vec(home))
+        overrides = {"rig": REFERENCE_RIG} if name == "reference" else None
+        policy = load_policy(name, make_vec(home, overrides=overrides))
         assert isinstance(policy, Policy)
 
 
