@@ -104,8 +104,9 @@ def type_text(hint: Any) -> str:
         return "keys"
     if get_origin(hint) is None:
         return {int: "whole number", float: "number", bool: "bool", str: "text"}[hint]
-    parts = [type_text(part) for part in get_args(hint) if part not in (..., type(None))]
-    inner = dict.fromkeys(parts) if get_origin(hint) is UnionType else parts
+    inner = [type_text(part) for part in get_args(hint) if part not in (..., type(None))]
+    if get_origin(hint) is UnionType:
+        return " or ".join(dict.fromkeys(inner))
     return {tuple: "list of ", dict: "mapping of "}.get(get_origin(hint), "") + " to ".join(inner)
 
 

@@ -74,7 +74,8 @@ def post_encroachment_s(one: NDArray[np.void], other: NDArray[np.void]) -> float
 
     Post-encroachment time (Allen, Shin, Cooper: "Analysis of traffic conflicts and collisions",
     Transportation Research Record 667, 1978), with the ground that a body covers as the place: inf
-    if no place was covered by both, 0 if both were there at a time.
+    if no place was covered by both, 0 if both were there at a time. As bodies are known at moments
+    only, it is too long by at most twice the time between two of them.
 
     Args:
         one: TRACE (n,).

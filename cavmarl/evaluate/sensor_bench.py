@@ -285,7 +285,7 @@ def _run(job: SensorJob) -> SensorRun:
         stdin=subprocess.PIPE,
         stdout=subprocess.PIPE,
         text=True,
-        start_new_session=True,
+        process_group=0,
     )
     try:
         said, _ = program.communicate(json.dumps(asdict(job)))

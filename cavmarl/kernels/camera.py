@@ -42,6 +42,9 @@ FIRST_FACE = 3
 
 _FACES_OF_PRISM = 6
 
+# Of a face with a corner nearer than this, or behind the camera, all rows are tried.
+NEAR_M = 0.01
+
 
 class Camera(NamedTuple):
     """Where a camera looks from and how."""
@@ -106,7 +109,7 @@ def _set_edge(
     edges[k, 0] = x - 0.5 * width * by_column - 0.5 * height * by_row
     edges[k, 1] = by_column
     edges[k, 2] = by_row
-    edges[k, 3] = 1.0 / by_column
+    edges[k, 3] = 1.0 / by_column if by_column != 0.0 else 0.0
 
 
 @kernel
@@ -159,9 +162,11 @@ def _set_face(camera: Camera, width: int, height: int) -> tuple[int, int, float,
             width,
             height,
         )
-        in_front &= px > 0.01
-        low = min(low, -pz / px)
-        high = max(high, -pz / px)
+        if px > NEAR_M:
+            low = min(low, -pz / px)
+            high = max(high, -pz / px)
+        else:
+            in_front = False
     _set_edge(camera, 4, nx / volume, ny / volume, nz / volume, width, height)
     edges = camera.edges
     constant, by_column, by_row = edges[4, 0], edges[4, 1], edges[4, 2]
@@ -219,9 +224,14 @@ def _clear(camera: Camera, picture: Picture) -> None:
 
 @kernel
 def ground_at(camera: Camera, width: int, height: int) -> tuple[float, float, float]:
-    """The closeness of the ground: constant, by column, by row. Overwrites edge 4."""
+    """The closeness of the ground: constant, by column, by row. Overwrites edge 4.
+
+    A camera on the ground does not see it.
+    """
     mount = camera.mount
     z = -mount[2, 3]
+    if z >= 0.0:
+        return 0.0, 0.0, 0.0
     _set_edge(camera, 4, mount[2, 0] / z, mount[2, 1] / z, mount[2, 2] / z, width, height)
     return camera.edges[4, 0], camera.edges[4, 1], camera.edges[4, 2]
 

@@ -247,8 +247,9 @@ def make_worlds(
     """Arrays of W worlds that hold `capacity` vehicles each, all of them empty.
 
     Agents' commands take effect `latency_ticks` later, scripts wait for `num_cues` cues. The rows
-    are those of a zone of `zoned`, if it is given. What all zones of a world have in common (ticks, keys, signals and what detectors
-    saw) are the arrays of `common`, if it is given; if not, `zeros` makes them.
+    are those of a zone of `zoned`, if it is given. What all zones of a world have in common (ticks,
+    keys, signals and what detectors saw) are the arrays of `common`, if it is given; if not,
+    `zeros` makes them.
     """
     if zoned is None:
         zoned = make_zoned(1, num_worlds, capacity)

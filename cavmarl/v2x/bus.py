@@ -36,7 +36,7 @@ from cavmarl.kernels.v2x_records import (
     Room,
     Sending,
 )
-from cavmarl.kernels.walls import Walls, make_walls
+from cavmarl.kernels.walls import make_walls
 from cavmarl.roads.network import RoadNetwork
 from cavmarl.v2x.channel import make_channel
 from cavmarl.v2x.messages import cause_code
@@ -57,12 +57,11 @@ class Bus:
 
     Args:
         config: the environment; `v2x.enabled`.
-        network: its roads.
+        network: its roads and buildings.
         types: VTYPE (num_types,).
         zoned: the vehicles of all zones.
         common: clocks, keys and signals.
         zeros: makes the arrays that outlive a tick.
-        walls: (n, 4) the sides of buildings, x, y, x, y in m; None: there are none.
 
     Attributes:
         units: UNIT (num_units,), the roadside units.
@@ -77,7 +76,6 @@ class Bus:
         zoned: Zoned,
         common: Common,
         zeros: Zeros = np.zeros,
-        walls: NDArray[np.float64] | None = None,
     ) -> None:
         v2x, dt = config.v2x, config.clock.sim_dt_s
         self._config = v2x
@@ -89,8 +87,8 @@ class Bus:
         self._roads: RoadArrays = network.arrays
         self.units = make_units(v2x.roadside, network)
         self._sending = _make_sending(v2x, dt)
-        built: Walls = make_walls(np.zeros((0, 4)) if walls is None else walls)
-        self._channel = make_channel(v2x.channel, dt, built)
+        walls = np.stack([network.walls[name] for name in ("ax", "ay", "bx", "by")], axis=1)
+        self._channel = make_channel(v2x.channel, dt, make_walls(walls))
         num_worlds, capacity = zoned.rows.shape[2:]
         num_receivers = self._num_agents + len(self.units)
         self.mail = _make_mail(v2x, num_worlds, capacity, num_receivers, len(self.units), zeros)

@@ -249,6 +249,7 @@ def test_verify_determinism_fails_and_names_the_first_difference(
         (("bench", "step", "--worlds", "-2"), "worlds = -2"),
         (("bench", "step", "--repeats", "x"), "valid integer"),
         (("bench", "step", "--at-least", "nan"), "--at-least nan: must be"),
+        (("bench", "rays", "--repeats", "0"), "repeats = 0: must be from 1 to 100"),
         (("bench", "step", "--at-least", "inf"), "--at-least inf: must be"),
         (("bench", "step", "--at-least", "0"), "--at-least 0: must be"),
         (("bench", "step", "--at-least", "-1"), "--at-least -1: must be"),

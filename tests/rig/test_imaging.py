@@ -104,7 +104,8 @@ def before_a_wall(tmp_path: Path) -> CavVectorEnv:
         for x, y in ((away, -30.0), (away + 5.0, -30.0), (away + 5.0, 30.0), (away, 30.0))
     ]
     shape = " ".join(f"{x!r},{y!r}" for x, y in (map(float, corner) for corner in corners))
-    hall = f'<poly id="hall" type="building" height="30" shape="{shape}"/>'
+    tall = '<param key="height" value="30"/>'
+    hall = f'<poly id="hall" type="building" shape="{shape}">{tall}</poly>'
     path = tmp_path / "hall.poly.xml"
     path.write_text(f"<additional>{hall}</additional>")
     return _alone(**{"map.buildings": str(path)})

@@ -14,6 +14,7 @@ from cavmarl.kernels.codes import DRIVER_AGENT, DRIVER_SUMO
 from cavmarl.kernels.ways import next_step
 from cavmarl.roads.network import SIGNAL_STATES
 from cavmarl.runtime.simulation import Simulation
+from cavmarl.runtime.step_trace import MIRROR, SENSORS, SUMO, TICK, StepTrace
 from cavmarl.shard.shard import Commands
 from tests.driving import drive, idle
 from tests.rerouting import CARS, make_map, passed, rerouter, sumo_passed, write_demand
@@ -319,3 +320,15 @@ def test_an_agent_that_leaves_the_road_and_the_map_stays_in_sumo(tmp_path: Path)
         for _ in range(50):
             drive(simulation)
         assert simulation.traffic_stats().removed == 1
+
+
+def test_a_cycle_is_that_of_algorithm_1(tmp_path: Path) -> None:
+    """SUMO goes to t + dt, its vehicles are mirrored, the world ticks once, sensors see t + dt."""
+    own = {"clock.sim_dt_s": 0.1, "clock.ctrl_dt_s": 0.1}
+    with coupled("grid4x4", [tiny_file(tmp_path)], agents=1, overrides=own) as simulation:
+        trace = StepTrace()
+        simulation.trace(trace.around, trace.note)
+        for _ in range(5):
+            trace.begin()
+            drive(simulation)
+        assert trace.cycles == [(SUMO, MIRROR, TICK, SENSORS)] * 5

@@ -30,12 +30,12 @@ VARIANTS: tuple[tuple[str, Mapping[str, bool | float]], ...] = (
 )
 # The reference driver on grid4x4, seed 0, nobody else on the road.
 GOLDEN = {
-    ("failed_u_turn", False): "",
-    ("intersection_blockage", False): "",
-    ("merge_conflict", False): "",
-    ("pedestrian_crossing", False): "",
-    ("pedestrian_crossing", True): "",
-    ("unprotected_left_turn", False): "",
+    ("failed_u_turn", False): "d328218ab78180a26e908b8588cbff9e",
+    ("intersection_blockage", False): "49c788c26bcf617b432dbb6a3e8d5a99",
+    ("merge_conflict", False): "d00fa41820b353bf730aaa6c574a7b10",
+    ("pedestrian_crossing", False): "1ecd190d1f275fa51cb0fc8c4db01b5a",
+    ("pedestrian_crossing", True): "17751e9da0f775beba34f709cf661460",
+    ("unprotected_left_turn", False): "c61fa293d08fb4492f54009630ed42ba",
 }
 
 
@@ -59,7 +59,7 @@ def test_the_library_is_what_lies_in_its_folder() -> None:
         assert summary_of(name).endswith(".")
         assert load_scenario(name).NEEDS
         for _, default, allowed, what in describe(load_scenario(name).Parameters):
-            assert default and allowed and what
+            assert all((default, allowed, what))
 
 
 @pytest.mark.parametrize(("name", "params"), VARIANTS)
@@ -69,7 +69,7 @@ def test_the_reference_driver_passes_and_who_never_yields_does_not(
 ) -> None:
     found = played(name, "idm", seed, params=params)
     assert (found.verdict, found.collisions) == ("passed", 0)
-    assert found.pet_s is not None and found.pet_s > 0.5
+    assert (found.pet_s or 0.0) > 0.5
     assert found.delay_s > 0.5
     careless = played(name, "never_yield", seed, params=params)
     assert careless.verdict == "collided"

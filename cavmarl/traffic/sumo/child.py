@@ -141,9 +141,16 @@ class Simulation:
         found = [(name, row) for name, row in zip(names, rows, strict=True) if row >= 0]
         for name, _ in found:
             if name not in self._type:
-                self._type[name] = self._type_row[vehicle.getTypeID(name)]
+                self._type[name] = self._row_of(vehicle.getTypeID(name))
         found = [pair for pair in found if self._type[pair[0]] >= 0]
         return [name for name, _ in found], [row for _, row in found]
+
+    def _row_of(self, kind: str) -> int:
+        """The row of a type; a vehicle's own one, `type@vehicle`, counts as what it was made of."""
+        row = self._type_row.get(kind, self._type_row.get(kind.partition("@")[0]))
+        if row is None:
+            raise LookupError(f"type '{kind}' is in none of the files")
+        return row
 
     def _register(self, name: str) -> list[Any]:
         """A number for a vehicle that has come, or has come back."""

@@ -140,10 +140,12 @@ def _words(
 ) -> list[str]:
     puppets = folder / "puppets.add.xml"
     puppets.write_text(_puppets(), encoding="utf-8")
+    own = int(given.options.get("max-num-vehicles", "-1"))
     more = {
         # Who touches whom is judged here, and nobody is taken away for it.
         "collision.action": "none",
-        "max-num-vehicles": str(most),
+        "max-num-vehicles": str(min(own, most) if own > 0 else most),
+        "random": "false",  # a seed that nobody knows
     }
     return command_words(map_file, given, folder, dt_s, seed, more, (puppets,))
 

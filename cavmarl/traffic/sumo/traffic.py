@@ -103,20 +103,21 @@ class SumoTraffic:
             for passed in range(tick):
                 self.worlds.step_one(w, passed, np.zeros(0, dtype=MOVED))
 
-    def step(self, worlds: Worlds, side: int) -> int:
-        """Let SUMO take its step, and bring its vehicles to where they are then.
+    def step(self, worlds: Worlds, side: int) -> None:
+        """Let SUMO take its step; errors as of `SumoWorlds.step`.
 
         Args:
             worlds: of any shard.
             side: where the next rows are.
+        """
+        self.worlds.step(worlds.ticks.tolist(), lambda w: self._moved(w, side))
+
+    def mirror(self, worlds: Worlds, side: int) -> int:
+        """Bring SUMO's vehicles to where they are after its step; arguments as of `step`.
 
         Returns:
             how many vehicles leave, in all worlds.
         """
-        ticks = worlds.ticks.tolist()
-        self.worlds.step(ticks, lambda w: self._moved(w, side))
-        if not self.drives:
-            return 0
         return sum(
             self._mirror(
                 self._roads,
@@ -128,7 +129,7 @@ class SumoTraffic:
                 w,
                 self._dt,
             )
-            for w in range(len(ticks))
+            for w in range(len(worlds.ticks))
         )
 
     def forgive(self, gate: Gate) -> None:

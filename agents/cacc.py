@@ -1,0 +1,144 @@
+"""Cooperative adaptive cruise control: follows by what the vehicle ahead says that it does.
+
+It steers, stops and gives way as the built-in driver does. Behind a vehicle whose messages it
+receives it takes its acceleration from van Arem, van Driel, Visser: "The impact of cooperative
+adaptive cruise control on traffic-flow characteristics", IEEE Trans. ITS 7 (4), 2006, eqs. (1) to
+(4): a radar measures gap and relative speed (the sensor `lanes`), and the acceleration of the
+vehicle ahead, which no radar can measure in time, comes over the air (the sensor `messages`).
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cavmarl.cav_env import CavEnv
+from cavmarl.errors import PolicyError
+from cavmarl.policies import Policy
+from cavmarl.spaces import observation_parts
+from cavmarl.vector_env import CavVectorEnv
+
+SPEED_GAIN = 1.0  # 1/s, towards the limit
+ACCEL_GAIN = 1.0
+APPROACH_GAIN = 0.58  # 1/s
+GAP_GAIN = 0.1  # 1/s²
+HEADWAY_S = 0.5  # behind somebody who tells what it does
+MIN_GAP_M = 2.0
+SAME_M = 4.0  # what is told and what is measured may differ by so much, and mean the same vehicle
+
+# Scales of the features, see the table of any environment's card.
+SPEED_SCALE = 40.0
+ACCEL_SCALE = 10.0
+LENGTH_SCALE = 20.0
+HALF_M = 10.0
+OBJECT_FEATURES = 11
+OWN_LENGTH_M = 5.0
+
+NEEDED = {
+    "v2x.enabled": True,
+    "sensors.messages.objects": 8,
+    "sensors.lanes.range_m": 100.0,
+    "sensors.signal.enabled": True,
+    "sensors.ego.enabled": True,
+    "action.kind": "continuous",
+}
+
+
+class CaccPolicy(Policy):
+    """Drives by messages where there are any, and as the built-in driver elsewhere.
+
+    Args:
+        env: where it drives.
+    """
+
+    def __init__(self, env: CavEnv | CavVectorEnv) -> None:
+        super().__init__(env)
+        config = env.config
+        parts = observation_parts(config.sensors)
+        if (
+            not {"ego", "signal", "lanes", "messages"} <= parts.keys()
+            or config.sensors.messages.objects == 0
+            or config.action.kind != "continuous"
+        ):
+            raise PolicyError(
+                f"cacc needs what other vehicles say, a look at lanes and signals, and continuous "
+                f"actions: make the environment with overrides={NEEDED}"
+            )
+        self._places = {name: part.place for name, part in parts.items()}
+        self._frame = sum(place.stop - place.start for place in self._places.values())
+        self._scale_m = config.sensors.messages.range_m
+        self._objects = config.sensors.messages.objects
+        self._signal_m = config.sensors.signal.range_m
+        self._accel_mps2 = config.action.acceleration_mps2
+
+    def act_batch(self, observations: NDArray[np.float32], mask: NDArray[np.bool_]) -> NDArray[Any]:
+        """(W, A, 2): the built-in driver's steering, and its throttle or that of a follower."""
+        newest = observations[..., -self._frame :].astype(np.float64)
+        actions: NDArray[Any] = self._suggested(mask.shape).copy()
+        follows, accel = self._follow(newest)
+        followed = np.clip(accel / self._accel_mps2, -1.0, 1.0)
+        # Where a line may have to be kept, or the lane is to be changed, the more careful one counts.
+        careful = np.minimum(followed, actions[..., 0])
+        throttle = np.where(self._may_stop(newest), careful, followed)
+        actions[..., 0] = np.where(follows, throttle, actions[..., 0])
+        return actions.astype(np.float32)
+
+    def _suggested(self, shape: tuple[int, ...]) -> NDArray[Any]:
+        """What the built-in driver would do, (W, A, 2)."""
+        env = self.env
+        if isinstance(env, CavVectorEnv):
+            return env.suggest_actions()
+        actions = np.zeros((*shape, 2), dtype=np.float32)
+        for agent, action in env.suggest_actions().items():
+            actions[0, env.possible_agents.index(agent)] = action
+        return actions
+
+    def _part(self, newest: NDArray[np.float64], name: str) -> NDArray[np.float64]:
+        part: NDArray[np.float64] = newest[..., self._places[name]]
+        return part
+
+    def _may_stop(self, newest: NDArray[np.float64]) -> NDArray[np.bool_]:
+        """(W, A) whether a stop line is nearer than the vehicle ahead, or the lane is to change."""
+        ego, signal = self._part(newest, "ego"), self._part(newest, "signal")
+        line_m = signal[..., 1] * self._signal_m
+        at_line = (signal[..., 0] > 0.0) & (line_m < self._gap_m(newest) + OWN_LENGTH_M)
+        changed: NDArray[np.bool_] = at_line | (ego[..., 9] != 0.0)
+        return changed
+
+    def _gap_m(self, newest: NDArray[np.float64]) -> NDArray[np.float64]:
+        """(W, A) to the vehicle ahead on the own way; inf: there is none in range."""
+        closeness = self._part(newest, "lanes")[..., 0]
+        with np.errstate(divide="ignore"):
+            gap: NDArray[np.float64] = HALF_M / closeness - HALF_M
+        return gap
+
+    def _follow(self, newest: NDArray[np.float64]) -> tuple[NDArray[np.bool_], NDArray[np.float64]]:
+        """(W, A) whether the vehicle ahead says what it does, and the acceleration behind it."""
+        ego, lanes = self._part(newest, "ego"), self._part(newest, "lanes")
+        gap_m = self._gap_m(newest)
+        told = self._part(newest, "messages")[..., : self._objects * OBJECT_FEATURES]
+        told = told.reshape(*told.shape[:-1], self._objects, OBJECT_FEATURES)
+        centre_m = np.hypot(told[..., 1], told[..., 2]) * self._scale_m
+        between_m = centre_m - 0.5 * (told[..., 8] * LENGTH_SCALE + OWN_LENGTH_M)
+        ahead = (told[..., 0] > 0.0) & (told[..., 1] > 0.0) & (told[..., 10] > 0.0)
+        with np.errstate(invalid="ignore"):
+            off_m = np.where(ahead, np.abs(between_m - gap_m[..., None]), np.inf)
+        which = np.argmin(off_m, axis=-1)[..., None]
+        follows = np.take_along_axis(off_m, which, axis=-1)[..., 0] < SAME_M
+        accel = np.take_along_axis(told[..., 7], which, axis=-1)[..., 0] * ACCEL_SCALE
+        speed = ego[..., 0] * SPEED_SCALE
+        wanted_m = np.maximum(HEADWAY_S * speed, MIN_GAP_M)
+        cooperative = (
+            ACCEL_GAIN * accel
+            + APPROACH_GAIN * lanes[..., 1] * SPEED_SCALE
+            + GAP_GAIN * (np.where(follows, gap_m, 0.0) - wanted_m)
+        )
+        free = SPEED_GAIN * (ego[..., 6] * SPEED_SCALE - speed)
+        return follows, np.minimum(cooperative, free)
+
+
+def make_policy(env: CavEnv | CavVectorEnv) -> Policy:
+    """Seat a driver with cooperative adaptive cruise control."""
+    return CaccPolicy(env)

@@ -1,0 +1,138 @@
+"""What is sent and what is received, by the definitions and slowly."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from statistics import NormalDist
+from typing import Any
+
+import numpy as np
+
+from cavmarl.config_v2x import ChannelConfig
+from cavmarl.kernels.rng import mix
+
+GOLDEN = 0x9E3779B97F4A7C15
+STREAM_V2X = 11 << 16
+MASK = (1 << 64) - 1
+
+
+@dataclass(frozen=True)
+class Said:
+    """One report."""
+
+    subject: int
+    sender: int
+    tick: int
+    x: float
+    y: float
+    cam: bool
+
+    @property
+    def rank(self) -> tuple[int, int, int]:
+        """The newest, then what one says of oneself, then the smallest sender counts."""
+        return (-self.tick, 0 if self.cam else 1, self.sender)
+
+
+@dataclass(frozen=True)
+class Sent:
+    """One packet."""
+
+    sender: int
+    tick: int
+    x: float
+    y: float
+    reports: tuple[Said, ...]
+
+
+def finalised(word: int) -> int:
+    return int(mix(np.uint64(word & MASK)))
+
+
+def number(key: int, receiver: int, sender: int, tick: int, kind: int) -> float:
+    """Of one reception, in [0, 1)."""
+    of_receiver = finalised(finalised(key + GOLDEN) ^ (receiver * GOLDEN & MASK))
+    stream = ((STREAM_V2X + kind) << 32) + tick
+    of_packet = finalised(finalised(sender * GOLDEN) ^ (stream * GOLDEN & MASK))
+    return (finalised(of_receiver ^ of_packet) >> 11) / (1 << 53)
+
+
+def chance(config: ChannelConfig, distance_m: float, blocked: bool, busy: float) -> float:
+    """Of a reception, by the formulas of docs/v2x.md."""
+    result = 1.0 - config.loss
+    loss_1m = 20.0 * math.log10(4.0 * math.pi * 5.9e9 / 299_792_458.0)
+    margin = config.tx_power_dbm - loss_1m - config.sensitivity_dbm
+    sensing = math.inf
+    if config.path_loss_exponent > 0.0:
+        lost = 10.0 * config.path_loss_exponent * math.log10(max(distance_m, 1.0))
+        lost += config.building_db if blocked else 0.0
+        result *= NormalDist().cdf((margin - lost) / config.shadowing_db)
+        sensing = 10.0 ** (margin / (10.0 * config.path_loss_exponent))
+    if config.data_rate_mbps > 0.0:
+        sensing = min(sensing, config.range_m or math.inf)
+        if sensing < math.inf:
+            half = min(0.5 * distance_m / sensing, 1.0)
+            shared = 2.0 / math.pi * (math.acos(half) - half * math.sqrt(1.0 - half * half))
+            result *= math.exp(-2.0 * busy * (1.0 - shared))
+    return result
+
+
+def inbox(
+    old: Sequence[Said], heard: Sequence[Said], receiver: int, x: float, y: float, most: int
+) -> list[Said]:
+    """The nearest subjects, each by its best report; nearest first, then by subject."""
+    best: dict[int, Said] = {}
+    for said in (*old, *heard):
+        if said.subject == receiver:
+            continue
+        known = best.get(said.subject)
+        if known is None or said.rank < known.rank:
+            best[said.subject] = said
+
+    # One that was known stays, wherever it is now, until nearer ones push it out.
+    def key(said: Said) -> tuple[float, int]:
+        return ((said.x - x) ** 2 + (said.y - y) ** 2, said.subject)
+
+    return sorted(best.values(), key=key)[:most]
+
+
+def seen(
+    rows: Any, own: int, x: float, y: float, range_m: float, most: int, bodies: bool
+) -> list[int]:
+    """Rows of the vehicles that are seen from (x, y): samples of the line of sight."""
+    places = [
+        (math.hypot(row["x"] - x, row["y"] - y), int(row["id"]), k)
+        for k, row in enumerate(rows)
+        if k != own
+    ]
+    places = sorted(place for place in places if place[0] <= range_m)
+    found = []
+    for rank, (_, _, k) in enumerate(places):
+        nearer = [other for _, _, other in places[:rank]]
+        if bodies and any(_meets(rows[o], x, y, rows[k]["x"], rows[k]["y"]) for o in nearer):
+            continue
+        found.append(k)
+        if len(found) == most:
+            break
+    return found
+
+
+def _meets(row: Any, x: float, y: float, to_x: float, to_y: float) -> bool:
+    """Whether a point of a line lies in the rectangle of a body; in 2,000 samples."""
+    share = np.linspace(0.0, 1.0, 2001)
+    dx, dy = x + share * (to_x - x) - row["x"], y + share * (to_y - y) - row["y"]
+    cos, sin = math.cos(row["heading"]), math.sin(row["heading"])
+    along, across = np.abs(dx * cos + dy * sin), np.abs(dy * cos - dx * sin)
+    return bool(((along < 0.5 * row["length"]) & (across < 0.5 * row["width"])).any())
+
+
+def crosses(wall: Sequence[float], x: float, y: float, to_x: float, to_y: float) -> bool:
+    """Whether two segments meet, by solving for the place."""
+    ax, ay, bx, by = wall
+    det = (to_x - x) * (by - ay) - (to_y - y) * (bx - ax)
+    if det == 0.0:
+        return False
+    t = ((ax - x) * (by - ay) - (ay - y) * (bx - ax)) / det
+    u = ((ax - x) * (to_y - y) - (ay - y) * (to_x - x)) / det
+    return 0.0 <= t <= 1.0 and 0.0 <= u <= 1.0

@@ -1,0 +1,71 @@
+"""Buses with vehicles that stand where a test puts them."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cavmarl.kernels.codes import DRIVER_AGENT
+from cavmarl.runtime.simulation import Simulation
+from cavmarl.shard.vehicles import VEHICLE, blank_vehicle
+from cavmarl.v2x.bus import Bus
+from cavmarl.worlds import load_world
+
+CLOCK = {"clock.sim_dt_s": 0.1, "clock.ctrl_dt_s": 0.1}
+
+
+class Standing:
+    """A bus of one world whose rows a test writes.
+
+    Args:
+        agents: seats; vehicle k < agents is driven by agent k.
+        env: whose map it is.
+        settings: keys under `v2x`.
+    """
+
+    def __init__(self, agents: int, env: str = "grid4x4", **settings: Any) -> None:
+        overrides = {f"v2x.{key.replace('__', '.')}": value for key, value in settings.items()}
+        config, network, demand, partition = load_world(
+            env,
+            agents=agents,
+            background=80,
+            overrides=CLOCK | {"population.mode": "seats", "v2x.enabled": True} | overrides,
+        )
+        self.config = config
+        self.agents = agents
+        self.simulation = Simulation(config, network, 1, demand, partition)
+        self.simulation.seed(3)
+        self.simulation.reset()
+        self.worlds = self.simulation._shard.worlds
+        self.bus: Bus = self.simulation.messages
+        self.bus.reset(np.ones(1, dtype=np.bool_))
+
+    def put(self, places: NDArray[np.float64], **fields: Any) -> NDArray[np.void]:
+        """Let vehicles stand at (n, 2) places; vehicle k has the id k."""
+        rows = np.zeros(len(places), VEHICLE)
+        rows[:] = blank_vehicle()
+        rows["id"] = np.arange(len(places))
+        rows["x"], rows["y"] = places.T
+        rows["agent"][: self.agents] = np.arange(self.agents)
+        rows["driver"][: self.agents] = DRIVER_AGENT
+        for name, values in fields.items():
+            rows[name] = values
+        return self.write(rows)
+
+    def write(self, rows: NDArray[np.void]) -> NDArray[np.void]:
+        """Make these the vehicles, in any order."""
+        self.worlds.rows[0, : len(rows)] = rows
+        self.worlds.num_owned[0] = self.worlds.num_rows[0] = len(rows)
+        return rows
+
+    def tick(self) -> int:
+        """Send and receive; which tick it was."""
+        self.worlds.ticks[0] += 1
+        self.bus.exchange(self.simulation._shard.side)
+        return int(self.worlds.ticks[0])
+
+    def key(self) -> int:
+        """Of the world's random numbers."""
+        return int(self.worlds.keys[0])

@@ -1,0 +1,114 @@
+"""Who cannot be seen can be heard of."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from cavmarl.kernels.v2x_records import FIRST_ROADSIDE_ID, KIND_CAM, KIND_CPM
+from cavmarl.kernels.walls import make_walls
+from cavmarl.shard.sensors import layout
+from tests.v2x.station_worlds import Standing
+
+# The agent, a truck before it, a car hidden behind the truck, and a car beside that sees both.
+PLACES = np.array([[100.0, 120.0], [112.0, 120.0], [135.0, 120.0], [118.0, 140.0]])
+HIDDEN = 2
+
+
+def known(world: Standing, receiver: int = 0) -> dict[int, tuple[int, int]]:
+    """Whom a receiver knows of, from whom and how."""
+    box = world.bus.mail.objects[0, receiver]
+    return {
+        int(report["subject"]): (int(report["sender"]), int(report["kind"]))
+        for report in box
+        if report["sender"] >= 0
+    }
+
+
+def behind_a_truck(**settings: Any) -> Standing:
+    world = Standing(1, **settings)
+    rows = world.put(PLACES)
+    rows["length"][1], rows["width"][1], rows["height"][1] = 16.0, 2.6, 4.0
+    world.write(rows)
+    return world
+
+
+def test_a_car_behind_a_truck_is_known_through_messages_only() -> None:
+    world = behind_a_truck(perception__rate_hz=10.0)
+    simulation = world.simulation
+    simulation.seed(3)
+    # What the agent sees itself, as a CPM of its own would say, is without the hidden car.
+    world.tick()
+    mail = world.bus.mail
+    reports = mail.reports[0, 0, : mail.num_reports[0, 0]]
+    own = reports[(reports["sender"] == 0) & (reports["kind"] == KIND_CPM)]
+    assert sorted(own["subject"].tolist()) == [1, 3]
+    assert known(world)[HIDDEN] == (HIDDEN, KIND_CAM)
+    silent = behind_a_truck(equipped=0.0)
+    silent.tick()
+    assert known(silent) == {}
+
+
+def test_lidar_does_not_meet_it_while_messages_tell_of_it() -> None:
+    world = Standing(1)
+    simulation = world.simulation
+    rows = world.worlds.rows[0, : world.worlds.num_owned[0]]
+    agent = rows[rows["agent"] == 0][0]
+    ahead = np.array([np.cos(agent["heading"]), np.sin(agent["heading"])])
+    places = np.array([[agent["x"], agent["y"]]] + [
+        [agent["x"], agent["y"]] + ahead * far for far in (14.0, 40.0)
+    ])  # fmt: skip
+    seated = rows[rows["agent"] == 0].copy()
+    placed = np.repeat(seated, 3)
+    placed["id"], placed["agent"][1:], placed["driver"][1:] = np.arange(3), -1, 0
+    placed["x"], placed["y"] = places.T
+    placed["length"][1], placed["width"][1] = 16.0, 2.6
+
+    def lidar(vehicles: Any) -> Any:
+        world.write(vehicles)
+        simulation._sense(simulation.everywhere)
+        place = layout(simulation.config.sensors)["lidar"]
+        return simulation.outputs.observations[0, 0, place].copy()
+
+    with_hidden, without = lidar(placed), lidar(placed[:2])
+    assert (with_hidden == without).all()  # no ray can tell whether it is there
+    world.write(placed)
+    world.tick()
+    assert known(world)[2] == (2, KIND_CAM)
+
+
+def test_a_car_without_radio_is_told_of_by_those_who_see_it() -> None:
+    # Only the agent and the roadside unit are equipped; a wall hides the car from the agent.
+    world = Standing(
+        1, equipped=0.0, perception__rate_hz=10.0,
+        roadside__signals=["all"], roadside__perception_hz=10.0, roadside__range_m=60.0,
+    )  # fmt: skip
+    unit = world.bus.units[5]
+    world.put(np.array([[unit["x"] - 40.0, unit["y"]], [unit["x"] + 3.0, unit["y"] + 30.0]]))
+    wall = [[unit["x"] - 15.0, unit["y"] + 5.0, unit["x"] - 15.0, unit["y"] + 200.0]]
+    world.bus._channel = world.bus._channel._replace(walls=make_walls(np.array(wall)))
+    world.tick()
+    world.tick()
+    assert known(world) == {1: (FIRST_ROADSIDE_ID + 5, KIND_CPM)}
+
+
+def test_buildings_weaken_what_goes_through_them() -> None:
+    ratios = []
+    for building_db in (0.0, 12.0, 60.0):
+        world = Standing(
+            1, channel__path_loss_exponent=2.75, channel__building_db=building_db,
+            inbox__objects=1,
+        )  # fmt: skip
+        wall = make_walls(np.array([[150.0, -500.0, 150.0, 500.0]]))
+        world.bus._channel = world.bus._channel._replace(walls=wall)
+        # 20 cars behind the wall, 60 m away: without it nearly all is received.
+        ring = np.linspace(-0.5, 0.5, 20)
+        behind = 100.0 + 60.0 * np.stack([np.cos(ring), np.sin(ring)], 1)
+        world.put(np.concatenate([[[100.0, 100.0]], behind]))
+        for _ in range(30):
+            world.tick()
+        ratios.append(world.bus.statistics().reception_ratio)
+    assert ratios[0] > 0.85
+    assert 0.15 < ratios[1] < ratios[0] - 0.2
+    assert ratios[2] == 0.0

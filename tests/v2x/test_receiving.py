@@ -1,0 +1,189 @@
+"""Who receives what, and what is kept of it, is what the definitions say."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from cavmarl.kernels.v2x_records import (
+    COUNT_NO_ACCESS,
+    COUNT_OVERFLOW,
+    COUNT_REACHABLE,
+    COUNT_RECEIVED,
+    KIND_CAM,
+    KIND_CPM,
+)
+from cavmarl.v2x.channel import BUSY_LEVELS, airtime_s, make_channel
+from tests.naive import v2x as naive
+from tests.v2x.station_worlds import Standing
+
+AGENTS, VEHICLES = 6, 40
+CHANNELS: dict[str, dict[str, Any]] = {
+    "ideal": {},
+    "range": {"channel__range_m": 120.0},
+    "loss": {"channel__loss": 0.3},
+    "path loss": {"channel__path_loss_exponent": 2.75, "channel__range_m": 300.0},
+    "all": {
+        "channel__path_loss_exponent": 2.3,
+        "channel__range_m": 400.0,
+        "channel__loss": 0.1,
+        "channel__data_rate_mbps": 1.0,
+        "channel__latency_ticks": 2,
+    },
+}
+
+
+def heard_by(
+    world: Standing, tick: int, receiver: int, x: float, y: float
+) -> tuple[list[naive.Said], int, int]:
+    """What one receives in a tick, of how many packets within reach, by the definitions."""
+    config = world.config.v2x.channel
+    slots = config.latency_ticks + 1
+    slot = (tick - config.latency_ticks) % slots
+    mail = world.bus.mail
+    packets = mail.packets[0, slot, : mail.num_packets[0, slot]]
+    channel = make_channel(config, 0.1, world.bus._channel.walls)
+    near = np.hypot(packets["x"] - x, packets["y"] - y)
+    busy = airtime_s(config) / 0.1 * float((near <= channel.sensing_m).sum())
+    busy = math.floor(min(busy, 1.0) * (BUSY_LEVELS - 1) + 0.5) / (BUSY_LEVELS - 1)
+    said: list[naive.Said] = []
+    reachable = received = 0
+    for packet, distance in zip(packets, near.tolist(), strict=True):
+        if packet["sender"] == receiver or distance > channel.reach_m:
+            continue
+        reachable += 1
+        metre = int(distance)
+        low, high = (naive.chance(config, metre + k, False, busy) for k in (0, 1))
+        chance = low + (high - low) * (distance - metre)
+        kind, sender = int(packet["kind"]), int(packet["sender"])
+        if naive.number(world.key(), receiver, sender, int(packet["tick"]), kind) >= chance:
+            continue
+        received += 1
+        for k in range(packet["first"], packet["first"] + packet["count"]):
+            report = mail.reports[0, slot, k]
+            if kind in (KIND_CAM, KIND_CPM):
+                said.append(_said(report))
+    return said, reachable, received
+
+
+def _said(report: Any) -> naive.Said:
+    return naive.Said(
+        int(report["subject"]),
+        int(report["sender"]),
+        int(report["tick"]),
+        float(report["x"]),
+        float(report["y"]),
+        int(report["kind"]) == KIND_CAM,
+    )
+
+
+def drift(random: np.random.Generator, places: NDArray[np.float64]) -> NDArray[np.float64]:
+    return places + random.normal(0.0, 8.0, places.shape)
+
+
+@pytest.mark.parametrize("seen", [False, True], ids=["cams", "cpms"])
+@pytest.mark.parametrize("name", CHANNELS)
+def test_inboxes_hold_what_the_definitions_say(name: str, seen: bool) -> None:
+    settings = CHANNELS[name] | {"inbox__objects": 5, "inbox__memory_s": 0.4, "cam__rate_hz": 5.0}
+    world = Standing(AGENTS, perception__rate_hz=2.5 if seen else 0.0, **settings)
+    random = np.random.default_rng(1)
+    places = random.uniform(0.0, 420.0, (VEHICLES, 2))
+    known: list[list[naive.Said]] = [[] for _ in range(AGENTS)]
+    total = [0, 0]
+    for _ in range(14):
+        places = drift(random, places)
+        rows = world.put(places)
+        world.write(random.permutation(rows))
+        tick = world.tick()
+        for agent in range(AGENTS):
+            x, y = places[agent]
+            said, reachable, received = heard_by(world, tick, agent, x, y)
+            total[0] += reachable
+            total[1] += received
+            old = [report for report in known[agent] if report.tick + 4 >= tick]
+            known[agent] = naive.inbox(old, said, agent, x, y, 5)
+            box = world.bus.mail.objects[0, agent]
+            assert [_said(report) for report in box if report["sender"] >= 0] == known[agent]
+    counts = world.bus.mail.counts[0]
+    assert [counts[COUNT_REACHABLE], counts[COUNT_RECEIVED]] == total
+    assert total[1] > 100
+    statistics = world.bus.statistics()
+    assert statistics.reception_ratio == total[1] / total[0]
+    assert statistics.mean_latency_s == pytest.approx(0.1 * world.config.v2x.channel.latency_ticks)
+
+
+def test_chances_are_met(monkeypatch: pytest.MonkeyPatch) -> None:
+    # 300 receptions at each distance: within four standard deviations.
+    world = Standing(1, channel__path_loss_exponent=2.75, channel__loss=0.1, equipped=1.0)
+    distances = np.array([20.0, 90.0, 120.0, 150.0, 220.0])
+    ring = np.linspace(0.0, 2.0 * np.pi, 60, endpoint=False)
+    config = world.config.v2x.channel
+    for distance in distances:
+        places = np.stack([200.0 + distance * np.cos(ring), 200.0 + distance * np.sin(ring)], 1)
+        world.bus.reset(np.ones(1, dtype=np.bool_))
+        world.put(np.concatenate([[[200.0, 200.0]], places]))
+        for _ in range(5):
+            world.tick()
+        chance = naive.chance(config, distance, False, 0.0)
+        spread = 4.0 * math.sqrt(chance * (1.0 - chance) / 300.0) + 1e-3
+        assert abs(world.bus.statistics().reception_ratio - chance) < spread
+        (band,) = world.bus.statistics().ratio_by_distance()
+        assert abs(band - distance) <= 13.0
+
+
+def test_packets_beyond_the_capacity_are_those_of_the_larger_ids() -> None:
+    world = Standing(1, capacity=10)
+    world.put(np.random.default_rng(2).uniform(0.0, 300.0, (30, 2)))
+    world.tick()
+    mail = world.bus.mail
+    assert mail.counts[0, COUNT_OVERFLOW] == 20
+    assert mail.packets[0, 0, :10]["sender"].tolist() == list(range(10))
+
+
+def test_what_the_air_cannot_carry_is_dropped() -> None:
+    # 60 packets of 300 bytes in 100 ms at 0.5 Mbit/s: three times what there is time for.
+    world = Standing(1, channel__data_rate_mbps=0.5)
+    world.put(np.random.default_rng(2).uniform(0.0, 300.0, (60, 2)))
+    world.tick()
+    dropped = world.bus.mail.counts[0, COUNT_NO_ACCESS]
+    load = 60 * airtime_s(world.config.v2x.channel) / 0.1
+    assert load == pytest.approx(2.9, abs=0.05)
+    assert abs((60 - dropped) - 60 / load) < 4.0 * math.sqrt(60 / load)
+    statistics = world.bus.statistics()
+    assert 0.5 < statistics.busy_mean <= 1.0
+    assert statistics.to_dict()["v2x_dropped"] == dropped
+
+
+def test_more_traffic_means_fewer_receptions() -> None:
+    ratios = []
+    for vehicles in (10, 40, 75):
+        world = Standing(
+            1, channel__path_loss_exponent=2.0, channel__sensitivity_dbm=-66.0,
+            channel__data_rate_mbps=3.0,
+        )  # fmt: skip
+        world.put(np.random.default_rng(5).uniform(0.0, 400.0, (vehicles, 2)))
+        for _ in range(40):
+            world.tick()
+        ratios.append(world.bus.statistics().reception_ratio)
+    assert ratios[0] > ratios[1] > ratios[2]
+
+
+def test_a_new_vehicle_in_a_seat_has_heard_nothing() -> None:
+    world = Standing(1, cam__rate_hz=1.0)
+    places = np.random.default_rng(3).uniform(0.0, 300.0, (20, 2))
+    rows = world.put(places)
+    for _ in range(9):
+        world.tick()
+    assert (world.bus.mail.objects[0, 0]["sender"] >= 0).all()
+    rows["id"][0] = 1000
+    world.write(rows)
+    world.tick()
+    there = world.bus.mail.objects[0, 0]["sender"]
+    assert (there >= 0).sum() == 2  # one in ten of 19 has sent in this tick
+    world.write(rows[1:])
+    world.tick()
+    assert (world.bus.mail.objects[0, 0]["sender"] < 0).all()
