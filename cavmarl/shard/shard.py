@@ -144,6 +144,7 @@ class Shard:
         self.target_speeds = np.array(config.action.target_speeds_mps)
         self.discrete = config.action.kind == "discrete"
         self._call_leave = repeated(leave)
+        self._call_drop_ghosts = repeated(drop_ghosts)
         self._call_observe_further = repeated(observe_further)
         self._call_observe_messages = repeated(observe_messages)
         self._call_fill_stacks = repeated(fill_stacks)
@@ -176,7 +177,7 @@ class Shard:
 
     def forget(self, gate: Gate) -> None:
         """Drop the ghosts of those who have been retired."""
-        drop_ghosts(gate, self.worlds, self.worlds.rows)
+        self._call_drop_ghosts(gate, self.worlds, self.worlds.rows)
 
     def commit(self) -> None:
         """Make the next rows the committed state."""
