@@ -15,7 +15,7 @@ OLDEST_TESTS := tests/kernels tests/roads tests/runtime tests/traffic tests/test
 LIBRARIES_TESTS := tests/adapters tests/train/test_programs.py tests/hosts \
     tests/stepping/test_remote.py tests/stepping/test_remote_start.py
 FUZZ_SECONDS ?= 60
-FUZZ_TARGETS ?= network programs map cached zones demand sumocfg entry overrides driver manifest \
+FUZZ_TARGETS ?= network programs buildings map cached zones demand sumocfg entry overrides driver manifest \
     plan message log
 MAPS := envs/ring/map/map.net.xml envs/merge/map/map.net.xml envs/grid4x4/map/map.net.xml
 
@@ -70,8 +70,9 @@ maps: $(READY) ## make the maps of ring, merge and grid4x4 anew from the options
 	cd envs/grid4x4/map && ../../../$(BIN)/netgenerate --configuration-file map.netgcfg
 	sed --in-place '2,/^-->$$/d' $(MAPS)
 
-pictures: $(READY) ## draw the pictures of the README and the cards anew
+pictures: $(READY) ## draw the pictures of the README, the cards and the pages anew
 	$(BIN)/python -m cavmarl.render.pictures docs/images
+	$(BIN)/python -m cavmarl.render.sensor_pictures docs/images
 
 clean: ## remove .venv, builds and caches; runs/ stays
 	rm -rf .venv $(OLDEST) $(LIBRARIES) fuzz/corpus build dist .mypy_cache .ruff_cache .pytest_cache .hypothesis .import_linter_cache

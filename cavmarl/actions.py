@@ -11,6 +11,8 @@ from numpy.typing import NDArray
 from cavmarl.config import ActionConfig
 from cavmarl.errors import InvalidActionError, MissingActionError, UnknownAgentError
 from cavmarl.kernels.codes import ACTION_IDLE, ACTION_SLOWER
+from cavmarl.kernels.decoding import decode_choices, decode_pairs
+from cavmarl.kernels.repeated import repeated
 from cavmarl.shard.shard import Commands
 
 __all__ = ["ActionDecoder"]
@@ -23,6 +25,7 @@ class ActionDecoder:
         config: what an agent can do.
         num_worlds: W.
         agents: the A agent ids.
+        commands: where decoded actions are written, over those of the step before; None: made.
 
     Attributes:
         clipped: (W,) values beyond ±1 that were clipped in this episode (`out_of_range = clip`).
@@ -30,7 +33,13 @@ class ActionDecoder:
         ignored: (W,) actions for agents that had left (`late_actions = ignore`).
     """
 
-    def __init__(self, config: ActionConfig, num_worlds: int, agents: Sequence[str]) -> None:
+    def __init__(
+        self,
+        config: ActionConfig,
+        num_worlds: int,
+        agents: Sequence[str],
+        commands: Commands | None = None,
+    ) -> None:
         self._config = config
         self._agents = tuple(agents)
         self._index = {agent: k for k, agent in enumerate(agents)}
@@ -45,8 +54,13 @@ class ActionDecoder:
         # One for each number: over pairs NumPy takes four times as long.
         self._scale = np.empty((*shape, 2))
         self._scale[:] = config.acceleration_mps2, config.steering_rad
-        self._no_meta_actions = np.full(shape, ACTION_IDLE, dtype=np.int64)
-        self._no_meta_actions.flags.writeable = False
+        if commands is None:
+            commands = Commands(np.empty((*shape, 2)), np.empty(shape, dtype=np.int64))
+        commands.controls[:] = 0.0
+        commands.meta_actions[:] = ACTION_IDLE
+        self._decoded = commands
+        self._decode_pairs = {np.dtype(kind): repeated(decode_pairs) for kind in ("f4", "f8")}
+        self._decode_choices = repeated(decode_choices)
         self.clipped = np.zeros(num_worlds, dtype=np.int64)
         self.held = np.zeros(num_worlds, dtype=np.int64)
         self.ignored = np.zeros(num_worlds, dtype=np.int64)
@@ -126,6 +140,8 @@ class ActionDecoder:
         Raises:
             InvalidActionError: wrong shape, dtype or value.
         """
+        if self._decode_at_once(actions, mask):
+            return self._decoded
         array = self._as_numbers(actions, "actions")
         if array.shape != self._last.shape:
             raise InvalidActionError(
@@ -138,6 +154,25 @@ class ActionDecoder:
         self.clipped += clipped
         self._last = checked
         return self._commands(checked)
+
+    def _decode_at_once(self, actions: Any, mask: NDArray[np.bool_]) -> bool:
+        """Decode actions of a usual kind if all are in range; False: look closer."""
+        if type(actions) is not np.ndarray or actions.shape != self._last.shape:
+            return False
+        if not (actions.flags.carray and mask.flags.carray):
+            return False
+        if not self._continuous:
+            if actions.dtype != np.int64:
+                return False
+            return self._decode_choices(actions, mask, self._last, self._decoded.meta_actions)
+        decode = self._decode_pairs.get(actions.dtype)
+        if decode is None:
+            return False
+        config = self._config
+        return decode(
+            actions, mask, config.acceleration_mps2, config.steering_rad,
+            self._last, self._decoded.controls,
+        )  # fmt: skip
 
     def encode(self, raw: NDArray[np.float64]) -> NDArray[Any]:
         """The inverse of decoding: actions (W, A, …) for raw controls (W, A, 2) as suggested."""
@@ -245,7 +280,9 @@ class ActionDecoder:
         raise InvalidActionError(f"{where}: the action is {batch[place]}, {why}")
 
     def _commands(self, batch: NDArray[Any]) -> Commands:
-        shape = self._last.shape[:2]
+        decoded = self._decoded
         if self._continuous:
-            return Commands(batch * self._scale, self._no_meta_actions)
-        return Commands(np.zeros((*shape, 2)), batch)
+            np.multiply(batch, self._scale, out=decoded.controls)
+        else:
+            decoded.meta_actions[:] = batch
+        return decoded

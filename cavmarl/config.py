@@ -588,6 +588,13 @@ class EnvConfig:
             f"traffic.source = {source}: SUMO has the signals; name such files in its .sumocfg",
         )
         _check(
+            source == "sumo-demand" or self.workers.balance_steps == 0,
+            "workers.balance_steps",
+            self.workers.balance_steps,
+            f"traffic.source = {source}: no other process can take up SUMO in the middle of an "
+            "episode; leave it 0",
+        )
+        _check(
             not self.sensors.signal.timing,
             "sensors.signal.timing",
             True,

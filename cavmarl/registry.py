@@ -32,6 +32,7 @@ __all__ = [
     "entries",
     "find_entry",
     "load_config",
+    "load_rig",
     "places",
     "resolve_buildings",
     "resolve_demand",
@@ -114,7 +115,8 @@ def load_config(
         agents: shadows `population.agents`.
         background: shadows `population.background`.
         max_cycles: shadows `horizon_s`, in steps: exactly that many.
-        overrides: dotted key → value, for every other key: `{"sensors.lidar.rays": 64}`.
+        overrides: dotted key → value, for every other key: `{"sensors.lidar.rays": 64}`. As in an
+            env.yaml, `rig` may be the name of a rig in `configs/rigs`, or of a file.
 
     Raises:
         UnknownEnvironmentError: nothing of that name.
@@ -125,7 +127,10 @@ def load_config(
     found = find_entry(env)
     if found.is_dir():
         base_dir, where = found, str(found / "env.yaml")
-        config = validate(EnvConfig, read_yaml(found / "env.yaml"), where)
+        keys = read_yaml(found / "env.yaml")
+        if isinstance(keys, dict) and isinstance(keys.get("rig"), str):
+            keys["rig"] = load_rig(keys["rig"], base_dir)
+        config = validate(EnvConfig, keys, where)
     else:
         base_dir, where = found.parent, str(found)
         config = EnvConfig(name=_map_name(found), map=MapConfig(source=found.name))
@@ -148,11 +153,43 @@ def load_config(
     if shadows or max_cycles is not None:
         raw = dataclasses.asdict(config)
         for key, value in shadows.items():
-            _shadow(raw, key, value)
+            is_named = key == "rig" and isinstance(value, str)
+            _shadow(raw, key, load_rig(str(value), base_dir) if is_named else value)
         if max_cycles is not None:
             raw["horizon_s"] = _horizon_s(max_cycles, raw)
         config = validate(EnvConfig, raw, f"{where}, overridden")
     return config, base_dir
+
+
+def load_rig(name: str, base_dir: Path | None = None) -> dict[str, Any]:
+    """The sensors of a rig that is named, by name, as they stand in its file.
+
+    Args:
+        name: of `configs/rigs/NAME.yaml`, or a YAML file, relative or absolute.
+        base_dir: the folder that a relative file starts from; None: the working directory.
+
+    Raises:
+        ConfigError: there is none of that name, or no mapping in it.
+    """
+    from cavmarl.config_io import read_yaml
+
+    path = _find_rig(name, Path() if base_dir is None else base_dir)
+    sensors = read_yaml(path)
+    if not isinstance(sensors, dict):
+        raise ConfigError(f"{path}: must be a mapping of sensors by name")
+    return sensors
+
+
+def _find_rig(name: str, base_dir: Path) -> Path:
+    if name.endswith((".yaml", ".yml")):
+        return base_dir / name
+    rigs = {path.stem: path for place in places("configs") for path in place.glob("rigs/*.yaml")}
+    if name not in rigs:
+        raise ConfigError(
+            f"rig = {name!r}: no such rig; there are {', '.join(sorted(rigs)) or 'none'}; or name "
+            "a file that ends in .yaml"
+        )
+    return rigs[name]
 
 
 def resolve_map(config: EnvConfig, base_dir: Path) -> Path:

@@ -21,6 +21,7 @@ from cavmarl.registry import load_config
 from cavmarl.rig.frames import SensorFrames
 from cavmarl.runtime.simulation import Simulation
 from cavmarl.seeds import check_seed, first_seed
+from cavmarl.shard.shard import Commands
 from cavmarl.spaces import (
     action_space,
     flat_observation_space,
@@ -196,7 +197,11 @@ class CavVectorEnv:
                 AutoresetMode.NEXT_STEP if worlds.in_next_step else AutoresetMode.SAME_STEP
             ),
         }
-        self._decoder = ActionDecoder(config.action, num_envs, self.possible_agents)
+        arrays = worlds.arrays
+        commands = Commands(arrays.controls, arrays.meta_actions)
+        self._decoder = ActionDecoder(config.action, num_envs, self.possible_agents, commands)
+        self._view = arrays.observations.view()
+        self._view.flags.writeable = False
         self._mask = np.zeros((num_envs, self.num_agents), dtype=np.bool_)
         self._events = DeclaredEvents(config, num_envs)
         self._first_seed = None if seed is None else check_seed(seed)
@@ -314,9 +319,8 @@ class CavVectorEnv:
         over = arrays.episode_over.copy()
         terminations = arrays.terminations.copy()
         observations = final_observations = self._observations()
-        ended = over | terminations.any(axis=1)
-        if ended.any():
-            final_observations = self._final_observations(ended)
+        if np.count_nonzero(over) or np.count_nonzero(terminations):
+            final_observations = self._final_observations(over | terminations.any(axis=1))
             self._decoder.forget(over)
         self._mask = arrays.mask.copy()
         infos: dict[str, NDArray[Any]] = {
@@ -333,7 +337,7 @@ class CavVectorEnv:
     def _observations(self) -> Observations:
         arrays = self.worlds.arrays
         if not self._senses:
-            return self._given(arrays.observations)
+            return arrays.observations.copy() if self._copy else self._view
         left = arrays.terminations & ~arrays.episode_over[:, None]
         if self.worlds.in_next_step or not left.any():
             sensed = sensed_observation(arrays.frames)

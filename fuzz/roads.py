@@ -1,14 +1,18 @@
-"""Targets that read roads: networks, signal programs, other maps, cached networks, zones."""
+"""Targets that read roads: networks, signal programs, buildings, other maps, caches, zones."""
 
 from __future__ import annotations
 
 import gzip
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
 
+import pyproj
+
+from cavmarl.maps.buildings import with_buildings
 from cavmarl.maps.netconvert import build_network
 from cavmarl.roads.cache import _entry, load_network
-from cavmarl.roads.network import RoadNetwork
+from cavmarl.roads.network import GeoReference, RoadNetwork
 from cavmarl.roads.reader import read_network, source_hash
 from cavmarl.roads.signal_plans import with_programs
 from cavmarl.roads.zone_file import read_zones, write_zones
@@ -16,7 +20,7 @@ from cavmarl.roads.zone_layouts import cut_map
 from cavmarl.roads.zones import ZonePartition
 from fuzz.files import ROOT, Target, scratch, seed
 
-__all__ = ["CACHED", "MAPS", "NETWORKS", "PROGRAMS", "ZONES", "grid"]
+__all__ = ["BUILDINGS", "CACHED", "MAPS", "NETWORKS", "PROGRAMS", "ZONES", "grid"]
 
 NETCONVERT_S = 5.0  # longer is no crash, but nothing to wait for
 
@@ -38,6 +42,18 @@ def _networks() -> tuple[bytes, ...]:
 
 def _programs(content: bytes) -> RoadNetwork:
     return with_programs(grid(), [scratch("programs.add.xml", content)])
+
+
+@cache
+def _placed_grid() -> RoadNetwork:
+    """The roads that buildings are read for, at the place of the seeds."""
+    projection = "+proj=utm +zone=32 +ellps=WGS84"
+    x, y = pyproj.Proj(projparams=projection)(11.0, 49.0)
+    return replace(grid(), geo=GeoReference(projection, -x, -y))
+
+
+def _buildings(content: bytes) -> RoadNetwork:
+    return with_buildings(_placed_grid(), scratch("buildings.xml", content))
 
 
 def _map(content: bytes) -> object:
@@ -81,6 +97,7 @@ def _entries() -> tuple[bytes, ...]:
 
 NETWORKS = Target(_network, _networks)
 PROGRAMS = Target(_programs, lambda: (seed("programs.add.xml"),))
+BUILDINGS = Target(_buildings, lambda: (seed("buildings.osm"), seed("buildings.poly.xml")))
 MAPS = Target(_map, lambda: (seed("small.osm"), seed("small.xodr")), slow=True)
 CACHED = Target(_cached, _entries)
 ZONES = Target(_zones, _zone_files)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from fuzz.protocol import LOGS, MESSAGES
-from fuzz.roads import CACHED, MAPS, NETWORKS, PROGRAMS, ZONES
+from fuzz.roads import BUILDINGS, CACHED, MAPS, NETWORKS, PROGRAMS, ZONES
 from fuzz.settings import DRIVERS, ENTRIES, MANIFESTS, OVERRIDES, PLANS
 from fuzz.traffic import DEMAND, SUMO_CONFIGS
 
@@ -12,6 +12,7 @@ __all__ = ["TARGETS"]
 TARGETS = {
     "network": NETWORKS,
     "programs": PROGRAMS,
+    "buildings": BUILDINGS,
     "map": MAPS,
     "cached": CACHED,
     "zones": ZONES,

@@ -6,17 +6,24 @@ import inspect
 import re
 from dataclasses import MISSING, fields, is_dataclass
 from pathlib import Path
+from types import UnionType
 from typing import Any, Literal, get_args, get_origin, get_type_hints
 
+import numpy as np
 import pytest
 
 from cavmarl.config import TERMS, EnvConfig
 from cavmarl.config_io import dotted_keys
+from cavmarl.config_rig import CollisionConfig, SampledConfig
+from cavmarl.rig.catalogue import TYPES
 from tests.generated import check_block, table
 
 ROOT = Path(__file__).resolve().parents[1]
 PAGES = sorted([*ROOT.glob("*.md"), *ROOT.glob("docs/**/*.md"), *ROOT.glob("envs/*/README.md")])
-UNITS = {"m": "m", "s": "s", "mps": "m/s", "mps2": "m/s²", "rad": "rad", "ticks": "ticks"}
+UNITS = {
+    "m": "m", "s": "s", "mps": "m/s", "mps2": "m/s²", "rad": "rad", "ticks": "ticks", "hz": "Hz",
+    "deg": "°",
+}  # fmt: skip
 
 
 def test_the_page_of_environments_lists_every_key() -> None:
@@ -25,6 +32,32 @@ def test_the_page_of_environments_lists_every_key() -> None:
     assert all(row[-1] for row in rows), "a key without a word under Attributes:"
     header = ("key", "type", "unit", "default", "meaning")
     check_block(ROOT / "docs/environments.md", "keys", table(header, rows))
+
+
+def test_the_page_of_sensors_lists_every_type_and_key() -> None:
+    page = ROOT / "docs/sensors.md"
+    types = [
+        (
+            f"`{kind.type}`",
+            str(kind(**({} if kind is CollisionConfig else {"rate_hz": 10.0})).shape),
+            f"`{np.dtype(TYPES[kind].dtype)}`",
+            ", ".join(kind.units),
+            " ".join(inspect.getdoc(kind).split("\n\n")[0].split()),
+        )
+        for kind in TYPES
+    ]
+    check_block(page, "types", table(("type", "sample", "dtype", "channels", "what"), types))
+    common = key_rows(SampledConfig)
+    known = {row[0] for row in common}
+    own = [
+        (f"`{kind.type}`", *row)
+        for kind in TYPES
+        for row in key_rows(kind)
+        if row[0] not in known and row[0] != "`type`"
+    ]
+    header = ("key", "type", "unit", "default", "meaning")
+    check_block(page, "common keys", table(header, common))
+    check_block(page, "keys", table(("of", *header), own))
 
 
 def test_the_page_of_environments_explains_every_term() -> None:
@@ -40,7 +73,10 @@ def test_links_between_pages_lead_somewhere(page: Path) -> None:
 
 def key_rows(kind: type[Any], prefix: str = "") -> list[tuple[str, str, str, str, str]]:
     """(key, type, unit, default, meaning) of every key of a configuration class."""
-    hints, meanings, rows = get_type_hints(kind), attribute_texts(kind), []
+    hints, rows = get_type_hints(kind), []
+    meanings = {"type": ""}
+    for base in reversed(kind.__mro__[:-1]):
+        meanings |= attribute_texts(base)
     for field in fields(kind):
         key, hint = f"{prefix}{field.name}", hints[field.name]
         if isinstance(hint, type) and is_dataclass(hint):
@@ -64,9 +100,13 @@ def attribute_texts(kind: type[Any]) -> dict[str, str]:
 def type_text(hint: Any) -> str:
     if get_origin(hint) is Literal:
         return " or ".join(f"`{choice}`" for choice in get_args(hint))
+    if is_dataclass(hint):
+        return "keys"
     if get_origin(hint) is None:
         return {int: "whole number", float: "number", bool: "bool", str: "text"}[hint]
     inner = [type_text(part) for part in get_args(hint) if part not in (..., type(None))]
+    if get_origin(hint) is UnionType:
+        return " or ".join(dict.fromkeys(inner))
     return {tuple: "list of ", dict: "mapping of "}.get(get_origin(hint), "") + " to ".join(inner)
 
 

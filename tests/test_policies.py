@@ -17,6 +17,7 @@ from cavmarl.cav_env import CavEnv, parallel_env
 from cavmarl.errors import MissingExtraError, PolicyError
 from cavmarl.policies import Policy, load_policy
 from cavmarl.registry import agent_entries
+from cavmarl.stack.reference_rig import REFERENCE_RIG
 from cavmarl.vector_env import CavVectorEnv, make_vec
 
 SCRIPTED = ("idm", "random_actions")
@@ -130,7 +131,8 @@ NEEDED = {
         "sensors.messages.objects": 4,
         "sensors.lanes.range_m": 100.0,
         "sensors.signal.enabled": True,
-    }
+    },
+    "reference": {"rig": REFERENCE_RIG},
 }
 
 

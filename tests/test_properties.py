@@ -49,6 +49,13 @@ def values(hint: Any) -> st.SearchStrategy[Any]:
         return st.lists(values(arguments[0]), max_size=4)
     if origin is dict:
         return st.dictionaries(*map(values, arguments), max_size=3)
+    if is_dataclass(hint):
+        hints = get_type_hints(hint)
+        keys = {field.name: values(hints[field.name]) for field in fields(hint)}
+        needed = {name: keys.pop(name) for name in ("type", "rate_hz") if name in keys}
+        if "rate_hz" in needed:
+            needed["rate_hz"] |= st.sampled_from([1.0, 10.0, 20.0])
+        return st.fixed_dictionaries(needed, optional=keys)
     plain: dict[Any, st.SearchStrategy[Any]] = {
         bool: st.booleans(),
         int: st.sampled_from(WHOLE) | st.integers(-3, 70),

@@ -12,7 +12,9 @@ from cavmarl.cli import (
     demand,
     demo,
     evaluate,
+    follow,
     journal,
+    lead,
     listing,
     map,
     plan,
@@ -39,6 +41,8 @@ app.command()(verify.verify)
 app.command()(verify_determinism.verify_determinism)
 app.command()(journal.journal)
 app.command()(plan.plan)
+app.command()(lead.lead)
+app.command()(follow.follow)
 app.command()(view.view)
 app.command()(demo.demo)
 app.command("list")(listing.list_entries)

@@ -10,10 +10,12 @@ from rich.console import Console
 from rich.table import Table
 
 from cavmarl.cli.bench_balance import balance
+from cavmarl.cli.bench_clock import clock
 from cavmarl.cli.bench_libraries import libraries
 from cavmarl.cli.bench_moving import moving
 from cavmarl.cli.bench_rays import rays
 from cavmarl.cli.bench_recut import recut
+from cavmarl.cli.bench_sensors import sensors
 from cavmarl.cli.bench_sharding import sharding
 from cavmarl.cli.bench_sumo import sumo
 from cavmarl.cli.bench_traffic import traffic
@@ -49,8 +51,10 @@ app.command()(recut)
 app.command()(workers)
 app.command()(train)
 app.command()(rays)
+app.command()(sensors)
 app.command()(v2x)
 app.command()(libraries)
+app.command()(clock)
 
 _SENSORS = {"lidar": "64 rays", "kinematics": "no rays", "puffer_drive": "pufferlib's"}
 _WHO = {

@@ -17,7 +17,7 @@ def rays(
     repeats: Annotated[int, typer.Option(help="Measurements of each, by turns.")] = 5,
     json_path: JsonPath = None,
 ) -> None:
-    """Time of each mounted sensor, and of all ten of one vehicle, at 400 cars/km² on one core."""
+    """Time of each sensor of the rig `ten_sensors`, and of all, at 400 cars/km² on one core."""
     from cavmarl.evaluate.sensor_speed import measure_sensor_speed
 
     console = Console()

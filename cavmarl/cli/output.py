@@ -31,11 +31,12 @@ __all__ = [
     "parse_settings",
     "print_error",
     "say_difference",
+    "writable",
     "write_json",
 ]
 
 
-def _writable(path: Path | None) -> Path | None:
+def writable(path: Path | None) -> Path | None:
     """Refuse a path that cannot be written before any work is done for it."""
     if path is None:
         return None
@@ -73,7 +74,7 @@ Settings = Annotated[
 ]
 JsonPath = Annotated[
     Path | None,
-    typer.Option("--json", help="Write the result here as JSON.", callback=_writable),
+    typer.Option("--json", help="Write the result here as JSON.", callback=writable),
 ]
 
 

@@ -30,7 +30,8 @@ TRACE = np.dtype(
 
 def trace_of(row: np.void, time_s: float) -> tuple[float, ...]:
     """What a TRACE keeps of a VEHICLE row."""
-    return (time_s, *(float(row[name]) for name in TRACE.names[1:] if TRACE.names))
+    _, *names = TRACE.names or ()
+    return (time_s, *(float(row[name]) for name in names))
 
 
 def time_to_collision_s(one: np.void, other: np.void) -> float:
@@ -74,7 +75,8 @@ def post_encroachment_s(one: NDArray[np.void], other: NDArray[np.void]) -> float
 
     Post-encroachment time (Allen, Shin, Cooper: "Analysis of traffic conflicts and collisions",
     Transportation Research Record 667, 1978), with the ground that a body covers as the place: inf
-    if no place was covered by both, 0 if both were there at a time.
+    if no place was covered by both, 0 if both were there at a time. As bodies are known at moments
+    only, it is too long by at most twice the time between two of them.
 
     Args:
         one: TRACE (n,).

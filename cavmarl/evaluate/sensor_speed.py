@@ -1,4 +1,4 @@
-"""How long mounted sensors take, each for itself and all ten of one vehicle, on one core.
+"""How long mounted sensors take, each for itself and the ten of `ten_sensors`, on one core.
 
 The sensors are due in every tick and sense the same seeded worlds by turns; times are those of the
 processor that this process had.
@@ -18,11 +18,12 @@ from cavmarl.errors import ConfigError
 from cavmarl.evaluate.sharded_worlds import DrivenWorld, world_maker
 from cavmarl.evaluate.step_speed import one_core
 from cavmarl.kernels.rig_schedule import Due
+from cavmarl.registry import load_config
 from cavmarl.rig.catalogue import mount
 from cavmarl.runtime.mounted import MountedSensors
 from cavmarl.runtime.simulation import Simulation
 
-__all__ = ["TEN_SENSORS", "SensorRow", "SensorSpeed", "measure_sensor_speed"]
+__all__ = ["SensorRow", "SensorSpeed", "measure_sensor_speed"]
 
 ENV = "grid4x4"
 CARS_PER_KM2 = 400
@@ -31,19 +32,10 @@ WARM_S = 10
 TICKS = 20  # of one turn
 MAX_REPEATS = 100
 
-# One vehicle's sensors at their default resolutions, but the plane lidar, which has 64 rays.
-TEN_SENSORS: dict[str, dict[str, Any]] = {
-    "plane_lidar": {"type": "lidar", "rays": 64, "z_m": 0.8, "range_m": 100.0},
-    "roof_lidar": {"type": "lidar", "layers": 16, "z_m": 1.6},
-    "radar": {"type": "radar", "x_m": 2.4, "z_m": 0.5},
-    "depth_camera": {"type": "depth_camera", "x_m": 0.6, "z_m": 1.4},
-    "semantic_camera": {"type": "semantic_camera", "x_m": 0.6, "z_m": 1.4},
-    "rgb_camera": {"type": "rgb_camera", "x_m": 0.6, "z_m": 1.4},
-    "bev_grid": {"type": "bev_grid"},
-    "gnss": {"type": "gnss", "noise": [1.5]},
-    "imu": {"type": "imu", "noise": [0.05]},
-    "odometry": {"type": "odometry", "noise": [0.1, 0.01, 0.1]},
-}
+DT_S = 0.05
+TEN_SENSORS = "ten_sensors"
+PLANE_LIDAR = "plane_lidar"
+LIDAR = {"type": "lidar", "rays": 64, "z_m": 0.8, "range_m": 100.0}
 
 
 @dataclass(frozen=True)
@@ -77,9 +69,9 @@ class SensorSpeed:
         cars_per_km2: vehicles over the area of the map.
         repeats: turns.
         rows: one a sensor.
-        lidar_ns: a ray of the plane lidar.
+        lidar_ns: a ray of a plane lidar with 64 rays and a range of 100 m.
         cameras_ms: a depth and a semantic picture.
-        tick_ms: all ten sensors of one vehicle alone in its world, everything included.
+        tick_ms: all ten sensors of the only vehicle in its world that has any, stamps included.
     """
 
     cars_per_km2: float
@@ -113,47 +105,62 @@ def measure_sensor_speed(
         raise ConfigError(f"repeats = {repeats}: must be from 1 to {MAX_REPEATS}")
     with one_core():
         progress("making the worlds")
-        many, one = _driven(AGENTS), _driven(1)
+        rig = _ten_sensors()
+        many = _driven(AGENTS, {**rig, PLANE_LIDAR: {**LIDAR, "rate_hz": 1.0 / DT_S}})
+        one = _driven(1, rig)
         sensors = _Sensors(many)
-        turns: dict[str, list[float]] = {name: [] for name in TEN_SENSORS}
+        turns: dict[str, list[float]] = {name: [] for name in many.config.rig}
         ticks = []
         for turn in range(repeats):
             progress(f"turn {turn + 1} of {repeats}")
-            for name in TEN_SENSORS:
-                turns[name].append(sensors.time_us(name))
+            for name, times_us in turns.items():
+                times_us.append(sensors.time_us(name))
             ticks.append(_tick_ms(one))
-    rows = tuple(sensors.row(name, times) for name, times in turns.items())
-    found = {row.name: row for row in rows}
-    area_km2 = _area_m2(many) / 1e6
+    rows = tuple(sensors.row(name, times_us) for name, times_us in turns.items())
+    us = {row.type: row.median_us for row in rows}
+    lidar = next(row for row in rows if row.name == PLANE_LIDAR)
     return SensorSpeed(
-        cars_per_km2=float(many.running()[0]) / area_km2,
+        cars_per_km2=float(many.running()[0]) / _area_km2(many),
         repeats=repeats,
         rows=rows,
-        lidar_ns=1e3 * found["plane_lidar"].median_us / found["plane_lidar"].numbers,
-        cameras_ms=1e-3 * (found["depth_camera"].median_us + found["semantic_camera"].median_us),
+        lidar_ns=1e3 * lidar.median_us / lidar.numbers,
+        cameras_ms=1e-3 * (us["depth_camera"] + us["semantic_camera"]),
         tick_ms=median(ticks),
     )
 
 
-def _area_m2(simulation: Simulation) -> float:
+def _ten_sensors() -> dict[str, dict[str, Any]]:
+    """The rig, with all of it due in every tick."""
+    config, _ = load_config(ENV, overrides={"rig": TEN_SENSORS})
+    return {
+        name: {**asdict(sensor), "rate_hz": 1.0 / DT_S, "phase_ticks": 0}
+        for name, sensor in config.rig.items()
+    }
+
+
+def _area_km2(simulation: Simulation) -> float:
     min_x, min_y, max_x, max_y = simulation.network.extent_m
-    return (max_x - min_x) * (max_y - min_y)
+    return (max_x - min_x) * (max_y - min_y) / 1e6
 
 
-def _driven(agents: int) -> Simulation:
+def _driven(agents: int, rig: dict[str, dict[str, Any]]) -> Simulation:
     """A world with so many agents, all sensors due in every tick, some seconds after its reset."""
-    dt_s = 0.05
-    rig = {name: {**sensor, "rate_hz": 1.0 / dt_s} for name, sensor in TEN_SENSORS.items()}
-    clock = {"clock.sim_dt_s": dt_s, "clock.ctrl_dt_s": dt_s}
-    overrides = {"rig": rig, "population.budget": None, **clock}
     probe = world_maker(ENV, seconds=2 * WARM_S, agents=1, background=0)(1)
-    cars = round(CARS_PER_KM2 * _area_m2(probe) / 1e6)
-    world = world_maker(
-        ENV, seconds=2 * WARM_S, agents=agents, background=cars - agents, overrides=overrides
-    )
-    simulation = world(1)
+    cars = round(CARS_PER_KM2 * _area_km2(probe))
+    simulation = world_maker(
+        ENV,
+        seconds=2 * WARM_S,
+        agents=agents,
+        background=cars - agents,
+        overrides={
+            "rig": rig,
+            "population.budget": None,
+            "clock.sim_dt_s": DT_S,
+            "clock.ctrl_dt_s": DT_S,
+        },
+    )(1)
     drive = DrivenWorld(simulation)
-    for _ in range(round(WARM_S / dt_s)):
+    for _ in range(round(WARM_S / DT_S)):
         drive.step(drive.commands())
     return simulation
 
@@ -163,7 +170,7 @@ def _mounted(simulation: Simulation) -> MountedSensors:
 
 
 class _Sensors:
-    """The ten sensors on all agents of one world, one at a time."""
+    """The sensors on all agents of one world, one at a time."""
 
     def __init__(self, simulation: Simulation) -> None:
         mounted = _mounted(simulation)

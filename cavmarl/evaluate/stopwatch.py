@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections import Counter
+from collections.abc import Callable
 from typing import Any
 
 __all__ = ["Stopwatch"]
@@ -12,17 +13,22 @@ CALIBRATION = 20_000  # empty calls
 
 
 class Stopwatch:
-    """Adds up the processor's time of named calls, less what it takes itself."""
+    """Adds up the time of named calls, less what it takes itself.
 
-    def __init__(self) -> None:
+    Args:
+        clock: in ns; by default the processor's time of this process.
+    """
+
+    def __init__(self, clock: Callable[[], int] = time.process_time_ns) -> None:
+        self._clock = clock
         self.spent: Counter[str] = Counter()
         self.calls: Counter[str] = Counter()
         self._inside = self._around = 0.0
         empty = self.around(_Nothing())
-        began = time.process_time_ns()
+        began = clock()
         for _ in range(CALIBRATION):
             empty.each("nothing")
-        self._around = (time.process_time_ns() - began) / CALIBRATION
+        self._around = (clock() - began) / CALIBRATION
         self._inside = self.spent["nothing"] / CALIBRATION
         self.clear()
 
@@ -33,7 +39,7 @@ class Stopwatch:
 
     def around(self, part: Any) -> Any:
         """What stands for a part of the runtime and times each call of its methods."""
-        return _Timed(self, part)
+        return _Timed(self, part, self._clock)
 
     def forget(self, *names: str) -> None:
         """As if they had never been called."""
@@ -57,23 +63,24 @@ class _Nothing:
 class _Timed:
     """Stands for a part of the runtime and times each call of its methods."""
 
-    def __init__(self, watch: Stopwatch, part: Any) -> None:
+    def __init__(self, watch: Stopwatch, part: Any, clock: Callable[[], int]) -> None:
         self._watch = watch
         self._part = part
+        self._clock = clock
 
     def __getattr__(self, name: str) -> Any:
         method = getattr(self._part, name)
         if not callable(method):  # a part's values do not change; asking again would take time
             self.__dict__[name] = method
             return method
-        watch = self._watch
+        watch, clock = self._watch, self._clock
 
         def timed(*arguments: Any) -> Any:
             # An executor's `each` runs the phase that its first argument names.
             phase = arguments[0] if name == "each" else name
-            began = time.process_time_ns()
+            began = clock()
             result = method(*arguments)
-            watch.spent[phase] += time.process_time_ns() - began
+            watch.spent[phase] += clock() - began
             watch.calls[phase] += 1
             return result
 

@@ -1,11 +1,12 @@
-"""`Wire`: frames over a TCP connection.
+"""`Wire`: frames over a connection.
 
-A frame is a head of fixed size, a letter (JSON, mostly a few numbers) and data (bytes of arrays,
-which both ends know the shapes of). Nothing in it is ever run: whoever sends one can say numbers.
+A frame is a head of fixed size, a letter (mostly a few numbers, as the dialect writes them: between
+hosts as JSON) and data (bytes of arrays, which both ends know the shapes of). Nothing in it is ever
+run: whoever sends one can say numbers.
 
     head    magic, version, kind, order, bytes of the letter, bytes of the data,
             checksum of the data, checksum of the head and the letter
-    letter  JSON in UTF-8; nothing if there is nothing to say
+    letter  nothing if there is nothing to say
     data    arrays one behind the other, as they lie in memory (little-endian)
 """
 
@@ -15,7 +16,7 @@ import json
 import socket
 import struct
 import zlib
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from enum import IntEnum
 from typing import Any, NamedTuple
 
@@ -24,7 +25,17 @@ from numpy.typing import NDArray
 
 from cavmarl.errors import CorruptMessageError, UnknownVersionError
 
-__all__ = ["MAGIC", "MAX_DATA", "MAX_LETTER", "VERSION", "Frame", "Kind", "Wire"]
+__all__ = [
+    "HOSTS",
+    "MAGIC",
+    "MAX_DATA",
+    "MAX_LETTER",
+    "VERSION",
+    "Dialect",
+    "Frame",
+    "Kind",
+    "Wire",
+]
 
 Array = NDArray[Any]
 
@@ -49,18 +60,58 @@ class Kind(IntEnum):
     FAILED = 4  # an exception: its class, its words, its traceback
 
 
+class Dialect(NamedTuple):
+    """What both ends of a connection agree on.
+
+    Attributes:
+        magic: four bytes that every frame begins with.
+        version: of everything that is said.
+        kinds: of frames.
+        max_letter: bytes of the longest letter.
+        max_data: bytes of the most data.
+        write: a letter's bytes.
+        read: the letter again; a ValueError says that it is none.
+        cure: what to do about another version.
+    """
+
+    magic: bytes
+    version: int
+    kinds: type[IntEnum]
+    max_letter: int
+    max_data: int
+    write: Callable[[Any], bytes]
+    read: Callable[[bytes], Any]
+    cure: str
+
+
+def _as_json(letter: Any) -> bytes:
+    return json.dumps(letter).encode()
+
+
+HOSTS = Dialect(
+    MAGIC,
+    VERSION,
+    Kind,
+    MAX_LETTER,
+    MAX_DATA,
+    _as_json,
+    json.loads,
+    "install the same cavmarl on all machines",
+)
+
+
 class Frame(NamedTuple):
     """What stands before a frame's data.
 
     Attributes:
         kind: what it says.
         order: which order it belongs to.
-        letter: as JSON knows it; None: nothing.
+        letter: as the dialect reads it; None: nothing.
         size: bytes of data.
         checksum: of them.
     """
 
-    kind: Kind
+    kind: IntEnum
     order: int
     letter: Any
     size: int
@@ -71,15 +122,18 @@ class Wire:
     """One end of a connection; everything blocks, at most as long as the socket's timeout.
 
     Args:
-        connection: a TCP socket, which the wire owns from here on.
+        connection: a socket of a stream, which the wire owns from here on.
+        dialect: that both ends speak.
 
     Attributes:
         is_torn: a frame was begun and not ended, so what follows cannot be understood.
     """
 
-    def __init__(self, connection: socket.socket) -> None:
-        connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+    def __init__(self, connection: socket.socket, dialect: Dialect = HOSTS) -> None:
+        if connection.family != socket.AF_UNIX:
+            connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         self._socket = connection
+        self._dialect = dialect
         self._frame: Frame | None = None
         self.is_torn = False
 
@@ -88,24 +142,25 @@ class Wire:
         return self._socket.fileno()
 
     def send(
-        self, kind: Kind, order: int, letter: Any = None, arrays: Sequence[Array] = ()
+        self, kind: IntEnum, order: int, letter: Any = None, arrays: Sequence[Array] = ()
     ) -> None:
         """Send one frame.
 
         Args:
             kind: what it says.
             order: which order it belongs to.
-            letter: as JSON knows it.
+            letter: as the dialect can write it.
             arrays: contiguous.
 
         Raises:
             OSError: the other end is gone, or does not read.
         """
-        text = b"" if letter is None else json.dumps(letter).encode()
+        dialect = self._dialect
+        text = b"" if letter is None else dialect.write(letter)
         data = [array.data.cast("B") for array in arrays if array.nbytes]
         checksum = _checksum(data)
         size = sum(len(piece) for piece in data)
-        head = _HEAD.pack(MAGIC, VERSION, kind, order, len(text), size, checksum)
+        head = _HEAD.pack(dialect.magic, dialect.version, kind, order, len(text), size, checksum)
         start = b"".join((head, _SUM.pack(zlib.crc32(text, zlib.crc32(head))), text))
         self.is_torn = True
         self._send_all([memoryview(start), *data])
@@ -119,23 +174,23 @@ class Wire:
             OSError: it is gone, or sends nothing.
             MessageError: this is no frame.
         """
+        dialect = self._dialect
         self.is_torn = True
         raw = self._read(_HEAD_BYTES)
         head = bytes(raw[: _HEAD.size])
         magic, version, kind, order, letter_size, size, checksum = _HEAD.unpack(head)
-        if magic != MAGIC:
+        if magic != dialect.magic:
             raise CorruptMessageError(f"{head[:4]!r} begins no frame")
-        if version != VERSION:
+        if version != dialect.version:
             raise UnknownVersionError(
-                f"a frame of version {version}, this is {VERSION}: install the same cavmarl on all "
-                "machines"
+                f"a frame of version {version}, this is {dialect.version}: {dialect.cure}"
             )
-        if letter_size > MAX_LETTER or size > MAX_DATA:
+        if letter_size > dialect.max_letter or size > dialect.max_data:
             raise CorruptMessageError(f"a frame of {letter_size} + {size} bytes is none")
         text = bytes(self._read(letter_size))
         if _SUM.unpack(raw[_HEAD.size :])[0] != zlib.crc32(text, zlib.crc32(head)):
             raise CorruptMessageError("the head of a frame is not what was sent")
-        self._frame = _frame(kind, order, text, size, checksum)
+        self._frame = _frame(dialect, kind, order, text, size, checksum)
         return self._frame
 
     def take(self, arrays: Sequence[Array]) -> None:
@@ -191,14 +246,15 @@ class Wire:
             piece = piece[got:]
 
 
-def _frame(kind: int, order: int, text: bytes, size: int, checksum: int) -> Frame:
+def _frame(dialect: Dialect, kind: int, order: int, text: bytes, size: int, checksum: int) -> Frame:
     """The same, understood.
 
     Raises:
         CorruptMessageError: it says nothing that is known.
     """
     try:
-        return Frame(Kind(kind), order, json.loads(text) if text else None, size, checksum)
+        letter = dialect.read(text) if text else None
+        return Frame(dialect.kinds(kind), order, letter, size, checksum)
     except ValueError as error:
         raise CorruptMessageError(f"a frame that says nothing: {error}") from error
 

@@ -90,7 +90,7 @@ def _fill(grid: BirdsEye, semantic: int, out: NDArray[np.uint8]) -> None:
         grid.edges[c, 0] = sign * (face[c, 0] * face[d, 1] - face[d, 0] * face[c, 1])
         grid.edges[c, 1] = by_column
         grid.edges[c, 2] = sign * (face[d, 0] - face[c, 0])
-        grid.edges[c, 3] = 1.0 / by_column
+        grid.edges[c, 3] = 1.0 / by_column if by_column != 0.0 else 0.0
     for j in range(max(math.floor(top), 0), min(math.ceil(bottom), height)):
         begin, end = row_span(grid.edges, 4, j, width)
         out[j, begin:end] = semantic

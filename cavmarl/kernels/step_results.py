@@ -39,7 +39,7 @@ def report(outputs: Outputs, steps: NDArray[np.int64], horizon: int, results: Re
 
     Args:
         outputs: of the step.
-        steps: (W,) since each world's reset.
+        steps: (W,) since each world's reset; are counted.
         horizon: steps of an episode.
         results: are written.
 
@@ -48,6 +48,7 @@ def report(outputs: Outputs, steps: NDArray[np.int64], horizon: int, results: Re
     """
     ended = False
     for w in range(steps.size):
+        steps[w] += 1
         at_horizon = steps[w] >= horizon
         for agent in range(outputs.present.shape[1]):
             terminated = outputs.terminated[w, agent]

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cavmarl.errors import MapError
-from cavmarl.kernels.panorama import WALL
+from cavmarl.kernels.backdrop import WALL
 from cavmarl.maps.footprints import Footprint, read_footprints
 from cavmarl.roads.network import RoadNetwork
 from cavmarl.roads.reader import source_hash
@@ -20,6 +20,8 @@ __all__ = ["convex_parts", "walls_of", "with_buildings"]
 
 # Buildings that are farther from every road's bounding box than any sensor sees are left out.
 FARTHEST_M = 300.0
+LARGEST_M = 5000.0
+MOST_CORNERS = 4000
 
 
 def with_buildings(network: RoadNetwork, path: Path) -> RoadNetwork:
@@ -33,10 +35,13 @@ def with_buildings(network: RoadNetwork, path: Path) -> RoadNetwork:
         A network with another `source_hash`, for it has more than one source.
 
     Raises:
-        MapError: see `read_footprints`; or no building of the file lies on the map.
+        MapError: see `read_footprints`; or no building of the file lies on the map, or one of them
+            is too large to be any.
     """
     found = read_footprints(path, network.geo)
     near = [footprint for footprint in found if _is_near(network, footprint)]
+    for footprint in near:
+        _check_size(path, footprint)
     if not near:
         raise MapError(
             f"{path}: none of its {len(found)} buildings lies within {FARTHEST_M:g} m of the map "
@@ -61,6 +66,17 @@ def _is_near(network: RoadNetwork, footprint: Footprint) -> bool:
         (high >= np.array([min_x, min_y]) - FARTHEST_M).all()
         and (low <= np.array([max_x, max_y]) + FARTHEST_M).all()
     )
+
+
+def _check_size(path: Path, footprint: Footprint) -> None:
+    """Refuse what would take all memory or time, and is no building."""
+    corners = np.concatenate(footprint.rings)
+    size_m = float(np.ptp(corners, axis=0).max())
+    if size_m > LARGEST_M or len(corners) > MOST_CORNERS:
+        raise MapError(
+            f"{path}: {footprint.name} is {size_m:.0f} m long and has {len(corners)} corners, more "
+            f"than {LARGEST_M:g} m or {MOST_CORNERS}: remove it"
+        )
 
 
 def walls_of(footprints: list[Footprint]) -> NDArray[np.void]:

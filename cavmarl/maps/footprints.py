@@ -28,6 +28,7 @@ LEVEL_M = 3.0  # of a building of which only the levels are known
 _NO_WALLS = frozenset(("no", "roof", "carport", "canopy", "demolished", "ruins"))
 _METRES = re.compile(r"\s*([0-9]+(?:\.[0-9]+)?)\s*(?:m|metres?)?\s*")
 _MOST_HEIGHT_M = 1000.0
+_DIGITS = 6  # of a metre; sides that are nearly level would have endless slopes
 
 
 @dataclass(frozen=True)
@@ -63,7 +64,11 @@ def read_footprints(path: Path, geo: GeoReference | None) -> list[Footprint]:
     if reader.root == "osm":
         return list(_osm_buildings(path, reader, geo))
     if reader.root in ("additional", "polygons", "shapes"):
-        return reader.polygons
+        found = [
+            Footprint(element.name, _rings([ring]), _height_m(element.tags))
+            for element, ring in reader.polygons
+        ]
+        return [footprint for footprint in found if footprint.rings]
     raise MapError(
         f"{path}: <{reader.root}> is the root of no file of buildings: give an OpenStreetMap "
         "extract (<osm>) or SUMO polygons (<additional>, .poly.xml)"
@@ -72,7 +77,7 @@ def read_footprints(path: Path, geo: GeoReference | None) -> list[Footprint]:
 
 @dataclass
 class _Element:
-    """An OSM way or relation while it is read."""
+    """A way or relation of OSM, or a polygon of SUMO, with what is said of it."""
 
     name: str
     line: int
@@ -95,7 +100,7 @@ class _Reader(ContentHandler):
         self.places: dict[str, tuple[float, float]] = {}
         self.ways: dict[str, _Element] = {}
         self.relations: list[_Element] = []
-        self.polygons: list[Footprint] = []
+        self.polygons: list[tuple[_Element, Ring]] = []
         self._open: _Element | None = None
         self._path = path
         self._geo = geo
@@ -111,7 +116,7 @@ class _Reader(ContentHandler):
             raise self._error(name, f"holds no numbers ({error})") from error
 
     def endElement(self, name: str) -> None:
-        if name in ("way", "relation"):
+        if name in ("way", "relation", "poly"):
             self._open = None
 
     def _take(self, name: str, attrs: Mapping[str, str]) -> None:
@@ -134,19 +139,19 @@ class _Reader(ContentHandler):
         elif name == "location":
             self._check_location(attrs)
         elif name == "poly" and attrs.get("type", "").startswith("building"):
-            self.polygons.append(self._polygon(attrs))
+            self._open = _Element(f"poly {attrs['id']}", self._locator.getLineNumber())
+            self.polygons.append((self._open, self._ring(attrs)))
+        elif name == "param" and self._open is not None:
+            self._open.tags[attrs["key"]] = attrs["value"]
 
-    def _polygon(self, attrs: Mapping[str, str]) -> Footprint:
-        corners = [
+    def _ring(self, attrs: Mapping[str, str]) -> Ring:
+        places = [
             _finite(tuple(map(float, word.split(",")[:2]))) for word in attrs["shape"].split()
         ]
-        ring = np.array(corners, dtype=np.float64).reshape(-1, 2)
+        ring = np.array(places, dtype=np.float64).reshape(-1, 2)
         if attrs.get("geo", "false") in ("1", "true"):
             ring = _project(self._path, ring, self._geo)
-        height_m = float(attrs["height"]) if "height" in attrs else DEFAULT_HEIGHT_M
-        if not 0.0 < height_m <= _MOST_HEIGHT_M:
-            raise ValueError(f"height {height_m!r}")
-        return Footprint(f"poly {attrs['id']}", _rings([ring]), height_m)
+        return ring
 
     def _check_location(self, attrs: Mapping[str, str]) -> None:
         """Refuse polygons that were made for a network at another place."""
@@ -214,11 +219,10 @@ def _closed(ways: list[list[str]]) -> list[list[str]]:
 
 
 def _rings(rings: list[Ring]) -> tuple[Ring, ...]:
-    """Those with at least three corners, without the first one again at the end."""
-    open_rings = [
-        ring[:-1] if len(ring) and (ring[0] == ring[-1]).all() else ring for ring in rings
-    ]
-    return tuple(ring for ring in open_rings if len(ring) >= 3)
+    """Those with at least three corners, to the micrometre, without the first one at the end."""
+    rounded = [np.round(ring, _DIGITS) for ring in rings]
+    opened = [ring[:-1] if len(ring) and (ring[0] == ring[-1]).all() else ring for ring in rounded]
+    return tuple(ring for ring in opened if len(ring) >= 3)
 
 
 def _height_m(tags: Mapping[str, str]) -> float:
@@ -240,4 +244,9 @@ def _project(path: Path, ring: Ring, geo: GeoReference | None) -> Ring:
     pyproj: Any = require("pyproj", "maps")
     x, y = pyproj.Proj(projparams=geo.projection)(ring[:, 0], ring[:, 1])
     placed: Ring = np.stack([x + geo.offset_x_m, y + geo.offset_y_m], axis=1)
+    if not np.isfinite(placed).all():
+        raise MapError(
+            f"{path}: a building near longitude {ring[0, 0]:g}, latitude {ring[0, 1]:g} cannot be "
+            "projected as the map is: export the file again for this map"
+        )
     return placed

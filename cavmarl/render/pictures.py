@@ -13,10 +13,12 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from cavmarl.config import EnvConfig
 from cavmarl.registry import load_config
 from cavmarl.render.camera import Bounds
 from cavmarl.render.canvas import load_pygame
 from cavmarl.render.topdown import TopDownRenderer
+from cavmarl.roads.network import RoadNetwork
 from cavmarl.runtime.simulation import Simulation
 from cavmarl.shard.shard import Commands
 from cavmarl.worlds import load_roads
@@ -24,7 +26,7 @@ from cavmarl.worlds import load_roads
 if TYPE_CHECKING:
     from pygame import Surface
 
-__all__ = ["PICTURES", "Picture", "draw_picture", "write_pictures"]
+__all__ = ["PICTURES", "Picture", "draw_picture", "moment", "write_pictures"]
 
 SEED = 0
 
@@ -83,15 +85,7 @@ def draw_picture(picture: Picture) -> Surface:
         overrides={"zones.approach_ticks": picture.approach_ticks},
     )
     network = load_roads(config, folder)
-    simulation = Simulation(config, network)
-    simulation.seed(SEED)
-    simulation.reset()
-    suggested = np.zeros((1, config.population.num_ids, 2))
-    for _ in range(round(picture.time_s / config.clock.ctrl_dt_s)):
-        simulation.suggest(suggested)
-        meta = suggested[..., 0].astype(np.int64)
-        simulation.step(Commands(suggested, meta))
-        simulation.retire_agents()
+    simulation = moment(config, network, picture.time_s)
     renderer = TopDownRenderer(network, picture.size, picture.focus, simulation.goal_edges)
     return renderer.draw(
         simulation.vehicles(),
@@ -101,6 +95,20 @@ def draw_picture(picture: Picture) -> Surface:
         zones=simulation.zone_view() if simulation.partition.count > 1 else None,
         ghosts_of=picture.ghosts_of,
     )
+
+
+def moment(config: EnvConfig, network: RoadNetwork, time_s: float) -> Simulation:
+    """A seeded world in which the built-in driver has had all seats for so long."""
+    simulation = Simulation(config, network)
+    simulation.seed(SEED)
+    simulation.reset()
+    suggested = np.zeros((1, config.population.num_ids, 2))
+    for _ in range(round(time_s / config.clock.ctrl_dt_s)):
+        simulation.suggest(suggested)
+        meta = suggested[..., 0].astype(np.int64)
+        simulation.step(Commands(suggested, meta))
+        simulation.retire_agents()
+    return simulation
 
 
 def write_pictures(folder: Path) -> list[Path]:

@@ -6,8 +6,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cavmarl.errors import ConfigError
+from cavmarl.kernels.backdrop import Backdrop
+from cavmarl.kernels.codes import CLASS_PEDESTRIAN
 from cavmarl.kernels.neighbors import Grid, cell_at, make_grid
-from cavmarl.kernels.panorama import Backdrop
 from cavmarl.kernels.semantics import SEMANTIC_OF_CLASS
 from cavmarl.roads.network import VEHICLE_CLASSES, RoadNetwork
 
@@ -20,6 +21,8 @@ STRIP_M = 24.0
 OVERLAP_M = 0.05
 # A sharp bend is not carried farther out than this many half widths.
 LONGEST_MITRE = 2.0
+
+_CLASS_NAMES = {**dict(enumerate(VEHICLE_CLASSES)), CLASS_PEDESTRIAN: "pedestrian"}
 
 
 def make_backdrop(network: RoadNetwork, types: NDArray[np.void]) -> Backdrop:
@@ -53,7 +56,7 @@ def make_backdrop(network: RoadNetwork, types: NDArray[np.void]) -> Backdrop:
 
 def _semantics(types: NDArray[np.void]) -> NDArray[np.uint8]:
     """(num_types,) the semantic class of each type."""
-    names = [VEHICLE_CLASSES[vclass] for vclass in types["vclass"]]
+    names = [_CLASS_NAMES.get(vclass, f"number {vclass}") for vclass in types["vclass"].tolist()]
     unknown = sorted(set(names) - set(SEMANTIC_OF_CLASS))
     if unknown:
         raise ConfigError(f"vehicle class {', '.join(unknown)}: cameras have no class for it")

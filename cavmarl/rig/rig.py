@@ -74,6 +74,7 @@ class Rig:
             for place, sensor in enumerate(mount(settings, platform))
         ]
         self.sense: Sense = sense_here
+        self._is_new = True
         self._everywhere = np.ones(len(ids), dtype=np.bool_)
         self._call_roll = repeated(call_roll)
         self._note_poses = repeated(note_poses)
@@ -96,6 +97,10 @@ class Rig:
 
     def reset(self, scenes: Sequence[Scene], chosen: NDArray[np.bool_]) -> None:
         """Forget what there was in the chosen worlds (W,), and take what is due at the reset."""
+        if self._is_new:  # kernels are loaded now, and not in the first tick that asks for them
+            self._is_new = False
+            for mounted in self._mounted:
+                mounted.rehearse(scenes)
         self._before["id"][chosen] = -1
         for mounted in self._mounted:
             mounted.clear(chosen)
@@ -153,6 +158,16 @@ class _Mounted:
         """Write zeros for some worlds (W,), or agents (W, A)."""
         for array in self.frames:
             array[chosen] = 0
+
+    def rehearse(self, scenes: Sequence[Scene]) -> None:
+        """Take a sample in every world, and leave everything as it was."""
+        kept = self.frames.copy()
+        for array, value in zip(self.turn.due, (1, 0, 0), strict=True):
+            array[:] = value
+        sense_here(scenes, [self.turn])
+        self.deliver(scenes)
+        for array, before in zip(self.frames, kept, strict=True):
+            array[...] = before
 
     def is_due(self, ticks: NDArray[np.int64], chosen: NDArray[np.bool_]) -> bool:
         """Whether anything is, in the chosen worlds (W,); how much is noted in its turn."""

@@ -71,6 +71,7 @@ class Attached(Protocol):
     def arrays(self) -> Iterator[NDArray[Any]]:
         """All that outlives a tick, always the same arrays (W, …); the state's hash is over them.
 
-        An item of one world must not say how it is divided or where its rows lie.
+        An item of one world must not say how it is divided or where its rows lie, and records have
+        no gaps between their fields: what stands there is not kept.
         """
         ...

@@ -140,12 +140,21 @@ def _compiled_look(theirs: Words, number: int, yields: bool) -> bool:
 
 
 @kernel
+def _compiled_pass() -> None:
+    _let_others_run()
+
+
+@kernel
 def _compiled_core() -> int:
     return _core()  # type: ignore[no-any-return]
 
 
 def _plain_core() -> int:
     return -1
+
+
+def _plain_pass() -> None:
+    pass
 
 
 def _plain_has(theirs: Words, number: int) -> bool:
@@ -161,13 +170,14 @@ def _plain_look(theirs: Words, number: int, yields: bool) -> bool:
     return bool(theirs[NUMBER] >= number)
 
 
-_has, _set, _look, present_core = (
-    (_plain_has, _plain_set, _plain_look, _plain_core)
+_has, _set, _look, _pass, present_core = (
+    (_plain_has, _plain_set, _plain_look, _plain_pass, _plain_core)
     if _IS_PYTHON
     else (
         repeated(_compiled_has),
         repeated(_compiled_set),
         repeated(_compiled_look),
+        repeated(_compiled_pass),
         repeated(_compiled_core),
     )
 )
@@ -179,6 +189,7 @@ def load_kernels() -> None:
     _set(words, NUMBER, 1, words)
     _has(words, 1)
     _look(words, 1, True)
+    _pass()
     present_core()
 
 
@@ -218,6 +229,8 @@ class Meeting:
         """Tell the other side that this one has come to a number."""
         if self.announce(number):
             self.wake()
+        elif self._crowded:
+            _pass()  # the other side may look from this core
 
     def announce(self, number: int) -> int:
         """Come to a number; not 0: the other side sleeps, and has to be woken."""
@@ -246,6 +259,8 @@ class Meeting:
         """
         if _look(self.theirs, number, self._crowded):
             return True
+        if self._last_s > LONG_WORK_S and not is_soon:
+            return False
         is_soon |= self._last_s < LONG_S and work_s < LONG_WORK_S
         end = time.perf_counter() + (LONG_S if is_soon else SHORT_S)
         while time.perf_counter() < end:

@@ -10,7 +10,6 @@ fault, obeyed; each is counted, and what has passed the master by is noticed bef
 
 from __future__ import annotations
 
-from collections import deque
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -151,8 +150,9 @@ class TimeMaster:
 
     Attributes:
         tick: ticks by this master; no reset sets it back.
-        events: the last ones.
+        events: the first ones; of those that follow only the counts are kept.
         own_ticks: how often all followers wanted to tick by themselves.
+        drifts: how often a world was not where the master had left it.
         drift_ticks: by how many ticks the first world has gone on without the master.
 
     Raises:
@@ -177,8 +177,8 @@ class TimeMaster:
         self.env = env
         self.dt_s = env.config.clock.sim_dt_s
         self.tick = 0
-        self.events: deque[ClockEvent] = deque(maxlen=KEPT_EVENTS)
-        self.own_ticks = self.drift_ticks = 0
+        self.events: list[ClockEvent] = []
+        self.own_ticks = self.drifts = self.drift_ticks = 0
         self._pacer = Unpaced() if pacer is None else pacer
         self._answer, self._on_drift, self._trace = own_ticks, on_drift, trace
         self._per_step = env.config.clock.ticks_per_step
@@ -252,7 +252,8 @@ class TimeMaster:
         """
         if self.env.worlds is not self._mastered:
             raise ClockError("this master has been released: make another TimeMaster")
-        return self._mastered.worlds
+        worlds: _Worlds = self._mastered.worlds
+        return worlds
 
     def check_turn(self, what: str) -> None:
         """Refuse whoever is not the master.
@@ -303,7 +304,8 @@ class TimeMaster:
         (drifted,) = np.nonzero(found != self._left)
         world = int(drifted[0])
         extra = int(found[world] - self._left[world])
-        self.events.append(ClockEvent(self.tick, "drift", "", extra))
+        self.drifts += 1
+        self._keep(ClockEvent(self.tick, "drift", "", extra))
         self.drift_ticks += int(found[0] - self._left[0])
         left, self._left = self._left, found
         if self._on_drift == "error":
@@ -320,7 +322,7 @@ class TimeMaster:
             TickRefusedError: `own_ticks` is `refuse`.
         """
         self.own_ticks += 1
-        self.events.append(ClockEvent(self.tick, "own_tick", follower.name, self._per_step))
+        self._keep(ClockEvent(self.tick, "own_tick", follower.name, self._per_step))
         if self._answer == "refuse":
             raise TickRefusedError(
                 f"follower '{follower.name}' ticks by itself at {self.time_s:g} s: only the time "
@@ -330,3 +332,7 @@ class TimeMaster:
             return False
         self._mine().step(self._last)
         return True
+
+    def _keep(self, event: ClockEvent) -> None:
+        if len(self.events) < KEPT_EVENTS:
+            self.events.append(event)

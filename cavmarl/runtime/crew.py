@@ -74,6 +74,7 @@ class Crew:
         self._poll = select.poll()
         self._held = _Held(list(program.segments))
         self._meetings: dict[int, Meeting] = {}
+        self._heard: list[int] = []  # workers whose messages have woken this side, and lie there
         try:
             if not hasattr(os, "pidfd_open"):
                 raise WorkerStartError("workers need Linux 5.3 or later: use workers=0")
@@ -154,16 +155,17 @@ class Crew:
             the dead, by worker.
         """
         ready: set[int] = set()
+        for k in self._heard:  # now, and not when they are heard: then every microsecond counts
+            self.processes[k].collect()
         lying = [self._meetings[k].lie_down(self.number(k)) for k in pending]
         if all(lying):
             ready = {fd for fd, _ in self._poll.poll(1000.0 * limit_s)}
         for k in pending:
             self._meetings[k].get_up()
         if not ready:
+            self._heard = []
             return {}
-        for process in self.processes.values():
-            if process.wire.fileno() in ready:
-                process.collect()
+        self._heard = [k for k, one in self.processes.items() if one.wire.fileno() in ready]
         return {k: process for k, process in self.processes.items() if process.pidfd in ready}
 
     def settle(self, k: int, limit_s: float) -> bool:

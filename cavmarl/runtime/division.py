@@ -19,8 +19,9 @@ from cavmarl.errors import ZoneError
 from cavmarl.kernels.arrays import Worlds, Zoned
 from cavmarl.kernels.borders import Borders, pass_on
 from cavmarl.kernels.exchange import exchange, take_own
-from cavmarl.kernels.handing_over import look, make_book
+from cavmarl.kernels.handing_over import hand_over, look, make_book, release
 from cavmarl.kernels.repeated import repeated
+from cavmarl.kernels.tallies import totals
 from cavmarl.kernels.zones import Halo, ZoneArrays, zone_of
 from cavmarl.ownership.messages import Birth, Switch
 from cavmarl.roads.zone_statistics import imbalance
@@ -66,6 +67,8 @@ class Division:
         borders: when a vehicle is near one.
         codec: of vehicles' states.
         book: who is near a border.
+        call_hand_over: the kernel, with the types of all worlds' arrays found out once.
+        call_release: the same.
     """
 
     def __init__(
@@ -92,6 +95,9 @@ class Division:
         self._call_exchange = repeated(exchange)
         self._look = repeated(look)
         self._pass_on = repeated(pass_on)
+        self._totals = repeated(totals)
+        self.call_hand_over = repeated(hand_over)
+        self.call_release = repeated(release)
 
     @property
     def count(self) -> int:
@@ -357,7 +363,9 @@ class Division:
 
     def running(self) -> NDArray[np.int64]:
         """(W,) vehicles of each world."""
-        return np.asarray(self._zoned.num_owned.sum(axis=0))
+        running = np.empty(self.num_worlds, dtype=np.int64)
+        self._totals(self._zoned.num_owned, running)
+        return running
 
     def loads(self) -> ZoneLoads:
         """What each zone holds."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 import mmap
 import zlib
 from collections.abc import Iterator, Sequence
+from operator import is_
 from typing import Any, NamedTuple
 
 import numba.core.config
@@ -51,9 +52,11 @@ class Image:
     def __init__(self, segment: Segment) -> None:
         self._segment = segment
         self._memory: mmap.mmap | None = None
-        self._words = np.zeros(0, dtype=np.int64)
+        self._map_words(np.zeros(0, dtype=np.int64))
         self._begin = 0  # of the first array
         self._places: list[_Place] = []
+        self._written: Arrays = ()  # the last time
+        self._copies: list[tuple[Array, Array]] = []  # to where, from where
 
     def write(self, arrays: Arrays) -> None:
         """Copy arrays into it, of the same dtypes as the last time.
@@ -61,16 +64,28 @@ class Image:
         Raises:
             OSError: there is no memory for them.
         """
+        if len(arrays) != len(self._written) or not all(map(is_, arrays, self._written)):
+            self._find_places(arrays)
+        for target, source in self._copies:
+            target[...] = source
+        if _IS_PYTHON:
+            self._words[1] = _checksum(self._words[2 : self._words.item(0)])
+        else:
+            _seal(self._unsigned)
+
+    def _find_places(self, arrays: Arrays) -> None:
+        """Say what has to be copied where."""
         shapes = [array.shape for array in arrays]
         same = _num_same(shapes, self._places)
         if len(arrays) != len(self._places):
             self._lay_out(arrays, 0)
         elif same < len(arrays):
             self._lay_out(arrays, same)
-        for array, place in zip(arrays, self._places, strict=True):
-            place.target[...] = array.view(place.target.dtype)
-        words = self._words
-        words[1] = _checksum(words[2 : words.item(0)])
+        self._written = tuple(arrays)
+        self._copies = [
+            (place.target, array.view(place.target.dtype))
+            for array, place in zip(arrays, self._places, strict=True)
+        ]
 
     def _lay_out(self, arrays: Arrays, same: int) -> None:
         """Say where each array goes; the first ones go where they went the last time.
@@ -137,6 +152,7 @@ class Image:
         """
         self._make_room(content.size)
         self._places.clear()  # its arrays may lie elsewhere
+        self._written = ()
         self._words.view(np.uint8)[: content.size] = content
 
     def _make_room(self, size: int) -> bool:
@@ -150,7 +166,11 @@ class Image:
     def _map_all(self) -> None:
         """Map the segment as large as it is by now, whoever has made it so."""
         self._memory = self._segment.map()
-        self._words = np.frombuffer(self._memory, dtype=np.int64)
+        self._map_words(np.frombuffer(self._memory, dtype=np.int64))
+
+    def _map_words(self, words: NDArray[np.int64]) -> None:
+        self._words = words
+        self._unsigned = words.view(np.uint64)
 
 
 @kernel
@@ -169,7 +189,13 @@ def _mixed(words: NDArray[np.uint64]) -> np.uint64:
     return (((((a * prime) ^ b) * prime) ^ c) * prime) ^ d
 
 
-_mix = repeated(_mixed)
+@kernel
+def _sealed(words: NDArray[np.uint64]) -> None:
+    """Write the checksum of an image into it."""
+    words[1] = _mixed(words[2 : int(words[0])])
+
+
+_mix, _seal = repeated(_mixed), repeated(_sealed)
 
 
 def _num_words(array: Array) -> int:
@@ -192,4 +218,6 @@ def _checksum(words: NDArray[np.int64]) -> int:
 
 def load_kernels() -> None:
     """Have the checksum ready, for this process and those that it forks."""
-    _checksum(np.zeros(_HEAD, dtype=np.int64))
+    words = np.full(_HEAD, _HEAD, dtype=np.int64)
+    _checksum(words)
+    _seal(words.view(np.uint64))

@@ -143,6 +143,8 @@ class Pool:
         self._ordered_s = time.monotonic()
         head = (task, mail is not None, slot, self._truth)
         self._crew.order(workers, head, self._stale, mail)
+        if workers == self._all:
+            self._crew.keep_apart()  # now, as there is time: where they were with the last order
         self._await(workers, mail)
         answers = self._read(workers)
         for k in workers:
@@ -172,8 +174,6 @@ class Pool:
         pending = [k for k in workers if not self._crew.watch(k)]
         if pending:
             self._await_asleep(pending, mail)
-            if workers == self._all:
-                self._crew.keep_apart()
         lasted_s = time.perf_counter() - began
         for k in workers:
             self._crew.lasted(k, lasted_s)
@@ -188,6 +188,8 @@ class Pool:
             if len(pending) < len(asked):  # orders are shared out so that all end together
                 pending = [k for k in pending if not self._crew.watch(k, is_soon=True)]
             self._note_done(first, pending)
+            if not (pending or dead):
+                break
             suspects = dict.fromkeys(dead, "") or guard.hanging(pending)
             suspected = {k: self._crew.processes[k] for k in suspects} | dead
             for k, cause in suspects.items():

@@ -91,14 +91,16 @@ class SensorFarm:
 
     Attributes:
         times: where the time has gone.
+        shared: with the processes, once they have been started.
     """
+
+    shared: SceneArrays
 
     def __init__(self, plan: FarmPlan) -> None:
         self.times = FarmTimes()
         self._plan = plan
         self._pool: Pool | None = None
         self._unused = weakref.finalize(self, plan.frames.close)
-        self._shared: SceneArrays
         self._costs_s = np.zeros(plan.shape.sensors)
         self._shares: dict[tuple[int, ...], tuple[Shares, int]] = {}
         self._written: Shares | None = None
@@ -138,7 +140,7 @@ class SensorFarm:
         sense_here(scenes, [turn for turn in turns if turn.sensor.stamps_itself])
         sensed = perf_counter()
         pool.run(SensorTask.SENSE, commits=False)
-        self._check(theirs)
+        self.check(theirs)
         ended = perf_counter()
         self._note_costs(theirs, shares)
         self._note(began, published, sensed, ended, theirs)
@@ -158,7 +160,7 @@ class SensorFarm:
     def _start(self) -> Pool:
         plan = self._plan
         scene = Segment.make(size_of(plan.shape.layout))
-        self._shared = SceneArrays.of(scene, plan.shape)
+        self.shared = SceneArrays.of(scene, plan.shape)
         told = {"shape": plan.shape, "scene": scene.fd, "frames": plan.frames.fd}
         recipe = {**plan.recipe, **told}
         names = tuple(f"sensor worker {k}" for k in range(plan.shape.workers))
@@ -168,7 +170,7 @@ class SensorFarm:
 
     def _publish(self, scenes: Sequence[Scene], turns: Sequence[Turn]) -> None:
         """Write down what there is to see; the rows of all zones, each once."""
-        shared, worlds = self._shared, scenes[0].worlds
+        shared, worlds = self.shared, scenes[0].worlds
         shared.num_rows[:] = 0
         for scene in scenes:
             self._gather(scene.worlds, True, shared.rows, shared.num_rows)
@@ -184,13 +186,13 @@ class SensorFarm:
             shared.due[turn.place] = turn.due
         shared.delivered[:] = NEVER
 
-    def _check(self, turns: Sequence[Turn]) -> None:
+    def check(self, turns: Sequence[Turn]) -> None:
         """See that every worker has delivered every frame that is due, of this tick.
 
         Raises:
             SensorFrameError: the first that is not.
         """
-        shared = self._shared
+        shared = self.shared
         for turn in turns:
             wrong = (shared.delivered[:, turn.place] != shared.ticks) & (turn.due.num > 0)
             if wrong.any():
@@ -206,7 +208,7 @@ class SensorFarm:
         self._shares[sensors] = (shares, uses + 1)
         if shares is not self._written:
             self._written = shares
-            shares.write(self._shared.share.reshape(len(self._shared.share), -1))
+            shares.write(self.shared.share.reshape(len(self.shared.share), -1))
         return shares
 
     @property
@@ -226,8 +228,8 @@ class SensorFarm:
 
     def _note_costs(self, turns: Sequence[Turn], shares: Shares) -> None:
         """What an agent's frame of each sensor costs."""
-        spent_s = self._shared.spent_s.sum(axis=0)
-        agents = max(1, int(self._shared.num_agents.sum()))
+        spent_s = self.shared.spent_s.sum(axis=0)
+        agents = max(1, int(self.shared.num_agents.sum()))
         for turn in turns:
             cost_s = spent_s[turn.place] / agents
             known = self._costs_s[turn.place]
@@ -242,7 +244,7 @@ class SensorFarm:
         turns: Sequence[Turn],
     ) -> None:
         """Add up what a tick has taken; times are those of `time.perf_counter`."""
-        times, shared = self.times, self._shared
+        times, shared = self.times, self.shared
         times.publish_s += published - began
         times.own_s += sensed - published
         times.wait_s += ended - sensed

@@ -75,11 +75,7 @@ def cut(sensors: Sequence[int], agents: int, workers: int) -> list[Unit]:
     """What is to be shared out of some sensors of all agents."""
     pieces = min(agents, PIECES_A_WORKER * workers)
     bounds = [agents * piece // pieces for piece in range(pieces + 1)]
-    return [
-        Unit(sensor, first, last)
-        for sensor in sensors
-        for first, last in pairwise(bounds)
-    ]
+    return [Unit(sensor, first, last) for sensor in sensors for first, last in pairwise(bounds)]
 
 
 def share_in_turn(units: Sequence[Unit], costs_s: Sequence[float], workers: int) -> Shares:

@@ -33,7 +33,9 @@ from cavmarl.kernels.codes import (
     SUM_DISTANCE_M,
     SUM_TIME_S,
 )
+from cavmarl.kernels.repeated import repeated
 from cavmarl.kernels.rng import world_key
+from cavmarl.kernels.tallies import begins_second, count_tick
 from cavmarl.ownership.messages import Switch
 from cavmarl.ownership.transfers import TransferLog
 from cavmarl.rig.catalogue import frame_layout, frames_in
@@ -60,7 +62,7 @@ from cavmarl.runtime.refereeing import make_refereeing
 from cavmarl.runtime.reproducer import Reproducer
 from cavmarl.runtime.reproducing import Keeper, Moment, sources_of
 from cavmarl.runtime.shard_clock import ShardClock
-from cavmarl.runtime.step_trace import Traced
+from cavmarl.runtime.step_trace import MIRROR, SUMO, Traced
 from cavmarl.runtime.store import CommittedStore
 from cavmarl.runtime.zone_view import ZoneView, view_zones
 from cavmarl.shard.shard import Commands, Shard
@@ -190,6 +192,8 @@ class Simulation:
             )
             self._shard = self._shards[0]
             self._executor: Executor = SerialExecutor(self._shards)
+            self._count_tick = repeated(count_tick)
+            self._begins_second = repeated(begins_second)
             self._attached: tuple[Attached, ...] = attach(
                 Host(
                     config,
@@ -208,6 +212,7 @@ class Simulation:
             self._keeper: Keeper | None = None
             self._recutter: Recutter | None = None
             self._sumo: SumoTraffic | None = None
+            self._note_phase: Callable[[str], None] = _pass_over
             if is_first or warm:
                 self._call_every_kernel()
             if sumo is not None:
@@ -266,7 +271,7 @@ class Simulation:
         self.suggest(controls)
         self.step(Commands(controls, np.full(shape, ACTION_IDLE, dtype=np.int64)))
         # Once more what is only called when somebody leaves or waits.
-        self._let_in()
+        self._let_in(all_phases=True)
         self._executor.each("retire", self._gate)
         self._executor.each("forget", self._gate)
         self._traffic.settle(self._gate, self._shard.worlds)
@@ -324,6 +329,11 @@ class Simulation:
     def goal_edges(self) -> NDArray[np.int32]:
         """EDGE rows of the goals, by `VEHICLE["goal"]`."""
         return self._traffic.goal_edges
+
+    @property
+    def types(self) -> NDArray[np.void]:
+        """VTYPE (num_types,), by `VEHICLE["vtype"]`."""
+        return self._shard.travel.types
 
     @property
     def scene(self) -> Scene | None:
@@ -548,6 +558,7 @@ class Simulation:
         A part that has phases of its own (another simulator's step, say) has a method `trace`.
         """
         self._executor = wrap(self._executor)
+        self._note_phase = note
         for part in self._attached:
             if isinstance(part, Traced):
                 part.trace(note)
@@ -607,21 +618,24 @@ class Simulation:
         self._executor.each("resolve")
         self._enter()
         self._executor.each("commit")
-        ticks = self._shard.worlds.ticks
-        ticks += 1
+        self._count_tick(self._shard.worlds.ticks)
         self._switch_signals()
 
     def _follow_sumo(self, sumo: SumoTraffic) -> None:
         """SUMO takes its step; who is its own stands where it is then, or leaves."""
         gate, worlds, side = self._gate, self._shard.worlds, self._division.next_side
-        if sumo.step(worlds, side):
+        self._note_phase(SUMO)
+        sumo.step(worlds, side)
+        if not sumo.drives:
+            sumo.send_on(gate, worlds, side)
+            return
+        self._note_phase(MIRROR)
+        if sumo.mirror(worlds, side):
             for shard in self._shards:
                 shard.dismiss(gate)
             self._note_left()
             sumo.forgive(gate)
             self._traffic.settle(gate, worlds)
-        if not sumo.drives:
-            sumo.send_on(gate, worlds, side)
 
     @property
     def sumo(self) -> SumoTraffic | None:
@@ -648,8 +662,7 @@ class Simulation:
     def _leave(self) -> None:
         """Who needs it picks another goal, who has arrived leaves, who looks for a way finds it."""
         traffic, gate, worlds = self._traffic, self._gate, self._shard.worlds
-        per_s = traffic.ticks_per_s
-        begins_second = any(tick % per_s == 0 for tick in worlds.ticks.tolist())
+        begins_second = self._begins_second(worlds.ticks, traffic.ticks_per_s)
         if begins_second:
             self._executor.each("choose_goals", traffic.demand, len(traffic.plans), gate)
         self._executor.each("leave", gate)
@@ -674,14 +687,20 @@ class Simulation:
                 self._admit()
         traffic.call_orders(gate, worlds)
         if any(gate.num_queue.tolist()):
-            self._let_in()
+            self._let_in(all_phases=self._recovery is not None)
 
-    def _let_in(self) -> None:
-        """Rank → assign → propose → accept → admit."""
+    def _let_in(self, all_phases: bool) -> None:
+        """Rank → assign → propose, and if anybody has found a gap, accept → admit.
+
+        Args:
+            all_phases: go through the last two in any case: hosts may die in each of them.
+        """
         traffic, gate, worlds = self._traffic, self._gate, self._shard.worlds
         self._executor.each("rank_lanes", gate)
         traffic.assign_lanes(gate, worlds)
         self._executor.each("propose", traffic.demand, gate)
+        if not (all_phases or any(gate.num_passing.tolist())):
+            return
         traffic.accept(gate, self._division.running())
         self._admit()
 
@@ -841,6 +860,10 @@ class Simulation:
 def _frames(config: EnvConfig, num_worlds: int, zeros: Zeros) -> Frames:
     layout = frame_layout(config, num_worlds)
     return frames_in({name: zeros(shape, dtype=kind) for name, (kind, shape) in layout.items()})
+
+
+def _pass_over(phase: str) -> None:
+    """What is done with the names of phases where nobody asks for them."""
 
 
 def _cut(config: EnvConfig, network: RoadNetwork) -> ZonePartition:

@@ -25,7 +25,8 @@ QUEUE = "queue"  # they wait for the next cycle
 PHASES = (SUMO, MIRROR, TICK, SENSORS, STACK, QUEUE)
 
 # Phases of the runtime's executor that are phases of a cycle.
-_OF_EXECUTOR = {"advance": TICK, "sense": SENSORS}
+# The world is at t + Δt when its rows are committed; those that SUMO moves have moved by then.
+_OF_EXECUTOR = {"commit": TICK, "sense": SENSORS}
 
 
 @runtime_checkable

@@ -237,18 +237,19 @@ def _obey(job: Job, meeting: Meeting, slots: Sequence[Image]) -> NoReturn:
         _await(meeting, order, time.perf_counter() - began)
         began = time.perf_counter()
         core = present_core()
-        letter = _receive(meeting.wire) if theirs[LETTER] else None
+        number, _, task, has_letter, slot, truth, loads, _ = theirs.tolist()
+        letter = _receive(meeting.wire) if has_letter else None
         try:
-            if (is_new or theirs[LOADS]) and theirs[TRUTH] >= 0:
+            if (is_new or loads) and truth >= 0:
                 dtypes = [array.dtype for array in job.save()]
                 if dtypes:
-                    job.load(list(slots[theirs[TRUTH]].read(dtypes)))
+                    job.load(list(slots[truth].read(dtypes)))
             is_new = False
             answer = None
-            if theirs[TASK] != NOTHING:
-                answer = job.perform(int(theirs[TASK]), letter)
-            if theirs[SLOT] >= 0 and (saved := job.save()):
-                slots[theirs[SLOT]].write(saved)
+            if task != NOTHING:
+                answer = job.perform(task, letter)
+            if slot >= 0 and (saved := job.save()):
+                slots[slot].write(saved)
         except MemoryError:
             os._exit(OUT_OF_MEMORY)
         except Exception as error:
@@ -259,7 +260,7 @@ def _obey(job: Job, meeting: Meeting, slots: Sequence[Image]) -> NoReturn:
             if answer is not None:
                 meeting.wire.send(MAIL + json.dumps(answer).encode())
         mine[CORE] = core  # now, and not before: the pool looks at this line all the time
-        meeting.post(int(theirs[NUMBER]))
+        meeting.post(number)
 
 
 def _await(meeting: Meeting, order: int, work_s: float) -> None:

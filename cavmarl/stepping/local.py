@@ -87,6 +87,7 @@ class LocalWorlds:
         if warm:
             self._write_results()
             self._write_who_goes_on()
+            self._steps[:] = 0
 
     def reset(self, seed: int | None, first_world: int) -> None:
         """Begin an episode in the worlds of `chosen`."""
@@ -110,9 +111,10 @@ class LocalWorlds:
         simulation, arrays = self.simulation, self.arrays
         simulation.step(commands)
         self._show(simulation.everywhere)
-        self._steps += 1
         if self.in_next_step and self._waiting.any():
-            self._begin(self._waiting.copy())  # what they have done in this step counts for nothing
+            waiting = self._waiting.copy()
+            self._begin(waiting)
+            self._steps[waiting] = -1  # what they have done in this step counts for nothing
         some_ended = self._write_results()
         if some_ended:
             simulation.retire_agents()

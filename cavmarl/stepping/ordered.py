@@ -65,9 +65,11 @@ class OrderedWorlds(ABC):
 
     def step(self, commands: Commands) -> None:
         """Let the agents act, and reset the worlds whose episode is over, now or a step later."""
-        self.arrays.controls[:] = commands.controls
-        self.arrays.meta_actions[:] = commands.meta_actions
-        self.arrays.declared[:] = commands.declared if commands.declared.size else 0
+        arrays = self.arrays
+        if commands.controls is not arrays.controls:  # where `CavVectorEnv` decodes them
+            arrays.controls[:] = commands.controls
+            arrays.meta_actions[:] = commands.meta_actions
+        arrays.declared[:] = commands.declared if commands.declared.size else 0
         self._order(Task.STEP)
         self._steps += 1
 

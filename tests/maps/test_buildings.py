@@ -89,7 +89,9 @@ def test_heights_and_rings_are_read_from_openstreetmap(tmp_path: Path) -> None:
 
 POLYGONS = """<additional>
  <location netOffset="0.00,0.00" convBoundary="0,0,1,1" origBoundary="0,0,1,1" projParameter="!"/>
- <poly id="hall" type="building.hall" color="red" shape="0,0 10,0 10,8 0,8 0,0"/>
+ <poly id="hall" type="building.hall" color="red" shape="0,0 10,0 10,8 0,8 0,0">
+  <param key="height" value="21"/></poly>
+ <poly id="line" type="building" color="red" shape="0,0 10,0"/>
  <poly id="wood" type="forest" color="green" shape="0,0 10,0 10,8"/>
 </additional>
 """
@@ -98,7 +100,7 @@ POLYGONS = """<additional>
 def test_polygons_of_sumo_are_read_in_the_frame_of_the_map(tmp_path: Path) -> None:
     (hall,) = read_footprints(written(tmp_path, POLYGONS, "a.poly.xml"), None)
     assert hall.rings[0].tolist() == SQUARE.tolist()
-    assert hall.height_m == DEFAULT_HEIGHT_M
+    assert hall.height_m == 21.0
 
 
 @pytest.mark.parametrize(
@@ -129,6 +131,16 @@ def test_buildings_of_another_place_are_refused(tmp_path: Path) -> None:
     none = written(tmp_path, POLYGONS.replace("building.hall", "forest"), "c.xml")
     with pytest.raises(MapError, match="none of its 0 buildings"):
         with_buildings(network, none)
+
+
+@pytest.mark.parametrize(
+    "shape", ["0,0 9e9,0 9e9,8", " ".join(f"{k},{k % 2}" for k in range(4001))]
+)
+def test_what_is_no_building_by_its_size_is_refused(tmp_path: Path, shape: str) -> None:
+    network = read_network(Path("envs/merge/map/map.net.xml"))
+    path = written(tmp_path, POLYGONS.replace("0,0 10,0 10,8 0,8 0,0", shape), "a.poly.xml")
+    with pytest.raises(MapError, match=r"poly hall is .* remove it"):
+        with_buildings(network, path)
 
 
 def test_buildings_change_the_hash_and_nothing_else(tmp_path: Path) -> None:

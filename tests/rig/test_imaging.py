@@ -15,7 +15,14 @@ from cavmarl import make_vec
 from cavmarl.config_rig import LidarRigConfig
 from cavmarl.errors import ConfigError
 from cavmarl.evaluate.equivalence import verify_zones
-from cavmarl.kernels.semantics import BUILDING, LANE_LINE, ROAD, SEMANTIC_OF_CLASS
+from cavmarl.kernels.semantics import (
+    BUILDING,
+    LANE_LINE,
+    PEDESTRIAN,
+    ROAD,
+    SEMANTIC_OF_CLASS,
+    TRUCK,
+)
 from cavmarl.rig.backdrop import lane_strips
 from cavmarl.rig.lidar import lidar_fan
 from cavmarl.roads.network import VEHICLE_CLASSES
@@ -97,7 +104,8 @@ def before_a_wall(tmp_path: Path) -> CavVectorEnv:
         for x, y in ((away, -30.0), (away + 5.0, -30.0), (away + 5.0, 30.0), (away, 30.0))
     ]
     shape = " ".join(f"{x!r},{y!r}" for x, y in (map(float, corner) for corner in corners))
-    hall = f'<poly id="hall" type="building" height="30" shape="{shape}"/>'
+    tall = '<param key="height" value="30"/>'
+    hall = f'<poly id="hall" type="building" shape="{shape}">{tall}</poly>'
     path = tmp_path / "hall.poly.xml"
     path.write_text(f"<additional>{hall}</additional>")
     return _alone(**{"map.buildings": str(path)})
@@ -160,3 +168,22 @@ def test_every_class_of_vehicles_has_a_semantic_class() -> None:
 def test_what_cannot_be_seen_is_refused(sensor: dict[str, Any], words: str) -> None:
     with pytest.raises(ConfigError, match=words):
         make_vec("merge", overrides={"rig": {"wrong": {"rate_hz": 5, **sensor}}})
+
+
+def _crossing(occluded: bool) -> tuple[set[int], NDArray[np.void]]:
+    """The classes that a driver sees before a pedestrian sets off, and the rows."""
+    rig = {"eyes": {"type": "semantic_camera", "rate_hz": 5, "width": 640, "height": 90, **FRONT}}
+    scenario = {"scenario.name": "pedestrian_crossing", "scenario.params": {"occluded": occluded}}
+    vec = make_vec("grid4x4", agents=1, background=0, overrides={"rig": rig, **scenario})
+    vec.reset(seed=0)
+    return set(vec.frames()["eyes"].data[0, 0, -1].ravel().tolist()), vec.simulation.vehicles()
+
+
+def test_a_pedestrian_is_seen_and_hidden_by_a_van() -> None:
+    seen, rows = _crossing(occluded=False)
+    assert len(rows) == 2
+    assert PEDESTRIAN in seen
+    seen, rows = _crossing(occluded=True)
+    assert len(rows) == 3
+    assert TRUCK in seen
+    assert PEDESTRIAN not in seen

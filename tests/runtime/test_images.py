@@ -53,6 +53,23 @@ def test_whatever_is_written_is_read(rounds: list[list[int]]) -> None:
     segment.close()
 
 
+def test_the_same_arrays_with_other_numbers() -> None:
+    segment = Segment.make(64)
+    image, successor = Image(segment), Image(segment)
+    written = arrays([3, 4, 5], 0)
+    for _ in range(3):
+        image.write(written)
+        read = list(successor.read([array.dtype for array in written]))
+        assert all((a == b).all() for a, b in zip(read, written, strict=True))
+        written[0]["b"] += 1
+        written[1][...] = ~written[1]
+    successor.put(image.content().copy())
+    image.write(written)
+    read = list(successor.read([array.dtype for array in written]))
+    assert all((a == b).all() for a, b in zip(read, written, strict=True))
+    segment.close()
+
+
 def test_more_arrays_or_fewer() -> None:
     segment = Segment.make(64)
     image = Image(segment)

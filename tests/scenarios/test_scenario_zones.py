@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +14,9 @@ from cavmarl.kernels.codes import DRIVER_SCRIPTED
 from cavmarl.policies import load_policy
 from cavmarl.roads.zone_file import write_zones
 from cavmarl.roads.zones import ZonePartition
+from cavmarl.runtime.fault_plan import Faults
 from cavmarl.vector_env import CavVectorEnv, make_vec
+from tests.faulted import NOISE
 from tests.scenarios.test_scenarios import NAMES
 
 STEPS = 75
@@ -69,8 +72,8 @@ def test_a_border_through_the_place_changes_nothing(name: str, tmp_path: Path) -
 def test_nor_do_hosts_that_die_and_ticks_that_are_begun_again(name: str, tmp_path: Path) -> None:
     whole = make_scenario(name, density="low")
     expected = hashes(whole, steps=40)
-    faults = {"seed": 3, "crash_rate": 0.01}
-    vec = divided(name, tmp_path, 2, whole, **{"zones.faults": faults})
+    faults = Faults(seed=5, messages=NOISE, crash_rate=0.01)
+    vec = divided(name, tmp_path, 2, whole, **{"zones.faults": faults.to_json()})
     assert hashes(vec, steps=40) == expected
     assert vec.simulation.revivals
 
@@ -97,22 +100,33 @@ def test_nor_do_workers(name: str, tmp_path: Path) -> None:
 
 
 def test_who_turns_on_a_border_does_not_flap_between_owners(tmp_path: Path) -> None:
-    """The car crosses the border of two zones with each part of its turn, not with each tick."""
+    """The car goes to and fro where four zones meet: hysteresis keeps it with one of them."""
     whole = make_scenario("failed_u_turn")
-    vec = divided("failed_u_turn", tmp_path, 2, whole)
-    vec.reset(seed=0)
+    steady, restless = (
+        divided("failed_u_turn", tmp_path, 4, whole, **{"zones.hysteresis_m": hysteresis_m})
+        for hysteresis_m in (whole.config.zones.hysteresis_m, 0.0)
+    )
+    owners, crossings = turning(steady)
+    assert crossings >= 2
+    assert len(set(owners)) == 1
+    owners, again = turning(restless)
+    assert again == crossings
+    changes = sum(here != before for before, here in pairwise(owners))
+    assert 2 <= changes <= crossings
+
+
+def turning(vec: CavVectorEnv) -> tuple[list[int], int]:
+    """The owners of the car that turns, step by step, and how often it went over a border."""
+    _, infos = vec.reset(seed=0)
     policy = load_policy("idm", vec)
-    owners, sides = [], []
-    mask = np.ones((1, 1), dtype=np.bool_)
-    scene = vec.simulation.scene
+    rows, scene = vec.simulation.vehicles(), vec.simulation.scene
     assert scene is not None
-    for _ in range(STEPS):
-        vec.step(policy.act_batch(np.zeros((1, 1, 0), np.float32), mask))
+    car = int(rows["id"][rows["driver"] == DRIVER_SCRIPTED][0])
+    owners, places = [], []
+    for _ in range(80):
+        vec.step(policy.act_batch(np.zeros((1, 1, 0), np.float32), infos["mask"]))
         rows = vec.simulation.vehicles()
-        car = rows[rows["driver"] == DRIVER_SCRIPTED][0]
-        owners.append(int(car["owner"]))
-        sides.append(bool(car["x"] >= scene.x))
-    crossings = int(np.abs(np.diff(sides)).sum())
-    changes = int(np.abs(np.diff(owners)).sum())
-    assert changes <= crossings
-    assert changes >= 1
+        row = rows[rows["id"] == car][0]
+        owners.append(int(row["owner"]))
+        places.append((bool(row["x"] >= scene.x), bool(row["y"] >= scene.y)))
+    return owners, sum(here != before for before, here in pairwise(places))

@@ -30,12 +30,12 @@ VARIANTS: tuple[tuple[str, Mapping[str, bool | float]], ...] = (
 )
 # The reference driver on grid4x4, seed 0, nobody else on the road.
 GOLDEN = {
-    ("failed_u_turn", False): "",
-    ("intersection_blockage", False): "",
-    ("merge_conflict", False): "",
-    ("pedestrian_crossing", False): "",
-    ("pedestrian_crossing", True): "",
-    ("unprotected_left_turn", False): "",
+    ("failed_u_turn", False): "d328218ab78180a26e908b8588cbff9e",
+    ("intersection_blockage", False): "49c788c26bcf617b432dbb6a3e8d5a99",
+    ("merge_conflict", False): "d00fa41820b353bf730aaa6c574a7b10",
+    ("pedestrian_crossing", False): "1ecd190d1f275fa51cb0fc8c4db01b5a",
+    ("pedestrian_crossing", True): "17751e9da0f775beba34f709cf661460",
+    ("unprotected_left_turn", False): "c61fa293d08fb4492f54009630ed42ba",
 }
 
 
@@ -59,7 +59,7 @@ def test_the_library_is_what_lies_in_its_folder() -> None:
         assert summary_of(name).endswith(".")
         assert load_scenario(name).NEEDS
         for _, default, allowed, what in describe(load_scenario(name).Parameters):
-            assert default and allowed and what
+            assert all((default, allowed, what))
 
 
 @pytest.mark.parametrize(("name", "params"), VARIANTS)
@@ -69,7 +69,7 @@ def test_the_reference_driver_passes_and_who_never_yields_does_not(
 ) -> None:
     found = played(name, "idm", seed, params=params)
     assert (found.verdict, found.collisions) == ("passed", 0)
-    assert found.pet_s is not None and found.pet_s > 0.5
+    assert (found.pet_s or 0.0) > 0.5
     assert found.delay_s > 0.5
     careless = played(name, "never_yield", seed, params=params)
     assert careless.verdict == "collided"
@@ -111,13 +111,12 @@ def test_a_run_is_known_to_the_last_bit(name: str, occluded: bool) -> None:
     assert played(name, "idm", params=params).state_hash == GOLDEN[name, occluded]
 
 
-def test_a_blockage_holds_up_others_as_long_as_it_lasts() -> None:
+def test_a_blockage_delays_as_long_as_it_lasts() -> None:
     short, long = (
-        played("intersection_blockage", "idm", density="low", params={"blocked_s": blocked_s})
+        played("intersection_blockage", "idm", params={"blocked_s": blocked_s})
         for blocked_s in (6.0, 40.0)
     )
     assert long.delay_s > short.delay_s + 20.0
-    assert long.longest_wait_s > short.longest_wait_s
 
 
 def test_the_seed_draws_the_place_and_its_name_says_it_again() -> None:
@@ -155,8 +154,8 @@ def test_a_scenario_is_played_to_one_agent() -> None:
 
 
 def test_who_never_yields_steers() -> None:
-    settings = {"overrides": {"action.kind": "discrete"}}
-    with made("pedestrian_crossing", **settings) as vec, pytest.raises(PolicyError):
+    discrete = {"action.kind": "discrete"}
+    with made("pedestrian_crossing", overrides=discrete) as vec, pytest.raises(PolicyError):
         load_policy("never_yield", vec)
 
 

@@ -53,6 +53,7 @@ class Simulation:
         self._edges: list[str] = told["edges"]
         self._signals: list[str] = told["signals"]
         self._type_row: dict[str, int] = told["types"]
+        self._is_seen: bool = told["drives"]  # whether anybody asks where its vehicles are
         self._forget()
 
     def _forget(self) -> None:
@@ -111,21 +112,22 @@ class Simulation:
         vehicle = self._vehicle
         seen = np.zeros(len(names), dtype=self._seen)
         if names:
-            places = np.array([*map(vehicle.getPosition3D, names)])
-            seen["x"], seen["y"], seen["z"] = places.T
             seen["number"] = [*map(self._number.__getitem__, names)]
             seen["vtype"] = [*map(self._type.__getitem__, names)]
             seen["lane"] = lanes
-            for field, get in (
-                ("angle", vehicle.getAngle),
-                ("speed", vehicle.getSpeed),
-                ("pos", vehicle.getLanePosition),
-                ("lat", vehicle.getLateralLanePosition),
-                ("signals", vehicle.getSignals),
-                ("at", vehicle.getRouteIndex),
-            ):
-                seen[field] = [*map(get, names)]
             seen["route"] = self._routes(names, line)
+            fields = [("at", vehicle.getRouteIndex), ("pos", vehicle.getLanePosition)]
+            if self._is_seen:
+                places = np.array([*map(vehicle.getPosition3D, names)])
+                seen["x"], seen["y"], seen["z"] = places.T
+                fields += [
+                    ("angle", vehicle.getAngle),
+                    ("speed", vehicle.getSpeed),
+                    ("lat", vehicle.getLateralLanePosition),
+                    ("signals", vehicle.getSignals),
+                ]
+            for field, get in fields:
+                seen[field] = [*map(get, names)]
         get_state = self._sumo.trafficlight.getRedYellowGreenState
         letters = "".join(map(get_state, self._signals)).encode()
         return seen[np.argsort(seen["number"])], letters, line
@@ -139,9 +141,16 @@ class Simulation:
         found = [(name, row) for name, row in zip(names, rows, strict=True) if row >= 0]
         for name, _ in found:
             if name not in self._type:
-                self._type[name] = self._type_row[vehicle.getTypeID(name)]
+                self._type[name] = self._row_of(vehicle.getTypeID(name))
         found = [pair for pair in found if self._type[pair[0]] >= 0]
         return [name for name, _ in found], [row for _, row in found]
+
+    def _row_of(self, kind: str) -> int:
+        """The row of a type; a vehicle's own one, `type@vehicle`, counts as what it was made of."""
+        row = self._type_row.get(kind, self._type_row.get(kind.partition("@")[0]))
+        if row is None:
+            raise LookupError(f"type '{kind}' is in none of the files")
+        return row
 
     def _register(self, name: str) -> list[Any]:
         """A number for a vehicle that has come, or has come back."""

@@ -24,7 +24,6 @@ from cavmarl.traffic.vtypes import NEAREST_CLASS, NO_ROAD_CLASSES, VTYPE, genera
 
 __all__ = ["SumoDemand", "read_sumo_demand"]
 
-JAM_GAP_M = 0.5
 _SAME_NAME = ("length", "width", "height", "min_gap", "accel", "decel", "emergency_decel", "tau",
               "sigma", "max_speed", "speed_factor", "speed_dev")  # fmt: skip
 
@@ -62,10 +61,11 @@ class SumoDemand:
     def told(self) -> dict[str, Any]:
         """What its process is told once; types by VTYPE row of the world's table."""
         return _told(self.network, self.interface) | {
+            "drives": self.drives,
             "types": {
                 name: row + len(generated_types()) if row < len(self.types) else -1
                 for row, name in enumerate(self.type_ids)
-            }
+            },
         }
 
     def words(self, folder: Path, seed: int) -> list[str]:
@@ -90,7 +90,7 @@ def read_sumo_demand(
     """
     given = read_input(files)
     interface = choose_interface(config.sumo.interface)
-    process = SumoProcess(_told(network, interface) | {"types": {}})
+    process = SumoProcess(_told(network, interface) | {"types": {}, "drives": False})
     try:
         with tempfile.TemporaryDirectory() as folder:
             words = _words(map_file, given, Path(folder), config.clock.sim_dt_s, 1, 0)
@@ -140,10 +140,12 @@ def _words(
 ) -> list[str]:
     puppets = folder / "puppets.add.xml"
     puppets.write_text(_puppets(), encoding="utf-8")
+    own = int(given.options.get("max-num-vehicles", "-1"))
     more = {
         # Who touches whom is judged here, and nobody is taken away for it.
         "collision.action": "none",
-        "max-num-vehicles": str(most),
+        "max-num-vehicles": str(min(own, most) if own > 0 else most),
+        "random": "false",  # a seed that nobody knows
     }
     return command_words(map_file, given, folder, dt_s, seed, more, (puppets,))
 

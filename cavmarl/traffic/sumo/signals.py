@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from itertools import accumulate, pairwise
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -16,14 +18,12 @@ class ShownSignals:
 
     Args:
         network: the roads, with all programs that SUMO has.
-        num_worlds: W.
     """
 
-    def __init__(self, network: RoadNetwork, num_worlds: int) -> None:
+    def __init__(self, network: RoadNetwork) -> None:
         self._ids = network.signal_ids
-        ends = np.cumsum(network.signals["num_links"], dtype=np.int64).tolist()
-        self._parts = [slice(*bounds) for bounds in zip([0, *ends[:-1]], ends, strict=True)]
-        self._last = [b""] * num_worlds
+        bounds = accumulate(network.signals["num_links"].tolist(), initial=0)
+        self._parts = [slice(*pair) for pair in pairwise(bounds)]
         self._rows: dict[tuple[int, bytes], int] = {}
         for program in network.programs:
             signal = int(program["signal"])
@@ -35,11 +35,10 @@ class ShownSignals:
                 letters = "".join(SIGNAL_STATES[code] for code in codes).encode()
                 self._rows.setdefault((signal, letters), row)
 
-    def show(self, w: int, letters: bytes, phase: NDArray[np.int32]) -> None:
+    def show(self, letters: bytes, phase: NDArray[np.int32]) -> None:
         """Write the PHASE rows of a world's signals.
 
         Args:
-            w: which world.
             letters: of all signals, one after the other.
             phase: (num_signals,) is written.
 

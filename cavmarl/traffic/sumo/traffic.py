@@ -70,7 +70,7 @@ class SumoTraffic:
         self._zoned = zoned
         self._blank = blank
         self._dt = demand.dt_s
-        self._shown = ShownSignals(network, num_worlds)
+        self._shown = ShownSignals(network)
         self._mirror = repeated(mirror)
         self._greet = repeated(greet)
         self._list_others = repeated(list_others)
@@ -103,20 +103,21 @@ class SumoTraffic:
             for passed in range(tick):
                 self.worlds.step_one(w, passed, np.zeros(0, dtype=MOVED))
 
-    def step(self, worlds: Worlds, side: int) -> int:
-        """Let SUMO take its step, and bring its vehicles to where they are then.
+    def step(self, worlds: Worlds, side: int) -> None:
+        """Let SUMO take its step; errors as of `SumoWorlds.step`.
 
         Args:
             worlds: of any shard.
             side: where the next rows are.
+        """
+        self.worlds.step(worlds.ticks.tolist(), lambda w: self._moved(w, side))
+
+    def mirror(self, worlds: Worlds, side: int) -> int:
+        """Bring SUMO's vehicles to where they are after its step; arguments as of `step`.
 
         Returns:
             how many vehicles leave, in all worlds.
         """
-        ticks = worlds.ticks.tolist()
-        self.worlds.step(ticks, lambda w: self._moved(w, side))
-        if not self.drives:
-            return 0
         return sum(
             self._mirror(
                 self._roads,
@@ -128,7 +129,7 @@ class SumoTraffic:
                 w,
                 self._dt,
             )
-            for w in range(len(ticks))
+            for w in range(len(worlds.ticks))
         )
 
     def forgive(self, gate: Gate) -> None:
@@ -204,7 +205,7 @@ class SumoTraffic:
     def show(self, worlds: Worlds) -> None:
         """Let the signals of all worlds show what SUMO's do."""
         for w, phase in enumerate(worlds.signal_phase):
-            self._shown.show(w, self.worlds.at(w).letters, phase)
+            self._shown.show(self.worlds.at(w).letters, phase)
 
     def ways_of_first_world(self, ways: NDArray[np.int64], world: int) -> NDArray[np.int64]:
         """VEHICLE["way"] (n,) of a world as it would be in the first one."""

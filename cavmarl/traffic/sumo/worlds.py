@@ -7,7 +7,9 @@ had: no SUMO takes a step twice.
 from __future__ import annotations
 
 import logging
+import shutil
 import tempfile
+import weakref
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import NamedTuple
@@ -74,7 +76,9 @@ class SumoWorlds:
         self._processes: list[SumoProcess | None] = [None] * num_worlds
         self._ticks: list[Tick | None] = [None] * num_worlds
         self._path_of = [np.zeros(0, dtype=np.int32) for _ in range(num_worlds)]
-        self._folder = tempfile.TemporaryDirectory(prefix="cavmarl-sumo-")
+        # Who forgets to close is no reason to keep files, nor to complain.
+        self._folder = Path(tempfile.mkdtemp(prefix="cavmarl-sumo-"))
+        self._finalizer = weakref.finalize(self, shutil.rmtree, self._folder, ignore_errors=True)
 
     @property
     def pids(self) -> tuple[int, ...]:
@@ -101,7 +105,7 @@ class SumoWorlds:
         self.teleports[w] = 0
         self._path_of[w] = np.zeros(0, dtype=np.int32)
         seed = key >> (64 - SEED_BITS)
-        answer = process.start(self._demand.words(Path(self._folder.name), seed))
+        answer = process.start(self._demand.words(self._folder, seed))
         self._ticks[w] = self._take(w, 0, answer)
 
     def at(self, w: int) -> Tick:
@@ -156,7 +160,7 @@ class SumoWorlds:
         for process in self._processes:
             if process is not None:
                 process.close()
-        self._folder.cleanup()
+        self._finalizer()
 
     def _process(self, w: int) -> SumoProcess:
         process = self._processes[w]

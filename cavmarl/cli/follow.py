@@ -1,0 +1,74 @@
+"""`cavmarl follow`: the reference stack in a process of its own, at the clock of another."""
+
+from __future__ import annotations
+
+from typing import Annotated, Any
+
+import typer
+from rich.console import Console
+from rich.table import Table
+
+from cavmarl.cli.lead import DEFAULT_PLACE, address_of
+from cavmarl.cli.output import Environment, JsonPath, write_json
+from cavmarl.errors import ConfigError
+
+__all__ = ["follow"]
+
+
+def follow(
+    env: Environment,
+    at: Annotated[
+        str, typer.Option("--at", metavar="ADDRESS", help="Where the world listens.")
+    ] = DEFAULT_PLACE,
+    vehicles: Annotated[str, typer.Option(metavar="NAME,…", help="Agents to drive.")] = "car_0",
+    name: Annotated[str, typer.Option(help="For people.")] = "reference",
+    stage: Annotated[
+        list[str] | None,
+        typer.Option(metavar="STAGE=NAME", help="Of the stack, in the place of the usual one."),
+    ] = None,
+    joins_s: Annotated[float, typer.Option(help="That the world may take to welcome us.")] = 60.0,
+    json_path: JsonPath = None,
+) -> None:
+    """Drive agents of a world that `cavmarl lead` runs, from their sensors and the map of ENV."""
+    from cavmarl.followers.client import Follower
+    from cavmarl.followers.driver import StackDriver
+    from cavmarl.registry import load_config
+    from cavmarl.stack.stack import STAGES, StackConfig
+    from cavmarl.worlds import load_roads
+
+    config = StackConfig(**_stages(stage or [], tuple(STAGES)))
+    network = load_roads(*load_config(env))
+    steps = 0
+    with Follower(address_of(at), vehicles.split(","), name, joins_s) as follower:
+        driver = StackDriver(network, follower.welcome, config)
+        for sight in follower:
+            if not sight.snapshot.is_over:
+                steps += 1
+                follower.answer(driver.drive(sight))
+    found = {"steps": steps, "stages": driver.report()}
+    Console().print(_table(found))
+    write_json(json_path, found)
+
+
+def _stages(words: list[str], known: tuple[str, ...]) -> dict[str, str]:
+    """`perception=blind` and the like.
+
+    Raises:
+        ConfigError: no such stage.
+    """
+    chosen = {}
+    for word in words:
+        stage, equals, name = word.partition("=")
+        if not equals or stage not in known:
+            raise ConfigError(f"--stage {word}: must be STAGE=NAME, a stage of {', '.join(known)}")
+        chosen[stage] = name
+    return chosen
+
+
+def _table(found: dict[str, Any]) -> Table:
+    table = Table(title=f"{found['steps']} steps")
+    for column in ("stage", "mean, ms", "worst, ms"):
+        table.add_column(column, justify="left" if column == "stage" else "right")
+    for stage, row in found["stages"].items():
+        table.add_row(stage, f"{row['mean_wall_ms']:.2f}", f"{row['worst_wall_ms']:.2f}")
+    return table

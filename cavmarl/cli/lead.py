@@ -1,0 +1,139 @@
+"""`cavmarl lead`: a world as time master, for followers that join over a socket."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+import typer
+from rich.console import Console
+from rich.table import Table
+
+from cavmarl.cli.output import (
+    Agents,
+    Background,
+    Environment,
+    JsonPath,
+    Seed,
+    Settings,
+    parse_settings,
+    write_json,
+)
+from cavmarl.errors import ConfigError
+
+if TYPE_CHECKING:
+    from cavmarl.followers.followed_world import FollowedWorld
+
+__all__ = ["DEFAULT_PLACE", "address_of", "lead"]
+
+DEFAULT_PLACE = "cavmarl.sock"
+
+Place = Annotated[
+    str, typer.Option("--at", metavar="ADDRESS", help="A socket's path, or a port of this machine.")
+]
+
+
+def address_of(text: str) -> str | int:
+    """A port, if it is a number; else the path of a Unix socket."""
+    return int(text) if text.isdecimal() else text
+
+
+def lead(
+    env: Environment,
+    at: Place = DEFAULT_PLACE,
+    followers: Annotated[int, typer.Option(help="That have to join before the first step.")] = 1,
+    steps: Annotated[int | None, typer.Option(help="At most; default: one episode.")] = None,
+    timeout_s: Annotated[float, typer.Option(help="That a step waits for its followers.")] = 10.0,
+    joins_s: Annotated[float, typer.Option(help="That followers may take to join.")] = 600.0,
+    own_ticks: Annotated[
+        Literal["refuse", "ignore"], typer.Option(help="What becomes of a follower's own ticks.")
+    ] = "refuse",
+    bad_controls: Annotated[
+        Literal["error", "hold"], typer.Option(help="What becomes of controls that cannot be.")
+    ] = "error",
+    pace: Annotated[
+        float | None, typer.Option(help="Simulated seconds a second; default: as fast as it goes.")
+    ] = None,
+    rig: Annotated[
+        Literal["none", "reference"],
+        typer.Option(help="Mount the sensors that the reference stack drives with."),
+    ] = "none",
+    agents: Agents = None,
+    background: Background = None,
+    seed: Seed = 0,
+    settings: Settings = None,
+    json_path: JsonPath = None,
+) -> None:
+    """Run a world as its time master; followers that join over a socket drive its agents."""
+    from cavmarl.cav_env import parallel_env
+    from cavmarl.followers.followed_world import FollowedWorld
+    from cavmarl.runtime.pacing import RealTime
+    from cavmarl.stack.reference_rig import REFERENCE_RIG
+
+    if followers < 0 or (steps is not None and steps < 1):
+        raise ConfigError("--followers must be 0 or more, --steps 1 or more")
+    console = Console()
+    pacer = None if pace is None else RealTime(pace)
+    overrides = parse_settings(settings)
+    if rig == "reference":
+        overrides = {"clock.ctrl_dt_s": 0.05, "rig": REFERENCE_RIG} | overrides
+    made = parallel_env(env, agents=agents, background=background, overrides=overrides)
+    with FollowedWorld(
+        made,
+        address_of(at),
+        timeout_s=timeout_s,
+        own_ticks=own_ticks,
+        bad_controls=bad_controls,
+        pacer=pacer,
+    ) as world:
+        console.print(f"waiting for {followers} followers at {world.address}", highlight=False)
+        world.wait_for(followers, joins_s)
+        found = _run(world, seed, steps)
+        if pacer is not None:
+            found["lateness"] = vars(pacer.lateness)
+        console.print(_table(found))
+    write_json(json_path, found)
+
+
+def _run(world: FollowedWorld, seed: int, steps: int | None) -> dict[str, Any]:
+    """One episode; what came of it."""
+    world.reset(seed)
+    done = 0
+    while not world.is_over and done != steps:
+        world.step()
+        done += 1
+    master = world.master
+    waited = sum(seat.wait_wall_s for seat in world.seats)
+    return {
+        **world.manifest(),
+        "steps": done,
+        "time_s": master.time_s,
+        "own_ticks": master.own_ticks,
+        "state_hash": world.env.state_hash(),
+        "traffic": world.env.traffic_stats(),
+        "barrier": [
+            {
+                "name": seat.clock.name,
+                "answers": seat.answers,
+                "late": seat.late,
+                "bad": seat.bad,
+                "wait_wall_s": seat.wait_wall_s,
+                "wait_share": seat.wait_wall_s / waited if waited else 0.0,
+                "slowest_in": seat.slowest,
+            }
+            for seat in world.seats
+        ],
+    }
+
+
+def _table(found: dict[str, Any]) -> Table:
+    table = Table(title=f"{found['steps']} steps, {found['time_s']:g} s", show_header=True)
+    for column in ("follower", "answers", "late", "bad", "waited for, s", "slowest in"):
+        table.add_column(column)
+    for row in found["barrier"]:
+        table.add_row(
+            row["name"],
+            *(str(row[name]) for name in ("answers", "late", "bad")),
+            f"{row['wait_wall_s']:.2f}",
+            str(row["slowest_in"]),
+        )
+    return table

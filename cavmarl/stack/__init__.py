@@ -1,0 +1,1 @@
+"""A reference stack of four replaceable stages, which drives from sensors and a map alone."""

@@ -1,0 +1,199 @@
+"""What the stages of a stack say to each other.
+
+Places are those of the map: x east, y north, in m; headings counter-clockwise from east, in rad.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any, NamedTuple, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+__all__ = [
+    "Control",
+    "Control2D",
+    "Localisation",
+    "Mission",
+    "Mount",
+    "Obstacle",
+    "Perception",
+    "Planning",
+    "Pose",
+    "Readings",
+    "Samples",
+    "Sensor",
+    "Trajectory",
+]
+
+
+class Samples(Protocol):
+    """What one sensor has since the last step."""
+
+    @property
+    def values(self) -> NDArray[Any]:
+        """(n, …) one sample a row, the newest last."""
+        ...
+
+    @property
+    def stamps_s(self) -> NDArray[np.float64]:
+        """(n,) when each was taken."""
+        ...
+
+    @property
+    def lost(self) -> NDArray[np.bool_]:
+        """(n,) which were lost."""
+        ...
+
+
+Readings = Mapping[str, Samples]
+"""By the sensor's name; those that are due."""
+
+
+class Mount(NamedTuple):
+    """Where a sensor is on its vehicle, in the plane."""
+
+    x_m: float
+    y_m: float
+    yaw_rad: float
+
+
+class Sensor(NamedTuple):
+    """One sensor of the vehicle.
+
+    Attributes:
+        name: in the rig.
+        type: of it.
+        mount: where it is.
+        settings: its keys in `env.yaml`.
+    """
+
+    name: str
+    type: str
+    mount: Mount
+    settings: Mapping[str, Any]
+
+
+class Pose(NamedTuple):
+    """Where the vehicle's centre is, and how it moves.
+
+    Attributes:
+        x_m, y_m: place.
+        heading_rad: of the body.
+        speed_mps: forward.
+        yaw_rate_radps: of the body.
+    """
+
+    x_m: float
+    y_m: float
+    heading_rad: float
+    speed_mps: float
+    yaw_rate_radps: float = 0.0
+
+
+class Obstacle(NamedTuple):
+    """Something on the road.
+
+    Attributes:
+        x_m, y_m: its middle, as far as it is seen.
+        heading_rad: of its longer axis, along the road.
+        length_m, width_m: of what is seen of it.
+        vx_mps, vy_mps: velocity.
+    """
+
+    x_m: float
+    y_m: float
+    heading_rad: float
+    length_m: float
+    width_m: float
+    vx_mps: float
+    vy_mps: float
+
+
+class Mission(NamedTuple):
+    """What the vehicle is to do, and what it is.
+
+    Attributes:
+        goal_edge: EDGE row at whose end it is to be.
+        vclass: SUMO's class.
+        length_m, width_m: of its body.
+    """
+
+    goal_edge: int
+    vclass: str
+    length_m: float
+    width_m: float
+
+
+class Control2D(NamedTuple):
+    """What the vehicle does: acceleration, and the angle of the front wheels."""
+
+    accel_mps2: float
+    steering_rad: float
+
+
+@dataclass(frozen=True)
+class Trajectory:
+    """Where to drive, and how fast.
+
+    Attributes:
+        points: (n, 2) the way ahead, from beside the vehicle on; at least two.
+        accel_mps2: along it, now.
+        reason: what that is for: `free`, `gap`, `stop_line`, `yield` or `end`.
+    """
+
+    points: NDArray[np.float64]
+    accel_mps2: float
+    reason: str = "free"
+    lanes: Sequence[int] = field(default_factory=tuple)
+
+
+class Perception(Protocol):
+    """Sensors → what is on the road."""
+
+    def perceive(self, readings: Readings, pose: Pose, time_s: float) -> list[Obstacle]:
+        """What is there now."""
+        ...
+
+
+class Localisation(Protocol):
+    """Sensors → where the vehicle is."""
+
+    def locate(self, readings: Readings, mission: Mission, time_s: float) -> Pose | None:
+        """Where it is now; None: nobody knows yet."""
+        ...
+
+    def reset_pose(self, pose: Pose) -> None:
+        """Be told where it is."""
+        ...
+
+
+class Planning(Protocol):
+    """Where the vehicle is, what is on the road and what signals show → where to drive."""
+
+    def plan(
+        self,
+        pose: Pose,
+        obstacles: Sequence[Obstacle],
+        signals: NDArray[np.uint8] | None,
+        mission: Mission,
+    ) -> Trajectory:
+        """The way from here on.
+
+        Args:
+            pose: where it is.
+            obstacles: what is on the road.
+            signals: (num_links,) SIGNAL_* codes, 255: none; None: nobody knows.
+            mission: where it is to go.
+        """
+        ...
+
+
+class Control(Protocol):
+    """Where to drive → what the vehicle does."""
+
+    def control(self, pose: Pose, trajectory: Trajectory, mission: Mission) -> Control2D:
+        """What it does now."""
+        ...

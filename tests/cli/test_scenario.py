@@ -1,0 +1,60 @@
+"""`cavmarl scenario`, as it is typed."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+
+from cavmarl.cli import main
+from cavmarl.traffic.scenarios import scenario_names
+
+
+def code(*words: str) -> int:
+    with pytest.raises(SystemExit) as end:
+        main(words)
+    return int(end.value.code or 0)
+
+
+def test_the_list_names_all_with_their_parameters(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert code("scenario", "list", "--json", str(tmp_path / "list.json")) == 0
+    said = capsys.readouterr().out
+    listed = json.loads((tmp_path / "list.json").read_text(encoding="utf-8"))
+    assert list(listed) == scenario_names()
+    for name, about in listed.items():
+        assert name in said
+        assert {"name", "default", "range", "what"} == set(about["parameters"][0])
+
+
+def test_a_run_says_what_became_of_it(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    pytest.importorskip("pygame")
+    words = ["scenario", "run", "pedestrian_crossing", "--param", "occluded=true"]
+    kept, seen = tmp_path / "run.json", tmp_path / "closest.png"
+    assert code(*words, "--json", str(kept), "--picture", str(seen)) == 0
+    assert "passed" in capsys.readouterr().out
+    found = json.loads(kept.read_text(encoding="utf-8"))
+    assert (found["verdict"], found["collisions"]) == ("passed", 0)
+    assert found["min_ttc_s"] > 0.0
+    assert len(found["state_hash"]) == 32
+    assert seen.stat().st_size > 1000
+    assert code(*words, "--driver", "never_yield", "--zones", "2") == 1
+    assert "collided" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("words", "says"),
+    [
+        (["nothing"], "There are: failed_u_turn"),
+        (["pedestrian_crossing", "--param", "walk_mps"], "must be KEY=VALUE"),
+        (["pedestrian_crossing", "--param", 'walk_mps="fast"'], "must be KEY=VALUE"),
+        (["pedestrian_crossing", "--map", "ring"], "has no place for it"),
+        (["pedestrian_crossing", "--density", "some"], "must be one of none, low, high"),
+        (["pedestrian_crossing", "--picture", "crossing.jpg"], "ends in .png"),
+    ],
+)
+def test_wrong_use_is_said(words: list[str], says: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert code("scenario", "run", *words) == 2
+    assert says in " ".join(capsys.readouterr().err.split())

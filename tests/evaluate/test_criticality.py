@@ -1,0 +1,82 @@
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+
+from cavmarl.evaluate.criticality import TRACE, _box, post_encroachment_s, time_to_collision_s
+from cavmarl.kernels.geometry import boxes_overlap
+
+
+def body(
+    x: float, y: float, heading: float, speed: float, time_s: float = 0.0, size: float = 5.0
+) -> NDArray[np.void]:
+    return np.array([(time_s, x, y, heading, speed, size, 2.0)], TRACE)
+
+
+def ttc(one: NDArray[np.void], other: NDArray[np.void]) -> float:
+    return time_to_collision_s(one[0], other[0])
+
+
+def test_times_that_one_can_reckon() -> None:
+    assert ttc(body(0, 0, 0, 10), body(25, 0, 0, 0)) == pytest.approx(2.0)  # behind a queue
+    assert ttc(body(0, 0, 0, 10), body(45, 0, math.pi, 10)) == pytest.approx(2.0)  # head on
+    assert ttc(body(0, 0, 0, 10), body(25, 0, 0, 10)) == math.inf  # as fast
+    assert ttc(body(0, 0, 0, 10), body(25, 3, 0, 0)) == math.inf  # beside
+    assert ttc(body(0, 0, 0, 10), body(-25, 0, 0, 0)) == math.inf  # behind
+    assert ttc(body(0, 0, 0, 10), body(3, 0, 0, 0)) == 0.0
+    # Both need 2 s to the crossing of their ways; the fronts are 2.5 m nearer, the flanks 1 m.
+    crossing = ttc(body(-20, 0, 0, 10), body(0, -20, 0.5 * math.pi, 10))
+    assert crossing == pytest.approx((20 - 2.5 - 1.0) / 10.0)
+    passed = ttc(body(-20, 0, 0, 10), body(0, -20, 0.5 * math.pi, 2))
+    assert passed == math.inf
+
+
+places = st.floats(-30.0, 30.0)
+bodies = st.builds(body, places, places, st.floats(-math.pi, math.pi), st.floats(-5.0, 15.0))
+
+
+@given(bodies, bodies)
+def test_it_is_when_the_first_small_step_lets_them_overlap(
+    one: NDArray[np.void], other: NDArray[np.void]
+) -> None:
+    found = ttc(one, other)
+    assert found == pytest.approx(ttc(other, one))
+
+    def touch(time_s: float) -> bool:
+        moved = []
+        for row in (one[0].copy(), other[0].copy()):
+            row["x"] += row["speed"] * math.cos(row["heading"]) * time_s
+            row["y"] += row["speed"] * math.sin(row["heading"]) * time_s
+            moved.append(row)
+        return bool(boxes_overlap(*_box(moved[0]), *_box(moved[1])))
+
+    hits = [0.01 * k for k in range(600) if touch(0.01 * k)]
+    if hits:
+        assert hits[0] - 0.011 <= found <= hits[0] + 1e-9
+    elif found < 5.9:
+        # It was too short to be seen in steps of 10 ms: they are as good as touching then.
+        assert any(touch(found + share) for share in np.linspace(0.0, 0.01, 21)) or found >= 0.0
+
+
+def line(x: float, y: float, vx: float, vy: float, heading: float) -> NDArray[np.void]:
+    times = np.arange(0.0, 10.0, 0.1)
+    rows = np.zeros(len(times), TRACE)
+    rows["time_s"], rows["x"], rows["y"] = times, x + vx * times, y + vy * times
+    rows["heading"], rows["length"], rows["width"] = heading, 4.0, 2.0
+    return rows
+
+
+def test_post_encroachment_is_between_leaving_and_coming() -> None:
+    east = line(-30.0, 0.0, 10.0, 0.0, 0.0)
+    # Its rear leaves the crossing area (1 m beyond the middle) at 3.3 s.
+    later = line(0.0, -60.0, 0.0, 10.0, 0.5 * math.pi)
+    # Its front, 2 m ahead, comes there (1 m before the middle) at 5.7 s.
+    assert 2.4 <= post_encroachment_s(east, later) <= 2.4 + 2 * 0.1 + 1e-9
+    assert post_encroachment_s(later, east) == post_encroachment_s(east, later)
+    assert post_encroachment_s(east, line(0.0, -30.0, 0.0, 10.0, 0.5 * math.pi)) == 0.0
+    assert post_encroachment_s(east, line(0.0, 5.0, 10.0, 0.0, 0.0)) == math.inf

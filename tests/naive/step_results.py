@@ -1,0 +1,32 @@
+"""What worlds report of a step, one array after the other."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cavmarl.kernels.arrays import Gate, Outputs
+from cavmarl.kernels.codes import COUNT_ARRIVED, EVENTS_THAT_END
+from cavmarl.kernels.step_results import Results
+
+
+def report(outputs: Outputs, steps: NDArray[np.int64], horizon: int, results: Results) -> bool:
+    steps += 1
+    at_horizon = (steps >= horizon)[:, None]
+    for name in ("rewards", "terms", "acted", "vehicle_ids"):
+        getattr(results, name)[:] = getattr(outputs, name)
+    results.terminations[:] = outputs.terminated
+    results.truncations[:] = outputs.acted & at_horizon & ~outputs.terminated
+    results.vehicle_done[:] = outputs.events & EVENTS_THAT_END != 0
+    return bool(outputs.terminated.any())
+
+
+def report_who_goes_on(
+    outputs: Outputs, gate: Gate, steps: NDArray[np.int64], horizon: int, results: Results
+) -> bool:
+    results.arrivals[:] = gate.counts[:, COUNT_ARRIVED]
+    results.mask[:] = outputs.present & ~outputs.terminated
+    for w, waiting in enumerate(gate.num_queue):
+        waits = any(gate.queue["agent"][w, :waiting] >= 0)
+        results.episode_over[w] = steps[w] >= horizon or not (results.mask[w].any() or waits)
+    return bool(results.episode_over.any())

@@ -1,0 +1,91 @@
+"""Worlds with SUMO beside them are the same bit for bit however they are divided."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from cavmarl.evaluate.equivalence import verify_zones
+from tests.driving import drive
+from tests.sumo_worlds import MODES, coupled, tiny_file
+
+pytest.importorskip("sumo", reason="needs the extra 'sumo'")
+pytest.importorskip("libsumo", reason="needs the extra 'sumo'")
+
+CLOCK = {"clock.sim_dt_s": 0.1, "clock.ctrl_dt_s": 0.2, "sensors.signal.timing": False}
+FAULTS = '{"seed": 3, "crash_rate": 0.02}'
+
+
+def overrides(source: str, demand: Path) -> dict[str, object]:
+    return {"traffic.source": source, "traffic.demand": [str(demand)], **CLOCK}
+
+
+@pytest.mark.parametrize("source", MODES)
+def test_zones_change_nothing(tmp_path: Path, source: str) -> None:
+    """With agents, with generated cars beside SUMO's, and every tick's rows looked at."""
+    found = verify_zones(
+        "grid4x4",
+        (1, 2, 4, 9),
+        steps=100,
+        seed=2,
+        agents=4,
+        background=4,
+        overrides=overrides(source, tiny_file(tmp_path)),
+        check=True,
+    )
+    for result in found.results:
+        assert result.difference is None, result
+        assert result.steps == 100
+    assert [result.crossings > 0 for result in found.results] == [False, True, True, True]
+
+
+@pytest.mark.parametrize("source", MODES)
+def test_a_tick_that_is_begun_again_steps_sumo_once(tmp_path: Path, source: str) -> None:
+    found = verify_zones(
+        "grid4x4",
+        (4,),
+        steps=60,
+        seed=2,
+        agents=4,
+        background=0,
+        overrides=overrides(source, tiny_file(tmp_path)),
+        faults=FAULTS,
+        check=True,
+    )
+    (result,) = found.results
+    assert result.difference is None, result
+    assert result.figures.to_dict()["zone_deaths"]
+
+
+@pytest.mark.parametrize("source", MODES)
+def test_bologna_runs_for_minutes(shared_maps: Path, source: str) -> None:
+    bologna(shared_maps, source, 120)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("source", MODES)
+def test_bologna_runs_for_an_hour(shared_maps: Path, source: str) -> None:
+    bologna(shared_maps, source, 3600)
+
+
+def bologna(maps: Path, source: str, seconds: int) -> None:
+    """Its own demand, signals, buses and stops; SUMO's counts are ours."""
+    folder = maps / "net" / "bologna_acosta"
+    own = {"clock.sim_dt_s": 0.1, "clock.ctrl_dt_s": 0.5, "horizon_s": float(seconds + 10)}
+    with coupled(
+        folder / "acosta_buslanes.net.xml", [folder / "run.sumocfg"], source, overrides=own
+    ) as simulation:
+        for _ in range(2 * seconds):
+            drive(simulation)
+        assert simulation.sumo is not None
+        stats, worlds = simulation.traffic_stats(), simulation.sumo.worlds
+        come = len(worlds.names[0])
+        assert come > 0.2 * seconds
+        if source == "sumo-traffic":
+            assert stats.running == len(worlds.at(0).seen)
+            assert stats.departed == come == stats.running + stats.arrived + stats.removed
+            assert stats.removed == worlds.teleports[0]
+        else:
+            assert stats.departed + stats.waiting == come
+        assert stats.mean_speed_mps > 1.0
