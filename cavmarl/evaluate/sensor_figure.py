@@ -11,6 +11,7 @@ from cavmarl.evaluate.sensor_scaling import ScalingRow
 __all__ = ["plot_sensor_workers"]
 
 FPS, STEP = "#2f6db5", "#d1793b"
+HEADROOM = 1.1  # over the largest value
 
 
 def plot_sensor_workers(rows: Sequence[ScalingRow], title: str, path: Path) -> None:
@@ -40,7 +41,7 @@ def plot_sensor_workers(rows: Sequence[ScalingRow], title: str, path: Path) -> N
     )
     (best,) = (row for row in rows if row.is_best)
     left.annotate(
-        "best", (best.workers, best.fps), (0.0, -18.0), textcoords="offset points", ha="center",
+        "best", (best.workers, best.fps), (0.0, 8.0), textcoords="offset points", ha="center",
         color=FPS, weight="bold",
     )  # fmt: skip
     for axes, label, color in (
@@ -49,7 +50,7 @@ def plot_sensor_workers(rows: Sequence[ScalingRow], title: str, path: Path) -> N
     ):
         axes.set_ylabel(label, color=color)
         axes.tick_params(axis="y", colors=color)
-        axes.set_ylim(bottom=0.0)
+        axes.set_ylim(0.0, HEADROOM * axes.get_ylim()[1])
     left.set_xlabel("sensor workers")
     left.set_xticks(numbers)
     figure.suptitle(title)
