@@ -108,7 +108,7 @@ PACKET = np.dtype(
         ("x", np.float64),  # m, where the sender was
         ("y", np.float64),
         ("word", np.uint64),  # of its random numbers
-        ("kind", np.int64),  # as wide as it is so that there is no gap: a store keeps fields only
+        ("kind", np.int32),
         ("first", np.int32),  # its reports
         ("count", np.int64),
     ],
