@@ -238,3 +238,19 @@ def test_an_action_takes_effect_after_the_latency() -> None:
             throttles.append(float(rows["throttle"][rows["agent"] == 0][0]))
         assert (throttles[0] < -1.0) is (latency == 0)
         assert throttles[1] < -1.0
+
+
+def test_worlds_of_worker_processes_have_a_master_too() -> None:
+    found = []
+    for workers in (0, 2):
+        vec = cavmarl.make_vec("ring", num_envs=2, workers=workers, agents=2, background=2)
+        master = TimeMaster(vec)
+        master.reset(seed=0)
+        for _ in range(5):
+            master.step(vec.suggest_actions())
+        with pytest.raises(TickRefusedError):
+            vec.step(vec.suggest_actions())
+        assert (master.tick, master.world_ticks.tolist()) == (10, [10, 10])
+        found.append([vec.state_hash(world) for world in range(2)])
+        vec.close()
+    assert found[0] == found[1]
