@@ -1,10 +1,11 @@
 """Cooperative adaptive cruise control: follows by what the vehicle ahead says that it does.
 
-It steers, stops and gives way as the built-in driver does. Behind a vehicle whose messages it
-receives it takes its acceleration from van Arem, van Driel, Visser: "The impact of cooperative
-adaptive cruise control on traffic-flow characteristics", IEEE Trans. ITS 7 (4), 2006, eqs. (1) to
-(4): a radar measures gap and relative speed (the sensor `lanes`), and the acceleration of the
-vehicle ahead, which no radar can measure in time, comes over the air (the sensor `messages`).
+It steers, stops and gives way as the built-in driver does, and near junctions it is as careful.
+Behind a vehicle whose messages it receives it takes its acceleration from van Arem, van Driel,
+Visser: "The impact of cooperative adaptive cruise control on traffic-flow characteristics", IEEE
+Trans. ITS 7 (4), 2006: a radar measures gap and relative speed (the sensor `lanes`), and the
+acceleration of the vehicle ahead, which no radar can measure in time, comes over the air (the
+sensor `messages`).
 """
 
 from __future__ import annotations
@@ -34,6 +35,8 @@ ACCEL_SCALE = 10.0
 LENGTH_SCALE = 20.0
 HALF_M = 10.0
 OBJECT_FEATURES = 11
+LANE_CHANGE = 9  # of the features of `ego`
+CROSSING = 10  # of those of `lanes`
 OWN_LENGTH_M = 5.0
 
 NEEDED = {
@@ -70,7 +73,6 @@ class CaccPolicy(Policy):
         self._frame = sum(place.stop - place.start for place in self._places.values())
         self._scale_m = config.sensors.messages.range_m
         self._objects = config.sensors.messages.objects
-        self._signal_m = config.sensors.signal.range_m
         self._accel_mps2 = config.action.acceleration_mps2
 
     def act_batch(self, observations: NDArray[np.float32], mask: NDArray[np.bool_]) -> NDArray[Any]:
@@ -79,33 +81,34 @@ class CaccPolicy(Policy):
         actions: NDArray[Any] = self._suggested(mask.shape).copy()
         follows, accel = self._follow(newest)
         followed = np.clip(accel / self._accel_mps2, -1.0, 1.0)
-        # Where a line may have to be kept, or the lane is to be changed, the more careful one counts.
+        # There it is not only the vehicle ahead that counts: the more careful one does.
         careful = np.minimum(followed, actions[..., 0])
-        throttle = np.where(self._may_stop(newest), careful, followed)
+        throttle = np.where(self._near_others(newest), careful, followed)
         actions[..., 0] = np.where(follows, throttle, actions[..., 0])
         return actions.astype(np.float32)
 
     def _suggested(self, shape: tuple[int, ...]) -> NDArray[Any]:
         """What the built-in driver would do, (W, A, 2)."""
-        env = self.env
-        if isinstance(env, CavVectorEnv):
-            return env.suggest_actions()
+        suggested = self.env.suggest_actions()
+        if not isinstance(suggested, dict):
+            return suggested
         actions = np.zeros((*shape, 2), dtype=np.float32)
-        for agent, action in env.suggest_actions().items():
-            actions[0, env.possible_agents.index(agent)] = action
+        for agent, action in suggested.items():
+            actions[0, self.env.possible_agents.index(agent)] = action
         return actions
 
     def _part(self, newest: NDArray[np.float64], name: str) -> NDArray[np.float64]:
         part: NDArray[np.float64] = newest[..., self._places[name]]
         return part
 
-    def _may_stop(self, newest: NDArray[np.float64]) -> NDArray[np.bool_]:
-        """(W, A) whether a stop line is nearer than the vehicle ahead, or the lane is to change."""
+    def _near_others(self, newest: NDArray[np.float64]) -> NDArray[np.bool_]:
+        """(W, A) whether a line is in sight, somebody crosses the way, or the lane is to change."""
         ego, signal = self._part(newest, "ego"), self._part(newest, "signal")
-        line_m = signal[..., 1] * self._signal_m
-        at_line = (signal[..., 0] > 0.0) & (line_m < self._gap_m(newest) + OWN_LENGTH_M)
-        changed: NDArray[np.bool_] = at_line | (ego[..., 9] != 0.0)
-        return changed
+        crossing = self._part(newest, "lanes")[..., CROSSING]
+        found: NDArray[np.bool_] = (
+            (signal[..., 0] > 0.0) | (crossing > 0.0) | (ego[..., LANE_CHANGE] != 0.0)
+        )
+        return found
 
     def _gap_m(self, newest: NDArray[np.float64]) -> NDArray[np.float64]:
         """(W, A) to the vehicle ahead on the own way; inf: there is none in range."""

@@ -13,7 +13,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cavmarl.cav_env import CavEnv
-from cavmarl.errors import PolicyError
 from cavmarl.followers.client import sight_of
 from cavmarl.followers.driver import StackDriver
 from cavmarl.followers.snapshots import Moment, take_snapshot, welcome_to
@@ -25,45 +24,48 @@ class ReferencePolicy(Policy):
     """One stack an agent.
 
     Args:
-        env: a world with the sensors that the stack needs.
+        env: with the sensors that the stack needs, in this process.
     """
 
-    env: CavEnv
-
-    def __init__(self, env: CavEnv) -> None:
+    def __init__(self, env: CavEnv | CavVectorEnv) -> None:
         super().__init__(env)
-        self.driver = StackDriver(env.network, welcome_to(env, env.possible_agents, 0))
-        self._episode = 0
+        num_worlds = len(env.worlds.arrays.mask)
+        welcome = welcome_to(env, env.possible_agents, 0)
+        self.drivers = [StackDriver(env.network, welcome) for _ in range(num_worlds)]
+        self._episodes = np.zeros(num_worlds, dtype=np.int64)
+        self._ticks = np.zeros(num_worlds, dtype=np.int64)
 
     def reset(self, seed: int | None = None) -> None:
         """Forget all vehicles."""
-        self._episode += 1
+        self._episodes += 1
 
     def act_batch(self, observations: NDArray[np.float32], mask: NDArray[np.bool_]) -> NDArray[Any]:
-        """Not possible: snapshots are those of one world."""
-        raise PolicyError("reference drives a parallel_env, whose act() it has")
+        """Controls (W, A, 2) from what the sensors of each vehicle have."""
+        actions = np.zeros((*mask.shape, 2), dtype=np.float32)
+        ticks = self.env.worlds.ticks()
+        self._episodes[ticks < self._ticks] += 1
+        self._ticks = ticks
+        for world, driver in enumerate(self.drivers):
+            moment = Moment(0, int(self._episodes[world]), int(ticks[world]), False)
+            agents = np.flatnonzero(mask[world]).tolist()
+            sight = sight_of(*take_snapshot(self.env, agents, moment, world))
+            for agent, controls in driver.drive(sight).items():
+                actions[world, self.env.possible_agents.index(agent)] = controls
+        return actions
 
     def act(self, observations: Mapping[str, Any]) -> dict[str, Any]:
-        """Controls from what the sensors of each agent's vehicle have."""
-        env = self.env
-        tick = int(env.worlds.ticks()[0])
-        moment = Moment(0, self._episode, tick, False)
-        agents = [k for k, agent in enumerate(env.possible_agents) if agent in env.agents]
-        controls = self.driver.drive(sight_of(*take_snapshot(env, agents, moment)))
-        idle = np.zeros(2, dtype=np.float32)
-        return {
-            agent: np.asarray(controls[agent], dtype=np.float32) if agent in controls else idle
-            for agent in env.agents
-        }
+        """Controls of the agents that are in the world."""
+        mask = self.env.worlds.arrays.mask
+        actions = self.act_batch(np.zeros((*mask.shape, 0), dtype=np.float32), mask)[0]
+        index = {agent: k for k, agent in enumerate(self.env.possible_agents)}
+        live = self.env.agents if isinstance(self.env, CavEnv) else self.env.possible_agents
+        return {agent: actions[index[agent]] for agent in live}
 
 
 def make_policy(env: CavEnv | CavVectorEnv) -> Policy:
     """Seat the stack.
 
     Raises:
-        PolicyError: many worlds.
         ConfigError: the environment has no GNSS, or meta-actions.
     """
-    if isinstance(env, CavVectorEnv):
-        raise PolicyError("reference drives a parallel_env, not a make_vec")
     return ReferencePolicy(env)

@@ -175,7 +175,7 @@ class CavEnv(ParallelEnv[str, Any, Any]):  # type: ignore[misc] # PettingZoo is 
         self._stack = config.sensors.stack
         self._parts = (
             observation_parts(config.sensors)
-            if config.observation.kind == "dict" and config.observation.mode == "ground_truth"
+            if config.observation.kind == "dict" and config.observation.mode != "sensors"
             else None
         )
         self.state_space = state_space(worlds.arrays.states.shape[1] // STATE_FEATURES)

@@ -604,7 +604,7 @@ class EnvConfig:
             not self.scenario.name,
             "scenario.name",
             self.scenario.name,
-            f"traffic.source = {source}: scenes are played in native traffic; leave one of them out",
+            f"traffic.source = {source}: scenes are for native traffic; leave one out",
         )
 
     @property

@@ -17,6 +17,7 @@ from cavmarl.cav_env import CavEnv, parallel_env
 from cavmarl.errors import MissingExtraError, PolicyError
 from cavmarl.policies import Policy, load_policy
 from cavmarl.registry import agent_entries
+from cavmarl.stack.reference_rig import REFERENCE_RIG
 from cavmarl.vector_env import CavVectorEnv, make_vec
 
 SCRIPTED = ("idm", "random_actions")
@@ -123,11 +124,23 @@ def test_random_actions_repeat_with_the_seed() -> None:
     assert draw(7) != draw(8)
 
 
+# What a scripted driver asks of an environment.
+NEEDED = {
+    "cacc": {
+        "v2x.enabled": True,
+        "sensors.messages.objects": 4,
+        "sensors.lanes.range_m": 100.0,
+        "sensors.signal.enabled": True,
+    },
+    "reference": {"rig": REFERENCE_RIG},
+}
+
+
 def test_every_driver_of_the_folder_loads_where_it_belongs() -> None:
     for name, path in agent_entries().items():
         config = path / "config.json"
         home = json.loads(config.read_text())["environment"] if path.is_dir() else "merge"
-        policy = load_policy(name, make_vec(home))
+        policy = load_policy(name, make_vec(home, overrides=NEEDED.get(name)))
         assert isinstance(policy, Policy)
 
 

@@ -20,6 +20,7 @@ from cavmarl.cli.bench_sharding import sharding
 from cavmarl.cli.bench_sumo import sumo
 from cavmarl.cli.bench_traffic import traffic
 from cavmarl.cli.bench_train import train
+from cavmarl.cli.bench_v2x import v2x
 from cavmarl.cli.bench_workers import workers
 from cavmarl.cli.output import (
     Agents,
@@ -51,6 +52,7 @@ app.command()(workers)
 app.command()(train)
 app.command()(rays)
 app.command()(sensors)
+app.command()(v2x)
 app.command()(libraries)
 app.command()(clock)
 

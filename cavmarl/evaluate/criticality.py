@@ -30,7 +30,8 @@ TRACE = np.dtype(
 
 def trace_of(row: np.void, time_s: float) -> tuple[float, ...]:
     """What a TRACE keeps of a VEHICLE row."""
-    return (time_s, *(float(row[name]) for name in TRACE.names[1:] if TRACE.names))
+    _, *names = TRACE.names or ()
+    return (time_s, *(float(row[name]) for name in names))
 
 
 def time_to_collision_s(one: np.void, other: np.void) -> float:

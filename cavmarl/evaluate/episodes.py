@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from cavmarl.config import TERMS
 from cavmarl.evaluate.encounters import Watch
+from cavmarl.evaluate.message_record import MessageRecord
 from cavmarl.evaluate.recorder import Recorder
 from cavmarl.evaluate.tables import EPISODE, TRACK, TRIP
 from cavmarl.evaluate.transfer_rows import TRANSFER, TransferRecorder
@@ -214,13 +215,14 @@ class _Part:
         observations, infos = vec.reset(seed=seed, options={"first_world": first})
         driver.reset(policy_seed)
         handed_over = TransferRecorder(vec.simulation.transfers)
-        imbalance = _Imbalance(vec)
+        imbalance, messages = _Imbalance(vec), MessageRecord(vec)
         running = np.arange(vec.num_envs) < self._count
         every = max(1, round(TRACK_S / vec.step_s))
         steps = 0
         while running.any():
             self._watch.locate()
             imbalance.add(running)
+            messages.add(running)
             if self._tracked and running[0] and steps % every == 0:
                 self._note_track(steps, infos["mask"][0])
             before = time.perf_counter()
@@ -247,6 +249,7 @@ class _Part:
         self.trips["episode"] += first
         self.episodes["episode"] += first
         self.episodes["zone_imbalance"] = imbalance.means()[: self._count]
+        messages.write(self.episodes)
         self.transfers, self.transfer_counts = handed_over.records(), handed_over.counts
         self.transfers["episode"] += first
 

@@ -153,6 +153,32 @@ METRICS = (
         "vehicles of the fullest zone over those of a mean one, mean over the steps: 1 is even",
         better="less",
     ),
+    Metric(
+        "v2x_reception_ratio",
+        "packets received",
+        "%",
+        "episode",
+        "share of the packets within reach of a receiver that it received",
+        scale=100.0,
+        better="more",
+    ),
+    Metric(
+        "v2x_latency_s",
+        "latency of packets",
+        "s",
+        "episode",
+        "mean time from sending to receiving",
+        better="less",
+    ),
+    Metric(
+        "v2x_busy_ratio",
+        "channel busy ratio",
+        "%",
+        "episode",
+        "share of the time in which receivers hear others send",
+        scale=100.0,
+        better="less",
+    ),
     *(
         Metric(
             reward_column(term),

@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cavmarl.config import TERMS
+from cavmarl.evaluate.message_record import MESSAGE_COLUMNS
 from cavmarl.evaluate.statistics import gini_coefficient, jain_index
 from cavmarl.evaluate.tables import EPISODE, TRIP, reward_column
 from cavmarl.kernels.terms import TTC_HORIZON_S
@@ -140,10 +141,11 @@ class Recorder:
     def episodes(self) -> NDArray[np.void]:
         """EPISODE (W,) of all worlds; those that have not ended have a duration of 0.
 
-        Of zones nothing is known here.
+        Of zones and messages nothing is known here.
         """
         rows = np.zeros(self._world_steps.size, dtype=EPISODE)
-        rows["zone_imbalance"] = np.nan
+        for name in ("zone_imbalance", *MESSAGE_COLUMNS):
+            rows[name] = np.nan
         num_agents = self._steps.shape[1]
         trips = self.trips()
         bounds = np.searchsorted(trips["episode"], np.arange(rows.size + 1))

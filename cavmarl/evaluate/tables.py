@@ -61,6 +61,9 @@ EPISODE = np.dtype(
         ("jain_speed", np.float64),  # of the mean speeds of its trips that count
         ("gini_delay", np.float64),  # of their delays a kilometre
         ("zone_imbalance", np.float64),  # max / mean of vehicles by zone; NaN: undivided
+        ("v2x_reception_ratio", np.float64),  # packets received over those in reach; NaN: no V2X
+        ("v2x_latency_s", np.float64),  # mean, from sending to receiving
+        ("v2x_busy_ratio", np.float64),  # share of the time in which the air is busy
         *((reward_column(term), np.float64) for term in TERMS),  # that part of the return
     ]
 )

@@ -13,13 +13,14 @@ from cavmarl.cav_env import CavEnv
 from cavmarl.followers.messages import ArrayView, SensorView, Snapshot, VehicleView, Welcome
 from cavmarl.rig.frames import SensorFrames
 from cavmarl.roads.network import VEHICLE_CLASSES
+from cavmarl.vector_env import CavVectorEnv
 
 __all__ = ["Moment", "take_snapshot", "welcome_to"]
 
 NO_SIGNAL = 255
 
 
-def welcome_to(env: CavEnv, vehicles: Sequence[str], tick: int) -> Welcome:
+def welcome_to(env: CavEnv | CavVectorEnv, vehicles: Sequence[str], tick: int) -> Welcome:
     """How time goes in a world, and what its vehicles carry.
 
     Args:
@@ -63,35 +64,36 @@ class Moment(NamedTuple):
 
 
 def take_snapshot(
-    env: CavEnv, agents: Sequence[int], moment: Moment
+    env: CavEnv | CavVectorEnv, agents: Sequence[int], moment: Moment, world: int = 0
 ) -> tuple[Snapshot, list[NDArray[Any]]]:
     """What a follower is sent.
 
     Args:
-        env: the world, in this process.
+        env: the world or worlds, in this process.
         agents: indices of the follower's.
         moment: when that is.
+        world: which one, of several.
 
     Returns:
         the message, and its arrays.
     """
     worlds = env.worlds.arrays
-    due = [k for k in agents if worlds.mask[0, k] and not moment.is_over]
+    due = [k for k in agents if worlds.mask[world, k] and not moment.is_over]
     vehicles: dict[str, VehicleView] = {}
     views: list[ArrayView] = []
     arrays: list[NDArray[Any]] = []
     time_s = moment.tick * env.config.clock.sim_dt_s
     if due:
-        rows = env.simulation.vehicles()
+        rows = env.simulation.vehicles(world)
         by_agent = {int(row["agent"]): row for row in rows[np.isin(rows["agent"], due)]}
         for k in due:
             name = env.possible_agents[k]
             vehicles[name] = _view(env, by_agent[k])
-            for sensor, seen in _due(env, k, time_s).items():
+            for sensor, seen in _due(env, world, k, time_s).items():
                 data = np.ascontiguousarray(seen.data)
                 views.append(_array(name, sensor, data, seen.stamp_s, seen.lost))
                 arrays.append(data)
-        shown = _signals(env)
+        shown = _signals(env, world)
         views.append(_array("", "signals", shown, np.array([time_s]), np.zeros(1, np.bool_)))
         arrays.append(shown)
     return Snapshot(
@@ -99,16 +101,18 @@ def take_snapshot(
     ), arrays
 
 
-def _due(env: CavEnv, agent: int, time_s: float) -> dict[str, SensorFrames]:
+def _due(
+    env: CavEnv | CavVectorEnv, world: int, agent: int, time_s: float
+) -> dict[str, SensorFrames]:
     """What an agent's sensors have taken in the last step; without a rig, its observation."""
     arrays = env.worlds.arrays
     if not arrays.frames:
-        seen = arrays.observations[0, agent : agent + 1]
+        seen = arrays.observations[world, agent : agent + 1]
         now, lost = np.array([time_s]), np.zeros(1, dtype=np.bool_)
         return {"observation": SensorFrames(seen, now, lost, np.ones((), dtype=np.int64))}
     found = {}
     for name, frames in arrays.frames.items():
-        data, stamp_s, lost, fresh = (array[0, agent] for array in frames)
+        data, stamp_s, lost, fresh = (array[world, agent] for array in frames)
         if fresh:
             found[name] = SensorFrames(data[-fresh:], stamp_s[-fresh:], lost[-fresh:], fresh)
     return found
@@ -125,19 +129,19 @@ def _array(
     return ArrayView(vehicle, name, data.dtype.str, shape, stamp_s.tolist(), lost.tolist())
 
 
-def _signals(env: CavEnv) -> NDArray[np.uint8]:
+def _signals(env: CavEnv | CavVectorEnv, world: int) -> NDArray[np.uint8]:
     """(1, num_links) what the signal of each link shows, as SIGNAL_* codes."""
     network = env.network
     shown = np.full((1, len(network.links)), NO_SIGNAL, dtype=np.uint8)
     signal = network.links["signal"]
     has_one = signal >= 0
-    phase = env.simulation.signal_phases()[signal[has_one]]
+    phase = env.simulation.signal_phases(world)[signal[has_one]]
     letter = network.phases["first_state"][phase] + network.links["signal_index"][has_one]
     shown[0, has_one] = network.phase_states[letter]
     return shown
 
 
-def _view(env: CavEnv, row: np.void) -> VehicleView:
+def _view(env: CavEnv | CavVectorEnv, row: np.void) -> VehicleView:
     network, simulation = env.network, env.simulation
     edge = int(simulation.goal_edges[row["goal"]])
     lane = int(network.edges["first_lane"][edge])

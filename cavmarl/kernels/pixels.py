@@ -6,7 +6,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cavmarl.kernels import kernel
-from cavmarl.kernels.camera import ROAD_FACE, SKY_FACE, Camera, Picture, ground_at
+from cavmarl.kernels.camera import ROAD_FACE, SKY_FACE
+from cavmarl.kernels.faces import Camera, Picture, ground_at
 from cavmarl.kernels.semantics import (
     BICYCLE,
     BUILDING,

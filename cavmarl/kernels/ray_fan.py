@@ -39,6 +39,8 @@ WALL_HIT = -3  # WALL row k of the scene is WALL_HIT - k
 
 # A ray that closes in on a slab by less than this each metre does not reach it within any range.
 _PARALLEL = 1e-200
+# One that falls by less than this each metre does not meet the ground within any range.
+_LEVEL = 1e-9
 
 
 class Fan(NamedTuple):
@@ -84,7 +86,7 @@ def make_fan(
     rays = own[..., :1] * mount[:, 0] + own[..., 1:2] * mount[:, 1] + own[..., 2:] * mount[:, 2]
     down = -rays[:, :, 2]
     ground_m = np.full(down.shape, np.inf)
-    np.divide(mount[2, 3], down, out=ground_m, where=down > 0.0)
+    np.divide(mount[2, 3], down, out=ground_m, where=down > _LEVEL)
     tilted = bool(mount[2, 0] != 0.0 or mount[2, 1] != 0.0)
     looks_down = bool((ground_m < range_m).any())
     return Fan(

@@ -9,11 +9,13 @@ from numpy.typing import NDArray
 
 from cavmarl.kernels import kernel
 from cavmarl.kernels.arrays import Worlds
+from cavmarl.kernels.backdrop import Backdrop
 from cavmarl.kernels.birds_eye import BirdsEye, look_down
-from cavmarl.kernels.camera import Camera, Picture, look
+from cavmarl.kernels.camera import look
 from cavmarl.kernels.codes import DRIVER_AGENT
+from cavmarl.kernels.faces import Camera, Picture
 from cavmarl.kernels.neighbors import Grid, fill_grid
-from cavmarl.kernels.panorama import Backdrop, Panorama, gather
+from cavmarl.kernels.panorama import Panorama, gather
 from cavmarl.kernels.pixels import (
     LEAST_DEPTH_M,
     measure_depths,

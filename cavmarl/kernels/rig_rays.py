@@ -9,9 +9,10 @@ from numpy.typing import NDArray
 
 from cavmarl.kernels import kernel
 from cavmarl.kernels.arrays import Worlds
+from cavmarl.kernels.backdrop import Backdrop
 from cavmarl.kernels.codes import DRIVER_AGENT
 from cavmarl.kernels.neighbors import Grid, fill_grid
-from cavmarl.kernels.panorama import Backdrop, Panorama, gather
+from cavmarl.kernels.panorama import Panorama, gather
 from cavmarl.kernels.radar import detect
 from cavmarl.kernels.ray_fan import Fan, cast
 from cavmarl.kernels.rig_noise import Noise, error_of, sensor_key

@@ -1,7 +1,8 @@
 """What goes over the air, as records, and what a bus of messages works on.
 
 A packet is what one station sends at once; it carries reports, one of its sender in a CAM, one of
-each vehicle that it sees in a CPM. `v2x/messages.py` is the schema that others see.
+each vehicle that it sees in a CPM. `v2x/messages.py` is the schema that others see. Records that
+outlive a tick have no bytes between their fields: the state's hash is over all of their bytes.
 """
 
 from __future__ import annotations
@@ -109,7 +110,7 @@ PACKET = np.dtype(
         ("word", np.uint64),  # of its random numbers
         ("kind", np.int64),  # as wide as it is so that there is no gap: a store keeps fields only
         ("first", np.int32),  # its reports
-        ("count", np.int32),
+        ("count", np.int64),
     ],
     align=True,
 )

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cavmarl.errors import MapError
-from cavmarl.kernels.panorama import WALL
+from cavmarl.kernels.backdrop import WALL
 from cavmarl.maps.footprints import Footprint, read_footprints
 from cavmarl.roads.network import RoadNetwork
 from cavmarl.roads.reader import source_hash

@@ -6,9 +6,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cavmarl.errors import ConfigError
+from cavmarl.kernels.backdrop import Backdrop
 from cavmarl.kernels.codes import CLASS_PEDESTRIAN
 from cavmarl.kernels.neighbors import Grid, cell_at, make_grid
-from cavmarl.kernels.panorama import Backdrop
 from cavmarl.kernels.semantics import SEMANTIC_OF_CLASS
 from cavmarl.roads.network import VEHICLE_CLASSES, RoadNetwork
 

@@ -160,12 +160,14 @@ class _Mounted:
             array[chosen] = 0
 
     def rehearse(self, scenes: Sequence[Scene]) -> None:
-        """Take a sample in every world, and forget it."""
+        """Take a sample in every world, and leave everything as it was."""
+        kept = self.frames.copy()
         for array, value in zip(self.turn.due, (1, 0, 0), strict=True):
             array[:] = value
         sense_here(scenes, [self.turn])
         self.deliver(scenes)
-        self.clear(self.turn.due.num == 1)
+        for array, before in zip(self.frames, kept, strict=True):
+            array[...] = before
 
     def is_due(self, ticks: NDArray[np.int64], chosen: NDArray[np.bool_]) -> bool:
         """Whether anything is, in the chosen worlds (W,); how much is noted in its turn."""

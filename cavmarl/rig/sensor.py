@@ -12,8 +12,8 @@ from numpy.typing import DTypeLike, NDArray
 
 from cavmarl.config_rig import MountedConfig, SampledConfig
 from cavmarl.kernels.arrays import LaneGrid, RoadArrays, Travel, Worlds
+from cavmarl.kernels.backdrop import Backdrop
 from cavmarl.kernels.neighbors import Grid
-from cavmarl.kernels.panorama import Backdrop
 from cavmarl.kernels.rig_noise import Noise
 from cavmarl.kernels.rig_schedule import Due
 from cavmarl.rig.frames import SensorFrames

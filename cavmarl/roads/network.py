@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cavmarl.kernels.arrays import RoadArrays
-from cavmarl.kernels.panorama import WALL
+from cavmarl.kernels.backdrop import WALL
 from cavmarl.kernels.signals import DETECTOR_REACH_M
 
 __all__ = [

@@ -7,8 +7,7 @@ from time import perf_counter
 from typing import NamedTuple
 
 from cavmarl.errors import LedgerError, ZoneError
-from cavmarl.kernels.handing_over import NOT_OWNED, hand_over, release
-from cavmarl.kernels.repeated import repeated
+from cavmarl.kernels.handing_over import NOT_OWNED
 from cavmarl.ownership.messages import Birth
 from cavmarl.runtime.division import Division
 
@@ -43,8 +42,8 @@ class BorderBook:
         self._division = division
         self._world = world
         self._book = division.book
-        self._hand_over = repeated(hand_over)
-        self._release = repeated(release)
+        self._hand_over = division.call_hand_over
+        self._release = division.call_release
 
     def hand_over(self, everybody: bool, vehicles: int, newborn: Sequence[Birth]) -> int:
         """Let vehicles change their owner, by the committed rows.

@@ -19,7 +19,7 @@ from cavmarl.errors import ZoneError
 from cavmarl.kernels.arrays import Worlds, Zoned
 from cavmarl.kernels.borders import Borders, pass_on
 from cavmarl.kernels.exchange import exchange, take_own
-from cavmarl.kernels.handing_over import look, make_book
+from cavmarl.kernels.handing_over import hand_over, look, make_book, release
 from cavmarl.kernels.repeated import repeated
 from cavmarl.kernels.tallies import totals
 from cavmarl.kernels.zones import Halo, ZoneArrays, zone_of
@@ -67,6 +67,8 @@ class Division:
         borders: when a vehicle is near one.
         codec: of vehicles' states.
         book: who is near a border.
+        call_hand_over: the kernel, with the types of all worlds' arrays found out once.
+        call_release: the same.
     """
 
     def __init__(
@@ -94,6 +96,8 @@ class Division:
         self._look = repeated(look)
         self._pass_on = repeated(pass_on)
         self._totals = repeated(totals)
+        self.call_hand_over = repeated(hand_over)
+        self.call_release = repeated(release)
 
     @property
     def count(self) -> int:

@@ -22,7 +22,7 @@ from cavmarl.errors import (
     V2xError,
     ZoneError,
 )
-from cavmarl.kernels.arrays import Gate, Outputs, Worlds
+from cavmarl.kernels.arrays import Common, Gate, Outputs, Worlds
 from cavmarl.kernels.codes import (
     ACTION_IDLE,
     COUNT_ARRIVED,
@@ -309,6 +309,21 @@ class Simulation:
     def gate(self) -> Gate:
         """Who waits to enter each world, and counts since its reset; a reset may replace it."""
         return self._gate
+
+    def listen(self, config: EnvConfig) -> tuple[Bus, Callable[[], None]]:
+        """A bus beside the world, for tools that measure: nobody in the world hears of it.
+
+        Args:
+            config: whose `v2x` it is of.
+
+        Returns:
+            the bus, and what lets it send and receive in the present tick.
+        """
+        worlds = self._shard.worlds
+        common = Common(*(getattr(worlds, name) for name in Common._fields))
+        types, zoned = self._shard.travel.types, self._division.zoned
+        bus = Bus(config, self.network, types, zoned, common)
+        return bus, lambda: bus.exchange(self._division.side)
 
     @property
     def goal_edges(self) -> NDArray[np.int32]:

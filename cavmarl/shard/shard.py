@@ -144,6 +144,7 @@ class Shard:
         self.target_speeds = np.array(config.action.target_speeds_mps)
         self.discrete = config.action.kind == "discrete"
         self._call_leave = repeated(leave)
+        self._call_drop_ghosts = repeated(drop_ghosts)
         self._call_observe_further = repeated(observe_further)
         self._call_observe_messages = repeated(observe_messages)
         self._call_fill_stacks = repeated(fill_stacks)
@@ -176,7 +177,7 @@ class Shard:
 
     def forget(self, gate: Gate) -> None:
         """Drop the ghosts of those who have been retired."""
-        drop_ghosts(gate, self.worlds, self.worlds.rows)
+        self._call_drop_ghosts(gate, self.worlds, self.worlds.rows)
 
     def commit(self) -> None:
         """Make the next rows the committed state."""
@@ -248,7 +249,7 @@ def make_worlds(
 
     Agents' commands take effect `latency_ticks` later, scripts wait for `num_cues` cues. The rows
     are those of a zone of `zoned`, if it is given. What all zones of a world have in common (ticks,
-    keys, signals and what detectors saw) are the arrays of `common`, if it is given; if not,
+    keys, signals, what detectors saw, cues) are the arrays of `common`, if it is given; if not,
     `zeros` makes them.
     """
     if zoned is None:

@@ -24,13 +24,13 @@ __all__ = ["GnssInertial"]
 
 # Standard deviations: of what the model leaves out, a square root of a second, and of sensors
 # whose settings give none.
-_DRIFT = (0.05, 0.05, 0.01, 0.5)
+_DRIFT = (0.1, 0.1, 0.01, 0.5)
 _LEAST = {"gnss": 0.05, "odometry": 0.02, "lane_d": 0.05, "lane_heading": 0.02}
 _FIRST_HEADING_RAD = 0.3
 _LANE_SEARCH_M = 8.0
 _LANE_MATCH_M = 4.0
 _LANE_SURE_M = 0.6  # lateral deviation below which lanes can be told apart
-_GATE = 9.0  # squared deviations beyond which a measurement is not believed
+_GATE = 9.0  # squared deviations beyond which what a camera says of lanes is not believed
 _COURSE_M = 8.0  # driven before the fixes' course is compared with the heading
 _STRAIGHT_RAD = 0.5
 
@@ -81,7 +81,8 @@ class GnssInertial:
         speed = self._newest(readings, "odometry")
         if speed is not None:
             deviation = self._deviation("odometry", 0, _LEAST["odometry"])
-            self._take(np.array([0.0, 0.0, 0.0, 1.0]), speed[0] - self._get()[3], deviation)
+            ahead = float(speed[0]) - float(self._get()[3])
+            self._take(np.array([0.0, 0.0, 0.0, 1.0]), ahead, deviation, gate=math.inf)
         self._take_lane(readings)
         x_m, y_m, heading, speed_mps = self._get().tolist()
         return Pose(x_m, y_m, wrap(heading), max(0.0, speed_mps), self._yaw_rate)
@@ -174,7 +175,7 @@ class GnssInertial:
             row = np.zeros(4)
             row[axis] = 1.0
             deviation = self._deviation("gnss", axis, _LEAST["gnss"])
-            self._take(row, seen - float(self._get()[axis]), deviation)
+            self._take(row, seen - float(self._get()[axis]), deviation, gate=math.inf)
         self._compare_course(fix)
 
     def _compare_course(self, fix: tuple[float, float]) -> None:
@@ -200,12 +201,15 @@ class GnssInertial:
         if math.sqrt(max(self._spread[0, 0], self._spread[1, 1])) > _LANE_SURE_M:
             return
         offset = 0.5 * float(seen[1] - seen[0])
+        near = self._map.near(x_m, y_m, _LANE_MATCH_M)
+        internal = self._map.network.lanes["internal"]
         candidates = [
             (abs(offset - place.d_m), place)
-            for place in self._map.near(x_m, y_m, _LANE_MATCH_M)
+            for place in near
             if abs(wrap(heading - float(seen[3]) - place.heading_rad)) < _FIRST_HEADING_RAD
         ]
-        if not candidates:
+        # Within junctions lanes lie across each other, and nobody can tell which one was seen.
+        if not candidates or any(internal[place.lane] for place in near):
             return
         _, place = min(candidates, key=lambda found: found[0])
         row = np.array([-math.sin(place.heading_rad), math.cos(place.heading_rad), 0.0, 0.0])
@@ -215,16 +219,19 @@ class GnssInertial:
             deviation = self._deviation("lane_boundary", 3, _LEAST["lane_heading"])
             self._take(np.array([0.0, 0.0, 1.0, 0.0]), turn, deviation)
 
-    def _take(self, row: NDArray[np.float64], surprise: float, deviation: float) -> bool:
+    def _take(
+        self, row: NDArray[np.float64], surprise: float, deviation: float, gate: float = _GATE
+    ) -> bool:
         """Take in one number; whether it was believed.
 
         Args:
             row: (4,) how it depends on the state.
             surprise: the number less what was expected.
             deviation: of its noise.
+            gate: squared deviations beyond which it is not believed.
         """
         spread = float(row @ self._spread @ row) + deviation**2
-        if surprise**2 > _GATE * spread:
+        if surprise**2 > gate * spread:
             return False
         gain = self._spread @ row / spread
         self._state = self._get() + gain * surprise

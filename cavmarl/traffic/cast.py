@@ -115,7 +115,7 @@ class Cast:
     def _departure(self, roads: RoadArrays) -> np.void:
         """What the agent's entry takes of a DEPARTURE."""
         seat = self.scene.seat
-        departure = np.zeros(1, DEPARTURE)[0]
+        departure: np.void = np.zeros(1, DEPARTURE)[0]
         for name in ("order", "stop", "stops_end"):
             departure[name] = -1
         departure["goal"] = self.goal

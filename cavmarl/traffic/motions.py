@@ -15,7 +15,7 @@ from cavmarl.kernels.approach import APPROACH_M, APPROACH_S, APPROACH_STANDING_M
 from cavmarl.kernels.geometry import lane_pose
 from cavmarl.roads.network import RoadNetwork
 
-__all__ = ["ACCEL_MPS2", "Await", "Move", "Pose", "Ride", "Wait", "arc", "path_of"]
+__all__ = ["ACCEL_MPS2", "Act", "Await", "Move", "Pose", "Ride", "Wait", "arc", "path_of"]
 
 ACCEL_MPS2 = 2.5  # how actors speed up and slow down
 CREEP_MPS = 0.2  # on the last centimetres before they stand
@@ -210,6 +210,10 @@ class Ride:
                 yield dist, link
 
 
+Act = Move | Ride | Wait | Await
+"""One thing that an actor does."""
+
+
 def path_of(network: RoadNetwork, link: int) -> tuple[int, ...]:
     """The lanes of a link, with the one that it leaves and the one that it reaches."""
     row = network.links[link]
@@ -220,7 +224,11 @@ def path_of(network: RoadNetwork, link: int) -> tuple[int, ...]:
 
 
 def arc(
-    start: Sequence[float], radius_m: float, turn_rad: float, *, backwards: bool = False
+    start: Sequence[float] | NDArray[np.float64],
+    radius_m: float,
+    turn_rad: float,
+    *,
+    backwards: bool = False,
 ) -> NDArray[np.float64]:
     """(n, 3) a circular arc of a vehicle's centre, from x, y and heading on.
 

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from cavmarl.kernels.arrays import Scripts
 from cavmarl.kernels.codes import CLASS_PEDESTRIAN, MODEL_IDM
 from cavmarl.roads.network import VEHICLE_CLASSES, RoadNetwork
-from cavmarl.traffic.motions import Await, Move, Pose, Ride, Wait
+from cavmarl.traffic.motions import Act, Pose
 from cavmarl.traffic.shadows import Shadow, Shadows
 from cavmarl.traffic.vtypes import CLASS_DEFAULTS, generated_types
 
@@ -131,7 +131,7 @@ class Actor:
     """
 
     body: str
-    acts: Sequence[Move | Ride | Wait | Await]
+    acts: Sequence[Act]
     released_to: int | None = None
 
 

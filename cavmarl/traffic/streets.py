@@ -83,7 +83,7 @@ class Streets:
         lanes = self.network.lanes
         good = ~lanes["internal"] & (lanes["permissions"] & CAR != 0)
         good &= lanes["length_m"] >= least_m
-        return [int(lane) for lane in np.flatnonzero(good) if self._bend(lane) < STRAIGHT_RAD]
+        return [lane for lane in np.flatnonzero(good).tolist() if self._bend(lane) < STRAIGHT_RAD]
 
     def kerbs_m(self, lane: int, s: float) -> tuple[float, float]:
         """How far right of the middle of a lane the whole road reaches, and how far left."""
@@ -160,8 +160,8 @@ class Streets:
         found, way_m = [lane], self.length_m(lane)
         while way_m < far_m:
             row = lanes[found[0]]
-            before = into[row["first_into"] : row["first_into"] + row["num_into"]]
-            before = [k for k in before.tolist() if lanes["permissions"][k] & CAR]
+            ends = into[row["first_into"] : row["first_into"] + row["num_into"]]
+            before = [k for k in ends.tolist() if lanes["permissions"][k] & CAR]
             if not before or before[0] in found:
                 return None
             found.insert(0, before[0])

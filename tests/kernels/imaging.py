@@ -8,8 +8,9 @@ import numpy as np
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
+from cavmarl.kernels.backdrop import WALL, Backdrop
 from cavmarl.kernels.neighbors import Grid, fill_grid, make_grid
-from cavmarl.kernels.panorama import WALL, Backdrop, Counts, Panorama, gather, make_panorama
+from cavmarl.kernels.panorama import Counts, Panorama, gather, make_panorama
 from cavmarl.kernels.semantics import CAR, PEDESTRIAN
 from tests.kernels.builders import coordinates
 from tests.naive.imaging import turn

@@ -8,8 +8,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from cavmarl.kernels.camera import Camera, Picture, look, make_camera, make_picture
-from cavmarl.kernels.panorama import WALL
+from cavmarl.kernels.backdrop import WALL
+from cavmarl.kernels.camera import look, make_camera, make_picture
+from cavmarl.kernels.faces import Camera, Picture
 from cavmarl.kernels.pixels import (
     colours,
     measure_depths,

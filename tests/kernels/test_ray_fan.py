@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from cavmarl.kernels.panorama import WALL
+from cavmarl.kernels.backdrop import WALL
 from cavmarl.kernels.ray_fan import HIT, WALL_HIT, Fan, cast, make_fan
 from tests.kernels.builders import crowds, vehicles
 from tests.kernels.imaging import NO_WALLS, backdrop, look_around, mount, mounts, wall_sets

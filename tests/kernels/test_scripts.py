@@ -70,6 +70,8 @@ def follow(tables: Travel, row: np.void, came: bool, ticks: int) -> list[tuple[f
     cues = np.array([0 if came else -1])
     places = []
     for _ in range(ticks):
+        if row["driver"] != DRIVER_SCRIPTED:
+            break
         follow_script(ROADS.arrays, tables, cues, row, DT)
         places.append((float(row["x"]), float(row["y"])))
     return places

@@ -117,7 +117,7 @@ def trace(
     nearest = min(found, key=lambda echo: (echo.distance, echo.what), default=Echo(math.inf))
     if nearest.distance < reach:
         return nearest
-    if ray[2] < 0.0 and -start[2] / ray[2] < reach:
+    if start[2] < reach * -ray[2]:
         return Echo(-start[2] / ray[2], ("ground", 0))
     return Echo(reach)
 

@@ -13,7 +13,10 @@ from cavmarl.config_rig import GnssConfig
 from cavmarl.errors import ConfigError, UnknownAgentError
 from cavmarl.evaluate.equivalence import verify_zones
 from cavmarl.registry import load_config, load_rig
+from cavmarl.shard.shard import Commands
+from cavmarl.stepping.local import LocalWorlds
 from cavmarl.vector_env import CavVectorEnv
+from cavmarl.worlds import load_world
 from tests.faulted import BUSY, ROUGH, record, replay
 
 PLACE = {"x_m": 1.5, "y_m": -0.5, "z_m": 1.2, "yaw_deg": 20.0}
@@ -96,6 +99,25 @@ def test_a_reset_begins_with_the_samples_that_are_due_then() -> None:
     assert (frames["wheels"].data[0, :, -1, 0] != 0.0).all()
     assert (frames["slow"].fresh[0] == 0).all()
     assert (frames["slow"].data[0] == 0.0).all()
+
+
+def test_worlds_that_go_on_elsewhere_keep_their_samples() -> None:
+    world = load_world("grid4x4", overrides=WORLD)
+    here, there = LocalWorlds(world, 2), LocalWorlds(world, 2)
+    here.arrays.chosen[:] = True
+    here.reset(3, 0)
+    nothing = Commands(here.arrays.controls, here.arrays.meta_actions)
+    for _ in range(3):
+        here.step(nothing)
+    there.load([array.copy() for array in here.save()])
+    for worlds in (here, there):
+        worlds.arrays.chosen[:] = [True, False]
+        worlds.reset(None, 0)
+        worlds.step(nothing)
+    for name, sensor in here.arrays.frames.items():
+        for array, other in zip(sensor, there.arrays.frames[name], strict=True):
+            np.testing.assert_array_equal(array, other)
+    assert [here.state_hash(w) for w in (0, 1)] == [there.state_hash(w) for w in (0, 1)]
 
 
 def test_agents_without_a_vehicle_have_zeros() -> None:

@@ -22,16 +22,20 @@ class Standing:
     Args:
         agents: seats; vehicle k < agents is driven by agent k.
         env: whose map it is.
+        rays: of the agents' lidar.
         settings: keys under `v2x`.
     """
 
-    def __init__(self, agents: int, env: str = "grid4x4", **settings: Any) -> None:
+    def __init__(self, agents: int, env: str = "grid4x4", rays: int = 0, **settings: Any) -> None:
         overrides = {f"v2x.{key.replace('__', '.')}": value for key, value in settings.items()}
         config, network, demand, partition = load_world(
             env,
             agents=agents,
             background=80,
-            overrides=CLOCK | {"population.mode": "seats", "v2x.enabled": True} | overrides,
+            overrides=CLOCK
+            | {"population.mode": "seats", "v2x.enabled": True}
+            | overrides
+            | {"sensors.lidar.rays": rays},
         )
         self.config = config
         self.agents = agents

@@ -36,8 +36,6 @@ def behind_a_truck(**settings: Any) -> Standing:
 
 def test_a_car_behind_a_truck_is_known_through_messages_only() -> None:
     world = behind_a_truck(perception__rate_hz=10.0)
-    simulation = world.simulation
-    simulation.seed(3)
     # What the agent sees itself, as a CPM of its own would say, is without the hidden car.
     world.tick()
     mail = world.bus.mail
@@ -51,7 +49,7 @@ def test_a_car_behind_a_truck_is_known_through_messages_only() -> None:
 
 
 def test_lidar_does_not_meet_it_while_messages_tell_of_it() -> None:
-    world = Standing(1)
+    world = Standing(1, rays=64)
     simulation = world.simulation
     rows = world.worlds.rows[0, : world.worlds.num_owned[0]]
     agent = rows[rows["agent"] == 0][0]

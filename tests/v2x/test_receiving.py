@@ -116,10 +116,10 @@ def test_inboxes_hold_what_the_definitions_say(name: str, seen: bool) -> None:
     assert statistics.mean_latency_s == pytest.approx(0.1 * world.config.v2x.channel.latency_ticks)
 
 
-def test_chances_are_met(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_chances_are_met() -> None:
     # 300 receptions at each distance: within four standard deviations.
     world = Standing(1, channel__path_loss_exponent=2.75, channel__loss=0.1, equipped=1.0)
-    distances = np.array([20.0, 90.0, 120.0, 150.0, 220.0])
+    distances = np.array([20.0, 90.0, 120.0, 140.0, 220.0])
     ring = np.linspace(0.0, 2.0 * np.pi, 60, endpoint=False)
     config = world.config.v2x.channel
     for distance in distances:
@@ -165,7 +165,9 @@ def test_more_traffic_means_fewer_receptions() -> None:
             1, channel__path_loss_exponent=2.0, channel__sensitivity_dbm=-66.0,
             channel__data_rate_mbps=3.0,
         )  # fmt: skip
-        world.put(np.random.default_rng(5).uniform(0.0, 400.0, (vehicles, 2)))
+        ring = np.linspace(0.0, 2.0 * np.pi, vehicles, endpoint=False)
+        around = 200.0 + 100.0 * np.stack([np.cos(ring), np.sin(ring)], 1)
+        world.put(np.concatenate([[[200.0, 200.0]], around]))
         for _ in range(40):
             world.tick()
         ratios.append(world.bus.statistics().reception_ratio)
@@ -183,7 +185,7 @@ def test_a_new_vehicle_in_a_seat_has_heard_nothing() -> None:
     world.write(rows)
     world.tick()
     there = world.bus.mail.objects[0, 0]["sender"]
-    assert (there >= 0).sum() == 2  # one in ten of 19 has sent in this tick
+    assert there[there >= 0].tolist() == [10]  # the only other one who has sent in this tick
     world.write(rows[1:])
     world.tick()
     assert (world.bus.mail.objects[0, 0]["sender"] < 0).all()

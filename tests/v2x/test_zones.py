@@ -8,6 +8,7 @@ import pytest
 
 from cavmarl import make_vec
 from cavmarl.evaluate.equivalence import verify_zones
+from tests.faulted import BUSY, ROUGH
 
 FAST = {"clock.sim_dt_s": 0.1, "clock.ctrl_dt_s": 0.2}
 OBSERVED = {
@@ -41,21 +42,17 @@ def test_what_agents_are_told_does_not_depend_on_zones(channel: dict[str, Any], 
     assert sum(result.crossings for result in found.results) >= 10
 
 
-def everything_said(zones: int, workers: int = 0, **more: Any) -> list[bytes]:
+def everything_said(zones: int) -> list[bytes]:
     """All inboxes and counts after each step, in the order of the receivers."""
-    overrides = FAST | OBSERVED | LOSSY | {"population.mode": "seats"} | more
-    env = make_vec("grid4x4", num_envs=2, zones=zones, workers=workers, overrides=overrides)
+    overrides = FAST | OBSERVED | LOSSY | {"population.mode": "seats"}
+    env = make_vec("grid4x4", num_envs=2, zones=zones, overrides=overrides)
     said = []
     observations, _ = env.reset(seed=4)
     for _ in range(20):
         said.append(observations.tobytes())
-        if workers:
-            said.append(env.state_hash(1).encode())
-        else:
-            said += [array.tobytes() for array in env.simulation.messages.mail]
-            said.append(env.state_hash(1).encode())
+        said += [array.tobytes() for array in env.simulation.messages.mail]
+        said.append(env.state_hash(1).encode())
         observations, *_ = env.step(env.suggest_actions())
-    env.close()
     return said
 
 
@@ -63,3 +60,40 @@ def test_inboxes_are_the_same_byte_for_byte() -> None:
     whole = everything_said(1)
     for zones in (2, 4, 9):
         assert everything_said(zones) == whole
+
+
+def test_worker_processes_say_the_same() -> None:
+    overrides = FAST | OBSERVED | LOSSY | {"population.mode": "seats"}
+
+    def seen(**split: int) -> list[bytes]:
+        env = make_vec("grid4x4", num_envs=1, overrides=overrides, **split)
+        observations, _ = env.reset(seed=4)
+        found = []
+        for _ in range(8):
+            found += [observations.tobytes(), env.state_hash(0).encode()]
+            observations, *_ = env.step(env.suggest_actions())
+        found.append(repr(sorted(env.traffic_stats().items())).encode())
+        env.close()
+        return found
+
+    assert seen(zones=2, workers=2) == seen()
+
+
+@pytest.mark.parametrize("channel", [{}, LOSSY], ids=["ideal", "lossy"])
+def test_ticks_that_are_begun_again_say_the_same(channel: dict[str, Any]) -> None:
+    rates = ("cam.rate_hz", "denm.rate_hz", "perception.rate_hz", "roadside.rate_hz")
+    overrides = dict(BUSY) | OBSERVED | channel | {f"v2x.{rate}": 5.0 for rate in rates}
+    whole = make_vec("grid4x4", overrides=overrides)
+    faults = {"zones.faults": ROUGH.to_json()}
+    harmed = make_vec("grid4x4", zones=4, overrides=overrides | faults)
+    observations = [env.reset(seed=1)[0] for env in (whole, harmed)]
+    for _ in range(25):
+        actions = whole.suggest_actions()
+        assert (actions == harmed.suggest_actions()).all()
+        observations = [env.step(actions)[0] for env in (whole, harmed)]
+        assert observations[0].tobytes() == observations[1].tobytes()
+        assert whole.state_hash() == harmed.state_hash()
+        mails = [env.simulation.messages.arrays() for env in (whole, harmed)]
+        for ours, theirs in zip(*mails, strict=True):
+            assert ours.tobytes() == theirs.tobytes()
+    assert harmed.simulation.revivals

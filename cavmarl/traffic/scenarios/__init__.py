@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import importlib
 import importlib.util
+import sys
 from difflib import get_close_matches
 from functools import cache, lru_cache
 from pathlib import Path
@@ -69,9 +70,11 @@ def _run(path: Path) -> ModuleType:
     if spec is None or spec.loader is None:
         raise ScenarioError(f"{path}: not a Python file")
     module = importlib.util.module_from_spec(spec)
+    sys.modules[spec.name] = module  # where its dataclass looks for what its annotations name
     try:
         spec.loader.exec_module(module)
     except Exception as error:  # the file is the user's: it may raise anything
+        del sys.modules[spec.name]
         raise ScenarioError(f"{path}: {type(error).__name__}: {error}") from error
     return module
 

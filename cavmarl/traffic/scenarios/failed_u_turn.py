@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from cavmarl.traffic.motions import ACCEL_MPS2, Await, Move, Wait, arc
+from cavmarl.traffic.motions import ACCEL_MPS2, Act, Await, Move, Wait, arc
 from cavmarl.traffic.scene import Scene, Seat
 from cavmarl.traffic.scripts import Actor, Cue
 from cavmarl.traffic.settings import setting
@@ -55,7 +55,7 @@ def stage(streets: Streets, place: int, parameters: Parameters) -> Scene:
     speed = parameters.turn_mps
     to_across_s = RADIUS_M * _first_turn(other) / speed + speed / ACCEL_MPS2
     radius_m = parameters.speed_mps * (to_across_s + parameters.lead_s)
-    acts = [
+    acts: list[Act] = [
         Move(forward[:1], other.lane),
         Await(0),
         Move(forward, place, speed),

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from cavmarl.traffic.motions import Await, Ride, Wait, path_of
+from cavmarl.traffic.motions import Act, Await, Ride, Wait, path_of
 from cavmarl.traffic.scene import Scene
 from cavmarl.traffic.scripts import Actor, Cue
 from cavmarl.traffic.settings import setting
@@ -50,7 +50,7 @@ def stage(streets: Streets, place: Crossing, parameters: Parameters) -> Scene:
     line_m = streets.length_m(path[0])
     stop_m = line_m + place.foe_middle_m
     end_m = line_m + float(streets.network.links["length_m"][place.foe]) + FREE_M
-    acts = [
+    acts: list[Act] = [
         Ride(path, line_m - ROLL_M, stop_m, 8.0, start_mps=6.0),
         Await(0),
         Wait(parameters.blocked_s),

@@ -1,0 +1,21 @@
+"""Evaluations say what became of messages."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+
+from cavmarl.evaluate.evaluation import evaluate
+
+LOSSY = {"v2x.enabled": True, "v2x.channel.loss": 0.25, "v2x.channel.latency_ticks": 2}
+
+
+def test_an_episode_has_its_reception_ratio_and_latency() -> None:
+    small: dict[str, Any] = {"episodes": 2, "agents": 3, "background": 12, "max_cycles": 30}
+    found = evaluate("grid4x4", "idm", overrides=LOSSY, **small)["idm"]
+    assert found["v2x_reception_ratio"].mean == pytest.approx(0.75, abs=0.02)
+    assert found["v2x_latency_s"].mean == pytest.approx(0.1)
+    silent = evaluate("grid4x4", "idm", **small)["idm"]
+    assert silent["v2x_reception_ratio"].mean is None
+    assert silent["v2x_busy_ratio"].mean is None
