@@ -260,9 +260,13 @@ def _columns_of_wall(
         )
     yaw_cos = fan.mount[0, 0]
     yaw_sin = fan.mount[1, 0]
+    across = ax * by - ay * bx
+    along = ax * bx + ay * by
+    if across == 0.0 and along == 0.0:
+        return 0, fan.rays.shape[0], 0  # the sensor is at an end of it
     from_a = rough_atan2(ay * yaw_cos - ax * yaw_sin, ax * yaw_cos + ay * yaw_sin)
     # From a to b the short way round.
-    turn = rough_atan2(ax * by - ay * bx, ax * bx + ay * by)
+    turn = rough_atan2(across, along)
     if abs(turn) > PI - 2.0 * ANGLE_ERROR_RAD:
         return 0, fan.rays.shape[0], 0  # it may be the other way round
     # Two angles are wrong, and not one.

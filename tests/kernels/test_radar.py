@@ -74,6 +74,12 @@ def test_a_wall_at_ten_metres_is_one_target() -> None:
     assert (target["body"], target["id"]) == (0, 7)
 
 
+def test_a_sensor_at_the_end_of_a_wall_is_in_it() -> None:
+    walls = np.array([(0.0, 0.0, 0.0, 1.0, 8.0, 3), (10.0, -20.0, 10.0, 20.0, 8.0, 7)], WALL)
+    targets = echoes(vehicles([(0.0, 0.0, 0.0)], speed=0.0), mount((0.0, 0.0, 0.5)), walls)
+    assert [(target["id"], target["range"]) for target in targets] == [(3, 0.0)]
+
+
 def test_radial_speeds_are_relative_and_positive_away() -> None:
     rows = vehicles(
         [(0.0, 0.0, 0.0), (20.0, 0.0, 0.0), (20.0, 8.0, math.pi)], speed=[10.0, 14.0, 5.0]
