@@ -7,9 +7,7 @@ had: no SUMO takes a step twice.
 from __future__ import annotations
 
 import logging
-import shutil
 import tempfile
-import weakref
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import NamedTuple
@@ -76,9 +74,6 @@ class SumoWorlds:
         self._processes: list[SumoProcess | None] = [None] * num_worlds
         self._ticks: list[Tick | None] = [None] * num_worlds
         self._path_of = [np.zeros(0, dtype=np.int32) for _ in range(num_worlds)]
-        # Who forgets to close is no reason to keep files, nor to complain.
-        self._folder = Path(tempfile.mkdtemp(prefix="cavmarl-sumo-"))
-        self._finalizer = weakref.finalize(self, shutil.rmtree, self._folder, ignore_errors=True)
 
     @property
     def pids(self) -> tuple[int, ...]:
@@ -105,7 +100,9 @@ class SumoWorlds:
         self.teleports[w] = 0
         self._path_of[w] = np.zeros(0, dtype=np.int32)
         seed = key >> (64 - SEED_BITS)
-        answer = process.start(self._demand.words(self._folder, seed))
+        # SUMO reads all additional files when it starts.
+        with tempfile.TemporaryDirectory(prefix="cavmarl-sumo-") as folder:
+            answer = process.start(self._demand.words(Path(folder), seed))
         self._ticks[w] = self._take(w, 0, answer)
 
     def at(self, w: int) -> Tick:
@@ -160,7 +157,6 @@ class SumoWorlds:
         for process in self._processes:
             if process is not None:
                 process.close()
-        self._finalizer()
 
     def _process(self, w: int) -> SumoProcess:
         process = self._processes[w]
