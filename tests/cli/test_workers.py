@@ -37,7 +37,7 @@ def test_a_successor_that_forgets_is_found_out(
         return replace(crew, k, mail, ordered)
 
     monkeypatch.setattr(Crew, "replace", without_memory)
-    assert run("verify", *SMALL, "--kill", "2") == 1
+    assert run("verify", *SMALL, "--kill", "5") == 1
     assert "different after step" in capsys.readouterr().out
 
 
