@@ -409,8 +409,8 @@ class CavEnv(ParallelEnv[str, Any, Any]):  # type: ignore[misc] # PettingZoo is 
     def traffic_stats(self) -> dict[str, float]:
         """Traffic since reset: departed, waiting, running, arrived, contacts, mean speed and more.
 
-        All fields of `runtime.simulation.TrafficStats`, and how many actions were clipped, held and
-        ignored.
+        All fields of `runtime.traffic_stats.TrafficStats`, and how many actions were clipped, held
+        and ignored.
         """
         return {**self.worlds.traffic_stats(0), **self._decoder.tolerated()}
 

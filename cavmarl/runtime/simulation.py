@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
@@ -23,16 +21,7 @@ from cavmarl.errors import (
     ZoneError,
 )
 from cavmarl.kernels.arrays import Common, Gate, Outputs, Worlds
-from cavmarl.kernels.codes import (
-    ACTION_IDLE,
-    COUNT_ARRIVED,
-    COUNT_DEPARTED,
-    COUNT_REMOVED,
-    COUNT_REROUTED,
-    SUM_DELAY_S,
-    SUM_DISTANCE_M,
-    SUM_TIME_S,
-)
+from cavmarl.kernels.codes import ACTION_IDLE
 from cavmarl.kernels.repeated import repeated
 from cavmarl.kernels.rng import world_key
 from cavmarl.kernels.tallies import begins_second, count_tick
@@ -62,11 +51,13 @@ from cavmarl.runtime.refereeing import make_refereeing
 from cavmarl.runtime.reproducer import Reproducer
 from cavmarl.runtime.reproducing import Keeper, Moment, sources_of
 from cavmarl.runtime.shard_clock import ShardClock
+from cavmarl.runtime.state_digest import digest_world
 from cavmarl.runtime.step_trace import MIRROR, SUMO, Traced
 from cavmarl.runtime.store import CommittedStore
+from cavmarl.runtime.traffic_stats import TrafficStats, count_traffic
 from cavmarl.runtime.zone_view import ZoneView, view_zones
 from cavmarl.shard.shard import Commands, Shard
-from cavmarl.shard.vehicles import STATE_FIELDS, blank_vehicle
+from cavmarl.shard.vehicles import blank_vehicle
 from cavmarl.traffic.demand import DemandFile
 from cavmarl.traffic.departures import make_gate
 from cavmarl.traffic.memory import Zeros
@@ -77,45 +68,13 @@ from cavmarl.traffic.sumo.demand import SumoDemand
 from cavmarl.traffic.sumo.traffic import SumoTraffic
 from cavmarl.v2x.bus import Bus
 
-__all__ = ["Simulation", "TrafficStats"]
+__all__ = ["Simulation"]
 
 # Fields of `Gate` that outlive a tick.
 KEPT_BY_GATE = (
     "next_order", "queue", "num_queue", "next_id", "num_entered", "counts", "sums", "num_passing",
     "lane_taken",
 )  # fmt: skip
-
-
-@dataclass(frozen=True)
-class TrafficStats:
-    """Traffic of one world since its reset; agents count as vehicles.
-
-    Attributes:
-        departed: vehicles that have entered, those placed at reset included.
-        waiting: departures that wait for a safe gap.
-        running: vehicles in the world.
-        arrived: vehicles that reached their goal.
-        contacts: vehicles that began to touch another one.
-        removed: agents taken out after a collision or off the road.
-        rerouted: vehicles that took another way; one that did so twice counts twice.
-        mean_speed_mps: over the vehicles in the world now.
-        mean_trip_m: over the arrived ones.
-        mean_trip_s: over the arrived ones.
-        mean_delay_s: over the arrived ones, time above what the way takes at the speed that
-            limit and driver allow.
-    """
-
-    departed: int
-    waiting: int
-    running: int
-    arrived: int
-    contacts: int
-    removed: int
-    rerouted: int
-    mean_speed_mps: float
-    mean_trip_m: float
-    mean_trip_s: float
-    mean_delay_s: float
 
 
 class Simulation:
@@ -799,62 +758,11 @@ class Simulation:
         all random numbers; not over where a record lives, nor over what a view keeps (steps to the
         horizon, held actions).
         """
-        worlds = self._shard.worlds
-        rows = self.vehicles(world)
-        rows = rows[np.argsort(rows["id"])]
-        rerouting = self._traffic.rerouting
-        if rerouting is not None:
-            rows["way"] = rerouting.ways_of_first_world(rows["way"], world)
-        if self._sumo is not None:
-            rows["way"] = self._sumo.ways_of_first_world(rows["way"], world)
-        digest = hashlib.blake2b(digest_size=16)
-        for name in STATE_FIELDS:
-            digest.update(np.ascontiguousarray(rows[name]).tobytes())
-        agents = rows["agent"][rows["agent"] >= 0]
-        digest.update(worlds.pending[world, agents].tobytes())
-        queue = self._gate.queue[world, : self._gate.num_queue[world]]
-        for name in queue.dtype.names or ():
-            digest.update(np.ascontiguousarray(queue[name]).tobytes())
-        for array in (
-            worlds.signal_phase[world],
-            worlds.controllers[world],
-            worlds.detected_s[world],
-            worlds.ticks[world],
-            worlds.keys[world],
-            worlds.cues[world],
-            self._gate.next_id[world],
-            self._gate.next_order[world],
-            self._gate.num_entered[world],
-        ):
-            digest.update(array.tobytes())
-        if rerouting is not None:
-            for array in rerouting.state(world, self.vehicles(world)):
-                digest.update(array.tobytes())
-        for part in self._attached:
-            for array in part.arrays():
-                digest.update(array[world].tobytes())
-        return digest.hexdigest()
+        return digest_world(self._parts(), self._sumo, world)
 
     def traffic_stats(self, world: int = 0) -> TrafficStats:
         """Counts and means since the world's reset."""
-        counts = self._gate.counts[world]
-        sums = self._gate.sums[world]
-        rows = self.vehicles(world)
-        arrived = int(counts[COUNT_ARRIVED])
-        trips = max(arrived, 1)
-        return TrafficStats(
-            departed=int(counts[COUNT_DEPARTED]),
-            waiting=int(self._gate.num_queue[world]),
-            running=len(rows),
-            arrived=arrived,
-            contacts=int(self._division.contacts()[world]),
-            removed=int(counts[COUNT_REMOVED]),
-            rerouted=int(counts[COUNT_REROUTED]),
-            mean_speed_mps=float(np.sort(rows["speed"]).mean()) if len(rows) else 0.0,
-            mean_trip_m=float(sums[SUM_DISTANCE_M]) / trips,
-            mean_trip_s=float(sums[SUM_TIME_S]) / trips,
-            mean_delay_s=float(sums[SUM_DELAY_S]) / trips,
-        )
+        return count_traffic(self._gate, self._division, world)
 
 
 def _frames(config: EnvConfig, num_worlds: int, zeros: Zeros) -> Frames:
