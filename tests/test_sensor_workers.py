@@ -252,7 +252,9 @@ def test_closing_and_forgetting_leave_nobody_behind() -> None:
 @pytest.mark.parametrize("how", [signal.SIGKILL, signal.SIGINT])
 def test_nobody_outlives_the_process_that_keeps_the_state(how: signal.Signals) -> None:
     text = (
-        "import sys, cavmarl\n"
+        "import signal, cavmarl\n"
+        # Started in the background, it would not hear of Ctrl-C.
+        "signal.signal(signal.SIGINT, signal.default_int_handler)\n"
         f"settings = {{'rig': {SMALL}}}\n"
         "vec = cavmarl.make_vec('grid4x4', agents=2, sensor_workers=2, overrides=settings)\n"
         "vec.reset(seed=0)\n"
