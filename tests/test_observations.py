@@ -222,7 +222,8 @@ def test_highway_envs_default_observation_alone() -> None:
 
 
 def test_features_are_named_once_and_bounded_by_the_space() -> None:
-    config, _ = load_config("merge", overrides=EVERYTHING)
+    told = {"v2x.enabled": True, "sensors.messages.objects": 4, "sensors.messages.events": 2}
+    config, _ = load_config("merge", overrides=EVERYTHING | told)
     box = flat_observation_space(config)
     start = 0
     for sensor in SENSORS:
