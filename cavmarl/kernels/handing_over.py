@@ -20,6 +20,7 @@ from cavmarl.kernels.zones import ZoneArrays, squared_distance
 __all__ = [
     "CHANGE",
     "COMING",
+    "LATE",
     "NOT_OWNED",
     "NOT_SEEN",
     "Book",
@@ -67,6 +68,10 @@ CHANGE = np.dtype(
 )
 
 
+LATE = 32
+"""Once so many changes wait they are read; the last tick may add one for each vehicle."""
+
+
 class Book(NamedTuple):
     """What is known of the borders of W worlds; C rows a zone can hold."""
 
@@ -83,7 +88,7 @@ class Book(NamedTuple):
     tick: NDArray[np.int64]  # (W,) whose rows have been looked at
     ms: NDArray[np.float64]  # (W,) of a clock, when it began
     newborn: NDArray[np.int64]  # (W, C) ids that have entered since the last tick began
-    changes: NDArray[np.void]  # CHANGE (W, 3 C) those that nobody has read yet
+    changes: NDArray[np.void]  # CHANGE (W, C + LATE) those that nobody has read yet
     num_changes: NDArray[np.int64]  # (W,)
 
 
@@ -112,7 +117,7 @@ def make_book(num_worlds: int, capacity: int) -> Book:
         tick=numbers(),
         ms=np.zeros(num_worlds),
         newborn=numbers(capacity),
-        changes=np.zeros((num_worlds, 3 * capacity), CHANGE),
+        changes=np.zeros((num_worlds, capacity + LATE), CHANGE),
         num_changes=numbers(),
     )
 

@@ -19,6 +19,7 @@ from collections.abc import Callable, Iterable
 from typing import NamedTuple
 
 from cavmarl.errors import LedgerError
+from cavmarl.kernels.handing_over import LATE
 from cavmarl.ownership.directory import Directory
 from cavmarl.ownership.ledger import world_digest
 from cavmarl.ownership.messages import Begin, Birth, Commit, Removed, Switch, ZoneLedger
@@ -28,9 +29,6 @@ from cavmarl.runtime.journal import AnyJournal
 from cavmarl.runtime.referee import Referee
 
 __all__ = ["DirectCoordinator"]
-
-LATE = 32
-"""So many changes of owner, or ticks with news, are put into the table together."""
 
 
 class _News(NamedTuple):

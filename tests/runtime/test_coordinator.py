@@ -11,12 +11,13 @@ import pytest
 from cavmarl import make_vec
 from cavmarl.errors import LedgerError
 from cavmarl.kernels.codes import DRIVER_AGENT, EVENT_COLLIDED
+from cavmarl.kernels.handing_over import LATE
 from cavmarl.ownership.messages import Begin, Commit, Reset
 from cavmarl.ownership.records import replay as replay_records
 from cavmarl.ownership.trace import LOG, Trace
 from cavmarl.ownership.transport import Rates
 from cavmarl.runtime.coordinator import Coordinator
-from cavmarl.runtime.direct import LATE, DirectCoordinator
+from cavmarl.runtime.direct import DirectCoordinator
 from cavmarl.runtime.fault_plan import Crash, Faults
 from cavmarl.runtime.journal import JournalReader
 from cavmarl.runtime.journal_summary import owners_at
@@ -109,6 +110,22 @@ def test_whoever_turns_away_from_a_border_is_forgotten() -> None:
     on_their_way = [entry[:3] for entry in direct.coordinators[0].in_flight()]
     assert on_their_way == [entry[:3] for entry in sent.coordinators[0].in_flight()]
     assert len(on_their_way) > 5
+
+
+def test_a_world_of_few_vehicles_has_room_for_all_changes_that_wait() -> None:
+    whole, divided = (
+        make_vec("ring", zones=zones, agents=2, background=3, max_cycles=1000) for zones in (1, 4)
+    )
+    book, most = divided.simulation._division.book, 0
+    for vec in (whole, divided):
+        vec.reset(seed=1)
+    for _ in range(500):
+        for vec in (whole, divided):
+            vec.step(vec.suggest_actions())
+        most = max(most, int(book.num_changes[0]))
+    assert most > 3 * divided.simulation.capacity
+    assert LATE - 1 + divided.simulation.capacity <= book.changes.shape[1]
+    assert whole.state_hash() == divided.state_hash()
 
 
 def test_the_table_is_brought_up_to_date_when_somebody_asks_or_it_is_late() -> None:
