@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
-from cavmarl.traffic.motions import Ride, path_of
-from cavmarl.traffic.scene import Seat
-from cavmarl.traffic.scripts import Actor
-from cavmarl.traffic.streets import Streets
+import math
 
-__all__ = ["approach", "stream"]
+from cavmarl.traffic.motions import Ride, path_of
+from cavmarl.traffic.scene import Scene, Seat
+from cavmarl.traffic.scripts import Actor
+from cavmarl.traffic.streets import Crossing, Streets
+
+__all__ = ["approach", "meet_stream", "stream"]
 
 FREE_M = 20.0  # beyond the junction a built-in driver takes over
 
@@ -55,3 +57,38 @@ def stream(
         ride = Ride((*lanes, *path[1:]), start_m, end_m, speed_mps, speed_mps, speed_mps)
         riders.append(Actor("car", [ride], streets.edge(path[-1])))
     return riders
+
+
+def meet_stream(
+    streets: Streets,
+    place: Crossing,
+    far_m: float,
+    speed_mps: float,
+    stream_mps: float,
+    *,
+    cars: float,
+    gap_s: float,
+    lead_s: float,
+) -> Scene | None:
+    """An agent that meets the first car of a stream if it keeps its speed; None: no room for them.
+
+    Args:
+        streets: of the map.
+        place: where both ways meet.
+        far_m: from the agent to the junction in the beginning.
+        speed_mps: of the agent.
+        stream_mps: of the cars.
+        cars: how many.
+        gap_s: between them, from centre to centre.
+        lead_s: how long the first is there before the agent.
+    """
+    seat = approach(streets, place.link, far_m, speed_mps)
+    if seat is None:
+        return None
+    first_s = (far_m + place.middle_m) / speed_mps - lead_s
+    times_s = [first_s + k * gap_s for k in range(math.floor(cars))]
+    actors = stream(streets, place.foe, place.foe_middle_m, stream_mps, times_s)
+    if actors is None:
+        return None
+    x, y, _ = streets.point(seat.lane, streets.length_m(seat.lane)).tolist()
+    return Scene(streets.name(seat.lane), x, y, seat, actors)

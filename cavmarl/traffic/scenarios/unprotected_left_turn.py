@@ -5,12 +5,11 @@ No signal phase of its own protects it: it has to find a gap, or to wait until a
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 
 from cavmarl.traffic.scene import Scene
 from cavmarl.traffic.settings import setting
-from cavmarl.traffic.stream import approach, stream
+from cavmarl.traffic.stream import meet_stream
 from cavmarl.traffic.streets import Crossing, Streets
 
 NEEDS = "a left turn across an oncoming lane, with 45 m of road before it"
@@ -52,13 +51,13 @@ def stage(streets: Streets, place: Crossing, parameters: Parameters) -> Scene:
 
 
 def _staged(streets: Streets, place: Crossing, parameters: Parameters) -> Scene | None:
-    seat = approach(streets, place.link, FAR_M, parameters.speed_mps)
-    if seat is None:
-        return None
-    first_s = (FAR_M + place.middle_m) / parameters.speed_mps - parameters.lead_s
-    times_s = [first_s + k * parameters.gap_s for k in range(math.floor(parameters.cars))]
-    cars = stream(streets, place.foe, place.foe_middle_m, parameters.oncoming_mps, times_s)
-    if cars is None:
-        return None
-    x, y, _ = streets.point(seat.lane, streets.length_m(seat.lane)).tolist()
-    return Scene(streets.name(seat.lane), x, y, seat, cars)
+    return meet_stream(
+        streets,
+        place,
+        FAR_M,
+        parameters.speed_mps,
+        parameters.oncoming_mps,
+        cars=parameters.cars,
+        gap_s=parameters.gap_s,
+        lead_s=parameters.lead_s,
+    )
