@@ -2,13 +2,15 @@
 
 All zones run in this process on one core, so the whole of the work is seen. Every number of zones
 has two worlds, one with a stopwatch on every phase. All worlds are advanced by turns, each of them
-a part of its turn at a time, and ratios are taken within a turn: what else the machine does falls
-on all of them.
+a part of its turn at a time and in an order that is drawn anew for every part, and ratios are taken
+within a turn: what else the machine does, and what a world before has pushed out of the caches,
+falls on all of them.
 """
 
 from __future__ import annotations
 
 import math
+import random
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from statistics import linear_regression, median, median_low
@@ -131,15 +133,19 @@ def measure_sharding(
         clock = first.config.clock
         for count, own in zip(counts, worlds, strict=True):
             progress(f"the first {after_s} s in {count} zones")
-            own.run(round(after_s / clock.ctrl_dt_s))
+            for number in range(len(own.worlds)):
+                own.run(number, round(after_s / clock.ctrl_dt_s))
             own.end_turn()
         _check_equal(worlds)
+        steps = round(TURN_S / clock.ctrl_dt_s)
+        draw = random.Random(0)
+        order = [(own, number) for own in worlds for number in range(len(own.worlds))]
         for repeat in range(repeats):
             progress(f"measuring, {repeat + 1} of {repeats}")
-            steps = round(TURN_S / clock.ctrl_dt_s)
             for part in range(PARTS):
-                for own in worlds:
-                    own.run(steps * (part + 1) // PARTS - steps * part // PARTS)
+                draw.shuffle(order)
+                for own, number in order:
+                    own.run(number, steps * (part + 1) // PARTS - steps * part // PARTS)
             for own in worlds:
                 own.turns.append(own.end_turn())
             _check_equal(worlds)

@@ -120,12 +120,11 @@ class TwinWorlds:
         """All of them."""
         return [self.plain, self.timed, *([] if self.checked is None else [self.checked])]
 
-    def run(self, steps: int) -> None:
-        """The next steps of all, as a part of the present turn."""
-        if not self._parts[0]:
+    def run(self, number: int, steps: int) -> None:
+        """The next steps of one of `worlds`, as a part of the present turn."""
+        if not any(self._parts):
             self._watch.clear()
-        for world, parts in zip(self.worlds, self._parts, strict=True):
-            parts.append(_run(world, steps, self._watch))
+        self._parts[number].append(_run(self.worlds[number], steps, self._watch))
 
     def end_turn(self) -> Pair:
         """The turn that has been run; another one begins.
