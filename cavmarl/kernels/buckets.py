@@ -7,7 +7,8 @@ is its list's start, and whoever puts the items there lets it rise.
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from collections.abc import Callable
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,10 +30,10 @@ class Lists(NamedTuple):
     words: NDArray[np.uint64]  # (N / 64,) the same memory, 8 blocks at a time
 
 
-def make_lists(number: int) -> Lists:
-    """So many empty lists, and some more."""
-    words = np.zeros(-(-number // WORD), dtype=np.uint64)
-    return Lists(np.zeros((words.size * WORD, 2), np.int32), words.view(np.bool_), words)
+def make_lists(number: int, zeros: Callable[..., NDArray[Any]] = np.zeros) -> Lists:
+    """So many empty lists, and some more, in arrays that `zeros` makes."""
+    words = zeros(-(-number // WORD), dtype=np.uint64)
+    return Lists(zeros((words.size * WORD, 2), dtype=np.int32), words.view(np.bool_), words)
 
 
 @kernel

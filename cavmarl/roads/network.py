@@ -21,6 +21,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from cavmarl.huge_pages import huge_copy
 from cavmarl.kernels.arrays import RoadArrays
 from cavmarl.kernels.backdrop import WALL
 from cavmarl.kernels.signals import DETECTOR_REACH_M
@@ -323,7 +324,7 @@ class RoadNetwork:
     @cached_property
     def arrays(self) -> RoadArrays:
         """The arrays that kernels take."""
-        return RoadArrays(
+        own = (
             self.points,
             self.lanes,
             self.edges,
@@ -339,6 +340,7 @@ class RoadNetwork:
             self.phase_detectors,
             *self._places,
         )
+        return RoadArrays(*map(huge_copy, own))
 
     @property
     def num_controllers(self) -> int:

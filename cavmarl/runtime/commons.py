@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cavmarl.config import TERMS, EnvConfig
+from cavmarl.huge_pages import huge_zeros
 from cavmarl.kernels.arrays import Worlds
 from cavmarl.kernels.outputs import clear_outputs, settle_outputs
 from cavmarl.kernels.repeated import repeated
@@ -37,7 +38,7 @@ class Commons:
         network: RoadNetwork,
         num_worlds: int,
         observations: NDArray[np.float32] | None = None,
-        zeros: Zeros = np.zeros,
+        zeros: Zeros = huge_zeros,
     ) -> None:
         self.outputs = make_outputs(config, num_worlds, observations, zeros)
         self._roads = network.arrays

@@ -4,9 +4,8 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-import numpy as np
-
 from cavmarl.config import EnvConfig, ZonesConfig
+from cavmarl.huge_pages import huge_zeros
 from cavmarl.kernels.arrays import Outputs
 from cavmarl.kernels.borders import Borders
 from cavmarl.kernels.motion import MAX_SPEED_MPS
@@ -37,7 +36,7 @@ def divide(
     traffic: NativeTraffic,
     outputs: Outputs,
     num_worlds: int,
-    zeros: Zeros = np.zeros,
+    zeros: Zeros = huge_zeros,
 ) -> tuple[list[Shard], Division]:
     """One shard a zone, and the division that knows them all.
 

@@ -20,6 +20,7 @@ from cavmarl.errors import (
     V2xError,
     ZoneError,
 )
+from cavmarl.huge_pages import huge_zeros
 from cavmarl.kernels.arrays import Common, Gate, Outputs, Worlds
 from cavmarl.kernels.codes import ACTION_IDLE
 from cavmarl.kernels.repeated import repeated
@@ -108,7 +109,7 @@ class Simulation:
         observations: NDArray[np.float32] | None = None,
         frames: Frames | None = None,
         warm: bool = False,
-        zeros: Zeros = np.zeros,
+        zeros: Zeros = huge_zeros,
         like: Simulation | None = None,
     ) -> None:
         self.config = config

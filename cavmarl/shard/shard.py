@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cavmarl.config import EnvConfig
+from cavmarl.huge_pages import huge_zeros
 from cavmarl.kernels.approach import APPROACH
 from cavmarl.kernels.arrays import (
     Common,
@@ -321,27 +322,27 @@ def _seen(
 
 def _make_scratch(num_lanes: int, num_links: int, capacity: int, covers: int = 0) -> Scratch:
     def integers(size: int) -> NDArray[np.int32]:
-        return np.zeros(size, dtype=np.int32)
+        return huge_zeros(size, dtype=np.int32)
 
     def floats(size: int) -> NDArray[np.float64]:
-        return np.zeros(size, dtype=np.float64)
+        return huge_zeros(size, dtype=np.float64)
 
-    lanes, links = make_lists(num_lanes + 1), make_lists(num_links)
+    lanes, links = make_lists(num_lanes + 1, huge_zeros), make_lists(num_links, huge_zeros)
     return Scratch(
         lanes=lanes,
         lane_start=lanes.bounds[:, 0],
         lane_end=lanes.bounds[:, 1],
-        entries=np.zeros(2 * capacity + covers, dtype=ENTRY),
+        entries=huge_zeros(2 * capacity + covers, dtype=ENTRY),
         links=links,
         link_start=links.bounds[:, 0],
         link_end=links.bounds[:, 1],
-        approach=np.zeros(3 * capacity, dtype=APPROACH),
-        pairs=np.zeros(3 * capacity, dtype=APPROACH),
+        approach=huge_zeros(3 * capacity, dtype=APPROACH),
+        pairs=huge_zeros(3 * capacity, dtype=APPROACH),
         order=integers(capacity),
         accel=floats(capacity),
         link_ahead=integers(capacity),
         lane_change=integers(capacity),
         blinker=integers(capacity),
         hold=integers(capacity),
-        hit=np.zeros(capacity, dtype=np.int64),
+        hit=huge_zeros(capacity, dtype=np.int64),
     )

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cavmarl.balance.plan import Plan
+from cavmarl.huge_pages import huge_zeros
 from cavmarl.kernels.repeated import repeated
 from cavmarl.kernels.step_results import Results, report, report_who_goes_on
 from cavmarl.rig.catalogue import frame_layout
@@ -52,7 +53,7 @@ class LocalWorlds:
         arrays: StepArrays | None = None,
         warm: bool = False,
         in_next_step: bool = False,
-        zeros: Zeros = np.zeros,
+        zeros: Zeros = huge_zeros,
         like: LocalWorlds | None = None,
     ) -> None:
         self.world = world

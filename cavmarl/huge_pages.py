@@ -1,0 +1,75 @@
+"""Arrays in huge pages: a tick looks at many places in memory, and each small page costs a look-up.
+
+In a virtual machine a page that the processor does not know by heart costs two walks through
+tables. Linux gives pages of 2 MiB to whoever asks for them, where they are not switched off
+(`/sys/kernel/mm/transparent_hugepage/enabled`); elsewhere arrays are NumPy's own.
+"""
+
+from __future__ import annotations
+
+import mmap
+import threading
+from math import prod
+from typing import Any
+
+import numpy as np
+from numpy.typing import DTypeLike, NDArray
+
+__all__ = ["huge_copy", "huge_zeros"]
+
+PAGE = 1 << 21  # bytes
+LEAST = 1 << 16  # bytes of an array that is worth it
+_LINE = 64  # bytes of a cache line: no two arrays share one
+
+
+class _Pages:
+    """Whole pages, which arrays take one after the other; they go with the last of them."""
+
+    def __init__(self) -> None:
+        self._bytes = np.zeros(0, dtype=np.uint8)
+        self._lock = threading.Lock()
+
+    def take(self, size: int) -> NDArray[np.uint8]:
+        """So many bytes, all 0."""
+        with self._lock:
+            if size > self._bytes.size:
+                self._bytes = _map(-(-size // PAGE) * PAGE)
+            taken = self._bytes[:size]
+            self._bytes = self._bytes[-(-size // _LINE) * _LINE :]
+            return taken
+
+
+_PAGES = _Pages()
+
+
+def huge_zeros(shape: int | tuple[int, ...], dtype: DTypeLike = np.float64) -> NDArray[Any]:
+    """As `numpy.zeros`; a large array shares huge pages with others, where there are any."""
+    kind = np.dtype(dtype)
+    sides = (shape,) if isinstance(shape, int) else shape
+    size = prod(sides) * kind.itemsize
+    if size < LEAST or not hasattr(mmap, "MADV_HUGEPAGE"):
+        return np.zeros(shape, dtype=kind)
+    return _PAGES.take(size).view(kind).reshape(sides)
+
+
+def huge_copy(array: NDArray[Any]) -> NDArray[Any]:
+    """The same array in huge pages, as writable as it was; a small one is not copied."""
+    if array.nbytes < LEAST:
+        return array
+    copy = huge_zeros(array.shape, array.dtype)
+    # Byte for byte: an assignment would leave out the padding of records, which hashes read.
+    copy.reshape(-1).view(np.uint8)[:] = np.frombuffer(array.tobytes(), dtype=np.uint8)
+    copy.setflags(write=array.flags.writeable)
+    return copy
+
+
+def _map(size: int) -> NDArray[np.uint8]:
+    """Memory of this process, from the start of a page on."""
+    memory = mmap.mmap(-1, size + PAGE, flags=mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS)
+    try:
+        memory.madvise(mmap.MADV_HUGEPAGE)
+    except OSError:
+        pass  # a kernel without them: the memory is as good in small pages
+    whole = np.frombuffer(memory, dtype=np.uint8)
+    first = -whole.ctypes.data % PAGE
+    return whole[first : first + size]
