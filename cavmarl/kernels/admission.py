@@ -27,7 +27,7 @@ from cavmarl.kernels.entering import (
 from cavmarl.kernels.geometry import boxes_overlap, lane_pose
 from cavmarl.kernels.lanes import index_lanes
 from cavmarl.kernels.neighbors import LEVEL_HEIGHT_M
-from cavmarl.kernels.zones import Halo, ZoneArrays, squared_distance, zone_of
+from cavmarl.kernels.zones import Halo, ZoneArrays, is_seen, squared_distance, zone_of
 
 __all__ = ["accept", "admit", "assign_lanes", "propose", "rank_lanes"]
 
@@ -294,7 +294,7 @@ def admit(zones: ZoneArrays, halo: Halo, zone: int, gate: Gate, worlds: Worlds) 
                 rows[owned] = row
                 rows[owned]["owner"] = zone
                 worlds.num_owned[w] = owned + 1
-            elif squared_distance(zones.rects, zone, row["x"], row["y"]) <= halo.halo_m**2:
+            elif is_seen(halo, zone, row, squared_distance(zones.rects, zone, row["x"], row["y"])):
                 rows[num] = row
             else:
                 continue

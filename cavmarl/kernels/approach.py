@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cavmarl.kernels import inlined_kernel, kernel
+from cavmarl.kernels.announcing import announced_m
 from cavmarl.kernels.arrays import RoadArrays, Scratch, Travel
 from cavmarl.kernels.buckets import add, forget, lay_out
 from cavmarl.kernels.codes import DRIVER_SCRIPTED
@@ -16,17 +17,11 @@ from cavmarl.kernels.ways import leave, next_step, own_step
 
 __all__ = [
     "APPROACH",
-    "APPROACH_M",
-    "APPROACH_S",
-    "APPROACH_STANDING_M",
     "FORK_BEYOND_M",
     "MAX_LINKS_AHEAD",
     "register_links",
 ]
 
-APPROACH_M = 150.0  # how far ahead a vehicle announces itself at most,
-APPROACH_S = 8.0  # which it does this time before it arrives,
-APPROACH_STANDING_M = 30.0  # and this far ahead in any case
 MAX_LINKS_AHEAD = 2
 BLOCK = 64  # rows that are still near in memory when they are looked at again
 FORK_BEYOND_M = 3.0  # how far beyond a junction paths from one lane can still run together
@@ -140,7 +135,7 @@ def _announce(
         rear = s - 0.5 * row["length"]
         if left["to_lane"] == lane and (rear < 0.0 or left["length_m"] + rear < left["fork_m"]):
             pairs = _note(scratch, pairs, row["link"], row, i, -(left["length_m"] + s))
-    reach = min(APPROACH_STANDING_M + APPROACH_S * row["speed"], APPROACH_M)
+    reach = announced_m(row["speed"])
     distance = here["length_m"] - s
     way = row["way"]
     found = 0

@@ -12,7 +12,7 @@ from cavmarl.kernels import inlined_kernel, kernel
 from cavmarl.kernels.arrays import Zoned
 from cavmarl.kernels.borders import Borders
 from cavmarl.kernels.handing_over import Book, look_on
-from cavmarl.kernels.zones import Halo, ZoneArrays, is_inside, squared_distance, zone_of
+from cavmarl.kernels.zones import Halo, ZoneArrays, is_inside, is_seen, squared_distance, zone_of
 
 __all__ = ["exchange", "take_own"]
 
@@ -31,9 +31,9 @@ def exchange(
 ) -> None:
     """Renew all ghosts of some worlds from the owned rows, and note who is near a border.
 
-    Zone z needs a vehicle if and only if it lies within `halo_m` of z's rectangle. A vehicle that
-    has left its own zone's rectangle, because its transfer is late, is published like any other,
-    to the zone that it is in as well.
+    Zone z needs a vehicle if and only if it lies within `halo_m` of z's rectangle, where somebody
+    there may ask about it (`zones.is_seen`). A vehicle that has left its own zone's rectangle,
+    because its transfer is late, is published like any other, to the zone that it is in as well.
 
     Args:
         zones: of the partition.
@@ -73,7 +73,6 @@ def _publish(
     w: int,
 ) -> None:
     """Copy the owned rows of one zone behind those of all that need them."""
-    limit = halo.halo_m * halo.halo_m
     near_limit = touching_m * touching_m
     border_limit = border_m * border_m
     noted = zoned.num_outer[zone, w]
@@ -94,7 +93,7 @@ def _publish(
             if other == zone:
                 continue
             squared = squared_distance(zones.rects, other, x, y)
-            if squared <= limit:
+            if is_seen(halo, other, row, squared):
                 _take_ghost(zoned, side, zone, i, other, w, squared <= near_limit)
                 at_border |= squared <= border_limit
         if at_border:

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from cavmarl.kernels import inlined_kernel, kernel
 from cavmarl.kernels.arrays import Zoned
 from cavmarl.kernels.rng import mix
-from cavmarl.kernels.zones import Halo, ZoneArrays, squared_distance, zone_of
+from cavmarl.kernels.zones import Halo, ZoneArrays, is_seen, squared_distance, zone_of
 
 __all__ = [
     "FINDING",
@@ -237,7 +237,6 @@ def _owe_ghosts(
     tallies: NDArray[np.void],
 ) -> None:
     """Add a zone's rows to what those zones have to see that they are near to."""
-    limit = halo.halo_m * halo.halo_m
     min_x, min_y = halo.inner[zone, 0], halo.inner[zone, 1]
     max_x, max_y = halo.inner[zone, 2], halo.inner[zone, 3]
     for i in range(num_owned):
@@ -249,5 +248,7 @@ def _owe_ghosts(
         here = zone_of(zones, x, y)
         for n in range(halo.near_start[here], halo.near_start[here + 1]):
             other = halo.near[n]
-            if other != zone and squared_distance(zones.rects, other, x, y) <= limit:
+            if other != zone and is_seen(
+                halo, other, rows[i], squared_distance(zones.rects, other, x, y)
+            ):
                 tallies[other]["due"] += digest

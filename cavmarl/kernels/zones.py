@@ -6,7 +6,7 @@ searches among the cuts find. Both only compare the coordinate with stored numbe
 gives the same answer, on a border as well.
 
 A vehicle is published by its position: each zone within the halo of it gets it as a ghost, whether
-or not that zone touches the vehicle's own (decision 012).
+or not that zone touches the vehicle's own (decision 012), if somebody there may ask about it.
 """
 
 from __future__ import annotations
@@ -17,11 +17,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cavmarl.kernels import inlined_kernel, kernel
+from cavmarl.kernels.announcing import announced_m
 
 __all__ = [
+    "LOOK",
     "Halo",
     "ZoneArrays",
     "is_inside",
+    "is_seen",
     "squared_distance",
     "zone_of",
     "zones_of",
@@ -37,14 +40,21 @@ class ZoneArrays(NamedTuple):
     rects: NDArray[np.float64]  # (k, 4) min_x, min_y, max_x, max_y; infinite at the rim
 
 
+LOOK = np.dtype([("head", np.float32), ("tail", np.float32), ("line", np.float32)])
+"""Whom a zone's drivers may ask about on a lane: those up to `head` m, those from `tail` m on, and
+those who announce themselves to a line that lies at `line` m (`kernels.looks`)."""
+
+
 class Halo(NamedTuple):
-    """How far zones see over their borders."""
+    """How far zones see over their borders, and whom."""
 
     halo_m: float
     inner: NDArray[np.float64]  # (k, 4) the part of a zone that no other zone's halo reaches
     near_start: NDArray[np.int32]  # (k + 1,)
     near: NDArray[np.int32]  # near[near_start[z] : near_start[z + 1]]: zones within the halo of
     # zone z, z itself among them
+    sure_m: float  # everybody within this distance is seen, further away those
+    looks: NDArray[np.void]  # LOOK (k, L) of whom somebody may ask; not read if sure_m is halo_m
 
 
 @kernel
@@ -102,3 +112,18 @@ def squared_distance(rects: NDArray[np.float64], zone: int, x: float, y: float) 
     dx = max(rects[zone, 0] - x, x - rects[zone, 2], 0.0)
     dy = max(rects[zone, 1] - y, y - rects[zone, 3], 0.0)
     return float(dx * dx + dy * dy)
+
+
+@inlined_kernel
+def is_seen(halo: Halo, zone: int, row: np.void, squared: float) -> bool:
+    """Whether a zone has to see a vehicle whose `squared_distance` from it is known."""
+    if squared > halo.halo_m * halo.halo_m:
+        return False
+    if squared <= halo.sure_m * halo.sure_m:
+        return True
+    look = halo.looks[zone, row["lane"]]
+    s = row["s"]
+    seen: bool = (
+        s <= look["head"] or s >= look["tail"] or look["line"] - s < announced_m(row["speed"])
+    )
+    return seen

@@ -11,7 +11,7 @@ import math
 import numpy as np
 
 from cavmarl.errors import ZoneError
-from cavmarl.kernels.zones import Halo
+from cavmarl.kernels.zones import LOOK, Halo
 from cavmarl.roads.zones import ZonePartition
 
 __all__ = ["zone_halo"]
@@ -21,7 +21,7 @@ _ROUNDING_M = 1e-6
 
 
 def zone_halo(partition: ZonePartition, halo_m: float) -> Halo:
-    """What `kernels.exchange.exchange` takes.
+    """What `kernels.exchange.exchange` takes, where everybody within the halo is seen.
 
     Raises:
         ZoneError: `halo_m` is negative or not finite.
@@ -36,4 +36,7 @@ def zone_halo(partition: ZonePartition, halo_m: float) -> Halo:
     gaps = np.maximum(gaps, gaps.swapaxes(0, 1))
     near = (gaps * gaps).sum(axis=2) <= halo_m * halo_m
     start = np.concatenate([[0], np.cumsum(near.sum(axis=1))]).astype(np.int32)
-    return Halo(float(halo_m), inner, start, np.nonzero(near)[1].astype(np.int32))
+    nobody = np.zeros((0, 0), dtype=LOOK)
+    return Halo(
+        float(halo_m), inner, start, np.nonzero(near)[1].astype(np.int32), float(halo_m), nobody
+    )

@@ -13,12 +13,12 @@ from cavmarl.ownership.distances import Distances, check_coverage, needed_overla
 from cavmarl.ownership.limits import DeadlinePolicy, Limits
 from cavmarl.rig.catalogue import rig_reach_m
 from cavmarl.roads.network import RoadNetwork
-from cavmarl.roads.zone_halo import zone_halo
 from cavmarl.roads.zones import ZonePartition
 from cavmarl.runtime.division import Division
 from cavmarl.shard.reach import driving_reach_m
 from cavmarl.shard.sensors import largest_radius_m, sensing_reach_m
 from cavmarl.shard.shard import Shard, make_zoned
+from cavmarl.shard.sight import Sight
 from cavmarl.shard.transfer import TransferCodec
 from cavmarl.traffic.memory import Zeros
 from cavmarl.traffic.native import NativeTraffic
@@ -54,12 +54,21 @@ def divide(
     """
     settings, dt = config.zones, config.clock.sim_dt_s
     radius_m = largest_radius_m(traffic.travel.types)
-    reach_m = max(
-        driving_reach_m(network, traffic.travel),
-        sensing_reach_m(config.sensors, radius_m),
-        rig_reach_m(config.rig, radius_m),
+    sensing_m = max(sensing_reach_m(config.sensors, radius_m), rig_reach_m(config.rig, radius_m))
+    reach_m = max(driving_reach_m(network, traffic.travel), sensing_m)
+    wide_m = halo_m(config, reach_m, partition.count)
+    touching_m = _needed_m(config, 2.0 * radius_m)
+    # Agents alone sense.
+    sensed_m = _needed_m(config, sensing_m) if config.population.agents else 0.0
+    near_m = max(touching_m, sensed_m, _approach_m(settings, dt))
+    sight = Sight(
+        network,
+        traffic.travel,
+        wide_m,
+        near_m if _goes_by_roads(config, traffic) else wide_m,
+        _needed_m(config, 0.0),
     )
-    halo = zone_halo(partition, halo_m(config, reach_m, partition.count))
+    halo = sight.halo(partition)
     zoned = make_zoned(partition.count, num_worlds, traffic.capacity, zeros)
     shards: list[Shard] = []
     for zone in range(partition.count):
@@ -82,7 +91,8 @@ def divide(
         zoned,
         partition.arrays,
         halo,
-        _needed_m(config, 2.0 * radius_m),
+        sight,
+        touching_m,
         Borders(settings.hysteresis_m, settings.approach_ticks * dt, MAX_SPEED_MPS),
         TransferCodec.of(shards[0].worlds, outputs, config.sensors.stack),
     )
@@ -103,15 +113,28 @@ def halo_m(config: EnvConfig, reach_m: float, zones: int) -> float:
     settings, dt = config.zones, config.clock.sim_dt_s
     wide_m = _needed_m(config, reach_m) if settings.halo_m is None else settings.halo_m
     if zones > 1:
-        approach_m = settings.approach_ticks * MAX_SPEED_MPS * dt
         check_coverage(
-            Distances(approach_m, settings.hysteresis_m, wide_m),
+            Distances(_approach_m(settings, dt), settings.hysteresis_m, wide_m),
             _limits_at_borders(settings),
             reach_m=reach_m,
             v_max_mps=MAX_SPEED_MPS,
             dt_s=dt,
         )
     return wide_m
+
+
+def _goes_by_roads(config: EnvConfig, traffic: NativeTraffic) -> bool:
+    """Whether all that drivers look at can be found along the roads.
+
+    Scripts put vehicles beside them, SUMO where it likes; and whoever names a halo wants it whole.
+    """
+    free = traffic.scene is not None or traffic.sumo is not None
+    return config.zones.halo_m is None and not free
+
+
+def _approach_m(settings: ZonesConfig, dt: float) -> float:
+    """How far before a border the zone behind it is told."""
+    return settings.approach_ticks * MAX_SPEED_MPS * dt
 
 
 def limits_of(settings: ZonesConfig, schema: int = 1) -> Limits:

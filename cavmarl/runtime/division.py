@@ -25,8 +25,10 @@ from cavmarl.kernels.tallies import totals
 from cavmarl.kernels.zones import Halo, ZoneArrays, zone_of
 from cavmarl.ownership.messages import Birth, Switch
 from cavmarl.roads.zone_statistics import imbalance
+from cavmarl.roads.zones import ZonePartition
 from cavmarl.runtime.referee import Near
 from cavmarl.shard.shard import Shard
+from cavmarl.shard.sight import Sight
 from cavmarl.shard.transfer import TransferCodec
 
 __all__ = ["Division", "ZoneLoads"]
@@ -57,7 +59,8 @@ class Division:
         shards: one a zone, in the order of zones.
         zoned: their rows.
         zones: of the partition.
-        halo: how far each zone sees over its borders.
+        halo: whom each zone sees over its borders.
+        sight: what says so for other zones.
         touching_m: no ghost further outside of a zone can touch one of its vehicles.
         borders: when a vehicle is near one.
         codec: of vehicles' states.
@@ -77,6 +80,7 @@ class Division:
         zoned: Zoned,
         zones: ZoneArrays,
         halo: Halo,
+        sight: Sight,
         touching_m: float,
         borders: Borders,
         codec: TransferCodec,
@@ -89,6 +93,7 @@ class Division:
         self._zoned = zoned
         self._first_side = shards[0].worlds.rows
         self._halo = halo
+        self._sight = sight
         self._touching_m = touching_m
         self._ids, self._x, self._y = (zoned.rows[name] for name in ("id", "x", "y"))
         self._rects: list[list[float]] = zones.rects.tolist()
@@ -126,15 +131,15 @@ class Division:
             self._forget_offers(w)
             self._exchange(first.rows, w, w + 1)
 
-    def cut(self, zones: ZoneArrays, halo: Halo) -> None:
+    def cut(self, partition: ZonePartition) -> None:
         """Divide the plane otherwise, between two ticks: owners stay, ghosts are those of now.
 
         Whoever is in another zone than its owner's changes its owner as at any border.
 
         Args:
-            zones: as many as before.
-            halo: of them.
+            partition: as many zones as before.
         """
+        zones, halo = partition.arrays, self._sight.halo(partition)
         self.zones, self._halo, self._rects = zones, halo, zones.rects.tolist()
         for shard in self._shards:
             shard.cut(zones, halo)

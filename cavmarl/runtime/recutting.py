@@ -14,7 +14,6 @@ import numpy as np
 
 from cavmarl.balance.repartition import propose_zones
 from cavmarl.roads.network import RoadNetwork
-from cavmarl.roads.zone_halo import zone_halo
 from cavmarl.roads.zones import ZonePartition
 from cavmarl.runtime.coordination import Coordination
 from cavmarl.runtime.division import Division
@@ -96,5 +95,5 @@ class Recutter:
 
     def cut(self, partition: ZonePartition) -> None:
         """Divide the worlds into these zones, as many as before."""
-        self._division.cut(partition.arrays, zone_halo(partition, self._division.halo.halo_m))
+        self._division.cut(partition)
         self._coordination.cut()

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from cavmarl.errors import InvariantError
 from cavmarl.kernels.monitor import KIND_DOUBLED, KIND_FAR, KIND_FULL, KIND_TICK, Clock
-from cavmarl.kernels.zones import squared_distance
+from cavmarl.kernels.zones import is_seen, squared_distance
 from cavmarl.ownership.messages import Birth
 from cavmarl.ownership.trace_check import Owner
 from cavmarl.runtime.division import Division
@@ -134,20 +134,20 @@ class Violations:
                 )
 
     def _ghosts(self) -> Iterator[str]:
-        halo_m, rects = self._division.halo.halo_m, self._division.zones.rects
+        halo, rects = self._division.halo, self._division.zones.rects
         for zone in range(self._division.count):
             ghosts = self._division.ghosts(self._w, zone)
             copies = Counter(ghosts["id"].tolist())
             for vehicle in sorted(self._places):
                 owner, row = self._places[vehicle][0]
                 squared = squared_distance(rects, zone, row["x"], row["y"])
-                due = owner != zone and squared <= halo_m * halo_m
+                due = owner != zone and is_seen(halo, zone, row, squared)
                 found = copies.pop(vehicle, 0)
                 if found != due:
                     yield (
                         f"ghosts: zone {zone} has {found} ghosts of vehicle {vehicle}, not "
                         f"{int(due)}: zone {owner} owns it {math.sqrt(squared):.2f} m outside of "
-                        f"that zone, which sees {halo_m:.2f} m far"
+                        f"that zone, which sees {halo.halo_m:.2f} m far"
                     )
             for vehicle in sorted(copies):
                 yield f"ghosts: zone {zone} has a ghost of vehicle {vehicle}, which is not there"

@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from cavmarl.kernels.approach import APPROACH_M
+from cavmarl.kernels.announcing import APPROACH_M
 from cavmarl.kernels.arrays import Travel
 from cavmarl.kernels.junctions import EXIT_LOOK_M
 from cavmarl.roads.network import RoadNetwork

@@ -11,7 +11,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from cavmarl.kernels.approach import APPROACH_M, APPROACH_S, APPROACH_STANDING_M, MAX_LINKS_AHEAD
+from cavmarl.kernels.announcing import announced_m
+from cavmarl.kernels.approach import MAX_LINKS_AHEAD
 from cavmarl.kernels.geometry import lane_pose
 from cavmarl.roads.network import RoadNetwork
 
@@ -194,7 +195,7 @@ class Ride:
         self, network: RoadNetwork, u: float, speed: float, length: float
     ) -> Iterator[tuple[float, int]]:
         """The links that it is on, or will be on soon, as `kernels.approach` lists them."""
-        reach = min(APPROACH_STANDING_M + APPROACH_S * speed, APPROACH_M)
+        reach = announced_m(speed)
         line_m, ahead = 0.0, 0
         for before, after in pairwise(self.lanes):
             line_m += float(network.lanes["length_m"][before])

@@ -1,0 +1,53 @@
+"""`Sight`: whom zones see over their borders, however the map is cut."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from cavmarl.huge_pages import huge_zeros
+from cavmarl.kernels.arrays import Travel
+from cavmarl.kernels.looks import find_looks, make_room
+from cavmarl.kernels.zones import LOOK, Halo
+from cavmarl.roads.network import RoadNetwork
+from cavmarl.roads.zone_halo import zone_halo
+from cavmarl.roads.zones import ZonePartition
+
+__all__ = ["Sight"]
+
+BESIDE_M = 10.0  # from a vehicle's place to that on its lane
+
+
+@dataclass(frozen=True, eq=False)
+class Sight:
+    """The distances that sight goes by, and what it takes to know on which roads it ends earlier.
+
+    Attributes:
+        network: the roads.
+        travel: the types of vehicles, and how far they look.
+        halo_m: nobody further away is seen.
+        sure_m: everybody nearer is; from `halo_m` on, roads are not asked.
+        outside_m: how far outside of its zone a vehicle can be whose transfer is late.
+    """
+
+    network: RoadNetwork
+    travel: Travel
+    halo_m: float
+    sure_m: float
+    outside_m: float
+
+    def halo(self, partition: ZonePartition) -> Halo:
+        """Whom each zone of a partition sees."""
+        halo = zone_halo(partition, self.halo_m)
+        if partition.count == 1 or self.sure_m >= self.halo_m:
+            return halo
+        roads = self.network.arrays
+        room = make_room(len(roads.lanes), len(roads.links))
+        half_m = 0.5 * float(self.travel.types["length"].max())
+        wide_m = self.outside_m + BESIDE_M
+        rects = partition.reaching + np.array([-wide_m, -wide_m, wide_m, wide_m])
+        looks = huge_zeros((partition.count, len(roads.lanes)), dtype=LOOK)
+        for rect, own in zip(rects, looks, strict=True):
+            find_looks(roads, rect, self.travel.view_m, self.travel.see_m, half_m, room, own)
+        return halo._replace(sure_m=float(self.sure_m), looks=looks)

@@ -1,0 +1,194 @@
+"""Whom a zone's drivers may ask about, by sets of lanes: the slow twin of `kernels.looks`."""
+
+from __future__ import annotations
+
+import heapq
+import math
+from collections import defaultdict
+from collections.abc import Callable, Iterable
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cavmarl.kernels.announcing import APPROACH_M
+from cavmarl.kernels.approach import FORK_BEYOND_M
+from cavmarl.kernels.entering import ENTER_REACH_M
+from cavmarl.kernels.junctions import EXIT_LOOK_M
+from cavmarl.kernels.lane_choice import LOOK_BACK_M
+from cavmarl.kernels.looks import ASIDE_M, ROUNDING_M
+from cavmarl.roads.network import RoadNetwork
+
+__all__ = ["Looks"]
+
+Ways = dict[int, float]
+STEP_M = 0.25  # between places of a lane that are looked at
+
+
+class Looks:
+    """The lanes of a map, and what a zone asks of them.
+
+    Args:
+        network: the map.
+        rect: min_x, min_y, max_x, max_y of where the zone's drivers can be.
+        view_m: as `kernels.looks.find_looks` takes it.
+        see_m: the same.
+        half_m: the same.
+    """
+
+    def __init__(
+        self,
+        network: RoadNetwork,
+        rect: tuple[float, float, float, float],
+        view_m: float,
+        see_m: float,
+        half_m: float,
+    ) -> None:
+        self.network = network
+        self.lengths = network.lanes["length_m"].tolist()
+        self.head: dict[int, float] = defaultdict(lambda: -math.inf)
+        self.tail: dict[int, float] = defaultdict(lambda: math.inf)
+        self.line: dict[int, float] = defaultdict(lambda: math.inf)
+        self.into: dict[int, list[int]] = defaultdict(list)
+        for lane in range(len(self.lengths)):
+            for other in self._after(lane):
+                self.into[other].append(lane)
+        self.own = self._own(rect)
+        view_m = max(view_m, see_m, LOOK_BACK_M)
+        ahead = self._along(view_m)
+        asked = self._asked(ahead, see_m)
+        foes = {int(conflict["foe"]) for link in asked for conflict in self._conflicts(link)}
+        self._at_lines(foes)
+        for link in asked | foes:
+            *inside, lane = self._path(link)
+            for each in inside:
+                self._see(each, 0.0, self.lengths[each])
+            self._see(lane, 0.0, FORK_BEYOND_M + half_m)
+        crossed = {self._path(link)[-1]: 0.0 for link in asked if len(self._conflicts(link))}
+        beyond = self._ways(crossed, self._after, EXIT_LOOK_M)
+        for lane, way in beyond.items():
+            self._see(lane, 0.0, EXIT_LOOK_M - way)
+
+    def _own(self, rect: tuple[float, float, float, float]) -> dict[int, tuple[float, float]]:
+        """The zone's part of each lane, a little wider; of lanes beside each other the same."""
+        parts: dict[int, list[float]] = defaultdict(list)
+        for lane in range(len(self.lengths)):
+            row = self.network.lanes[lane]
+            points = self.network.points[row["first_point"] :][: row["num_points"]]
+            places = np.union1d(np.arange(0.0, points["s"][-1], STEP_M), points["s"])
+            x = np.interp(places, points["s"], points["x"])
+            y = np.interp(places, points["s"], points["y"])
+            inside = (rect[0] <= x) & (x <= rect[2]) & (rect[1] <= y) & (y <= rect[3])
+            parts[int(row["edge"])] += places[inside].tolist()
+        own = {}
+        for lane, length in enumerate(self.lengths):
+            part = parts[int(self.network.lanes["edge"][lane])]
+            if part:
+                first, last = max(min(part) - ASIDE_M, 0.0), max(part) + ASIDE_M
+                own[lane] = min(first, length), min(last, length)
+        return own
+
+    def _along(self, view_m: float) -> Ways:
+        """See along the roads, ahead and back; the ways to the lanes ahead."""
+        starts: Ways = {}
+        ends: Ways = {}
+        for lane, (first, last) in self.own.items():
+            self._see(lane, first - view_m, last + view_m)
+            _shorten(starts, self._after(lane), self.lengths[lane] - last)
+            _shorten(ends, self._before(lane), first)
+        ahead = self._ways(starts, self._after, view_m)
+        for lane, way in ahead.items():
+            self._see(lane, 0.0, view_m - way)
+            if way <= LOOK_BACK_M:
+                for beside in self._beside(lane):
+                    _shorten(ends, self._before(beside), 0.0)
+        for lane in self._ways(ends, self._before, max(LOOK_BACK_M, ENTER_REACH_M)):
+            self._see(lane, self.lengths[lane] - view_m, self.lengths[lane])
+        return ahead
+
+    def _asked(self, ahead: Ways, see_m: float) -> set[int]:
+        """Links that its drivers may want to enter, or are on."""
+        lanes = set()
+        for lane, row in enumerate(self.network.lanes):
+            if row["internal"]:
+                if lane in self.own:
+                    lanes.add(int(self.network.links["from_lane"][row["link"]]))
+                continue
+            if lane in self.own and self.lengths[lane] - self.own[lane][1] <= see_m:
+                lanes.add(lane)
+            if ahead.get(lane, math.inf) + self.lengths[lane] <= see_m:
+                lanes.add(lane)
+        return {
+            link for lane in lanes for beside in self._beside(lane) for link in self._links(beside)
+        }
+
+    def _at_lines(self, foes: set[int]) -> None:
+        """See who announces itself at the lines of foes."""
+        lines: Ways = {}
+        for link in foes:
+            _shorten(lines, self._beside(int(self.network.links["from_lane"][link])), 0.0)
+        for lane, way in self._ways(lines, self._before, APPROACH_M).items():
+            for beside in self._beside(lane):
+                line = way + self.lengths[beside] - ROUNDING_M
+                self.line[beside] = min(self.line[beside], line)
+
+    def _see(self, lane: int, first: float, last: float) -> None:
+        for beside in self._beside(lane):
+            length = self.lengths[beside]
+            if first > last or last < 0.0 or first > length:
+                continue
+            if first <= 0.0:
+                self.head[beside] = max(self.head[beside], last + ROUNDING_M)
+            elif last >= length:
+                self.tail[beside] = min(self.tail[beside], first - ROUNDING_M)
+            else:
+                self.head[beside] = math.inf
+
+    def _ways(self, begin: Ways, neighbors: Callable[[int], list[int]], limit_m: float) -> Ways:
+        """Dijkstra's shortest ways."""
+        found: Ways = {}
+        waiting = [(way, lane) for lane, way in begin.items() if way <= limit_m]
+        heapq.heapify(waiting)
+        while waiting:
+            way, lane = heapq.heappop(waiting)
+            if lane in found:
+                continue
+            found[lane] = way
+            further = way + self.lengths[lane]
+            if further <= limit_m:
+                for other in neighbors(lane):
+                    heapq.heappush(waiting, (further, other))
+        return found
+
+    def _links(self, lane: int) -> list[int]:
+        row = self.network.lanes[lane]
+        return list(range(row["first_link"], row["first_link"] + row["num_links"]))
+
+    def _after(self, lane: int) -> list[int]:
+        if self.network.lanes["internal"][lane]:
+            return [int(self.network.lanes["successor"][lane])]
+        return [int(self.network.links["next_lane"][link]) for link in self._links(lane)]
+
+    def _before(self, lane: int) -> list[int]:
+        return self.into[lane]
+
+    def _beside(self, lane: int) -> list[int]:
+        edge = self.network.lanes["edge"][lane]
+        beside: list[int] = np.flatnonzero(self.network.lanes["edge"] == edge).tolist()
+        return beside
+
+    def _path(self, link: int) -> list[int]:
+        """The lanes of a link inside the junction, and the one behind it."""
+        path = [int(self.network.links["next_lane"][link])]
+        while self.network.lanes["internal"][path[-1]]:
+            path += self._after(path[-1])
+        return path
+
+    def _conflicts(self, link: int) -> NDArray[np.void]:
+        row = self.network.links[link]
+        found: NDArray[np.void] = self.network.conflicts[row["first_conflict"] :]
+        return found[: row["num_conflicts"]]
+
+
+def _shorten(ways: Ways, lanes: Iterable[int], way: float) -> None:
+    for lane in lanes:
+        ways[lane] = min(ways.get(lane, math.inf), way)
