@@ -11,7 +11,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from cavmarl.kernels import kernel
+from cavmarl.kernels import inlined_kernel, kernel
 from cavmarl.kernels.neighbors import cell_columns, cell_rows
 from cavmarl.kernels.v2x_air import find_cam, let_on_the_air, list_cams, load_around
 from cavmarl.kernels.v2x_channel import Channel, busy_level, draw, is_heard
@@ -33,7 +33,7 @@ from cavmarl.kernels.v2x_records import (
 __all__ = ["age", "deliver", "learn"]
 
 
-@kernel
+@inlined_kernel
 def _hears(
     channel: Channel, me: np.void, level: int, word: np.uint64, x: float, y: float, squared: float
 ) -> bool:
@@ -52,7 +52,7 @@ def _note_band(bands: NDArray[np.int64], distance_m: float, received: bool) -> N
     bands[band, 1] += received
 
 
-@kernel
+@inlined_kernel
 def _refresh_by_cams(
     channel: Channel,
     me: np.void,
@@ -81,7 +81,7 @@ def _refresh_by_cams(
                 box[k] = report
 
 
-@kernel
+@inlined_kernel
 def _drop_lost(
     channel: Channel,
     me: np.void,
@@ -109,7 +109,7 @@ def _drop_lost(
     return kept
 
 
-@kernel
+@inlined_kernel
 def _let_in_cams(
     channel: Channel,
     mail: Mail,
@@ -223,7 +223,7 @@ def _take_others(
     return num
 
 
-@kernel
+@inlined_kernel
 def _receive_objects(
     channel: Channel,
     mail: Mail,
@@ -272,7 +272,7 @@ def _receive_others(
     return _take_others(channel, mail, w, me, level, packets, reports, room, kind, box, num, True)
 
 
-@kernel
+@inlined_kernel
 def _receive(
     channel: Channel,
     mail: Mail,
