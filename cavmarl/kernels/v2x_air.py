@@ -13,7 +13,7 @@ from cavmarl.kernels.rng import mix
 from cavmarl.kernels.v2x_channel import Channel, gets_access
 from cavmarl.kernels.v2x_records import COUNT_NO_ACCESS, KIND_CAM, Air, Mail, Room
 
-__all__ = ["find_cam", "let_on_the_air", "list_cams", "load_around"]
+__all__ = ["count_within", "find_cam", "let_on_the_air", "list_cams", "load_around"]
 
 
 @kernel
@@ -43,7 +43,7 @@ def _fill_air(
 
 
 @inlined_kernel
-def _count_within(air: Air, x: float, y: float, radius_m: float) -> int:
+def count_within(air: Air, x: float, y: float, radius_m: float) -> int:
     """How many packets are sent within a distance."""
     cells = air.cells
     if radius_m == math.inf:
@@ -65,8 +65,8 @@ def _count_within(air: Air, x: float, y: float, radius_m: float) -> int:
 @inlined_kernel
 def load_around(channel: Channel, room: Room, x: float, y: float) -> float:
     """Share of the tick that all packets take that one hears there; above 1, they do not fit."""
-    count = _count_within(room.cams, x, y, channel.sensing_m)
-    count += _count_within(room.others, x, y, channel.sensing_m)
+    count = count_within(room.cams, x, y, channel.sensing_m)
+    count += count_within(room.others, x, y, channel.sensing_m)
     return channel.load * count
 
 
