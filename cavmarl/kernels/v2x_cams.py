@@ -97,7 +97,7 @@ def _list_within(
             heard.place[near] = b
             heard.squared[near] = squared
             heard.word[near] = air.word[b]
-            near += squared <= limit and air.sender[b] != own
+            near += (squared <= limit) & (air.sender[b] != own)
     return near
 
 
@@ -108,31 +108,33 @@ def _drop_lost(channel: Channel, me: np.void, level: int, room: Room, num: int) 
     place = room.heard.place
     squared = room.heard.squared
     words = room.heard.word
-    fate = room.heard.fate
+    distances = room.heard.distance
+    numbers = room.heard.number
+    tally = room.tally
     of_receiver = me["word"]
+    x = me["x"]
+    y = me["y"]
     clear = channel.clear[level]
     for k in range(num):
-        distance_m = math.sqrt(squared[k])
-        is_received = draw(of_receiver, words[k]) < chance_at(clear, distance_m)
-        fate[k] = 2 * band_of(distance_m) + is_received
-    if channel.blocked.shape[0] > 0:
-        blocked = channel.blocked[level]
-        x = me["x"]
-        y = me["y"]
-        for k in range(num):
-            # What is received even behind a building needs no look whether one is there.
-            if (
-                fate[k] % 2 == 1
-                and draw(of_receiver, words[k]) >= chance_at(blocked, math.sqrt(squared[k]))
-                and is_cut(channel.walls, x, y, air.x[place[k]], air.y[place[k]])
-            ):
-                fate[k] -= 1
+        distances[k] = math.sqrt(squared[k])
+        numbers[k] = draw(of_receiver, words[k])
+    has_walls = channel.blocked.shape[0] > 0
     kept = 0
     for k in range(num):
-        room.tally[fate[k]] += 1
+        distance_m = distances[k]
+        is_received = numbers[k] < chance_at(clear, distance_m)
+        # What is received even behind a building needs no look whether one is there.
+        if (
+            has_walls
+            and is_received
+            and numbers[k] >= chance_at(channel.blocked[level], distance_m)
+        ):
+            b = place[k]
+            is_received = not is_cut(channel.walls, x, y, air.x[b], air.y[b])
+        tally[2 * band_of(distance_m) + is_received] += 1
         place[kept] = place[k]
         squared[kept] = squared[k]
-        kept += fate[k] % 2
+        kept += is_received
     return kept
 
 

@@ -222,7 +222,8 @@ class Heard(NamedTuple):
     place: NDArray[np.int32]  # (P + 1,) in `Room.cams`
     squared: NDArray[np.float64]  # squared distance, m²
     word: NDArray[np.uint64]  # see PACKET
-    fate: NDArray[np.int64]  # twice the band of distance, and 1 more if it is received
+    distance: NDArray[np.float64]  # m
+    number: NDArray[np.float64]  # of the reception, see `draw`
 
 
 class Room(NamedTuple):
@@ -243,5 +244,5 @@ class Room(NamedTuple):
     access: NDArray[np.bool_]  # (P,) whether a packet gets on the air
     cam_of: NDArray[np.int32]  # (a power of 2,) the CAM of a sender, or -1; a hash table
     heard: Heard
-    tally: NDArray[np.int64]  # (2 NUM_BANDS,) packets by fate, see `Heard`
+    tally: NDArray[np.int64]  # (2 NUM_BANDS,) packets lost and received by bands of distance
     squared: NDArray[np.float64]  # (largest inbox,)
