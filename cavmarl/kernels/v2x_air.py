@@ -7,13 +7,13 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from cavmarl.kernels import kernel
+from cavmarl.kernels import inlined_kernel, kernel
 from cavmarl.kernels.neighbors import cell_at, cell_columns, cell_rows
 from cavmarl.kernels.rng import mix
 from cavmarl.kernels.v2x_channel import Channel, gets_access
 from cavmarl.kernels.v2x_records import COUNT_NO_ACCESS, KIND_CAM, Air, Mail, Room
 
-__all__ = ["find_cam", "let_on_the_air", "list_cams", "load_around"]
+__all__ = ["count_within", "find_cam", "let_on_the_air", "list_cams", "load_around"]
 
 
 @kernel
@@ -42,8 +42,8 @@ def _fill_air(
             air.which[place] = p
 
 
-@kernel
-def _count_within(air: Air, x: float, y: float, radius_m: float) -> int:
+@inlined_kernel
+def count_within(air: Air, x: float, y: float, radius_m: float) -> int:
     """How many packets are sent within a distance."""
     cells = air.cells
     if radius_m == math.inf:
@@ -62,11 +62,11 @@ def _count_within(air: Air, x: float, y: float, radius_m: float) -> int:
     return count
 
 
-@kernel
+@inlined_kernel
 def load_around(channel: Channel, room: Room, x: float, y: float) -> float:
     """Share of the tick that all packets take that one hears there; above 1, they do not fit."""
-    count = _count_within(room.cams, x, y, channel.sensing_m)
-    count += _count_within(room.others, x, y, channel.sensing_m)
+    count = count_within(room.cams, x, y, channel.sensing_m)
+    count += count_within(room.others, x, y, channel.sensing_m)
     return channel.load * count
 
 
@@ -90,7 +90,7 @@ def list_cams(room: Room, packets: NDArray[np.void], num: int) -> None:
             table[place] = p
 
 
-@kernel
+@inlined_kernel
 def find_cam(room: Room, packets: NDArray[np.void], sender: int) -> int:
     """The CAM of a sender, or -1."""
     table = room.cam_of

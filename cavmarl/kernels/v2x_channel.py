@@ -18,6 +18,7 @@ from cavmarl.kernels.walls import Walls, is_cut
 __all__ = [
     "Channel",
     "busy_level",
+    "chance_at",
     "draw",
     "gets_access",
     "is_equipped",
@@ -100,8 +101,8 @@ def busy_level(channel: Channel, busy: float) -> int:
 
 
 @kernel
-def _at(chances: NDArray[np.float64], distance_m: float) -> float:
-    """A table's value at a distance."""
+def chance_at(chances: NDArray[np.float64], distance_m: float) -> float:
+    """A table's chance (K,) at a distance."""
     below = min(int(distance_m), chances.size - 2)
     low = chances[below]
     return float(low + (chances[below + 1] - low) * (distance_m - below))
@@ -130,9 +131,9 @@ def is_heard(
         from_y: likewise.
         distance_m: between them.
     """
-    if number >= _at(channel.clear[level], distance_m):
+    if number >= chance_at(channel.clear[level], distance_m):
         return False
     # What is received even behind a building needs no look whether one is there.
-    if channel.blocked.shape[0] == 0 or number < _at(channel.blocked[level], distance_m):
+    if channel.blocked.shape[0] == 0 or number < chance_at(channel.blocked[level], distance_m):
         return True
     return not is_cut(channel.walls, x, y, from_x, from_y)

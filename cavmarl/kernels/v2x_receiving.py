@@ -11,13 +11,13 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from cavmarl.kernels import kernel
+from cavmarl.kernels import inlined_kernel, kernel
 from cavmarl.kernels.neighbors import cell_columns, cell_rows
-from cavmarl.kernels.v2x_air import find_cam, let_on_the_air, list_cams, load_around
-from cavmarl.kernels.v2x_channel import Channel, busy_level, draw, is_heard
+from cavmarl.kernels.v2x_air import let_on_the_air, list_cams, load_around
+from cavmarl.kernels.v2x_cams import band_of, hears, let_in_cams, refresh_by_cams
+from cavmarl.kernels.v2x_channel import Channel, busy_level
 from cavmarl.kernels.v2x_inbox import empty, find, forget, insert, is_better, sort_by_distance
 from cavmarl.kernels.v2x_records import (
-    BANDS_PER_M,
     COUNT_REACHABLE,
     COUNT_RECEIVED,
     KIND_CAM,
@@ -25,149 +25,11 @@ from cavmarl.kernels.v2x_records import (
     KIND_DENM,
     KIND_SPAT,
     NUM_BANDS,
-    Air,
     Mail,
     Room,
 )
 
 __all__ = ["age", "deliver", "learn"]
-
-
-@kernel
-def _hears(
-    channel: Channel, me: np.void, level: int, word: np.uint64, x: float, y: float, squared: float
-) -> bool:
-    """Whether a receiver receives the packet of that word, sent within reach from (x, y)."""
-    if channel.sure:
-        return True
-    number = draw(me["word"], word)
-    return is_heard(channel, level, number, me["x"], me["y"], x, y, math.sqrt(squared))
-
-
-@kernel
-def _note_band(bands: NDArray[np.int64], distance_m: float, received: bool) -> None:
-    """Count a packet that could be received by the distance of its sender."""
-    band = min(int(distance_m * BANDS_PER_M), NUM_BANDS - 1)
-    bands[band, 0] += 1
-    bands[band, 1] += received
-
-
-@kernel
-def _refresh_by_cams(
-    channel: Channel,
-    me: np.void,
-    level: int,
-    packets: NDArray[np.void],
-    reports: NDArray[np.void],
-    room: Room,
-    box: NDArray[np.void],
-    num: int,
-) -> None:
-    """Let those that a receiver knows tell the newest of themselves."""
-    limit = channel.reach_m * channel.reach_m
-    for k in range(num):
-        p = find_cam(room, packets, box[k]["subject"])
-        if p < 0:
-            continue
-        packet = packets[p]
-        dx = packet["x"] - me["x"]
-        dy = packet["y"] - me["y"]
-        squared = dx * dx + dy * dy
-        if squared <= limit and _hears(
-            channel, me, level, packet["word"], packet["x"], packet["y"], squared
-        ):
-            report = reports[packet["first"]]
-            if is_better(report, box[k]):
-                box[k] = report
-
-
-@kernel
-def _drop_lost(
-    channel: Channel,
-    me: np.void,
-    level: int,
-    air: Air,
-    num: int,
-    bands: NDArray[np.int64],
-    heard: NDArray[np.int32],
-) -> int:
-    """Of the packets `heard[:num]` within reach keep those that are received; returns how many."""
-    x = me["x"]
-    y = me["y"]
-    word = me["word"]
-    kept = 0
-    for k in range(num):
-        b = heard[k]
-        dx = air.x[b] - x
-        dy = air.y[b] - y
-        distance_m = math.sqrt(dx * dx + dy * dy)
-        number = draw(word, air.word[b])
-        is_received = is_heard(channel, level, number, x, y, air.x[b], air.y[b], distance_m)
-        _note_band(bands, distance_m, is_received)
-        heard[kept] = b
-        kept += is_received
-    return kept
-
-
-@kernel
-def _let_in_cams(
-    channel: Channel,
-    mail: Mail,
-    w: int,
-    me: np.void,
-    level: int,
-    packets: NDArray[np.void],
-    reports: NDArray[np.void],
-    room: Room,
-    box: NDArray[np.void],
-    num: int,
-) -> int:
-    """Let the nearest of those in that a receiver did not know; returns how many it knows then."""
-    air = room.cams
-    cells = air.cells
-    reach_m = channel.reach_m
-    limit = reach_m * reach_m
-    counts = mail.counts[w]
-    hears_all = channel.sure and reach_m == math.inf
-    if hears_all:
-        heard = cells.start[cells.start.size - 1]
-        heard -= find_cam(room, packets, me["id"]) >= 0
-        counts[COUNT_REACHABLE] += heard
-        counts[COUNT_RECEIVED] += heard
-        if num == box.size:
-            # Whoever is further away than all that it knows is not let in.
-            limit = room.squared[num - 1]
-            reach_m = math.sqrt(limit)
-    x = me["x"]
-    y = me["y"]
-    own = me["id"]
-    near = 0
-    first_column, last_column = cell_columns(cells, x, reach_m)
-    first_row, last_row = cell_rows(cells, y, reach_m)
-    for j in range(first_row, last_row + 1):
-        begin = cells.start[j * cells.num_x + first_column]
-        end = cells.start[j * cells.num_x + last_column + 1]
-        # Here and below a place is written in any case: who is in and who is not cannot be guessed.
-        for b in range(begin, end):
-            dx = air.x[b] - x
-            dy = air.y[b] - y
-            room.heard[near] = b
-            near += dx * dx + dy * dy <= limit and air.sender[b] != own
-    heard = near
-    if not channel.sure:
-        heard = _drop_lost(channel, me, level, air, near, mail.bands[w], room.heard)
-    if not hears_all:
-        counts[COUNT_REACHABLE] += near
-        counts[COUNT_RECEIVED] += heard
-    for k in range(heard):
-        b = room.heard[k]
-        dx = air.x[b] - x
-        dy = air.y[b] - y
-        if num < box.size or dx * dx + dy * dy <= room.squared[num - 1]:
-            report = reports[packets[air.which[b]]["first"]]
-            if find(box, num, report["subject"]) < 0:
-                num = insert(box, num, room.squared, report, x, y)
-    return num
 
 
 @kernel
@@ -203,12 +65,12 @@ def _take_others(
             packet = packets[air.which[b]]
             if packet["kind"] != kind:
                 continue
-            is_received = _hears(channel, me, level, air.word[b], air.x[b], air.y[b], squared)
+            is_received = hears(channel, me, level, air.word[b], air.x[b], air.y[b], squared)
             if new:
                 mail.counts[w, COUNT_REACHABLE] += 1
                 mail.counts[w, COUNT_RECEIVED] += is_received
                 if not channel.sure:
-                    _note_band(mail.bands[w], math.sqrt(squared), is_received)
+                    room.tally[2 * band_of(math.sqrt(squared)) + is_received] += 1
             if not is_received:
                 continue
             for k in range(packet["first"], packet["first"] + packet["count"]):
@@ -223,7 +85,7 @@ def _take_others(
     return num
 
 
-@kernel
+@inlined_kernel
 def _receive_objects(
     channel: Channel,
     mail: Mail,
@@ -239,11 +101,11 @@ def _receive_objects(
     """Take what is told of vehicles, by themselves and by those who see them."""
     packets = mail.packets[w, slot]
     reports = mail.reports[w, slot]
-    _refresh_by_cams(channel, me, level, packets, reports, room, box, num)
+    refresh_by_cams(channel, me, level, packets, reports, room, box, num)
     if with_seen:
         _take_others(channel, mail, w, me, level, packets, reports, room, KIND_CPM, box, num, False)
     sort_by_distance(box, num, room.squared, me["x"], me["y"])
-    num = _let_in_cams(channel, mail, w, me, level, packets, reports, room, box, num)
+    num = let_in_cams(channel, mail, w, me, level, packets, reports, room, box, num)
     if with_seen:
         num = _take_others(
             channel, mail, w, me, level, packets, reports, room, KIND_CPM, box, num, True
@@ -272,7 +134,7 @@ def _receive_others(
     return _take_others(channel, mail, w, me, level, packets, reports, room, kind, box, num, True)
 
 
-@kernel
+@inlined_kernel
 def _receive(
     channel: Channel,
     mail: Mail,
@@ -339,10 +201,15 @@ def deliver(
     let_on_the_air(channel, mail, w, slot, key, room)
     list_cams(room, mail.packets[w, slot], mail.num_packets[w, slot])
     before = mail.counts[w, COUNT_RECEIVED]
+    room.tally[:] = 0
     for r in range(room.receivers.size):
         if room.receivers[r]["id"] >= 0:
             _receive(channel, mail, w, slot, r, tick, kinds, room)
     mail.delays[w, latency] += mail.counts[w, COUNT_RECEIVED] - before
+    for band in range(NUM_BANDS):
+        received = room.tally[2 * band + 1]
+        mail.bands[w, band, 0] += room.tally[2 * band] + received
+        mail.bands[w, band, 1] += received
 
 
 @kernel

@@ -44,6 +44,7 @@ __all__ = [
     "STATION",
     "UNIT",
     "Air",
+    "Heard",
     "Mail",
     "Room",
     "Sending",
@@ -215,6 +216,16 @@ class Air(NamedTuple):
     which: NDArray[np.int32]  # the packet
 
 
+class Heard(NamedTuple):
+    """CAMs that one receiver could receive, in the order in which they are found."""
+
+    place: NDArray[np.int32]  # (P + 1,) in `Room.cams`
+    squared: NDArray[np.float64]  # squared distance, m²
+    word: NDArray[np.uint64]  # see PACKET
+    distance: NDArray[np.float64]  # m
+    number: NDArray[np.float64]  # of the reception, see `draw`
+
+
 class Room(NamedTuple):
     """What a tick works in; holds nothing between ticks."""
 
@@ -232,5 +243,6 @@ class Room(NamedTuple):
     kinds: NDArray[np.int64]  # (NUM_KINDS,) packets that are received now
     access: NDArray[np.bool_]  # (P,) whether a packet gets on the air
     cam_of: NDArray[np.int32]  # (a power of 2,) the CAM of a sender, or -1; a hash table
-    heard: NDArray[np.int32]  # (P + 1,) places of `cams` that a receiver hears
+    heard: Heard
+    tally: NDArray[np.int64]  # (2 NUM_BANDS,) packets lost and received by bands of distance
     squared: NDArray[np.float64]  # (largest inbox,)

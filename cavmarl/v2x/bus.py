@@ -32,6 +32,7 @@ from cavmarl.kernels.v2x_records import (
     REPORT,
     STATION,
     Air,
+    Heard,
     Mail,
     Room,
     Sending,
@@ -290,6 +291,13 @@ def _make_room(network: RoadNetwork, mail: Mail, zoned: Zoned, num_receivers: in
         kinds=np.zeros(NUM_KINDS, np.int64),
         access=np.zeros(most, np.bool_),
         cam_of=np.zeros(1 << (2 * capacity).bit_length(), np.int32),
-        heard=np.zeros(most + 1, np.int32),
+        heard=Heard(
+            place=np.zeros(most + 1, np.int32),
+            squared=np.zeros(most + 1),
+            word=np.zeros(most + 1, np.uint64),
+            distance=np.zeros(most + 1),
+            number=np.zeros(most + 1),
+        ),
+        tally=np.zeros(2 * NUM_BANDS, np.int64),
         squared=np.zeros(largest),
     )
