@@ -697,7 +697,8 @@ class Simulation:
         """Go on from what `save` gave, in worlds of the same environment.
 
         Raises:
-            SumoStateError: SUMO moves vehicles there, and cannot begin in the middle.
+            SumoStateError: SUMO moves vehicles there, and what it was told is not on record; see
+                `SumoTraffic.keep_logs`.
         """
         self._put_back(saved)
         if self._sumo is not None:

@@ -12,11 +12,13 @@ are ours.
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable
+from itertools import repeat
 
 import numpy as np
 from numpy.typing import NDArray
 
-from cavmarl.errors import CapacityError, SumoStateError
+from cavmarl.errors import CapacityError
 from cavmarl.kernels.arrays import Gate, RoadArrays, Travel, Worlds, Zoned
 from cavmarl.kernels.codes import (
     COUNT_REROUTED,
@@ -31,6 +33,7 @@ from cavmarl.traffic.sumo.demand import SumoDemand
 from cavmarl.traffic.sumo.records import MOVED
 from cavmarl.traffic.sumo.route_book import RouteBook
 from cavmarl.traffic.sumo.signals import ShownSignals
+from cavmarl.traffic.sumo.told import ToldLog
 from cavmarl.traffic.sumo.worlds import SumoWorlds
 
 __all__ = ["SumoTraffic"]
@@ -70,6 +73,7 @@ class SumoTraffic:
         self._zoned = zoned
         self._blank = blank
         self._dt = demand.dt_s
+        self._replay_bytes = demand.replay_bytes
         self._shown = ShownSignals(network)
         self._mirror = repeated(mirror)
         self._greet = repeated(greet)
@@ -87,21 +91,30 @@ class SumoTraffic:
         for w in np.flatnonzero(chosen).tolist():
             self.worlds.begin(w, int(worlds.keys[w]))
 
+    def keep_logs(self) -> tuple[ToldLog, ...]:
+        """From the next reset on keep what SUMO is told, one log a world, for `catch_up`.
+
+        There is none where SUMO moves nobody: then it is told nothing.
+        """
+        if self.drives and not self.worlds.logs:
+            num_worlds = self._zoned.rows.shape[2]
+            self.worlds.logs = tuple(ToldLog(self._replay_bytes) for _ in range(num_worlds))
+        return self.worlds.logs
+
     def catch_up(self, worlds: Worlds) -> None:
         """Bring SUMO to the worlds' ticks, from the beginning of their episodes.
 
         Raises:
-            SumoStateError: it moves its vehicles, and what it has seen of ours is not on record.
+            SumoStateError: SUMO has been told where ours are, and that is not on record.
         """
-        if self.drives:
-            raise SumoStateError(
-                "traffic.source = sumo-traffic: a worker process died, and its successor cannot "
-                "take up SUMO in the middle of an episode: reset the worlds"
-            )
         for w, (key, tick) in enumerate(zip(worlds.keys, worlds.ticks.tolist(), strict=True)):
+            told: Iterable[NDArray[np.void]] = repeat(np.zeros(0, dtype=MOVED), tick)
+            if self.drives:
+                log = self.worlds.logs[w] if self.worlds.logs else ToldLog(0)
+                told = log.ticks(tick)
             self.worlds.begin(w, int(key))
-            for passed in range(tick):
-                self.worlds.step_one(w, passed, np.zeros(0, dtype=MOVED))
+            for passed, moved in enumerate(told):
+                self.worlds.step_one(w, passed, moved)
 
     def step(self, worlds: Worlds, side: int) -> None:
         """Let SUMO take its step; errors as of `SumoWorlds.step`.

@@ -20,6 +20,7 @@ from cavmarl.kernels.mirroring import Paths
 from cavmarl.traffic.sumo.demand import SumoDemand
 from cavmarl.traffic.sumo.process import Answer, SumoProcess
 from cavmarl.traffic.sumo.route_book import RouteBook
+from cavmarl.traffic.sumo.told import ToldLog
 
 __all__ = ["SumoWorlds", "Tick"]
 
@@ -62,12 +63,14 @@ class SumoWorlds:
         book: of their routes.
         names: by world, SUMO's names of the vehicles by number.
         teleports: (W,) vehicles that SUMO has put elsewhere since each reset.
+        logs: by world, what SUMO has been told since its reset; none: nobody keeps it.
     """
 
     def __init__(self, demand: SumoDemand, book: RouteBook, num_worlds: int) -> None:
         self.book = book
         self.names: list[list[str]] = [[] for _ in range(num_worlds)]
         self.teleports = np.zeros(num_worlds, dtype=np.int64)
+        self.logs: tuple[ToldLog, ...] = ()
         self._demand = demand
         self._tick_ms = round(1000.0 * demand.dt_s)
         self._begin_ms = round(1000.0 * demand.given.begin_s)
@@ -98,6 +101,8 @@ class SumoWorlds:
         self.book.begin(w)
         self.names[w] = []
         self.teleports[w] = 0
+        if self.logs:
+            self.logs[w].begin()
         self._path_of[w] = np.zeros(0, dtype=np.int32)
         seed = key >> (64 - SEED_BITS)
         # SUMO reads all additional files when it starts.
@@ -135,11 +140,14 @@ class SumoWorlds:
             if last.tick != tick:
                 raise SumoStateError(f"world {w} is at tick {tick}, its SUMO at {last.tick}")
             asked.append(w)
+        told = {}
         try:
             for w in asked:
-                self._process(w).begin_step(moved(w))
+                told[w] = moved(w)
+                self._process(w).begin_step(told[w])
             for w in asked:
                 self._ticks[w] = self._take(w, ticks[w] + 1, self._process(w).end_step())
+                self._note(w, told[w])
         except (SumoDiedError, ConfigError) as error:
             # Others may have taken the step, and their worlds have not.
             for w in asked:
@@ -151,6 +159,11 @@ class SumoWorlds:
         process = self._process(w)
         process.begin_step(moved)
         self._ticks[w] = self._take(w, tick + 1, process.end_step())
+        self._note(w, moved)
+
+    def _note(self, w: int, moved: NDArray[np.void]) -> None:
+        if self.logs:
+            self.logs[w].note(moved)
 
     def close(self) -> None:
         """End all processes."""
