@@ -737,6 +737,7 @@ class Simulation:
             self._coordination,
             self.config.sensors.stack > 1,
             self._attached,
+            self._sumo,
         )
 
     def agents_to_come(self) -> NDArray[np.bool_]:
@@ -759,7 +760,7 @@ class Simulation:
         all random numbers; not over where a record lives, nor over what a view keeps (steps to the
         horizon, held actions).
         """
-        return digest_world(self._parts(), self._sumo, world)
+        return digest_world(self._parts(), world)
 
     def traffic_stats(self, world: int = 0) -> TrafficStats:
         """Counts and means since the world's reset."""

@@ -5,7 +5,7 @@ vehicle moves from tick t to t + 1 has seen all others at t, on both sides: ours
 that needs nothing but t; then SUMO takes its step and is told where ours have come to.
 
 `sumo-demand`: SUMO runs the demand by itself. Who departs there is ordered here at the same tick,
-with its type, route, lane and speed factor; who gets another route there gets it here; its signals
+with its type, route, stops, lane and speed factor; who gets another route there gets it here; its signals
 are ours.
 """
 
@@ -33,6 +33,7 @@ from cavmarl.traffic.sumo.demand import SumoDemand
 from cavmarl.traffic.sumo.records import MOVED
 from cavmarl.traffic.sumo.route_book import RouteBook
 from cavmarl.traffic.sumo.signals import ShownSignals
+from cavmarl.traffic.sumo.stop_book import StopBook
 from cavmarl.traffic.sumo.told import ToldLog
 from cavmarl.traffic.sumo.worlds import SumoWorlds
 
@@ -67,7 +68,8 @@ class SumoTraffic:
         self.drives = demand.drives
         num_worlds, capacity = zoned.rows.shape[2:]
         book = RouteBook(network, travel.steps, first_step, num_worlds, travel.types["permissions"])
-        self.worlds = SumoWorlds(demand, book, num_worlds)
+        stops = StopBook(network, travel.stops, num_worlds)
+        self.worlds = SumoWorlds(demand, book, stops, num_worlds)
         self._roads: RoadArrays = network.arrays
         self._travel = travel
         self._zoned = zoned
@@ -187,7 +189,8 @@ class SumoTraffic:
         """
         for w in range(len(worlds.ticks)):
             now = self.worlds.at(w)
-            for number, factor in zip(now.departed.tolist(), now.speed_factors, strict=True):
+            come = zip(now.departed.tolist(), now.speed_factors, now.stops, strict=True)
+            for number, factor, stops in come:
                 if gate.num_queue[w] == gate.queue.shape[1]:
                     self._check_room(gate.queue.shape[1] + 1)
                 row = gate.queue[w, gate.num_queue[w]]
@@ -195,6 +198,7 @@ class SumoTraffic:
                 row["id"] = gate.next_id[w]
                 row["due"] = worlds.ticks[w] + 1
                 row["speed_factor"] = factor
+                row["stop"], row["stops_end"] = stops
                 gate.next_id[w] += 1
                 gate.num_queue[w] += 1
 
@@ -220,9 +224,13 @@ class SumoTraffic:
         for w, phase in enumerate(worlds.signal_phase):
             self._shown.show(self.worlds.at(w).letters, phase)
 
-    def ways_of_first_world(self, ways: NDArray[np.int64], world: int) -> NDArray[np.int64]:
-        """VEHICLE["way"] (n,) of a world as it would be in the first one."""
-        return self.worlds.book.ways_of_first_world(ways, world)
+    def shift(self, rows: NDArray[np.void], worlds: int) -> None:
+        """Let rows of a world, VEHICLE or departures, be those of so many worlds later.
+
+        Their ways and stops are written, which stand in another part of the tables there.
+        """
+        self.worlds.book.shift(rows, worlds)
+        self.worlds.stops.shift(rows, worlds)
 
     def close(self) -> None:
         """End all processes."""
@@ -249,7 +257,7 @@ class SumoTraffic:
         """Where, in what and by which route somebody departs."""
         lane = int(seen["lane"])
         edge = self._roads.edges[self._roads.lanes[lane]["edge"]]
-        row["agent"] = row["goal"] = row["stop"] = row["stops_end"] = -1
+        row["agent"] = row["goal"] = -1
         row["order"] = seen["number"]
         row["vtype"] = seen["vtype"]
         row["lane"] = lane

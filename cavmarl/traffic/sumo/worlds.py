@@ -20,6 +20,7 @@ from cavmarl.kernels.mirroring import Paths
 from cavmarl.traffic.sumo.demand import SumoDemand
 from cavmarl.traffic.sumo.process import Answer, SumoProcess
 from cavmarl.traffic.sumo.route_book import RouteBook
+from cavmarl.traffic.sumo.stop_book import StopBook
 from cavmarl.traffic.sumo.told import ToldLog
 
 __all__ = ["SumoWorlds", "Tick"]
@@ -38,6 +39,8 @@ class Tick(NamedTuple):
         letters: of all signals.
         departed: (m,) numbers of those who have come, rising.
         speed_factors: (m,) theirs.
+        stops: (m, 2) STOP rows [first, end) that they are to make, -1: none; (0, 2) where SUMO
+            moves them.
         teleported: numbers of those who have been lifted off the road.
         rerouted: (r,) numbers of those on another route than a tick before, rising.
     """
@@ -47,6 +50,7 @@ class Tick(NamedTuple):
     letters: bytes
     departed: NDArray[np.int64]
     speed_factors: NDArray[np.float64]
+    stops: NDArray[np.int64]
     teleported: tuple[int, ...]
     rerouted: NDArray[np.int64]
 
@@ -57,17 +61,22 @@ class SumoWorlds:
     Args:
         demand: what they run.
         book: where their routes are written.
+        stops: where their stops are written.
         num_worlds: W.
 
     Attributes:
         book: of their routes.
+        stops: of their stops.
         names: by world, SUMO's names of the vehicles by number.
         teleports: (W,) vehicles that SUMO has put elsewhere since each reset.
         logs: by world, what SUMO has been told since its reset; none: nobody keeps it.
     """
 
-    def __init__(self, demand: SumoDemand, book: RouteBook, num_worlds: int) -> None:
+    def __init__(
+        self, demand: SumoDemand, book: RouteBook, stops: StopBook, num_worlds: int
+    ) -> None:
         self.book = book
+        self.stops = stops
         self.names: list[list[str]] = [[] for _ in range(num_worlds)]
         self.teleports = np.zeros(num_worlds, dtype=np.int64)
         self.logs: tuple[ToldLog, ...] = ()
@@ -99,6 +108,7 @@ class SumoWorlds:
             process = self._processes[w] = SumoProcess(self._demand.told())
         self._ticks[w] = None
         self.book.begin(w)
+        self.stops.begin(w)
         self.names[w] = []
         self.teleports[w] = 0
         if self.logs:
@@ -187,7 +197,8 @@ class SumoWorlds:
         self.book.enter(w, line.get("routes", []))
         seen["route"] = self.book.look_up(w, seen["route"], seen["vtype"])
         departed = line.get("departed", [])
-        self.names[w] += [name for _, name, _ in departed]
+        self.names[w] += [name for _, name, _, _ in departed]
+        stops = [self.stops.enter(w, stops) for *_, stops in departed]
         lifted = line.get("teleported", [])
         for number, name in lifted:
             log.warning("world %d, tick %d: SUMO teleports %s (%d)", w, tick, name, number)
@@ -196,8 +207,9 @@ class SumoWorlds:
             tick,
             seen,
             answer.letters,
-            np.array([number for number, _, _ in departed], dtype=np.int64),
-            np.array([factor for _, _, factor in departed], dtype=np.float64),
+            np.array([number for number, *_ in departed], dtype=np.int64),
+            np.array([factor for _, _, factor, _ in departed], dtype=np.float64),
+            np.array(stops, dtype=np.int64).reshape(-1, 2),
             tuple(number for number, _ in lifted),
             self._changed(w, seen),
         )
