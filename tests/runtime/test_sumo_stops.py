@@ -15,44 +15,13 @@ from cavmarl.runtime.simulation import Simulation
 from cavmarl.traffic.demand import read_demand
 from cavmarl.traffic.sumo.stop_book import StopBook
 from tests.driving import drive
-from tests.sumo_worlds import coupled
+from tests.sumo_worlds import coupled, write_stops
 
 pytest.importorskip("sumo", reason="needs the extra 'sumo'")
 pytest.importorskip("libsumo", reason="needs the extra 'sumo'")
 
-# A bus stop that an additional file names, a place that a lane names, one that counts from the
-# lane's end, and one that its route has for everybody.
-PLACES = """<additional>
-  <busStop id="market" lane="main_in_0" startPos="80" endPos="110" lines="1"/>
-</additional>"""
-DEMAND = """<routes>
-  <vType id="car" sigma="0" speedDev="0"/>
-  <vType id="bus" vClass="bus" sigma="0" speedDev="0"/>
-  <route id="straight" edges="main_in weave main_out"/>
-  <route id="pause" edges="main_in weave main_out">
-    <stop lane="main_out_0" endPos="-20" duration="3"/>
-  </route>
-  <vehicle id="bus" type="bus" route="straight" depart="1" departLane="0">
-    <stop busStop="market" duration="6" until="25"/>
-    <stop lane="main_out_0" startPos="30" endPos="60" duration="4"/>
-  </vehicle>
-  <vehicle id="van" type="car" route="pause" depart="4" departLane="1"/>
-  <vehicle id="car" type="car" route="straight" depart="8" departLane="1"/>
-  <vehicle id="taxi" type="car" route="straight" depart="12" departLane="0">
-    <stop lane="weave_0" endPos="40" duration="0" speed="5"/>
-    <stop lane="main_out_0" endPos="90" duration="2" parking="true"/>
-  </vehicle>
-  <flow id="more" type="car" route="pause" begin="20" end="50" period="6" departLane="1"/>
-</routes>"""
 SECONDS = {"bus": [6.0, 4.0], "van": [3.0], "car": [], "taxi": [2.0]}
 MODE = {"traffic.source": "sumo-demand", "sensors.signal.timing": False}
-
-
-def files(folder: Path, demand: str = DEMAND) -> list[Path]:
-    paths = [folder / "stops.add.xml", folder / "stops.rou.xml"]
-    for path, text in zip(paths, (PLACES, demand), strict=True):
-        path.write_text(text, encoding="utf-8")
-    return paths
 
 
 def stands(simulation: Simulation, seconds: int) -> dict[str, list[tuple[float, float, float]]]:
@@ -79,7 +48,7 @@ def stands(simulation: Simulation, seconds: int) -> dict[str, list[tuple[float, 
 
 def test_the_table_is_what_the_reader_of_demand_finds(tmp_path: Path) -> None:
     """SUMO tells of lanes, places and times as our own reader does, also of a bus stop."""
-    paths = files(tmp_path)
+    paths = write_stops(tmp_path)
     with coupled("merge", paths, "sumo-demand") as simulation:
         network, travel = simulation.network, simulation._traffic.travel
         own = read_demand(paths, network).stops
@@ -110,7 +79,7 @@ def test_the_table_is_what_the_reader_of_demand_finds(tmp_path: Path) -> None:
 
 
 def test_vehicles_stand_where_and_as_long_as_they_are_told(tmp_path: Path) -> None:
-    with coupled("merge", files(tmp_path), "sumo-demand") as simulation:
+    with coupled("merge", write_stops(tmp_path), "sumo-demand") as simulation:
         network = simulation.network
         found = stands(simulation, 110)
         ends = {
@@ -130,7 +99,7 @@ def test_vehicles_stand_where_and_as_long_as_they_are_told(tmp_path: Path) -> No
 
 
 def test_zones_and_workers_change_nothing(tmp_path: Path) -> None:
-    paths = [str(path) for path in files(tmp_path)]
+    paths = [str(path) for path in write_stops(tmp_path)]
     both = {**MODE, "traffic.demand": paths, "clock.sim_dt_s": 0.1, "clock.ctrl_dt_s": 0.2}
     verified = verify_zones(
         "merge", (1, 2), steps=200, seed=3, agents=2, background=2, overrides=both, check=True
@@ -150,7 +119,7 @@ def test_zones_and_workers_change_nothing(tmp_path: Path) -> None:
 
 
 def test_more_stops_than_there_is_room_for_are_refused(tmp_path: Path) -> None:
-    with coupled("merge", files(tmp_path), "sumo-demand", seed=None) as simulation:
+    with coupled("merge", write_stops(tmp_path), "sumo-demand", seed=None) as simulation:
         table = np.zeros(5, dtype=simulation._traffic.travel.stops.dtype)
         book = StopBook(simulation.network, table, 2)
         stop = (0, 1.0, 2.0, 3.0, -1.0, False)

@@ -5,8 +5,8 @@ vehicle moves from tick t to t + 1 has seen all others at t, on both sides: ours
 that needs nothing but t; then SUMO takes its step and is told where ours have come to.
 
 `sumo-demand`: SUMO runs the demand by itself. Who departs there is ordered here at the same tick,
-with its type, route, stops, lane and speed factor; who gets another route there gets it here; its signals
-are ours.
+with its type, route, stops, lane and speed factor; who gets another route there gets it here; its
+signals are ours.
 """
 
 from __future__ import annotations
