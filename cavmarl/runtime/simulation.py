@@ -510,6 +510,8 @@ class Simulation:
         self._commons = wrap(self._commons)
         if self._coordination is not None:
             self._coordination = wrap(self._coordination)
+        if self._sumo is not None:
+            self._sumo = wrap(self._sumo)
 
     def trace(self, wrap: Callable[[Any], Any], note: Callable[[str], None]) -> None:
         """Let `wrap(executor)` note the phases of a tick, and attached parts name theirs to `note`.
