@@ -186,6 +186,8 @@ def _parts(found: SensorBench) -> Table:
         table.add_column(f"{row.workers}", justify="right")
         columns.append((found.parts_ms(row.workers), row.step_ms))
     for name in columns[0][0]:
+        if name == "SUMO" and not any(parts[name] for parts, _ in columns):
+            continue  # no world has one
         table.add_row(name, *(f"{parts[name]:.3f}" for parts, _ in columns))
     table.add_section()
     sums = (f"{sum(parts.values()) / step_ms:.1%}" for parts, step_ms in columns)

@@ -28,11 +28,13 @@ __all__ = ["PARTS", "SensorJob", "SensorRun", "Window", "main", "run_sensors"]
 WINDOW = 25  # steps
 
 PARTS = (
-    "physics", "ghosts", "transfers", "sensor compute", "sensor transport", "barrier",
+    "physics", "SUMO", "ghosts", "transfers", "sensor compute", "sensor transport", "barrier",
     "observation", "environment",
 )  # fmt: skip
 # Calls of the runtime that belong to a part; the executor's and the traffic's others are physics.
+# Those of SUMO's side are its own step, for which this process waits, and what comes of it here.
 _PART_OF = {
+    **dict.fromkeys(("step", "mirror", "forgive", "let_in", "order", "send_on", "show"), "SUMO"),
     "exchange": "ghosts",
     **dict.fromkeys(("begin", "end", "left", "entered", "save"), "transfers"),
     **dict.fromkeys(("sense", "clear_outputs", "settle_outputs", "credit"), "observation"),

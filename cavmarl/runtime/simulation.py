@@ -511,6 +511,8 @@ class Simulation:
         self._commons = wrap(self._commons)
         if self._coordination is not None:
             self._coordination = wrap(self._coordination)
+        if self._sumo is not None:
+            self._sumo = wrap(self._sumo)
 
     def trace(self, wrap: Callable[[Any], Any], note: Callable[[str], None]) -> None:
         """Let `wrap(executor)` note the phases of a tick, and attached parts name theirs to `note`.
@@ -698,7 +700,8 @@ class Simulation:
         """Go on from what `save` gave, in worlds of the same environment.
 
         Raises:
-            SumoStateError: SUMO moves vehicles there, and cannot begin in the middle.
+            SumoStateError: SUMO moves vehicles there, and what it was told is not on record; see
+                `SumoTraffic.keep_logs`.
         """
         self._put_back(saved)
         if self._sumo is not None:
@@ -737,6 +740,7 @@ class Simulation:
             self._coordination,
             self.config.sensors.stack > 1,
             self._attached,
+            self._sumo,
         )
 
     def agents_to_come(self) -> NDArray[np.bool_]:
@@ -759,7 +763,7 @@ class Simulation:
         all random numbers; not over where a record lives, nor over what a view keeps (steps to the
         horizon, held actions).
         """
-        return digest_world(self._parts(), self._sumo, world)
+        return digest_world(self._parts(), world)
 
     def traffic_stats(self, world: int = 0) -> TrafficStats:
         """Counts and means since the world's reset."""

@@ -18,6 +18,7 @@ from cavmarl.runtime.coordination import Coordination
 from cavmarl.runtime.division import Division
 from cavmarl.shard.shard import COMMON
 from cavmarl.traffic.native import NativeTraffic
+from cavmarl.traffic.sumo.traffic import SumoTraffic
 
 __all__ = ["Parts", "join", "load", "save", "share_of"]
 
@@ -39,6 +40,7 @@ class Parts(NamedTuple):
         coordination: who says who owns what; None: all is one zone.
         has_frames: an observation has frames of the ones before.
         attached: what acts in each tick beside the traffic.
+        sumo: beside the worlds; None: there is none.
     """
 
     worlds: Worlds
@@ -49,6 +51,7 @@ class Parts(NamedTuple):
     coordination: Coordination | None
     has_frames: bool
     attached: tuple[Attached, ...]
+    sumo: SumoTraffic | None
 
 
 def save(parts: Parts) -> list[Array]:
@@ -101,15 +104,19 @@ def load(parts: Parts, saved: Sequence[Array]) -> Gate:
 def share_of(parts: Parts, w: int) -> list[Array]:
     """What `save` would give if there were no world but one; some are views, to be copied."""
     gate, rerouting = parts.gate, parts.traffic.rerouting
-    waiting = gate.num_queue.item(w)
+    waiting = gate.queue[w : w + 1, : gate.num_queue.item(w)]
     owned = [parts.division.owned(w, zone) for zone in range(parts.division.count)]
+    if parts.sumo is not None:
+        waiting, owned = waiting.copy(), [rows.copy() for rows in owned]
+        for rows in (waiting, *owned):
+            parts.sumo.shift(rows, -w)
     if rerouting is not None:
         owned = [rows.copy() for rows in owned]
         for rows in owned:
             rows["way"] = rerouting.ways_of_first_world(rows["way"], w)
     return [
         *(array[w : w + 1] for array in _fixed(parts)),
-        gate.queue[w : w + 1, :waiting],
+        waiting,
         parts.division.contacts()[w : w + 1],
         *(() if rerouting is None else rerouting.arrays_of(w)),
         *owned,
@@ -124,6 +131,8 @@ def join(parts: Parts, shares: Sequence[Sequence[Array]]) -> list[Array]:
         shares: what `share_of` gave, in the order in which the worlds are to be.
     """
     zones, rerouting = parts.division.count, parts.traffic.rerouting
+    if parts.sumo is not None:
+        shares = [_shifted(parts, parts.sumo, share, w) for w, share in enumerate(shares)]
     fields = zip(*(share[:-zones] for share in shares), strict=True)
     joined = [_stacked(arrays) for arrays in fields]
     for w, share in enumerate(shares):
@@ -133,6 +142,18 @@ def join(parts: Parts, shares: Sequence[Sequence[Array]]) -> list[Array]:
                 rows["way"] = rerouting.ways_of_world(rows["way"], w)
             joined.append(rows)
     return joined
+
+
+def _shifted(
+    parts: Parts, sumo: SumoTraffic, share: Sequence[Array], worlds: int
+) -> Sequence[Array]:
+    """A share whose rows and queue are those of so many worlds later."""
+    found = list(share)
+    queue = sum(1 for _ in _fixed(parts))
+    for n in (queue, *range(len(found) - parts.division.count, len(found))):
+        found[n] = found[n].copy()
+        sumo.shift(found[n], worlds)
+    return found
 
 
 def _stacked(arrays: Sequence[Array]) -> Array:

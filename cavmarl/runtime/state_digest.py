@@ -8,32 +8,34 @@ import numpy as np
 
 from cavmarl.runtime.snapshot import Parts
 from cavmarl.shard.vehicles import STATE_FIELDS
-from cavmarl.traffic.sumo.traffic import SumoTraffic
 
 __all__ = ["digest_world"]
 
 
-def digest_world(parts: Parts, sumo: SumoTraffic | None, world: int) -> str:
+def digest_world(parts: Parts, world: int) -> str:
     """Hex digest of one world; see `Simulation.state_hash`.
 
     Args:
         parts: who keeps the state of the worlds.
-        sumo: beside them; None: there is none.
         world: which one.
     """
     worlds, gate, rerouting = parts.worlds, parts.gate, parts.traffic.rerouting
+    sumo = parts.sumo
     rows = parts.division.vehicles(world)
     rows = rows[np.argsort(rows["id"])]
     if rerouting is not None:
         rows["way"] = rerouting.ways_of_first_world(rows["way"], world)
     if sumo is not None:
-        rows["way"] = sumo.ways_of_first_world(rows["way"], world)
+        sumo.shift(rows, -world)
     digest = hashlib.blake2b(digest_size=16)
     for name in STATE_FIELDS:
         digest.update(np.ascontiguousarray(rows[name]).tobytes())
     agents = rows["agent"][rows["agent"] >= 0]
     digest.update(worlds.pending[world, agents].tobytes())
     queue = gate.queue[world, : gate.num_queue[world]]
+    if sumo is not None:
+        queue = queue.copy()
+        sumo.shift(queue, -world)
     for name in queue.dtype.names or ():
         digest.update(np.ascontiguousarray(queue[name]).tobytes())
     for array in (

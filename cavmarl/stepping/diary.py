@@ -7,12 +7,16 @@ as well begin from an older image and go through the same steps again.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from cavmarl.config import EnvConfig
 from cavmarl.runtime.images import Arrays, Image
 from cavmarl.runtime.shared_memory import Layout, Segment, arrays_in, size_of
 from cavmarl.shard.shard import Commands
+from cavmarl.stepping.kept_log import FIRST_LOG_BYTES, KeptLog
+from cavmarl.traffic.sumo.told import ToldLog
 
 __all__ = ["Diary", "make_segments"]
 
@@ -28,13 +32,16 @@ def make_segments(config: EnvConfig, num_worlds: int) -> list[Segment]:
         WorkerStartError: there is none.
     """
     images = [Segment.make(_FIRST_IMAGE_BYTES) for _ in range(2)]
-    return [*images, Segment.make(size_of(_layout(config, num_worlds)))]
+    steps = Segment.make(size_of(_layout(config, num_worlds)))
+    num_logs = num_worlds if config.traffic.source == "sumo-traffic" else 0
+    return [*images, steps, *(Segment.make(FIRST_LOG_BYTES) for _ in range(2 * num_logs))]
 
 
 class Diary:
     """What there is in it between two orders is the state of some worlds.
 
     There are two images: while one is written, the other one is the state's that was committed.
+    What SUMOs were told is kept beside each of them.
 
     Args:
         config: the environment.
@@ -47,9 +54,11 @@ class Diary:
     """
 
     def __init__(self, config: EnvConfig, num_worlds: int, descriptors: list[int]) -> None:
-        *images, steps = (Segment(fd, 0) for fd in descriptors)
+        *images, steps = (Segment(fd, 0) for fd in descriptors[:3])
         self.place = np.zeros(2, dtype=np.int64)
         self._images = [Image(segment) for segment in images]
+        kept = [KeptLog(Segment(fd, 0)) for fd in descriptors[3:]]
+        self._logs = kept[::2], kept[1::2]  # of each image, by world
         arrays = arrays_in(steps.map(), _layout(config, num_worlds))
         self.entries = tuple(map(Commands, *(arrays[name] for name in _COMMANDS)))
 
@@ -66,10 +75,17 @@ class Diary:
         entry.declared[:] = commands.declared
         self.place[1] += 1
 
-    def begin(self, state: Arrays) -> None:
-        """Begin anew with an image of the state."""
+    def begin(self, state: Arrays, logs: Sequence[ToldLog] = ()) -> None:
+        """Begin anew with an image of the state.
+
+        Args:
+            state: what is to be in it.
+            logs: what the SUMO of each world was told; none: no SUMO is told anything.
+        """
         image = 1 - self.place.item(0)
         self._images[image].write(state)
+        for kept, log in zip(self._logs[image], logs, strict=True):
+            kept.write(log)
         self.place[:] = image, 0
 
     def state(self, like: Arrays) -> Arrays:
@@ -80,6 +96,15 @@ class Diary:
         """
         dtypes = [array.dtype for array in like]
         return list(self._images[self.place.item(0)].read(dtypes))
+
+    def read_logs(self, logs: Sequence[ToldLog]) -> None:
+        """Let logs go on from what they were in that state.
+
+        Raises:
+            WorkerError: it is not what was written.
+        """
+        for kept, log in zip(self._logs[self.place.item(0)], logs, strict=True):
+            log.take_up(kept.read())
 
     def steps(self) -> tuple[Commands, ...]:
         """What the agents have done since."""

@@ -21,6 +21,7 @@ from cavmarl.spaces import state_space, write_sensed
 from cavmarl.state import global_state
 from cavmarl.stepping.arrays import StepArrays, layout_of
 from cavmarl.traffic.memory import Zeros
+from cavmarl.traffic.sumo.told import ToldLog
 from cavmarl.worlds import World
 
 __all__ = ["LocalWorlds"]
@@ -194,9 +195,14 @@ class LocalWorlds:
         return [self._steps, self._waiting, *self.simulation.save()]
 
     def load(self, saved: Sequence[NDArray[Any]]) -> None:
-        """Go on from what `save` gave."""
+        """Go on from what `save` gave; errors as of `Simulation.load`."""
         self._steps[:], self._waiting[:] = saved[:2]
         self.simulation.load(saved[2:])
+
+    def keep_logs(self) -> tuple[ToldLog, ...]:
+        """Keep what SUMO is told, which `load` needs: one log a world; see `SumoTraffic`."""
+        sumo = self.simulation.sumo
+        return () if sumo is None else sumo.keep_logs()
 
     def share_of(self, world: int) -> list[NDArray[Any]]:
         """What `save` would give if there were no world but one; views, to be copied."""

@@ -141,17 +141,26 @@ class HostedWorlds:
 
     def save(self) -> list[Array]:
         """All that the next task depends on."""
-        return [*results_of(Task.RESET, self._worlds.arrays, None), *self._worlds.save()]
+        begun = results_of(Task.RESET, self._worlds.arrays, None)
+        return [*begun, *(log.words for log in self._logs), *self._worlds.save()]
 
     def load(self, saved: Sequence[Array]) -> None:
         """Go on from what `save` gave."""
         begun = results_of(Task.RESET, self._worlds.arrays, None)
-        self._worlds.load(saved[len(begun) :])
+        rest = iter(saved[len(begun) :])
+        for log in self._logs:
+            log.take_up(next(rest))
+        self._worlds.load(list(rest))
         for array, kept in zip(begun, saved, strict=False):
             array[:] = kept
 
+    def close(self) -> None:
+        """End the processes that the worlds have."""
+        self._worlds.close()
+
     def _make(self, size: int) -> None:
         self._worlds = LocalWorlds(self._world, size, in_next_step=self._in_next_step)
+        self._logs = self._worlds.keep_logs()
         self._job = WorldsJob(self._worlds, 0)
         self._rehearse()
 

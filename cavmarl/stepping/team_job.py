@@ -81,14 +81,14 @@ class LeaderJob(DiaryJob):
             return None
         diary = self._diary
         with self._leader.order():
-            self._catch_up()
+            self._catch_up(task)
             begins_anew = task == Task.RESET or (task == Task.STEP and diary.is_full)
             if task == Task.STEP and not begins_anew:
                 diary.note(self._commands)
             self._leader.end_after(LAST.get(Task(task), ""))
             WorldsJob.perform(self, task, letter)
         if begins_anew:
-            diary.begin(self._worlds.save())
+            diary.begin(self._worlds.save(), self._logs)
         return None
 
     def _host(self, hosts: NDArray[np.int64]) -> None:

@@ -32,6 +32,7 @@ from cavmarl.traffic.schedule import Schedule
 from cavmarl.traffic.scripts import NO_SCRIPTS
 from cavmarl.traffic.sumo.demand import SumoDemand
 from cavmarl.traffic.sumo.route_book import RouteBook
+from cavmarl.traffic.sumo.stop_book import StopBook
 from cavmarl.traffic.vtypes import generated_types
 from cavmarl.traffic.way_slots import WaySlots, way_slots
 
@@ -175,15 +176,16 @@ class NativeTraffic:
     def _travel_of_sumo(
         self, sumo: SumoDemand, types: NDArray[np.void], fixed: NDArray[np.void]
     ) -> Travel:
-        """The same with SUMO's types, and room for its routes behind the fixed ways."""
+        """The same with SUMO's types, room for its routes behind the fixed ways, and for stops."""
         steps = self.zeros(
             len(fixed) + RouteBook.room(self.network, self.num_worlds), dtype=fixed.dtype
         )
         steps[: len(fixed)] = fixed
+        stops = self.zeros(0 if sumo.drives else StopBook.room(self.num_worlds), dtype=STOP)
         return Travel(
             np.concatenate([types, sumo.types]),
             steps,
-            np.zeros(0, dtype=STOP),
+            stops,
             0,
             sumo.given.begin_s,
             VIEW_M,

@@ -16,6 +16,7 @@ from cavmarl.evaluate.sensor_bench import SensorBench, measure_sensor_workers
 from cavmarl.evaluate.sensor_load import describe_rig, find_rig, load_rig, scaled
 from cavmarl.evaluate.sensor_run import PARTS
 from cavmarl.registry import load_config
+from tests.sumo_worlds import MODES, tiny_file
 
 RIG: dict[str, dict[str, Any]] = {
     "lidar": {"type": "lidar", "rate_hz": 10, "rays": 30, "z_m": 1.6},
@@ -48,6 +49,25 @@ def test_the_parts_of_a_step_are_within_it(found: SensorBench) -> None:
         assert min(parts.values()) >= 0.0
         assert 0.0 < sum(parts.values()) <= row.step_ms * (1.0 + 1e-9)
         assert row.wait_ms < row.step_ms
+
+
+def test_the_time_of_sumo_is_named_apart(found: SensorBench, tmp_path: Path) -> None:
+    """Its own step and waiting for it, in both ways to couple it; elsewhere there is none."""
+    pytest.importorskip("libsumo", reason="needs the extra 'sumo'")
+    assert found.parts_ms(1)["SUMO"] == 0.0
+    for source in MODES:
+        more = {
+            "traffic.source": source,
+            "traffic.demand": [str(tiny_file(tmp_path))],
+            "sensors.signal.timing": False,
+        }
+        coupled = measure_sensor_workers(
+            "grid4x4", RIG, workers=(1,), warmup=1, steps=4, repeats=1, overrides=more
+        )
+        parts = coupled.parts_ms(1)
+        assert parts["SUMO"] > 0.0
+        assert sum(parts.values()) <= coupled.rows[0].step_ms * (1.0 + 1e-9)
+        assert "SUMO" in coupled.to_dict()["parts_ms"][1]
 
 
 def test_resources_are_those_of_all_processes(found: SensorBench) -> None:

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import json
 import os
 import signal
 import subprocess
 import sys
 import time
+from dataclasses import asdict
 from pathlib import Path
 
 import numpy as np
@@ -20,11 +22,13 @@ from cavmarl.errors import (
     SumoBusyError,
     SumoDiedError,
     SumoError,
-    WorkerError,
 )
 from cavmarl.evaluate.manifest import describe_world
+from cavmarl.registry import load_config
+from cavmarl.stepping.job import Task, fingerprint
+from cavmarl.stepping.remote_job import HostedWorlds
 from cavmarl.traffic.sumo.options import free_libsumo
-from cavmarl.worlds import load_world
+from cavmarl.worlds import load_world, make_world
 from tests.driving import drive, start
 from tests.rerouting import make_map
 from tests.sumo_worlds import MODES, alone, coupled, demand_of, tiny_file
@@ -216,6 +220,10 @@ def test_files_that_name_what_is_not_there_are_refused(tmp_path: Path) -> None:
         ({"map.program": {"A0": "1"}}, "SUMO has the signals"),
         ({"sumo.interface": "telnet"}, "sumo.interface"),
         ({"sumo.max_vehicles": 0}, "sumo.max_vehicles"),
+        ({"sumo.replay_mib": -1}, "sumo.replay_mib"),
+        ({"sumo.replay_mib": 0.5}, "sumo.replay_mib"),
+        ({"sumo.replay_mib": "much"}, "sumo.replay_mib"),
+        ({"workers.balance_steps": 8}, "workers.balance_steps"),
     ],
 )
 def test_what_cannot_be_is_refused(tmp_path: Path, wanted: dict[str, object], words: str) -> None:
@@ -255,25 +263,74 @@ def test_workers_have_sumos_of_their_own(tmp_path: Path, source: str, zones: int
 
 
 @pytest.mark.parametrize("source", MODES)
-def test_a_worker_that_dies_is_followed_where_sumo_can_be(tmp_path: Path, source: str) -> None:
-    """SUMO runs its demand again up to the tick; its traffic it cannot, and says so."""
-    both = settings(tiny_file(tmp_path), source)
-    made = {"num_envs": 2, "agents": 3, "background": 0, "overrides": both}
+@pytest.mark.parametrize("zones", [1, 2])
+def test_a_worker_that_dies_is_followed(tmp_path: Path, source: str, zones: int) -> None:
+    """SUMO runs again up to the tick; after it, after a reset in the middle of it, and again."""
+    worlds = 2 if zones == 1 else 1
+    made = {"num_envs": worlds, "agents": 3, "background": 2, "zones": zones, "max_cycles": 37,
+            "overrides": settings(tiny_file(tmp_path), source)}  # fmt: skip
     plain, vec = make_vec("grid4x4", **made), make_vec("grid4x4", workers=2, **made)
+    draw = np.random.default_rng(11)
     try:
         for one in (plain, vec):
             one.reset(seed=5)
-            for _ in range(20):
-                one.step(one.suggest_actions())
-        os.kill(vec.worlds.pool.pids[0], signal.SIGKILL)
-        if source == "sumo-traffic":
-            with pytest.raises((SumoError, WorkerError), match="in the middle of an episode"):
-                vec.step(vec.suggest_actions())
-            return
-        for one in (plain, vec):
-            for _ in range(5):
-                one.step(one.suggest_actions())
-        assert [vec.state_hash(w) for w in range(2)] == [plain.state_hash(w) for w in range(2)]
+        for step in range(80):
+            if step in (20, 21, 36, 37, 38, 70):  # 37 begins new episodes
+                os.kill(int(draw.choice(vec.worlds.pool.pids)), signal.SIGKILL)
+            results = [one.step(one.suggest_actions()) for one in (plain, vec)]
+            assert results[0][0].tobytes() == results[1][0].tobytes(), step
+            if step % 20 == 19:
+                hashes = [[one.state_hash(w) for w in range(worlds)] for one in (plain, vec)]
+                assert hashes[0] == hashes[1], step
+        assert len(vec.worlds.deaths) >= 6
     finally:
         plain.close()
         vec.close()
+
+
+def test_a_worker_dies_whose_sumo_was_told_too_much_to_keep(tmp_path: Path) -> None:
+    both = settings(tiny_file(tmp_path), "sumo-traffic") | {"sumo.replay_mib": 0}
+    vec = make_vec("grid4x4", num_envs=2, agents=3, background=0, workers=2, overrides=both)
+    try:
+        vec.reset(seed=5)
+        for _ in range(20):
+            actions = vec.suggest_actions()
+            vec.step(actions)
+        os.kill(vec.worlds.pool.pids[0], signal.SIGKILL)
+        for _ in range(2):
+            with pytest.raises(SumoError, match=r"(?s)more than 0 MiB.*reset.*sumo\.replay_mib"):
+                vec.step(actions)
+        vec.reset(seed=6)
+        vec.step(vec.suggest_actions())
+    finally:
+        vec.close()
+
+
+@pytest.mark.parametrize("source", MODES)
+def test_a_host_elsewhere_goes_on_with_what_another_one_sends(tmp_path: Path, source: str) -> None:
+    config, base_dir = load_config(
+        "grid4x4", agents=3, background=0, overrides=settings(tiny_file(tmp_path), source)
+    )
+    recipe = {
+        "config": asdict(config),
+        "base_dir": str(base_dir.resolve()),
+        "fingerprint": fingerprint(make_world(config, base_dir)),
+        "in_next_step": False,
+        "size": 1,
+    }
+    hosts = [HostedWorlds(json.loads(json.dumps(recipe))) for _ in range(2)]
+    try:
+        for array in hosts[0].inputs(Task.RESET):
+            array[:] = True
+        hosts[0].perform(Task.RESET, {"seed": 4, "first_world": 0})
+        for _ in range(30):
+            hosts[0].perform(Task.STEP, None)
+        hosts[1].load([array.copy() for array in hosts[0].save()])
+        for _ in range(10):
+            for host in hosts:
+                host.perform(Task.STEP, None)
+        first, second = (host.perform(Task.STATE_HASH, 0).answer for host in hosts)
+        assert first == second
+    finally:
+        for host in hosts:
+            host.close()

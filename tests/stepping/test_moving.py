@@ -26,6 +26,7 @@ from cavmarl.stepping.placement import Placement
 from cavmarl.stepping.pooled import PooledWorlds
 from tests.rerouting import CARS, DEVICE, FLOW, make_map, write_demand
 from tests.stepping.vec_runs import Make, drive, pool_of, same
+from tests.sumo_worlds import write_stops
 
 pytestmark = pytest.mark.filterwarnings("ignore:workers = :RuntimeWarning")
 
@@ -91,6 +92,25 @@ def test_vehicles_that_find_their_own_way_keep_it(
     before = drive(whole, steps=400)
     assert whole.traffic_stats()["rerouted"] > 0
     assert same(drive(make(net, workers=2, **wanted), steps=400), before)
+    assert sum(uneven) > 0
+
+
+def test_worlds_with_demand_of_sumos_take_their_ways_along(
+    make: Make, uneven: list[int], tmp_path: Path
+) -> None:
+    """Those who drive and those who wait; ways and stops stand elsewhere in each worker."""
+    pytest.importorskip("libsumo", reason="needs the extra 'sumo'")
+    overrides: dict[str, Any] = {
+        "traffic.source": "sumo-demand",
+        "traffic.demand": [str(path) for path in write_stops(tmp_path)],
+        "sensors.signal.timing": False,
+        "clock.sim_dt_s": 0.2,
+        "clock.ctrl_dt_s": 1.0,
+    }
+    wanted = {"num_envs": 3, "agents": 1, "background": 0}
+    whole = drive(make("merge", overrides=overrides, **wanted), steps=40)
+    vec = make("merge", workers=2, overrides=overrides | RESTLESS, **wanted)
+    assert same(drive(vec, steps=40), whole)
     assert sum(uneven) > 0
 
 

@@ -29,6 +29,7 @@ DONE, REFUSED = 0, 1  # kinds of answers
 NOWHERE = ""  # the lane of who is on none: it waits, it is being teleported
 PUPPET = "cavmarl."  # begins the names of vehicles that are moved from outside
 FREE = 2  # moveToXY: wherever it is told, on a road or not
+PARKS = 1 | 64  # flags of a stop: beside the road, at a parking area
 BY_ITSELF = 0  # speed and lane change modes: SUMO decides nothing for it
 
 _PR_SET_PDEATHSIG = 1
@@ -156,7 +157,24 @@ class Simulation:
         """A number for a vehicle that has come, or has come back."""
         self._number[name] = self._given
         self._given += 1
-        return [self._number[name], name, self._vehicle.getSpeedFactor(name)]
+        stops = [] if self._is_seen else self._stops(name)
+        return [self._number[name], name, self._vehicle.getSpeedFactor(name), stops]
+
+    def _stops(self, name: str) -> list[list[Any]]:
+        """Stops that a vehicle is to make: LANE row, start, end, duration, until, off the road.
+
+        Times are in s, -1 where there is none. Those that end by neither, on no lane of the map, or
+        at which nobody stands are left out.
+        """
+        found = []
+        for stop in self._vehicle.getStops(name):
+            row = self._lane_row.get(stop.lane, -1)
+            ends = stop.duration >= 0.0 or stop.until >= 0.0
+            if row >= 0 and ends and not stop.speed > 0.0:
+                times = [max(-1.0, time) for time in (stop.duration, stop.until)]
+                parks = bool(stop.stopFlags & PARKS)
+                found.append([row, stop.startPos, stop.endPos, *times, parks])
+        return found
 
     def _routes(self, names: list[str], line: dict[str, Any]) -> list[int]:
         """Numbers of their routes; the edges of new ones go into the line."""

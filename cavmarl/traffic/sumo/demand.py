@@ -38,6 +38,7 @@ class SumoDemand:
         given: demand and options.
         drives: SUMO moves its vehicles (`sumo-traffic`), not only says who departs.
         max_vehicles: that one world can hold.
+        replay_bytes: for what a world's SUMO is told in an episode.
         dt_s: seconds a tick.
         interface: `libsumo` or `traci`.
         version: of SUMO.
@@ -51,6 +52,7 @@ class SumoDemand:
     given: SumoInput
     drives: bool
     max_vehicles: int
+    replay_bytes: int
     dt_s: float
     interface: str
     version: str
@@ -117,6 +119,7 @@ def read_sumo_demand(
         given,
         drives=config.traffic.source == "sumo-traffic",
         max_vehicles=config.sumo.max_vehicles,
+        replay_bytes=config.sumo.replay_mib << 20,
         dt_s=config.clock.sim_dt_s,
         interface=interface,
         version=found["version"],

@@ -62,10 +62,10 @@ class RouteBook:
         """What a world has."""
         return self._worlds[w].arrays(self._nowhere)
 
-    def ways_of_first_world(self, ways: NDArray[np.int64], w: int) -> NDArray[np.int64]:
-        """VEHICLE["way"] (n,) of a world as it would be in the first one."""
-        own = ways >= self._first - len(self._network.lanes)
-        return ways - own * (w * self._of_world)
+    def shift(self, rows: NDArray[np.void], worlds: int) -> None:
+        """Let rows, VEHICLE or departures, mean the ways of so many worlds later."""
+        own = rows["way"] >= self._first - len(self._network.lanes)
+        rows["way"] += own * (worlds * self._of_world)
 
     def enter(self, w: int, routes: list[list[int]]) -> None:
         """Take up routes that SUMO has told of, EDGE rows of each, numbered in this order."""

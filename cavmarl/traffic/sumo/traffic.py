@@ -5,18 +5,20 @@ vehicle moves from tick t to t + 1 has seen all others at t, on both sides: ours
 that needs nothing but t; then SUMO takes its step and is told where ours have come to.
 
 `sumo-demand`: SUMO runs the demand by itself. Who departs there is ordered here at the same tick,
-with its type, route, lane and speed factor; who gets another route there gets it here; its signals
-are ours.
+with its type, route, stops, lane and speed factor; who gets another route there gets it here; its
+signals are ours.
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable
+from itertools import repeat
 
 import numpy as np
 from numpy.typing import NDArray
 
-from cavmarl.errors import CapacityError, SumoStateError
+from cavmarl.errors import CapacityError
 from cavmarl.kernels.arrays import Gate, RoadArrays, Travel, Worlds, Zoned
 from cavmarl.kernels.codes import (
     COUNT_REROUTED,
@@ -31,6 +33,8 @@ from cavmarl.traffic.sumo.demand import SumoDemand
 from cavmarl.traffic.sumo.records import MOVED
 from cavmarl.traffic.sumo.route_book import RouteBook
 from cavmarl.traffic.sumo.signals import ShownSignals
+from cavmarl.traffic.sumo.stop_book import StopBook
+from cavmarl.traffic.sumo.told import ToldLog
 from cavmarl.traffic.sumo.worlds import SumoWorlds
 
 __all__ = ["SumoTraffic"]
@@ -64,12 +68,14 @@ class SumoTraffic:
         self.drives = demand.drives
         num_worlds, capacity = zoned.rows.shape[2:]
         book = RouteBook(network, travel.steps, first_step, num_worlds, travel.types["permissions"])
-        self.worlds = SumoWorlds(demand, book, num_worlds)
+        stops = StopBook(network, travel.stops, num_worlds)
+        self.worlds = SumoWorlds(demand, book, stops, num_worlds)
         self._roads: RoadArrays = network.arrays
         self._travel = travel
         self._zoned = zoned
         self._blank = blank
         self._dt = demand.dt_s
+        self._replay_bytes = demand.replay_bytes
         self._shown = ShownSignals(network)
         self._mirror = repeated(mirror)
         self._greet = repeated(greet)
@@ -87,21 +93,30 @@ class SumoTraffic:
         for w in np.flatnonzero(chosen).tolist():
             self.worlds.begin(w, int(worlds.keys[w]))
 
+    def keep_logs(self) -> tuple[ToldLog, ...]:
+        """From the next reset on keep what SUMO is told, one log a world, for `catch_up`.
+
+        There is none where SUMO moves nobody: then it is told nothing.
+        """
+        if self.drives and not self.worlds.logs:
+            num_worlds = self._zoned.rows.shape[2]
+            self.worlds.logs = tuple(ToldLog(self._replay_bytes) for _ in range(num_worlds))
+        return self.worlds.logs
+
     def catch_up(self, worlds: Worlds) -> None:
         """Bring SUMO to the worlds' ticks, from the beginning of their episodes.
 
         Raises:
-            SumoStateError: it moves its vehicles, and what it has seen of ours is not on record.
+            SumoStateError: SUMO has been told where ours are, and that is not on record.
         """
-        if self.drives:
-            raise SumoStateError(
-                "traffic.source = sumo-traffic: a worker process died, and its successor cannot "
-                "take up SUMO in the middle of an episode: reset the worlds"
-            )
         for w, (key, tick) in enumerate(zip(worlds.keys, worlds.ticks.tolist(), strict=True)):
+            told: Iterable[NDArray[np.void]] = repeat(np.zeros(0, dtype=MOVED), tick)
+            if self.drives:
+                log = self.worlds.logs[w] if self.worlds.logs else ToldLog(0)
+                told = log.ticks(tick)
             self.worlds.begin(w, int(key))
-            for passed in range(tick):
-                self.worlds.step_one(w, passed, np.zeros(0, dtype=MOVED))
+            for passed, moved in enumerate(told):
+                self.worlds.step_one(w, passed, moved)
 
     def step(self, worlds: Worlds, side: int) -> None:
         """Let SUMO take its step; errors as of `SumoWorlds.step`.
@@ -174,7 +189,8 @@ class SumoTraffic:
         """
         for w in range(len(worlds.ticks)):
             now = self.worlds.at(w)
-            for number, factor in zip(now.departed.tolist(), now.speed_factors, strict=True):
+            come = zip(now.departed.tolist(), now.speed_factors, now.stops, strict=True)
+            for number, factor, stops in come:
                 if gate.num_queue[w] == gate.queue.shape[1]:
                     self._check_room(gate.queue.shape[1] + 1)
                 row = gate.queue[w, gate.num_queue[w]]
@@ -182,6 +198,7 @@ class SumoTraffic:
                 row["id"] = gate.next_id[w]
                 row["due"] = worlds.ticks[w] + 1
                 row["speed_factor"] = factor
+                row["stop"], row["stops_end"] = stops
                 gate.next_id[w] += 1
                 gate.num_queue[w] += 1
 
@@ -207,9 +224,13 @@ class SumoTraffic:
         for w, phase in enumerate(worlds.signal_phase):
             self._shown.show(self.worlds.at(w).letters, phase)
 
-    def ways_of_first_world(self, ways: NDArray[np.int64], world: int) -> NDArray[np.int64]:
-        """VEHICLE["way"] (n,) of a world as it would be in the first one."""
-        return self.worlds.book.ways_of_first_world(ways, world)
+    def shift(self, rows: NDArray[np.void], worlds: int) -> None:
+        """Let rows of a world, VEHICLE or departures, be those of so many worlds later.
+
+        Their ways and stops are written, which stand in another part of the tables there.
+        """
+        self.worlds.book.shift(rows, worlds)
+        self.worlds.stops.shift(rows, worlds)
 
     def close(self) -> None:
         """End all processes."""
@@ -236,7 +257,7 @@ class SumoTraffic:
         """Where, in what and by which route somebody departs."""
         lane = int(seen["lane"])
         edge = self._roads.edges[self._roads.lanes[lane]["edge"]]
-        row["agent"] = row["goal"] = row["stop"] = row["stops_end"] = -1
+        row["agent"] = row["goal"] = -1
         row["order"] = seen["number"]
         row["vtype"] = seen["vtype"]
         row["lane"] = lane

@@ -20,6 +20,8 @@ from cavmarl.kernels.mirroring import Paths
 from cavmarl.traffic.sumo.demand import SumoDemand
 from cavmarl.traffic.sumo.process import Answer, SumoProcess
 from cavmarl.traffic.sumo.route_book import RouteBook
+from cavmarl.traffic.sumo.stop_book import StopBook
+from cavmarl.traffic.sumo.told import ToldLog
 
 __all__ = ["SumoWorlds", "Tick"]
 
@@ -37,6 +39,8 @@ class Tick(NamedTuple):
         letters: of all signals.
         departed: (m,) numbers of those who have come, rising.
         speed_factors: (m,) theirs.
+        stops: (m, 2) STOP rows [first, end) that they are to make, -1: none; (0, 2) where SUMO
+            moves them.
         teleported: numbers of those who have been lifted off the road.
         rerouted: (r,) numbers of those on another route than a tick before, rising.
     """
@@ -46,6 +50,7 @@ class Tick(NamedTuple):
     letters: bytes
     departed: NDArray[np.int64]
     speed_factors: NDArray[np.float64]
+    stops: NDArray[np.int64]
     teleported: tuple[int, ...]
     rerouted: NDArray[np.int64]
 
@@ -56,18 +61,25 @@ class SumoWorlds:
     Args:
         demand: what they run.
         book: where their routes are written.
+        stops: where their stops are written.
         num_worlds: W.
 
     Attributes:
         book: of their routes.
+        stops: of their stops.
         names: by world, SUMO's names of the vehicles by number.
         teleports: (W,) vehicles that SUMO has put elsewhere since each reset.
+        logs: by world, what SUMO has been told since its reset; none: nobody keeps it.
     """
 
-    def __init__(self, demand: SumoDemand, book: RouteBook, num_worlds: int) -> None:
+    def __init__(
+        self, demand: SumoDemand, book: RouteBook, stops: StopBook, num_worlds: int
+    ) -> None:
         self.book = book
+        self.stops = stops
         self.names: list[list[str]] = [[] for _ in range(num_worlds)]
         self.teleports = np.zeros(num_worlds, dtype=np.int64)
+        self.logs: tuple[ToldLog, ...] = ()
         self._demand = demand
         self._tick_ms = round(1000.0 * demand.dt_s)
         self._begin_ms = round(1000.0 * demand.given.begin_s)
@@ -96,8 +108,11 @@ class SumoWorlds:
             process = self._processes[w] = SumoProcess(self._demand.told())
         self._ticks[w] = None
         self.book.begin(w)
+        self.stops.begin(w)
         self.names[w] = []
         self.teleports[w] = 0
+        if self.logs:
+            self.logs[w].begin()
         self._path_of[w] = np.zeros(0, dtype=np.int32)
         seed = key >> (64 - SEED_BITS)
         # SUMO reads all additional files when it starts.
@@ -135,11 +150,14 @@ class SumoWorlds:
             if last.tick != tick:
                 raise SumoStateError(f"world {w} is at tick {tick}, its SUMO at {last.tick}")
             asked.append(w)
+        told = {}
         try:
             for w in asked:
-                self._process(w).begin_step(moved(w))
+                told[w] = moved(w)
+                self._process(w).begin_step(told[w])
             for w in asked:
                 self._ticks[w] = self._take(w, ticks[w] + 1, self._process(w).end_step())
+                self._note(w, told[w])
         except (SumoDiedError, ConfigError) as error:
             # Others may have taken the step, and their worlds have not.
             for w in asked:
@@ -151,6 +169,11 @@ class SumoWorlds:
         process = self._process(w)
         process.begin_step(moved)
         self._ticks[w] = self._take(w, tick + 1, process.end_step())
+        self._note(w, moved)
+
+    def _note(self, w: int, moved: NDArray[np.void]) -> None:
+        if self.logs:
+            self.logs[w].note(moved)
 
     def close(self) -> None:
         """End all processes."""
@@ -174,7 +197,8 @@ class SumoWorlds:
         self.book.enter(w, line.get("routes", []))
         seen["route"] = self.book.look_up(w, seen["route"], seen["vtype"])
         departed = line.get("departed", [])
-        self.names[w] += [name for _, name, _ in departed]
+        self.names[w] += [name for _, name, _, _ in departed]
+        stops = [self.stops.enter(w, stops) for *_, stops in departed]
         lifted = line.get("teleported", [])
         for number, name in lifted:
             log.warning("world %d, tick %d: SUMO teleports %s (%d)", w, tick, name, number)
@@ -183,8 +207,9 @@ class SumoWorlds:
             tick,
             seen,
             answer.letters,
-            np.array([number for number, _, _ in departed], dtype=np.int64),
-            np.array([factor for _, _, factor in departed], dtype=np.float64),
+            np.array([number for number, *_ in departed], dtype=np.int64),
+            np.array([factor for _, _, factor, _ in departed], dtype=np.float64),
+            np.array(stops, dtype=np.int64).reshape(-1, 2),
             tuple(number for number, _ in lifted),
             self._changed(w, seen),
         )
