@@ -77,7 +77,7 @@ class PooledWorlds(OrderedWorlds):
                 f"workers = {workers}: there are {cores} cores; more workers than cores do not "
                 "make it faster",
                 RuntimeWarning,
-                stacklevel=3,
+                stacklevel=4,
             )
         if not compiled_before():
             Simulation(config, world.network, 1, world.demand, world.partition)
