@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from itertools import compress
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from gymnasium import spaces
@@ -31,9 +31,8 @@ from cavmarl.spaces import (
     state_space,
 )
 from cavmarl.stepping.arrays import SteppedWorlds
-from cavmarl.stepping.pooled import PooledWorlds
-from cavmarl.stepping.sensing import local_worlds
-from cavmarl.worlds import check_agents, check_workers, make_world
+from cavmarl.stepping.making import make_worlds
+from cavmarl.worlds import check_agents, check_hosts, make_world
 
 __all__ = ["CavEnv", "parallel_env"]
 
@@ -50,7 +49,8 @@ def parallel_env(
     env: str | Path = "merge",
     *,
     zones: int | None = None,
-    workers: int | None = None,
+    workers: int | Literal["ray"] | None = None,
+    hosts: Literal["ray"] | None = None,
     sensor_workers: int | None = None,
     agents: int | None = None,
     background: int | None = None,
@@ -65,7 +65,9 @@ def parallel_env(
         env: name of an entry of `envs/`, a folder with an env.yaml, or a map file.
         zones: shadows zones.count, how many shards run the world; results do not depend on it.
         workers: processes that the zones are shared out over; 0: the caller's process runs them.
-            Results do not depend on it.
+            Results do not depend on it. "ray": as with hosts="ray", as many as are of use.
+        hosts: "ray" runs the workers on the machines of a Ray cluster (docs/cluster.md). None: on
+            this one.
         sensor_workers: shadows workers.sensors, how many processes the sensors of `rig` are shared
             out over (docs/sensor_workers.md). Results do not depend on it.
         agents: shadows population.agents.
@@ -79,11 +81,12 @@ def parallel_env(
         ConfigError: a key, value or combination that cannot work.
         MapError: the map cannot be read or driven.
         WorkerError: worker processes cannot be started, or have no memory.
+        MissingExtraError: hosts on Ray without Ray.
     """
-    num_workers = check_workers(workers)
+    check_hosts(workers, hosts)
     first_seed = None if seed is None else check_seed(seed)
     if render_mode is not None:
-        _check_rendering(render_mode, num_workers)
+        _check_rendering(render_mode, workers)
     config, base_dir = load_config(
         env,
         zones=zones,
@@ -95,15 +98,11 @@ def parallel_env(
     )
     check_agents(config)
     world = make_world(config, base_dir)
-    worlds: SteppedWorlds = (
-        PooledWorlds(world, base_dir, 1, num_workers, in_next_step=True)
-        if num_workers
-        else local_worlds(world, base_dir, 1, in_next_step=True)
-    )
+    worlds = make_worlds(world, base_dir, 1, workers, hosts, in_next_step=True)
     return CavEnv(worlds, seed=first_seed, render_mode=render_mode)
 
 
-def _check_rendering(render_mode: str, workers: int) -> None:
+def _check_rendering(render_mode: str, workers: int | str | None) -> None:
     """Refuse what cannot be drawn.
 
     Raises:
@@ -115,7 +114,7 @@ def _check_rendering(render_mode: str, workers: int) -> None:
         )
     if workers:
         raise ConfigError(
-            f"render_mode = {render_mode!r} with workers = {workers}: only a world of the "
+            f"render_mode = {render_mode!r} with workers = {workers!r}: only a world of the "
             "caller's process can be drawn; use workers=0"
         )
 

@@ -29,10 +29,8 @@ from cavmarl.spaces import (
     sensed_observation,
 )
 from cavmarl.stepping.arrays import SteppedWorlds
-from cavmarl.stepping.pooled import PooledWorlds
-from cavmarl.stepping.remote import RemoteWorlds
-from cavmarl.stepping.sensing import local_worlds
-from cavmarl.worlds import check_agents, check_hosts, check_workers, make_world
+from cavmarl.stepping.making import make_worlds
+from cavmarl.worlds import check_agents, check_hosts, make_world
 
 __all__ = ["CavVectorEnv", "make_vec"]
 
@@ -99,8 +97,7 @@ def make_vec(
     if not 1 <= num_envs <= MAX_WORLDS:
         raise ConfigError(f"num_envs = {num_envs}: must be from 1 to {MAX_WORLDS}")
     num_envs = int(num_envs)
-    on_ray = check_hosts(workers, hosts)
-    num_workers = None if workers == "ray" else check_workers(workers)
+    check_hosts(workers, hosts)
     in_next_step = _in_next_step(autoreset_mode)
     first_seed = None if seed is None else check_seed(seed)
     config, base_dir = load_config(
@@ -114,13 +111,7 @@ def make_vec(
     )
     check_agents(config)
     world = make_world(config, base_dir)
-    worlds: SteppedWorlds
-    if on_ray:
-        worlds = RemoteWorlds(world, base_dir, num_envs, num_workers, in_next_step)
-    elif num_workers:
-        worlds = PooledWorlds(world, base_dir, num_envs, num_workers, in_next_step)
-    else:
-        worlds = local_worlds(world, base_dir, num_envs, in_next_step)
+    worlds = make_worlds(world, base_dir, num_envs, workers, hosts, in_next_step)
     return CavVectorEnv(worlds, seed=first_seed, copy=copy)
 
 

@@ -193,12 +193,14 @@ def check_hosts(workers: int | str | None, hosts: str | None) -> bool:
     """Whether workers run on the machines of a Ray cluster.
 
     Raises:
-        ConfigError: another name, or no workers to be hosted.
+        ConfigError: another name, no number, or no workers to be hosted.
     """
     if hosts not in (None, "ray"):
         raise ConfigError(f"hosts = {hosts!r}: must be 'ray', or None for this machine")
     if isinstance(workers, str) and workers != "ray":
         raise ConfigError(f"workers = {workers!r}: must be a whole number, or 'ray'")
+    if not isinstance(workers, str):
+        check_workers(workers)
     if hosts and workers in (None, 0):
         raise ConfigError("hosts = 'ray' without workers: say how many, or workers='ray'")
     return "ray" in (workers, hosts)

@@ -34,7 +34,7 @@ class Order(NamedTuple):
     Attributes:
         task: what to do.
         letter: what is said to it.
-        size: of the part that it is about.
+        size: of the part that it is about, before it.
         image: bytes of the image to begin from; 0: go on from where you are.
         repeats: how often what was done since has to be done again; each has data of its own.
         repeated: the task that is.
@@ -74,8 +74,8 @@ class RemoteJob(Protocol):
         """Be ready for a part of that size."""
         ...
 
-    def inputs(self, task: int) -> Sequence[Array]:
-        """Arrays that an order of this task fills."""
+    def inputs(self, task: int, letter: Any) -> Sequence[Array]:
+        """Arrays that an order of this task fills, as many as its letter says."""
         ...
 
     def perform(self, task: int, letter: Any) -> Outcome:
@@ -143,9 +143,9 @@ def _carry_out(
         job.load(list(taken.read([array.dtype for array in job.save()])))
     at = order.image
     for _ in range(order.repeats):
-        at = _fill(job.inputs(order.repeated), data, at)
+        at = _fill(job.inputs(order.repeated, None), data, at)
         job.perform(order.repeated, None)
-    _fill(job.inputs(order.task), data, at)
+    _fill(job.inputs(order.task, order.letter), data, at)
     answer, arrays = job.perform(order.task, order.letter)
     if not order.saves:
         return {"answer": answer, "image": 0}, arrays

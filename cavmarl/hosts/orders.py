@@ -23,7 +23,7 @@ class HostProgram:
 
     Attributes:
         parts: of the job, in words.
-        sizes: of each part, as the job counts.
+        sizes: of each part to begin with, as the job counts.
         tasks: names of the job's tasks.
         noted: the task whose inputs are noted, in the place of an image.
         code: what all machines have to have in common.
@@ -46,6 +46,7 @@ class OpenOrder:
         letters: what is said to each part.
         inputs: arrays for each part.
         outputs: part, answer → arrays that what comes out is written to.
+        sizes: of the parts once it has been carried out.
         saves: an image is to come of each part.
         ordered_s: when it was given, by `time.monotonic`.
         first_death: how many hosts had died before.
@@ -61,6 +62,7 @@ class OpenOrder:
     letters: Sequence[Any]
     inputs: Sequence[Arrays]
     outputs: Callable[[int, Any], Arrays]
+    sizes: Sequence[int]
     saves: bool
     ordered_s: float
     first_death: int
@@ -76,18 +78,20 @@ class Truth:
     """What is committed of one part.
 
     Attributes:
+        size: of the part, as the job counts.
         image: (n,) bytes of an image of its state; none: it has not begun yet.
         since: (n,) bytes of the inputs of each order since.
     """
 
+    size: int
     image: Array = field(default_factory=lambda: np.zeros(0, dtype=np.uint8))
     since: list[Array] = field(default_factory=list)
 
     def after(self, order: OpenOrder, part: int) -> Truth:
         """What is committed of a part once an order has been carried out."""
         if order.saves:
-            return Truth(order.images[part])
-        return Truth(self.image, [*self.since, _bytes_of(order.inputs[part])])
+            return Truth(order.sizes[part], order.images[part])
+        return Truth(self.size, self.image, [*self.since, _bytes_of(order.inputs[part])])
 
 
 def _bytes_of(arrays: Arrays) -> Array:

@@ -66,7 +66,8 @@ class HostPool:
         self._timeout_s = timeout_s
         self._repeats = repeats
         self._all = tuple(range(len(program.parts)))
-        self._truths = [Truth() for _ in self._all]
+        self._names = program.parts
+        self._truths = [Truth(size) for size in program.sizes]
         self._hosts: dict[int, Host] = {}
         self._number = 0
         self._open: OpenOrder | None = None
@@ -87,6 +88,15 @@ class HostPool:
     def machines(self) -> list[str]:
         """Names of those that the parts are on."""
         return [self._hosts[k].machine for k in self._all]
+
+    @property
+    def sizes(self) -> tuple[int, ...]:
+        """Of the parts, by what is committed."""
+        return tuple(truth.size for truth in self._truths)
+
+    def rename(self, names: Sequence[str]) -> None:
+        """Say in other words what the parts are."""
+        self._names = tuple(names)
 
     def signal(self, part: int, how: signal.Signals) -> bool:
         """Send a signal to the process of a part, which has to be on this machine.
@@ -110,6 +120,7 @@ class HostPool:
         inputs: Sequence[Arrays],
         outputs: Callable[[int, Any], Arrays],
         commits: bool = True,
+        sizes: Sequence[int] | None = None,
     ) -> list[Any]:
         """Let all hosts do a task.
 
@@ -119,6 +130,7 @@ class HostPool:
             inputs: arrays for each part.
             outputs: part, answer → arrays that what comes out is written to.
             commits: the task changes their state.
+            sizes: of the parts after it, where it changes them; such a task is not the noted one.
 
         Returns:
             what each part has answered.
@@ -128,7 +140,7 @@ class HostPool:
             WorkerStartError: there is no host left, and none comes; the pool is closed.
             WorkerFailureError: an exception in a host; all are as they were before.
         """
-        return self._command(self._all, task, letters, inputs, outputs, commits)
+        return self._command(self._all, task, letters, inputs, outputs, commits, sizes)
 
     def ask(self, part: int, task: int, letter: Any = None) -> Any:
         """Let the host of one part do a task that changes nothing; raises as `run`."""
@@ -149,7 +161,7 @@ class HostPool:
         """
         began = time.monotonic()
         nothing = OpenOrder(
-            self._number, NOTHING, (), (), lambda k, answer: (), saves=False, ordered_s=began,
+            self._number, NOTHING, (), (), lambda k, answer: (), (), saves=False, ordered_s=began,
             first_death=len(self.deaths), pending=set(), is_void=True,
         )  # fmt: skip
         while not self._company.free:
@@ -169,6 +181,7 @@ class HostPool:
         inputs: Sequence[Arrays],
         outputs: Callable[[int, Any], Arrays],
         commits: bool,
+        sizes: Sequence[int] | None = None,
     ) -> list[Any]:
         if not self._finalizer.alive:
             raise WorkerError("the hosts are closed: make the environment anew")
@@ -177,7 +190,7 @@ class HostPool:
         is_full = len(self._truths[0].since) == IMAGE_EVERY
         self._number += 1
         order = self._open = OpenOrder(
-            self._number, task, letters, inputs, outputs,
+            self._number, task, letters, inputs, outputs, self.sizes if sizes is None else sizes,
             saves=commits and (task != self._program.noted or is_full),
             ordered_s=time.monotonic(), first_death=len(self.deaths), pending=set(parts),
         )  # fmt: skip
@@ -238,7 +251,7 @@ class HostPool:
         program, truth = self._program, self._truths[k]
         before = [] if host.knows or not truth.image.size else [truth.image, *truth.since]
         letter = Order(
-            order.task, order.letters[k], program.sizes[k], before[0].size if before else 0,
+            order.task, order.letters[k], truth.size, before[0].size if before else 0,
             max(len(before) - 1, 0), program.noted, order.saves,
         )  # fmt: skip
         host.part, host.knows = k, False
@@ -287,7 +300,7 @@ class HostPool:
         order.pending.discard(k)
         first = order.failure is None or k < order.failure.worker
         if frame.kind == Kind.FAILED and first:
-            order.failure = WorkerFailureError(k, self._program.parts[k], **frame.letter)
+            order.failure = WorkerFailureError(k, self._names[k], **frame.letter)
 
     def _lose(self, order: OpenOrder, k: int, cause: str, restart: bool) -> None:
         """A host is gone, or taken for it: another one goes on in its place.
@@ -307,7 +320,7 @@ class HostPool:
         if len(causes) > self._repeats:
             self.close()
             what = "nothing" if order.task == NOTHING else self._program.tasks[order.task]
-            raise WorkerDeathError(k, self._program.parts[k], order.number, what, causes)
+            raise WorkerDeathError(k, self._names[k], order.number, what, causes)
 
     def _check(self, order: OpenOrder) -> None:
         """Look after those who are waited for.
@@ -322,7 +335,7 @@ class HostPool:
             if host is None:
                 missed_s = max((one.noticed_s for one in self.deaths), default=0.0)
                 waited_s = now - max(missed_s, order.ordered_s)
-                self._complain(waited_s, f"for {self._program.parts[k]}")
+                self._complain(waited_s, f"for {self._names[k]}")
             elif now - host.heard_s > SILENCE_S:
                 self._lose(order, k, f"silent for {now - host.heard_s:.1f} s", restart=True)
             elif now - host.given_s > self._timeout_s:

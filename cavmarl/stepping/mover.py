@@ -6,15 +6,14 @@ import time
 from collections.abc import Callable, Mapping
 from typing import Any
 
-from cavmarl.errors import WorkerStartError
-from cavmarl.runtime.shared_memory import Segment, arrays_in, size_of
+import numpy as np
+from numpy.typing import NDArray
+
 from cavmarl.stepping.job import Task
 from cavmarl.stepping.parts import Part, parts_of
 from cavmarl.stepping.placement import Placement
 
 __all__ = ["Mover"]
-
-_CASE_BYTES = 1 << 12  # of what a worker leaves for others; it grows
 
 Run = Callable[[Task, Any, bool], None]
 
@@ -24,42 +23,26 @@ class Mover:
 
     Args:
         placement: the plans.
-        num_worlds: W.
         num_zones: of each world.
-        workers: how many.
         every: so many steps from one round to the next.
+        spent_s: (W, zones) processor time of each shard from the start on, which others add up;
+            whole worlds count as one zone.
 
     Attributes:
-        segments: memory for the workers.
-        recipe: what they are told about it.
         moves: of shards, up to now.
         moved_s: how long they have taken together.
-
-    Raises:
-        WorkerStartError: there is no memory.
     """
 
     def __init__(
-        self, placement: Placement, num_worlds: int, num_zones: int, workers: int, every: int
+        self, placement: Placement, num_zones: int, every: int, spent_s: NDArray[np.float64]
     ) -> None:
         self._placement = placement
         self._num_zones = num_zones
         self._every = every
+        self._spent_s = spent_s
         self._steps = 0
         self.moves = 0
         self.moved_s = 0.0
-        layout = {"spent_s": ("<f8", (num_worlds, 1 if placement.in_row else num_zones))}
-        self.segments = [Segment.make(size_of(layout))]
-        try:
-            if placement.in_row:
-                self.segments += [Segment.make(_CASE_BYTES) for _ in range(workers)]
-            self._spent_s = arrays_in(self.segments[0].map(), layout)["spent_s"]
-        except WorkerStartError:
-            for segment in self.segments:
-                segment.close()
-            raise
-        spent, *cases = (segment.fd for segment in self.segments)
-        self.recipe = {"spent": spent, "layout": layout, "cases": cases}
 
     def before_step(self, run: Run, pids: Callable[[], Mapping[int, int]]) -> list[Part] | None:
         """Count a step; if it is time, plan anew and move.

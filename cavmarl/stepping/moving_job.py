@@ -8,7 +8,6 @@ is replaced as ever; where the worlds are is part of the state that is committed
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable, Sequence
 from itertools import pairwise
 from typing import Any
@@ -65,18 +64,10 @@ class MovingJob(WorldsJob):
         elif task == Task.UNPACK:
             self._unpack(letter)
         elif task == Task.STEP:
-            self._step(letter)
+            self._spent_s[slice(*self._range)] += self.timed_step()
         else:
             return super().perform(task, letter)
         return None
-
-    def _step(self, letter: Any) -> None:
-        """Step, and note what it has cost: the worlds share it by their vehicles."""
-        began_ns = time.thread_time_ns()
-        super().perform(Task.STEP, letter)
-        spent_s = 1e-9 * (time.thread_time_ns() - began_ns)
-        vehicles = self._worlds.simulation.running() + 1
-        self._spent_s[slice(*self._range)] += vehicles * (spent_s / float(vehicles.sum()))
 
     def _pack(self, bounds: Sequence[int]) -> None:
         """Leave the worlds that are to be another's in the case."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 from abc import ABC, abstractmethod
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -17,6 +18,9 @@ from cavmarl.errors import CavmarlError, ConfigError, WorkerDeathError, WorkerFa
 from cavmarl.shard.shard import Commands
 from cavmarl.stepping.arrays import StepArrays
 from cavmarl.stepping.job import Task
+from cavmarl.stepping.mover import Mover
+from cavmarl.stepping.parts import Part
+from cavmarl.stepping.placement import Placement
 
 __all__ = ["OrderedWorlds", "check_zones", "own_error"]
 
@@ -28,15 +32,27 @@ class OrderedWorlds(ABC):
 
     Attributes:
         arrays: what goes in and comes out.
+        placement: who hosts what.
+        mover: has that changed; None: it does not change.
     """
 
     arrays: StepArrays
+    placement: Placement
+    mover: Mover | None = None
     _steps = 0  # since the last reset of all
 
     @property
-    @abstractmethod
     def plans(self) -> tuple[Plan, ...]:
         """Who hosts what now."""
+        return self.placement.plans
+
+    @abstractmethod
+    def _pids(self) -> Mapping[int, int]:
+        """Of the workers' processes, as far as this machine can look at them."""
+
+    @abstractmethod
+    def _settle(self, parts: list[Part]) -> None:
+        """Note who runs what from now on."""
 
     @abstractmethod
     def _send(self, task: Task, letter: Any, commits: bool) -> None:
@@ -64,7 +80,13 @@ class OrderedWorlds(ABC):
             log.info("%s", "\n\n".join(map(describe_plan, self.plans)))
 
     def step(self, commands: Commands) -> None:
-        """Let the agents act, and reset the worlds whose episode is over, now or a step later."""
+        """Let the agents act, and reset the worlds whose episode is over, now or a step later.
+
+        Before that worlds or zones change their worker, if it is time.
+        """
+        parts = None if self.mover is None else self.mover.before_step(self._order, self._pids)
+        if parts is not None:
+            self._settle(parts)
         arrays = self.arrays
         if commands.controls is not arrays.controls:  # where `CavVectorEnv` decodes them
             arrays.controls[:] = commands.controls

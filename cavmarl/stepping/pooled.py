@@ -8,18 +8,17 @@ from itertools import accumulate, pairwise
 from pathlib import Path
 from typing import Any
 
-from cavmarl.balance.plan import Plan
 from cavmarl.errors import ConfigError, WorkerFailureError, WorkerStartError
 from cavmarl.runtime.barrier import usable_cores
 from cavmarl.runtime.compilation import compiled_before
 from cavmarl.runtime.pool import Death, Pool, Program
 from cavmarl.runtime.shared_memory import Segment, arrays_in, size_of
 from cavmarl.runtime.simulation import Simulation
-from cavmarl.shard.shard import Commands
 from cavmarl.stepping.arrays import StepArrays, layout_of
 from cavmarl.stepping.diary import make_segments
 from cavmarl.stepping.job import Task, fingerprint
 from cavmarl.stepping.mover import Mover
+from cavmarl.stepping.moving_memory import MovingMemory
 from cavmarl.stepping.ordered import OrderedWorlds, check_zones, own_error
 from cavmarl.stepping.parts import Part, parts_of
 from cavmarl.stepping.placement import Placement
@@ -77,7 +76,7 @@ class PooledWorlds(OrderedWorlds):
                 f"workers = {workers}: there are {cores} cores; more workers than cores do not "
                 "make it faster",
                 RuntimeWarning,
-                stacklevel=3,
+                stacklevel=4,
             )
         if not compiled_before():
             Simulation(config, world.network, 1, world.demand, world.partition)
@@ -89,7 +88,7 @@ class PooledWorlds(OrderedWorlds):
         except WorkerStartError:
             segment.close()
             raise
-        self.mover = self._make_mover(num_worlds, workers)
+        memory = self._make_mover(num_worlds, workers)
         may_change = self.mover is not None and self.placement.in_row
         if may_change and config.workers.sensors:
             segment.close()
@@ -112,12 +111,12 @@ class PooledWorlds(OrderedWorlds):
             "in_next_step": in_next_step,
             "parts": parts,
             "diaries": [[one.fd for one in diary] for diary in diaries],
-            "mover": None if self.mover is None else self.mover.recipe,
+            "mover": None if memory is None else memory.recipe,
         }
         tasks = tuple(task.name.lower().replace("_", " ") for task in Task)
         leaders = [0, *accumulate(len(part.zones) for part in parts)]
         teams = tuple(tuple(range(*bounds)) for bounds in pairwise(leaders))
-        moving = () if self.mover is None else self.mover.segments
+        moving = () if memory is None else memory.segments
         segments = (segment, *(one for diary in diaries for one in diary), *moving)
         pins = config.workers.pin
         what = Program(program or PROGRAM, recipe, _names(parts), segments, tasks, pins, teams)
@@ -128,16 +127,15 @@ class PooledWorlds(OrderedWorlds):
         self._asked = _leaders(parts)
         self.placement.watch(self._pids())
 
-    def _make_mover(self, num_worlds: int, workers: int) -> Mover | None:
+    def _make_mover(self, num_worlds: int, workers: int) -> MovingMemory | None:
+        """What the workers are to share for it; None: nothing moves."""
         every = self.world.config.workers.balance_steps
         if not every or workers == 1:
             return None
-        return Mover(self.placement, num_worlds, self.world.partition.count, workers, every)
-
-    @property
-    def plans(self) -> tuple[Plan, ...]:
-        """Who hosts what now."""
-        return self.placement.plans
+        num_zones, in_row = self.world.partition.count, self.placement.in_row
+        memory = MovingMemory(num_worlds, *((1, workers) if in_row else (num_zones, 0)))
+        self.mover = Mover(self.placement, num_zones, every, memory.spent_s)
+        return memory
 
     @property
     def simulation(self) -> Simulation:
@@ -153,23 +151,13 @@ class PooledWorlds(OrderedWorlds):
         """Of worker processes, up to now."""
         return self.pool.deaths
 
-    def step(self, commands: Commands) -> None:
-        """Let worlds or zones change their worker, if it is time, and step as `OrderedWorlds`."""
-        self._move()
-        super().step(commands)
-
     def close(self) -> None:
         """End the processes."""
         self.pool.close()
 
-    def _move(self) -> None:
-        """Give the orders of a round, if it is time."""
-        if self.mover is None:
-            return
-        parts = self.mover.before_step(self._order, self._pids)
-        if parts is not None:
-            self._asked = _leaders(parts)
-            self.pool.rename(_names(parts))
+    def _settle(self, parts: list[Part]) -> None:
+        self._asked = _leaders(parts)
+        self.pool.rename(_names(parts))
 
     def _pids(self) -> dict[int, int]:
         return dict(enumerate(self.pool.pids))

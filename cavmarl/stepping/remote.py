@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import json
+from bisect import bisect_right
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict
+from itertools import accumulate, pairwise
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
-from cavmarl.balance.plan import Plan
 from cavmarl.errors import ConfigError, WorkerFailureError
 from cavmarl.hosts.orders import Arrays, HostProgram
 from cavmarl.hosts.pool import HostPool
@@ -18,13 +21,18 @@ from cavmarl.runtime.compilation import compiled_before
 from cavmarl.runtime.pool import Death
 from cavmarl.runtime.simulation import Simulation
 from cavmarl.stepping.arrays import StepArrays, layout_of
+from cavmarl.stepping.cases import Move, buffers, moves_of
 from cavmarl.stepping.job import Task, fingerprint
+from cavmarl.stepping.mover import Mover
 from cavmarl.stepping.ordered import OrderedWorlds, check_zones, own_error
-from cavmarl.stepping.parts import make_plans, parts_of
+from cavmarl.stepping.parts import Part, parts_of
+from cavmarl.stepping.placement import Placement
 from cavmarl.stepping.remote_job import code_stamp, host_worlds, inputs_of, results_of
 from cavmarl.worlds import World
 
 __all__ = ["RemoteWorlds"]
+
+Array = NDArray[np.uint8]
 
 
 class RemoteWorlds(OrderedWorlds):
@@ -42,6 +50,8 @@ class RemoteWorlds(OrderedWorlds):
         arrays: of this process; what hosts send is written to them.
         pool: the hosts.
         in_next_step: when worlds begin anew.
+        placement: who hosts what.
+        mover: has that changed; None: it does not change.
 
     Raises:
         MissingExtraError: Ray is not installed.
@@ -68,10 +78,10 @@ class RemoteWorlds(OrderedWorlds):
                 "world(s) need at most as many; use fewer workers, more worlds, or no hosts to "
                 "divide a world over processes of this machine"
             )
-        if config.workers.balance_steps:
+        if config.workers.watch:
             raise ConfigError(
-                f"workers.balance_steps = {config.workers.balance_steps}, hosts = 'ray': worlds "
-                "stay on their host; leave it 0, or leave out the hosts"
+                "workers.watch = True, hosts = 'ray': only this machine is looked at; leave it out "
+                "(Ray tells what is reserved on each node), or leave out the hosts"
             )
         if config.workers.sensors:
             raise ConfigError(
@@ -87,17 +97,22 @@ class RemoteWorlds(OrderedWorlds):
             "base_dir": str(base_dir.resolve()),
             "fingerprint": fingerprint(world),
             "in_next_step": in_next_step,
+            "measures": bool(config.workers.balance_steps),
         }
 
         def told(count: int) -> str:
             return json.dumps({**recipe, "size": -(-num_worlds // count)})
 
         actors = RayActors(host_worlds, told, workers, num_worlds)
-        self._plans = tuple(make_plans(world, num_worlds, actors.workers))
-        self._parts = parts_of(self._plans, world.partition.count)
+        self.placement = Placement(world, num_worlds, actors.workers)
+        parts = parts_of(self.placement.plans, world.partition.count)
+        self._spent_s = np.zeros((num_worlds, 1))
+        if config.workers.balance_steps and actors.workers > 1:
+            every, zones = config.workers.balance_steps, world.partition.count
+            self.mover = Mover(self.placement, zones, every, self._spent_s)
         program = HostProgram(
-            tuple(part.names[0] for part in self._parts),
-            tuple(part.last - part.first for part in self._parts),
+            _names(parts),
+            tuple(part.last - part.first for part in parts),
             tuple(task.name.lower().replace("_", " ") for task in Task),
             Task.STEP,
             code_stamp(),
@@ -106,12 +121,8 @@ class RemoteWorlds(OrderedWorlds):
             self.pool = HostPool(actors, program, config.workers.timeout_s, config.workers.repeats)
         except WorkerFailureError as failure:
             raise own_error(failure) from failure
-        self._mine = [self.arrays.part(part.first, part.last) for part in self._parts]
-
-    @property
-    def plans(self) -> tuple[Plan, ...]:
-        """Who hosts what."""
-        return self._plans
+        self._cases: dict[int, Array] = {}  # worlds that are on their way
+        self._look()
 
     @property
     def simulation(self) -> Simulation:
@@ -131,18 +142,89 @@ class RemoteWorlds(OrderedWorlds):
         """End the hosts, and the cluster if it was started for them."""
         self.pool.close()
 
+    def _pids(self) -> Mapping[int, int]:
+        return dict.fromkeys(range(len(self._mine)), 0)  # nobody looks: they run elsewhere
+
+    def _settle(self, parts: list[Part]) -> None:
+        self.pool.rename(_names(parts))
+
+    def _look(self) -> None:
+        """Note where worlds are by what is committed, whatever was interrupted before."""
+        self._sizes = self.pool.sizes
+        self._bounds = [0, *accumulate(self._sizes)]
+        self._mine = [self.arrays.part(*bounds) for bounds in pairwise(self._bounds)]
+
     def _send(self, task: Task, letter: Any, commits: bool) -> None:
+        if self.pool.sizes != self._sizes:
+            self._look()
+        if task == Task.PACK:
+            self._pack(letter)
+        elif task == Task.UNPACK:
+            self._unpack(letter)
+        else:
+            self._carry_out(task, letter, commits)
+
+    def _carry_out(self, task: Task, letter: Any, commits: bool) -> None:
+        measures = task == Task.STEP and self.world.config.workers.balance_steps > 0
+        spent_s = [np.zeros(size) for size in self._sizes] if measures else []
+
         def outputs(k: int, ended: Any) -> Arrays:
-            return results_of(task, self._mine[k], ended)
+            return [*results_of(task, self._mine[k], ended), *spent_s[k : k + 1]]
 
         letters = [letter] * len(self._mine)
         if task == Task.RESET:  # a host counts its worlds from 0
-            firsts = [letter["first_world"] + part.first for part in self._parts]
+            firsts = [letter["first_world"] + first for first in self._bounds[:-1]]
             letters = [{**letter, "first_world": first} for first in firsts]
         inputs = [inputs_of(task, arrays) for arrays in self._mine]
         self.pool.run(task, letters, inputs, outputs, commits)
+        if measures:
+            self._spent_s[:, 0] += np.concatenate(spent_s)
+
+    def _pack(self, bounds: Sequence[int]) -> None:
+        """Let hosts send the worlds that are to be another's."""
+        moves = moves_of(self._bounds, bounds)
+        found = [buffers(0, 0) for _ in moves]
+
+        def outputs(k: int, answer: Any) -> Arrays:
+            found[k] = buffers(*answer)
+            return found[k]
+
+        nothing: list[Arrays] = [()] * len(moves)
+        self.pool.run(Task.PACK, moves, nothing, outputs, commits=False)
+        self._cases = {}
+        for move, (first, last), (sizes, content) in zip(
+            moves, pairwise(self._bounds), found, strict=True
+        ):
+            kept = range(first + move.first, first + move.last)
+            leaving = [world for world in range(first, last) if world not in kept]
+            cases = np.split(content, np.cumsum(sizes)[:-1]) if leaving else []
+            self._cases.update(zip(leaving, cases, strict=True))
+
+    def _unpack(self, bounds: Sequence[int]) -> None:
+        """Let hosts go on with the worlds that are theirs from now on."""
+        moves: list[Move] = []
+        inputs: list[Arrays] = []
+        for k, move in enumerate(moves_of(self._bounds, bounds)):
+            own = range(*self._bounds[k : k + 2])
+            kept = own[move.first : move.last]
+            wanted = range(*bounds[k : k + 2])
+            cases = [self._cases[world] for world in wanted if world not in kept]
+            sizes = np.array([case.size for case in cases], dtype=np.int64)
+            moves.append(move._replace(bytes=int(sizes.sum())))
+            inputs.append([sizes, *cases])
+        after = [last - first for first, last in pairwise(bounds)]
+        self.pool.run(Task.UNPACK, moves, inputs, lambda k, answer: (), sizes=after)
+        self._cases = {}
+        self._look()
 
     def _ask(self, task: Task, world: int) -> Any:
+        if self.pool.sizes != self._sizes:
+            self._look()
         number = range(len(self.arrays.mask))[world]
-        k = next(k for k, part in enumerate(self._parts) if number < part.last)
-        return self.pool.ask(k, task, number - self._parts[k].first)
+        k = bisect_right(self._bounds, number) - 1
+        return self.pool.ask(k, task, number - self._bounds[k])
+
+
+def _names(parts: Sequence[Part]) -> tuple[str, ...]:
+    """What each host runs, in words."""
+    return tuple(part.names[0] for part in parts)

@@ -17,7 +17,10 @@ from cavmarl.config import EnvConfig
 from cavmarl.errors import WorkerStartError
 from cavmarl.hosts.host import Outcome, serve
 from cavmarl.rig.frames import Frames
+from cavmarl.runtime.images import Image
+from cavmarl.runtime.shared_memory import Segment
 from cavmarl.stepping.arrays import StepArrays
+from cavmarl.stepping.cases import Move, buffers, pack, unpack
 from cavmarl.stepping.job import Task, WorldsJob, fingerprint
 from cavmarl.stepping.local import LocalWorlds
 from cavmarl.worlds import make_world
@@ -25,6 +28,8 @@ from cavmarl.worlds import make_world
 __all__ = ["HostedWorlds", "code_stamp", "host_worlds", "inputs_of", "results_of"]
 
 Array = NDArray[Any]
+
+_CASE_BYTES = 1 << 12
 
 # Fields of `StepArrays` that every step writes.
 _STEPPED = (
@@ -102,6 +107,9 @@ class HostedWorlds:
         CavmarlError: they cannot be read.
     """
 
+    _worlds: LocalWorlds
+    _job: WorldsJob
+
     def __init__(self, recipe: dict[str, Any]) -> None:
         from cavmarl.config_io import validate  # pydantic is slow to import
 
@@ -113,7 +121,9 @@ class HostedWorlds:
                 "them to all machines"
             )
         self._in_next_step: bool = recipe["in_next_step"]
-        LocalWorlds(self._world, 1, warm=True)
+        self._measures: bool = recipe["measures"]
+        self._one = LocalWorlds(self._world, 1, warm=True)
+        self._case = Image(Segment.make(_CASE_BYTES))
         self._make(recipe["size"])
 
     @property
@@ -126,18 +136,68 @@ class HostedWorlds:
         if size != len(self._worlds.arrays.mask):
             self._make(size)
 
-    def inputs(self, task: int) -> list[Array]:
+    def inputs(self, task: int, letter: Any) -> list[Array]:
         """Arrays that an order of this task fills."""
+        if task == Task.UNPACK:
+            move = Move(*letter)
+            self._coming = buffers(move.coming, move.bytes)
+            return [*self._coming]
         return inputs_of(task, self._worlds.arrays)
 
     def perform(self, task: int, letter: Any) -> Outcome:
-        """Do a task; the answer to a step is in which worlds something ended."""
-        arrays = self._worlds.arrays
-        answer = self._job.perform(task, letter)
+        """Do a task.
+
+        The answer to a step is in which worlds something ended; to PACK, how many worlds leave, and
+        the bytes of their cases.
+        """
+        if task == Task.PACK:
+            return self._pack(Move(*letter))
+        if task == Task.UNPACK:
+            self._unpack(Move(*letter))
+            return Outcome(None, ())
         if task == Task.STEP:
-            ended = arrays.episode_over | arrays.terminations.any(axis=1)
-            answer = np.flatnonzero(ended).tolist() or None
-        return Outcome(answer, results_of(task, arrays, answer))
+            return self._step()
+        answer = self._job.perform(task, letter)
+        return Outcome(answer, results_of(task, self._worlds.arrays, answer))
+
+    def _step(self) -> Outcome:
+        arrays, spent_s = self._worlds.arrays, []
+        if self._measures:
+            spent_s.append(self._job.timed_step())
+        else:
+            self._job.perform(Task.STEP, None)
+        ended = arrays.episode_over | arrays.terminations.any(axis=1)
+        answer = np.flatnonzero(ended).tolist() or None
+        return Outcome(answer, [*results_of(Task.STEP, arrays, answer), *spent_s])
+
+    def _pack(self, move: Move) -> Outcome:
+        """The cases of all worlds that it does not keep."""
+        kept = range(move.first, move.last)
+        leaving = [w for w in range(len(self._worlds.arrays.mask)) if w not in kept]
+        sizes, content = pack(self._case, [self._share_of(w) for w in leaving])
+        return Outcome([len(sizes), content.size], [sizes, content])
+
+    def _unpack(self, move: Move) -> None:
+        """Go on with what it keeps and what has come."""
+        kept = range(move.first, move.last)
+        if not move.coming and len(kept) == len(self._worlds.arrays.mask):
+            return
+        dtypes = [array.dtype for array in self._share_of(0)]
+        coming = unpack(self._case, *self._coming, dtypes)
+        mine = map(self._share_of, kept)
+        shares = [*coming[: move.before], *mine, *coming[move.before :]]
+        worlds = self._new(len(shares))
+        begun = results_of(Task.RESET, worlds.arrays, None)
+        worlds.load(worlds.join([share[len(begun) :] for share in shares]))
+        for w, share in enumerate(shares):
+            for array, kept_row in zip(begun, share, strict=False):
+                array[w : w + 1] = kept_row
+        self._worlds, self._job = worlds, WorldsJob(worlds, 0)
+
+    def _share_of(self, w: int) -> list[Array]:
+        """What `save` would give if there were no world but one; views, to be copied."""
+        begun = results_of(Task.RESET, self._worlds.arrays, None)
+        return [*(array[w : w + 1] for array in begun), *self._worlds.share_of(w)]
 
     def save(self) -> list[Array]:
         """All that the next task depends on."""
@@ -157,9 +217,13 @@ class HostedWorlds:
     def close(self) -> None:
         """End the processes that the worlds have."""
         self._worlds.close()
+        self._one.close()
+
+    def _new(self, size: int) -> LocalWorlds:
+        return LocalWorlds(self._world, size, in_next_step=self._in_next_step, like=self._one)
 
     def _make(self, size: int) -> None:
-        self._worlds = LocalWorlds(self._world, size, in_next_step=self._in_next_step)
+        self._worlds = self._new(size)
         self._logs = self._worlds.keep_logs()
         self._job = WorldsJob(self._worlds, 0)
         self._rehearse()

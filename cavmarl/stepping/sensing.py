@@ -58,7 +58,7 @@ def warn_if_crowded(sensor_workers: int, times: int) -> None:
             f"{sensor_workers * times} sensor workers: there are {cores} cores; more workers than "
             "cores do not make it faster",
             RuntimeWarning,
-            stacklevel=4,
+            stacklevel=5,
         )
 
 

@@ -38,7 +38,7 @@ class ToyJob:
         if size != len(getattr(self, "totals", ())) or not size:
             self.totals = np.zeros(size)
 
-    def inputs(self, task: int) -> list[NDArray[Any]]:
+    def inputs(self, task: int, letter: Any) -> list[NDArray[Any]]:
         return [self.given] if task in (ADD, WRITE) else []
 
     def perform(self, task: int, letter: Any) -> Outcome:

@@ -83,3 +83,18 @@ def test_the_processes_end_with_the_environment() -> None:
     assert alive(pids) == []
     with pytest.raises(WorkerError, match="closed"):
         env.reset(seed=0)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        ({"hosts": "mars", "workers": 1}, r"hosts = 'mars': must be 'ray'"),
+        ({"hosts": "ray"}, r"hosts = 'ray' without workers"),
+        ({"workers": "two"}, r"workers = 'two': must be a whole number, or 'ray'"),
+        ({"workers": -1, "hosts": "ray"}, r"workers = -1: must be a number from 0"),
+        ({"workers": "ray", "render_mode": "rgb_array"}, r"workers = 'ray': only a world of the"),
+    ],
+)
+def test_hosts_that_cannot_be(arguments: dict[str, Any], words: str) -> None:
+    with pytest.raises(ConfigError, match=words):
+        parallel_env("ring", **arguments)

@@ -16,12 +16,18 @@ import numpy as np
 import psutil
 import pytest
 
-from cavmarl import CapacityError, ConfigError
+from cavmarl import CapacityError, ConfigError, parallel_env
+from cavmarl.errors import WorkerError
 from cavmarl.stepping.remote import RemoteWorlds
 from cavmarl.vector_env import CavVectorEnv
+from tests.stepping.test_moving import RESTLESS, uneven
+from tests.stepping.test_parallel import drive as drive_view
+from tests.stepping.test_parallel import settings
 from tests.stepping.vec_runs import STEPS, Make, drive, same
 
 ray = pytest.importorskip("ray", reason="needs the extra: ray (make libraries)")
+
+__all__ = ["uneven"]
 
 pytestmark = pytest.mark.filterwarnings("ignore")  # Ray's warnings of itself are many
 
@@ -130,6 +136,49 @@ def test_an_actor_that_dies_in_the_middle_of_a_step(make: Make, cluster: Any, wh
         timer.join()
     remote(vec).pool.ping()
     assert len(remote(vec).deaths) == 2
+
+
+@pytest.mark.parametrize("more", [{"workers": 1, "hosts": "ray"}, {"workers": "ray"}])
+def test_the_view_of_pettingzoo_is_the_one_of_one_process(
+    cluster: Any, more: dict[str, Any]
+) -> None:
+    whole = drive_view(parallel_env("grid4x4", **settings("entering", "dict")))
+    env = parallel_env("grid4x4", **settings("entering", "dict"), **more)
+    assert isinstance(env.worlds, RemoteWorlds)
+    pool = env.worlds.pool
+
+    def kill(step: int) -> None:
+        if step % 9 == 4:
+            pool.await_spare()
+            os.kill(pool.pids[0], signal.SIGKILL)
+
+    assert drive_view(env, before=kill) == whole
+    assert pool.deaths
+    with pytest.raises(ConfigError, match="workers=0"):
+        _ = env.simulation
+    pids = pool.pids
+    env.close()
+    await_true(lambda: not any(psutil.pid_exists(pid) for pid in pids))
+    with pytest.raises(WorkerError, match="closed"):
+        env.reset(seed=0)
+
+
+def test_worlds_that_move_between_nodes_are_the_same(
+    make: Make, cluster: Any, uneven: list[int]
+) -> None:
+    """The host that dies has worlds by then that it had not been started with."""
+    whole = drive(make("grid4x4", **WANTED), steps=16)
+    vec = make("grid4x4", workers=3, hosts="ray", overrides=RESTLESS, **WANTED)
+    assert len(set(nodes_of(remote(vec).pool.pids))) == 2
+
+    def strike(step: int) -> None:
+        if step in (5, 11):
+            remote(vec).pool.await_spare()
+            os.kill(remote(vec).pool.pids[step % 3], signal.SIGKILL)
+
+    assert same(drive(vec, steps=16, before=strike), whole)
+    assert len(remote(vec).deaths) == 2
+    assert sum(uneven) > 0
 
 
 def test_errors_are_those_of_one_process(make: Make, cluster: Any) -> None:
