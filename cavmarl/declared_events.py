@@ -25,6 +25,7 @@ class DeclaredEvents:
     def __init__(self, config: EnvConfig, num_worlds: int) -> None:
         self._enabled = config.v2x.enabled
         self._causes = np.zeros((num_worlds, config.population.num_ids), dtype=np.int32)
+        self._are_any = False
 
     def declare(self, world: int, agent: int, cause: str) -> None:
         """Note an event.
@@ -41,11 +42,13 @@ class DeclaredEvents:
                 f"agent {agent} of world {world}: there are {num_agents} in each of {num_worlds}"
             )
         self._causes[world, agent] = cause_code(cause)
+        self._are_any = True
 
     def add_to(self, commands: Commands) -> Commands:
         """Commands of a step with all that has been declared for it."""
-        if not self._causes.any():
+        if not self._are_any:
             return commands
         declared = self._causes.copy()
         self._causes[:] = 0
+        self._are_any = False
         return replace(commands, declared=declared)

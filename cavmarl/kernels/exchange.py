@@ -1,6 +1,9 @@
 """Rows that go from shard to shard: ghosts, every tick.
 
-A shard's owned rows come first, its ghosts after them.
+A shard's owned rows come first, its ghosts after them. `exchange` renews those of all zones: every
+zone publishes. Where zones are run by several processes, each lets its own ones `gather`, and then
+`note_gathered` is called once. What comes of it is the same, row by row; but `gather` asks every
+zone, near or far.
 """
 
 from __future__ import annotations
@@ -14,7 +17,7 @@ from cavmarl.kernels.borders import Borders
 from cavmarl.kernels.handing_over import Book, look_on
 from cavmarl.kernels.zones import Halo, ZoneArrays, is_inside, is_seen, squared_distance, zone_of
 
-__all__ = ["exchange", "take_own"]
+__all__ = ["exchange", "gather", "note_gathered", "take_own"]
 
 
 @kernel
@@ -58,6 +61,80 @@ def exchange(
         if count > 1:
             for zone in range(count):
                 _publish(zones, halo, touching_m, border_m, zoned, side, zone, w)
+        look_on(zones, borders, zoned, side, w, book)
+
+
+@kernel
+def gather(
+    zones: ZoneArrays,
+    halo: Halo,
+    touching_m: float,
+    border_m: float,
+    zoned: Zoned,
+    side: int,
+    zone: int,
+    w: int,
+) -> None:
+    """Renew the ghosts of one zone from the owned rows of all others, and note who is at a border.
+
+    It writes what is this zone's alone, and reads of the others what no other call of it writes.
+
+    Args:
+        zones: of the partition.
+        halo: as for `exchange`.
+        touching_m: as for `exchange`.
+        border_m: within that of another zone an owned row is at a border, m.
+        zoned: the ghosts of this zone and how many there are, its border and num_border are
+            written; outer and num_outer stay.
+        side: whose rows, 0 or 1.
+        zone: whose ghosts.
+        w: in which world.
+    """
+    near_limit = touching_m * touching_m
+    border_limit = min(halo.halo_m * halo.halo_m, border_m * border_m)
+    count = zones.rects.shape[0]
+    zoned.num_rows[zone, w] = zoned.num_owned[zone, w]
+    zoned.num_near[zone, w] = zoned.num_owned[zone, w]
+    for source in range(count):
+        if source == zone:
+            continue
+        noted = zoned.num_outer[source, w]
+        for n in range(noted if noted >= 0 else zoned.num_owned[source, w]):
+            i = zoned.outer[source, w, n] if noted >= 0 else n
+            row = zoned.rows[side, source, w, i]
+            squared = squared_distance(zones.rects, zone, row["x"], row["y"])
+            if is_seen(halo, zone, row, squared):
+                _take_ghost(zoned, side, source, i, zone, w, squared <= near_limit)
+    found = 0
+    noted = zoned.num_outer[zone, w]
+    for n in range(noted if noted >= 0 else zoned.num_owned[zone, w]):
+        i = zoned.outer[zone, w, n] if noted >= 0 else n
+        row = zoned.rows[side, zone, w, i]
+        for other in range(count):
+            if (
+                other != zone
+                and squared_distance(zones.rects, other, row["x"], row["y"]) <= border_limit
+            ):
+                zoned.border[zone, w, found] = i
+                found += 1
+                break
+    zoned.num_border[zone, w] = found
+
+
+@kernel
+def note_gathered(zones: ZoneArrays, borders: Borders, zoned: Zoned, side: int, book: Book) -> None:
+    """All zones have gathered their ghosts: note who is near a border, as `exchange` does.
+
+    Args:
+        zones: of the partition.
+        borders: when a vehicle is near one.
+        zoned: num_outer is written: rows may change from here on.
+        side: whose rows, 0 or 1.
+        book: who is near a border is written.
+    """
+    for w in range(zoned.num_outer.shape[1]):
+        for zone in range(zones.rects.shape[0]):
+            zoned.num_outer[zone, w] = -1
         look_on(zones, borders, zoned, side, w, book)
 
 

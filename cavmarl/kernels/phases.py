@@ -28,6 +28,7 @@ from cavmarl.kernels.arrays import (
     Zoned,
 )
 from cavmarl.kernels.departures import choose_goals
+from cavmarl.kernels.exchange import gather
 from cavmarl.kernels.neighbors import Grid
 from cavmarl.kernels.outputs import credit
 from cavmarl.kernels.sense import sense
@@ -44,6 +45,7 @@ __all__ = [
     "choose_goals_each",
     "credit_each",
     "detect_each",
+    "gather_each",
     "propose_each",
     "rank_lanes_each",
     "resolve_each",
@@ -155,6 +157,23 @@ def advance_each(
             side == next_side,
         )
     return arrived
+
+
+@kernel
+def gather_each(members: Members, side: int, touching_m: float, border_m: float) -> None:
+    """`gather` in each zone; who is called with it may run beside others."""
+    for w in range(members.common.ticks.size):
+        for zone in members.numbers:
+            gather(
+                members.zones,
+                members.halo,
+                touching_m,
+                border_m,
+                members.zoned,
+                side,
+                zone,
+                w,
+            )
 
 
 @kernel

@@ -32,6 +32,7 @@ from cavmarl.kernels.repeated import repeated
 
 __all__ = [
     "ASLEEP",
+    "LONG_WORK_S",
     "NUMBER",
     "WORDS",
     "Meeting",
@@ -223,7 +224,6 @@ class Meeting:
         self.theirs = theirs
         self.wire = wire
         self._crowded = crowded
-        self._last_s = 0.0
 
     def post(self, number: int) -> None:
         """Tell the other side that this one has come to a number."""
@@ -245,7 +245,7 @@ class Meeting:
         """Whether the other side has come to a number."""
         return _has(self.theirs, number)
 
-    def watch(self, number: int, work_s: float = 0.0, is_soon: bool = False) -> bool:
+    def watch(self, number: int, last_s: float, work_s: float = 0.0, is_soon: bool = False) -> bool:
         """Look for a moment whether the other side comes to a number.
 
         Who has had to wait for long the last time does not look for long, nor who has worked for
@@ -254,23 +254,24 @@ class Meeting:
 
         Args:
             number: to wait for.
+            last_s: how long it has had to wait the last time.
             work_s: since this side waited last.
             is_soon: it is known that it does not take long.
         """
         if _look(self.theirs, number, self._crowded):
             return True
-        if self._last_s > LONG_WORK_S and not is_soon:
+        if last_s > LONG_WORK_S and not is_soon:
             return False
-        is_soon |= self._last_s < LONG_S and work_s < LONG_WORK_S
+        is_soon |= last_s < LONG_S and work_s < LONG_WORK_S
         end = time.perf_counter() + (LONG_S if is_soon else SHORT_S)
         while time.perf_counter() < end:
             if _look(self.theirs, number, self._crowded):
                 return True
         return False
 
-    def lasted(self, wait_s: float) -> None:
-        """Note how long this side has had to wait."""
-        self._last_s = wait_s
+    def lie_down_first(self) -> None:
+        """Say that this side sleeps when it comes to its next number: it will have to wait long."""
+        self.mine[ASLEEP] = 1  # seen with that number, or before
 
     def lie_down(self, number: int) -> bool:
         """Say that this side sleeps from here on; False: there is no need any more."""

@@ -74,7 +74,8 @@ class Crew:
         self._poll = select.poll()
         self._held = _Held(list(program.segments))
         self._meetings: dict[int, Meeting] = {}
-        self._heard: list[int] = []  # workers whose messages have woken this side, and lie there
+        self._owners: dict[int, tuple[int, bool]] = {}  # descriptor → worker, whether of its death
+        self._heard: set[int] = set()  # workers whose messages have woken this side, and lie there
         try:
             if not hasattr(os, "pidfd_open"):
                 raise WorkerStartError("workers need Linux 5.3 or later: use workers=0")
@@ -106,6 +107,7 @@ class Crew:
         head: tuple[int, ...],
         stale: Sequence[bool],
         mail: bytes | None,
+        sleeps: bool = False,
     ) -> None:
         """Give workers their next order; that one is dead is noticed later.
 
@@ -117,7 +119,13 @@ class Crew:
             head: words of the order, from TASK to TRUTH.
             stale: of all workers, whose memory is not what is committed.
             mail: what goes with it.
+            sleeps: this side goes to sleep at once: what it does from here on it does on a core on
+                which a worker waits to begin.
         """
+        if sleeps:
+            self._hear_no_more()
+            for k in workers:
+                self._meetings[k].lie_down_first()
         asleep = []
         for k in workers:
             words = self.orders[k]
@@ -140,33 +148,63 @@ class Crew:
         """Whether a worker has carried it out."""
         return self._meetings[k].has(self.number(k))
 
-    def watch(self, k: int, is_soon: bool = False) -> bool:
-        """The same, but look for a moment; a longer one if it cannot take long."""
-        return self._meetings[k].watch(self.number(k), is_soon=is_soon)
+    def watch(self, k: int, last_s: float = 0.0, is_soon: bool = False) -> bool:
+        """The same, but look for a moment; a longer one if it cannot take long.
 
-    def lasted(self, k: int, wait_s: float) -> None:
-        """Note how long it has taken."""
-        self._meetings[k].lasted(wait_s)
+        Args:
+            k: which worker.
+            last_s: how long such an order has taken the last time.
+            is_soon: it is known that it does not take long.
+        """
+        return self._meetings[k].watch(self.number(k), last_s, is_soon=is_soon)
 
-    def sleep(self, pending: list[int], limit_s: float) -> dict[int, Process]:
+    def sleep(
+        self, pending: Sequence[int], limit_s: float, is_lying: bool = False
+    ) -> dict[int, Process]:
         """Sleep until one of those is done, or anybody is dead, but not for ever.
+
+        Args:
+            pending: who is waited for.
+            limit_s: for no longer than that.
+            is_lying: they know it from `order`.
 
         Returns:
             the dead, by worker.
         """
-        ready: set[int] = set()
-        for k in self._heard:  # now, and not when they are heard: then every microsecond counts
-            self.processes[k].collect()
-        lying = [self._meetings[k].lie_down(self.number(k)) for k in pending]
-        if all(lying):
-            ready = {fd for fd, _ in self._poll.poll(1000.0 * limit_s)}
+        ready: list[tuple[int, int]] = []
+        if is_lying or self._lie_down(pending):
+            ready = self._poll.poll(1000.0 * limit_s)
         for k in pending:
             self._meetings[k].get_up()
         if not ready:
-            self._heard = []
             return {}
-        self._heard = [k for k, one in self.processes.items() if one.wire.fileno() in ready]
-        return {k: process for k, process in self.processes.items() if process.pidfd in ready}
+        found = [self._owners[fd] for fd, _ in ready]
+        self._heard.update(k for k, is_dead in found if not is_dead)
+        return {k: self.processes[k] for k, is_dead in found if is_dead}
+
+    def _lie_down(self, pending: Sequence[int]) -> bool:
+        """Say that this side sleeps; False: somebody is through by now, or is heard already."""
+        self.forget_calls()
+        # Of several it is enough that one of them is through: who is up is woken by nobody.
+        return all(self._meetings[k].lie_down(self.number(k)) for k in pending)
+
+    def forget_calls(self) -> None:
+        """Take what has been heard out of the wires, so that it wakes nobody again.
+
+        Mostly it is one message; whoever finds another one there hears it then.
+        """
+        for k in self._heard:
+            with suppress(BlockingIOError, ConnectionResetError):
+                self.processes[k].take()
+        self._heard.clear()
+
+    def _hear_no_more(self) -> None:
+        """The same, also of who has called while this side was about to get up."""
+        for fd, _ in self._poll.poll(0):
+            k, is_dead = self._owners[fd]
+            if not is_dead:
+                self._heard.add(k)
+        self.forget_calls()
 
     def settle(self, k: int, limit_s: float) -> bool:
         """Whether a worker has carried out its order or has died of it, after a while at most."""
@@ -184,9 +222,9 @@ class Crew:
 
     def keep_apart(self) -> None:
         """Give those who have been on one core different ones, unless each has its own for good."""
-        if not self._program.pins:
-            pids = [process.pid for process in self.processes.values()]
-            keep_apart(pids, [status.item(CORE) for status in self._statuses])
+        cores = [status.item(CORE) for status in self._statuses]
+        if len(set(cores)) < len(cores) and not self._program.pins:
+            keep_apart([process.pid for process in self.processes.values()], cores)
 
     def answer(self, k: int) -> tuple[int, Any]:
         """How a worker's order ended, as its line says, and what it has answered."""
@@ -229,8 +267,9 @@ class Crew:
 
     def _dismiss(self, process: Process) -> None:
         process.kill()
-        self._poll.unregister(process.pidfd)
-        self._poll.unregister(process.wire)
+        for fd in (process.pidfd, process.wire.fileno()):
+            self._poll.unregister(fd)
+            del self._owners[fd]
         process.collect()
 
     def _take_back(self, team: tuple[int, ...], ordered: Collection[int]) -> None:
@@ -316,8 +355,9 @@ class Crew:
         assert self._held.server is not None
         process = self._held.server.fork(k)
         self.processes[k] = process
-        self._poll.register(process.pidfd, select.POLLIN)
-        self._poll.register(process.wire, select.POLLIN)
+        for fd, is_dead in ((process.pidfd, True), (process.wire.fileno(), False)):
+            self._poll.register(fd, select.POLLIN)
+            self._owners[fd] = k, is_dead
         self._meetings[k] = Meeting(self.orders[k], self._statuses[k], process.wire, self._crowded)
 
 

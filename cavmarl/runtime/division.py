@@ -18,14 +18,15 @@ from numpy.typing import NDArray
 from cavmarl.errors import ZoneError
 from cavmarl.kernels.arrays import Worlds, Zoned
 from cavmarl.kernels.borders import Borders, pass_on
-from cavmarl.kernels.exchange import exchange, take_own
-from cavmarl.kernels.handing_over import hand_over, look, make_book, release
+from cavmarl.kernels.exchange import exchange, note_gathered, take_own
+from cavmarl.kernels.handing_over import Book, hand_over, look, make_book, release
 from cavmarl.kernels.repeated import repeated
 from cavmarl.kernels.tallies import totals
 from cavmarl.kernels.zones import Halo, ZoneArrays, zone_of
 from cavmarl.ownership.messages import Birth, Switch
 from cavmarl.roads.zone_statistics import imbalance
 from cavmarl.roads.zones import ZonePartition
+from cavmarl.runtime.executor import Executor
 from cavmarl.runtime.referee import Near
 from cavmarl.shard.shard import Shard
 from cavmarl.shard.sight import Sight
@@ -70,6 +71,8 @@ class Division:
         borders: when a vehicle is near one.
         codec: of vehicles' states.
         book: who is near a border.
+        gathering: what shards are called with that `gather` their ghosts: how far outside of a zone
+            a ghost can be that touches somebody in it, and how far inside one is at a border, m.
         call_hand_over: the kernel, with the types of all worlds' arrays found out once.
         call_release: the same.
     """
@@ -95,9 +98,12 @@ class Division:
         self._halo = halo
         self._sight = sight
         self._touching_m = touching_m
+        self.gathering = (touching_m, borders.max_speed_mps * borders.ahead_s)
+        self._gatherers: Executor | None = None
         self._ids, self._x, self._y = (zoned.rows[name] for name in ("id", "x", "y"))
         self._rects: list[list[float]] = zones.rects.tolist()
         self._call_exchange = repeated(exchange)
+        self._note_gathered = repeated(note_gathered)
         self._look = repeated(look)
         self._pass_on = repeated(pass_on)
         self._totals = repeated(totals)
@@ -170,8 +176,27 @@ class Division:
 
     def exchange(self) -> None:
         """Renew all ghosts from the owned `next_rows`."""
+        if self._gatherers is not None:
+            self._gatherers.each("gather", *self.gathering)
+            self._note_those_near(self.book)
+            return
         worlds = self._shards[0].worlds
         self._exchange(worlds.next_rows, 0, len(worlds.ticks))
+
+    def let_gather(self, executor: Executor) -> None:
+        """From now on let shards `exchange` as a phase, if they run side by side.
+
+        A shard that gathers asks all others, so not where there are some that it never sees.
+        """
+        if len(self._halo.near) == self.count**2:
+            self._gatherers = executor
+
+    def rehearse_gathering(self) -> None:
+        """Call what is called after shards have gathered, and forget what it has found."""
+        self._note_those_near(make_book(*self._first_side.shape))
+
+    def _note_those_near(self, book: Book) -> None:
+        self._note_gathered(self.zones, self.borders, self._zoned, self.next_side, book)
 
     def _exchange(self, rows: NDArray[np.void], first: int, last: int) -> None:
         """Renew the ghosts of some worlds; `rows` are the first shard's rows or next ones."""

@@ -16,6 +16,7 @@ Phase = Literal[
     "advance",
     "choose_goals",
     "leave",
+    "gather",
     "resolve",
     "rank_lanes",
     "propose",

@@ -54,9 +54,20 @@ class Process:
     def collect(self) -> None:
         """Take what has come through the wire; calls to wake up are forgotten."""
         with suppress(BlockingIOError, ConnectionResetError):
-            while message := self.wire.recv(MAX_MESSAGE, socket.MSG_DONTWAIT):
-                if message != WAKE:
-                    self.mail.append(message[len(MAIL) :])
+            while self.take():
+                pass
+
+    def take(self) -> bool:
+        """Take one message; False: the other end is closed.
+
+        Raises:
+            BlockingIOError: none has come.
+            ConnectionResetError: the other end was closed before it had read all.
+        """
+        message = self.wire.recv(MAX_MESSAGE, socket.MSG_DONTWAIT)
+        if message and message != WAKE:
+            self.mail.append(message[len(MAIL) :])
+        return bool(message)
 
     def kill(self) -> None:
         """See to it that it is dead, whatever it was doing."""

@@ -17,6 +17,7 @@ from math import isnan, nan
 from typing import Any
 
 from cavmarl.errors import WorkerDeathError, WorkerError, WorkerFailureError
+from cavmarl.runtime.barrier import LONG_WORK_S
 from cavmarl.runtime.crew import Crew, Program
 from cavmarl.runtime.team import LeftAloneError
 from cavmarl.runtime.watchdog import CHECK_S, Watchdog, processor_s
@@ -74,6 +75,7 @@ class Pool:
         self._open: tuple[int, ...] = ()  # workers with an order that is not committed
         self._stale = [False] * len(program.parts)  # whose memory is not what is committed
         self._ordered_s = 0.0
+        self._lasted: dict[int, float] = {}  # how long each task has taken the last time, s
         self._crew = Crew(program)
         self._finalizer = weakref.finalize(self, self._crew.release)
 
@@ -142,10 +144,13 @@ class Pool:
         self._open = workers
         self._ordered_s = time.monotonic()
         head = (task, mail is not None, slot, self._truth)
-        self._crew.order(workers, head, self._stale, mail)
+        expected_s = self._lasted.get(task, 0.0)
+        sleeps = expected_s > LONG_WORK_S
         if workers == self._all:
-            self._crew.keep_apart()  # now, as there is time: where they were with the last order
-        self._await(workers, mail)
+            self._crew.keep_apart()  # where they were with the last order
+        self._crew.order(workers, head, self._stale, mail, sleeps)
+        self._await(workers, mail, expected_s, sleeps)
+        self._lasted[task] = time.monotonic() - self._ordered_s
         answers = self._read(workers)
         for k in workers:
             self._stale[k] = False
@@ -164,28 +169,36 @@ class Pool:
             self._stale[k] = True
         self._open = ()
 
-    def _await(self, workers: tuple[int, ...], mail: bytes | None) -> None:
+    def _await(
+        self, workers: tuple[int, ...], mail: bytes | None, expected_s: float, sleeps: bool
+    ) -> None:
         """Return when all workers have carried out their order.
+
+        Args:
+            workers: who has one.
+            mail: that came with it.
+            expected_s: how long it has taken the last time.
+            sleeps: they know that nobody looks.
 
         Raises:
             WorkerDeathError: too many processes died of it; the pool is closed.
         """
-        began = time.perf_counter()
-        pending = [k for k in workers if not self._crew.watch(k)]
+        pending = list(workers)
+        if not sleeps:
+            pending = [k for k in workers if not self._crew.watch(k, expected_s)]
         if pending:
-            self._await_asleep(pending, mail)
-        lasted_s = time.perf_counter() - began
-        for k in workers:
-            self._crew.lasted(k, lasted_s)
+            self._await_asleep(pending, mail, sleeps)
 
-    def _await_asleep(self, pending: list[int], mail: bytes | None) -> None:
+    def _await_asleep(self, pending: list[int], mail: bytes | None, is_lying: bool) -> None:
+        dead = self._crew.sleep(pending, CHECK_S, is_lying)
         first = len(self.deaths)
-        guard = _Guard(self._crew, self._timeout_s)
-        while pending:
+        guard = _Guard(self._crew, self._timeout_s, self._ordered_s)
+        while pending or dead:
             asked = pending
-            dead = self._crew.sleep(pending, CHECK_S)
             pending = self._pending()
-            if len(pending) < len(asked):  # orders are shared out so that all end together
+            if pending and len(pending) < len(asked):
+                # Orders are shared out so that all end together.
+                self._crew.forget_calls()
                 pending = [k for k in pending if not self._crew.watch(k, is_soon=True)]
             self._note_done(first, pending)
             if not (pending or dead):
@@ -201,6 +214,7 @@ class Pool:
                 causes = [death.cause for death in self.deaths[first:] if death.worker in team]
                 if len(causes) > self._repeats:
                     self._give_up(k, causes)
+            dead = self._crew.sleep(pending, CHECK_S) if pending else {}
         self._note_done(first, pending)
 
     def _note_done(self, first: int, pending: list[int]) -> None:
@@ -256,13 +270,14 @@ class _Guard:
     Args:
         crew: they belong to.
         timeout_s: for so long each may be busy.
+        since_s: when they were given their order, by `time.monotonic`.
     """
 
-    def __init__(self, crew: Crew, timeout_s: float) -> None:
+    def __init__(self, crew: Crew, timeout_s: float, since_s: float) -> None:
         self._crew = crew
         self._timeout_s = timeout_s
         self._watchdogs: dict[int, Watchdog] = {}
-        self._next_s = time.monotonic() + CHECK_S
+        self._next_s = since_s + CHECK_S
 
     def hanging(self, pending: list[int]) -> dict[int, str]:
         """Who of them does not go on, and why one thinks so."""

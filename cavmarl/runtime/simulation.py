@@ -234,6 +234,8 @@ class Simulation:
         self._let_in(all_phases=True)
         self._executor.each("retire", self._gate)
         self._executor.each("forget", self._gate)
+        self._executor.each("gather", *self._division.gathering)
+        self._division.rehearse_gathering()
         self._traffic.settle(self._gate, self._shard.worlds)
         self._division.near(0, everybody=True)
         with suppress(ZoneError):
@@ -525,14 +527,18 @@ class Simulation:
             if isinstance(part, Traced):
                 part.trace(note)
 
-    def host(self, make: Callable[[Sequence[Shard]], Executor]) -> None:
+    def host(self, make: Callable[[Sequence[Shard], tuple[float, float]], Executor]) -> None:
         """From now on let somebody else run the phases of the shards, as `make` returns it.
+
+        Args:
+            make: called with the shards, and with what the phase `gather` is called with.
 
         Raises:
             ConfigError: zones become others, and nobody would tell him.
         """
         self._refuse_recutting("the zones of one world over workers")
-        self._executor = make(self._shards)
+        self._executor = make(self._shards, self._division.gathering)
+        self._division.let_gather(self._executor)
 
     def time_shards(self, every: int = 1) -> ShardClock:
         """From now on run phases zone by zone, with a clock on each.

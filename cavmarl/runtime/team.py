@@ -2,7 +2,7 @@
 
 The first of them leads: it runs the tick as one process would. Each phase that is mostly done zone
 by zone it announces to the others, the followers, runs it on its own zones, and goes on when they
-have run it on theirs. What is in between, ghosts, gate, signals and owners, it does alone.
+have run it on theirs. What is in between, gate, signals and owners, it does alone.
 
 All arrays that shards write are shared (`shared_memory.shared_zeros`), and each row has one writer
 at a time. A follower keeps nothing from one phase to the next but room to work in: what a phase
@@ -45,7 +45,7 @@ FAILED = 2
 CORE = 5  # a word of both: where the process was when it began with a phase
 
 # Methods of `ShardGroup` and `Shard` that are run together, by their code.
-TOGETHER = ("begin_step", "move", "resolve", "sense", "credit", "suggest")
+TOGETHER = ("begin_step", "move", "gather", "resolve", "sense", "credit", "suggest")
 END = len(TOGETHER)
 # After which nobody waits: the next phase only asks that it has been run on the same zone.
 UNSEEN_BY_OTHERS = "begin_step"

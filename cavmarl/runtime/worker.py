@@ -231,10 +231,11 @@ def _obey(job: Job, meeting: Meeting, slots: Sequence[Image]) -> NoReturn:
     """Carry out one order after the other."""
     mine, theirs = meeting.mine, meeting.theirs
     is_new = True
+    wait_s = 0.0
     began = time.perf_counter()
     while True:
         order = int(mine[NUMBER]) + 1
-        _await(meeting, order, time.perf_counter() - began)
+        wait_s = _await(meeting, order, wait_s, time.perf_counter() - began)
         began = time.perf_counter()
         core = present_core()
         number, _, task, has_letter, slot, truth, loads, _ = theirs.tolist()
@@ -263,12 +264,22 @@ def _obey(job: Job, meeting: Meeting, slots: Sequence[Image]) -> NoReturn:
         meeting.post(number)
 
 
-def _await(meeting: Meeting, order: int, work_s: float) -> None:
-    """Return when there is an order, after some work; end with the pool."""
+def _await(meeting: Meeting, order: int, last_s: float, work_s: float) -> float:
+    """Return when there is an order; end with the pool.
+
+    Args:
+        meeting: with the pool.
+        order: its number.
+        last_s: how long the last wait was that was one.
+        work_s: how long was worked since.
+
+    Returns:
+        how long the last wait was, which may be this one.
+    """
     if meeting.has(order):
-        return
+        return last_s
     began = time.perf_counter()
-    if not meeting.watch(order, work_s):
+    if not meeting.watch(order, last_s, work_s):
         while meeting.lie_down(order):
             # A letter may come before its order: it is left where it is.
             message = meeting.wire.recv(len(WAKE), socket.MSG_PEEK)
@@ -277,7 +288,7 @@ def _await(meeting: Meeting, order: int, work_s: float) -> None:
                 os._exit(0)
             if message == WAKE:
                 meeting.wire.recv(len(WAKE))
-    meeting.lasted(time.perf_counter() - began)
+    return time.perf_counter() - began
 
 
 def _receive(wire: socket.socket) -> Any:

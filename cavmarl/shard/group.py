@@ -18,6 +18,7 @@ from cavmarl.kernels.phases import (
     choose_goals_each,
     credit_each,
     detect_each,
+    gather_each,
     propose_each,
     rank_lanes_each,
     resolve_each,
@@ -60,6 +61,7 @@ class ShardGroup:
         )
         self._controls = np.zeros_like(first.worlds.pending[:, :, 0])
         self._advance = repeated(advance_each)
+        self._gather = repeated(gather_each)
         self._resolve = repeated(resolve_each)
         self._choose_goals = repeated(choose_goals_each)
         self._rank_lanes = repeated(rank_lanes_each)
@@ -134,6 +136,10 @@ class ShardGroup:
             action.steering_rad,
             self._config.clock.sim_dt_s,
         )
+
+    def gather(self, touching_m: float, border_m: float) -> None:
+        """Renew the ghosts of the next rows, as `kernels.exchange.gather` says."""
+        self._gather(self._members, self._first.next_side, touching_m, border_m)
 
     def resolve(self) -> None:
         """Find who touches whom in the next rows."""

@@ -10,7 +10,8 @@ from typing import Any
 from cavmarl.config import EnvConfig
 from cavmarl.errors import WorkerStartError
 from cavmarl.runtime.images import Image
-from cavmarl.runtime.shared_memory import Segment, arrays_in, shared_zeros
+from cavmarl.runtime.large_pages import large_shared_zeros
+from cavmarl.runtime.shared_memory import Segment, arrays_in
 from cavmarl.runtime.worker import Job
 from cavmarl.stepping.arrays import StepArrays, layout_of
 from cavmarl.stepping.diary import Diary
@@ -78,7 +79,7 @@ def make_jobs(recipe: Mapping[str, Any]) -> list[Job]:
                 1,
                 arrays.part(part.first, part.last),
                 in_next_step=recipe["in_next_step"],
-                zeros=shared_zeros,
+                zeros=large_shared_zeros,
             )
             theirs = None if spent_s is None else spent_s[part.first]
             leader = LeaderJob(hire(worlds, part), part.first, part.zones, diary, theirs)

@@ -17,8 +17,9 @@ from cavmarl.stepping.local import LocalWorlds
 
 __all__ = ["FollowerJob", "LeaderJob"]
 
-# Phases that end a task for the followers; what comes after them the leader does alone.
-LAST = {Task.STEP: "credit", Task.SUGGEST: "suggest"}
+# Phases that end a task for the followers; what comes after them the leader does alone, and one of
+# the followers wakes the caller in the meantime.
+LAST = {Task.STEP: "sense", Task.SUGGEST: "suggest"}
 ALONE = (Task.STATE_HASH, Task.TRAFFIC_STATS)  # tasks of the leader, of which no follower hears
 
 
@@ -45,15 +46,16 @@ class LeaderJob(DiaryJob):
         self._zones = zones
         self._hosts = _hosts(zones)
         self._spent_s = spent_s
-        worlds.simulation.host(self._gather)
+        worlds.simulation.host(self._lead)
 
-    def _gather(self, shards: Sequence[Shard]) -> Leader:
+    def _lead(self, shards: Sequence[Shard], gathering: tuple[float, float]) -> Leader:
         """Let a team run the phases."""
         commands = [(self._commands,), *((entry,) for entry in self._diary.entries)]
         chosen = [(self._worlds.simulation.everywhere,)]
         known: dict[str, Sequence[tuple[Any, ...]]] = {
             "begin_step": commands,
             "move": commands,
+            "gather": [gathering],
             "sense": chosen,
             "credit": chosen,
             "suggest": [(self._worlds.arrays.suggested,)],

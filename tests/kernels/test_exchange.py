@@ -8,11 +8,12 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from cavmarl.kernels import codes
-from cavmarl.kernels.arrays import Gate, Worlds
+from cavmarl.kernels.arrays import Gate, Worlds, Zoned
 from cavmarl.kernels.borders import Borders
-from cavmarl.kernels.exchange import exchange, take_own
+from cavmarl.kernels.exchange import exchange, gather, note_gathered, take_own
 from cavmarl.kernels.handing_over import make_book
 from cavmarl.kernels.leaving import drop_ghosts, leave
+from cavmarl.kernels.zones import Halo
 from cavmarl.roads.zone_halo import zone_halo
 from cavmarl.roads.zones import ZonePartition
 from cavmarl.shard.shard import make_worlds, make_zoned
@@ -108,6 +109,54 @@ def test_exchange_equals_twin(
         assert ids(own[zoned.border[zone, 0, :noted]]) == sorted(at_border)
 
 
+@given(
+    st.data(),
+    partitions(3),
+    st.sampled_from([0.0, 7.5, 30.0, 1000.0]),
+    st.sampled_from([0.0, 5.0, 40.0]),
+    st.sampled_from([0.0, 3.0, 40.0]),
+    st.booleans(),
+)
+def test_zones_that_gather_have_what_those_have_that_exchange(
+    data: st.DataObject,
+    partition: ZonePartition,
+    halo_m: float,
+    touching_m: float,
+    border_m: float,
+    are_noted: bool,
+) -> None:
+    parts = spread(data, partition)
+    borders = Borders(2.0, 1.0, border_m)
+    book, other = (make_book(1, sum(map(len, parts)) * partition.count) for _ in range(2))
+    expected = exchanged(partition, halo_m, parts, touching_m, borders, book)
+    zoned, halo = zoned_of(parts), zone_halo(partition, halo_m)
+    if are_noted:
+        note_outer(zoned, halo, parts)
+    for zone in data.draw(st.permutations(range(partition.count))):
+        gather(partition.arrays, halo, touching_m, border_m, zoned, SIDE, zone, 0)
+    note_gathered(partition.arrays, borders, zoned, SIDE, other)
+    names = ["rows", "num_rows", "num_near", "num_outer"]
+    if partition.count > 1:
+        names.append("num_border")
+        for zone, number in enumerate(expected.num_border[:, 0].tolist()):
+            found = zoned.border[zone, 0, :number]
+            assert found.tolist() == expected.border[zone, 0, :number].tolist()
+    for name in names:
+        assert getattr(zoned, name).tobytes() == getattr(expected, name).tobytes(), name
+    for name, array in other._asdict().items():
+        assert array.tobytes() == getattr(book, name).tobytes(), name
+
+
+def note_outer(zoned: Zoned, halo: Halo, parts: list[NDArray[np.void]]) -> None:
+    """Note who may be seen by other zones, as `advance` does."""
+    for zone, rows in enumerate(parts):
+        left, low, right, high = halo.inner[zone]
+        x, y = rows["x"], rows["y"]
+        outer = np.flatnonzero(~((left < x) & (x < right) & (low < y) & (y < high)))
+        zoned.outer[zone, 0, : len(outer)] = outer
+        zoned.num_outer[zone, 0] = len(outer)
+
+
 def test_a_world_of_one_zone_has_no_ghosts() -> None:
     whole = ZonePartition((0.0, 0.0, 9.0, 9.0), np.array([[0.0, 0.0, 9.0, 9.0]]))
     zoned = exchanged(whole, 5.0, [cars(3)], touching_m=5.0)
@@ -130,12 +179,7 @@ def test_rows_that_are_noted_are_enough(
     borders = Borders(2.0, 1.0, 3.0)
     expected = exchanged(partition, halo_m, parts, 5.0, borders)
     zoned, halo = zoned_of(parts), zone_halo(partition, halo_m)
-    for zone, rows in enumerate(parts):
-        left, low, right, high = halo.inner[zone]
-        x, y = rows["x"], rows["y"]
-        outer = np.flatnonzero(~((left < x) & (x < right) & (low < y) & (y < high)))
-        zoned.outer[zone, 0, : len(outer)] = outer
-        zoned.num_outer[zone, 0] = len(outer)
+    note_outer(zoned, halo, parts)
     book = make_book(1, zoned.rows.shape[-1] * partition.count)
     exchange(partition.arrays, halo, 5.0, borders, zoned, SIDE, 0, 1, book)
     for name in ("rows", "num_rows", "num_near", "border", "num_border"):
