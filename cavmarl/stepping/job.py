@@ -27,6 +27,8 @@ class Task(IntEnum):
     UNPACK = 6
     HOST = 7
     WRITE_STATES = 8
+    DRIVEN = 9
+    SIGNAL_PHASES = 10
 
 
 class WorldsJob:
@@ -65,6 +67,10 @@ class WorldsJob:
             return worlds.state_hash(letter - self._first)
         elif task == Task.TRAFFIC_STATS:
             return worlds.traffic_stats(letter - self._first)
+        elif task == Task.DRIVEN:
+            return worlds.driven(letter[0] - self._first, letter[1])
+        elif task == Task.SIGNAL_PHASES:
+            return worlds.signal_phases(letter - self._first).tolist()
         return None
 
     def save(self) -> list[NDArray[Any]]:

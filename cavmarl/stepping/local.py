@@ -19,6 +19,7 @@ from cavmarl.shard.shard import Commands
 from cavmarl.spaces import state_space, write_sensed
 from cavmarl.state import global_state
 from cavmarl.stepping.arrays import StepArrays, layout_of
+from cavmarl.stepping.driven import Driven, driven_by
 from cavmarl.traffic.memory import Zeros
 from cavmarl.worlds import World
 
@@ -187,6 +188,14 @@ class LocalWorlds:
         if self.world.config.v2x.enabled:
             stats |= self.simulation.messages.statistics(world).to_dict()
         return stats
+
+    def driven(self, world: int, agents: Sequence[int]) -> list[Driven]:
+        """The vehicles of some agents of one world, in no order."""
+        return driven_by(self.simulation, world, agents)
+
+    def signal_phases(self, world: int) -> NDArray[np.int32]:
+        """(num_signals,) PHASE rows that are on in one world; a view."""
+        return self.simulation.signal_phases(world)
 
     def save(self) -> list[NDArray[Any]]:
         """All that the next step depends on; views, to be copied."""

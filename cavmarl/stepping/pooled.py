@@ -177,9 +177,10 @@ class PooledWorlds(OrderedWorlds):
     def _send(self, task: Task, letter: Any, commits: bool) -> None:
         self.pool.run(task, letter, commits)
 
-    def _ask(self, task: Task, world: int) -> Any:
+    def _ask(self, task: Task, world: int, more: Any = None) -> Any:
         number = range(len(self.arrays.mask))[world]
-        return self.pool.ask(self._asked[number], task, number)
+        letter = number if more is None else [number, more]
+        return self.pool.ask(self._asked[number], task, letter)
 
 
 def _names(parts: list[Part]) -> tuple[str, ...]:

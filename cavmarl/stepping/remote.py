@@ -142,7 +142,8 @@ class RemoteWorlds(OrderedWorlds):
         inputs = [inputs_of(task, arrays) for arrays in self._mine]
         self.pool.run(task, letters, inputs, outputs, commits)
 
-    def _ask(self, task: Task, world: int) -> Any:
+    def _ask(self, task: Task, world: int, more: Any = None) -> Any:
         number = range(len(self.arrays.mask))[world]
         k = next(k for k, part in enumerate(self._parts) if number < part.last)
-        return self.pool.ask(k, task, number - self._parts[k].first)
+        number -= self._parts[k].first
+        return self.pool.ask(k, task, number if more is None else [number, more])

@@ -19,7 +19,8 @@ __all__ = ["FollowerJob", "LeaderJob"]
 
 # Phases that end a task for the followers; what comes after them the leader does alone.
 LAST = {Task.STEP: "credit", Task.SUGGEST: "suggest"}
-ALONE = (Task.STATE_HASH, Task.TRAFFIC_STATS)  # tasks of the leader, of which no follower hears
+# Tasks of the leader, of which no follower hears.
+ALONE = (Task.STATE_HASH, Task.TRAFFIC_STATS, Task.DRIVEN, Task.SIGNAL_PHASES)
 
 
 class LeaderJob(DiaryJob):
