@@ -9,10 +9,11 @@ from typing import Any
 from numpy.typing import NDArray
 
 from cavmarl.shard.shard import Commands
+from cavmarl.stepping.arrays import StepArrays
 from cavmarl.stepping.local import LocalWorlds
 from cavmarl.worlds import World
 
-__all__ = ["Task", "WorldsJob", "fingerprint"]
+__all__ = ["Task", "WorldsJob", "commands_of", "fingerprint"]
 
 
 class Task(IntEnum):
@@ -45,9 +46,7 @@ class WorldsJob:
     def _take(self, worlds: LocalWorlds, first: int) -> None:
         self._worlds = worlds
         self._first = first
-        self._commands = Commands(
-            worlds.arrays.controls, worlds.arrays.meta_actions, worlds.arrays.declared
-        )
+        self._commands = commands_of(worlds.arrays)
 
     def prepare(self) -> None:
         """Nothing to do."""
@@ -80,6 +79,11 @@ class WorldsJob:
     def load(self, saved: Sequence[NDArray[Any]]) -> None:
         """Go on from what `save` gave."""
         self._worlds.load(saved)
+
+
+def commands_of(arrays: StepArrays) -> Commands:
+    """What agents do in the next step; views."""
+    return Commands(arrays.controls, arrays.meta_actions, arrays.declared)
 
 
 def fingerprint(world: World) -> str:

@@ -13,6 +13,7 @@ from cavmarl.balance.plan import Plan
 from cavmarl.kernels.repeated import repeated
 from cavmarl.kernels.step_results import Results, report, report_who_goes_on
 from cavmarl.rig.catalogue import frame_layout
+from cavmarl.runtime.refereeing import Run
 from cavmarl.runtime.sensor_farm import SensorFarm
 from cavmarl.runtime.simulation import Simulation
 from cavmarl.shard.shard import Commands
@@ -37,6 +38,7 @@ class LocalWorlds:
         in_next_step: when worlds begin anew; see `SteppedWorlds`.
         zeros: makes the arrays that shards write.
         like: worlds of the same environment, whose tables are used; None: they are made.
+        runs: see `Simulation`.
 
     Attributes:
         world: what each is made of.
@@ -55,6 +57,7 @@ class LocalWorlds:
         in_next_step: bool = False,
         zeros: Zeros = np.zeros,
         like: LocalWorlds | None = None,
+        runs: Sequence[Run] | None = None,
     ) -> None:
         self.world = world
         self.in_next_step = in_next_step
@@ -73,6 +76,7 @@ class LocalWorlds:
             warm=warm,
             zeros=zeros,
             like=None if like is None else like.simulation,
+            runs=runs,
         )
         if arrays is None:
             arrays = _own_arrays(self.simulation, num_worlds)

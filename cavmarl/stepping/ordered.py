@@ -13,14 +13,13 @@ from numpy.typing import NDArray
 import cavmarl.errors
 from cavmarl.balance.plan import Plan
 from cavmarl.balance.plan_text import describe_plan
-from cavmarl.config import ZonesConfig
-from cavmarl.errors import CavmarlError, ConfigError, WorkerDeathError, WorkerFailureError
+from cavmarl.errors import CavmarlError, WorkerDeathError, WorkerFailureError
 from cavmarl.shard.shard import Commands
 from cavmarl.stepping.arrays import StepArrays
 from cavmarl.stepping.driven import Driven
 from cavmarl.stepping.job import Task
 
-__all__ = ["OrderedWorlds", "check_zones", "own_error"]
+__all__ = ["OrderedWorlds", "own_error"]
 
 ASKED_AT_ONCE = 500  # agents: an answer is one message
 
@@ -125,20 +124,6 @@ class OrderedWorlds(ABC):
         except WorkerDeathError as death:
             death.add_note(f"in step {self._steps + 1} since the reset")
             raise
-
-
-def check_zones(zones: ZonesConfig) -> None:
-    """Refuse what only worlds of one process can have.
-
-    Raises:
-        ConfigError: a journal or faults.
-    """
-    for name in ("journal", "faults"):
-        if getattr(zones, name):
-            raise ConfigError(
-                f"zones.{name} = {getattr(zones, name)!r}: of worlds of one process only; "
-                "use workers=0"
-            )
 
 
 def own_error(failure: WorkerFailureError) -> CavmarlError:

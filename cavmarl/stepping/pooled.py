@@ -20,10 +20,11 @@ from cavmarl.stepping.arrays import StepArrays, layout_of
 from cavmarl.stepping.diary import make_segments
 from cavmarl.stepping.job import Task, fingerprint
 from cavmarl.stepping.mover import Mover
-from cavmarl.stepping.ordered import OrderedWorlds, check_zones, own_error
+from cavmarl.stepping.ordered import OrderedWorlds, own_error
 from cavmarl.stepping.parts import Part, parts_of
 from cavmarl.stepping.placement import Placement
 from cavmarl.stepping.sensing import warn_if_crowded
+from cavmarl.stepping.watched import check_watched, is_watched, runs_as_text, unwatched
 from cavmarl.worlds import World
 
 __all__ = ["PooledWorlds"]
@@ -68,9 +69,10 @@ class PooledWorlds(OrderedWorlds):
         self.world = world
         self.in_next_step = in_next_step
         config = world.config
-        check_zones(config.zones)
         self.placement = Placement(world, num_worlds, workers)
         parts = parts_of(self.placement.plans, world.partition.count)
+        may_change = bool(config.workers.balance_steps) and workers > 1 and self.placement.in_row
+        check_watched(world, parts, may_change)
         cores = len(usable_cores())
         if workers > cores:
             warnings.warn(
@@ -80,7 +82,8 @@ class PooledWorlds(OrderedWorlds):
                 stacklevel=3,
             )
         if not compiled_before():
-            Simulation(config, world.network, 1, world.demand, world.partition)
+            plain = unwatched(world)
+            Simulation(plain.config, world.network, 1, world.demand, world.partition)
         capacity = world.capacity
         layout = layout_of(config, capacity, num_worlds)
         segment = Segment.make(size_of(layout))
@@ -90,7 +93,6 @@ class PooledWorlds(OrderedWorlds):
             segment.close()
             raise
         self.mover = self._make_mover(num_worlds, workers)
-        may_change = self.mover is not None and self.placement.in_row
         if may_change and config.workers.sensors:
             segment.close()
             raise ConfigError(
@@ -100,7 +102,12 @@ class PooledWorlds(OrderedWorlds):
             )
         warn_if_crowded(config.workers.sensors, len(parts))
         diaries = [
-            [] if may_change else make_segments(config, part.last - part.first) for part in parts
+            []
+            if may_change
+            else [Segment.make(0)]
+            if is_watched(config.zones)
+            else make_segments(config, part.last - part.first)
+            for part in parts
         ]
         recipe = {
             "config": asdict(config),
@@ -112,6 +119,7 @@ class PooledWorlds(OrderedWorlds):
             "in_next_step": in_next_step,
             "parts": parts,
             "diaries": [[one.fd for one in diary] for diary in diaries],
+            "runs": runs_as_text(config.zones, num_worlds),
             "mover": None if self.mover is None else self.mover.recipe,
         }
         tasks = tuple(task.name.lower().replace("_", " ") for task in Task)

@@ -19,9 +19,10 @@ from cavmarl.runtime.pool import Death
 from cavmarl.runtime.simulation import Simulation
 from cavmarl.stepping.arrays import StepArrays, layout_of
 from cavmarl.stepping.job import Task, fingerprint
-from cavmarl.stepping.ordered import OrderedWorlds, check_zones, own_error
+from cavmarl.stepping.ordered import OrderedWorlds, own_error
 from cavmarl.stepping.parts import make_plans, parts_of
 from cavmarl.stepping.remote_job import code_stamp, host_worlds, inputs_of, results_of
+from cavmarl.stepping.watched import refuse_watched
 from cavmarl.worlds import World
 
 __all__ = ["RemoteWorlds"]
@@ -61,7 +62,9 @@ class RemoteWorlds(OrderedWorlds):
         self.world = world
         self.in_next_step = in_next_step
         config = world.config
-        check_zones(config.zones)
+        refuse_watched(
+            config.zones, "of worlds on hosts", "run them on this machine; leave out hosts"
+        )
         if workers is not None and workers > num_worlds:
             raise ConfigError(
                 f"workers = {workers}, hosts = 'ray': a world lives on one host, so {num_worlds} "
