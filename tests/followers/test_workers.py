@@ -28,7 +28,7 @@ RIG: dict[str, dict[str, Any]] = {
     "lidar": {"type": "lidar", "rate_hz": 10, "rays": 16, "z_m": 1.6, "noise": [0.02]},
     "wheels": {"type": "odometry", "rate_hz": 20, "noise": [0.1]},
 }
-ROUGH = json.dumps({"seed": 3, "messages": {"PREPARE": {"drop": 0.3}}, "crash_rate": 0.01})
+ROUGH = json.dumps({"seed": 3, "messages": {"Prepare": {"drop": 0.3}}, "crash_rate": 0.01})
 Seen = tuple[list[str], list[Sight]]
 
 
