@@ -17,7 +17,7 @@ LIBRARIES_TESTS := tests/adapters tests/train/test_programs.py tests/hosts \
     tests/stepping/test_remote_start.py
 FUZZ_SECONDS ?= 60
 FUZZ_TARGETS ?= network programs buildings map cached zones demand sumocfg entry overrides driver manifest \
-    plan message log
+    plan message log follower
 MAPS := envs/ring/map/map.net.xml envs/merge/map/map.net.xml envs/grid4x4/map/map.net.xml
 
 .PHONY: help demo test check bench bounds soak model fuzz oldest libraries maps pictures clean

@@ -1,7 +1,8 @@
-"""All targets by name: one for every kind of file that cavmarl reads."""
+"""All targets by name: one for every kind of file that cavmarl reads, and for what sockets say."""
 
 from __future__ import annotations
 
+from fuzz.followers import FOLLOWER
 from fuzz.protocol import LOGS, MESSAGES
 from fuzz.roads import BUILDINGS, CACHED, MAPS, NETWORKS, PROGRAMS, ZONES
 from fuzz.settings import DRIVERS, ENTRIES, MANIFESTS, OVERRIDES, PLANS
@@ -25,4 +26,5 @@ TARGETS = {
     "plan": PLANS,
     "message": MESSAGES,
     "log": LOGS,
+    "follower": FOLLOWER,
 }

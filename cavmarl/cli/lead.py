@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import closing
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
@@ -57,6 +58,10 @@ def lead(
         Literal["none", "reference"],
         typer.Option(help="Mount the sensors that the reference stack drives with."),
     ] = "none",
+    zones: Annotated[int | None, typer.Option(help="Shadows zones.count.")] = None,
+    workers: Annotated[
+        int, typer.Option(help="Processes that run the world; 0: the master's own.")
+    ] = 0,
     agents: Agents = None,
     background: Background = None,
     seed: Seed = 0,
@@ -76,15 +81,25 @@ def lead(
     overrides = parse_settings(settings)
     if rig == "reference":
         overrides = {"clock.ctrl_dt_s": 0.05, "rig": REFERENCE_RIG} | overrides
-    made = parallel_env(env, agents=agents, background=background, overrides=overrides)
-    with FollowedWorld(
-        made,
-        address_of(at),
-        timeout_s=timeout_s,
-        own_ticks=own_ticks,
-        bad_controls=bad_controls,
-        pacer=pacer,
-    ) as world:
+    made = parallel_env(
+        env,
+        zones=zones,
+        workers=workers,
+        agents=agents,
+        background=background,
+        overrides=overrides,
+    )
+    with (
+        closing(made),
+        FollowedWorld(
+            made,
+            address_of(at),
+            timeout_s=timeout_s,
+            own_ticks=own_ticks,
+            bad_controls=bad_controls,
+            pacer=pacer,
+        ) as world,
+    ):
         console.print(f"waiting for {followers} followers at {world.address}", highlight=False)
         world.wait_for(followers, joins_s)
         found = _run(world, seed, steps)

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from cavmarl.errors import ConfigError
+from cavmarl.errors import ConfigError, FollowerMessageError
 from cavmarl.followers.client import Sight
 from cavmarl.followers.messages import VehicleView, Welcome
 from cavmarl.roads.network import RoadNetwork
@@ -87,4 +87,6 @@ class StackDriver:
         return self.stacks[agent]
 
     def _mission(self, view: VehicleView) -> Mission:
+        if view.goal_edge not in self._edges:
+            raise FollowerMessageError(f"no edge '{view.goal_edge[:80]}' on this map to drive to")
         return Mission(self._edges[view.goal_edge], view.vclass, view.length_m, view.width_m)

@@ -45,7 +45,7 @@ class FollowedWorld:
     gone.
 
     Args:
-        env: the world, in this process; it is mastered until `close`.
+        env: the world, in this process or run by workers; it is mastered until `close`.
         address: path of a Unix socket, or a port of this machine, 0: any.
         timeout_s: for so long a step waits for its followers, by the wall clock.
         own_ticks: what becomes of a follower's own tick; see `TimeMaster`.
@@ -59,10 +59,9 @@ class FollowedWorld:
     Attributes:
         master: of the time.
         address: where followers call.
-        simulation: the world itself.
 
     Raises:
-        ConfigError: nobody can listen there, or the world lives in worker processes.
+        ConfigError: nobody can listen there, or a trace of a world that workers run.
         SecondMasterError: the environment has a master.
     """
 
@@ -81,7 +80,6 @@ class FollowedWorld:
         if not 0.0 < timeout_s < float("inf"):
             raise ConfigError(f"timeout_s = {timeout_s}: must be a number above 0")
         self.env = env
-        self.simulation = env.simulation
         self._reception = Reception(address)
         self.address = self._reception.address
         try:

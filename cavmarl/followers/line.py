@@ -40,7 +40,9 @@ Address = str | Path | int
 
 LOOPBACK = "127.0.0.1"
 MAX_PATH = 100  # bytes that every system takes for a Unix socket
-_KINDS = "biuf"  # of NumPy's dtypes: numbers, and nothing that points anywhere
+# Dtypes of arrays, as NumPy writes them: numbers, and nothing that points anywhere.
+_DTYPES = {np.dtype(code).newbyteorder("<").str for code in "?bBhHiIqQefd"}
+_MAX_AXES = 8
 
 
 class Heard(NamedTuple):
@@ -210,15 +212,21 @@ def _size(view: ArrayView) -> int:
     """Bytes of an array.
 
     Raises:
-        FollowerMessageError: of a dtype that is none, or that holds no plain numbers.
+        FollowerMessageError: of a dtype that holds no plain numbers, a shape that no array has, or
+            stamps of other samples.
     """
-    try:
-        dtype = np.dtype(view.dtype)
-    except TypeError as error:
-        raise FollowerMessageError(f"{view.name}: no dtype '{view.dtype}'") from error
-    if dtype.kind not in _KINDS or any(length < 0 for length in view.shape):
-        raise FollowerMessageError(f"{view.name}: no array of {view.dtype} {view.shape}")
-    return prod(view.shape) * dtype.itemsize
+    shape, name = view.shape, view.name[:80]
+    if view.dtype not in _DTYPES:
+        known = ", ".join(sorted(_DTYPES))
+        raise FollowerMessageError(f"{name}: dtype '{view.dtype[:80]}' is none of {known}")
+    is_shape = 1 <= len(shape) <= _MAX_AXES and all(length >= 0 for length in shape)
+    if not is_shape or prod(length or 1 for length in shape) > FOLLOWERS.max_data:
+        raise FollowerMessageError(f"{name}: no array has the shape {str(shape)[:80]}")
+    if not len(view.stamps_s) == len(view.lost) == shape[0]:
+        raise FollowerMessageError(
+            f"{name}: {shape[0]} samples with {len(view.stamps_s)} stamps, {len(view.lost)} marks"
+        )
+    return prod(shape) * np.dtype(view.dtype).itemsize
 
 
 def listen(address: Address) -> socket.socket:

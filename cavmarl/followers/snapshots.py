@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 from cavmarl.cav_env import CavEnv
 from cavmarl.followers.messages import ArrayView, SensorView, Snapshot, VehicleView, Welcome
 from cavmarl.rig.frames import SensorFrames
-from cavmarl.roads.network import VEHICLE_CLASSES
+from cavmarl.roads.network import VEHICLE_CLASSES, RoadNetwork
+from cavmarl.stepping.driven import Driven
 from cavmarl.vector_env import CavVectorEnv
 
 __all__ = ["Moment", "take_snapshot", "welcome_to"]
@@ -69,7 +70,7 @@ def take_snapshot(
     """What a follower is sent.
 
     Args:
-        env: the world or worlds, in this process.
+        env: the world or worlds.
         agents: indices of the follower's.
         moment: when that is.
         world: which one, of several.
@@ -84,11 +85,10 @@ def take_snapshot(
     arrays: list[NDArray[Any]] = []
     time_s = moment.tick * env.config.clock.sim_dt_s
     if due:
-        rows = env.simulation.vehicles(world)
-        by_agent = {int(row["agent"]): row for row in rows[np.isin(rows["agent"], due)]}
+        by_agent = {vehicle.agent: vehicle for vehicle in env.worlds.driven(world, due)}
         for k in due:
             name = env.possible_agents[k]
-            vehicles[name] = _view(env, by_agent[k])
+            vehicles[name] = _view(env.network, by_agent[k])
             for sensor, seen in _due(env, world, k, time_s).items():
                 data = np.ascontiguousarray(seen.data)
                 views.append(_array(name, sensor, data, seen.stamp_s, seen.lost))
@@ -135,23 +135,20 @@ def _signals(env: CavEnv | CavVectorEnv, world: int) -> NDArray[np.uint8]:
     shown = np.full((1, len(network.links)), NO_SIGNAL, dtype=np.uint8)
     signal = network.links["signal"]
     has_one = signal >= 0
-    phase = env.simulation.signal_phases(world)[signal[has_one]]
+    phase = env.worlds.signal_phases(world)[signal[has_one]]
     letter = network.phases["first_state"][phase] + network.links["signal_index"][has_one]
     shown[0, has_one] = network.phase_states[letter]
     return shown
 
 
-def _view(env: CavEnv | CavVectorEnv, row: np.void) -> VehicleView:
-    network, simulation = env.network, env.simulation
-    edge = int(simulation.goal_edges[row["goal"]])
-    lane = int(network.edges["first_lane"][edge])
+def _view(network: RoadNetwork, vehicle: Driven) -> VehicleView:
+    lane = int(network.edges["first_lane"][vehicle.goal_edge])
     end = network.lane_polyline(lane)[-1]
-    vclass = int(simulation.types[row["vtype"]]["vclass"])
     return VehicleView(
-        vehicle_id=int(row["id"]),
-        vclass=VEHICLE_CLASSES[vclass],
-        length_m=float(row["length"]),
-        width_m=float(row["width"]),
-        goal_edge=network.edge_ids[edge],
+        vehicle_id=vehicle.vehicle_id,
+        vclass=VEHICLE_CLASSES[vehicle.vclass],
+        length_m=vehicle.length_m,
+        width_m=vehicle.width_m,
+        goal_edge=network.edge_ids[vehicle.goal_edge],
         goal_m=[float(end[0]), float(end[1])],
     )

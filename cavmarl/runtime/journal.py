@@ -87,6 +87,7 @@ class Journal:
         path: of the file; without `resume` it must not exist.
         resume: go on behind what is there. All of it is read, and a last line that is cut short is
             dropped.
+        anew: the file may exist, and is begun anew: by a run that does again what is in it.
         sync: when an append returns, its lines have been given to the operating system ("flush"),
             so that they outlive the process, or have been written out ("fsync"), so that they
             outlive the machine.
@@ -102,7 +103,9 @@ class Journal:
         CorruptJournalError: what is there is damaged.
     """
 
-    def __init__(self, path: Path, *, resume: bool = False, sync: Sync = "flush") -> None:
+    def __init__(
+        self, path: Path, *, resume: bool = False, anew: bool = False, sync: Sync = "flush"
+    ) -> None:
         if sync not in get_args(Sync):
             raise ConfigError(f"sync is {sync!r}: it has to be one of {get_args(Sync)}")
         self.path = path
@@ -111,7 +114,7 @@ class Journal:
         if resume and not path.is_file():
             raise JournalError(f"{path}: is no file to go on with; begin one without resume")
         try:
-            self._file = path.open("ab" if resume else "xb", buffering=0)
+            self._file = path.open("ab" if resume or anew else "xb", buffering=0)
         except FileExistsError as error:
             raise JournalError(
                 f"{path}: exists; go on with it (resume), or choose another path"
@@ -124,6 +127,8 @@ class Journal:
             self._lock()
             if resume:
                 self._read()
+            elif anew:
+                self._file.truncate(0)
         except JournalError:
             self._file.close()
             raise

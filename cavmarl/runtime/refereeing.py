@@ -34,7 +34,14 @@ from cavmarl.runtime.row_digests import RowDigests
 from cavmarl.runtime.store import CommittedStore
 from cavmarl.shard.shard import Shard
 
-__all__ = ["Refereeing", "journal_path", "make_refereeing"]
+__all__ = [
+    "Refereeing",
+    "Run",
+    "check_faults",
+    "journal_path",
+    "make_refereeing",
+    "prepare_runs",
+]
 
 
 class Refereeing(NamedTuple):
@@ -55,6 +62,62 @@ class Refereeing(NamedTuple):
     store: CommittedStore | None = None
 
 
+class Run(NamedTuple):
+    """One world's, where another process has said what it is.
+
+    Attributes:
+        run: 16 bytes that no other run has.
+        journal: its file, which is there and is begun anew; None: it has none.
+    """
+
+    run: bytes
+    journal: Path | None
+
+
+def prepare_runs(settings: ZonesConfig, num_worlds: int) -> list[Run]:
+    """What `make_refereeing` would choose for each world, for processes that may do it repeatedly.
+
+    Raises:
+        JournalError: a journal cannot be begun.
+    """
+    runs = []
+    for w in range(num_worlds):
+        path = None
+        if settings.journal:
+            path = journal_path(settings.journal, w, num_worlds).absolute()
+            Journal(path).close()
+        runs.append(Run(secrets.token_bytes(RUN_BYTES), path))
+    return runs
+
+
+def check_faults(settings: ZonesConfig, zones: int, num_worlds: int) -> tuple[Faults | None, bool]:
+    """The plan of faults, and whether hosts may die by it or be given up.
+
+    Args:
+        settings: of the zones.
+        zones: of each world.
+        num_worlds: in all.
+
+    Raises:
+        ConfigError: faults that cannot be, deaths in several worlds at once, or no folder for
+            reproducers.
+    """
+    faults = read_faults(settings.faults) if settings.faults else None
+    if settings.reproducers and faults is None:
+        faults = Faults()  # none on purpose
+    deaths = faults is not None and (faults.may_crash or bool(settings.reproducers))
+    if faults is not None:
+        faults.check_zones(zones)
+    if deaths and num_worlds > 1:
+        raise ConfigError(
+            "zones.faults and zones.reproducers: hosts die in one world at a time, not in "
+            f"{num_worlds}; messages may be lost in any number"
+        )
+    if settings.reproducers and not Path(settings.reproducers).is_dir():
+        raise ConfigError(f"zones.reproducers = {settings.reproducers!r}: no such folder; make it")
+    return faults, deaths
+
+
 def make_refereeing(
     settings: ZonesConfig,
     shards: Sequence[Shard],
@@ -62,6 +125,7 @@ def make_refereeing(
     shared: Callable[[], Iterable[NDArray[Any]]],
     dt: float,
     safeguards: Safeguards = ALL_ON,
+    runs: Sequence[Run] | None = None,
 ) -> Refereeing:
     """The coordinators of a divided world.
 
@@ -72,6 +136,7 @@ def make_refereeing(
         shared: the arrays beside theirs that a tick changes.
         dt: seconds of a tick.
         safeguards: remedies of the protocol; tests take one away.
+        runs: one a world; None: they are chosen, and their journals must not be there.
 
     Raises:
         ConfigError: faults that cannot be, deaths in several worlds at once, or no folder for
@@ -79,25 +144,22 @@ def make_refereeing(
         JournalError: a journal cannot be begun.
     """
     limits = limits_of(settings, division.codec.schema)
-    faults = read_faults(settings.faults) if settings.faults else None
-    if settings.reproducers and faults is None:
-        faults = Faults()  # none on purpose
-    deaths = faults is not None and (faults.may_crash or bool(settings.reproducers))
-    if faults is not None:
-        faults.check_zones(division.count)
-    if deaths and division.num_worlds > 1:
-        raise ConfigError(
-            "zones.faults and zones.reproducers: hosts die in one world at a time, not in "
-            f"{division.num_worlds}; messages may be lost in any number"
-        )
-    if settings.reproducers and not Path(settings.reproducers).is_dir():
-        raise ConfigError(f"zones.reproducers = {settings.reproducers!r}: no such folder; make it")
+    faults, deaths = check_faults(settings, division.count, division.num_worlds)
     crashes = Crashes(faults) if faults is not None and deaths else None
     states = [RowStates(division, w) for w in range(division.num_worlds)]
     transfers = tuple(TransferLog(limits.lifetime, known.borders) for known in states)
     coordinators = [
         _referee(
-            settings, w, division, states[w], limits, transfers[w], faults, crashes, safeguards
+            settings,
+            w,
+            division,
+            states[w],
+            limits,
+            transfers[w],
+            faults,
+            crashes,
+            safeguards,
+            None if runs is None else runs[w],
         )
         for w in range(division.num_worlds)
     ]
@@ -124,11 +186,15 @@ def _referee(
     faults: Faults | None,
     crashes: Crashes | None,
     safeguards: Safeguards,
+    given: Run | None,
 ) -> Referee:
     """Of one world; over messages where a plan says what may be lost, and directly else."""
-    run, zones = secrets.token_bytes(RUN_BYTES), division.count
+    run = secrets.token_bytes(RUN_BYTES) if given is None else given.run
+    zones = division.count
     journal: Journal | MemoryJournal | None = None
-    if settings.journal:
+    if given is not None and given.journal is not None:
+        journal = Journal(given.journal, anew=True)
+    elif settings.journal:
         journal = Journal(journal_path(settings.journal, w, division.num_worlds))
     elif crashes is not None:
         journal = MemoryJournal()

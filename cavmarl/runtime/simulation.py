@@ -48,7 +48,7 @@ from cavmarl.runtime.mounted import MountedSensors
 from cavmarl.runtime.recovery import Recovery, Revival
 from cavmarl.runtime.recutting import Recut, Recutter
 from cavmarl.runtime.referee import Referee
-from cavmarl.runtime.refereeing import make_refereeing
+from cavmarl.runtime.refereeing import Run, make_refereeing
 from cavmarl.runtime.reproducer import Reproducer
 from cavmarl.runtime.reproducing import Keeper, Moment, sources_of
 from cavmarl.runtime.shard_clock import ShardClock
@@ -92,6 +92,7 @@ class Simulation:
         warm: call every kernel now, so that none is loaded in a step.
         zeros: makes the arrays that shards write.
         like: worlds of the same environment, whose tables are used; None: they are made.
+        runs: what coordinators are to go by, one a world; None: as `config.zones` says.
 
     Attributes:
         everywhere: (W,) all of the worlds.
@@ -111,6 +112,7 @@ class Simulation:
         warm: bool = False,
         zeros: Zeros = huge_zeros,
         like: Simulation | None = None,
+        runs: Sequence[Run] | None = None,
     ) -> None:
         self.config = config
         self.network = network
@@ -183,7 +185,7 @@ class Simulation:
             zones = config.zones
             watched = zones.journal or zones.check or zones.faults or zones.reproducers
             if self.partition.count > 1 or watched:
-                self._let_coordinate()
+                self._let_coordinate(runs)
             if zones.recut_steps and self.partition.count > 1 and self._coordination is not None:
                 self._recutter = Recutter(
                     network,
@@ -193,7 +195,7 @@ class Simulation:
                     zones.recut_tolerance,
                 )
 
-    def _let_coordinate(self) -> None:
+    def _let_coordinate(self, runs: Sequence[Run] | None) -> None:
         """Let coordinators say who owns what; nobody asks where all is one zone."""
         refereeing = make_refereeing(
             self.config.zones,
@@ -201,6 +203,7 @@ class Simulation:
             self._division,
             self._shared_arrays,
             self.config.clock.sim_dt_s,
+            runs=runs,
         )
         self._coordination = refereeing.coordination
         self._recovery = refereeing.recovery

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple, Protocol
 
 import numpy as np
@@ -16,6 +16,7 @@ from cavmarl.runtime.shared_memory import Layout
 from cavmarl.runtime.simulation import Simulation
 from cavmarl.shard.shard import Commands
 from cavmarl.spaces import flat_observation_space, state_space
+from cavmarl.stepping.driven import Driven
 from cavmarl.worlds import World
 
 __all__ = ["StepArrays", "SteppedWorlds", "layout_of"]
@@ -147,6 +148,14 @@ class SteppedWorlds(Protocol):
 
     def traffic_stats(self, world: int) -> dict[str, float]:
         """Traffic of one world since its reset."""
+        ...
+
+    def driven(self, world: int, agents: Sequence[int]) -> list[Driven]:
+        """The vehicles of some agents of one world, in no order."""
+        ...
+
+    def signal_phases(self, world: int) -> NDArray[np.int32]:
+        """(num_signals,) PHASE rows that are on in one world."""
         ...
 
     def close(self) -> None:

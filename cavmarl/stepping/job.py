@@ -11,10 +11,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cavmarl.shard.shard import Commands
+from cavmarl.stepping.arrays import StepArrays
 from cavmarl.stepping.local import LocalWorlds
 from cavmarl.worlds import World
 
-__all__ = ["Task", "WorldsJob", "fingerprint"]
+__all__ = ["Task", "WorldsJob", "commands_of", "fingerprint"]
 
 
 class Task(IntEnum):
@@ -29,6 +30,8 @@ class Task(IntEnum):
     UNPACK = 6
     HOST = 7
     WRITE_STATES = 8
+    DRIVEN = 9
+    SIGNAL_PHASES = 10
 
 
 class WorldsJob:
@@ -45,9 +48,7 @@ class WorldsJob:
     def _take(self, worlds: LocalWorlds, first: int) -> None:
         self._worlds = worlds
         self._first = first
-        self._commands = Commands(
-            worlds.arrays.controls, worlds.arrays.meta_actions, worlds.arrays.declared
-        )
+        self._commands = commands_of(worlds.arrays)
 
     def prepare(self) -> None:
         """Nothing to do."""
@@ -67,6 +68,10 @@ class WorldsJob:
             return worlds.state_hash(letter - self._first)
         elif task == Task.TRAFFIC_STATS:
             return worlds.traffic_stats(letter - self._first)
+        elif task == Task.DRIVEN:
+            return worlds.driven(letter[0] - self._first, letter[1])
+        elif task == Task.SIGNAL_PHASES:
+            return worlds.signal_phases(letter - self._first).tolist()
         return None
 
     def timed_step(self) -> NDArray[np.float64]:
@@ -84,6 +89,11 @@ class WorldsJob:
     def load(self, saved: Sequence[NDArray[Any]]) -> None:
         """Go on from what `save` gave."""
         self._worlds.load(saved)
+
+
+def commands_of(arrays: StepArrays) -> Commands:
+    """What agents do in the next step; views."""
+    return Commands(arrays.controls, arrays.meta_actions, arrays.declared)
 
 
 def fingerprint(world: World) -> str:

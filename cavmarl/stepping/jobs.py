@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -11,17 +12,21 @@ from cavmarl.config import EnvConfig
 from cavmarl.errors import WorkerStartError
 from cavmarl.runtime.images import Image
 from cavmarl.runtime.large_pages import large_shared_zeros
+from cavmarl.runtime.refereeing import Run
 from cavmarl.runtime.shared_memory import Segment, arrays_in
 from cavmarl.runtime.worker import Job
 from cavmarl.stepping.arrays import StepArrays, layout_of
 from cavmarl.stepping.diary import Diary
 from cavmarl.stepping.diary_job import DiaryJob
-from cavmarl.stepping.job import fingerprint
+from cavmarl.stepping.job import commands_of, fingerprint
 from cavmarl.stepping.local import LocalWorlds
 from cavmarl.stepping.moving_job import MovingJob
 from cavmarl.stepping.parts import Part
 from cavmarl.stepping.sensing import farm_of
+from cavmarl.stepping.tape import Tape
+from cavmarl.stepping.tape_job import TapeJob
 from cavmarl.stepping.team_job import LeaderJob
+from cavmarl.stepping.watched import runs_of, unwatched
 from cavmarl.worlds import make_world
 
 __all__ = ["make_jobs"]
@@ -46,12 +51,16 @@ def make_jobs(recipe: Mapping[str, Any]) -> list[Job]:
         )
     layout = layout_of(config, recipe["capacity"], recipe["num_worlds"])
     arrays = StepArrays.of(arrays_in(Segment(recipe["arrays"], 0).map(), layout))
-    one = LocalWorlds(world, 1, warm=True)
+    one = LocalWorlds(unwatched(world), 1, warm=True)
     parts = [Part(*given) for given in recipe["parts"]]
 
-    def make(first: int, last: int) -> LocalWorlds:
+    def make(first: int, last: int, runs: Sequence[Run] | None = None) -> LocalWorlds:
         part, in_next_step = arrays.part(first, last), recipe["in_next_step"]
-        return LocalWorlds(world, last - first, part, in_next_step=in_next_step, like=one)
+        count = last - first
+        return LocalWorlds(world, count, part, in_next_step=in_next_step, like=one, runs=runs)
+
+    def make_watched(part: Part) -> LocalWorlds:
+        return hire(make(part.first, part.last, runs_of(recipe["runs"], part)), part)
 
     def hire(worlds: LocalWorlds, part: Part) -> LocalWorlds:
         if config.workers.sensors:
@@ -72,6 +81,11 @@ def make_jobs(recipe: Mapping[str, Any]) -> list[Job]:
             return [MovingJob(make, bounds, k, cases, whole_s) for k in range(len(parts))]
     jobs: list[Job] = []
     for part, descriptors in zip(parts, recipe["diaries"], strict=True):
+        if recipe["runs"]:
+            (tape,) = descriptors
+            commands = commands_of(arrays.part(part.first, part.last))
+            jobs.append(TapeJob(partial(make_watched, part), part.first, Tape(tape, commands)))
+            continue
         diary = Diary(config, part.last - part.first, descriptors)
         if len(part.zones) > 1:
             worlds = LocalWorlds(

@@ -14,12 +14,14 @@ from cavmarl.huge_pages import huge_zeros
 from cavmarl.kernels.repeated import repeated
 from cavmarl.kernels.step_results import Results, report, report_who_goes_on
 from cavmarl.rig.catalogue import frame_layout
+from cavmarl.runtime.refereeing import Run
 from cavmarl.runtime.sensor_farm import SensorFarm
 from cavmarl.runtime.simulation import Simulation
 from cavmarl.shard.shard import Commands
 from cavmarl.spaces import state_space, write_sensed
 from cavmarl.state import global_state
 from cavmarl.stepping.arrays import StepArrays, layout_of
+from cavmarl.stepping.driven import Driven, driven_by
 from cavmarl.traffic.memory import Zeros
 from cavmarl.traffic.sumo.told import ToldLog
 from cavmarl.worlds import World
@@ -38,6 +40,7 @@ class LocalWorlds:
         in_next_step: when worlds begin anew; see `SteppedWorlds`.
         zeros: makes the arrays that shards write.
         like: worlds of the same environment, whose tables are used; None: they are made.
+        runs: see `Simulation`.
 
     Attributes:
         world: what each is made of.
@@ -56,6 +59,7 @@ class LocalWorlds:
         in_next_step: bool = False,
         zeros: Zeros = huge_zeros,
         like: LocalWorlds | None = None,
+        runs: Sequence[Run] | None = None,
     ) -> None:
         self.world = world
         self.in_next_step = in_next_step
@@ -74,6 +78,7 @@ class LocalWorlds:
             warm=warm,
             zeros=zeros,
             like=None if like is None else like.simulation,
+            runs=runs,
         )
         if arrays is None:
             arrays = _own_arrays(self.simulation, num_worlds)
@@ -189,6 +194,14 @@ class LocalWorlds:
         if self.world.config.v2x.enabled:
             stats |= self.simulation.messages.statistics(world).to_dict()
         return stats
+
+    def driven(self, world: int, agents: Sequence[int]) -> list[Driven]:
+        """The vehicles of some agents of one world, in no order."""
+        return driven_by(self.simulation, world, agents)
+
+    def signal_phases(self, world: int) -> NDArray[np.int32]:
+        """(num_signals,) PHASE rows that are on in one world; a view."""
+        return self.simulation.signal_phases(world)
 
     def save(self) -> list[NDArray[Any]]:
         """All that the next step depends on; views, to be copied."""

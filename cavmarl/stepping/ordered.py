@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 from abc import ABC, abstractmethod
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -13,16 +13,18 @@ from numpy.typing import NDArray
 import cavmarl.errors
 from cavmarl.balance.plan import Plan
 from cavmarl.balance.plan_text import describe_plan
-from cavmarl.config import ZonesConfig
-from cavmarl.errors import CavmarlError, ConfigError, WorkerDeathError, WorkerFailureError
+from cavmarl.errors import CavmarlError, WorkerDeathError, WorkerFailureError
 from cavmarl.shard.shard import Commands
 from cavmarl.stepping.arrays import StepArrays
+from cavmarl.stepping.driven import Driven
 from cavmarl.stepping.job import Task
 from cavmarl.stepping.mover import Mover
 from cavmarl.stepping.parts import Part
 from cavmarl.stepping.placement import Placement
 
-__all__ = ["OrderedWorlds", "check_zones", "own_error"]
+__all__ = ["OrderedWorlds", "own_error"]
+
+ASKED_AT_ONCE = 500  # agents: an answer is one message
 
 log = logging.getLogger("cavmarl.workers")
 
@@ -69,8 +71,14 @@ class OrderedWorlds(ABC):
         """
 
     @abstractmethod
-    def _ask(self, task: Task, world: int) -> Any:
-        """Let the worker of a world answer; numbers from the end count as they do for arrays."""
+    def _ask(self, task: Task, world: int, more: Any = None) -> Any:
+        """Let the worker of a world answer.
+
+        Args:
+            task: what is asked.
+            world: its number; numbers from the end count as they do for arrays.
+            more: than the world that the worker has to know.
+        """
 
     def reset(self, seed: int | None, first_world: int) -> None:
         """Begin an episode in the worlds of `chosen`."""
@@ -116,6 +124,18 @@ class OrderedWorlds(ABC):
         found: dict[str, float] = self._ask(Task.TRAFFIC_STATS, world)
         return found
 
+    def driven(self, world: int, agents: Sequence[int]) -> list[Driven]:
+        """The vehicles of some agents of one world, in no order."""
+        found = []
+        for first in range(0, len(agents), ASKED_AT_ONCE):
+            some = list(agents[first : first + ASKED_AT_ONCE])
+            found += [Driven(*row) for row in self._ask(Task.DRIVEN, world, some)]
+        return found
+
+    def signal_phases(self, world: int) -> NDArray[np.int32]:
+        """(num_signals,) PHASE rows that are on in one world."""
+        return np.array(self._ask(Task.SIGNAL_PHASES, world), dtype=np.int32)
+
     def _order(self, task: Task, letter: Any = None, commits: bool = True) -> None:
         """`_send`, with the errors that the worlds would raise in this process."""
         try:
@@ -125,20 +145,6 @@ class OrderedWorlds(ABC):
         except WorkerDeathError as death:
             death.add_note(f"in step {self._steps + 1} since the reset")
             raise
-
-
-def check_zones(zones: ZonesConfig) -> None:
-    """Refuse what only worlds of one process can have.
-
-    Raises:
-        ConfigError: a journal or faults.
-    """
-    for name in ("journal", "faults"):
-        if getattr(zones, name):
-            raise ConfigError(
-                f"zones.{name} = {getattr(zones, name)!r}: of worlds of one process only; "
-                "use workers=0"
-            )
 
 
 def own_error(failure: WorkerFailureError) -> CavmarlError:

@@ -19,10 +19,11 @@ from cavmarl.stepping.diary import make_segments
 from cavmarl.stepping.job import Task, fingerprint
 from cavmarl.stepping.mover import Mover
 from cavmarl.stepping.moving_memory import MovingMemory
-from cavmarl.stepping.ordered import OrderedWorlds, check_zones, own_error
+from cavmarl.stepping.ordered import OrderedWorlds, own_error
 from cavmarl.stepping.parts import Part, parts_of
 from cavmarl.stepping.placement import Placement
 from cavmarl.stepping.sensing import warn_if_crowded
+from cavmarl.stepping.watched import check_watched, is_watched, runs_as_text, unwatched
 from cavmarl.worlds import World
 
 __all__ = ["PooledWorlds"]
@@ -67,9 +68,10 @@ class PooledWorlds(OrderedWorlds):
         self.world = world
         self.in_next_step = in_next_step
         config = world.config
-        check_zones(config.zones)
         self.placement = Placement(world, num_worlds, workers)
         parts = parts_of(self.placement.plans, world.partition.count)
+        may_change = bool(config.workers.balance_steps) and workers > 1 and self.placement.in_row
+        check_watched(world, parts, may_change)
         cores = len(usable_cores())
         if workers > cores:
             warnings.warn(
@@ -79,7 +81,8 @@ class PooledWorlds(OrderedWorlds):
                 stacklevel=4,
             )
         if not compiled_before():
-            Simulation(config, world.network, 1, world.demand, world.partition)
+            plain = unwatched(world)
+            Simulation(plain.config, world.network, 1, world.demand, world.partition)
         capacity = world.capacity
         layout = layout_of(config, capacity, num_worlds)
         segment = Segment.make(size_of(layout))
@@ -99,7 +102,12 @@ class PooledWorlds(OrderedWorlds):
             )
         warn_if_crowded(config.workers.sensors, len(parts))
         diaries = [
-            [] if may_change else make_segments(config, part.last - part.first) for part in parts
+            []
+            if may_change
+            else [Segment.make(0)]
+            if is_watched(config.zones)
+            else make_segments(config, part.last - part.first)
+            for part in parts
         ]
         recipe = {
             "config": asdict(config),
@@ -111,6 +119,7 @@ class PooledWorlds(OrderedWorlds):
             "in_next_step": in_next_step,
             "parts": parts,
             "diaries": [[one.fd for one in diary] for diary in diaries],
+            "runs": runs_as_text(config.zones, num_worlds),
             "mover": None if memory is None else memory.recipe,
         }
         tasks = tuple(task.name.lower().replace("_", " ") for task in Task)
@@ -165,9 +174,10 @@ class PooledWorlds(OrderedWorlds):
     def _send(self, task: Task, letter: Any, commits: bool) -> None:
         self.pool.run(task, letter, commits)
 
-    def _ask(self, task: Task, world: int) -> Any:
+    def _ask(self, task: Task, world: int, more: Any = None) -> Any:
         number = range(len(self.arrays.mask))[world]
-        return self.pool.ask(self._asked[number], task, number)
+        letter = number if more is None else [number, more]
+        return self.pool.ask(self._asked[number], task, letter)
 
 
 def _names(parts: list[Part]) -> tuple[str, ...]:

@@ -24,10 +24,11 @@ from cavmarl.stepping.arrays import StepArrays, layout_of
 from cavmarl.stepping.cases import Move, buffers, moves_of
 from cavmarl.stepping.job import Task, fingerprint
 from cavmarl.stepping.mover import Mover
-from cavmarl.stepping.ordered import OrderedWorlds, check_zones, own_error
+from cavmarl.stepping.ordered import OrderedWorlds, own_error
 from cavmarl.stepping.parts import Part, parts_of
 from cavmarl.stepping.placement import Placement
 from cavmarl.stepping.remote_job import code_stamp, host_worlds, inputs_of, results_of
+from cavmarl.stepping.watched import refuse_watched
 from cavmarl.worlds import World
 
 __all__ = ["RemoteWorlds"]
@@ -71,7 +72,9 @@ class RemoteWorlds(OrderedWorlds):
         self.world = world
         self.in_next_step = in_next_step
         config = world.config
-        check_zones(config.zones)
+        refuse_watched(
+            config.zones, "of worlds on hosts", "run them on this machine; leave out hosts"
+        )
         if workers is not None and workers > num_worlds:
             raise ConfigError(
                 f"workers = {workers}, hosts = 'ray': a world lives on one host, so {num_worlds} "
@@ -217,12 +220,13 @@ class RemoteWorlds(OrderedWorlds):
         self._cases = {}
         self._look()
 
-    def _ask(self, task: Task, world: int) -> Any:
+    def _ask(self, task: Task, world: int, more: Any = None) -> Any:
         if self.pool.sizes != self._sizes:
             self._look()
         number = range(len(self.arrays.mask))[world]
         k = bisect_right(self._bounds, number) - 1
-        return self.pool.ask(k, task, number - self._bounds[k])
+        number -= self._bounds[k]
+        return self.pool.ask(k, task, number if more is None else [number, more])
 
 
 def _names(parts: Sequence[Part]) -> tuple[str, ...]:

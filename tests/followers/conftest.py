@@ -19,9 +19,14 @@ from cavmarl.followers.followed_world import FollowedWorld
 SETTINGS = {"population.mode": "seats", "clock.ctrl_dt_s": 0.05, "horizon_s": 60}
 
 
-def make_env(agents: int = 3, zones: int = 1, **more: Any) -> cavmarl.CavEnv:
+def make_env(agents: int = 3, zones: int = 1, workers: int = 0, **more: Any) -> cavmarl.CavEnv:
     return cavmarl.parallel_env(
-        "ring", agents=agents, background=3, zones=zones, overrides=SETTINGS | more
+        "ring",
+        agents=agents,
+        background=3,
+        zones=zones,
+        workers=workers,
+        overrides=SETTINGS | more,
     )
 
 

@@ -17,6 +17,7 @@ from cavmarl.followers.followed_world import FollowedWorld
 from cavmarl.followers.line import Line
 from cavmarl.followers.messages import (
     FOLLOWERS,
+    ArrayView,
     Control,
     Hello,
     Say,
@@ -171,6 +172,33 @@ def test_any_letter_is_a_message_or_a_typed_error(letter: object) -> None:
             read_letter(kind, letter)
         except FollowerMessageError:
             pass
+
+
+@pytest.mark.parametrize(
+    ("dtype", "shape", "stamps", "words"),
+    [
+        ("O", [1], 1, "dtype 'O' is none of"),
+        ("<f4,<f4", [1], 1, "dtype '<f4,<f4' is none of"),
+        ("<f4", [], 1, "no array has the shape"),
+        ("<f4", [-1], 1, "no array has the shape"),
+        ("<f4", [0] + [1 << 40] * 2, 0, "no array has the shape"),
+        ("<f4", [1] * 40, 1, "no array has the shape"),
+        ("<f4", [2, 3], 1, "2 samples with 1 stamps"),
+    ],
+)
+def test_arrays_that_cannot_be_are_refused(
+    dtype: str, shape: list[int], stamps: int, words: str
+) -> None:
+    near, far = socket.socketpair()
+    view = ArrayView("car_0", "lidar", dtype, shape, [0.0] * stamps, [False] * stamps)
+    world, line = Line(far, "a follower"), Line(near, "the world")
+    try:
+        world.say(Say.SNAPSHOT, Snapshot(0, 0, 0, 0.0, False, {}, [view]))
+        with pytest.raises(FollowerMessageError, match=words):
+            line.take(line.hear(5.0))
+    finally:
+        line.close()
+        world.close()
 
 
 def test_a_port_of_this_machine_will_do_too() -> None:

@@ -141,10 +141,6 @@ def test_errors_are_those_of_one_process(make: Make) -> None:
         ({"workers": -1}, ("workers = -1", "from 0")),
         ({"workers": 1.5}, ("workers = 1.5", "whole number")),
         ({"workers": True}, ("workers = True", "whole number")),
-        (
-            {"workers": 1, "overrides": {"zones.journal": "run.jsonl"}},
-            ("zones.journal", "workers=0"),
-        ),
         ({"workers": 1, "overrides": {"workers.repeats": -1}}, ("workers.repeats", "0")),
         ({"workers": 1, "overrides": {"horizon_s": print}}, ("horizon_s",)),
     ],

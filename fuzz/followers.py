@@ -1,0 +1,230 @@
+"""The target that reads what followers and worlds say to each other, at both ends of a socket.
+
+An input is what one end says. Its first byte says which: `W` or `w`, a world that talks to a
+`Follower`; any other, a follower that calls a world and answers two of its snapshots. After a small
+letter come lines of JSON, `[kind, letter, bytes of data]`, which are packed to frames: so the
+fuzzer gets past lengths and msgpack to what is said. After another byte come the frames
+themselves, the checksums of which are made right, as those of the ownership protocol.
+"""
+
+from __future__ import annotations
+
+import json
+import socket
+import struct
+import tempfile
+import zlib
+from collections.abc import Sequence
+from contextlib import suppress
+from functools import cache
+from pathlib import Path
+from threading import Thread
+from typing import Any
+
+import msgpack
+
+from cavmarl.cav_env import CavEnv, parallel_env
+from cavmarl.errors import FollowerError, FollowerMessageError, TickRefusedError
+from cavmarl.followers.barrier import Barrier, Seat
+from cavmarl.followers.client import Follower
+from cavmarl.followers.line import Line, listen
+from cavmarl.followers.messages import (
+    FOLLOWERS,
+    Control,
+    Hello,
+    Refusal,
+    Say,
+    Ticked,
+    letter_of,
+)
+from cavmarl.followers.reception import Reception
+from cavmarl.followers.snapshots import Moment, take_snapshot, welcome_to
+from cavmarl.runtime.clock import TimeMaster
+from fuzz.files import Target
+
+__all__ = ["FOLLOWER"]
+
+WORLD, STACK = b"W", b"F"
+AGENTS = ("car_0", "car_1")
+HEAD = struct.Struct("<4sHHQIQI")
+CRC_BYTES = 4
+WITHIN_S = 5.0
+MAX_BYTES = 1 << 15  # that a socket takes before anybody reads
+
+
+def _sealed(content: bytes) -> bytes:
+    """The same frames with checksums that are right, up to where they are frames."""
+    raw, at = bytearray(content), 0
+    while at + HEAD.size + CRC_BYTES <= len(raw):
+        *start, letter_size, size, _ = HEAD.unpack_from(raw, at)
+        letter = at + HEAD.size + CRC_BYTES
+        data, end = letter + letter_size, letter + letter_size + size
+        if end > len(raw):
+            break
+        HEAD.pack_into(raw, at, *start, letter_size, size, zlib.crc32(raw[data:end]))
+        checksum = zlib.crc32(raw[letter:data], zlib.crc32(raw[at : at + HEAD.size]))
+        struct.pack_into("<I", raw, at + HEAD.size, checksum)
+        at = end
+    return bytes(raw)
+
+
+def _packed(content: bytes) -> bytes:
+    """The frames that lines of JSON say.
+
+    Raises:
+        FollowerMessageError: they say none.
+    """
+    frames = []
+    for line in content.splitlines():
+        try:
+            kind, letter, size = json.loads(line)
+            words = b"" if letter is None else msgpack.packb(letter)
+            data = bytes(min(size, MAX_BYTES))
+            frames.append(
+                HEAD.pack(FOLLOWERS.magic, FOLLOWERS.version, kind, 0, len(words), size, 0)
+            )
+        except (ValueError, TypeError, OverflowError, RecursionError, struct.error) as error:
+            raise FollowerMessageError(f"no frame: {error}") from error
+        frames += [bytes(CRC_BYTES), words, data]
+    return b"".join(frames)
+
+
+def _parse(content: bytes) -> None:
+    start, said = content[:1], content[1 : 1 + MAX_BYTES]
+    said = _sealed(_packed(said) if start.islower() else said)[:MAX_BYTES]
+    (_a_follower_hears if start.upper() == WORLD else _a_world_hears)(said)
+
+
+@cache
+def _place() -> tuple[Path, tempfile.TemporaryDirectory[str]]:
+    folder = tempfile.TemporaryDirectory(prefix="cavmarl-fuzz-")
+    return Path(folder.name) / "s", folder
+
+
+@cache
+def _env() -> CavEnv:
+    settings = {"population.mode": "seats", "clock.ctrl_dt_s": 0.05}
+    env = parallel_env("ring", agents=len(AGENTS), background=1, overrides=settings)
+    env.reset(seed=0)
+    return env
+
+
+def _a_world_hears(said: bytes) -> None:
+    """Take in a caller, and pass the barrier twice with it."""
+    env, place = _env(), _place()[0]
+    reception, master = Reception(place), TimeMaster(env, own_ticks="ignore")
+    line = None
+    try:
+        with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as caller:
+            caller.settimeout(WITHIN_S)
+            caller.connect(str(place))
+            caller.sendall(said)
+            caller.shutdown(socket.SHUT_WR)
+            found = [*reception.callers(WITHIN_S), *reception.callers(WITHIN_S)]
+            if not found:
+                raise FollowerMessageError("the caller was turned away")
+            line, hello = found[0]
+            seat = Seat(line, master.follow(hello.name), tuple(range(len(AGENTS))))
+            barrier = Barrier(env, WITHIN_S, "error")
+            for frame in range(2):
+                outcome = barrier.pass_through([seat], Moment(frame, 0, 0, False))
+                for error in outcome.failed.values():
+                    raise error
+                if outcome.left:
+                    break
+    finally:
+        master.release()
+        reception.close()
+        place.unlink(missing_ok=True)
+        if line is not None:
+            line.close()
+
+
+def _a_follower_hears(said: bytes) -> None:
+    """Follow until the world says goodbye, and answer whatever comes."""
+    place = _place()[0]
+    with listen(place) as listener:
+        world = Thread(target=_talk, args=(listener, said))
+        world.start()
+        try:
+            with Follower(place, AGENTS, joins_s=WITHIN_S) as follower:
+                follower.tick()
+                for sight in follower:
+                    controls = {vehicle: [0.0, 0.0] for vehicle in sight.snapshot.vehicles}
+                    follower.answer(controls)
+        except TickRefusedError:
+            pass  # understood
+        except FollowerError as error:
+            if type(error) is not FollowerError:  # else it was refused, and knows why
+                raise
+        finally:
+            world.join()
+            place.unlink(missing_ok=True)
+
+
+def _talk(listener: socket.socket, said: bytes) -> None:
+    """Say it to the first who calls, and hear whatever comes until it hangs up."""
+    connection, _ = listener.accept()
+    with connection, suppress(OSError):  # it may hang up before
+        connection.sendall(said)
+        connection.shutdown(socket.SHUT_WR)
+        while connection.recv(MAX_BYTES):
+            pass
+
+
+Words = tuple[Any, ...]  # what `Line.say` takes
+
+
+def _lines(*said: Words) -> bytes:
+    """The same, to be packed."""
+    found = []
+    for kind, message, arrays in ((*words, None, ())[:3] for words in said):
+        letter = None if message is None else letter_of(message)
+        size = sum(array.nbytes for array in arrays or ())
+        found.append(json.dumps([kind, letter, size]))
+    return "\n".join(found).encode()
+
+
+def _frames(*said: Words) -> bytes:
+    """What a line would send."""
+    ours, theirs = socket.socketpair()
+    line = Line(ours, "nobody")
+    for words in said:
+        line.say(*words)
+    line.close()
+    with theirs, theirs.makefile("rb") as stream:
+        return stream.read()
+
+
+def _seeds() -> tuple[bytes, ...]:
+    env = _env()
+    hello = (Say.HELLO, Hello("a stack", list(AGENTS)))
+    welcome = (Say.WELCOME, welcome_to(env, AGENTS, 12))
+    ticked = (Say.TICKED, Ticked(False, "", 12))
+    goodbye = (Say.GOODBYE,)
+
+    def control(frame: int, *given: list[float] | int) -> tuple[Say, Control]:
+        return Say.CONTROL, Control(frame, dict(zip(AGENTS, given, strict=False)))
+
+    def snapshot(frame: int, agents: Sequence[int], is_over: bool = False) -> Words:
+        return Say.SNAPSHOT, *take_snapshot(env, agents, Moment(frame, 0, frame, is_over))
+
+    both = [0.25, -0.5], [1.0, 0.0]
+    stacks: tuple[tuple[Words, ...], ...] = (
+        (hello, control(0, *both), control(1, *both)),
+        (hello, (Say.TICK,), control(0, *both), control(0, *both), goodbye),
+    )
+    worlds: tuple[tuple[Words, ...], ...] = (
+        (welcome, ticked, snapshot(7, [0]), snapshot(8, [0, 1]), goodbye),
+        (welcome, ticked, snapshot(0, [], True), goodbye),
+        (welcome, (Say.TICKED, Ticked(False, "only the time master ticks", 12))),
+        (welcome, ticked, (Say.REFUSAL, Refusal("too slow"))),
+    )
+    found = []
+    for start, talks in ((STACK, stacks), (WORLD, worlds)):
+        found += [start + _frames(*said) for said in talks]
+        found += [start.lower() + _lines(*said) for said in talks]
+    return tuple(found)
+
+
+FOLLOWER = Target(_parse, _seeds)
