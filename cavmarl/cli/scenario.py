@@ -106,6 +106,54 @@ def run(
         raise typer.Exit(1)
 
 
+@app.command("sweep")
+def sweep(
+    names: Annotated[
+        list[str] | None, typer.Argument(metavar="[NAME]...", help="Scenarios; default: all.")
+    ] = None,
+    map_names: Annotated[
+        list[str] | None,
+        typer.Option("--map", help="Of an environment; may be repeated. Default: grid4x4."),
+    ] = None,
+    seeds: Annotated[int, typer.Option(min=1, help="How many, from 0 on.")] = 5,
+    passes: Annotated[str, typer.Option(help="The driver that is to pass all.")] = "idm",
+    fails: Annotated[str, typer.Option(help="The one that is to pass none.")] = "never_yield",
+    density: Annotated[str, typer.Option(help="Other traffic: none, low or high.")] = "none",
+    agents: Annotated[int, typer.Option(min=1, help="How many in each world.")] = 1,
+    json_path: JsonPath = None,
+) -> None:
+    """Play scenarios on maps to two drivers; exit code 1 unless one passes all, the other none."""
+    from cavmarl.evaluate.scenario_sweep import sweep_scenarios
+    from cavmarl.traffic.scenarios import scenario_names
+
+    table = Table("scenario", "map", passes, "least TTC, s", "least PET, s", fails,
+                  box=box.MARKDOWN)  # fmt: skip
+    rows = []
+    for row in sweep_scenarios(
+        names or scenario_names(),
+        map_names or ["grid4x4"],
+        range(seeds),
+        passes=passes,
+        fails=fails,
+        density=density,
+        agents=agents,
+    ):
+        rows.append(row)
+        cells = (
+            f"`{row.scenario}`",
+            Path(row.environment).stem,
+            row.verdicts(row.passing) or "no place",
+            number(row.least("min_ttc_s")),
+            number(row.least("pet_s")),
+            row.verdicts(row.failing) or "no place",
+        )
+        table.add_row(*map(escape, cells))
+    Console().print(table)
+    write_json(json_path, {"rows": [row.to_dict() for row in rows]})
+    if not all(row.holds for row in rows):
+        raise typer.Exit(1)
+
+
 def _params(given: list[str] | None) -> dict[str, bool | float]:
     """`walk_mps=2` and the like.
 
