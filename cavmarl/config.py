@@ -521,10 +521,10 @@ class EnvConfig:
             "there is no sensor under rig; mount one",
         )
         _check(
-            not self.scenario.name or self.population.agents == 1,
+            not self.scenario.name or self.population.agents >= 1,
             "population.agents",
             self.population.agents,
-            "must be 1 where there is a scenario: it is played to one agent",
+            "must be 1 or more where there is a scenario: it is played to agents",
         )
         steps = self.horizon_s / self.clock.ctrl_dt_s
         _check(

@@ -9,7 +9,8 @@
     ├── MapError               a map that cannot be read, built or driven
     │   └── RouteError         no way from here to there
     ├── DemandError            a file of traffic that cannot be read or does not fit its map
-    ├── ScenarioError          a scenario that is none, or has no place on the map
+    ├── ScenarioError          a scenario that is none, or has no room for so many agents
+    │   └── NoPlaceError       a map without a place for it
     ├── ActionError            refused before any state has changed
     │   ├── InvalidActionError    wrong shape, dtype or value
     │   ├── MissingActionError    a live agent without an action
@@ -168,7 +169,11 @@ class PlacementError(ConfigError):
 
 
 class ScenarioError(CavmarlError):
-    """No scenario of that name, a broken file of one, or a map without a place for it."""
+    """No scenario of that name, a broken file of one, or no room for so many agents."""
+
+
+class NoPlaceError(ScenarioError):
+    """A map that has no place for a scenario."""
 
 
 class MapError(CavmarlError):

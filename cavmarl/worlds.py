@@ -22,7 +22,7 @@ from cavmarl.registry import (
 )
 from cavmarl.roads.cache import load_network
 from cavmarl.roads.network import RoadNetwork
-from cavmarl.roads.signal_plans import with_programs
+from cavmarl.roads.signal_plans import with_outages, with_programs
 from cavmarl.roads.zone_file import zones_for
 from cavmarl.roads.zone_layouts import cut_map
 from cavmarl.roads.zones import ZonePartition
@@ -119,6 +119,9 @@ def make_world(config: EnvConfig, base_dir: Path) -> World:
         demand = read_sumo_demand(config, network, path, files)
     elif files:
         demand = read_demand(files, network, on_bad_route=config.traffic.on_bad_route)
+    scene = plan_scene(config.scenario, network)
+    if scene is not None and scene.outages:
+        network = with_outages(network, dict(scene.outages))
     return World(config, network, demand, load_zones(config, base_dir, network))
 
 

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 __all__ = ["app"]
 
-app = typer.Typer(help="Scripted conflicts for one agent.", no_args_is_help=True)
+app = typer.Typer(help="Scripted conflicts for agents.", no_args_is_help=True)
 
 
 @app.command("list")
@@ -61,7 +61,10 @@ def run(
         list[str] | None,
         typer.Option("--param", metavar="KEY=VALUE", help="Of the scenario; may be repeated."),
     ] = None,
-    driver: Annotated[str, typer.Option(help="Of the agent: a name, or a path.")] = "idm",
+    driver: Annotated[str, typer.Option(help="Of the agents: a name, or a path.")] = "idm",
+    agents: Annotated[
+        int, typer.Option(min=1, help="How many: one in the conflict, the others behind it.")
+    ] = 1,
     density: Annotated[str, typer.Option(help="Other traffic: none, low or high.")] = "none",
     zones: Annotated[
         int | None, typer.Option(help="How many; default: as the environment says.")
@@ -74,7 +77,7 @@ def run(
     video: Annotated[Path | None, typer.Option(help="Write an .mp4 of the run here.")] = None,
     json_path: JsonPath = None,
 ) -> None:
-    """Play a scenario to a driver; exit code 1 unless it comes through and hurts nobody."""
+    """Play a scenario to a driver; exit code 1 unless all come through and hurt nobody."""
     from contextlib import ExitStack
 
     from cavmarl.evaluate.scenario_films import ScenarioCamera
@@ -89,6 +92,7 @@ def run(
             density=density,
             seed=seed,
             zones=zones,
+            agents=agents,
             overrides=parse_settings(settings),
         )
         stack.callback(vec.close)
@@ -99,6 +103,54 @@ def run(
     Console().print(_table(found))
     write_json(json_path, found.to_dict())
     if not found.passed:
+        raise typer.Exit(1)
+
+
+@app.command("sweep")
+def sweep(
+    names: Annotated[
+        list[str] | None, typer.Argument(metavar="[NAME]...", help="Scenarios; default: all.")
+    ] = None,
+    map_names: Annotated[
+        list[str] | None,
+        typer.Option("--map", help="Of an environment; may be repeated. Default: grid4x4."),
+    ] = None,
+    seeds: Annotated[int, typer.Option(min=1, help="How many, from 0 on.")] = 5,
+    passes: Annotated[str, typer.Option(help="The driver that is to pass all.")] = "idm",
+    fails: Annotated[str, typer.Option(help="The one that is to pass none.")] = "never_yield",
+    density: Annotated[str, typer.Option(help="Other traffic: none, low or high.")] = "none",
+    agents: Annotated[int, typer.Option(min=1, help="How many in each world.")] = 1,
+    json_path: JsonPath = None,
+) -> None:
+    """Play scenarios on maps to two drivers; exit code 1 unless one passes all, the other none."""
+    from cavmarl.evaluate.scenario_sweep import sweep_scenarios
+    from cavmarl.traffic.scenarios import scenario_names
+
+    table = Table("scenario", "map", passes, "least TTC, s", "least PET, s", fails,
+                  box=box.MARKDOWN)  # fmt: skip
+    rows = []
+    for row in sweep_scenarios(
+        names or scenario_names(),
+        map_names or ["grid4x4"],
+        range(seeds),
+        passes=passes,
+        fails=fails,
+        density=density,
+        agents=agents,
+    ):
+        rows.append(row)
+        cells = (
+            f"`{row.scenario}`",
+            Path(row.environment).stem,
+            row.verdicts(row.passing) or "no place",
+            number(row.least("min_ttc_s")),
+            number(row.least("pet_s")),
+            row.verdicts(row.failing) or "no place",
+        )
+        table.add_row(*map(escape, cells))
+    Console().print(table)
+    write_json(json_path, {"rows": [row.to_dict() for row in rows]})
+    if not all(row.holds for row in rows):
         raise typer.Exit(1)
 
 
@@ -125,9 +177,9 @@ def _table(found: ScenarioRun) -> Table:
     table = Table(show_header=False, box=box.SIMPLE)
     rows = {
         "scenario": f"{found.scenario} on {found.environment}, {found.place}",
-        "driver": f"{found.driver}, seed {found.seed}, {found.background} others, "
-        f"{found.zones} zones",
-        "verdict": found.verdict,
+        "driver": f"{found.driver} ({found.agents} agents), seed {found.seed}, "
+        f"{found.background} others, {found.zones} zones",
+        "verdict": ", ".join(found.verdicts),
         "least time to collision, s": number(found.min_ttc_s),
         "post-encroachment time, s": number(found.pet_s),
         "collisions": str(found.collisions),

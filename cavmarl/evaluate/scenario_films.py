@@ -31,7 +31,7 @@ class ScenarioCamera:
 
     Args:
         vec: the worlds, run in this process, after `make_scenario`.
-        picture: where the moment goes in which the agent was closest to an actor that has moved;
+        picture: where the moment goes in which an agent was closest to an actor that has moved;
             None: nowhere.
         video: where everything goes; None: nowhere.
 
@@ -73,9 +73,10 @@ class ScenarioCamera:
         """Take in the present moment."""
         simulation, config = self._vec.simulation, self._vec.config
         rows = simulation.vehicles()
-        agent = rows[rows["agent"] >= 0][0]
+        agents = rows[rows["agent"] >= 0][:, None]
         actors = rows[(rows["driver"] == DRIVER_SCRIPTED) & (rows["distance_m"] > 0.0)]
-        apart_m = np.hypot(actors["x"] - agent["x"], actors["y"] - agent["y"]).min(initial=math.inf)
+        off_m = np.hypot(actors["x"] - agents["x"], actors["y"] - agents["y"])
+        apart_m = off_m.min(initial=math.inf)
         is_closest = self._picture is not None and apart_m < self._closest_m
         if self._writer is None and not is_closest:
             return

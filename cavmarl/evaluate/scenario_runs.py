@@ -1,10 +1,11 @@
-"""A scenario, played to a driver: how critical it was, and whether the driver has passed."""
+"""A scenario, played to agents of one driver: how critical it was, and whether all have passed."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import asdict, dataclass
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -25,6 +26,7 @@ from cavmarl.kernels.codes import (
     EVENT_COLLIDED,
     EVENT_OFF_ROAD,
     EVENT_RED_LIGHT,
+    EVENTS_THAT_END,
 )
 from cavmarl.policies import load_policy
 from cavmarl.vector_env import CavVectorEnv, make_vec
@@ -37,6 +39,14 @@ DENSITIES = {"none": 0.0, "low": 2.0, "high": 8.0}
 
 HORIZON_S = 180.0
 
+VERDICTS = {
+    "collided": EVENT_COLLIDED,
+    "off road": EVENT_OFF_ROAD,
+    "stuck": 0,
+    "passed": EVENT_ARRIVED,
+}
+"""From the worst on, with the event that says so."""
+
 
 @dataclass(frozen=True)
 class ScenarioRun:
@@ -46,18 +56,20 @@ class ScenarioRun:
         scenario: its name.
         environment: whose map it was played on.
         place: where.
-        driver: of the agent.
+        driver: of the agents.
         seed: of place and traffic.
         zones: into which the world was divided.
-        background: vehicles beside the agent and the actors.
-        verdict: `passed` (through, and nobody hurt), `collided`, `off road`, or `stuck`.
-        min_ttc_s: least time to collision with an actor, 0 after a collision with anybody; None:
-            they were never about to.
-        pet_s: least post-encroachment time with an actor, 0 likewise; None: no place was used by
-            both.
-        collisions: vehicles and actors that began to touch another one, the agent among them.
-        red_lights: steps in which the agent entered a junction at red.
-        delay_s: of the agent, above what its way takes at the speed that it started with.
+        agents: how many.
+        background: vehicles beside the agents and the actors.
+        verdict: `passed` (all through, and nobody hurt), or what became of the worst of the
+            agents: `collided`, `off road`, or `stuck`.
+        verdicts: of each agent, that to whom the scene is played first.
+        min_ttc_s: least time to collision of an agent with an actor, 0 after a collision with
+            anybody; None: they were never about to.
+        pet_s: least post-encroachment time likewise; None: no place was used by both.
+        collisions: vehicles and actors that began to touch another one, agents among them.
+        red_lights: steps in which an agent entered a junction at red.
+        delay_s: of the first agent, above what its way takes at the speed that it started with.
         longest_wait_s: for which any other vehicle had stood when the run was over.
         time_s: the run took.
         state_hash: of the world at the end.
@@ -69,8 +81,10 @@ class ScenarioRun:
     driver: str
     seed: int
     zones: int
+    agents: int
     background: int
     verdict: str
+    verdicts: tuple[str, ...]
     min_ttc_s: float | None
     pet_s: float | None
     collisions: int
@@ -82,7 +96,7 @@ class ScenarioRun:
 
     @property
     def passed(self) -> bool:
-        """Whether the driver came through and hurt nobody."""
+        """Whether all agents came through and hurt nobody."""
         return self.verdict == "passed"
 
     def to_dict(self) -> dict[str, Any]:
@@ -99,9 +113,10 @@ def make_scenario(
     density: str = "none",
     seed: int = 0,
     zones: int | None = None,
+    agents: int = 1,
     overrides: Mapping[str, Any] | None = None,
 ) -> CavVectorEnv:
-    """One world in which a scenario is played to its only agent, who steers and accelerates.
+    """One world in which a scenario is played to its agents, who steer and accelerate.
 
     Args:
         scenario: name, or path of a file.
@@ -111,10 +126,11 @@ def make_scenario(
         density: of the other traffic, of `DENSITIES`.
         seed: draws the place, and is that of the first reset.
         zones: into which the world is divided; None: as the environment says.
+        agents: how many: the first is in the conflict, the others come after it.
         overrides: values for any other key.
 
     Raises:
-        ScenarioError: no such scenario, or no place for it on the map.
+        ScenarioError: no such scenario, no place for it on the map, or no room for the agents.
         ConfigError: a parameter, a density or a key that cannot work.
     """
     if density not in DENSITIES:
@@ -138,7 +154,7 @@ def make_scenario(
     return make_vec(
         env,
         zones=zones,
-        agents=1,
+        agents=agents,
         background=background,
         seed=seed,
         autoreset_mode="NextStep",
@@ -158,7 +174,7 @@ def run_scenario(
         vec: as `make_scenario` returns it, run in this process.
         driver: a name or a path of a policy.
         seed: of the reset, and of a driver that draws.
-        look: called after each step, while the agent is there.
+        look: called after each step, while an agent is there.
     """
     policy = load_policy(driver, vec)
     observations, infos = vec.reset(seed=seed)
@@ -171,6 +187,7 @@ def run_scenario(
             look()
         results = vec.step(policy.act_batch(observations, mask))
         observations, mask = results[0], results[4]["mask"]
+        record.note()
         if results[4]["episode_over"][0]:
             return record.finish(driver, seed)
 
@@ -184,28 +201,39 @@ class _Record:
             raise ConfigError("scenario.name = '': there is no scenario to play in this world")
         self._vec, self._simulation, self._scene = vec, simulation, simulation.scene
         rows = simulation.vehicles()
-        self._agent = int(rows["id"][rows["agent"] >= 0][0])
+        agents = np.sort(rows[rows["agent"] >= 0], order="agent")
+        self._agents = agents["id"].tolist()
         self._actors = rows["id"][rows["driver"] == DRIVER_SCRIPTED].tolist()
         self._traces: dict[int, list[tuple[float, ...]]] = {}
-        self._driven_m = 0.0
+        self._events = np.zeros(len(agents), np.int64)
+        self._driven_m, self._left_s = 0.0, 0.0
         self._red_lights = 0
 
     def take(self) -> None:
-        """Note where the agent and the actors are."""
+        """Note where agents and actors are."""
         now_s = self._now_s()
         rows = self._simulation.vehicles()
-        for row in rows[np.isin(rows["id"], [self._agent, *self._actors])]:
+        for row in rows[np.isin(rows["id"], [*self._agents, *self._actors])]:
             self._traces.setdefault(int(row["id"]), []).append(trace_of(row, now_s))
-        self._driven_m = float(rows["distance_m"][rows["id"] == self._agent][0])
-        self._red_lights += bool(self._events() & EVENT_RED_LIGHT)
+        for row in rows[rows["id"] == self._agents[0]]:
+            self._driven_m = float(row["distance_m"])
+        self._red_lights += int(np.count_nonzero(self._now() & EVENT_RED_LIGHT))
+
+    def note(self) -> None:
+        """Note what the step that is just over has brought."""
+        if not self._events[0] & EVENTS_THAT_END:
+            self._left_s = self._now_s()
+        self._events |= self._now()
 
     def finish(self, driver: str, seed: int) -> ScenarioRun:
         """What became of the run, after its last step."""
         config, simulation = self._vec.config, self._simulation
-        verdict = self._verdict()
+        verdicts = tuple(map(self._verdict, range(len(self._agents))))
+        verdict = min(verdicts, key=list(VERDICTS).index)
         traces = {vehicle: np.array(t, TRACE) for vehicle, t in self._traces.items()}
-        own = traces.pop(self._agent)
+        own = [traces.pop(agent) for agent in self._agents]
         touched = verdict == "collided"
+        pets = [post_encroachment_s(one, other) for one in own for other in traces.values()]
         rows = simulation.vehicles()
         waits = rows["wait_s"][rows["driver"] == DRIVER_BACKGROUND]
         return ScenarioRun(
@@ -215,42 +243,40 @@ class _Record:
             driver=driver,
             seed=seed,
             zones=simulation.partition.count,
+            agents=len(self._agents),
             background=config.population.background,
             verdict=verdict,
+            verdicts=verdicts,
             min_ttc_s=0.0 if touched else _finite(_least_ttc_s(own, traces.values())),
-            pet_s=0.0 if touched else _finite(
-                min((post_encroachment_s(own, other) for other in traces.values()), default=np.inf)
-            ),
+            pet_s=0.0 if touched else _finite(min(pets, default=math.inf)),
             collisions=simulation.traffic_stats().contacts,
             red_lights=self._red_lights,
-            delay_s=self._now_s() - self._driven_m / self._scene.seat.speed_mps,
+            delay_s=self._left_s - self._driven_m / self._scene.seat.speed_mps,
             longest_wait_s=float(waits.max(initial=0.0)),
             time_s=self._now_s(),
             state_hash=self._vec.state_hash(),
-        )  # fmt: skip
+        )
 
     def _now_s(self) -> float:
         return float(self._simulation.ticks()[0]) * self._vec.config.clock.sim_dt_s
 
-    def _events(self) -> int:
-        return int(self._simulation.outputs.events[0, 0])
+    def _now(self) -> NDArray[np.int64]:
+        """EVENT_* of each agent in the last step."""
+        found: NDArray[np.int64] = self._simulation.outputs.events[0].astype(np.int64)
+        return found
 
-    def _verdict(self) -> str:
-        events = self._events()
-        if events & EVENT_COLLIDED:
-            return "collided"
-        if events & EVENT_OFF_ROAD:
-            return "off road"
-        return "passed" if events & EVENT_ARRIVED else "stuck"
+    def _verdict(self, agent: int) -> str:
+        events = int(self._events[agent])
+        return next((name for name, event in VERDICTS.items() if events & event), "stuck")
 
 
-def _least_ttc_s(own: NDArray[np.void], others: Iterable[NDArray[np.void]]) -> float:
-    """Over all moments in which both are there."""
+def _least_ttc_s(own: Iterable[NDArray[np.void]], others: Iterable[NDArray[np.void]]) -> float:
+    """Over all agents and actors, and all moments in which both are there."""
     least = math.inf
-    for other in others:
-        _, here, there = np.intersect1d(own["time_s"], other["time_s"], return_indices=True)
+    for one, other in product(own, others):
+        _, here, there = np.intersect1d(one["time_s"], other["time_s"], return_indices=True)
         for i, j in zip(here.tolist(), there.tolist(), strict=True):
-            least = min(least, time_to_collision_s(own[i], other[j]))
+            least = min(least, time_to_collision_s(one[i], other[j]))
     return least
 
 

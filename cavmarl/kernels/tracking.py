@@ -22,7 +22,8 @@ __all__ = ["locate", "side_lane"]
 JUNCTION_MARGIN_M = (
     2.0  # inside junctions lanes are guides: this much beyond their sides is still road
 )
-END_MARGIN_M = 1.0  # lanes may leave gaps up to this between end and start
+END_MARGIN_M = 1.0  # lanes may leave gaps up to this between end and start,
+SEAM_M = 1.0  # and side by side, where they bend: what lies between is road
 WINDOW_M = 40.0
 SIDE_MARGIN_M = 0.1  # a body this near to a neighbour lane counts as in it: it may stand askew
 LEVEL_M = 4.0  # lanes further above or below are another road
@@ -165,11 +166,16 @@ def locate(roads: RoadArrays, plans: NDArray[np.void], grid: LaneGrid, row: np.v
         beside = roads.lanes[row["lane"]]["right"]
     if beside >= 0:
         s, d, off = _on(roads, beside, row["x"], row["y"], row["s"])
+        between = row["d"] * d < 0.0
+        apart = abs(row["d"]) + abs(d) - half - 0.5 * roads.lanes[beside]["width_m"]
         if abs(d) < abs(row["d"]):
             row["lane"] = beside
             row["s"] = s
             row["d"] = d
             outside = off
+        if outside > 0.0 and between and apart <= SEAM_M:
+            length = roads.lanes[row["lane"]]["length_m"]
+            outside = max(row["s"] - length, -row["s"]) - END_MARGIN_M
     events = 0
     if outside > 0.0:
         events |= _search(roads, grid, row)

@@ -16,7 +16,7 @@ from cavmarl.roads.programs import OFF, Phase, Program, Timetable, read_programs
 from cavmarl.roads.reader import source_hash
 from cavmarl.roads.signals import SignalRows
 
-__all__ = ["with_programs"]
+__all__ = ["with_outages", "with_programs"]
 
 
 def with_programs(
@@ -58,6 +58,41 @@ def with_programs(
         row = rows.row[signal_id]
         rows.signals[row][0] = _program(network, rows, signal_id, program_id, "map.program")
         rows.switches = [switch for switch in rows.switches if switch[0] != row]
+    return _remade(network, rows, sources)
+
+
+def with_outages(network: RoadNetwork, outages: Mapping[str, float]) -> RoadNetwork:
+    """A network some of whose signals go dark while the world runs, and stay so.
+
+    They change to their program `off`: who must give way anyway sees them blink.
+
+    Args:
+        network: not changed.
+        outages: when each goes dark, in s since the beginning of the episode, by signal.
+
+    Returns:
+        A network with another `source_hash`.
+
+    Raises:
+        MapError: an unknown signal.
+    """
+    rows = SignalRows.of(network)
+    sources = [network.source_hash]
+    for signal_id, at_s in sorted(outages.items()):
+        _check_signal(rows, signal_id, "outage")
+        row = rows.row[signal_id]
+        # A program that is added is on; this one waits for its time.
+        present = rows.signals[row][0]
+        off = _program(network, rows, signal_id, OFF, "outage")
+        rows.signals[row][0] = present
+        earlier = [s for s in rows.switches if s[0] != row or s[1] < at_s]
+        rows.switches = [*earlier, (row, at_s, off)]
+        sources.append(f"{signal_id} off at {at_s!r}")
+    return _remade(network, rows, sources)
+
+
+def _remade(network: RoadNetwork, rows: SignalRows, sources: Sequence[str]) -> RoadNetwork:
+    """A network with other signals."""
     roads = DetectorRoads(
         network.lanes,
         network.edges,

@@ -11,15 +11,18 @@ from numpy.typing import NDArray
 from cavmarl.kernels.arrays import Gate, RoadArrays, Scripts, Travel, Worlds
 from cavmarl.kernels.codes import COUNT_DEPARTED, DRIVER_SCRIPTED
 from cavmarl.kernels.departures import enter
+from cavmarl.kernels.geometry import lane_pose
 from cavmarl.kernels.scripts import stand_at
 from cavmarl.roads.network import RoadNetwork
 from cavmarl.traffic.departures import DEPARTURE
-from cavmarl.traffic.scene import Scene
+from cavmarl.traffic.scene import Scene, Seat
 from cavmarl.traffic.scripts import actor_types, bodies_of, compile_scripts
+from cavmarl.traffic.seats import take_seats
+from cavmarl.traffic.streets import Streets
 
 __all__ = ["Cast"]
 
-AGENT = 0  # to whom scenes are played
+SEAT_CLEAR_M = 30.0  # around the seat of an agent that is not the first
 
 
 @dataclass(frozen=True)
@@ -32,7 +35,8 @@ class Cast:
         firsts: FRAME of each actor at the beginning.
         types: VTYPE rows of all bodies.
         vtypes: (n,) VTYPE row of each actor, among all types of a world.
-        goal: of the agent, a row of the plans' table.
+        seats: of the agents.
+        goal: of all of them, a row of the plans' table.
     """
 
     scene: Scene
@@ -40,11 +44,17 @@ class Cast:
     firsts: list[int]
     types: NDArray[np.void]
     vtypes: list[int]
+    seats: list[Seat]
     goal: int
 
     @staticmethod
     def of(
-        scene: Scene, network: RoadNetwork, goals: Mapping[int, int], first_type: int, dt: float
+        scene: Scene,
+        network: RoadNetwork,
+        goals: Mapping[int, int],
+        first_type: int,
+        dt: float,
+        num_agents: int = 1,
     ) -> Cast:
         """The cast of a scene.
 
@@ -54,11 +64,16 @@ class Cast:
             goals: row of the plans' table by EDGE.
             first_type: how many types of vehicles there are without the actors'.
             dt: seconds a tick.
+            num_agents: of a world.
+
+        Raises:
+            ScenarioError: the scene has no room for so many agents.
         """
+        seats = take_seats(Streets(network), scene, num_agents)
         scripts, firsts = compile_scripts(network, scene.actors, scene.cues, goals, dt)
         vtypes = [first_type + number for number in bodies_of(scene.actors)]
         goal = goals[scene.seat.goal_edge]
-        return Cast(scene, scripts, firsts, actor_types(), vtypes, goal)
+        return Cast(scene, scripts, firsts, actor_types(), vtypes, seats, goal)
 
     def enter(
         self,
@@ -69,9 +84,9 @@ class Cast:
         w: int,
         blank: NDArray[np.void],
     ) -> None:
-        """Put the agent and the actors into a world that has just been populated.
+        """Put the agents and the actors into a world that has just been populated.
 
-        Whoever else stands in the scene is left out. The agent keeps its id, actors get the next
+        Whoever else stands in the scene is left out. Agents keep their ids, actors get the next
         ones.
 
         Args:
@@ -82,19 +97,21 @@ class Cast:
             w: which world.
             blank: VEHICLE (1,), the record that every vehicle starts from.
         """
-        seat, rows = self.scene.seat, worlds.rows[w]
+        rows = worlds.rows[w]
         others = rows[: worlds.num_owned[w]]
-        off_m = np.hypot(others["x"] - self.scene.x, others["y"] - self.scene.y)
-        others = others[(others["agent"] < 0) & (off_m > self.scene.clear_m)].copy()
+        others = others[(others["agent"] < 0) & self._is_clear(roads, others)].copy()
         queue = gate.queue[w, : gate.num_queue[w]]
         queue = queue[queue["agent"] < 0].copy()
         gate.queue[w, : len(queue)] = queue
         gate.num_queue[w] = len(queue)
-        rows[0] = blank[0]
-        departure = self._departure(roads)
-        enter(roads, travel, worlds, w, departure, seat.lane, seat.s, seat.speed_mps, rows[0])
-        rows[1 : 1 + len(others)] = others
-        num = 1 + len(others)
+        for agent, seat in enumerate(self.seats):
+            row = rows[agent]
+            rows[agent] = blank[0]
+            departure = self._departure(roads, agent, seat)
+            enter(roads, travel, worlds, w, departure, seat.lane, seat.s, seat.speed_mps, row)
+        num = len(self.seats)
+        rows[num : num + len(others)] = others
+        num += len(others)
         for first, vtype in zip(self.firsts, self.vtypes, strict=True):
             row = rows[num]
             rows[num] = blank[0]
@@ -112,12 +129,23 @@ class Cast:
         gate.counts[w, COUNT_DEPARTED] = num
         worlds.num_owned[w] = worlds.num_rows[w] = num
 
-    def _departure(self, roads: RoadArrays) -> np.void:
-        """What the agent's entry takes of a DEPARTURE."""
-        seat = self.scene.seat
+    def _is_clear(self, roads: RoadArrays, rows: NDArray[np.void]) -> NDArray[np.bool_]:
+        """(n,) which vehicles stand neither in the scene nor where an agent begins."""
+        clear: NDArray[np.bool_] = (
+            np.hypot(rows["x"] - self.scene.x, rows["y"] - self.scene.y) > self.scene.clear_m
+        )
+        for seat in self.seats[1:]:
+            lane = roads.lanes[seat.lane]
+            x, y, *_ = lane_pose(roads.points, lane["first_point"], lane["num_points"], seat.s)
+            clear &= np.hypot(rows["x"] - x, rows["y"] - y) > SEAT_CLEAR_M
+        return clear
+
+    def _departure(self, roads: RoadArrays, agent: int, seat: Seat) -> np.void:
+        """What an agent's entry takes of a DEPARTURE."""
         departure: np.void = np.zeros(1, DEPARTURE)[0]
         for name in ("order", "stop", "stops_end"):
             departure[name] = -1
+        departure["id"] = departure["agent"] = agent
         departure["goal"] = self.goal
         departure["way"] = self.goal * len(roads.lanes)
         departure["speed_factor"] = seat.speed_mps / roads.lanes["speed_mps"][seat.lane]

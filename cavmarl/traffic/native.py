@@ -71,7 +71,7 @@ class NativeTraffic:
         file: the demand whose vehicles drive beside the generator's.
         num_worlds: how many worlds are stepped together.
         zeros: makes the table of ways, where vehicles find some while the world runs.
-        scene: what is played to the agent of each world.
+        scene: what is played to the agents of each world.
         sumo: in the place of a file: what SUMO runs beside these worlds.
     """
 
@@ -138,7 +138,8 @@ class NativeTraffic:
             return None
         first_type = len(generated_types()) + (0 if self.file is None else len(self.file.types))
         goals = {edge: goal for goal, edge in enumerate(self.goal_edges.tolist())}
-        return Cast.of(self.scene, self.network, goals, first_type, self.dt)
+        agents = self.population.agents
+        return Cast.of(self.scene, self.network, goals, first_type, self.dt, agents)
 
     @cached_property
     def travel(self) -> Travel:

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 from cavmarl.traffic.scripts import Actor, Cue
 
-__all__ = ["Scene", "Seat"]
+__all__ = ["Outage", "Scene", "Seat"]
 
 
 @dataclass(frozen=True)
@@ -27,6 +28,13 @@ class Seat:
     goal_edge: int
 
 
+class Outage(NamedTuple):
+    """A signal that goes dark: the name of the signal, and when, in s since the beginning."""
+
+    signal: str
+    at_s: float
+
+
 @dataclass(frozen=True)
 class Scene:
     """One conflict, played to one agent.
@@ -38,6 +46,7 @@ class Scene:
         actors: who follows a script.
         cues: what they wait for, by the numbers of their `Await`s.
         clear_m: how far around the middle no other vehicle is in the beginning.
+        outages: signals that go dark, and stay so.
     """
 
     place: str
@@ -47,6 +56,7 @@ class Scene:
     actors: Sequence[Actor]
     cues: Sequence[Cue] = ()
     clear_m: float = 90.0
+    outages: Sequence[Outage] = ()
 
     @property
     def goal_edges(self) -> list[int]:

@@ -145,6 +145,39 @@ class Streets:
                 0.5 * float(row["foe_enter_m"] + row["foe_leave_m"]),
             )
 
+    def movements(self, directions: str) -> list[int]:
+        """LINK rows over junctions for cars, in SUMO's directions, as `s` or `lL`."""
+        links, lanes = self.network.links, self.network.lanes
+        ends = lanes["permissions"][links["from_lane"]] & lanes["permissions"][links["to_lane"]]
+        good = (ends & CAR != 0) & (links["first_internal"] >= 0)
+        good &= np.isin(links["direction"], [ord(letter) for letter in directions])
+        found: list[int] = np.flatnonzero(good).tolist()
+        return found
+
+    def onward(self, lane: int) -> int | None:
+        """The lane for cars that follows another one beyond a junction, straight on if it can be.
+
+        None where no car can go on.
+        """
+        links, lanes = self.network.links, self.network.lanes
+        first = int(lanes["first_link"][lane])
+        ways = [
+            link for link in range(first, first + int(lanes["num_links"][lane]))
+            if lanes["permissions"][links["to_lane"][link]] & CAR
+        ]  # fmt: skip
+        ways.sort(key=lambda link: (links["direction"][link] != ord("s"), link))
+        return int(links["to_lane"][ways[0]]) if ways else None
+
+    def lanes_beside(self, lane: int) -> list[int]:
+        """A lane and all others of its road that lead the same way, from the right to the left."""
+        lanes = self.network.lanes
+        while lanes["right"][lane] >= 0:
+            lane = int(lanes["right"][lane])
+        found = [lane]
+        while lanes["left"][found[-1]] >= 0:
+            found.append(int(lanes["left"][found[-1]]))
+        return found
+
     def turn_rad(self, one: int, other: int) -> float:
         """Between the directions of the ends of the lanes that two links leave, unsigned."""
         ends = [int(self.network.links["from_lane"][link]) for link in (one, other)]
@@ -156,17 +189,21 @@ class Streets:
 
         None where there are not `far_m` of them.
         """
-        lanes, into = self.network.lanes, self.network.into
         found, way_m = [lane], self.length_m(lane)
         while way_m < far_m:
-            row = lanes[found[0]]
-            ends = into[row["first_into"] : row["first_into"] + row["num_into"]]
-            before = [k for k in ends.tolist() if lanes["permissions"][k] & CAR]
-            if not before or before[0] in found:
+            before = self.before(found[0])
+            if before is None or before in found:
                 return None
-            found.insert(0, before[0])
-            way_m += self.length_m(before[0])
+            found.insert(0, before)
+            way_m += self.length_m(before)
         return tuple(found), way_m
+
+    def before(self, lane: int) -> int | None:
+        """The first of the lanes from which cars come onto a lane; None: from nowhere."""
+        lanes, into = self.network.lanes, self.network.into
+        row = lanes[lane]
+        ends = into[row["first_into"] : row["first_into"] + row["num_into"]]
+        return next((k for k in ends.tolist() if lanes["permissions"][k] & CAR), None)
 
     def name(self, lane: int) -> str:
         """Of a lane."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -75,6 +76,22 @@ def test_beyond_half_a_lane_the_neighbour_takes_over() -> None:
     shift(row, 0.0, -0.02)
     assert find("merge", row)[0] == "main_in_0"
     assert left == roads.lanes[right]["left"]
+
+
+@pytest.mark.parametrize(("apart_m", "expected"), [(0.01, 0), (0.9, 0), (1.5, EVENT_OFF_ROAD)])
+def test_what_lies_between_neighbours_is_road(apart_m: float, expected: int) -> None:
+    """Where lanes bend, and by rounding, there is a seam between them; an island is wider."""
+    roads = network("merge")
+    right, left = (roads.lanes[lane_of(roads, f"main_in_{k}")] for k in (0, 1))
+    points = roads.points.copy()
+    moved = points[left["first_point"] : left["first_point"] + left["num_points"]]
+    moved["x"] -= apart_m * np.sin(moved["heading"])
+    moved["y"] += apart_m * np.cos(moved["heading"])
+    arrays = replace(roads, points=points).arrays
+    row = on_lane(roads, lane_of(roads, "main_in_0"), 50.0)
+    shift(row, 0.0, 0.5 * float(right["width_m"]) + 0.5 * apart_m)
+    grid = GRIDS.setdefault("merge", lane_grid(roads))
+    assert locate(arrays, plans("merge"), grid, row[0]) == expected
 
 
 def test_past_its_end_a_lane_is_followed_by_the_planned_one() -> None:

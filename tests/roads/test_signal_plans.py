@@ -12,7 +12,7 @@ from cavmarl.kernels.signals import switch_signals
 from cavmarl.maps.check import check_map
 from cavmarl.roads.network import SIGNAL_STATES, RoadNetwork
 from cavmarl.roads.reader import read_network
-from cavmarl.roads.signal_plans import with_programs
+from cavmarl.roads.signal_plans import with_outages, with_programs
 from cavmarl.shard.shard import make_worlds
 
 NIGHT = """<additional>
@@ -100,6 +100,23 @@ def test_a_choice_stands_above_all(
         "Grr",
     ]
     assert states(with_programs(plain, chosen={"c": "off"}), [0, 50]) == ["Ooo", "Ooo"]
+
+
+def test_a_signal_goes_dark_and_stays_so(
+    crossing: Callable[..., Path], additional: Callable[..., Path]
+) -> None:
+    plain = read_network(crossing())
+    dark = with_outages(plain, {"c": 4.0})
+
+    assert states(dark, [3, 4, 5, 500]) == [*states(plain, [3]), "Ooo", "Ooo", "Ooo"]
+    assert states(with_outages(plain, {"c": 0.0}), [0]) == ["Ooo"]
+    assert dark.source_hash not in (plain.source_hash, with_outages(plain, {"c": 5.0}).source_hash)
+    timed = with_programs(plain, [additional(WEEK)])
+    assert states(with_outages(timed, {"c": 50.0}), [45, 50, 55, 70]) == [
+        *states(timed, [45]), "Ooo", "Ooo", "Ooo",
+    ]  # fmt: skip
+    with pytest.raises(MapError, match="this map has no signal 'd'"):
+        with_outages(plain, {"d": 4.0})
 
 
 def test_a_timetable_switches_programs(

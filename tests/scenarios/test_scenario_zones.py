@@ -20,6 +20,7 @@ from tests.faulted import NOISE
 from tests.scenarios.test_scenarios import NAMES
 
 STEPS = 75
+CUTS = {2: (2, 1), 4: (2, 2), 9: (3, 3)}  # columns and lines of zones
 
 
 def cut_through(vec: CavVectorEnv, path: Path, count: int) -> Path:
@@ -27,13 +28,11 @@ def cut_through(vec: CavVectorEnv, path: Path, count: int) -> Path:
     scene, extent = vec.simulation.scene, vec.network.extent_m
     assert scene is not None
     low_x, low_y, high_x, high_y = extent
-    x, y = scene.x, scene.y
-    rects = [[low_x, low_y, x, high_y], [x, low_y, high_x, high_y]]
-    if count == 4:
-        rects = [
-            [low_x, low_y, x, y], [x, low_y, high_x, y],
-            [low_x, y, x, high_y], [x, y, high_x, high_y],
-        ]  # fmt: skip
+    columns, lines = CUTS[count]
+    across = [low_x, scene.x, 0.5 * (scene.x + high_x), high_x]
+    along = [low_y, scene.y, 0.5 * (scene.y + high_y), high_y]
+    across, along = [*across[:columns], high_x], [*along[:lines], high_y]
+    rects = [[x, y, to_x, to_y] for y, to_y in pairwise(along) for x, to_x in pairwise(across)]
     write_zones(path, ZonePartition(extent, np.array(rects)))
     return path
 
@@ -62,41 +61,56 @@ def divided(name: str, path: Path, count: int, whole: CavVectorEnv, **keys: Any)
 def test_a_border_through_the_place_changes_nothing(name: str, tmp_path: Path) -> None:
     whole = make_scenario(name, density="low")
     expected = hashes(whole)
-    for count in (2, 4):
+    for count in CUTS:
         vec = divided(name, tmp_path, count, whole)
         assert hashes(vec) == expected
         assert vec.simulation.partition.count == count
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_nor_do_hosts_that_die_and_ticks_that_are_begun_again(name: str, tmp_path: Path) -> None:
+@pytest.mark.parametrize("count", [2, pytest.param(9, marks=pytest.mark.slow)])
+def test_nor_do_hosts_that_die_and_ticks_that_are_begun_again(
+    name: str, count: int, tmp_path: Path
+) -> None:
     whole = make_scenario(name, density="low")
     expected = hashes(whole, steps=40)
     faults = Faults(seed=5, messages=NOISE, crash_rate=0.01)
-    vec = divided(name, tmp_path, 2, whole, **{"zones.faults": faults.to_json()})
+    vec = divided(name, tmp_path, count, whole, **{"zones.faults": faults.to_json()})
     assert hashes(vec, steps=40) == expected
     assert vec.simulation.revivals
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["failed_u_turn", "pedestrian_crossing"])
-def test_nor_do_workers(name: str, tmp_path: Path) -> None:
-    whole = make_scenario(name, density="low")
+@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize(("count", "agents"), [(2, 1), (9, 3)])
+def test_nor_do_workers(name: str, count: int, agents: int, tmp_path: Path) -> None:
+    whole = make_scenario(name, density="low", agents=agents)
     expected = hashes(whole, steps=60)
-    scenario, file = whole.config.scenario, cut_through(whole, tmp_path / "2.json", 2)
+    file = cut_through(whole, tmp_path / f"{count}.json", count)
     keys = {
-        "zones.layout": str(file), "scenario.name": name, "scenario.seed": scenario.seed,
+        "zones.layout": str(file), "scenario.name": name,
+        "scenario.seed": whole.config.scenario.seed,
         "population.mode": "closed", "population.budget": None, "action.kind": "continuous",
         "horizon_s": whole.config.horizon_s,
     }  # fmt: skip
     vec = make_vec(
-        "grid4x4", zones=2, workers=2, agents=1, overrides=keys,
+        "grid4x4", zones=count, workers=2, agents=agents, overrides=keys,
         background=whole.config.population.background, autoreset_mode="NextStep",
     )  # fmt: skip
     try:
         assert hashes(vec, steps=60) == expected
     finally:
         vec.close()
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_nor_do_several_agents(name: str, tmp_path: Path) -> None:
+    whole = make_scenario(name, density="low", agents=3)
+    expected = hashes(whole, steps=50)
+    file = cut_through(whole, tmp_path / "4.json", 4)
+    overrides = {"zones.layout": str(file), "zones.check": True}
+    vec = make_scenario(name, density="low", agents=3, zones=4, overrides=overrides)
+    assert hashes(vec, steps=50) == expected
 
 
 def test_who_turns_on_a_border_does_not_flap_between_owners(tmp_path: Path) -> None:

@@ -10,9 +10,13 @@ from typing import Any
 import numpy as np
 import pytest
 
+from cavmarl.cav_env import parallel_env
 from cavmarl.errors import CavmarlError, ConfigError, PolicyError, ScenarioError
 from cavmarl.evaluate.scenario_runs import ScenarioRun, make_scenario, run_scenario
+from cavmarl.kernels.codes import DRIVER_SCRIPTED
+from cavmarl.kernels.junctions import link_signal
 from cavmarl.policies import load_policy
+from cavmarl.roads.network import SIGNAL_STATES
 from cavmarl.traffic.scenarios import load_scenario, scenario_names, summary_of
 from cavmarl.traffic.settings import describe
 from cavmarl.vector_env import CavVectorEnv, make_vec
@@ -22,6 +26,8 @@ NAMES = (
     "intersection_blockage",
     "merge_conflict",
     "pedestrian_crossing",
+    "road_closure",
+    "signal_outage",
     "unprotected_left_turn",
 )
 VARIANTS: tuple[tuple[str, Mapping[str, bool | float]], ...] = (
@@ -98,11 +104,29 @@ def test_so_it_is_among_other_traffic(
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", NAMES)
-def test_so_it_is_on_a_real_map(name: str, shared_maps: Path) -> None:
+@pytest.mark.parametrize(("name", "params"), VARIANTS)
+@pytest.mark.parametrize("seed", [0, 1, 2, 3, 4])
+def test_so_it_is_on_a_real_map(
+    name: str, params: Mapping[str, bool | float], seed: int, shared_maps: Path
+) -> None:
     env = shared_maps / "net/bologna_acosta/acosta_buslanes.net.xml"
-    assert played(name, "idm", 1, env=env).verdict == "passed"
-    assert played(name, "never_yield", 1, env=env).verdict == "collided"
+    assert played(name, "idm", seed, env=env, params=params).verdict == "passed"
+    assert played(name, "never_yield", seed, env=env, params=params).verdict == "collided"
+
+
+def test_a_light_ahead_is_no_reason_to_change_lanes(shared_maps: Path) -> None:
+    """At this place the line ahead once made either lane look better from the other one."""
+    env = shared_maps / "net/bologna_acosta/acosta_buslanes.net.xml"
+    with made("intersection_blockage", env, place="85_1") as vec:
+        policy = load_policy("idm", vec)
+        observations, infos = vec.reset(seed=0)
+        seat = int(vec.simulation.vehicles()["lane"][0])
+        for _ in range(100):
+            results = vec.step(policy.act_batch(observations, infos["mask"]))
+            observations, infos = results[0], results[4]
+            rows = vec.simulation.vehicles()
+            agent = rows[rows["agent"] == 0][0]
+            assert (agent["lane"], abs(agent["d"]) < 0.2) == (seat, True)
 
 
 @pytest.mark.parametrize(("name", "occluded"), GOLDEN)
@@ -117,6 +141,47 @@ def test_a_blockage_delays_as_long_as_it_lasts() -> None:
         for blocked_s in (6.0, 40.0)
     )
     assert long.delay_s > short.delay_s + 20.0
+
+
+def test_a_closure_delays_as_long_as_it_lasts() -> None:
+    short, long = (
+        played("road_closure", "idm", params={"closed_s": closed_s}) for closed_s in (8.0, 60.0)
+    )
+    assert (short.verdict, long.verdict) == ("passed", "passed")
+    assert long.delay_s > short.delay_s + 30.0
+
+
+def test_all_lanes_of_a_closed_road_are() -> None:
+    with made("road_closure") as vec:
+        scene, lanes = vec.simulation.scene, vec.network.lanes
+        assert scene is not None
+        vec.reset(seed=0)
+        rows = vec.simulation.vehicles()
+        vans = rows[rows["driver"] == DRIVER_SCRIPTED]
+        edge = int(lanes["edge"][vans["lane"][0]])
+        assert set(vans["lane"].tolist()) == set(np.flatnonzero(lanes["edge"] == edge).tolist())
+        assert len(vans) == 2
+        assert edge not in (scene.seat.goal_edge, lanes["edge"][scene.seat.lane])
+
+
+def test_signals_that_fail_are_dark_from_then_on() -> None:
+    with made("signal_outage", params={"dark_s": 2.0}) as vec:
+        scene, network = vec.simulation.scene, vec.network
+        assert scene is not None
+        (outage,) = scene.outages
+        signal = network.signal_ids.index(outage.signal)
+        links = network.links["signal"] == signal
+        shown = []
+        vec.reset(seed=0)
+        for _ in range(40):
+            phase = vec.simulation.signal_phases().copy()
+            letters = [link_signal(network.arrays, k, phase) for k in np.flatnonzero(links)]
+            shown.append({SIGNAL_STATES[letter] for letter in letters})
+            vec.step(np.zeros((1, 1, 2), np.float32))
+    step_s = vec.step_s
+    for k, letters in enumerate(shown):
+        assert (letters <= {"o", "O"}) == (k * step_s > 2.0 - 0.01)
+    assert shown[-1] == {"o", "O"}
 
 
 def test_the_seed_draws_the_place_and_its_name_says_it_again() -> None:
@@ -146,9 +211,47 @@ def test_what_cannot_be_is_refused(
         make_scenario(**{"scenario": given.pop("name", "pedestrian_crossing"), **given})
 
 
-def test_a_scenario_is_played_to_one_agent() -> None:
-    with pytest.raises(ConfigError, match=r"population\.agents = 2: must be 1"):
-        make_vec("grid4x4", agents=2, overrides={"scenario.name": "failed_u_turn"})
+@pytest.mark.parametrize("name", NAMES)
+def test_several_agents_come_one_after_the_other(name: str) -> None:
+    found = played(name, "idm", agents=4)
+    assert (found.verdicts, found.verdict) == (("passed",) * 4, "passed")
+    assert (found.agents, found.collisions) == (4, 0)
+    careless = played(name, "never_yield", agents=4)
+    assert (careless.verdict, careless.verdicts[0]) == ("collided", "collided")
+
+
+def test_the_first_agent_is_where_it_is_alone() -> None:
+    starts = []
+    for agents in (1, 3):
+        with made("unprotected_left_turn", agents=agents, density="high") as vec:
+            vec.reset(seed=0)
+            rows = vec.simulation.vehicles()
+            own = np.sort(rows[rows["agent"] >= 0], order="agent")
+            assert own["agent"].tolist() == list(range(agents))
+            starts.append(own)
+            others = rows[rows["agent"] < 0]
+            for row in own[1:]:
+                off_m = np.hypot(others["x"] - row["x"], others["y"] - row["y"])
+                assert off_m.min() > 5.0
+    for name in ("x", "y", "heading", "speed", "lane", "goal"):
+        assert starts[0][name][0] == starts[1][name][0]
+
+
+def test_agents_of_a_parallel_env_play_it_too() -> None:
+    keys = {"scenario.name": "road_closure", "population.mode": "closed",
+            "population.budget": None}  # fmt: skip
+    env = parallel_env("grid4x4", agents=3, background=0, overrides=keys)
+    env.reset(seed=0)
+    for _ in range(5):
+        assert len(env.agents) == 3
+        env.step(env.suggest_actions())
+
+
+def test_a_scene_has_room_for_so_many_agents() -> None:
+    with pytest.raises(ScenarioError, match=r"population\.agents = 400: .* ask for at most \d+"):
+        make_scenario("merge_conflict", agents=400)
+    with pytest.raises(ConfigError, match=r"population\.agents = 0: must be 1 or more"):
+        make_vec("grid4x4", agents=0, overrides={"scenario.name": "failed_u_turn"})
     with pytest.raises(ConfigError, match="must name a scenario"):
         make_vec("grid4x4", overrides={"scenario.place": "left1A1_0"})
 

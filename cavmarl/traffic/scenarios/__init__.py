@@ -23,7 +23,7 @@ from typing import Any
 import numpy as np
 
 from cavmarl.config_scenario import ScenarioConfig
-from cavmarl.errors import ScenarioError
+from cavmarl.errors import NoPlaceError, ScenarioError
 from cavmarl.kernels.rng import STREAM_PLACE, below, world_key
 from cavmarl.roads.network import RoadNetwork
 from cavmarl.traffic.scene import Scene
@@ -90,6 +90,7 @@ def plan_scene(config: ScenarioConfig, network: RoadNetwork) -> Scene | None:
 
     Raises:
         ScenarioError: no such scenario, or no such place on the map.
+        NoPlaceError: the map has none at all.
         ConfigError: a parameter that it does not have, or a value out of range.
     """
     if not config.name:
@@ -98,7 +99,7 @@ def plan_scene(config: ScenarioConfig, network: RoadNetwork) -> Scene | None:
     parameters = checked(scenario.Parameters, config.params, config.name)
     places = _places(config.name, network, parameters)
     if not places:
-        raise ScenarioError(
+        raise NoPlaceError(
             f"scenario '{config.name}': the map '{network.name}' has no place for it; it needs "
             f"{scenario.NEEDS}"
         )
