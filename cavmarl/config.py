@@ -591,8 +591,8 @@ class EnvConfig:
             source == "sumo-demand" or self.workers.balance_steps == 0,
             "workers.balance_steps",
             self.workers.balance_steps,
-            f"traffic.source = {source}: no other process can take up SUMO in the middle of an "
-            "episode; leave it 0",
+            f"traffic.source = {source}: a process that takes up a SUMO has to run it again from "
+            "the beginning of the episode; leave it 0",
         )
         _check(
             not self.sensors.signal.timing,

@@ -8,6 +8,7 @@ __all__ = ["CHECK_S", "Watchdog", "processor_s"]
 
 CHECK_S = 0.1
 STILL_CHECKS = 8  # for so long a process may sleep without the processor
+AT_WORK = ("R", "D")  # states: runs or could, waits for a disk
 STOPPED_CHECKS = 2  # for so long it may be stopped
 
 
@@ -38,9 +39,12 @@ class Watchdog:
             return None  # it has ended, which others notice
         self._checks += 1
         self._stopped = self._stopped + 1 if state in "Tt" else 0
-        if state == "S":
-            spent += sum(_spent_by(child) for child in _started_by(self._pid))
-        self._still = self._still + 1 if state == "S" and spent == self._spent else 0
+        is_still = state == "S"
+        if is_still:  # those that it has started may work for it, or wait for the processor
+            for child, ticks in map(_look_if_there, _started_by(self._pid)):
+                is_still &= child not in AT_WORK
+                spent += ticks
+        self._still = self._still + 1 if is_still and spent == self._spent else 0
         self._spent = spent
         if self._stopped >= STOPPED_CHECKS:
             return "stopped (SIGSTOP)"
@@ -66,12 +70,12 @@ def _started_by(pid: int) -> list[int]:
     return children + [one for child in children for one in _started_by(child)]
 
 
-def _spent_by(pid: int) -> int:
-    """Processor time of a process that may have ended, in ticks of the system."""
+def _look_if_there(pid: int) -> tuple[str, int]:
+    """The same as `_look` of a process that may have ended."""
     try:
-        return _look(pid)[1]
+        return _look(pid)
     except OSError:
-        return 0
+        return "X", 0
 
 
 def _look(pid: int) -> tuple[str, int]:

@@ -6,6 +6,9 @@ import subprocess
 import sys
 import time
 
+import pytest
+
+from cavmarl.runtime import watchdog
 from cavmarl.runtime.watchdog import CHECK_S, STILL_CHECKS, Watchdog
 
 PARENT = """
@@ -37,3 +40,15 @@ def test_a_process_whose_child_sleeps_too_is_noticed() -> None:
     found = verdict("import time; time.sleep(8)")
     assert found is not None
     assert "asleep" in found
+
+
+@pytest.mark.parametrize(("state", "is_at_work"), [("R", True), ("D", True), ("S", False)])
+def test_a_child_that_waits_for_the_processor_is_at_work(
+    monkeypatch: pytest.MonkeyPatch, state: str, is_at_work: bool
+) -> None:
+    """Other programs may leave it none for seconds; nothing of it sleeps."""
+    monkeypatch.setattr(watchdog, "_look", lambda pid: ("S" if pid == 1 else state, 7))
+    monkeypatch.setattr(watchdog, "_started_by", lambda pid: [2])
+    dog = Watchdog(1, 60.0)
+    found = [dog.verdict() for _ in range(3 * STILL_CHECKS)]
+    assert (found[-1] is None) == is_at_work
