@@ -13,8 +13,7 @@ OLDEST_TESTS := tests/kernels tests/roads tests/runtime tests/traffic tests/test
     tests/test_registry.py tests/test_registration.py tests/test_env.py tests/test_vector_env.py \
     tests/test_bad_input.py tests/test_public_api.py tests/adapters
 LIBRARIES_TESTS := tests/adapters tests/train/test_programs.py tests/hosts \
-    tests/stepping/test_remote.py tests/stepping/test_remote_moving.py \
-    tests/stepping/test_remote_start.py
+    tests/stepping/test_remote.py tests/stepping/test_remote_start.py
 FUZZ_SECONDS ?= 60
 FUZZ_TARGETS ?= network programs buildings map cached zones demand sumocfg entry overrides driver manifest \
     plan message log
