@@ -13,8 +13,7 @@ OLDEST_TESTS := tests/kernels tests/roads tests/runtime tests/traffic tests/test
     tests/test_registry.py tests/test_registration.py tests/test_env.py tests/test_vector_env.py \
     tests/test_bad_input.py tests/test_public_api.py tests/adapters
 LIBRARIES_TESTS := tests/adapters tests/train/test_programs.py tests/hosts \
-    tests/stepping/test_remote.py tests/stepping/test_remote_moving.py \
-    tests/stepping/test_remote_start.py
+    tests/stepping/test_remote.py tests/stepping/test_remote_start.py
 FUZZ_SECONDS ?= 60
 FUZZ_TARGETS ?= network programs buildings map cached zones demand sumocfg entry overrides driver manifest \
     plan message log follower
@@ -101,6 +100,6 @@ $(LIBRARIES)/.ready: pyproject.toml constraints-libraries.txt
 	"$(PYTHON)" -m venv --clear $(LIBRARIES)
 	$(LIBRARIES)/bin/python -m pip install $$(grep '^torch==' constraints-libraries.txt) \
 	    --constraint constraints-libraries.txt
-	$(LIBRARIES)/bin/python -m pip install --editable '.[sb3,torchrl,benchmarl,rllib]' pytest \
+	$(LIBRARIES)/bin/python -m pip install --editable '.[sumo,sb3,torchrl,benchmarl,rllib]' pytest \
 	    hypothesis --constraint constraints-libraries.txt
 	@touch $@

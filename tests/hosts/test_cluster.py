@@ -43,6 +43,11 @@ def test_more_workers_than_cpus() -> None:
         ({"workers": 0, "hosts": "ray"}, "without workers"),
         ({"workers": -1, "hosts": "ray"}, "workers = -1"),
         ({"workers": 3, "hosts": "ray", "num_envs": 2}, "a world lives on one host"),
+        ({"workers": 2, "hosts": "ray", "zones": 4}, "1 world.s. need at most as many"),
+        (
+            {"workers": "ray", "sensor_workers": 1, "overrides": {"rig": "ten_sensors"}},
+            "workers.sensors = 1, hosts = 'ray': sensor workers are on the machine",
+        ),
         ({"workers": "ray", "overrides": {"zones.journal": "a.jsonl"}}, "zones.journal"),
     ],
 )
