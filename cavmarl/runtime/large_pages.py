@@ -56,7 +56,7 @@ def large_shared_zeros(shape: int | tuple[int, ...], dtype: DTypeLike = np.float
     memory = _map_aligned(size)
     whole = size // LARGE_BYTES * LARGE_BYTES  # the rest stays in small ones
     for place in range(0, whole, LARGE_BYTES):
-        memory[place] = 0  # what is not there is not laid together
+        memory[place] = b"\0"  # what is not there is not laid together
     _libc.madvise(ctypes.addressof(memory), whole, _COLLAPSE)  # nothing is lost where it fails
     return np.frombuffer(memoryview(memory), dtype=kind, count=prod(sides)).reshape(sides)
 
