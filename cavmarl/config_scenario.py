@@ -1,4 +1,4 @@
-"""The key `scenario`: what happens to the agent, and where."""
+"""The key `scenario`: what happens to the agents, and where."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ __all__ = ["ScenarioConfig"]
 
 @dataclass(frozen=True)
 class ScenarioConfig:
-    """One scripted conflict for the agent of each world; docs/scenarios.md.
+    """One scripted conflict for the agents of each world; docs/scenarios.md.
 
     Attributes:
         name: of a scenario, or the path of a `.py` file with one; empty: none.

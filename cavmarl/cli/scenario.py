@@ -11,7 +11,7 @@ import typer
 from rich import box
 from rich.console import Console
 from rich.markup import escape
-from rich.table import Table
+from rich.table import Column, Table
 
 from cavmarl.cli.output import JsonPath, Seed, Settings, number, parse_settings, write_json
 from cavmarl.errors import ConfigError
@@ -20,6 +20,8 @@ if TYPE_CHECKING:
     from cavmarl.evaluate.scenario_runs import ScenarioRun
 
 __all__ = ["app"]
+
+WIDTH = 140  # of the table of a sweep, which goes into pages: it is never cut off
 
 app = typer.Typer(help="Scripted conflicts for agents.", no_args_is_help=True)
 
@@ -126,8 +128,8 @@ def sweep(
     from cavmarl.evaluate.scenario_sweep import sweep_scenarios
     from cavmarl.traffic.scenarios import scenario_names
 
-    table = Table("scenario", "map", passes, "least TTC, s", "least PET, s", fails,
-                  box=box.MARKDOWN)  # fmt: skip
+    heads = ("scenario", "map", passes, "least TTC, s", "least PET, s", fails)
+    table = Table(*(Column(head, no_wrap=True) for head in heads), box=box.MARKDOWN)
     rows = []
     for row in sweep_scenarios(
         names or scenario_names(),
@@ -148,7 +150,7 @@ def sweep(
             row.verdicts(row.failing) or "no place",
         )
         table.add_row(*map(escape, cells))
-    Console().print(table)
+    Console(width=WIDTH).print(table)
     write_json(json_path, {"rows": [row.to_dict() for row in rows]})
     if not all(row.holds for row in rows):
         raise typer.Exit(1)

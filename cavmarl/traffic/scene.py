@@ -37,7 +37,7 @@ class Outage(NamedTuple):
 
 @dataclass(frozen=True)
 class Scene:
-    """One conflict, played to one agent.
+    """One conflict, played to an agent; others may come behind it (`seats`).
 
     Attributes:
         place: where, by the map's name.

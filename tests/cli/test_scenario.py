@@ -44,6 +44,26 @@ def test_a_run_says_what_became_of_it(tmp_path: Path, capsys: pytest.CaptureFixt
     assert "collided" in capsys.readouterr().out
 
 
+def test_a_sweep_says_who_passes_where(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    kept = tmp_path / "sweep.json"
+    words = ["scenario", "sweep", "road_closure", "--map", "grid4x4", "--map", "ring"]
+    assert code(*words, "--seeds", "2", "--json", str(kept)) == 0
+    said = " ".join(capsys.readouterr().out.split())
+    assert "| `road_closure` | grid4x4 | 2 passed |" in said
+    assert "| `road_closure` | ring | no place |" in said
+    here, nowhere = json.loads(kept.read_text(encoding="utf-8"))["rows"]
+    assert [run["verdict"] for run in here["failing"]] == ["collided"] * 2
+    assert (here["holds"], nowhere["passing"]) == (True, [])
+    assert code(*words, "--seeds", "1", "--fails", "idm") == 1
+
+
+def test_a_run_is_played_to_several_agents(capsys: pytest.CaptureFixture[str]) -> None:
+    assert code("scenario", "run", "signal_outage", "--agents", "2") == 0
+    said = capsys.readouterr().out
+    assert "passed, passed" in said
+    assert "idm (2 agents)" in said
+
+
 @pytest.mark.parametrize(
     ("words", "says"),
     [
@@ -51,6 +71,8 @@ def test_a_run_says_what_became_of_it(tmp_path: Path, capsys: pytest.CaptureFixt
         (["pedestrian_crossing", "--param", "walk_mps"], "must be KEY=VALUE"),
         (["pedestrian_crossing", "--param", 'walk_mps="fast"'], "must be KEY=VALUE"),
         (["pedestrian_crossing", "--map", "ring"], "has no place for it"),
+        (["failed_u_turn", "--agents", "99"], "ask for at most"),
+        (["signal_outage", "--map", "merge"], "it needs a signal"),
         (["pedestrian_crossing", "--density", "some"], "must be one of none, low, high"),
         (["pedestrian_crossing", "--picture", "crossing.jpg"], "ends in .png"),
     ],

@@ -17,7 +17,7 @@ from cavmarl.roads.zones import ZonePartition
 from cavmarl.runtime.fault_plan import Faults
 from cavmarl.vector_env import CavVectorEnv, make_vec
 from tests.faulted import NOISE
-from tests.scenarios.test_scenarios import NAMES
+from tests.scenarios.test_scenarios import NAMES, ROOMY
 
 STEPS = 75
 CUTS = {2: (2, 1), 4: (2, 2), 9: (3, 3)}  # columns and lines of zones
@@ -84,12 +84,13 @@ def test_nor_do_hosts_that_die_and_ticks_that_are_begun_again(
 @pytest.mark.parametrize("name", NAMES)
 @pytest.mark.parametrize(("count", "agents"), [(2, 1), (9, 3)])
 def test_nor_do_workers(name: str, count: int, agents: int, tmp_path: Path) -> None:
-    whole = make_scenario(name, density="low", agents=agents)
+    place = ROOMY.get(name, "")
+    whole = make_scenario(name, density="low", agents=agents, place=place)
     expected = hashes(whole, steps=60)
     file = cut_through(whole, tmp_path / f"{count}.json", count)
     keys = {
         "zones.layout": str(file), "scenario.name": name,
-        "scenario.seed": whole.config.scenario.seed,
+        "scenario.seed": whole.config.scenario.seed, "scenario.place": place,
         "population.mode": "closed", "population.budget": None, "action.kind": "continuous",
         "horizon_s": whole.config.horizon_s,
     }  # fmt: skip
@@ -105,11 +106,12 @@ def test_nor_do_workers(name: str, count: int, agents: int, tmp_path: Path) -> N
 
 @pytest.mark.parametrize("name", NAMES)
 def test_nor_do_several_agents(name: str, tmp_path: Path) -> None:
-    whole = make_scenario(name, density="low", agents=3)
+    place = ROOMY.get(name, "")
+    whole = make_scenario(name, density="low", agents=3, place=place)
     expected = hashes(whole, steps=50)
     file = cut_through(whole, tmp_path / "4.json", 4)
     overrides = {"zones.layout": str(file), "zones.check": True}
-    vec = make_scenario(name, density="low", agents=3, zones=4, overrides=overrides)
+    vec = make_scenario(name, density="low", agents=3, place=place, zones=4, overrides=overrides)
     assert hashes(vec, steps=50) == expected
 
 

@@ -34,6 +34,7 @@ VARIANTS: tuple[tuple[str, Mapping[str, bool | float]], ...] = (
     *((name, {}) for name in NAMES),
     ("pedestrian_crossing", {"occluded": True}),
 )
+ROOMY = {"failed_u_turn": "A1B1_1"}  # where there is a road before that which is drawn has none
 # The reference driver on grid4x4, seed 0, nobody else on the road.
 GOLDEN = {
     ("failed_u_turn", False): "d328218ab78180a26e908b8588cbff9e",
@@ -41,6 +42,8 @@ GOLDEN = {
     ("merge_conflict", False): "d00fa41820b353bf730aaa6c574a7b10",
     ("pedestrian_crossing", False): "1ecd190d1f275fa51cb0fc8c4db01b5a",
     ("pedestrian_crossing", True): "17751e9da0f775beba34f709cf661460",
+    ("road_closure", False): "4c0d6855a8ae2af9dddd74a9eddd257e",
+    ("signal_outage", False): "5962afa02a50f8dfb0bf3460943e9d36",
     ("unprotected_left_turn", False): "c61fa293d08fb4492f54009630ed42ba",
 }
 
@@ -213,10 +216,11 @@ def test_what_cannot_be_is_refused(
 
 @pytest.mark.parametrize("name", NAMES)
 def test_several_agents_come_one_after_the_other(name: str) -> None:
-    found = played(name, "idm", agents=4)
+    place = ROOMY.get(name, "")
+    found = played(name, "idm", agents=4, place=place)
     assert (found.verdicts, found.verdict) == (("passed",) * 4, "passed")
     assert (found.agents, found.collisions) == (4, 0)
-    careless = played(name, "never_yield", agents=4)
+    careless = played(name, "never_yield", agents=4, place=place)
     assert (careless.verdict, careless.verdicts[0]) == ("collided", "collided")
 
 
