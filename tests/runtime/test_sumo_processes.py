@@ -288,6 +288,34 @@ def test_a_worker_that_dies_is_followed(tmp_path: Path, source: str, zones: int)
         vec.close()
 
 
+@pytest.mark.parametrize("source", MODES)
+def test_a_sumo_of_a_worker_that_dies_runs_again_with_the_next_step(
+    tmp_path: Path, source: str
+) -> None:
+    both = settings(tiny_file(tmp_path), source)
+    made = {"num_envs": 2, "agents": 3, "background": 2, "overrides": both}
+    plain, vec = make_vec("grid4x4", **made), make_vec("grid4x4", workers=2, **made)
+    try:
+        for one in (plain, vec):
+            one.reset(seed=5)
+            for _ in range(20):
+                one.step(one.suggest_actions())
+        actions = plain.suggest_actions()
+        (sumo,) = psutil.Process(vec.worlds.pool.pids[1]).children()
+        sumo.kill()
+        with pytest.raises(SumoDiedError, match="ended with -9"):
+            vec.step(actions)
+        for _ in range(10):
+            actions = plain.suggest_actions()
+            for one in (plain, vec):
+                one.step(actions)
+        assert [vec.state_hash(w) for w in range(2)] == [plain.state_hash(w) for w in range(2)]
+        assert not vec.worlds.deaths
+    finally:
+        plain.close()
+        vec.close()
+
+
 def test_a_worker_dies_whose_sumo_was_told_too_much_to_keep(tmp_path: Path) -> None:
     both = settings(tiny_file(tmp_path), "sumo-traffic") | {"sumo.replay_mib": 0}
     vec = make_vec("grid4x4", num_envs=2, agents=3, background=0, workers=2, overrides=both)
