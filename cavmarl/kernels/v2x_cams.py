@@ -1,7 +1,9 @@
 """What a receiver takes of the CAMs of one tick: most packets are CAMs, one of every vehicle.
 
-All packets that could be received are asked for their fate in one loop over numbers that lie
-together, which the compiler makes vector instructions of.
+All packets within reach are listed first. Their distances and random numbers are then taken in one
+loop over what lies together, which the compiler makes vector instructions of; only what is looked
+up in tables comes one by one. What takes whole bundles of arrays is inlined: handed over for every
+receiver, they would take longer than the rest.
 """
 
 from __future__ import annotations
@@ -118,7 +120,7 @@ def _drop_lost(channel: Channel, me: np.void, level: int, room: Room, num: int) 
     for k in range(num):
         distances[k] = math.sqrt(squared[k])
         numbers[k] = draw(of_receiver, words[k])
-    has_walls = channel.blocked.shape[0] > 0
+    has_walls = channel.blocked.shape[0] > 0 and channel.walls.segments.shape[0] > 0
     kept = 0
     for k in range(num):
         distance_m = distances[k]
