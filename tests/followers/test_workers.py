@@ -144,6 +144,7 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> Seen:
         {"workers": 1},
         {"workers": 2},
         {"workers": 1, "sensor_workers": 1},
+        {"workers": 1, "sensor_workers": 1, "zones.faults": ROUGH},
     ],
     ids=str,
 )
