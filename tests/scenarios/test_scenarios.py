@@ -34,7 +34,8 @@ VARIANTS: tuple[tuple[str, Mapping[str, bool | float]], ...] = (
     *((name, {}) for name in NAMES),
     ("pedestrian_crossing", {"occluded": True}),
 )
-ROOMY = {"failed_u_turn": "A1B1_1"}  # where there is a road before that which is drawn has none
+# Where there is a road behind the first agent: that which is drawn has none.
+ROOMY = {"failed_u_turn": "A1B1_1", "pedestrian_crossing": "A1B1_0"}
 # The reference driver on grid4x4, seed 0, nobody else on the road.
 GOLDEN = {
     ("failed_u_turn", False): "d328218ab78180a26e908b8588cbff9e",
@@ -117,19 +118,10 @@ def test_so_it_is_on_a_real_map(
     assert played(name, "never_yield", seed, env=env, params=params).verdict == "collided"
 
 
-def test_a_light_ahead_is_no_reason_to_change_lanes(shared_maps: Path) -> None:
-    """At this place the line ahead once made either lane look better from the other one."""
+def test_between_two_lanes_of_a_bent_road_nobody_is_off_it(shared_maps: Path) -> None:
+    """The lanes at this place leave a seam of millimetres, on which the driver once was."""
     env = shared_maps / "net/bologna_acosta/acosta_buslanes.net.xml"
-    with made("intersection_blockage", env, place="85_1") as vec:
-        policy = load_policy("idm", vec)
-        observations, infos = vec.reset(seed=0)
-        seat = int(vec.simulation.vehicles()["lane"][0])
-        for _ in range(100):
-            results = vec.step(policy.act_batch(observations, infos["mask"]))
-            observations, infos = results[0], results[4]
-            rows = vec.simulation.vehicles()
-            agent = rows[rows["agent"] == 0][0]
-            assert (agent["lane"], abs(agent["d"]) < 0.2) == (seat, True)
+    assert played("intersection_blockage", "idm", env=env, place="85_1").verdict == "passed"
 
 
 @pytest.mark.parametrize(("name", "occluded"), GOLDEN)
