@@ -43,8 +43,8 @@ GOLDEN = {
     ("merge_conflict", False): "d00fa41820b353bf730aaa6c574a7b10",
     ("pedestrian_crossing", False): "1ecd190d1f275fa51cb0fc8c4db01b5a",
     ("pedestrian_crossing", True): "17751e9da0f775beba34f709cf661460",
-    ("road_closure", False): "4c0d6855a8ae2af9dddd74a9eddd257e",
-    ("signal_outage", False): "5962afa02a50f8dfb0bf3460943e9d36",
+    ("road_closure", False): "ad1cd41f91dba04a10e71c89efa38671",
+    ("signal_outage", False): "0c4af1b6f8eb914752d74c5041e87ef0",
     ("unprotected_left_turn", False): "c61fa293d08fb4492f54009630ed42ba",
 }
 
