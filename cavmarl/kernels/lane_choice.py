@@ -62,44 +62,6 @@ def _desired(roads: RoadArrays, kind: np.void, row: np.void, lane: int) -> float
     return float(min(limit * row["speed_factor"], kind["max_speed"]))
 
 
-@inlined_kernel
-def _leader_on(
-    roads: RoadArrays, travel: Travel, row: np.void, lane: int, s: float, scratch: Scratch
-) -> tuple[int, float]:
-    """The entry ahead of `s` on a lane or on what follows it, or -1; and how far it is ahead, m."""
-    j = ahead_on(scratch, lane, s, row["id"], travel.view_m)
-    if j >= 0:
-        return j, scratch.entries[j]["s"] - s
-    ahead = roads.lanes[lane]["length_m"] - s
-    beyond, way, _ = next_step(roads, travel, lane, row["way"])
-    while beyond >= 0:
-        j = last_on(scratch, beyond, row["id"], ahead, travel.view_m)
-        if j >= 0:
-            ahead += scratch.entries[j]["s"]
-        if j >= 0 or not roads.lanes[beyond]["internal"]:
-            break
-        ahead += roads.lanes[beyond]["length_m"]
-        beyond, way, _ = next_step(roads, travel, beyond, way)
-    return j, ahead
-
-
-@kernel
-def _wish_here(roads: RoadArrays, travel: Travel, row: np.void, scratch: Scratch) -> float:
-    """The acceleration in m/s² that a driver wants on its own lane, by what MOBIL asks of others.
-
-    That is the leader and the lane's speed. The line ahead, a bend or a red light are the same for
-    the lane beside it: who counted them here alone would find the other lane better, from either.
-    """
-    kind = travel.types[row["vtype"]]
-    desired = _desired(roads, kind, row, row["lane"])
-    j, ahead = _leader_on(roads, travel, row, row["lane"], row["s"], scratch)
-    if j < 0:
-        return float(wish(kind, row["speed"], desired, no_press(kind)))
-    leader = scratch.entries[j]
-    net = ahead - 0.5 * row["length"] - leader["half"]
-    return float(accel_behind(kind, row["speed"], desired, net, leader["speed"], leader["decel"]))
-
-
 @kernel
 def _change_is_safe(
     roads: RoadArrays,
@@ -116,9 +78,24 @@ def _change_is_safe(
     kind = travel.types[row["vtype"]]
     speed = row["speed"]
     half = 0.5 * row["length"]
+    lane = roads.lanes[target]
     s = beside_s(roads, row["lane"], target, row["s"])
     desired = _desired(roads, kind, row, target)
-    j, ahead = _leader_on(roads, travel, row, target, s, scratch)
+    ahead = 0.0
+    j = ahead_on(scratch, target, s, row["id"], travel.view_m)
+    if j >= 0:
+        ahead = scratch.entries[j]["s"] - s
+    else:
+        ahead = lane["length_m"] - s
+        beyond, way, _ = next_step(roads, travel, target, row["way"])
+        while beyond >= 0:
+            j = last_on(scratch, beyond, row["id"], ahead, travel.view_m)
+            if j >= 0:
+                ahead += scratch.entries[j]["s"]
+            if j >= 0 or not roads.lanes[beyond]["internal"]:
+                break
+            ahead += roads.lanes[beyond]["length_m"]
+            beyond, way, _ = next_step(roads, travel, beyond, way)
     after = wish(kind, speed, desired, no_press(kind))
     if j >= 0:
         leader = scratch.entries[j]
@@ -186,8 +163,6 @@ def _may_change(
     if needed == 0:
         if row["speed"] < 1.0 or lane_to_stop(roads, travel, row) == STAY:
             return False
-        if row["driver"] == DRIVER_AGENT:
-            own_wish = _wish_here(roads, travel, row, scratch)
         # Not even an empty lane would be worth it.
         kind = travel.types[row["vtype"]]
         desired = _desired(roads, kind, row, target)
