@@ -11,8 +11,8 @@ from typing import Any
 from cavmarl.config import EnvConfig
 from cavmarl.errors import WorkerStartError
 from cavmarl.runtime.images import Image
-from cavmarl.runtime.large_pages import large_shared_zeros
 from cavmarl.runtime.refereeing import Run
+from cavmarl.runtime.shared_huge_pages import huge_shared_zeros
 from cavmarl.runtime.shared_memory import Segment, arrays_in
 from cavmarl.runtime.worker import Job
 from cavmarl.stepping.arrays import StepArrays, layout_of
@@ -93,7 +93,7 @@ def make_jobs(recipe: Mapping[str, Any]) -> list[Job]:
                 1,
                 arrays.part(part.first, part.last),
                 in_next_step=recipe["in_next_step"],
-                zeros=large_shared_zeros,
+                zeros=huge_shared_zeros,
             )
             theirs = None if spent_s is None else spent_s[part.first]
             leader = LeaderJob(hire(worlds, part), part.first, part.zones, diary, theirs)

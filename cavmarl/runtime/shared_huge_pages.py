@@ -1,8 +1,8 @@
-"""Memory that a process shares with those that it forks, in large pages where the system has them.
+"""Memory that a process shares with those that it forks, in huge pages where the system has them.
 
 A city's rows take thousands of small pages, and where each of them has to be looked up, as in a
 virtual machine, that takes some hundredths of a tick. Systems are mostly set to give shared memory
-no large pages by themselves (`shmem_enabled`), but Linux from 6.1 on lays pages together if it is
+no huge pages by themselves (`shmem_enabled`), but Linux from 6.1 on lays pages together if it is
 asked to. Where it cannot, they stay small: that is only slower.
 """
 
@@ -20,9 +20,9 @@ from numpy.typing import DTypeLike, NDArray
 
 from cavmarl.runtime.shared_memory import shared_zeros
 
-__all__ = ["LARGE_BYTES", "MOST_BYTES", "large_shared_zeros"]
+__all__ = ["HUGE_BYTES", "MOST_BYTES", "huge_shared_zeros"]
 
-LARGE_BYTES = 1 << 21  # of a large page, on most processors
+HUGE_BYTES = 1 << 21  # of a huge page, on most processors
 MOST_BYTES = 1 << 28  # of an array that is had as a whole, whatever of it will be written
 
 _NO_ACCESS = 0  # PROT_NONE: the room is only kept free
@@ -39,8 +39,8 @@ _libc.munmap.argtypes = (ctypes.c_void_p, ctypes.c_size_t)
 _libc.madvise.argtypes = (ctypes.c_void_p, ctypes.c_size_t, ctypes.c_int)
 
 
-def large_shared_zeros(shape: int | tuple[int, ...], dtype: DTypeLike = np.float64) -> NDArray[Any]:
-    """As `shared_zeros`, but large arrays lie in large pages, as far as the system has some.
+def huge_shared_zeros(shape: int | tuple[int, ...], dtype: DTypeLike = np.float64) -> NDArray[Any]:
+    """As `shared_zeros`, but large arrays lie in huge pages, as far as the system has some.
 
     Of an array of more than `MOST_BYTES` memory that is never written is never taken, and its pages
     are small.
@@ -51,24 +51,24 @@ def large_shared_zeros(shape: int | tuple[int, ...], dtype: DTypeLike = np.float
     kind = np.dtype(dtype)
     sides = (shape,) if isinstance(shape, int) else shape
     size = prod(sides) * kind.itemsize
-    if not LARGE_BYTES <= size <= MOST_BYTES:
+    if not HUGE_BYTES <= size <= MOST_BYTES:
         return shared_zeros(shape, dtype)
     memory = _map_aligned(size)
-    whole = size // LARGE_BYTES * LARGE_BYTES  # the rest stays in small ones
-    for place in range(0, whole, LARGE_BYTES):
+    whole = size // HUGE_BYTES * HUGE_BYTES  # the rest stays in small ones
+    for place in range(0, whole, HUGE_BYTES):
         memory[place] = b"\0"  # what is not there is not laid together
     _libc.madvise(ctypes.addressof(memory), whole, _COLLAPSE)  # nothing is lost where it fails
     return np.frombuffer(memoryview(memory), dtype=kind, count=prod(sides)).reshape(sides)
 
 
 def _map_aligned(size: int) -> ctypes.Array[ctypes.c_char]:
-    """Shared memory that begins where a large page can; it goes with the object."""
-    room = size + LARGE_BYTES
+    """Shared memory that begins where a huge page can; it goes with the object."""
+    room = size + HUGE_BYTES
     private, shared = mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS, mmap.MAP_SHARED | mmap.MAP_ANONYMOUS
     first = _libc.mmap(None, room, _NO_ACCESS, private, -1, 0)
     if first == _FAILED:
         raise MemoryError(f"no room for {size} bytes: {os.strerror(ctypes.get_errno())}")
-    start = -(-first // LARGE_BYTES) * LARGE_BYTES
+    start = -(-first // HUGE_BYTES) * HUGE_BYTES
     access = mmap.PROT_READ | mmap.PROT_WRITE
     if _libc.mmap(start, size, access, shared | _AT_THIS_PLACE, -1, 0) == _FAILED:
         why = os.strerror(ctypes.get_errno())

@@ -1,4 +1,4 @@
-"""Shared memory in large pages: what is written there, who shares it, and where it lies."""
+"""Shared memory in huge pages: what is written there, who shares it, and where it lies."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from cavmarl.runtime import large_pages
-from cavmarl.runtime.large_pages import LARGE_BYTES, MOST_BYTES, large_shared_zeros
+from cavmarl.runtime import shared_huge_pages
+from cavmarl.runtime.shared_huge_pages import HUGE_BYTES, MOST_BYTES, huge_shared_zeros
 
 ROW = np.dtype([("id", np.int64), ("place", np.float32, (3,))], align=True)
 
@@ -25,17 +25,17 @@ def mapped(address: int) -> dict[str, int]:
 
 
 def test_a_large_array_is_zeros_where_a_large_page_can_begin() -> None:
-    array = large_shared_zeros((2, 3, LARGE_BYTES // 8), ROW)
-    assert array.shape == (2, 3, LARGE_BYTES // 8)
+    array = huge_shared_zeros((2, 3, HUGE_BYTES // 8), ROW)
+    assert array.shape == (2, 3, HUGE_BYTES // 8)
     assert array.dtype == ROW
-    assert array.ctypes.data % LARGE_BYTES == 0
+    assert array.ctypes.data % HUGE_BYTES == 0
     assert not array["id"].any()
     assert not array["place"].any()
 
 
-@pytest.mark.parametrize("size", [0, 5, LARGE_BYTES - 1, LARGE_BYTES, 3 * LARGE_BYTES + 7])
+@pytest.mark.parametrize("size", [0, 5, HUGE_BYTES - 1, HUGE_BYTES, 3 * HUGE_BYTES + 7])
 def test_any_size_can_be_had(size: int) -> None:
-    array = large_shared_zeros(size, np.uint8)
+    array = huge_shared_zeros(size, np.uint8)
     expected = np.arange(size, dtype=np.uint8)
     array[:] = expected
     assert array.tobytes() == expected.tobytes()
@@ -44,8 +44,8 @@ def test_any_size_can_be_had(size: int) -> None:
 @pytest.mark.parametrize("can", [True, False])
 def test_a_fork_writes_the_same_array(can: bool, monkeypatch: pytest.MonkeyPatch) -> None:
     if not can:  # as on a system that knows nothing of it
-        monkeypatch.setattr(large_pages, "_COLLAPSE", -1)
-    array = large_shared_zeros(LARGE_BYTES, np.int64)
+        monkeypatch.setattr(shared_huge_pages, "_COLLAPSE", -1)
+    array = huge_shared_zeros(HUGE_BYTES, np.int64)
     pid = os.fork()
     if pid == 0:
         array[:] = 7
@@ -57,30 +57,30 @@ def test_a_fork_writes_the_same_array(can: bool, monkeypatch: pytest.MonkeyPatch
 
 
 def test_all_of_its_pages_are_large_or_none() -> None:
-    array = large_shared_zeros(3 * LARGE_BYTES + 9, np.uint8)
+    array = huge_shared_zeros(3 * HUGE_BYTES + 9, np.uint8)
     array[:] = 1
     large = mapped(array.ctypes.data)["ShmemPmdMapped"]
-    assert large == (3 * LARGE_BYTES if lays_together() else 0)
+    assert large == (3 * HUGE_BYTES if lays_together() else 0)
 
 
 def lays_together() -> bool:
-    """Whether this system has large pages for those who ask for them."""
+    """Whether this system has huge pages for those who ask for them."""
     setting = Path("/sys/kernel/mm/transparent_hugepage/shmem_enabled")
     version = tuple(map(int, os.uname().release.split(".")[:2]))
     return version >= (6, 1) and setting.is_file() and "[deny]" not in setting.read_text()
 
 
 def test_of_a_very_large_one_only_that_is_had_which_is_written() -> None:
-    array = large_shared_zeros(MOST_BYTES + 1, np.uint8)
+    array = huge_shared_zeros(MOST_BYTES + 1, np.uint8)
     before = mapped(array.ctypes.data)["Rss"]
-    array[:LARGE_BYTES] = 1
+    array[:HUGE_BYTES] = 1
     after = mapped(array.ctypes.data)["Rss"]
     assert before == 0
-    assert LARGE_BYTES <= after < 2 * LARGE_BYTES
+    assert HUGE_BYTES <= after < 2 * HUGE_BYTES
 
 
 def test_what_is_forgotten_is_given_back() -> None:
-    array = large_shared_zeros(4 * LARGE_BYTES, np.uint8)
+    array = huge_shared_zeros(4 * HUGE_BYTES, np.uint8)
     view, address = array[5:], array.ctypes.data
     del array
     gc.collect()
@@ -91,6 +91,6 @@ def test_what_is_forgotten_is_given_back() -> None:
 
 
 def test_that_there_is_no_room_is_said(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(large_pages, "MOST_BYTES", 1 << 62)
+    monkeypatch.setattr(shared_huge_pages, "MOST_BYTES", 1 << 62)
     with pytest.raises(MemoryError, match=f"no room for {1 << 60} bytes"):
-        large_shared_zeros(1 << 60, np.uint8)
+        huge_shared_zeros(1 << 60, np.uint8)
