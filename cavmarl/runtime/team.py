@@ -4,9 +4,9 @@ The first of them leads: it runs the tick as one process would. Each phase that 
 by zone it announces to the others, the followers, runs it on its own zones, and goes on when they
 have run it on theirs. What is in between, gate, signals and owners, it does alone.
 
-All arrays that shards write are shared (`shared_huge_pages`), and each row has one writer at a time.
-A follower keeps nothing from one phase to the next but room to work in: what a phase needs to know
-beside the arrays stands in the leader's line.
+All arrays that shards write are shared (`shared_huge_pages`), and each row has one writer at a
+time. A follower keeps nothing from one phase to the next but room to work in: what a phase needs to
+know beside the arrays stands in the leader's line.
 """
 
 from __future__ import annotations
