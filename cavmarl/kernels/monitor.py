@@ -244,11 +244,15 @@ def _owe_ghosts(
         y = rows[i]["y"]
         if min_x < x and x < max_x and min_y < y and y < max_y:
             continue
-        digest = _digest(words, i, masks, factors)
+        digest = np.uint64(0)
+        sought = True
         here = zone_of(zones, x, y)
         for n in range(halo.near_start[here], halo.near_start[here + 1]):
             other = halo.near[n]
             if other != zone and is_seen(
                 halo, other, rows[i], squared_distance(zones.rects, other, x, y)
             ):
+                if sought:  # most are seen by nobody
+                    digest = _digest(words, i, masks, factors)
+                    sought = False
                 tallies[other]["due"] += digest
