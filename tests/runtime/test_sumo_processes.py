@@ -344,11 +344,12 @@ def test_a_host_elsewhere_goes_on_with_what_another_one_sends(tmp_path: Path, so
         "base_dir": str(base_dir.resolve()),
         "fingerprint": fingerprint(make_world(config, base_dir)),
         "in_next_step": False,
+        "measures": False,
         "size": 1,
     }
     hosts = [HostedWorlds(json.loads(json.dumps(recipe))) for _ in range(2)]
     try:
-        for array in hosts[0].inputs(Task.RESET):
+        for array in hosts[0].inputs(Task.RESET, None):
             array[:] = True
         hosts[0].perform(Task.RESET, {"seed": 4, "first_world": 0})
         for _ in range(30):
