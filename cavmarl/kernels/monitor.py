@@ -252,7 +252,7 @@ def _owe_ghosts(
             if other != zone and is_seen(
                 halo, other, rows[i], squared_distance(zones.rects, other, x, y)
             ):
-                if sought:  # most are seen by nobody
+                if sought:  # many out here are seen by nobody
                     digest = _digest(words, i, masks, factors)
                     sought = False
                 tallies[other]["due"] += digest
