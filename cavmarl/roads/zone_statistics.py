@@ -38,7 +38,7 @@ class ZoneStatistics:
         junctions_cut: of these, in more than one zone.
         cut_junctions: of the cut ones, how many each zone has a part of.
         vehicles: owned by place; zeros without positions.
-        ghosts: that each zone has to be given; zeros without positions.
+        ghosts: that each zone is given at most, all within its halo; zeros without positions.
         narrow: zones with a side shorter than the halo. They are exact; most of what they simulate
             are ghosts.
     """
@@ -106,7 +106,7 @@ def zone_statistics(
 
 
 def _within(rect: Floats, places: Floats, halo_m: float) -> NDArray[np.bool_]:
-    """Whether places lie within the halo of a rectangle, as `kernels.exchange` decides it."""
+    """Whether places lie within the halo of a rectangle: nobody else is ever seen there."""
     away = np.maximum(np.maximum(rect[:2] - places, places - rect[2:]), 0.0)
     return np.asarray((away * away).sum(axis=1) <= halo_m * halo_m)
 
