@@ -124,7 +124,7 @@ class Worlds(NamedTuple):
     num_contacts: NDArray[np.int64]  # (W,) vehicles that began to touch another, since reset
     step: NDArray[np.void]  # PLAN (W, C) of each row the step of its lane, see `ways.own_step`
     step_at: NDArray[np.int64]  # (W, C) 1 + which of `Travel.steps` that is, 0: none yet
-    outer: NDArray[np.int32]  # (W, C) owned next rows that other zones may see, rising
+    outer: NDArray[np.void]  # OUTER (W, C) owned next rows that other zones may see, rising
     num_outer: NDArray[np.int64]  # (W,) -1: nobody has noted them since rows have changed
     cues: NDArray[np.int64]  # (W, T) the tick in which each cue of the script came, -1: not yet
 
@@ -141,7 +141,7 @@ class Zoned(NamedTuple):
     num_contacts: NDArray[np.int64]  # (k, W)
     step: NDArray[np.void]  # PLAN (k, W, C)
     step_at: NDArray[np.int64]  # (k, W, C)
-    outer: NDArray[np.int32]  # (k, W, C)
+    outer: NDArray[np.void]  # OUTER (k, W, C)
     num_outer: NDArray[np.int64]  # (k, W)
     border: NDArray[np.int32]  # (k, W, C) owned rows that are noted at a border, rising
     num_border: NDArray[np.int64]  # (k, W)

@@ -15,7 +15,15 @@ from cavmarl.kernels import inlined_kernel, kernel
 from cavmarl.kernels.arrays import Zoned
 from cavmarl.kernels.borders import Borders
 from cavmarl.kernels.handing_over import Book, look_on
-from cavmarl.kernels.zones import Halo, ZoneArrays, is_inside, is_seen, squared_distance, zone_of
+from cavmarl.kernels.zones import (
+    Halo,
+    ZoneArrays,
+    is_inside,
+    is_seen,
+    note_outer,
+    squared_distance,
+    zone_of,
+)
 
 __all__ = ["exchange", "gather", "note_gathered", "take_own"]
 
@@ -44,7 +52,7 @@ def exchange(
         touching_m: no ghost further outside of a zone can touch one of its vehicles.
         borders: when a vehicle is near one.
         zoned: the ghosts and how many there are, border and num_border are written. Of the owned
-            rows those in `outer` are looked at, where they are noted.
+            rows those in `outer` are looked at; they are noted here, if nobody has noted them.
         side: whose rows, 0 or 1.
         first: the first world.
         last: the one after the last.
@@ -99,8 +107,13 @@ def gather(
         if source == zone:
             continue
         noted = zoned.num_outer[source, w]
-        for n in range(noted if noted >= 0 else zoned.num_owned[source, w]):
-            i = zoned.outer[source, w, n] if noted >= 0 else n
+        for n in range(noted):
+            outer = zoned.outer[source, w, n]
+            squared = squared_distance(zones.rects, zone, outer["x"], outer["y"])
+            if is_seen(halo, zone, outer, squared):
+                near = squared <= near_limit
+                _take_ghost(zoned, side, source, outer["row"], zone, w, near)
+        for i in range(zoned.num_owned[source, w] if noted < 0 else 0):
             row = zoned.rows[side, source, w, i]
             squared = squared_distance(zones.rects, zone, row["x"], row["y"])
             if is_seen(halo, zone, row, squared):
@@ -108,13 +121,16 @@ def gather(
     found = 0
     noted = zoned.num_outer[zone, w]
     for n in range(noted if noted >= 0 else zoned.num_owned[zone, w]):
-        i = zoned.outer[zone, w, n] if noted >= 0 else n
-        row = zoned.rows[side, zone, w, i]
+        i = n
+        x = zoned.outer[zone, w, n]["x"]
+        y = zoned.outer[zone, w, n]["y"]
+        if noted >= 0:
+            i = zoned.outer[zone, w, n]["row"]
+        else:
+            x = zoned.rows[side, zone, w, i]["x"]
+            y = zoned.rows[side, zone, w, i]["y"]
         for other in range(count):
-            if (
-                other != zone
-                and squared_distance(zones.rects, other, row["x"], row["y"]) <= border_limit
-            ):
+            if other != zone and squared_distance(zones.rects, other, x, y) <= border_limit:
                 zoned.border[zone, w, found] = i
                 found += 1
                 break
@@ -152,15 +168,14 @@ def _publish(
     """Copy the owned rows of one zone behind those of all that need them."""
     near_limit = touching_m * touching_m
     border_limit = border_m * border_m
-    noted = zoned.num_outer[zone, w]
+    if zoned.num_outer[zone, w] < 0:
+        _note_all_outer(halo.inner[zone], zoned, side, zone, w)
     found = 0
-    for n in range(noted if noted >= 0 else zoned.num_owned[zone, w]):
-        i = zoned.outer[zone, w, n] if noted >= 0 else n
-        row = zoned.rows[side, zone, w, i]
-        x = row["x"]
-        y = row["y"]
-        if noted < 0 and is_inside(halo.inner[zone], x, y):
-            continue
+    for n in range(zoned.num_outer[zone, w]):
+        outer = zoned.outer[zone, w, n]
+        i = outer["row"]
+        x = outer["x"]
+        y = outer["y"]
         at_border = False
         here = zone
         if squared_distance(zones.rects, zone, x, y) > 0.0:
@@ -170,7 +185,7 @@ def _publish(
             if other == zone:
                 continue
             squared = squared_distance(zones.rects, other, x, y)
-            if is_seen(halo, other, row, squared):
+            if is_seen(halo, other, outer, squared):
                 _take_ghost(zoned, side, zone, i, other, w, squared <= near_limit)
                 at_border |= squared <= border_limit
         if at_border:
@@ -178,6 +193,18 @@ def _publish(
             found += 1
     zoned.num_border[zone, w] = found
     zoned.num_outer[zone, w] = -1
+
+
+@kernel
+def _note_all_outer(inner: NDArray[np.float64], zoned: Zoned, side: int, zone: int, w: int) -> None:
+    """Note a zone's outer rows, as `advance` does, where rows have changed since."""
+    outer = 0
+    for i in range(zoned.num_owned[zone, w]):
+        row = zoned.rows[side, zone, w, i]
+        if not is_inside(inner, row["x"], row["y"]):
+            note_outer(zoned.outer[zone, w, outer], row, i)
+            outer += 1
+    zoned.num_outer[zone, w] = outer
 
 
 @inlined_kernel

@@ -13,6 +13,7 @@ from cavmarl.kernels.codes import (
     EVENT_ARRIVED,
     EVENTS_THAT_END,
 )
+from cavmarl.kernels.zones import note_outer
 
 __all__ = ["drop_ghosts", "leave"]
 
@@ -25,6 +26,25 @@ def _is_through(row: np.void, driver: int, ticks_per_step: int) -> bool:
         return False
     acted: bool = row["departed"] <= row["tick"] - ticks_per_step
     return driver == DRIVER_BACKGROUND or acted
+
+
+@kernel
+def _strike(worlds: Worlds, w: int, rows: NDArray[np.void], i: int, last: int) -> None:
+    """Of the rows that other zones may see row i is gone, and what has been row `last` is row i."""
+    outer = worlds.outer[w]
+    num = worlds.num_outer[w]
+    place = 0
+    while place < num and outer[place]["row"] < i:
+        place += 1
+    if place < num and outer[place]["row"] == i:
+        num -= 1
+        for n in range(place, num):
+            outer[n] = outer[n + 1]
+    if place < num and outer[num - 1]["row"] == last:
+        for n in range(num - 1, place, -1):
+            outer[n] = outer[n - 1]
+        note_outer(outer[place], rows[i], i)
+    worlds.num_outer[w] = num
 
 
 @kernel
@@ -59,7 +79,8 @@ def leave(
             rows[w, last_owned] = rows[w, last]  # a ghost moves up
             worlds.num_owned[w] = last_owned
             worlds.num_rows[w] = last
-            worlds.num_outer[w] = -1
+            if worlds.num_outer[w] >= 0:
+                _strike(worlds, w, rows[w], i, last_owned)
 
 
 @kernel

@@ -37,7 +37,7 @@ from cavmarl.kernels.scalars import clamp
 from cavmarl.kernels.scripts import follow_script
 from cavmarl.kernels.steering import nearest_speed, steer_to_lane, take_meta_action
 from cavmarl.kernels.ways import own_step
-from cavmarl.kernels.zones import is_inside
+from cavmarl.kernels.zones import is_inside, note_outer
 
 __all__ = ["advance", "begin_step", "resolve", "suggest"]
 
@@ -247,7 +247,7 @@ def advance(
                     dt,
                 )
             if not is_inside(inner, row["x"], row["y"]):
-                worlds.outer[w, outer] = k
+                note_outer(worlds.outer[w, outer], row, k)
                 outer += 1
         worlds.num_outer[w] = outer
         worlds.num_through[w] = through

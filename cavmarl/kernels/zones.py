@@ -21,10 +21,12 @@ from cavmarl.kernels.announcing import announced_m
 
 __all__ = [
     "LOOK",
+    "OUTER",
     "Halo",
     "ZoneArrays",
     "is_inside",
     "is_seen",
+    "note_outer",
     "squared_distance",
     "zone_of",
     "zones_of",
@@ -43,6 +45,21 @@ class ZoneArrays(NamedTuple):
 LOOK = np.dtype([("head", np.float32), ("tail", np.float32), ("line", np.float32)])
 """Whom a zone's drivers may ask about on a lane: those up to `head` m, those from `tail` m on, and
 those who announce themselves to a line that lies at `line` m (`kernels.looks`)."""
+
+
+OUTER = np.dtype(
+    [
+        ("x", np.float64),
+        ("y", np.float64),
+        ("s", np.float64),
+        ("speed", np.float64),
+        ("row", np.int32),  # VEHICLE row
+        ("lane", np.int32),
+    ],
+    align=True,
+)
+"""What says of an owned row which zones have to see it. It is noted when the row has just been
+written: rows are large, and those that matter here lie far apart in memory."""
 
 
 class Halo(NamedTuple):
@@ -115,8 +132,26 @@ def squared_distance(rects: NDArray[np.float64], zone: int, x: float, y: float) 
 
 
 @inlined_kernel
+def note_outer(outer: np.void, row: np.void, i: int) -> None:
+    """Note VEHICLE row i as one that other zones may have to see."""
+    outer["x"] = row["x"]
+    outer["y"] = row["y"]
+    outer["s"] = row["s"]
+    outer["speed"] = row["speed"]
+    outer["row"] = i
+    outer["lane"] = row["lane"]
+
+
+@inlined_kernel
 def is_seen(halo: Halo, zone: int, row: np.void, squared: float) -> bool:
-    """Whether a zone has to see a vehicle whose `squared_distance` from it is known."""
+    """Whether a zone has to see a vehicle whose `squared_distance` from it is known.
+
+    Args:
+        halo: of all zones.
+        zone: that sees, or not.
+        row: VEHICLE or OUTER.
+        squared: m².
+    """
     if squared > halo.halo_m * halo.halo_m:
         return False
     if squared <= halo.sure_m * halo.sure_m:

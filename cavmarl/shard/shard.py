@@ -37,7 +37,7 @@ from cavmarl.kernels.repeated import repeated
 from cavmarl.kernels.stacking import fill_stacks
 from cavmarl.kernels.tick import suggest
 from cavmarl.kernels.v2x_records import Mail
-from cavmarl.kernels.zones import Halo, ZoneArrays
+from cavmarl.kernels.zones import OUTER, Halo, ZoneArrays
 from cavmarl.roads.network import RoadNetwork
 from cavmarl.roads.routing import PLAN, lane_grid
 from cavmarl.shard.controllers import CONTROLLER
@@ -298,7 +298,7 @@ def make_zoned(num_zones: int, num_worlds: int, capacity: int, zeros: Zeros = np
         num_contacts=numbers[5],
         step=zeros(everybody, dtype=PLAN),
         step_at=zeros(everybody, dtype=np.int64),
-        outer=zeros(everybody, dtype=np.int32),
+        outer=zeros(everybody, dtype=OUTER),
         num_outer=numbers[7],
         border=zeros(everybody, dtype=np.int32),
         num_border=numbers[6],

@@ -153,8 +153,15 @@ def note_outer(zoned: Zoned, halo: Halo, parts: list[NDArray[np.void]]) -> None:
         left, low, right, high = halo.inner[zone]
         x, y = rows["x"], rows["y"]
         outer = np.flatnonzero(~((left < x) & (x < right) & (low < y) & (y < high)))
-        zoned.outer[zone, 0, : len(outer)] = outer
+        note(zoned.outer[zone, 0], rows, outer)
         zoned.num_outer[zone, 0] = len(outer)
+
+
+def note(noted: NDArray[np.void], rows: NDArray[np.void], places: NDArray[np.int64]) -> None:
+    """Note some rows as OUTER."""
+    noted["row"][: len(places)] = places
+    for name in ("x", "y", "s", "speed", "lane"):
+        noted[name][: len(places)] = rows[name][places]
 
 
 def test_a_world_of_one_zone_has_no_ghosts() -> None:
@@ -216,6 +223,27 @@ def test_background_vehicles_leave_when_they_have_arrived() -> None:
     assert (worlds.num_owned[0], worlds.num_rows[0]) == (2, 4)
     assert set(ids(worlds.rows[0, :2])) == {101, 102}
     assert set(ids(worlds.rows[0, 2:4])) == {104, 105}, "ghosts leave where they are owned"
+
+
+@given(st.lists(st.tuples(st.booleans(), st.booleans()), min_size=1, max_size=9))
+def test_who_leaves_is_no_longer_noted_and_the_others_are_where_they_are(
+    fates: list[tuple[bool, bool]],
+) -> None:
+    rows = cars(len(fates))
+    rows["driver"] = codes.DRIVER_BACKGROUND
+    rows["x"] = np.arange(len(fates))
+    rows["events"] = [codes.EVENT_ARRIVED * arrives for arrives, _ in fates]
+    seen = {int(row["id"]) for row, (_, is_seen) in zip(rows, fates, strict=True) if is_seen}
+    worlds, gate = world(rows, owned=len(rows))
+    note(worlds.outer[0], rows, np.flatnonzero([is_seen for _, is_seen in fates]))
+    worlds.num_outer[0] = len(seen)
+    leave(gate, worlds, worlds.rows, codes.DRIVER_BACKGROUND, 1)
+    left = worlds.rows[0, : worlds.num_owned[0]]
+    expected = np.zeros_like(worlds.outer[0])
+    places = np.flatnonzero([int(row["id"]) in seen for row in left])
+    note(expected, left, places)
+    assert worlds.num_outer[0] == len(places)
+    assert worlds.outer[0, : len(places)].tobytes() == expected[: len(places)].tobytes()
 
 
 def test_agents_leave_when_their_trip_has_ended_and_they_have_acted() -> None:
