@@ -13,6 +13,7 @@ from cavmarl.kernels.announcing import announced_m
 from cavmarl.kernels.arrays import RoadArrays, Scratch, Travel
 from cavmarl.kernels.buckets import add, forget, lay_out
 from cavmarl.kernels.codes import DRIVER_SCRIPTED
+from cavmarl.kernels.lanes import is_lost
 from cavmarl.kernels.ways import leave, next_step, own_step
 
 __all__ = [
@@ -78,6 +79,8 @@ def register_links(
         for i in range(first, last):
             if rows[i]["driver"] == DRIVER_SCRIPTED:
                 pairs = _announce_claims(travel, rows[i], i, pairs, scratch)
+                continue
+            if is_lost(rows[i]):
                 continue
             pairs = _announce(roads, travel, rows[i], i, step[i], pairs, scratch)
     end = scratch.link_end

@@ -34,7 +34,7 @@ from cavmarl.kernels.lane_choice import (
     needed_change,
     thinks_of_lanes,
 )
-from cavmarl.kernels.lanes import VIEW_M, ahead_on, beside_s, last_on, neighbor_behind
+from cavmarl.kernels.lanes import VIEW_M, ahead_on, beside_s, is_lost, last_on, neighbor_behind
 from cavmarl.kernels.rng import STREAM_DRIVER, quick_uniform
 from cavmarl.kernels.stopping import way_to_stop
 from cavmarl.kernels.ways import leave, next_step
@@ -59,6 +59,7 @@ MERGE_ROOM_SHARE = 0.25  # to the right at most this share of the lane's length
 LATERAL_ACCEL = 2.5  # m/s², with which a steered car takes a bend: where a lane turns
 MIN_BEND_RAD = 0.2  # by more than this
 BEND_M = 6.0  # within this length
+RETURN_MPS = 5.0  # at which who is lost looks for its lane
 
 
 @inlined_kernel
@@ -459,6 +460,13 @@ def decide(
         scratch.blinker[i] = needed
         scratch.hold[i] = hold
         scratch.link_ahead[i] = link_ahead
+    if driver == DRIVER_AGENT:
+        for i in range(num):
+            if is_lost(rows[i]):
+                kind = travel.types[rows[i]["vtype"]]
+                speed = rows[i]["speed"]
+                scratch.accel[i] = response(kind, speed, RETURN_MPS, no_press(kind), 0.0, dt)
+                scratch.lane_change[i] = 0
     for k in range(total):
         entry = scratch.entries[k]
         if entry["blinker"] != 0 and not entry["side"]:

@@ -2,7 +2,7 @@
 
 The index lists, lane by lane, the vehicles on it by rising (s, id). A vehicle whose body also
 covers a neighbour lane stands in both lists, who follows a script in those of all lanes that it
-covers or is about to cover. What others look at is copied into the entries, which lie together in
+covers or is about to cover, and who is lost in none. What others look at is copied into the entries, which lie together in
 memory. Nothing here depends on the order of rows.
 """
 
@@ -16,16 +16,18 @@ from numpy.typing import NDArray
 from cavmarl.kernels import inlined_kernel, kernel
 from cavmarl.kernels.arrays import RoadArrays, Scratch, Travel
 from cavmarl.kernels.buckets import add, forget, lay_out
-from cavmarl.kernels.codes import DRIVER_SCRIPTED
+from cavmarl.kernels.codes import DRIVER_AGENT, DRIVER_SCRIPTED
 from cavmarl.kernels.geometry import segment_at
 
 __all__ = [
     "ENTRY",
+    "LOST_M",
     "VIEW_M",
     "ahead_on",
     "behind_on",
     "beside_s",
     "index_lanes",
+    "is_lost",
     "is_off_lanes",
     "last_on",
     "neighbor_behind",
@@ -33,6 +35,7 @@ __all__ = [
 
 MAX_LOOK_BACK_LANES = 4
 OFF_LANES_M = 1.5  # from the middle of the nearest lane
+LOST_M = 10.0  # from its place on its lane: who is steered off further is no longer there
 VIEW_M = 250.0  # the farthest view along the road that a world can have
 
 ENTRY = np.dtype(
@@ -64,10 +67,20 @@ def beside_s(roads: RoadArrays, lane: int, neighbor: int, s: float) -> float:
 
 
 @inlined_kernel
+def is_lost(row: np.void) -> bool:
+    """Whether a row has been steered away from its lane, and onto no other: against the traffic.
+
+    Nobody on that lane has to mind it any more.
+    """
+    lost: bool = abs(row["d"]) > LOST_M and row["driver"] == DRIVER_AGENT
+    return lost
+
+
+@inlined_kernel
 def is_off_lanes(row: np.void) -> bool:
-    """Whether a script has led a row off the lanes, so that its lane is only the nearest one."""
+    """Whether a row's lane is only the nearest one, or where it has been."""
     off: bool = row["driver"] == DRIVER_SCRIPTED and abs(row["d"]) > OFF_LANES_M
-    return off
+    return off or is_lost(row)
 
 
 @inlined_kernel
@@ -103,6 +116,8 @@ def index_lanes(
         if row["driver"] == DRIVER_SCRIPTED:
             _count_covers(travel, row, scratch)
             continue
+        if is_lost(row):
+            continue
         add(scratch.lanes, row["lane"])
         if row["side_lane"] >= 0:
             add(scratch.lanes, row["side_lane"])
@@ -111,6 +126,8 @@ def index_lanes(
         row = rows[i]
         if row["driver"] == DRIVER_SCRIPTED:
             _insert_covers(travel, row, i, scratch)
+            continue
+        if is_lost(row):
             continue
         lane = row["lane"]
         _insert(scratch, travel.types, lane, row, i, row["s"], False)

@@ -30,7 +30,7 @@ from cavmarl.kernels.control import speed_control
 from cavmarl.kernels.drivers import decide
 from cavmarl.kernels.junctions import STOP_SIGN_S
 from cavmarl.kernels.lane_choice import needed_change
-from cavmarl.kernels.lanes import index_lanes
+from cavmarl.kernels.lanes import index_lanes, is_lost
 from cavmarl.kernels.motion import move_agent, move_background
 from cavmarl.kernels.neighbors import Grid
 from cavmarl.kernels.scalars import clamp
@@ -89,7 +89,8 @@ def _order_by_lane(roads: RoadArrays, rows: NDArray[np.void], owned: int, scratc
     """The owned rows in the order of the index: neighbours on the road become so in memory."""
     found = 0
     for i in range(owned):
-        if rows[i]["driver"] == DRIVER_SCRIPTED:  # it may stand in many lists, or in none
+        # Who follows a script may stand in many lists, or in none.
+        if rows[i]["driver"] == DRIVER_SCRIPTED or is_lost(rows[i]):
             scratch.order[found] = i
             found += 1
     for k in range(scratch.lane_start[roads.lanes.shape[0]]):

@@ -12,7 +12,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from cavmarl.kernels import kernel
+from cavmarl.kernels import inlined_kernel, kernel
 from cavmarl.kernels.arrays import LaneGrid, RoadArrays
 from cavmarl.kernels.codes import EVENT_OFF_ROAD, EVENT_WRONG_WAY
 from cavmarl.kernels.geometry import lane_pose, project, project_near
@@ -138,6 +138,14 @@ def _search(roads: RoadArrays, grid: LaneGrid, row: np.void) -> int:
     return 0
 
 
+@inlined_kernel
+def _tell_how_far(roads: RoadArrays, row: np.void) -> None:
+    """Let d say how far a vehicle is from its lane that is beyond its start, or its end."""
+    beyond = max(row["s"] - roads.lanes[row["lane"]]["length_m"], -row["s"])
+    if beyond > abs(row["d"]):
+        row["d"] = math.copysign(beyond, row["d"])
+
+
 @kernel
 def locate(roads: RoadArrays, plans: NDArray[np.void], grid: LaneGrid, row: np.void) -> int:
     """Bring lane, s, d and link of a steered vehicle up to its new place.
@@ -149,7 +157,8 @@ def locate(roads: RoadArrays, plans: NDArray[np.void], grid: LaneGrid, row: np.v
         row: VEHICLE with the new x, y, heading and the old lane context; written.
 
     Returns:
-        EVENT_OFF_ROAD, EVENT_WRONG_WAY or 0.
+        EVENT_OFF_ROAD, EVENT_WRONG_WAY or 0. Who is on no lane of its direction keeps the last one;
+        there s ends at the lane's ends, and d is then the way beyond, if that is more.
     """
     lane = row["lane"]
     s, d, outside = _on(roads, lane, row["x"], row["y"], row["s"])
@@ -179,6 +188,8 @@ def locate(roads: RoadArrays, plans: NDArray[np.void], grid: LaneGrid, row: np.v
     events = 0
     if outside > 0.0:
         events |= _search(roads, grid, row)
+        if events:
+            _tell_how_far(roads, row)
     here = roads.lanes[row["lane"]]
     row["s"] = min(max(row["s"], 0.0), here["length_m"])
     if not _drives_along(roads, row):

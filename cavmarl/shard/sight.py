@@ -8,6 +8,7 @@ import numpy as np
 
 from cavmarl.huge_pages import huge_zeros
 from cavmarl.kernels.arrays import Travel
+from cavmarl.kernels.lanes import LOST_M
 from cavmarl.kernels.looks import find_looks, make_room
 from cavmarl.kernels.zones import LOOK, Halo
 from cavmarl.roads.network import RoadNetwork
@@ -15,8 +16,6 @@ from cavmarl.roads.zone_halo import zone_halo
 from cavmarl.roads.zones import ZonePartition
 
 __all__ = ["Sight"]
-
-BESIDE_M = 10.0  # from a vehicle's place to that on its lane
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,7 +44,7 @@ class Sight:
         roads = self.network.arrays
         room = make_room(len(roads.lanes), len(roads.links))
         half_m = 0.5 * float(self.travel.types["length"].max())
-        wide_m = self.outside_m + BESIDE_M
+        wide_m = self.outside_m + LOST_M  # its place on its lane is not further away
         rects = partition.reaching + np.array([-wide_m, -wide_m, wide_m, wide_m])
         looks = huge_zeros((partition.count, len(roads.lanes)), dtype=LOOK)
         for rect, own in zip(rects, looks, strict=True):

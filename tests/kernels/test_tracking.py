@@ -151,6 +151,17 @@ def test_on_the_lanes_of_the_other_direction_is_the_wrong_way() -> None:
     assert found.startswith("B1A1")
 
 
+def test_who_is_on_no_lane_of_its_direction_says_how_far_from_its_last_one_it_is() -> None:
+    roads = network("grid4x4")
+    row = on_lane(roads, lane_of(roads, "A1B1_0"), 2.0)
+    row["heading"] += math.pi
+    shift(row, 30.0, 0.0)
+    found, s, d, events = find("grid4x4", row)
+    assert (found, s) == ("A1B1_0", 0.0)
+    assert abs(d) == pytest.approx(28.0)
+    assert events & EVENT_WRONG_WAY
+
+
 def test_who_cuts_across_is_found_on_the_other_road() -> None:
     roads = network("grid4x4")
     row = on_lane(roads, lane_of(roads, "A1B1_0"), 40.0)
