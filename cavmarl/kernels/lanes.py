@@ -2,8 +2,8 @@
 
 The index lists, lane by lane, the vehicles on it by rising (s, id). A vehicle whose body also
 covers a neighbour lane stands in both lists, who follows a script in those of all lanes that it
-covers or is about to cover, and who is lost in none. What others look at is copied into the entries, which lie together in
-memory. Nothing here depends on the order of rows.
+covers or is about to cover, and who is lost in none. What others look at is copied into the
+entries, which lie together in memory. Nothing here depends on the order of rows.
 """
 
 from __future__ import annotations

@@ -15,7 +15,7 @@ from cavmarl.rig.catalogue import rig_reach_m
 from cavmarl.roads.network import RoadNetwork
 from cavmarl.roads.zones import ZonePartition
 from cavmarl.runtime.division import Division
-from cavmarl.shard.reach import driving_reach_m
+from cavmarl.shard.reach import driving_reach_m, longest_move_m
 from cavmarl.shard.sensors import largest_radius_m, sensing_reach_m
 from cavmarl.shard.shard import Shard, make_zoned
 from cavmarl.shard.sight import Sight
@@ -56,17 +56,18 @@ def divide(
     radius_m = largest_radius_m(traffic.travel.types)
     sensing_m = max(sensing_reach_m(config.sensors, radius_m), rig_reach_m(config.rig, radius_m))
     reach_m = max(driving_reach_m(network, traffic.travel), sensing_m)
-    wide_m = halo_m(config, reach_m, partition.count)
-    touching_m = _needed_m(config, 2.0 * radius_m)
+    fastest_mps = longest_move_m(network, dt) / dt
+    wide_m = halo_m(config, reach_m, partition.count, fastest_mps)
+    touching_m = _needed_m(config, 2.0 * radius_m, fastest_mps)
     # Agents alone sense.
-    sensed_m = _needed_m(config, sensing_m) if config.population.agents else 0.0
-    near_m = max(touching_m, sensed_m, _approach_m(settings, dt))
+    sensed_m = _needed_m(config, sensing_m, fastest_mps) if config.population.agents else 0.0
+    near_m = max(touching_m, sensed_m, settings.approach_ticks * fastest_mps * dt)
     sight = Sight(
         network,
         traffic.travel,
         wide_m,
         near_m if _goes_by_roads(config, traffic) else wide_m,
-        _needed_m(config, 0.0),
+        _needed_m(config, 0.0, fastest_mps),
     )
     halo = sight.halo(partition)
     zoned = make_zoned(partition.count, num_worlds, traffic.capacity, zeros)
@@ -99,25 +100,30 @@ def divide(
     return shards, division
 
 
-def halo_m(config: EnvConfig, reach_m: float, zones: int) -> float:
+def halo_m(
+    config: EnvConfig, reach_m: float, zones: int, fastest_mps: float = MAX_SPEED_MPS
+) -> float:
     """How far zones see over their borders.
 
     Args:
         config: `zones.halo_m` is taken if it is given.
         reach_m: the farthest that anybody looks.
         zones: how many there are.
+        fastest_mps: the way of a tick over its length, with what vehicles jump on the map.
 
     Raises:
         CoverageError: that is less than exactness needs, with all numbers.
     """
     settings, dt = config.zones, config.clock.sim_dt_s
-    wide_m = _needed_m(config, reach_m) if settings.halo_m is None else settings.halo_m
+    wide_m = settings.halo_m
+    if wide_m is None:
+        wide_m = _needed_m(config, reach_m, fastest_mps)
     if zones > 1:
         check_coverage(
-            Distances(_approach_m(settings, dt), settings.hysteresis_m, wide_m),
+            Distances(settings.approach_ticks * fastest_mps * dt, settings.hysteresis_m, wide_m),
             _limits_at_borders(settings),
             reach_m=reach_m,
-            v_max_mps=MAX_SPEED_MPS,
+            v_max_mps=fastest_mps,
             dt_s=dt,
         )
     return wide_m
@@ -130,11 +136,6 @@ def _goes_by_roads(config: EnvConfig, traffic: NativeTraffic) -> bool:
     """
     free = traffic.scene is not None or traffic.sumo is not None
     return config.zones.halo_m is None and not free
-
-
-def _approach_m(settings: ZonesConfig, dt: float) -> float:
-    """How far before a border the zone behind it is told."""
-    return settings.approach_ticks * MAX_SPEED_MPS * dt
 
 
 def limits_of(settings: ZonesConfig, schema: int = 1) -> Limits:
@@ -157,9 +158,9 @@ def _limits_at_borders(settings: ZonesConfig) -> Limits:
     return replace(limits, deferral=0, policy=DeadlinePolicy.FORCE, grace=0)
 
 
-def _needed_m(config: EnvConfig, reach_m: float) -> float:
+def _needed_m(config: EnvConfig, reach_m: float, fastest_mps: float) -> float:
     limits = _limits_at_borders(config.zones)
     needed_m = needed_overlap_m(
-        reach_m, config.zones.hysteresis_m, limits, MAX_SPEED_MPS, config.clock.sim_dt_s
+        reach_m, config.zones.hysteresis_m, limits, fastest_mps, config.clock.sim_dt_s
     )
     return needed_m + _ROUNDING_M

@@ -22,7 +22,6 @@ from cavmarl.kernels.monitor import (
     owner_hash,
     watch,
 )
-from cavmarl.kernels.motion import LATERAL_MPS, MAX_SPEED_MPS
 from cavmarl.kernels.repeated import repeated
 from cavmarl.ownership.limits import Limits
 from cavmarl.ownership.messages import Birth, Commit, Item, Message, Record, Reset
@@ -34,20 +33,9 @@ from cavmarl.runtime.row_digests import digest_tables
 from cavmarl.runtime.violations import Violations
 from cavmarl.shard.vehicles import GHOST_FIELDS
 
-__all__ = ["Monitor", "OwnersOnRecord", "longest_move_m"]
+__all__ = ["Monitor", "OwnersOnRecord"]
 
 WORD = 1 << 64
-# m that a body a lane's width aside jumps where its lane turns by a right angle at once.
-KINK_M = 5.0
-
-
-def longest_move_m(dt: float) -> float:
-    """So far, in m, a vehicle moves in a tick of `dt` seconds, and no further.
-
-    Along its lane at the speed that the dynamics do not exceed, sideways as a lane change goes, and
-    over the kinks between the pieces of a map's lines.
-    """
-    return (MAX_SPEED_MPS + LATERAL_MPS) * dt + KINK_M
 
 
 def _add(sums: NDArray[np.uint64], zone: int, term: int) -> None:
@@ -156,13 +144,15 @@ class Monitor:
     Args:
         division: whose rows are looked at.
         records: of the coordinator of each world.
-        dt: seconds of a tick.
+        longest_move_m: no vehicle moves further in a tick.
     """
 
-    def __init__(self, division: Division, records: Sequence[OwnersOnRecord], dt: float) -> None:
+    def __init__(
+        self, division: Division, records: Sequence[OwnersOnRecord], longest_move_m: float
+    ) -> None:
         self._division = division
         self._records = tuple(records)
-        self._limit_m = longest_move_m(dt)
+        self._limit_m = longest_move_m
         num_worlds, capacity = division.zoned.rows.shape[2:]
         self._ticks = [0] * num_worlds
         self._looks = [0] * num_worlds

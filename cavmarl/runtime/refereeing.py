@@ -123,7 +123,7 @@ def make_refereeing(
     shards: Sequence[Shard],
     division: Division,
     shared: Callable[[], Iterable[NDArray[Any]]],
-    dt: float,
+    longest_move_m: float,
     safeguards: Safeguards = ALL_ON,
     runs: Sequence[Run] | None = None,
 ) -> Refereeing:
@@ -134,7 +134,7 @@ def make_refereeing(
         shards: one a zone.
         division: of them.
         shared: the arrays beside theirs that a tick changes.
-        dt: seconds of a tick.
+        longest_move_m: of a vehicle in a tick.
         safeguards: remedies of the protocol; tests take one away.
         runs: one a world; None: they are chosen, and their journals must not be there.
 
@@ -164,7 +164,7 @@ def make_refereeing(
         for w in range(division.num_worlds)
     ]
     digests = RowDigests() if settings.journal or deaths else None
-    monitor = _monitor(division, coordinators, limits, dt) if settings.check else None
+    monitor = _monitor(division, coordinators, limits, longest_move_m) if settings.check else None
     dying = coordinators[0]
     if crashes is None or not isinstance(dying, Coordinator):
         coordination = Coordination(division, coordinators, states, digests, monitor=monitor)
@@ -214,7 +214,7 @@ def _referee(
 
 
 def _monitor(
-    division: Division, coordinators: Sequence[Referee], limits: Limits, dt: float
+    division: Division, coordinators: Sequence[Referee], limits: Limits, longest_move_m: float
 ) -> Monitor:
     """What looks at all worlds, and is told what their coordinators do."""
     is_direct = isinstance(coordinators[0], DirectCoordinator)
@@ -223,7 +223,7 @@ def _monitor(
         coordinator.watch(record)
         if isinstance(coordinator, DirectCoordinator):
             coordinator.foretell, record.ask = record.foretold, coordinator.catch_up
-    return Monitor(division, records, dt)
+    return Monitor(division, records, longest_move_m)
 
 
 def journal_path(journal: str, w: int, num_worlds: int) -> Path:

@@ -57,6 +57,7 @@ from cavmarl.runtime.step_trace import MIRROR, SUMO, Traced
 from cavmarl.runtime.store import CommittedStore
 from cavmarl.runtime.traffic_stats import TrafficStats, count_traffic
 from cavmarl.runtime.zone_view import ZoneView, view_zones
+from cavmarl.shard.reach import longest_move_m
 from cavmarl.shard.shard import Commands, Shard
 from cavmarl.shard.vehicles import blank_vehicle
 from cavmarl.traffic.demand import DemandFile
@@ -202,7 +203,7 @@ class Simulation:
             self._shards,
             self._division,
             self._shared_arrays,
-            self.config.clock.sim_dt_s,
+            longest_move_m(self.network, self.config.clock.sim_dt_s),
             runs=runs,
         )
         self._coordination = refereeing.coordination

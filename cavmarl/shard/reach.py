@@ -1,4 +1,4 @@
-"""How far a shard has to see over its borders: the farthest look of drivers and of sensors.
+"""How far a shard has to see over its borders: the farthest look of drivers, the longest move.
 
 Distances are between centres, in the plane. What is measured along a road is at least as long,
 except over junctions without lanes inside, where vehicles jump.
@@ -12,9 +12,10 @@ from numpy.typing import NDArray
 from cavmarl.kernels.announcing import APPROACH_M
 from cavmarl.kernels.arrays import Travel
 from cavmarl.kernels.junctions import EXIT_LOOK_M
+from cavmarl.kernels.motion import CROSSINGS_PER_TICK, LATERAL_MPS, MAX_SPEED_MPS
 from cavmarl.roads.network import RoadNetwork
 
-__all__ = ["driving_reach_m"]
+__all__ = ["driving_reach_m", "longest_move_m"]
 
 ASIDE_M = 10.0  # between the centres of neighbour lanes, and of vehicles beside them
 
@@ -37,6 +38,37 @@ def driving_reach_m(network: RoadNetwork, travel: Travel) -> float:
     bodies_m = 2.0 * float(travel.types["length"].max())
     roads_m = stretch * max(travel.view_m, junction_m + beyond_m) + 2.0 * jump_m
     return roads_m + _across_m(network) + bodies_m + ASIDE_M + travel.scripts.reach_m
+
+
+def longest_move_m(network: RoadNetwork, dt: float) -> float:
+    """So far, in m, a vehicle moves in a tick of `dt` seconds, and no further.
+
+    Along its lane at the speed that the dynamics do not exceed, sideways as a lane change goes,
+    over the kinks between the pieces of the map's lines, and over its junctions.
+    """
+    _, jump_m = _jumps(network)
+    shortest_m = float(network.lanes["length_m"].min())
+    jumps = 1 + min(int(MAX_SPEED_MPS * dt / max(shortest_m, 1e-9)), CROSSINGS_PER_TICK - 1)
+    way_m = float(np.hypot(MAX_SPEED_MPS, LATERAL_MPS)) * dt
+    return way_m + _kink_m(network) + jumps * jump_m
+
+
+def _kink_m(network: RoadNetwork) -> float:
+    """The longest way that a place a lane's width aside jumps where a lane turns at once."""
+    lanes, links = network.lanes, network.links
+    direction = network.points["cos"] + 1j * network.points["sin"]
+    first = lanes["first_point"]
+    last = first + lanes["num_points"] - 2  # of its last piece
+    within = np.ones(len(direction), dtype=bool)
+    within[last + 1] = False  # from there on it is another lane
+    within = np.flatnonzero(within)
+    before = [direction[within], direction[last[links["from_lane"]]]]
+    after = [direction[within + 1], direction[first[links["next_lane"]]]]
+    inside = np.flatnonzero(lanes["internal"])
+    before.append(direction[last[inside]])
+    after.append(direction[first[lanes["successor"][inside]]])
+    turn = np.abs(np.angle(np.concatenate(after) / np.concatenate(before)))
+    return float(2.0 * np.sin(0.5 * turn.max(initial=0.0)) * lanes["width_m"].max(initial=0.0))
 
 
 def _ends(network: RoadNetwork) -> tuple[NDArray[np.float64], NDArray[np.float64]]:

@@ -17,7 +17,7 @@ from cavmarl.evaluate.transfer_rows import TRANSFER, transfers_of
 from cavmarl.roads.zone_file import write_zones
 from cavmarl.roads.zones import ZonePartition
 from cavmarl.runtime.journal_summary import summarize
-from cavmarl.runtime.monitor import longest_move_m
+from cavmarl.shard.reach import longest_move_m
 from cavmarl.worlds import load_world
 
 SMALL: dict[str, Any] = {"episodes": 3, "agents": 4, "background": 40, "max_cycles": 40}
@@ -43,7 +43,7 @@ def test_each_transfer_has_its_row(folder: Path) -> None:
     staying = rows[~rows["removed"]]
     moved_m = staying["release_depth_m"] - staying["switch_depth_m"]
     assert (moved_m > -0.5).all()
-    assert (moved_m < longest_move_m(0.1)).all()
+    assert (moved_m < longest_move_m(load_world("grid4x4")[1], 0.1)).all()
     assert np.median(moved_m) > 0.0
     assert np.isnan(rows[rows["removed"]]["release_depth_m"]).all()
     assert (rows["ms"] > 0.0).all()
