@@ -1,18 +1,23 @@
-"""How far drivers look, as declared: no less than what they look at."""
+"""How far drivers look, as declared: no less than what they look at; and how far vehicles move."""
 
 from __future__ import annotations
 
+import math
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from cavmarl.kernels.lanes import VIEW_M
+from cavmarl.kernels.motion import LATERAL_MPS, MAX_SPEED_MPS
 from cavmarl.roads.cache import load_network
 from cavmarl.roads.network import RoadNetwork
-from cavmarl.shard.reach import APPROACH_M, ASIDE_M, driving_reach_m
+from cavmarl.shard.reach import APPROACH_M, ASIDE_M, driving_reach_m, longest_move_m
 from cavmarl.worlds import find_map
+from tests.driving import drive, make_traffic, start
 from tests.kernels.traffic import NAMES, network, travel
+from tests.netgenerate import netgenerate
 
 LENGTH_M = 5.0  # of the generator's cars
 # Two roads of 40 m and a gap of 20 m between them, which vehicles jump over.
@@ -81,3 +86,52 @@ def test_jumps_over_junctions_without_lanes_count(tmp_path: Path) -> None:
     reach_m = driving_reach_m(roads, travel("merge"))
     stretched = 1.5 * (VIEW_M + APPROACH_M) + 3.0 * 20.0
     assert reach_m == pytest.approx(stretched + 2.0 * LENGTH_M + ASIDE_M)
+
+
+def test_the_longest_move_counts_jumps_over_junctions_without_lanes(tmp_path: Path) -> None:
+    path = tmp_path / "gap.net.xml"
+    path.write_text(GAP, encoding="utf-8")
+    tick_s = 0.1
+    way_m = float(np.hypot(MAX_SPEED_MPS, LATERAL_MPS)) * tick_s
+    roads = load_network(find_map(path))
+    assert longest_move_m(roads, tick_s) == pytest.approx(way_m + 20.0)
+    assert longest_move_m(roads, 1.0) == pytest.approx(10.0 * way_m + 2.0 * 20.0), "two in a tick"
+
+
+def test_the_longest_move_counts_kinks() -> None:
+    roads, tick_s = network("merge"), 0.1
+    way_m = float(np.hypot(MAX_SPEED_MPS, LATERAL_MPS)) * tick_s
+    lines = zip(roads.lanes["first_point"], roads.lanes["num_points"], strict=True)
+    turns = [
+        abs(math.remainder(b - a, math.tau))
+        for first, num in lines
+        for a, b in pairwise(roads.points["heading"][first : first + num - 1].tolist())
+    ]
+    aside_m = float(roads.lanes["width_m"].max())
+    kink_m = 2.0 * aside_m * math.sin(0.5 * max(turns))
+    assert longest_move_m(roads, tick_s) >= way_m + kink_m - 1e-9
+    assert longest_move_m(roads, tick_s) < way_m + aside_m
+
+
+@pytest.mark.parametrize("internal", [(), ("--no-internal-links",)])
+def test_nobody_moves_further(internal: tuple[str, ...], tmp_path: Path) -> None:
+    path = netgenerate(
+        tmp_path / "x.net.xml",
+        "--grid", "--grid.number", "3", "--grid.length", "80", "-L", "3", *internal,
+    )  # fmt: skip
+    tick_s = 0.1
+    simulation = make_traffic(
+        path, background=60, overrides={"clock.sim_dt_s": tick_s, "clock.ctrl_dt_s": tick_s}
+    )
+    start(simulation, seed=1)
+    furthest_m = 0.0
+    before: dict[int, tuple[float, float]] = {}
+    for _ in range(300):
+        drive(simulation)
+        rows = simulation.vehicles(0)
+        now = {int(row["id"]): (float(row["x"]), float(row["y"])) for row in rows}
+        for vehicle in now.keys() & before.keys():
+            furthest_m = max(furthest_m, math.dist(now[vehicle], before[vehicle]))
+        before = now
+    assert furthest_m <= longest_move_m(simulation.network, tick_s)
+    assert (furthest_m > MAX_SPEED_MPS * tick_s) == bool(internal)
