@@ -56,7 +56,7 @@ def divide(
     radius_m = largest_radius_m(traffic.travel.types)
     sensing_m = max(sensing_reach_m(config.sensors, radius_m), rig_reach_m(config.rig, radius_m))
     reach_m = max(driving_reach_m(network, traffic.travel), sensing_m)
-    fastest_mps = longest_move_m(network, dt) / dt
+    fastest_mps = longest_move_m(network, traffic.travel, dt) / dt
     wide_m = halo_m(config, reach_m, partition.count, fastest_mps)
     touching_m = _needed_m(config, 2.0 * radius_m, fastest_mps)
     # Agents alone sense.

@@ -203,7 +203,7 @@ class Simulation:
             self._shards,
             self._division,
             self._shared_arrays,
-            longest_move_m(self.network, self.config.clock.sim_dt_s),
+            longest_move_m(self.network, self._traffic.travel, self.config.clock.sim_dt_s),
             runs=runs,
         )
         self._coordination = refereeing.coordination

@@ -40,17 +40,19 @@ def driving_reach_m(network: RoadNetwork, travel: Travel) -> float:
     return roads_m + _across_m(network) + bodies_m + ASIDE_M + travel.scripts.reach_m
 
 
-def longest_move_m(network: RoadNetwork, dt: float) -> float:
+def longest_move_m(network: RoadNetwork, travel: Travel, dt: float) -> float:
     """So far, in m, a vehicle moves in a tick of `dt` seconds, and no further.
 
     Along its lane at the speed that the dynamics do not exceed, sideways as a lane change goes,
-    over the kinks between the pieces of the map's lines, and over its junctions.
+    over the kinks between the pieces of the map's lines, and over its junctions. In a hairpin the
+    centre of a body leaves the lane for the chord between the bumpers, half its length away.
     """
     _, jump_m = _jumps(network)
     shortest_m = float(network.lanes["length_m"].min())
     jumps = 1 + min(int(MAX_SPEED_MPS * dt / max(shortest_m, 1e-9)), CROSSINGS_PER_TICK - 1)
     way_m = float(np.hypot(MAX_SPEED_MPS, LATERAL_MPS)) * dt
-    return way_m + _kink_m(network) + jumps * jump_m
+    half_m = 0.5 * float(travel.types["length"].max())
+    return way_m + _kink_m(network) + jumps * jump_m + half_m
 
 
 def _kink_m(network: RoadNetwork) -> float:

@@ -19,6 +19,7 @@ from cavmarl.roads.zones import ZonePartition
 from cavmarl.runtime.journal_summary import summarize
 from cavmarl.shard.reach import longest_move_m
 from cavmarl.worlds import load_world
+from tests.kernels.traffic import network, travel
 
 SMALL: dict[str, Any] = {"episodes": 3, "agents": 4, "background": 40, "max_cycles": 40}
 ZONES = {"zones.count": 4}
@@ -43,7 +44,7 @@ def test_each_transfer_has_its_row(folder: Path) -> None:
     staying = rows[~rows["removed"]]
     moved_m = staying["release_depth_m"] - staying["switch_depth_m"]
     assert (moved_m > -0.5).all()
-    assert (moved_m < longest_move_m(load_world("grid4x4")[1], 0.1)).all()
+    assert (moved_m < longest_move_m(network("grid4x4"), travel("grid4x4"), 0.1)).all()
     assert np.median(moved_m) > 0.0
     assert np.isnan(rows[rows["removed"]]["release_depth_m"]).all()
     assert (rows["ms"] > 0.0).all()

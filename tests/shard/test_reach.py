@@ -94,8 +94,12 @@ def test_the_longest_move_counts_jumps_over_junctions_without_lanes(tmp_path: Pa
     tick_s = 0.1
     way_m = float(np.hypot(MAX_SPEED_MPS, LATERAL_MPS)) * tick_s
     roads = load_network(find_map(path))
-    assert longest_move_m(roads, tick_s) == pytest.approx(way_m + 20.0)
-    assert longest_move_m(roads, 1.0) == pytest.approx(10.0 * way_m + 2.0 * 20.0), "two in a tick"
+    assert longest_move_m(roads, travel("merge"), tick_s) == pytest.approx(
+        way_m + 20.0 + LENGTH_M / 2
+    )
+    assert longest_move_m(roads, travel("merge"), 1.0) == pytest.approx(
+        10.0 * way_m + 2.0 * 20.0 + LENGTH_M / 2
+    ), "two in a tick"
 
 
 def test_the_longest_move_counts_kinks() -> None:
@@ -109,8 +113,8 @@ def test_the_longest_move_counts_kinks() -> None:
     ]
     aside_m = float(roads.lanes["width_m"].max())
     kink_m = 2.0 * aside_m * math.sin(0.5 * max(turns))
-    assert longest_move_m(roads, tick_s) >= way_m + kink_m - 1e-9
-    assert longest_move_m(roads, tick_s) < way_m + aside_m
+    assert longest_move_m(roads, travel("merge"), tick_s) >= way_m + kink_m + LENGTH_M / 2 - 1e-9
+    assert longest_move_m(roads, travel("merge"), tick_s) < way_m + aside_m + LENGTH_M / 2
 
 
 @pytest.mark.parametrize("internal", [(), ("--no-internal-links",)])
@@ -133,5 +137,5 @@ def test_nobody_moves_further(internal: tuple[str, ...], tmp_path: Path) -> None
         for vehicle in now.keys() & before.keys():
             furthest_m = max(furthest_m, math.dist(now[vehicle], before[vehicle]))
         before = now
-    assert furthest_m <= longest_move_m(simulation.network, tick_s)
+    assert furthest_m <= longest_move_m(simulation.network, travel("merge"), tick_s)
     assert (furthest_m > MAX_SPEED_MPS * tick_s) == bool(internal)
