@@ -193,7 +193,7 @@ def draw_faces(picture: Picture, num: int, first: int, last: int) -> None:
 
 @kernel
 def _draw(picture: Picture, k: int, first: int, begin_row: int, end_row: int) -> None:
-    """Draw a face over what is farther away; row `first` is the uppermost that there is room for."""
+    """Draw a face over what is farther away; row `first` is the first that there is room for."""
     width = picture.face.shape[1]
     edges = picture.faces.edges[k]
     plane = picture.faces.plane[k]
