@@ -17,7 +17,7 @@ import os
 import signal
 import socket
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from itertools import chain, compress, repeat
 from typing import Any, NoReturn
 
@@ -83,6 +83,12 @@ class Simulation:
         self._sumo.start([_binary(self._interface), *words])
         self._runs = True
         self._vehicle = self._sumo.vehicle
+        fields = {**_FIELDS, **(_FIELDS_SEEN if self._is_seen else {})}
+        self._getters = {field: _bare(self._sumo, "vehicle", get) for field, get in fields.items()}
+        self._lane_of = _bare(self._sumo, "vehicle", "getLaneID")
+        self._route_of = _bare(self._sumo, "vehicle", "getRouteID")
+        self._place_of = _bare(self._sumo, "vehicle", "getPosition3D")
+        self._state_of = _bare(self._sumo, "trafficlight", "getRedYellowGreenState")
         return {"version": str(self._sumo.getVersion()[1]), "time_ms": self._time_ms()}
 
     def _stop(self) -> None:
@@ -122,17 +128,13 @@ class Simulation:
         seen["vtype"] = np.array(self._types, dtype=np.int32)[numbers]
         seen["lane"] = lanes
         seen["route"] = self._routes(names, line)
-        vehicle, fields = self._vehicle, _FIELDS
         if self._is_seen:
-            places = chain.from_iterable(map(vehicle.getPosition3D, names))
+            places = chain.from_iterable(map(self._place_of, names))
             xyz = np.fromiter(places, np.float64, 3 * len(names)).reshape(-1, 3)
             seen["x"], seen["y"], seen["z"] = xyz.T
-            fields = {**_FIELDS, **_FIELDS_SEEN}
-        for field, name in fields.items():
-            kind = self._seen[field]
-            seen[field] = np.fromiter(map(getattr(vehicle, name), names), kind, len(names))
-        get_state = self._sumo.trafficlight.getRedYellowGreenState
-        letters = "".join(map(get_state, self._signals)).encode()
+        for field, get in self._getters.items():
+            seen[field] = np.fromiter(map(get, names), self._seen[field], len(names))
+        letters = "".join(map(self._state_of, self._signals)).encode()
         return seen[np.argsort(numbers)], letters, line
 
     def _on_road(
@@ -145,7 +147,7 @@ class Simulation:
         """
         vehicle, nobody = self._vehicle, repeat(-1)
         names = vehicle.getIDList()
-        lanes = map(self._lane_row.get, map(vehicle.getLaneID, names), nobody)
+        lanes = map(self._lane_row.get, map(self._lane_of, names), nobody)
         rows = np.fromiter(lanes, np.int32, len(names))
         known = map(self._number.get, names, nobody)
         numbers = np.fromiter(known, np.int32, len(names))
@@ -201,7 +203,7 @@ class Simulation:
     def _routes(self, names: Sequence[str], line: dict[str, Any]) -> NDArray[np.int32]:
         """Numbers of their routes; the edges of new ones go into the line."""
         known = self._route_row
-        ids = [*map(self._vehicle.getRouteID, names)]
+        ids = [*map(self._route_of, names)]
         rows = np.fromiter(map(known.get, ids, repeat(-1)), np.int32, len(ids))
         for place in np.flatnonzero(rows < 0).tolist():
             route = ids[place]
@@ -240,6 +242,18 @@ class Simulation:
     def _time_ms(self) -> int:
         time_s: float = self._sumo.simulation.getTime()
         return round(1000.0 * time_s)
+
+
+def _bare(sumo: Any, domain: str, getter: str) -> Callable[[str], Any]:
+    """A getter for names, of libsumo without the Python function that SWIG puts around it.
+
+    That one only hands on what it is given, and costs a fifth of the call. TraCI has none, nor may
+    another libsumo: there it is the usual one.
+    """
+    inner = getattr(getattr(sumo, "libsumo", None), "_libsumo", None)
+    usual: Callable[[str], Any] = getattr(getattr(sumo, domain), getter)
+    bare: Callable[[str], Any] = getattr(inner, f"{domain}_{getter}", usual)
+    return bare
 
 
 def _describe(kinds: Any, name: str) -> dict[str, Any]:
