@@ -236,10 +236,11 @@ class SensorFarm:
             SensorFrameError: the first that is not.
         """
         shared = self.shared
+        wrong = (shared.delivered != shared.ticks) & (shared.due[:, 0] > 0)  # (n, S, W)
+        if not wrong.any():
+            return
         for turn in turns:
-            wrong = (shared.delivered[:, turn.place] != shared.ticks) & (turn.due.num > 0)
-            if wrong.any():
-                worker, world = np.argwhere(wrong)[0]
+            for worker, world in np.argwhere(wrong[:, turn.place]).tolist():
                 found = shared.delivered[worker, turn.place, world]
                 raise SensorFrameError(turn.sensor.name, int(shared.ticks[world]), int(found))
 
@@ -306,7 +307,8 @@ class SensorFarm:
         times.sent_bytes += int(shared.num_rows.sum()) * shared.rows.itemsize + sum(
             array.nbytes for array in (shared.before, shared.due, shared.signal_phase)
         )
-        times.got_bytes += sum(
-            int(turn.due.num.sum()) * turn.frames.data[0, :, 0].nbytes for turn in turns
-        )
+        for turn in turns:
+            frames = turn.frames.data
+            one = frames.nbytes // (frames.shape[0] * frames.shape[2])  # of all agents of a world
+            times.got_bytes += int(turn.due.num.sum()) * one
         times.messages += 2 * self._plan.shape.workers
