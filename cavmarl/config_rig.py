@@ -43,6 +43,7 @@ __all__ = [
 ]
 
 MAX_SENSORS = 64
+MAX_RAYS = 8192  # of a layer: one every 0.05 degrees all around, and less than that
 MAX_SAMPLE_NUMBERS = 1 << 22  # of one sensor: a picture of 1920 by 1080 with two bytes
 MAX_RATE_HZ = 10_000.0
 MAX_REACH_M = 300.0
@@ -238,7 +239,7 @@ class LidarRigConfig(SampledConfig):
         """As `MountedConfig.check`."""
         super().check(key)
         check_finite(f"{key}.range_m", self.range_m, 1.0, MAX_REACH_M)
-        _check_count(f"{key}.rays", self.rays, 1, 4096)
+        _check_count(f"{key}.rays", self.rays, 1, MAX_RAYS)
         _check_count(f"{key}.layers", self.layers, 1, 128)
         check_finite(f"{key}.fov_deg", self.fov_deg, 1.0, 360.0)
         check_finite(f"{key}.lower_deg", self.lower_deg, -89.0, 89.0)
@@ -274,7 +275,7 @@ class RadarConfig(SampledConfig):
         check_finite(f"{key}.range_m", self.range_m, 1.0, MAX_REACH_M)
         check_finite(f"{key}.fov_deg", self.fov_deg, 1.0, 360.0)
         _check_count(f"{key}.targets", self.targets, 1, 256)
-        _check_count(f"{key}.rays", self.rays, 1, 4096)
+        _check_count(f"{key}.rays", self.rays, 1, MAX_RAYS)
 
 
 @dataclass(frozen=True, kw_only=True)

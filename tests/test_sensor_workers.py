@@ -21,7 +21,9 @@ import cavmarl
 from cavmarl import CavVectorEnv, make_vec
 from cavmarl.errors import ConfigError, SensorFrameError, WorkerError
 from cavmarl.rig.rig import Turn
+from cavmarl.runtime import sensor_farm, sensor_shares
 from cavmarl.runtime.sensor_farm import SensorFarm
+from cavmarl.runtime.sensor_shares import LineWorth, Shares
 from cavmarl.stepping.local import LocalWorlds
 
 RIG: dict[str, dict[str, Any]] = {
@@ -53,7 +55,8 @@ def _crowded() -> Iterator[None]:
 
 def _make(rig: dict[str, dict[str, Any]] = RIG, **keywords: Any) -> CavVectorEnv:
     overrides = {"rig": rig, "population.mode": "seats", **keywords.pop("overrides", {})}
-    return make_vec("grid4x4", agents=6, background=30, overrides=overrides, **keywords)
+    agents = keywords.pop("num_agents", 6)
+    return make_vec("grid4x4", agents=agents, background=30, overrides=overrides, **keywords)
 
 
 def _results(vec: CavVectorEnv) -> list[bytes | str]:
@@ -109,6 +112,26 @@ def test_nothing_depends_on_how_many_there_are_nor_who_senses_what(
 ) -> None:
     settings = {"workers.sensor_placement": placement}
     assert _drive(sensor_workers=sensor_workers, overrides=settings) == alone
+
+
+@pytest.mark.parametrize("sensor_workers", [2, 3])
+def test_nothing_depends_on_how_frames_are_divided(
+    alone: list[list[bytes | str]], monkeypatch: pytest.MonkeyPatch, sensor_workers: int
+) -> None:
+    """Frames as small as here are not worth it; divided they are all the same."""
+    divided: list[dict[int, Any]] = []
+
+    def divide(shares: Shares, worth: LineWorth) -> Shares:
+        found = sensor_shares.divide(shares, worth)
+        divided.append(found.divided)
+        return found
+
+    monkeypatch.setattr(sensor_shares, "LEAST_S", 0.0)
+    monkeypatch.setattr(sensor_farm, "divide", divide)
+    assert _drive(sensor_workers=sensor_workers) == alone
+    one = _drive(sensor_workers=sensor_workers, num_agents=1)
+    assert any(divided)
+    assert one == _drive(num_agents=1)
 
 
 @pytest.mark.parametrize("zones", [2, 4, 9])

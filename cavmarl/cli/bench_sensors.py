@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from cavmarl.evaluate.sensor_bench import SensorBench
     from cavmarl.evaluate.sensor_run import Window
     from cavmarl.evaluate.sensor_scaling import ScalingRow
+    from cavmarl.runtime.sensor_shares import Shares
 
 __all__ = ["sensors"]
 
@@ -114,13 +115,7 @@ def _sensors(found: SensorBench) -> Table:
     for number in shared:
         table.add_column(f"in turn / by cost, {number}", justify="right")
     plans = [found.shares(number) for number in shared]
-    homes = [
-        {
-            name: {unit.sensor: home for unit, home in zip(plan.units, plan.homes, strict=True)}
-            for name, plan in both.items()
-        }
-        for both in plans
-    ]
+    homes = [{name: _homes(plan) for name, plan in both.items()} for both in plans]
     for place, (sensor, cost_ms) in enumerate(
         zip(found.turns[0].run.sensors, found.costs_ms, strict=True)
     ):
@@ -144,6 +139,14 @@ def _sensors(found: SensorBench) -> Table:
     )
     table.add_row("all; the slowest", "", "", "", "", f"{sum(found.costs_ms):.3f}", *slowest)
     return table
+
+
+def _homes(plan: Shares) -> dict[int, str]:
+    """Who writes the frames of each sensor, or parts of them."""
+    homes: dict[int, list[str]] = {}
+    for unit, home in zip(plan.units, plan.homes, strict=True):
+        homes.setdefault(unit.sensor, []).append(str(home))
+    return {sensor: "+".join(own) for sensor, own in homes.items()}
 
 
 def _scaling(found: SensorBench, rows: list[ScalingRow]) -> Table:
@@ -226,6 +229,13 @@ def _say(console: Console, found: SensorBench, rows: list[ScalingRow]) -> None:
         f"{rows[0].workers}",
         highlight=False,
     )
+    if found.ceiling is not None:
+        console.print(
+            f"{found.ceiling.programs} programs that share nothing and do the same, side by side: "
+            f"[bold]{found.ceiling.ratio:.2f}[/] times one after the other: more this machine does "
+            "not give",
+            highlight=False,
+        )
     intervals = (
         f"{row.workers}: {row.ci95_between_runs.low:.2f} to {row.ci95_between_runs.high:.2f} ms"
         for row in rows

@@ -61,6 +61,7 @@ def measure_ceiling(
     agents: int | None = None,
     background: int | None = None,
     overrides: Mapping[str, Any] | None = None,
+    alike: bool = False,
 ) -> CoreCeiling:
     """Let programs step as many worlds as workers would, without an order from anybody.
 
@@ -74,6 +75,7 @@ def measure_ceiling(
         agents: shadows population.agents.
         background: shadows population.background.
         overrides: values for any other key.
+        alike: every program steps the same worlds as the first, so that none has more to do.
 
     Raises:
         ConfigError: fewer worlds than programs.
@@ -89,7 +91,7 @@ def measure_ceiling(
     try:
         for first, last in pairwise(bounds):
             ours, theirs = context.Pipe()
-            given = (theirs, env, last - first, first, seed, wanted)
+            given = (theirs, env, last - first, 0 if alike else first, seed, wanted)
             processes.append(context.Process(target=_serve, args=given, daemon=True))
             processes[-1].start()
             theirs.close()

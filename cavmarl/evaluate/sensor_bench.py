@@ -17,12 +17,15 @@ from typing import Any
 from cavmarl import errors
 from cavmarl.config import EnvConfig
 from cavmarl.errors import ConfigError, EvaluationError
+from cavmarl.evaluate.core_ceiling import CoreCeiling, measure_ceiling
 from cavmarl.evaluate.machine import describe_code, describe_hardware, describe_software
 from cavmarl.evaluate.sensor_load import Rig, scaled
 from cavmarl.evaluate.sensor_run import PARTS, SensorJob, SensorRun, Window
 from cavmarl.evaluate.sensor_scaling import ScalingRow, Series, scaling_table, summarize
 from cavmarl.registry import load_config
-from cavmarl.runtime.sensor_shares import Shares, Unit, share_by_cost, share_in_turn
+from cavmarl.runtime.barrier import usable_cores
+from cavmarl.runtime.line_costs import LineCosts
+from cavmarl.runtime.sensor_shares import Shares, Unit, divide, share_by_cost, share_in_turn
 
 __all__ = ["SensorBench", "Turn", "measure_sensor_workers"]
 
@@ -32,6 +35,7 @@ TRIES = 8  # to find a load
 TRIED_STEPS = 12
 MARGIN = 1.15  # above the load that was asked for
 TOO_MUCH = 1.5
+CEILING_STEPS, CEILING_TURNS = 10, 7
 
 Say = Callable[[str], None]
 
@@ -67,6 +71,8 @@ class SensorBench:
         placement: who sensed what: by `cost` or `in_turn`.
         load_ms: of sensing, a tick, that was asked for; None: the rig as it is.
         turns: all runs, in their order.
+        ceiling: how much faster programs that share nothing do the same sensing side by side, as
+            many as the most workers for which there are cores; None: only one.
     """
 
     env: str
@@ -78,6 +84,7 @@ class SensorBench:
     placement: str
     load_ms: float | None
     turns: tuple[Turn, ...]
+    ceiling: CoreCeiling | None
 
     def of(self, workers: int) -> list[SensorRun]:
         """The runs with so many sensor workers."""
@@ -124,13 +131,21 @@ class SensorBench:
         return [statistics.median(column) for column in columns]
 
     def shares(self, workers: int) -> dict[str, Shares]:
-        """Both ways to share out all sensors of one vehicle, by what they have cost."""
+        """Both ways to share out all sensors of one vehicle, by what they have cost.
+
+        As if all lines of a frame cost the same: who divides frames finds out which cost more.
+        """
         costs_ms = self.costs_ms
-        units = [Unit(sensor, 0, 1) for sensor, cost_ms in enumerate(costs_ms) if cost_ms]
+        num_lines = [sensor["lines"] for sensor in self.turns[0].run.sensors]
+        units = [
+            Unit(sensor, 0, 1, 0, lines)
+            for sensor, (cost_ms, lines) in enumerate(zip(costs_ms, num_lines, strict=True))
+            if cost_ms
+        ]
         costs_s = [1e-3 * costs_ms[unit.sensor] for unit in units]
         return {
             "in_turn": share_in_turn(units, costs_s, workers),
-            "cost": share_by_cost(units, costs_s, workers),
+            "cost": divide(share_by_cost(units, costs_s, workers), LineCosts(num_lines)),
         }
 
     def windows(self, workers: int) -> list[Window]:
@@ -146,6 +161,7 @@ class SensorBench:
         return {
             **asdict(self),
             "rows": [row.to_dict() for row in self.rows],
+            "ceiling": None if self.ceiling is None else self.ceiling.to_dict(),
             "sd": "sd_within_run is the sample standard deviation (n - 1) of steps within a run",
             "parts_ms": {workers: self.parts_ms(workers) for workers in self.numbers},
             "sensing_ms": self.sensing_ms,
@@ -219,6 +235,27 @@ def measure_sensor_workers(
         placement=config.workers.sensor_placement,
         load_ms=load_ms,
         turns=tuple(turns),
+        ceiling=_ceiling(job, workers, say),
+    )
+
+
+def _ceiling(job: SensorJob, workers: Sequence[int], say: Say) -> CoreCeiling | None:
+    """What the machine allows with as many workers as it has cores for; see `SensorBench`."""
+    programs = max((number for number in workers if number <= len(usable_cores())), default=1)
+    if programs == 1:
+        return None
+    say(f"{programs} programs that share nothing")
+    return measure_ceiling(
+        job.env,
+        worlds=programs,
+        programs=programs,
+        steps=CEILING_STEPS,
+        repeats=CEILING_TURNS,
+        seed=job.seed,
+        agents=job.agents,
+        background=job.background,
+        overrides=job.overrides,
+        alike=True,
     )
 
 

@@ -13,13 +13,14 @@ from cavmarl.config_io import read_yaml
 from cavmarl.config_rig import MAX_SAMPLE_NUMBERS, MountedConfig
 from cavmarl.errors import ConfigError
 from cavmarl.registry import places
+from cavmarl.rig.catalogue import type_of
 
 __all__ = ["Rig", "describe_rig", "find_rig", "load_rig", "scaled"]
 
 Rig = dict[str, dict[str, Any]]
 
 # The most of each that a sensor can have; see `config_rig`.
-_LIMITS = {"rays": 4096, "layers": 128, "width": 4096, "height": 4096}
+_LIMITS = {"rays": 8192, "layers": 128, "width": 4096, "height": 4096}
 _LEAST_CELL_M = 0.05
 _SCALED = {*_LIMITS, "cell_m"}
 _PLACE = ("x_m", "y_m", "z_m", "yaw_deg", "pitch_deg", "roll_deg")
@@ -55,12 +56,13 @@ def load_rig(path: Path) -> Rig:
 
 
 def describe_rig(config: EnvConfig) -> list[dict[str, Any]]:
-    """Type, resolution, rate and placement of each sensor of an environment."""
+    """Type, resolution, lines, rate and placement of each sensor of an environment."""
     return [
         {
             "name": name,
             "type": getattr(sensor, "type", type(sensor).__name__),
             "resolution": list(sensor.shape),
+            "lines": type_of(name, sensor).num_lines(sensor),
             "rate_hz": getattr(sensor, "rate_hz", None),
             "placement": {key: getattr(sensor, key) for key in _PLACE},
         }

@@ -10,9 +10,10 @@ from numpy.typing import NDArray
 from cavmarl.kernels import kernel
 from cavmarl.kernels.faces import (
     Camera,
+    Faces,
     Picture,
-    draw,
-    draw_on_ground,
+    add_face,
+    draw_faces,
     ground_at,
     set_corner,
 )
@@ -20,7 +21,15 @@ from cavmarl.kernels.panorama import Counts, Panorama
 from cavmarl.kernels.semantics import BUILDING, GROUND, NOTHING, ROAD
 from cavmarl.kernels.spans import row_span
 
-__all__ = ["GROUND_FACE", "ROAD_FACE", "SKY_FACE", "look", "make_camera", "make_picture"]
+__all__ = [
+    "GROUND_FACE",
+    "ROAD_FACE",
+    "SKY_FACE",
+    "find_faces",
+    "look",
+    "make_camera",
+    "make_picture",
+]
 
 # Faces that every picture has; those of bodies and buildings follow.
 SKY_FACE = 0
@@ -29,6 +38,10 @@ ROAD_FACE = 2
 FIRST_FACE = 3
 
 _FACES_OF_PRISM = 6
+_SEEN_OF_PRISM = 3  # at most
+
+# With 12 bytes each they stay in a core's second-level cache, beside what is delivered of them.
+BAND_PIXELS = 1 << 14
 
 
 def make_camera(mount: NDArray[np.float64], width: int, fov_rad: float, range_m: float) -> Camera:
@@ -45,28 +58,42 @@ def make_camera(mount: NDArray[np.float64], width: int, fov_rad: float, range_m:
 
 
 def make_picture(width: int, height: int, panorama: Panorama) -> Picture:
-    """Room for a picture of such a panorama."""
+    """Room for a picture of such a panorama, some rows at a time."""
     faces = FIRST_FACE + _FACES_OF_PRISM * len(panorama.prisms) + len(panorama.walls)
     semantic = np.zeros(faces, np.uint8)
     semantic[:FIRST_FACE] = NOTHING, GROUND, ROAD
-    light = np.ones(faces)
-    return Picture(np.zeros((height, width)), np.zeros((height, width), np.int32), semantic, light)
+    seen = len(panorama.strips) + _SEEN_OF_PRISM * len(panorama.prisms) + len(panorama.walls)
+    rows = min(height, max(1, BAND_PIXELS // width))
+    return Picture(
+        height,
+        np.zeros((rows, width)),
+        np.zeros((rows, width), np.int32),
+        semantic,
+        np.ones(faces),
+        Faces(
+            np.zeros((seen, 5, 4)),
+            np.zeros((seen, 3)),
+            np.zeros((seen, 2), np.int32),
+            np.zeros(seen, np.int32),
+            np.zeros(seen, np.bool_),
+        ),
+    )
 
 
 @kernel
-def _clear(camera: Camera, picture: Picture) -> None:
-    """Sky, and the ground as far as the camera sees it."""
-    height, width = picture.face.shape
+def _clear(camera: Camera, picture: Picture, first: int, last: int) -> None:
+    """Sky, and the ground as far as the camera sees it, in the rows [first, last)."""
+    width = picture.face.shape[1]
     mount = camera.mount
-    picture.closeness[:] = 0.0
-    picture.face[:] = SKY_FACE
+    picture.closeness[: last - first] = 0.0
+    picture.face[: last - first] = SKY_FACE
     if mount[2, 3] <= 0.0:
         return
-    ground_at(camera, width, height)
+    ground_at(camera, width, picture.height)
     camera.edges[4, 0] -= 1.0 / camera.range_m
-    for j in range(height):
+    for j in range(first, last):
         begin, end = row_span(camera.edges[4:], 1, j, width)
-        picture.face[j, begin:end] = GROUND_FACE
+        picture.face[j - first, begin:end] = GROUND_FACE
 
 
 @kernel
@@ -80,8 +107,8 @@ def _corner_of(prism: np.void, along: float, across: float) -> tuple[float, floa
 
 
 @kernel
-def _draw_prism(camera: Camera, picture: Picture, prism: np.void, first: int) -> None:
-    """Draw the faces of a body that turn to the camera: at most two sides and one end."""
+def _add_prism(camera: Camera, picture: Picture, num: int, prism: np.void, first: int) -> int:
+    """Add the faces of a body that turn to the camera: at most two sides and one end."""
     cos = prism["cos"]
     sin = prism["sin"]
     dx = camera.mount[0, 3] - prism["x"]
@@ -105,7 +132,7 @@ def _draw_prism(camera: Camera, picture: Picture, prism: np.void, first: int) ->
         set_corner(camera, 3, x1, y1, top)
         picture.semantic[first + side] = prism["semantic"]
         picture.light[first + side] = _light(along * cos - across * sin, along * sin + across * cos)
-        draw(camera, picture, first + side)
+        num = add_face(camera, picture, num, first + side, False)
     z = camera.mount[2, 3]
     if z > top or z < bottom:
         level = top if z > top else bottom
@@ -117,7 +144,8 @@ def _draw_prism(camera: Camera, picture: Picture, prism: np.void, first: int) ->
         number = first + (4 if z > top else 5)
         picture.semantic[number] = prism["semantic"]
         picture.light[number] = 1.0 if z > top else 0.3
-        draw(camera, picture, number)
+        num = add_face(camera, picture, num, number, False)
+    return num
 
 
 @kernel
@@ -127,8 +155,8 @@ def _light(x: float, y: float) -> float:
 
 
 @kernel
-def _draw_wall(camera: Camera, picture: Picture, wall: np.void, number: int) -> None:
-    """Draw a wall, which looks the same from both sides."""
+def _add_wall(camera: Camera, picture: Picture, num: int, wall: np.void, number: int) -> int:
+    """Add a wall, which looks the same from both sides."""
     ax, ay, bx, by = wall["ax"], wall["ay"], wall["bx"], wall["by"]
     height = wall["height"]
     set_corner(camera, 0, ax, ay, 0.0)
@@ -142,33 +170,48 @@ def _draw_wall(camera: Camera, picture: Picture, wall: np.void, number: int) -> 
         # The side that is seen.
         away = x * (camera.mount[0, 3] - ax) + y * (camera.mount[1, 3] - ay)
         picture.light[number] = _light(math.copysign(x, x * away), math.copysign(y, y * away))
-    draw(camera, picture, number)
+    return add_face(camera, picture, num, number, False)
 
 
 @kernel
-def look(
-    camera: Camera,
-    panorama: Panorama,
-    counts: Counts,
-    picture: Picture,
-) -> None:
-    """Take a picture.
+def find_faces(camera: Camera, panorama: Panorama, counts: Counts, picture: Picture) -> int:
+    """Find the faces that a picture shows.
 
     Args:
         camera: where it looks from.
         panorama: what stands around the vehicle, prisms ordered by id.
         counts: how many things of each kind there are.
-        picture: overwritten.
+        picture: its faces are overwritten.
+
+    Returns:
+        how many there are.
     """
-    _clear(camera, picture)
+    num = 0
     if camera.mount[2, 3] > 0.0:
         for k in range(counts.strips):
             for c in range(4):
                 set_corner(camera, c, panorama.strips[k, c, 0], panorama.strips[k, c, 1], 0.0)
-            draw_on_ground(camera, picture, ROAD_FACE)
+            num = add_face(camera, picture, num, ROAD_FACE, True)
     for n in range(counts.prisms):
         k = panorama.order[n]
-        _draw_prism(camera, picture, panorama.prisms[k], FIRST_FACE + _FACES_OF_PRISM * k)
+        first = FIRST_FACE + _FACES_OF_PRISM * k
+        num = _add_prism(camera, picture, num, panorama.prisms[k], first)
     first = FIRST_FACE + _FACES_OF_PRISM * panorama.prisms.size
     for k in range(counts.walls):
-        _draw_wall(camera, picture, panorama.walls[k], first + k)
+        num = _add_wall(camera, picture, num, panorama.walls[k], first + k)
+    return num
+
+
+@kernel
+def look(camera: Camera, picture: Picture, num: int, first: int, last: int) -> None:
+    """Take the rows [first, last) of a picture.
+
+    Args:
+        camera: where it looks from.
+        picture: with faces; its rows are overwritten from the first on.
+        num: how many faces there are.
+        first: row.
+        last: the one after the last; as many as there is room for, at most.
+    """
+    _clear(camera, picture, first, last)
+    draw_faces(picture, num, first, last)

@@ -5,6 +5,10 @@ is drawn row by row, from the first to the last column of the row inside it, wit
 pixel, and the nearest face stays. That is exact for every direction of the camera, roll included,
 and no ray is cast.
 
+A picture is drawn some rows at a time: so many as stay in the processor's own cache with all that
+is noted of a pixel. No row depends on which others are drawn with it, and memory that cores share
+gets only what is delivered.
+
 Depth is along the optical axis. The camera's axes are those of its mount: ahead, left, up; pixel
 rows go down, columns to the right, and pixels are square.
 """
@@ -20,7 +24,7 @@ from numpy.typing import NDArray
 from cavmarl.kernels import kernel
 from cavmarl.kernels.spans import row_span
 
-__all__ = ["Camera", "Picture", "draw", "draw_on_ground", "ground_at", "set_corner"]
+__all__ = ["Camera", "Faces", "Picture", "add_face", "draw_faces", "ground_at", "set_corner"]
 
 # Of a face with a corner nearer than this, or behind the camera, all rows are tried.
 NEAR_M = 0.01
@@ -36,13 +40,25 @@ class Camera(NamedTuple):
     face: NDArray[np.float64]  # (4, 3) room for its corners in the camera's frame
 
 
-class Picture(NamedTuple):
-    """What the pixels show; rows from top to bottom."""
+class Faces(NamedTuple):
+    """The faces of one picture that can be seen, in the order in which they are drawn."""
 
-    closeness: NDArray[np.float64]  # (H, W) one over the depth in m; 0: no body and no building
-    face: NDArray[np.int32]  # (H, W) a face
-    semantic: NDArray[np.uint8]  # (F,) of each face
-    light: NDArray[np.float64]  # (F,) how bright each face is, in [0, 1]
+    edges: NDArray[np.float64]  # (F, 5, 4) of each, the fifth being the range
+    plane: NDArray[np.float64]  # (F, 3) its closeness: constant, by column, by row
+    rows: NDArray[np.int32]  # (F, 2) [first, last) that it can be in
+    number: NDArray[np.int32]  # (F,) which face it is
+    flat: NDArray[np.bool_]  # (F,) it lies on the ground, and covers whatever was there
+
+
+class Picture(NamedTuple):
+    """What some rows of pixels show, R at a time from top to bottom, and what is drawn."""
+
+    height: int  # of the whole picture, pixels
+    closeness: NDArray[np.float64]  # (R, W) one over the depth in m; 0: no body and no building
+    face: NDArray[np.int32]  # (R, W) a face
+    semantic: NDArray[np.uint8]  # (all faces,) of each face
+    light: NDArray[np.float64]  # (all faces,) how bright each face is, in [0, 1]
+    faces: Faces
 
 
 @kernel
@@ -138,15 +154,56 @@ def _set_face(camera: Camera, width: int, height: int) -> tuple[int, int, float,
 
 
 @kernel
-def draw(camera: Camera, picture: Picture, number: int) -> None:
-    """Draw the face whose corners are set over what is farther away."""
-    height, width = picture.face.shape
-    first, last, constant, by_column, by_row = _set_face(camera, width, height)
-    for j in range(first, last):
-        begin, end = row_span(camera.edges, 5, j, width)
+def add_face(camera: Camera, picture: Picture, num: int, number: int, flat: bool) -> int:
+    """Put the face whose corners are set behind the `num` that are drawn before it.
+
+    Returns:
+        how many there are now: no more if it cannot be seen.
+    """
+    width = picture.face.shape[1]
+    first, last, constant, by_column, by_row = _set_face(camera, width, picture.height)
+    if first >= last:
+        return num
+    faces = picture.faces
+    for k in range(5):
+        for n in range(4):
+            faces.edges[num, k, n] = camera.edges[k, n]
+    faces.plane[num, 0] = constant
+    faces.plane[num, 1] = by_column
+    faces.plane[num, 2] = by_row
+    faces.rows[num, 0] = first
+    faces.rows[num, 1] = last
+    faces.number[num] = number
+    faces.flat[num] = flat
+    return num + 1
+
+
+@kernel
+def draw_faces(picture: Picture, num: int, first: int, last: int) -> None:
+    """Draw the first `num` faces over what is farther away, in the rows [first, last)."""
+    faces = picture.faces
+    for k in range(num):
+        begin_row = max(first, faces.rows[k, 0])
+        end_row = min(last, faces.rows[k, 1])
+        if begin_row < end_row and faces.flat[k]:
+            _draw_flat(picture, k, first, begin_row, end_row)
+        elif begin_row < end_row:
+            _draw(picture, k, first, begin_row, end_row)
+
+
+@kernel
+def _draw(picture: Picture, k: int, first: int, begin_row: int, end_row: int) -> None:
+    """Draw a face over what is farther away; row `first` is the first that there is room for."""
+    width = picture.face.shape[1]
+    edges = picture.faces.edges[k]
+    plane = picture.faces.plane[k]
+    constant, by_column, by_row = plane[0], plane[1], plane[2]
+    number = picture.faces.number[k]
+    for j in range(begin_row, end_row):
+        begin, end = row_span(edges, 5, j, width)
         start = constant + by_row * (j + 0.5) + by_column * 0.5
-        closeness = picture.closeness[j]
-        face = picture.face[j]
+        closeness = picture.closeness[j - first]
+        face = picture.face[j - first]
         for i in range(begin, end):
             value = start + by_column * i
             nearer = value > closeness[i]
@@ -155,13 +212,14 @@ def draw(camera: Camera, picture: Picture, number: int) -> None:
 
 
 @kernel
-def draw_on_ground(camera: Camera, picture: Picture, number: int) -> None:
-    """Draw the face whose corners are set over whatever was there."""
-    height, width = picture.face.shape
-    first, last, _, _, _ = _set_face(camera, width, height)
-    for j in range(first, last):
-        begin, end = row_span(camera.edges, 5, j, width)
-        picture.face[j, begin:end] = number
+def _draw_flat(picture: Picture, k: int, first: int, begin_row: int, end_row: int) -> None:
+    """Draw a face over whatever was there."""
+    width = picture.face.shape[1]
+    edges = picture.faces.edges[k]
+    number = picture.faces.number[k]
+    for j in range(begin_row, end_row):
+        begin, end = row_span(edges, 5, j, width)
+        picture.face[j - first, begin:end] = number
 
 
 @kernel

@@ -1,4 +1,8 @@
-"""Depth, class and colour of the pixels of a camera's picture, as they are delivered."""
+"""Depth, class and colour of the pixels of a camera's picture, as they are delivered.
+
+All of these take some rows of a picture: those that have been taken last, the first of them being
+row `first` of the whole picture.
+"""
 
 from __future__ import annotations
 
@@ -67,45 +71,46 @@ def colours() -> NDArray[np.float64]:
 
 
 @kernel
-def _deepen(camera: Camera, picture: Picture) -> None:
+def _deepen(camera: Camera, picture: Picture, first: int, rows: int) -> None:
     """Set the closeness also where there is only the ground or the sky."""
-    height, width = picture.face.shape
-    constant, by_column, by_row = ground_at(camera, width, height)
+    width = picture.face.shape[1]
+    constant, by_column, by_row = ground_at(camera, width, picture.height)
     nothing = 1.0 / camera.range_m
-    for j in range(height):
+    for j in range(rows):
         closeness = picture.closeness[j]
         face = picture.face[j]
-        start = constant + by_row * (j + 0.5) + by_column * 0.5
+        start = constant + by_row * (first + j + 0.5) + by_column * 0.5
         for i in range(width):
             empty = start + by_column * i if face[i] != SKY_FACE else nothing
             closeness[i] = closeness[i] if face[i] > ROAD_FACE else empty
 
 
 @kernel
-def measure_depths(camera: Camera, picture: Picture, out: NDArray[np.float32]) -> None:
-    """Depths (H, W) in metres along the optical axis, the range where nothing is.
+def measure_depths(camera: Camera, picture: Picture, first: int, out: NDArray[np.float32]) -> None:
+    """Depths (rows, W) in metres along the optical axis, the range where nothing is.
 
     Args:
         camera: that took the picture.
         picture: taken; its closeness is completed.
-        out: (H, W).
+        first: row.
+        out: (rows, W).
     """
-    _deepen(camera, picture)
-    height, width = picture.face.shape
+    rows, width = out.shape
+    _deepen(camera, picture, first, rows)
     nearest = np.float32(LEAST_DEPTH_M)
-    for j in range(height):
+    for j in range(rows):
         for i in range(width):
             out[j, i] = max(np.float32(1.0 / picture.closeness[j, i]), nearest)
 
 
 @kernel
 def write_halves(bits: NDArray[np.uint32], out: NDArray[np.uint16]) -> None:
-    """The bits of float16 (H, W) from those of float32, all between 2^-14 and 65504.
+    """The bits of float16 (rows, W) from those of float32, all between 2^-14 and 65504.
 
     Rounded to the nearest, and of two equally near ones to the even one.
     """
-    height, width = out.shape
-    for j in range(height):
+    rows, width = out.shape
+    for j in range(rows):
         for i in range(width):
             half = bits[j, i] - _REBIAS + ((bits[j, i] >> _DROPPED) & _ONE)
             out[j, i] = np.uint16(half >> _DROPPED)
@@ -113,28 +118,33 @@ def write_halves(bits: NDArray[np.uint32], out: NDArray[np.uint16]) -> None:
 
 @kernel
 def write_classes(picture: Picture, out: NDArray[np.uint8]) -> None:
-    """The class of what each pixel shows, (H, W)."""
-    height, width = picture.face.shape
-    for j in range(height):
+    """The class of what each pixel shows, (rows, W)."""
+    rows, width = out.shape
+    for j in range(rows):
         for i in range(width):
             out[j, i] = picture.semantic[picture.face[j, i]]
 
 
 @kernel
 def write_colours(
-    camera: Camera, picture: Picture, palette: NDArray[np.float64], out: NDArray[np.uint8]
+    camera: Camera,
+    picture: Picture,
+    first: int,
+    palette: NDArray[np.float64],
+    out: NDArray[np.uint8],
 ) -> None:
     """Red, green and blue: the class's colour in the face's light, paler with the distance.
 
     Args:
         camera: that took the picture.
         picture: taken; its closeness is completed.
+        first: row.
         palette: (classes, 3).
-        out: (H, W, 3).
+        out: (rows, W, 3).
     """
-    _deepen(camera, picture)
-    height, width = picture.face.shape
-    for j in range(height):
+    rows, width, _ = out.shape
+    _deepen(camera, picture, first, rows)
+    for j in range(rows):
         for i in range(width):
             face = picture.face[j, i]
             semantic = picture.semantic[face]

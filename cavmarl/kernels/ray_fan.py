@@ -164,7 +164,19 @@ def _ray_to_prism(
 
 
 @kernel
-def _cast_at_prism(fan: Fan, prisms: NDArray[np.void], k: int, hits: NDArray[np.void]) -> None:
+def _between(columns: tuple[int, int, int], first: int, last: int) -> tuple[int, int, int, int]:
+    """Of the columns that `_columns` tells, those in [first, last): [begin, end) and a second."""
+    begin, end, wrapped = columns
+    begin = min(max(begin, first), last)
+    end = min(max(end, begin), last)
+    wrapped = min(wrapped, last)
+    return begin, end, first, max(wrapped, first)
+
+
+@kernel
+def _cast_at_prism(
+    fan: Fan, prisms: NDArray[np.void], k: int, first: int, last: int, hits: NDArray[np.void]
+) -> None:
     """Let the rays that can meet a body meet it; of equally near bodies the smaller id counts."""
     prism = prisms[k]
     cos = prism["cos"]
@@ -180,8 +192,9 @@ def _cast_at_prism(fan: Fan, prisms: NDArray[np.void], k: int, hits: NDArray[np.
     radius = prism["radius"]
     if fan.tilted:
         radius = math.sqrt(radius * radius + half_height * half_height)
-    begin, end, wrapped = _columns_of_ball(fan, prism["x"], prism["y"], middle, radius)
-    if begin == end and wrapped == 0:
+    columns = _columns_of_ball(fan, prism["x"], prism["y"], middle, radius)
+    begin, end, start, wrapped = _between(columns, first, last)
+    if begin == end and start == wrapped:
         return
     # The body's axes, each turned to point from the sensor towards the body.
     along = dx * cos + dy * sin
@@ -192,8 +205,8 @@ def _cast_at_prism(fan: Fan, prisms: NDArray[np.void], k: int, hits: NDArray[np.
     place = (abs(along), abs(beside), abs(dz))
     half = (prism["half_length"], prism["half_width"], half_height)
     rays = fan.rays
-    for n in range(end - begin + wrapped):
-        a = begin + n if n < end - begin else n - (end - begin)
+    for n in range(end - begin + wrapped - start):
+        a = begin + n if n < end - begin else start + n - (end - begin)
         for e in range(rays.shape[1]):
             closing = (
                 (rays[a, e, 0] * cos + rays[a, e, 1] * sin) * along_sign,
@@ -211,7 +224,9 @@ def _cast_at_prism(fan: Fan, prisms: NDArray[np.void], k: int, hits: NDArray[np.
 
 
 @kernel
-def _cast_at_wall(fan: Fan, walls: NDArray[np.void], k: int, hits: NDArray[np.void]) -> None:
+def _cast_at_wall(
+    fan: Fan, walls: NDArray[np.void], k: int, first: int, last: int, hits: NDArray[np.void]
+) -> None:
     """Let the rays that can meet a wall meet it; bodies and earlier walls count before it."""
     wall = walls[k]
     x = fan.mount[0, 3]
@@ -221,11 +236,12 @@ def _cast_at_wall(fan: Fan, walls: NDArray[np.void], k: int, hits: NDArray[np.vo
     ay = wall["ay"] - y
     bx = wall["bx"] - x
     by = wall["by"] - y
-    begin, end, wrapped = _columns_of_wall(fan, wall, ax, ay, bx, by)
+    columns = _columns_of_wall(fan, wall, ax, ay, bx, by)
+    begin, end, start, wrapped = _between(columns, first, last)
     facing = ax * by - ay * bx
     rays = fan.rays
-    for n in range(end - begin + wrapped):
-        a = begin + n if n < end - begin else n - (end - begin)
+    for n in range(end - begin + wrapped - start):
+        a = begin + n if n < end - begin else start + n - (end - begin)
         for e in range(rays.shape[1]):
             ray_x = rays[a, e, 0]
             ray_y = rays[a, e, 1]
@@ -280,6 +296,8 @@ def cast(
     num_prisms: int,
     walls: NDArray[np.void],
     num_walls: int,
+    first: int,
+    last: int,
     hits: NDArray[np.void],
 ) -> None:
     """Find what each ray of a fan meets first; the ground only where nothing else is.
@@ -290,21 +308,23 @@ def cast(
         num_prisms: how many there are.
         walls: WALL (num_walls,) of the panorama.
         num_walls: how many there are.
-        hits: HIT (A, E), overwritten.
+        first: column.
+        last: the one after the last that is cast.
+        hits: HIT (A, E), overwritten in these columns.
     """
-    for a in range(hits.shape[0]):
+    for a in range(first, last):
         for e in range(hits.shape[1]):
             hit = hits[a, e]
             hit["distance"] = fan.range_m
             hit["id"] = -1
             hit["what"] = NO_HIT
     for k in range(num_prisms):
-        _cast_at_prism(fan, prisms, k, hits)
+        _cast_at_prism(fan, prisms, k, first, last, hits)
     for k in range(num_walls):
-        _cast_at_wall(fan, walls, k, hits)
+        _cast_at_wall(fan, walls, k, first, last, hits)
     if not fan.looks_down:
         return
-    for a in range(hits.shape[0]):
+    for a in range(first, last):
         for e in range(hits.shape[1]):
             hit = hits[a, e]
             if hit["what"] == NO_HIT and fan.ground_m[a, e] < fan.range_m:

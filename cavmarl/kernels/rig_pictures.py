@@ -11,7 +11,7 @@ from cavmarl.kernels import kernel
 from cavmarl.kernels.arrays import Worlds
 from cavmarl.kernels.backdrop import Backdrop
 from cavmarl.kernels.birds_eye import BirdsEye, look_down
-from cavmarl.kernels.camera import look
+from cavmarl.kernels.camera import find_faces, look
 from cavmarl.kernels.codes import DRIVER_AGENT
 from cavmarl.kernels.faces import Camera, Picture
 from cavmarl.kernels.neighbors import Grid, fill_grid
@@ -56,6 +56,7 @@ def take_depths(
     grid: Grid,
     backdrop: Backdrop,
     due: Due,
+    lines: NDArray[np.int32],
     noise: Noise,
     camera: Camera,
     panorama: Panorama,
@@ -71,16 +72,17 @@ def take_depths(
         grid: room for the index of one world.
         backdrop: of the map.
         due: in this tick.
+        lines: (W, agents, 2) rows [first, last) of each agent's picture that are written.
         noise: of the sensor; what is as far as the range has none.
         camera: the camera.
         panorama: room.
         picture: room.
-        room: (H, W) room.
+        room: (rows of `picture`, W) room.
         room_bits: the same memory.
         data: (W, agents, S, H, W) float16 as bits, m.
     """
-    height, width = picture.face.shape
-    reach_m = camera_reach_m(camera, width, height)
+    band, width = picture.face.shape
+    reach_m = camera_reach_m(camera, width, picture.height)
     noisy = _is_noisy(noise)
     for w in range(worlds.ticks.size):
         if due.num[w] == 0:
@@ -92,24 +94,38 @@ def take_depths(
             if row["driver"] != DRIVER_AGENT:
                 continue
             counts = gather(rows, i, grid, backdrop, reach_m, True, panorama)
-            look(camera, panorama, counts, picture)
-            measure_depths(camera, picture, room)
-            if noisy:
-                _add_noise(noise, row, worlds.ticks[w], camera.range_m, room)
-            write_halves(room_bits, data[w, row["agent"], due.slot[w]])
+            num = find_faces(camera, panorama, counts, picture)
+            out = data[w, row["agent"], due.slot[w]]
+            begin, end = lines[w, row["agent"], 0], lines[w, row["agent"], 1]
+            for first in range(begin, end, band):
+                last = min(first + band, end)
+                look(camera, picture, num, first, last)
+                depths = room[: last - first]
+                measure_depths(camera, picture, first, depths)
+                if noisy:
+                    _add_noise(noise, row, worlds.ticks[w], camera.range_m, first, depths)
+                write_halves(room_bits, out[first:last])
 
 
 @kernel
 def _add_noise(
-    noise: Noise, row: np.void, tick: int, range_m: float, depths: NDArray[np.float32]
+    noise: Noise,
+    row: np.void,
+    tick: int,
+    range_m: float,
+    first: int,
+    depths: NDArray[np.float32],
 ) -> None:
-    """Make depths (H, W) that are less than the range wrong, from a centimetre to the range."""
+    """Make depths (rows, W) less than the range wrong, from a centimetre to the range.
+
+    `first` is their first row in the picture.
+    """
     key = sensor_key(row, noise.stream)
-    height, width = depths.shape
-    for j in range(height):
+    rows, width = depths.shape
+    for j in range(rows):
         for i in range(width):
             if depths[j, i] < range_m:
-                error = error_of(noise, key, row["id"], tick, j * width + i, 0)
+                error = error_of(noise, key, row["id"], tick, (first + j) * width + i, 0)
                 depths[j, i] = min(max(depths[j, i] + error, LEAST_DEPTH_M), range_m)
 
 
@@ -119,14 +135,15 @@ def take_classes(
     grid: Grid,
     backdrop: Backdrop,
     due: Due,
+    lines: NDArray[np.int32],
     camera: Camera,
     panorama: Panorama,
     picture: Picture,
     data: NDArray[np.uint8],
 ) -> None:
     """Write the semantic pictures (W, agents, S, H, W) that are due; see `take_depths`."""
-    height, width = picture.face.shape
-    reach_m = camera_reach_m(camera, width, height)
+    band, width = picture.face.shape
+    reach_m = camera_reach_m(camera, width, picture.height)
     for w in range(worlds.ticks.size):
         if due.num[w] == 0:
             continue
@@ -137,8 +154,13 @@ def take_classes(
             if row["driver"] != DRIVER_AGENT:
                 continue
             counts = gather(rows, i, grid, backdrop, reach_m, True, panorama)
-            look(camera, panorama, counts, picture)
-            write_classes(picture, data[w, row["agent"], due.slot[w]])
+            num = find_faces(camera, panorama, counts, picture)
+            out = data[w, row["agent"], due.slot[w]]
+            begin, end = lines[w, row["agent"], 0], lines[w, row["agent"], 1]
+            for first in range(begin, end, band):
+                last = min(first + band, end)
+                look(camera, picture, num, first, last)
+                write_classes(picture, out[first:last])
 
 
 @kernel
@@ -147,6 +169,7 @@ def take_colours(
     grid: Grid,
     backdrop: Backdrop,
     due: Due,
+    lines: NDArray[np.int32],
     noise: Noise,
     camera: Camera,
     panorama: Panorama,
@@ -155,8 +178,8 @@ def take_colours(
     data: NDArray[np.uint8],
 ) -> None:
     """Write the coloured pictures (W, agents, S, H, W, 3) that are due; see `take_depths`."""
-    height, width = picture.face.shape
-    reach_m = camera_reach_m(camera, width, height)
+    band, width = picture.face.shape
+    reach_m = camera_reach_m(camera, width, picture.height)
     noisy = _is_noisy(noise)
     for w in range(worlds.ticks.size):
         if due.num[w] == 0:
@@ -168,22 +191,28 @@ def take_colours(
             if row["driver"] != DRIVER_AGENT:
                 continue
             counts = gather(rows, i, grid, backdrop, reach_m, True, panorama)
-            look(camera, panorama, counts, picture)
+            num = find_faces(camera, panorama, counts, picture)
             out = data[w, row["agent"], due.slot[w]]
-            write_colours(camera, picture, palette, out)
-            if noisy:
-                _add_colour_noise(noise, row, worlds.ticks[w], out)
+            begin, end = lines[w, row["agent"], 0], lines[w, row["agent"], 1]
+            for first in range(begin, end, band):
+                last = min(first + band, end)
+                look(camera, picture, num, first, last)
+                write_colours(camera, picture, first, palette, out[first:last])
+                if noisy:
+                    _add_colour_noise(noise, row, worlds.ticks[w], first, out[first:last])
 
 
 @kernel
-def _add_colour_noise(noise: Noise, row: np.void, tick: int, out: NDArray[np.uint8]) -> None:
-    """Make each colour (H, W, 3) wrong, from 0 to 255."""
+def _add_colour_noise(
+    noise: Noise, row: np.void, tick: int, first: int, out: NDArray[np.uint8]
+) -> None:
+    """Make each colour (rows, W, 3) wrong, from 0 to 255; `first` is the first row."""
     key = sensor_key(row, noise.stream)
-    height, width, _ = out.shape
-    for j in range(height):
+    rows, width, _ = out.shape
+    for j in range(rows):
         for i in range(width):
             for c in range(3):
-                draw = (j * width + i) * 3 + c
+                draw = ((first + j) * width + i) * 3 + c
                 error = error_of(noise, key, row["id"], tick, draw, c)
                 out[j, i, c] = np.uint8(min(max(out[j, i, c] + error + 0.5, 0.0), 255.0))
 

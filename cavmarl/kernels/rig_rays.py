@@ -33,6 +33,7 @@ def measure_lidar(
     grid: Grid,
     backdrop: Backdrop,
     due: Due,
+    lines: NDArray[np.int32],
     noise: Noise,
     fan: Fan,
     panorama: Panorama,
@@ -46,6 +47,7 @@ def measure_lidar(
         grid: room for the index of one world.
         backdrop: of the map.
         due: in this tick.
+        lines: (W, agents, 2) columns [first, last) of each agent's rays that are written.
         noise: of the sensor; what meets nothing has none.
         fan: its rays.
         panorama: room.
@@ -64,24 +66,37 @@ def measure_lidar(
             if row["driver"] != DRIVER_AGENT:
                 continue
             counts = gather(rows, i, grid, backdrop, reach_m, False, panorama)
-            cast(fan, panorama.prisms, counts.prisms, panorama.walls, counts.walls, hits)
+            first, last = lines[w, row["agent"], 0], lines[w, row["agent"], 1]
+            cast(
+                fan, panorama.prisms, counts.prisms, panorama.walls, counts.walls, first, last,
+                hits,
+            )  # fmt: skip
             out = data[w, row["agent"], due.slot[w]]
-            for a in range(hits.shape[0]):
+            for a in range(first, last):
                 for e in range(hits.shape[1]):
                     out[e, a] = hits[a, e]["distance"]
             if noisy:
-                _add_noise(noise, row, worlds.ticks[w], fan.range_m, out)
+                _add_noise(noise, row, worlds.ticks[w], fan.range_m, first, last, out)
 
 
 @kernel
 def _add_noise(
-    noise: Noise, row: np.void, tick: int, range_m: float, out: NDArray[np.float32]
+    noise: Noise,
+    row: np.void,
+    tick: int,
+    range_m: float,
+    first: int,
+    last: int,
+    out: NDArray[np.float32],
 ) -> None:
-    """Make the distances (E, A) that are less than the range wrong, from 0 to the range."""
+    """Make the distances (E, A) that are less than the range wrong, from 0 to the range.
+
+    In the columns [first, last).
+    """
     key = sensor_key(row, noise.stream)
     layers, rays = out.shape
     for e in range(layers):
-        for a in range(rays):
+        for a in range(first, last):
             if out[e, a] < range_m:
                 error = error_of(noise, key, row["id"], tick, e * rays + a, 0)
                 out[e, a] = min(max(out[e, a] + error, 0.0), range_m)
@@ -127,7 +142,10 @@ def measure_radar(
             if row["driver"] != DRIVER_AGENT:
                 continue
             counts = gather(rows, i, grid, backdrop, reach_m, False, panorama)
-            cast(fan, panorama.prisms, counts.prisms, panorama.walls, counts.walls, hits)
+            cast(
+                fan, panorama.prisms, counts.prisms, panorama.walls, counts.walls, 0,
+                hits.shape[0], hits,
+            )  # fmt: skip
             found = detect(fan, panorama, row, hits, targets, order)
             out = data[w, row["agent"], due.slot[w]]
             out[:] = 0.0

@@ -45,8 +45,7 @@ def take_rows(rows: NDArray[np.void], num_rows: NDArray[np.int64], own: NDArray[
 def put_first(
     rows: NDArray[np.void],
     num_agents: NDArray[np.int64],
-    share: NDArray[np.int16],
-    worker: int,
+    lines: NDArray[np.int32],
     spare: NDArray[np.void],
     num_owned: NDArray[np.int64],
 ) -> int:
@@ -55,8 +54,7 @@ def put_first(
     Args:
         rows: VEHICLE (W, C), agents before the others.
         num_agents: (W,) how many agents.
-        share: (W, A) who senses for each agent.
-        worker: its number.
+        lines: (W, A, 2) [first, last) that it writes of each agent's frame; none: others do.
         spare: VEHICLE (1,), room.
         num_owned: (W,) overwritten with how many are first.
 
@@ -67,7 +65,8 @@ def put_first(
     for w in range(num_agents.size):
         count = 0
         for i in range(num_agents[w]):
-            if share[w, rows[w, i]["agent"]] != worker:
+            agent = rows[w, i]["agent"]
+            if lines[w, agent, 0] >= lines[w, agent, 1]:
                 continue
             if i != count:
                 spare[0] = rows[w, count]

@@ -51,6 +51,11 @@ class _Camera(MountedSensor[C]):
         )
         return camera_reach_m(camera, config.width, config.height) + largest_radius_m
 
+    @staticmethod
+    def num_lines(config: C) -> int:
+        """The rows of the picture."""
+        return config.height
+
 
 class DepthCamera(_Camera[DepthCameraConfig]):
     """Depth along the optical axis, as float16 in m."""
@@ -59,7 +64,7 @@ class DepthCamera(_Camera[DepthCameraConfig]):
 
     def __init__(self, name: str, config: DepthCameraConfig, platform: Platform) -> None:
         super().__init__(name, config, platform)
-        self._room = np.zeros(config.shape, np.float32)
+        self._room = np.zeros(self._picture.face.shape, np.float32)
         self._take = repeated(take_depths)
 
     @staticmethod
@@ -75,6 +80,7 @@ class DepthCamera(_Camera[DepthCameraConfig]):
                 scene.grid,
                 self._backdrop,
                 due,
+                self.lines,
                 self._noise,
                 self._camera,
                 self._panorama,
@@ -107,6 +113,7 @@ class SemanticCamera(_Camera[SemanticCameraConfig]):
                 scene.grid,
                 self._backdrop,
                 due,
+                self.lines,
                 self._camera,
                 self._panorama,
                 self._picture,
@@ -137,6 +144,7 @@ class RgbCamera(_Camera[RgbCameraConfig]):
                 scene.grid,
                 self._backdrop,
                 due,
+                self.lines,
                 self._noise,
                 self._camera,
                 self._panorama,

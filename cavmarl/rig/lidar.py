@@ -64,6 +64,11 @@ class Lidar(MountedSensor[LidarRigConfig]):
         """Its range, from where it is mounted to the nearest side of a body."""
         return config.range_m + math.hypot(config.x_m, config.y_m) + largest_radius_m
 
+    @staticmethod
+    def num_lines(config: LidarRigConfig) -> int:
+        """The columns of rays."""
+        return config.rays
+
     def sense(self, scenes: Sequence[Scene], due: Due, frames: SensorFrames) -> None:
         """Write what is due."""
         for scene in scenes:
@@ -72,6 +77,7 @@ class Lidar(MountedSensor[LidarRigConfig]):
                 scene.grid,
                 self._backdrop,
                 due,
+                self.lines,
                 self._noise,
                 self._fan,
                 self._panorama,

@@ -85,6 +85,8 @@ class MountedSensor(ABC, Generic[C]):
         config: its settings.
         mount: where on the vehicle.
         frame: name of the frame that its directions are in.
+        lines: (W, A, 2) which lines [first, last) of each agent's frame `sense` writes: all,
+            unless others write the rest.
     """
 
     dtype: ClassVar[DTypeLike]
@@ -95,6 +97,8 @@ class MountedSensor(ABC, Generic[C]):
         self.config = config
         self.mount = mount_of(config)
         self.frame = SENSOR_FRAME.format(name=name)
+        self.lines = np.zeros((platform.num_worlds, platform.num_agents, 2), dtype=np.int32)
+        self.lines[..., 1] = self.num_lines(config)
         check_place(name, config, platform.body)
 
     @staticmethod
@@ -111,6 +115,11 @@ class MountedSensor(ABC, Generic[C]):
             largest_radius_m: half the diagonal of the largest body.
         """
         return 0.0
+
+    @staticmethod
+    def num_lines(config: C) -> int:
+        """Into how many lines a frame can be divided, each of which can be written by itself."""
+        return 1
 
     @abstractmethod
     def sense(self, scenes: Sequence[Scene], due: Due, frames: SensorFrames) -> None:

@@ -17,17 +17,17 @@ from cavmarl.kernels.repeated import repeated
 from cavmarl.kernels.sensor_share import gather_rows
 from cavmarl.rig.rig import Turn, sense_here
 from cavmarl.rig.sensor import Scene
+from cavmarl.runtime.line_costs import LineCosts
 from cavmarl.runtime.pool import Death, Pool, Program
 from cavmarl.runtime.sensor_job import SensorTask
 from cavmarl.runtime.sensor_scene import NEVER, SceneArrays, SceneShape
-from cavmarl.runtime.sensor_shares import Shares, cut, share_by_cost, share_in_turn
+from cavmarl.runtime.sensor_shares import Shares, cut, divide, share_by_cost, share_in_turn
 from cavmarl.runtime.shared_memory import Segment, size_of
 
 __all__ = ["FarmPlan", "FarmTimes", "SensorFarm"]
 
-SHARED_ANEW = 32  # ticks from one sharing out to the next of the same sensors
-SHARED_EARLY = 4  # so many at first, until costs are known
-NEW_COST = 0.2  # weight of the latest cost in the mean
+SHARED_ANEW = 32  # ticks from one sharing out to the next; at first 1, 2, 4, … until there are more
+NEW_COST = 0.5  # weight of the latest costs from then on; what is first measured is of cold caches
 
 
 class FarmPlan(NamedTuple):
@@ -38,6 +38,7 @@ class FarmPlan(NamedTuple):
         recipe: from which it makes its jobs; `shape` and `scene` are added.
         frames: memory that samples are written to; it goes with the farm.
         shape: of what is shared.
+        num_lines: (S,) into how many lines a frame of each sensor can be divided.
         workers: how they are watched, and how sensing is shared out.
     """
 
@@ -45,6 +46,7 @@ class FarmPlan(NamedTuple):
     recipe: Mapping[str, Any]
     frames: Segment
     shape: SceneShape
+    num_lines: tuple[int, ...]
     workers: WorkersConfig
 
 
@@ -79,6 +81,45 @@ class FarmTimes:
         )
 
 
+class _Sharing:
+    """Who senses what of the same sensors, and what that has taken since it was so.
+
+    Attributes:
+        shares: who senses what.
+        uses: ticks, in all.
+        spent_s: (n, S) processor time since then, of each worker for each sensor.
+        agents: that have been sensed for, summed over these ticks.
+    """
+
+    def __init__(self, shares: Shares, sensors: int) -> None:
+        self.shares = shares
+        self.uses = 0
+        self.spent_s = np.zeros((shares.workers, sensors))
+        self.agents = 0
+
+    def note(self, spent_s: NDArray[np.float64], agents: int) -> None:
+        """Add what a tick has taken."""
+        self.uses += 1
+        self.spent_s += spent_s
+        self.agents += agents
+
+    @property
+    def is_settled(self) -> bool:
+        """Whether it has been measured often enough to be kept for long."""
+        return self.uses >= SHARED_ANEW
+
+    @property
+    def is_over(self) -> bool:
+        """Whether it is time to look at what has been measured."""
+        often = self.uses % SHARED_ANEW == 0 if self.is_settled else self.uses.bit_count() == 1
+        return often and self.agents > 0
+
+    def forget(self) -> None:
+        """Begin to measure anew."""
+        self.spent_s[:] = 0.0
+        self.agents = 0
+
+
 class SensorFarm:
     """n sensor workers; it lets them sense as `rig.Sense` describes.
 
@@ -102,7 +143,8 @@ class SensorFarm:
         self._pool: Pool | None = None
         self._unused = weakref.finalize(self, plan.frames.close)
         self._costs_s = np.zeros(plan.shape.sensors)
-        self._shares: dict[tuple[int, ...], tuple[Shares, int]] = {}
+        self._line_costs = LineCosts(plan.num_lines)
+        self._sharings: dict[tuple[int, ...], _Sharing] = {}
         self._written: Shares | None = None
         self._gather = repeated(gather_rows)
 
@@ -134,7 +176,7 @@ class SensorFarm:
             return
         pool = self._started()
         began = perf_counter()
-        shares = self._share(tuple(turn.place for turn in theirs))
+        sharing = self._share(tuple(turn.place for turn in theirs))
         self._publish(scenes, theirs)
         published = perf_counter()
         sense_here(scenes, [turn for turn in turns if turn.sensor.stamps_itself])
@@ -142,7 +184,7 @@ class SensorFarm:
         pool.run(SensorTask.SENSE, commits=False)
         self.check(theirs)
         ended = perf_counter()
-        self._note_costs(theirs, shares)
+        sharing.note(self.shared.spent_s, int(self.shared.num_agents.sum()))
         self._note(began, published, sensed, ended, theirs)
 
     def close(self) -> None:
@@ -185,6 +227,7 @@ class SensorFarm:
         for turn in turns:
             shared.due[turn.place] = turn.due
         shared.delivered[:] = NEVER
+        shared.spent_s[:] = 0.0
 
     def check(self, turns: Sequence[Turn]) -> None:
         """See that every worker has delivered every frame that is due, of this tick.
@@ -193,47 +236,58 @@ class SensorFarm:
             SensorFrameError: the first that is not.
         """
         shared = self.shared
+        wrong = (shared.delivered != shared.ticks) & (shared.due[:, 0] > 0)  # (n, S, W)
+        if not wrong.any():
+            return
         for turn in turns:
-            wrong = (shared.delivered[:, turn.place] != shared.ticks) & (turn.due.num > 0)
-            if wrong.any():
-                worker, world = np.argwhere(wrong)[0]
+            for worker, world in np.argwhere(wrong[:, turn.place]).tolist():
                 found = shared.delivered[worker, turn.place, world]
                 raise SensorFrameError(turn.sensor.name, int(shared.ticks[world]), int(found))
 
-    def _share(self, sensors: tuple[int, ...]) -> Shares:
+    def _share(self, sensors: tuple[int, ...]) -> _Sharing:
         """Who senses what of some sensors, written for the workers."""
-        shares, uses = self._shares.get(sensors, (None, 0))
-        if shares is None or (self._by_cost and (uses < SHARED_EARLY or uses % SHARED_ANEW == 0)):
-            shares = self._share_anew(sensors)
-        self._shares[sensors] = (shares, uses + 1)
-        if shares is not self._written:
-            self._written = shares
-            shares.write(self.shared.share.reshape(len(self.shared.share), -1))
-        return shares
+        sharing = self._sharings.get(sensors)
+        if sharing is None:
+            sharing = _Sharing(self._share_anew(sensors), self._plan.shape.sensors)
+            self._sharings[sensors] = sharing
+        elif sharing.is_over:
+            self._learn(sharing)
+            if self._by_cost:
+                sharing.shares = self._share_anew(sensors)
+        if sharing.shares is not self._written:
+            self._written = sharing.shares
+            lines = self.shared.lines
+            self._written.write(lines.reshape(*lines.shape[:2], -1, 2))
+        return sharing
 
     @property
     def _by_cost(self) -> bool:
         return self._plan.workers.sensor_placement == "cost"
 
     def _share_anew(self, sensors: tuple[int, ...]) -> Shares:
-        shape = self._plan.shape
-        units = cut(sensors, shape.worlds * shape.agents, shape.workers)
+        plan, shape = self._plan, self._plan.shape
+        lines = {sensor: plan.num_lines[sensor] for sensor in sensors}
+        units = cut(lines, shape.worlds * shape.agents, shape.workers)
         unknown = not self._costs_s[list(sensors)].all()
         costs = [
             float(unknown or self._costs_s[unit.sensor]) * (unit.last - unit.first)
             for unit in units
         ]
-        share_out = share_by_cost if self._by_cost else share_in_turn
-        return share_out(units, costs, shape.workers)
+        if not self._by_cost:
+            return share_in_turn(units, costs, shape.workers)
+        shares = share_by_cost(units, costs, shape.workers)
+        return shares if unknown else divide(shares, self._line_costs)
 
-    def _note_costs(self, turns: Sequence[Turn], shares: Shares) -> None:
-        """What an agent's frame of each sensor costs."""
-        spent_s = self.shared.spent_s.sum(axis=0)
-        agents = max(1, int(self.shared.num_agents.sum()))
-        for turn in turns:
-            cost_s = spent_s[turn.place] / agents
-            known = self._costs_s[turn.place]
-            self._costs_s[turn.place] = known + NEW_COST * (cost_s - known) if known else cost_s
+    def _learn(self, sharing: _Sharing) -> None:
+        """Take over what has been measured: what a frame costs, and which of its lines."""
+        costs_s = sharing.spent_s.sum(axis=0) / sharing.agents
+        weight = NEW_COST if sharing.is_settled else 1.0
+        known = np.where(self._costs_s > 0.0, self._costs_s, costs_s)
+        self._costs_s = np.where(costs_s > 0.0, known + weight * (costs_s - known), self._costs_s)
+        for sensor, parts in sharing.shares.divided.items():
+            spent_s = [float(sharing.spent_s[home, sensor]) for home, _ in parts]
+            self._line_costs.learn(sensor, [lines for _, lines in parts], spent_s)
+        sharing.forget()
 
     def _note(
         self,
@@ -253,7 +307,8 @@ class SensorFarm:
         times.sent_bytes += int(shared.num_rows.sum()) * shared.rows.itemsize + sum(
             array.nbytes for array in (shared.before, shared.due, shared.signal_phase)
         )
-        times.got_bytes += sum(
-            int(turn.due.num.sum()) * turn.frames.data[0, :, 0].nbytes for turn in turns
-        )
+        for turn in turns:
+            frames = turn.frames.data
+            one = frames.nbytes // (frames.shape[0] * frames.shape[2])  # of all agents of a world
+            times.got_bytes += int(turn.due.num.sum()) * one
         times.messages += 2 * self._plan.shape.workers

@@ -8,6 +8,7 @@ from time import perf_counter, thread_time
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from cavmarl.kernels.repeated import repeated
 from cavmarl.kernels.sensor_share import put_first, take_rows
@@ -48,7 +49,7 @@ class SensorJob:
         self._worlds = scene.worlds
         self._scenes = [scene._replace(before=shared.before)]
         self._sensors = [
-            (place, sensor, shared.due_of(place), frames[sensor.name])
+            (place, sensor, shared.due_of(place), frames[sensor.name], shared.lines[number, place])
             for place, sensor in enumerate(mounted.rig.sensors)
             if not sensor.stamps_itself
         ]
@@ -59,8 +60,9 @@ class SensorJob:
     def warm(self) -> None:
         """Have the kernels of all sensors ready; nobody is there to be sensed."""
         self._look()
-        for place, sensor, due, frames in self._sensors:
-            self._own(place)
+        for _, sensor, due, frames, lines in self._sensors:
+            self._own(lines)
+            sensor.lines = lines
             sensor.sense(self._scenes, due, frames)
 
     def prepare(self) -> None:
@@ -71,11 +73,12 @@ class SensorJob:
         began = perf_counter()
         self._look()
         shared, number = self._shared, self._number
-        for place, sensor, due, frames in self._sensors:
+        for place, sensor, due, frames, lines in self._sensors:
             if not due.num.any():
                 continue
             spent = thread_time()
-            if self._own(place):
+            if self._own(lines):
+                sensor.lines = lines
                 sensor.sense(self._scenes, due, frames)
             shared.spent_s[number, place] = thread_time() - spent
             shared.delivered[number, place] = shared.ticks
@@ -97,10 +100,7 @@ class SensorJob:
         worlds.keys[:] = shared.keys
         worlds.signal_phase[:] = shared.signal_phase
 
-    def _own(self, place: int) -> int:
-        """How many agents it senses for with a sensor; their rows come first."""
+    def _own(self, lines: NDArray[np.int32]) -> int:
+        """For how many agents it writes lines (W, A, 2) of a sensor; their rows come first."""
         shared, worlds = self._shared, self._worlds
-        return self._put_first(
-            worlds.rows, shared.num_agents, shared.share[place], self._number, self._spare,
-            worlds.num_owned,
-        )  # fmt: skip
+        return self._put_first(worlds.rows, shared.num_agents, lines, self._spare, worlds.num_owned)

@@ -53,7 +53,7 @@ class SceneShape(NamedTuple):
             "signal_phase": ("<i4", (w, signals)),
             "before": ("|u1", (w, a, POSE.itemsize)),
             "due": ("<i8", (s, len(Due._fields), w)),
-            "share": ("<i2", (s, w, a)),
+            "lines": ("<i4", (n, s, w, a, 2)),
             "delivered": ("<i8", (n, s, w)),
             "spent_s": ("<f8", (n, s)),
             "busy_s": ("<f8", (n,)),
@@ -71,9 +71,9 @@ class SceneArrays(NamedTuple):
     signal_phase: NDArray[np.int32]  # (W, num_signals) see `Worlds`
     before: NDArray[np.void]  # POSE (W, A) of the tick before
     due: NDArray[np.int64]  # (S, 3, W) each sensor's `Due`
-    share: NDArray[np.int16]  # (S, W, A) who senses for each agent
+    lines: NDArray[np.int32]  # (n, S, W, A, 2) [first, last) that a worker writes of each frame
     delivered: NDArray[np.int64]  # (n, S, W) tick of the frames that a worker has written
-    spent_s: NDArray[np.float64]  # (n, S) processor time that it took for each sensor
+    spent_s: NDArray[np.float64]  # (n, S) processor time that it took for each that was due
     busy_s: NDArray[np.float64]  # (n,) time that it took for all
 
     @classmethod

@@ -1,16 +1,17 @@
 """Which sensor worker senses what: in turn, or by what it costs.
 
 What is shared out is a sensor of some agents. Agents of one sensor cost about the same, so where
-there are many of them they are shared out by the dozen.
+there are many of them they are shared out by the dozen. By cost, frames are divided as well where
+whole ones leave a worker with too much: each worker writes some lines of them.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import NamedTuple
+from typing import NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,9 +23,10 @@ from cavmarl.balance.refining import refine
 from cavmarl.balance.snapshot import idle_snapshot
 from cavmarl.balance.spreading import spread
 
-__all__ = ["Shares", "Unit", "cut", "share_by_cost", "share_in_turn"]
+__all__ = ["LineWorth", "Shares", "Unit", "cut", "divide", "share_by_cost", "share_in_turn"]
 
 PIECES_A_WORKER = 4  # of the agents of one sensor, where there are so many
+LEAST_S = 2e-4  # that has to be saved to divide frames: what stands around is looked up twice then
 
 
 class Unit(NamedTuple):
@@ -34,11 +36,25 @@ class Unit(NamedTuple):
         sensor: its number in the rig.
         first: agent.
         last: the one after the last.
+        begin: line of their frames.
+        end: the one after the last.
     """
 
     sensor: int
     first: int
     last: int
+    begin: int = 0
+    end: int = 1
+
+
+class LineWorth(Protocol):
+    """Where in the frames of each sensor the time goes."""
+
+    def part(self, sensor: int, begin: int, end: int) -> float:
+        """What the lines [begin, end) cost, as a part of the frame."""
+
+    def line_at(self, sensor: int, part: float) -> int:
+        """The line before which about that part of the frame's cost lies."""
 
 
 @dataclass(frozen=True)
@@ -65,17 +81,40 @@ class Shares:
             loads[home].append(cost_s)
         return [math.fsum(costs) for costs in loads]
 
-    def write(self, share: NDArray[np.int16]) -> None:
-        """Write the worker of each agent of the sensors that are shared out, (S, agents)."""
+    @property
+    def divided(self) -> dict[int, list[tuple[int, tuple[int, int]]]]:
+        """Worker and lines of each part of sensors all of whose agents' frames are divided alike.
+
+        Of others it cannot be told what a worker has spent on which lines.
+        """
+        parts: dict[int, list[tuple[int, tuple[int, int]]]] = {}
+        agents: dict[int, set[tuple[int, int]]] = {}
+        for unit, home in sorted(zip(self.units, self.homes, strict=True)):
+            parts.setdefault(unit.sensor, []).append((home, (unit.begin, unit.end)))
+            agents.setdefault(unit.sensor, set()).add((unit.first, unit.last))
+        return {
+            sensor: own
+            for sensor, own in parts.items()
+            if len(own) > 1 and len(agents[sensor]) == 1
+        }
+
+    def write(self, lines: NDArray[np.int32]) -> None:
+        """Write which lines each worker writes, (n, S, agents, 2), of the sensors shared out."""
+        for unit in self.units:
+            lines[:, unit.sensor, unit.first : unit.last] = 0
         for unit, home in zip(self.units, self.homes, strict=True):
-            share[unit.sensor, unit.first : unit.last] = home
+            lines[home, unit.sensor, unit.first : unit.last] = unit.begin, unit.end
 
 
-def cut(sensors: Sequence[int], agents: int, workers: int) -> list[Unit]:
-    """What is to be shared out of some sensors of all agents."""
+def cut(sensors: Mapping[int, int], agents: int, workers: int) -> list[Unit]:
+    """What is to be shared out of all agents, of sensors with so many lines a frame."""
     pieces = min(agents, PIECES_A_WORKER * workers)
     bounds = [agents * piece // pieces for piece in range(pieces + 1)]
-    return [Unit(sensor, first, last) for sensor in sensors for first, last in pairwise(bounds)]
+    return [
+        Unit(sensor, first, last, 0, lines)
+        for sensor, lines in sensors.items()
+        for first, last in pairwise(bounds)
+    ]
 
 
 def share_in_turn(units: Sequence[Unit], costs_s: Sequence[float], workers: int) -> Shares:
@@ -102,3 +141,40 @@ def share_by_cost(units: Sequence[Unit], costs_s: Sequence[float], workers: int)
     nowhere = Placement(problem, hosts, [-1] * len(units))
     placed = refine(spread(nowhere, [[number] for number in range(len(units))]))
     return Shares(tuple(units), tuple(placed.homes), tuple(costs_s), workers)
+
+
+def divide(shares: Shares, worth: LineWorth) -> Shares:
+    """Give lines of who has too much to who has too little, until all have about the same.
+
+    Each step leaves one worker with the mean, so no more frames are divided than there are workers.
+    """
+    units, homes, costs_s = list(shares.units), list(shares.homes), list(shares.costs_s)
+    for _ in range(shares.workers - 1):
+        loads_s = Shares(tuple(units), tuple(homes), tuple(costs_s), shares.workers).loads_s
+        mean_s = math.fsum(loads_s) / shares.workers
+        giver = max(range(shares.workers), key=loads_s.__getitem__)
+        taker = min(range(shares.workers), key=loads_s.__getitem__)
+        wanted_s = min(loads_s[giver] - mean_s, mean_s - loads_s[taker])
+        if wanted_s < LEAST_S:
+            break
+        owned = [number for number, home in enumerate(homes) if home == giver]
+        number = max(owned, key=costs_s.__getitem__)
+        unit, cost_s = units[number], costs_s[number]
+        if cost_s <= wanted_s:
+            break  # nothing so large is left that a part of it would do
+        if any(
+            home == taker and other[:3] == unit[:3]
+            for other, home in zip(units, homes, strict=True)
+        ):
+            break  # what one worker writes of a frame is in one piece
+        before = worth.part(unit.sensor, 0, unit.end)
+        within = worth.part(unit.sensor, unit.begin, unit.end)
+        line = worth.line_at(unit.sensor, before - within * wanted_s / cost_s)
+        if not unit.begin < line < unit.end:
+            break  # it cannot be divided, or not so finely
+        given_s = cost_s * worth.part(unit.sensor, line, unit.end) / within
+        units[number], costs_s[number] = unit._replace(end=line), cost_s - given_s
+        units.append(unit._replace(begin=line))
+        homes.append(taker)
+        costs_s.append(given_s)
+    return Shares(tuple(units), tuple(homes), tuple(costs_s), shares.workers)

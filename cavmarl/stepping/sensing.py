@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from cavmarl.config import EnvConfig, WorkersConfig, ZonesConfig
+from cavmarl.rig.catalogue import type_of
 from cavmarl.runtime.barrier import usable_cores
 from cavmarl.runtime.sensor_farm import FarmPlan, SensorFarm
 from cavmarl.runtime.sensor_job import SensorJob
@@ -90,7 +91,8 @@ def farm_of(
         "part": part,
         "num_worlds": num_worlds,
     }
-    return SensorFarm(FarmPlan(PROGRAM, recipe, arrays, shape, config.workers))
+    lines = tuple(type_of(name, sensor).num_lines(sensor) for name, sensor in config.rig.items())
+    return SensorFarm(FarmPlan(PROGRAM, recipe, arrays, shape, lines, config.workers))
 
 
 def make_sensor_jobs(recipe: Mapping[str, Any]) -> list[SensorJob]:

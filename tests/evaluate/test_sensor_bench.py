@@ -16,6 +16,7 @@ from cavmarl.evaluate.sensor_bench import SensorBench, measure_sensor_workers
 from cavmarl.evaluate.sensor_load import describe_rig, find_rig, load_rig, scaled
 from cavmarl.evaluate.sensor_run import PARTS
 from cavmarl.registry import load_config
+from cavmarl.runtime.barrier import usable_cores
 from tests.sumo_worlds import MODES, tiny_file
 
 RIG: dict[str, dict[str, Any]] = {
@@ -39,6 +40,15 @@ def test_every_run_is_on_record(found: SensorBench) -> None:
     assert all(len(turn.run.step_ms) == 6 for turn in found.turns)
     assert found.is_same
     assert all(len(turn.run.digests) == 3 for turn in found.turns)
+
+
+def test_the_ceiling_of_the_machine_is_measured_beside(found: SensorBench) -> None:
+    if len(usable_cores()) < 2:
+        assert found.ceiling is None
+        return
+    assert found.ceiling is not None
+    assert found.ceiling.programs == 2
+    assert 0.0 < found.ceiling.ratio == found.to_dict()["ceiling"]["ratio"]
 
 
 def test_the_parts_of_a_step_are_within_it(found: SensorBench) -> None:
@@ -100,7 +110,9 @@ def test_the_rig_of_ten_lists_what_it_is() -> None:
     config, _ = load_config("grid4x4", overrides={"rig": rig})
     told = describe_rig(config)
     assert len(told) == 10
-    assert all({"type", "resolution", "rate_hz", "placement"} <= sensor.keys() for sensor in told)
+    assert all(
+        {"type", "resolution", "lines", "rate_hz", "placement"} <= sensor.keys() for sensor in told
+    )
 
 
 @pytest.mark.parametrize("factor", [0.1, 1.0, 3.0, 1e3, 1e6])

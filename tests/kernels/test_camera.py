@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from cavmarl.kernels.backdrop import WALL
-from cavmarl.kernels.camera import look, make_camera, make_picture
+from cavmarl.kernels.camera import find_faces, look, make_camera, make_picture
 from cavmarl.kernels.faces import Camera, Picture
 from cavmarl.kernels.pixels import (
     colours,
@@ -41,11 +41,12 @@ def shoot(
     reach_m = 2.0 * camera.range_m
     panorama, counts = look_around(rows, row, backdrop(walls, strips), reach_m)
     picture = make_picture(*size, panorama)
-    look(camera, panorama, counts, picture)
+    num = find_faces(camera, panorama, counts, picture)
+    look(camera, picture, num, 0, size[1])
     depths = np.zeros(size[::-1], np.float32)
     classes = np.zeros(size[::-1], np.uint8)
     write_classes(picture, classes)
-    measure_depths(camera, picture, depths)
+    measure_depths(camera, picture, 0, depths)
     return depths, classes, picture
 
 
@@ -178,7 +179,7 @@ def test_colours_are_those_of_the_classes_and_pale_with_the_distance() -> None:
     camera = forward()
     _, classes, picture = shoot(rows, camera)
     out = np.zeros((HEIGHT, WIDTH, 3), np.uint8)
-    write_colours(camera, picture, colours(), out)
+    write_colours(camera, picture, 0, colours(), out)
     middle = HEIGHT // 2 - 1
     near, far = out[middle, WIDTH // 2].astype(int), out[middle, 0].astype(int)
     assert classes[middle, 0] == classes[middle, WIDTH // 2] == CAR

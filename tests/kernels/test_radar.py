@@ -29,7 +29,7 @@ def echoes(
     fan = make_fan(matrix, AZIMUTHS, np.zeros(1), 60.0)
     panorama, counts = look_around(rows, row, backdrop(walls), 65.0)
     hits = np.zeros((AZIMUTHS[2], 1), HIT)
-    cast(fan, panorama.prisms, counts.prisms, panorama.walls, counts.walls, hits)
+    cast(fan, panorama.prisms, counts.prisms, panorama.walls, counts.walls, 0, len(hits), hits)
     targets = np.zeros(AZIMUTHS[2], TARGET)
     order = np.zeros(AZIMUTHS[2], np.int32)
     found = detect(fan, panorama, rows[row], hits, targets, order)

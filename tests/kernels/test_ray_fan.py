@@ -24,7 +24,7 @@ def scan(
     """HIT (A, E); `what` of bodies and walls is their own number and not the panorama's."""
     panorama, counts = look_around(rows, row, backdrop(walls), fan.range_m + 3.0)
     hits = np.zeros(fan.rays.shape[:2], HIT)
-    cast(fan, panorama.prisms, counts.prisms, panorama.walls, counts.walls, hits)
+    cast(fan, panorama.prisms, counts.prisms, panorama.walls, counts.walls, 0, len(hits), hits)
     return hits
 
 

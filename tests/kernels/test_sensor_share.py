@@ -24,10 +24,12 @@ def test_who_is_sensed_for_comes_first_and_nobody_is_lost(share: list[int], othe
     published["agent"][0, :agents] = np.arange(agents)[::-1]
     published["id"][0, : agents + others] = 10 + np.arange(agents + others)
     take_rows(published, np.array([agents + others]), rows)
-    whose = np.array([share if share else [0]], dtype=np.int16)
+    whose = np.array(share if share else [0])
     spare, num_owned = np.zeros(1, dtype=VEHICLE), np.zeros(1, dtype=np.int64)
     for worker in (0, 1, 2, 1):
-        total = put_first(rows, np.array([agents]), whose, worker, spare, num_owned)
+        lines = np.zeros((1, whose.size, 2), dtype=np.int32)
+        lines[0, whose == worker, 1] = 3
+        total = put_first(rows, np.array([agents]), lines, spare, num_owned)
         assert total == num_owned[0] == share.count(worker)
         own = rows["agent"][0, :total].tolist()
         assert sorted(own) == [agent for agent, home in enumerate(share) if home == worker]

@@ -17,6 +17,8 @@ import os
 import signal
 import socket
 import sys
+from collections.abc import Callable, Sequence
+from itertools import chain, compress, repeat
 from typing import Any, NoReturn
 
 import numpy as np
@@ -31,6 +33,15 @@ PUPPET = "cavmarl."  # begins the names of vehicles that are moved from outside
 FREE = 2  # moveToXY: wherever it is told, on a road or not
 PARKS = 1 | 64  # flags of a stop: beside the road, at a parking area
 BY_ITSELF = 0  # speed and lane change modes: SUMO decides nothing for it
+
+# What is asked of every vehicle, by field of its record; the second only where somebody looks.
+_FIELDS = {"at": "getRouteIndex", "pos": "getLanePosition"}
+_FIELDS_SEEN = {
+    "angle": "getAngle",
+    "speed": "getSpeed",
+    "lat": "getLateralLanePosition",
+    "signals": "getSignals",
+}
 
 _PR_SET_PDEATHSIG = 1
 
@@ -59,8 +70,7 @@ class Simulation:
 
     def _forget(self) -> None:
         self._number: dict[str, int] = {}  # of vehicles on the road, by name
-        self._type: dict[str, int] = {}
-        self._given = 0  # numbers
+        self._types: list[int] = []  # by number
         self._route_row: dict[str, int] = {}
         self._puppets: dict[int, str] = {}
 
@@ -73,6 +83,12 @@ class Simulation:
         self._sumo.start([_binary(self._interface), *words])
         self._runs = True
         self._vehicle = self._sumo.vehicle
+        fields = {**_FIELDS, **(_FIELDS_SEEN if self._is_seen else {})}
+        self._getters = {field: _bare(self._sumo, "vehicle", get) for field, get in fields.items()}
+        self._lane_of = _bare(self._sumo, "vehicle", "getLaneID")
+        self._route_of = _bare(self._sumo, "vehicle", "getRouteID")
+        self._place_of = _bare(self._sumo, "vehicle", "getPosition3D")
+        self._state_of = _bare(self._sumo, "trafficlight", "getRedYellowGreenState")
         return {"version": str(self._sumo.getVersion()[1]), "time_ms": self._time_ms()}
 
     def _stop(self) -> None:
@@ -103,48 +119,56 @@ class Simulation:
             for name in self._sumo.simulation.getStartingTeleportIDList()
             if name in self._number
         ]
-        names, lanes = self._on_road()
-        for name in self._number.keys() - set(names):
-            del self._number[name]
-        fresh = [self._register(name) for name in names if name not in self._number]
+        names, numbers, lanes, fresh = self._on_road()
         for key, news in (("teleported", lifted), ("departed", fresh)):
             if news:
                 line[key] = news
-        vehicle = self._vehicle
         seen = np.zeros(len(names), dtype=self._seen)
-        if names:
-            seen["number"] = [*map(self._number.__getitem__, names)]
-            seen["vtype"] = [*map(self._type.__getitem__, names)]
-            seen["lane"] = lanes
-            seen["route"] = self._routes(names, line)
-            fields = [("at", vehicle.getRouteIndex), ("pos", vehicle.getLanePosition)]
-            if self._is_seen:
-                places = np.array([*map(vehicle.getPosition3D, names)])
-                seen["x"], seen["y"], seen["z"] = places.T
-                fields += [
-                    ("angle", vehicle.getAngle),
-                    ("speed", vehicle.getSpeed),
-                    ("lat", vehicle.getLateralLanePosition),
-                    ("signals", vehicle.getSignals),
-                ]
-            for field, get in fields:
-                seen[field] = [*map(get, names)]
-        get_state = self._sumo.trafficlight.getRedYellowGreenState
-        letters = "".join(map(get_state, self._signals)).encode()
-        return seen[np.argsort(seen["number"])], letters, line
+        seen["number"] = numbers
+        seen["vtype"] = np.array(self._types, dtype=np.int32)[numbers]
+        seen["lane"] = lanes
+        seen["route"] = self._routes(names, line)
+        if self._is_seen:
+            places = chain.from_iterable(map(self._place_of, names))
+            xyz = np.fromiter(places, np.float64, 3 * len(names)).reshape(-1, 3)
+            seen["x"], seen["y"], seen["z"] = xyz.T
+        for field, get in self._getters.items():
+            seen[field] = np.fromiter(map(get, names), self._seen[field], len(names))
+        letters = "".join(map(self._state_of, self._signals)).encode()
+        return seen[np.argsort(numbers)], letters, line
 
-    def _on_road(self) -> tuple[list[str], list[int]]:
-        """Names of the vehicles that stand or drive on the map's lanes, and LANE rows."""
-        vehicle = self._vehicle
-        own = set(self._puppets.values())
-        names = [name for name in vehicle.getIDList() if name not in own]
-        rows = [self._lane_row.get(lane, -1) for lane in map(vehicle.getLaneID, names)]
-        found = [(name, row) for name, row in zip(names, rows, strict=True) if row >= 0]
-        for name, _ in found:
-            if name not in self._type:
-                self._type[name] = self._row_of(vehicle.getTypeID(name))
-        found = [pair for pair in found if self._type[pair[0]] >= 0]
-        return [name for name, _ in found], [row for _, row in found]
+    def _on_road(
+        self,
+    ) -> tuple[Sequence[str], NDArray[np.int32], NDArray[np.int32], list[list[Any]]]:
+        """The vehicles that stand or drive on the map's lanes, and which of them have come now.
+
+        Returns:
+            names, numbers and LANE rows, and what is to be said of those who have come.
+        """
+        vehicle, nobody = self._vehicle, repeat(-1)
+        names = vehicle.getIDList()
+        lanes = map(self._lane_row.get, map(self._lane_of, names), nobody)
+        rows = np.fromiter(lanes, np.int32, len(names))
+        known = map(self._number.get, names, nobody)
+        numbers = np.fromiter(known, np.int32, len(names))
+        is_here = (rows >= 0) & (numbers >= 0)
+        there = int(is_here.sum())
+        come = np.flatnonzero((rows >= 0) & (numbers < 0)).tolist()
+        if there < len(self._number):
+            for name in self._number.keys() - set(compress(names, is_here)):
+                del self._number[name]
+        fresh = []
+        puppets = set(self._puppets.values()) if come else set()
+        for place in come:
+            name = names[place]
+            if name in puppets:
+                continue
+            kind = self._row_of(vehicle.getTypeID(name))
+            if kind >= 0:
+                fresh.append(self._register(name, kind))
+                numbers[place] = self._number[name]
+                is_here[place] = True
+        return [*compress(names, is_here)], numbers[is_here], rows[is_here], fresh
 
     def _row_of(self, kind: str) -> int:
         """The row of a type; a vehicle's own one, `type@vehicle`, counts as what it was made of."""
@@ -153,10 +177,10 @@ class Simulation:
             raise LookupError(f"type '{kind}' is in none of the files")
         return row
 
-    def _register(self, name: str) -> list[Any]:
-        """A number for a vehicle that has come, or has come back."""
-        self._number[name] = self._given
-        self._given += 1
+    def _register(self, name: str, kind: int) -> list[Any]:
+        """A number for a vehicle of a type that has come, or has come back."""
+        self._number[name] = len(self._types)
+        self._types.append(kind)
         stops = [] if self._is_seen else self._stops(name)
         return [self._number[name], name, self._vehicle.getSpeedFactor(name), stops]
 
@@ -176,16 +200,19 @@ class Simulation:
                 found.append([row, stop.startPos, stop.endPos, *times, parks])
         return found
 
-    def _routes(self, names: list[str], line: dict[str, Any]) -> list[int]:
+    def _routes(self, names: Sequence[str], line: dict[str, Any]) -> NDArray[np.int32]:
         """Numbers of their routes; the edges of new ones go into the line."""
         known = self._route_row
-        ids = [*map(self._vehicle.getRouteID, names)]
-        for name, route in zip(names, ids, strict=True):
+        ids = [*map(self._route_of, names)]
+        rows = np.fromiter(map(known.get, ids, repeat(-1)), np.int32, len(ids))
+        for place in np.flatnonzero(rows < 0).tolist():
+            route = ids[place]
             if route not in known:
                 known[route] = len(known)
-                edges = [self._edge_row.get(edge, -1) for edge in self._vehicle.getRoute(name)]
-                line.setdefault("routes", []).append(edges)
-        return [known[route] for route in ids]
+                edges = self._vehicle.getRoute(names[place])
+                line.setdefault("routes", []).append([self._edge_row.get(e, -1) for e in edges])
+            rows[place] = known[route]
+        return rows
 
     def _place(self, moved: NDArray[np.void]) -> None:
         """Bring the puppets to their places; new ones come, others go."""
@@ -215,6 +242,18 @@ class Simulation:
     def _time_ms(self) -> int:
         time_s: float = self._sumo.simulation.getTime()
         return round(1000.0 * time_s)
+
+
+def _bare(sumo: Any, domain: str, getter: str) -> Callable[[str], Any]:
+    """A getter for names, of libsumo without the Python function that SWIG puts around it.
+
+    That one only hands on what it is given, and costs a fifth of the call. TraCI has none, nor may
+    another libsumo: there it is the usual one.
+    """
+    inner = getattr(getattr(sumo, "libsumo", None), "_libsumo", None)
+    usual: Callable[[str], Any] = getattr(getattr(sumo, domain), getter)
+    bare: Callable[[str], Any] = getattr(inner, f"{domain}_{getter}", usual)
+    return bare
 
 
 def _describe(kinds: Any, name: str) -> dict[str, Any]:

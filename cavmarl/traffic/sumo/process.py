@@ -28,6 +28,8 @@ __all__ = ["Answer", "SumoProcess", "choose_interface"]
 ANSWER_S = 120.0  # who takes longer for one step hangs
 END_S = 2.0  # for it to end by itself
 LAST_WORDS = 2000  # characters of what it has printed last
+# SUMO follows pointers all over its memory: in pages of 2 MiB a step is up to a sixth faster.
+HUGE_PAGES = "glibc.malloc.hugetlb=1"
 
 
 class Answer(NamedTuple):
@@ -80,7 +82,12 @@ class SumoProcess:
                 stdout=said,
                 stderr=said,
                 pass_fds=(theirs.fileno(),),
-                env={**os.environ, "PYTHONPATH": path, "OMP_NUM_THREADS": "1"},
+                env={
+                    **os.environ,
+                    "PYTHONPATH": path,
+                    "OMP_NUM_THREADS": "1",
+                    "GLIBC_TUNABLES": ":".join([HUGE_PAGES, *_tunables()]),
+                },
             )
         ours.settimeout(ANSWER_S)
         self.pid = process.pid
@@ -175,6 +182,12 @@ class SumoProcess:
         self._said.seek(0)
         text = self._said.read().decode(errors="replace").strip()[-LAST_WORDS:]
         return f": {text}" if text else ""
+
+
+def _tunables() -> list[str]:
+    """What the user has set of the C library, which comes last and so counts."""
+    own = os.environ.get("GLIBC_TUNABLES")
+    return [own] if own else []
 
 
 def _end(process: subprocess.Popen[bytes], wire: socket.socket, said: IO[bytes]) -> None:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -132,23 +134,35 @@ class _Pages:
         self.routes: list[NDArray[np.int32]] = []
         self.path_of = np.zeros(0, dtype=np.int32)
         self.known: dict[tuple[bytes, int], int] = {}
-        self._edges: list[NDArray[np.int32]] = []
-        self._ways: list[NDArray[np.int64]] = []
-        self._arrays: Paths | None = None
+        self._num = 0
+        self._first = np.zeros(1, dtype=np.int64)
+        self._edges = np.zeros(0, dtype=np.int32)
+        self._ways = np.zeros(0, dtype=np.int64)
 
     def add(self, edges: NDArray[np.int32], mask: int, ways: NDArray[np.int64]) -> int:
         """A new path's number."""
-        number = self.known[edges.tobytes(), mask] = len(self._edges)
-        self._edges.append(edges)
-        self._ways.append(ways)
-        self._arrays = None
+        number = self.known[edges.tobytes(), mask] = self._num
+        begin = int(self._first[number])
+        end = begin + len(edges)
+        self._first = _with_room(self._first, number + 1, number + 2)
+        self._edges = _with_room(self._edges, begin, end)
+        self._ways = _with_room(self._ways, begin, end)
+        self._first[number + 1] = end
+        self._edges[begin:end] = edges
+        self._ways[begin:end] = ways
+        self._num += 1
         return number
 
     def arrays(self, nowhere: int) -> Paths:
         """All paths, for kernels."""
-        if self._arrays is None:
-            sizes = np.array([0, *map(len, self._edges)], dtype=np.int64)
-            edges = np.concatenate([*self._edges, np.zeros(0, dtype=np.int32)])
-            ways = np.concatenate([*self._ways, np.zeros(0, dtype=np.int64)])
-            self._arrays = Paths(np.cumsum(sizes), edges, ways, nowhere)
-        return self._arrays
+        end = int(self._first[self._num])
+        return Paths(self._first[: self._num + 1], self._edges[:end], self._ways[:end], nowhere)
+
+
+def _with_room(array: NDArray[Any], used: int, wanted: int) -> NDArray[Any]:
+    """The same array, or one of twice the room with what is used: paths come one by one."""
+    if wanted <= len(array):
+        return array
+    larger = np.zeros(2 * wanted, dtype=array.dtype)
+    larger[:used] = array[:used]
+    return larger

@@ -76,7 +76,7 @@ class SumoTraffic:
         self._blank = blank
         self._dt = demand.dt_s
         self._replay_bytes = demand.replay_bytes
-        self._shown = ShownSignals(network)
+        self._shown = ShownSignals(network, num_worlds)
         self._mirror = repeated(mirror)
         self._greet = repeated(greet)
         self._list_others = repeated(list_others)
@@ -222,7 +222,7 @@ class SumoTraffic:
     def show(self, worlds: Worlds) -> None:
         """Let the signals of all worlds show what SUMO's do."""
         for w, phase in enumerate(worlds.signal_phase):
-            self._shown.show(self.worlds.at(w).letters, phase)
+            self._shown.show(w, self.worlds.at(w).letters, phase)
 
     def shift(self, rows: NDArray[np.void], worlds: int) -> None:
         """Let rows of a world, VEHICLE or departures, be those of so many worlds later.
