@@ -103,6 +103,7 @@ class Leader:
         self._codes = {name: code for code, name in enumerate(TOGETHER)}
         self._leads = False
         self._last = ""
+        self._is_ahead = False  # a phase is announced that nobody has waited for
 
     @contextmanager
     def order(self) -> Iterator[None]:
@@ -112,7 +113,7 @@ class Leader:
             LeftAloneError: one of them has failed.
         """
         self._wait()
-        self._leads, self._last = True, ""
+        self._leads, self._last, self._is_ahead = True, "", False
         try:
             yield
         finally:
@@ -151,6 +152,7 @@ class Leader:
             self._everybody.each(name, *arguments)
             return
         self._announce(self._codes[name], which)
+        self._is_ahead = True
         self._own.each(name, *arguments)
         if is_late:
             return
@@ -164,7 +166,10 @@ class Leader:
         Raises:
             LeftAloneError: a follower has failed.
         """
+        if not self._is_ahead:
+            return
         self._wait()
+        self._is_ahead = False
         for line in self._others:
             if line.item(FAILED):
                 raise LeftAloneError

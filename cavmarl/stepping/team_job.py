@@ -19,7 +19,7 @@ __all__ = ["FollowerJob", "LeaderJob"]
 
 # Phases that end a task for the followers; what comes after them the leader does alone, and one of
 # the followers wakes the caller in the meantime.
-LAST = {Task.STEP: "credit", Task.SUGGEST: "suggest"}
+LAST = {Task.STEP: "sense", Task.SUGGEST: "suggest"}
 # Tasks of the leader, of which no follower hears.
 ALONE = (Task.STATE_HASH, Task.TRAFFIC_STATS, Task.DRIVEN, Task.SIGNAL_PHASES)
 
