@@ -25,7 +25,7 @@ from cavmarl.kernels.arrays import Common, Gate, Outputs, Worlds
 from cavmarl.kernels.codes import ACTION_IDLE
 from cavmarl.kernels.repeated import repeated
 from cavmarl.kernels.rng import world_key
-from cavmarl.kernels.tallies import begins_second, count_tick
+from cavmarl.kernels.tallies import count_tick, occasions
 from cavmarl.ownership.messages import Switch
 from cavmarl.ownership.transfers import TransferLog
 from cavmarl.rig.catalogue import frame_layout, frames_in
@@ -157,7 +157,7 @@ class Simulation:
             self._meet: Callable[[], None] = _there
             self._gathers = False
             self._count_tick = repeated(count_tick)
-            self._begins_second = repeated(begins_second)
+            self._occasions = repeated(occasions)
             self._attached: tuple[Attached, ...] = attach(
                 Host(
                     config,
@@ -641,13 +641,16 @@ class Simulation:
     def _leave(self) -> None:
         """Who needs it picks another goal, who has arrived leaves, who looks for a way finds it."""
         traffic, gate, worlds = self._traffic, self._gate, self._shard.worlds
-        begins_second = self._begins_second(worlds.ticks, traffic.ticks_per_s)
+        begins_second, some_arrived = self._occasions(
+            worlds.ticks, traffic.ticks_per_s, self._shard.zoned.num_through
+        )
         if begins_second:
             self._executor.each("choose_goals", traffic.demand, len(traffic.plans), gate)
-        self._executor.each("leave", gate)
-        if any(gate.num_passing.tolist()):
-            self._note_left()
-            traffic.settle(gate, worlds)
+        if some_arrived or self._recovery is not None:  # hosts may die in this phase
+            self._executor.each("leave", gate)
+            if any(gate.num_passing.tolist()):
+                self._note_left()
+                traffic.settle(gate, worlds)
         if begins_second and traffic.rerouting is not None:
             with self._division.everybody_next() as everybody:
                 traffic.rerouting.act(gate, everybody)
