@@ -240,8 +240,8 @@ class Meeting:
         """Tell the other side that this one has come to a number."""
         if self.announce(number):
             self.wake()
-        elif self._crowded:
-            _pass()  # the other side may look from this core
+        if self._crowded:
+            _pass()  # the other side may look from this core, or wake up on it
 
     def announce(self, number: int) -> int:
         """Come to a number; not 0: the other side sleeps, and has to be woken."""

@@ -63,6 +63,9 @@ class SensorJob:
             self._own(place)
             sensor.sense(self._scenes, due, frames)
 
+    def afterwards(self) -> None:
+        """Nothing to do."""
+
     def prepare(self) -> None:
         """Nothing to do."""
 
