@@ -30,6 +30,9 @@ class TrivialJob:
         arrays.mask[:] = True
         arrays.acted[:] = True
 
+    def afterwards(self) -> None:
+        """Nothing to do."""
+
     def prepare(self) -> None:
         """Nothing to do."""
 

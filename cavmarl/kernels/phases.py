@@ -27,8 +27,10 @@ from cavmarl.kernels.arrays import (
     Worlds,
     Zoned,
 )
+from cavmarl.kernels.codes import DRIVER_AGENT
 from cavmarl.kernels.departures import choose_goals
 from cavmarl.kernels.exchange import gather
+from cavmarl.kernels.leaving import drop_ghosts, leave
 from cavmarl.kernels.neighbors import Grid
 from cavmarl.kernels.outputs import credit
 from cavmarl.kernels.sense import sense
@@ -45,10 +47,12 @@ __all__ = [
     "choose_goals_each",
     "credit_each",
     "detect_each",
+    "forget_each",
     "gather_each",
     "propose_each",
     "rank_lanes_each",
     "resolve_each",
+    "retire_each",
     "sense_each",
 ]
 
@@ -314,3 +318,19 @@ def admit_each(members: Members, side: int, next_side: int, gate: Gate) -> None:
     for zone in members.numbers:
         worlds = _worlds(members, zone, side, next_side)
         admit(members.zones, members.halo, zone, gate, worlds)
+
+
+@kernel
+def retire_each(members: Members, side: int, gate: Gate, ticks_per_step: int) -> None:
+    """Let the agents of each zone whose trip has ended `leave`."""
+    for zone in members.numbers:
+        worlds = _worlds(members, zone, side, side)
+        leave(gate, worlds, worlds.rows, DRIVER_AGENT, ticks_per_step)
+
+
+@kernel
+def forget_each(members: Members, side: int, gate: Gate) -> None:
+    """`drop_ghosts` in each zone."""
+    for zone in members.numbers:
+        worlds = _worlds(members, zone, side, side)
+        drop_ghosts(gate, worlds, worlds.rows)

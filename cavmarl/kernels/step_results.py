@@ -15,7 +15,7 @@ from cavmarl.kernels import kernel
 from cavmarl.kernels.arrays import Gate, Outputs
 from cavmarl.kernels.codes import COUNT_ARRIVED, EVENTS_THAT_END
 
-__all__ = ["Results", "report", "report_who_goes_on"]
+__all__ = ["Results", "keep_last", "report", "report_who_goes_on"]
 
 
 class Results(NamedTuple):
@@ -97,3 +97,33 @@ def report_who_goes_on(
         results.episode_over[w] = over
         some_over |= over
     return some_over
+
+
+@kernel
+def keep_last(
+    results: Results,
+    observations: NDArray[np.float32],
+    final_observations: NDArray[np.float32],
+    in_next_step: bool,
+) -> None:
+    """Keep what those saw last who have ended.
+
+    Args:
+        results: who has ended, and which episodes are over.
+        observations: (W, A, D); those of agents who are gone become 0, unless worlds begin anew in
+            the next step.
+        final_observations: (W, A, D) where something has ended, what they were; written.
+        in_next_step: when worlds begin anew.
+    """
+    for w in range(observations.shape[0]):
+        ended = results.episode_over[w]
+        for agent in range(observations.shape[1]):
+            ended |= results.terminations[w, agent]
+        if not ended:
+            continue
+        for agent in range(observations.shape[1]):
+            is_gone = results.terminations[w, agent] and not in_next_step
+            for k in range(observations.shape[2]):
+                final_observations[w, agent, k] = observations[w, agent, k]
+                if is_gone:
+                    observations[w, agent, k] = 0.0

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from cavmarl.kernels import kernel
 
-__all__ = ["begins_second", "count_tick", "totals"]
+__all__ = ["begins_second", "count_tick", "occasions", "totals"]
 
 
 @kernel
@@ -21,6 +21,24 @@ def begins_second(ticks: NDArray[np.int64], ticks_per_s: int) -> bool:
         if tick % ticks_per_s == 0:
             return True
     return False
+
+
+@kernel
+def occasions(
+    ticks: NDArray[np.int64], ticks_per_s: int, num_through: NDArray[np.int64]
+) -> tuple[bool, bool]:
+    """Whether a second begins in some world, and whether anybody has arrived.
+
+    Args:
+        ticks: (W,) the present tick.
+        ticks_per_s: in a second.
+        num_through: (k, W) who has arrived in each zone.
+    """
+    somebody = False
+    for zone in range(num_through.shape[0]):
+        for w in range(num_through.shape[1]):
+            somebody |= num_through[zone, w] > 0
+    return begins_second(ticks, ticks_per_s), somebody
 
 
 @kernel

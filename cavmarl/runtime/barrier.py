@@ -54,6 +54,7 @@ LONG_S = 200e-6  # that it looks where the last time has not been longer
 LONG_WORK_S = 500e-6  # after which nobody looks for so long
 PAUSES = 4  # looks before it lets others run
 ROUNDS = 16  # of those before it looks at the clock
+ALONE_S = 300e-6  # that who waits so, and has a core for itself, looks without a break
 AWAKE_S = 10e-3  # that who waits for a part of an order lets others run between two looks
 NAP_S = 100e-6  # that it sleeps between them from then on
 WAKE = b"!"
@@ -199,13 +200,23 @@ def post(mine: Words, number: int) -> None:
     _set(mine, NUMBER, number, mine)
 
 
-def wait_for(theirs: Words, number: int) -> None:
-    """Return when the other side comes to a number, which it does soon unless it is dead."""
+def wait_for(theirs: Words, number: int, is_apart: bool = False) -> None:
+    """Return when the other side comes to a number, which it does soon unless it is dead.
+
+    Args:
+        theirs: (WORDS,) that the other side writes.
+        number: to wait for.
+        is_apart: the other side was on another core when it was seen last. Then nobody is let in
+            for a while: of other programs that have the same core, one that is may keep it for
+            milliseconds.
+    """
     if _look(theirs, number, False):
         return
-    end = time.perf_counter() + AWAKE_S
-    while not _look(theirs, number, True):
-        if time.perf_counter() > end:
+    now = time.perf_counter()
+    alone, end = now + is_apart * ALONE_S, now + AWAKE_S
+    while not _look(theirs, number, now >= alone):
+        now = time.perf_counter()
+        if now > end:
             time.sleep(NAP_S)
 
 
@@ -229,8 +240,8 @@ class Meeting:
         """Tell the other side that this one has come to a number."""
         if self.announce(number):
             self.wake()
-        elif self._crowded:
-            _pass()  # the other side may look from this core
+        if self._crowded:
+            _pass()  # the other side may look from this core, or wake up on it
 
     def announce(self, number: int) -> int:
         """Come to a number; not 0: the other side sleeps, and has to be woken."""

@@ -123,7 +123,6 @@ class Crew:
                 which a worker waits to begin.
         """
         if sleeps:
-            self._hear_no_more()
             for k in workers:
                 self._meetings[k].lie_down_first()
         asleep = []
@@ -172,7 +171,7 @@ class Crew:
             the dead, by worker.
         """
         ready: list[tuple[int, int]] = []
-        if is_lying or self._lie_down(pending):
+        if self._hears_nobody(pending) if is_lying else self._lie_down(pending):
             ready = self._poll.poll(1000.0 * limit_s)
         for k in pending:
             self._meetings[k].get_up()
@@ -198,13 +197,18 @@ class Crew:
                 self.processes[k].take()
         self._heard.clear()
 
-    def _hear_no_more(self) -> None:
-        """The same, also of who has called while this side was about to get up."""
+    def _hears_nobody(self, pending: Sequence[int]) -> bool:
+        """Forget also who has called while this side was about to get up; False: one is through.
+
+        Only once they have their order, so that nobody waits for it: of a call that is forgotten
+        too much, the number is there before it.
+        """
         for fd, _ in self._poll.poll(0):
             k, is_dead = self._owners[fd]
             if not is_dead:
                 self._heard.add(k)
         self.forget_calls()
+        return not any(map(self.has, pending))
 
     def settle(self, k: int, limit_s: float) -> bool:
         """Whether a worker has carried out its order or has died of it, after a while at most."""

@@ -175,21 +175,28 @@ class Division:
             known[w] = 0
 
     def exchange(self) -> None:
-        """Renew all ghosts from the owned `next_rows`."""
+        """Renew all ghosts from the owned `next_rows`.
+
+        Where shards `gather` them, `note_gathered` has to follow before the tick is over.
+        """
         if self._gatherers is not None:
             self._gatherers.each("gather", *self.gathering)
-            self._note_those_near(self.book)
             return
         worlds = self._shards[0].worlds
         self._exchange(worlds.next_rows, 0, len(worlds.ticks))
 
-    def let_gather(self, executor: Executor) -> None:
-        """From now on let shards `exchange` as a phase, if they run side by side.
+    def let_gather(self, executor: Executor) -> bool:
+        """From now on let shards `exchange` as a phase, if they run side by side; whether they do.
 
         A shard that gathers asks all others, so not where there are some that it never sees.
         """
         if len(self._halo.near) == self.count**2:
             self._gatherers = executor
+        return self._gatherers is not None
+
+    def note_gathered(self) -> None:
+        """Note who is near a border, after all shards have gathered."""
+        self._note_those_near(self.book)
 
     def rehearse_gathering(self) -> None:
         """Call what is called after shards have gathered, and forget what it has found."""

@@ -8,7 +8,7 @@ from typing import Any, Literal, Protocol
 from cavmarl.shard.group import ShardGroup
 from cavmarl.shard.shard import Shard
 
-__all__ = ["Executor", "Phase", "SerialExecutor"]
+__all__ = ["Executor", "Phase", "SerialExecutor", "Together"]
 
 # What a tick is made of: a name and its arguments can be sent anywhere.
 Phase = Literal[
@@ -36,6 +36,14 @@ class Executor(Protocol):
 
     def each(self, phase: Phase, *arguments: Any) -> None:
         """Run the phase on every shard with the same arguments; see `ShardGroup`."""
+        ...
+
+
+class Together(Executor, Protocol):
+    """Several that run phases side by side; after some the first of them does not wait."""
+
+    def meet(self) -> None:
+        """Wait until all shards are through with the last phase."""
         ...
 
 

@@ -65,6 +65,9 @@ class SensorJob:
             sensor.lines = lines
             sensor.sense(self._scenes, due, frames)
 
+    def afterwards(self) -> None:
+        """Nothing to do."""
+
     def prepare(self) -> None:
         """Nothing to do."""
 

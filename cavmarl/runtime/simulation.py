@@ -25,7 +25,7 @@ from cavmarl.kernels.arrays import Common, Gate, Outputs, Worlds
 from cavmarl.kernels.codes import ACTION_IDLE
 from cavmarl.kernels.repeated import repeated
 from cavmarl.kernels.rng import world_key
-from cavmarl.kernels.tallies import begins_second, count_tick
+from cavmarl.kernels.tallies import count_tick, occasions
 from cavmarl.ownership.messages import Switch
 from cavmarl.ownership.transfers import TransferLog
 from cavmarl.rig.catalogue import frame_layout, frames_in
@@ -42,7 +42,7 @@ from cavmarl.runtime.compilation import first_compilation
 from cavmarl.runtime.coordination import Coordination
 from cavmarl.runtime.dividing import divide
 from cavmarl.runtime.division import ZoneLoads
-from cavmarl.runtime.executor import Executor, SerialExecutor
+from cavmarl.runtime.executor import Executor, SerialExecutor, Together
 from cavmarl.runtime.messaging import Messaging
 from cavmarl.runtime.mounted import MountedSensors
 from cavmarl.runtime.recovery import Recovery, Revival
@@ -155,8 +155,10 @@ class Simulation:
             )
             self._shard = self._shards[0]
             self._executor: Executor = SerialExecutor(self._shards)
+            self._meet: Callable[[], None] = _there
+            self._gathers = False
             self._count_tick = repeated(count_tick)
-            self._begins_second = repeated(begins_second)
+            self._occasions = repeated(occasions)
             self._attached: tuple[Attached, ...] = attach(
                 Host(
                     config,
@@ -531,8 +533,8 @@ class Simulation:
             if isinstance(part, Traced):
                 part.trace(note)
 
-    def host(self, make: Callable[[Sequence[Shard], tuple[float, float]], Executor]) -> None:
-        """From now on let somebody else run the phases of the shards, as `make` returns it.
+    def host(self, make: Callable[[Sequence[Shard], tuple[float, float]], Together]) -> None:
+        """From now on let others run the phases of the shards, as `make` returns them.
 
         Args:
             make: called with the shards, and with what the phase `gather` is called with.
@@ -541,8 +543,9 @@ class Simulation:
             ConfigError: zones become others, and nobody would tell him.
         """
         self._refuse_recutting("the zones of one world over workers")
-        self._executor = make(self._shards, self._division.gathering)
-        self._division.let_gather(self._executor)
+        team = make(self._shards, self._division.gathering)
+        self._executor, self._meet = team, team.meet
+        self._gathers = self._division.let_gather(team)
 
     def time_shards(self, every: int = 1) -> ShardClock:
         """From now on run phases zone by zone, with a clock on each.
@@ -573,10 +576,13 @@ class Simulation:
         if is_first:
             self._executor.each("begin_step", commands)
         self._advance(commands)
+        if self._attached:
+            self._meet()
         for part in self._attached:
             part.end()
         if is_last:
             self._sense(self.everywhere)
+        self._meet()
         if self._coordination is not None:
             self._coordination.end()
 
@@ -588,6 +594,8 @@ class Simulation:
         self._leave()
         self._division.exchange()
         self._executor.each("resolve")
+        if self._gathers:
+            self._division.note_gathered()  # others may still be about their contacts
         self._enter()
         self._executor.each("commit")
         self._count_tick(self._shard.worlds.ticks)
@@ -634,13 +642,16 @@ class Simulation:
     def _leave(self) -> None:
         """Who needs it picks another goal, who has arrived leaves, who looks for a way finds it."""
         traffic, gate, worlds = self._traffic, self._gate, self._shard.worlds
-        begins_second = self._begins_second(worlds.ticks, traffic.ticks_per_s)
+        begins_second, some_arrived = self._occasions(
+            worlds.ticks, traffic.ticks_per_s, self._shard.zoned.num_through
+        )
         if begins_second:
             self._executor.each("choose_goals", traffic.demand, len(traffic.plans), gate)
-        self._executor.each("leave", gate)
-        if any(gate.num_passing.tolist()):
-            self._note_left()
-            traffic.settle(gate, worlds)
+        if some_arrived or self._recovery is not None:  # hosts may die in this phase
+            self._executor.each("leave", gate)
+            if any(gate.num_passing.tolist()):
+                self._note_left()
+                traffic.settle(gate, worlds)
         if begins_second and traffic.rerouting is not None:
             with self._division.everybody_next() as everybody:
                 traffic.rerouting.act(gate, everybody)
@@ -653,6 +664,7 @@ class Simulation:
         """Those who wait and find a gap enter `next_rows`."""
         traffic, gate, worlds = self._traffic, self._gate, self._shard.worlds
         if self._sumo is not None:
+            self._meet()
             if not self._sumo.drives:
                 self._sumo.order(gate, worlds)
             elif self._sumo.let_in(gate, worlds):
@@ -783,6 +795,10 @@ class Simulation:
 def _frames(config: EnvConfig, num_worlds: int, zeros: Zeros) -> Frames:
     layout = frame_layout(config, num_worlds)
     return frames_in({name: zeros(shape, dtype=kind) for name, (kind, shape) in layout.items()})
+
+
+def _there() -> None:
+    """Nobody is waited for where one process runs all phases."""
 
 
 def _pass_over(phase: str) -> None:

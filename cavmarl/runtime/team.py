@@ -47,8 +47,11 @@ CORE = 5  # a word of both: where the process was when it began with a phase
 # Methods of `ShardGroup` and `Shard` that are run together, by their code.
 TOGETHER = ("begin_step", "move", "gather", "resolve", "sense", "credit", "suggest")
 END = len(TOGETHER)
-# After which nobody waits: the next phase only asks that it has been run on the same zone.
-UNSEEN_BY_OTHERS = "begin_step"
+# After which the next phase only asks that it has been run on the same zone: nobody waits before
+# somebody looks at what other zones have made of it.
+WAITED_FOR_LATER = ("begin_step", "resolve")
+# What the leader runs on all zones, and what asks for nothing that those write.
+AT_ANY_TIME = ("commit", "detect")
 
 
 class LeftAloneError(Exception):
@@ -100,6 +103,7 @@ class Leader:
         self._codes = {name: code for code, name in enumerate(TOGETHER)}
         self._leads = False
         self._last = ""
+        self._is_ahead = False  # a phase is announced that nobody has waited for
 
     @contextmanager
     def order(self) -> Iterator[None]:
@@ -109,7 +113,7 @@ class Leader:
             LeftAloneError: one of them has failed.
         """
         self._wait()
-        self._leads, self._last = True, ""
+        self._leads, self._last, self._is_ahead = True, "", False
         try:
             yield
         finally:
@@ -141,18 +145,34 @@ class Leader:
             self._everybody.turn()
             name = "move"
         which = self._which(name, arguments)
+        is_late = name in WAITED_FOR_LATER
+        if (which < 0 and name not in AT_ANY_TIME) or is_late:
+            self.meet()
         if which < 0:
             self._everybody.each(name, *arguments)
             return
         self._announce(self._codes[name], which)
+        self._is_ahead = True
         self._own.each(name, *arguments)
-        if name == UNSEEN_BY_OTHERS:
+        if is_late:
             return
-        self._wait()
-        if any(line[FAILED] for line in self._others):
-            raise LeftAloneError
+        self.meet()
         if name == self._last:
             self._dismiss()
+
+    def meet(self) -> None:
+        """Wait until the followers are through with the last phase, whatever it was.
+
+        Raises:
+            LeftAloneError: a follower has failed.
+        """
+        if not self._is_ahead:
+            return
+        self._wait()
+        self._is_ahead = False
+        for line in self._others:
+            if line.item(FAILED):
+                raise LeftAloneError
 
     def _which(self, name: str, arguments: tuple[Any, ...]) -> int:
         """Which of what the followers know a phase is called with; -1: none, or nobody follows."""
@@ -171,9 +191,9 @@ class Leader:
         post(line, number)
 
     def _wait(self) -> None:
-        number = self._line.item(NUMBER)
+        number, core = self._line.item(NUMBER), self._line.item(CORE)
         for line in self._others:
-            wait_for(line, number)
+            wait_for(line, number, line.item(CORE) != core)
 
 
 class Follower:
@@ -199,7 +219,7 @@ class Follower:
         failure: Exception | None = None
         while True:
             number = line.item(NUMBER) + 1
-            wait_for(leader, number)
+            wait_for(leader, number, leader.item(CORE) != line.item(CORE))
             call = leader.item(CALLS[number % 2])
             code = call >> 2 & 0xFF
             if code != END:

@@ -92,6 +92,14 @@ class Job(Protocol):
         """Go on from what `save` has given."""
         ...
 
+    def afterwards(self) -> None:
+        """Called when an order is carried out and the pool knows: for what nobody waits for.
+
+        What it makes must not be needed before another order is carried out: that one may be
+        carried out by a successor, which finds what was committed.
+        """
+        ...
+
     def prepare(self) -> None:
         """Called where workers are forked, before each fork that is to do this job.
 
@@ -262,6 +270,11 @@ def _obey(job: Job, meeting: Meeting, slots: Sequence[Image]) -> NoReturn:
                 meeting.wire.send(MAIL + json.dumps(answer).encode())
         mine[CORE] = core  # now, and not before: the pool looks at this line all the time
         meeting.post(number)
+        if mine[ANSWER] != FAILED:
+            try:
+                job.afterwards()
+            except MemoryError:
+                os._exit(OUT_OF_MEMORY)
 
 
 def _await(meeting: Meeting, order: int, last_s: float, work_s: float) -> float:

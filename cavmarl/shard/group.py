@@ -18,10 +18,12 @@ from cavmarl.kernels.phases import (
     choose_goals_each,
     credit_each,
     detect_each,
+    forget_each,
     gather_each,
     propose_each,
     rank_lanes_each,
     resolve_each,
+    retire_each,
     sense_each,
 )
 from cavmarl.kernels.repeated import repeated
@@ -72,6 +74,8 @@ class ShardGroup:
         self._detect = repeated(detect_each)
         self._sense = repeated(sense_each)
         self._credit = repeated(credit_each)
+        self._retire = repeated(retire_each)
+        self._forget = repeated(forget_each)
 
     @property
     def sides(self) -> tuple[int, int]:
@@ -208,3 +212,12 @@ class ShardGroup:
         """Add the step's rewards to the episode's of the chosen worlds' owned agents."""
         first = self._first
         self._credit(self._members, first.side, first.outputs.rewards, chosen)
+
+    def retire(self, gate: Gate) -> None:
+        """Hand the agents' vehicles of the committed rows whose trip has ended to the gate."""
+        ticks = self._config.clock.ticks_per_step
+        self._retire(self._members, self._first.side, gate, ticks)
+
+    def forget(self, gate: Gate) -> None:
+        """Drop the ghosts of those who have been retired."""
+        self._forget(self._members, self._first.side, gate)

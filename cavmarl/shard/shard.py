@@ -27,9 +27,9 @@ from cavmarl.kernels.arrays import (
     Zoned,
 )
 from cavmarl.kernels.buckets import make_lists
-from cavmarl.kernels.codes import DRIVER_AGENT, DRIVER_BACKGROUND, DRIVER_SUMO
+from cavmarl.kernels.codes import DRIVER_BACKGROUND, DRIVER_SUMO
 from cavmarl.kernels.lanes import ENTRY
-from cavmarl.kernels.leaving import drop_ghosts, leave
+from cavmarl.kernels.leaving import leave
 from cavmarl.kernels.neighbors import make_grid
 from cavmarl.kernels.observe_further import observe_further
 from cavmarl.kernels.observing_messages import observe_messages
@@ -145,7 +145,6 @@ class Shard:
         self.target_speeds = np.array(config.action.target_speeds_mps)
         self.discrete = config.action.kind == "discrete"
         self._call_leave = repeated(leave)
-        self._call_drop_ghosts = repeated(drop_ghosts)
         self._call_observe_further = repeated(observe_further)
         self._call_observe_messages = repeated(observe_messages)
         self._call_fill_stacks = repeated(fill_stacks)
@@ -170,15 +169,6 @@ class Shard:
     def dismiss(self, gate: Gate) -> None:
         """Hand SUMO's vehicles of `next_rows` that it has no more to the gate."""
         self._call_leave(gate, self.worlds, self.worlds.next_rows, DRIVER_SUMO, 0)
-
-    def retire(self, gate: Gate) -> None:
-        """Hand the agents' vehicles of the committed rows whose trip has ended to the gate."""
-        ticks = self.config.clock.ticks_per_step
-        self._call_leave(gate, self.worlds, self.worlds.rows, DRIVER_AGENT, ticks)
-
-    def forget(self, gate: Gate) -> None:
-        """Drop the ghosts of those who have been retired."""
-        self._call_drop_ghosts(gate, self.worlds, self.worlds.rows)
 
     def commit(self) -> None:
         """Make the next rows the committed state."""

@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
+from numpy.typing import NDArray
 
 from cavmarl.config import EnvConfig
 from cavmarl.runtime.images import Arrays, Image
@@ -40,8 +41,8 @@ def make_segments(config: EnvConfig, num_worlds: int) -> list[Segment]:
 class Diary:
     """What there is in it between two orders is the state of some worlds.
 
-    There are two images: while one is written, the other one is the state's that was committed.
-    What SUMOs were told is kept beside each of them.
+    There are two images, each with room for the steps after it: while one is written, the other one
+    is what was committed begins with. What SUMOs were told is kept beside each of them.
 
     Args:
         config: the environment.
@@ -50,33 +51,40 @@ class Diary:
 
     Attributes:
         place: (2,) which image it begins with, and how many steps follow; to be committed.
-        entries: what the agents do in each of the steps that there is room for.
+        entries: what the agents do in each of the steps that there is room for, of both images.
+        is_prepared: the other image is that of the state at the end of the diary.
     """
 
     def __init__(self, config: EnvConfig, num_worlds: int, descriptors: list[int]) -> None:
         *images, steps = (Segment(fd, 0) for fd in descriptors[:3])
         self.place = np.zeros(2, dtype=np.int64)
+        self.is_prepared = False
         self._images = [Image(segment) for segment in images]
         kept = [KeptLog(Segment(fd, 0)) for fd in descriptors[3:]]
         self._logs = kept[::2], kept[1::2]  # of each image, by world
         arrays = arrays_in(steps.map(), _layout(config, num_worlds))
         self.entries = tuple(map(Commands, *(arrays[name] for name in _COMMANDS)))
 
+    def __len__(self) -> int:
+        """How many steps follow its image."""
+        return self.place.item(1)
+
     @property
     def is_full(self) -> bool:
         """Whether the next entry has to be an image."""
-        return self.place.item(1) == STEPS
+        return len(self) == STEPS
 
     def note(self, commands: Commands) -> None:
         """Write down what the agents do in one more step."""
-        entry = self.entries[self.place.item(1)]
+        entry = self.entries[self.place.item(0) * STEPS + len(self)]
         entry.controls[:] = commands.controls
         entry.meta_actions[:] = commands.meta_actions
         entry.declared[:] = commands.declared
         self.place[1] += 1
+        self.is_prepared = False
 
-    def begin(self, state: Arrays, logs: Sequence[ToldLog] = ()) -> None:
-        """Begin anew with an image of the state.
+    def prepare(self, state: Arrays, logs: Sequence[ToldLog] = ()) -> None:
+        """Write the image of the present state that it will begin anew with.
 
         Args:
             state: what is to be in it.
@@ -86,7 +94,17 @@ class Diary:
         self._images[image].write(state)
         for kept, log in zip(self._logs[image], logs, strict=True):
             kept.write(log)
-        self.place[:] = image, 0
+        self.is_prepared = True
+
+    def begin(self) -> None:
+        """Begin anew with the image that was prepared."""
+        self.place[:] = 1 - self.place.item(0), 0
+        self.is_prepared = False
+
+    def go_to(self, place: NDArray[np.int64]) -> None:
+        """Let it be what it was when that was its `place`."""
+        self.place[:] = place
+        self.is_prepared = False
 
     def state(self, like: Arrays) -> Arrays:
         """The state it begins with, in arrays of the same dtypes as those.
@@ -108,11 +126,12 @@ class Diary:
 
     def steps(self) -> tuple[Commands, ...]:
         """What the agents have done since."""
-        return self.entries[: self.place.item(1)]
+        first = self.place.item(0) * STEPS
+        return self.entries[first : first + len(self)]
 
 
 def _layout(config: EnvConfig, num_worlds: int) -> Layout:
-    agents: tuple[int, ...] = (STEPS, num_worlds, config.population.num_ids)
+    agents: tuple[int, ...] = (2 * STEPS, num_worlds, config.population.num_ids)
     return dict(
         zip(_COMMANDS, (("<f8", (*agents, 2)), ("<i8", agents), ("<i4", agents)), strict=True)
     )

@@ -40,17 +40,44 @@ class DiaryJob(WorldsJob):
         self._catch_up(task)
         if task not in (Task.STEP, Task.RESET):
             return super().perform(task, letter)
-        diary = self._diary
-        begins_anew = task == Task.RESET or diary.is_full or self._again_s > AGAIN_S
-        if not begins_anew:
-            diary.note(self._commands)
+        if task == Task.RESET:
+            super().perform(task, letter)
+            self._begin_anew()
+            return None
+        self._note_step()
         began_s = perf_counter()
         super().perform(task, letter)
         self._again_s += perf_counter() - began_s
-        if begins_anew:
-            diary.begin(self._worlds.save(), self._logs)
-            self._again_s = 0.0
         return None
+
+    def afterwards(self) -> None:
+        """Write the image that the diary begins anew with, if it is due: nobody waits for it.
+
+        Not in the order in which it began anew the last time: what is committed may still begin
+        with the image before, whose place this one would take.
+        """
+        diary = self._diary
+        is_there = not self._is_behind and self._lost is None
+        if self._is_due and is_there and not diary.is_prepared and len(diary) > 1:
+            diary.prepare(self._worlds.save(), self._logs)
+
+    @property
+    def _is_due(self) -> bool:
+        """Whether the diary has to begin anew with the next step."""
+        return self._diary.is_full or self._again_s > AGAIN_S
+
+    def _note_step(self) -> None:
+        """Write down what the agents are about to do, in a diary that begins anew if it is due."""
+        if self._is_due:
+            self._begin_anew(self._diary.is_prepared)
+        self._diary.note(self._commands)
+
+    def _begin_anew(self, is_prepared: bool = False) -> None:
+        """Let the diary begin with the present state, unless that is written already."""
+        if not is_prepared:
+            self._diary.prepare(self._worlds.save(), self._logs)
+        self._diary.begin()
+        self._again_s = 0.0
 
     def _catch_up(self, task: int) -> None:
         """Go through the steps of the diary, if they are not behind it.
@@ -76,7 +103,7 @@ class DiaryJob(WorldsJob):
     def load(self, saved: Sequence[NDArray[Any]]) -> None:
         """Go on from what `save` gave; the steps since the last image wait for a task."""
         diary, worlds = self._diary, self._worlds
-        diary.place[:] = saved[0]
+        diary.go_to(saved[0])
         diary.read_logs(self._logs)
         self._is_behind = True
         try:

@@ -50,6 +50,9 @@ class WorldsJob:
         self._first = first
         self._commands = commands_of(worlds.arrays)
 
+    def afterwards(self) -> None:
+        """Nothing to do."""
+
     def prepare(self) -> None:
         """Nothing to do."""
 

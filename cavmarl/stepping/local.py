@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from cavmarl.balance.plan import Plan
 from cavmarl.huge_pages import huge_zeros
 from cavmarl.kernels.repeated import repeated
-from cavmarl.kernels.step_results import Results, report, report_who_goes_on
+from cavmarl.kernels.step_results import Results, keep_last, report, report_who_goes_on
 from cavmarl.rig.catalogue import frame_layout
 from cavmarl.runtime.refereeing import Run
 from cavmarl.runtime.sensor_farm import SensorFarm
@@ -91,9 +91,11 @@ class LocalWorlds:
         self._results = Results(*(getattr(arrays, name) for name in Results._fields))
         self._report = repeated(report)
         self._report_who_goes_on = repeated(report_who_goes_on)
+        self._keep_last = repeated(keep_last)
         if warm:
             self._write_results()
             self._write_who_goes_on()
+            self._keep_observations()
             self._steps[:] = 0
 
     def reset(self, seed: int | None, first_world: int) -> None:
@@ -125,8 +127,9 @@ class LocalWorlds:
         some_ended = self._write_results()
         if some_ended:
             simulation.retire_agents()
-        if self._write_who_goes_on() or some_ended:
-            self._end(arrays.episode_over)
+        some_over = self._write_who_goes_on()
+        if some_over or some_ended:
+            self._end(arrays.episode_over, some_over)
         arrays.ticks[:] = simulation.ticks()
 
     def _write_results(self) -> bool:
@@ -141,22 +144,28 @@ class LocalWorlds:
             simulation.outputs, simulation.gate, self._steps, self._horizon, self._results
         )
 
-    def _end(self, over: NDArray[np.bool_]) -> None:
+    def _end(self, over: NDArray[np.bool_], some_over: bool) -> None:
         """Keep what those saw last who have ended, and begin the new episodes."""
-        simulation, arrays = self.simulation, self.arrays
-        ended = over | arrays.terminations.any(axis=1)
-        arrays.final_observations[ended] = arrays.observations[ended]
-        for name, frames in arrays.frames.items():
-            for final, array in zip(arrays.final_frames[name], frames, strict=True):
-                final[ended] = array[ended]
+        arrays = self.arrays
+        self._keep_observations()
+        if arrays.frames:
+            ended = over | arrays.terminations.any(axis=1)
+            for name, frames in arrays.frames.items():
+                for final, array in zip(arrays.final_frames[name], frames, strict=True):
+                    final[ended] = array[ended]
         if self.in_next_step:
             self._waiting[over] = True
             arrays.mask[over] = False
-            return
-        arrays.observations[arrays.terminations] = 0.0
-        if over.any():
+        elif some_over:
             self._begin(over)
-            arrays.mask[over] = simulation.outputs.present[over]
+            arrays.mask[over] = self.simulation.outputs.present[over]
+
+    def _keep_observations(self) -> None:
+        """Of those who have ended."""
+        arrays = self.arrays
+        self._keep_last(
+            self._results, arrays.observations, arrays.final_observations, self.in_next_step
+        )
 
     def _begin(self, chosen: NDArray[np.bool_]) -> None:
         self.simulation.reset(chosen)

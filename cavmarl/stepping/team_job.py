@@ -82,16 +82,14 @@ class LeaderJob(DiaryJob):
         if task == Task.HOST:
             self._host(_hosts(letter[self._first]))
             return None
-        diary = self._diary
         with self._leader.order():
             self._catch_up(task)
-            begins_anew = task == Task.RESET or (task == Task.STEP and diary.is_full)
-            if task == Task.STEP and not begins_anew:
-                diary.note(self._commands)
+            if task == Task.STEP:
+                self._note_step()
             self._leader.end_after(LAST.get(Task(task), ""))
             WorldsJob.perform(self, task, letter)
-        if begins_anew:
-            diary.begin(self._worlds.save(), self._logs)
+        if task == Task.RESET:
+            self._begin_anew()
         return None
 
     def _host(self, hosts: NDArray[np.int64]) -> None:
@@ -127,6 +125,9 @@ class FollowerJob:
         self._world = world
         self._number = number
         self._hosts = hosts
+
+    def afterwards(self) -> None:
+        """Nothing to do."""
 
     def prepare(self) -> None:
         """Nothing to do."""

@@ -38,7 +38,7 @@ def test_the_phases_are_the_tick(make: Callable[[int], Simulation]) -> None:
         assert sum(row.phases.values()) == pytest.approx(row.timed_ns)
         assert row.plain_ns > 0.0
         assert row.vehicles == found.rows[0].vehicles
-        assert {"advance", "resolve", "leave"} <= row.calls.keys()
+        assert {"advance", "resolve", "commit"} <= row.calls.keys()
         assert not {"suggest", "loads", "vehicles"} & row.calls.keys()
 
 

@@ -5,7 +5,7 @@ import pytest
 
 from cavmarl.kernels.arrays import Gate, Outputs
 from cavmarl.kernels.codes import EVENT_ARRIVED, EVENT_COLLIDED, NUM_COUNTS
-from cavmarl.kernels.step_results import Results, report, report_who_goes_on
+from cavmarl.kernels.step_results import Results, keep_last, report, report_who_goes_on
 from cavmarl.roads.network import RoadNetwork
 from cavmarl.shard.vehicles import blank_vehicle
 from cavmarl.traffic.departures import make_gate
@@ -73,3 +73,20 @@ def test_report_is_that_of_one_array_after_the_other(seed: int, network: RoadNet
     np.testing.assert_array_equal(steps, expected_steps)
     for name in Results._fields:
         np.testing.assert_array_equal(getattr(found, name), getattr(expected, name), name)
+
+
+@pytest.mark.parametrize("in_next_step", [False, True])
+@pytest.mark.parametrize("seed", range(10))
+def test_what_those_saw_last_who_have_ended(
+    seed: int, in_next_step: bool, network: RoadNetwork
+) -> None:
+    rng = np.random.default_rng(seed)
+    results = results_of()
+    report(outputs_of(rng), np.zeros(WORLDS, np.int64), HORIZON, results)
+    results.episode_over[:] = rng.random(WORLDS) < 0.3
+    seen = rng.random((WORLDS, AGENTS, 6), dtype=np.float32)
+    found, expected = (seen.copy(), np.zeros_like(seen)), (seen.copy(), np.zeros_like(seen))
+    keep_last(results, *found, in_next_step)
+    naive.keep_last(results, *expected, in_next_step)
+    for array, other in zip(found, expected, strict=True):
+        np.testing.assert_array_equal(array, other)

@@ -3,12 +3,19 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from cavmarl.kernels.tallies import begins_second, count_tick, totals
+from cavmarl.kernels.tallies import begins_second, count_tick, occasions, totals
 
 
 @pytest.mark.parametrize(("ticks", "expected"), [([3, 7], False), ([3, 20], True), ([0, 1], True)])
 def test_a_second_begins_in_some_world(ticks: list[int], expected: bool) -> None:
     assert begins_second(np.array(ticks), 10) == expected
+
+
+@pytest.mark.parametrize("tick", [4, 20])
+@pytest.mark.parametrize("through", [[[0, 0], [0, 0]], [[0, 0], [3, 0]]])
+def test_what_there_is_to_do_before_the_exchange(tick: int, through: list[list[int]]) -> None:
+    found = occasions(np.array([tick, 7]), 10, np.array(through))
+    assert found == (tick == 20, bool(np.any(through)))
 
 
 def test_ticks_are_counted() -> None:

@@ -30,3 +30,15 @@ def report_who_goes_on(
         waits = any(gate.queue["agent"][w, :waiting] >= 0)
         results.episode_over[w] = steps[w] >= horizon or not (results.mask[w].any() or waits)
     return bool(results.episode_over.any())
+
+
+def keep_last(
+    results: Results,
+    observations: NDArray[np.float32],
+    final_observations: NDArray[np.float32],
+    in_next_step: bool,
+) -> None:
+    ended = results.episode_over | results.terminations.any(axis=1)
+    final_observations[ended] = observations[ended]
+    if not in_next_step:
+        observations[results.terminations] = 0.0

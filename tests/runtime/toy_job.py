@@ -33,6 +33,9 @@ class Adder:
         self.more = np.zeros(0)  # another one each time
         self.falls_at = ""
 
+    def afterwards(self) -> None:
+        """Nothing to do."""
+
     def prepare(self) -> None:
         """Nothing is shared."""
 
