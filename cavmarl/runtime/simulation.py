@@ -249,6 +249,11 @@ class Simulation:
         self._episodes[:] = 0
 
     @property
+    def shards(self) -> Sequence[Shard]:
+        """One a zone, for who runs their phases."""
+        return self._shards
+
+    @property
     def capacity(self) -> int:
         """How many vehicles a world can hold."""
         return int(self._shard.worlds.rows.shape[1])
@@ -530,18 +535,24 @@ class Simulation:
             if isinstance(part, Traced):
                 part.trace(note)
 
-    def host(self, make: Callable[[Sequence[Shard], tuple[float, float]], Executor]) -> None:
+    def host(
+        self,
+        make: Callable[[Sequence[Shard], tuple[float, float]], Executor],
+        gathers: bool = True,
+    ) -> None:
         """From now on let somebody else run the phases of the shards, as `make` returns it.
 
         Args:
             make: called with the shards, and with what the phase `gather` is called with.
+            gathers: whether that phase is his, too.
 
         Raises:
             ConfigError: zones become others, and nobody would tell him.
         """
         self._refuse_recutting("the zones of one world over workers")
         self._executor = make(self._shards, self._division.gathering)
-        self._division.let_gather(self._executor)
+        if gathers:
+            self._division.let_gather(self._executor)
 
     def time_shards(self, every: int = 1) -> ShardClock:
         """From now on run phases zone by zone, with a clock on each.

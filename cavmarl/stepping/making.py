@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from cavmarl.stepping.arrays import SteppedWorlds
+from cavmarl.stepping.divided import DividedWorlds
 from cavmarl.stepping.pooled import PooledWorlds
 from cavmarl.stepping.remote import RemoteWorlds
 from cavmarl.stepping.sensing import local_worlds
@@ -38,6 +39,8 @@ def make_worlds(
     """
     on_ray = check_hosts(workers, hosts)
     number = None if workers == "ray" else int(workers or 0)
+    if on_ray and number is not None and number > num_worlds:
+        return DividedWorlds(world, base_dir, num_worlds, number, in_next_step)
     if on_ray:
         return RemoteWorlds(world, base_dir, num_worlds, number, in_next_step)
     if number:
