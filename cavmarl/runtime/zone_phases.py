@@ -159,7 +159,11 @@ class ZonePhases:
         }
         of_agents = {
             ZonePhase.MOVE: [first.worlds.pending],
-            ZonePhase.SENSE: [getattr(first.outputs, name) for name in self._sensed(first)],
+            ZonePhase.SENSE: [
+                array
+                for array in (getattr(first.outputs, name) for name in SENSED)
+                if memory.find(array) is not None  # with `observation.mode: sensors` nobody sees some
+            ],
             ZonePhase.SUGGEST: [inputs.suggested],
             ZonePhase.MOUNTED: [frames.data for frames in inputs.frames.values()],
         }
