@@ -142,9 +142,7 @@ class HostPool:
         """
         return self._command(self._all, task, _said(letters, inputs), outputs, commits, sizes)
 
-    def tell(
-        self, task: int, say: Say, outputs: Callable[[int, Any], Arrays]
-    ) -> list[Any]:
+    def tell(self, task: int, say: Say, outputs: Callable[[int, Any], Arrays]) -> list[Any]:
         """Let all hosts do a task for a caller who keeps the state of all parts himself.
 
         Nothing is committed: who takes up the part of a host that has died is told all that it

@@ -58,9 +58,7 @@ def _note(memory: Words, known: Words, begin: int, end: int, out: Words, at: int
 
 
 @kernel
-def note_spans(
-    memory: Words, known: Words, spans: NDArray[np.int64], out: Words, at: int
-) -> int:
+def note_spans(memory: Words, known: Words, spans: NDArray[np.int64], out: Words, at: int) -> int:
     """Note what has changed between some bytes.
 
     Args:
@@ -89,13 +87,17 @@ def note_rows(
     out: Words,
     at: int,
 ) -> int:
-    """Note what has changed in the first rows of some zones; the rest as of `note_spans`.
+    """Note what has changed in the first rows of some zones; the stream's words afterwards.
 
     Args:
+        memory: what there is.
+        known: what the other process has; made the same.
         first: byte of the first row of zone 0 in world 0.
         strides: (3,) bytes from zone to zone, from world to world, from row to row.
         zones: which ones.
         counts: (k, W) rows to look at.
+        out: as for `note_spans`.
+        at: as for `note_spans`.
     """
     for zone in zones:
         for w in range(counts.shape[1]):
@@ -115,12 +117,16 @@ def note_agents(
     out: Words,
     at: int,
 ) -> int:
-    """Note what has changed at the indices of some agents; the rest as of `note_spans`.
+    """Note what has changed at the indices of some agents; the stream's words afterwards.
 
     Args:
+        memory: what there is.
+        known: what the other process has; made the same.
         first: byte at which an array (W, A, …) begins.
         size: bytes of each agent in it.
         marks: (W, A) which agents.
+        out: as for `note_spans`.
+        at: as for `note_spans`.
     """
     for w in range(marks.shape[0]):
         for agent in range(marks.shape[1]):

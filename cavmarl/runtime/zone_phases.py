@@ -1,4 +1,4 @@
-"""`ZonePhases`: what each phase reads and writes that hosts run zone by zone, each in its own memory.
+"""`ZonePhases`: what phases read and write that hosts run, each on its zones in its own memory.
 
 A host has the rows of its own zones and their ghosts, and what all zones have in common. Before a
 phase it is sent what has changed of that; after it, it sends what has changed of what its zones
@@ -134,9 +134,7 @@ class ZonePhases:
         pieces: of a stream there are at most so many that do not lie next to each other.
     """
 
-    def __init__(
-        self, shards: Sequence[Shard], memory: ReplicaMemory, inputs: PhaseInputs
-    ) -> None:
+    def __init__(self, shards: Sequence[Shard], memory: ReplicaMemory, inputs: PhaseInputs) -> None:
         first = shards[0]
         self.inputs = inputs
         self._memory = memory
@@ -162,7 +160,8 @@ class ZonePhases:
             ZonePhase.SENSE: [
                 array
                 for array in (getattr(first.outputs, name) for name in SENSED)
-                if memory.find(array) is not None  # with `observation.mode: sensors` nobody sees some
+                if memory.find(array)
+                is not None  # with `observation.mode: sensors` nobody sees some
             ],
             ZonePhase.SUGGEST: [inputs.suggested],
             ZonePhase.MOUNTED: [frames.data for frames in inputs.frames.values()],

@@ -24,12 +24,12 @@ from cavmarl.runtime.refereeing import check_faults
 from cavmarl.runtime.simulation import Simulation
 from cavmarl.shard.shard import Commands, Shard
 from cavmarl.stepping.driven import Driven
+from cavmarl.stepping.job import fingerprint
 from cavmarl.stepping.ordered import own_error
 from cavmarl.stepping.parts import parts_of
 from cavmarl.stepping.placement import Placement
-from cavmarl.stepping.job import fingerprint
 from cavmarl.stepping.remote_job import code_stamp
-from cavmarl.stepping.zone_leader import PHASE, ZoneLeader
+from cavmarl.stepping.zone_leader import ZoneLeader
 from cavmarl.stepping.zones_job import host_zones, make_replicated
 from cavmarl.worlds import World
 
