@@ -24,9 +24,10 @@ from cavmarl.runtime.refereeing import check_faults
 from cavmarl.runtime.simulation import Simulation
 from cavmarl.shard.shard import Commands, Shard
 from cavmarl.stepping.driven import Driven
-from cavmarl.stepping.job import fingerprint
+from cavmarl.stepping.job import Task, fingerprint
+from cavmarl.stepping.mover import Mover
 from cavmarl.stepping.ordered import own_error
-from cavmarl.stepping.parts import parts_of
+from cavmarl.stepping.parts import Part, parts_of
 from cavmarl.stepping.placement import Placement
 from cavmarl.stepping.remote_job import code_stamp
 from cavmarl.stepping.zone_leader import ZoneLeader
@@ -54,6 +55,9 @@ class DividedWorlds:
         pool: the hosts.
         in_next_step: when worlds begin anew.
         placement: which host has which zones.
+        leader: runs the phases.
+        spent_s: (1, zones) processor time of each zone of all worlds, if hosts measure it.
+        mover: has that changed; None: it does not change.
 
     Raises:
         MissingExtraError: Ray is not installed.
@@ -78,33 +82,34 @@ class DividedWorlds:
         self._worlds, memory, inputs = make_replicated(world, num_worlds, in_next_step, warm=True)
         self.arrays = self._worlds.arrays
         self._is_torn = False
+        self.spent_s = np.zeros((1, world.partition.count))
+        self.mover: Mover | None = None
+        if every := config.workers.balance_steps:
+            self.mover = Mover(self.placement, world.partition.count, every, self.spent_s)
 
         def lead(shards: Sequence[Shard], gathering: tuple[float, float]) -> Executor:
-            self._leader = ZoneLeader(shards, memory, inputs, part.zones)
-            return self._leader
+            self.leader = ZoneLeader(shards, memory, inputs, part.zones, self.spent_s[0])
+            return self.leader
 
         simulation = self._worlds.simulation
         simulation.host(lead, gathers=False)
         if simulation.mounted is not None:
-            simulation.mounted.rig.sense = self._leader.sense
+            simulation.mounted.rig.sense = self.leader.sense
         recipe = {
             "config": asdict(config),
             "base_dir": str(base_dir.resolve()),
             "fingerprint": fingerprint(world),
             "in_next_step": in_next_step,
             "num_worlds": num_worlds,
+            "measures": self.mover is not None,
         }
         actors = RayActors(host_zones, lambda count: json.dumps(recipe), workers, workers)
-        names = tuple(
-            f"{'zone' if len(zones) == 1 else 'zones'} {', '.join(map(str, zones))}"
-            for zones in part.zones
-        )
-        program = HostProgram(names, (1,) * workers, ("phase",), -1, code_stamp())
+        program = HostProgram(_names(part), (1,) * workers, ("phase",), -1, code_stamp())
         try:
             self.pool = HostPool(actors, program, config.workers.timeout_s, config.workers.repeats)
         except WorkerFailureError as failure:
             raise own_error(failure) from failure
-        self._leader.let_work(self.pool)
+        self.leader.let_work(self.pool)
 
     @property
     def simulation(self) -> Simulation:
@@ -139,8 +144,19 @@ class DividedWorlds:
         Raises:
             WorkerError: hosts cannot go on, or a step before was interrupted in its middle.
         """
+        if self.mover is not None:
+            self.mover.before_step(self._host, self._pids)
         with self._whole():
             self._worlds.step(commands)
+
+    def _host(self, task: Task, zones: Sequence[Sequence[Sequence[int]]], commits: bool) -> None:
+        """Let zones have other hosts: they are sent whole with the next phase."""
+        self.leader.host(zones[0])
+        (part,) = parts_of(self.placement.plans, self.world.partition.count)
+        self.pool.rename(_names(part))
+
+    def _pids(self) -> dict[int, int]:
+        return dict.fromkeys(range(len(self.pool.sizes)), 0)  # nobody looks: they run elsewhere
 
     def suggest(self) -> None:
         """Write what the built-in driver would do in the agents' place."""
@@ -195,6 +211,14 @@ class DividedWorlds:
         self._is_torn = False
 
 
+def _names(part: Part) -> tuple[str, ...]:
+    """What each host runs, in words."""
+    return tuple(
+        f"{'zone' if len(zones) == 1 else 'zones'} {', '.join(map(str, zones))}"
+        for zones in part.zones
+    )
+
+
 def _check(world: World, num_worlds: int, workers: int) -> None:
     """Refuse what such worlds cannot have.
 
@@ -217,11 +241,6 @@ def _check(world: World, num_worlds: int, workers: int) -> None:
         raise ConfigError(
             f"workers.sensors = {config.workers.sensors}, hosts = 'ray': sensor workers are on the "
             "machine of the worlds; leave it 0, or leave out the hosts"
-        )
-    if config.workers.balance_steps:
-        raise ConfigError(
-            f"workers.balance_steps = {config.workers.balance_steps}: the zones of a world over "
-            "hosts stay where they are; leave it 0"
         )
     _, deaths = check_faults(config.zones, count, num_worlds)
     if deaths:

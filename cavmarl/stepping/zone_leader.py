@@ -37,6 +37,10 @@ class ZoneLeader:
         memory: in which their arrays lie.
         inputs: what phases are called with.
         zones: of each host.
+        spent_s: (k,) where the processor time of each zone is added up, if hosts measure it.
+
+    Attributes:
+        zones: of each host.
     """
 
     def __init__(
@@ -45,10 +49,12 @@ class ZoneLeader:
         memory: ReplicaMemory,
         inputs: PhaseInputs,
         zones: Sequence[Sequence[int]],
+        spent_s: NDArray[np.float64],
     ) -> None:
         self._everybody = ShardGroup(shards)
         self._phases = ZonePhases(shards, memory, inputs)
         self._inputs = inputs
+        self._spent_s = spent_s
         self._replicas = [Replica(memory, self._phases.pieces) for _ in zones]
         self._coming: list[Words] = [np.zeros(0, dtype=np.uint64) for _ in zones]
         self._begins_step = False
@@ -57,7 +63,7 @@ class ZoneLeader:
 
     def host(self, zones: Sequence[Sequence[int]]) -> None:
         """From now on each host has these zones."""
-        self._zones = [np.array(sorted(own), dtype=np.int64) for own in zones]
+        self.zones = [np.array(sorted(own), dtype=np.int64) for own in zones]
 
     def let_work(self, pool: HostPool) -> None:
         """From now on there are hosts; before, all was done here."""
@@ -119,7 +125,7 @@ class ZoneLeader:
         side, next_side = self._everybody.sides
 
         def say(k: int, knows: bool) -> tuple[PhaseOrder, Arrays]:
-            replica, zones = self._replicas[k], self._zones[k]
+            replica, zones = self._replicas[k], self.zones[k]
             if not knows:
                 replica.forget()
             turn = ZoneTurn(phase, zones, side, next_side, self._begins_step, sensors)
@@ -131,10 +137,12 @@ class ZoneLeader:
             )  # fmt: skip
             return order, [stream]
 
-        def outputs(k: int, words: int) -> Arrays:
-            self._coming[k] = np.empty(words, dtype=np.uint64)
+        def outputs(k: int, answer: Any) -> Arrays:
+            self._coming[k] = np.empty(answer[0], dtype=np.uint64)
             return [self._coming[k]]
 
-        self._pool.tell(PHASE, say, outputs)
-        for replica, stream in zip(self._replicas, self._coming, strict=True):
-            replica.take(stream)
+        answers = self._pool.tell(PHASE, say, outputs)
+        for k, (_, *costs_s) in enumerate(answers):
+            self._replicas[k].take(self._coming[k])
+            if costs_s:
+                self._spent_s[self.zones[k]] += costs_s

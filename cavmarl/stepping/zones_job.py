@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import time
 from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
@@ -119,7 +120,8 @@ class ZonesJob:
         self._mounted = simulation.mounted
         self._phases = ZonePhases(shards, memory, self._inputs)
         self._caller = Replica(memory, self._phases.pieces)
-        self._hosted = HostedZones(shards, ())
+        self._spent_s = np.zeros(len(shards)) if recipe["measures"] else None
+        self._hosted = HostedZones(shards, (), self._spent_s)
         self._zones: list[int] = []
         self._coming: Array = np.zeros(0, dtype=np.uint64)
 
@@ -137,7 +139,11 @@ class ZonesJob:
         return [self._coming]
 
     def perform(self, task: int, letter: Any) -> Outcome:
-        """Run a phase; the answer is how many words of changes come out."""
+        """Run a phase.
+
+        The answer is how many words of changes come out; where that is asked for, also the
+        processor time of each zone, in s.
+        """
         order = PhaseOrder(*letter)
         if order.is_new:
             self._phases.clear()
@@ -153,7 +159,15 @@ class ZonesJob:
         self._run(turn)
         self._phases.note_results(self._caller, turn)
         stream = self._caller.stream
-        return Outcome(stream.size, [stream])
+        return Outcome([stream.size, *self._costs(turn.zones)], [stream])
+
+    def _costs(self, zones: NDArray[np.int64]) -> list[float]:
+        """Processor time of each zone since it was asked for last."""
+        if self._spent_s is None:
+            return []
+        costs: list[float] = self._spent_s[zones].tolist()
+        self._spent_s[:] = 0.0
+        return costs
 
     def _run(self, turn: ZoneTurn) -> None:
         hosted, inputs = self._hosted, self._inputs
@@ -182,7 +196,13 @@ class ZonesJob:
         turns = [
             Turn(k, sensors[k], Due(*inputs.due[k]), inputs.frames[sensors[k].name]) for k in places
         ]
-        sense_here(scenes, turns)
+        if self._spent_s is None:
+            sense_here(scenes, turns)
+            return
+        for zone, scene in zip(self._zones, scenes, strict=True):
+            began_ns = time.thread_time_ns()
+            sense_here([scene], turns)
+            self._spent_s[zone] += 1e-9 * (time.thread_time_ns() - began_ns)
 
     def save(self) -> list[Array]:
         """Nothing: the caller keeps all of it."""
@@ -202,3 +222,4 @@ class ZonesJob:
         worlds.reset(0, 0)
         worlds.step(self._inputs.commands)
         worlds.suggest()
+        worlds.close()  # SUMO, if there is one, is the caller's
