@@ -217,7 +217,7 @@ def test_the_view_of_pettingzoo_is_the_one_of_one_process() -> None:
     assert picture.std() > 0.0
     env.close()
     with pytest.raises(WorkerError, match="closed"):
-        env.step({})
+        env.reset(seed=0)
 
 
 @pytest.mark.parametrize("source", MODES)
