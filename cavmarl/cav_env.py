@@ -32,7 +32,7 @@ from cavmarl.spaces import (
 )
 from cavmarl.stepping.arrays import SteppedWorlds
 from cavmarl.stepping.making import make_worlds
-from cavmarl.worlds import check_agents, check_hosts, make_world
+from cavmarl.worlds import check_agents, check_hosts, leads_hosts, make_world
 
 __all__ = ["CavEnv", "parallel_env"]
 
@@ -86,7 +86,7 @@ def parallel_env(
     check_hosts(workers, hosts)
     first_seed = None if seed is None else check_seed(seed)
     if render_mode is not None:
-        _check_rendering(render_mode, workers)
+        _check_rendering(render_mode, 0 if leads_hosts(1, workers, hosts) else workers)
     config, base_dir = load_config(
         env,
         zones=zones,
@@ -106,7 +106,7 @@ def _check_rendering(render_mode: str, workers: int | str | None) -> None:
     """Refuse what cannot be drawn.
 
     Raises:
-        ConfigError: an unknown mode, or a world of other processes.
+        ConfigError: an unknown mode, or a world that only other processes have.
     """
     if render_mode not in RENDER_MODES:
         raise ConfigError(

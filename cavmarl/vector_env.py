@@ -73,8 +73,8 @@ def make_vec(
         workers: processes that the worlds are shared out over, whole worlds each; where there are
             more of them than worlds, the zones of each world. 0: all run in the caller's process.
             Results do not depend on it. "ray": as with hosts="ray", as many as CPUs and worlds.
-        hosts: "ray" runs the workers on the machines of a Ray cluster (docs/cluster.md), whole
-            worlds each. None: on this one.
+        hosts: "ray" runs the workers on the machines of a Ray cluster (docs/cluster.md). None: on
+            this one.
         sensor_workers: shadows workers.sensors, how many processes the sensors of `rig` are shared
             out over (docs/sensor_workers.md). Results do not depend on it.
         agents: shadows population.agents.

@@ -38,6 +38,7 @@ __all__ = [
     "check_hosts",
     "check_workers",
     "find_map",
+    "leads_hosts",
     "load_roads",
     "load_world",
     "load_zones",
@@ -207,6 +208,17 @@ def check_hosts(workers: int | str | None, hosts: str | None) -> bool:
     if hosts and workers in (None, 0):
         raise ConfigError("hosts = 'ray' without workers: say how many, or workers='ray'")
     return "ray" in (workers, hosts)
+
+
+def leads_hosts(num_worlds: int, workers: int | str | None, hosts: str | None) -> bool:
+    """Whether this process leads the worlds, and hosts run their zones; arguments as checked.
+
+    Args:
+        num_worlds: W.
+        workers: how many; "ray": as many as are of use for whole worlds.
+        hosts: "ray": they are on the machines of a Ray cluster.
+    """
+    return hosts is not None and isinstance(workers, int) and workers > num_worlds
 
 
 def check_agents(config: EnvConfig) -> None:

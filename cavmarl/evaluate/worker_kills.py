@@ -21,6 +21,7 @@ from cavmarl.hosts.pool import HostPool
 from cavmarl.policies import Policy, load_policy
 from cavmarl.runtime.pool import Death, Pool
 from cavmarl.seeds import check_seed
+from cavmarl.stepping.divided import DividedWorlds
 from cavmarl.stepping.pooled import PooledWorlds
 from cavmarl.stepping.remote import RemoteWorlds
 from cavmarl.vector_env import CavVectorEnv, make_vec
@@ -179,7 +180,7 @@ def verify_kills(
 
 
 def _pool(vec: CavVectorEnv) -> Pool | HostPool:
-    assert isinstance(vec.worlds, PooledWorlds | RemoteWorlds)
+    assert isinstance(vec.worlds, PooledWorlds | RemoteWorlds | DividedWorlds)
     return vec.worlds.pool
 
 

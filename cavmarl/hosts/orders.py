@@ -11,10 +11,12 @@ from numpy.typing import NDArray
 
 from cavmarl.errors import WorkerFailureError
 
-__all__ = ["Arrays", "HostProgram", "OpenOrder", "Truth"]
+__all__ = ["Arrays", "HostProgram", "OpenOrder", "Say", "Truth"]
 
 Array = NDArray[Any]
 Arrays = Sequence[Array]
+Say = Callable[[int, bool], tuple[Any, Arrays]]
+"""Part, whether its host knows what is committed → the letter to it, and its arrays."""
 
 
 @dataclass(frozen=True)
@@ -43,8 +45,7 @@ class OpenOrder:
     Attributes:
         number: of the order.
         task: of the job.
-        letters: what is said to each part.
-        inputs: arrays for each part.
+        say: what is said to each part.
         outputs: part, answer → arrays that what comes out is written to.
         sizes: of the parts once it has been carried out.
         saves: an image is to come of each part.
@@ -59,8 +60,7 @@ class OpenOrder:
 
     number: int
     task: int
-    letters: Sequence[Any]
-    inputs: Sequence[Arrays]
+    say: Say
     outputs: Callable[[int, Any], Arrays]
     sizes: Sequence[int]
     saves: bool
@@ -91,7 +91,7 @@ class Truth:
         """What is committed of a part once an order has been carried out."""
         if order.saves:
             return Truth(order.sizes[part], order.images[part])
-        return Truth(self.size, self.image, [*self.since, _bytes_of(order.inputs[part])])
+        return Truth(self.size, self.image, [*self.since, _bytes_of(order.say(part, True)[1])])
 
 
 def _bytes_of(arrays: Arrays) -> Array:

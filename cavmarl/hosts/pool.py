@@ -28,7 +28,7 @@ from cavmarl.errors import (
 )
 from cavmarl.hosts.company import ENDED, SILENCE_S, Company, Host, Launcher
 from cavmarl.hosts.host import Order
-from cavmarl.hosts.orders import Arrays, HostProgram, OpenOrder, Truth
+from cavmarl.hosts.orders import Arrays, HostProgram, OpenOrder, Say, Truth
 from cavmarl.hosts.wire import Frame, Kind
 from cavmarl.runtime.pool import Death
 from cavmarl.runtime.watchdog import CHECK_S
@@ -140,18 +140,34 @@ class HostPool:
             WorkerStartError: there is no host left, and none comes; the pool is closed.
             WorkerFailureError: an exception in a host; all are as they were before.
         """
-        return self._command(self._all, task, letters, inputs, outputs, commits, sizes)
+        return self._command(self._all, task, _said(letters, inputs), outputs, commits, sizes)
+
+    def tell(self, task: int, say: Say, outputs: Callable[[int, Any], Arrays]) -> list[Any]:
+        """Let all hosts do a task for a caller who keeps the state of all parts himself.
+
+        Nothing is committed: who takes up the part of a host that has died is told all that it
+        needs.
+
+        Args:
+            task: of the job.
+            say: called for each host that is given the order, and told whether it has carried out
+                the last one; what it returns is sent at once.
+            outputs: part, answer → arrays that what comes out is written to.
+
+        Returns:
+            what each part has answered; errors as of `run`.
+        """
+        return self._command(self._all, task, say, outputs, False)
 
     def ask(self, part: int, task: int, letter: Any = None) -> Any:
         """Let the host of one part do a task that changes nothing; raises as `run`."""
         letters = [letter] * len(self._all)
         nothing: list[Arrays] = [()] * len(self._all)
-        return self._command((part,), task, letters, nothing, lambda k, answer: (), False)[0]
+        return self._command((part,), task, _said(letters, nothing), _no_arrays, False)[0]
 
     def ping(self) -> None:
         """Let all hosts do nothing: an empty barrier."""
-        nothing: list[Arrays] = [()] * len(self._all)
-        self.run(NOTHING, [None] * len(self._all), nothing, lambda k, answer: (), False)
+        self._command(self._all, NOTHING, _say_nothing, _no_arrays, False)
 
     def await_spare(self) -> None:
         """Return when there is a host that would take up a part at once.
@@ -161,7 +177,7 @@ class HostPool:
         """
         began = time.monotonic()
         nothing = OpenOrder(
-            self._number, NOTHING, (), (), lambda k, answer: (), (), saves=False, ordered_s=began,
+            self._number, NOTHING, _say_nothing, _no_arrays, (), saves=False, ordered_s=began,
             first_death=len(self.deaths), pending=set(), is_void=True,
         )  # fmt: skip
         while not self._company.free:
@@ -177,8 +193,7 @@ class HostPool:
         self,
         parts: tuple[int, ...],
         task: int,
-        letters: Sequence[Any],
-        inputs: Sequence[Arrays],
+        say: Say,
         outputs: Callable[[int, Any], Arrays],
         commits: bool,
         sizes: Sequence[int] | None = None,
@@ -190,7 +205,7 @@ class HostPool:
         is_full = len(self._truths[0].since) == IMAGE_EVERY
         self._number += 1
         order = self._open = OpenOrder(
-            self._number, task, letters, inputs, outputs, self.sizes if sizes is None else sizes,
+            self._number, task, say, outputs, self.sizes if sizes is None else sizes,
             saves=commits and (task != self._program.noted or is_full),
             ordered_s=time.monotonic(), first_death=len(self.deaths), pending=set(parts),
         )  # fmt: skip
@@ -204,7 +219,7 @@ class HostPool:
         if commits:  # at once: an interruption finds the one truth or the other
             self._truths = [self._truths[k].after(order, k) for k in parts]
         self._open = None
-        for k in parts:
+        for k in parts if task != NOTHING else ():
             self._hosts[k].knows = not self._hosts[k].is_gone
         return [order.answers[k] for k in parts]
 
@@ -249,17 +264,19 @@ class HostPool:
     def _give(self, order: OpenOrder, k: int, host: Host) -> None:
         """Give a host the order, and what is committed if it does not know it."""
         program, truth = self._program, self._truths[k]
-        before = [] if host.knows or not truth.image.size else [truth.image, *truth.since]
+        is_behind = not host.knows and order.task != NOTHING
+        before = [truth.image, *truth.since] if is_behind and truth.image.size else []
+        said, inputs = order.say(k, host.knows)
         letter = Order(
-            order.task, order.letters[k], truth.size, before[0].size if before else 0,
+            order.task, said, truth.size, before[0].size if before else 0,
             max(len(before) - 1, 0), program.noted, order.saves,
         )  # fmt: skip
-        host.part, host.knows = k, False
+        host.part, host.knows = k, host.knows and order.task == NOTHING
         host.given_s = host.heard_s = time.monotonic()
         try:
             if host.is_gone:
                 raise EOFError
-            host.wire.send(Kind.ORDER, order.number, letter, [*before, *order.inputs[k]])
+            host.wire.send(Kind.ORDER, order.number, letter, [*before, *inputs])
             host.heard_s = time.monotonic()  # it has read most of it
         except (EOFError, OSError) as error:
             self._lose(order, k, _words(error), restart=False)
@@ -364,6 +381,19 @@ class HostPool:
         if trouble is not None:
             self.close()
             raise WorkerStartError(f"no host ({where}): {trouble}")
+
+
+def _said(letters: Sequence[Any], inputs: Sequence[Arrays]) -> Say:
+    """What is said to each part, whoever has it."""
+    return lambda k, knows: (letters[k], inputs[k])
+
+
+def _say_nothing(part: int, knows: bool) -> tuple[None, Arrays]:
+    return None, ()
+
+
+def _no_arrays(part: int, answer: Any) -> Arrays:
+    return ()
 
 
 def _words(error: Exception) -> str:

@@ -252,6 +252,11 @@ class Simulation:
         self._episodes[:] = 0
 
     @property
+    def shards(self) -> Sequence[Shard]:
+        """One a zone, for who runs their phases."""
+        return self._shards
+
+    @property
     def capacity(self) -> int:
         """How many vehicles a world can hold."""
         return int(self._shard.worlds.rows.shape[1])
@@ -533,11 +538,16 @@ class Simulation:
             if isinstance(part, Traced):
                 part.trace(note)
 
-    def host(self, make: Callable[[Sequence[Shard], tuple[float, float]], Together]) -> None:
+    def host(
+        self,
+        make: Callable[[Sequence[Shard], tuple[float, float]], Together],
+        gathers: bool = True,
+    ) -> None:
         """From now on let others run the phases of the shards, as `make` returns them.
 
         Args:
             make: called with the shards, and with what the phase `gather` is called with.
+            gathers: whether that phase is his, too.
 
         Raises:
             ConfigError: zones become others, and nobody would tell him.
@@ -545,7 +555,7 @@ class Simulation:
         self._refuse_recutting("the zones of one world over workers")
         team = make(self._shards, self._division.gathering)
         self._executor, self._meet = team, team.meet
-        self._gathers = self._division.let_gather(team)
+        self._gathers = gathers and self._division.let_gather(team)
 
     def time_shards(self, every: int = 1) -> ShardClock:
         """From now on run phases zone by zone, with a clock on each.

@@ -75,12 +75,6 @@ class RemoteWorlds(OrderedWorlds):
         refuse_watched(
             config.zones, "of worlds on hosts", "run them on this machine; leave out hosts"
         )
-        if workers is not None and workers > num_worlds:
-            raise ConfigError(
-                f"workers = {workers}, hosts = 'ray': a world lives on one host, so {num_worlds} "
-                "world(s) need at most as many; use fewer workers, more worlds, or no hosts to "
-                "divide a world over processes of this machine"
-            )
         if config.workers.watch:
             raise ConfigError(
                 "workers.watch = True, hosts = 'ray': only this machine is looked at; leave it out "

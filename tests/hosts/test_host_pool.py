@@ -92,6 +92,17 @@ def test_hosts_that_die_are_not_missed(make: Make, how: signal.Signals) -> None:
         assert death.noticed_s <= death.replaced_s <= death.done_s
 
 
+def test_a_successor_that_first_did_nothing_knows_what_is_committed(make: Make) -> None:
+    adder = make()
+    adder.run(WRITE)
+    adder.run()
+    adder.kill(0)
+    adder.pool.ping()
+    adder.check()
+    adder.run()
+    assert len(adder.pool.deaths) == 1
+
+
 def test_all_hosts_die_at_once(make: Make) -> None:
     adder = make(count=4)
     adder.run(WRITE)

@@ -92,7 +92,7 @@ def test_the_processes_end_with_the_environment() -> None:
         ({"hosts": "ray"}, r"hosts = 'ray' without workers"),
         ({"workers": "two"}, r"workers = 'two': must be a whole number, or 'ray'"),
         ({"workers": -1, "hosts": "ray"}, r"workers = -1: must be a number from 0"),
-        ({"workers": 2, "hosts": "ray", "zones": 4}, r"workers = 2, .*: a world lives on one host"),
+        ({"workers": 5, "hosts": "ray", "zones": 4}, r"workers = 5, .* at most as many as zones"),
         ({"workers": "ray", "render_mode": "rgb_array"}, r"workers = 'ray': only a world of the"),
     ],
 )

@@ -18,6 +18,7 @@ import pytest
 
 from cavmarl import CapacityError, ConfigError, parallel_env
 from cavmarl.errors import WorkerError
+from cavmarl.stepping.divided import DividedWorlds
 from cavmarl.stepping.remote import RemoteWorlds
 from cavmarl.vector_env import CavVectorEnv
 from tests.stepping.test_moving import RESTLESS, uneven
@@ -180,6 +181,40 @@ def test_worlds_that_move_between_nodes_are_the_same(
     assert same(drive(vec, steps=16, before=strike), whole)
     assert len(remote(vec).deaths) == 2
     assert sum(uneven) > 0
+
+
+@pytest.mark.parametrize("how", [signal.SIGKILL, signal.SIGSTOP])
+def test_one_world_over_two_nodes(make: Make, cluster: Any, how: signal.Signals) -> None:
+    wanted = WANTED | {"num_envs": 1, "background": 40}
+    whole = drive(make("town", **wanted))
+    vec = make("town", zones=4, workers=2, hosts="ray", **wanted)
+    assert isinstance(vec.worlds, DividedWorlds)
+    pool = vec.worlds.pool
+    assert len(set(nodes_of(pool.pids))) == 2
+    timers: list[Timer] = []
+
+    def strike(step: int) -> None:
+        if step in (3, 8):
+            pool.await_spare()
+            timers.append(Timer(0.001 * step, os.kill, (pool.pids[step % 2], how)))
+            timers[-1].start()
+
+    assert same(drive(vec, before=strike), whole)
+    for timer in timers:
+        timer.join()
+    pool.ping()
+    assert [death.worker for death in pool.deaths] == [1, 0]
+    pids = pool.pids
+    vec.close()
+    await_true(lambda: not any(psutil.pid_exists(pid) for pid in pids))
+
+
+def test_the_divided_world_as_pettingzoo_sees_it(cluster: Any) -> None:
+    whole = drive_view(parallel_env("grid4x4", **settings("entering", "dict")))
+    env = parallel_env("grid4x4", workers=2, hosts="ray", **settings("entering", "dict"))
+    assert isinstance(env.worlds, DividedWorlds)
+    assert drive_view(env) == whole
+    env.close()
 
 
 def test_errors_are_those_of_one_process(make: Make, cluster: Any) -> None:

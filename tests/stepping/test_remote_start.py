@@ -43,8 +43,11 @@ def test_a_cluster_that_was_started_for_them_ends_with_the_last_of_them() -> Non
     assert done.stdout.strip().endswith("left: []")
 
 
-def test_hosts_are_killed_and_nobody_can_tell() -> None:
-    command = ["verify", "ring", "--agents", "3", "--background", "4", "--kill", "2"]
+@pytest.mark.parametrize(
+    "env", [["ring"], ["town", "--worlds", "1", "--zones", "4", "--workers", "2"]]
+)
+def test_hosts_are_killed_and_nobody_can_tell(env: list[str]) -> None:
+    command = ["verify", *env, "--agents", "3", "--background", "4", "--kill", "2"]
     done = subprocess.run(
         [sys.executable, "-m", "cavmarl", *command, "--hosts", "ray"],
         cwd=ROOT, capture_output=True, text=True, timeout=200,
