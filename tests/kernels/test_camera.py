@@ -50,6 +50,27 @@ def shoot(
     return depths, classes, picture
 
 
+@given(crowds(most=6), wall_sets(), mounts(), st.integers(1, HEIGHT))
+def test_rows_do_not_depend_on_which_are_taken_together(
+    rows: NDArray[np.void], walls: NDArray[np.void], matrix: Floats, band: int
+) -> None:
+    """Pictures that are too large for the cache are taken in bands; a worker takes some of them."""
+    camera = make_camera(matrix, WIDTH, RIGHT, 60.0)
+    depths, classes, _ = shoot(rows, camera, walls=walls)
+    panorama, counts = look_around(rows, 0, backdrop(walls), 2.0 * camera.range_m)
+    picture = make_picture(WIDTH, HEIGHT, panorama)
+    num = find_faces(camera, panorama, counts, picture)
+    for first in reversed(range(0, HEIGHT, band)):
+        last = min(first + band, HEIGHT)
+        own_depths = np.zeros((last - first, WIDTH), np.float32)
+        own_classes = np.zeros((last - first, WIDTH), np.uint8)
+        look(camera, picture, num, first, last)
+        write_classes(picture, own_classes)
+        measure_depths(camera, picture, first, own_depths)
+        assert (own_classes == classes[first:last]).all()
+        assert (own_depths == depths[first:last]).all()
+
+
 def forward(range_m: float = 60.0, width: int = WIDTH, z_m: float = 1.0) -> Camera:
     return make_camera(mount((0.0, 0.0, z_m)), width, RIGHT, range_m)
 

@@ -37,6 +37,20 @@ AZIMUTHS = st.sampled_from(
 )
 
 
+@given(crowds(most=6), wall_sets(), mounts(), st.integers(1, 16))
+def test_columns_do_not_depend_on_which_are_cast_together(
+    rows: NDArray[np.void], walls: NDArray[np.void], matrix: Floats, columns: int
+) -> None:
+    fan = make_fan(matrix, (0.3, math.pi / 8, 16), np.array([-0.2, 0.1]), 60.0)
+    panorama, counts = look_around(rows, 0, backdrop(walls), fan.range_m + 3.0)
+    bodies = panorama.prisms, counts.prisms, panorama.walls, counts.walls
+    whole, parts = np.zeros((2, 16, 2), HIT)
+    cast(fan, *bodies, 0, 16, whole)
+    for first in range(0, 16, columns):
+        cast(fan, *bodies, first, min(first + columns, 16), parts)
+    assert (parts == whole).all()
+
+
 @given(
     crowds(most=6), wall_sets(), mounts(), AZIMUTHS,
     st.sampled_from([(0.0,), (-0.4, -0.1, 0.2)]), st.sampled_from([5.0, 60.0]),

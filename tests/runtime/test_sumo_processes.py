@@ -363,3 +363,27 @@ def test_a_host_elsewhere_goes_on_with_what_another_one_sends(tmp_path: Path, so
     finally:
         for host in hosts:
             host.close()
+
+
+@pytest.mark.skipif(not Path("/proc").is_dir(), reason="asks Linux for a process's settings")
+@pytest.mark.parametrize("own", ["", "glibc.malloc.hugetlb=0"])
+def test_what_the_user_has_set_of_the_c_library_counts_last(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, own: str
+) -> None:
+    monkeypatch.setenv("GLIBC_TUNABLES", own)
+    vec = make_vec(
+        "grid4x4", agents=1, background=0, overrides=settings(tiny_file(tmp_path), "sumo-traffic")
+    )
+    try:
+        vec.reset(seed=7)
+        simulation = vec.simulation
+        assert simulation.sumo is not None
+        (pid,) = simulation.sumo.worlds.pids
+        environ = Path(f"/proc/{pid}/environ").read_bytes()
+    finally:
+        vec.close()
+    # The C library ends each setting where it has read it.
+    _, _, found = environ.replace(b":", b"\0").partition(b"GLIBC_TUNABLES=")
+    words = found.decode().split("\0")
+    assert words[0] == "glibc.malloc.hugetlb=1"
+    assert not own or words[1] == own
