@@ -218,7 +218,8 @@ def leads_hosts(num_worlds: int, workers: int | str | None, hosts: str | None) -
         workers: how many; "ray": as many as are of use for whole worlds.
         hosts: "ray": they are on the machines of a Ray cluster.
     """
-    return hosts is not None and isinstance(workers, int) and workers > num_worlds
+    is_number = workers is not None and not isinstance(workers, str)
+    return hosts is not None and is_number and int(workers or 0) > num_worlds
 
 
 def check_agents(config: EnvConfig) -> None:

@@ -58,6 +58,7 @@ class ZoneLeader:
         self._replicas = [Replica(memory, self._phases.pieces) for _ in zones]
         self._coming: list[Words] = [np.zeros(0, dtype=np.uint64) for _ in zones]
         self._begins_step = False
+        self._is_open = False  # an order has been given, and not all is here that comes of it
         self._pool: HostPool | None = None
         self.host(zones)
 
@@ -126,16 +127,18 @@ class ZoneLeader:
     def _run(self, phase: ZonePhase, sensors: tuple[int, ...] = ()) -> None:
         assert self._pool is not None
         side, next_side = self._everybody.sides
+        was_interrupted, self._is_open = self._is_open, True
 
         def say(k: int, knows: bool) -> tuple[PhaseOrder, Arrays]:
             replica, zones = self._replicas[k], self.zones[k]
-            if not knows:
+            is_new = not knows or was_interrupted
+            if is_new:
                 replica.forget()
             turn = ZoneTurn(phase, zones, side, next_side, self._begins_step, sensors)
             self._phases.note_inputs(replica, turn)
             stream = replica.stream
             order = PhaseOrder(
-                not knows, stream.size, phase, zones.tolist(), side, next_side,
+                is_new, stream.size, phase, zones.tolist(), side, next_side,
                 self._begins_step, list(sensors),
             )  # fmt: skip
             return order, [stream]
@@ -149,3 +152,4 @@ class ZoneLeader:
             self._replicas[k].take(self._coming[k])
             if costs_s:
                 self._spent_s[self.zones[k]] += costs_s
+        self._is_open = False

@@ -190,6 +190,7 @@ def test_one_world_over_two_nodes(make: Make, cluster: Any, how: signal.Signals)
     vec = make("town", zones=4, workers=2, hosts="ray", **wanted)
     assert isinstance(vec.worlds, DividedWorlds)
     pool = vec.worlds.pool
+    vec.reset(seed=0)
     assert len(set(nodes_of(pool.pids))) == 2
     timers: list[Timer] = []
 
