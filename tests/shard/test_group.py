@@ -101,7 +101,9 @@ def test_who_may_be_seen_elsewhere_is_noted_while_it_is_moved() -> None:
                 x, y = rows["x"], rows["y"]
                 inside = (left < x) & (x < right) & (low < y) & (y < high)
                 noted = worlds.outer[w, : worlds.num_outer[w]]
-                np.testing.assert_array_equal(noted, np.flatnonzero(~inside))
+                np.testing.assert_array_equal(noted["row"], np.flatnonzero(~inside))
+                for name in ("x", "y", "s", "speed", "lane"):
+                    np.testing.assert_array_equal(noted[name], rows[name][noted["row"]])
         simulation._division.exchange()
         assert (division.zoned.num_outer == -1).all()
         simulation._executor.each("commit")
