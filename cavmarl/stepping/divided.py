@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from cavmarl.balance.plan import Plan
 from cavmarl.balance.plan_text import describe_plan
-from cavmarl.errors import ConfigError, WorkerError, WorkerFailureError
+from cavmarl.errors import ConfigError, SumoError, WorkerError, WorkerFailureError
 from cavmarl.hosts.orders import HostProgram
 from cavmarl.hosts.pool import HostPool
 from cavmarl.hosts.ray_actors import RayActors
@@ -205,6 +205,9 @@ class DividedWorlds:
         self._is_torn = True
         try:
             yield
+        except SumoError:  # the worlds have been put back
+            self._is_torn = begins_anew
+            raise
         except WorkerFailureError as failure:
             raise own_error(failure) from failure
         self._is_torn = False

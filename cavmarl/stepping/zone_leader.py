@@ -56,7 +56,8 @@ class ZoneLeader:
         self._inputs = inputs
         self._spent_s = spent_s
         self._replicas = [Replica(memory, self._phases.pieces) for _ in zones]
-        self._coming: list[Words] = [np.zeros(0, dtype=np.uint64) for _ in zones]
+        self._room: list[Words] = [np.zeros(0, dtype=np.uint64) for _ in zones]
+        self._coming = list(self._room)
         self._begins_step = False
         self._is_open = False  # an order has been given, and not all is here that comes of it
         self._pool: HostPool | None = None
@@ -144,7 +145,9 @@ class ZoneLeader:
             return order, [stream]
 
         def outputs(k: int, answer: Any) -> Arrays:
-            self._coming[k] = np.empty(answer[0], dtype=np.uint64)
+            if answer[0] > self._room[k].size:  # memory that is new has to be had page by page
+                self._room[k] = np.empty(2 * answer[0], dtype=np.uint64)
+            self._coming[k] = self._room[k][: answer[0]]
             return [self._coming[k]]
 
         answers = self._pool.tell(PHASE, say, outputs)

@@ -114,7 +114,6 @@ class ZonesJob:
         self._worlds, memory, self._inputs = make_replicated(
             unwatched(world), recipe["num_worlds"], recipe["in_next_step"], warm=True
         )
-        self._rehearse()
         simulation = self._worlds.simulation
         shards = simulation.shards
         self._mounted = simulation.mounted
@@ -124,6 +123,7 @@ class ZonesJob:
         self._hosted = HostedZones(shards, (), self._spent_s)
         self._zones: list[int] = []
         self._coming: Array = np.zeros(0, dtype=np.uint64)
+        self._rehearse(np.arange(len(shards)))
 
     @property
     def code(self) -> str:
@@ -215,11 +215,18 @@ class ZonesJob:
         """End the processes that the worlds have."""
         self._worlds.close()
 
-    def _rehearse(self) -> None:
-        """Begin and step once: the first time takes longer, and is none of a death's business."""
+    def _rehearse(self, zones: NDArray[np.int64]) -> None:
+        """Do all once: the first time takes longer, and is none of a death's business.
+
+        Nothing of it stays, since a caller begins with a new host.
+        """
         worlds = self._worlds
         worlds.arrays.chosen[:] = True
         worlds.reset(0, 0)
         worlds.step(self._inputs.commands)
         worlds.suggest()
         worlds.close()  # SUMO, if there is one, is the caller's
+        turn = ZoneTurn(ZonePhase.MOVE, zones, 0, 0)
+        self._phases.note_inputs(self._caller, turn)
+        self._caller.take(self._caller.stream.copy())
+        self._phases.note_results(self._caller, turn)

@@ -233,16 +233,22 @@ def test_sumo_beside_the_world(make: Make, tmp_path: Path, source: str) -> None:
     assert same(drive(vec, steps=30, before=Killer(vec, 10)), whole)
 
 
-def test_an_interruption_is_told(make: Make, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("is_late", [False, True])
+def test_an_interruption_is_told(
+    make: Make, monkeypatch: pytest.MonkeyPatch, is_late: bool
+) -> None:
+    """Late: hosts have run the phase, and nobody has taken what has come of it."""
     vec = make("grid4x4", zones=4, workers=2, hosts="ray", **WANTED)
     whole = drive(vec)
     tell, calls = divided(vec).pool.tell, []
 
     def interrupted(*arguments: Any) -> Any:
         calls.append(arguments)
-        if len(calls) == 4:
-            raise KeyboardInterrupt
-        return tell(*arguments)
+        if len(calls) != 4:
+            return tell(*arguments)
+        if is_late:
+            tell(*arguments)
+        raise KeyboardInterrupt
 
     monkeypatch.setattr(divided(vec).pool, "tell", interrupted)
     vec.reset(seed=1)
