@@ -61,7 +61,7 @@ def divide(
     touching_m = _needed_m(config, 2.0 * radius_m, fastest_mps)
     # Agents alone sense.
     sensed_m = _needed_m(config, sensing_m, fastest_mps) if config.population.agents else 0.0
-    near_m = max(touching_m, sensed_m, settings.approach_ticks * fastest_mps * dt)
+    near_m = max(touching_m, sensed_m, _approach_m(config, fastest_mps))
     sight = Sight(
         network,
         traffic.travel,
@@ -120,7 +120,7 @@ def halo_m(
         wide_m = _needed_m(config, reach_m, fastest_mps)
     if zones > 1:
         check_coverage(
-            Distances(settings.approach_ticks * fastest_mps * dt, settings.hysteresis_m, wide_m),
+            Distances(_approach_m(config, fastest_mps), settings.hysteresis_m, wide_m),
             _limits_at_borders(settings),
             reach_m=reach_m,
             v_max_mps=fastest_mps,
@@ -156,6 +156,12 @@ def _limits_at_borders(settings: ZonesConfig) -> Limits:
     if may_be_late:
         return limits
     return replace(limits, deferral=0, policy=DeadlinePolicy.FORCE, grace=0)
+
+
+def _approach_m(config: EnvConfig, fastest_mps: float) -> float:
+    """From so far away a vehicle can be offered: as far as it drives, or jumps in a tick."""
+    dt = config.clock.sim_dt_s
+    return max(config.zones.approach_ticks * MAX_SPEED_MPS * dt, fastest_mps * dt)
 
 
 def _needed_m(config: EnvConfig, reach_m: float, fastest_mps: float) -> float:

@@ -47,10 +47,11 @@ def reference(steps: int, drivers: dict[str, Any]) -> list[str]:
 def test_a_follower_drives_as_a_policy_would(address: Path, start: Start) -> None:
     seen: list[Sight] = []
     with FollowedWorld(make_env(), address) as world:
-        start(lambda: seen.extend(drive(address, ["car_1"])))
+        driver = start(lambda: seen.extend(drive(address, ["car_1"])))
         world.wait_for(1, 10.0)
         world.reset(seed=1)
         found = hashes(world, 10)
+    driver.join(10.0)
     assert found == reference(10, {"car_1": None})
     assert not address.exists()
     for frame, sight in enumerate(seen):
@@ -203,7 +204,7 @@ def test_a_follower_that_leaves_is_no_error(address: Path) -> None:
 def test_the_end_of_an_episode_is_shown_and_needs_no_answer(address: Path, start: Start) -> None:
     seen: list[Sight] = []
     with FollowedWorld(make_env(horizon_s=0.15), address) as world:
-        start(lambda: seen.extend(drive(address, ["car_0"])))
+        driver = start(lambda: seen.extend(drive(address, ["car_0"])))
         world.wait_for(1, 10.0)
         for seed in (0, 1):
             world.reset(seed=seed)
@@ -211,6 +212,7 @@ def test_the_end_of_an_episode_is_shown_and_needs_no_answer(address: Path, start
                 world.step()
         with pytest.raises(EpisodeEndedError, match="reset"):
             world.step()
+    driver.join(10.0)
     assert [sight.snapshot.is_over for sight in seen] == [False, False, False, True] * 2
     assert [sight.snapshot.episode for sight in seen] == [0] * 4 + [1] * 4
     assert [sight.snapshot.frame for sight in seen] == list(range(8))

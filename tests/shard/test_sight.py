@@ -22,7 +22,7 @@ def blocks(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return netgenerate(
         tmp_path_factory.mktemp("blocks") / "blocks.net.xml",
         "--grid", "--grid.number", "4", "--grid.length", "200", "-L", "2",
-        "--default-junction-type", "priority", "--default.speed", "25",
+        "--default-junction-type", "priority", "--default.speed", "33",
     )  # fmt: skip
 
 
@@ -33,7 +33,7 @@ def driven(path: Path, **overrides: object) -> DrivenWorld:
         (),
         layout="bisection",
         seconds=100,
-        seed=4,
+        seed=0,
         agents=0,
         background=60,
         overrides=overrides,
