@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import os
 import random
 import signal
@@ -290,30 +291,60 @@ def _config(job: SensorJob) -> EnvConfig:
 def _loaded(job: SensorJob, load_ms: float, say: Say) -> SensorJob:
     """The job with resolutions at which the sensors take so long a tick.
 
-    Those that can have any resolution take about as long as each other.
+    Those that can have any resolution take about as long as each other. What they take does not
+    grow as their resolutions do, so once one rig is too light and another too heavy, the next one
+    lies between them.
 
     Raises:
         ConfigError: they do not.
     """
-    dt_s = _config(job).clock.sim_dt_s
-    heavy = replace(job, overrides={**job.overrides, "clock.ctrl_dt_s": dt_s})
-    factors = dict.fromkeys(job.overrides["rig"], 1.0)
-    share_ms, found_ms = load_ms / len(factors), 0.0
-    for number in range(TRIES):
-        rig = scaled(_config(heavy), factors, 1.0 / dt_s)
-        heavy = replace(heavy, overrides={**heavy.overrides, "rig": rig})
-        say(f"looking for a load of {load_ms:g} ms: it was {found_ms:.3g} ms")
-        tried = _run(replace(heavy, warmup=TRIED_STEPS, steps=TRIED_STEPS))
-        found_ms = statistics.median(tried.parts_ms["sensor compute"])
-        if number and load_ms <= found_ms <= TOO_MUCH * load_ms:
-            return heavy
-        share_ms *= MARGIN * load_ms / found_ms if number else 1.0
-        for name, cost_ms in zip(factors, tried.costs_ms, strict=True):
-            factors[name] = share_ms / (cost_ms * job.agents) if cost_ms else 1.0
+    even, found_ms = _evened(job, load_ms, say), 0.0
+    scale, light, heavy = 1.0, 0.0, math.inf
+    for _ in range(TRIES):
+        tried = _scaled_by(even, dict.fromkeys(even.overrides["rig"], scale))
+        found_ms, _ = _tried(tried, load_ms, say)
+        if load_ms <= found_ms <= TOO_MUCH * load_ms:
+            return tried
+        if found_ms < load_ms:
+            light = scale
+        else:
+            heavy = scale
+        between = 0.0 < light and heavy < math.inf
+        scale = math.sqrt(light * heavy) if between else scale * MARGIN * load_ms / found_ms
     raise ConfigError(
         f"load {load_ms:g} ms a tick: after {TRIES} tries this rig takes {found_ms:.1f} ms; use "
         "more agents or other sensors, or nothing else on this machine"
     )
+
+
+def _evened(job: SensorJob, load_ms: float, say: Say) -> SensorJob:
+    """The job with each sensor due in every tick, and taking about its share of a load."""
+    dt_s = _config(job).clock.sim_dt_s
+    even = replace(job, overrides={**job.overrides, "clock.ctrl_dt_s": dt_s})
+    factors = dict.fromkeys(job.overrides["rig"], 1.0)
+    share_ms = load_ms / len(factors)
+    for grown in (False, True):  # what a sensor takes at a low resolution says little
+        even = _scaled_by(even, factors)
+        found_ms, costs_ms = _tried(even, load_ms, say)
+        if grown:  # some cannot take their share: the others get what is left of it
+            share_ms *= MARGIN * load_ms / found_ms
+        for name, cost_ms in zip(factors, costs_ms, strict=True):
+            factors[name] = share_ms / (cost_ms * job.agents) if cost_ms else 1.0
+    return _scaled_by(even, factors)
+
+
+def _scaled_by(job: SensorJob, factors: Mapping[str, float]) -> SensorJob:
+    config = _config(job)
+    rig = scaled(config, factors, 1.0 / config.clock.sim_dt_s)
+    return replace(job, overrides={**job.overrides, "rig": rig})
+
+
+def _tried(job: SensorJob, load_ms: float, say: Say) -> tuple[float, Sequence[float]]:
+    """What all sensors take a tick, in ms, and each of them."""
+    tried = _run(replace(job, warmup=TRIED_STEPS, steps=TRIED_STEPS))
+    found_ms = statistics.median(tried.parts_ms["sensor compute"])
+    say(f"looking for a load of {load_ms:g} ms: it was {found_ms:.3g} ms")
+    return found_ms, tried.costs_ms
 
 
 def _run(job: SensorJob) -> SensorRun:

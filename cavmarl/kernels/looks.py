@@ -23,8 +23,9 @@ from cavmarl.kernels.arrays import RoadArrays
 from cavmarl.kernels.entering import ENTER_REACH_M
 from cavmarl.kernels.junctions import EXIT_LOOK_M
 from cavmarl.kernels.lane_choice import LOOK_BACK_M
+from cavmarl.kernels.zones import squared_distance
 
-__all__ = ["Room", "find_looks", "make_room"]
+__all__ = ["Room", "farthest_m", "find_looks", "make_room"]
 
 ASIDE_M = 10.0  # places beside each other on lanes of one edge are not further apart, nor more of s
 BACK_M = max(LOOK_BACK_M, ENTER_REACH_M)  # to the end of a lane on which followers are looked for
@@ -334,3 +335,56 @@ def find_looks(
     _look_along(roads, view_m, see_m, room, looks)
     _find_lines(roads, see_m, room)
     _look_at_junctions(roads, half_m, room, looks)
+
+
+@kernel
+def _farther(
+    near: np.void,
+    far: np.void,
+    first: float,
+    last: float,
+    rects: NDArray[np.float64],
+    zone: int,
+    squared: float,
+) -> float:
+    """The largest of `squared` and the squared distances from a zone of part of a straight piece.
+
+    That part reaches from `first` to `last` m of the lane. Nothing of it is further away than its
+    two ends are.
+    """
+    first = max(first, near["s"])
+    last = min(last, far["s"])
+    if first > last:
+        return squared
+    long = far["s"] - near["s"]
+    for s in (first, last):
+        share = (s - near["s"]) / long if long > 0.0 else 0.0
+        x = near["x"] + share * (far["x"] - near["x"])
+        y = near["y"] + share * (far["y"] - near["y"])
+        squared = max(squared, squared_distance(rects, zone, x, y))
+    return squared
+
+
+@kernel
+def farthest_m(
+    roads: RoadArrays, rects: NDArray[np.float64], zone: int, looks: NDArray[np.void]
+) -> float:
+    """How far outside of a zone the farthest place lies that somebody may ask about.
+
+    Args:
+        roads: the road arrays.
+        rects: (k, 4) all zones, as in `ZoneArrays`.
+        zone: which one.
+        looks: LOOK (L,) what `find_looks` has found for it.
+    """
+    squared = 0.0
+    for lane in range(roads.lanes.shape[0]):
+        look = looks[lane]
+        first = roads.lanes[lane]["first_point"]
+        for k in range(first, first + roads.lanes[lane]["num_points"] - 1):
+            near = roads.points[k]
+            far = roads.points[k + 1]
+            squared = _farther(near, far, -math.inf, look["head"], rects, zone, squared)
+            squared = _farther(near, far, look["tail"], math.inf, rects, zone, squared)
+            squared = _farther(near, far, look["line"] - APPROACH_M, math.inf, rects, zone, squared)
+    return math.sqrt(squared)

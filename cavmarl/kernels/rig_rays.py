@@ -20,6 +20,10 @@ from cavmarl.kernels.rig_schedule import Due
 
 __all__ = ["measure_lidar", "measure_radar", "reach_of"]
 
+# Rays that are written together, a cache line of them: with 1,024 or more in a layer the same place
+# of all layers is kept in one set of the cache, which does not hold them.
+BLOCK = 16
+
 
 @kernel
 def reach_of(fan: Fan) -> float:
@@ -72,9 +76,11 @@ def measure_lidar(
                 hits,
             )  # fmt: skip
             out = data[w, row["agent"], due.slot[w]]
-            for a in range(first, last):
+            for begin in range(first, last, BLOCK):
+                end = min(begin + BLOCK, last)
                 for e in range(hits.shape[1]):
-                    out[e, a] = hits[a, e]["distance"]
+                    for a in range(begin, end):
+                        out[e, a] = hits[a, e]["distance"]
             if noisy:
                 _add_noise(noise, row, worlds.ticks[w], fan.range_m, first, last, out)
 

@@ -66,12 +66,13 @@ class Halo(NamedTuple):
     """How far zones see over their borders, and whom."""
 
     halo_m: float
-    inner: NDArray[np.float64]  # (k, 4) the part of a zone that no other zone's halo reaches
+    inner: NDArray[np.float64]  # (k, 4) the part of a zone in which no other zone sees anybody
     near_start: NDArray[np.int32]  # (k + 1,)
     near: NDArray[np.int32]  # near[near_start[z] : near_start[z + 1]]: zones within the halo of
     # zone z, z itself among them
     sure_m: float  # everybody within this distance is seen, further away those
-    looks: NDArray[np.void]  # LOOK (k, L) of whom somebody may ask; not read if sure_m is halo_m
+    looks: NDArray[np.void]  # LOOK (k, L) of whom somebody may ask; not read if sure_m is seen_m
+    seen_m: float  # and beyond this one nobody, since roads lead no further
 
 
 @kernel
@@ -152,7 +153,7 @@ def is_seen(halo: Halo, zone: int, row: np.void, squared: float) -> bool:
         row: VEHICLE or OUTER.
         squared: m².
     """
-    if squared > halo.halo_m * halo.halo_m:
+    if squared > halo.seen_m * halo.seen_m:
         return False
     if squared <= halo.sure_m * halo.sure_m:
         return True

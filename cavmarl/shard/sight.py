@@ -9,10 +9,10 @@ import numpy as np
 from cavmarl.huge_pages import huge_zeros
 from cavmarl.kernels.arrays import Travel
 from cavmarl.kernels.lanes import LOST_M
-from cavmarl.kernels.looks import find_looks, make_room
+from cavmarl.kernels.looks import farthest_m, find_looks, make_room
 from cavmarl.kernels.zones import LOOK, Halo
 from cavmarl.roads.network import RoadNetwork
-from cavmarl.roads.zone_halo import zone_halo
+from cavmarl.roads.zone_halo import inner_parts, zone_halo
 from cavmarl.roads.zones import ZonePartition
 
 __all__ = ["Sight"]
@@ -47,6 +47,14 @@ class Sight:
         wide_m = self.outside_m + LOST_M  # its place on its lane is not further away
         rects = partition.reaching + np.array([-wide_m, -wide_m, wide_m, wide_m])
         looks = huge_zeros((partition.count, len(roads.lanes)), dtype=LOOK)
-        for rect, own in zip(rects, looks, strict=True):
+        seen_m = self.sure_m
+        for zone, (rect, own) in enumerate(zip(rects, looks, strict=True)):
             find_looks(roads, rect, self.travel.view_m, self.travel.see_m, half_m, room, own)
-        return halo._replace(sure_m=float(self.sure_m), looks=looks)
+            seen_m = max(seen_m, LOST_M + farthest_m(roads, partition.arrays.rects, zone, own))
+        seen_m = min(seen_m, self.halo_m)
+        return halo._replace(
+            inner=inner_parts(partition, seen_m),
+            sure_m=float(self.sure_m),
+            looks=looks,
+            seen_m=float(seen_m),
+        )

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from cavmarl.kernels.announcing import announced_m
-from cavmarl.kernels.looks import ASIDE_M, ROUNDING_M, find_looks, make_room
+from cavmarl.kernels.announcing import APPROACH_M, announced_m
+from cavmarl.kernels.looks import ASIDE_M, ROUNDING_M, farthest_m, find_looks, make_room
 from cavmarl.kernels.zones import LOOK
 from cavmarl.roads.cache import load_network
 from cavmarl.roads.network import RoadNetwork
@@ -93,6 +93,35 @@ def test_a_place_without_roads_asks_about_nobody(line: RoadNetwork) -> None:
     looks = looks_of(line, (0.0, 50.0, 1200.0, 90.0))
     assert (looks["head"] == -np.inf).all()
     assert (looks["tail"] == np.inf).all()
+
+
+@pytest.mark.parametrize("part", [(0.0, 0.0, 0.4, 1.0), (0.5, 0.5, 0.6, 0.6)])
+def test_nobody_is_asked_about_further_away_than_the_farthest(
+    part: tuple[float, float, float, float],
+) -> None:
+    """Beside places that lie close together on all lanes."""
+    roads = network("grid4x4")
+    min_x, min_y, max_x, max_y = roads.extent_m
+    low, high = np.array([min_x, min_y] * 2), np.array([max_x, max_y] * 2)
+    rect = low + np.array(part) * (high - low)
+    looks = looks_of(roads, tuple(rect.tolist()))
+    farthest = 0.0
+    for lane, look in zip(roads.lanes, looks, strict=True):
+        points = roads.points[lane["first_point"] :][: lane["num_points"]]
+        s = np.arange(0.0, points["s"][-1], STEP_M)
+        x, y = (np.interp(s, points["s"], points[axis]) for axis in ("x", "y"))
+        asked = (s <= look["head"]) | (s >= look["tail"]) | (look["line"] - s < APPROACH_M)
+        dx = np.maximum(np.maximum(rect[0] - x, x - rect[2]), 0.0)
+        dy = np.maximum(np.maximum(rect[1] - y, y - rect[3]), 0.0)
+        farthest = max(farthest, float(np.hypot(dx, dy)[asked].max(initial=0.0)))
+    found = farthest_m(roads.arrays, rect[None, :], 0, looks)
+    assert 0.0 <= found - farthest <= 2.0 * STEP_M
+    assert VIEW_M < found
+
+
+def test_where_nobody_is_asked_about_the_farthest_is_no_distance(line: RoadNetwork) -> None:
+    rect = (0.0, 50.0, 1200.0, 90.0)
+    assert farthest_m(line.arrays, np.array([rect]), 0, looks_of(line, rect)) == 0.0
 
 
 @pytest.mark.parametrize(("speed", "expected"), [(0.0, 30.0), (5.0, 70.0), (20.0, 150.0)])
