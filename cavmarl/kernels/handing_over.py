@@ -68,7 +68,7 @@ CHANGE = np.dtype(
 )
 
 
-LATE = 32
+LATE = 256
 """Once so many changes wait they are read; the last tick may add one for each vehicle."""
 
 

@@ -130,6 +130,8 @@ class TransferLog:
         self.episode = -1
         self.ask: Callable[[], None] = lambda: None
         self._rows: deque[Transfer] = deque(maxlen=KEPT_ROWS)
+        self._later: deque[tuple[int, Callable[[], Iterable[Transfer]]]] = deque()
+        self._num_later = 0
         self._counts: Counter[str] = Counter()
         self._lifetime = lifetime
         self._surroundings = surroundings
@@ -142,6 +144,7 @@ class TransferLog:
     def rows(self) -> deque[Transfer]:
         """The newest KEPT_ROWS transfers that have been committed; `take` takes them away."""
         self.ask()
+        self._make_rows()
         return self._rows
 
     @property
@@ -196,13 +199,34 @@ class TransferLog:
             case Nack() if destination == COORDINATOR:
                 self._counts["refused"] += len(message.entries)
 
-    def add(self, rows: Iterable[Transfer]) -> None:
-        """Note changes of owner that no message tells of."""
-        for row in rows:
-            self._counts["forced" if row.forced else "switched"] += 1
-            if row.removed:
-                self._counts["removed"] += 1
-            self._rows.append(row)
+    def add_later(self, number: int, removed: int, make: Callable[[], Iterable[Transfer]]) -> None:
+        """Note changes of owner that no message tells of, whose rows are made when they are read.
+
+        Args:
+            number: how many; none of them was forced.
+            removed: how many of them left the world in that tick.
+            make: makes the rows.
+        """
+        self._counts["switched"] += number
+        if removed:
+            self._counts["removed"] += removed
+        self._later.append((number, make))
+        self._num_later += number
+        while self._num_later - self._later[0][0] >= KEPT_ROWS:
+            self._num_later -= self._later.popleft()[0]
+
+    def _make_rows(self) -> None:
+        for _, make in self._later:
+            self._rows.extend(make())
+        self._later.clear()
+        self._num_later = 0
+
+    def _add(self, row: Transfer) -> None:
+        self._make_rows()
+        self._counts["forced" if row.forced else "switched"] += 1
+        if row.removed:
+            self._counts["removed"] += 1
+        self._rows.append(row)
 
     def count(self, **numbers: int) -> None:
         """Note so many of `counts` that no message tells of."""
@@ -256,4 +280,4 @@ class TransferLog:
             switching.depth_m, release_m,
             None if began_ms is None or ended_ms is None else ended_ms - began_ms,
         )  # fmt: skip
-        self.add([row])
+        self._add(row)

@@ -6,6 +6,9 @@ from collections.abc import Sequence
 from time import perf_counter
 from typing import NamedTuple
 
+import numpy as np
+from numpy.typing import NDArray
+
 from cavmarl.errors import LedgerError, ZoneError
 from cavmarl.kernels.handing_over import NOT_OWNED
 from cavmarl.ownership.messages import Birth
@@ -101,11 +104,11 @@ class BorderBook:
         found = self._book.changes[self._world, last - count : last]
         return [Change(*change) for change in found.tolist()]
 
-    def take(self, but: int = 0) -> list[Change]:
-        """All changes but so many of the newest, which are kept."""
+    def take(self, but: int = 0) -> NDArray[np.void]:
+        """CHANGE (n,), all but so many of the newest, which are kept."""
         last = len(self)
         changes = self._book.changes[self._world]
-        taken = [Change(*change) for change in changes[: last - but].tolist()]
+        taken: NDArray[np.void] = changes[: last - but].copy()
         changes[:but] = changes[last - but : last].copy()
         self._book.num_changes[self._world] = but
         return taken

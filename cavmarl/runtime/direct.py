@@ -14,9 +14,13 @@ Whoever has to know of changes in their own tick gives himself to `foretell`.
 
 from __future__ import annotations
 
-from collections import Counter, defaultdict
-from collections.abc import Callable, Iterable
+from collections import Counter
+from collections.abc import Callable, Iterable, Mapping
+from itertools import repeat
 from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
 
 from cavmarl.errors import LedgerError
 from cavmarl.kernels.handing_over import LATE
@@ -170,25 +174,26 @@ class DirectCoordinator(Referee):
         changes = self._book.take(but=self._changed)
         news, self._news, self._late = self._news, {}, 0
         if self.journal is None and self._watchers:
-            by_tick: defaultdict[int, list[Change]] = defaultdict(list)
-            for change in changes:
-                by_tick[change.tick].append(change)
-            for tick in sorted({*by_tick, *news}):
-                self._settle(tick, by_tick[tick], news.get(tick, _NO_NEWS), is_told=True)
-        elif changes or news:
+            ticks = changes["tick"]
+            for tick in sorted({*ticks.tolist(), *news}):
+                these = changes[ticks == tick]
+                self._settle(tick, these, news.get(tick, _NO_NEWS), is_told=True)
+        elif len(changes) or news:
             births = tuple(birth for tick in news.values() for birth in tick.births)
             removed = tuple(entry for tick in news.values() for entry in tick.removed)
             self._settle(self._tick, changes, _News(births, removed), is_told=False)
         table.settle(self._tick)
-        left = {entry.vehicle: tick for tick, those in news.items() for entry in those.removed}
-        self._transfers.add(
-            _row(change, table.episode, left.get(change.vehicle) == change.tick)
-            for change in changes
-        )
+        if len(changes):
+            left = {entry.vehicle: tick for tick, those in news.items() for entry in those.removed}
+            removed_now = _removed_with(changes, left)
+            episode = table.episode
+            self._transfers.add_later(
+                len(changes), sum(removed_now), lambda: _rows(changes, episode, removed_now)
+            )
         acknowledged, aborted = self._book.take_counts()
         self._transfers.count(acknowledged=acknowledged, aborted=aborted)
 
-    def _settle(self, tick: int, changes: list[Change], news: _News, is_told: bool) -> None:
+    def _settle(self, tick: int, changes: NDArray[np.void], news: _News, is_told: bool) -> None:
         """Put what came of one tick, or of all up to one, on the table, and tell watchers of it.
 
         Raises:
@@ -196,7 +201,8 @@ class DirectCoordinator(Referee):
             SpawnError: a vehicle entered that has been there.
         """
         table = self._directory.table
-        switches = tuple(map(_switch, changes))
+        columns = (changes[name].tolist() for name in ("vehicle", "source", "target", "epoch"))
+        switches = tuple(map(Switch, *columns, repeat(False)))
         if is_told:
             self._record(Begin(table.episode, tick, switches, (), news.births))
         if news.births:
@@ -251,6 +257,24 @@ def _no_digest(zone: int) -> int:
 
 def _switch(change: Change) -> Switch:
     return Switch(change.vehicle, change.source, change.target, change.epoch, False)
+
+
+def _removed_with(changes: NDArray[np.void], left: Mapping[int, int]) -> list[bool]:
+    """Whether each vehicle left the world in the tick in which it changed.
+
+    Args:
+        changes: CHANGE (n,).
+        left: vehicle → tick, of those that have left.
+    """
+    if not left:
+        return [False] * len(changes)
+    pairs = zip(changes["vehicle"].tolist(), changes["tick"].tolist(), strict=True)
+    return [left.get(vehicle) == tick for vehicle, tick in pairs]
+
+
+def _rows(changes: NDArray[np.void], episode: int, removed: list[bool]) -> list[Transfer]:
+    found = (Change(*change) for change in changes.tolist())
+    return [_row(change, episode, gone) for change, gone in zip(found, removed, strict=True)]
 
 
 def _row(change: Change, episode: int, removed: bool) -> Transfer:

@@ -113,6 +113,32 @@ def test_rows_do_not_grow_for_ever_and_can_be_taken_away() -> None:
     assert log.counts["switched"] + log.counts["forced"] == len(rows)
 
 
+def test_rows_that_are_made_later_are_those_of_the_newest_changes() -> None:
+    log = TransferLog(Limits().lifetime)
+    made = []
+
+    def later(first: int, number: int) -> None:
+        def make() -> list[Transfer]:
+            made.append(first)
+            return [
+                Transfer(0, tick, 1, 0, 1, tick, False, False, tick, 0, 0, 0)
+                for tick in range(first, first + number)
+            ]
+
+        log.add_later(number, 1, make)
+
+    batch = KEPT_ROWS // 4
+    for first in range(0, 6 * batch, batch):
+        later(first, batch)
+    assert log.counts == {"switched": 6 * batch, "removed": 6}
+    assert made == [], "nobody has read a row"
+    assert [row.tick for row in log.rows] == list(range(2 * batch, 6 * batch))
+    assert made == [2 * batch, 3 * batch, 4 * batch, 5 * batch]
+    later(6 * batch, 3)
+    assert [row.tick for row in log.take()] == list(range(2 * batch + 3, 6 * batch + 3))
+    assert not log.rows
+
+
 def test_the_summary_counts_and_ranks() -> None:
     rows = [
         Transfer(

@@ -16,6 +16,7 @@ from cavmarl.ownership.messages import Begin, Commit, Reset
 from cavmarl.ownership.records import replay as replay_records
 from cavmarl.ownership.trace import LOG, Trace
 from cavmarl.ownership.transport import Rates
+from cavmarl.runtime import direct
 from cavmarl.runtime.coordinator import Coordinator
 from cavmarl.runtime.direct import DirectCoordinator
 from cavmarl.runtime.fault_plan import Crash, Faults
@@ -128,7 +129,11 @@ def test_a_world_of_few_vehicles_has_room_for_all_changes_that_wait() -> None:
     assert whole.state_hash() == divided.state_hash()
 
 
-def test_the_table_is_brought_up_to_date_when_somebody_asks_or_it_is_late() -> None:
+def test_the_table_is_brought_up_to_date_when_somebody_asks_or_it_is_late(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    late = 16  # so many changes are soon there
+    monkeypatch.setattr(direct, "LATE", late)
     vec = make_vec("grid4x4", zones=ZONES, overrides=BUSY)
     vec.reset(seed=1)
     for _ in range(3 * STEPS):
@@ -136,9 +141,9 @@ def test_the_table_is_brought_up_to_date_when_somebody_asks_or_it_is_late() -> N
     simulation = vec.simulation
     (coordinator,), (log,) = simulation.coordinators, simulation.transfers
     assert isinstance(coordinator, DirectCoordinator)
-    assert 0 < len(coordinator._book) < LATE
+    assert 0 < len(coordinator._book) < late
     assert coordinator._directory.table.tick < coordinator.tick == 6 * STEPS
-    assert len(log.rows) == simulation.migrations > LATE
+    assert len(log.rows) == simulation.migrations > late
     assert coordinator._directory.table.tick == coordinator.tick
     assert len(coordinator._book) == 0
     owners = {v: zone for v, (zone, _) in coordinator.directory.table.owners.items()}
