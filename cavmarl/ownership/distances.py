@@ -40,7 +40,8 @@ class Distances:
         if self.overlap_m <= max(self.approach_m, self.hysteresis_m):
             raise ConfigError(
                 f"an overlap of {self.overlap_m:g} m has to be wider than the approach of "
-                f"{self.approach_m:g} m and the hysteresis of {self.hysteresis_m:g} m"
+                f"{self.approach_m:g} m and the hysteresis of {self.hysteresis_m:g} m: widen it or "
+                "shorten them"
             )
 
     def offers(self, depth_m: float, safeguards: Safeguards = ALL_ON) -> bool:
