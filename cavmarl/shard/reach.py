@@ -12,10 +12,11 @@ from numpy.typing import NDArray
 from cavmarl.kernels.announcing import APPROACH_M
 from cavmarl.kernels.arrays import Travel
 from cavmarl.kernels.junctions import EXIT_LOOK_M
+from cavmarl.kernels.lanes import LOST_M
 from cavmarl.kernels.motion import CROSSINGS_PER_TICK, LATERAL_MPS, MAX_SPEED_MPS
 from cavmarl.roads.network import RoadNetwork
 
-__all__ = ["driving_reach_m", "longest_move_m"]
+__all__ = ["driving_reach_m", "longest_move_m", "off_lane_m"]
 
 ASIDE_M = 10.0  # between the centres of neighbour lanes, and of vehicles beside them
 
@@ -53,6 +54,18 @@ def longest_move_m(network: RoadNetwork, travel: Travel, dt: float) -> float:
     way_m = float(np.hypot(MAX_SPEED_MPS, LATERAL_MPS)) * dt
     half_m = 0.5 * float(travel.types["length"].max())
     return way_m + _kink_m(network) + jumps * jump_m + half_m
+
+
+def off_lane_m(network: RoadNetwork, travel: Travel) -> float:
+    """So far, in m, the centre of a body is from its place in the middle of its lane at most.
+
+    Beside it by a lane's width while it changes, off it by half its length where its bumpers are
+    round a bend, and with the way of a jump between them on a junction without lanes inside. Agents
+    may be further away, but not than `LOST_M`.
+    """
+    _, jump_m = _jumps(network)
+    half_m = 0.5 * float(travel.types["length"].max())
+    return max(LOST_M, float(network.lanes["width_m"].max(initial=0.0)) + half_m + jump_m)
 
 
 def _kink_m(network: RoadNetwork) -> float:

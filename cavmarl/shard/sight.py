@@ -8,12 +8,12 @@ import numpy as np
 
 from cavmarl.huge_pages import huge_zeros
 from cavmarl.kernels.arrays import Travel
-from cavmarl.kernels.lanes import LOST_M
 from cavmarl.kernels.looks import farthest_m, find_looks, make_room
 from cavmarl.kernels.zones import LOOK, Halo
 from cavmarl.roads.network import RoadNetwork
 from cavmarl.roads.zone_halo import inner_parts, zone_halo
 from cavmarl.roads.zones import ZonePartition
+from cavmarl.shard.reach import off_lane_m
 
 __all__ = ["Sight"]
 
@@ -44,13 +44,14 @@ class Sight:
         roads = self.network.arrays
         room = make_room(len(roads.lanes), len(roads.links))
         half_m = 0.5 * float(self.travel.types["length"].max())
-        wide_m = self.outside_m + LOST_M  # its place on its lane is not further away
+        aside_m = off_lane_m(self.network, self.travel)
+        wide_m = self.outside_m + aside_m  # its place on its lane is not further away
         rects = partition.reaching + np.array([-wide_m, -wide_m, wide_m, wide_m])
         looks = huge_zeros((partition.count, len(roads.lanes)), dtype=LOOK)
         seen_m = self.sure_m
         for zone, (rect, own) in enumerate(zip(rects, looks, strict=True)):
             find_looks(roads, rect, self.travel.view_m, self.travel.see_m, half_m, room, own)
-            seen_m = max(seen_m, LOST_M + farthest_m(roads, partition.arrays.rects, zone, own))
+            seen_m = max(seen_m, aside_m + farthest_m(roads, partition.arrays.rects, zone, own))
         seen_m = min(seen_m, self.halo_m)
         return halo._replace(
             inner=inner_parts(partition, seen_m),

@@ -9,11 +9,17 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from cavmarl.kernels.lanes import VIEW_M
+from cavmarl.kernels.lanes import LOST_M, VIEW_M
 from cavmarl.kernels.motion import LATERAL_MPS, MAX_SPEED_MPS
 from cavmarl.roads.cache import load_network
 from cavmarl.roads.network import RoadNetwork
-from cavmarl.shard.reach import APPROACH_M, ASIDE_M, driving_reach_m, longest_move_m
+from cavmarl.shard.reach import (
+    APPROACH_M,
+    ASIDE_M,
+    driving_reach_m,
+    longest_move_m,
+    off_lane_m,
+)
 from cavmarl.worlds import find_map
 from tests.driving import drive, make_traffic, start
 from tests.kernels.traffic import NAMES, network, travel
@@ -139,3 +145,29 @@ def test_nobody_moves_further(internal: tuple[str, ...], tmp_path: Path) -> None
         before = now
     assert furthest_m <= longest_move_m(simulation.network, travel("merge"), tick_s)
     assert (furthest_m > MAX_SPEED_MPS * tick_s) == bool(internal)
+
+
+@pytest.mark.parametrize("internal", [(), ("--no-internal-links",)])
+def test_nobody_is_further_off_its_lane(internal: tuple[str, ...], tmp_path: Path) -> None:
+    """A body whose bumpers are on both sides of a jump has its centre between them."""
+    path = netgenerate(
+        tmp_path / "x.net.xml",
+        "--grid", "--grid.number", "3", "--grid.length", "120", "-L", "3", *internal,
+    )  # fmt: skip
+    simulation = make_traffic(path, background=60)
+    start(simulation, seed=1)
+    roads = simulation.network
+    furthest_m = 0.0
+    for _ in range(300):
+        drive(simulation)
+        for row in simulation.vehicles(0):
+            lane = roads.lanes[row["lane"]]
+            points = roads.points[lane["first_point"] :][: lane["num_points"]]
+            x, y = (np.interp(row["s"], points["s"], points[axis]) for axis in ("x", "y"))
+            furthest_m = max(furthest_m, math.dist((x, y), (row["x"], row["y"])))
+    assert (furthest_m > LOST_M) == bool(internal)
+    assert furthest_m <= off_lane_m(roads, travel("merge"))
+
+
+def test_where_nobody_jumps_agents_are_furthest_off_their_lanes() -> None:
+    assert off_lane_m(network("grid4x4"), travel("grid4x4")) == LOST_M
