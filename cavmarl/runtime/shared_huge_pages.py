@@ -20,7 +20,7 @@ from numpy.typing import DTypeLike, NDArray
 
 from cavmarl.runtime.shared_memory import shared_zeros
 
-__all__ = ["HUGE_BYTES", "MOST_BYTES", "huge_shared_zeros"]
+__all__ = ["HUGE_BYTES", "MOST_BYTES", "collapse_heap", "huge_shared_zeros"]
 
 HUGE_BYTES = 1 << 21  # of a huge page, on most processors
 MOST_BYTES = 1 << 28  # of an array that is had as a whole, whatever of it will be written
@@ -59,6 +59,21 @@ def huge_shared_zeros(shape: int | tuple[int, ...], dtype: DTypeLike = np.float6
         memory[place] = b"\0"  # what is not there is not laid together
     _libc.madvise(ctypes.addressof(memory), whole, _COLLAPSE)  # nothing is lost where it fails
     return np.frombuffer(memoryview(memory), dtype=kind, count=prod(sides)).reshape(sides)
+
+
+def collapse_heap() -> None:
+    """Lay the heap of this process into huge pages, as far as the system has some.
+
+    A process that is forked then shares fewer pages, and is gone sooner when it is killed: the
+    system tells of a death when it has let go of each of them.
+    """
+    with open("/proc/self/maps", encoding="utf-8") as maps:
+        heaps = [line.split()[0] for line in maps if line.rstrip().endswith("[heap]")]
+    for heap in heaps:
+        first, last = (int(place, 16) for place in heap.split("-"))
+        first, last = -(-first // HUGE_BYTES) * HUGE_BYTES, last // HUGE_BYTES * HUGE_BYTES
+        if first < last:
+            _libc.madvise(first, last - first, _COLLAPSE)  # nothing is lost where it fails
 
 
 def _map_aligned(size: int) -> ctypes.Array[ctypes.c_char]:

@@ -31,6 +31,7 @@ import numpy as np
 from cavmarl.runtime import barrier, images
 from cavmarl.runtime.barrier import NUMBER, WAKE, WORDS, Meeting, present_core
 from cavmarl.runtime.images import Arrays, Image
+from cavmarl.runtime.shared_huge_pages import collapse_heap
 from cavmarl.runtime.shared_memory import Segment
 
 __all__ = [
@@ -142,6 +143,7 @@ def serve(make_jobs: MakeJobs) -> NoReturn:
         os._exit(1)
     gc.collect()
     gc.freeze()  # what is ready is not moved around by workers
+    collapse_heap()
     pool.send(json.dumps({"ready": len(jobs)}).encode())
     _fork_on_demand(pool, parent, jobs, start)
 

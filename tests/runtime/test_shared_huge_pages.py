@@ -11,7 +11,12 @@ import numpy as np
 import pytest
 
 from cavmarl.runtime import shared_huge_pages
-from cavmarl.runtime.shared_huge_pages import HUGE_BYTES, MOST_BYTES, huge_shared_zeros
+from cavmarl.runtime.shared_huge_pages import (
+    HUGE_BYTES,
+    MOST_BYTES,
+    collapse_heap,
+    huge_shared_zeros,
+)
 
 ROW = np.dtype([("id", np.int64), ("place", np.float32, (3,))], align=True)
 
@@ -94,3 +99,9 @@ def test_that_there_is_no_room_is_said(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(shared_huge_pages, "MOST_BYTES", 1 << 62)
     with pytest.raises(MemoryError, match=f"no room for {1 << 60} bytes"):
         huge_shared_zeros(1 << 60, np.uint8)
+
+
+def test_a_heap_in_huge_pages_holds_what_it_held() -> None:
+    words = [bytes([n % 251]) * 100 for n in range(100_000)]  # small, so they lie in the heap
+    collapse_heap()
+    assert words == [bytes([n % 251]) * 100 for n in range(100_000)]
