@@ -292,8 +292,8 @@ def _loaded(job: SensorJob, load_ms: float, say: Say) -> SensorJob:
     """The job with resolutions at which the sensors take so long a tick.
 
     Those that can have any resolution take about as long as each other. What they take does not
-    grow as their resolutions do, so once one rig is too light and another too heavy, the next one
-    lies between them.
+    grow in proportion to their resolutions, so once one rig is too light and another too heavy, the
+    next one lies between them.
 
     Raises:
         ConfigError: they do not.

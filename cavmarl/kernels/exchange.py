@@ -42,9 +42,9 @@ def exchange(
 ) -> None:
     """Renew all ghosts of some worlds from the owned rows, and note who is near a border.
 
-    Zone z needs a vehicle if and only if it lies within `halo_m` of z's rectangle, where somebody
-    there may ask about it (`zones.is_seen`). A vehicle that has left its own zone's rectangle,
-    because its transfer is late, is published like any other, to the zone that it is in as well.
+    Zone z needs a vehicle if and only if somebody there may ask about it (`zones.is_seen`). A
+    vehicle that has left its own zone's rectangle, because its transfer is late, is published like
+    any other, to the zone that it is in as well.
 
     Args:
         zones: of the partition.

@@ -147,7 +147,7 @@ class Violations:
                     yield (
                         f"ghosts: zone {zone} has {found} ghosts of vehicle {vehicle}, not "
                         f"{int(due)}: zone {owner} owns it {math.sqrt(squared):.2f} m outside of "
-                        f"that zone, which sees {halo.halo_m:.2f} m far"
+                        f"that zone, which sees {halo.seen_m:.2f} m far"
                     )
             for vehicle in sorted(copies):
                 yield f"ghosts: zone {zone} has a ghost of vehicle {vehicle}, which is not there"

@@ -18,6 +18,7 @@ from cavmarl.runtime.shared_huge_pages import (
     huge_shared_zeros,
 )
 
+MAPS = Path("/proc/self/maps")
 ROW = np.dtype([("id", np.int64), ("place", np.float32, (3,))], align=True)
 
 
@@ -104,4 +105,7 @@ def test_that_there_is_no_room_is_said(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_a_heap_in_huge_pages_holds_what_it_held() -> None:
     words = [bytes([n % 251]) * 100 for n in range(100_000)]  # small, so they lie in the heap
     collapse_heap()
+    if lays_together():
+        heap = int(re.search(r"^(\w+)-.*\[heap\]$", MAPS.read_text(), re.MULTILINE)[1], 16)
+        assert mapped(heap)["AnonHugePages"] >= HUGE_BYTES
     assert words == [bytes([n % 251]) * 100 for n in range(100_000)]

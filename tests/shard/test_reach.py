@@ -10,9 +10,11 @@ import numpy as np
 import pytest
 
 from cavmarl.kernels.lanes import LOST_M, VIEW_M
+from cavmarl.kernels.looks import farthest_m
 from cavmarl.kernels.motion import LATERAL_MPS, MAX_SPEED_MPS
 from cavmarl.roads.cache import load_network
 from cavmarl.roads.network import RoadNetwork
+from cavmarl.roads.zone_layouts import cut_map
 from cavmarl.shard.reach import (
     APPROACH_M,
     ASIDE_M,
@@ -20,6 +22,7 @@ from cavmarl.shard.reach import (
     longest_move_m,
     off_lane_m,
 )
+from cavmarl.shard.sight import Sight
 from cavmarl.worlds import find_map
 from tests.driving import drive, make_traffic, start
 from tests.kernels.traffic import NAMES, network, travel
@@ -167,6 +170,29 @@ def test_nobody_is_further_off_its_lane(internal: tuple[str, ...], tmp_path: Pat
             furthest_m = max(furthest_m, math.dist((x, y), (row["x"], row["y"])))
     assert (furthest_m > LOST_M) == bool(internal)
     assert furthest_m <= off_lane_m(roads, travel("merge"))
+
+
+def test_zones_see_who_is_off_a_lane_that_matters(tmp_path: Path) -> None:
+    """As far as anybody asks about lanes, and as far as bodies are off them."""
+    path = netgenerate(
+        tmp_path / "x.net.xml",
+        "--grid", "--grid.number", "8", "--grid.length", "100", "--no-internal-links",
+    )  # fmt: skip
+    roads, kinds = load_network(path), travel("merge")
+    partition = cut_map(roads, "grid", 4)
+    sight = Sight(roads, kinds, halo_m=1000.0, sure_m=5.0, outside_m=8.0)
+    halo = sight.halo(partition)
+    asked_m = max(
+        farthest_m(roads.arrays, partition.arrays.rects, zone, halo.looks[zone])
+        for zone in range(4)
+    )
+    aside_m = off_lane_m(roads, kinds)
+    assert aside_m > LOST_M
+    assert halo.seen_m == asked_m + aside_m < halo.halo_m
+    inner = np.isfinite(partition.reaching[:, 2])
+    margins = partition.reaching[inner, 2] - halo.inner[inner, 2]
+    assert len(margins) == 2
+    assert margins == pytest.approx(halo.seen_m, abs=1e-4)
 
 
 def test_where_nobody_jumps_agents_are_furthest_off_their_lanes() -> None:
