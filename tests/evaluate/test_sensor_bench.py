@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import csv
 import json
+from collections.abc import Mapping
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -12,9 +14,10 @@ from typer.testing import CliRunner
 
 from cavmarl.cli import app
 from cavmarl.errors import ConfigError
+from cavmarl.evaluate import sensor_bench
 from cavmarl.evaluate.sensor_bench import SensorBench, measure_sensor_workers
 from cavmarl.evaluate.sensor_load import describe_rig, find_rig, load_rig, scaled
-from cavmarl.evaluate.sensor_run import PARTS
+from cavmarl.evaluate.sensor_run import PARTS, SensorJob
 from cavmarl.registry import load_config
 from cavmarl.runtime.barrier import usable_cores
 from tests.sumo_worlds import MODES, tiny_file
@@ -32,6 +35,29 @@ def found() -> SensorBench:
     return measure_sensor_workers(
         "grid4x4", RIG, workers=(1, 2), warmup=2, steps=6, repeats=1, background=3
     )
+
+
+def test_a_load_is_found_beyond_which_sensors_take_much_longer_at_once(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """What does not fit into a cache takes 2.4 times as long: no load is between 10 and 24 ms."""
+
+    def costs_ms(rig: Mapping[str, Any]) -> float:
+        rays = rig["lidar"]["rays"]
+        return rays / 100.0 if rays <= 1000 else 2.4 * rays / 100.0
+
+    def run(job: SensorJob) -> SimpleNamespace:
+        found = costs_ms(job.overrides["rig"])
+        return SimpleNamespace(parts_ms={"sensor compute": [found]}, costs_ms=[found / job.agents])
+
+    monkeypatch.setattr(sensor_bench, "_run", run)
+    said: list[str] = []
+    job = SensorJob("grid4x4", {"rig": {"lidar": RIG["lidar"]}}, 2, 3, 1, 2, 6, 0)
+    loaded = sensor_bench._loaded(job, 20.0, said.append)
+    assert 24.0 <= costs_ms(loaded.overrides["rig"]) <= 30.0
+    tries = [float(text.split()[-2]) for text in said[2:]]
+    assert min(tries) < 20.0, "one was too light,"
+    assert max(tries) > 30.0, "another too heavy"
 
 
 def test_every_run_is_on_record(found: SensorBench) -> None:

@@ -16,6 +16,8 @@ from cavmarl.ownership.messages import Begin, Commit, Reset
 from cavmarl.ownership.records import replay as replay_records
 from cavmarl.ownership.trace import LOG, Trace
 from cavmarl.ownership.transport import Rates
+from cavmarl.roads.zone_file import write_zones
+from cavmarl.roads.zones import ZonePartition
 from cavmarl.runtime import direct
 from cavmarl.runtime.coordinator import Coordinator
 from cavmarl.runtime.direct import DirectCoordinator
@@ -23,9 +25,10 @@ from cavmarl.runtime.fault_plan import Crash, Faults
 from cavmarl.runtime.journal import JournalReader
 from cavmarl.runtime.journal_summary import owners_at
 from cavmarl.runtime.referee import Near
+from cavmarl.worlds import load_world
 from tests.cli.test_main import run as command
 from tests.driving import idle, make_simulation, start
-from tests.faulted import BUSY, ROUGH, Recorded, record, replay
+from tests.faulted import BUSY, QUICK, ROUGH, Recorded, record, replay
 
 ZONES = 4
 STEPS = 15
@@ -102,6 +105,48 @@ def test_without_messages_the_same_is_put_on_record_as_with_them(env: str, tmp_p
         assert mine.counts[name] == theirs.counts[name], name
     kept = [row._replace(ms=None, state_bytes=0) for row in mine.rows]
     assert kept == [row._replace(ms=None, state_bytes=0) for row in theirs.rows]
+
+
+def just_before_the_end_of(edge: str, path: Path) -> Path:
+    """A zone file with two strips of grid4x4: the right one begins 8 m before an edge ends."""
+    roads = load_world("grid4x4").network
+    lane = roads.lanes[int(roads.edges[roads.edge_ids.index(edge)]["first_lane"])]
+    end_x = float(roads.points[int(lane["first_point"] + lane["num_points"]) - 1]["x"])
+    cut_x = end_x - 8.0
+    low_x, low_y, high_x, high_y = roads.extent_m
+    rects = [
+        (low_x - 9.0, low_y - 9.0, cut_x, high_y + 9.0),
+        (cut_x, low_y - 9.0, high_x + 9.0, high_y + 9.0),
+    ]
+    bounds = (rects[0][0], rects[0][1], rects[1][2], rects[1][3])
+    write_zones(path, ZonePartition(bounds, np.array(rects)))
+    return path
+
+
+def test_who_leaves_in_the_tick_of_its_change_is_told_from_others(tmp_path: Path) -> None:
+    """With messages and without them: of 5.5 m to its end a car may go 2.8 in one tick."""
+    demand = tmp_path / "grid.rou.xml"
+    demand.write_text(
+        '<routes><flow id="a" from="C3D3" to="D3right3" begin="0" end="60" period="2"/></routes>',
+        encoding="utf-8",
+    )
+    settings = {
+        **QUICK,
+        "population.mode": "seats",
+        "population.agents": 1,
+        "population.background": 0,
+        "traffic.demand": [str(demand)],
+        "zones.layout": str(just_before_the_end_of("D3right3", tmp_path / "zones.json")),
+        "zones.hysteresis_m": 0.0,
+    }
+    run = record("grid4x4", settings, 150)
+    logs = [replay(run, 2, faults).simulation.transfers[0] for faults in (None, Faults())]
+    direct, sent = ([row._replace(ms=None, state_bytes=0) for row in log.rows] for log in logs)
+    assert direct == sent
+    gone = [row.removed for row in direct]
+    assert 3 < sum(gone) < len(gone) - 3
+    assert [log.counts["removed"] for log in logs] == [sum(gone)] * 2
+    assert [row.release_depth_m is None for row in direct] == gone
 
 
 def test_whoever_turns_away_from_a_border_is_forgotten() -> None:

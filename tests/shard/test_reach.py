@@ -10,8 +10,9 @@ import numpy as np
 import pytest
 
 from cavmarl.kernels.lanes import LOST_M, VIEW_M
-from cavmarl.kernels.looks import farthest_m
+from cavmarl.kernels.looks import farthest_m, find_looks, make_room
 from cavmarl.kernels.motion import LATERAL_MPS, MAX_SPEED_MPS
+from cavmarl.kernels.zones import LOOK
 from cavmarl.roads.cache import load_network
 from cavmarl.roads.network import RoadNetwork
 from cavmarl.roads.zone_layouts import cut_map
@@ -193,6 +194,15 @@ def test_zones_see_who_is_off_a_lane_that_matters(tmp_path: Path) -> None:
     margins = partition.reaching[inner, 2] - halo.inner[inner, 2]
     assert len(margins) == 2
     assert margins == pytest.approx(halo.seen_m, abs=1e-4)
+    # A zone's own drivers, too: they may be late, and as far off their lanes.
+    wide_m = 8.0 + aside_m
+    half_m = 0.5 * float(kinds.types["length"].max())
+    room = make_room(len(roads.lanes), len(roads.links))
+    for zone, rect in enumerate(partition.reaching):
+        looks = np.zeros(len(roads.lanes), dtype=LOOK)
+        wide = rect + np.array([-wide_m, -wide_m, wide_m, wide_m])
+        find_looks(roads.arrays, wide, kinds.view_m, kinds.see_m, half_m, room, looks)
+        assert halo.looks[zone].tolist() == looks.tolist()
 
 
 def test_where_nobody_jumps_agents_are_furthest_off_their_lanes() -> None:
