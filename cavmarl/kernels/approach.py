@@ -14,6 +14,7 @@ from cavmarl.kernels.arrays import RoadArrays, Scratch, Travel
 from cavmarl.kernels.buckets import add, forget, lay_out
 from cavmarl.kernels.codes import DRIVER_SCRIPTED
 from cavmarl.kernels.lanes import is_lost
+from cavmarl.kernels.prefetch import prefetch
 from cavmarl.kernels.ways import leave, next_step, own_step
 
 __all__ = [
@@ -76,6 +77,9 @@ def register_links(
             if at + 1 != step_at[i] or at >= travel.num_fixed:
                 step[i] = travel.steps[at]
                 step_at[i] = at + 1
+            prefetch(roads.lanes, step[i]["next"], 0)
+            prefetch(roads.links, step[i]["link"], 0)
+            prefetch(roads.links, step[i]["link"], 1)
         for i in range(first, last):
             if rows[i]["driver"] == DRIVER_SCRIPTED:
                 pairs = _announce_claims(travel, rows[i], i, pairs, scratch)

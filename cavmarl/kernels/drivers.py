@@ -35,6 +35,7 @@ from cavmarl.kernels.lane_choice import (
     thinks_of_lanes,
 )
 from cavmarl.kernels.lanes import VIEW_M, ahead_on, beside_s, is_lost, last_on, neighbor_behind
+from cavmarl.kernels.prefetch import SOON, prefetch
 from cavmarl.kernels.rng import STREAM_DRIVER, quick_uniform
 from cavmarl.kernels.stopping import way_to_stop
 from cavmarl.kernels.ways import leave, next_step
@@ -59,6 +60,7 @@ MERGE_ROOM_SHARE = 0.25  # to the right at most this share of the lane's length
 LATERAL_ACCEL = 2.5  # m/s², with which a steered car takes a bend: where a lane turns
 MIN_BEND_RAD = 0.2  # by more than this
 BEND_M = 6.0  # within this length
+ROW_LINES = 3  # of a VEHICLE row that drivers ask for
 RETURN_MPS = 5.0  # at which who is lost looks for its lane
 
 
@@ -383,6 +385,35 @@ def _let_merge(
     scratch.accel[i] = min(scratch.accel[i], max(accel, -COURTESY_DECEL))
 
 
+@inlined_kernel
+def _prefetch_first(
+    roads: RoadArrays, rows: NDArray[np.void], i: int, step: NDArray[np.void], scratch: Scratch
+) -> None:
+    """What row i asks about first: itself, and where it goes next."""
+    for line in range(ROW_LINES):
+        prefetch(rows, i, line)
+    link, ahead = step[i]["link"], step[i]["next"]
+    prefetch(roads.links, link, 0)
+    prefetch(roads.links, link, 1)
+    prefetch(scratch.link_start, link, 0)
+    prefetch(roads.lanes, ahead, 0)
+    prefetch(scratch.lane_start, ahead, 0)
+
+
+@inlined_kernel
+def _prefetch_further(roads: RoadArrays, step: np.void, scratch: Scratch) -> None:
+    """What it asks about then: foes on the junction, and the lane behind it."""
+    link = step["link"]
+    if link < 0 or link >= roads.links.shape[0]:  # who follows a script has no step
+        return
+    first = roads.links[link]["first_conflict"]
+    prefetch(roads.conflicts, first, 0)
+    prefetch(roads.conflicts, first, 1)
+    ahead = roads.lanes[roads.links[link]["next_lane"]]["successor"]
+    prefetch(roads.lanes, ahead, 0)
+    prefetch(scratch.lane_start, ahead, 0)
+
+
 @kernel
 def decide(
     roads: RoadArrays,
@@ -413,6 +444,12 @@ def decide(
     """
     total = scratch.lane_start[roads.lanes.shape[0]]
     for k in range(total):
+        if k + SOON < total:
+            first, further = scratch.entries[k + SOON]["row"], scratch.entries[k + SOON // 2]["row"]
+            if first < num:
+                _prefetch_first(roads, rows, first, step, scratch)
+            if further < num:
+                _prefetch_further(roads, step[further], scratch)
         i = scratch.entries[k]["row"]
         if scratch.entries[k]["side"] or i >= num or rows[i]["driver"] != driver:
             continue

@@ -33,6 +33,7 @@ from cavmarl.kernels.lane_choice import needed_change
 from cavmarl.kernels.lanes import index_lanes, is_lost
 from cavmarl.kernels.motion import move_agent, move_background
 from cavmarl.kernels.neighbors import Grid
+from cavmarl.kernels.prefetch import SOON, prefetch
 from cavmarl.kernels.scalars import clamp
 from cavmarl.kernels.scripts import follow_script
 from cavmarl.kernels.steering import nearest_speed, steer_to_lane, take_meta_action
@@ -215,6 +216,11 @@ def advance(
         outer = 0
         touching = 0
         for k in range(owned):
+            if k + SOON < owned:  # a place on a lane is found among its points
+                prefetch(roads.lanes, rows[scratch.order[k + SOON]]["lane"], 0)
+                near = roads.lanes[rows[scratch.order[k + SOON // 2]]["lane"]]
+                prefetch(roads.points, near["first_point"], 0)
+                prefetch(roads.points, near["first_point"], 1)
             i = scratch.order[k]
             if not in_place:
                 worlds.next_rows[w, k] = rows[i]

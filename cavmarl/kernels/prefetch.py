@@ -1,0 +1,57 @@
+"""Have memory come nearer that is needed soon.
+
+What a vehicle asks about lies scattered over the tables of a city: its lane, the lanes and links
+behind that, the row of its leader. Each look that misses the caches takes as long as a hundred
+operations. A loop that says some rounds before which records it is going to read has many of them
+under way at once.
+
+This never changes a result: nothing is read, and a place outside of an array does no harm.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numba.core.config
+from llvmlite import ir
+from numba.core import cgutils, types
+from numba.extending import intrinsic
+from numpy.typing import NDArray
+
+__all__ = ["SOON", "prefetch"]
+
+SOON = 8  # rounds of a loop over vehicles: about as long as memory takes to come
+
+_settings: Any = numba.core.config
+_intrinsic: Any = intrinsic
+_function: Any = cgutils.get_or_insert_function
+_item: Any = cgutils.get_item_pointer
+_FOR_READING, _INTO_ALL_CACHES, _DATA = 0, 3, 1
+_LINE = 64  # bytes
+
+
+@_intrinsic  # type: ignore[untyped-decorator]
+def _compiled_prefetch(typing: Any, array: Any, index: Any, line: Any) -> Any:
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        kind = signature.args[0]
+        view = context.make_array(kind)(context, builder, arguments[0])
+        at = [context.cast(builder, arguments[1], signature.args[1], types.intp)]
+        record = _item(context, builder, kind, view, at)
+        byte, word = ir.IntType(8).as_pointer(), ir.IntType(32)
+        further = builder.mul(arguments[2], arguments[2].type(_LINE))
+        place = builder.gep(builder.bitcast(record, byte), [further])
+        signature_ir = ir.FunctionType(ir.VoidType(), [byte, word, word, word])
+        call = _function(builder.module, signature_ir, "llvm.prefetch")
+        how = [word(value) for value in (_FOR_READING, _INTO_ALL_CACHES, _DATA)]
+        builder.call(call, [place, *how])
+        return context.get_dummy_value()
+
+    return types.void(array, index, line), generate
+
+
+def _plain_prefetch(array: NDArray[Any], index: int, line: int) -> None:
+    pass
+
+
+prefetch = _plain_prefetch if _settings.DISABLE_JIT else _compiled_prefetch
+"""`prefetch(array, i, n)`: have the nth cache line of record i of a (N,) array come nearer."""
