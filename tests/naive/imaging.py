@@ -67,7 +67,7 @@ def ray_to_body(start: Vector, ray: Vector, ego: np.void, body: np.void, margin:
     ]  # fmt: skip
     enter, leave = 0.0, math.inf
     for normal, offset in sides:
-        outside = float(normal @ (start - base)) - offset - margin
+        outside = float(normal @ (start - base) - offset - margin)
         closing = float(normal @ ray)
         if closing == 0.0:
             if outside > 0.0:
