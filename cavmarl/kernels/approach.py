@@ -14,7 +14,7 @@ from cavmarl.kernels.arrays import RoadArrays, Scratch, Travel
 from cavmarl.kernels.buckets import add, forget, lay_out
 from cavmarl.kernels.codes import DRIVER_SCRIPTED
 from cavmarl.kernels.lanes import is_lost
-from cavmarl.kernels.prefetch import prefetch
+from cavmarl.kernels.prefetch import SOON, prefetch
 from cavmarl.kernels.ways import leave, next_step, own_step
 
 __all__ = [
@@ -71,6 +71,8 @@ def register_links(
         # and a loop that does nothing else has many of them under way at once. And most rows are
         # where they were a tick before, with the same vehicle on the same lane.
         for i in range(first, last):
+            if i + SOON < num:
+                prefetch(roads.lanes, rows[i + SOON]["lane"], 0)
             if rows[i]["driver"] == DRIVER_SCRIPTED:
                 continue
             at = own_step(roads, rows[i])

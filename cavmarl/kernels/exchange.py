@@ -14,10 +14,12 @@ from numpy.typing import NDArray
 from cavmarl.kernels import inlined_kernel, kernel
 from cavmarl.kernels.arrays import Zoned
 from cavmarl.kernels.borders import Borders
+from cavmarl.kernels.codes import DRIVER_BACKGROUND
 from cavmarl.kernels.handing_over import Book, look_on
 from cavmarl.kernels.zones import (
     Halo,
     ZoneArrays,
+    is_asked_about,
     is_inside,
     is_seen,
     note_outer,
@@ -170,6 +172,9 @@ def _publish(
     border_limit = border_m * border_m
     if zoned.num_outer[zone, w] < 0:
         _note_all_outer(halo.inner[zone], zoned, side, zone, w)
+    seen_limit = halo.seen_m * halo.seen_m
+    sure_limit = halo.sure_m * halo.sure_m
+    by_lane = halo.watcher_start.size > 1
     found = 0
     for n in range(zoned.num_outer[zone, w]):
         outer = zoned.outer[zone, w, n]
@@ -177,17 +182,28 @@ def _publish(
         x = outer["x"]
         y = outer["y"]
         at_border = False
-        here = zone
-        if squared_distance(zones.rects, zone, x, y) > 0.0:
-            here = zone_of(zones, x, y)
-        for n in range(halo.near_start[here], halo.near_start[here + 1]):
-            other = halo.near[n]
-            if other == zone:
-                continue
-            squared = squared_distance(zones.rects, other, x, y)
-            if is_seen(halo, other, outer, squared):
-                _take_ghost(zoned, side, zone, i, other, w, squared <= near_limit)
-                at_border |= squared <= border_limit
+        # Agents may be anywhere beside their lanes, all others are on them.
+        if by_lane and outer["driver"] == DRIVER_BACKGROUND:
+            lane = outer["lane"]
+            for k in range(halo.watcher_start[lane], halo.watcher_start[lane + 1]):
+                watch = halo.watchers[k]
+                other = watch["zone"]
+                squared = squared_distance(zones.rects, other, x, y)
+                if other == zone or squared > seen_limit:
+                    continue
+                if squared <= sure_limit or is_asked_about(watch, outer):
+                    _take_ghost(zoned, side, zone, i, other, w, squared <= near_limit)
+                    at_border |= squared <= border_limit
+        else:
+            here = zone
+            if squared_distance(zones.rects, zone, x, y) > 0.0:
+                here = zone_of(zones, x, y)
+            for k in range(halo.near_start[here], halo.near_start[here + 1]):
+                other = halo.near[k]
+                squared = squared_distance(zones.rects, other, x, y)
+                if other != zone and is_seen(halo, other, outer, squared):
+                    _take_ghost(zoned, side, zone, i, other, w, squared <= near_limit)
+                    at_border |= squared <= border_limit
         if at_border:
             zoned.border[zone, w, found] = i
             found += 1

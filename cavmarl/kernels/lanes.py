@@ -18,6 +18,7 @@ from cavmarl.kernels.arrays import RoadArrays, Scratch, Travel
 from cavmarl.kernels.buckets import add, forget, lay_out
 from cavmarl.kernels.codes import DRIVER_AGENT, DRIVER_SCRIPTED
 from cavmarl.kernels.geometry import segment_at
+from cavmarl.kernels.prefetch import SOON, prefetch
 
 __all__ = [
     "ENTRY",
@@ -113,6 +114,10 @@ def index_lanes(
     forget(scratch.lanes)
     for i in range(num):
         row = rows[i]
+        prefetch(rows, i + 2 * SOON, 0)
+        prefetch(rows, i + 2 * SOON, 1)
+        if i + SOON < num:
+            prefetch(scratch.lane_start, rows[i + SOON]["lane"], 0)
         if row["driver"] == DRIVER_SCRIPTED:
             _count_covers(travel, row, scratch)
             continue

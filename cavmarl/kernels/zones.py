@@ -22,8 +22,10 @@ from cavmarl.kernels.announcing import announced_m
 __all__ = [
     "LOOK",
     "OUTER",
+    "WATCH",
     "Halo",
     "ZoneArrays",
+    "is_asked_about",
     "is_inside",
     "is_seen",
     "note_outer",
@@ -46,6 +48,9 @@ LOOK = np.dtype([("head", np.float32), ("tail", np.float32), ("line", np.float32
 """Whom a zone's drivers may ask about on a lane: those up to `head` m, those from `tail` m on, and
 those who announce themselves to a line that lies at `line` m (`kernels.looks`)."""
 
+WATCH = np.dtype([("zone", np.int32), *((name, LOOK[name]) for name in LOOK.names or ())])
+"""A LOOK, and whose it is."""
+
 
 OUTER = np.dtype(
     [
@@ -55,6 +60,7 @@ OUTER = np.dtype(
         ("speed", np.float64),
         ("row", np.int32),  # VEHICLE row
         ("lane", np.int32),
+        ("driver", np.int32),
     ],
     align=True,
 )
@@ -70,9 +76,11 @@ class Halo(NamedTuple):
     near_start: NDArray[np.int32]  # (k + 1,)
     near: NDArray[np.int32]  # near[near_start[z] : near_start[z + 1]]: zones within the halo of
     # zone z, z itself among them
-    sure_m: float  # everybody within this distance is seen, further away those
-    looks: NDArray[np.void]  # LOOK (k, L) of whom somebody may ask; not read if sure_m is seen_m
-    seen_m: float  # and beyond this one nobody, since roads lead no further
+    sure_m: float  # everybody within this distance is seen, further away those of whom
+    seen_m: float  # somebody may ask, and beyond this one nobody, since roads lead no further
+    watcher_start: NDArray[np.int32]  # (L + 1,); (1,) if sure_m is seen_m, so that nobody asks
+    watchers: NDArray[np.void]  # WATCH: watchers[watcher_start[l] : watcher_start[l + 1]] are those
+    # zones that may see somebody who is on lane l, and of whom there they may ask
 
 
 @kernel
@@ -141,6 +149,22 @@ def note_outer(outer: np.void, row: np.void, i: int) -> None:
     outer["speed"] = row["speed"]
     outer["row"] = i
     outer["lane"] = row["lane"]
+    outer["driver"] = row["driver"]
+
+
+@inlined_kernel
+def is_asked_about(watch: np.void, row: np.void) -> bool:
+    """Whether some driver of a zone that watches a vehicle's lane may ask about it.
+
+    Args:
+        watch: WATCH of the lane.
+        row: VEHICLE or OUTER.
+    """
+    s = row["s"]
+    asked: bool = (
+        s <= watch["head"] or s >= watch["tail"] or watch["line"] - s < announced_m(row["speed"])
+    )
+    return asked
 
 
 @inlined_kernel
@@ -157,9 +181,7 @@ def is_seen(halo: Halo, zone: int, row: np.void, squared: float) -> bool:
         return False
     if squared <= halo.sure_m * halo.sure_m:
         return True
-    look = halo.looks[zone, row["lane"]]
-    s = row["s"]
-    seen: bool = (
-        s <= look["head"] or s >= look["tail"] or look["line"] - s < announced_m(row["speed"])
-    )
-    return seen
+    for k in range(halo.watcher_start[row["lane"]], halo.watcher_start[row["lane"] + 1]):
+        if halo.watchers[k]["zone"] == zone:
+            return is_asked_about(halo.watchers[k], row)
+    return False

@@ -12,10 +12,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cavmarl.errors import ZoneError
-from cavmarl.kernels.zones import LOOK, Halo
+from cavmarl.kernels.zones import LOOK, WATCH, Halo
 from cavmarl.roads.zones import ZonePartition
 
-__all__ = ["inner_parts", "zone_halo"]
+__all__ = ["inner_parts", "lane_watchers", "zone_halo"]
 
 # Added to the halo, so that no rounding of the sum below can make it too narrow.
 _ROUNDING_M = 1e-6
@@ -34,16 +34,41 @@ def zone_halo(partition: ZonePartition, halo_m: float) -> Halo:
     gaps = np.maximum(gaps, gaps.swapaxes(0, 1))
     near = (gaps * gaps).sum(axis=2) <= halo_m * halo_m
     start = np.concatenate([[0], np.cumsum(near.sum(axis=1))]).astype(np.int32)
-    nobody = np.zeros((0, 0), dtype=LOOK)
     return Halo(
         halo_m=float(halo_m),
         inner=inner_parts(partition, halo_m),
         near_start=start,
         near=np.nonzero(near)[1].astype(np.int32),
         sure_m=float(halo_m),
-        looks=nobody,
         seen_m=float(halo_m),
+        watcher_start=np.zeros(1, dtype=np.int32),
+        watchers=np.zeros(0, dtype=WATCH),
     )
+
+
+def lane_watchers(
+    partition: ZonePartition, lanes: NDArray[np.void], looks: NDArray[np.void], within_m: float
+) -> tuple[NDArray[np.int32], NDArray[np.void]]:
+    """`watcher_start` and `watchers` of a `Halo`.
+
+    Args:
+        partition: of k zones.
+        lanes: LANE (L,).
+        looks: LOOK (k, L), of whom each zone may ask.
+        within_m: zones that are nearer to a lane's bounding box watch it in any case.
+    """
+    asked = (looks["head"] > -np.inf) | (looks["tail"] < np.inf) | (looks["line"] < np.inf)
+    min_x, min_y, max_x, max_y = partition.arrays.rects.T[:, :, None]
+    dx = np.maximum(np.maximum(min_x - lanes["max_x"], lanes["min_x"] - max_x), 0.0)
+    dy = np.maximum(np.maximum(min_y - lanes["max_y"], lanes["min_y"] - max_y), 0.0)
+    watching = (asked | (np.hypot(dx, dy) <= within_m + _ROUNDING_M)).T
+    start = np.concatenate([[0], np.cumsum(watching.sum(axis=1))])
+    lane, zone = np.nonzero(watching)
+    watchers = np.zeros(zone.size, dtype=WATCH)
+    watchers["zone"] = zone
+    for place in LOOK.names or ():
+        watchers[place] = looks[place][zone, lane]
+    return start.astype(np.int32), watchers
 
 
 def inner_parts(partition: ZonePartition, seen_m: float) -> NDArray[np.float64]:

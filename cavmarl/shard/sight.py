@@ -6,12 +6,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from cavmarl.huge_pages import huge_zeros
+from cavmarl.huge_pages import huge_copy
 from cavmarl.kernels.arrays import Travel
 from cavmarl.kernels.looks import farthest_m, find_looks, make_room
 from cavmarl.kernels.zones import LOOK, Halo
 from cavmarl.roads.network import RoadNetwork
-from cavmarl.roads.zone_halo import inner_parts, zone_halo
+from cavmarl.roads.zone_halo import inner_parts, lane_watchers, zone_halo
 from cavmarl.roads.zones import ZonePartition
 from cavmarl.shard.reach import off_lane_m
 
@@ -47,15 +47,17 @@ class Sight:
         aside_m = off_lane_m(self.network, self.travel)
         wide_m = self.outside_m + aside_m  # its place on its lane is not further away
         rects = partition.reaching + np.array([-wide_m, -wide_m, wide_m, wide_m])
-        looks = huge_zeros((partition.count, len(roads.lanes)), dtype=LOOK)
+        looks = np.zeros((partition.count, len(roads.lanes)), dtype=LOOK)
         seen_m = self.sure_m
         for zone, (rect, own) in enumerate(zip(rects, looks, strict=True)):
             find_looks(roads, rect, self.travel.view_m, self.travel.see_m, half_m, room, own)
             seen_m = max(seen_m, aside_m + farthest_m(roads, partition.arrays.rects, zone, own))
         seen_m = min(seen_m, self.halo_m)
+        start, watchers = lane_watchers(partition, roads.lanes, looks, self.sure_m + aside_m)
         return halo._replace(
             inner=inner_parts(partition, seen_m),
             sure_m=float(self.sure_m),
-            looks=looks,
             seen_m=float(seen_m),
+            watcher_start=huge_copy(start),
+            watchers=huge_copy(watchers),
         )

@@ -160,7 +160,7 @@ def note_outer(zoned: Zoned, halo: Halo, parts: list[NDArray[np.void]]) -> None:
 def note(noted: NDArray[np.void], rows: NDArray[np.void], places: NDArray[np.int64]) -> None:
     """Note some rows as OUTER."""
     noted["row"][: len(places)] = places
-    for name in ("x", "y", "s", "speed", "lane"):
+    for name in ("x", "y", "s", "speed", "lane", "driver"):
         noted[name][: len(places)] = rows[name][places]
 
 
@@ -243,7 +243,7 @@ def test_who_leaves_is_no_longer_noted_and_the_others_are_where_they_are(
     places = np.flatnonzero([int(row["id"]) in seen for row in left])
     note(expected, left, places)
     assert worlds.num_outer[0] == len(places)
-    assert worlds.outer[0, : len(places)].tobytes() == expected[: len(places)].tobytes()
+    assert worlds.outer[0, : len(places)].tolist() == expected[: len(places)].tolist()
 
 
 def test_agents_leave_when_their_trip_has_ended_and_they_have_acted() -> None:

@@ -71,7 +71,7 @@ def test_a_look_less_makes_another_world(
     def blind(sight: Sight, partition: ZonePartition) -> Halo:
         halo = seen(sight, partition)
         if partition.count > 1:
-            halo.looks[field] = -np.inf if field == "head" else np.inf
+            halo.watchers[field] = -np.inf if field == "head" else np.inf
         return halo
 
     whole = driven(blocks).simulation.state_hash()
