@@ -11,6 +11,8 @@ import threading
 import time
 import warnings
 from collections.abc import Iterator
+from dataclasses import replace
+from itertools import count
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +24,7 @@ from cavmarl import CavVectorEnv, make_vec
 from cavmarl.errors import ConfigError, SensorFrameError, WorkerError
 from cavmarl.rig.rig import Turn
 from cavmarl.runtime import sensor_farm, sensor_shares
+from cavmarl.runtime.line_costs import LineCosts
 from cavmarl.runtime.sensor_farm import SensorFarm
 from cavmarl.runtime.sensor_shares import LineWorth, Shares
 from cavmarl.stepping.local import LocalWorlds
@@ -115,23 +118,34 @@ def test_nothing_depends_on_how_many_there_are_nor_who_senses_what(
 
 
 @pytest.mark.parametrize("sensor_workers", [2, 3])
+@pytest.mark.parametrize("agents", [1, 6])
 def test_nothing_depends_on_how_frames_are_divided(
-    alone: list[list[bytes | str]], monkeypatch: pytest.MonkeyPatch, sensor_workers: int
+    monkeypatch: pytest.MonkeyPatch, agents: int, sensor_workers: int
 ) -> None:
-    """Frames as small as here are not worth it; divided they are all the same."""
-    divided: list[dict[int, Any]] = []
+    """Frames as small as here are not worth it; divided they are all the same.
 
-    def divide(shares: Shares, worth: LineWorth) -> Shares:
-        found = sensor_shares.divide(shares, worth)
-        divided.append(found.divided)
+    What a frame costs is said to the sharing, as what is measured depends on the machine: each time
+    another one is so dear that all workers have to write of it.
+    """
+    divided, turn = set[int](), count()
+
+    def divide(shares: Shares, _: LineWorth) -> Shares:
+        lines = {unit.sensor: unit.end for unit in shares.units}
+        fine = [number for number, unit in enumerate(shares.units) if unit.end >= 8]
+        if not fine:
+            return shares
+        dear = fine[next(turn) * 7 % len(fine)]
+        costs_s = tuple(float(number == dear) for number in range(len(shares.units)))
+        even = LineCosts([lines.get(sensor, 1) for sensor in range(len(RIG))])
+        found = sensor_shares.divide(replace(shares, costs_s=costs_s), even)
+        assert len(found.units) == len(shares.units) + sensor_workers - 1
+        divided.add(shares.units[dear].sensor)
         return found
 
-    monkeypatch.setattr(sensor_shares, "LEAST_S", 0.0)
     monkeypatch.setattr(sensor_farm, "divide", divide)
-    assert _drive(sensor_workers=sensor_workers) == alone
-    one = _drive(sensor_workers=sensor_workers, num_agents=1)
-    assert any(divided)
-    assert one == _drive(num_agents=1)
+    frames = _drive(sensor_workers=sensor_workers, num_agents=agents)
+    assert len(divided) > 1
+    assert frames == _drive(num_agents=agents)
 
 
 @pytest.mark.parametrize("zones", [2, 4, 9])
