@@ -209,14 +209,15 @@ def _run(
         )
     except subprocess.TimeoutExpired as error:
         raise MapError(
-            f"{source}: netconvert took longer than {timeout_s:g} s: crop the map (--bbox) or "
-            "allow more time"
+            f"{source}: netconvert took longer than {timeout_s:g} s: crop the map "
+            f"(cavmarl map build {source} --bbox …) or allow more time"
         ) from error
     log = BuildLog(done.stdout, done.stderr)
     if done.returncode != 0 or not draft.exists():
         tolerant = "--ignore-errors" in options
         cure = "mend the source"
-        cure += "" if tolerant else ", or leave out what is broken (--tolerant)"
+        if not tolerant:
+            cure += f", or leave out what is broken: cavmarl map build {source} --tolerant"
         raise MapError(
             f"{source}: netconvert gave up (exit code {done.returncode}):\n"
             f"{_quote(log.complaint())}\nCure: {cure}."
