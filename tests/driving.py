@@ -46,7 +46,7 @@ def make_traffic(
     simulation = make_simulation(
         env, mode="seats", background=background, num_worlds=num_worlds, overrides=overrides
     )
-    traffic = simulation._traffic
+    traffic = simulation._tick.traffic
     vars(traffic)["demand"] = traffic.demand._replace(num_agents=0, reenter=renewed)
     return simulation
 

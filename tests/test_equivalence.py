@@ -235,7 +235,7 @@ def test_a_full_world_is_full_wherever_its_vehicles_are(tmp_path: Path) -> None:
 
     def build(zones: dict[str, Any]) -> Simulation:
         simulation = tiny("merge", tmp_path, overrides=FAST | zones)
-        vars(simulation._traffic)["capacity"] = most
+        vars(simulation._tick.traffic)["capacity"] = most
         return simulation
 
     whole = hashes_agree(build, 150, (2, 4))

@@ -57,7 +57,7 @@ def test_every_type_of_sensor_is_on() -> None:
 
 def test_what_is_kept_of_a_tick_has_no_gaps() -> None:
     simulation = make_vec("grid4x4", overrides=EVERYTHING).simulation
-    for part in simulation._attached:
+    for part in simulation.attached:
         for array in part.arrays():
             sizes = [array.dtype[name].itemsize for name in array.dtype.names or ()]
             assert sum(sizes) in (0, array.dtype.itemsize), (part, array.dtype)

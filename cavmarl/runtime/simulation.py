@@ -1,4 +1,4 @@
-"""`Simulation`: W worlds of one environment, stepped together. The tick is written here, once."""
+"""`Simulation`: W worlds of one environment, stepped together."""
 
 from __future__ import annotations
 
@@ -23,9 +23,7 @@ from cavmarl.errors import (
 from cavmarl.huge_pages import huge_zeros
 from cavmarl.kernels.arrays import Common, Gate, Outputs, Worlds
 from cavmarl.kernels.codes import ACTION_IDLE
-from cavmarl.kernels.repeated import repeated
 from cavmarl.kernels.rng import world_key
-from cavmarl.kernels.tallies import count_tick, occasions
 from cavmarl.ownership.messages import Switch
 from cavmarl.ownership.transfers import TransferLog
 from cavmarl.rig.catalogue import frame_layout, frames_in
@@ -39,10 +37,9 @@ from cavmarl.runtime.attaching import attach
 from cavmarl.runtime.border_book import BorderBook
 from cavmarl.runtime.commons import Commons
 from cavmarl.runtime.compilation import first_compilation
-from cavmarl.runtime.coordination import Coordination
 from cavmarl.runtime.dividing import divide
 from cavmarl.runtime.division import ZoneLoads
-from cavmarl.runtime.executor import Executor, SerialExecutor, Together
+from cavmarl.runtime.executor import SerialExecutor, Together
 from cavmarl.runtime.messaging import Messaging
 from cavmarl.runtime.mounted import MountedSensors
 from cavmarl.runtime.recovery import Recovery, Revival
@@ -53,8 +50,8 @@ from cavmarl.runtime.reproducer import Reproducer
 from cavmarl.runtime.reproducing import Keeper, Moment, sources_of
 from cavmarl.runtime.shard_clock import ShardClock
 from cavmarl.runtime.state_digest import digest_world
-from cavmarl.runtime.step_trace import MIRROR, SUMO, Traced
 from cavmarl.runtime.store import CommittedStore
+from cavmarl.runtime.tick import Tick
 from cavmarl.runtime.traffic_stats import TrafficStats, count_traffic
 from cavmarl.runtime.zone_view import ZoneView, view_zones
 from cavmarl.shard.reach import longest_move_m
@@ -129,7 +126,7 @@ class Simulation:
         with first_compilation() as is_first:
             blank = blank_vehicle()
             sumo = demand if isinstance(demand, SumoDemand) else None
-            traffic = (
+            traffic: NativeTraffic = (
                 NativeTraffic(
                     network,
                     config.traffic,
@@ -144,75 +141,69 @@ class Simulation:
                     sumo,
                 )
                 if like is None
-                else like._traffic.for_worlds(num_worlds)
+                else like._tick.traffic.for_worlds(num_worlds)
             )
-            capacity = traffic.capacity
-            self._traffic: NativeTraffic = traffic
-            self._gate = make_gate(num_worlds, capacity, network.arrays, blank.dtype)
-            self._commons = Commons(config, network, num_worlds, observations, zeros)
-            self._shards, self._division = divide(
-                config, network, self.partition, traffic, self._commons.outputs, num_worlds, zeros
+            commons = Commons(config, network, num_worlds, observations, zeros)
+            self._shards, division = divide(
+                config, network, self.partition, traffic, commons.outputs, num_worlds, zeros
             )
             self._shard = self._shards[0]
-            self._executor: Executor = SerialExecutor(self._shards)
-            self._meet: Callable[[], None] = _there
-            self._gathers = False
-            self._count_tick = repeated(count_tick)
-            self._occasions = repeated(occasions)
-            self._attached: tuple[Attached, ...] = attach(
+            attached = attach(
                 Host(
                     config,
                     network,
                     num_worlds,
                     self._shards,
-                    self._division,
+                    division,
                     self._shard.travel,
-                    self.outputs,
+                    commons.outputs,
                     zeros,
                     self.frames,
                 )
             )
-            self._coordination: Coordination | None = None
+            gate = make_gate(num_worlds, traffic.capacity, network.arrays, blank.dtype)
+            self._tick: Tick = Tick(self._shards, division, traffic, commons, gate, attached)
             self._recovery: Recovery | None = None
             self._keeper: Keeper | None = None
             self._recutter: Recutter | None = None
-            self._sumo: SumoTraffic | None = None
-            self._note_phase: Callable[[str], None] = _pass_over
             if is_first or warm:
                 self._call_every_kernel()
             if sumo is not None:
                 travel = traffic.travel
-                self._sumo = SumoTraffic(
-                    sumo, network, travel, travel.num_fixed, self._division.zoned, blank
+                self._tick.sumo = SumoTraffic(
+                    sumo, network, travel, travel.num_fixed, division.zoned, blank
                 )
             zones = config.zones
             watched = zones.journal or zones.check or zones.faults or zones.reproducers
             if self.partition.count > 1 or watched:
                 self._let_coordinate(runs)
-            if zones.recut_steps and self.partition.count > 1 and self._coordination is not None:
+            coordination = self._tick.coordination
+            if zones.recut_steps and self.partition.count > 1 and coordination is not None:
                 self._recutter = Recutter(
                     network,
-                    self._division,
-                    self._coordination,
+                    division,
+                    coordination,
                     zones.recut_steps,
                     zones.recut_tolerance,
                 )
 
     def _let_coordinate(self, runs: Sequence[Run] | None) -> None:
         """Let coordinators say who owns what; nobody asks where all is one zone."""
+        tick = self._tick
         refereeing = make_refereeing(
             self.config.zones,
             self._shards,
-            self._division,
+            tick.division,
             self._shared_arrays,
-            longest_move_m(self.network, self._traffic.travel, self.config.clock.sim_dt_s),
+            longest_move_m(self.network, tick.traffic.travel, self.config.clock.sim_dt_s),
             runs=runs,
         )
-        self._coordination = refereeing.coordination
+        tick.coordination = refereeing.coordination
         self._recovery = refereeing.recovery
+        tick.hosts_may_die = refereeing.recovery is not None
         self.transfers = refereeing.transfers
         if refereeing.phases is not None:
-            self._executor = refereeing.phases
+            tick.executor = refereeing.phases
         if refereeing.store is not None:
             sources = sources_of(self.network, self.demand, self.partition)
             (coordinator,) = self.coordinators
@@ -220,34 +211,36 @@ class Simulation:
 
     def _shared_arrays(self) -> Iterator[NDArray[Any]]:
         """What a tick changes beside the shards' own and what they have in common."""
-        gate = self._gate
+        tick = self._tick
+        gate = tick.gate
         for name in KEPT_BY_GATE:
             yield getattr(gate, name)
         yield from self.outputs
-        if self._traffic.rerouting is not None:
-            yield from self._traffic.rerouting.arrays()
-        for part in self._attached:
+        if tick.traffic.rerouting is not None:
+            yield from tick.traffic.rerouting.arrays()
+        for part in tick.attached:
             yield from part.arrays()
 
     def _call_every_kernel(self) -> None:
         """Run one step of a world that the first reset forgets."""
+        tick = self._tick
         shape = self.outputs.present.shape
         controls = np.zeros((*shape, 2))
         self._populate(self.everywhere)
         self.suggest(controls)
         self.step(Commands(controls, np.full(shape, ACTION_IDLE, dtype=np.int64)))
         # Once more what is only called when somebody leaves or waits.
-        self._let_in(all_phases=True)
-        self._executor.each("retire", self._gate)
-        self._executor.each("forget", self._gate)
-        self._executor.each("gather", *self._division.gathering)
-        self._division.rehearse_gathering()
-        self._traffic.settle(self._gate, self._shard.worlds)
-        self._division.near(0, everybody=True)
+        tick.let_in(all_phases=True)
+        tick.executor.each("retire", tick.gate)
+        tick.executor.each("forget", tick.gate)
+        tick.executor.each("gather", *tick.division.gathering)
+        tick.division.rehearse_gathering()
+        tick.traffic.settle(tick.gate, self._shard.worlds)
+        tick.division.near(0, everybody=True)
         with suppress(ZoneError):
-            self._division.hand_over(0, Switch(-1, 0, 0, 0, False), None)
-        book = BorderBook(self._division, 0)
-        book.release(book.hand_over(True, sum(self._division.counts(0)), ()))
+            tick.division.hand_over(0, Switch(-1, 0, 0, 0, False), None)
+        book = BorderBook(tick.division, 0)
+        book.release(book.hand_over(True, sum(tick.division.counts(0)), ()))
         book.reset(0)
         self._episodes[:] = 0
 
@@ -264,7 +257,7 @@ class Simulation:
     @property
     def outputs(self) -> Outputs:
         """What the agents got at the end of the last step; arrays that the next step overwrites."""
-        return self._commons.outputs
+        return self._tick.commons.outputs
 
     @property
     def messages(self) -> Bus:
@@ -273,7 +266,7 @@ class Simulation:
         Raises:
             V2xError: they tell each other nothing.
         """
-        for part in self._attached:
+        for part in self._tick.attached:
             if isinstance(part, Messaging):
                 return part.bus
         raise V2xError("nobody says anything here: set v2x.enabled to true")
@@ -281,7 +274,7 @@ class Simulation:
     @property
     def gate(self) -> Gate:
         """Who waits to enter each world, and counts since its reset; a reset may replace it."""
-        return self._gate
+        return self._tick.gate
 
     def listen(self, config: EnvConfig) -> tuple[Bus, Callable[[], None]]:
         """A bus beside the world, for tools that measure: nobody in the world hears of it.
@@ -294,14 +287,14 @@ class Simulation:
         """
         worlds = self._shard.worlds
         common = Common(*(getattr(worlds, name) for name in Common._fields))
-        types, zoned = self._shard.travel.types, self._division.zoned
+        types, zoned = self._shard.travel.types, self._tick.division.zoned
         bus = Bus(config, self.network, types, zoned, common)
-        return bus, lambda: bus.exchange(self._division.side)
+        return bus, lambda: bus.exchange(self._tick.division.side)
 
     @property
     def goal_edges(self) -> NDArray[np.int32]:
         """EDGE rows of the goals, by `VEHICLE["goal"]`."""
-        return self._traffic.goal_edges
+        return self._tick.traffic.goal_edges
 
     @property
     def types(self) -> NDArray[np.void]:
@@ -311,40 +304,40 @@ class Simulation:
     @property
     def scene(self) -> Scene | None:
         """What is played to the agent of each world."""
-        return self._traffic.scene
+        return self._tick.traffic.scene
 
     @property
     def plans(self) -> NDArray[np.void]:
         """PLAN (G, L): the ways of agents, by `VEHICLE["goal"]`."""
-        return self._traffic.plans
+        return self._tick.traffic.plans
 
     def vehicles(self, world: int = 0) -> NDArray[np.void]:
         """The live vehicles of one world, VEHICLE records in no order.
 
         A view, or, where the world is divided, a copy.
         """
-        return self._division.vehicles(world)
+        return self._tick.division.vehicles(world)
 
     def zone_loads(self) -> ZoneLoads:
         """What each zone holds now."""
-        return self._division.loads()
+        return self._tick.division.loads()
 
     def zone_view(self, world: int = 0) -> ZoneView:
         """Who owns and sees which vehicles of one world now."""
-        halo_m, coordination = self.zone_loads().halo_m, self._coordination
+        halo_m, coordination = self.zone_loads().halo_m, self._tick.coordination
         transfers = () if coordination is None else coordination.in_flight(world)
         return view_zones(self._shards, self.partition, halo_m, world, transfers)
 
     def running(self) -> NDArray[np.int64]:
         """(W,) vehicles of each world."""
-        return self._division.running()
+        return self._tick.division.running()
 
     def ghosts(self, zone: int, world: int = 0) -> NDArray[np.void]:
         """What a zone sees of other zones' vehicles: VEHICLE (n,), a view that cannot be written.
 
         It shows the present tick, until the next one.
         """
-        return self._division.ghosts(world, zone)
+        return self._tick.division.ghosts(world, zone)
 
     @property
     def migrations(self) -> int:
@@ -354,12 +347,12 @@ class Simulation:
     @property
     def coordinators(self) -> tuple[Referee, ...]:
         """Who says who owns what, one a world; none where all is one zone."""
-        return () if self._coordination is None else self._coordination.coordinators
+        return () if self._tick.coordination is None else self._tick.coordination.coordinators
 
     @property
     def attached(self) -> tuple[Attached, ...]:
         """What acts in each tick beside the traffic."""
-        return self._attached
+        return self._tick.attached
 
     @property
     def worlds(self) -> Worlds:
@@ -367,12 +360,12 @@ class Simulation:
 
         A copy where worlds are divided.
         """
-        return self._division.whole()
+        return self._tick.division.whole()
 
     @property
     def mounted(self) -> MountedSensors | None:
         """The rigs of the agents; None: they have none."""
-        rigs = (part for part in self._attached if isinstance(part, MountedSensors))
+        rigs = (part for part in self._tick.attached if isinstance(part, MountedSensors))
         return next(rigs, None)
 
     def signal_phases(self, world: int = 0) -> NDArray[np.int32]:
@@ -420,25 +413,26 @@ class Simulation:
             )
 
     def _populate(self, chosen: NDArray[np.bool_]) -> None:
+        tick = self._tick
         worlds = self._shard.worlds
         for w in np.flatnonzero(chosen):
             number = self._first_world + int(w)
             worlds.keys[w] = world_key(self._seed, number, int(self._episodes[w]))
             worlds.ticks[w] = 0
         self._episodes[chosen] += 1
-        self._gate = self._traffic.draw_orders(self._gate, worlds, chosen)
-        self._traffic.populate(self._gate, worlds, chosen)
-        if self._sumo is not None:
-            self._sumo.reset(chosen, worlds)
-        self._division.distribute(chosen)
-        if self._coordination is not None:
-            self._coordination.reset(chosen)
-        self._switch_signals()
-        for part in self._attached:
+        tick.gate = tick.traffic.draw_orders(tick.gate, worlds, chosen)
+        tick.traffic.populate(tick.gate, worlds, chosen)
+        if tick.sumo is not None:
+            tick.sumo.reset(chosen, worlds)
+        tick.division.distribute(chosen)
+        if tick.coordination is not None:
+            tick.coordination.reset(chosen)
+        tick.switch_signals()
+        for part in tick.attached:
             part.reset(chosen)
-        self._sense(chosen)
-        if self._coordination is not None:
-            self._coordination.save()
+        tick.sense(chosen)
+        if tick.coordination is not None:
+            tick.coordination.save()
 
     def step(self, commands: Commands) -> None:
         """One agent step: its ticks, then what the agents sense.
@@ -447,7 +441,7 @@ class Simulation:
             LostTickError: as of `run_tick`.
             SumoError: SUMO cannot go on; the worlds are as they were before the step.
         """
-        if self._sumo is None:
+        if self._tick.sumo is None:
             self._run_ticks(commands)
             return
         before = [array.copy() for array in self.save()]
@@ -465,7 +459,7 @@ class Simulation:
             partition = self._recutter.after_step(self.partition)
             if partition is not None:
                 self.partition = partition
-                self._executor = SerialExecutor(self._shards)
+                self._tick.executor = SerialExecutor(self._shards)
 
     @property
     def recuts(self) -> Sequence[Recut]:
@@ -484,10 +478,10 @@ class Simulation:
             LostTickError: every host of a zone, or every coordinator, died of it.
         """
         if self._recovery is None:
-            self._tick(commands, is_first, is_last)
+            self._tick.run(commands, is_first, is_last)
             return
         try:
-            self._recovery.run(partial(self._tick, commands, is_first, is_last))
+            self._recovery.run(partial(self._tick.run, commands, is_first, is_last))
         except LostTickError as error:
             if self._keeper is not None:
                 episode = int(self._episodes[0])
@@ -503,40 +497,29 @@ class Simulation:
         Raises:
             ReproducerError: it is of other worlds.
         """
-        if self._sumo is not None:
+        if self._tick.sumo is not None:
             raise ReproducerError("a world with SUMO beside it cannot be taken up in its middle")
         self._keeper = None
         self.seed(kept.seed, kept.first_world)
         self._episodes[:] = kept.episode - 1
         self.reset()
-        self._division.align()
+        self._tick.division.align()
         notes = CommittedStore(self._shards, self._shared_arrays).adopt(kept.image)
-        if self._coordination is not None:
-            self._coordination.take_up(kept.records, notes)
-            self._coordination.save()
+        if self._tick.coordination is not None:
+            self._tick.coordination.take_up(kept.records, notes)
+            self._tick.coordination.save()
 
     def instrument(self, wrap: Callable[[Any], Any]) -> None:
         """Put `wrap(part)` in the place of each part that phases are calls of, to time them."""
         self._refuse_recutting("measuring the phases of a tick")
-        self._executor = wrap(self._executor)
-        self._division = wrap(self._division)
-        self._traffic = wrap(self._traffic)
-        self._commons = wrap(self._commons)
-        if self._coordination is not None:
-            self._coordination = wrap(self._coordination)
-        if self._sumo is not None:
-            self._sumo = wrap(self._sumo)
+        self._tick.instrument(wrap)
 
     def trace(self, wrap: Callable[[Any], Any], note: Callable[[str], None]) -> None:
         """Let `wrap(executor)` note the phases of a tick, and attached parts name theirs to `note`.
 
         A part that has phases of its own (another simulator's step, say) has a method `trace`.
         """
-        self._executor = wrap(self._executor)
-        self._note_phase = note
-        for part in self._attached:
-            if isinstance(part, Traced):
-                part.trace(note)
+        self._tick.trace(wrap, note)
 
     def host(
         self,
@@ -553,9 +536,7 @@ class Simulation:
             ConfigError: zones become others, and nobody would tell him.
         """
         self._refuse_recutting("the zones of one world over workers")
-        team = make(self._shards, self._division.gathering)
-        self._executor, self._meet = team, team.meet
-        self._gathers = gathers and self._division.let_gather(team)
+        self._tick.host(make, gathers)
 
     def time_shards(self, every: int = 1) -> ShardClock:
         """From now on run phases zone by zone, with a clock on each.
@@ -570,158 +551,28 @@ class Simulation:
             raise ConfigError("zones.faults: shards are timed where no host dies; leave it out")
         self._refuse_recutting("measuring what each zone costs")
         clock = ShardClock(self._shards, every)
-        self._executor = clock
+        self._tick.executor = clock
         return clock
 
     def _refuse_recutting(self, what: str) -> None:
         if self._recutter is not None:
             raise ConfigError(f"zones.recut_steps: {what} needs zones that stay; leave one out")
 
-    def _tick(self, commands: Commands, is_first: bool, is_last: bool) -> None:
-        """Begin → attached → begin the step → advance … signals → attached → sense → end."""
-        if self._coordination is not None:
-            self._coordination.begin(commands)
-        for part in self._attached:
-            part.begin(commands)
-        if is_first:
-            self._executor.each("begin_step", commands)
-        self._advance(commands)
-        if self._attached:
-            self._meet()
-        for part in self._attached:
-            part.end()
-        if is_last:
-            self._sense(self.everywhere)
-        self._meet()
-        if self._coordination is not None:
-            self._coordination.end()
-
-    def _advance(self, commands: Commands) -> None:
-        """Advance → leave → exchange → resolve → enter → commit → signals."""
-        self._executor.each("advance", commands)
-        if self._sumo is not None:
-            self._follow_sumo(self._sumo)
-        self._leave()
-        self._division.exchange()
-        self._executor.each("resolve")
-        if self._gathers:
-            self._division.note_gathered()  # others may still be about their contacts
-        self._enter()
-        self._executor.each("commit")
-        self._count_tick(self._shard.worlds.ticks)
-        self._switch_signals()
-
-    def _follow_sumo(self, sumo: SumoTraffic) -> None:
-        """SUMO takes its step; who is its own stands where it is then, or leaves."""
-        gate, worlds, side = self._gate, self._shard.worlds, self._division.next_side
-        self._note_phase(SUMO)
-        sumo.step(worlds, side)
-        if not sumo.drives:
-            sumo.send_on(gate, worlds, side)
-            return
-        self._note_phase(MIRROR)
-        if sumo.mirror(worlds, side):
-            for shard in self._shards:
-                shard.dismiss(gate)
-            self._note_left()
-            sumo.forgive(gate)
-            self._traffic.settle(gate, worlds)
-
     @property
     def sumo(self) -> SumoTraffic | None:
         """SUMO beside these worlds; None where `traffic.source` is native."""
-        return self._sumo
-
-    def _switch_signals(self) -> None:
-        """Detect → switch."""
-        if self._sumo is not None:
-            self._sumo.show(self._shard.worlds)
-            return
-        self._executor.each("detect")
-        self._commons.switch_signals(self._shard.worlds)
-
-    def _sense(self, chosen: NDArray[np.bool_]) -> None:
-        """Clear → sense → settle → credit."""
-        if self.config.population.agents == 0:
-            return
-        self._commons.clear_outputs(chosen)
-        self._executor.each("sense", chosen)
-        self._commons.settle_outputs(chosen)
-        self._executor.each("credit", chosen)
-
-    def _leave(self) -> None:
-        """Who needs it picks another goal, who has arrived leaves, who looks for a way finds it."""
-        traffic, gate, worlds = self._traffic, self._gate, self._shard.worlds
-        begins_second, some_arrived = self._occasions(
-            worlds.ticks, traffic.ticks_per_s, self._shard.zoned.num_through
-        )
-        if begins_second:
-            self._executor.each("choose_goals", traffic.demand, len(traffic.plans), gate)
-        if some_arrived or self._recovery is not None:  # hosts may die in this phase
-            self._executor.each("leave", gate)
-            if any(gate.num_passing.tolist()):
-                self._note_left()
-                traffic.settle(gate, worlds)
-        if begins_second and traffic.rerouting is not None:
-            with self._division.everybody_next() as everybody:
-                traffic.rerouting.act(gate, everybody)
-
-    def _note_left(self) -> None:
-        if self._coordination is not None:
-            self._coordination.left(self._gate)
-
-    def _enter(self) -> None:
-        """Those who wait and find a gap enter `next_rows`."""
-        traffic, gate, worlds = self._traffic, self._gate, self._shard.worlds
-        if self._sumo is not None:
-            self._meet()
-            if not self._sumo.drives:
-                self._sumo.order(gate, worlds)
-            elif self._sumo.let_in(gate, worlds):
-                self._admit()
-        traffic.call_orders(gate, worlds)
-        if any(gate.num_queue.tolist()):
-            self._let_in(all_phases=self._recovery is not None)
-
-    def _let_in(self, all_phases: bool) -> None:
-        """Rank → assign → propose, and if anybody has found a gap, accept → admit.
-
-        Args:
-            all_phases: go through the last two in any case: hosts may die in each of them.
-        """
-        traffic, gate, worlds = self._traffic, self._gate, self._shard.worlds
-        self._executor.each("rank_lanes", gate)
-        traffic.assign_lanes(gate, worlds)
-        self._executor.each("propose", traffic.demand, gate)
-        if not (all_phases or any(gate.num_passing.tolist())):
-            return
-        traffic.accept(gate, self._division.running())
-        self._admit()
-
-    def _admit(self) -> None:
-        """Those who have been let in become rows of the zones that they are in."""
-        self._executor.each("admit", self._gate)
-        if self._coordination is not None:
-            self._coordination.entered(self._gate)
-        self._gate.num_passing[:] = 0
+        return self._tick.sumo
 
     def close(self) -> None:
         """End the processes that the worlds have."""
-        if self._sumo is not None:
-            self._sumo.close()
+        if self._tick.sumo is not None:
+            self._tick.sumo.close()
 
     def retire_agents(self) -> None:
         """Take out the agents whose trip ended in the last step; to be called after it is read."""
         if not self.outputs.terminated.any():
             return
-        gate = self._gate
-        self._executor.each("retire", gate)
-        if any(gate.num_passing.tolist()):
-            self._note_left()
-            self._executor.each("forget", gate)
-            self._traffic.settle(gate, self._shard.worlds)
-            if self._coordination is not None:
-                self._coordination.save()
+        self._tick.retire_agents()
 
     def save(self) -> list[NDArray[Any]]:
         """All that the next step depends on, between two steps; views, to be copied."""
@@ -736,14 +587,14 @@ class Simulation:
                 `SumoTraffic.keep_logs`.
         """
         self._put_back(saved)
-        if self._sumo is not None:
-            self._sumo.catch_up(self._shard.worlds)
+        if self._tick.sumo is not None:
+            self._tick.sumo.catch_up(self._shard.worlds)
 
     def _put_back(self, saved: Sequence[NDArray[Any]]) -> None:
         roots, episodes, *rest = saved
         self.seed(*roots.tolist())
         self._episodes[:] = episodes
-        self._gate = snapshot.load(self._parts(), rest)
+        self._tick.gate = snapshot.load(self._parts(), rest)
 
     def share_of(self, world: int) -> list[NDArray[Any]]:
         """What `save` would give if there were no world but one; views, to be copied."""
@@ -763,30 +614,32 @@ class Simulation:
         ]  # fmt: skip
 
     def _parts(self) -> snapshot.Parts:
+        tick = self._tick
         return snapshot.Parts(
             self._shard.worlds,
-            self._division,
-            self._gate,
-            self._traffic,
+            tick.division,
+            tick.gate,
+            tick.traffic,
             self.outputs,
-            self._coordination,
+            tick.coordination,
             self.config.sensors.stack > 1,
-            self._attached,
-            self._sumo,
+            tick.attached,
+            tick.sumo,
         )
 
     def agents_to_come(self) -> NDArray[np.bool_]:
         """(W,) whether an agent waits to enter."""
-        longest = int(self._gate.num_queue.max(initial=0))
+        tick = self._tick
+        longest = int(tick.gate.num_queue.max(initial=0))
         if longest == 0:
             return np.zeros(self.num_worlds, dtype=np.bool_)
-        waiting = np.arange(longest) < self._gate.num_queue[:, None]
-        found = np.any(waiting & (self._gate.queue["agent"][:, :longest] >= 0), axis=1)
+        waiting = np.arange(longest) < tick.gate.num_queue[:, None]
+        found = np.any(waiting & (tick.gate.queue["agent"][:, :longest] >= 0), axis=1)
         return np.asarray(found, dtype=np.bool_)
 
     def suggest(self, out: NDArray[np.float64]) -> None:
         """Write what the built-in driver would do in the agents' place into `out` (W, A, 2)."""
-        self._executor.each("suggest", out)
+        self._tick.executor.each("suggest", out)
 
     def state_hash(self, world: int = 0) -> str:
         """Hex digest of a world's state.
@@ -799,20 +652,12 @@ class Simulation:
 
     def traffic_stats(self, world: int = 0) -> TrafficStats:
         """Counts and means since the world's reset."""
-        return count_traffic(self._gate, self._division, world)
+        return count_traffic(self._tick.gate, self._tick.division, world)
 
 
 def _frames(config: EnvConfig, num_worlds: int, zeros: Zeros) -> Frames:
     layout = frame_layout(config, num_worlds)
     return frames_in({name: zeros(shape, dtype=kind) for name, (kind, shape) in layout.items()})
-
-
-def _there() -> None:
-    """Nobody is waited for where one process runs all phases."""
-
-
-def _pass_over(phase: str) -> None:
-    """What is done with the names of phases where nobody asks for them."""
 
 
 def _cut(config: EnvConfig, network: RoadNetwork) -> ZonePartition:

@@ -27,7 +27,7 @@ def world(request: pytest.FixtureRequest) -> Simulation:
 
 def listed(simulation: Simulation, rows: NDArray[np.void]) -> Scratch:
     room = scratch(simulation.network, len(rows))
-    travel = simulation._traffic.travel
+    travel = simulation._tick.traffic.travel
     step, step_at = np.zeros(len(rows), PLAN), np.zeros(len(rows), np.int64)
     register_links(simulation.network.arrays, travel, rows, len(rows), step, step_at, room)
     return room
@@ -41,7 +41,7 @@ def entries(room: Scratch, link: int) -> list[tuple[int, float, float, float]]:
 
 
 def test_every_link_lists_who_is_on_it_and_who_comes(world: Simulation) -> None:
-    travel, roads = world._traffic.travel, world.network
+    travel, roads = world._tick.traffic.travel, world.network
     for step in range(12):
         for _ in range(step):
             drive(world)

@@ -62,7 +62,7 @@ class Scene:
         self.simulation: Simulation = make_traffic(
             path, background=12, renewed=False, overrides={"clock.ctrl_dt_s": 0.05}
         )
-        traffic = self.simulation._traffic
+        traffic = self.simulation._tick.traffic
         vars(traffic)["demand"] = traffic.demand._replace(num_background=0)
         start(self.simulation, seed=0)
         self.names: list[str] = []
@@ -73,12 +73,12 @@ class Scene:
         row = network.lane_ids.index(lane)
         s = float(network.lanes[row]["length_m"]) - to_line_m - 2.5
         goals = [network.edge_ids[edge] for edge in self.simulation.goal_edges]
-        travel = self.simulation._traffic.travel
+        travel = self.simulation._tick.traffic.travel
         car = on_lane(network, row, s, travel, goal=goals.index(goal), **fields)
-        plan = self.simulation._traffic.plans[car[0]["goal"], row]
+        plan = self.simulation._tick.traffic.plans[car[0]["goal"], row]
         car["to_go"] = plan["to_go"] - s
-        car["id"] = self.simulation._gate.next_id[0]
-        self.simulation._gate.next_id[0] += 1
+        car["id"] = self.simulation.gate.next_id[0]
+        self.simulation.gate.next_id[0] += 1
         worlds.rows[0, worlds.num_owned[0]] = car[0]
         worlds.num_owned[0] += 1
         worlds.num_rows[0] += 1
@@ -87,7 +87,7 @@ class Scene:
     def clear(self) -> None:
         """Take all cars out."""
         worlds = self.simulation._shard.worlds
-        worlds.num_owned[0] = worlds.num_rows[0] = self.simulation._gate.next_id[0] = 0
+        worlds.num_owned[0] = worlds.num_rows[0] = self.simulation.gate.next_id[0] = 0
         self.names.clear()
 
     def __getitem__(self, name: str) -> Any:
@@ -251,7 +251,7 @@ def test_at_red_one_stops_before_the_line_and_goes_at_green(scene: Make) -> None
     for arm, goal in (("W", "E_out"), ("S", "N_out")):
         here.put(arm, f"{arm}_in_0", 60.0, goal, speed=13.0)
     links = {
-        arm: int(here.simulation._traffic.plans[here[arm]["goal"], here[arm]["lane"]]["link"])
+        arm: int(here.simulation._tick.traffic.plans[here[arm]["goal"], here[arm]["lane"]]["link"])
         for arm in ("W", "S")
     }
     stood = set()
@@ -278,7 +278,9 @@ def test_at_yellow_one_goes_on_only_if_stopping_would_be_hard(
     here = scene("traffic_light")
     network = here.simulation.network
     here.put("probe", "W_in_0", 140.0, "E_out")
-    link = int(here.simulation._traffic.plans[here["probe"]["goal"], here["probe"]["lane"]]["link"])
+    link = int(
+        here.simulation._tick.traffic.plans[here["probe"]["goal"], here["probe"]["lane"]]["link"]
+    )
     # On to the first tick of yellow, then put the car where it is to decide.
     here.clear()
     for _ in here.run(200.0):
@@ -321,7 +323,7 @@ def test_a_left_turn_waits_inside_for_who_comes_and_goes_when_they_are_through(s
     here = scene("traffic_light")
     network = here.simulation.network
     here.put("probe", "W_in_0", 140.0, "N_out")
-    step = here.simulation._traffic.plans[here["probe"]["goal"], here["probe"]["lane"]]
+    step = here.simulation._tick.traffic.plans[here["probe"]["goal"], here["probe"]["lane"]]
     link = int(step["link"])
     wait_m = float(network.links[link]["wait_m"])
     assert np.isfinite(wait_m), "this turn has a waiting position"

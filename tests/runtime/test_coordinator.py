@@ -50,7 +50,7 @@ def test_at05_the_journal_of_a_run_with_deaths_names_the_owners(
     assert told.owners == table.owners
     assert told.hosts == table.hosts
     assert told.tick == table.tick == 2 * STEPS
-    rows = dict(vec.simulation._division.owners(0))
+    rows = dict(vec.simulation._tick.division.owners(0))
     gone = {entry.vehicle for entry in vec.simulation.coordinators[0].notes()[1]}
     owners = {v: zone for v, (zone, _) in table.owners.items() if v not in gone}
     assert owners.items() <= rows.items()
@@ -162,7 +162,7 @@ def test_a_world_of_few_vehicles_has_room_for_all_changes_that_wait() -> None:
     whole, divided = (
         make_vec("ring", zones=zones, agents=2, background=3, max_cycles=1000) for zones in (1, 4)
     )
-    book, most = divided.simulation._division.book, 0
+    book, most = divided.simulation._tick.division.book, 0
     for vec in (whole, divided):
         vec.reset(seed=1)
     for _ in range(500):
@@ -195,7 +195,7 @@ def test_the_table_is_brought_up_to_date_when_somebody_asks_or_it_is_late(
     born = dict(entry[:2] for entry in coordinator.notes()[0])
     gone = {entry.vehicle for entry in coordinator.notes()[1]}
     on_record = {v: zone for v, zone in (owners | born).items() if v not in gone}
-    assert on_record == dict(simulation._division.owners(0))
+    assert on_record == dict(simulation._tick.division.owners(0))
 
 
 def test_a_change_from_somebody_who_is_not_the_owner_on_record_is_noticed() -> None:
@@ -294,7 +294,7 @@ def test_all_rows_are_looked_at_where_the_list_of_those_near_a_border_is_stale(
     settings = {"zones.count": 4, "zones.faults": plan, "clock.ctrl_dt_s": 0.05}
     simulation = make_simulation("grid4x4", mode="seats", agents=4, overrides=settings)
     start(simulation, seed=1)
-    division, looked = simulation._division, []
+    division, looked = simulation._tick.division, []
     near = division.near
 
     def look(w: int, everybody: bool) -> list[Near]:

@@ -91,7 +91,7 @@ def test_a_reset_with_the_seed_repeats_the_episode_and_without_it_goes_on(make: 
 def test_nobody_is_lost(make: Make) -> None:
     simulation = make()
     start(simulation, seed=3)
-    gate = simulation._gate
+    gate = simulation.gate
     due = gate.orders[0, : gate.num_orders[0]]["due"]
     assert (np.diff(due) >= 0).all()
     most_waiting = 0
@@ -139,7 +139,7 @@ def test_two_processes_agree(tmp_path: Path) -> None:
 def test_the_hash_covers_who_waits_and_how_many_orders_were_called(tmp_path: Path) -> None:
     simulation = tiny("merge", tmp_path)
     start(simulation, seed=1)
-    gate = simulation._gate
+    gate = simulation.gate
     while not gate.num_queue[0]:
         drive(simulation)
     before = simulation.state_hash()

@@ -86,7 +86,7 @@ def test_a_vehicle_that_a_zone_has_not_seen_come_is_an_error() -> None:
     here, there = (int(owned(simulation, 0)[zone]["id"][0]) for zone in (0, 3))
     for shard in simulation._shards:
         shard.worlds.num_rows[:] = shard.worlds.num_owned
-    division = simulation._division
+    division = simulation._tick.division
     with pytest.raises(ZoneError, match=f"vehicle {here} entered zone 3, which has not seen"):
         division.hand_over(0, Switch(here, 0, 3, 1, False), division.state(0, 0, 0))
     with pytest.raises(ZoneError, match=f"zone 0 does not own vehicle {there}"):
@@ -138,7 +138,7 @@ def test_all_shards_together_are_the_world() -> None:
         rows = [w.rows[world, : w.num_owned[world]] for w in (first, second)]
         one, other = (part[np.argsort(part["id"])] for part in rows)
         assert (one[list(STATE_FIELDS)] == other[list(STATE_FIELDS)]).all()
-        assert len(one) == parts._division.running()[world]
+        assert len(one) == parts._tick.division.running()[world]
     assert set(PLACEMENT_FIELDS).isdisjoint(STATE_FIELDS)
 
 
@@ -148,7 +148,7 @@ def test_what_is_changed_in_all_next_rows_goes_back_to_their_shards() -> None:
     for shard in simulation._shards:
         np.copyto(shard.worlds.next_rows, shard.worlds.rows)
     before = [[part.copy() for part in owned(simulation, world)] for world in range(2)]
-    with simulation._division.everybody_next() as everybody:
+    with simulation._tick.division.everybody_next() as everybody:
         for world in range(2):
             num = everybody.num_owned[world]
             assert num == len(simulation.vehicles(world))

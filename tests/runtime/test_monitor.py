@@ -80,7 +80,7 @@ class Meddling:
 
     def __init__(self, simulation: Simulation, monkeypatch: pytest.MonkeyPatch) -> None:
         self.simulation, self._patch = simulation, monkeypatch
-        self.division: Division = simulation._division
+        self.division: Division = simulation._tick.division
 
     def zone(self, zone: int) -> tuple[Any, int, int]:
         """Rows, owned ones and all of a zone."""
@@ -88,7 +88,7 @@ class Meddling:
         return worlds.rows[0], int(worlds.num_owned[0]), int(worlds.num_rows[0])
 
     def caught(self, meddle: Any, words: str) -> None:
-        coordination: Any = self.simulation._coordination
+        coordination: Any = self.simulation._tick.coordination
         look = coordination.check
 
         def check() -> None:
@@ -248,7 +248,7 @@ def test_a_ghost_of_nobody(narrow: Meddling) -> None:
 
 def test_an_arrival_that_nobody_has_told_of(monkeypatch: pytest.MonkeyPatch) -> None:
     simulation = watched(**{"zones.faults": "{}"})
-    coordination: Any = simulation._coordination
+    coordination: Any = simulation._tick.coordination
     coordinator = coordination.coordinators[0]
     coordinator._births.append(Birth(8_888, 0, b""))
     monkeypatch.setattr(coordinator, "notes", lambda: ((Birth(8_888, 0, b""),), ()))
@@ -262,7 +262,7 @@ def test_an_arrival_that_nobody_has_told_of(monkeypatch: pytest.MonkeyPatch) -> 
 )
 def test_a_step_of_a_transfer_that_is_left_out(kind: type[Message], words: str) -> None:
     simulation = watched(**{"zones.faults": "{}"})
-    coordination: Any = simulation._coordination
+    coordination: Any = simulation._tick.coordination
     coordinator = coordination.coordinators[0]
     (record,) = coordinator._watchers[1:]
     heard = record.delivered
@@ -284,7 +284,7 @@ def test_a_step_of_a_transfer_that_is_left_out(kind: type[Message], words: str) 
 @pytest.mark.parametrize("faults", ["", "{}"], ids=["directly", "by messages"])
 def test_the_monitor_takes_as_much_memory_as_it_began_with(faults: str) -> None:
     simulation = watched(**{"zones.faults": faults})
-    coordination: Any = simulation._coordination
+    coordination: Any = simulation._tick.coordination
     monitor = coordination._monitor
     kept = monitor._kept
     for _ in range(100):

@@ -83,7 +83,7 @@ def test_a_control_counts_where_the_vehicle_is_owned_and_nowhere_else(
 ) -> None:
     plain, watched = divided(kind), divided(kind)
     strict = Strict(watched, strangers)
-    watched._executor = strict
+    watched._tick.executor = strict
     for _ in range(STEPS):
         for simulation in (plain, watched):
             drive(simulation)
@@ -97,7 +97,7 @@ def test_a_control_counts_where_the_vehicle_is_owned_and_nowhere_else(
 
 def test_a_control_that_its_owner_does_not_get_is_missed() -> None:
     plain, watched = divided("continuous"), divided("continuous")
-    watched._executor = Strict(watched, 0.0)
+    watched._tick.executor = Strict(watched, 0.0)
     shard = watched._shards[0]
     agent = int(agents_of(shard)[0])
     for simulation in (plain, watched):

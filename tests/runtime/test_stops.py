@@ -128,7 +128,7 @@ def test_who_cannot_change_lanes_for_long_goes_on_another_way(world: World) -> N
         '<trip id="v" type="c" depart="0" from="A1B1" to="D3right3"/>',
         "grid4x4",
     )
-    network, travel = simulation.network, simulation._traffic.travel
+    network, travel = simulation.network, simulation._tick.traffic.travel
     # Drivers ask themselves once a second.
     while not len(simulation.vehicles()) or simulation.ticks()[0] % round(1.0 / DT):
         drive(simulation)
@@ -143,7 +143,7 @@ def test_who_cannot_change_lanes_for_long_goes_on_another_way(world: World) -> N
         row["wait_s"] = waited
         worlds = simulation._shard.worlds
         worlds.next_rows[0, 0] = row
-        simulation._leave()
+        simulation._tick.leave()
         assert simulation.traffic_stats().rerouted == times
         worlds.rows[0, 0] = worlds.next_rows[0, 0]
     row = simulation.vehicles()[0]

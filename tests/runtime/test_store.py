@@ -98,7 +98,7 @@ def test_what_was_written_is_not_the_truth_until_it_is_flipped(busy: Recorded) -
     store.flip()
     for shard in simulation._shards:
         shard.worlds.rows["speed"] += 1.0
-    simulation._gate.next_id[:] += 1
+    simulation.gate.next_id[:] += 1
     store.write((((), ()),))
     assert simulation.state_hash() != before
     assert np.all(store.written(0, 0)["speed"] >= 1.0)

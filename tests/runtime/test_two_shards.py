@@ -47,7 +47,7 @@ class Halves:
 
     def __init__(self, whole: Simulation) -> None:
         self.commons = Commons(whole.config, whole.network, whole.num_worlds)
-        traffic = whole._traffic
+        traffic = whole._tick.traffic
         shards = []
         partition = cut_map(whole.network, "strips", 2)
         halo = zone_halo(partition, EVERYWHERE_M)

@@ -41,7 +41,7 @@ def divided(**overrides: Any) -> Simulation:
 
 def all_rows(simulation: Simulation) -> bytes:
     """Every row of every zone as it lies, and the counts."""
-    zoned = simulation._division.zoned
+    zoned = simulation._tick.division.zoned
     numbers = (zoned.num_owned, zoned.num_rows, zoned.num_near, zoned.num_contacts)
     rows = [
         shard.worlds.rows[w, :num].tobytes()
@@ -61,7 +61,7 @@ def all_rows(simulation: Simulation) -> bytes:
 )
 def test_all_together_do_what_parts_of_them_do(part: Parting) -> None:
     together, apart = divided(), divided()
-    apart._executor = Groups(part(apart._shards))
+    apart._tick.executor = Groups(part(apart._shards))
     for step in range(STEPS):
         drive(together)
         drive(apart)
@@ -90,9 +90,9 @@ def test_a_shard_is_stepped_alone() -> None:
 
 def test_who_may_be_seen_elsewhere_is_noted_while_it_is_moved() -> None:
     simulation = divided()
-    division = simulation._division
+    division = simulation._tick.division
     for _ in range(STEPS):
-        simulation._executor.each("advance", idle(simulation))
+        simulation._tick.executor.each("advance", idle(simulation))
         for shard in simulation._shards:
             left, low, right, high = division.halo.inner[shard.zone]
             worlds = shard.worlds
@@ -104,7 +104,7 @@ def test_who_may_be_seen_elsewhere_is_noted_while_it_is_moved() -> None:
                 np.testing.assert_array_equal(noted["row"], np.flatnonzero(~inside))
                 for name in ("x", "y", "s", "speed", "lane"):
                     np.testing.assert_array_equal(noted[name], rows[name][noted["row"]])
-        simulation._division.exchange()
+        simulation._tick.division.exchange()
         assert (division.zoned.num_outer == -1).all()
-        simulation._executor.each("commit")
+        simulation._tick.executor.each("commit")
         simulation._shard.worlds.ticks[:] += 1

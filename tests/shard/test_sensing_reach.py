@@ -116,7 +116,7 @@ def sensed(simulation: Simulation, rows: NDArray[np.void]) -> tuple[bytes, bytes
     worlds = simulation.worlds
     worlds.rows[0, : rows.size] = rows
     worlds.num_owned[0] = worlds.num_rows[0] = rows.size
-    simulation._sense(EVERYWHERE)
+    simulation._tick.sense(EVERYWHERE)
     outputs = simulation.outputs
     assert outputs.acted[0, 0]
     return outputs.observations[0, 0].tobytes(), outputs.terms[0, 0].tobytes()

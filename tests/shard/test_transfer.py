@@ -122,7 +122,7 @@ def test_who_is_carried_every_tick_goes_on_bit_for_bit(
 ) -> None:
     expected = trace(rough_world(hilly, **{"action.kind": kind}))
     carried = rough_world(hilly, **{"action.kind": kind})
-    advance, seen = carried._advance, np.zeros(0, dtype=VEHICLE)
+    advance, seen = carried._tick._advance, np.zeros(0, dtype=VEHICLE)
 
     def advance_and_carry(commands: Commands) -> None:
         nonlocal seen
@@ -130,7 +130,7 @@ def test_who_is_carried_every_tick_goes_on_bit_for_bit(
         carry_everybody(carried)
         seen = np.concatenate([seen, carried.vehicles(0)])
 
-    monkeypatch.setattr(carried, "_advance", advance_and_carry)
+    monkeypatch.setattr(carried._tick, "_advance", advance_and_carry)
     assert trace(carried) == expected
     assert len(np.unique(seen["vtype"])) >= 4  # the generator's cars, and those of the demand
     assert len(np.unique(seen["length"])) >= 3

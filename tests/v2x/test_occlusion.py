@@ -65,7 +65,7 @@ def test_lidar_does_not_meet_it_while_messages_tell_of_it() -> None:
 
     def lidar(vehicles: Any) -> Any:
         world.write(vehicles)
-        simulation._sense(simulation.everywhere)
+        simulation._tick.sense(simulation.everywhere)
         place = layout(simulation.config.sensors)["lidar"]
         return simulation.outputs.observations[0, 0, place].copy()
 
