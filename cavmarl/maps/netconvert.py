@@ -220,7 +220,7 @@ def _run(
             cure += f", or leave out what is broken: cavmarl map build {source} --tolerant"
         raise MapError(
             f"{source}: netconvert gave up (exit code {done.returncode}):\n"
-            f"{_quote(log.complaint())}\nCure: {cure}."
+            f"{_quote(log.complaint())}\nCure: {cure}"
         )
     return log
 
