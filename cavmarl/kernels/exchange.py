@@ -182,7 +182,7 @@ def _publish(
         x = outer["x"]
         y = outer["y"]
         at_border = False
-        # Agents may be anywhere beside their lanes, all others are on them.
+        # Drivers of the background are on their lanes; agents may be anywhere beside them.
         if by_lane and outer["driver"] == DRIVER_BACKGROUND:
             lane = outer["lane"]
             for k in range(halo.watcher_start[lane], halo.watcher_start[lane + 1]):
