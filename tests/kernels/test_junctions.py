@@ -439,7 +439,7 @@ def test_who_gives_way_follows_a_faster_one_into_the_same_lane_and_waits_for_a_s
     assert (slowest < 5.9) == brakes
 
 
-@pytest.mark.parametrize(("place_m", "blocked"), [(149.0, True), (151.0, False)])
+@pytest.mark.parametrize(("place_m", "blocked"), [(74.0, True), (76.0, False)])
 def test_nobody_counts_who_stands_farther_beyond_the_junction_than_is_looked(
     place_m: float, blocked: bool
 ) -> None:
@@ -452,7 +452,7 @@ def test_nobody_counts_who_stands_farther_beyond_the_junction_than_is_looked(
     )
     lane = _beyond(roads, int(roads.links[link]["next_lane"]))
     queue = [
-        on_lane(roads, lane, 4.0 + 8.0 * k, ways, id=k, speed=2.0 * STANDING_MPS) for k in range(18)
+        on_lane(roads, lane, 4.0 + 8.0 * k, ways, id=k, speed=2.0 * STANDING_MPS) for k in range(9)
     ]
     standing = on_lane(roads, lane, place_m, ways, id=98)
     before = on_lane(roads, int(roads.links[link]["from_lane"]), 5.0, ways, id=99, speed=10.0)
