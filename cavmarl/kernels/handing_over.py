@@ -217,7 +217,22 @@ def hand_over(
         place = _change(zoned, side, w, near[n], book)
         if place < 0:
             return place
+        _follow_swap(zoned, w, near[n], changed, book)
         changed += 1
+
+
+@inlined_kernel
+def _follow_swap(zoned: Zoned, w: int, near: np.void, changed: int, book: Book) -> None:
+    """Who came last into a zone fills the row of one who leaves it in the same tick.
+
+    Without this `release` would look for it among all rows.
+    """
+    last = zoned.num_owned[near["source"], w]
+    newest = book.num_changes[w] - 1
+    for n in range(newest - changed, newest):
+        change = book.changes[w, n]
+        if change["target"] == near["source"] and change["place"] == last:
+            change["place"] = near["row"]
 
 
 @inlined_kernel

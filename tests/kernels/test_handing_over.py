@@ -78,6 +78,18 @@ def test_whoever_has_crossed_changes_by_rising_ids() -> None:
     assert book.num_crossed[0] == 0
 
 
+def test_who_has_just_come_is_found_where_another_has_left() -> None:
+    coming_in = vehicles([(13.0, 5.0, 0.0)], id=np.array([10]))
+    leaving = vehicles([(7.0, 5.0, math.pi), (15.0, 5.0, 0.0)], id=np.array([20, 30]))
+    book = make_book(1, 16)
+    parts = [coming_in, leaving, coming_in[:0], coming_in[:0]]
+    zoned = exchanged(PARTITION, 60.0, parts, borders=BORDERS, book=book)
+    assert call(zoned, book) == 2
+    assert [row["id"] for row in zoned.rows[SIDE, 1, 0, :2]] == [10, 30]
+    assert changes(book)["vehicle"].tolist() == [10, 20]
+    assert changes(book)["place"].tolist() == [0, 0]
+
+
 def test_an_approach_is_remembered_until_the_change() -> None:
     zoned, book = world((9.5, 5.0, 0.0), ids=[3], speed=20.0)
     rows = zoned.rows[SIDE, 0, 0]
