@@ -1,7 +1,8 @@
 """One look at all rows of a world after a tick: what the invariants of ownership need of them.
 
-Sets are compared by sums of hashes, so nobody keeps lists, and neither the order of rows nor that
-of zones matters. What cannot be told from sums, a vehicle's own last tick, stands in a hash table.
+Sets are compared by sums of hashes, so neither the order of rows nor that of zones matters. What
+cannot be told from sums, a vehicle's own last tick, stands where its row does: nearly all stay
+there. Who has moved to another row is looked for among those who are not where they were.
 """
 
 from __future__ import annotations
@@ -14,19 +15,29 @@ from numpy.typing import NDArray
 from cavmarl.kernels import inlined_kernel, kernel
 from cavmarl.kernels.arrays import Zoned
 from cavmarl.kernels.rng import mix
-from cavmarl.kernels.zones import Halo, ZoneArrays, is_seen, squared_distance, zone_of
+from cavmarl.kernels.zones import (
+    Halo,
+    ZoneArrays,
+    is_inside,
+    is_seen,
+    squared_distance,
+    zone_of,
+)
 
 __all__ = [
     "FINDING",
     "KEPT",
-    "KIND_DOUBLED",
     "KIND_FAR",
-    "KIND_FULL",
     "KIND_NONE",
     "KIND_SUMS",
     "KIND_TICK",
+    "LOST",
     "TALLY",
     "Clock",
+    "Kept",
+    "Strays",
+    "make_kept",
+    "make_strays",
     "owner_hash",
     "watch",
 ]
@@ -36,11 +47,23 @@ KEPT = np.dtype(
         ("id", np.int64),
         ("x", np.float64),
         ("y", np.float64),
-        ("look", np.int32),  # number of the look that wrote this; others are blanks
-        ("late", np.int32),  # the world's tick less the vehicle's
+        ("late", np.int64),  # the world's tick less the vehicle's
     ],
     align=True,
 )
+
+LOST = np.dtype(
+    [
+        ("id", np.int64),
+        ("zone", np.int32),  # where the last look has seen it
+        ("row", np.int32),
+        ("state", np.int64),  # BLANK, MISSING or FOUND
+    ],
+    align=True,
+)
+BLANK = 0
+MISSING = 1
+FOUND = 2
 
 TALLY = np.dtype(
     [
@@ -52,7 +75,15 @@ TALLY = np.dtype(
     align=True,
 )
 
-FINDING = np.dtype([("kind", np.int64), ("vehicle", np.int64)], align=True)
+FINDING = np.dtype(
+    [
+        ("kind", np.int64),
+        ("vehicle", np.int64),
+        ("entered", np.int64),  # vehicles that the last look has not seen
+        ("left", np.int64),  # that this one has not seen
+    ],
+    align=True,
+)
 
 
 class Clock(NamedTuple):
@@ -60,23 +91,62 @@ class Clock(NamedTuple):
 
     Attributes:
         tick: of the world.
-        look: number of this look, one more than that of the last.
         new_late: by how much the tick of a vehicle lags that was not there before.
         limit_m: no vehicle moves further from one look to the next.
     """
 
     tick: int
-    look: int
     new_late: int
     limit_m: float
 
 
+class Kept(NamedTuple):
+    """What one look leaves for the next.
+
+    Attributes:
+        rows: KEPT (k, C) of the vehicles that each zone owns, in the order of its rows.
+        num: (k,) how many.
+    """
+
+    rows: NDArray[np.void]
+    num: NDArray[np.int64]
+
+
+class Strays(NamedTuple):
+    """Vehicles that are not where the last look has seen them; scratch of one look.
+
+    Attributes:
+        table: LOST (a power of two,), a hash table; blank between two looks.
+        places: (n,) where in it somebody stands.
+        rows: (n, 2) zone and row where somebody else stood.
+        entered: (n,) vehicles that the last look has not seen.
+        left: (n,) vehicles that this one has not seen.
+    """
+
+    table: NDArray[np.void]
+    places: NDArray[np.int64]
+    rows: NDArray[np.int64]
+    entered: NDArray[np.int64]
+    left: NDArray[np.int64]
+
+
+def make_kept(zones: int, capacity: int) -> Kept:
+    """Of a world that nobody has looked at."""
+    return Kept(np.zeros((zones, capacity), KEPT), np.zeros(zones, np.int64))
+
+
+def make_strays(zones: int, capacity: int) -> Strays:
+    """For worlds of so many zones and rows in each; what is not needed is never touched."""
+    most = zones * capacity
+    # Half empty, so that places are found at once.
+    table = np.zeros(1 << max(2 * most - 1, 1).bit_length(), LOST)
+    return Strays(table, *(np.zeros(shape, np.int64) for shape in (most, (most, 2), most, most)))
+
+
 KIND_NONE = 0
-KIND_DOUBLED = 1  # two zones own it, or one does twice
-KIND_TICK = 2  # it was not advanced once
-KIND_FAR = 3  # it is too far from where it was
-KIND_FULL = 4  # there are more vehicles than a world can hold
-KIND_SUMS = 5  # zones own others, or see others, than they should
+KIND_TICK = 1  # it was not advanced once
+KIND_FAR = 2  # it is too far from where it was
+KIND_SUMS = 3  # zones own others, or see others, than they should
 
 
 @kernel
@@ -96,17 +166,27 @@ def _digest(
     return mix(total)
 
 
-@inlined_kernel
-def _place(table: NDArray[np.void], vehicle: int, hashed: np.uint64, look: int) -> int:
-    """Where a vehicle of that look stands, or the first blank behind its hash; -1: no room."""
+@kernel
+def _place(table: NDArray[np.void], vehicle: int) -> int:
+    """Where a vehicle stands, or the first blank behind its hash."""
     last = table.shape[0] - 1
-    place = np.int64(hashed & np.uint64(last))
-    for _ in range(table.shape[0]):
-        entry = table[place]
-        if entry["look"] != look or entry["id"] == vehicle:
-            return int(place)
+    place = np.int64(mix(np.uint64(vehicle)) & np.uint64(last))
+    while table[place]["state"] != BLANK and table[place]["id"] != vehicle:
         place = (place + 1) & last
-    return -1
+    return int(place)
+
+
+@kernel
+def _miss(strays: Strays, vehicle: int, zone: int, row: int, num: int) -> int:
+    """Note where somebody stood who is not there; how many are noted, who were `num`."""
+    place = _place(strays.table, vehicle)
+    entry = strays.table[place]
+    entry["id"] = vehicle
+    entry["zone"] = zone
+    entry["row"] = row
+    entry["state"] = MISSING
+    strays.places[num] = place
+    return num + 1
 
 
 @inlined_kernel
@@ -118,37 +198,14 @@ def _note(found: np.void, kind: int, vehicle: int) -> None:
 
 
 @inlined_kernel
-def _judge(
-    row: np.void,
-    hashed: np.uint64,
-    clock: Clock,
-    before: NDArray[np.void],
-    now: NDArray[np.void],
-) -> int:
-    """KIND_* of an owned row beside that of the tick before; `now` is written."""
-    vehicle = row["id"]
-    look = clock.look
-    late = clock.tick - row["tick"]
-    place = _place(now, vehicle, hashed, look)
-    if place < 0:
-        return KIND_FULL
-    entry = now[place]
-    if entry["look"] == look:
-        return KIND_DOUBLED
-    entry["id"] = vehicle
-    entry["x"] = row["x"]
-    entry["y"] = row["y"]
-    entry["look"] = look
-    entry["late"] = late
-    place = _place(before, vehicle, hashed, look - 1)
-    if place < 0 or before[place]["look"] != look - 1:
-        return KIND_TICK if late != clock.new_late else KIND_NONE
-    last = before[place]
-    if late != last["late"]:
-        return KIND_TICK
-    dx = row["x"] - last["x"]
-    dy = row["y"] - last["y"]
-    return KIND_NONE if dx * dx + dy * dy <= clock.limit_m * clock.limit_m else KIND_FAR
+def _judge(found: np.void, last: np.void, now: np.void, limit_m: float) -> None:
+    """Look at a vehicle beside what it was at the last look."""
+    dx = now["x"] - last["x"]
+    dy = now["y"] - last["y"]
+    if now["late"] != last["late"]:
+        _note(found, KIND_TICK, now["id"])
+    elif not dx * dx + dy * dy <= limit_m * limit_m:  # nor where it is nowhere
+        _note(found, KIND_FAR, now["id"])
 
 
 @kernel
@@ -162,8 +219,9 @@ def watch(
     clock: Clock,
     masks: NDArray[np.uint64],
     factors: NDArray[np.uint64],
-    before: NDArray[np.void],
-    now: NDArray[np.void],
+    before: Kept,
+    now: Kept,
+    strays: Strays,
     live: int,
     expected: NDArray[np.uint64],
     tallies: NDArray[np.void],
@@ -181,47 +239,100 @@ def watch(
         clock: of it.
         masks: (n,) which bits a ghost has in common with its owner's row.
         factors: (n,) odd random numbers.
-        before: KEPT (a power of two,), what the last look wrote.
-        now: KEPT, of the same size; what the last look but one wrote counts as blank.
+        before: what the last look wrote.
+        now: overwritten, for the next look.
+        strays: scratch; entered and left are overwritten.
         live: vehicles that there should be.
         expected: (k,) what `TALLY["owned"]` should be of each zone.
         tallies: TALLY (k,) overwritten.
         found: FINDING (1,) overwritten: the one about the smallest id, if there is any.
     """
-    found[0]["kind"] = KIND_NONE
+    finding = found[0]
+    finding["kind"] = KIND_NONE
     count = zones.rects.shape[0]
     for zone in range(count):
-        tallies[zone]["owned"] = 0
         tallies[zone]["due"] = 0
-        tallies[zone]["seen"] = 0
+    missing = 0
+    moved = 0
     for zone in range(count):
         rows = zoned.rows[side, zone, w]
+        own_words = words[side, zone, w]
         num_owned = zoned.num_owned[zone, w]
+        num_before = before.num[zone]
+        inner = halo.inner[zone]
         owned = np.uint64(0)
         for i in range(num_owned):
             row = rows[i]
-            hashed = mix(np.uint64(row["id"]))
-            owned += mix(hashed + np.uint64(row["epoch"]))
-            kind = _judge(row, hashed, clock, before, now)
-            if kind != KIND_NONE:
-                _note(found[0], kind, row["id"])
+            entry = now.rows[zone, i]
+            entry["id"] = row["id"]
+            entry["x"] = row["x"]
+            entry["y"] = row["y"]
+            entry["late"] = clock.tick - row["tick"]
+            owned += owner_hash(row["id"], row["epoch"])
+            last = before.rows[zone, i]
+            if i < num_before and last["id"] == entry["id"]:
+                _judge(finding, last, entry, clock.limit_m)
+            else:
+                if i < num_before:
+                    missing = _miss(strays, last["id"], zone, i, missing)
+                strays.rows[moved, 0] = zone
+                strays.rows[moved, 1] = i
+                moved += 1
+            if not is_inside(inner, row["x"], row["y"]):
+                _owe_ghosts(zones, halo, zone, row, own_words, i, masks, factors, tallies)
+        for i in range(num_owned, num_before):
+            missing = _miss(strays, before.rows[zone, i]["id"], zone, i, missing)
+        now.num[zone] = num_owned
         tallies[zone]["vehicles"] = num_owned
         tallies[zone]["owned"] = owned
-        _owe_ghosts(
-            zones, halo, zone, rows, words[side, zone, w], num_owned, masks, factors, tallies
-        )
         seen = np.uint64(0)
         for i in range(num_owned, zoned.num_rows[zone, w]):
-            seen += _digest(words[side, zone, w], i, masks, factors)
+            seen += _digest(own_words, i, masks, factors)
         tallies[zone]["seen"] = seen
-    if found[0]["kind"] == KIND_NONE:
+    _match(before, now, clock, strays, missing, moved, finding)
+    if finding["kind"] == KIND_NONE:
         for zone in range(count):
             tally = tallies[zone]
             live -= tally["vehicles"]
             if tally["owned"] != expected[zone] or tally["due"] != tally["seen"]:
                 return KIND_SUMS
         return KIND_NONE if live == 0 else KIND_SUMS
-    return int(found[0]["kind"])
+    return int(finding["kind"])
+
+
+@kernel
+def _match(
+    before: Kept,
+    now: Kept,
+    clock: Clock,
+    strays: Strays,
+    missing: int,
+    moved: int,
+    finding: np.void,
+) -> None:
+    """Look for those who are on other rows among those who are not where they were."""
+    table = strays.table
+    entered = 0
+    for n in range(moved):
+        entry = now.rows[strays.rows[n, 0], strays.rows[n, 1]]
+        stood = table[_place(table, entry["id"])]
+        if stood["state"] == MISSING:
+            stood["state"] = FOUND
+            _judge(finding, before.rows[stood["zone"], stood["row"]], entry, clock.limit_m)
+        else:
+            strays.entered[entered] = entry["id"]
+            entered += 1
+            if entry["late"] != clock.new_late:
+                _note(finding, KIND_TICK, entry["id"])
+    left = 0
+    for n in range(missing):
+        stood = table[strays.places[n]]
+        if stood["state"] == MISSING:
+            strays.left[left] = stood["id"]
+            left += 1
+        stood["state"] = BLANK
+    finding["entered"] = entered
+    finding["left"] = left
 
 
 @inlined_kernel
@@ -229,30 +340,23 @@ def _owe_ghosts(
     zones: ZoneArrays,
     halo: Halo,
     zone: int,
-    rows: NDArray[np.void],
+    row: np.void,
     words: NDArray[np.uint64],
-    num_owned: int,
+    i: int,
     masks: NDArray[np.uint64],
     factors: NDArray[np.uint64],
     tallies: NDArray[np.void],
 ) -> None:
-    """Add a zone's rows to what those zones have to see that they are near to."""
-    min_x, min_y = halo.inner[zone, 0], halo.inner[zone, 1]
-    max_x, max_y = halo.inner[zone, 2], halo.inner[zone, 3]
-    for i in range(num_owned):
-        x = rows[i]["x"]
-        y = rows[i]["y"]
-        if min_x < x and x < max_x and min_y < y and y < max_y:
-            continue
-        digest = np.uint64(0)
-        sought = True
-        here = zone_of(zones, x, y)
-        for n in range(halo.near_start[here], halo.near_start[here + 1]):
-            other = halo.near[n]
-            if other != zone and is_seen(
-                halo, other, rows[i], squared_distance(zones.rects, other, x, y)
-            ):
-                if sought:  # many out here are seen by nobody
-                    digest = _digest(words, i, masks, factors)
-                    sought = False
-                tallies[other]["due"] += digest
+    """Add a zone's row to what those zones have to see that it is near to."""
+    x = row["x"]
+    y = row["y"]
+    digest = np.uint64(0)
+    sought = True
+    here = zone_of(zones, x, y)
+    for n in range(halo.near_start[here], halo.near_start[here + 1]):
+        other = halo.near[n]
+        if other != zone and is_seen(halo, other, row, squared_distance(zones.rects, other, x, y)):
+            if sought:  # many out here are seen by nobody
+                digest = _digest(words, i, masks, factors)
+                sought = False
+            tallies[other]["due"] += digest

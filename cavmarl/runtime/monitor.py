@@ -1,8 +1,8 @@
 """`Monitor`: the invariants of ownership, looked at after every tick of every world.
 
-What it needs of the vehicles is taken in one compiled look at their rows (`kernels.monitor`); what
-it knows of owners comes from the coordinators' records, and costs what changes in them. The words
-of an error are found when there is one (`runtime.violations`).
+What it needs of the vehicles is taken in one compiled look at their rows (`kernels.monitor`), which
+tells who has come and gone; what it knows of owners comes from the coordinators' records, and costs
+what changes in them. The words of an error are found when there is one (`runtime.violations`).
 """
 
 from __future__ import annotations
@@ -15,10 +15,11 @@ from numpy.typing import NDArray
 from cavmarl.errors import InvariantError
 from cavmarl.kernels.monitor import (
     FINDING,
-    KEPT,
     KIND_NONE,
     TALLY,
     Clock,
+    make_kept,
+    make_strays,
     owner_hash,
     watch,
 )
@@ -153,18 +154,18 @@ class Monitor:
         self._division = division
         self._records = tuple(records)
         self._limit_m = longest_move_m
-        num_worlds, capacity = division.zoned.rows.shape[2:]
+        _, count, num_worlds, capacity = division.zoned.rows.shape
         self._ticks = [0] * num_worlds
-        self._looks = [0] * num_worlds
+        self._vehicles: list[set[int]] = [set() for _ in range(num_worlds)]
+        # What the last look has written, and the last but one.
+        self._kept = [
+            (make_kept(count, capacity), make_kept(count, capacity)) for _ in range(num_worlds)
+        ]
+        self._strays = make_strays(count, capacity)
         self._masks, self._factors = digest_tables(GHOST_FIELDS)
         self._words = division.zoned.rows.view(np.uint64).reshape(
             *division.zoned.rows.shape, len(self._masks)
         )
-        # Half empty, so that places are found at once.
-        size = 1 << max(2 * capacity - 1, 1).bit_length()
-        # What two looks in a row say of a vehicle lies side by side.
-        tables = np.zeros((num_worlds, size, 2), dtype=KEPT)
-        self._kept = [(table[:, 0], table[:, 1]) for table in tables]
         self._tallies = np.zeros(division.count, dtype=TALLY)
         self._found = np.zeros(1, dtype=FINDING)
         self._watch = repeated(watch)
@@ -180,7 +181,8 @@ class Monitor:
             InvariantError: an invariant does not hold.
         """
         self._ticks[w] = 0
-        self._looks[w] += 2  # what the last look wrote is of another episode
+        self._kept[w][0].num[:] = 0
+        self._vehicles[w].clear()
         self._look(w, births, new_late=0)
 
     def end(self, w: int, births: Sequence[Birth]) -> None:
@@ -194,22 +196,35 @@ class Monitor:
             InvariantError: an invariant does not hold.
         """
         self._ticks[w] += 1
-        self._looks[w] += 1
         self._look(w, births, new_late=1)
 
     def _look(self, w: int, births: Sequence[Birth], new_late: int) -> None:
         division, record = self._division, self._records[w]
-        tick, look = self._ticks[w], self._looks[w]
-        clock = Clock(tick, look, new_late, self._limit_m)
-        now, before = self._kept[w][look & 1], self._kept[w][(look + 1) & 1]
+        clock = Clock(self._ticks[w], new_late, self._limit_m)
+        before, now = self._kept[w]
         kind = self._watch(
             division.zones, division.halo, division.zoned, self._words, division.side, w, clock,
-            self._masks, self._factors, before, now,
+            self._masks, self._factors, before, now, self._strays,
             record.entered + len(births) - record.left, record.sums(births),
             self._tallies, self._found,
         )  # fmt: skip
-        holds = kind == KIND_NONE and all(zone_tick == tick for zone_tick in division.ticks(w))
+        self._kept[w] = now, before
+        holds = (
+            kind == KIND_NONE
+            and self._are_single(w)
+            and all(tick == clock.tick for tick in division.ticks(w))
+        )
         if not holds:
             vehicle = int(self._found["vehicle"][0])
             violations = Violations(division, w, clock, before)
             violations.explain(kind, vehicle, record.owners, births)
+
+    def _are_single(self, w: int) -> bool:
+        """Note who has come and gone; whether nobody has come who was there."""
+        entered = self._strays.entered[: self._found["entered"].item()].tolist()
+        left = self._strays.left[: self._found["left"].item()].tolist()
+        vehicles = self._vehicles[w]
+        vehicles.difference_update(left)
+        total = len(vehicles) + len(entered)
+        vehicles.update(entered)
+        return len(vehicles) == total

@@ -10,10 +10,9 @@ from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
 from cavmarl.errors import InvariantError
-from cavmarl.kernels.monitor import KIND_DOUBLED, KIND_FAR, KIND_FULL, KIND_TICK, Clock
+from cavmarl.kernels.monitor import KIND_FAR, KIND_TICK, Clock, Kept
 from cavmarl.kernels.zones import is_seen, squared_distance
 from cavmarl.ownership.messages import Birth
 from cavmarl.ownership.trace_check import Owner
@@ -33,10 +32,10 @@ class Violations:
         division: of the rows.
         w: which world.
         clock: of the look that found it.
-        before: KEPT, what the look before wrote.
+        before: what the look before wrote.
     """
 
-    def __init__(self, division: Division, w: int, clock: Clock, before: NDArray[np.void]) -> None:
+    def __init__(self, division: Division, w: int, clock: Clock, before: Kept) -> None:
         self._division = division
         self._w = w
         self._clock = clock
@@ -62,6 +61,7 @@ class Violations:
         """
         expected = {**owners, **{birth.vehicle: (birth.zone, 0) for birth in births}}
         for words in (
+            self._doubled(),
             self._finding(kind, vehicle),
             self._clocks(),
             self._owners(expected),
@@ -74,14 +74,15 @@ class Violations:
             "rows have been changed meanwhile"
         )
 
+    def _doubled(self) -> Iterator[str]:
+        for vehicle, places in sorted(self._places.items()):
+            if len(places) > 1:
+                zones = [zone for zone, _ in places]
+                yield f"one owner: vehicle {vehicle} is owned by zones {zones}"
+
     def _finding(self, kind: int, vehicle: int) -> Iterator[str]:
         places = self._places.get(vehicle, [])
-        if kind == KIND_DOUBLED:
-            zones = [zone for zone, _ in places]
-            yield f"one owner: vehicle {vehicle} is owned by zones {zones}"
-        elif kind == KIND_FULL:
-            yield f"population: there are more vehicles than a world holds, {vehicle} among them"
-        elif kind == KIND_TICK:
+        if kind == KIND_TICK:
             zone, row = places[0]
             last = self._last(vehicle)
             should = self._clock.tick - (self._clock.new_late if last is None else last["late"])
@@ -101,11 +102,11 @@ class Violations:
             )
 
     def _last(self, vehicle: int) -> np.void | None:
-        kept = self._before
-        found: NDArray[np.void] = kept[
-            (kept["id"] == vehicle) & (kept["look"] == self._clock.look - 1)
-        ]
-        return found[0] if len(found) else None
+        for rows, num in zip(self._before.rows, self._before.num.tolist(), strict=True):
+            for found in np.flatnonzero(rows["id"][:num] == vehicle).tolist():
+                last: np.void = rows[found]
+                return last
+        return None
 
     def _clocks(self) -> Iterator[str]:
         for zone, tick in enumerate(self._division.ticks(self._w)):

@@ -34,26 +34,19 @@ def owner_hash(vehicle: int, epoch: int) -> int:
 
 def findings(
     zones: list[Zone], before: Mapping[int, Kept], tick: int, new_late: int, limit_m: float
-) -> dict[int, set[str]]:
-    """Vehicle → what is wrong with it: `doubled`, `tick`, `far`."""
-    found: dict[int, set[str]] = {}
-    seen: set[int] = set()
+) -> dict[int, str]:
+    """Vehicle → what is wrong with it: `tick` or `far`."""
+    found: dict[int, str] = {}
     for zone in zones:
         for row in zone.owned:
-            vehicle = int(row["id"])
-            wrong = found.setdefault(vehicle, set())
-            if vehicle in seen:
-                wrong.add("doubled")
-                continue
-            seen.add(vehicle)
-            last = before.get(vehicle)
+            last = before.get(int(row["id"]))
             if tick - row["tick"] != (new_late if last is None else last.late):
-                wrong.add("tick")
+                found[int(row["id"])] = "tick"
             elif last is not None:
                 way = (row["x"] - last.x) ** 2 + (row["y"] - last.y) ** 2
                 if way > limit_m * limit_m:
-                    wrong.add("far")
-    return {vehicle: wrong for vehicle, wrong in found.items() if wrong}
+                    found[int(row["id"])] = "far"
+    return found
 
 
 def tallies(

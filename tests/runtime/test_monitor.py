@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from cavmarl.errors import InvariantError
-from cavmarl.kernels.zones import squared_distance
+from cavmarl.kernels.zones import is_inside, squared_distance
 from cavmarl.ownership.messages import Ack, Birth, Done, Message
 from cavmarl.runtime import dividing
 from cavmarl.runtime.division import Division
@@ -246,6 +246,29 @@ def test_a_ghost_of_nobody(narrow: Meddling) -> None:
     narrow.caught(meddle, r"ghosts: zone 1 has a ghost of vehicle 7777, which is not there")
 
 
+def test_an_arrival_of_somebody_who_is_there(
+    narrow: Meddling, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """All sums hold: it is said to arrive, deep in a zone where nobody else sees it."""
+    coordination: Any = narrow.simulation._tick.coordination
+    coordinator = coordination.coordinators[0]
+
+    def meddle() -> None:
+        rows, owned, num = narrow.zone(1)
+        rect = narrow.division.halo.inner[1]
+        inside = [is_inside(rect, row["x"], row["y"]) for row in rows[:owned]]
+        rows[owned + 1 : num + 1] = rows[owned:num].copy()
+        rows[owned] = rows[inside.index(True)]
+        rows[owned]["id"] = vehicle = narrow.zone(2)[0][0]["id"]
+        rows[owned]["epoch"], rows[owned]["tick"] = 0, narrow.simulation.ticks()[0] - 1
+        worlds = narrow.simulation._shards[1].worlds
+        worlds.num_owned[0] += 1
+        worlds.num_rows[0] += 1
+        monkeypatch.setattr(coordinator, "notes", lambda: ((Birth(int(vehicle), 1, b""),), ()))
+
+    narrow.caught(meddle, r"one owner: vehicle \d+ is owned by zones \[1, 2\]")
+
+
 def test_an_arrival_that_nobody_has_told_of(monkeypatch: pytest.MonkeyPatch) -> None:
     simulation = watched(**{"zones.faults": "{}"})
     coordination: Any = simulation._tick.coordination
@@ -286,10 +309,11 @@ def test_the_monitor_takes_as_much_memory_as_it_began_with(faults: str) -> None:
     simulation = watched(**{"zones.faults": faults})
     coordination: Any = simulation._tick.coordination
     monitor = coordination._monitor
-    kept = monitor._kept
+    kept = {id(part.rows) for part in monitor._kept[0]}
     for _ in range(100):
         drive(simulation)
-    assert monitor._kept is kept
+    assert {id(part.rows) for part in monitor._kept[0]} == kept
+    assert len(monitor._vehicles[0]) <= simulation.capacity
     checker = coordination.coordinators[0]._watchers[-1]._checker
     assert len(checker.owners) <= simulation.capacity
     assert len(checker._born.above) <= simulation.capacity
