@@ -16,9 +16,9 @@ from numpy.typing import NDArray
 from cavmarl.kernels import inlined_kernel, kernel
 from cavmarl.kernels.arrays import RoadArrays, Scratch, Travel
 from cavmarl.kernels.codes import DRIVER_AGENT, DRIVER_BACKGROUND, HOLD_NONE, MODEL_KRAUSS
+from cavmarl.kernels.courtesy import COURTESY_DECEL, let_merge
 from cavmarl.kernels.following import (
     LINE_MARGIN_M,
-    accel_behind,
     before_line,
     behind,
     no_press,
@@ -27,14 +27,8 @@ from cavmarl.kernels.following import (
 )
 from cavmarl.kernels.geometry import wrap_angle
 from cavmarl.kernels.junctions import may_enter, press_inside, waits_inside
-from cavmarl.kernels.lane_choice import (
-    LOOK_BACK_M,
-    SIDE_GAP_M,
-    choose_lane,
-    needed_change,
-    thinks_of_lanes,
-)
-from cavmarl.kernels.lanes import VIEW_M, ahead_on, beside_s, is_lost, last_on, neighbor_behind
+from cavmarl.kernels.lane_choice import choose_lane, needed_change, thinks_of_lanes
+from cavmarl.kernels.lanes import VIEW_M, ahead_on, beside_s, is_lost, last_on
 from cavmarl.kernels.prefetch import SOON, prefetch
 from cavmarl.kernels.rng import STREAM_DRIVER, quick_uniform
 from cavmarl.kernels.stopping import way_to_stop
@@ -51,7 +45,6 @@ STOP_LINE_M = 5.0  # standing with the front nearer than this counts as standing
 LIMIT_DECEL = 2.0  # m/s², how a driver slows for a lower limit ahead,
 LIMIT_LEAD_S = 1.0  # to be down this time before it, as the model lags behind what is allowed
 FALL_IN_M = 100.0  # before the place where a lane change must be made
-COURTESY_DECEL = 3.0  # m/s², the hardest braking to let somebody merge
 # A driver that has to leave a lane waits this far before its end to change right, and a vehicle's
 # length further back to change left: two that want to swap do not stand side by side for ever.
 MERGE_ROOM_M = 2.0
@@ -359,32 +352,6 @@ def _beside(
     return press
 
 
-@kernel
-def _let_merge(
-    roads: RoadArrays, travel: Travel, rows: NDArray[np.void], row: np.void, scratch: Scratch
-) -> None:
-    """Soften the way of the follower on the lane that a vehicle needs to change to."""
-    lane = roads.lanes[row["lane"]]
-    target = lane["left"] if row["blinker"] > 0 else lane["right"]
-    if target < 0:
-        return
-    s = beside_s(roads, row["lane"], target, row["s"])
-    k, apart = neighbor_behind(roads, scratch, target, s, row["id"], LOOK_BACK_M, travel.view_m)
-    if k < 0 or scratch.entries[k]["side"]:
-        return
-    follower = scratch.entries[k]
-    gap = apart - 0.5 * row["length"] - follower["half"]
-    if gap < SIDE_GAP_M or apart > LOOK_BACK_M:
-        return
-    other = rows[follower["row"]]
-    kind = travel.types[other["vtype"]]
-    desired = roads.lanes[target]["speed_mps"] * other["speed_factor"]
-    decel = travel.types[row["vtype"]]["decel"]
-    accel = accel_behind(kind, follower["speed"], desired, gap, row["speed"], decel)
-    i = follower["row"]
-    scratch.accel[i] = min(scratch.accel[i], max(accel, -COURTESY_DECEL))
-
-
 @inlined_kernel
 def _prefetch_first(
     roads: RoadArrays, rows: NDArray[np.void], i: int, step: NDArray[np.void], scratch: Scratch
@@ -507,4 +474,4 @@ def decide(
     for k in range(total):
         entry = scratch.entries[k]
         if entry["blinker"] != 0 and not entry["side"]:
-            _let_merge(roads, travel, rows, rows[entry["row"]], scratch)
+            let_merge(roads, travel, rows, rows[entry["row"]], scratch)

@@ -16,6 +16,7 @@ from cavmarl.kernels.arrays import Zoned
 from cavmarl.kernels.borders import Borders
 from cavmarl.kernels.codes import DRIVER_BACKGROUND
 from cavmarl.kernels.handing_over import Book, look_on
+from cavmarl.kernels.prefetch import SOON, prefetch
 from cavmarl.kernels.zones import (
     Halo,
     ZoneArrays,
@@ -28,6 +29,8 @@ from cavmarl.kernels.zones import (
 )
 
 __all__ = ["exchange", "gather", "note_gathered", "take_own"]
+
+ROW_LINES = 6  # of memory, that a VEHICLE row takes
 
 
 @kernel
@@ -70,7 +73,7 @@ def exchange(
             zoned.num_near[zone, w] = owned
         if count > 1:
             for zone in range(count):
-                _publish(zones, halo, touching_m, border_m, zoned, side, zone, w)
+                _publish(zones, halo, touching_m, border_m, zoned, side, zone, w, book.due)
         look_on(zones, borders, zoned, side, w, book)
 
 
@@ -166,8 +169,13 @@ def _publish(
     side: int,
     zone: int,
     w: int,
+    due: NDArray[np.void],
 ) -> None:
-    """Copy the owned rows of one zone behind those of all that need them."""
+    """Copy the owned rows of one zone behind those of all that need them.
+
+    Who needs whom is found first, for as many as `due` holds: nobody can guess it, and so nothing
+    that follows has to wait for it.
+    """
     near_limit = touching_m * touching_m
     border_limit = border_m * border_m
     if zoned.num_outer[zone, w] < 0:
@@ -175,25 +183,32 @@ def _publish(
     seen_limit = halo.seen_m * halo.seen_m
     sure_limit = halo.sure_m * halo.sure_m
     by_lane = halo.watcher_start.size > 1
-    found = 0
-    for n in range(zoned.num_outer[zone, w]):
-        outer = zoned.outer[zone, w, n]
-        i = outer["row"]
+    zoned.num_border[zone, w] = 0
+    outers = zoned.outer[zone, w]
+    num_outer = zoned.num_outer[zone, w]
+    num_due = 0
+    for n in range(num_outer):
+        if by_lane and n + 2 * SOON < num_outer:
+            prefetch(halo.watcher_start, outers[n + 2 * SOON]["lane"], 0)
+            prefetch(halo.watchers, halo.watcher_start[outers[n + SOON]["lane"]], 0)
+        if num_due + zones.rects.shape[0] > due.size:
+            _send(zoned, side, zone, w, due, num_due)
+            num_due = 0
+        outer = outers[n]
         x = outer["x"]
         y = outer["y"]
-        at_border = False
         # Drivers of the background are on their lanes; agents may be anywhere beside them.
         if by_lane and outer["driver"] == DRIVER_BACKGROUND:
             lane = outer["lane"]
             for k in range(halo.watcher_start[lane], halo.watcher_start[lane + 1]):
                 watch = halo.watchers[k]
                 other = watch["zone"]
-                squared = squared_distance(zones.rects, other, x, y)
-                if other == zone or squared > seen_limit:
+                if other == zone:
                     continue
-                if squared <= sure_limit or is_asked_about(watch, outer):
-                    _take_ghost(zoned, side, zone, i, other, w, squared <= near_limit)
-                    at_border |= squared <= border_limit
+                squared = squared_distance(zones.rects, other, x, y)
+                sought = (squared <= sure_limit) | is_asked_about(halo, watch, outer)
+                _note_due(due[num_due], outer, other, squared, near_limit, border_limit)
+                num_due += int((squared <= seen_limit) & sought)
         else:
             here = zone
             if squared_distance(zones.rects, zone, x, y) > 0.0:
@@ -202,13 +217,44 @@ def _publish(
                 other = halo.near[k]
                 squared = squared_distance(zones.rects, other, x, y)
                 if other != zone and is_seen(halo, other, outer, squared):
-                    _take_ghost(zoned, side, zone, i, other, w, squared <= near_limit)
-                    at_border |= squared <= border_limit
-        if at_border:
-            zoned.border[zone, w, found] = i
-            found += 1
-    zoned.num_border[zone, w] = found
+                    _note_due(due[num_due], outer, other, squared, near_limit, border_limit)
+                    num_due += 1
+    _send(zoned, side, zone, w, due, num_due)
     zoned.num_outer[zone, w] = -1
+
+
+@inlined_kernel
+def _note_due(
+    due: np.void,
+    outer: np.void,
+    zone: int,
+    squared: float,
+    near_limit: float,
+    border_limit: float,
+) -> None:
+    """Note a row for a zone that is so far away, as squares of m; it counts if its place stays."""
+    due["row"] = outer["row"]
+    due["zone"] = zone
+    due["near"] = squared <= near_limit
+    due["at_border"] = squared <= border_limit
+
+
+@kernel
+def _send(zoned: Zoned, side: int, zone: int, w: int, due: NDArray[np.void], num_due: int) -> None:
+    """Copy rows of a zone to those that they are due to, and note which are at a border."""
+    for n in range(num_due):
+        if n + SOON < num_due:
+            later = due[n + SOON]["row"]
+            for line in range(ROW_LINES):
+                prefetch(zoned.rows[side, zone, w], later, line)
+            prefetch(zoned.step[zone, w], later, 0)
+        i = due[n]["row"]
+        _take_ghost(zoned, side, zone, i, due[n]["zone"], w, due[n]["near"])
+        found = zoned.num_border[zone, w]
+        # What a row is due to follows one another.
+        if due[n]["at_border"] and (found == 0 or zoned.border[zone, w, found - 1] != i):
+            zoned.border[zone, w, found] = i
+            zoned.num_border[zone, w] = found + 1
 
 
 @kernel

@@ -68,6 +68,20 @@ CHANGE = np.dtype(
 )
 
 
+DUE = np.dtype(
+    [
+        ("row", np.int32),  # of its owner
+        ("zone", np.int32),  # that needs it
+        ("near", np.bool_),  # it can touch somebody there
+        ("at_border", np.bool_),  # of that zone
+    ],
+    align=True,
+)
+"""A row that is to be sent to a zone as a ghost."""
+
+AT_ONCE = 512
+"""So many are found before they are sent; more than there can be zones."""
+
 LATE = 256
 """Once so many changes wait they are read; the last tick may add one for each vehicle."""
 
@@ -90,6 +104,7 @@ class Book(NamedTuple):
     newborn: NDArray[np.int64]  # (W, C) ids that have entered since the last tick began
     changes: NDArray[np.void]  # CHANGE (W, C + LATE) those that nobody has read yet
     num_changes: NDArray[np.int64]  # (W,)
+    due: NDArray[np.void]  # DUE (AT_ONCE,) scratch of `exchange`
 
 
 def make_book(num_worlds: int, capacity: int) -> Book:
@@ -119,6 +134,7 @@ def make_book(num_worlds: int, capacity: int) -> Book:
         newborn=numbers(capacity),
         changes=np.zeros((num_worlds, capacity + LATE), CHANGE),
         num_changes=numbers(),
+        due=np.zeros(AT_ONCE, DUE),
     )
 
 

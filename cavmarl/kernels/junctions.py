@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cavmarl.kernels import kernel
+from cavmarl.kernels.announcing import IMPATIENT_S, STANDING_MPS, is_let_stand
 from cavmarl.kernels.arrays import RoadArrays, Scratch, Travel
 from cavmarl.kernels.codes import (
     DRIVER_AGENT,
@@ -47,10 +48,8 @@ COMFORT_STOP = 3.0  # m/s², a driver stops for yellow where this braking is eno
 HARD_STOP = 5.0  # m/s², a vehicle that needs more to stop before the line will not stop
 GAP_S = 1.0  # s between the last of one and the first of the other in a shared area
 STEERED_MPS = 5.0  # a steered car is taken to turn no faster than this
-STANDING_MPS = 0.5
 LAST_CHANCE_M = 3.0  # with the front this near to the line
 ROOM_M = 3.0  # free way left behind a vehicle that clears a junction
-IMPATIENT_S = 3.0  # a vehicle that stands this long without reason is not waited for
 EXIT_LANES = 4  # looked along for room,
 EXIT_LOOK_M = 75.0  # and no further than this: ten cars stand there
 IMPATIENCE_S = 180.0  # after which one who gives way makes others brake
@@ -93,20 +92,17 @@ def _ignores(row: np.void, foe: np.void, link: int, signal: int) -> bool:
         return True
     if signal == SIGNAL_YELLOW_MINOR or signal == SIGNAL_YELLOW_MAJOR:
         return True  # who cannot stop any more has been looked at before
-    if foe["speed"] > STANDING_MPS:
-        return False
-    if foe["hold"] == HOLD_SIGNAL or foe["hold"] == HOLD_EXIT_BLOCKED:
+    if is_let_stand(foe):
         return True
-    if foe["hold"] == HOLD_YIELD:
-        # Both wait for somebody: who has stood longer goes first, and then goes on.
-        if row["hold"] == HOLD_NONE and row["stopped_at"] == link:
-            return True
-        if row["wait_s"] < STOP_SIGN_S or row["speed"] > STANDING_MPS:
-            return False
-        longer: bool = row["wait_s"] > foe["wait_s"]
-        return longer or (row["wait_s"] == foe["wait_s"] and row["id"] < foe["id"])
-    waited: bool = foe["wait_s"] > IMPATIENT_S
-    return waited
+    if foe["speed"] > STANDING_MPS or foe["hold"] != HOLD_YIELD:
+        return False
+    # Both wait for somebody: who has stood longer goes first, and then goes on.
+    if row["hold"] == HOLD_NONE and row["stopped_at"] == link:
+        return True
+    if row["wait_s"] < STOP_SIGN_S or row["speed"] > STANDING_MPS:
+        return False
+    longer: bool = row["wait_s"] > foe["wait_s"]
+    return longer or (row["wait_s"] == foe["wait_s"] and row["id"] < foe["id"])
 
 
 @kernel

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cavmarl.kernels import inlined_kernel, kernel
+from cavmarl.kernels.announcing import announced_m
 from cavmarl.kernels.arrays import RoadArrays, Scratch, Travel
 from cavmarl.kernels.buckets import add, forget, lay_out
 from cavmarl.kernels.codes import DRIVER_AGENT, DRIVER_SCRIPTED
@@ -27,6 +28,7 @@ __all__ = [
     "ahead_on",
     "behind_on",
     "beside_s",
+    "comes_over",
     "index_lanes",
     "is_lost",
     "is_off_lanes",
@@ -247,6 +249,42 @@ def behind_on(scratch: Scratch, lane: int, s: float, own_id: int) -> int:
 
 
 @kernel
+def comes_over(
+    roads: RoadArrays,
+    scratch: Scratch,
+    before: int,
+    s: float,
+    own_id: int,
+    reach_m: float,
+    view_m: float,
+) -> tuple[int, float]:
+    """The nearest vehicle that comes from lane `before` to a place `s` m behind its end.
+
+    Answers as `neighbor_behind`. Who stands or creeps far from here does not announce itself, and
+    is passed over.
+    """
+    distance = s
+    for _ in range(MAX_LOOK_BACK_LANES):
+        if distance > reach_m:
+            break
+        row = roads.lanes[before]
+        for k in range(scratch.lane_end[before] - 1, scratch.lane_start[before] - 1, -1):
+            other = scratch.entries[k]
+            gap = distance + row["length_m"] - other["s"]
+            if gap > view_m:
+                break
+            if gap < announced_m(other["speed"]) and other["id"] != own_id:
+                return k, gap
+        distance += row["length_m"]
+        if row["num_into"] == 0:
+            break
+        # Beyond a junction the first of the lanes that lead here stands for all: the others
+        # are checked there, by the right of way.
+        before = roads.into[row["first_into"]]
+    return -1, math.inf
+
+
+@kernel
 def neighbor_behind(
     roads: RoadArrays,
     scratch: Scratch,
@@ -258,9 +296,9 @@ def neighbor_behind(
 ) -> tuple[int, float]:
     """The nearest vehicle behind place `s` of `lane`: (position in the index, distance in m).
 
-    Looks back over lane borders that are up to `reach_m` away, along every lane that leads here; of
-    several the nearest counts, at equal distances the smallest id. (-1, inf) where there is none
-    within `view_m`.
+    Looks back over lane borders that are up to `reach_m` away, along every lane that leads here,
+    for those that announce themselves (`announced_m`); of several the nearest counts, at equal
+    distances the smallest id. (-1, inf) where there is none within `view_m`.
     """
     best = behind_on(scratch, lane, s, own_id)
     if best >= 0:
@@ -269,27 +307,10 @@ def neighbor_behind(
     best_distance = math.inf
     row = roads.lanes[lane]
     for k in range(row["first_into"], row["first_into"] + row["num_into"]):
-        before = roads.into[k]
-        distance = s
-        for _ in range(MAX_LOOK_BACK_LANES):
-            if distance > reach_m:
-                break
-            length = roads.lanes[before]["length_m"]
-            other = behind_on(scratch, before, math.inf, own_id)
-            if other >= 0:
-                gap = distance + length - scratch.entries[other]["s"]
-                nearer = gap < best_distance and gap <= view_m
-                tie = gap == best_distance and best >= 0
-                if tie:
-                    tie = scratch.entries[other]["id"] < scratch.entries[best]["id"]
-                if nearer or tie:
-                    best = other
-                    best_distance = gap
-                break
-            distance += length
-            if roads.lanes[before]["num_into"] == 0:
-                break
-            # Beyond a junction the first of the lanes that lead here stands for all: the others
-            # are checked there, by the right of way.
-            before = roads.into[roads.lanes[before]["first_into"]]
+        other, gap = comes_over(roads, scratch, roads.into[k], s, own_id, reach_m, view_m)
+        if other < 0 or gap > best_distance:
+            continue
+        if gap < best_distance or scratch.entries[other]["id"] < scratch.entries[best]["id"]:
+            best = other
+            best_distance = gap
     return best, best_distance

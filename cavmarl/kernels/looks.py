@@ -27,6 +27,7 @@ from cavmarl.kernels.zones import squared_distance
 
 __all__ = ["Room", "farthest_m", "find_looks", "make_room"]
 
+AT_LINE_M = 0.2  # so near before a line somebody may be about to drive over it
 ASIDE_M = 10.0  # places beside each other on lanes of one edge are not further apart, nor more of s
 BACK_M = max(LOOK_BACK_M, ENTER_REACH_M)  # to the end of a lane on which followers are looked for
 ROUNDING_M = 0.1  # more than sums over lanes, and float32, are off
@@ -211,7 +212,7 @@ def _see(roads: RoadArrays, lane: int, first: float, last: float, looks: NDArray
 def _look_along(
     roads: RoadArrays, view_m: float, see_m: float, room: Room, looks: NDArray[np.void]
 ) -> None:
-    """Leaders ahead, and the followers of lane changes: own ones, and theirs who drive ahead."""
+    """Leaders ahead, and who follows: on own lanes, and over their starts."""
     view_m = max(view_m, see_m, LOOK_BACK_M)
     for lane in range(roads.lanes.shape[0]):
         room.ahead[lane] = math.inf
@@ -226,15 +227,14 @@ def _look_along(
     for lane in range(roads.lanes.shape[0]):
         if room.ahead[lane] <= view_m:
             _see(roads, lane, 0.0, view_m - room.ahead[lane], looks)
-        if room.ahead[lane] <= LOOK_BACK_M:
-            edge = roads.edges[roads.lanes[lane]["edge"]]
-            for other in range(edge["first_lane"], edge["first_lane"] + edge["num_lanes"]):
-                _begin(roads, other, False, 0.0, room.behind)
     _spread(roads, False, BACK_M, room.behind, room)
     for lane in range(roads.lanes.shape[0]):
         if room.behind[lane] <= BACK_M:
-            length = roads.lanes[lane]["length_m"]
-            _see(roads, lane, length - view_m, length, looks)
+            back = room.behind[lane] + roads.lanes[lane]["length_m"] - ROUNDING_M
+            edge = roads.edges[roads.lanes[lane]["edge"]]
+            for other in range(edge["first_lane"], edge["first_lane"] + edge["num_lanes"]):
+                place = back if other == lane else back - ASIDE_M
+                looks[other]["back"] = min(looks[other]["back"], place)
 
 
 @kernel
@@ -330,6 +330,7 @@ def find_looks(
     for lane in range(roads.lanes.shape[0]):
         looks[lane]["head"] = -math.inf
         looks[lane]["tail"] = math.inf
+        looks[lane]["back"] = math.inf
         looks[lane]["line"] = math.inf
     _find_own(roads, rect, room)
     _look_along(roads, view_m, see_m, room, looks)
@@ -386,5 +387,6 @@ def farthest_m(
             far = roads.points[k + 1]
             squared = _farther(near, far, -math.inf, look["head"], rects, zone, squared)
             squared = _farther(near, far, look["tail"], math.inf, rects, zone, squared)
-            squared = _farther(near, far, look["line"] - APPROACH_M, math.inf, rects, zone, squared)
+            announced = min(look["back"], look["line"]) - APPROACH_M
+            squared = _farther(near, far, announced, math.inf, rects, zone, squared)
     return math.sqrt(squared)

@@ -17,7 +17,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cavmarl.kernels import inlined_kernel, kernel
-from cavmarl.kernels.announcing import announced_m
+from cavmarl.kernels.announcing import announced_m, is_let_stand
+from cavmarl.kernels.codes import DRIVER_BACKGROUND
 
 __all__ = [
     "LOOK",
@@ -44,9 +45,10 @@ class ZoneArrays(NamedTuple):
     rects: NDArray[np.float64]  # (k, 4) min_x, min_y, max_x, max_y; infinite at the rim
 
 
-LOOK = np.dtype([("head", np.float32), ("tail", np.float32), ("line", np.float32)])
+LOOK = np.dtype([(name, np.float32) for name in ("head", "tail", "back", "line")])
 """Whom a zone's drivers may ask about on a lane: those up to `head` m, those from `tail` m on, and
-those who announce themselves to a line that lies at `line` m (`kernels.looks`)."""
+those who announce themselves to somebody at `back` m whom they follow, or to a line that lies at
+`line` m, unless they are let stand before it (`kernels.looks`)."""
 
 WATCH = np.dtype([("zone", np.int32), *((name, LOOK[name]) for name in LOOK.names or ())])
 """A LOOK, and whose it is."""
@@ -61,6 +63,8 @@ OUTER = np.dtype(
         ("row", np.int32),  # VEHICLE row
         ("lane", np.int32),
         ("driver", np.int32),
+        ("hold", np.int32),
+        ("wait_s", np.float64),
     ],
     align=True,
 )
@@ -78,6 +82,7 @@ class Halo(NamedTuple):
     # zone z, z itself among them
     sure_m: float  # everybody within this distance is seen, further away those of whom
     seen_m: float  # somebody may ask, and beyond this one nobody, since roads lead no further
+    line_m: float  # whose centre is further than this before a line has not reached it
     watcher_start: NDArray[np.int32]  # (L + 1,); (1,) if sure_m is seen_m, so that nobody asks
     watchers: NDArray[np.void]  # WATCH: watchers[watcher_start[l] : watcher_start[l + 1]] are those
     # zones that may see somebody who is on lane l, and of whom there they may ask
@@ -150,20 +155,27 @@ def note_outer(outer: np.void, row: np.void, i: int) -> None:
     outer["row"] = i
     outer["lane"] = row["lane"]
     outer["driver"] = row["driver"]
+    outer["hold"] = row["hold"]
+    outer["wait_s"] = row["wait_s"]
 
 
 @inlined_kernel
-def is_asked_about(watch: np.void, row: np.void) -> bool:
+def is_asked_about(halo: Halo, watch: np.void, row: np.void) -> bool:
     """Whether some driver of a zone that watches a vehicle's lane may ask about it.
 
     Args:
+        halo: of all zones.
         watch: WATCH of the lane.
         row: VEHICLE or OUTER.
     """
+    # Nobody can guess who is asked about: branches would be dearer than all that they leave out.
     s = row["s"]
-    asked: bool = (
-        s <= watch["head"] or s >= watch["tail"] or watch["line"] - s < announced_m(row["speed"])
-    )
+    reach_m = announced_m(row["speed"])
+    to_line = watch["line"] - s
+    is_let = (row["driver"] == DRIVER_BACKGROUND) & is_let_stand(row) & (to_line > halo.line_m)
+    comes = (to_line < reach_m) & (not is_let)
+    follows = watch["back"] - s < reach_m
+    asked: bool = (s <= watch["head"]) | (s >= watch["tail"]) | follows | comes
     return asked
 
 
@@ -183,5 +195,5 @@ def is_seen(halo: Halo, zone: int, row: np.void, squared: float) -> bool:
         return True
     for k in range(halo.watcher_start[row["lane"]], halo.watcher_start[row["lane"] + 1]):
         if halo.watchers[k]["zone"] == zone:
-            return is_asked_about(halo.watchers[k], row)
+            return is_asked_about(halo, halo.watchers[k], row)
     return False

@@ -41,6 +41,7 @@ def zone_halo(partition: ZonePartition, halo_m: float) -> Halo:
         near=np.nonzero(near)[1].astype(np.int32),
         sure_m=float(halo_m),
         seen_m=float(halo_m),
+        line_m=math.inf,
         watcher_start=np.zeros(1, dtype=np.int32),
         watchers=np.zeros(0, dtype=WATCH),
     )
@@ -57,7 +58,9 @@ def lane_watchers(
         looks: LOOK (k, L), of whom each zone may ask.
         within_m: zones that are nearer to a lane's bounding box watch it in any case.
     """
-    asked = (looks["head"] > -np.inf) | (looks["tail"] < np.inf) | (looks["line"] < np.inf)
+    asked = looks["head"] > -np.inf
+    for place in ("tail", "back", "line"):
+        asked |= looks[place] < np.inf
     min_x, min_y, max_x, max_y = partition.arrays.rects.T[:, :, None]
     dx = np.maximum(np.maximum(min_x - lanes["max_x"], lanes["min_x"] - max_x), 0.0)
     dy = np.maximum(np.maximum(min_y - lanes["max_y"], lanes["min_y"] - max_y), 0.0)

@@ -8,7 +8,7 @@ import numpy as np
 
 from cavmarl.huge_pages import huge_copy
 from cavmarl.kernels.arrays import Travel
-from cavmarl.kernels.looks import farthest_m, find_looks, make_room
+from cavmarl.kernels.looks import AT_LINE_M, farthest_m, find_looks, make_room
 from cavmarl.kernels.zones import LOOK, Halo
 from cavmarl.roads.network import RoadNetwork
 from cavmarl.roads.zone_halo import inner_parts, lane_watchers, zone_halo
@@ -58,6 +58,7 @@ class Sight:
             inner=inner_parts(partition, seen_m),
             sure_m=float(self.sure_m),
             seen_m=float(seen_m),
+            line_m=half_m + float(roads.lanes["stop_back_m"].max()) + AT_LINE_M,
             watcher_start=huge_copy(start),
             watchers=huge_copy(watchers),
         )

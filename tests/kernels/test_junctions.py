@@ -11,9 +11,10 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from cavmarl.kernels.announcing import STANDING_MPS
 from cavmarl.kernels.codes import DRIVER_AGENT
 from cavmarl.kernels.geometry import boxes_overlap, lane_pose
-from cavmarl.kernels.junctions import STANDING_MPS, _exit_blocked
+from cavmarl.kernels.junctions import _exit_blocked
 from cavmarl.kernels.lanes import index_lanes
 from cavmarl.roads.network import RoadNetwork
 from cavmarl.roads.reader import read_network

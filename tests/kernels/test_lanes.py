@@ -144,6 +144,26 @@ def test_of_two_at_one_place_the_larger_id_leads() -> None:
     assert (seen(room, k)[0], distance) == (1, 0.0)
 
 
+def test_who_stands_far_behind_a_border_is_passed_over() -> None:
+    roads = network("grid4x4")
+    lane = int(np.flatnonzero(roads.lanes["internal"])[0])
+    link = roads.links[roads.lanes["link"][lane]]
+    before, length = int(link["from_lane"]), float(roads.lanes["length_m"][link["from_lane"]])
+    rows = np.zeros(2, VEHICLE)
+    rows["id"], rows["side_lane"], rows["lane"] = [3, 4], -1, before
+    for apart, speeds, expected in (
+        ([40.0, 29.0], [0.0, 0.0], 1),
+        ([60.0, 31.0], [0.0, 0.0], -1),
+        ([60.0, 31.0], [5.0, 0.0], 0),
+        ([60.0, 31.0], [0.0, 1.0], 1),
+    ):
+        rows["s"], rows["speed"] = length + 1.0 - np.array(apart), speeds
+        room = indexed("grid4x4", rows)
+        k, gap = neighbor_behind(roads.arrays, room, lane, 1.0, 9, 60.0, VIEW_M)
+        assert seen(room, k)[0] == expected
+        assert gap == (pytest.approx(apart[expected]) if expected >= 0 else np.inf)
+
+
 @pytest.mark.parametrize("name", NAMES)
 def test_places_on_neighbour_lanes_equal_twin_and_lie_beside(name: str) -> None:
     roads = network(name)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from cavmarl.kernels.announcing import APPROACH_M, announced_m
+from cavmarl.kernels.announcing import APPROACH_M
 from cavmarl.kernels.looks import ASIDE_M, ROUNDING_M, farthest_m, find_looks, make_room
 from cavmarl.kernels.zones import LOOK
 from cavmarl.roads.cache import load_network
@@ -57,7 +57,12 @@ def test_kernel_sees_what_sets_of_lanes_see(
     low, high = np.array([min_x, min_y] * 2), np.array([max_x, max_y] * 2)
     rect = tuple((low + np.array(part) * (high - low)).tolist())
     found, twin = looks_of(roads, rect), Looks(roads, rect, VIEW_M, SEE_M, HALF_M)
-    for field, told in (("head", twin.head), ("tail", twin.tail), ("line", twin.line)):
+    for field, told in (
+        ("head", twin.head),
+        ("tail", twin.tail),
+        ("back", twin.back),
+        ("line", twin.line),
+    ):
         expected = np.array([told[lane] for lane in range(len(roads.lanes))])
         np.testing.assert_allclose(found[field], expected, atol=2.0 * STEP_M, err_msg=field)
     assert np.isfinite(found["line"]).any() == (name == "grid4x4")
@@ -75,7 +80,7 @@ def test_drivers_look_ahead_and_less_far_back(line: RoadNetwork) -> None:
     """From a zone at the end of the second road into the third, and back on their own."""
     before, own, beyond = looks_of(line, (780.0, -10.0, 795.0, 10.0))
     assert before["head"] == -np.inf
-    assert before["tail"] == np.inf, "followers this far behind concern nobody"
+    assert before["back"] == np.inf, "followers this far behind concern nobody"
     assert own["tail"] == pytest.approx(380.0 - ASIDE_M - VIEW_M - ROUNDING_M)
     assert beyond["head"] == pytest.approx(VIEW_M + ROUNDING_M)
     assert (np.array([before["line"], own["line"], beyond["line"]]) == np.inf).all()
@@ -84,7 +89,8 @@ def test_drivers_look_ahead_and_less_far_back(line: RoadNetwork) -> None:
 def test_who_follows_over_a_border_is_seen(line: RoadNetwork) -> None:
     """The end of a lane before the zone is near, so who comes on it may be a follower."""
     before, own, beyond = looks_of(line, (450.0, -10.0, 460.0, 10.0))
-    assert before["tail"] == pytest.approx(400.0 - VIEW_M - ROUNDING_M)
+    assert before["tail"] == np.inf
+    assert before["back"] == pytest.approx(400.0 + 50.0 - ASIDE_M - ROUNDING_M)
     assert own["head"] == pytest.approx(60.0 + ASIDE_M + VIEW_M + ROUNDING_M)
     assert beyond["head"] == -np.inf
 
@@ -93,6 +99,7 @@ def test_a_place_without_roads_asks_about_nobody(line: RoadNetwork) -> None:
     looks = looks_of(line, (0.0, 50.0, 1200.0, 90.0))
     assert (looks["head"] == -np.inf).all()
     assert (looks["tail"] == np.inf).all()
+    assert (looks["back"] == np.inf).all()
 
 
 @pytest.mark.parametrize("part", [(0.0, 0.0, 0.4, 1.0), (0.5, 0.5, 0.6, 0.6)])
@@ -110,7 +117,8 @@ def test_nobody_is_asked_about_further_away_than_the_farthest(
         points = roads.points[lane["first_point"] :][: lane["num_points"]]
         s = np.arange(0.0, points["s"][-1], STEP_M)
         x, y = (np.interp(s, points["s"], points[axis]) for axis in ("x", "y"))
-        asked = (s <= look["head"]) | (s >= look["tail"]) | (look["line"] - s < APPROACH_M)
+        asked = (s <= look["head"]) | (s >= look["tail"])
+        asked |= min(look["back"], look["line"]) - s < APPROACH_M
         dx = np.maximum(np.maximum(rect[0] - x, x - rect[2]), 0.0)
         dy = np.maximum(np.maximum(rect[1] - y, y - rect[3]), 0.0)
         farthest = max(farthest, float(np.hypot(dx, dy)[asked].max(initial=0.0)))
@@ -122,8 +130,3 @@ def test_nobody_is_asked_about_further_away_than_the_farthest(
 def test_where_nobody_is_asked_about_the_farthest_is_no_distance(line: RoadNetwork) -> None:
     rect = (0.0, 50.0, 1200.0, 90.0)
     assert farthest_m(line.arrays, np.array([rect]), 0, looks_of(line, rect)) == 0.0
-
-
-@pytest.mark.parametrize(("speed", "expected"), [(0.0, 30.0), (5.0, 70.0), (20.0, 150.0)])
-def test_vehicles_announce_themselves_by_time(speed: float, expected: float) -> None:
-    assert announced_m(speed) == expected

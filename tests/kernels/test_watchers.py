@@ -8,7 +8,14 @@ from numpy.typing import NDArray
 
 from cavmarl.kernels.announcing import announced_m
 from cavmarl.kernels.borders import Borders
-from cavmarl.kernels.codes import DRIVER_AGENT, DRIVER_BACKGROUND
+from cavmarl.kernels.codes import (
+    DRIVER_AGENT,
+    DRIVER_BACKGROUND,
+    HOLD_EXIT_BLOCKED,
+    HOLD_NONE,
+    HOLD_SIGNAL,
+    HOLD_YIELD,
+)
 from cavmarl.kernels.exchange import exchange, gather
 from cavmarl.kernels.handing_over import make_book
 from cavmarl.kernels.zones import Halo
@@ -22,7 +29,7 @@ from tests.kernels.watchers import blank_looks, looks_of
 from tests.kernels.zoned import SIDE, ghosts_of, zoned_of
 from tests.naive import zones as naive
 
-SURE_M, SEEN_M, ASIDE_M = 12.0, 90.0, 10.0
+SURE_M, SEEN_M, ASIDE_M, LINE_M = 12.0, 90.0, 10.0, 4.0
 VEHICLES = 150
 
 
@@ -32,7 +39,7 @@ def asked_at_random(
     """What zones ask of lanes, mostly nothing."""
     looks = blank_looks((partition.count, len(roads.lanes)))
     length = roads.lanes["length_m"]
-    for field, nothing in (("head", -np.inf), ("tail", np.inf), ("line", np.inf)):
+    for field, nothing in (("head", -np.inf), ("tail", np.inf), ("back", np.inf), ("line", np.inf)):
         place = rng.uniform(0.0, 1.0, looks.shape) * length
         looks[field] = np.where(rng.random(looks.shape) < 0.2, place, nothing)
     start, watchers = lane_watchers(partition, roads.lanes, looks, SURE_M + ASIDE_M)
@@ -40,6 +47,7 @@ def asked_at_random(
         inner=inner_parts(partition, SEEN_M),
         sure_m=SURE_M,
         seen_m=SEEN_M,
+        line_m=LINE_M,
         watcher_start=start,
         watchers=watchers,
     )
@@ -55,6 +63,8 @@ def dealt(
     rows["lane"] = lanes
     rows["s"] = rng.uniform(0.0, 1.0, VEHICLES) * roads.lanes["length_m"][lanes]
     rows["speed"] = rng.choice([0.0, 14.0], VEHICLES)
+    rows["hold"] = rng.choice([HOLD_NONE, HOLD_SIGNAL, HOLD_YIELD, HOLD_EXIT_BLOCKED], VEHICLES)
+    rows["wait_s"] = rng.choice([1.0, 9.0], VEHICLES)
     rows["driver"] = rng.choice([DRIVER_BACKGROUND, DRIVER_AGENT], VEHICLES, p=[0.8, 0.2])
     min_x, min_y, max_x, max_y = roads.extent_m
     for row in rows:
@@ -77,8 +87,13 @@ def expected_of(
     found = []
     for row in naive.within(partition.reaching[zone], SEEN_M, others):
         look, s = looks[zone, row["lane"]], row["s"]
-        asked = s <= look["head"] or s >= look["tail"]
-        if asked or look["line"] - s < announced_m(row["speed"]) or int(row["id"]) in near:
+        asked = s <= look["head"] or s >= look["tail"] or int(row["id"]) in near
+        coming = look["line"] - s < announced_m(row["speed"])
+        idle = row["hold"] in (HOLD_SIGNAL, HOLD_EXIT_BLOCKED)
+        idle |= row["hold"] == HOLD_NONE and row["wait_s"] > 3.0
+        idle &= row["speed"] == 0.0 and row["driver"] == DRIVER_BACKGROUND
+        coming &= not idle or look["line"] - s <= LINE_M
+        if asked or coming or look["back"] - s < announced_m(row["speed"]):
             found.append(int(row["id"]))
     return sorted(found)
 

@@ -96,16 +96,18 @@ def crowds_on_lanes(draw: st.DrawFn, name: str, most: int = 24) -> NDArray[np.vo
     lanes = draw(st.lists(st.integers(0, len(roads.lanes) - 1), min_size=1, max_size=5))
     places = draw(
         st.lists(
-            st.tuples(st.sampled_from(lanes), st.integers(0, 4), st.booleans()),
+            st.tuples(
+                st.sampled_from(lanes), st.integers(0, 4), st.booleans(), st.sampled_from([0, 14])
+            ),
             min_size=1,
             max_size=most,
         )
     )
     rows = np.zeros(len(places), VEHICLE)
     rows["id"] = draw(st.permutations(range(len(places))))
-    for row, (lane, quarter, astride) in zip(rows, places, strict=True):
+    for row, (lane, quarter, astride, speed) in zip(rows, places, strict=True):
         here = roads.lanes[lane]
         row["lane"], row["s"] = lane, 0.25 * quarter * here["length_m"]
         row["side_lane"] = max(here["left"], here["right"]) if astride else -1
-        row["length"] = 5.0
+        row["length"], row["speed"] = 5.0, speed
     return rows

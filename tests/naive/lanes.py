@@ -8,6 +8,7 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
+from cavmarl.kernels.announcing import announced_m
 from cavmarl.roads.network import RoadNetwork
 
 Entry = tuple[float, int, int]  # s, id, row
@@ -70,9 +71,13 @@ def behind(
             if distance > reach_m:
                 break
             length = float(roads.lanes[before]["length_m"])
-            j, other_s = _behind_here(roads, rows, i, before, math.inf)
-            if j >= 0:
-                found.append((distance + length - other_s, int(rows[j]["id"]), j))
+            coming = [
+                (distance + length - at, int(rows[j]["id"]), j)
+                for at, _, j in on_lane(roads, rows, before)
+                if j != i and distance + length - at < announced_m(rows[j]["speed"])
+            ]
+            if coming and coming[-1][0] <= VIEW_M:
+                found.append(coming[-1])
                 break
             distance += length
             following = _into(roads, before)

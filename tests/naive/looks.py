@@ -47,6 +47,7 @@ class Looks:
         self.lengths = network.lanes["length_m"].tolist()
         self.head: dict[int, float] = defaultdict(lambda: -math.inf)
         self.tail: dict[int, float] = defaultdict(lambda: math.inf)
+        self.back: dict[int, float] = defaultdict(lambda: math.inf)
         self.line: dict[int, float] = defaultdict(lambda: math.inf)
         self.into: dict[int, list[int]] = defaultdict(list)
         for lane in range(len(self.lengths)):
@@ -98,11 +99,11 @@ class Looks:
         ahead = self._ways(starts, self._after, view_m)
         for lane, way in ahead.items():
             self._see(lane, 0.0, view_m - way)
-            if way <= LOOK_BACK_M:
-                for beside in self._beside(lane):
-                    _shorten(ends, self._before(beside), 0.0)
-        for lane in self._ways(ends, self._before, max(LOOK_BACK_M, ENTER_REACH_M)):
-            self._see(lane, self.lengths[lane] - view_m, self.lengths[lane])
+        for lane, way in self._ways(ends, self._before, max(LOOK_BACK_M, ENTER_REACH_M)).items():
+            for beside in self._beside(lane):
+                aside_m = 0.0 if beside == lane else ASIDE_M
+                back = way + self.lengths[lane] - aside_m - ROUNDING_M
+                self.back[beside] = min(self.back[beside], back)
         return ahead
 
     def _asked(self, ahead: Ways, see_m: float) -> set[int]:

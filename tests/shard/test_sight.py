@@ -56,6 +56,15 @@ def test_a_named_halo_is_seen_whole_and_nobody_can_tell(blocks: Path) -> None:
     assert narrow.simulation.state_hash() == whole.simulation.state_hash()
 
 
+def test_who_may_have_reached_a_line_is_nearer_than_half_a_body_and_what_is_kept_clear(
+    blocks: Path,
+) -> None:
+    simulation = driven(blocks).simulation
+    kept_m = float(simulation.network.lanes["stop_back_m"].max())
+    half_m = 0.5 * float(simulation._tick.division.owned(0, 0)["length"].max())
+    assert half_m + kept_m < simulation._tick.division.halo.line_m < half_m + kept_m + 5.0
+
+
 def test_the_monitor_asks_for_those_who_are_seen(blocks: Path) -> None:
     """It would name a ghost too few as well as one too many."""
     assert ghosts(driven(blocks, **{"zones.check": True})) > 0
