@@ -9,11 +9,11 @@ OLDEST := .venv-oldest
 LIBRARIES := .venv-libraries
 # What old versions of others will no longer do is no news; the rest stays an error.
 OLDEST_WARNINGS := -W default::DeprecationWarning -W default::PendingDeprecationWarning
-OLDEST_TESTS := tests/kernels tests/roads tests/runtime tests/traffic tests/test_config.py \
-    tests/test_registry.py tests/test_registration.py tests/test_env.py tests/test_vector_env.py \
+OLDEST_TESTS := tests/kernels tests/roads tests/runtime tests/traffic tests/config/test_config.py \
+    tests/config/test_registry.py tests/env/test_registration.py tests/env/test_parallel_env.py tests/env/test_vector_env.py \
     tests/test_bad_input.py tests/test_public_api.py tests/adapters
 LIBRARIES_TESTS := tests/adapters tests/train/test_programs.py tests/hosts \
-    tests/stepping/test_remote.py tests/stepping/test_remote_start.py
+    tests/parallel/test_remote_worlds.py tests/parallel/test_remote_start.py
 FUZZ_SECONDS ?= 60
 FUZZ_TARGETS ?= network programs buildings map cached zones demand sumocfg entry overrides driver manifest \
     plan message log follower
@@ -71,8 +71,8 @@ maps: $(READY) ## make the maps of ring, merge and grid4x4 anew from the options
 	sed --in-place '2,/^-->$$/d' $(MAPS)
 
 pictures: $(READY) ## draw the pictures of the README, the cards and the pages anew
-	$(BIN)/python -m cavmarl.render.pictures docs/images
-	$(BIN)/python -m cavmarl.render.sensor_pictures docs/images
+	$(BIN)/python -m docs.pictures.pictures docs/images
+	$(BIN)/python -m docs.pictures.sensor_pictures docs/images
 
 clean: ## remove .venv, builds and caches; runs/ stays
 	rm -rf .venv $(OLDEST) $(LIBRARIES) fuzz/corpus build dist .mypy_cache .ruff_cache .pytest_cache .hypothesis .import_linter_cache

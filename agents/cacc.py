@@ -15,11 +15,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from cavmarl.cav_env import CavEnv
-from cavmarl.errors import PolicyError
-from cavmarl.policies import Policy
-from cavmarl.spaces import observation_parts
-from cavmarl.vector_env import CavVectorEnv
+from cavmarl.core.errors import PolicyError
+from cavmarl.engine.spaces import observation_parts
+from cavmarl.env.parallel import CavEnv
+from cavmarl.env.vector import CavVectorEnv
+from cavmarl.policies.policy import Policy
 
 SPEED_GAIN = 1.0  # 1/s, towards the limit
 ACCEL_GAIN = 1.0

@@ -12,10 +12,10 @@ from typing import Any, cast
 import numpy as np
 from numpy.typing import NDArray
 
-from cavmarl.cav_env import CavEnv
-from cavmarl.errors import PolicyError
-from cavmarl.policies import Policy
-from cavmarl.vector_env import CavVectorEnv
+from cavmarl.core.errors import PolicyError
+from cavmarl.env.parallel import CavEnv
+from cavmarl.env.vector import CavVectorEnv
+from cavmarl.policies.policy import Policy
 
 
 class IdmPolicy(Policy):

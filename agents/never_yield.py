@@ -8,11 +8,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from cavmarl.cav_env import CavEnv
-from cavmarl.errors import PolicyError
-from cavmarl.kernels.steering import steer_to_lane
-from cavmarl.policies import Policy
-from cavmarl.vector_env import CavVectorEnv
+from cavmarl.core.errors import PolicyError
+from cavmarl.driving.kernels.steering import steer_to_lane
+from cavmarl.env.parallel import CavEnv
+from cavmarl.env.vector import CavVectorEnv
+from cavmarl.policies.policy import Policy
 
 
 class NeverYieldPolicy(Policy):

@@ -7,9 +7,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from cavmarl.cav_env import CavEnv
-from cavmarl.policies import Policy
-from cavmarl.vector_env import CavVectorEnv
+from cavmarl.env.parallel import CavEnv
+from cavmarl.env.vector import CavVectorEnv
+from cavmarl.policies.policy import Policy
 
 NUM_META_ACTIONS = 5
 

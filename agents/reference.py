@@ -1,7 +1,7 @@
 """The reference stack: perception, localisation, planning and control from sensors and the map.
 
-It needs the sensors of `cavmarl.stack.reference_rig` on its vehicle. Here it runs in the process of
-the environment, from the same snapshots that `cavmarl follow` gets over a socket.
+It needs the sensors of `cavmarl.cosim.stack.reference_rig` on its vehicle. Here it runs in
+the process of the environment, from the same snapshots that `cavmarl follow` gets over a socket.
 """
 
 from __future__ import annotations
@@ -12,12 +12,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from cavmarl.cav_env import CavEnv
-from cavmarl.followers.client import sight_of
-from cavmarl.followers.driver import StackDriver
-from cavmarl.followers.snapshots import Moment, take_snapshot, welcome_to
-from cavmarl.policies import Policy
-from cavmarl.vector_env import CavVectorEnv
+from cavmarl.cosim.followers.follower_client import sight_of
+from cavmarl.cosim.followers.follower_driver import StackDriver
+from cavmarl.cosim.followers.follower_snapshots import Moment, take_snapshot, welcome_to
+from cavmarl.env.parallel import CavEnv
+from cavmarl.env.vector import CavVectorEnv
+from cavmarl.policies.policy import Policy
 
 
 class ReferencePolicy(Policy):

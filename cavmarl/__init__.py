@@ -9,9 +9,9 @@
 Importing it registers the entries of `envs/` with Gymnasium and PettingZoo.
 """
 
-from cavmarl.cav_env import CavEnv, parallel_env
-from cavmarl.config import TERMS, EnvConfig
-from cavmarl.errors import (
+from cavmarl.config.env import TERMS, EnvConfig
+from cavmarl.config.registry import entries
+from cavmarl.core.errors import (
     ActionError,
     CapacityError,
     CavmarlError,
@@ -32,10 +32,10 @@ from cavmarl.errors import (
     UnknownEnvironmentError,
     WorkerError,
 )
-from cavmarl.policies import Policy, load_policy
-from cavmarl.registration import env, raw_env, register_all
-from cavmarl.registry import entries
-from cavmarl.vector_env import CavVectorEnv, make_vec
+from cavmarl.env.parallel import CavEnv, parallel_env
+from cavmarl.env.registration import env, raw_env, register_all
+from cavmarl.env.vector import CavVectorEnv, make_vec
+from cavmarl.policies.policy import Policy, load_policy
 
 __version__ = "0.1.0"
 

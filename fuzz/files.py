@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 
-from cavmarl.errors import CavmarlError
+from cavmarl.core.errors import CavmarlError
 
 __all__ = ["ROOT", "Target", "scratch", "seed"]
 

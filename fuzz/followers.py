@@ -23,12 +23,11 @@ from typing import Any
 
 import msgpack
 
-from cavmarl.cav_env import CavEnv, parallel_env
-from cavmarl.errors import FollowerError, FollowerMessageError, TickRefusedError
-from cavmarl.followers.barrier import Barrier, Seat
-from cavmarl.followers.client import Follower
-from cavmarl.followers.line import Line, listen
-from cavmarl.followers.messages import (
+from cavmarl.core.errors import FollowerError, FollowerMessageError, TickRefusedError
+from cavmarl.cosim.followers.follower_barrier import Barrier, Seat
+from cavmarl.cosim.followers.follower_client import Follower
+from cavmarl.cosim.followers.follower_connection import Line, listen
+from cavmarl.cosim.followers.follower_messages import (
     FOLLOWERS,
     Control,
     Hello,
@@ -37,9 +36,10 @@ from cavmarl.followers.messages import (
     Ticked,
     letter_of,
 )
-from cavmarl.followers.reception import Reception
-from cavmarl.followers.snapshots import Moment, take_snapshot, welcome_to
-from cavmarl.runtime.clock import TimeMaster
+from cavmarl.cosim.followers.follower_snapshots import Moment, take_snapshot, welcome_to
+from cavmarl.cosim.followers.reception import Reception
+from cavmarl.cosim.time_master import TimeMaster
+from cavmarl.env.parallel import CavEnv, parallel_env
 from fuzz.files import Target
 
 __all__ = ["FOLLOWER"]

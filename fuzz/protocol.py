@@ -16,6 +16,7 @@ from cavmarl.ownership.directory import Directory
 from cavmarl.ownership.endpoint import Endpoint
 from cavmarl.ownership.ledger import Tally
 from cavmarl.ownership.limits import Limits
+from cavmarl.ownership.log_records import record_to_line, records_from_lines, replay, sealed
 from cavmarl.ownership.messages import (
     Abort,
     Ack,
@@ -38,7 +39,6 @@ from cavmarl.ownership.messages import (
     Step,
     Withdrawn,
 )
-from cavmarl.ownership.records import record_to_line, records_from_lines, replay, sealed
 from cavmarl.ownership.store import MemoryStore
 from fuzz.files import Target
 

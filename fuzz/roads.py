@@ -13,11 +13,11 @@ from cavmarl.maps.buildings import with_buildings
 from cavmarl.maps.netconvert import build_network
 from cavmarl.roads.cache import _entry, load_network
 from cavmarl.roads.network import GeoReference, RoadNetwork
-from cavmarl.roads.reader import read_network, source_hash
-from cavmarl.roads.signal_plans import with_programs
-from cavmarl.roads.zone_file import read_zones, write_zones
-from cavmarl.roads.zone_layouts import cut_map
-from cavmarl.roads.zones import ZonePartition
+from cavmarl.roads.sumo_net.reader import read_network, source_hash
+from cavmarl.roads.sumo_net.signal_plans import with_programs
+from cavmarl.zones.partition.zone_file import read_zones, write_zones
+from cavmarl.zones.partition.zone_layouts import cut_map
+from cavmarl.zones.partition.zone_partition import ZonePartition
 from fuzz.files import ROOT, Target, scratch, seed
 
 __all__ = ["BUILDINGS", "CACHED", "MAPS", "NETWORKS", "PROGRAMS", "ZONES", "grid"]

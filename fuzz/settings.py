@@ -8,16 +8,22 @@ from dataclasses import replace
 from functools import cache
 from pathlib import Path
 
-from cavmarl.balance.plan import make_plan, replan
+from cavmarl.balance.balance_plan import make_plan, replan
+from cavmarl.balance.load_snapshot import idle_snapshot
 from cavmarl.balance.plan_file import read_plan
 from cavmarl.balance.plan_text import describe_plan
 from cavmarl.balance.problem import Problem, equal_costs
-from cavmarl.balance.snapshot import idle_snapshot
 from cavmarl.cli.output import parse_settings
-from cavmarl.config import ActionConfig, EnvConfig, SensorsConfig
-from cavmarl.config_io import read_yaml, validate
-from cavmarl.evaluate.manifest import MANIFEST_FILE, close_manifest, open_manifest, read_closed
-from cavmarl.networks import (
+from cavmarl.config.env import ActionConfig, EnvConfig, SensorsConfig
+from cavmarl.config.io import read_yaml, validate
+from cavmarl.config.registry import load_config
+from cavmarl.evaluate.provenance.manifest import (
+    MANIFEST_FILE,
+    close_manifest,
+    open_manifest,
+    read_closed,
+)
+from cavmarl.policies.networks import (
     CONFIG_FILE,
     WEIGHTS_FILE,
     ActorCritic,
@@ -25,7 +31,6 @@ from cavmarl.networks import (
     load_network,
     save_network,
 )
-from cavmarl.registry import load_config
 from fuzz.files import ROOT, Target, scratch, seed
 
 __all__ = ["DRIVERS", "ENTRIES", "MANIFESTS", "OVERRIDES", "PLANS"]

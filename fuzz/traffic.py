@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from contextlib import suppress
 
-from cavmarl.errors import CavmarlError
+from cavmarl.core.errors import CavmarlError
 from cavmarl.traffic.demand import read_demand
 from cavmarl.traffic.demand.sumo_config import read_sumo_config
 from cavmarl.traffic.schedule import Schedule
-from cavmarl.traffic.sumo.input import read_input
+from cavmarl.traffic.sumo.sumo_input import read_input
 from fuzz.files import Target, scratch, seed
 from fuzz.roads import grid
 

@@ -5,7 +5,8 @@ from pathlib import Path
 
 import pytest
 
-from cavmarl.config_sensors import (
+from cavmarl.config.registry import entries, load_config
+from cavmarl.config.sensors import (
     EgoConfig,
     KinematicsConfig,
     LidarConfig,
@@ -18,10 +19,9 @@ from cavmarl.config_sensors import (
     SensorsConfig,
     SignalAheadConfig,
 )
-from cavmarl.registry import entries, load_config
-from cavmarl.shard.sensors import SENSORS, layout
-from cavmarl.spaces import flat_observation_space, observation_table
-from tests.generated import check_block
+from cavmarl.engine.spaces import flat_observation_space, observation_table
+from cavmarl.sensors.observed import SENSORS, layout
+from tests.support.generated import check_block
 
 ROOT = Path(__file__).parent.parent
 

@@ -13,8 +13,8 @@ import numpy as np
 import pytest
 
 import cavmarl
-from cavmarl.cav_env import CavEnv
-from cavmarl.registry import entries
+from cavmarl.config.registry import entries
+from cavmarl.env.parallel import CavEnv
 
 with warnings.catch_warnings():
     # PettingZoo's tests import its own environments the way that it has deprecated.

@@ -12,11 +12,11 @@ from typing import Any, Literal, get_args, get_origin, get_type_hints
 import numpy as np
 import pytest
 
-from cavmarl.config import TERMS, EnvConfig
-from cavmarl.config_io import dotted_keys
-from cavmarl.config_rig import CollisionConfig, SampledConfig
-from cavmarl.rig.catalogue import TYPES
-from tests.generated import check_block, table
+from cavmarl.config.env import TERMS, EnvConfig
+from cavmarl.config.io import dotted_keys
+from cavmarl.config.rig import CollisionConfig, SampledConfig
+from cavmarl.sensors.mounted.catalogue import TYPES
+from tests.support.generated import check_block, table
 
 ROOT = Path(__file__).resolve().parents[1]
 PAGES = sorted([*ROOT.glob("*.md"), *ROOT.glob("docs/**/*.md"), *ROOT.glob("envs/*/README.md")])

@@ -10,11 +10,11 @@ from pathlib import Path
 
 import pytest
 
-from cavmarl.config import EnvConfig
-from cavmarl.errors import MissingExtraError
+from cavmarl.config.env import EnvConfig
+from cavmarl.config.registry import load_config, resolve_map
+from cavmarl.core.errors import MissingExtraError
 from cavmarl.maps.check import check_map
-from cavmarl.registry import load_config, resolve_map
-from tests.generated import check_block, table
+from tests.support.generated import check_block, table
 
 ROOT = Path(__file__).resolve().parents[1]
 FOLDERS = sorted(path for path in (ROOT / "envs").iterdir() if path.is_dir())

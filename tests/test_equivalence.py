@@ -12,24 +12,24 @@ import numpy as np
 import pytest
 
 from cavmarl import make_vec, parallel_env
-from cavmarl.evaluate.equivalence import Equivalence, verify_zones
+from cavmarl.engine.simulation import Simulation
+from cavmarl.engine.world_setup import find_map
+from cavmarl.env.vector import StepResult
+from cavmarl.handoff import shard_setup as dividing
 from cavmarl.roads.cache import load_network
-from cavmarl.roads.zone_file import write_zones
-from cavmarl.roads.zones import ZonePartition
-from cavmarl.runtime import dividing
-from cavmarl.runtime.simulation import Simulation
-from cavmarl.vector_env import StepResult
-from cavmarl.worlds import find_map
-from tests.actuated import actuated_grid
-from tests.demand_worlds import make, tiny
-from tests.driving import drive, start
-from tests.rerouting import CARS, DEVICE, FLOW, make_map, rerouter, write_demand
+from cavmarl.verify.equivalence import Equivalence, verify_zones
+from cavmarl.zones.partition.zone_file import write_zones
+from cavmarl.zones.partition.zone_partition import ZonePartition
+from tests.support.actuated import actuated_grid
+from tests.support.demand_worlds import make, tiny
+from tests.support.driving import drive, start
+from tests.support.rerouting import CARS, DEVICE, FLOW, make_map, rerouter, write_demand
 
 ZONES = (2, 3, 4, 9)
 # The built-in driver with a trembling hand: some collide, leave the road, and are followed.
 TREMBLING = """
 import numpy as np
-from cavmarl.policies import Policy
+from cavmarl.policies.policy import Policy
 
 class Trembling(Policy):
     def reset(self, seed=None):

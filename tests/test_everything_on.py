@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 from cavmarl import make_vec
-from cavmarl.evaluate.equivalence import verify_zones
-from cavmarl.rig.catalogue import TYPES
-from tests.faulted import ROUGH, record, replay
+from cavmarl.sensors.mounted.catalogue import TYPES
+from cavmarl.verify.equivalence import verify_zones
+from tests.support.faulted import ROUGH, record, replay
 
 ABOVE: dict[str, Any] = {"z_m": 1.4, "yaw_deg": 30.0}
 CAMERA: dict[str, Any] = {"rate_hz": 5, "width": 24, "height": 16, **ABOVE}

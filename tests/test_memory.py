@@ -10,8 +10,8 @@ from typing import Any
 import pytest
 
 from cavmarl import make_vec, parallel_env
-from cavmarl.evaluate.equivalence import verify_zones
-from cavmarl.registry import load_config
+from cavmarl.config.registry import load_config
+from cavmarl.verify.equivalence import verify_zones
 
 STATM = Path("/proc/self/statm")
 GROWTH_MB = 5.0

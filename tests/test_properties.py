@@ -17,8 +17,8 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as npst
 
 from cavmarl import CavEnv, CavVectorEnv, make_vec, parallel_env
-from cavmarl.config import EnvConfig
-from cavmarl.errors import ActionError, CavmarlError, EpisodeEndedError
+from cavmarl.config.env import EnvConfig
+from cavmarl.core.errors import ActionError, CavmarlError, EpisodeEndedError
 
 # Configurations
 

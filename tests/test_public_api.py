@@ -13,7 +13,7 @@ import pettingzoo
 import pytest
 
 import cavmarl
-from cavmarl import registry
+from cavmarl.config import registry
 
 ROOT = Path(__file__).resolve().parents[1]
 

@@ -20,9 +20,11 @@ with warnings.catch_warnings():
     from highway_env.vehicle.controller import ControlledVehicle
     from highway_env.vehicle.kinematics import Vehicle
 
-from cavmarl.kernels import car_following as idm
-from cavmarl.kernels import control, kinematics, lane_change
-from cavmarl.kernels.geometry import wrap_angle
+from cavmarl.core.math.geometry import wrap_angle
+from cavmarl.driving.kernels import bicycle as kinematics
+from cavmarl.driving.kernels import car_following as idm
+from cavmarl.driving.kernels import highway_control as control
+from cavmarl.driving.kernels import lane_change
 
 IDM_DEFAULTS = (idm.ACCEL_MAX, idm.DECEL_COMFORT, idm.JAM_DISTANCE_M, idm.TIME_HEADWAY_S)
 

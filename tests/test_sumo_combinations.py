@@ -12,10 +12,10 @@ import pytest
 
 import cavmarl
 from cavmarl import CavVectorEnv, make_vec
-from cavmarl.evaluate.equivalence import verify_zones
-from cavmarl.followers.followed_world import FollowedWorld
-from tests.followers.conftest import drive as follow
-from tests.sumo_worlds import MODES, tiny_file
+from cavmarl.cosim.followers.followed_world import FollowedWorld
+from cavmarl.verify.equivalence import verify_zones
+from tests.cosim.conftest import drive as follow
+from tests.support.sumo_worlds import MODES, tiny_file
 from tests.test_everything_on import EVERYTHING
 
 pytest.importorskip("sumo", reason="needs the extra 'sumo'")

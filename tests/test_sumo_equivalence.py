@@ -6,9 +6,9 @@ from pathlib import Path
 
 import pytest
 
-from cavmarl.evaluate.equivalence import verify_zones
-from tests.driving import drive
-from tests.sumo_worlds import MODES, coupled, tiny_file
+from cavmarl.verify.equivalence import verify_zones
+from tests.support.driving import drive
+from tests.support.sumo_worlds import MODES, coupled, tiny_file
 
 pytest.importorskip("sumo", reason="needs the extra 'sumo'")
 pytest.importorskip("libsumo", reason="needs the extra 'sumo'")

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 
-from cavmarl.registry import agent_entries, entries
+from cavmarl.config.registry import agent_entries, entries
 
 ROOT = Path(__file__).resolve().parents[1]
 
@@ -100,7 +100,7 @@ def test_a_wheel_carries_the_data_folders_whole(site: Path, kind: str) -> None:
 @pytest.mark.slow
 def test_a_wheel_finds_its_own_entries(site: Path) -> None:
     code = (
-        "import json; from cavmarl.registry import *; "
+        "import json; from cavmarl.config.registry import *; "
         "maps = [str(resolve_map(*load_config(name))) for name in entries()]; "
         "print(json.dumps([[*entries()], [*agent_entries()], maps]))"
     )

@@ -25,11 +25,11 @@ from pathlib import Path
 
 import numpy as np
 
-from cavmarl.config_io import read_yaml
-from cavmarl.errors import CavmarlError, ConfigError, require
+from cavmarl.config.io import read_yaml
+from cavmarl.core.errors import CavmarlError, ConfigError, require
 from cavmarl.evaluate import EvaluationReport, evaluate
+from cavmarl.evaluate.provenance.training_record import is_trained
 from cavmarl.evaluate.statistics import Interval, mean_interval
-from cavmarl.evaluate.training_record import is_trained
 
 PROGRAM = Path(__file__).with_name("ippo_torch.py")
 SCRIPTED = ("idm", "random_actions")

@@ -23,8 +23,8 @@ from benchmarl.experiment import Experiment, ExperimentConfig
 from benchmarl.models.mlp import MlpConfig
 
 from cavmarl.adapters.benchmarl_task import CavTaskClass
-from cavmarl.errors import ConfigError
-from cavmarl.evaluate.training_record import begin_training, end_training
+from cavmarl.core.errors import ConfigError
+from cavmarl.evaluate.provenance.training_record import begin_training, end_training
 from cavmarl.learning.options import (
     check_at_least,
     parse_settings,

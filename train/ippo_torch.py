@@ -26,8 +26,8 @@ from typing import ClassVar
 from rich.console import Console
 
 from cavmarl.learning.options import run_program
+from cavmarl.learning.ppo_settings import PpoSettings, parse_ppo
 from cavmarl.learning.run import train
-from cavmarl.learning.settings import PpoSettings, parse_ppo
 
 
 @dataclass(frozen=True)

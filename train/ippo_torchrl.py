@@ -28,7 +28,8 @@ from torchrl.objectives import ClipPPOLoss
 from torchrl.objectives.value import GAE
 
 from cavmarl.adapters.torchrl_env import GROUP, CavTorchRLEnv
-from cavmarl.evaluate.training_record import begin_training, end_training
+from cavmarl.config.registry import load_config
+from cavmarl.evaluate.provenance.training_record import begin_training, end_training
 from cavmarl.learning.log import CSV_FILE, WINDOW, Log, curve_row
 from cavmarl.learning.options import (
     check_at_least,
@@ -36,8 +37,13 @@ from cavmarl.learning.options import (
     run_folder,
     run_program,
 )
-from cavmarl.networks import CONFIG_FILE, WEIGHTS_FILE, ActorCritic, NetworkConfig, save_network
-from cavmarl.registry import load_config
+from cavmarl.policies.networks import (
+    CONFIG_FILE,
+    WEIGHTS_FILE,
+    ActorCritic,
+    NetworkConfig,
+    save_network,
+)
 
 LEAST_DEVIATION = 0.02  # of an observation; those that hardly change are not blown up
 OBSERVATION, MASK, ACTION, LOG_PROB, VALUE = (

@@ -25,8 +25,8 @@ from gymnasium.vector import AutoresetMode
 from gymnasium.wrappers.vector import NormalizeObservation, RecordEpisodeStatistics
 from torch import Tensor
 
-from cavmarl.errors import ConfigError
-from cavmarl.evaluate.training_record import begin_training, end_training
+from cavmarl.core.errors import ConfigError
+from cavmarl.evaluate.provenance.training_record import begin_training, end_training
 from cavmarl.learning.log import CSV_FILE, WINDOW, Log, curve_row
 from cavmarl.learning.options import (
     check_at_least,
@@ -34,7 +34,13 @@ from cavmarl.learning.options import (
     run_folder,
     run_program,
 )
-from cavmarl.networks import CONFIG_FILE, WEIGHTS_FILE, ActorCritic, NetworkConfig, save_network
+from cavmarl.policies.networks import (
+    CONFIG_FILE,
+    WEIGHTS_FILE,
+    ActorCritic,
+    NetworkConfig,
+    save_network,
+)
 
 
 @dataclass(frozen=True)

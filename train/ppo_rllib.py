@@ -29,8 +29,8 @@ from ray.rllib.core.rl_module.torch import TorchRLModule
 from torch import Tensor
 
 from cavmarl.adapters.rllib_env import CavRllibEnv
-from cavmarl.cav_env import parallel_env
-from cavmarl.evaluate.training_record import begin_training, end_training
+from cavmarl.env.parallel import parallel_env
+from cavmarl.evaluate.provenance.training_record import begin_training, end_training
 from cavmarl.learning.log import CSV_FILE, WINDOW, Log, curve_row
 from cavmarl.learning.options import (
     check_at_least,
@@ -38,7 +38,13 @@ from cavmarl.learning.options import (
     run_folder,
     run_program,
 )
-from cavmarl.networks import CONFIG_FILE, WEIGHTS_FILE, ActorCritic, NetworkConfig, save_network
+from cavmarl.policies.networks import (
+    CONFIG_FILE,
+    WEIGHTS_FILE,
+    ActorCritic,
+    NetworkConfig,
+    save_network,
+)
 
 DRIVER = "driver"  # the policy that all agents share
 

@@ -27,7 +27,8 @@ from stable_baselines3.common.running_mean_std import RunningMeanStd
 from stable_baselines3.common.vec_env import VecMonitor, VecNormalize
 
 from cavmarl.adapters.sb3_vec_env import CavSb3VecEnv
-from cavmarl.evaluate.training_record import begin_training, end_training
+from cavmarl.config.registry import load_config
+from cavmarl.evaluate.provenance.training_record import begin_training, end_training
 from cavmarl.learning.log import CSV_FILE, WINDOW, Log, curve_row
 from cavmarl.learning.options import (
     check_at_least,
@@ -35,7 +36,7 @@ from cavmarl.learning.options import (
     run_folder,
     run_program,
 )
-from cavmarl.networks import (
+from cavmarl.policies.networks import (
     CONFIG_FILE,
     MAX_DEVIATIONS,
     WEIGHTS_FILE,
@@ -43,7 +44,6 @@ from cavmarl.networks import (
     NetworkConfig,
     save_network,
 )
-from cavmarl.registry import load_config
 
 MODEL_FILE = "model.zip"
 

@@ -10,7 +10,7 @@ from typing import Any
 
 from cavmarl.adapters.decided import refuse_decided
 from cavmarl.adapters.torchrl_env import GROUP, CavTorchRLEnv
-from cavmarl.errors import missing
+from cavmarl.core.errors import missing
 
 try:
     from benchmarl.environments.common import Task, TaskClass

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from typing import Any
 
-from cavmarl.errors import ConfigError
+from cavmarl.core.errors import ConfigError
 
 __all__ = ["refuse_decided"]
 

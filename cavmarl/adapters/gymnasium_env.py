@@ -8,8 +8,8 @@ from typing import Any
 import gymnasium
 
 from cavmarl.adapters.decided import refuse_decided
-from cavmarl.cav_env import CavEnv, parallel_env
-from cavmarl.registry import load_config
+from cavmarl.config.registry import load_config
+from cavmarl.env.parallel import CavEnv, parallel_env
 
 __all__ = ["CavEgoEnv"]
 

@@ -13,10 +13,10 @@ from numpy.typing import NDArray
 
 from cavmarl.adapters.decided import refuse_decided
 from cavmarl.adapters.observations import ObservationForm, Observations
-from cavmarl.config import TERMS
-from cavmarl.errors import ConfigError
-from cavmarl.registry import load_config
-from cavmarl.vector_env import CavVectorEnv, make_vec
+from cavmarl.config.env import TERMS
+from cavmarl.config.registry import load_config
+from cavmarl.core.errors import ConfigError
+from cavmarl.env.vector import CavVectorEnv, make_vec
 
 __all__ = ["CavAgentRows"]
 

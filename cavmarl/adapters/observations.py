@@ -7,9 +7,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from cavmarl.config import EnvConfig
-from cavmarl.errors import ConfigError
-from cavmarl.spaces import named_observation, observation_parts, observation_space
+from cavmarl.config.env import EnvConfig
+from cavmarl.core.errors import ConfigError
+from cavmarl.engine.spaces import named_observation, observation_parts, observation_space
 
 __all__ = ["ObservationForm"]
 

@@ -8,8 +8,8 @@ from __future__ import annotations
 from collections.abc import Collection, Mapping
 from typing import Any
 
-from cavmarl.cav_env import parallel_env
-from cavmarl.errors import missing
+from cavmarl.core.errors import missing
+from cavmarl.env.parallel import parallel_env
 
 try:
     from ray.rllib.env.multi_agent_env import MultiAgentEnv

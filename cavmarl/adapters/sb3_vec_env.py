@@ -15,9 +15,9 @@ from numpy.typing import NDArray
 
 from cavmarl.adapters.decided import refuse_decided
 from cavmarl.adapters.observations import ObservationForm, Observations
-from cavmarl.config import TERMS
-from cavmarl.errors import missing
-from cavmarl.vector_env import make_vec
+from cavmarl.config.env import TERMS
+from cavmarl.core.errors import missing
+from cavmarl.env.vector import make_vec
 
 try:
     from stable_baselines3.common.vec_env.base_vec_env import VecEnv

@@ -17,10 +17,10 @@ from numpy.typing import NDArray
 
 from cavmarl.adapters.decided import refuse_decided
 from cavmarl.adapters.observations import ObservationForm
-from cavmarl.config import TERMS
-from cavmarl.errors import missing
-from cavmarl.seeds import check_seed
-from cavmarl.vector_env import CavVectorEnv, make_vec
+from cavmarl.config.env import TERMS
+from cavmarl.core.errors import missing
+from cavmarl.core.seeds import check_seed
+from cavmarl.env.vector import CavVectorEnv, make_vec
 
 try:
     import torch

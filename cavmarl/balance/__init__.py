@@ -1,1 +1,4 @@
-"""Which worker hosts which shard: scores of workers, costs of shards, plans."""
+"""Which worker hosts which shard: load scores, costs of shards, plans.
+
+Pure arithmetic; `parallel` measures for it and carries its plans out.
+"""

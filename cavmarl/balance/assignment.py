@@ -6,9 +6,9 @@ from collections.abc import Sequence
 from itertools import groupby
 
 from cavmarl.balance.load_score import Candidate, Rejection, admissible, find_rejections
-from cavmarl.balance.placement import Placement, Workers
 from cavmarl.balance.problem import Problem
 from cavmarl.balance.refining import refine
+from cavmarl.balance.shard_placement import Placement, Workers
 from cavmarl.balance.sliding import divide_row, slide
 from cavmarl.balance.spreading import spread, string
 

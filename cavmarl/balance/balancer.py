@@ -5,11 +5,11 @@ from __future__ import annotations
 from collections.abc import Iterable
 from dataclasses import replace
 
-from cavmarl.balance.plan import Plan, make_plan
+from cavmarl.balance.balance_plan import Plan, make_plan
+from cavmarl.balance.load_snapshot import Snapshot
 from cavmarl.balance.problem import MEASURED_COSTS, BalanceRule, Problem, ShardCost
 from cavmarl.balance.smoothing import SmoothCosts
-from cavmarl.balance.snapshot import Snapshot
-from cavmarl.errors import PlacementError
+from cavmarl.core.errors import PlacementError
 
 __all__ = ["Balancer"]
 

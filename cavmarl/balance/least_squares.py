@@ -7,7 +7,7 @@ from itertools import combinations
 import numpy as np
 from numpy.typing import NDArray
 
-from cavmarl.errors import PlacementError
+from cavmarl.core.errors import PlacementError
 
 __all__ = ["MAX_COLUMNS", "fit_non_negative"]
 

@@ -16,7 +16,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Literal, NamedTuple
 
-from cavmarl.errors import NoAdmissibleWorkerError, PlacementError
+from cavmarl.core.errors import NoAdmissibleWorkerError, PlacementError
 
 __all__ = [
     "RESOURCES",

@@ -7,11 +7,11 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from cavmarl.balance.balance_plan import SCHEMA, VERSION, Plan
 from cavmarl.balance.load_score import RESOURCES, Candidate, LoadRule, Utilisation
-from cavmarl.balance.plan import SCHEMA, VERSION, Plan
+from cavmarl.balance.load_snapshot import Snapshot
 from cavmarl.balance.problem import MEASURED_COSTS, BalanceRule, Problem, ShardCost
-from cavmarl.balance.snapshot import Snapshot
-from cavmarl.errors import PlacementError
+from cavmarl.core.errors import PlacementError
 
 __all__ = [
     "PLACEMENT",

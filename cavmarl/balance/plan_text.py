@@ -6,7 +6,7 @@ import math
 from collections.abc import Iterable, Sequence
 from itertools import groupby
 
-from cavmarl.balance.plan import Plan
+from cavmarl.balance.balance_plan import Plan
 from cavmarl.balance.problem import MEASURED_COSTS
 
 __all__ = ["describe_plan"]

@@ -18,7 +18,7 @@ from typing import NamedTuple
 import numpy as np
 
 from cavmarl.balance.least_squares import fit_non_negative
-from cavmarl.errors import PlacementError
+from cavmarl.core.errors import PlacementError
 
 __all__ = ["CostModel", "ShardContent", "fit_costs"]
 

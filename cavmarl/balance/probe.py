@@ -11,8 +11,8 @@ from collections.abc import Mapping
 import psutil
 
 from cavmarl.balance.load_score import Candidate, Utilisation
-from cavmarl.balance.snapshot import NO_GPU, Snapshot
-from cavmarl.errors import PlacementError
+from cavmarl.balance.load_snapshot import NO_GPU, Snapshot
+from cavmarl.core.errors import PlacementError
 
 __all__ = ["MEASURED", "Watch", "take_snapshot"]
 

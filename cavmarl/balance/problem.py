@@ -9,8 +9,8 @@ from functools import cached_property
 from typing import NamedTuple
 
 from cavmarl.balance.load_score import LoadRule
-from cavmarl.balance.snapshot import Snapshot
-from cavmarl.errors import PlacementError
+from cavmarl.balance.load_snapshot import Snapshot
+from cavmarl.core.errors import PlacementError
 
 __all__ = ["MEASURED_COSTS", "BalanceRule", "Problem", "ShardCost", "equal_costs"]
 

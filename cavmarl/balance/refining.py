@@ -7,8 +7,8 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from cavmarl.balance.placement import Placement
 from cavmarl.balance.problem import Problem
+from cavmarl.balance.shard_placement import Placement
 
 __all__ = ["LEAST_GAIN", "refine"]
 

@@ -8,9 +8,9 @@ from itertools import accumulate
 import numpy as np
 
 from cavmarl.balance.load_score import find_rejections
-from cavmarl.balance.placement import Placement
 from cavmarl.balance.refining import LEAST_GAIN
-from cavmarl.errors import NoAdmissibleWorkerError
+from cavmarl.balance.shard_placement import Placement
+from cavmarl.core.errors import NoAdmissibleWorkerError
 
 __all__ = ["divide_row", "slide"]
 

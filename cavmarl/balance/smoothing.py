@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 
 from cavmarl.balance.problem import ShardCost
-from cavmarl.errors import PlacementError
+from cavmarl.core.errors import PlacementError
 
 __all__ = ["NEWEST", "SmoothCosts"]
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Sequence
 
-from cavmarl.balance.placement import Placement
+from cavmarl.balance.shard_placement import Placement
 
 __all__ = ["spread", "string"]
 

@@ -21,11 +21,11 @@ from cavmarl.cli import (
     scenario,
     suite,
     verify,
-    verify_determinism,
     view,
 )
 from cavmarl.cli.output import print_error
-from cavmarl.errors import CavmarlError
+from cavmarl.cli.verify import determinism as verify_determinism
+from cavmarl.core.errors import CavmarlError
 
 __all__ = ["app", "main"]
 

@@ -32,9 +32,9 @@ def random(
     json_path: JsonPath = None,
 ) -> None:
     """Cars with explicit random routes, from edges drawn by the length of their lanes."""
+    from cavmarl.engine.world_setup import find_map
     from cavmarl.roads.cache import load_network
     from cavmarl.traffic.random_trips import write_random_demand
-    from cavmarl.worlds import find_map
 
     network = load_network(find_map(map_name))
     write_random_demand(network, out, vehicles=vehicles, within_s=within, route_m=route, seed=seed)

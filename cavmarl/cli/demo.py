@@ -14,7 +14,7 @@ from rich.console import Console
 from cavmarl.cli.evaluate import evaluate_showing, report_table
 from cavmarl.cli.output import JsonPath, Seed, make_folder, write_json
 from cavmarl.cli.view import record
-from cavmarl.errors import ConfigError
+from cavmarl.core.errors import ConfigError
 
 __all__ = ["demo"]
 
@@ -36,8 +36,8 @@ def demo(
     json_path: JsonPath = None,
 ) -> None:
     """Train on `merge`, evaluate beside `idm` and `random_actions`, drive `town`, leave videos."""
-    from cavmarl.cav_env import parallel_env
-    from cavmarl.errors import require
+    from cavmarl.core.errors import require
+    from cavmarl.env.parallel import parallel_env
 
     if not _SCRIPT.is_file():
         raise ConfigError(

@@ -27,7 +27,7 @@ from cavmarl.cli.output import (
     parse_settings,
     write_json,
 )
-from cavmarl.errors import require
+from cavmarl.core.errors import require
 
 if TYPE_CHECKING:
     from cavmarl.evaluate import EvaluationReport

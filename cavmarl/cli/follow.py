@@ -10,7 +10,7 @@ from rich.table import Table
 
 from cavmarl.cli.lead import DEFAULT_PLACE, address_of
 from cavmarl.cli.output import Environment, JsonPath, write_json
-from cavmarl.errors import ConfigError
+from cavmarl.core.errors import ConfigError
 
 __all__ = ["follow"]
 
@@ -30,11 +30,11 @@ def follow(
     json_path: JsonPath = None,
 ) -> None:
     """Drive agents of a world that `cavmarl lead` runs, from their sensors and the map of ENV."""
-    from cavmarl.followers.client import Follower
-    from cavmarl.followers.driver import StackDriver
-    from cavmarl.registry import load_config
-    from cavmarl.stack.stack import STAGES, StackConfig
-    from cavmarl.worlds import load_roads
+    from cavmarl.config.registry import load_config
+    from cavmarl.cosim.followers.follower_client import Follower
+    from cavmarl.cosim.followers.follower_driver import StackDriver
+    from cavmarl.cosim.stack.stack import STAGES, StackConfig
+    from cavmarl.engine.world_setup import load_roads
 
     config = StackConfig(**_stages(stage or [], tuple(STAGES)))
     network = load_roads(*load_config(env))

@@ -14,8 +14,8 @@ from rich.table import Table
 from cavmarl.cli.output import JsonPath, write_json
 
 if TYPE_CHECKING:
+    from cavmarl.handoff.coordinator.journal_summary import JournalSummary
     from cavmarl.ownership.table import Table as OwnerTable
-    from cavmarl.runtime.journal_summary import JournalSummary
 
 __all__ = ["journal"]
 
@@ -31,7 +31,7 @@ def journal(
     json_path: JsonPath = None,
 ) -> None:
     """Replay the log of a divided run: hand-offs, hosts, and the owners at its end or at a tick."""
-    from cavmarl.runtime.journal_summary import owners_at, summarize
+    from cavmarl.handoff.coordinator.journal_summary import owners_at, summarize
 
     console = Console()
     if at is not None:

@@ -19,10 +19,10 @@ from cavmarl.cli.output import (
     parse_settings,
     write_json,
 )
-from cavmarl.errors import ConfigError
+from cavmarl.core.errors import ConfigError
 
 if TYPE_CHECKING:
-    from cavmarl.followers.followed_world import FollowedWorld
+    from cavmarl.cosim.followers.followed_world import FollowedWorld
 
 __all__ = ["DEFAULT_PLACE", "address_of", "lead"]
 
@@ -69,10 +69,10 @@ def lead(
     json_path: JsonPath = None,
 ) -> None:
     """Run a world as its time master; followers that join over a socket drive its agents."""
-    from cavmarl.cav_env import parallel_env
-    from cavmarl.followers.followed_world import FollowedWorld
-    from cavmarl.runtime.pacing import RealTime
-    from cavmarl.stack.reference_rig import REFERENCE_RIG
+    from cavmarl.cosim.followers.followed_world import FollowedWorld
+    from cavmarl.cosim.pacing import RealTime
+    from cavmarl.cosim.stack.reference_rig import REFERENCE_RIG
+    from cavmarl.env.parallel import parallel_env
 
     if followers < 0 or (steps is not None and steps < 1):
         raise ConfigError("--followers must be 0 or more, --steps 1 or more")

@@ -8,7 +8,7 @@ from rich.console import Console
 from rich.table import Table
 
 from cavmarl.cli.output import JsonPath, write_json
-from cavmarl.registry import agent_entries, entries, load_config
+from cavmarl.config.registry import agent_entries, entries, load_config
 
 __all__ = ["list_entries"]
 

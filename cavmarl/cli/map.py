@@ -14,7 +14,7 @@ from cavmarl.cli import map_zones
 from cavmarl.cli.output import JsonPath, write_json
 from cavmarl.maps.check import MapReport, check_map
 from cavmarl.maps.netconvert import Box, BuildResult, build_network, map_file
-from cavmarl.roads.reader import map_name
+from cavmarl.roads.sumo_net.reader import map_name
 
 __all__ = ["app"]
 

@@ -12,15 +12,15 @@ from rich.table import Table
 from rich.text import Text
 
 from cavmarl.cli.output import JsonPath, write_json
-from cavmarl.config import ZONE_LAYOUTS
-from cavmarl.errors import ConfigError
+from cavmarl.config.env import ZONE_LAYOUTS
+from cavmarl.core.errors import ConfigError
 from cavmarl.maps.netconvert import map_file
-from cavmarl.maps.zone_loops import zones_without_loop
 from cavmarl.roads.cache import load_network
 from cavmarl.roads.network import RoadNetwork
-from cavmarl.roads.zone_file import named_zones, write_zones
-from cavmarl.roads.zone_statistics import ZoneStatistics, zone_statistics
-from cavmarl.roads.zones import ZonePartition
+from cavmarl.zones.partition.zone_file import named_zones, write_zones
+from cavmarl.zones.partition.zone_loops import zones_without_loop
+from cavmarl.zones.partition.zone_partition import ZonePartition
+from cavmarl.zones.partition.zone_statistics import ZoneStatistics, zone_statistics
 
 __all__ = ["zones"]
 
@@ -132,7 +132,7 @@ def _named(numbers: Sequence[int]) -> str:
 
 def _draw(network: RoadNetwork, partition: ZonePartition, halo_m: float, path: Path) -> None:
     from cavmarl.render.canvas import load_pygame
-    from cavmarl.render.zones import zone_picture
+    from cavmarl.render.zone_overlay import zone_picture
 
     surface = zone_picture(network, partition, halo_m, network.name)
     try:

@@ -12,11 +12,11 @@ import typer
 from rich.console import Console
 from rich.text import Text
 
-from cavmarl.errors import ConfigError
-from cavmarl.seeds import check_seed
+from cavmarl.core.errors import ConfigError
+from cavmarl.core.seeds import check_seed
 
 if TYPE_CHECKING:
-    from cavmarl.evaluate.differences import Difference
+    from cavmarl.verify.differences import Difference
 
 __all__ = [
     "Agents",

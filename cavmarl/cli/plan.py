@@ -18,14 +18,14 @@ from cavmarl.cli.output import (
     print_error,
     write_json,
 )
-from cavmarl.config import ZONE_LAYOUTS
-from cavmarl.errors import ConfigError, NoAdmissibleWorkerError
+from cavmarl.config.env import ZONE_LAYOUTS
+from cavmarl.core.errors import ConfigError, NoAdmissibleWorkerError
 
 if TYPE_CHECKING:
-    from cavmarl.balance.snapshot import Snapshot
-    from cavmarl.evaluate.shard_costs import MeasuredWorlds
+    from cavmarl.balance.load_snapshot import Snapshot
+    from cavmarl.bench.shard_costs import MeasuredWorlds
     from cavmarl.roads.network import RoadNetwork
-    from cavmarl.roads.zones import ZonePartition
+    from cavmarl.zones.partition.zone_partition import ZonePartition
 
 __all__ = ["plan"]
 
@@ -76,11 +76,11 @@ def plan(
     json_path: JsonPath = None,
 ) -> None:
     """Measure what each zone costs, place the shards, and print the plan; nothing is started."""
-    from cavmarl.balance.plan import make_plan
+    from cavmarl.balance.balance_plan import make_plan
     from cavmarl.balance.plan_text import describe_plan
     from cavmarl.balance.problem import BalanceRule, Problem
-    from cavmarl.evaluate.shard_costs import measure_shards
-    from cavmarl.evaluate.sharded_worlds import world_maker
+    from cavmarl.bench.shard_costs import measure_shards
+    from cavmarl.bench.sharded_worlds import world_maker
 
     if again is not None:
         _make_again(again)
@@ -126,8 +126,8 @@ def _cut_anew(
     path: Path,
 ) -> str:
     """Write zones of about the same cost, if that gains anything, and say what."""
-    from cavmarl.balance.repartition import propose_zones
-    from cavmarl.roads.zone_file import write_zones
+    from cavmarl.handoff.repartition_plan import propose_zones
+    from cavmarl.zones.partition.zone_file import write_zones
 
     found = propose_zones(
         network, partition, measured.places, measured.zone_costs_s(), tolerance=tolerance
@@ -142,9 +142,9 @@ def _cut_anew(
 
 
 def _snapshot(said: str, workers: int) -> Snapshot:
+    from cavmarl.balance.load_snapshot import idle_snapshot
     from cavmarl.balance.plan_file import read_plan
     from cavmarl.balance.probe import take_snapshot
-    from cavmarl.balance.snapshot import idle_snapshot
 
     if said == NOW:
         return take_snapshot(dict.fromkeys(range(workers)))
@@ -157,7 +157,7 @@ def _snapshot(said: str, workers: int) -> Snapshot:
 
 
 def _make_again(path: Path) -> None:
-    from cavmarl.balance.plan import replan
+    from cavmarl.balance.balance_plan import replan
     from cavmarl.balance.plan_file import read_plans
     from cavmarl.balance.plan_text import describe_plan
 

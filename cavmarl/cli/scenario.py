@@ -14,10 +14,10 @@ from rich.markup import escape
 from rich.table import Column, Table
 
 from cavmarl.cli.output import JsonPath, Seed, Settings, number, parse_settings, write_json
-from cavmarl.errors import ConfigError
+from cavmarl.core.errors import ConfigError
 
 if TYPE_CHECKING:
-    from cavmarl.evaluate.scenario_runs import ScenarioRun
+    from cavmarl.evaluate.scenarios.scenario_runs import ScenarioRun
 
 __all__ = ["app"]
 
@@ -29,8 +29,8 @@ app = typer.Typer(help="Scripted conflicts for agents.", no_args_is_help=True)
 @app.command("list")
 def list_scenarios(json_path: JsonPath = None) -> None:
     """Show the scenarios, what each needs of a map, and its parameters."""
-    from cavmarl.traffic.scenarios import load_scenario, scenario_names, summary_of
-    from cavmarl.traffic.settings import describe
+    from cavmarl.traffic.scenarios.library import load_scenario, scenario_names, summary_of
+    from cavmarl.traffic.scenarios.scenario_parameters import describe
 
     console = Console()
     document: dict[str, Any] = {}
@@ -82,8 +82,8 @@ def run(
     """Play a scenario to a driver; exit code 1 unless all come through and hurt nobody."""
     from contextlib import ExitStack
 
-    from cavmarl.evaluate.scenario_films import ScenarioCamera
-    from cavmarl.evaluate.scenario_runs import make_scenario, run_scenario
+    from cavmarl.evaluate.scenarios.scenario_films import ScenarioCamera
+    from cavmarl.evaluate.scenarios.scenario_runs import make_scenario, run_scenario
 
     with ExitStack() as stack:
         vec = make_scenario(
@@ -125,8 +125,8 @@ def sweep(
     json_path: JsonPath = None,
 ) -> None:
     """Play scenarios on maps to two drivers; exit code 1 unless one passes all, the other none."""
-    from cavmarl.evaluate.scenario_sweep import sweep_scenarios
-    from cavmarl.traffic.scenarios import scenario_names
+    from cavmarl.evaluate.scenarios.scenario_sweep import sweep_scenarios
+    from cavmarl.traffic.scenarios.library import scenario_names
 
     heads = ("scenario", "map", passes, "least TTC, s", "least PET, s", fails)
     table = Table(*(Column(head, no_wrap=True) for head in heads), box=box.MARKDOWN)

@@ -22,10 +22,10 @@ from cavmarl.cli.output import (
     parse_settings,
     write_json,
 )
-from cavmarl.errors import ConfigError
+from cavmarl.core.errors import ConfigError
 
 if TYPE_CHECKING:
-    from cavmarl.cav_env import CavEnv
+    from cavmarl.env.parallel import CavEnv
 
 __all__ = ["record", "view"]
 
@@ -47,7 +47,7 @@ def view(
     json_path: JsonPath = None,
 ) -> None:
     """Drive one world and show it from above."""
-    from cavmarl.cav_env import parallel_env
+    from cavmarl.env.parallel import parallel_env
 
     if not 0.0 < seconds <= 3600.0:
         raise ConfigError(f"--seconds {seconds:g}: must be above 0 and at most 3600")
@@ -89,7 +89,7 @@ def record(
     """
     from contextlib import ExitStack
 
-    from cavmarl.policies import load_policy
+    from cavmarl.policies.policy import load_policy
     from cavmarl.render.video import VideoWriter
 
     driver = load_policy(policy, world)

@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from cavmarl.env.vector import CavVectorEnv
+from cavmarl.evaluate.kernels.watching import locate_agents, watch_encroachments
 from cavmarl.evaluate.recorder import Recorder
-from cavmarl.kernels.watching import locate_agents, watch_encroachments
 from cavmarl.roads.network import RoadNetwork
-from cavmarl.vector_env import CavVectorEnv
 
 __all__ = ["Watch", "mirrored_conflicts"]
 

@@ -12,18 +12,18 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from cavmarl.config import TERMS
+from cavmarl.config.env import TERMS
+from cavmarl.engine.shard_clock import ShardClock
+from cavmarl.engine.world_setup import load_world
+from cavmarl.env.vector import CavVectorEnv
 from cavmarl.evaluate.encounters import Watch
 from cavmarl.evaluate.message_record import MessageRecord
 from cavmarl.evaluate.recorder import Recorder
 from cavmarl.evaluate.tables import EPISODE, TRACK, TRIP
 from cavmarl.evaluate.transfer_rows import TRANSFER, TransferRecorder
-from cavmarl.policies import Policy, load_policy
-from cavmarl.roads.zone_statistics import imbalance
-from cavmarl.runtime.shard_clock import ShardClock
-from cavmarl.stepping.local import LocalWorlds
-from cavmarl.vector_env import CavVectorEnv
-from cavmarl.worlds import load_world
+from cavmarl.parallel.local_worlds import LocalWorlds
+from cavmarl.policies.policy import Policy, load_policy
+from cavmarl.zones.partition.zone_statistics import imbalance
 
 __all__ = ["Job", "RunData", "Speed", "drive_run", "worlds_at_once"]
 

@@ -13,10 +13,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from cavmarl.errors import ConfigError, JournalError, PolicyError
+from cavmarl.core.errors import ConfigError, JournalError, PolicyError
+from cavmarl.core.seeds import check_seed
+from cavmarl.engine.world_setup import load_world
+from cavmarl.env.vector import CavVectorEnv
 from cavmarl.evaluate.episodes import Job, Progress, RunData, Speed, drive_run, worlds_at_once
 from cavmarl.evaluate.fresh import drive_in_fresh_process
-from cavmarl.evaluate.manifest import (
+from cavmarl.evaluate.map_outline import map_outline
+from cavmarl.evaluate.provenance.manifest import (
     close_manifest,
     describe_policies,
     describe_world,
@@ -24,17 +28,13 @@ from cavmarl.evaluate.manifest import (
     read_closed,
     write_text,
 )
-from cavmarl.evaluate.map_outline import map_outline
 from cavmarl.evaluate.report import EvaluationReport, make_report
 from cavmarl.evaluate.tables import EPISODE, TRACK, TRIP, read_table, write_table
 from cavmarl.evaluate.transfer_rows import TRANSFER, transfers_of
+from cavmarl.handoff.coordinator.coordinator_setup import journal_path
 from cavmarl.ownership.transfer_summary import TransferSummary
-from cavmarl.policies import load_policy
-from cavmarl.runtime.refereeing import journal_path
-from cavmarl.seeds import check_seed
-from cavmarl.stepping.local import LocalWorlds
-from cavmarl.vector_env import CavVectorEnv
-from cavmarl.worlds import load_world
+from cavmarl.parallel.local_worlds import LocalWorlds
+from cavmarl.policies.policy import load_policy
 
 __all__ = ["evaluate", "load_map", "load_report", "load_tables", "load_tracks", "run_seeds"]
 

@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from cavmarl import errors
+from cavmarl.core import errors
 from cavmarl.evaluate.episodes import Job, Progress, RunData, Speed, drive_run
 
 __all__ = ["drive_in_fresh_process", "main"]

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from cavmarl.vector_env import CavVectorEnv
+from cavmarl.env.vector import CavVectorEnv
 
 __all__ = ["MESSAGE_COLUMNS", "MessageRecord"]
 

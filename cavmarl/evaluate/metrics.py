@@ -8,7 +8,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from cavmarl.config import TERMS
+from cavmarl.config.env import TERMS
 from cavmarl.evaluate.tables import reward_column
 
 __all__ = ["METRICS", "Metric", "metric_values"]

@@ -7,11 +7,11 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from cavmarl.errors import require
+from cavmarl.core.errors import require
 from cavmarl.evaluate.evaluation import load_map, load_report, load_tables, load_tracks
-from cavmarl.evaluate.manifest import write_text
 from cavmarl.evaluate.metrics import METRICS, Metric
 from cavmarl.evaluate.page_transfers import transfer_rows
+from cavmarl.evaluate.provenance.manifest import write_text
 from cavmarl.evaluate.report import Difference, EvaluationReport, Found
 from cavmarl.evaluate.statistics import Interval
 

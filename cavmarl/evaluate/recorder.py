@@ -5,11 +5,11 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from cavmarl.config import TERMS
+from cavmarl.config.env import TERMS
 from cavmarl.evaluate.message_record import MESSAGE_COLUMNS
 from cavmarl.evaluate.statistics import gini_coefficient, jain_index
 from cavmarl.evaluate.tables import EPISODE, TRIP, reward_column
-from cavmarl.kernels.terms import TTC_HORIZON_S
+from cavmarl.rewards.kernels.terms import TTC_HORIZON_S
 
 __all__ = ["PET_HORIZON_S", "SHORT_TTC_S", "Recorder"]
 

@@ -6,11 +6,11 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from cavmarl.config_io import read_yaml, validate
-from cavmarl.errors import ConfigError
+from cavmarl.config.io import read_yaml, validate
+from cavmarl.config.registry import entries, places
+from cavmarl.core.errors import ConfigError
 from cavmarl.evaluate.evaluation import evaluate
 from cavmarl.evaluate.report import EvaluationReport
-from cavmarl.registry import entries, places
 
 __all__ = ["Suite", "World", "find_suite", "load_suite", "run_suite", "worlds_of"]
 

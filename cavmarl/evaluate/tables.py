@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from cavmarl.config import TERMS
+from cavmarl.config.env import TERMS
 
 __all__ = ["EPISODE", "TRACK", "TRIP", "read_table", "reward_column", "write_table"]
 

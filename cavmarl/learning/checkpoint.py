@@ -11,9 +11,9 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 import torch
 
-from cavmarl.config_io import validate
-from cavmarl.errors import ConfigError, PolicyError
-from cavmarl.networks import ActorCritic, NetworkConfig, load_network, save_network
+from cavmarl.config.io import validate
+from cavmarl.core.errors import ConfigError, PolicyError
+from cavmarl.policies.networks import ActorCritic, NetworkConfig, load_network, save_network
 
 if TYPE_CHECKING:
     from _typeshed import DataclassInstance

@@ -7,11 +7,11 @@ import time
 import torch
 from torch import Tensor
 
+from cavmarl.env.vector import CavVectorEnv
 from cavmarl.learning.batch import Batch
-from cavmarl.learning.clock import Clock
+from cavmarl.learning.run_clock import Clock
 from cavmarl.learning.trips import Trips
-from cavmarl.networks import ActorCritic
-from cavmarl.vector_env import CavVectorEnv
+from cavmarl.policies.networks import ActorCritic
 
 __all__ = ["Collector"]
 

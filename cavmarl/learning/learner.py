@@ -9,8 +9,8 @@ import torch
 from torch import Tensor, nn
 
 from cavmarl.learning.batch import Batch
-from cavmarl.learning.settings import PpoSettings
-from cavmarl.networks import ActorCritic
+from cavmarl.learning.ppo_settings import PpoSettings
+from cavmarl.policies.networks import ActorCritic
 
 __all__ = ["Learner"]
 

@@ -11,7 +11,7 @@ import numpy as np
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
-from cavmarl.errors import require
+from cavmarl.core.errors import require
 
 __all__ = ["CSV_FILE", "WINDOW", "Log", "curve_row", "describe", "progress_bar"]
 

@@ -13,8 +13,8 @@ from dataclasses import fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar, get_args, get_type_hints
 
-from cavmarl.config_io import read_yaml, validate
-from cavmarl.errors import CavmarlError, ConfigError
+from cavmarl.config.io import read_yaml, validate
+from cavmarl.core.errors import CavmarlError, ConfigError
 
 if TYPE_CHECKING:
     from _typeshed import DataclassInstance

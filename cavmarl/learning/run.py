@@ -12,17 +12,17 @@ import torch
 from gymnasium.vector import AutoresetMode
 from rich.console import Console
 
-from cavmarl.errors import ConfigError
-from cavmarl.evaluate.training_record import begin_training, end_training
+from cavmarl.core.errors import ConfigError
+from cavmarl.env.vector import CavVectorEnv, make_vec
+from cavmarl.evaluate.provenance.training_record import begin_training, end_training
 from cavmarl.learning.batch import Batch
 from cavmarl.learning.checkpoint import State, load_checkpoint, read_state, save_checkpoint
 from cavmarl.learning.collector import Collector
 from cavmarl.learning.learner import Learner
 from cavmarl.learning.log import CSV_FILE, Log, describe, progress_bar
+from cavmarl.learning.ppo_settings import PpoSettings
 from cavmarl.learning.scales import Scales
-from cavmarl.learning.settings import PpoSettings
-from cavmarl.networks import CONFIG_FILE, WEIGHTS_FILE, ActorCritic, NetworkConfig
-from cavmarl.vector_env import CavVectorEnv, make_vec
+from cavmarl.policies.networks import CONFIG_FILE, WEIGHTS_FILE, ActorCritic, NetworkConfig
 
 __all__ = ["Run", "train"]
 

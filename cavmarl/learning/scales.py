@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from torch import Tensor
 
-from cavmarl.networks import ActorCritic
+from cavmarl.policies.networks import ActorCritic
 
 __all__ = ["Scales"]
 

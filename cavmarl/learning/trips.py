@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from cavmarl.config import TERMS
+from cavmarl.config.env import TERMS
 from cavmarl.learning.log import WINDOW
 
 __all__ = ["Trips"]

@@ -1,1 +1,4 @@
-"""Map files: built into SUMO networks, and checked."""
+"""Map files: built into SUMO networks, checked, with buildings beside them.
+
+Stands on `roads`.
+"""

@@ -10,11 +10,11 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from cavmarl.errors import MapError
-from cavmarl.kernels.backdrop import WALL
+from cavmarl.core.errors import MapError
 from cavmarl.maps.footprints import Footprint, read_footprints
+from cavmarl.roads.kernels.backdrop_pieces import WALL
 from cavmarl.roads.network import RoadNetwork
-from cavmarl.roads.reader import source_hash
+from cavmarl.roads.sumo_net.reader import source_hash
 
 __all__ = ["convex_parts", "walls_of", "with_buildings"]
 

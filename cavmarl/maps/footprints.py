@@ -13,9 +13,9 @@ from xml.sax.handler import ContentHandler
 import numpy as np
 from numpy.typing import NDArray
 
-from cavmarl.errors import MapError, require
+from cavmarl.core.errors import MapError, require
 from cavmarl.roads.network import GeoReference
-from cavmarl.roads.xml_source import read_xml
+from cavmarl.roads.sumo_net.xml_source import read_xml
 
 __all__ = ["DEFAULT_HEIGHT_M", "LEVEL_M", "Footprint", "read_footprints"]
 

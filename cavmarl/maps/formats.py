@@ -7,8 +7,8 @@ from typing import Any, Literal
 from xml.sax import SAXParseException
 from xml.sax.handler import ContentHandler
 
-from cavmarl.errors import MapError
-from cavmarl.roads.xml_source import read_xml
+from cavmarl.core.errors import MapError
+from cavmarl.roads.sumo_net.xml_source import read_xml
 
 __all__ = ["MAP_ENDINGS", "MapKind", "map_kind"]
 

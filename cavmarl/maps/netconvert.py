@@ -17,12 +17,12 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
-from cavmarl.errors import ConfigError, MapError, require
-from cavmarl.kernels import cache_dir
+from cavmarl.core.errors import ConfigError, MapError, require
+from cavmarl.core.numba import cache_dir
 from cavmarl.maps.build_log import BuildLog
 from cavmarl.maps.formats import MapKind, map_kind
-from cavmarl.roads.reader import map_name, read_network, source_hash
-from cavmarl.roads.xml_source import read_bytes
+from cavmarl.roads.sumo_net.reader import map_name, read_network, source_hash
+from cavmarl.roads.sumo_net.xml_source import read_bytes
 
 __all__ = ["OPENDRIVE_OPTIONS", "OSM_OPTIONS", "Box", "BuildResult", "build_network", "map_file"]
 

@@ -17,7 +17,7 @@ from dataclasses import fields
 from enum import IntEnum
 from typing import Any, get_args, get_origin, get_type_hints
 
-from cavmarl.errors import (
+from cavmarl.core.errors import (
     CorruptMessageError,
     ForeignRunError,
     TruncatedMessageError,

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 from typing import Protocol
 
-from cavmarl.errors import ProtocolError, SpawnError
+from cavmarl.core.errors import ProtocolError, SpawnError
 from cavmarl.ownership.ledger import state_digest
 from cavmarl.ownership.limits import Limits
 from cavmarl.ownership.messages import Birth, Deferral, Switch

@@ -12,7 +12,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 
-from cavmarl.errors import JournalError, ProtocolError, StoreError, ZoneStepError
+from cavmarl.core.errors import JournalError, ProtocolError, StoreError, ZoneStepError
 from cavmarl.ownership.decisions import CommittedStates, Decisions
 from cavmarl.ownership.leases import make_step
 from cavmarl.ownership.ledger import world_digest

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from cavmarl.errors import ConfigError, CoverageError
+from cavmarl.core.errors import ConfigError, CoverageError
 from cavmarl.ownership.limits import Limits
 from cavmarl.ownership.safeguards import ALL_ON, Safeguards
 

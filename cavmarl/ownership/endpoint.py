@@ -11,7 +11,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Iterable, Sequence
 
-from cavmarl.errors import ProtocolError
+from cavmarl.core.errors import ProtocolError
 from cavmarl.ownership.ledger import Tally, tally
 from cavmarl.ownership.limits import Limits
 from cavmarl.ownership.messages import (

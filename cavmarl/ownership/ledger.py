@@ -12,7 +12,7 @@ from functools import lru_cache
 from hashlib import blake2b
 from typing import NamedTuple
 
-from cavmarl.errors import LedgerError
+from cavmarl.core.errors import LedgerError
 
 _ID = struct.Struct("<q")
 _WORLD = 1 << 128

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from enum import StrEnum
 
-from cavmarl.errors import ConfigError
+from cavmarl.core.errors import ConfigError
 
 
 class DeadlinePolicy(StrEnum):

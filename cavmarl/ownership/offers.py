@@ -11,7 +11,7 @@ from collections import defaultdict
 from collections.abc import Iterable, Mapping
 from typing import NamedTuple
 
-from cavmarl.errors import ProtocolError
+from cavmarl.core.errors import ProtocolError
 from cavmarl.ownership.ledger import state_digest
 from cavmarl.ownership.limits import Limits
 from cavmarl.ownership.messages import Ack, Nack, Offer, Refusal, Withdrawn

@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 
-from cavmarl.errors import LedgerError
+from cavmarl.core.errors import LedgerError
 from cavmarl.ownership.ledger import Tally
 from cavmarl.ownership.messages import Begin, Confirmed, Done, Out, Removed, Spawn, Switch
 

@@ -10,7 +10,7 @@ from collections import Counter
 from collections.abc import Iterable
 from typing import TypeAlias
 
-from cavmarl.errors import JournalError, LedgerError, ProtocolError
+from cavmarl.core.errors import JournalError, LedgerError, ProtocolError
 from cavmarl.ownership.ledger import SeenIds, Tally
 from cavmarl.ownership.messages import (
     RUN_BYTES,

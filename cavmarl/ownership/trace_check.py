@@ -15,7 +15,7 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
-from cavmarl.errors import InvariantError
+from cavmarl.core.errors import InvariantError
 from cavmarl.ownership.ledger import SeenIds, Tally, state_digest
 from cavmarl.ownership.messages import (
     COORDINATOR,

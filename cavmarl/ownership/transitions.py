@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from enum import StrEnum
 
-from cavmarl.errors import TransitionError
+from cavmarl.core.errors import TransitionError
 
 
 class _Word(StrEnum):

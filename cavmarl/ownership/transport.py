@@ -13,7 +13,7 @@ from dataclasses import dataclass, field
 from hashlib import blake2b
 from typing import Any, NamedTuple
 
-from cavmarl.errors import ConfigError, MessageError
+from cavmarl.core.errors import ConfigError, MessageError
 from cavmarl.ownership.codec import decode, encode
 from cavmarl.ownership.messages import COORDINATOR, Message, Step
 

@@ -1,1 +1,4 @@
-"""Pictures of worlds: frames, windows, videos."""
+"""Pictures of worlds: frames, windows, videos.
+
+Reads the engine's rows; `env` and `evaluate` draw with it.
+"""

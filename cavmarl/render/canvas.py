@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from cavmarl.errors import require
+from cavmarl.core.errors import require
 
 if TYPE_CHECKING:
     from pygame import Font, Surface

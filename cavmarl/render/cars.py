@@ -8,8 +8,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from cavmarl.kernels.codes import DRIVER_SCRIPTED, EVENT_COLLIDED
-from cavmarl.render.camera import Camera
+from cavmarl.core.records.codes import DRIVER_SCRIPTED, EVENT_COLLIDED
 from cavmarl.render.canvas import Part, stamp
 from cavmarl.render.marks import opaque
 from cavmarl.render.palette import (
@@ -23,6 +22,7 @@ from cavmarl.render.palette import (
     Color,
     agent_color,
 )
+from cavmarl.render.viewport import Camera
 from cavmarl.render.walkers import draw_walker, is_walker
 
 if TYPE_CHECKING:

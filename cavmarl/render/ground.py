@@ -7,8 +7,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from cavmarl.kernels.codes import SIGNAL_NONE
-from cavmarl.render.camera import Camera
+from cavmarl.core.records.codes import SIGNAL_NONE
 from cavmarl.render.canvas import blank, load_pygame, stamp
 from cavmarl.render.palette import (
     ASPHALT,
@@ -21,6 +20,7 @@ from cavmarl.render.palette import (
     Color,
 )
 from cavmarl.render.shapes import RoadShapes, level_of
+from cavmarl.render.viewport import Camera
 from cavmarl.roads.network import SIGNAL_STATES, RoadNetwork
 
 if TYPE_CHECKING:

@@ -9,11 +9,11 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from cavmarl.render.camera import Camera
 from cavmarl.render.canvas import blank, lettering, load_pygame, stamp
 from cavmarl.render.legend import SWATCH_PX, Sample
 from cavmarl.render.marks import pill, target
 from cavmarl.render.palette import INK, MUTED_INK, PANEL, agent_color, ink_on
+from cavmarl.render.viewport import Camera
 
 if TYPE_CHECKING:
     from pygame import Surface

@@ -7,13 +7,13 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from cavmarl.render.camera import Camera
+from cavmarl.handoff.zone_view import TransferInFlight, ZoneView
 from cavmarl.render.canvas import stamp
 from cavmarl.render.cars import Paint
 from cavmarl.render.marks import pointer
 from cavmarl.render.palette import INK, zone_color
-from cavmarl.roads.zones import ZonePartition
-from cavmarl.runtime.zone_view import TransferInFlight, ZoneView
+from cavmarl.render.viewport import Camera
+from cavmarl.zones.partition.zone_partition import ZonePartition
 
 if TYPE_CHECKING:
     from pygame import Surface

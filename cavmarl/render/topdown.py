@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from cavmarl.kernels.codes import DRIVER_SCRIPTED
-from cavmarl.render.camera import Bounds, Camera, suitable_size
+from cavmarl.core.records.codes import DRIVER_SCRIPTED
+from cavmarl.handoff.zone_view import ZoneView
 from cavmarl.render.canvas import load_pygame, pixels
 from cavmarl.render.cars import draw_cars, in_view
 from cavmarl.render.ground import draw_ground, draw_stop_lines, signal_codes
@@ -17,10 +17,10 @@ from cavmarl.render.legend import Sample, samples_of_drivers, samples_of_zones
 from cavmarl.render.overlay import Overlay, clock_text
 from cavmarl.render.owners import draw_transfers, owner_paints
 from cavmarl.render.shapes import road_shapes
+from cavmarl.render.viewport import Bounds, Camera, suitable_size
 from cavmarl.render.window import Window
-from cavmarl.render.zones import draw_sight, draw_zones
+from cavmarl.render.zone_overlay import draw_sight, draw_zones
 from cavmarl.roads.network import RoadNetwork
-from cavmarl.runtime.zone_view import ZoneView
 
 if TYPE_CHECKING:
     from pygame import Surface

@@ -9,7 +9,7 @@ from types import TracebackType
 import numpy as np
 from numpy.typing import NDArray
 
-from cavmarl.errors import ConfigError, require
+from cavmarl.core.errors import ConfigError, require
 
 __all__ = ["VideoWriter"]
 

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from cavmarl.kernels.codes import DRIVER_SCRIPTED, EVENT_COLLIDED
+from cavmarl.core.records.codes import DRIVER_SCRIPTED, EVENT_COLLIDED
 from cavmarl.render.canvas import Part, stamp
 from cavmarl.render.marks import opaque
 from cavmarl.render.palette import ACTOR, COLLIDED, INK, PANEL

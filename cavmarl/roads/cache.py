@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from cavmarl.kernels import cache_dir
+from cavmarl.core.numba import cache_dir
 from cavmarl.roads.network import (
     CONFLICT,
     DETECTOR,
@@ -30,7 +30,7 @@ from cavmarl.roads.network import (
     GeoReference,
     RoadNetwork,
 )
-from cavmarl.roads.reader import map_name, read_network, source_hash
+from cavmarl.roads.sumo_net.reader import map_name, read_network, source_hash
 
 __all__ = ["load_network"]
 

@@ -21,10 +21,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from cavmarl.huge_pages import huge_copy
-from cavmarl.kernels.arrays import RoadArrays
-from cavmarl.kernels.backdrop import WALL
-from cavmarl.kernels.signals import DETECTOR_REACH_M
+from cavmarl.core.huge_pages import huge_copy
+from cavmarl.core.records.arrays import RoadArrays
+from cavmarl.roads.kernels.backdrop_pieces import WALL
+from cavmarl.roads.kernels.signal_phases import DETECTOR_REACH_M
 
 __all__ = [
     "CONFLICT",

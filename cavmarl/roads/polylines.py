@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from cavmarl.errors import MapError
+from cavmarl.core.errors import MapError
 from cavmarl.roads.network import POINT
 
 __all__ = ["STUB_M", "clean_shape", "extend_stubs", "point_rows"]

@@ -13,9 +13,9 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from cavmarl.errors import RouteError
-from cavmarl.kernels.arrays import LaneGrid
-from cavmarl.kernels.plans import plan_goal
+from cavmarl.core.errors import RouteError
+from cavmarl.core.records.arrays import LaneGrid
+from cavmarl.roads.kernels.plans import plan_goal
 from cavmarl.roads.network import VEHICLE_CLASSES, RoadNetwork
 
 __all__ = ["PLAN", "lane_grid", "make_plans", "way"]

@@ -11,29 +11,29 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from cavmarl.config import PopulationConfig, TrafficConfig
-from cavmarl.errors import CapacityError, ConfigError, RouteError
-from cavmarl.kernels.admission import accept, assign_lanes
-from cavmarl.kernels.arrays import Demand, Gate, Travel, Worlds
-from cavmarl.kernels.codes import MODEL_KRAUSS
-from cavmarl.kernels.departures import call_orders, populate, settle
-from cavmarl.kernels.drivers import look_ahead_m, see_line_m
-from cavmarl.kernels.lanes import VIEW_M
-from cavmarl.kernels.repeated import repeated
+from cavmarl.config.env import PopulationConfig, TrafficConfig
+from cavmarl.core.errors import CapacityError, ConfigError, RouteError
+from cavmarl.core.memory import Zeros
+from cavmarl.core.numba.repeated import repeated
+from cavmarl.core.records.arrays import Demand, Gate, Travel, Worlds
+from cavmarl.core.records.codes import MODEL_KRAUSS
+from cavmarl.driving.kernels.drivers import look_ahead_m, see_line_m
+from cavmarl.driving.kernels.lane_index import VIEW_M
+from cavmarl.driving.vehicle_types import generated_types
 from cavmarl.roads.network import VEHICLE_CLASSES, RoadNetwork
 from cavmarl.roads.routing import make_plans
-from cavmarl.traffic.cast import Cast
 from cavmarl.traffic.demand import STOP, DemandFile
-from cavmarl.traffic.departures import with_room
-from cavmarl.traffic.memory import Zeros
+from cavmarl.traffic.departure_queue import with_room
+from cavmarl.traffic.kernels.admission import accept, assign_lanes
+from cavmarl.traffic.kernels.demand_generator import call_orders, populate, settle
 from cavmarl.traffic.rerouting import Rerouting
-from cavmarl.traffic.scene import Scene
+from cavmarl.traffic.scenarios.cast import Cast
+from cavmarl.traffic.scenarios.movement_scripts import NO_SCRIPTS
+from cavmarl.traffic.scenarios.scene import Scene
 from cavmarl.traffic.schedule import Schedule
-from cavmarl.traffic.scripts import NO_SCRIPTS
-from cavmarl.traffic.sumo.demand import SumoDemand
 from cavmarl.traffic.sumo.route_book import RouteBook
 from cavmarl.traffic.sumo.stop_book import StopBook
-from cavmarl.traffic.vtypes import generated_types
+from cavmarl.traffic.sumo.sumo_demand import SumoDemand
 from cavmarl.traffic.way_slots import WaySlots, way_slots
 
 __all__ = ["NativeTraffic", "capacity_of"]

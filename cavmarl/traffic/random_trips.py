@@ -10,7 +10,7 @@ from xml.sax.saxutils import quoteattr
 import numpy as np
 from numpy.typing import NDArray
 
-from cavmarl.errors import ConfigError, RouteError
+from cavmarl.core.errors import ConfigError, RouteError
 from cavmarl.maps.components import strong_components
 from cavmarl.roads.network import VEHICLE_CLASSES, RoadNetwork
 

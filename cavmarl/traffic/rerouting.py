@@ -12,14 +12,14 @@ from collections.abc import Iterator
 import numpy as np
 from numpy.typing import NDArray
 
-from cavmarl.kernels.arrays import Gate, RoadArrays, Travel, Worlds
-from cavmarl.kernels.codes import COUNT_REROUTED
-from cavmarl.kernels.edge_speeds import limit_speeds, sample_speeds
-from cavmarl.kernels.rerouting import find_asking, mark_slots
-from cavmarl.kernels.rng import STREAM_REROUTER, uniform
+from cavmarl.core.math.rng import STREAM_REROUTER, uniform
+from cavmarl.core.records.arrays import Gate, RoadArrays, Travel, Worlds
+from cavmarl.core.records.codes import COUNT_REROUTED
 from cavmarl.roads.routing import PLAN
 from cavmarl.traffic.demand import Choices
 from cavmarl.traffic.demand.rerouters import KEEP_DESTINATION
+from cavmarl.traffic.kernels.edge_speeds import limit_speeds, sample_speeds
+from cavmarl.traffic.kernels.way_requests import find_asking, mark_slots
 from cavmarl.traffic.schedule import Schedule
 from cavmarl.traffic.way_search import Answer, Traffic, WaySearch
 from cavmarl.traffic.way_slots import WaySlots

@@ -8,15 +8,15 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from cavmarl.errors import CapacityError, RouteError
-from cavmarl.kernels.codes import LANE_GIVEN, SPEED_GIVEN
-from cavmarl.kernels.plans import plan_goal
-from cavmarl.kernels.routes import plan_route, trace_edges
+from cavmarl.core.errors import CapacityError, RouteError
+from cavmarl.core.records.codes import LANE_GIVEN, SPEED_GIVEN
+from cavmarl.roads.kernels.plans import plan_goal
+from cavmarl.roads.kernels.route_steps import plan_route, trace_edges
 from cavmarl.roads.network import RoadNetwork
 from cavmarl.roads.routing import PLAN
 from cavmarl.traffic.demand import DemandFile
 from cavmarl.traffic.demand.drawing import speed_factors
-from cavmarl.traffic.departures import DEPARTURE
+from cavmarl.traffic.departure_queue import DEPARTURE
 
 __all__ = ["Schedule"]
 

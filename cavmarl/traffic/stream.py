@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import math
 
-from cavmarl.traffic.motions import Ride, path_of
-from cavmarl.traffic.scene import Scene, Seat
-from cavmarl.traffic.scripts import Actor
-from cavmarl.traffic.streets import Crossing, Streets
+from cavmarl.traffic.scenarios.motions import Ride, path_of
+from cavmarl.traffic.scenarios.movement_scripts import Actor
+from cavmarl.traffic.scenarios.scene import Scene, Seat
+from cavmarl.traffic.scenarios.streets import Crossing, Streets
 
 __all__ = ["approach", "meet_stream", "stream"]
 

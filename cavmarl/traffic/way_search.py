@@ -8,10 +8,11 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from cavmarl.kernels.arrays import RoadArrays, Travel
-from cavmarl.kernels.edge_speeds import CLOSED_S, slow_lanes
-from cavmarl.kernels.plans import plan_goal
-from cavmarl.kernels.rerouting import (
+from cavmarl.core.records.arrays import RoadArrays, Travel
+from cavmarl.roads.kernels.plans import plan_goal
+from cavmarl.roads.routing import PLAN
+from cavmarl.traffic.kernels.edge_speeds import CLOSED_S, slow_lanes
+from cavmarl.traffic.kernels.way_requests import (
     find_way,
     has_room,
     mark_slots,
@@ -19,7 +20,6 @@ from cavmarl.kernels.rerouting import (
     take_slot,
     time_left,
 )
-from cavmarl.roads.routing import PLAN
 from cavmarl.traffic.way_slots import WaySlots
 
 __all__ = ["Answer", "Traffic", "WaySearch"]

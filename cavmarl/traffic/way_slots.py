@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from cavmarl.errors import CapacityError
+from cavmarl.core.errors import CapacityError
 from cavmarl.roads.routing import PLAN
 from cavmarl.traffic.schedule import MAX_STEPS, Schedule
 

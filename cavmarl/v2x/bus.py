@@ -13,14 +13,17 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from cavmarl.config import EnvConfig
-from cavmarl.config_v2x import V2xConfig, period_ticks
-from cavmarl.errors import V2xError
-from cavmarl.kernels.arrays import Common, RoadArrays, Zoned
-from cavmarl.kernels.neighbors import make_grid
-from cavmarl.kernels.repeated import repeated
-from cavmarl.kernels.v2x_exchange import exchange_messages, hand_out
-from cavmarl.kernels.v2x_records import (
+from cavmarl.config.env import EnvConfig
+from cavmarl.config.v2x import V2xConfig, period_ticks
+from cavmarl.core.errors import V2xError
+from cavmarl.core.math.neighbors import make_grid
+from cavmarl.core.math.walls import make_walls
+from cavmarl.core.numba.repeated import repeated
+from cavmarl.core.records.arrays import Common, RoadArrays, Zoned
+from cavmarl.roads.network import RoadNetwork
+from cavmarl.v2x.channel import make_channel
+from cavmarl.v2x.kernels.v2x_exchange import exchange_messages, hand_out
+from cavmarl.v2x.kernels.v2x_records import (
     LAST_CAM,
     MAX_DELAYS,
     MAX_NEAR,
@@ -37,13 +40,10 @@ from cavmarl.kernels.v2x_records import (
     Room,
     Sending,
 )
-from cavmarl.kernels.walls import make_walls
-from cavmarl.roads.network import RoadNetwork
-from cavmarl.v2x.channel import make_channel
-from cavmarl.v2x.messages import cause_code
-from cavmarl.v2x.network import Exchange, NetworkSimulator, check_receptions
+from cavmarl.v2x.message_statistics import V2xStatistics, statistics_of
+from cavmarl.v2x.network_simulator import Exchange, NetworkSimulator, check_receptions
 from cavmarl.v2x.roadside import make_units
-from cavmarl.v2x.statistics import V2xStatistics, statistics_of
+from cavmarl.v2x.v2x_messages import cause_code
 
 __all__ = ["Bus"]
 

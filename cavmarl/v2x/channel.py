@@ -8,9 +8,9 @@ from statistics import NormalDist
 import numpy as np
 from numpy.typing import NDArray
 
-from cavmarl.config_v2x import ChannelConfig
-from cavmarl.kernels.v2x_channel import Channel
-from cavmarl.kernels.walls import Walls
+from cavmarl.config.v2x import ChannelConfig
+from cavmarl.core.math.walls import Walls
+from cavmarl.v2x.kernels.v2x_channel import Channel
 
 __all__ = [
     "BUSY_LEVELS",

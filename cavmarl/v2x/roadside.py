@@ -7,11 +7,11 @@ import difflib
 import numpy as np
 from numpy.typing import NDArray
 
-from cavmarl.config_v2x import EVERY_SIGNAL, RoadsideConfig
-from cavmarl.errors import ConfigError
-from cavmarl.kernels.v2x_records import FIRST_ROADSIDE_ID, UNIT
+from cavmarl.config.v2x import EVERY_SIGNAL, RoadsideConfig
+from cavmarl.core.errors import ConfigError
 from cavmarl.roads.network import RoadNetwork
-from cavmarl.v2x.messages import MAP
+from cavmarl.v2x.kernels.v2x_records import FIRST_ROADSIDE_ID, UNIT
+from cavmarl.v2x.v2x_messages import MAP
 
 __all__ = ["make_units", "map_of"]
 

@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from cavmarl.errors import ConfigError
-from cavmarl.registry import entries
+from cavmarl.config.registry import entries
+from cavmarl.core.errors import ConfigError
 
 benchmarl = pytest.importorskip("benchmarl", reason="needs the extra: benchmarl (make libraries)")
 

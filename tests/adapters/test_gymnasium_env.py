@@ -10,8 +10,8 @@ import pytest
 from gymnasium.utils.env_checker import check_env
 from gymnasium.wrappers import FlattenObservation, RecordEpisodeStatistics
 
-from cavmarl.errors import ConfigError
-from cavmarl.registry import load_config
+from cavmarl.config.registry import load_config
+from cavmarl.core.errors import ConfigError
 
 MODES = ("closed", "entering", "seats")
 

@@ -11,10 +11,10 @@ from gymnasium.vector import AutoresetMode
 from gymnasium.wrappers import vector as wrappers
 from numpy.typing import NDArray
 
-from cavmarl.config import TERMS
-from cavmarl.errors import ConfigError
-from cavmarl.spaces import flat_observation
-from cavmarl.vector_env import make_vec
+from cavmarl.config.env import TERMS
+from cavmarl.core.errors import ConfigError
+from cavmarl.engine.spaces import flat_observation
+from cavmarl.env.vector import make_vec
 
 MODES = ("closed", "entering", "seats")
 AUTORESET = (AutoresetMode.SAME_STEP, AutoresetMode.NEXT_STEP)

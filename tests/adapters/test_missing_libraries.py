@@ -7,7 +7,7 @@ import sys
 
 import pytest
 
-from cavmarl.errors import MissingExtraError
+from cavmarl.core.errors import MissingExtraError
 
 
 @pytest.mark.parametrize(

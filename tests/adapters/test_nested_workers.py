@@ -15,8 +15,8 @@ import pytest
 from gymnasium.vector import AsyncVectorEnv, AutoresetMode
 from numpy.typing import NDArray
 
-from cavmarl.spaces import flat_observation_space
-from cavmarl.vector_env import make_vec
+from cavmarl.engine.spaces import flat_observation_space
+from cavmarl.env.vector import make_vec
 
 WORKERS = (0, 1)  # processes of our own within each worker
 STEPS = 30

@@ -8,8 +8,8 @@ from typing import Any
 
 import pytest
 
-from cavmarl.cav_env import parallel_env
-from cavmarl.errors import ConfigError
+from cavmarl.core.errors import ConfigError
+from cavmarl.env.parallel import parallel_env
 
 ray = pytest.importorskip("ray", reason="needs the extra: rllib (make libraries)")
 pytest.importorskip("ray.rllib", reason="needs the extra: rllib (make libraries)")

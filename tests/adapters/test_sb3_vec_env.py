@@ -7,10 +7,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from cavmarl.errors import ConfigError, InvalidActionError
-from cavmarl.registry import load_config
-from cavmarl.spaces import flat_observation, observation_parts
-from cavmarl.vector_env import make_vec
+from cavmarl.config.registry import load_config
+from cavmarl.core.errors import ConfigError, InvalidActionError
+from cavmarl.engine.spaces import flat_observation, observation_parts
+from cavmarl.env.vector import make_vec
 
 sb3 = pytest.importorskip("stable_baselines3")
 

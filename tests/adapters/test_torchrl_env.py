@@ -7,10 +7,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from cavmarl.config import TERMS
-from cavmarl.errors import ConfigError, InvalidActionError
-from cavmarl.spaces import flat_observation, observation_parts
-from cavmarl.vector_env import make_vec
+from cavmarl.config.env import TERMS
+from cavmarl.core.errors import ConfigError, InvalidActionError
+from cavmarl.engine.spaces import flat_observation, observation_parts
+from cavmarl.env.vector import make_vec
 
 torch = pytest.importorskip("torch", reason="needs the extra: torchrl")
 torchrl = pytest.importorskip("torchrl", reason="needs the extra: torchrl")

@@ -8,8 +8,8 @@ from itertools import product
 from hypothesis import strategies as st
 
 from cavmarl.balance.load_score import Candidate, Utilisation
+from cavmarl.balance.load_snapshot import Snapshot
 from cavmarl.balance.problem import Problem, ShardCost
-from cavmarl.balance.snapshot import Snapshot
 
 COSTS = st.one_of(st.floats(0.0, 1.0), st.sampled_from([0.0, 0.001, 0.01, 1.0]))
 

@@ -10,12 +10,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from cavmarl.balance.balance_plan import Plan, make_plan
 from cavmarl.balance.load_score import Candidate, LoadRule, Utilisation
-from cavmarl.balance.plan import Plan, make_plan
+from cavmarl.balance.load_snapshot import Snapshot, idle_snapshot
 from cavmarl.balance.problem import BalanceRule, Problem, ShardCost
 from cavmarl.balance.smoothing import SmoothCosts
-from cavmarl.balance.snapshot import Snapshot, idle_snapshot
-from cavmarl.errors import NoAdmissibleWorkerError, PlacementError
+from cavmarl.core.errors import NoAdmissibleWorkerError, PlacementError
 from tests.balance.shards import COSTS, busy, grid, least_makespan_s, row
 
 STRICT = BalanceRule(tolerance=0.0)

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import pytest
 
+from cavmarl.balance.balance_plan import replan
 from cavmarl.balance.balancer import Balancer
-from cavmarl.balance.plan import replan
+from cavmarl.balance.load_snapshot import Snapshot, idle_snapshot
 from cavmarl.balance.problem import BalanceRule, Problem, ShardCost, equal_costs
-from cavmarl.balance.snapshot import Snapshot, idle_snapshot
-from cavmarl.errors import PlacementError
+from cavmarl.core.errors import PlacementError
 from tests.balance.shards import grid, row
 
 

@@ -14,12 +14,12 @@ from cavmarl.balance.calibration import Calibration, LoggedTick, calibrate
 from cavmarl.balance.least_squares import fit_non_negative
 from cavmarl.balance.load_score import WEIGHTS, Utilisation
 from cavmarl.balance.prediction import CostModel, ShardContent, fit_costs
-from cavmarl.balance.repartition import propose_zones
-from cavmarl.errors import PlacementError
+from cavmarl.core.errors import PlacementError
+from cavmarl.engine.world_setup import find_map
+from cavmarl.handoff.repartition_plan import propose_zones
 from cavmarl.roads.cache import load_network
-from cavmarl.roads.zone_layouts import cut_map
-from cavmarl.roads.zones import ZonePartition
-from cavmarl.worlds import find_map
+from cavmarl.zones.partition.zone_layouts import cut_map
+from cavmarl.zones.partition.zone_partition import ZonePartition
 
 NUMBERS = st.floats(-10.0, 10.0).map(lambda value: round(value, 3))
 

@@ -21,7 +21,7 @@ from cavmarl.balance.load_score import (
     load_score,
     select,
 )
-from cavmarl.errors import NoAdmissibleWorkerError, PlacementError
+from cavmarl.core.errors import NoAdmissibleWorkerError, PlacementError
 
 SHARES = st.floats(0.0, 1.0)
 USES = st.builds(Utilisation, SHARES, SHARES, SHARES)

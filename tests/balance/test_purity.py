@@ -25,7 +25,7 @@ def test_what_a_file_imports(path: Path) -> None:
         for name in names:
             if any(name.startswith(more) for more in MORE.get(path.stem, ())):
                 continue
-            ours = name == "cavmarl.errors" or name.startswith("cavmarl.balance.")
+            ours = name == "cavmarl.core.errors" or name.startswith("cavmarl.balance.")
             top = name.split(".")[0]
             assert ours or top == "numpy" or top in sys.stdlib_module_names, name
             assert path.stem == "probe" or top not in IMPURE, name

@@ -9,13 +9,13 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from cavmarl.balance.balance_plan import Plan, make_plan
 from cavmarl.balance.balancer import Balancer
-from cavmarl.balance.plan import Plan, make_plan
+from cavmarl.balance.load_snapshot import Snapshot, idle_snapshot
 from cavmarl.balance.plan_file import plan_from_dict
 from cavmarl.balance.plan_text import describe_plan
 from cavmarl.balance.problem import BalanceRule, Problem, ShardCost, equal_costs
-from cavmarl.balance.snapshot import Snapshot, idle_snapshot
-from cavmarl.errors import NoAdmissibleWorkerError, PlacementError
+from cavmarl.core.errors import NoAdmissibleWorkerError, PlacementError
 from tests.balance.shards import COSTS, busy
 
 EAGER = BalanceRule(tolerance=0.0, move_s=0.0, max_moves=3)

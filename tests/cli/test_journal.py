@@ -7,9 +7,9 @@ from pathlib import Path
 
 import pytest
 
-from cavmarl.runtime.journal import Journal
+from cavmarl.handoff.coordinator.journal import Journal
 from tests.cli.test_main import refusal, run
-from tests.runtime.test_journal import eventful
+from tests.handoff.test_journal import eventful
 
 
 @pytest.fixture

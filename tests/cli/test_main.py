@@ -10,11 +10,11 @@ from pathlib import Path
 import pytest
 
 from cavmarl.cli import main
+from cavmarl.engine.world_setup import find_map
+from cavmarl.handoff import shard_setup as dividing
 from cavmarl.roads.cache import load_network
-from cavmarl.roads.zone_file import write_zones
-from cavmarl.roads.zone_layouts import cut_map
-from cavmarl.runtime import dividing
-from cavmarl.worlds import find_map
+from cavmarl.zones.partition.zone_file import write_zones
+from cavmarl.zones.partition.zone_layouts import cut_map
 
 COMMANDS = (
     "evaluate",
@@ -195,7 +195,7 @@ def test_verify_determinism_fails_and_names_the_first_difference(
 ) -> None:
     script = tmp_path / "hashing.py"
     script.write_text(
-        "from cavmarl.policies import Policy\n"
+        "from cavmarl.policies.policy import Policy\n"
         "class Hashing(Policy):\n"
         "    def act_batch(self, observations, mask):\n"
         "        return self.env.suggest_actions() * 0.0 + hash('a') % 997 / 1000.0\n"

@@ -7,7 +7,7 @@ import pytest
 from typer.testing import CliRunner
 
 from cavmarl.cli.map import app
-from cavmarl.errors import ConfigError, MapError, ZoneError
+from cavmarl.core.errors import ConfigError, MapError, ZoneError
 
 runner = CliRunner()
 

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from cavmarl.cli import main
-from cavmarl.traffic.scenarios import scenario_names
+from cavmarl.traffic.scenarios.library import scenario_names
 
 
 def code(*words: str) -> int:

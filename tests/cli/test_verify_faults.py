@@ -7,10 +7,10 @@ from pathlib import Path
 
 import pytest
 
-from cavmarl.evaluate.fault_campaign import run_campaign
-from cavmarl.evaluate.fault_matrix import ELSEWHERE
-from cavmarl.runtime.journal import JournalReader
-from cavmarl.runtime.store import CommittedStore
+from cavmarl.handoff.coordinator.journal import JournalReader
+from cavmarl.handoff.fault_injection.committed_store import CommittedStore
+from cavmarl.verify.fault_campaign import run_campaign
+from cavmarl.verify.fault_matrix import ELSEWHERE
 from tests.cli.test_main import refusal, run
 
 BUSY = (

@@ -8,8 +8,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from cavmarl.evaluate.criticality import TRACE, _box, post_encroachment_s, time_to_collision_s
-from cavmarl.kernels.geometry import boxes_overlap
+from cavmarl.core.math.geometry import boxes_overlap
+from cavmarl.evaluate.scenarios.criticality import (
+    TRACE,
+    _box,
+    post_encroachment_s,
+    time_to_collision_s,
+)
 
 
 def body(

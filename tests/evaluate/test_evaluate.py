@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from cavmarl.errors import ConfigError, PolicyError, UnknownEnvironmentError
+from cavmarl.core.errors import ConfigError, PolicyError, UnknownEnvironmentError
 from cavmarl.evaluate import EvaluationReport, episodes, evaluate, load_report
 from cavmarl.evaluate.episodes import worlds_at_once
 from cavmarl.evaluate.evaluation import load_tables, run_seeds

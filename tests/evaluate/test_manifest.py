@@ -12,9 +12,9 @@ from typing import Any
 
 import pytest
 
-from cavmarl.errors import ManifestError
+from cavmarl.core.errors import ManifestError
 from cavmarl.evaluate import evaluate, load_report
-from cavmarl.evaluate.manifest import MANIFEST_FILE, hash_of_file, read_closed
+from cavmarl.evaluate.provenance.manifest import MANIFEST_FILE, hash_of_file, read_closed
 
 SMALL: dict[str, Any] = {"episodes": 1, "agents": 2, "background": 2, "max_cycles": 5}
 

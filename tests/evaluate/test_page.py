@@ -16,7 +16,7 @@ import pytest
 pytest.importorskip("matplotlib")
 pytest.importorskip("jinja2")
 
-from cavmarl.errors import ManifestError
+from cavmarl.core.errors import ManifestError
 from cavmarl.evaluate import evaluate, load_report
 from cavmarl.evaluate.page import write_page
 

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from cavmarl.errors import ConfigError
+from cavmarl.core.errors import ConfigError
 from cavmarl.evaluate import load_report
 from cavmarl.evaluate.suite import find_suite, load_suite, run_suite, worlds_of
 

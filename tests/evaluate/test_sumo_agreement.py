@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import pytest
 
-from cavmarl.evaluate.traffic_comparison import compare_traffic
+from cavmarl.evaluate.traffic.traffic_comparison import compare_traffic
 
 sumo = pytest.importorskip("sumo", reason="needs the extra 'sumo'")
 pytest.importorskip("libsumo", reason="needs the extra 'sumo'")

@@ -8,14 +8,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from cavmarl.bench.traffic_speed import measure_traffic_speed
 from cavmarl.cli import main
-from cavmarl.errors import ConfigError
-from cavmarl.evaluate.native_traffic import make_world
-from cavmarl.evaluate.traffic_comparison import RATIOS, TrafficComparison, compare_traffic
-from cavmarl.evaluate.traffic_metrics import EDGE_MINUTE, TrafficFigures, TrafficRun
-from cavmarl.evaluate.traffic_plot import binned_means, plot_fundamental_diagram
-from cavmarl.evaluate.traffic_speed import measure_traffic_speed
-from cavmarl.roads.reader import read_network
+from cavmarl.core.errors import ConfigError
+from cavmarl.evaluate.traffic.native_side import make_world
+from cavmarl.evaluate.traffic.traffic_comparison import RATIOS, TrafficComparison, compare_traffic
+from cavmarl.evaluate.traffic.traffic_metrics import EDGE_MINUTE, TrafficFigures, TrafficRun
+from cavmarl.evaluate.traffic.traffic_plot import binned_means, plot_fundamental_diagram
+from cavmarl.roads.sumo_net.reader import read_network
 
 sumo = pytest.importorskip("sumo", reason="needs the extra 'sumo'")
 pytest.importorskip("libsumo", reason="needs the extra 'sumo'")

@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from cavmarl.evaluate.junction_locks import STOP_LINE_M
-from cavmarl.evaluate.traffic_metrics import TrafficCounts, TrafficMeter, TrafficRun
-from cavmarl.kernels.codes import SIGNAL_GREEN_MAJOR, SIGNAL_NONE, SIGNAL_RED
-from cavmarl.registry import find_entry
+from cavmarl.config.registry import find_entry
+from cavmarl.core.records.codes import SIGNAL_GREEN_MAJOR, SIGNAL_NONE, SIGNAL_RED
+from cavmarl.driving.vehicles import VEHICLE, blank_vehicle
+from cavmarl.evaluate.traffic.junction_locks import STOP_LINE_M
+from cavmarl.evaluate.traffic.traffic_metrics import TrafficCounts, TrafficMeter, TrafficRun
 from cavmarl.roads.network import RoadNetwork
-from cavmarl.roads.reader import read_network
-from cavmarl.shard.vehicles import VEHICLE, blank_vehicle
+from cavmarl.roads.sumo_net.reader import read_network
 
 COUNTS = TrafficCounts(departed=3, waiting=2, arrived=1, mean_delay_s=4.5, teleports=7)
 

@@ -7,8 +7,8 @@ from pathlib import Path
 import pytest
 
 from cavmarl import make_vec
-from cavmarl.evaluate.manifest import MANIFEST_FILE, read_closed
-from cavmarl.evaluate.training_record import begin_training, end_training
+from cavmarl.evaluate.provenance.manifest import MANIFEST_FILE, read_closed
+from cavmarl.evaluate.provenance.training_record import begin_training, end_training
 from tests.cli.test_main import refusal, run
 
 

@@ -9,17 +9,17 @@ from typing import Any
 import numpy as np
 import pytest
 
-from cavmarl.errors import JournalError
+from cavmarl.core.errors import JournalError
+from cavmarl.engine.world_setup import load_world
 from cavmarl.evaluate import EvaluationReport, evaluate, load_report
 from cavmarl.evaluate.evaluation import EPISODES_FILE, TRANSFERS_FILE
 from cavmarl.evaluate.tables import EPISODE, read_table
 from cavmarl.evaluate.transfer_rows import TRANSFER, transfers_of
-from cavmarl.roads.zone_file import write_zones
-from cavmarl.roads.zones import ZonePartition
-from cavmarl.runtime.journal_summary import summarize
-from cavmarl.shard.reach import longest_move_m
-from cavmarl.worlds import load_world
-from tests.kernels.traffic import network, travel
+from cavmarl.handoff.coordinator.journal_summary import summarize
+from cavmarl.zones.partition.zone_file import write_zones
+from cavmarl.zones.partition.zone_partition import ZonePartition
+from cavmarl.zones.reach import longest_move_m
+from tests.support.traffic import network, travel
 
 SMALL: dict[str, Any] = {"episodes": 3, "agents": 4, "background": 40, "max_cycles": 40}
 ZONES = {"zones.count": 4}

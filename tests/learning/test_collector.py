@@ -5,9 +5,9 @@ from __future__ import annotations
 import pytest
 import torch
 
+from cavmarl.env.vector import CavVectorEnv, make_vec
 from cavmarl.learning.collector import Collector
-from cavmarl.networks import ActorCritic, NetworkConfig
-from cavmarl.vector_env import CavVectorEnv, make_vec
+from cavmarl.policies.networks import ActorCritic, NetworkConfig
 
 STEPS, HORIZON = 60, 25
 

@@ -8,7 +8,7 @@ from typing import Annotated
 
 import pytest
 
-from cavmarl.errors import ConfigError
+from cavmarl.core.errors import ConfigError
 from cavmarl.learning.options import check_at_least, parse_settings, run_folder, run_program
 
 

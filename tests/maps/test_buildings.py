@@ -6,12 +6,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from cavmarl.errors import MapError
+from cavmarl.core.errors import MapError
+from cavmarl.engine.world_setup import load_world
 from cavmarl.maps.buildings import convex_parts, walls_of, with_buildings
 from cavmarl.maps.footprints import DEFAULT_HEIGHT_M, LEVEL_M, Footprint, read_footprints
 from cavmarl.roads.network import GeoReference
-from cavmarl.roads.reader import read_network
-from cavmarl.worlds import load_world
+from cavmarl.roads.sumo_net.reader import read_network
 
 GEO = GeoReference("+proj=utm +zone=32 +ellps=WGS84", -655629.53, -5481164.76)
 SQUARE = np.array([(0.0, 0.0), (10.0, 0.0), (10.0, 8.0), (0.0, 8.0)])

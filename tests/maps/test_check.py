@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from cavmarl.maps.check import MapReport, check_map
 from cavmarl.maps.components import strong_components
-from cavmarl.roads.reader import read_network
+from cavmarl.roads.sumo_net.reader import read_network
 
 BuiltMap = Callable[[str], Path]
 

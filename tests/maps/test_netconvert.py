@@ -6,10 +6,10 @@ from pathlib import Path
 
 import pytest
 
-from cavmarl.errors import ConfigError, MapError
+from cavmarl.core.errors import ConfigError, MapError
 from cavmarl.maps import netconvert
 from cavmarl.maps.netconvert import OSM_OPTIONS, build_network, map_file
-from cavmarl.roads.reader import read_network
+from cavmarl.roads.sumo_net.reader import read_network
 
 pytest.importorskip("sumo", reason="needs the extra 'sumo'")
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from cavmarl.kernels.arrays import Travel
+from cavmarl.core.records.arrays import Travel
 from cavmarl.roads.network import RoadNetwork
 
 Entry = tuple[int, int, float]  # link, vehicle's id, m of its centre to the stop line

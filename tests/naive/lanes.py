@@ -8,7 +8,7 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from cavmarl.kernels.announcing import announced_m
+from cavmarl.driving.kernels.announcing import announced_m
 from cavmarl.roads.network import RoadNetwork
 
 Entry = tuple[float, int, int]  # s, id, row

@@ -10,13 +10,12 @@ from collections.abc import Callable, Iterable
 import numpy as np
 from numpy.typing import NDArray
 
-from cavmarl.kernels.announcing import APPROACH_M
-from cavmarl.kernels.approach import FORK_BEYOND_M
-from cavmarl.kernels.entering import ENTER_REACH_M
-from cavmarl.kernels.junctions import EXIT_LOOK_M
-from cavmarl.kernels.lane_choice import LOOK_BACK_M
-from cavmarl.kernels.looks import ASIDE_M, ROUNDING_M
+from cavmarl.core.records.rows import ENTER_REACH_M, FORK_BEYOND_M
+from cavmarl.driving.kernels.announcing import APPROACH_M
+from cavmarl.driving.kernels.junctions import EXIT_LOOK_M
+from cavmarl.driving.kernels.lane_choice import LOOK_BACK_M
 from cavmarl.roads.network import RoadNetwork
+from cavmarl.zones.kernels.visibility_tests import ASIDE_M, ROUNDING_M
 
 __all__ = ["Looks"]
 

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from cavmarl.kernels.arrays import Gate, Outputs
-from cavmarl.kernels.codes import COUNT_ARRIVED, EVENTS_THAT_END
-from cavmarl.kernels.step_results import Results
+from cavmarl.core.records.arrays import Gate, Outputs
+from cavmarl.core.records.codes import COUNT_ARRIVED, EVENTS_THAT_END
+from cavmarl.engine.kernels.step_results import Results
 
 
 def report(outputs: Outputs, steps: NDArray[np.int64], horizon: int, results: Results) -> bool:

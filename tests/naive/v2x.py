@@ -10,8 +10,8 @@ from typing import Any
 
 import numpy as np
 
-from cavmarl.config_v2x import ChannelConfig
-from cavmarl.kernels.rng import mix
+from cavmarl.config.v2x import ChannelConfig
+from cavmarl.core.math.rng import mix
 
 GOLDEN = 0x9E3779B97F4A7C15
 STREAM_V2X = 11 << 16

@@ -18,7 +18,7 @@ from dataclasses import dataclass, fields, is_dataclass
 from itertools import product
 from typing import Any, NamedTuple
 
-from cavmarl.errors import InvariantError
+from cavmarl.core.errors import InvariantError
 from cavmarl.ownership.decisions import Decisions
 from cavmarl.ownership.directory import Directory
 from cavmarl.ownership.endpoint import Endpoint

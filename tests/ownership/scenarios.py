@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import pytest
 
-from cavmarl.errors import LedgerError, SpawnError, StoreError, ZoneStepError
+from cavmarl.core.errors import LedgerError, SpawnError, StoreError, ZoneStepError
 from cavmarl.ownership.distances import Distances
 from cavmarl.ownership.limits import Limits
 from cavmarl.ownership.messages import Ack, Confirmed, Done, Held, Nack, Need, Prepare, Removed

@@ -10,12 +10,13 @@ from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass, field
 
-from cavmarl.errors import StoreError
+from cavmarl.core.errors import StoreError
 from cavmarl.ownership.directory import Directory
 from cavmarl.ownership.endpoint import Endpoint
 from cavmarl.ownership.invariants import Monitor
 from cavmarl.ownership.ledger import row_hash, world_digest
 from cavmarl.ownership.limits import Limits
+from cavmarl.ownership.log_records import record_to_line, records_from_lines, whole_lines
 from cavmarl.ownership.messages import (
     COORDINATOR,
     Birth,
@@ -28,7 +29,6 @@ from cavmarl.ownership.messages import (
 )
 from cavmarl.ownership.offers import Approach
 from cavmarl.ownership.reactions import Advance
-from cavmarl.ownership.records import record_to_line, records_from_lines, whole_lines
 from cavmarl.ownership.safeguards import ALL_ON, Safeguards
 from cavmarl.ownership.store import MemoryStore
 from cavmarl.ownership.trace import Trace

@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from cavmarl.errors import (
+from cavmarl.core.errors import (
     CorruptMessageError,
     ForeignRunError,
     MessageError,

@@ -6,7 +6,7 @@ from typing import Any
 
 import pytest
 
-from cavmarl.errors import ConfigError, LedgerError
+from cavmarl.core.errors import ConfigError, LedgerError
 from cavmarl.ownership.distances import Distances
 from cavmarl.ownership.ledger import SeenIds, Tally, tally
 from cavmarl.ownership.limits import DeadlinePolicy, Limits

@@ -31,7 +31,7 @@ def imports(path: Path) -> set[str]:
 def test_a_file_of_the_core_is_pure(path: Path) -> None:
     for module in imports(path):
         top = module.split(".")[0]
-        ours = module == "cavmarl.errors" or module.startswith("cavmarl.ownership.")
+        ours = module == "cavmarl.core.errors" or module.startswith("cavmarl.ownership.")
         assert ours or (top in sys.stdlib_module_names and top not in IMPURE), module
 
 

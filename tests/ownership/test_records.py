@@ -7,15 +7,14 @@ from dataclasses import replace
 
 import pytest
 
-from cavmarl.errors import (
+from cavmarl.core.errors import (
     CorruptJournalError,
     JournalError,
     ProtocolError,
     TornJournalError,
     TransitionError,
 )
-from cavmarl.ownership.messages import Begin, Birth, Commit, Host, Removed, Reset
-from cavmarl.ownership.records import (
+from cavmarl.ownership.log_records import (
     SCHEMA,
     record_from_dict,
     record_to_dict,
@@ -25,6 +24,7 @@ from cavmarl.ownership.records import (
     sealed,
     whole_lines,
 )
+from cavmarl.ownership.messages import Begin, Birth, Commit, Host, Removed, Reset
 from tests.ownership.bench import Bench
 from tests.ownership.test_simulator import campaign
 

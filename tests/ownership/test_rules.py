@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import pytest
 
-from cavmarl.errors import (
+from cavmarl.core.errors import (
     CoverageError,
     JournalError,
     LedgerError,

@@ -6,7 +6,7 @@ from dataclasses import fields, replace
 
 import pytest
 
-from cavmarl.errors import ProtocolError
+from cavmarl.core.errors import ProtocolError
 from cavmarl.ownership.safeguards import ALL_ON, Safeguards
 from tests.ownership.scenarios import SCENARIOS
 

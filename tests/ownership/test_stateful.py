@@ -8,8 +8,8 @@ from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, ru
 
 from cavmarl.ownership.directory import Directory
 from cavmarl.ownership.limits import Limits
+from cavmarl.ownership.log_records import record_to_line, records_from_lines, replay
 from cavmarl.ownership.messages import COORDINATOR, Abort, Ack, Message, Nack, Prepare, Step
-from cavmarl.ownership.records import record_to_line, records_from_lines, replay
 from tests.ownership.bench import Bench
 
 ZONES = 3

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 
-from cavmarl.errors import InvariantError
+from cavmarl.core.errors import InvariantError
 from cavmarl.ownership.directory import Directory
 from cavmarl.ownership.limits import Limits
 from cavmarl.ownership.messages import (

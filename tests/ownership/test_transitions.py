@@ -7,7 +7,7 @@ from itertools import product
 
 import pytest
 
-from cavmarl.errors import LedgerError, TransitionError
+from cavmarl.core.errors import LedgerError, TransitionError
 from cavmarl.ownership.endpoint import Endpoint
 from cavmarl.ownership.messages import In, Out, Removed, Spawn
 from cavmarl.ownership.transitions import TABLE, Event, Party, State, after, mermaid

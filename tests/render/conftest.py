@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from cavmarl.registry import load_config, resolve_map
+from cavmarl.config.registry import load_config, resolve_map
+from cavmarl.driving.vehicles import blank_vehicle
 from cavmarl.roads.cache import load_network
 from cavmarl.roads.network import RoadNetwork
-from cavmarl.shard.vehicles import blank_vehicle
 
 
 @pytest.fixture(scope="session")

@@ -13,15 +13,15 @@ from numpy.typing import NDArray
 pytest.importorskip("pygame", reason="pictures need the extra 'render'")
 
 from cavmarl import parallel_env
-from cavmarl.errors import ConfigError
+from cavmarl.core.errors import ConfigError
+from cavmarl.handoff.zone_view import TransferInFlight, ZoneView
 from cavmarl.render import palette
-from cavmarl.render.camera import Camera
 from cavmarl.render.canvas import blank, pixels
 from cavmarl.render.topdown import MARGIN_PX, TopDownRenderer
-from cavmarl.render.zones import draw_sight
+from cavmarl.render.viewport import Camera
+from cavmarl.render.zone_overlay import draw_sight
 from cavmarl.roads.network import RoadNetwork
-from cavmarl.runtime.zone_view import TransferInFlight, ZoneView
-from tests.partitions import PINWHEEL, four
+from tests.support.partitions import PINWHEEL, four
 
 SIZE = (640, 480)
 FOCUS = (-20.0, -15.0, 20.0, 15.0)

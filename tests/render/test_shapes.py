@@ -5,9 +5,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from cavmarl.render.camera import Camera
 from cavmarl.render.overlay import clock_text, scale_bar_m
 from cavmarl.render.shapes import convex_hull, offset_polyline, road_shapes
+from cavmarl.render.viewport import Camera
 from cavmarl.roads.network import RoadNetwork
 
 coordinates = st.tuples(st.integers(-20, 20), st.integers(-20, 20))

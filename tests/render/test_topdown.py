@@ -8,14 +8,14 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from cavmarl.errors import MissingExtraError
+from cavmarl.core.errors import MissingExtraError
+from cavmarl.driving.vehicles import VEHICLE
 from cavmarl.render import palette
 from cavmarl.render.canvas import load_pygame
 from cavmarl.render.cars import BRAKING_MPS2
 from cavmarl.render.ground import signal_codes, signal_letter
 from cavmarl.render.topdown import TopDownRenderer
 from cavmarl.roads.network import SIGNAL_STATES, RoadNetwork
-from cavmarl.shard.vehicles import VEHICLE
 
 pytest.importorskip("pygame")
 

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from cavmarl.errors import ConfigError, MissingExtraError
+from cavmarl.core.errors import ConfigError, MissingExtraError
 from cavmarl.render.video import VideoWriter
 
 imageio_ffmpeg = pytest.importorskip("imageio_ffmpeg")

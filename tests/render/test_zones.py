@@ -6,12 +6,12 @@ from numpy.typing import NDArray
 
 pytest.importorskip("pygame", reason="pictures need the extra 'render'")
 
-from cavmarl.render.camera import Camera
 from cavmarl.render.canvas import blank, load_pygame
-from cavmarl.render.zones import draw_zones, zone_picture
+from cavmarl.render.viewport import Camera
+from cavmarl.render.zone_overlay import draw_zones, zone_picture
 from cavmarl.roads.network import RoadNetwork
-from cavmarl.roads.zone_layouts import cut_map
-from tests.partitions import PINWHEEL
+from cavmarl.zones.partition.zone_layouts import cut_map
+from tests.support.partitions import PINWHEEL
 
 
 def pixels(surface: object) -> NDArray[np.uint8]:

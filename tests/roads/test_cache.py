@@ -10,7 +10,7 @@ import pytest
 from cavmarl.roads import cache
 from cavmarl.roads.cache import load_network
 from cavmarl.roads.network import RoadNetwork
-from cavmarl.roads.reader import read_network
+from cavmarl.roads.sumo_net.reader import read_network
 
 
 @pytest.fixture

@@ -8,9 +8,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from cavmarl.errors import MapError
+from cavmarl.core.errors import MapError
 from cavmarl.roads.network import SIGNAL_STATES, VEHICLE_CLASSES, RoadNetwork
-from cavmarl.roads.reader import read_network
+from cavmarl.roads.sumo_net.reader import read_network
 
 Crossing = Callable[..., Path]
 
@@ -283,7 +283,7 @@ def test_truncated_gzip_and_missing_files_are_refused(crossing: Crossing, tmp_pa
 
 
 def test_size_is_limited(crossing: Crossing, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("cavmarl.roads.xml_source.MAX_XML_BYTES", 100)
+    monkeypatch.setattr("cavmarl.roads.sumo_net.xml_source.MAX_XML_BYTES", 100)
 
     with pytest.raises(MapError, match="larger than 100 bytes"):
         read_network(crossing())

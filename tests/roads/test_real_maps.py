@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 import sumolib.net
 
-from cavmarl.errors import MapError
+from cavmarl.core.errors import MapError
 from cavmarl.roads.network import RoadNetwork
-from cavmarl.roads.reader import read_network
+from cavmarl.roads.sumo_net.reader import read_network
 
 BuiltMap = Callable[[str], Path]
 

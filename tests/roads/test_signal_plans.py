@@ -7,13 +7,13 @@ from pathlib import Path
 
 import pytest
 
-from cavmarl.errors import MapError
-from cavmarl.kernels.signals import switch_signals
+from cavmarl.core.errors import MapError
 from cavmarl.maps.check import check_map
+from cavmarl.roads.kernels.signal_phases import switch_signals
 from cavmarl.roads.network import SIGNAL_STATES, RoadNetwork
-from cavmarl.roads.reader import read_network
-from cavmarl.roads.signal_plans import with_outages, with_programs
-from cavmarl.shard.shard import make_worlds
+from cavmarl.roads.sumo_net.reader import read_network
+from cavmarl.roads.sumo_net.signal_plans import with_outages, with_programs
+from cavmarl.shards.shard import make_worlds
 
 NIGHT = """<additional>
   <inductionLoop id="passed over" lane="s_0" pos="1" period="60" file="x"/>

@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 
 from cavmarl.cli import main
-from cavmarl.errors import ConfigError, RouteError
-from cavmarl.registry import find_entry
+from cavmarl.config.registry import find_entry
+from cavmarl.core.errors import ConfigError, RouteError
 from cavmarl.roads.network import RoadNetwork
-from cavmarl.roads.reader import read_network
+from cavmarl.roads.sumo_net.reader import read_network
 from cavmarl.traffic.random_trips import RandomTrips, write_random_demand
 
 

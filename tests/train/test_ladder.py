@@ -14,9 +14,9 @@ from types import ModuleType
 import numpy as np
 import pytest
 
-from cavmarl.config import TERMS
-from cavmarl.policies import load_policy
-from cavmarl.vector_env import make_vec
+from cavmarl.config.env import TERMS
+from cavmarl.env.vector import make_vec
+from cavmarl.policies.policy import load_policy
 
 pytest.importorskip("torch")
 pytestmark = pytest.mark.slow

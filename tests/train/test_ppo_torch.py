@@ -16,16 +16,16 @@ import pytest
 import torch
 import yaml
 
-from cavmarl.errors import ConfigError
-from cavmarl.evaluate.manifest import read_closed
+from cavmarl.config.registry import entries
+from cavmarl.core.errors import ConfigError
+from cavmarl.env.vector import make_vec
+from cavmarl.evaluate.provenance.manifest import read_closed
 from cavmarl.learning.batch import Batch
 from cavmarl.learning.collector import Collector
-from cavmarl.learning.settings import parse_ppo
-from cavmarl.networks import load_network
-from cavmarl.policies import load_policy
-from cavmarl.registry import entries
-from cavmarl.stepping.pooled import PooledWorlds
-from cavmarl.vector_env import make_vec
+from cavmarl.learning.ppo_settings import parse_ppo
+from cavmarl.parallel.pooled_worlds import PooledWorlds
+from cavmarl.policies.networks import load_network
+from cavmarl.policies.policy import load_policy
 
 TRAIN = Path(__file__).resolve().parents[2] / "train"
 CONFIGS = sorted((TRAIN.parent / "configs" / "train").glob("*.yaml"))

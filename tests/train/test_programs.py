@@ -9,9 +9,9 @@ from pathlib import Path
 
 import pytest
 
-from cavmarl.evaluate.manifest import read_closed
-from cavmarl.evaluate.training_record import is_trained
-from cavmarl.registry import load_config
+from cavmarl.config.registry import load_config
+from cavmarl.evaluate.provenance.manifest import read_closed
+from cavmarl.evaluate.provenance.training_record import is_trained
 
 pytest.importorskip("torch", reason="needs the extra: torch")
 
@@ -64,8 +64,8 @@ def test_a_library_trains_a_driver_that_evaluate_takes(
     header, *rows = (tmp_path / "a" / "progress.csv").read_text().splitlines()
     assert header == "updates,agent_steps,seconds,trips,trip_return,success"
     assert len(rows) == 2
-    from cavmarl.policies import load_policy
-    from cavmarl.vector_env import make_vec
+    from cavmarl.env.vector import make_vec
+    from cavmarl.policies.policy import load_policy
 
     vec = make_vec("merge")
     observations, infos = vec.reset(seed=0)

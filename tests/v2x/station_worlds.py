@@ -7,11 +7,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from cavmarl.kernels.codes import DRIVER_AGENT
-from cavmarl.runtime.simulation import Simulation
-from cavmarl.shard.vehicles import VEHICLE, blank_vehicle
+from cavmarl.core.records.codes import DRIVER_AGENT
+from cavmarl.driving.vehicles import VEHICLE, blank_vehicle
+from cavmarl.engine.simulation import Simulation
+from cavmarl.engine.world_setup import load_world
 from cavmarl.v2x.bus import Bus
-from cavmarl.worlds import load_world
 
 CLOCK = {"clock.sim_dt_s": 0.1, "clock.ctrl_dt_s": 0.1}
 

@@ -11,8 +11,8 @@ import pytest
 from numpy.typing import NDArray
 
 from cavmarl import load_policy, make_vec
-from cavmarl.errors import PolicyError
-from tests.rerouting import sumo_binary
+from cavmarl.core.errors import PolicyError
+from tests.support.rerouting import sumo_binary
 
 AGENTS = 8
 HEARS = {

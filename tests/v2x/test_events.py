@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 from cavmarl import make_vec, parallel_env
-from cavmarl.errors import UnknownAgentError, V2xError
-from cavmarl.kernels.v2x_records import CAUSE_OBSTACLE, KIND_DENM
-from cavmarl.spaces import observation_parts
-from cavmarl.v2x.messages import messages_of
+from cavmarl.core.errors import UnknownAgentError, V2xError
+from cavmarl.engine.spaces import observation_parts
+from cavmarl.v2x.kernels.v2x_records import CAUSE_OBSTACLE, KIND_DENM
+from cavmarl.v2x.v2x_messages import messages_of
 
 TOLD = {
     "v2x.enabled": True,

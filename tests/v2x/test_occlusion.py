@@ -6,9 +6,9 @@ from typing import Any
 
 import numpy as np
 
-from cavmarl.kernels.v2x_records import FIRST_ROADSIDE_ID, KIND_CAM, KIND_CPM
-from cavmarl.kernels.walls import make_walls
-from cavmarl.shard.sensors import layout
+from cavmarl.core.math.walls import make_walls
+from cavmarl.sensors.observed import layout
+from cavmarl.v2x.kernels.v2x_records import FIRST_ROADSIDE_ID, KIND_CAM, KIND_CPM
 from tests.v2x.station_worlds import Standing
 
 # The agent, a truck before it, a car hidden behind the truck, and a car beside that sees both.

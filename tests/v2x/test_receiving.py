@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from cavmarl.kernels.v2x_records import (
+from cavmarl.v2x.channel import BUSY_LEVELS, airtime_s, make_channel
+from cavmarl.v2x.kernels.v2x_records import (
     COUNT_NO_ACCESS,
     COUNT_OVERFLOW,
     COUNT_REACHABLE,
@@ -17,7 +18,6 @@ from cavmarl.kernels.v2x_records import (
     KIND_CAM,
     KIND_CPM,
 )
-from cavmarl.v2x.channel import BUSY_LEVELS, airtime_s, make_channel
 from tests.naive import v2x as naive
 from tests.v2x.station_worlds import Standing
 

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from cavmarl.kernels.v2x_records import (
+from cavmarl.v2x.kernels.v2x_records import (
     FIRST_ROADSIDE_ID,
     KIND_CAM,
     KIND_CPM,
@@ -18,7 +18,7 @@ from cavmarl.kernels.v2x_records import (
     PACKET,
     REPORT,
 )
-from cavmarl.v2x.messages import messages_of
+from cavmarl.v2x.v2x_messages import messages_of
 from tests.naive import v2x as naive
 from tests.v2x.station_worlds import Standing
 

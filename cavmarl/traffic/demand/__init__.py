@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from cavmarl.traffic.demand.demand_file import DemandFile, read_demand
-from cavmarl.traffic.demand.records import ELEMENT, ORDER, ROUTE, STOP, Choices
-from cavmarl.traffic.demand.report import DemandReport
+from cavmarl.traffic.demand.demand_records import ELEMENT, ORDER, ROUTE, STOP, Choices
+from cavmarl.traffic.demand.demand_report import DemandReport
 
 __all__ = [
     "ELEMENT",

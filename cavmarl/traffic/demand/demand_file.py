@@ -11,9 +11,11 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from cavmarl.errors import DemandError
+from cavmarl.core.errors import DemandError
 from cavmarl.roads.network import RoadNetwork, content_of
-from cavmarl.traffic.demand.collector import Collector
+from cavmarl.traffic.demand.definition_collector import Collector
+from cavmarl.traffic.demand.demand_records import ORDER, POS_GIVEN, Choices
+from cavmarl.traffic.demand.demand_report import DemandReport
 from cavmarl.traffic.demand.drawing import (
     DRAW_REROUTE,
     DRAW_ROUTE,
@@ -23,8 +25,6 @@ from cavmarl.traffic.demand.drawing import (
 )
 from cavmarl.traffic.demand.element import MAX_TIME_MS
 from cavmarl.traffic.demand.map_index import MapIndex
-from cavmarl.traffic.demand.records import ORDER, POS_GIVEN, Choices
-from cavmarl.traffic.demand.report import DemandReport
 from cavmarl.traffic.demand.rerouters import Rerouters
 from cavmarl.traffic.demand.rerouting_device import DeviceOptions
 from cavmarl.traffic.demand.resolver import Resolver

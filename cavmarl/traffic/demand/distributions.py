@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+from cavmarl.traffic.demand.demand_records import Options
 from cavmarl.traffic.demand.element import Element
-from cavmarl.traffic.demand.records import Options
 
 __all__ = ["MAX_WEIGHT", "listed", "weighted"]
 

@@ -7,8 +7,8 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from cavmarl.kernels.rng import STREAM_DEMAND, fill_uniform
-from cavmarl.traffic.demand.records import (
+from cavmarl.core.math.rng import STREAM_DEMAND, fill_uniform
+from cavmarl.traffic.demand.demand_records import (
     FLOW_PROBABILITY,
     FLOW_REGULAR,
 )

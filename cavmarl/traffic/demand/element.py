@@ -8,7 +8,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass, field
 from difflib import get_close_matches
 
-from cavmarl.errors import CavmarlError, DemandError
+from cavmarl.core.errors import CavmarlError, DemandError
 
 __all__ = ["MAX_TIME_MS", "Element", "near", "parse_time_ms"]
 

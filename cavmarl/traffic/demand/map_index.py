@@ -7,7 +7,7 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from cavmarl.errors import CavmarlError, RouteError
+from cavmarl.core.errors import CavmarlError, RouteError
 from cavmarl.roads.network import VEHICLE_CLASSES, RoadNetwork
 from cavmarl.traffic.demand.element import Element, near
 

@@ -7,22 +7,22 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from cavmarl.driving.vehicle_types import DEFAULT_TYPES
 from cavmarl.roads.network import VEHICLE_CLASSES
-from cavmarl.traffic.demand.collector import Collector
-from cavmarl.traffic.demand.element import Element
-from cavmarl.traffic.demand.map_index import MapIndex
-from cavmarl.traffic.demand.records import (
+from cavmarl.traffic.demand.definition_collector import Collector
+from cavmarl.traffic.demand.demand_records import (
     LANE_CURRENT,
     UNTIL_ABSOLUTE,
     UNTIL_FLOW,
     Choices,
     Options,
 )
+from cavmarl.traffic.demand.element import Element
+from cavmarl.traffic.demand.map_index import MapIndex
 from cavmarl.traffic.demand.rerouters import Rerouters, read_rerouters
-from cavmarl.traffic.demand.routes import RouteTable
+from cavmarl.traffic.demand.route_records import RouteTable
 from cavmarl.traffic.demand.stops import StopReader
 from cavmarl.traffic.demand.type_table import TypeTable
-from cavmarl.traffic.vtypes import DEFAULT_TYPES
 
 __all__ = ["Resolver"]
 

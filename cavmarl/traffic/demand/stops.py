@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import NamedTuple
 
-from cavmarl.errors import CavmarlError
+from cavmarl.core.errors import CavmarlError
+from cavmarl.traffic.demand.demand_report import DemandReport
 from cavmarl.traffic.demand.element import Element, near
 from cavmarl.traffic.demand.map_index import MapIndex
-from cavmarl.traffic.demand.report import DemandReport
 from cavmarl.traffic.demand.xml_files import STOPPING_PLACES
 
 __all__ = ["Stop", "StopReader"]

@@ -7,8 +7,8 @@ from pathlib import Path
 from typing import Any
 from xml.sax.handler import ContentHandler
 
-from cavmarl.errors import DemandError
-from cavmarl.roads.xml_source import read_xml
+from cavmarl.core.errors import DemandError
+from cavmarl.roads.sumo_net.xml_source import read_xml
 from cavmarl.traffic.demand.element import Element
 from cavmarl.traffic.demand.rerouting_device import DeviceOptions
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 import re
 from typing import NamedTuple
 
+from cavmarl.traffic.demand.demand_records import FLOW_EXPONENTIAL, FLOW_PROBABILITY, FLOW_REGULAR
 from cavmarl.traffic.demand.element import MAX_TIME_MS, Element
-from cavmarl.traffic.demand.records import FLOW_EXPONENTIAL, FLOW_PROBABILITY, FLOW_REGULAR
 
 __all__ = ["DAY_MS", "Timing", "flow_timing", "single_timing"]
 

@@ -5,12 +5,12 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from cavmarl.driving.vehicle_types import DEFAULT_TYPES, VTYPE
+from cavmarl.traffic.demand.demand_records import Options
+from cavmarl.traffic.demand.demand_report import DemandReport
 from cavmarl.traffic.demand.distributions import MAX_WEIGHT, listed, weighted
 from cavmarl.traffic.demand.element import Element, near
-from cavmarl.traffic.demand.records import Options
-from cavmarl.traffic.demand.report import DemandReport
-from cavmarl.traffic.demand.types import vtype_record
-from cavmarl.traffic.vtypes import DEFAULT_TYPES, VTYPE
+from cavmarl.traffic.demand.vehicle_type_reader import vtype_record
 
 __all__ = ["TypeTable"]
 

@@ -7,10 +7,10 @@ from pathlib import Path
 from typing import Any
 from xml.sax.handler import ContentHandler
 
-from cavmarl.errors import DemandError
-from cavmarl.roads.xml_source import read_xml
+from cavmarl.core.errors import DemandError
+from cavmarl.roads.sumo_net.xml_source import read_xml
+from cavmarl.traffic.demand.demand_report import DemandReport
 from cavmarl.traffic.demand.element import Element, near
-from cavmarl.traffic.demand.report import DemandReport
 
 __all__ = ["STOPPING_PLACES", "read_elements"]
 

@@ -7,10 +7,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from cavmarl.errors import CapacityError
-from cavmarl.kernels.mirroring import Paths
-from cavmarl.kernels.routes import plan_route
+from cavmarl.core.errors import CapacityError
+from cavmarl.roads.kernels.route_steps import plan_route
 from cavmarl.roads.network import RoadNetwork
+from cavmarl.traffic.kernels.mirroring import Paths
 
 __all__ = ["MAX_WAY_STEPS", "RouteBook"]
 

@@ -8,9 +8,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from cavmarl.errors import CapacityError
+from cavmarl.core.errors import CapacityError
 from cavmarl.roads.network import RoadNetwork
-from cavmarl.traffic.demand.records import STOP, UNTIL_ABSOLUTE
+from cavmarl.traffic.demand.demand_records import STOP, UNTIL_ABSOLUTE
 
 __all__ = ["MAX_STOPS", "StopBook", "Told"]
 

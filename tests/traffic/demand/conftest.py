@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from cavmarl.roads.network import RoadNetwork
-from cavmarl.roads.reader import read_network
+from cavmarl.roads.sumo_net.reader import read_network
 from cavmarl.traffic.demand import DemandFile, read_demand
 
 # A B C from west to east, two lanes each way, X north of B: AB BC CB BA BX XB.

@@ -9,13 +9,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from cavmarl.roads.reader import read_network
+from cavmarl.driving.vehicle_types import CLASS_DEFAULTS
+from cavmarl.roads.sumo_net.reader import read_network
 from cavmarl.traffic.demand import DemandFile, read_demand
+from cavmarl.traffic.demand.demand_report import DemandReport
 from cavmarl.traffic.demand.element import Element
-from cavmarl.traffic.demand.report import DemandReport
 from cavmarl.traffic.demand.sumo_config import read_sumo_config
-from cavmarl.traffic.demand.types import vtype_record
-from cavmarl.traffic.vtypes import CLASS_DEFAULTS
+from cavmarl.traffic.demand.vehicle_type_reader import vtype_record
 from tests.traffic.demand.conftest import Reader, sumo_binary
 
 VEHICLE = re.compile(

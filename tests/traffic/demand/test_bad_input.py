@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from cavmarl.errors import CapacityError, DemandError, RouteError
+from cavmarl.core.errors import CapacityError, DemandError, RouteError
 from cavmarl.roads.network import RoadNetwork
 from cavmarl.traffic.demand import read_demand
 from tests.traffic.demand.conftest import Reader

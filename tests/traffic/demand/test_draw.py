@@ -7,9 +7,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from cavmarl.kernels.rng import world_key
+from cavmarl.core.math.rng import world_key
 from cavmarl.traffic.demand import Choices
-from cavmarl.traffic.demand.records import (
+from cavmarl.traffic.demand.demand_records import (
     LANE_BEST,
     POS_GIVEN,
     SPEED_MAX,

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from cavmarl.errors import CavmarlError
+from cavmarl.core.errors import CavmarlError
 from cavmarl.roads.network import RoadNetwork
 from cavmarl.traffic.demand import read_demand
 

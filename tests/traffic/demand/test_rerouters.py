@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from cavmarl.errors import CapacityError, DemandError
+from cavmarl.core.errors import CapacityError, DemandError
 from cavmarl.roads.network import VEHICLE_CLASSES, RoadNetwork
 from cavmarl.traffic.demand import DemandFile, read_demand
 from cavmarl.traffic.demand import rerouters as reading

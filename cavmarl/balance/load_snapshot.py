@@ -1,0 +1,56 @@
+"""`Snapshot`: what is in use of each worker's resources, as it was seen once.
+
+A placement depends on live readings only through a snapshot: kept in a manifest, it gives the same
+plan again. `probe` takes one of this machine.
+"""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass
+from typing import Any
+
+from cavmarl.balance.load_score import Candidate, Utilisation
+from cavmarl.core.errors import PlacementError
+
+__all__ = ["NO_GPU", "SUPPOSED_IDLE", "Snapshot", "idle_snapshot"]
+
+NO_GPU = "none"
+SUPPOSED_IDLE = "supposed idle"
+
+
+@dataclass(frozen=True)
+class Snapshot:
+    """Utilisation of all workers.
+
+    Attributes:
+        workers: by number; at least one.
+        gpu_source: what told the use of GPUs; `none`: there is none, and it counts as 0.
+        origin: where the shares come from, in words: `measured`, `supposed idle`, `generated`.
+
+    Raises:
+        PlacementError: no worker, or one twice.
+    """
+
+    workers: tuple[Candidate, ...]
+    gpu_source: str
+    origin: str
+
+    def __post_init__(self) -> None:
+        numbers = [candidate.worker for candidate in self.workers]
+        if not numbers:
+            raise PlacementError("a snapshot of no workers: there must be at least one")
+        if len(set(numbers)) != len(numbers):
+            raise PlacementError(f"workers {sorted(numbers)}: one of them is named twice")
+        ordered = sorted(self.workers, key=lambda one: one.worker)
+        object.__setattr__(self, "workers", tuple(ordered))
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain values, for JSON."""
+        return asdict(self) | {"workers": [asdict(worker) for worker in self.workers]}
+
+
+def idle_snapshot(count: int) -> Snapshot:
+    """Workers 0 to `count` - 1 of which nothing is in use."""
+    idle = Utilisation(0.0, 0.0)
+    workers = tuple(Candidate(worker, idle) for worker in range(count))
+    return Snapshot(workers, NO_GPU, SUPPOSED_IDLE)

@@ -1,0 +1,193 @@
+"""How far the clock of a follower in another process drifts from its master's: Table II.
+
+The table of the co-simulation paper has, at some steps, the time of the master, that of the
+follower, the same from when it has joined on, their difference and their ratio. Both clocks are
+read where they are: the master's here, the follower's in its own process, from what it is sent.
+"""
+
+from __future__ import annotations
+
+import csv
+import json
+import subprocess
+import sys
+from dataclasses import asdict, dataclass
+from fractions import Fraction
+from pathlib import Path
+from typing import Any
+
+from cavmarl.core.errors import ConfigError, EvaluationError
+from cavmarl.cosim.followers.followed_world import FollowedWorld
+from cavmarl.cosim.time_master import OwnTicks
+from cavmarl.env.parallel import parallel_env
+
+__all__ = ["ClockDrift", "DriftRow", "measure_drift", "rows_of", "write_rows"]
+
+PROGRAM = "cavmarl.cosim.followers.clock_reader"
+ENDS_S = 30.0  # for the follower to end by itself
+JOINS_S = 60.0  # for it to start
+TIMEOUT_S = 60.0
+BEFORE = 20  # steps that the world has gone on before somebody follows
+
+
+@dataclass(frozen=True)
+class DriftRow:
+    """The two clocks after a step; times are simulated.
+
+    Attributes:
+        step: steps since the follower has joined.
+        master_s: the master's time since then.
+        follower_s: the world's time as the follower has it.
+        normalised_s: the same since it has joined.
+        delta_s: by how much that is ahead of the master's.
+        ratio: of the two.
+    """
+
+    step: int
+    master_s: float
+    follower_s: float
+    normalised_s: float
+    delta_s: float
+    ratio: float
+
+
+@dataclass(frozen=True)
+class ClockDrift:
+    """What was measured.
+
+    Attributes:
+        environment: on which.
+        dt_s: seconds a tick, which is a step here.
+        rogue: the share of steps in which the follower ticked by itself.
+        answer: what the master did about that.
+        rows: at steps 100, 500, 1000, 5000 and so on, and the last one.
+        own_ticks: how often it did, by its own count.
+        counted: the same by the master's.
+        drift_events: how often the master has noticed that the world had gone on without him.
+        noticed_ticks: ticks of the master from the first such tick until he noticed; None: there
+            was none, or he did not notice.
+    """
+
+    environment: str
+    dt_s: float
+    rogue: float
+    answer: OwnTicks
+    rows: tuple[DriftRow, ...]
+    own_ticks: int
+    counted: int
+    drift_events: int
+    noticed_ticks: int | None
+
+    @property
+    def holds(self) -> bool:
+        """The clocks are equal; or, where own ticks are obeyed, that was noticed in time."""
+        if self.answer == "obey" and self.own_ticks:
+            return self.noticed_ticks is not None and self.noticed_ticks <= 1
+        return all(row.delta_s == 0.0 and row.ratio == 1.0 for row in self.rows)
+
+    def to_dict(self) -> dict[str, Any]:
+        """As JSON."""
+        return {**asdict(self), "holds": self.holds}
+
+
+def measure_drift(
+    env: str,
+    *,
+    steps: int,
+    rogue: float = 0.0,
+    answer: OwnTicks = "obey",
+    seed: int = 0,
+    overrides: dict[str, Any] | None = None,
+) -> ClockDrift:
+    """Run a world as master, with a follower in a process of its own that reads its clock.
+
+    Args:
+        env: name, folder or map file of an environment; a step is a tick in it, agents have seats,
+            and the horizon is as long as need be.
+        steps: of the master, from when the follower has joined on.
+        rogue: in which share of the steps the follower ticks by itself.
+        answer: what the master does about that; `obey`: the unprotected world, which really ticks.
+        seed: of the world.
+        overrides: values for any other key.
+
+    Raises:
+        ConfigError: no steps, or a share that is none.
+        EvaluationError: the follower's process has failed.
+    """
+    if steps < 1:
+        raise ConfigError(f"steps = {steps}: must be at least 1")
+    if not 0.0 <= rogue <= 1.0:
+        raise ConfigError(f"rogue = {rogue}: must be a share, from 0 to 1")
+    settings = {"population.mode": "seats", **(overrides or {})}
+    made = parallel_env(env, overrides=settings)
+    dt_s = made.config.clock.sim_dt_s
+    settings |= {"clock.ctrl_dt_s": dt_s, "horizon_s": dt_s * (BEFORE + 2 * steps + 1)}
+    with FollowedWorld(
+        parallel_env(env, overrides=settings),
+        0,
+        timeout_s=TIMEOUT_S,
+        own_ticks=answer,
+        on_drift="record",
+    ) as world:
+        world.reset(seed)
+        for _ in range(BEFORE):
+            world.step()
+        command = [sys.executable, "-m", PROGRAM, str(world.address), str(rogue)]
+        with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
+            try:
+                world.wait_for(1, JOINS_S)
+                joined = world.master.tick
+                clock = [0]
+                for _ in range(steps):
+                    world.step()
+                    clock.append(world.master.tick - joined)
+                master = world.master
+                master.look_for_drift()
+                world.close()
+                told, _ = process.communicate(timeout=ENDS_S)
+            finally:
+                process.kill()
+        if process.returncode:
+            raise EvaluationError(f"{PROGRAM} ended with {process.returncode}; see its own words")
+    read = json.loads(told)
+    own = [event.tick for event in master.events if event.kind == "own_tick"]
+    drifts = [event.tick for event in master.events if event.kind == "drift"]
+    return ClockDrift(
+        environment=made.metadata["name"],
+        dt_s=dt_s,
+        rogue=rogue,
+        answer=answer,
+        rows=rows_of(clock, read["ticks"], dt_s),
+        own_ticks=read["own_ticks"],
+        counted=master.own_ticks,
+        drift_events=master.drifts,
+        noticed_ticks=drifts[0] - own[0] if own and drifts else None,
+    )
+
+
+def rows_of(master: list[int], follower: list[int], dt_s: float) -> tuple[DriftRow, ...]:
+    """Table II of two series of ticks, from when the follower has joined on."""
+    last = len(master) - 1
+    marks = [mark for n in range(2, 9) for mark in (10**n, 5 * 10**n) if mark < last]
+    rows = []
+    for step in [*marks, last]:
+        elapsed, seen = master[step], follower[step] - follower[0]
+        rows.append(
+            DriftRow(
+                step=step,
+                master_s=elapsed * dt_s,
+                follower_s=follower[step] * dt_s,
+                normalised_s=seen * dt_s,
+                delta_s=(seen - elapsed) * dt_s,
+                ratio=float(Fraction(seen, elapsed)),
+            )
+        )
+    return tuple(rows)
+
+
+def write_rows(path: Path, rows: tuple[DriftRow, ...]) -> None:
+    """Write the table as CSV."""
+    with path.open("w", newline="", encoding="utf-8") as file:
+        writer = csv.DictWriter(file, list(asdict(rows[0])))
+        writer.writeheader()
+        writer.writerows(asdict(row) for row in rows)

@@ -1,0 +1,333 @@
+"""How fast PPO is from end to end, next to stable-baselines3's on highway-env.
+
+Both learn on two cores with the same network, observation (highway-env's `Kinematics`), actions,
+number of vehicles, batch, minibatches and epochs; the same road, 20 Hz and 10 decisions a second,
+new episodes after 40 s. Each has a process a core for its worlds, and one thread of torch.
+"""
+
+from __future__ import annotations
+
+import tempfile
+import time
+from collections.abc import Callable
+from contextlib import ExitStack
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from statistics import median
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import yaml
+
+from cavmarl.bench.highway_worlds import (
+    THEIR_KINEMATICS,
+    highway_env,
+    length_m,
+    overrides,
+    straight_road,
+)
+from cavmarl.core.errors import ConfigError, require
+from cavmarl.evaluate.provenance.machine import describe_hardware
+
+if TYPE_CHECKING:
+    from cavmarl.bench.highway_rows import HighwayRows
+    from cavmarl.learning.ppo_settings import PpoSettings
+    from cavmarl.learning.run import Run
+
+__all__ = ["TrainingRow", "TrainingSpeed", "measure_training"]
+
+HORIZON_S = 40.0
+OUR_STEPS = 32  # of a world between two updates
+EPOCHS = 4
+MINIBATCHES = 8
+HIDDEN = 64
+STEPPING_STEPS = 100
+OUR_SENSORS: dict[str, Any] = {
+    "sensors.kinematics.vehicles_count": 5,
+    "sensors.ego.enabled": False,
+    "sensors.route.points": 0,
+    "sensors.neighbors.count": 0,
+    "sensors.signal.enabled": False,
+    "sensors.lidar.rays": 0,
+}
+
+
+@dataclass(frozen=True)
+class TrainingRow:
+    """One side.
+
+    Attributes:
+        who: `cavmarl` or `stable_baselines3`; `cavmarl_overlap` collects while it learns.
+        worlds: stepped together.
+        decisions: of an update.
+        rates: agent-steps a second of each turn: one update, collecting and learning.
+        shares: of the time, by phase, over all turns. Theirs of `simulation` is with what goes
+            between the processes, which ours do not send.
+    """
+
+    who: str
+    worlds: int
+    decisions: int
+    rates: tuple[float, ...]
+    shares: dict[str, float]
+
+
+@dataclass(frozen=True)
+class TrainingSpeed:
+    """What was measured: two kinds of benchmark, whose numbers are never mixed.
+
+    Attributes:
+        agents: of a world.
+        workers: of each side.
+        numbers: in an observation.
+        end_to_end: PPO, collecting and learning.
+        stepping: agent-steps a second of our worlds and sensors alone, of each turn; nothing
+            learns, and nobody decides.
+        hardware: that it ran on.
+    """
+
+    agents: int
+    workers: int
+    numbers: int
+    end_to_end: tuple[TrainingRow, ...]
+    stepping: tuple[float, ...]
+    hardware: dict[str, Any]
+
+    @property
+    def ratio(self) -> float:
+        """How many times as many agent-steps a second as theirs; median of the turns."""
+        return self._over("cavmarl", "stable_baselines3")
+
+    @property
+    def overlap_ratio(self) -> float:
+        """What collecting while learning brings: the same over ours without."""
+        return self._over("cavmarl_overlap", "cavmarl")
+
+    @property
+    def is_crowded(self) -> bool:
+        """More workers than cores."""
+        return self.workers > (self.hardware["usable_cores"] or 1)
+
+    def _over(self, one: str, other: str) -> float:
+        rates = {row.who: row.rates for row in self.end_to_end}
+        return median(a / b for a, b in zip(rates[one], rates[other], strict=True))
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain values, for JSON; each benchmark says of which kind it is."""
+        plain = asdict(self)
+        return {
+            **plain,
+            "end_to_end": {
+                "kind": "end_to_end",
+                "rows": plain["end_to_end"],
+                "ratio": self.ratio,
+                "overlap_ratio": self.overlap_ratio,
+            },
+            "stepping": {"kind": "sensors", "agent_steps_per_s": self.stepping},
+            "is_crowded": self.is_crowded,
+        }
+
+
+def measure_training(
+    agents: int = 20,
+    worlds: int = 16,
+    workers: int = 2,
+    repeats: int = 3,
+    say: Callable[[str], None] = lambda text: None,
+) -> TrainingSpeed:
+    """Update by turns, after an update of each that does not count.
+
+    Args:
+        agents: of a world, on both sides; there are no other vehicles.
+        worlds: of ours. Theirs are as many as workers.
+        workers: processes of each side.
+        repeats: updates of each.
+        say: told what is being done.
+
+    Raises:
+        ConfigError: numbers that cannot be.
+        MissingExtraError: highway-env, stable-baselines3 or torch is not installed.
+        WorkerError: workers cannot be started.
+    """
+    for name, value in {"agents": agents, "workers": workers, "repeats": repeats}.items():
+        if value < 1:
+            raise ConfigError(f"{name} = {value}: must be at least 1")
+    if worlds % workers:
+        raise ConfigError(f"{worlds} worlds over {workers} workers: must be the same for each")
+    for module, extra in (
+        ("torch", "torch"),
+        ("highway_env", "highway"),
+        ("stable_baselines3", "sb3"),
+    ):
+        require(module, extra)
+    with ExitStack() as stack:
+        folder = Path(stack.enter_context(tempfile.TemporaryDirectory()))
+        say("starting theirs")
+        theirs = _Theirs(agents, workers, OUR_STEPS * worlds // workers)
+        stack.callback(theirs.close)
+        settings = _settings(folder, agents, worlds, workers)
+        say("starting ours")
+        ours = [_Ours("cavmarl", settings)]
+        stack.callback(ours[0].close)
+        ours.append(_Ours("cavmarl_overlap", replace(settings, overlap=True, name="overlap")))
+        stack.callback(ours[1].close)
+        sides: list[_Theirs | _Ours] = [*ours, theirs]
+        stepping = []
+        for turn in range(repeats + 1):
+            for side in sides:
+                say(f"update {turn} of {repeats}: {side.who}")
+                side.update(counts=turn > 0)
+            stepping.append(_stepping(ours[0].run))
+        rows = tuple(side.row() for side in sides)
+        size = ours[0].run.config.observation_size
+    return TrainingSpeed(agents, workers, size, rows, tuple(stepping[1:]), describe_hardware())
+
+
+def _settings(folder: Path, agents: int, worlds: int, workers: int) -> PpoSettings:
+    """Of a run on a road as long as theirs."""
+    from cavmarl.learning.ppo_settings import PpoSettings
+
+    road_m = length_m(highway_env(agents, THEIR_KINEMATICS))
+    entry: dict[str, Any] = {
+        "name": "straight",
+        "map": {"source": str(straight_road(folder, road_m))},
+        "horizon_s": HORIZON_S,
+    }
+    for key, value in (overrides(OUR_SENSORS, agents) | {"population.mode": "seats"}).items():
+        *parents, name = key.split(".")
+        place = entry
+        for parent in parents:
+            place = place.setdefault(parent, {})
+        place[name] = value
+    (folder / "env.yaml").write_text(yaml.safe_dump(entry), encoding="utf-8")
+    return PpoSettings(
+        env=str(folder),
+        agents=agents,
+        background=0,
+        num_envs=worlds,
+        workers=workers,
+        total_agent_steps=10**12,
+        num_steps=OUR_STEPS,
+        epochs=EPOCHS,
+        minibatches=MINIBATCHES,
+        hidden=HIDDEN,
+        runs=str(folder),
+        name="plain",
+    )
+
+
+class _Ours:
+    """A run of our PPO."""
+
+    def __init__(self, who: str, settings: PpoSettings) -> None:
+        from cavmarl.learning.run import Run
+
+        self.who = who
+        self.run = Run(settings)
+        self._rates: list[float] = []
+        self._spent_s: dict[str, float] = {}
+
+    def update(self, counts: bool) -> None:
+        """Collect and learn."""
+        from cavmarl.learning.run_clock import PHASES
+
+        began, before = time.perf_counter(), self.run.agent_steps
+        row = self.run.update()
+        rate = (self.run.agent_steps - before) / (time.perf_counter() - began)
+        if counts:
+            self._rates.append(rate)
+            for phase in PHASES:
+                self._spent_s[phase] = self._spent_s.get(phase, 0.0) + row[f"{phase}_s"]
+
+    def row(self) -> TrainingRow:
+        """What was found."""
+        settings, updates = self.run.settings, self.run.updates
+        decisions = self.run.agent_steps // updates
+        shares = _shares(self._spent_s)
+        return TrainingRow(self.who, settings.num_envs, decisions, tuple(self._rates), shares)
+
+    def close(self) -> None:
+        """End its workers."""
+        self.run.close()
+
+
+class _Theirs:
+    """stable-baselines3's PPO on highway-env."""
+
+    who = "stable_baselines3"
+
+    def __init__(self, agents: int, worlds: int, num_steps: int) -> None:
+        from stable_baselines3 import PPO
+
+        from cavmarl.bench.highway_rows import HighwayRows
+
+        self._rows: HighwayRows = HighwayRows(worlds, agents, THEIR_KINEMATICS, HORIZON_S)
+        self._worlds = worlds
+        self._decisions = num_steps * self._rows.num_envs
+        self._model = PPO(
+            "MlpPolicy",
+            self._rows,
+            n_steps=num_steps,
+            batch_size=self._decisions // MINIBATCHES,
+            n_epochs=EPOCHS,
+            policy_kwargs={"net_arch": [HIDDEN, HIDDEN]},
+            seed=0,
+            device="cpu",
+        )
+        self._rates: list[float] = []
+        self._spent_s = dict.fromkeys(("simulation", "inference", "learning"), 0.0)
+
+    def update(self, counts: bool) -> None:
+        """Collect and learn."""
+        simulated_s = self._rows.simulated_s
+        watch = _watch()
+        began = time.perf_counter()
+        self._model.learn(self._decisions, watch, reset_num_timesteps=False)
+        now = time.perf_counter()
+        if counts:
+            simulated_s = self._rows.simulated_s - simulated_s
+            self._rates.append(self._decisions / (now - began))
+            self._spent_s["simulation"] += simulated_s
+            self._spent_s["inference"] += watch.collected_s - began - simulated_s
+            self._spent_s["learning"] += now - watch.collected_s
+
+    def row(self) -> TrainingRow:
+        """What was found."""
+        rates, shares = tuple(self._rates), _shares(self._spent_s)
+        return TrainingRow(self.who, self._worlds, self._decisions, rates, shares)
+
+    def close(self) -> None:
+        """End its processes."""
+        self._rows.close()
+
+
+def _watch() -> Any:
+    """A callback of stable-baselines3 that notes when everything is collected."""
+    from stable_baselines3.common.callbacks import BaseCallback
+
+    class Watch(BaseCallback):
+        collected_s = 0.0
+
+        def _on_step(self) -> bool:
+            return True
+
+        def _on_rollout_end(self) -> None:
+            self.collected_s = time.perf_counter()
+
+    return Watch()
+
+
+def _shares(spent_s: dict[str, float]) -> dict[str, float]:
+    total_s = sum(spent_s.values())
+    return {phase: seconds / total_s for phase, seconds in spent_s.items()}
+
+
+def _stepping(run: Run) -> float:
+    """Agent-steps a second of the worlds of a run, all agents keeping to one action."""
+    vec = run.vec
+    actions = np.ones((vec.num_envs, vec.num_agents), dtype=np.int64)
+    decisions = 0
+    began = time.perf_counter()
+    for _ in range(STEPPING_STEPS):
+        decisions += int(vec.step(actions)[4]["acted"].sum())
+    return decisions / (time.perf_counter() - began)

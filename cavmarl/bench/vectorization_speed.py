@@ -1,0 +1,246 @@
+"""What it takes to step worlds over worker processes in which nothing happens.
+
+The agents are shared out evenly over the workers, one world each; they see the same numbers in
+every library, are paid nothing, and nobody leaves. So a step takes what vectorization takes.
+"""
+
+from __future__ import annotations
+
+import time
+import warnings
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
+from dataclasses import asdict, dataclass
+from functools import partial
+from pathlib import Path
+from statistics import median
+from typing import Any
+
+import gymnasium
+import numpy as np
+from gymnasium import spaces
+from gymnasium.vector import AsyncVectorEnv
+from pettingzoo import ParallelEnv
+
+from cavmarl.core.errors import ConfigError, MissingExtraError, require
+from cavmarl.engine.spaces import flat_observation_space
+from cavmarl.engine.world_setup import load_world
+from cavmarl.env.vector import CavVectorEnv
+from cavmarl.parallel.pooled_worlds import PooledWorlds
+from cavmarl.shards.shard import Commands
+
+__all__ = ["VectorizationRow", "VectorizationSpeed", "measure_vectorization"]
+
+PROGRAM = "cavmarl.bench.trivial_worker"
+SETTINGS = {"population.mode": "seats", "observation.kind": "flat", "action.kind": "continuous"}
+STEPS = 300  # a turn
+WARM_STEPS = 50
+
+Step = Callable[[], object]
+
+
+@dataclass(frozen=True)
+class VectorizationRow:
+    """One library.
+
+    Attributes:
+        library: `cavmarl`, `gymnasium` (`AsyncVectorEnv`), or `supersuit` (`concat_vec_envs_v1`).
+        step_us: median of each turn; empty: the library is missing.
+        missing: how to install the library, where it is missing.
+    """
+
+    library: str
+    step_us: tuple[float, ...]
+    missing: str = ""
+
+
+@dataclass(frozen=True)
+class VectorizationSpeed:
+    """What was measured.
+
+    Attributes:
+        agents: of all worlds.
+        workers: one world each.
+        numbers: in an observation.
+        order_us: what the workers add to ours: actions into shared memory, the order, until results
+            are in shared memory and committed; without checking actions and copying results, which
+            worlds of one process take, too. Median of each turn.
+        rows: the libraries.
+    """
+
+    agents: int
+    workers: int
+    numbers: int
+    order_us: tuple[float, ...]
+    rows: tuple[VectorizationRow, ...]
+
+    def ratio(self, library: str) -> float | None:
+        """How many times longer a step of a library takes than ours; None: missing."""
+        ours = next(row.step_us for row in self.rows if row.library == "cavmarl")
+        return self._over(library, ours)
+
+    def order_ratio(self, library: str) -> float | None:
+        """How many times longer it takes than our order to the workers; None: missing."""
+        return self._over(library, self.order_us)
+
+    def _over(self, library: str, ours: tuple[float, ...]) -> float | None:
+        """Median of the turns, each beside the other."""
+        theirs = next(row.step_us for row in self.rows if row.library == library)
+        if not theirs:
+            return None
+        return median(b / a for a, b in zip(ours, theirs, strict=True))
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain values, for JSON."""
+        libraries = [row.library for row in self.rows]
+        return {
+            **asdict(self),
+            "ratios": {library: self.ratio(library) for library in libraries},
+            "order_ratios": {library: self.order_ratio(library) for library in libraries},
+        }
+
+
+def measure_vectorization(
+    agents: int = 100,
+    workers: int = 2,
+    repeats: int = 7,
+    say: Callable[[str], None] = lambda text: None,
+) -> VectorizationSpeed:
+    """Step worlds in which nothing happens through each library's workers, by turns.
+
+    Args:
+        agents: of all worlds.
+        workers: of each library.
+        repeats: turns of each.
+        say: told what is being done.
+
+    Raises:
+        ConfigError: agents that cannot be shared out evenly.
+        WorkerError: workers cannot be started.
+    """
+    if workers < 1 or agents < 1 or agents % workers:
+        raise ConfigError(f"{agents} agents over {workers} workers: must be the same for each")
+    each = agents // workers
+    world = load_world("merge", agents=each, background=0, overrides=SETTINGS)
+    size = flat_observation_space(world.config).shape[0]
+    steps: dict[str, Step] = {}
+    missing: dict[str, str] = {}
+    with ExitStack() as stack:
+        # Those that fork this process go first: it has not mapped anything yet.
+        for library, make in (("supersuit", _supersuit), ("gymnasium", _gymnasium)):
+            say(f"starting the workers of {library}")
+            try:
+                steps[library] = stack.enter_context(make(each, size, workers))
+            except MissingExtraError as error:
+                missing[library] = str(error)
+        say("starting ours")
+        worlds = PooledWorlds(world, Path(), workers, workers, program=PROGRAM)
+        vec = CavVectorEnv(worlds)
+        stack.callback(vec.close)
+        vec.reset(seed=0)
+        actions = np.zeros((workers, each, 2), dtype=np.float32)
+        steps["cavmarl"] = partial(vec.step, actions)
+        idle = Commands(np.zeros(actions.shape), np.zeros(actions.shape[:2], dtype=np.int64))
+        orders: list[float] = []
+        turns: dict[str, list[float]] = {library: [] for library in steps}
+        for turn in range(repeats):
+            say(f"nothing happens: turn {turn + 1} of {repeats}")
+            for library, step in steps.items():
+                turns[library].append(_microseconds(step))
+            orders.append(_microseconds(partial(worlds.step, idle)))
+    rows = tuple(
+        VectorizationRow(library, tuple(turns.get(library, ())), missing.get(library, ""))
+        for library in ("cavmarl", "gymnasium", "supersuit")
+    )
+    return VectorizationSpeed(agents, workers, size, tuple(orders), rows)
+
+
+def _microseconds(step: Step) -> float:
+    """Median of a turn."""
+    found = []
+    for n in range(WARM_STEPS + STEPS):
+        began = time.perf_counter()
+        step()
+        if n >= WARM_STEPS:
+            found.append(1e6 * (time.perf_counter() - began))
+    return median(found)
+
+
+@contextmanager
+def _gymnasium(agents: int, size: int, workers: int) -> Iterator[Step]:
+    vec = AsyncVectorEnv([partial(_TrivialWorld, agents, size)] * workers)
+    try:
+        vec.reset()
+        yield partial(vec.step, np.zeros((workers, agents, 2), dtype=np.float32))
+    finally:
+        vec.close()
+
+
+@contextmanager
+def _supersuit(agents: int, size: int, workers: int) -> Iterator[Step]:
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # what the library says of itself
+        supersuit = require("supersuit", "supersuit")
+        rows = supersuit.pettingzoo_env_to_vec_env_v1(_TrivialAgents(agents, size))
+        vec = supersuit.concat_vec_envs_v1(rows, workers, workers, base_class="gymnasium")
+        try:
+            vec.reset()
+            yield partial(vec.step, np.zeros((workers * agents, 2), dtype=np.float32))
+        finally:
+            vec.close()
+
+
+def _boxes(*shape: int) -> tuple[spaces.Box, spaces.Box]:
+    """Of observations and of actions."""
+    *agents, size = shape
+    actions = spaces.Box(-1.0, 1.0, (*agents, 2), np.float32)
+    return spaces.Box(-1.0, 1.0, (*agents, size), np.float32), actions
+
+
+class _TrivialWorld(gymnasium.Env[Any, Any]):
+    """All agents of a world in one array."""
+
+    def __init__(self, agents: int, size: int) -> None:
+        self.observation_space, self.action_space = _boxes(agents, size)
+        self._seen = np.zeros((agents, size), dtype=np.float32)
+
+    def reset(self, **_: Any) -> tuple[Any, dict[str, Any]]:
+        return self._seen, {}
+
+    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+        self._seen += 1.0
+        return self._seen, 0.0, False, False, {}
+
+
+class _TrivialAgents(ParallelEnv[str, Any, Any]):  # type: ignore[misc] # PettingZoo is not typed
+    """The agents of a world in dicts that are made once."""
+
+    metadata: dict[str, Any] = {  # noqa: RUF012 - PettingZoo declares it as an instance's attribute
+        "name": "trivial",
+        "is_parallelizable": True,
+    }
+    render_mode = None
+
+    def __init__(self, agents: int, size: int) -> None:
+        self.agents = self.possible_agents = [f"car_{k}" for k in range(agents)]
+        observations, actions = _boxes(size)
+        self.observation_spaces = dict.fromkeys(self.agents, observations)
+        self.action_spaces = dict.fromkeys(self.agents, actions)
+        self._batch = np.zeros((agents, size), dtype=np.float32)
+        self._seen = dict(zip(self.agents, self._batch, strict=True))
+        self._paid = dict.fromkeys(self.agents, 0.0)
+        self._ended = dict.fromkeys(self.agents, False)
+        self._told: dict[str, dict[str, Any]] = {agent: {} for agent in self.agents}
+
+    def observation_space(self, agent: str) -> spaces.Space[Any]:
+        return self.observation_spaces[agent]
+
+    def action_space(self, agent: str) -> spaces.Space[Any]:
+        return self.action_spaces[agent]
+
+    def reset(self, seed: int | None = None, options: Any = None) -> tuple[Any, Any]:
+        return self._seen, self._told
+
+    def step(self, actions: Any) -> tuple[Any, Any, Any, Any, Any]:
+        self._batch += 1.0
+        return self._seen, self._paid, self._ended, self._ended, self._told

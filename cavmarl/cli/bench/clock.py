@@ -1,0 +1,88 @@
+"""`cavmarl bench clock`: the drift between a master's clock and a follower's, Table II."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Literal
+
+import typer
+from rich.console import Console
+from rich.table import Table
+
+from cavmarl.cli.output import (
+    JsonPath,
+    Seed,
+    Settings,
+    parse_settings,
+    writable,
+    write_json,
+)
+
+if TYPE_CHECKING:
+    from cavmarl.bench.clock_drift import ClockDrift
+
+__all__ = ["clock"]
+
+
+def clock(
+    env: Annotated[
+        str, typer.Argument(metavar="[ENV]", help="Name, folder or map file of an environment.")
+    ] = "ring",
+    steps: Annotated[int, typer.Option(help="Of the master; a step is a tick here.")] = 5000,
+    rogue: Annotated[
+        float, typer.Option(help="Share of steps in which the follower ticks by itself, too.")
+    ] = 0.0,
+    own_ticks: Annotated[
+        Literal["obey", "refuse", "ignore"],
+        typer.Option(help="What the master does about that; obey: the unprotected world ticks."),
+    ] = "obey",
+    seed: Seed = 0,
+    settings: Settings = None,
+    csv_path: Annotated[
+        Path | None, typer.Option("--csv", help="Write the table here.", callback=writable)
+    ] = None,
+    json_path: JsonPath = None,
+) -> None:
+    """Read a master's clock and that of a follower in another process, after the same steps."""
+    from cavmarl.bench.clock_drift import measure_drift, write_rows
+
+    console = Console()
+    with console.status(f"{steps} steps"):
+        found = measure_drift(
+            env,
+            steps=steps,
+            rogue=rogue,
+            answer=own_ticks,
+            seed=seed,
+            overrides=parse_settings(settings),
+        )
+    console.print(_table(found))
+    console.print(_verdict(found), highlight=False)
+    if csv_path is not None:
+        write_rows(csv_path, found.rows)
+    write_json(json_path, found.to_dict())
+    if not found.holds:
+        raise typer.Exit(1)
+
+
+def _table(found: ClockDrift) -> Table:
+    table = Table(title=f"{found.environment}, {1000.0 * found.dt_s:g} ms a step")
+    for column in ("step", "master, s", "follower, s", "normalised, s", "Δ, s", "ratio"):
+        table.add_column(column, justify="right")
+    for row in found.rows:
+        seconds = (row.master_s, row.follower_s, row.normalised_s, row.delta_s)
+        table.add_row(str(row.step), *(f"{time_s:.1f}" for time_s in seconds), f"{row.ratio:.2f}")
+    return table
+
+
+def _verdict(found: ClockDrift) -> str:
+    if not found.own_ticks:
+        equal = "equal" if found.holds else "[bold]not equal[/]"
+        return f"the follower did not tick by itself; the clocks are {equal}"
+    told = f"the follower ticked by itself {found.own_ticks} times ({found.answer})"
+    if found.noticed_ticks is None:
+        return f"{told}; the master counted {found.counted}, and the world went on only with him"
+    return (
+        f"{told}; the master noticed {found.drift_events} times that the world had gone on without "
+        f"him, first {found.noticed_ticks} of his ticks after the first time"
+    )

@@ -1,0 +1,274 @@
+"""`cavmarl bench sensors`: ten sensors of one vehicle over several sensor workers."""
+
+from __future__ import annotations
+
+import csv
+import math
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+from rich import box
+from rich.console import Console
+from rich.table import Table
+
+from cavmarl.cli.output import JsonPath, Seed, Settings, parse_settings, write_json
+from cavmarl.core.errors import ConfigError
+
+if TYPE_CHECKING:
+    from cavmarl.bench.sensor_bench import SensorBench
+    from cavmarl.bench.sensor_run import Window
+    from cavmarl.bench.sensor_scaling import ScalingRow
+    from cavmarl.parallel.sensor_workers.sensor_shares import Shares
+
+__all__ = ["sensors"]
+
+
+def sensors(
+    env: Annotated[
+        str, typer.Argument(metavar="[ENV]", help="Name, folder or map file of an environment.")
+    ] = "town",
+    workers: Annotated[
+        str, typer.Option(metavar="N,…", help="Numbers of sensor workers.")
+    ] = "1,2,3,4",
+    warmup: Annotated[int, typer.Option(help="Steps that do not count.")] = 40,
+    steps: Annotated[int, typer.Option(help="Of each run that do.")] = 150,
+    repeats: Annotated[int, typer.Option(help="Runs of each number.")] = 5,
+    rig: Annotated[
+        str, typer.Option(help="Sensors: a name in configs/rigs/, or a .yaml.")
+    ] = "ten_sensors",
+    agents: Annotated[int, typer.Option(help="Vehicles with sensors.")] = 1,
+    background: Annotated[int, typer.Option(help="Vehicles without.")] = 0,
+    load: Annotated[
+        float | None,
+        typer.Option(
+            metavar="MS", help="Raise resolutions and rates until sensing takes so long a tick."
+        ),
+    ] = None,
+    seed: Seed = 0,
+    settings: Settings = None,
+    csv_path: Annotated[
+        Path | None, typer.Option("--csv", help="Write every step of every run here.")
+    ] = None,
+    plot: Annotated[
+        Path | None, typer.Option(help="Write the figure here (.png, .svg, .pdf).")
+    ] = None,
+    at_least: Annotated[
+        float | None, typer.Option(help="Exit with 1 if the second is not so many times faster.")
+    ] = None,
+    json_path: JsonPath = None,
+) -> None:
+    """One vehicle and its sensors, with each number of sensor workers, in processes anew.
+
+    Exit code 1: states or frames differed between runs, or --at-least did not hold.
+    """
+    from cavmarl.bench.sensor_bench import measure_sensor_workers
+    from cavmarl.bench.sensor_figure import plot_sensor_workers
+    from cavmarl.bench.sensor_load import find_rig, load_rig
+
+    if at_least is not None and not 0.0 < at_least < math.inf:
+        raise ConfigError(f"--at-least {at_least:g}: must be a number above 0")
+    numbers = _numbers(workers)
+    console = Console()
+    with console.status("") as status:
+        found = measure_sensor_workers(
+            env,
+            load_rig(find_rig(rig)),
+            workers=numbers,
+            warmup=warmup,
+            steps=steps,
+            repeats=repeats,
+            agents=agents,
+            background=background,
+            seed=seed,
+            load_ms=load,
+            overrides=parse_settings(settings),
+            say=status.update,
+        )
+    rows = found.rows
+    for table in (_sensors(found), _scaling(found, rows), _parts(found), _resources(found)):
+        console.print(table)
+    _say(console, found, rows)
+    write_json(json_path, found.to_dict())
+    if csv_path is not None:
+        _write_csv(csv_path, found)
+    if plot is not None:
+        title = f"{Path(env).stem}: {len(found.costs_ms)} sensors, {found.sensing_ms:.1f} ms a tick"
+        plot_sensor_workers(rows, title, plot)
+    is_slow = at_least is not None and len(rows) > 1 and rows[1].speedup < at_least
+    if is_slow or not found.is_same:
+        raise typer.Exit(1)
+
+
+def _numbers(text: str) -> list[int]:
+    try:
+        return [int(word) for word in text.split(",")]
+    except ValueError:
+        raise ConfigError(f"--workers {text}: must be whole numbers with commas between") from None
+
+
+def _sensors(found: SensorBench) -> Table:
+    """What was sensed, what it costs, and who does it either way."""
+    table = Table("sensor", "type", "sample", "Hz", "x, y, z m; yaw °", "ms", title="the rig")
+    shared = [number for number in found.numbers if number > 1]
+    for number in shared:
+        table.add_column(f"in turn / by cost, {number}", justify="right")
+    plans = [found.shares(number) for number in shared]
+    homes = [{name: _homes(plan) for name, plan in both.items()} for both in plans]
+    for place, (sensor, cost_ms) in enumerate(
+        zip(found.turns[0].run.sensors, found.costs_ms, strict=True)
+    ):
+        at = sensor["placement"]
+        table.add_row(
+            sensor["name"],
+            sensor["type"],
+            " by ".join(map(str, sensor["resolution"])),
+            "" if sensor["rate_hz"] is None else f"{sensor['rate_hz']:g}",
+            f"{at['x_m']:g}, {at['y_m']:g}, {at['z_m']:g}; {at['yaw_deg']:g}",
+            f"{cost_ms:.3f}",
+            *(
+                f"{both['in_turn'].get(place, '-')} / {both['cost'].get(place, '-')}"
+                for both in homes
+            ),
+        )
+    table.add_section()
+    slowest = (
+        " / ".join(f"{1e3 * max(both[name].loads_s):.2f}" for name in ("in_turn", "cost"))
+        for both in plans
+    )
+    table.add_row("all; the slowest", "", "", "", "", f"{sum(found.costs_ms):.3f}", *slowest)
+    return table
+
+
+def _homes(plan: Shares) -> dict[int, str]:
+    """Who writes the frames of each sensor, or parts of them."""
+    homes: dict[int, list[str]] = {}
+    for unit, home in zip(plan.units, plan.homes, strict=True):
+        homes.setdefault(unit.sensor, []).append(str(home))
+    return {sensor: "+".join(own) for sensor, own in homes.items()}
+
+
+def _scaling(found: SensorBench, rows: list[ScalingRow]) -> Table:
+    table = Table(
+        title=(
+            f"{Path(found.env).stem}, {found.agents} vehicle{'s' if found.agents > 1 else ''} with "
+            f"sensors, {found.warmup} + {found.steps} steps, placed by {found.placement}"
+        ),
+        caption="bold: the best of those measured; SD: of the steps of a run",
+        box=box.SIMPLE_HEAD,
+        pad_edge=False,
+    )
+    for column in (
+        "sensor\nworkers", "FPS", "tick +\nsensors\nms", "SD\nms", "wait\nms", "speedup",
+        "effi-\nciency\n%", "CV\n%", "wait\n%", "rest\nms",
+    ):  # fmt: skip
+        table.add_column(column, justify="right", no_wrap=True)
+    for row in rows:
+        table.add_row(
+            str(row.workers),
+            f"{row.fps:.2f}",
+            f"{row.step_ms:.2f}",
+            f"{row.sd_within_run:.2f}",
+            f"{row.wait_ms:.2f}",
+            f"{row.speedup:.2f}",
+            f"{row.efficiency_pct:.1f}",
+            f"{row.cv_pct:.1f}",
+            f"{row.wait_share_pct:.1f}",
+            f"{row.rest_ms:.2f}",
+            style="bold" if row.is_best else None,
+        )
+    return table
+
+
+def _parts(found: SensorBench) -> Table:
+    """Where a step goes."""
+    table = Table("ms a step", title="parts of a step, each with a clock of its own")
+    columns = []
+    for row in found.rows:
+        table.add_column(f"{row.workers}", justify="right")
+        columns.append((found.parts_ms(row.workers), row.step_ms))
+    for name in columns[0][0]:
+        if name == "SUMO" and not any(parts[name] for parts, _ in columns):
+            continue  # no world has one
+        table.add_row(name, *(f"{parts[name]:.3f}" for parts, _ in columns))
+    table.add_section()
+    sums = (f"{sum(parts.values()) / step_ms:.1%}" for parts, step_ms in columns)
+    table.add_row("sum, of the step", *sums)
+    return table
+
+
+def _resources(found: SensorBench) -> Table:
+    """What all processes took a step, in the last run of each number."""
+    table = Table("a step", title="resources")
+    columns = []
+    for number in found.numbers:
+        table.add_column(f"{number}", justify="right")
+        columns.append(found.windows(number))
+    lines: dict[str, Callable[[Window], float]] = {
+        "processor, state, ms": lambda w: 1e3 * w.leader_cpu_s / w.steps,
+        "processor, sensor workers, ms": lambda w: 1e3 * sum(w.worker_cpu_s) / w.steps,
+        "memory, state, MB": lambda w: w.leader_rss_mb,
+        "memory, largest sensor worker, MB": lambda w: max(w.worker_rss_mb),
+        "to sensor workers, kB": lambda w: 1e-3 * w.sent_bytes / w.steps,
+        "frames, kB": lambda w: 1e-3 * w.got_bytes / w.steps,
+        "messages": lambda w: w.messages / w.steps,
+    }
+    for name, value in lines.items():
+        table.add_row(name, *(f"{value(windows[-1]):,.1f}" for windows in columns))
+    return table
+
+
+def _say(console: Console, found: SensorBench, rows: list[ScalingRow]) -> None:
+    from cavmarl.bench.sensor_scaling import MIN_RUNS
+
+    best = next(row for row in rows if row.is_best)
+    console.print(
+        f"the best of those measured: [bold]{best.workers}[/] sensor workers, {best.speedup:.2f} "
+        f"times {rows[0].workers}; sensing takes {found.sensing_ms:.2f} ms a tick on "
+        f"{rows[0].workers}",
+        highlight=False,
+    )
+    if found.ceiling is not None:
+        console.print(
+            f"{found.ceiling.programs} programs that share nothing and do the same, side by side: "
+            f"[bold]{found.ceiling.ratio:.2f}[/] times one after the other: more this machine does "
+            "not give",
+            highlight=False,
+        )
+    intervals = (
+        f"{row.workers}: {row.ci95_between_runs.low:.2f} to {row.ci95_between_runs.high:.2f} ms"
+        for row in rows
+        if row.ci95_between_runs is not None
+    )
+    console.print(
+        f"95 % between runs: {'; '.join(intervals) or f'none, it takes {MIN_RUNS} runs'}",
+        highlight=False,
+    )
+    same = "the same" if found.is_same else "[red]not the same[/]"
+    console.print(f"states and frames of all runs, step by step: {same}")
+    cores = found.to_dict()["hardware"]["usable_cores"]
+    console.print(f"cores: {cores}; runs in this order: {[turn.workers for turn in found.turns]}")
+    crowded = [number for number in found.numbers if number > cores]
+    if crowded:
+        console.print(f"note: {crowded} are more sensor workers than cores", style="yellow")
+
+
+def _write_csv(path: Path, found: SensorBench) -> None:
+    """One line a step: the raw series.
+
+    Raises:
+        ConfigError: the path cannot be written.
+    """
+    parts = list(found.turns[0].run.parts_ms)
+    try:
+        with path.open("w", newline="", encoding="utf-8") as file:
+            writer = csv.writer(file)
+            writer.writerow(["place", "repeat", "workers", "step", "step_ms", "wait_ms", *parts])
+            for turn in found.turns:
+                run = turn.run
+                columns = (run.step_ms, run.wait_ms, *(run.parts_ms[name] for name in parts))
+                for step, values in enumerate(zip(*columns, strict=True), 1):
+                    writer.writerow([turn.place, turn.repeat, turn.workers, step, *values])
+    except OSError as error:
+        raise ConfigError(f"--csv {path}: cannot be written ({error.strerror})") from error

@@ -1,0 +1,284 @@
+"""`cavmarl verify`: whether divided worlds are the undivided one, bit for bit."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+from rich import box
+from rich.console import Console
+from rich.markup import escape
+from rich.table import Table
+
+from cavmarl.cli.evaluate import progress_bar
+from cavmarl.cli.output import (
+    Agents,
+    Background,
+    JsonPath,
+    PolicyName,
+    Seed,
+    Settings,
+    make_folder,
+    parse_settings,
+    say_difference,
+    write_json,
+)
+from cavmarl.cli.verify.faults import check_campaign, print_campaign, print_figures
+from cavmarl.cli.verify.kills import verify_with_kills
+from cavmarl.cli.verify.replay import run_again
+from cavmarl.config.env import ZONE_LAYOUTS
+from cavmarl.core.errors import ConfigError
+
+if TYPE_CHECKING:
+    from cavmarl.verify.equivalence import Equivalence, ZoneResult
+
+__all__ = ["verify"]
+
+
+def verify(
+    env: Annotated[
+        str | None,
+        typer.Argument(
+            metavar="[ENV]",
+            help="Name, folder or map file of an environment; of a campaign, default: a busy grid.",
+        ),
+    ] = None,
+    zones: Annotated[
+        str | None,
+        typer.Option(
+            metavar="K,K,…",
+            help="Numbers of zones; default: 1,2,4,9, or what a zone file has; of a campaign 4,9.",
+        ),
+    ] = None,
+    steps: Annotated[
+        int | None, typer.Option(help="That are compared; default: 200, of a campaign 40 a run.")
+    ] = None,
+    seed: Seed = 0,
+    layout: Annotated[
+        str | None,
+        typer.Option(
+            help=f"{', '.join(ZONE_LAYOUTS)}, or a zone file; default: the environment's."
+        ),
+    ] = None,
+    policy: PolicyName = "idm",
+    worlds: Annotated[
+        int | None,
+        typer.Option(help="Stepped together; default: 1, with --kill two a worker."),
+    ] = None,
+    agents: Agents = None,
+    background: Background = None,
+    settings: Settings = None,
+    faults: Annotated[
+        str | None,
+        typer.Option(
+            metavar="PLAN",
+            help="JSON file of faults in the divided worlds, see docs/faults.md; `campaign`: "
+            "the whole matrix.",
+        ),
+    ] = None,
+    seeds: Annotated[
+        int, typer.Option(help="Of a campaign: runs in which anybody dies at any time.")
+    ] = 12,
+    kill: Annotated[
+        int | None,
+        typer.Option(
+            metavar="N",
+            help="Kill or stop N workers at random times instead of dividing worlds, and compare.",
+        ),
+    ] = None,
+    workers: Annotated[int, typer.Option(help="Of --kill, that the worlds are run by.")] = 2,
+    hosts: Annotated[
+        str | None,
+        typer.Option(
+            metavar="ray",
+            help="Of --kill: the workers are actors of a Ray cluster on this machine.",
+        ),
+    ] = None,
+    check: Annotated[
+        bool, typer.Option("--check", help="Watch the invariants of ownership, too.")
+    ] = False,
+    journal: Annotated[
+        Path | None,
+        typer.Option(metavar="DIR", help="Folder for the journals of the divided worlds."),
+    ] = None,
+    replay: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FILE",
+            help="Run a tick again that every host of a zone died of, see docs/faults.md; beside "
+            "it goes ENV only, where the map is found.",
+        ),
+    ] = None,
+    json_path: JsonPath = None,
+) -> None:
+    """Drive divided worlds beside the undivided one; exit code 1 and where one first differs.
+
+    With --kill: worlds whose workers are killed beside some that nobody disturbs.
+    """
+    if hosts is not None and kill is None:
+        raise ConfigError(f"--hosts {hosts}: goes with --kill only")
+    if replay is not None:
+        given = (zones, steps, layout, agents, background, settings, faults, journal, kill, worlds)
+        if check or any(value is not None for value in given):
+            raise ConfigError("--replay: all else stands in the file; beside it goes ENV only")
+        run_again(replay, env, json_path)
+        return
+    overrides = parse_settings(settings)
+    counts = None if zones is None else _counts(zones)
+    console = Console()
+    if kill is not None:
+        _refuse_with_kill(
+            env, counts, {"--faults": faults, "--layout": layout, "--journal": journal}
+        )
+        verify_with_kills(
+            console,
+            str(env),
+            kill,
+            json_path,
+            workers=workers,
+            hosts=hosts,
+            worlds=worlds,
+            steps=steps,
+            seed=seed,
+            policy=policy,
+            zones=None if counts is None else counts[0],
+            agents=agents,
+            background=background,
+            overrides=overrides | ({"zones.check": True} if check else {}),
+        )
+        return
+    worlds = 1 if worlds is None else worlds
+    if faults == "campaign":
+        check_campaign(layout, worlds, journal)
+        named = {"population.agents": agents, "population.background": background}
+        overrides |= {key: value for key, value in named.items() if value is not None}
+        overrides |= {"zones.check": True} if check else {}
+        _campaign(console, env, counts, steps, seed, seeds, policy, overrides, json_path)
+        return
+    if env is None:
+        raise ConfigError("verify: name an environment; without one goes --faults campaign only")
+    if journal is not None:
+        make_folder(journal)
+    from cavmarl.verify.equivalence import verify_zones
+
+    with progress_bar(console) as bar:
+        task = bar.add_task(f"{policy} drives {env}, undivided and divided")
+        found = verify_zones(
+            env,
+            counts,
+            steps=200 if steps is None else steps,
+            seed=seed,
+            layout=layout,
+            policy=policy,
+            worlds=worlds,
+            agents=agents,
+            background=background,
+            overrides=overrides,
+            faults=faults,
+            check=check,
+            journals=journal,
+            progress=lambda k, n: bar.update(task, completed=k, total=n),
+        )
+    write_json(json_path, found.to_dict())
+    console.print(_table(found, seed))
+    if faults is not None:
+        print_figures(console, found)
+    for result in found.results:
+        if result.difference is not None:
+            console.print(_sentence(result, found.worlds), markup=False, soft_wrap=True)
+    if not found.holds:
+        raise typer.Exit(1)
+    hashes = ", ".join(found.state_hashes)
+    console.print(f"state after tick {found.ticks}: {hashes}", highlight=False, soft_wrap=True)
+
+
+def _campaign(
+    console: Console,
+    env: str | None,
+    counts: list[int] | None,
+    steps: int | None,
+    seed: int,
+    seeds: int,
+    policy: str,
+    overrides: dict[str, Any],
+    json_path: Path | None,
+) -> None:
+    """The whole matrix of faults; exit code 1 if a run is not as it has to be."""
+    from cavmarl.verify.fault_campaign import run_campaign
+
+    with progress_bar(console) as bar:
+        task = bar.add_task("faults beside the undivided world")
+        campaign = run_campaign(
+            env,
+            counts,
+            steps=40 if steps is None else steps,
+            seed=seed,
+            seeds=seeds,
+            policy=policy,
+            overrides=overrides,
+            progress=lambda k, n: bar.update(task, completed=k, total=n),
+        )
+    write_json(json_path, campaign.to_dict())
+    print_campaign(console, campaign, seed)
+    if not campaign.holds:
+        raise typer.Exit(1)
+
+
+def _refuse_with_kill(
+    env: str | None, counts: list[int] | None, others: dict[str, str | Path | None]
+) -> None:
+    """Refuse what does not go with `--kill`.
+
+    Raises:
+        ConfigError: one of it was given, or no environment.
+    """
+    if env is None:
+        raise ConfigError("--kill: name an environment")
+    if counts is not None and len(counts) > 1:
+        raise ConfigError(f"--zones {','.join(map(str, counts))}: --kill takes one number of zones")
+    for option, value in others.items():
+        if value is not None:
+            raise ConfigError(f"{option} does not go with --kill: zones.layout is for --set")
+
+
+def _counts(text: str) -> list[int]:
+    """The numbers of `--zones`.
+
+    Raises:
+        ConfigError: something else.
+    """
+    try:
+        return [int(word) for word in text.split(",")]
+    except ValueError:
+        raise ConfigError(f"--zones {text}: must be numbers with commas between, 1,2,4") from None
+
+
+def _table(found: Equivalence, seed: int) -> Table:
+    many = "a world" if found.worlds == 1 else f"{found.worlds} worlds"
+    table = Table(
+        title=escape(f"{Path(found.env).name}, {many}, seed {seed}: beside the undivided"),
+        box=box.SIMPLE_HEAD,
+        pad_edge=False,
+    )
+    for heading in ("zones", "steps", "vehicles", "crossings"):
+        table.add_column(heading, justify="right")
+    table.add_column("")
+    for result in found.results:
+        equal = result.difference is None
+        table.add_row(
+            str(result.zones),
+            str(result.steps),
+            f"{result.vehicles:,.0f}",
+            f"{result.crossings:,}",
+            "[green]equal[/]" if equal else "[red]different[/]",
+        )
+    return table
+
+
+def _sentence(result: ZoneResult, worlds: int) -> str:
+    assert result.difference is not None
+    where = f"{result.zones} zone{'' if result.zones == 1 else 's'}"
+    if worlds > 1:
+        where += f", world {result.world}"
+    return f"{where}: {say_difference(result.difference, ('undivided', 'divided'))}"

@@ -1,0 +1,104 @@
+"""What `cavmarl verify --kill` does and prints: workers are killed, and nobody can tell."""
+
+from __future__ import annotations
+
+from bisect import bisect_right
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import typer
+from rich import box
+from rich.console import Console
+from rich.markup import escape
+from rich.table import Table
+
+from cavmarl.cli.evaluate import progress_bar
+from cavmarl.cli.output import write_json
+
+if TYPE_CHECKING:
+    from cavmarl.verify.worker_kills import Kill, KillReport
+
+__all__ = ["verify_with_kills"]
+
+BOUNDS_MS = (1, 2, 5, 10, 20, 50, 100, 200, 500, 1000)
+WIDTH = 30  # letters of the longest bar
+
+
+def verify_with_kills(
+    console: Console, env: str, kills: int, json_path: Path | None, **arguments: Any
+) -> None:
+    """Kill and stop workers beside undisturbed worlds; exit code 1 if anything differs."""
+    from cavmarl.verify.worker_kills import verify_kills
+
+    with progress_bar(console) as bar:
+        task = bar.add_task(f"{kills} workers of {env} are killed or stopped")
+        found = verify_kills(
+            env,
+            kills,
+            progress=lambda k, n: bar.update(task, completed=k, total=n),
+            **arguments,
+        )
+    write_json(json_path, found.to_dict())
+    _print(console, found)
+    if not found.holds:
+        raise typer.Exit(1)
+
+
+def _print(console: Console, found: KillReport) -> None:
+    hardware = found.hardware
+    console.print(
+        f"{escape(Path(found.env).name)}: {found.worlds} worlds over {found.workers} workers, "
+        f"{found.steps} steps of {found.step_ms:.3g} ms; {len(found.kills)} deaths\n"
+        f"an empty order to all workers: {found.ping_us:.3g} µs\n"
+        f"{hardware['cpu']}, {hardware['usable_cores']} cores",
+        highlight=False,
+    )
+    if found.workers > (hardware["usable_cores"] or found.workers):
+        console.print("note: more workers than cores", style="yellow")
+    console.print(_spreads(found))
+    console.print(_histogram(found.kills))
+    if found.holds:
+        console.print(f"[green]equal[/] in all {found.steps} steps", highlight=False)
+    else:
+        console.print(f"[red]different[/] after step {found.different}", highlight=False)
+
+
+def _spreads(found: KillReport) -> Table:
+    import numpy as np
+
+    table = Table("", "deaths", box=box.SIMPLE_HEAD, pad_edge=False)
+    for heading in ("p50", "p95", "p99", "max"):
+        table.add_column(heading, justify="right")
+    for text, kind, name in (
+        ("killed at work: noticed after, ms", "SIGKILL", "noticed_ms"),
+        ("stopped at work: noticed after, ms", "SIGSTOP", "noticed_ms"),
+        ("successor has the order after, ms", None, "replaced_ms"),
+        ("successor has done it after, ms", None, "recovered_ms"),
+    ):
+        values = [
+            getattr(kill, name)
+            for kill in found.kills
+            if kind is None or (kill.signal == kind and not kill.idle)
+        ]
+        shown = [f"{np.percentile(values, p):.3g}" if values else "-" for p in (50, 95, 99, 100)]
+        table.add_row(text, str(len(values)), *shown)
+    return table
+
+
+def _histogram(kills: tuple[Kill, ...]) -> Table:
+    """How many were noticed, and recovered from, how fast."""
+    names = ("noticed_ms", "recovered_ms")
+    counts = {name: [0] * (len(BOUNDS_MS) + 1) for name in names}
+    for kill in kills:
+        for name in names:
+            counts[name][bisect_right(BOUNDS_MS, getattr(kill, name))] += 1
+    most = max(1, *(max(column) for column in counts.values()))
+    table = Table("ms", "noticed", "recovered", box=box.SIMPLE_HEAD, pad_edge=False)
+    labels = [f"below {BOUNDS_MS[0]}", *(f"from {bound}" for bound in BOUNDS_MS)]
+    for n, label in enumerate(labels):
+        if any(counts[name][n] for name in names):
+            bars = (
+                f"{'█' * -(-WIDTH * counts[name][n] // most)} {counts[name][n]}" for name in names
+            )
+            table.add_row(label, *bars)
+    return table

@@ -1,0 +1,613 @@
+"""What a world is: `EnvConfig`, frozen dataclasses whose fields are the keys of `env.yaml`.
+
+A unit ends the name of every bare number. Each class refuses, in `__post_init__`, the values and
+the combinations that cannot work, and says what to change. Types and unknown keys are checked at
+the border by `registry.load_config`.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+from itertools import pairwise
+from typing import Literal
+
+from cavmarl.config.checks import check as _check
+from cavmarl.config.checks import check_finite as _check_finite
+from cavmarl.config.rig import Rig, check_rig
+from cavmarl.config.scenario import ScenarioConfig
+from cavmarl.config.sensors import SensorsConfig
+from cavmarl.config.sumo import SumoConfig
+from cavmarl.config.v2x import V2xConfig
+
+__all__ = [
+    "MAX_ZONES",
+    "TERMS",
+    "ZONE_FILE_SUFFIXES",
+    "ZONE_LAYOUTS",
+    "ActionConfig",
+    "ClockConfig",
+    "EnvConfig",
+    "MapConfig",
+    "ObservationConfig",
+    "PopulationConfig",
+    "ScenarioConfig",
+    "SensorsConfig",
+    "SumoConfig",
+    "TermsConfig",
+    "TrafficConfig",
+    "WorkersConfig",
+    "ZonesConfig",
+]
+
+# The named terms of one step, in the order of every terms array (`rewards/kernels/terms.py`).
+TERMS = (
+    "progress",
+    "speed",
+    "comfort",
+    "time_to_collision",
+    "collision",
+    "off_road",
+    "wrong_way",
+    "red_light",
+    "arrival",
+    "delay",
+)
+
+MAX_ZONES = 256  # of one map
+ZONE_LAYOUTS = ("grid", "strips", "bisection")
+ZONE_FILE_SUFFIXES = (".json", ".yaml", ".yml")
+
+MAX_SENSOR_WORKERS = 256  # of one process
+MAX_IDS = 1_000_000  # of agents in one episode: each has its space and its rows in every output
+
+
+@dataclass(frozen=True)
+class MapConfig:
+    """Where the roads come from.
+
+    Attributes:
+        source: a map file: relative to the entry's folder, absolute, or `sumo:PATH` for a file of
+            the eclipse-sumo wheel.
+        programs: additional files with more signal programs, named as the source is; of several
+            programs of a signal the last is on.
+        program: the program of each signal named here, whatever was loaded; `off` is one, too.
+        buildings: `osm`: those of the OpenStreetMap file that `source` is; or a file of buildings
+            (OpenStreetMap or SUMO's polygons), named as the source is; empty: none.
+    """
+
+    source: str
+    programs: tuple[str, ...] = ()
+    program: dict[str, str] = field(default_factory=dict)
+    buildings: str = ""
+
+    def __post_init__(self) -> None:
+        _check(bool(self.source), "map.source", self.source, "must name a map file")
+        _check(all(self.programs), "map.programs", self.programs, "must name files")
+
+
+@dataclass(frozen=True)
+class ClockConfig:
+    """Time: the integer tick is the truth, seconds = tick · sim_dt_s.
+
+    Attributes:
+        sim_dt_s: seconds a tick.
+        ctrl_dt_s: seconds an agent's decision (step); a whole number of ticks.
+        control_latency_ticks: ticks between an action and its effect.
+    """
+
+    sim_dt_s: float = 0.05
+    ctrl_dt_s: float = 0.1
+    control_latency_ticks: int = 0
+
+    def __post_init__(self) -> None:
+        _check_finite("clock.sim_dt_s", self.sim_dt_s, 0.001, 0.2)
+        _check_finite("clock.ctrl_dt_s", self.ctrl_dt_s, 0.001, 10.0)
+        ticks = self.ctrl_dt_s / self.sim_dt_s
+        _check(
+            round(ticks) >= 1 and abs(ticks - round(ticks)) < 1e-9,
+            "clock.ctrl_dt_s",
+            self.ctrl_dt_s,
+            f"must be a whole number of ticks of clock.sim_dt_s = {self.sim_dt_s:g}; "
+            f"try {max(1, round(ticks)) * self.sim_dt_s:g}",
+        )
+        _check(
+            0 <= self.control_latency_ticks <= 16,
+            "clock.control_latency_ticks",
+            self.control_latency_ticks,
+            "must be a whole number from 0 to 16",
+        )
+
+    @property
+    def ticks_per_step(self) -> int:
+        """Ticks in one agent step."""
+        return round(self.ctrl_dt_s / self.sim_dt_s)
+
+
+@dataclass(frozen=True)
+class ZonesConfig:
+    """How the map is divided; see docs/zones.md.
+
+    Attributes:
+        layout: how zones are cut: `grid`, `strips`, `bisection`, or a zone file named as
+            `map.source` is.
+        count: number of zones; of a zone file, as many as it has.
+        avoid_junctions: move cuts aside where that keeps junctions whole.
+        weight: what `bisection` shares out evenly: length of lanes, or area.
+        hysteresis_m: how far behind a border a vehicle changes its zone.
+        max_deferred_ticks: ticks for which a vehicle that has crossed stays with its old zone, if
+            the new one does not acknowledge it.
+        policy: what follows: `force`: the change is forced at once; `extend`: after `grace_ticks`
+            more. `hold` (it waits at the border) and `reroute` (it turns away) are refused: a
+            divided world would not be the undivided one any more.
+        grace_ticks: that `extend` grants.
+        backoff_ticks: for which a zone that has refused a vehicle is not asked again.
+        halo_m: how far zones see over their borders; default: as far as exactness needs, and less
+            is refused.
+        approach_ticks: so many ticks before a vehicle is there at its present speed, the zone that
+            it drives to is told.
+        journal: file for the coordinator's log; empty: none. It must not exist.
+        check: watch the invariants of ownership at run time.
+        faults: a plan of faults to inject, as JSON or a file of it; empty: none.
+        reproducers: folder for ticks that every host of a zone died of, from which they can be run
+            again. With it, what a zone's code raises is the death of its host. Empty: only where
+            faults kill hosts, and then the system's folder for temporary files.
+        recut_steps: every so many steps zones become others by bisection of where the vehicles are,
+            if that shares them out better; results do not depend on it. 0: they stay.
+        recut_tolerance: by which share of the mean the fullest zone has to become emptier.
+    """
+
+    layout: str = "bisection"
+    count: int = 1
+    avoid_junctions: bool = False
+    weight: Literal["lane_length", "uniform"] = "lane_length"
+    hysteresis_m: float = 2.0
+    max_deferred_ticks: int = 2
+    policy: Literal["force", "extend", "hold", "reroute"] = "force"
+    grace_ticks: int = 0
+    backoff_ticks: int = 4
+    halo_m: float | None = None
+    approach_ticks: int = 2
+    journal: str = ""
+    check: bool = False
+    faults: str = ""
+    reproducers: str = ""
+    recut_steps: int = 0
+    recut_tolerance: float = 0.1
+
+    def __post_init__(self) -> None:
+        _check(
+            self.layout in ZONE_LAYOUTS or self.layout.endswith(ZONE_FILE_SUFFIXES),
+            "zones.layout",
+            self.layout,
+            f"must be {', '.join(ZONE_LAYOUTS)}, or a zone file ({', '.join(ZONE_FILE_SUFFIXES)})",
+        )
+        _check(
+            1 <= self.count <= MAX_ZONES,
+            "zones.count",
+            self.count,
+            f"must be a whole number from 1 to {MAX_ZONES}",
+        )
+        _check_finite("zones.hysteresis_m", self.hysteresis_m, 0.0, 100.0)
+        for name in ("max_deferred_ticks", "grace_ticks", "backoff_ticks"):
+            value = getattr(self, name)
+            _check(0 <= value <= 1000, f"zones.{name}", value, "must be a whole number to 1000")
+        _check(
+            self.policy not in ("hold", "reroute"),
+            "zones.policy",
+            self.policy,
+            "would change what vehicles do, and then the divided world is not the undivided one, "
+            "bit for bit; use extend, which lets them drive on, or force",
+        )
+        _check(
+            (self.policy == "extend") == (self.grace_ticks > 0),
+            "zones.grace_ticks",
+            self.grace_ticks,
+            "must be 1 or more with zones.policy = extend, and 0 with force",
+        )
+        if self.halo_m is not None:
+            _check_finite("zones.halo_m", self.halo_m, 0.0, 1e6)
+        _check(
+            1 <= self.approach_ticks <= 1000,
+            "zones.approach_ticks",
+            self.approach_ticks,
+            "must be a whole number from 1 to 1000",
+        )
+        _check(
+            0 <= self.recut_steps <= 1_000_000,
+            "zones.recut_steps",
+            self.recut_steps,
+            "must be a whole number from 0 to 1000000",
+        )
+        _check_finite("zones.recut_tolerance", self.recut_tolerance, 0.0, 100.0)
+        _check(
+            not (self.recut_steps and (self.faults or self.reproducers)),
+            "zones.recut_steps",
+            self.recut_steps,
+            "vehicles that change their zone must not be late: leave out zones.faults and "
+            "zones.reproducers, or let zones stay",
+        )
+
+
+@dataclass(frozen=True)
+class WorkersConfig:
+    """How worker processes are watched and given work, where there are some; see docs/workers.md.
+
+    Attributes:
+        timeout_s: for so long a worker may be busy with one step or reset; then it is taken to hang
+            and replaced. One that is stopped or sleeps is noticed within a second.
+        repeats: how often a step is begun again because a worker has died.
+        pin: keep each worker on a core of its own. The system sometimes leaves two on one; but of
+            several environments with workers on one machine all take the same cores.
+        balance_steps: so many steps from one round to the next, in which worlds, or zones of a
+            split world, may change their worker by what they have cost; 0: they stay where they
+            are. Results do not depend on it.
+        tolerance: while the slowest worker takes at most this share longer than a perfect division
+            would, nothing moves.
+        max_moves: worlds or zones that change their worker in one round.
+        watch: see how busy others keep the workers' cores, and give nothing more to workers above
+            a threshold; without it nobody else is supposed to use them.
+        sensors: processes that the sensors of `rig` are shared out over, for each process that
+            keeps the state of worlds; 0: it senses itself. Results do not depend on it. See
+            docs/sensor_workers.md.
+        sensor_placement: who of them senses what: by what it `cost` of late, or `in_turn`.
+    """
+
+    timeout_s: float = 300.0
+    repeats: int = 3
+    pin: bool = False
+    balance_steps: int = 0
+    tolerance: float = 0.1
+    max_moves: int = 4
+    watch: bool = False
+    sensors: int = 0
+    sensor_placement: Literal["cost", "in_turn"] = "cost"
+
+    def __post_init__(self) -> None:
+        _check(
+            0 <= self.sensors <= MAX_SENSOR_WORKERS,
+            "workers.sensors",
+            self.sensors,
+            f"must be a whole number from 0 to {MAX_SENSOR_WORKERS}",
+        )
+        _check_finite("workers.timeout_s", self.timeout_s, 1.0, 1e6)
+        _check(
+            0 <= self.repeats <= 1000,
+            "workers.repeats",
+            self.repeats,
+            "must be a whole number from 0 to 1000",
+        )
+        _check(
+            0 <= self.balance_steps <= 1_000_000,
+            "workers.balance_steps",
+            self.balance_steps,
+            "must be a whole number from 0 to 1000000",
+        )
+        _check_finite("workers.tolerance", self.tolerance, 0.0, 100.0)
+        _check(
+            1 <= self.max_moves <= 65_536,
+            "workers.max_moves",
+            self.max_moves,
+            "must be a whole number from 1 to 65536",
+        )
+
+
+@dataclass(frozen=True)
+class PopulationConfig:
+    """Who is in the world.
+
+    Attributes:
+        mode: `closed`: all enter at reset, nobody later. `entering`: agents also enter during the
+            episode, every id once, `budget` in all. `seats`: `agents` fixed ids; when a seat's
+            vehicle ends, the seat gets a new one.
+        agents: vehicles driven by policies at any one time.
+        background: vehicles driven by the built-in drivers. In `closed` worlds they are placed at
+            reset; else each arrival orders a new departure, so that their number holds.
+        budget: how many agents may enter in one episode of an `entering` world (default 4 ·
+            agents); the other modes do not read it.
+    """
+
+    mode: Literal["closed", "entering", "seats"] = "closed"
+    agents: int = 4
+    background: int = 20
+    budget: int | None = None
+
+    def __post_init__(self) -> None:
+        _check(
+            0 <= self.agents <= 100_000,
+            "population.agents",
+            self.agents,
+            "must be a whole number from 0 (a world to watch) to 100000",
+        )
+        _check(
+            0 <= self.background <= 1_000_000,
+            "population.background",
+            self.background,
+            "must be a whole number from 0 to 1000000",
+        )
+        if self.budget is not None and self.mode == "entering":
+            _check(
+                self.agents <= self.budget <= MAX_IDS,
+                "population.budget",
+                self.budget,
+                f"must be at least population.agents = {self.agents}, and at most {MAX_IDS}",
+            )
+
+    @property
+    def num_ids(self) -> int:
+        """How many agent ids an episode can use."""
+        if self.mode == "entering":
+            return self.budget if self.budget is not None else 4 * self.agents
+        return self.agents
+
+
+@dataclass(frozen=True)
+class TrafficConfig:
+    """Where departures come from.
+
+    Attributes:
+        source: who the demand files are for. `native`: they are read here. `sumo-demand`: SUMO says
+            who departs when and on which route, and what signals show; our drivers drive.
+            `sumo-traffic`: SUMO moves its vehicles, too. The generator's drive beside them.
+        demand: SUMO files of vehicles, flows, routes and types (`.rou.xml`, `.add.xml`,
+            `.sumocfg`): named as `map.source`; their vehicles drive beside the generator's.
+        on_bad_route: what to do with vehicles of the demand that cannot drive their route, and with
+            stops off it: `error`, or `skip` them (counted).
+        goals: how many destination edges the generator uses; lane-level plans are made for each.
+        origins: edges that agents start on, by id; empty: all that lead somewhere.
+        destinations: edges that agents drive to, by id; empty: the generator's goals.
+        min_trip_m: shortest way of an agent between origin and destination.
+        max_trip_m: longest way of an agent; 0: no limit.
+        speed_factor_spread: half width of the drivers' uniform spread of desired speed over limit.
+    """
+
+    source: Literal["native", "sumo-demand", "sumo-traffic"] = "native"
+    demand: tuple[str, ...] = ()
+    on_bad_route: Literal["error", "skip"] = "error"
+    goals: int = 32
+    origins: tuple[str, ...] = ()
+    destinations: tuple[str, ...] = ()
+    min_trip_m: float = 100.0
+    max_trip_m: float = 0.0
+    speed_factor_spread: float = 0.1
+
+    def __post_init__(self) -> None:
+        _check(
+            self.source == "native" or bool(self.demand),
+            "traffic.source",
+            self.source,
+            "needs traffic.demand: a .sumocfg, or files of routes",
+        )
+        _check(1 <= self.goals <= 1024, "traffic.goals", self.goals, "must be from 1 to 1024")
+        _check_finite("traffic.min_trip_m", self.min_trip_m, 0.0, 1e6)
+        _check_finite("traffic.max_trip_m", self.max_trip_m, 0.0, 1e6)
+        _check(
+            self.max_trip_m == 0.0 or self.max_trip_m > self.min_trip_m,
+            "traffic.max_trip_m",
+            self.max_trip_m,
+            f"must be 0 (no limit) or above traffic.min_trip_m = {self.min_trip_m:g}",
+        )
+        _check_finite("traffic.speed_factor_spread", self.speed_factor_spread, 0.0, 0.5)
+
+
+@dataclass(frozen=True)
+class ActionConfig:
+    """What an agent can do.
+
+    Attributes:
+        kind: `continuous`: (throttle, steering) in [-1, 1]; `discrete`: highway-env's five
+            meta-actions LANE_LEFT, IDLE, LANE_RIGHT, FASTER, SLOWER.
+        acceleration_mps2: what throttle ±1 means.
+        steering_rad: what steering ±1 means (front wheels, left positive).
+        target_speeds_mps: `discrete`: the speeds that FASTER and SLOWER step through.
+        out_of_range: continuous values beyond ±1: `error`, or `clip` (see `traffic_stats`).
+        missing_action: a live agent without an action: `error`, or `hold` its last one (counted).
+        late_actions: an action for an agent that has left: `error`, or `ignore` (counted).
+    """
+
+    kind: Literal["continuous", "discrete"] = "continuous"
+    acceleration_mps2: float = 5.0
+    steering_rad: float = 0.7853981633974483
+    target_speeds_mps: tuple[float, ...] = (0.0, 3.0, 6.0, 9.0, 12.0, 15.0, 20.0, 25.0, 30.0)
+    out_of_range: Literal["error", "clip"] = "error"
+    missing_action: Literal["error", "hold"] = "error"
+    late_actions: Literal["error", "ignore"] = "error"
+
+    def __post_init__(self) -> None:
+        _check_finite("action.acceleration_mps2", self.acceleration_mps2, 0.1, 20.0)
+        _check_finite("action.steering_rad", self.steering_rad, 0.01, 1.2)
+        speeds = self.target_speeds_mps
+        _check(
+            len(speeds) >= 2
+            and all(math.isfinite(v) and 0.0 <= v <= 60.0 for v in speeds)
+            and all(a < b for a, b in pairwise(speeds)),
+            "action.target_speeds_mps",
+            speeds,
+            "must be at least two rising speeds from 0 to 60",
+        )
+
+
+@dataclass(frozen=True)
+class ObservationConfig:
+    """What an observation is made of, and its form.
+
+    Attributes:
+        mode: `ground_truth`: what `sensors` says, taken from the world itself. `sensors`: the
+            latest samples of the `rig`. `messages`: of `sensors` only what the vehicle knows of
+            itself and its route, and what it is told over the air.
+        kind: `flat`: one Box of float32. `dict`: one Box a sensor.
+    """
+
+    mode: Literal["ground_truth", "sensors", "messages"] = "ground_truth"
+    kind: Literal["flat", "dict"] = "flat"
+
+
+@dataclass(frozen=True)
+class TermsConfig:
+    """Reward = Σ weight · term; see `TERMS` and docs/environments.md for what each term is.
+
+    Attributes:
+        weights: weight of each named term; terms that are not named weigh 0.
+        team_share: share of the reward that is the mean over all live agents: 0 individual, 1 team.
+    """
+
+    weights: dict[str, float] = field(
+        default_factory=lambda: {
+            "progress": 0.1,
+            "speed": -1.0,
+            "comfort": -0.01,
+            "time_to_collision": -0.1,
+            "collision": -10.0,
+            "off_road": -10.0,
+            "wrong_way": -1.0,
+            "red_light": -5.0,
+            "arrival": 10.0,
+        }
+    )
+    team_share: float = 0.0
+
+    def __post_init__(self) -> None:
+        for name, weight in self.weights.items():
+            _check(
+                name in TERMS, "terms.weights", name, f"no such term; there are {', '.join(TERMS)}"
+            )
+            _check_finite(f"terms.weights.{name}", weight, -1e6, 1e6)
+        _check_finite("terms.team_share", self.team_share, 0.0, 1.0)
+
+
+@dataclass(frozen=True)
+class EnvConfig:
+    """The whole decision process of one environment: the keys of `env.yaml`.
+
+    Attributes:
+        name: of the entry, as its folder.
+        version: goes up whenever results change that others may have reported.
+        rig: sensors that are mounted on every agent's vehicle, by name; see docs/sensors.md.
+        horizon_s: when an episode is truncated.
+    """
+
+    name: str
+    map: MapConfig
+    version: int = 0
+    clock: ClockConfig = field(default_factory=ClockConfig)
+    zones: ZonesConfig = field(default_factory=ZonesConfig)
+    workers: WorkersConfig = field(default_factory=WorkersConfig)
+    population: PopulationConfig = field(default_factory=PopulationConfig)
+    traffic: TrafficConfig = field(default_factory=TrafficConfig)
+    sumo: SumoConfig = field(default_factory=SumoConfig)
+    action: ActionConfig = field(default_factory=ActionConfig)
+    observation: ObservationConfig = field(default_factory=ObservationConfig)
+    sensors: SensorsConfig = field(default_factory=SensorsConfig)
+    v2x: V2xConfig = field(default_factory=V2xConfig)
+    terms: TermsConfig = field(default_factory=TermsConfig)
+    rig: Rig = field(default_factory=dict)
+    scenario: ScenarioConfig = field(default_factory=ScenarioConfig)
+    horizon_s: float = 60.0
+
+    def __post_init__(self) -> None:
+        _check(self.version >= 0, "version", self.version, "must be 0 or more")
+        _check_finite("horizon_s", self.horizon_s, self.clock.ctrl_dt_s, 1e6)
+        check_rig(self.rig, self.clock.sim_dt_s, self.clock.ticks_per_step)
+        _check(
+            not self.workers.sensors or bool(self.rig),
+            "workers.sensors",
+            self.workers.sensors,
+            "there is no rig whose sensors they could share; name some under rig, or leave it 0",
+        )
+        _check(
+            self.observation.mode != "sensors" or bool(self.rig),
+            "observation.mode",
+            self.observation.mode,
+            "there is no sensor under rig; mount one",
+        )
+        _check(
+            not self.scenario.name or self.population.agents >= 1,
+            "population.agents",
+            self.population.agents,
+            "must be 1 or more where there is a scenario: it is played to agents",
+        )
+        steps = self.horizon_s / self.clock.ctrl_dt_s
+        _check(
+            abs(steps - round(steps)) < 1e-6 * steps,
+            "horizon_s",
+            self.horizon_s,
+            f"must be a whole number of steps of clock.ctrl_dt_s = {self.clock.ctrl_dt_s:g}; "
+            f"try {max(1, round(steps)) * self.clock.ctrl_dt_s:g}",
+        )
+        if self.v2x.enabled:
+            self.v2x.check_clock(self.clock.sim_dt_s)
+        self._check_messages()
+        if self.observation.mode == "messages":
+            self._keep_what_is_told()
+        if self.traffic.source != "native":
+            self._check_sumo()
+
+    def _keep_what_is_told(self) -> None:
+        """Switch the sensors off that look at others."""
+        told = self.sensors.messages
+        _check(
+            bool(told.objects or told.events or told.signal),
+            "observation.mode",
+            self.observation.mode,
+            "no messages are observed: set sensors.messages.objects",
+        )
+        object.__setattr__(self, "sensors", self.sensors.without_sight())
+
+    def _check_messages(self) -> None:
+        """Refuse to observe messages that nobody keeps."""
+        kept = {"objects": self.v2x.inbox.objects, "events": self.v2x.inbox.events}
+        for name, most in kept.items():
+            key, count = f"sensors.messages.{name}", getattr(self.sensors.messages, name)
+            _check(
+                count == 0 or self.v2x.enabled,
+                key,
+                count,
+                "there are no messages: set v2x.enabled to true, or this to 0",
+            )
+            _check(count <= most, key, count, f"v2x.inbox.{name} = {most} keeps fewer")
+        _check(
+            self.v2x.enabled or not self.sensors.messages.signal,
+            "sensors.messages.signal",
+            True,
+            "there are no messages: set v2x.enabled to true, or this to false",
+        )
+
+    def _check_sumo(self) -> None:
+        """Refuse what cannot be together with SUMO as global traffic."""
+        source, tick_ms = self.traffic.source, self.clock.sim_dt_s * 1000.0
+        _check(
+            abs(tick_ms - round(tick_ms)) < 1e-9,
+            "clock.sim_dt_s",
+            self.clock.sim_dt_s,
+            f"must be whole milliseconds with traffic.source = {source}: SUMO counts in them",
+        )
+        _check(
+            not self.map.programs and not self.map.program,
+            "map.programs",
+            self.map.programs or self.map.program,
+            f"traffic.source = {source}: SUMO has the signals; name such files in its .sumocfg",
+        )
+        _check(
+            source == "sumo-demand" or self.workers.balance_steps == 0,
+            "workers.balance_steps",
+            self.workers.balance_steps,
+            f"traffic.source = {source}: a process that takes up a SUMO has to run it again from "
+            "the beginning of the episode; leave it 0",
+        )
+        _check(
+            not self.sensors.signal.timing,
+            "sensors.signal.timing",
+            True,
+            f"traffic.source = {source}: nobody knows when SUMO's signals change; leave it out",
+        )
+        _check(
+            not self.scenario.name,
+            "scenario.name",
+            self.scenario.name,
+            f"traffic.source = {source}: scenes are for native traffic; leave one out",
+        )
+
+    @property
+    def max_steps(self) -> int:
+        """Steps until truncation."""
+        return max(1, round(self.horizon_s / self.clock.ctrl_dt_s))

@@ -1,0 +1,243 @@
+"""The border where text becomes configuration: YAML in, checked frozen dataclasses out.
+
+YAML is read by the core schema of YAML 1.2 (`1e-3` is a number, `on` and `1:30` are text). Tags,
+aliases, duplicate keys, deep nesting and large files are refused: a configuration needs none.
+Types are strict: a bool is not an int, a quoted number is not a number.
+"""
+
+from __future__ import annotations
+
+import difflib
+import json
+import re
+from collections.abc import Hashable, Mapping
+from dataclasses import fields, is_dataclass
+from pathlib import Path
+from typing import Any, TypeVar, get_args, get_origin, get_type_hints
+
+import numpy as np
+import yaml
+from pydantic import ConfigDict, TypeAdapter, ValidationError
+from pydantic_core import ErrorDetails
+
+from cavmarl.core.errors import ConfigError
+
+__all__ = ["dotted_keys", "read_yaml", "validate"]
+
+T = TypeVar("T")
+
+MAX_BYTES = 1 << 16
+MAX_DEPTH = 16
+
+# The units that end a key's name, for `range_km` where `range_m` is meant.
+UNITS = frozenset("m km cm mm s ms min h hz mps kmh mph mps2 mps3 rad deg ticks steps".split())
+
+
+class _CoreLoader(yaml.SafeLoader):
+    """YAML 1.2's core schema, without the features that a configuration does not need."""
+
+    yaml_implicit_resolvers = {}  # noqa: RUF012 - PyYAML's own way; the resolvers follow below
+    depth = 0
+
+    def compose_node(self, parent: yaml.Node | None, index: int) -> yaml.Node | None:
+        event: Any = self.peek_event()  # type: ignore[no-untyped-call]
+        if isinstance(event, yaml.AliasEvent):
+            raise _refusal(f"alias *{event.anchor}: write the value out", event.start_mark)
+        if getattr(event, "tag", None) is not None:
+            raise _refusal(f"tag {event.tag}: write the plain value", event.start_mark)
+        if self.depth == MAX_DEPTH:
+            raise _refusal(f"nested more than {MAX_DEPTH} deep", event.start_mark)
+        self.depth += 1
+        node = super().compose_node(parent, index)
+        self.depth -= 1
+        return node
+
+    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Hashable, Any]:
+        seen = set()
+        for key, _ in node.value:
+            if not isinstance(key, yaml.ScalarNode):
+                raise _refusal("a key must be a name", key.start_mark)
+            if key.value in seen:
+                raise _refusal(f"key '{key.value}' stands twice", key.start_mark)
+            seen.add(key.value)
+        return super().construct_mapping(node, deep)
+
+
+def _refusal(problem: str, mark: Any) -> yaml.MarkedYAMLError:
+    return yaml.MarkedYAMLError(problem=problem, problem_mark=mark)
+
+
+for _tag, _pattern, _first in (
+    ("null", r"~|null|Null|NULL|", ["~", "n", "N", ""]),
+    ("bool", r"true|True|TRUE|false|False|FALSE", list("tTfF")),
+    ("int", r"[-+]?(?:0|[1-9][0-9]{0,17})", list("-+0123456789")),
+    (
+        "float",
+        r"[-+]?(?:[0-9]+(?:\.[0-9]*)?|\.[0-9]+)(?:[eE][-+]?[0-9]+)?"
+        r"|[-+]?\.(?:inf|Inf|INF)|\.(?:nan|NaN|NAN)",
+        list("-+0123456789."),
+    ),
+):
+    _CoreLoader.add_implicit_resolver(
+        f"tag:yaml.org,2002:{_tag}", re.compile(f"(?:{_pattern})\\Z"), _first
+    )
+
+
+def read_yaml(path: Path) -> object:
+    """The content of a YAML file as plain Python values.
+
+    Raises:
+        ConfigError: unreadable, too large, not UTF-8, not YAML, or YAML with an alias, a tag or a
+            duplicate key; with the line.
+    """
+    try:
+        with path.open("rb") as file:
+            data = file.read(MAX_BYTES + 1)
+    except OSError as error:
+        raise ConfigError(f"{path}: {error.strerror}") from error
+    if len(data) > MAX_BYTES:
+        raise ConfigError(f"{path}: more than {MAX_BYTES // 1024} KiB; is this a configuration?")
+    try:
+        loaded: object = yaml.load(data.decode(), Loader=_CoreLoader)
+    except UnicodeDecodeError as error:
+        raise ConfigError(f"{path}: not UTF-8 at byte {error.start}") from error
+    except yaml.MarkedYAMLError as error:
+        line = f"line {error.problem_mark.line + 1}: " if error.problem_mark else ""
+        raise ConfigError(f"{path}: {line}{error.problem}") from error
+    except yaml.YAMLError as error:
+        raise ConfigError(f"{path}: {error}") from error
+    return loaded
+
+
+def validate(kind: type[T], raw: object, where: str) -> T:
+    """Build the dataclass `kind` from plain values, with its nested dataclasses.
+
+    Args:
+        kind: a frozen dataclass, which may hold others.
+        raw: mappings, sequences, strings, numbers, bools, None.
+        where: begins every message: the file that `raw` comes from.
+
+    Raises:
+        ConfigError: an unknown key, a missing key, a wrong type or a value that `kind` refuses; the
+            message names the key, the value and the cure, one line each.
+    """
+    if not isinstance(raw, Mapping):
+        raise ConfigError(f"{where}: must be a mapping of keys, not {raw!r}")
+    try:
+        # By way of JSON: its strict mode knows no difference between list and tuple, or mapping and
+        # dataclass. NumPy's numbers count as Python's; what else JSON cannot carry becomes text,
+        # which no number accepts.
+        text = json.dumps(raw, default=_plain)
+    except (TypeError, ValueError, RecursionError) as error:
+        raise ConfigError(f"{where}: holds what no configuration can hold ({error})") from error
+    try:
+        checked: T = _adapter(kind).validate_json(text)
+    except ValidationError as error:
+        lines = [_explain(kind, details) for details in error.errors(include_url=False)]
+        raise ConfigError("\n".join(f"{where}: {line}" for line in lines)) from error
+    except ConfigError as error:
+        raise ConfigError(f"{where}: {error}") from error
+    return checked
+
+
+def _plain(value: object) -> object:
+    """What JSON takes in place of `value`."""
+    return value.item() if isinstance(value, np.generic) else str(value)
+
+
+def dotted_keys(kind: type[Any], prefix: str = "") -> list[str]:
+    """Every key of the dataclass `kind` and of those inside it, as `sensors.lidar.rays`."""
+    keys = []
+    for name, hint in _fields(kind).items():
+        if isinstance(hint, type) and is_dataclass(hint):
+            keys += dotted_keys(hint, f"{prefix}{name}.")
+        else:
+            keys.append(f"{prefix}{name}")
+    return keys
+
+
+def _adapter(kind: type[Any]) -> TypeAdapter[Any]:
+    """Pydantic's view of `kind`, strict and closed.
+
+    In a union, because a dataclass by itself takes no configuration from outside.
+    """
+    union: Any = kind | None
+    return TypeAdapter(union, config=ConfigDict(extra="forbid", strict=True))
+
+
+def _fields(kind: type[Any]) -> dict[str, Any]:
+    """Field names of a dataclass with their resolved types."""
+    hints = get_type_hints(kind)
+    return {field.name: hints[field.name] for field in fields(kind)}
+
+
+def _explain(kind: type[Any], details: ErrorDetails) -> str:
+    """One line about one of pydantic's findings, in the words of the configuration."""
+    location = [str(part) for part in details["loc"]]
+    keys, _ = _walk(kind, location)
+    path = ".".join(keys)
+    match details["type"]:
+        case "unexpected_keyword_argument":
+            return f"{path}: unknown key; {_nearest(kind, location)}"
+        case "missing":
+            return f"{path}: missing; it has no default"
+        case "dataclass_type" | "dict_type":
+            return f"{path} = {details['input']!r}: must be a mapping of keys"
+        case "union_tag_not_found":
+            return f"{path}: must be a mapping of keys with a type, one of {_types(kind, location)}"
+        case "union_tag_invalid":
+            tag = details["ctx"]["tag"]
+            return f"{path}.type = {tag!r}: no such type; there are {_types(kind, location)}"
+        case "json_invalid":
+            return f"holds what no configuration can hold ({details['msg']})"
+        case "tuple_type":
+            return f"{path} = {details['input']!r}: must be a list"
+    return f"{path} = {details['input']!r}: {details['msg'].replace('Input should', 'must')}"
+
+
+def _walk(kind: type[Any], location: list[str]) -> tuple[list[str], Any]:
+    """The keys of a location, and the type of what stands there.
+
+    Pydantic names the member of a union between two keys; those are left out.
+    """
+    keys: list[str] = []
+    inner: Any = kind
+    for part in location:
+        members = [one for one in get_args(inner) if getattr(one, "type", None) == part]
+        if members:
+            inner = members[0]
+            continue
+        keys.append(part)
+        if isinstance(inner, type) and is_dataclass(inner):
+            inner = _fields(inner).get(part)
+        else:  # the values of a mapping, or the items of a list
+            arguments = get_args(inner)
+            inner = arguments[get_origin(inner) is dict] if arguments else None
+    return keys, inner
+
+
+def _types(kind: type[Any], location: list[str]) -> str:
+    """The types of the members of a union."""
+    return ", ".join(one.type for one in get_args(_walk(kind, location)[1]))
+
+
+def _nearest(kind: type[Any], location: list[str]) -> str:
+    """The advice for an unknown key: what was probably meant, else what there is."""
+    parents, inner = _walk(kind, location[:-1])
+    key = location[-1]
+    known = list(_fields(inner))
+    for name in known:
+        if name != key and _stem(name) == _stem(key):
+            return f"use {name} (the end of a name is its unit: convert the value)"
+    if close := difflib.get_close_matches(key, known, n=1):
+        return f"did you mean {'.'.join([*parents, *close])}?"
+    elsewhere = [other for other in dotted_keys(kind) if other.split(".")[-1] == key]
+    if elsewhere:
+        return f"did you mean {elsewhere[0]}?"
+    return f"known here: {', '.join(known)}"
+
+
+def _stem(key: str) -> str:
+    """A key without its unit: `range_m`, `range_km` and `range` have the same stem."""
+    head, _, tail = key.rpartition("_")
+    return head if head and tail.lower() in UNITS else key

@@ -1,0 +1,310 @@
+"""The finder of entries: what stands in `envs/` and `agents/` is what there is.
+
+A name is looked up in the working directory first, then in what the wheel carries, else beside the
+package in a checkout. A path to a folder or to a map file works wherever a name does.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import difflib
+from collections.abc import Callable, Mapping
+from os.path import isdir, isfile
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from cavmarl.config.env import ZONE_LAYOUTS, EnvConfig, MapConfig
+from cavmarl.core.errors import (
+    CavmarlError,
+    ConfigError,
+    DemandError,
+    MapError,
+    UnknownEnvironmentError,
+    ZoneError,
+    require,
+)
+
+__all__ = [
+    "MAP_SUFFIXES",
+    "agent_entries",
+    "entries",
+    "find_entry",
+    "load_config",
+    "load_rig",
+    "places",
+    "resolve_buildings",
+    "resolve_demand",
+    "resolve_map",
+    "resolve_programs",
+    "resolve_zones",
+]
+
+MAP_SUFFIXES = (".net.xml", ".net.xml.gz", ".osm", ".osm.gz", ".osm.xml", ".xodr")
+
+_PACKAGE = Path(__file__).resolve().parents[1]
+_SUMO_PREFIX = "sumo:"
+
+
+def places(kind: str) -> list[Path]:
+    """The folders that hold entries of `kind` (`envs`, `agents`, `configs`), first wins."""
+    packaged = _PACKAGE / "data" / kind
+    ours = packaged if packaged.is_dir() else _PACKAGE.parent / kind
+    return [place for place in (Path.cwd() / kind, ours) if place.is_dir()]
+
+
+def entries() -> dict[str, Path]:
+    """Every environment that a name can mean: name → its folder, sorted by name."""
+    return _collect("envs", _environment_name)
+
+
+def agent_entries() -> dict[str, Path]:
+    """Every driver that can take a seat: name → `NAME.py`, or the folder of a trained one."""
+    return _collect("agents", _agent_name)
+
+
+def find_entry(env: str | Path) -> Path:
+    """The entry folder or the map file that `env` means.
+
+    Args:
+        env: a name from `entries()`, a folder with an `env.yaml`, or a map file.
+
+    Raises:
+        UnknownEnvironmentError: nothing there; the message says what there is.
+    """
+    if not isinstance(env, (str, Path)):
+        raise UnknownEnvironmentError(
+            f"env = {env!r}: must be the name of an environment, or the path of a folder or a map"
+        )
+    known = entries()
+    if isinstance(env, str) and env in known:
+        return known[env]
+    path = Path(env)
+    if isfile(path / "env.yaml"):  # unlike Path's, it takes names that no file can have
+        return path
+    if isfile(path):
+        if not path.name.endswith(MAP_SUFFIXES):
+            raise UnknownEnvironmentError(
+                f"{path}: not a map file; their names end in {', '.join(MAP_SUFFIXES)}"
+            )
+        return path
+    if isdir(path):
+        raise UnknownEnvironmentError(f"{path}: a folder without an env.yaml")
+    raise UnknownEnvironmentError(
+        f"no environment, folder or map file '{env}'; {_advice(env, known)}"
+    )
+
+
+def load_config(
+    env: str | Path,
+    *,
+    zones: int | None = None,
+    sensor_workers: int | None = None,
+    agents: int | None = None,
+    background: int | None = None,
+    max_cycles: int | None = None,
+    overrides: Mapping[str, object] | None = None,
+) -> tuple[EnvConfig, Path]:
+    """The configuration of an environment, and the folder that its map's source is relative to.
+
+    Args:
+        env: what `find_entry` takes; a map file gets a default environment.
+        zones: shadows `zones.count`.
+        sensor_workers: shadows `workers.sensors`.
+        agents: shadows `population.agents`.
+        background: shadows `population.background`.
+        max_cycles: shadows `horizon_s`, in steps: exactly that many.
+        overrides: dotted key → value, for every other key: `{"sensors.lidar.rays": 64}`. As in an
+            env.yaml, `rig` may be the name of a rig in `configs/rigs`, or of a file.
+
+    Raises:
+        UnknownEnvironmentError: nothing of that name.
+        ConfigError: a key, a type or a value that cannot work, with the nearest that can.
+    """
+    from cavmarl.config.io import read_yaml, validate
+
+    found = find_entry(env)
+    if found.is_dir():
+        base_dir, where = found, str(found / "env.yaml")
+        keys = read_yaml(found / "env.yaml")
+        if isinstance(keys, dict) and isinstance(keys.get("rig"), str):
+            keys["rig"] = load_rig(keys["rig"], base_dir)
+        config = validate(EnvConfig, keys, where)
+    else:
+        base_dir, where = found.parent, str(found)
+        config = EnvConfig(name=_map_name(found), map=MapConfig(source=found.name))
+    keywords = {
+        "zones.count": zones,
+        "workers.sensors": sensor_workers,
+        "population.agents": agents,
+        "population.background": background,
+        "horizon_s": max_cycles,
+    }
+    given = {key: value for key, value in keywords.items() if value is not None}
+    if not isinstance(overrides, Mapping | None):
+        raise ConfigError(f"overrides = {overrides!r}: must be a mapping of dotted keys")
+    shadows = dict(overrides or {})
+    if strange := [key for key in shadows if not isinstance(key, str)]:
+        raise ConfigError(f"overrides: {strange[0]!r} is no key; keys are text, dotted")
+    if twice := given.keys() & shadows.keys():
+        raise ConfigError(f"{min(twice)} stands in overrides and is given as a keyword; use one")
+    shadows |= {key: value for key, value in given.items() if key != "horizon_s"}
+    if shadows or max_cycles is not None:
+        raw = dataclasses.asdict(config)
+        for key, value in shadows.items():
+            is_named = key == "rig" and isinstance(value, str)
+            _shadow(raw, key, load_rig(str(value), base_dir) if is_named else value)
+        if max_cycles is not None:
+            raw["horizon_s"] = _horizon_s(max_cycles, raw)
+        config = validate(EnvConfig, raw, f"{where}, overridden")
+    return config, base_dir
+
+
+def load_rig(name: str, base_dir: Path | None = None) -> dict[str, Any]:
+    """The sensors of a rig that is named, by name, as they stand in its file.
+
+    Args:
+        name: of `configs/rigs/NAME.yaml`, or a YAML file, relative or absolute.
+        base_dir: the folder that a relative file starts from; None: the working directory.
+
+    Raises:
+        ConfigError: there is none of that name, or no mapping in it.
+    """
+    from cavmarl.config.io import read_yaml
+
+    path = _find_rig(name, Path() if base_dir is None else base_dir)
+    sensors = read_yaml(path)
+    if not isinstance(sensors, dict):
+        raise ConfigError(f"{path}: must be a mapping of sensors by name")
+    return sensors
+
+
+def _find_rig(name: str, base_dir: Path) -> Path:
+    if name.endswith((".yaml", ".yml")):
+        return base_dir / name
+    rigs = {path.stem: path for place in places("configs") for path in place.glob("rigs/*.yaml")}
+    if name not in rigs:
+        raise ConfigError(
+            f"rig = {name!r}: no such rig; there are {', '.join(sorted(rigs)) or 'none'}; or name "
+            "a file that ends in .yaml"
+        )
+    return rigs[name]
+
+
+def resolve_map(config: EnvConfig, base_dir: Path) -> Path:
+    """The file that `map.source` means.
+
+    Args:
+        config: of the environment.
+        base_dir: the folder that a relative source starts from.
+
+    Raises:
+        MapError: no such file.
+        MissingExtraError: the source lies in the eclipse-sumo wheel, which is not installed.
+    """
+    return _resolve("map.source", config.map.source, base_dir, MapError)
+
+
+def resolve_demand(config: EnvConfig, base_dir: Path) -> list[Path]:
+    """The files that `traffic.demand` means; as `resolve_map`.
+
+    Raises:
+        DemandError: no such file.
+        MissingExtraError: a file lies in the eclipse-sumo wheel, which is not installed.
+    """
+    return [
+        _resolve("traffic.demand", source, base_dir, DemandError)
+        for source in config.traffic.demand
+    ]
+
+
+def resolve_programs(config: EnvConfig, base_dir: Path) -> list[Path]:
+    """The files that `map.programs` means; arguments and errors as for `resolve_map`."""
+    return [_resolve("map.programs", source, base_dir, MapError) for source in config.map.programs]
+
+
+def resolve_buildings(config: EnvConfig, base_dir: Path) -> Path | None:
+    """The file that `map.buildings` means; None: no buildings. Else as `resolve_map`."""
+    match config.map.buildings:
+        case "":
+            return None
+        case "osm":
+            return resolve_map(config, base_dir)
+        case source:
+            return _resolve("map.buildings", source, base_dir, MapError)
+
+
+def resolve_zones(config: EnvConfig, base_dir: Path) -> Path | None:
+    """The zone file that `zones.layout` means; None where it is no file. Else as `resolve_map`."""
+    layout = config.zones.layout
+    if layout in ZONE_LAYOUTS:
+        return None
+    return _resolve("zones.layout", layout, base_dir, ZoneError)
+
+
+def _resolve(key: str, source: str, base_dir: Path, failure: type[CavmarlError]) -> Path:
+    if source.startswith(_SUMO_PREFIX):
+        home = Path(require("sumo", "sumo").SUMO_HOME).resolve()
+        path = (home / source.removeprefix(_SUMO_PREFIX)).resolve()
+        if not path.is_relative_to(home):
+            raise failure(f"{key} = {source!r}: leads out of the eclipse-sumo wheel")
+    else:
+        path = base_dir / source
+    if not isfile(path):
+        raise failure(f"{key} = {source!r}: no file {path}")
+    return path
+
+
+def _collect(kind: str, name_of: Callable[[Path], str | None]) -> dict[str, Path]:
+    """Name → path of all entries of `kind`, sorted by name; of equal names the first place wins."""
+    found = {
+        name: path
+        for place in reversed(places(kind))
+        for path in place.iterdir()
+        if (name := name_of(path)) is not None
+    }
+    return dict(sorted(found.items()))
+
+
+def _environment_name(path: Path) -> str | None:
+    return path.name if (path / "env.yaml").is_file() else None
+
+
+def _agent_name(path: Path) -> str | None:
+    if path.suffix == ".py" and not path.name.startswith("_"):
+        return path.stem
+    return path.name if (path / "model.safetensors").is_file() else None
+
+
+def _advice(env: str | Path, known: Mapping[str, Path]) -> str:
+    """What was probably meant by an unknown name, and what there is."""
+    close = difflib.get_close_matches(str(env), known, n=3)
+    meant = f"did you mean {' or '.join(close)}? " if close else ""
+    return f"{meant}There are: {', '.join(known) or 'none'}"
+
+
+def _map_name(path: Path) -> str:
+    """A map file's name without its ending."""
+    ending = max((s for s in MAP_SUFFIXES if path.name.endswith(s)), key=len)
+    return path.name.removesuffix(ending)
+
+
+def _shadow(raw: dict[str, Any], key: str, value: object) -> None:
+    """Put `value` at a dotted key of nested mappings."""
+    *parents, last = key.split(".")
+    inner: Any = raw
+    for depth, parent in enumerate(parents):
+        inner = inner.setdefault(parent, {})
+        if not isinstance(inner, dict):
+            raise ConfigError(f"{key}: {'.'.join(parents[: depth + 1])} has no keys inside")
+    inner[last] = value
+
+
+def _horizon_s(max_cycles: int, raw: Mapping[str, Any]) -> object:
+    """The horizon of `max_cycles` steps; of an impossible step, whatever stands there."""
+    whole = isinstance(max_cycles, (int, np.integer)) and not isinstance(max_cycles, bool)
+    if not whole or max_cycles < 1:
+        raise ConfigError(f"max_cycles = {max_cycles!r}: must be a whole number from 1")
+    step_s = raw["clock"].get("ctrl_dt_s") if isinstance(raw["clock"], Mapping) else None
+    return int(max_cycles) * step_s if isinstance(step_s, (int, float)) else raw["horizon_s"]

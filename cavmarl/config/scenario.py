@@ -1,0 +1,36 @@
+"""The key `scenario`: what happens to the agents, and where."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+from cavmarl.config.checks import check
+
+__all__ = ["ScenarioConfig"]
+
+
+@dataclass(frozen=True)
+class ScenarioConfig:
+    """One scripted conflict for the agents of each world; docs/scenarios.md.
+
+    Attributes:
+        name: of a scenario, or the path of a `.py` file with one; empty: none.
+        place: where, by a name of the map as `cavmarl scenario run` prints it; empty: one of the
+            places that the map has, drawn by `seed`.
+        seed: draws the place.
+        params: values of the scenario's parameters; the others have their defaults.
+    """
+
+    name: str = ""
+    place: str = ""
+    seed: int = 0
+    params: dict[str, bool | float] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        check(self.seed >= 0, "scenario.seed", self.seed, "must be 0 or more")
+        check(
+            bool(self.name) or not (self.place or self.params),
+            "scenario.name",
+            self.name,
+            "must name a scenario where scenario.place or scenario.params is given",
+        )

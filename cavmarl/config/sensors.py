@@ -1,0 +1,434 @@
+"""The keys under `sensors` of `env.yaml`: what each sensor of an agent is set to.
+
+Counts of 0 and empty lists switch a sensor off. `kinematics`, `occupancy_grid` and
+`lidar_observation` take the names, the defaults and the meanings of highway-env's observations
+(Leurent: "An environment for autonomous driving decision-making", 2018), so that a policy made for
+those can be used here.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field, replace
+from typing import Literal
+
+from cavmarl.config.checks import check, check_finite
+
+__all__ = [
+    "GRID_FEATURES",
+    "VEHICLE_FEATURES",
+    "EgoConfig",
+    "KinematicsConfig",
+    "LanesConfig",
+    "LidarConfig",
+    "LidarObservationConfig",
+    "MessagesConfig",
+    "NeighborsConfig",
+    "OccupancyGridConfig",
+    "PufferDriveConfig",
+    "RoadgraphConfig",
+    "RouteAheadConfig",
+    "SensorsConfig",
+    "SignalAheadConfig",
+]
+
+# highway-env's features of one vehicle, in the order of their codes in
+# sensors/kernels/vehicle_features.py.
+VEHICLE_FEATURES = (
+    "presence",
+    "x",
+    "y",
+    "vx",
+    "vy",
+    "heading",
+    "cos_h",
+    "sin_h",
+    "cos_d",
+    "sin_d",
+    "long_off",
+    "lat_off",
+    "ang_off",
+)
+# A layer of an occupancy grid shows one of them, or where the road is.
+GRID_FEATURES = (*VEHICLE_FEATURES, "on_road")
+
+# More numbers than this in one grid are a mistake: 100 agents would observe 26 MB a step.
+MAX_GRID_NUMBERS = 65_536
+
+
+@dataclass(frozen=True)
+class EgoConfig:
+    """The vehicle itself, its lane and what the plan asks of it.
+
+    Attributes:
+        enabled: false switches the sensor off.
+    """
+
+    enabled: bool = True
+
+
+@dataclass(frozen=True)
+class RouteAheadConfig:
+    """Points of the route ahead, in the ego frame.
+
+    Attributes:
+        points: how many; 0 switches the sensor off.
+        spacing_m: way between one and the next.
+    """
+
+    points: int = 8
+    spacing_m: float = 6.0
+
+    def __post_init__(self) -> None:
+        check(0 <= self.points <= 64, "sensors.route.points", self.points, "must be from 0 to 64")
+        check_finite("sensors.route.spacing_m", self.spacing_m, 0.5, 100.0)
+
+
+@dataclass(frozen=True)
+class NeighborsConfig:
+    """The nearest vehicles, in the ego frame.
+
+    Attributes:
+        count: how many at most; 0 switches the sensor off.
+        range_m: distance up to which a vehicle is seen.
+    """
+
+    count: int = 8
+    range_m: float = 60.0
+
+    def __post_init__(self) -> None:
+        check(0 <= self.count <= 64, "sensors.neighbors.count", self.count, "must be from 0 to 64")
+        check_finite("sensors.neighbors.range_m", self.range_m, 1.0, 300.0)
+
+
+@dataclass(frozen=True)
+class SignalAheadConfig:
+    """The next signal or duty to give way on the route.
+
+    Attributes:
+        enabled: false switches the sensor off.
+        range_m: how far ahead it is seen.
+        timing: adds the time until the signal changes, as roadside units broadcast it.
+    """
+
+    enabled: bool = True
+    range_m: float = 80.0
+    timing: bool = False
+
+    def __post_init__(self) -> None:
+        check_finite("sensors.signal.range_m", self.range_m, 1.0, 300.0)
+
+
+@dataclass(frozen=True)
+class LanesConfig:
+    """Vehicles by their place along the lanes around, and the one that crosses the own way first.
+
+    Attributes:
+        range_m: how far along lanes a vehicle is seen; 0 switches the sensor off.
+    """
+
+    range_m: float = 0.0
+
+    def __post_init__(self) -> None:
+        check_finite("sensors.lanes.range_m", self.range_m, 0.0, 300.0)
+
+
+@dataclass(frozen=True)
+class LidarConfig:
+    """Distances around the vehicle.
+
+    Attributes:
+        rays: how many, equally spaced; 0 switches the sensor off.
+        range_m: how far a ray reaches.
+        speeds: adds the relative speed of what each ray hits.
+    """
+
+    rays: int = 64
+    range_m: float = 60.0
+    speeds: bool = False
+
+    def __post_init__(self) -> None:
+        check(0 <= self.rays <= 1024, "sensors.lidar.rays", self.rays, "must be from 0 to 1024")
+        check_finite("sensors.lidar.range_m", self.range_m, 1.0, 300.0)
+
+
+@dataclass(frozen=True)
+class KinematicsConfig:
+    """highway-env's `Kinematics`: a table of vehicles by features, the own one first.
+
+    Attributes:
+        vehicles_count: rows, the own vehicle included (highway-env: 5); 0 switches the sensor off.
+        features: columns, of `presence`, `x`, `y`, `vx`, `vy`, `heading`, `cos_h`, `sin_h`,
+            `cos_d`, `sin_d`, `long_off`, `lat_off`, `ang_off`.
+        features_range: feature to [min, max], which are mapped to [-1, 1]; features that are not
+            named stay as they are. Empty: x ±200 m, y ±4 m for each lane of the map's widest road,
+            vx and vy ±80 m/s.
+        absolute: whether x, y, vx and vy of the others are the world's; else relative to the own
+            ones. The own row always has the world's.
+        order: `sorted`: nearest along the lane first. `shuffled`: the first by id, in random order.
+        normalize: whether ranges are mapped to [-1, 1].
+        clip: whether what was mapped is clipped to [-1, 1].
+        see_behind: whether vehicles more than two lengths behind are seen.
+        observe_intentions: whether `cos_d` and `sin_d` of the others are shown; else they are 0.
+    """
+
+    vehicles_count: int = 0
+    features: tuple[str, ...] = ("presence", "x", "y", "vx", "vy")
+    features_range: dict[str, tuple[float, ...]] = field(default_factory=dict)
+    absolute: bool = False
+    order: Literal["sorted", "shuffled"] = "sorted"
+    normalize: bool = True
+    clip: bool = True
+    see_behind: bool = False
+    observe_intentions: bool = False
+
+    def __post_init__(self) -> None:
+        key = "sensors.kinematics"
+        check(
+            0 <= self.vehicles_count <= 256,
+            f"{key}.vehicles_count",
+            self.vehicles_count,
+            "must be from 0 to 256",
+        )
+        check(bool(self.features), f"{key}.features", self.features, "must name at least one")
+        _check_features(f"{key}.features", self.features, VEHICLE_FEATURES)
+        _check_ranges(f"{key}.features_range", self.features_range)
+
+
+@dataclass(frozen=True)
+class OccupancyGridConfig:
+    """highway-env's `OccupancyGrid`: layers of cells around the vehicle.
+
+    Attributes:
+        features: layers, of `kinematics.features` and `on_road` (highway-env: presence, vx, vy,
+            on_road); an empty list switches the sensor off.
+        features_range: feature to [min, max], which are mapped to [-1, 1]. Empty: vx and vy
+            ±80 m/s.
+        grid_size_m: [[min x, max x], [min y, max y]] around the vehicle.
+        grid_step_m: [x, y], sides of a cell.
+        align_to_vehicle_axes: whether the cells turn with the vehicle.
+        clip: whether all is clipped to [-1, 1].
+        as_image: whether [-1, 1] is given as whole numbers from 0 to 255.
+    """
+
+    features: tuple[str, ...] = ()
+    features_range: dict[str, tuple[float, ...]] = field(default_factory=dict)
+    grid_size_m: tuple[tuple[float, ...], ...] = ((-27.5, 27.5), (-27.5, 27.5))
+    grid_step_m: tuple[float, ...] = (5.0, 5.0)
+    align_to_vehicle_axes: bool = False
+    clip: bool = True
+    as_image: bool = False
+
+    def __post_init__(self) -> None:
+        key = "sensors.occupancy_grid"
+        _check_features(f"{key}.features", self.features, GRID_FEATURES)
+        _check_ranges(f"{key}.features_range", self.features_range)
+        check(
+            len(self.grid_size_m) == 2 and all(_is_range(axis) for axis in self.grid_size_m),
+            f"{key}.grid_size_m",
+            self.grid_size_m,
+            "must be [[min x, max x], [min y, max y]], both rising",
+        )
+        for axis in self.grid_size_m:
+            for bound in axis:
+                check_finite(f"{key}.grid_size_m", bound, -300.0, 300.0)
+        check(
+            len(self.grid_step_m) == 2,
+            f"{key}.grid_step_m",
+            self.grid_step_m,
+            "must be [x, y], the sides of a cell",
+        )
+        for step in self.grid_step_m:
+            check_finite(f"{key}.grid_step_m", step, 0.1, 300.0)
+        columns, rows = self.shape
+        check(
+            columns >= 1 and rows >= 1,
+            f"{key}.grid_step_m",
+            self.grid_step_m,
+            "must fit into grid_size_m at least once",
+        )
+        numbers = len(self.features) * columns * rows
+        check(
+            numbers <= MAX_GRID_NUMBERS,
+            f"{key}.grid_size_m",
+            self.grid_size_m,
+            f"{len(self.features)} layers of {columns} by {rows} cells are {numbers} numbers, more "
+            f"than {MAX_GRID_NUMBERS}; use larger grid_step_m or a smaller grid_size_m",
+        )
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Cells along x and along y."""
+        columns, rows = (
+            math.floor((high - low) / step)
+            for (low, high), step in zip(self.grid_size_m, self.grid_step_m, strict=True)
+        )
+        return columns, rows
+
+
+@dataclass(frozen=True)
+class LidarObservationConfig:
+    """highway-env's `LidarObservation`: distance and speed in sectors around the vehicle.
+
+    Attributes:
+        cells: sectors (highway-env: 16); 0 switches the sensor off.
+        maximum_range_m: how far it sees.
+        normalize: whether distances and speeds are divided by `maximum_range_m`.
+    """
+
+    cells: int = 0
+    maximum_range_m: float = 60.0
+    normalize: bool = True
+
+    def __post_init__(self) -> None:
+        key = "sensors.lidar_observation"
+        check(0 <= self.cells <= 1024, f"{key}.cells", self.cells, "must be from 0 to 1024")
+        check_finite(f"{key}.maximum_range_m", self.maximum_range_m, 1.0, 300.0)
+
+
+@dataclass(frozen=True)
+class RoadgraphConfig:
+    """The nearest points of the road network, as Waymax's `roadgraph_points`.
+
+    Attributes:
+        points: how many; 0 switches the sensor off.
+        range_m: distance up to which a point is seen.
+        spacing_m: largest distance between one point of a line and the next.
+    """
+
+    points: int = 0
+    range_m: float = 50.0
+    spacing_m: float = 2.0
+
+    def __post_init__(self) -> None:
+        key = "sensors.roadgraph"
+        check(0 <= self.points <= 2048, f"{key}.points", self.points, "must be from 0 to 2048")
+        check_finite(f"{key}.range_m", self.range_m, 1.0, 300.0)
+        check_finite(f"{key}.spacing_m", self.spacing_m, 0.25, 50.0)
+
+
+@dataclass(frozen=True)
+class MessagesConfig:
+    """What the vehicle has been told over the air, see `v2x`.
+
+    Attributes:
+        objects: vehicles that it has heard of, the nearest ones; 0: none.
+        events: that it has heard of, the nearest ones; 0: none.
+        signal: adds what the roadside unit of the next signal on the route says.
+        range_m: distance that a place of 1 stands for; what is further away has 1, too.
+    """
+
+    objects: int = 0
+    events: int = 0
+    signal: bool = False
+    range_m: float = 100.0
+
+    def __post_init__(self) -> None:
+        key = "sensors.messages"
+        check(0 <= self.objects <= 64, f"{key}.objects", self.objects, "must be from 0 to 64")
+        check(0 <= self.events <= 64, f"{key}.events", self.events, "must be from 0 to 64")
+        check_finite(f"{key}.range_m", self.range_m, 1.0, 10_000.0)
+
+
+@dataclass(frozen=True)
+class PufferDriveConfig:
+    """The observation of pufferlib's `drive`: 1,847 numbers with its own settings.
+
+    Attributes:
+        enabled: true switches the sensor on.
+        partners: others within 50 m that are shown, by id.
+        segments: road segments that are shown, of the cells around the vehicle from its own one
+            outwards.
+        spacing_m: longest segment that a line of the road is cut into.
+    """
+
+    enabled: bool = False
+    partners: int = 63
+    segments: int = 200
+    spacing_m: float = 2.0
+
+    def __post_init__(self) -> None:
+        key = "sensors.puffer_drive"
+        check(0 <= self.partners <= 256, f"{key}.partners", self.partners, "must be from 0 to 256")
+        check(
+            0 <= self.segments <= 2048, f"{key}.segments", self.segments, "must be from 0 to 2048"
+        )
+        check_finite(f"{key}.spacing_m", self.spacing_m, 0.25, 50.0)
+
+
+@dataclass(frozen=True)
+class SensorsConfig:
+    """The sensors of every agent; counts and ranges of 0 switch one off.
+
+    Attributes:
+        stack: observations in one: the last ones, oldest first. At first all are the first.
+    """
+
+    stack: int = 1
+    ego: EgoConfig = field(default_factory=EgoConfig)
+    route: RouteAheadConfig = field(default_factory=RouteAheadConfig)
+    neighbors: NeighborsConfig = field(default_factory=NeighborsConfig)
+    signal: SignalAheadConfig = field(default_factory=SignalAheadConfig)
+    lanes: LanesConfig = field(default_factory=LanesConfig)
+    lidar: LidarConfig = field(default_factory=LidarConfig)
+    kinematics: KinematicsConfig = field(default_factory=KinematicsConfig)
+    occupancy_grid: OccupancyGridConfig = field(default_factory=OccupancyGridConfig)
+    lidar_observation: LidarObservationConfig = field(default_factory=LidarObservationConfig)
+    roadgraph: RoadgraphConfig = field(default_factory=RoadgraphConfig)
+    messages: MessagesConfig = field(default_factory=MessagesConfig)
+    puffer_drive: PufferDriveConfig = field(default_factory=PufferDriveConfig)
+
+    def __post_init__(self) -> None:
+        check(1 <= self.stack <= 64, "sensors.stack", self.stack, "must be from 1 to 64")
+        counts = (
+            self.ego.enabled,
+            self.route.points,
+            self.neighbors.count,
+            self.signal.enabled,
+            self.lanes.range_m,
+            self.lidar.rays,
+            self.kinematics.vehicles_count,
+            len(self.occupancy_grid.features),
+            self.lidar_observation.cells,
+            self.roadgraph.points,
+            self.messages.objects,
+            self.messages.events,
+            self.messages.signal,
+            self.puffer_drive.enabled,
+        )
+        check(any(counts), "sensors", "all off", "an agent must observe something; switch one on")
+
+    def without_sight(self) -> SensorsConfig:
+        """The same without those that look at others or at signals."""
+        return replace(
+            self,
+            neighbors=replace(self.neighbors, count=0),
+            signal=replace(self.signal, enabled=False),
+            lanes=replace(self.lanes, range_m=0.0),
+            lidar=replace(self.lidar, rays=0),
+            kinematics=replace(self.kinematics, vehicles_count=0),
+            occupancy_grid=replace(self.occupancy_grid, features=()),
+            lidar_observation=replace(self.lidar_observation, cells=0),
+            puffer_drive=replace(self.puffer_drive, enabled=False),
+        )
+
+
+def _is_range(bounds: tuple[float, ...]) -> bool:
+    return len(bounds) == 2 and all(math.isfinite(b) for b in bounds) and bounds[0] < bounds[1]
+
+
+def _check_features(key: str, features: tuple[str, ...], known: tuple[str, ...]) -> None:
+    for name in features:
+        check(name in known, key, name, f"no such feature; there are {', '.join(known)}")
+    check(len(set(features)) == len(features), key, features, "must name each feature once")
+
+
+def _check_ranges(key: str, ranges: dict[str, tuple[float, ...]]) -> None:
+    for name, bounds in ranges.items():
+        check(
+            name in VEHICLE_FEATURES,
+            key,
+            name,
+            f"no such feature; there are {', '.join(VEHICLE_FEATURES)}",
+        )
+        check(_is_range(bounds), f"{key}.{name}", bounds, "must be [min, max], rising and finite")

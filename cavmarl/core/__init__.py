@@ -1,0 +1,4 @@
+"""Ground: errors, seeds, memory, and what all kernels share.
+
+Imports nothing of the package.
+"""

@@ -1,0 +1,31 @@
+"""Directions to within a known error, for bounds that need no accuracy."""
+
+from __future__ import annotations
+
+from cavmarl.core.math.geometry import PI
+from cavmarl.core.numba import kernel
+
+__all__ = ["ANGLE_ERROR_RAD", "rough_atan2"]
+
+# `rough_atan2` is off by less than this.
+ANGLE_ERROR_RAD = 0.005
+
+
+@kernel
+def rough_atan2(y: float, x: float) -> float:
+    """The angle of (x, y), not both zero, with an error below `ANGLE_ERROR_RAD`.
+
+    Rajan, Wang, Inkol, Joyal: "Efficient approximations for the arctangent function", IEEE Signal
+    Processing Magazine 23(3), 2006, their equation for 0.0038 rad.
+    """
+    across = abs(y)
+    along = abs(x)
+    small = min(across, along)
+    large = max(across, along)
+    ratio = small / large
+    angle = ratio * (0.25 * PI + 0.273 * (1.0 - ratio))
+    if across > along:
+        angle = 0.5 * PI - angle
+    if x < 0.0:
+        angle = PI - angle
+    return -angle if y < 0.0 else angle

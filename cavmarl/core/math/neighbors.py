@@ -1,0 +1,280 @@
+"""Who is near: vehicles of one world in square cells, and the nearest of them.
+
+`fill_grid` sorts the vehicles into cells once a tick and puts what others look at into `bodies`:
+small records that lie together in memory, with sine and cosine of the heading taken once. Within a
+cell they lie in row order; whoever reads them must not depend on it and breaks ties by id.
+
+Cells reach to the ends of the plane: what lies outside the grid's area belongs to the border cells.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cavmarl.core.numba import kernel
+
+__all__ = [
+    "BODY",
+    "LEVEL_HEIGHT_M",
+    "SPOT",
+    "Grid",
+    "cell_at",
+    "cell_columns",
+    "cell_rows",
+    "fill_grid",
+    "k_nearest",
+    "make_grid",
+    "nearest_bodies",
+]
+
+LEVEL_HEIGHT_M = (
+    4.0  # vehicles further apart in z are on different levels and do not see each other
+)
+
+# Added to every search: a place at just the search distance must not depend on where cells begin.
+_MARGIN_M = 1e-6
+
+BODY = np.dtype(
+    [
+        ("id", np.int64),
+        ("row", np.int64),  # VEHICLE row
+        ("x", np.float64),  # centre, m
+        ("y", np.float64),
+        ("z", np.float64),
+        ("cos", np.float64),  # of the heading
+        ("sin", np.float64),
+        ("speed", np.float64),  # m/s
+        ("half_length", np.float64),  # m
+        ("half_width", np.float64),
+        ("height", np.float64),
+        ("radius", np.float64),  # half the diagonal, m
+    ],
+    align=True,
+)
+
+SPOT = np.dtype(
+    [
+        ("x", np.float64),  # centre, m
+        ("y", np.float64),
+        ("radius", np.float64),  # half the diagonal, m
+        ("next", np.int32),  # VEHICLE row of another one in the same cell, or -1
+    ],
+    align=True,
+)
+
+
+class Grid(NamedTuple):
+    """Square cells over a map and the bodies in them; holds nothing between ticks."""
+
+    min_x: float  # m, corner of cell (0, 0)
+    min_y: float
+    cells_per_m: float
+    num_x: int
+    num_y: int
+    start: NDArray[
+        np.int32
+    ]  # (num_x * num_y + 1,) cell (i, j) has bodies[start[c] : start[c + 1]],
+    bodies: NDArray[np.void]  # BODY (capacity,)             c = j * num_x + i
+    cell: NDArray[np.int32]  # (capacity,) the cell of each row
+    largest: NDArray[np.float64]  # (1,) the largest radius of all bodies, m
+    newest: NDArray[np.int32]  # (num_x * num_y,) the VEHICLE row put last into each cell, or -1
+    spots: NDArray[np.void]  # SPOT (capacity,) by VEHICLE row; both only `contacts` uses
+
+
+def make_grid(bounds: tuple[float, float, float, float], cell_m: float, capacity: int) -> Grid:
+    """An empty grid.
+
+    Args:
+        bounds: min_x, min_y, max_x, max_y of the area in m.
+        cell_m: side of a cell in m; about half the usual search distance is fast.
+        capacity: most vehicles that it can take.
+    """
+    min_x, min_y, max_x, max_y = bounds
+    num_x = max(1, math.ceil((max_x - min_x) / cell_m))
+    num_y = max(1, math.ceil((max_y - min_y) / cell_m))
+    return Grid(
+        min_x=float(min_x),
+        min_y=float(min_y),
+        cells_per_m=1.0 / float(cell_m),
+        num_x=num_x,
+        num_y=num_y,
+        start=np.zeros(num_x * num_y + 1, np.int32),
+        bodies=np.zeros(capacity, BODY),
+        cell=np.zeros(capacity, np.int32),
+        largest=np.zeros(1),
+        newest=np.zeros(num_x * num_y, np.int32),
+        spots=np.zeros(capacity, SPOT),
+    )
+
+
+@kernel
+def _slot(offset: float, cells_per_m: float, count: int) -> int:
+    """The cell along one axis; the first or last one outside of the area, the first one for NaN."""
+    cells = offset * cells_per_m
+    if not cells > 0.0:
+        return 0
+    return int(cells) if cells < count else count - 1
+
+
+@kernel
+def cell_at(grid: Grid, x: float, y: float) -> int:
+    """The cell of a place."""
+    column = _slot(x - grid.min_x, grid.cells_per_m, grid.num_x)
+    return _slot(y - grid.min_y, grid.cells_per_m, grid.num_y) * grid.num_x + column
+
+
+@kernel
+def cell_columns(grid: Grid, x: float, distance_m: float) -> tuple[int, int]:
+    """The first and last column of cells that can hold a body within `distance_m` of `x`."""
+    return (
+        _slot(x - distance_m - _MARGIN_M - grid.min_x, grid.cells_per_m, grid.num_x),
+        _slot(x + distance_m + _MARGIN_M - grid.min_x, grid.cells_per_m, grid.num_x),
+    )
+
+
+@kernel
+def cell_rows(grid: Grid, y: float, distance_m: float) -> tuple[int, int]:
+    """The first and last row of cells that can hold a body within `distance_m` of `y`."""
+    return (
+        _slot(y - distance_m - _MARGIN_M - grid.min_y, grid.cells_per_m, grid.num_y),
+        _slot(y + distance_m + _MARGIN_M - grid.min_y, grid.cells_per_m, grid.num_y),
+    )
+
+
+@kernel
+def _fill_body(body: np.void, vehicle: np.void, row: int) -> None:
+    """Copy what others see of a vehicle."""
+    half_length = 0.5 * vehicle["length"]
+    half_width = 0.5 * vehicle["width"]
+    heading = vehicle["heading"]
+    cos = math.cos(heading)
+    sin = math.sin(heading)
+    body["id"] = vehicle["id"]
+    body["row"] = row
+    body["x"] = vehicle["x"]
+    body["y"] = vehicle["y"]
+    body["z"] = vehicle["z"]
+    body["cos"] = cos
+    body["sin"] = sin
+    body["speed"] = vehicle["speed"]
+    body["half_length"] = half_length
+    body["half_width"] = half_width
+    body["height"] = vehicle["height"]
+    body["radius"] = math.sqrt(half_length * half_length + half_width * half_width)
+
+
+@kernel
+def fill_grid(rows: NDArray[np.void], num: int, grid: Grid) -> None:
+    """Sort the vehicles of one world into the cells of `grid`, which forgets what it held.
+
+    Args:
+        rows: VEHICLE (C,).
+        num: live rows, `rows[:num]`; at most the grid's capacity.
+        grid: from `make_grid`, overwritten.
+    """
+    start = grid.start
+    cell = grid.cell
+    start[:] = 0
+    for i in range(num):
+        c = cell_at(grid, rows[i]["x"], rows[i]["y"])
+        cell[i] = c
+        start[c] += 1
+    for c in range(1, start.size):
+        start[c] += start[c - 1]
+    # From the ends of the cells to their beginnings, hence the rows from last to first.
+    largest = 0.0
+    for i in range(num - 1, -1, -1):
+        c = cell[i]
+        start[c] -= 1
+        body = grid.bodies[start[c]]
+        _fill_body(body, rows[i], i)
+        largest = max(largest, body["radius"])
+    grid.largest[0] = largest
+
+
+@kernel
+def k_nearest(
+    grid: Grid,
+    row: int,
+    x: float,
+    y: float,
+    z: float,
+    radius_m: float,
+    k: int,
+    out_row: NDArray[np.int32],
+    out_squared: NDArray[np.float64],
+) -> int:
+    """The nearest vehicles around a place on the same level, sorted by distance, then by id.
+
+    Args:
+        grid: filled for this tick.
+        row: VEHICLE row to leave out, who is asking; -1 for none.
+        x: m.
+        y: m.
+        z: m; vehicles more than `LEVEL_HEIGHT_M` above or below are not seen.
+        radius_m: centres further away than this are not seen, in the plane.
+        k: how many to find at most.
+        out_row: (k,) int, VEHICLE rows of those found, overwritten up to the returned number.
+        out_squared: (k,) squared distances in m², likewise.
+
+    Returns:
+        how many were found.
+    """
+    found = nearest_bodies(grid, row, x, y, z, radius_m, k, out_row, out_squared)
+    for m in range(found):
+        out_row[m] = grid.bodies[out_row[m]]["row"]
+    return found
+
+
+@kernel
+def nearest_bodies(
+    grid: Grid,
+    row: int,
+    x: float,
+    y: float,
+    z: float,
+    radius_m: float,
+    k: int,
+    out_body: NDArray[np.int32],
+    out_squared: NDArray[np.float64],
+) -> int:
+    """`k_nearest` as positions in `grid.bodies`, whose records hold what others see."""
+    bodies = grid.bodies
+    limit = radius_m * radius_m
+    first_column, last_column = cell_columns(grid, x, radius_m)
+    first_row, last_row = cell_rows(grid, y, radius_m)
+    found = 0
+    for j in range(first_row, last_row + 1):
+        begin = grid.start[j * grid.num_x + first_column]
+        end = grid.start[j * grid.num_x + last_column + 1]
+        for b in range(begin, end):
+            body = bodies[b]
+            dx = body["x"] - x
+            dy = body["y"] - y
+            squared = dx * dx + dy * dy
+            if not squared <= limit or body["row"] == row or abs(body["z"] - z) > LEVEL_HEIGHT_M:
+                continue
+            # Insertion from the end.
+            place = found
+            while place > 0 and (
+                squared < out_squared[place - 1]
+                or (
+                    squared == out_squared[place - 1]
+                    and body["id"] < bodies[out_body[place - 1]]["id"]
+                )
+            ):
+                place -= 1
+            if place == k:
+                continue
+            if found < k:
+                found += 1
+            for m in range(found - 1, place, -1):
+                out_body[m] = out_body[m - 1]
+                out_squared[m] = out_squared[m - 1]
+            out_body[place] = b
+            out_squared[place] = squared
+    return found

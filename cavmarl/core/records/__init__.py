@@ -1,0 +1,1 @@
+"""Bundles of arrays that kernels take together, codes, and questions about a vehicle's row."""

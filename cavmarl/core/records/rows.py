@@ -1,0 +1,34 @@
+"""What a vehicle's row says of its place, asked by more than one domain."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from cavmarl.core.numba import inlined_kernel
+from cavmarl.core.records.codes import DRIVER_AGENT, DRIVER_SCRIPTED
+
+__all__ = ["ENTER_REACH_M", "FORK_BEYOND_M", "LOST_M", "is_lost", "is_off_lanes"]
+
+ENTER_REACH_M = 80.0  # how far along its lane a departing vehicle looks for others
+FORK_BEYOND_M = 3.0  # how far beyond a junction paths from one lane can still run together
+LOST_M = (
+    10.0  # from its place on its lane: a vehicle that is steered off further is no longer there
+)
+OFF_LANES_M = 1.5  # from the middle of the nearest lane
+
+
+@inlined_kernel
+def is_lost(row: np.void) -> bool:
+    """Whether a vehicle was steered away from its lane, and onto no other: against the traffic.
+
+    No other vehicle on that lane has to mind it any more.
+    """
+    lost: bool = abs(row["d"]) > LOST_M and row["driver"] == DRIVER_AGENT
+    return lost
+
+
+@inlined_kernel
+def is_off_lanes(row: np.void) -> bool:
+    """Whether a row's lane is only the nearest one, or the last one that it was on."""
+    off: bool = row["driver"] == DRIVER_SCRIPTED and abs(row["d"]) > OFF_LANES_M
+    return off or is_lost(row)

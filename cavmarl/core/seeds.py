@@ -1,0 +1,39 @@
+"""Seeds at the border: which ones are taken, and what is taken where none is given."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from cavmarl.core.errors import ConfigError
+
+__all__ = ["check_seed", "first_seed"]
+
+SEED_BITS = 63
+
+
+def check_seed(seed: Any) -> int:
+    """A seed that all random numbers can be rooted in.
+
+    Raises:
+        ConfigError: not a whole number from 0 to 2**63 - 1.
+    """
+    if isinstance(seed, bool) or not isinstance(seed, (int, np.integer)):
+        raise ConfigError(f"seed = {seed!r}: must be a whole number")
+    if not 0 <= int(seed) < 1 << SEED_BITS:
+        raise ConfigError(f"seed = {seed}: must be from 0 to 2**{SEED_BITS} - 1")
+    return int(seed)
+
+
+def first_seed(given: Any, default: int | None) -> int:
+    """The seed of a reset: the one given, else the default, else one that nobody has seen.
+
+    Raises:
+        ConfigError: a given seed that `check_seed` refuses.
+    """
+    if given is not None:
+        return check_seed(given)
+    if default is not None:
+        return default
+    return int(np.random.SeedSequence().generate_state(1, np.uint64)[0] >> np.uint64(1))

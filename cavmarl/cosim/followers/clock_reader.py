@@ -1,0 +1,46 @@
+"""A program: follow a world's clock, write down what it shows, and, if asked to, tick by oneself.
+
+    python -m cavmarl.cosim.followers.clock_reader ADDRESS SHARE
+
+At the end it prints one line of JSON: the world's tick when it joined, then after each step, as the
+follower has it then, and how many of its own ticks were refused. It ticks by itself in SHARE of the
+steps, spread as evenly as can be.
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+from fractions import Fraction
+
+from cavmarl.core.errors import TickRefusedError
+from cavmarl.cosim.followers.follower_client import Follower
+
+__all__ = ["is_due"]
+
+
+def is_due(step: int, share: Fraction) -> bool:
+    """Whether step 1, 2, … is one of those: of the first n there are always floor(n · share)."""
+    return int(step * share) > int((step - 1) * share)
+
+
+def _main(place: str, share: Fraction) -> None:
+    ticks: list[int] = []
+    own = refused = 0
+    with Follower(int(place) if place.isdecimal() else place, name="clock reader") as follower:
+        for sight in follower:
+            tick = sight.snapshot.tick
+            if ticks and is_due(len(ticks), share):
+                own += 1
+                try:
+                    tick = follower.tick().tick
+                except TickRefusedError:
+                    refused += 1
+            ticks.append(tick)
+            if not sight.snapshot.is_over:
+                follower.answer({})
+    print(json.dumps({"ticks": ticks, "own_ticks": own, "refused": refused}))
+
+
+if __name__ == "__main__":
+    _main(sys.argv[1], Fraction(sys.argv[2]))

@@ -1,0 +1,286 @@
+"""`FollowedWorld`: one world whose time a master advances and whose agents followers drive.
+
+A cycle is that of Algorithm 1 of the co-simulation paper: the controls that were queued take
+effect, the world ticks, sensors deliver the frame of t + Δt, each follower computes u from it, and
+u is queued for the next cycle. The cycle ends when every follower has answered, so that a slow one
+holds the world and no frame is left out.
+
+Followers are served in the order of the first agent that they drive, those that drive none behind,
+by name. Answers may arrive in any order: nothing depends on it.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterable, Sequence
+from contextlib import suppress
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Literal, Self
+
+from cavmarl.core.errors import (
+    ConfigError,
+    EpisodeEndedError,
+    FollowerError,
+    FollowerMessageError,
+    FollowerTimeoutError,
+)
+from cavmarl.cosim.followers.follower_barrier import BadControls, Barrier, Seat
+from cavmarl.cosim.followers.follower_connection import Address, Line
+from cavmarl.cosim.followers.follower_messages import Hello, Say
+from cavmarl.cosim.followers.follower_snapshots import Moment, welcome_to
+from cavmarl.cosim.followers.reception import Reception, refuse
+from cavmarl.cosim.pacing import Pacer
+from cavmarl.cosim.time_master import OwnTicks, TimeMaster
+from cavmarl.engine.step_trace import QUEUE, STACK, StepTrace
+from cavmarl.env.parallel import CavEnv
+
+__all__ = ["FollowedWorld"]
+
+
+class FollowedWorld:
+    """A master, its world, and a socket for followers.
+
+    Agents that no follower drives are driven by the built-in driver, those too whose follower is
+    gone.
+
+    Args:
+        env: the world, in this process or run by workers; it is mastered until `close`.
+        address: path of a Unix socket, or a port of this machine, 0: any.
+        timeout_s: for so long a step waits for its followers, by the wall clock.
+        own_ticks: what becomes of a follower's own tick; see `TimeMaster`.
+        on_drift: see `TimeMaster`.
+        bad_controls: what becomes of controls that cannot be carried out: `error`: its follower is
+            let go with a `ControlError`; `hold`: the vehicle's last ones are used, and it is
+            counted.
+        pacer: how fast by the wall clock; None: as fast as it goes.
+        trace: notes the phases of each step.
+
+    Attributes:
+        master: of the time.
+        address: where followers call.
+
+    Raises:
+        ConfigError: nobody can listen there, or a trace of a world that workers run.
+        SecondMasterError: the environment has a master.
+    """
+
+    def __init__(
+        self,
+        env: CavEnv,
+        address: Address,
+        *,
+        timeout_s: float = 10.0,
+        own_ticks: OwnTicks = "refuse",
+        on_drift: Literal["error", "record"] = "error",
+        bad_controls: BadControls = "error",
+        pacer: Pacer | None = None,
+        trace: StepTrace | None = None,
+    ) -> None:
+        if not 0.0 < timeout_s < float("inf"):
+            raise ConfigError(f"timeout_s = {timeout_s}: must be a number above 0")
+        self.env = env
+        self._reception = Reception(address)
+        self.address = self._reception.address
+        try:
+            self.master = TimeMaster(
+                env, pacer=pacer, own_ticks=own_ticks, on_drift=on_drift, trace=trace
+            )
+        except BaseException:
+            self.close_reception()
+            raise
+        self._timeout_s = timeout_s
+        self._barrier = Barrier(env, timeout_s, bad_controls)
+        self._trace = trace
+        self._seats: list[Seat] = []
+        self._queued: dict[str, Any] = {}
+        self._frame = self._episode = -1
+        self._is_closed = False
+
+    def __enter__(self) -> Self:
+        """The world."""
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        traceback: TracebackType | None,
+    ) -> None:
+        """Close it."""
+        self.close()
+
+    @property
+    def seats(self) -> tuple[Seat, ...]:
+        """The followers, in the order in which they are served."""
+        return tuple(self._seats)
+
+    @property
+    def is_over(self) -> bool:
+        """The episode has ended, or none has begun."""
+        return not self.env.agents
+
+    def wait_for(self, followers: int, within_s: float) -> None:
+        """Wait until so many follow.
+
+        Raises:
+            FollowerTimeoutError: they have not come in time.
+        """
+        until_s = time.monotonic() + within_s
+        while len(self._seats) < followers:
+            left_s = until_s - time.monotonic()
+            if left_s <= 0.0:
+                raise FollowerTimeoutError(
+                    f"{len(self._seats)} of {followers} followers have called {self.address} "
+                    f"within {within_s:g} s: start them with `cavmarl follow {self.address}`"
+                )
+            self._admit(left_s)
+
+    def reset(self, seed: int | None = None) -> None:
+        """Begin an episode, and let followers see it.
+
+        Raises:
+            FollowerError: see `step`.
+        """
+        self._admit(0.0)
+        self.master.reset(seed)
+        self._episode += 1
+        self._queued.clear()
+        self._next_frame()
+        self._exchange(self._seats)
+
+    def step(self) -> dict[str, float]:
+        """One cycle; rewards by agent.
+
+        Raises:
+            EpisodeEndedError: there is nobody to go on with.
+            FollowerTimeoutError: a follower has not answered in time; it is let go. The world has
+                gone on by one step, and the next call goes on from there.
+            FollowerLostError: the same, where a follower has ended.
+            FollowerMessageError: the same, where it has said what nobody understands.
+            ControlError: the same, where its controls cannot be carried out.
+            ClockDriftError: somebody else has advanced the world.
+        """
+        if self.is_over:
+            raise EpisodeEndedError("the episode is over: call FollowedWorld.reset()")
+        self._admit(0.0)
+        self._exchange([seat for seat in self._seats if seat.frame < self._frame])
+        agents = self.env.agents
+        actions = {agent: self._queued[agent] for agent in agents if agent in self._queued}
+        if len(actions) < len(agents):
+            actions = {**self.env.suggest_actions(), **actions}
+        _, rewards, *_ = self.master.step(actions)
+        self._queued.clear()
+        self._next_frame()
+        self._exchange(self._seats)
+        return dict(rewards)
+
+    def manifest(self) -> dict[str, Any]:
+        """What a result depends on: who follows, and when controls take effect."""
+        clock = self.env.config.clock
+        return {
+            "sim_dt_s": clock.sim_dt_s,
+            "ctrl_dt_s": clock.ctrl_dt_s,
+            "control_latency_steps": 1,  # queued for the next cycle, as Algorithm 1 has it
+            "control_latency_ticks": clock.control_latency_ticks,
+            "followers": [
+                {"name": seat.clock.name, "agents": self._names(seat.agents)}
+                for seat in self._seats
+            ],
+        }
+
+    def close(self) -> None:
+        """Say goodbye to all followers, and let the environment go; again: nothing to do."""
+        if self._is_closed:
+            return
+        self._is_closed = True
+        for seat in list(self._seats):
+            with suppress(FollowerError):
+                seat.line.say(Say.GOODBYE, within_s=self._timeout_s)
+            self._drop(seat)
+        self.close_reception()
+        self.master.release()
+
+    def close_reception(self) -> None:
+        """Let nobody call any more."""
+        self._reception.close()
+        if not isinstance(self.address, int):
+            Path(self.address).unlink(missing_ok=True)
+
+    def _admit(self, within_s: float) -> None:
+        """Give seats to those who have called."""
+        for line, hello in self._reception.callers(within_s):
+            try:
+                self._seat(line, hello)
+            except FollowerError as error:
+                self._reception.turn_away(line, str(error))
+
+    def _seat(self, line: Line, hello: Hello) -> None:
+        agents = self._indices(hello.vehicles)
+        welcome = welcome_to(self.env, self._names(agents), self.master.tick)
+        line.say(Say.WELCOME, welcome, within_s=self._timeout_s)
+        self._seats.append(Seat(line, self.master.follow(hello.name), agents))
+        self._seats.sort(key=lambda each: each.rank)
+
+    def _indices(self, vehicles: Sequence[str]) -> tuple[int, ...]:
+        """The agents that a newcomer wants.
+
+        Raises:
+            FollowerMessageError: there are none of that name, or somebody else drives them.
+        """
+        known = {agent: k for k, agent in enumerate(self.env.possible_agents)}
+        taken = {k: seat.clock.name for seat in self._seats for k in seat.agents}
+        for agent in vehicles:
+            if agent not in known:
+                raise FollowerMessageError(
+                    f"no agent '{agent[:80]}': there are {self.env.possible_agents[0]} to "
+                    f"{self.env.possible_agents[-1]}"
+                )
+            if known[agent] in taken:
+                raise FollowerMessageError(
+                    f"{agent} is driven by '{taken[known[agent]]}': ask for another one"
+                )
+        if len(set(vehicles)) < len(vehicles):
+            raise FollowerMessageError("an agent was asked for twice")
+        return tuple(sorted(known[agent] for agent in vehicles))
+
+    def _names(self, agents: Iterable[int]) -> list[str]:
+        return [self.env.possible_agents[k] for k in agents]
+
+    def _drop(self, seat: Seat) -> None:
+        """Go on without a follower."""
+        seat.line.close()
+        self._seats.remove(seat)
+        if seat.clock in self.master.followers:
+            seat.clock.leave()
+
+    def _next_frame(self) -> None:
+        self._frame += 1
+        tick = int(self.master.world_ticks[0])
+        self._moment = Moment(self._frame, self._episode, tick, self.is_over)
+
+    def _exchange(self, seats: Sequence[Seat]) -> None:
+        """Let followers see the world as it is, and queue what they do.
+
+        Raises:
+            FollowerError: of the first one, in their order, with whom it cannot go on; what the
+                others do is queued all the same.
+        """
+        if self._episode < 0 or not seats:
+            return
+        self._note(STACK)
+        found = self._barrier.pass_through(list(seats), self._moment)
+        self._note(QUEUE)
+        self._queued |= found.actions
+        for seat in found.left:
+            self._drop(seat)
+        failed = sorted(found.failed, key=lambda seat: seat.rank)
+        for seat in failed:
+            refuse(seat.line, str(found.failed[seat]))
+            self._drop(seat)
+        if failed:
+            raise found.failed[failed[0]]
+
+    def _note(self, phase: str) -> None:
+        if self._trace is not None:
+            self._trace.note(phase)

@@ -1,0 +1,241 @@
+"""`Barrier`: every follower gets its snapshot, and the world waits for all of their controls."""
+
+from __future__ import annotations
+
+import selectors
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any, Literal
+
+import numpy as np
+
+from cavmarl.core.errors import (
+    ControlError,
+    FollowerError,
+    FollowerLostError,
+    FollowerMessageError,
+    FollowerTimeoutError,
+    InvalidActionError,
+    TickRefusedError,
+)
+from cavmarl.cosim.followers.follower_connection import Line
+from cavmarl.cosim.followers.follower_messages import Control, Say, Ticked, read_letter
+from cavmarl.cosim.followers.follower_snapshots import Moment, take_snapshot
+from cavmarl.cosim.time_master import TimeFollower
+from cavmarl.env.parallel import CavEnv
+
+__all__ = ["BadControls", "Barrier", "Outcome", "Seat"]
+
+BadControls = Literal["error", "hold"]
+
+
+@dataclass(eq=False)
+class Seat:
+    """A follower, as the world knows it.
+
+    Attributes:
+        line: to it.
+        clock: its place at the master's clock.
+        agents: indices of the agents that it drives, rising.
+        frame: of the last snapshot that it was sent; -1: none yet.
+        held: the last controls of its vehicles.
+        answers: controls that it has sent in time.
+        late: answers to earlier snapshots, which were thrown away.
+        bad: controls of a vehicle that could not be carried out.
+        wait_wall_s: how long the world has waited for it, by the wall clock.
+        slowest: in how many steps it was the last one to answer.
+    """
+
+    line: Line
+    clock: TimeFollower
+    agents: tuple[int, ...]
+    frame: int = -1
+    held: dict[str, Any] = field(default_factory=dict)
+    answers: int = 0
+    late: int = 0
+    bad: int = 0
+    wait_wall_s: float = 0.0
+    slowest: int = 0
+
+    @property
+    def rank(self) -> tuple[float, str]:
+        """What followers are ordered by: their first agent, then the name."""
+        return (self.agents[0] if self.agents else float("inf"), self.clock.name)
+
+
+@dataclass
+class Outcome:
+    """What has come of one barrier.
+
+    Attributes:
+        actions: by agent.
+        failed: with whom the world cannot go on, and why.
+        left: who has said goodbye.
+    """
+
+    actions: dict[str, Any] = field(default_factory=dict)
+    failed: dict[Seat, FollowerError] = field(default_factory=dict)
+    left: list[Seat] = field(default_factory=list)
+
+
+class Barrier:
+    """Asks followers and waits for them.
+
+    Args:
+        env: the world.
+        timeout_s: for so long all of them together may take, by the wall clock.
+        bad_controls: `error`: who sends them fails; `hold`: the vehicle's last ones are used.
+    """
+
+    def __init__(self, env: CavEnv, timeout_s: float, bad_controls: BadControls) -> None:
+        self._env = env
+        self._timeout_s = timeout_s
+        self._bad_controls = bad_controls
+
+    def pass_through(self, seats: Sequence[Seat], moment: Moment) -> Outcome:
+        """Send each its snapshot, and hear what its vehicles do.
+
+        Args:
+            seats: in the order in which they are served.
+            moment: of the snapshots.
+        """
+        found = Outcome()
+        asked: dict[Seat, list[str]] = {}
+        for seat in seats:
+            snapshot, arrays = take_snapshot(self._env, seat.agents, moment)
+            seat.frame = moment.frame
+            asked[seat] = list(snapshot.vehicles)
+            try:
+                seat.line.say(Say.SNAPSHOT, snapshot, arrays, self._timeout_s)
+            except FollowerTimeoutError as error:
+                found.failed[seat] = error
+                del asked[seat]
+            except FollowerLostError:
+                continue  # its last words are heard below: it may have said goodbye
+        if moment.is_over or not asked:
+            return found
+        answers = self._collect(asked, moment, found)
+        for seat in asked:
+            if seat in answers:
+                try:
+                    found.actions |= self._checked(seat, answers[seat], asked[seat])
+                    seat.answers += 1
+                except ControlError as error:
+                    found.failed[seat] = error
+        return found
+
+    def _collect(
+        self, asked: Mapping[Seat, list[str]], moment: Moment, found: Outcome
+    ) -> dict[Seat, Mapping[str, Any]]:
+        """Hear everybody's controls, in the order in which they come."""
+        answers: dict[Seat, Mapping[str, Any]] = {}
+        began = time.monotonic()
+        with selectors.DefaultSelector() as selector:
+            for seat in asked:
+                selector.register(seat.line, selectors.EVENT_READ, seat)
+            while waiting := [key.data for key in selector.get_map().values()]:
+                left_s = max(began + self._timeout_s - time.monotonic(), 0.0)
+                ready = [key.data for key, _ in selector.select(left_s)]
+                for seat in ready or waiting:
+                    try:
+                        if not ready:
+                            raise seat.line.too_late("answered", self._timeout_s)
+                        if not self._hear(seat, moment, answers, found, left_s):
+                            continue
+                    except FollowerError as error:
+                        found.failed[seat] = error
+                    seat.wait_wall_s += time.monotonic() - began
+                    selector.unregister(seat.line)
+                    last = seat
+        last.slowest += 1
+        return answers
+
+    def _hear(
+        self,
+        seat: Seat,
+        moment: Moment,
+        answers: dict[Seat, Mapping[str, Any]],
+        found: Outcome,
+        within_s: float,
+    ) -> bool:
+        """One frame of a follower; whether it is done.
+
+        Raises:
+            FollowerError: the world cannot go on with it.
+        """
+        # What has arrived in time is read even if that was just before the end.
+        within_s = max(within_s, 1e-3)
+        heard = seat.line.hear(within_s)
+        seat.line.skip(heard)
+        match heard.kind:
+            case Say.TICK:
+                self._answer_tick(seat, within_s)
+                return False
+            case Say.GOODBYE:
+                found.left.append(seat)
+                return True
+            case Say.CONTROL:
+                control = read_letter(Control, heard.letter)
+            case kind:
+                raise FollowerMessageError(
+                    f"{seat.line.name} says {kind.name}: controls of frame {moment.frame} are due"
+                )
+        if control.frame > moment.frame:
+            raise FollowerMessageError(
+                f"{seat.line.name} answers frame {control.frame}; the last is {moment.frame}"
+            )
+        if control.frame < moment.frame:
+            seat.late += 1
+            return False
+        answers[seat] = control.controls
+        return True
+
+    def _answer_tick(self, seat: Seat, within_s: float) -> None:
+        done, refused = False, ""
+        try:
+            done = seat.clock.tick()
+        except TickRefusedError as error:
+            refused = str(error)
+        tick = int(seat.clock.master.world_ticks[0])
+        seat.line.say(Say.TICKED, Ticked(done, refused, tick), within_s=within_s)
+
+    def _checked(
+        self, seat: Seat, controls: Mapping[str, Any], vehicles: Sequence[str]
+    ) -> dict[str, Any]:
+        """The actions of a follower's vehicles.
+
+        Raises:
+            ControlError: they cannot be carried out, and `bad_controls` is `error`.
+        """
+        strangers = controls.keys() - set(vehicles)
+        if strangers:
+            raise ControlError(
+                f"{seat.line.name}: controls of {min(strangers)[:80]}, which is not in the frame"
+            )
+        checked: dict[str, Any] = {}
+        for vehicle in vehicles:
+            try:
+                action = _action(vehicle, controls)
+                self._env.check_action(vehicle, action)
+                checked[vehicle] = action
+            except (ControlError, InvalidActionError) as error:
+                seat.bad += 1
+                if self._bad_controls == "error":
+                    raise ControlError(f"{seat.line.name}: {error}") from error
+                if vehicle in seat.held:
+                    checked[vehicle] = seat.held[vehicle]
+        seat.held = checked
+        return checked
+
+
+def _action(vehicle: str, controls: Mapping[str, Any]) -> Any:
+    """One vehicle's action.
+
+    Raises:
+        ControlError: there is none.
+    """
+    if vehicle not in controls:
+        raise ControlError(f"no controls of {vehicle}, which is in the frame")
+    given = controls[vehicle]
+    return np.asarray(given, dtype=np.float32) if isinstance(given, list) else given

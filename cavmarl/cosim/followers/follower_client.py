@@ -1,0 +1,199 @@
+"""`Follower`: the end of the connection where a stack runs."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from types import TracebackType
+from typing import Any, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cavmarl.core.errors import FollowerError, FollowerMessageError, TickRefusedError
+from cavmarl.cosim.followers.follower_connection import Address, Heard, call
+from cavmarl.cosim.followers.follower_messages import (
+    Control,
+    Hello,
+    Refusal,
+    Say,
+    Snapshot,
+    Ticked,
+    Welcome,
+    read_letter,
+)
+
+__all__ = ["Follower", "Samples", "Sight", "sight_of"]
+
+CALL_S = 10.0
+
+
+@dataclass(frozen=True)
+class Samples:
+    """What one sensor has since the last snapshot.
+
+    Attributes:
+        values: (n, …) one sample a row, the newest last.
+        stamps_s: (n,) when each was taken, in simulated time since the reset.
+        lost: (n,) which were lost: zeros.
+    """
+
+    values: NDArray[Any]
+    stamps_s: NDArray[np.float64]
+    lost: NDArray[np.bool_]
+
+
+@dataclass(frozen=True)
+class Sight:
+    """One snapshot.
+
+    Attributes:
+        snapshot: the clock, and the vehicles that have to be driven.
+        sensors: by vehicle and name of the sensor; those that are due. What is of the whole map
+            stands under no name.
+    """
+
+    snapshot: Snapshot
+    sensors: Mapping[str, Mapping[str, Samples]]
+
+
+class Follower:
+    """Follows a world's clock: waits for snapshots and answers them.
+
+        with Follower("/tmp/town.sock", vehicles=["car_0"]) as follower:
+            for sight in follower:
+                follower.answer({"car_0": [0.2, 0.0]})
+
+    Args:
+        address: path of a Unix socket, or a port of this machine.
+        vehicles: agents to drive; none: it follows the clock only, and answers with {}.
+        name: for people.
+        joins_s: how long the world may take to welcome us, which it does between two steps; None:
+            for ever.
+
+    Attributes:
+        welcome: how time goes in that world.
+
+    Raises:
+        FollowerLostError: nobody is there.
+        FollowerError: whoever is there does not want us, or speaks another version.
+    """
+
+    def __init__(
+        self,
+        address: Address,
+        vehicles: Sequence[str] = (),
+        name: str = "follower",
+        joins_s: float | None = 60.0,
+    ) -> None:
+        self._line = call(address, CALL_S)
+        try:
+            self._line.say(Say.HELLO, Hello(name, list(vehicles)), within_s=CALL_S)
+            self.welcome = read_letter(Welcome, self._expect(joins_s, Say.WELCOME).letter)
+        except BaseException:
+            self._line.close()
+            raise
+        self._frame: int | None = None
+
+    def __enter__(self) -> Self:
+        """The follower."""
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        traceback: TracebackType | None,
+    ) -> None:
+        """Leave."""
+        self.close()
+
+    def __iter__(self) -> Iterator[Sight]:
+        """Snapshots, until the world says goodbye; each but those of an end has to be answered.
+
+        Raises:
+            FollowerLostError: the world has ended without a goodbye.
+            FollowerMessageError: what it says cannot be understood, or a frame is missing.
+            FollowerError: it does not go on with us.
+        """
+        while (sight := self.wait()) is not None:
+            yield sight
+
+    def wait(self) -> Sight | None:
+        """The next snapshot, however long it takes; None: the world has said goodbye.
+
+        Raises:
+            FollowerError: as of `__iter__`.
+        """
+        heard = self._expect(None, Say.SNAPSHOT, Say.GOODBYE)
+        if heard.kind is Say.GOODBYE:
+            return None
+        snapshot, arrays = self._line.take(heard)
+        if self._frame is not None and snapshot.frame != self._frame + 1:
+            raise FollowerMessageError(
+                f"frame {snapshot.frame} follows {self._frame}: one was left out"
+            )
+        self._frame = snapshot.frame
+        return sight_of(snapshot, arrays)
+
+    def answer(self, controls: Mapping[str, Any]) -> None:
+        """Say what the vehicles of the last snapshot do in the next step.
+
+        Args:
+            controls: by vehicle: two numbers in [-1, 1], or the number of a meta-action.
+
+        Raises:
+            FollowerLostError: the world is gone.
+            FollowerError: there was no snapshot.
+        """
+        if self._frame is None:
+            raise FollowerError("answer() before the first snapshot: call wait()")
+        plain = {vehicle: _plain(given) for vehicle, given in controls.items()}
+        self._line.say(Say.CONTROL, Control(self._frame, plain))
+
+    def tick(self) -> Ticked:
+        """Try to advance the world, which a follower should not do; what has become of it.
+
+        Raises:
+            TickRefusedError: the world's master refuses.
+        """
+        self._line.say(Say.TICK)
+        ticked = read_letter(Ticked, self._expect(None, Say.TICKED).letter)
+        if ticked.refused:
+            raise TickRefusedError(ticked.refused)
+        return ticked
+
+    def leave(self) -> None:
+        """Say goodbye in the place of an answer: the built-in driver goes on with the vehicles."""
+        self._line.say(Say.GOODBYE)
+        self._line.close()
+
+    def close(self) -> None:
+        """Hang up."""
+        self._line.close()
+
+    def _expect(self, within_s: float | None, *kinds: Say) -> Heard:
+        heard = self._line.hear(within_s)
+        if heard.kind in kinds:
+            if heard.kind is not Say.SNAPSHOT:
+                self._line.skip(heard)
+            return heard
+        if heard.kind is Say.REFUSAL:
+            self._line.skip(heard)
+            raise FollowerError(read_letter(Refusal, heard.letter).reason)
+        raise FollowerMessageError(f"{self._line.name} says {heard.kind.name}, which is not due")
+
+
+def sight_of(snapshot: Snapshot, arrays: Sequence[NDArray[Any]]) -> Sight:
+    """A snapshot with its arrays where they belong."""
+    sensors: dict[str, dict[str, Samples]] = {vehicle: {} for vehicle in snapshot.vehicles}
+    for view, array in zip(snapshot.arrays, arrays, strict=True):
+        samples = Samples(array, np.array(view.stamps_s), np.array(view.lost, dtype=np.bool_))
+        sensors.setdefault(view.vehicle, {})[view.name] = samples
+    return Sight(snapshot, sensors)
+
+
+def _plain(given: Any) -> list[float] | int:
+    """A control as msgpack writes it."""
+    array = np.asarray(given)
+    return int(array) if array.ndim == 0 else [float(number) for number in array]

@@ -1,0 +1,299 @@
+"""`Line`: one end of the connection between a world and a follower."""
+
+from __future__ import annotations
+
+import os
+import socket
+import stat
+import time
+from collections.abc import Sequence
+from math import prod
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cavmarl.core.errors import (
+    ConfigError,
+    FollowerLostError,
+    FollowerMessageError,
+    FollowerTimeoutError,
+    MessageError,
+)
+from cavmarl.cosim.followers.follower_messages import (
+    FOLLOWERS,
+    ArrayView,
+    Say,
+    Snapshot,
+    letter_of,
+    read_letter,
+)
+from cavmarl.parallel.hosts.framed_socket import Wire
+
+__all__ = ["Address", "Heard", "Line", "call", "listen"]
+
+Array = NDArray[Any]
+
+# A path of a Unix socket, or a port of this machine.
+Address = str | Path | int
+
+LOOPBACK = "127.0.0.1"
+MAX_PATH = 100  # bytes that every system takes for a Unix socket
+# Dtypes of arrays, as NumPy writes them: numbers, and nothing that points anywhere.
+_DTYPES = {np.dtype(code).newbyteorder("<").str for code in "?bBhHiIqQefd"}
+_MAX_AXES = 8
+
+
+class Heard(NamedTuple):
+    """One frame.
+
+    Attributes:
+        kind: what it says.
+        letter: as msgpack knows it.
+        size: bytes of its data.
+    """
+
+    kind: Say
+    letter: Any
+    size: int
+
+
+class _Patient(socket.socket):
+    """A socket that has until a deadline for all calls together.
+
+    Attributes:
+        until_s: by `time.monotonic`; None: for ever.
+    """
+
+    until_s: float | None = None
+
+    def _hurry(self) -> None:
+        if self.until_s is None:
+            self.settimeout(None)
+            return
+        left_s = self.until_s - time.monotonic()
+        if left_s <= 0.0:
+            raise TimeoutError("timed out")
+        self.settimeout(left_s)
+
+    def recv_into(self, *arguments: Any, **named: Any) -> int:
+        self._hurry()
+        return super().recv_into(*arguments, **named)
+
+    def sendmsg(self, *arguments: Any, **named: Any) -> int:
+        self._hurry()
+        return super().sendmsg(*arguments, **named)
+
+
+class Line:
+    """Sends and hears frames; whatever goes wrong with the other end is a `FollowerError`.
+
+    Args:
+        connection: a connected socket, which the line owns from here on.
+        name: of the other end, for people.
+        cure: what can be done when that is gone, as the end of a sentence.
+    """
+
+    def __init__(self, connection: socket.socket, name: str, cure: str = "") -> None:
+        self._socket = _Patient(fileno=connection.detach())
+        self._wire = Wire(self._socket, FOLLOWERS)
+        self.name = name
+        self._cure = f"; {cure}" if cure else ""
+
+    def fileno(self) -> int:
+        """The socket's descriptor."""
+        return self._socket.fileno()
+
+    def say(
+        self,
+        kind: Say,
+        message: Any = None,
+        arrays: Sequence[Array] = (),
+        within_s: float | None = None,
+    ) -> None:
+        """Send one frame.
+
+        Args:
+            kind: what it says.
+            message: one of `messages`; None: nothing.
+            arrays: contiguous.
+            within_s: for so long it may take.
+
+        Raises:
+            FollowerTimeoutError: the other end does not read.
+            FollowerLostError: the other end is gone.
+        """
+        self._allow(within_s)
+        letter = None if message is None else letter_of(message)
+        try:
+            self._wire.send(kind, 0, letter, arrays)
+        except TimeoutError as error:
+            raise self.too_late("read", within_s) from error
+        except OSError as error:
+            raise self._lost(error) from error
+
+    def hear(self, within_s: float | None = None) -> Heard:
+        """The next frame; its data then have to be taken (`take`) or left out (`skip`).
+
+        Raises:
+            FollowerTimeoutError: there is none in time.
+            FollowerLostError: the other end is gone.
+            FollowerMessageError: this is no frame, or one of another version.
+        """
+        self._allow(within_s)
+        try:
+            frame = self._wire.receive()
+        except TimeoutError as error:
+            raise self.too_late("answered", within_s) from error
+        except (EOFError, OSError) as error:
+            raise self._lost(error) from error
+        except MessageError as error:
+            raise FollowerMessageError(f"{self.name}: {error}") from error
+        return Heard(Say(frame.kind), frame.letter, frame.size)
+
+    def skip(self, heard: Heard) -> None:
+        """Leave out the data of what was heard.
+
+        Raises:
+            FollowerError: as of `hear`; and there are some, where none belong.
+        """
+        if heard.size:
+            raise FollowerMessageError(
+                f"{self.name}: {heard.size} bytes of data with a {heard.kind.name}: it has none"
+            )
+        self._take([])
+
+    def take(self, heard: Heard) -> tuple[Snapshot, list[Array]]:
+        """The snapshot that was heard, with its arrays.
+
+        Raises:
+            FollowerError: as of `hear`.
+        """
+        snapshot = read_letter(Snapshot, heard.letter)
+        sizes = [_size(view) for view in snapshot.arrays]
+        if sum(sizes) != heard.size:
+            raise FollowerMessageError(
+                f"{self.name}: {heard.size} bytes of data, but its arrays have {sum(sizes)}"
+            )
+        arrays = [np.empty(view.shape, dtype=view.dtype) for view in snapshot.arrays]
+        self._take(arrays)
+        return snapshot, arrays
+
+    def close(self) -> None:
+        """End the connection."""
+        self._wire.close()
+
+    def _take(self, arrays: list[Array]) -> None:
+        try:
+            self._wire.take(arrays)
+        except TimeoutError as error:
+            raise self.too_late("sent its data", None) from error
+        except (EOFError, OSError) as error:
+            raise self._lost(error) from error
+        except MessageError as error:
+            raise FollowerMessageError(f"{self.name}: {error}") from error
+
+    def _allow(self, within_s: float | None) -> None:
+        self._socket.until_s = None if within_s is None else time.monotonic() + within_s
+
+    def too_late(self, what: str, within_s: float | None) -> FollowerTimeoutError:
+        """The error that says that the other end has not done `what` in time."""
+        span = "in time" if within_s is None else f"within {within_s:.3g} s"
+        return FollowerTimeoutError(
+            f"{self.name} has not {what} {span}: it is dead, stopped or too slow{self._cure}"
+        )
+
+    def _lost(self, error: Exception) -> FollowerLostError:
+        return FollowerLostError(f"{self.name} has ended ({error}){self._cure}")
+
+
+def _size(view: ArrayView) -> int:
+    """Bytes of an array.
+
+    Raises:
+        FollowerMessageError: of a dtype that holds no plain numbers, a shape that no array has, or
+            stamps of other samples.
+    """
+    shape, name = view.shape, view.name[:80]
+    if view.dtype not in _DTYPES:
+        known = ", ".join(sorted(_DTYPES))
+        raise FollowerMessageError(f"{name}: dtype '{view.dtype[:80]}' is none of {known}")
+    is_shape = 1 <= len(shape) <= _MAX_AXES and all(length >= 0 for length in shape)
+    if not is_shape or prod(length or 1 for length in shape) > FOLLOWERS.max_data:
+        raise FollowerMessageError(f"{name}: no array has the shape {str(shape)[:80]}")
+    if not len(view.stamps_s) == len(view.lost) == shape[0]:
+        raise FollowerMessageError(
+            f"{name}: {shape[0]} samples with {len(view.stamps_s)} stamps, {len(view.lost)} marks"
+        )
+    return prod(shape) * np.dtype(view.dtype).itemsize
+
+
+def listen(address: Address) -> socket.socket:
+    """Listen for followers, on this machine only.
+
+    A Unix socket lets in whom the file system lets in, at first its owner. A port of the loopback
+    lets in everybody who is logged in on this machine.
+
+    Args:
+        address: a path for a Unix socket, which must not be there; or a port, 0: any that is free.
+
+    Raises:
+        ConfigError: nobody can listen there.
+    """
+    if isinstance(address, int):
+        try:
+            return socket.create_server((LOOPBACK, address))
+        except (OSError, OverflowError) as error:
+            raise ConfigError(f"port {address}: cannot listen there ({error})") from error
+    path = _path_of(address)
+    _remove_leftover(path)
+    listener = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
+    before = os.umask(0o177)
+    try:
+        listener.bind(str(path))
+        listener.listen()
+    except OSError as error:
+        listener.close()
+        raise ConfigError(f"{path}: cannot listen there ({error})") from error
+    finally:
+        os.umask(before)
+    return listener
+
+
+def call(address: Address, within_s: float) -> Line:
+    """Connect to a world that listens at an address.
+
+    Raises:
+        FollowerLostError: nobody listens there.
+        ConfigError: a path that no socket can have.
+    """
+    family = socket.AF_INET if isinstance(address, int) else socket.AF_UNIX
+    place = (LOOPBACK, address) if isinstance(address, int) else str(_path_of(address))
+    where = f"the world at {address}"
+    connection = socket.socket(family, socket.SOCK_STREAM)
+    try:
+        connection.settimeout(within_s)
+        connection.connect(place)
+    except (OSError, OverflowError) as error:
+        connection.close()
+        raise FollowerLostError(f"{where} does not answer ({error}): is it running?") from error
+    return Line(connection, where)
+
+
+def _path_of(address: str | Path) -> Path:
+    path = Path(address)
+    if len(os.fsencode(path)) > MAX_PATH:
+        raise ConfigError(f"{path}: a socket's path has at most {MAX_PATH} bytes; shorten it")
+    return path
+
+
+def _remove_leftover(path: Path) -> None:
+    """Remove the socket of a world that has died, and nothing else."""
+    if not path.exists() or not stat.S_ISSOCK(path.stat().st_mode):
+        return
+    with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as probe:
+        try:
+            probe.connect(str(path))
+        except ConnectionRefusedError:
+            path.unlink()

@@ -1,0 +1,92 @@
+"""`StackDriver`: one stack a vehicle, from snapshots to controls, wherever these come from."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+
+from cavmarl.core.errors import ConfigError, FollowerMessageError
+from cavmarl.cosim.followers.follower_client import Sight
+from cavmarl.cosim.followers.follower_messages import VehicleView, Welcome
+from cavmarl.cosim.stack.hd_map import HdMap
+from cavmarl.cosim.stack.stack import Stack, StackConfig, sensor_of, vehicle_of
+from cavmarl.cosim.stack.stack_types import Mission
+from cavmarl.roads.network import RoadNetwork
+
+__all__ = ["StackDriver"]
+
+
+class StackDriver:
+    """Drives the vehicles of a follower.
+
+    Args:
+        network: the map, which has to be the world's.
+        welcome: how time goes there, and what the vehicles carry.
+        config: of the stacks.
+
+    Attributes:
+        stacks: of the vehicles that are driven now, by agent.
+
+    Raises:
+        ConfigError: another map, sensors that a stage needs and does not have, or meta-actions.
+    """
+
+    def __init__(
+        self, network: RoadNetwork, welcome: Welcome, config: StackConfig | None = None
+    ) -> None:
+        if welcome.map_hash != network.source_hash:
+            raise ConfigError(
+                f"{welcome.environment} is on another map than '{network.name}': give the stack "
+                "the environment or the map file that the world was made from"
+            )
+        if welcome.action != "continuous":
+            raise ConfigError("action.kind = discrete: the stack needs continuous controls")
+        self._edges = {name: row for row, name in enumerate(network.edge_ids)}
+        sensors = [sensor_of(view.name, view.settings) for view in welcome.sensors]
+        step_s = welcome.dt_s * welcome.ticks_per_step
+        self._vehicle = vehicle_of(HdMap(network), sensors, step_s)
+        self._scale = (welcome.acceleration_mps2, welcome.steering_rad)
+        self._config = StackConfig() if config is None else config
+        self._driven: dict[str, tuple[int, int]] = {}
+        self.stacks: dict[str, Stack] = {}
+        Stack(self._vehicle, self._config)  # to know now what it lacks
+
+    def drive(self, sight: Sight) -> dict[str, list[float]]:
+        """What the vehicles of a snapshot do; a new vehicle gets a new stack."""
+        signals = sight.sensors.get("", {}).get("signals")
+        shown = None if signals is None else np.asarray(signals.values[-1], dtype=np.uint8)
+        controls = {}
+        for agent, view in sight.snapshot.vehicles.items():
+            stack = self._stack_of(agent, sight.snapshot.episode, view.vehicle_id)
+            mission = self._mission(view)
+            readings = sight.sensors.get(agent, {})
+            driven = stack.drive(readings, shown, mission, sight.snapshot.time_s)
+            numbers = np.array(driven) / self._scale
+            controls[agent] = np.clip(numbers, -1.0, 1.0).tolist()
+        return controls
+
+    def report(self) -> Mapping[str, Mapping[str, float]]:
+        """Mean and worst wall time of the stages, in ms, over the stacks of now."""
+        found: dict[str, dict[str, float]] = {}
+        for stack in self.stacks.values():
+            for stage, seconds in stack.times.wall_s.items():
+                row = found.setdefault(stage, {"steps": 0, "mean_wall_ms": 0.0, "worst_wall_ms": 0})
+                row["steps"] += stack.times.steps
+                row["mean_wall_ms"] += 1e3 * seconds
+                worst = 1e3 * stack.times.worst_wall_s[stage]
+                row["worst_wall_ms"] = max(row["worst_wall_ms"], worst)
+        for row in found.values():
+            row["mean_wall_ms"] /= max(row["steps"], 1)
+        return found
+
+    def _stack_of(self, agent: str, episode: int, vehicle_id: int) -> Stack:
+        if self._driven.get(agent) != (episode, vehicle_id):
+            self._driven[agent] = (episode, vehicle_id)
+            self.stacks[agent] = Stack(self._vehicle, self._config)
+        return self.stacks[agent]
+
+    def _mission(self, view: VehicleView) -> Mission:
+        if view.goal_edge not in self._edges:
+            raise FollowerMessageError(f"no edge '{view.goal_edge[:80]}' on this map to drive to")
+        return Mission(self._edges[view.goal_edge], view.vclass, view.length_m, view.width_m)

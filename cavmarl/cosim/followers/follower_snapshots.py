@@ -1,0 +1,160 @@
+"""What followers see of a world: which of their vehicles are in it, and what their sensors have."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import asdict
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cavmarl.cosim.followers.follower_messages import (
+    ArrayView,
+    SensorView,
+    Snapshot,
+    VehicleView,
+    Welcome,
+)
+from cavmarl.env.parallel import CavEnv
+from cavmarl.env.vector import CavVectorEnv
+from cavmarl.parallel.driven_vehicles import Driven
+from cavmarl.roads.network import VEHICLE_CLASSES, RoadNetwork
+from cavmarl.sensors.mounted.frames import SensorFrames
+
+__all__ = ["Moment", "take_snapshot", "welcome_to"]
+
+NO_SIGNAL = 255
+
+
+def welcome_to(env: CavEnv | CavVectorEnv, vehicles: Sequence[str], tick: int) -> Welcome:
+    """How time goes in a world, and what its vehicles carry.
+
+    Args:
+        env: the world.
+        vehicles: that a follower has been given.
+        tick: the master's.
+    """
+    action, clock = env.config.action, env.config.clock
+    return Welcome(
+        environment=f"{env.config.name}-v{env.config.version}",
+        map_hash=env.network.source_hash,
+        vehicles=list(vehicles),
+        tick=tick,
+        dt_s=clock.sim_dt_s,
+        ticks_per_step=clock.ticks_per_step,
+        control_latency_ticks=clock.control_latency_ticks,
+        action=action.kind,
+        acceleration_mps2=action.acceleration_mps2,
+        steering_rad=action.steering_rad,
+        sensors=[
+            SensorView(name, list(sensor.units), asdict(sensor))
+            for name, sensor in env.config.rig.items()
+        ],
+    )
+
+
+class Moment(NamedTuple):
+    """When a snapshot is taken.
+
+    Attributes:
+        frame: its number.
+        episode: goes up with each reset.
+        tick: of the world, since its reset.
+        is_over: the episode has ended.
+    """
+
+    frame: int
+    episode: int
+    tick: int
+    is_over: bool
+
+
+def take_snapshot(
+    env: CavEnv | CavVectorEnv, agents: Sequence[int], moment: Moment, world: int = 0
+) -> tuple[Snapshot, list[NDArray[Any]]]:
+    """What a follower is sent.
+
+    Args:
+        env: the world or worlds.
+        agents: indices of the follower's.
+        moment: when that is.
+        world: which one, of several.
+
+    Returns:
+        the message, and its arrays.
+    """
+    worlds = env.worlds.arrays
+    due = [k for k in agents if worlds.mask[world, k] and not moment.is_over]
+    vehicles: dict[str, VehicleView] = {}
+    views: list[ArrayView] = []
+    arrays: list[NDArray[Any]] = []
+    time_s = moment.tick * env.config.clock.sim_dt_s
+    if due:
+        by_agent = {vehicle.agent: vehicle for vehicle in env.worlds.driven(world, due)}
+        for k in due:
+            name = env.possible_agents[k]
+            vehicles[name] = _view(env.network, by_agent[k])
+            for sensor, seen in _due(env, world, k, time_s).items():
+                data = np.ascontiguousarray(seen.data)
+                views.append(_array(name, sensor, data, seen.stamp_s, seen.lost))
+                arrays.append(data)
+        shown = _signals(env, world)
+        views.append(_array("", "signals", shown, np.array([time_s]), np.zeros(1, np.bool_)))
+        arrays.append(shown)
+    return Snapshot(
+        moment.frame, moment.episode, moment.tick, time_s, moment.is_over, vehicles, views
+    ), arrays
+
+
+def _due(
+    env: CavEnv | CavVectorEnv, world: int, agent: int, time_s: float
+) -> dict[str, SensorFrames]:
+    """What an agent's sensors have taken in the last step; without a rig, its observation."""
+    arrays = env.worlds.arrays
+    if not arrays.frames:
+        seen = arrays.observations[world, agent : agent + 1]
+        now, lost = np.array([time_s]), np.zeros(1, dtype=np.bool_)
+        return {"observation": SensorFrames(seen, now, lost, np.ones((), dtype=np.int64))}
+    found = {}
+    for name, frames in arrays.frames.items():
+        data, stamp_s, lost, fresh = (array[world, agent] for array in frames)
+        if fresh:
+            found[name] = SensorFrames(data[-fresh:], stamp_s[-fresh:], lost[-fresh:], fresh)
+    return found
+
+
+def _array(
+    vehicle: str,
+    name: str,
+    data: NDArray[Any],
+    stamp_s: NDArray[np.float64],
+    lost: NDArray[np.bool_],
+) -> ArrayView:
+    shape = list(data.shape)
+    return ArrayView(vehicle, name, data.dtype.str, shape, stamp_s.tolist(), lost.tolist())
+
+
+def _signals(env: CavEnv | CavVectorEnv, world: int) -> NDArray[np.uint8]:
+    """(1, num_links) what the signal of each link shows, as SIGNAL_* codes."""
+    network = env.network
+    shown = np.full((1, len(network.links)), NO_SIGNAL, dtype=np.uint8)
+    signal = network.links["signal"]
+    has_one = signal >= 0
+    phase = env.worlds.signal_phases(world)[signal[has_one]]
+    letter = network.phases["first_state"][phase] + network.links["signal_index"][has_one]
+    shown[0, has_one] = network.phase_states[letter]
+    return shown
+
+
+def _view(network: RoadNetwork, vehicle: Driven) -> VehicleView:
+    lane = int(network.edges["first_lane"][vehicle.goal_edge])
+    end = network.lane_polyline(lane)[-1]
+    return VehicleView(
+        vehicle_id=vehicle.vehicle_id,
+        vclass=VEHICLE_CLASSES[vehicle.vclass],
+        length_m=vehicle.length_m,
+        width_m=vehicle.width_m,
+        goal_edge=network.edge_ids[vehicle.goal_edge],
+        goal_m=[float(end[0]), float(end[1])],
+    )

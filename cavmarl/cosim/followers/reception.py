@@ -1,0 +1,119 @@
+"""`Reception`: takes in followers that call while a world runs, without waiting for any of them."""
+
+from __future__ import annotations
+
+import selectors
+import time
+from collections.abc import Iterator
+from contextlib import suppress
+
+from cavmarl.core.errors import FollowerError, FollowerMessageError
+from cavmarl.cosim.followers.follower_connection import Address, Line, listen
+from cavmarl.cosim.followers.follower_messages import MAX_VEHICLES, Hello, Refusal, Say, read_letter
+
+__all__ = ["Reception", "refuse"]
+
+GREETING_S = 5.0  # for one who has called to say who it is
+HEARING_S = 1.0  # for what has begun to arrive
+MAX_GUESTS = 64  # who have not said who they are
+GOES_ON = (
+    "the world is whole and can be stepped on, with the built-in driver in its place or another "
+    "follower"
+)
+
+
+class Reception:
+    """Listens at an address.
+
+    Args:
+        address: path of a Unix socket, or a port of this machine.
+
+    Attributes:
+        address: where it listens; the port that was found, where any would do.
+        turned_away: how many callers were not understood, or said nothing.
+
+    Raises:
+        ConfigError: nobody can listen there.
+    """
+
+    def __init__(self, address: Address) -> None:
+        self._listener = listen(address)
+        self._listener.setblocking(False)
+        name = self._listener.getsockname()
+        self.address: Address = name[1] if isinstance(name, tuple) else name
+        self.turned_away = 0
+        self._selector = selectors.DefaultSelector()
+        self._selector.register(self._listener, selectors.EVENT_READ)
+        self._since: dict[Line, float] = {}
+
+    def callers(self, within_s: float = 0.0) -> Iterator[tuple[Line, Hello]]:
+        """Those who have said who they are since the last call, in the order of their calls.
+
+        Args:
+            within_s: how long to wait until somebody moves; 0: not at all.
+        """
+        heard = self._selector.select(within_s)
+        for key, _ in sorted(heard, key=lambda found: found[0].fd):
+            if key.fileobj is self._listener:
+                self._open()
+                continue
+            line = key.data
+            self._forget(line)
+            try:
+                yield line, self._greeting(line)
+            except FollowerError as error:
+                self.turn_away(line, str(error))
+        self._dismiss_the_silent()
+
+    def turn_away(self, line: Line, reason: str) -> None:
+        """Say why, and hang up."""
+        self.turned_away += 1
+        refuse(line, reason)
+
+    def close(self) -> None:
+        """Listen no more; a Unix socket's path is removed."""
+        for line in list(self._since):
+            self._forget(line)
+            line.close()
+        self._selector.close()
+        self._listener.close()
+
+    def _open(self) -> None:
+        try:
+            connection, _ = self._listener.accept()
+        except OSError:  # it is gone already
+            return
+        line = Line(connection, "a caller", GOES_ON)
+        if len(self._since) == MAX_GUESTS:
+            self.turn_away(line, "too many have called and not said who they are")
+            return
+        self._since[line] = time.monotonic()
+        self._selector.register(line, selectors.EVENT_READ, line)
+
+    def _greeting(self, line: Line) -> Hello:
+        heard = line.hear(HEARING_S)
+        if heard.kind is not Say.HELLO:
+            raise FollowerMessageError(f"a caller begins with {heard.kind.name}: HELLO comes first")
+        line.skip(heard)
+        hello = read_letter(Hello, heard.letter)
+        if len(hello.vehicles) > MAX_VEHICLES:
+            raise FollowerMessageError(f"a caller wants {len(hello.vehicles)} vehicles")
+        line.name = f"follower '{hello.name[:80]}'"
+        return hello
+
+    def _dismiss_the_silent(self) -> None:
+        for line, since in list(self._since.items()):
+            if time.monotonic() - since > GREETING_S:
+                self._forget(line)
+                self.turn_away(line, f"said nothing within {GREETING_S:g} s")
+
+    def _forget(self, line: Line) -> None:
+        del self._since[line]
+        self._selector.unregister(line)
+
+
+def refuse(line: Line, reason: str) -> None:
+    """Tell a follower why it is not gone on with, if it still listens, and hang up."""
+    with suppress(FollowerError):
+        line.say(Say.REFUSAL, Refusal(reason), within_s=HEARING_S)
+    line.close()

@@ -1,0 +1,248 @@
+"""Localisation by GNSS, IMU and odometry: an extended Kalman filter of x, y, heading and speed.
+
+The model is that of Thrun, Burgard, Fox: "Probabilistic Robotics", 2005, chapter 3.3, with the
+kinematic bicycle's slip angle: the centre moves at heading + asin(r L / 2 v) where r is the yaw
+rate and L the length between the axles. The first fix tells the place; the heading comes from the
+lane there, and is turned round if the fixes go the other way. Where a sensor sees lane markings,
+these say how far from the middle of its lane the vehicle is.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cavmarl.cosim.stack.hd_map import HdMap, OnLane, wrap
+from cavmarl.cosim.stack.stack_types import Mission, Mount, Pose, Readings, Samples, Sensor
+from cavmarl.sensors.kernels.inertia import GRAVITY_MPS2
+from cavmarl.sensors.mounted.geodesy import Geodesy
+
+__all__ = ["GnssInertial"]
+
+# Standard deviations: of what the model leaves out, a square root of a second, and of sensors
+# whose settings give none.
+_DRIFT = (0.1, 0.1, 0.01, 0.5)
+_LEAST = {"gnss": 0.05, "odometry": 0.02, "lane_d": 0.05, "lane_heading": 0.02}
+_FIRST_HEADING_RAD = 0.3
+_LANE_SEARCH_M = 8.0
+_LANE_MATCH_M = 4.0
+_LANE_SURE_M = 0.6  # lateral deviation below which lanes can be told apart
+_GATE = 9.0  # squared deviations beyond which what a camera says of lanes is not believed
+_COURSE_M = 8.0  # driven before the fixes' course is compared with the heading
+_STRAIGHT_RAD = 0.5
+
+
+class GnssInertial:
+    """The filter.
+
+    Args:
+        sensors: of the vehicle; one GNSS at least.
+        geodesy: where the map is on the earth.
+        hd_map: the lanes.
+        tick_s: seconds a step of the stack.
+    """
+
+    def __init__(
+        self, sensors: Sequence[Sensor], geodesy: Geodesy, hd_map: HdMap, tick_s: float
+    ) -> None:
+        self._by_type = {sensor.type: sensor for sensor in sensors}
+        self._geodesy = geodesy
+        self._map = hd_map
+        self._tick_s = tick_s
+        self._state: NDArray[np.float64] | None = None
+        self._spread = np.eye(4)
+        self._yaw_rate = 0.0
+        self._before_s: float | None = None
+        self._anchor: tuple[float, float] | None = None
+        self._driven_m = self._turned_rad = 0.0
+
+    def reset_pose(self, pose: Pose) -> None:
+        """Be told where the vehicle is, to within some centimetres."""
+        self._state = np.array([pose.x_m, pose.y_m, pose.heading_rad, pose.speed_mps])
+        self._spread = np.diag([0.05, 0.05, 0.02, 0.2]) ** 2
+        self._anchor = None
+
+    def locate(self, readings: Readings, mission: Mission, time_s: float) -> Pose | None:
+        """Predict to `time_s` and take in what the sensors have."""
+        elapsed_s = 0.0 if self._before_s is None else time_s - self._before_s
+        self._before_s = time_s
+        fix = self._fix(readings)
+        if self._state is None:
+            if fix is None:
+                return None
+            self._begin(fix, readings)
+        elif elapsed_s > 0.0:
+            self._predict(readings, mission, elapsed_s)
+        if fix is not None:
+            self._take_fix(fix)
+        speed = self._newest(readings, "odometry")
+        if speed is not None:
+            deviation = self._deviation("odometry", 0, _LEAST["odometry"])
+            ahead = float(speed[0]) - float(self._get()[3])
+            self._take(np.array([0.0, 0.0, 0.0, 1.0]), ahead, deviation, gate=math.inf)
+        self._take_lane(readings)
+        x_m, y_m, heading, speed_mps = self._get().tolist()
+        return Pose(x_m, y_m, wrap(heading), max(0.0, speed_mps), self._yaw_rate)
+
+    def _get(self) -> NDArray[np.float64]:
+        assert self._state is not None
+        return self._state
+
+    def _newest(self, readings: Readings, kind: str) -> NDArray[np.float64] | None:
+        """The newest sample of a type of sensor that was not lost."""
+        samples = self._samples(readings, kind)
+        if samples is None or samples.lost.all():
+            return None
+        return np.asarray(samples.values[~samples.lost][-1], dtype=np.float64)
+
+    def _samples(self, readings: Readings, kind: str) -> Samples | None:
+        sensor = self._by_type.get(kind)
+        return None if sensor is None else readings.get(sensor.name)
+
+    def _deviation(self, kind: str, channel: int, least: float) -> float:
+        """What a sensor's settings say of its noise."""
+        noise = self._by_type[kind].settings["noise"]
+        return max(least, float(noise[min(channel, len(noise) - 1)]))
+
+    def _fix(self, readings: Readings) -> tuple[float, float] | None:
+        """The place of the antenna on the map."""
+        found = self._newest(readings, "gnss")
+        if found is None:
+            return None
+        x_m, y_m, _ = self._geodesy.to_map(found[None, :])[0]
+        return float(x_m), float(y_m)
+
+    def _begin(self, fix: tuple[float, float], readings: Readings) -> None:
+        """The first fix, and the direction of the lane there."""
+        lanes = self._map.near(*fix, _LANE_SEARCH_M)
+        roads = [place for place in lanes if not self._map.network.lanes["internal"][place.lane]]
+        best = (roads or lanes or [OnLane(-1, 0.0, 0.0, 0.0)])[0]
+        speed = self._newest(readings, "odometry")
+        speed_mps = 0.0 if speed is None else float(speed[0])
+        mount = self._by_type["gnss"].mount
+        x_m, y_m = _centre(fix, mount, best.heading_rad)
+        self._state = np.array([x_m, y_m, best.heading_rad, speed_mps])
+        deviation = self._deviation("gnss", 0, _LEAST["gnss"])
+        self._spread = np.diag([deviation, deviation, _FIRST_HEADING_RAD, 2.0]) ** 2
+        self._anchor = fix
+        self._driven_m = self._turned_rad = 0.0
+
+    def _predict(self, readings: Readings, mission: Mission, elapsed_s: float) -> None:
+        """Where the model and the inertial sensors say that it is now."""
+        state = self._get()
+        accel, self._yaw_rate = self._inertia(readings)
+        x_m, y_m, heading, speed = state.tolist()
+        half = 0.5 * mission.length_m
+        slip = math.asin(max(-0.9, min(0.9, self._yaw_rate * half / speed))) if speed > 1.0 else 0.0
+        course = heading + slip + 0.5 * self._yaw_rate * elapsed_s
+        driven = max(0.0, speed + 0.5 * accel * elapsed_s) * elapsed_s
+        cos, sin = math.cos(course), math.sin(course)
+        self._state = np.array(
+            [
+                x_m + driven * cos,
+                y_m + driven * sin,
+                heading + self._yaw_rate * elapsed_s,
+                speed + accel * elapsed_s,
+            ]
+        )
+        slope = np.eye(4)
+        slope[0, 2], slope[1, 2] = -driven * sin, driven * cos
+        slope[0, 3], slope[1, 3] = elapsed_s * cos, elapsed_s * sin
+        drift = np.diag(_DRIFT) ** 2 * elapsed_s
+        self._spread = slope @ self._spread @ slope.T + drift
+        self._driven_m += driven
+        self._turned_rad += abs(self._yaw_rate) * elapsed_s
+
+    def _inertia(self, readings: Readings) -> tuple[float, float]:
+        """Acceleration along the body and yaw rate, the means of what came since the last step."""
+        samples = self._samples(readings, "imu")
+        if samples is not None and not samples.lost.all():
+            force_x, _, force_z, _, _, turn = samples.values[~samples.lost].mean(axis=0).tolist()
+            pitch = math.acos(max(-1.0, min(1.0, force_z / GRAVITY_MPS2)))
+            # A pitch as small as the noise of the force along z would be no more than noise.
+            climbs = math.copysign(GRAVITY_MPS2 * math.sin(pitch), force_x) if pitch > 0.15 else 0.0
+            return force_x - climbs, turn
+        wheels = self._newest(readings, "odometry")
+        return 0.0, self._yaw_rate if wheels is None else float(wheels[1])
+
+    def _take_fix(self, fix: tuple[float, float]) -> None:
+        state = self._get()
+        x_m, y_m = _centre(fix, self._by_type["gnss"].mount, float(state[2]))
+        for axis, seen in enumerate((x_m, y_m)):
+            row = np.zeros(4)
+            row[axis] = 1.0
+            deviation = self._deviation("gnss", axis, _LEAST["gnss"])
+            self._take(row, seen - float(self._get()[axis]), deviation, gate=math.inf)
+        self._compare_course(fix)
+
+    def _compare_course(self, fix: tuple[float, float]) -> None:
+        """Turn round if the fixes go where the heading does not."""
+        if self._anchor is None or self._driven_m < _COURSE_M:
+            return
+        east, north = fix[0] - self._anchor[0], fix[1] - self._anchor[1]
+        state = self._get()
+        if self._turned_rad < _STRAIGHT_RAD:
+            apart = wrap(math.atan2(north, east) - float(state[2]))
+            if abs(apart) > 0.5 * math.pi:
+                state[:3] = fix[0], fix[1], wrap(float(state[2]) + apart)
+                self._spread = np.diag([1.0, 1.0, _FIRST_HEADING_RAD, 1.0]) ** 2
+        self._anchor = fix
+        self._driven_m = self._turned_rad = 0.0
+
+    def _take_lane(self, readings: Readings) -> None:
+        """Where lane markings are, if lanes can be told apart."""
+        seen = self._newest(readings, "lane_boundary")
+        if seen is None:
+            return
+        x_m, y_m, heading, _ = self._get().tolist()
+        if math.sqrt(max(self._spread[0, 0], self._spread[1, 1])) > _LANE_SURE_M:
+            return
+        offset = 0.5 * float(seen[1] - seen[0])
+        near = self._map.near(x_m, y_m, _LANE_MATCH_M)
+        internal = self._map.network.lanes["internal"]
+        candidates = [
+            (abs(offset - place.d_m), place)
+            for place in near
+            if abs(wrap(heading - float(seen[3]) - place.heading_rad)) < _FIRST_HEADING_RAD
+        ]
+        # Within junctions lanes lie across each other, and nobody can tell which one was seen.
+        if not candidates or any(internal[place.lane] for place in near):
+            return
+        _, place = min(candidates, key=lambda found: found[0])
+        row = np.array([-math.sin(place.heading_rad), math.cos(place.heading_rad), 0.0, 0.0])
+        deviation = self._deviation("lane_boundary", 0, _LEAST["lane_d"])
+        if self._take(row, offset - place.d_m, deviation):
+            turn = wrap(place.heading_rad + float(seen[3]) - float(self._get()[2]))
+            deviation = self._deviation("lane_boundary", 3, _LEAST["lane_heading"])
+            self._take(np.array([0.0, 0.0, 1.0, 0.0]), turn, deviation)
+
+    def _take(
+        self, row: NDArray[np.float64], surprise: float, deviation: float, gate: float = _GATE
+    ) -> bool:
+        """Take in one number; whether it was believed.
+
+        Args:
+            row: (4,) how it depends on the state.
+            surprise: the number less what was expected.
+            deviation: of its noise.
+            gate: squared deviations beyond which it is not believed.
+        """
+        spread = float(row @ self._spread @ row) + deviation**2
+        if surprise**2 > gate * spread:
+            return False
+        gain = self._spread @ row / spread
+        self._state = self._get() + gain * surprise
+        self._spread = self._spread - np.outer(gain, row @ self._spread)
+        return True
+
+
+def _centre(fix: tuple[float, float], mount: Mount, heading: float) -> tuple[float, float]:
+    """Where the vehicle's centre is when its antenna is at a place."""
+    cos, sin = math.cos(heading), math.sin(heading)
+    return (
+        fix[0] - mount.x_m * cos + mount.y_m * sin,
+        fix[1] - mount.x_m * sin - mount.y_m * cos,
+    )

@@ -1,0 +1,165 @@
+"""Perception from a lidar: echoes near roads are grouped into objects, which are followed.
+
+Neighbouring echoes belong together where they are no farther apart than `_GAP_M` and the distance
+between two rays there. What lies off the lanes is a building or a parked thing and is left out. An
+object is a box along the lane that it is on; its velocity comes from an alpha-beta filter
+(Kalata: "The tracking index", IEEE Trans. AES 20, 1984) over the boxes of the last steps.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cavmarl.cosim.stack.hd_map import HdMap, OnLane, wrap
+from cavmarl.cosim.stack.stack_types import Obstacle, Pose, Readings, Sensor
+
+__all__ = ["LidarObjects"]
+
+_GAP_M = 0.8
+_ROAD_M = 2.5  # from the centre of a lane
+_RANGE_MARGIN_M = 0.05
+_MATCH_M = 3.0  # between an object and where it was expected
+_ALPHA, _BETA = 0.5, 0.2
+_FORGET_S = 0.5
+_STILL_MPS = 0.6
+_FEW = 3  # steps before a velocity is believed
+
+
+@dataclass
+class _Track:
+    """An object that has been seen before."""
+
+    x_m: float
+    y_m: float
+    vx_mps: float
+    vy_mps: float
+    seen_s: float
+    times: int
+
+
+class LidarObjects:
+    """The stage.
+
+    Args:
+        sensors: of the vehicle; those that are lidars are used.
+        hd_map: the lanes.
+    """
+
+    def __init__(self, sensors: Sequence[Sensor], hd_map: HdMap) -> None:
+        self._lidars = [sensor for sensor in sensors if sensor.type == "lidar"]
+        self._map = hd_map
+        self._tracks: list[_Track] = []
+        self._last: list[Obstacle] = []
+
+    def perceive(self, readings: Readings, pose: Pose, time_s: float) -> list[Obstacle]:
+        """Objects on the road; between two scans, those of the last one, moved on."""
+        echoes = []
+        for lidar in self._lidars:
+            samples = readings.get(lidar.name)
+            if samples is not None and not samples.lost.all():
+                scan = np.asarray(samples.values[~samples.lost][-1], dtype=np.float64)
+                echoes.extend(_groups(lidar, scan, pose))
+        if echoes:
+            boxes = [box for group in echoes if (box := self._box(group, pose)) is not None]
+            self._last = [self._follow(box, time_s) for box in boxes]
+            self._tracks = [track for track in self._tracks if time_s - track.seen_s < _FORGET_S]
+        return self._last
+
+    def _box(self, group: NDArray[np.float64], pose: Pose) -> Obstacle | None:
+        """The box around echoes (n, 2), along the lane that they are on; None: off the road."""
+        x_m, y_m = group.mean(axis=0).tolist()
+        lanes = self._map.near(x_m, y_m, _ROAD_M)
+        if not lanes:
+            return None
+        heading = _along(lanes, pose)
+        cos, sin = math.cos(heading), math.sin(heading)
+        along, across = group @ (cos, sin), group @ (-sin, cos)
+        middle_along = 0.5 * float(along.min() + along.max())
+        middle_across = 0.5 * float(across.min() + across.max())
+        return Obstacle(
+            middle_along * cos - middle_across * sin,
+            middle_along * sin + middle_across * cos,
+            heading,
+            float(np.ptp(along)),
+            float(np.ptp(across)),
+            0.0,
+            0.0,
+        )
+
+    def _follow(self, box: Obstacle, time_s: float) -> Obstacle:
+        """The box with the velocity of the object that it is taken for."""
+        best, nearest = None, _MATCH_M
+        for track in self._tracks:
+            elapsed = time_s - track.seen_s
+            if elapsed <= 0.0:
+                continue
+            off = math.hypot(
+                box.x_m - track.x_m - track.vx_mps * elapsed,
+                box.y_m - track.y_m - track.vy_mps * elapsed,
+            )
+            if off < nearest:
+                best, nearest = track, off
+        if best is None:
+            self._tracks.append(_Track(box.x_m, box.y_m, 0.0, 0.0, time_s, 1))
+            return box
+        elapsed = time_s - best.seen_s
+        for axis, speed, seen in (("x_m", "vx_mps", box.x_m), ("y_m", "vy_mps", box.y_m)):
+            expected = getattr(best, axis) + getattr(best, speed) * elapsed
+            surprise = seen - expected
+            # The first two sightings are the best guess of a velocity that there is.
+            beta = 1.0 if best.times == 1 else _BETA
+            setattr(best, axis, expected + _ALPHA * surprise)
+            setattr(best, speed, getattr(best, speed) + beta * surprise / elapsed)
+        best.seen_s, best.times = time_s, best.times + 1
+        speed_mps = math.hypot(best.vx_mps, best.vy_mps)
+        if best.times < _FEW or speed_mps < _STILL_MPS:
+            return box
+        return box._replace(vx_mps=best.vx_mps, vy_mps=best.vy_mps)
+
+
+def _along(lanes: Sequence[OnLane], pose: Pose) -> float:
+    """The direction of the nearest lane; of two in opposite directions the one of our own."""
+    nearest = lanes[0].heading_rad
+    apart = abs(wrap(nearest - pose.heading_rad))
+    return nearest if apart < 0.5 * math.pi else wrap(nearest + math.pi)
+
+
+def _groups(lidar: Sensor, scan: NDArray[np.float64], pose: Pose) -> list[NDArray[np.float64]]:
+    """Echoes on the map, (n, 2) each group.
+
+    Args:
+        lidar: the sensor.
+        scan: (layers, rays) distances in m.
+        pose: of the vehicle.
+    """
+    settings = lidar.settings
+    layers, rays, fov = scan.shape[0], scan.shape[1], math.radians(settings["fov_deg"])
+    level = 0
+    if layers > 1:
+        elevations = np.linspace(settings["lower_deg"], settings["upper_deg"], layers)
+        level = int(np.argmin(np.abs(elevations)))
+    all_around = settings["fov_deg"] == 360.0
+    step = fov / rays if all_around else fov / max(rays - 1, 1)
+    azimuths = np.arange(rays) * step - (0.0 if all_around else 0.5 * fov) + lidar.mount.yaw_rad
+    ranges = scan[level]
+    is_echo = ranges < settings["range_m"] - _RANGE_MARGIN_M
+    x_m = lidar.mount.x_m + ranges * np.cos(azimuths)
+    y_m = lidar.mount.y_m + ranges * np.sin(azimuths)
+    cos, sin = math.cos(pose.heading_rad), math.sin(pose.heading_rad)
+    points = np.stack([pose.x_m + x_m * cos - y_m * sin, pose.y_m + x_m * sin + y_m * cos], axis=1)
+    (hits,) = np.nonzero(is_echo)
+    if not hits.size:
+        return []
+    apart = np.hypot(*(points[hits[1:]] - points[hits[:-1]]).T)
+    allowed = _GAP_M + np.maximum(ranges[hits[1:]], ranges[hits[:-1]]) * step
+    groups = np.split(hits, np.flatnonzero(apart > allowed) + 1)
+    if all_around and len(groups) > 1:
+        first, last = groups[0][0], groups[-1][-1]
+        if np.hypot(*(points[first] - points[last])) <= _GAP_M + ranges[first] * step:
+            groups[0] = np.concatenate([groups.pop(), groups[0]])
+    return [points[group] for group in groups]

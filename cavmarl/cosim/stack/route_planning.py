@@ -1,0 +1,324 @@
+"""Planning over the lane graph: the way to the goal, and how fast along it.
+
+The way is that of `roads.routing.make_plans`, the map as it is. Along it the acceleration is the
+least of what the Intelligent Driver Model (Treiber, Hennecke, Helbing, 2000) asks for behind
+whatever is on the way, and behind a standing obstacle at each line where a signal or somebody with
+the right of way says to stop.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from functools import lru_cache
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cavmarl.core.records.codes import (
+    SIGNAL_GREEN_MAJOR,
+    SIGNAL_NONE,
+    SIGNAL_RED,
+    SIGNAL_RED_YELLOW,
+    SIGNAL_YELLOW_MAJOR,
+    SIGNAL_YELLOW_MINOR,
+)
+from cavmarl.cosim.stack.hd_map import HdMap, OnLane, wrap
+from cavmarl.cosim.stack.stack_types import Mission, Obstacle, Pose, Trajectory
+from cavmarl.roads.routing import make_plans
+
+__all__ = ["LaneRoute"]
+
+_AHEAD_M = 70.0
+_MATCH_M = 5.0
+_HEADING_COST_M = 3.0  # of a radian, against metres beside a lane
+_EXPECTED_M = 1.5  # by which a lane on the way is preferred
+_ACCEL, _DECEL, _HEADWAY_S, _GAP_M = 1.5, 2.5, 1.4, 2.0
+_HARDEST = 6.0
+_BESIDE_M = 0.3  # that is left to a body beside the way
+_BEND_MPS2 = 2.0  # sideways, in a bend
+_BRAKE_FOR_YELLOW = 3.0
+_CLEAR_S = 4.0  # that others who go first are away from where the ways meet
+_CLEAR_M = 12.0
+_CHANGE_BEHIND_M, _CHANGE_AHEAD_M = 10.0, 6.0
+_SIGHT_M = 50.0  # before a line, from where on it is looked at
+_STANDS_MPS = 0.7
+
+
+class _Limit(NamedTuple):
+    accel: float
+    reason: str
+
+
+class LaneRoute:
+    """The stage.
+
+    Args:
+        hd_map: the lanes.
+    """
+
+    def __init__(self, hd_map: HdMap) -> None:
+        self._map = hd_map
+        self._network = hd_map.network
+        self._expected: tuple[int, ...] = ()
+
+    def plan(
+        self,
+        pose: Pose,
+        obstacles: Sequence[Obstacle],
+        signals: NDArray[np.uint8] | None,
+        mission: Mission,
+    ) -> Trajectory:
+        """The way from here on."""
+        plan = _plan_of(self._map, mission.goal_edge, mission.vclass)
+        here = self._here(pose, plan)
+        if here is None:
+            straight = np.array([[0.0, 0.0], [10.0, 0.0]]) @ _turn(pose.heading_rad)
+            return Trajectory(straight + np.array([pose.x_m, pose.y_m]), -_DECEL, "end")
+        here = self._change_lane(here, pose, plan, obstacles)
+        lanes, starts, points, ends = self._way(here, plan)
+        self._expected = tuple(lanes)
+        limits = [
+            self._free(pose, here, lanes, starts, points),
+            *self._gaps(pose, points, obstacles, mission),
+            *self._lines(pose, lanes, starts, plan, obstacles, signals, mission),
+        ]
+        if ends is not None:
+            limits.append(_Limit(_behind(pose.speed_mps, 0.0, ends), "end"))
+        hardest = min(limits, key=lambda limit: limit.accel)
+        return Trajectory(points, max(hardest.accel, -_HARDEST), hardest.reason, lanes)
+
+    def _here(self, pose: Pose, plan: NDArray[np.void]) -> OnLane | None:
+        """The lane that the vehicle is on, of those that lead to the goal."""
+        best, least = None, math.inf
+        for place in self._map.near(pose.x_m, pose.y_m, _MATCH_M):
+            apart = abs(wrap(pose.heading_rad - place.heading_rad))
+            if not np.isfinite(plan["to_go"][place.lane]) or apart > 1.2:
+                continue
+            cost = abs(place.d_m) + _HEADING_COST_M * apart
+            cost -= _EXPECTED_M if place.lane in self._expected else 0.0
+            if cost < least:
+                best, least = place, cost
+        return best
+
+    def _change_lane(
+        self, here: OnLane, pose: Pose, plan: NDArray[np.void], obstacles: Sequence[Obstacle]
+    ) -> OnLane:
+        """The lane beside, where the way needs it and there is room."""
+        change = int(plan["change"][here.lane])
+        row = self._network.lanes[here.lane]
+        if change == 0 or row["internal"]:
+            return here
+        beside = int(row["left"] if change > 0 else row["right"])
+        if beside < 0:
+            return here
+        there = self._map.on_lane(beside, pose.x_m, pose.y_m)
+        for obstacle in obstacles:
+            place = self._map.on_lane(beside, obstacle.x_m, obstacle.y_m)
+            half = 0.5 * obstacle.length_m
+            gap = place.s_m - there.s_m
+            speed = math.hypot(obstacle.vx_mps, obstacle.vy_mps)
+            behind = _CHANGE_BEHIND_M + max(0.0, speed - pose.speed_mps) * 2.0 + half
+            ahead = _CHANGE_AHEAD_M + max(0.0, pose.speed_mps - speed) * 2.0 + half
+            if abs(place.d_m) < 0.5 * float(row["width_m"]) and -behind < gap < ahead:
+                return here
+        return there
+
+    def _way(
+        self, here: OnLane, plan: NDArray[np.void]
+    ) -> tuple[list[int], list[float], NDArray[np.float64], float | None]:
+        """Lanes ahead, where each begins, their points, and where the way ends, all from here."""
+        lanes, starts = [here.lane], [-here.s_m]
+        pieces = [self._map.polyline(here.lane, here.s_m)]
+        reached = float(self._network.lanes["length_m"][here.lane]) - here.s_m
+        ends = None
+        while reached < _AHEAD_M:
+            following = int(plan["next"][lanes[-1]])
+            if plan["change"][lanes[-1]] != 0 or following < 0:
+                # Of a lane that has to be left, the end is a place to wait; so is the goal's.
+                ends = reached if plan["change"][lanes[-1]] != 0 else None
+                break
+            lanes.append(following)
+            starts.append(reached)
+            pieces.append(self._map.polyline(following, 0.0))
+            reached += float(self._network.lanes["length_m"][following])
+        points = np.concatenate(pieces)
+        apart = np.hypot(*np.diff(points, axis=0).T)
+        kept = np.concatenate([[True], apart > 0.05])
+        points = points[kept]
+        if len(points) < 2:
+            step = np.array([math.cos(here.heading_rad), math.sin(here.heading_rad)])
+            points = np.stack([points[0], points[0] + step])
+        return lanes, starts, points, ends
+
+    def _free(
+        self,
+        pose: Pose,
+        here: OnLane,
+        lanes: Sequence[int],
+        starts: Sequence[float],
+        points: NDArray[np.float64],
+    ) -> _Limit:
+        """Towards the limits of the lanes, and slowly enough for the bends."""
+        speed = max(pose.speed_mps, 0.1)
+        limit = float(self._network.lanes["speed_mps"][here.lane])
+        accel = _ACCEL * (1.0 - (speed / limit) ** 4)
+        for lane, start in zip(lanes[1:], starts[1:], strict=True):
+            ahead = float(self._network.lanes["speed_mps"][lane])
+            accel = min(accel, _slow_to(speed, ahead, start))
+        for distance, allowed in _bends(points):
+            accel = min(accel, _slow_to(speed, allowed, distance))
+        return _Limit(accel, "free")
+
+    def _gaps(
+        self,
+        pose: Pose,
+        points: NDArray[np.float64],
+        obstacles: Sequence[Obstacle],
+        mission: Mission,
+    ) -> list[_Limit]:
+        """Behind everything that is on the way."""
+        found = []
+        for obstacle in obstacles:
+            s, d, cos, sin = _beside(points, obstacle.x_m, obstacle.y_m)
+            half_width = 0.5 * max(obstacle.width_m, 0.5)
+            free = 0.5 * mission.width_m + half_width + _BESIDE_M
+            if s <= 0.0 or abs(d) > free:
+                continue
+            gap = s - 0.5 * obstacle.length_m - 0.5 * mission.length_m
+            speed = max(0.0, obstacle.vx_mps * cos + obstacle.vy_mps * sin)
+            found.append(_Limit(_behind(pose.speed_mps, speed, gap), "gap"))
+        return found
+
+    def _lines(
+        self,
+        pose: Pose,
+        lanes: Sequence[int],
+        starts: Sequence[float],
+        plan: NDArray[np.void],
+        obstacles: Sequence[Obstacle],
+        signals: NDArray[np.uint8] | None,
+        mission: Mission,
+    ) -> list[_Limit]:
+        """Before lines where somebody else goes first."""
+        found = []
+        for lane, start in zip(lanes, starts, strict=True):
+            link = int(plan["link"][lane])
+            row = self._network.lanes[lane]
+            if link < 0 or row["internal"] or plan["change"][lane] != 0:
+                continue
+            line = start + float(row["length_m"]) - float(row["stop_back_m"])
+            gap = line - 0.5 * mission.length_m
+            if gap < -1.0 or gap > _SIGHT_M:
+                continue
+            code = SIGNAL_NONE if signals is None else int(signals[link])
+            reason = self._stops(link, code, pose, gap, obstacles)
+            if reason:
+                # The gap of the model is kept from cars; before a line half a metre is enough.
+                room = gap + _GAP_M - 0.5
+                found.append(_Limit(_behind(pose.speed_mps, 0.0, room), reason))
+        return found
+
+    def _stops(
+        self, link: int, code: int, pose: Pose, gap: float, obstacles: Sequence[Obstacle]
+    ) -> str:
+        """Why to stop before a link; nothing: there is no reason."""
+        if code in (SIGNAL_RED, SIGNAL_RED_YELLOW):
+            return "stop_line"
+        if code in (SIGNAL_YELLOW_MINOR, SIGNAL_YELLOW_MAJOR):
+            needed = pose.speed_mps**2 / (2.0 * max(gap, 0.1))
+            return "stop_line" if needed < _BRAKE_FOR_YELLOW else ""
+        if code != SIGNAL_GREEN_MAJOR and self._must_yield(link, obstacles):
+            return "yield"
+        return ""
+
+    def _must_yield(self, link: int, obstacles: Sequence[Obstacle]) -> bool:
+        """Whether somebody with the right of way is inside the junction or about to be."""
+        network = self._network
+        row = network.links[link]
+        conflicts = network.conflicts[
+            row["first_conflict"] : row["first_conflict"] + row["num_conflicts"]
+        ]
+        foes = conflicts["foe"][conflicts["must_yield"]]
+        if not foes.size:
+            return False
+        inside = {int(network.links["first_internal"][foe]) for foe in foes}
+        before = {int(network.links["from_lane"][foe]) for foe in foes}
+        for obstacle in obstacles:
+            speed = math.hypot(obstacle.vx_mps, obstacle.vy_mps)
+            if speed < _STANDS_MPS:
+                continue
+            course = math.atan2(obstacle.vy_mps, obstacle.vx_mps)
+            for place in self._map.near(obstacle.x_m, obstacle.y_m, 2.5):
+                if abs(wrap(course - place.heading_rad)) > 1.0:
+                    continue
+                left = float(network.lanes["length_m"][place.lane]) - place.s_m
+                if place.lane in inside or (
+                    place.lane in before and (left < speed * _CLEAR_S or left < _CLEAR_M)
+                ):
+                    return True
+        return False
+
+
+@lru_cache(maxsize=64)
+def _plan_of(hd_map: HdMap, goal_edge: int, vclass: str) -> NDArray[np.void]:
+    """PLAN (L,) to a goal."""
+    plan: NDArray[np.void] = make_plans(hd_map.network, [goal_edge], vclass)[0]
+    return plan
+
+
+def _turn(heading: float) -> NDArray[np.float64]:
+    """The matrix that turns rows by a heading."""
+    cos, sin = math.cos(heading), math.sin(heading)
+    return np.array([[cos, sin], [-sin, cos]])
+
+
+def _behind(speed: float, ahead_mps: float, gap: float) -> float:
+    """The IDM's acceleration behind something, without its wish for speed."""
+    closing = speed * (speed - ahead_mps) / (2.0 * math.sqrt(_ACCEL * _DECEL))
+    wanted = _GAP_M + max(0.0, speed * _HEADWAY_S + closing)
+    return _ACCEL * (1.0 - (wanted / max(gap, 0.1)) ** 2)
+
+
+def _slow_to(speed: float, allowed: float, distance: float) -> float:
+    """The acceleration with which a lower speed is reached in time; _ACCEL: no need yet."""
+    if speed <= allowed:
+        return _ACCEL if distance > 0.0 else min(_ACCEL, allowed - speed)
+    needed = (speed**2 - allowed**2) / (2.0 * max(distance, 1.0))
+    return -needed if needed > 0.5 * _DECEL else _ACCEL
+
+
+def _bends(points: NDArray[np.float64]) -> list[tuple[float, float]]:
+    """Where the way bends, in m from its begin, and the speed there."""
+    steps = np.diff(points, axis=0)
+    lengths = np.hypot(steps[:, 0], steps[:, 1])
+    headings = np.unwrap(np.arctan2(steps[:, 1], steps[:, 0]))
+    along = np.concatenate([[0.0], np.cumsum(lengths)])
+    found = []
+    for s in np.arange(0.0, min(float(along[-1]), 45.0), 3.0):
+        low, high = np.searchsorted(along, [s, s + 6.0])
+        turn = abs(float(headings[min(high, len(headings)) - 1] - headings[max(low - 1, 0)]))
+        if turn > 0.1:
+            found.append((float(s), math.sqrt(_BEND_MPS2 * 6.0 / turn)))
+    return found
+
+
+def _beside(
+    points: NDArray[np.float64], x_m: float, y_m: float
+) -> tuple[float, float, float, float]:
+    """The s and d of a place beside a way, and the way's direction there; s below 0: behind it."""
+    steps = np.diff(points, axis=0)
+    lengths = np.hypot(steps[:, 0], steps[:, 1])
+    units = steps / lengths[:, None]
+    offset = np.array([x_m, y_m]) - points[:-1]
+    raw = (offset * units).sum(axis=1)
+    share = np.clip(raw, 0.0, lengths)
+    off = np.hypot(*(offset - share[:, None] * units).T)
+    k = int(np.argmin(off))
+    cos, sin = units[k].tolist()
+    before = float(lengths[:k].sum())
+    s = before + float(raw[k] if k == 0 else share[k])
+    d = float(offset[k, 1] * cos - offset[k, 0] * sin)
+    beyond = k == len(lengths) - 1 and raw[k] > lengths[k]
+    return s, (float(off[k]) if beyond else d), cos, sin

@@ -1,0 +1,220 @@
+"""`Stack`: perception, localisation, planning and control, each chosen by name and timed."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cavmarl.config.rig import GnssConfig
+from cavmarl.core.errors import ConfigError
+from cavmarl.cosim.stack.hd_map import HdMap
+from cavmarl.cosim.stack.localisation import GnssInertial
+from cavmarl.cosim.stack.perception import LidarObjects
+from cavmarl.cosim.stack.route_planning import LaneRoute
+from cavmarl.cosim.stack.stack_control import PurePursuit
+from cavmarl.cosim.stack.stack_types import (
+    Control,
+    Control2D,
+    Localisation,
+    Mission,
+    Mount,
+    Obstacle,
+    Perception,
+    Planning,
+    Pose,
+    Readings,
+    Sensor,
+)
+from cavmarl.sensors.mounted.geodesy import Geodesy, geodesy_of
+
+__all__ = ["STAGES", "Stack", "StackConfig", "StageTimes", "Vehicle", "sensor_of", "vehicle_of"]
+
+
+class Vehicle(NamedTuple):
+    """What a stage may know of the vehicle that it is made for.
+
+    Attributes:
+        hd_map: the roads.
+        sensors: that are mounted.
+        geodesy: where the map is on the earth; None: there is no GNSS.
+        tick_s: seconds a step of the stack.
+    """
+
+    hd_map: HdMap
+    sensors: Sequence[Sensor]
+    geodesy: Geodesy | None
+    tick_s: float
+
+
+class Blind:
+    """A perception that sees nothing."""
+
+    def perceive(self, readings: Readings, pose: Pose, time_s: float) -> list[Obstacle]:
+        """Nothing."""
+        return []
+
+
+def _localisation(vehicle: Vehicle) -> Localisation:
+    if vehicle.geodesy is None:
+        raise ConfigError(
+            "localisation = gnss_imu: there is no gnss among the sensors; mount one under `rig`, "
+            "as {gnss: {type: gnss, rate_hz: 10}}"
+        )
+    return GnssInertial(vehicle.sensors, vehicle.geodesy, vehicle.hd_map, vehicle.tick_s)
+
+
+# Stage → name → how it is made. A stage of one's own is one more entry.
+STAGES: dict[str, dict[str, Callable[[Vehicle], Any]]] = {
+    "perception": {
+        "lidar": lambda vehicle: LidarObjects(vehicle.sensors, vehicle.hd_map),
+        "blind": lambda vehicle: Blind(),
+    },
+    "localisation": {"gnss_imu": _localisation},
+    "planning": {"lane_route": lambda vehicle: LaneRoute(vehicle.hd_map)},
+    "control": {"pure_pursuit": lambda vehicle: PurePursuit(vehicle.tick_s)},
+}
+
+
+@dataclass(frozen=True)
+class StackConfig:
+    """Which stages a stack is made of.
+
+    Attributes:
+        perception: `lidar`, or `blind`.
+        localisation: `gnss_imu`.
+        planning: `lane_route`.
+        control: `pure_pursuit`.
+    """
+
+    perception: str = "lidar"
+    localisation: str = "gnss_imu"
+    planning: str = "lane_route"
+    control: str = "pure_pursuit"
+
+    def __post_init__(self) -> None:
+        for stage, known in STAGES.items():
+            name = getattr(self, stage)
+            if name not in known:
+                raise ConfigError(f"{stage} = {name!r}: must be {' or '.join(known)}")
+
+
+@dataclass
+class StageTimes:
+    """How long stages took, by the wall clock.
+
+    Attributes:
+        steps: of the stack.
+        wall_s: sum of each stage.
+        worst_wall_s: of one step.
+    """
+
+    steps: int = 0
+    wall_s: dict[str, float] = field(default_factory=lambda: dict.fromkeys(STAGES, 0.0))
+    worst_wall_s: dict[str, float] = field(default_factory=lambda: dict.fromkeys(STAGES, 0.0))
+
+    def add(self, stage: str, seconds: float) -> None:
+        """Count one stage of one step."""
+        self.wall_s[stage] += seconds
+        self.worst_wall_s[stage] = max(self.worst_wall_s[stage], seconds)
+
+
+class Stack:
+    """Drives one vehicle.
+
+    Args:
+        vehicle: that is driven.
+        config: of which stages.
+
+    Attributes:
+        times: how long the stages took.
+        pose: where the vehicle is taken to be; None: nobody knows yet.
+        obstacles: what is on the road.
+        reason: of the acceleration; see `Trajectory`.
+    """
+
+    def __init__(self, vehicle: Vehicle, config: StackConfig | None = None) -> None:
+        chosen = StackConfig() if config is None else config
+        made = {name: known[getattr(chosen, name)](vehicle) for name, known in STAGES.items()}
+        self._perception: Perception = made["perception"]
+        self._localisation: Localisation = made["localisation"]
+        self._planning: Planning = made["planning"]
+        self._control: Control = made["control"]
+        self.times = StageTimes()
+        self.pose: Pose | None = None
+        self.obstacles: list[Obstacle] = []
+        self.reason = ""
+
+    def reset_pose(self, pose: Pose) -> None:
+        """Tell the localisation where the vehicle is; nobody has to."""
+        self._localisation.reset_pose(pose)
+
+    def drive(
+        self,
+        readings: Readings,
+        signals: NDArray[np.uint8] | None,
+        mission: Mission,
+        time_s: float,
+    ) -> Control2D:
+        """One step of all stages; without a pose the vehicle brakes.
+
+        Args:
+            readings: what the sensors have that is due.
+            signals: what signals show; see `Planning.plan`.
+            mission: where to go.
+            time_s: simulated.
+        """
+        self.times.steps += 1
+        pose = self.pose = self._timed(
+            "localisation", self._localisation.locate, readings, mission, time_s
+        )
+        if pose is None:
+            self.reason = "no pose"
+            return Control2D(-1.0, 0.0)
+        self.obstacles = self._timed(
+            "perception", self._perception.perceive, readings, pose, time_s
+        )
+        trajectory = self._timed(
+            "planning", self._planning.plan, pose, self.obstacles, signals, mission
+        )
+        self.reason = trajectory.reason
+        driven: Control2D = self._timed("control", self._control.control, pose, trajectory, mission)
+        return driven
+
+    def _timed(self, stage: str, run: Callable[..., Any], *arguments: Any) -> Any:
+        began = time.perf_counter()
+        found = run(*arguments)
+        self.times.add(stage, time.perf_counter() - began)
+        return found
+
+
+def sensor_of(name: str, settings: Mapping[str, Any]) -> Sensor:
+    """A sensor by its keys in `env.yaml`."""
+    mount = Mount(settings["x_m"], settings["y_m"], math.radians(settings["yaw_deg"]))
+    return Sensor(name, settings["type"], mount, settings)
+
+
+def vehicle_of(hd_map: HdMap, sensors: Sequence[Sensor], tick_s: float) -> Vehicle:
+    """What stages may know.
+
+    Args:
+        hd_map: the roads.
+        sensors: that are mounted.
+        tick_s: seconds a step of the stack.
+
+    Raises:
+        MissingExtraError: the map is projected, and pyproj is not installed.
+        MapError: nobody knows its projection.
+    """
+    gnss = [sensor for sensor in sensors if sensor.type == "gnss"]
+    geodesy = None
+    if gnss:
+        names = ("rate_hz", "origin_lat_deg", "origin_lon_deg", "origin_height_m")
+        config = GnssConfig(**{name: gnss[0].settings[name] for name in names})
+        geodesy = geodesy_of(hd_map.network, config)
+    return Vehicle(hd_map, sensors, geodesy, tick_s)

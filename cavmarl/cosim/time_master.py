@@ -1,0 +1,338 @@
+"""`TimeMaster`: who alone advances the time of an environment; `TimeFollower`: who reads it.
+
+The integer tick is the truth, and time = tick · Δt: after 5,000 ticks of 50 ms it is exactly 250.0.
+A master takes the place of the environment's worlds, so that from then on nobody else steps or
+resets them; an environment without a master pays nothing for that. Followers come and go while the
+world runs. What one of them does when it ticks by itself, which made the world of the
+co-simulation paper advance 1.92 times as fast as its master, is refused, ignored or, to show the
+fault, obeyed; each is counted, and what has passed the master by is noticed before his next step.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass
+from typing import Any, Literal, NamedTuple, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cavmarl.config.env import EnvConfig
+from cavmarl.core.errors import ClockDriftError, ClockError, SecondMasterError, TickRefusedError
+from cavmarl.cosim.pacing import Pacer, Unpaced
+from cavmarl.engine.simulation import Simulation
+from cavmarl.engine.step_trace import StepTrace
+from cavmarl.shards.shard import Commands
+
+__all__ = ["ClockEvent", "OwnTicks", "Steppable", "TimeFollower", "TimeMaster"]
+
+OwnTicks = Literal["refuse", "ignore", "obey"]
+
+KEPT_EVENTS = 10_000
+
+
+class _Worlds(Protocol):
+    """What of `stepping.SteppedWorlds` a master needs."""
+
+    @property
+    def simulation(self) -> Simulation: ...
+
+    def ticks(self) -> NDArray[np.int64]: ...
+
+    def step(self, commands: Commands) -> None: ...
+
+    def reset(self, seed: int | None, first_world: int) -> None: ...
+
+
+class Steppable(Protocol):
+    """A `CavEnv` or a `CavVectorEnv`."""
+
+    config: EnvConfig
+    worlds: Any
+
+    def step(self, actions: Any) -> Any:
+        """Let agents act."""
+        ...
+
+    def reset(self, seed: int | None = None, options: dict[str, Any] | None = None) -> Any:
+        """Begin an episode."""
+        ...
+
+
+class ClockEvent(NamedTuple):
+    """Something about time that should not have been.
+
+    Attributes:
+        tick: the master's when it was noticed.
+        kind: `own_tick`: a follower wanted to tick; `drift`: a world is not where its master left
+            it.
+        who: name of the follower; of a drift nobody knows.
+        ticks: by how many the world has gone on, or would have.
+    """
+
+    tick: int
+    kind: Literal["own_tick", "drift"]
+    who: str
+    ticks: int
+
+
+@dataclass
+class TimeFollower:
+    """One who reads the master's clock, in this process or at the other end of a socket.
+
+    Attributes:
+        master: whose clock it reads.
+        name: of it.
+        since_tick: the master's when it has joined.
+        own_ticks: how often it has wanted to tick by itself.
+    """
+
+    master: TimeMaster
+    name: str
+    since_tick: int
+    own_ticks: int = 0
+
+    @property
+    def time_s(self) -> float:
+        """The master's time."""
+        return self.master.time_s
+
+    def tick(self) -> bool:
+        """Try to advance the world; whether it has advanced.
+
+        Raises:
+            TickRefusedError: the master refuses; see `TimeMaster`.
+            ClockError: it is no follower any more.
+        """
+        self.master.check_follower(self)
+        self.own_ticks += 1
+        return self.master.tick_for(self)
+
+    def leave(self) -> None:
+        """Follow no longer."""
+        self.master.let_go(self)
+
+
+class _Mastered:
+    """Stands for an environment's worlds: steps and resets them for their master only."""
+
+    def __init__(self, worlds: _Worlds, master: TimeMaster) -> None:
+        self.worlds = worlds
+        self._master = master
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self.worlds, name)
+
+    def step(self, commands: Commands) -> None:
+        self._master.check_turn("step")
+        self._master.advance(self.worlds, commands)
+
+    def reset(self, seed: int | None, first_world: int) -> None:
+        self._master.check_turn("reset")
+        self.worlds.reset(seed, first_world)
+        self._master.set_back(self.worlds)
+
+
+class TimeMaster:
+    """The one who advances time.
+
+    Args:
+        env: a `CavEnv` or a `CavVectorEnv`; until `release` only `TimeMaster.step` and
+            `TimeMaster.reset` step and reset it.
+        pacer: how fast by the wall clock; None: as fast as it goes.
+        own_ticks: what becomes of a follower's own tick: `refuse`: an error where it was called;
+            `ignore`: nothing happens; `obey`: the world really goes on, with the controls of the
+            last step. That is the fault of the unprotected co-simulation.
+        on_drift: what becomes of a world that is not where the master has left it: `error`, before
+            the next step; `record`: an event, and it goes on from there.
+        trace: notes the phases of each step; of worlds in this process only.
+
+    Attributes:
+        tick: ticks by this master; no reset sets it back.
+        events: the first ones; of those that follow only the counts are kept.
+        own_ticks: how often all followers wanted to tick by themselves.
+        drifts: how often a world was not where the master had left it.
+        drift_ticks: by how many ticks the first world has gone on without the master.
+
+    Raises:
+        SecondMasterError: the environment has a master.
+        ConfigError: a trace of worlds in other processes.
+    """
+
+    def __init__(
+        self,
+        env: Steppable,
+        *,
+        pacer: Pacer | None = None,
+        own_ticks: OwnTicks = "refuse",
+        on_drift: Literal["error", "record"] = "error",
+        trace: StepTrace | None = None,
+    ) -> None:
+        if isinstance(env.worlds, _Mastered):
+            raise SecondMasterError(
+                "this environment has a time master already: follow it (TimeMaster.follow), or let "
+                "it go first (TimeMaster.release)"
+            )
+        self.env = env
+        self.dt_s = env.config.clock.sim_dt_s
+        self.tick = 0
+        self.events: list[ClockEvent] = []
+        self.own_ticks = self.drifts = self.drift_ticks = 0
+        self._pacer = Unpaced() if pacer is None else pacer
+        self._answer, self._on_drift, self._trace = own_ticks, on_drift, trace
+        self._per_step = env.config.clock.ticks_per_step
+        self._followers: list[TimeFollower] = []
+        self._is_turn = False
+        self._last: Commands | None = None
+        worlds: _Worlds = env.worlds
+        if trace is not None:
+            worlds.simulation.trace(trace.around, trace.note)
+        self._left = worlds.ticks()
+        self._mastered = env.worlds = _Mastered(worlds, self)
+
+    @property
+    def time_s(self) -> float:
+        """Seconds: tick · Δt, from the integer, so that nothing adds up."""
+        return self.tick * self.dt_s
+
+    @property
+    def world_ticks(self) -> NDArray[np.int64]:
+        """(W,) ticks of each world since its reset, whoever made them."""
+        return self._mine().ticks()
+
+    @property
+    def followers(self) -> tuple[TimeFollower, ...]:
+        """Who follows, in the order in which they joined."""
+        return tuple(self._followers)
+
+    def follow(self, name: str) -> TimeFollower:
+        """Let somebody follow from now on; nothing of the world changes by it."""
+        follower = TimeFollower(self, name, self.tick)
+        self._followers.append(follower)
+        return follower
+
+    def let_go(self, follower: TimeFollower) -> None:
+        """Let it follow no longer."""
+        self._followers.remove(follower)
+
+    def step(self, actions: Any) -> Any:
+        """Advance the environment by one step; returns what its `step` returns.
+
+        Raises:
+            ClockDriftError: a world is not where the last step has left it.
+        """
+        with self._turn():
+            return self.env.step(actions)
+
+    def reset(self, seed: int | None = None, options: Mapping[str, Any] | None = None) -> Any:
+        """Begin an episode; returns what the environment's `reset` returns."""
+        with self._turn():
+            return self.env.reset(seed=seed, options=None if options is None else dict(options))
+
+    def release(self) -> None:
+        """Be master no longer: the environment can be stepped as before."""
+        self.env.worlds = self._mine()
+        self._followers.clear()
+
+    @contextmanager
+    def _turn(self) -> Iterator[None]:
+        self._mine()
+        self._is_turn = True
+        try:
+            yield
+        finally:
+            self._is_turn = False
+
+    def _mine(self) -> _Worlds:
+        """The worlds behind the guard.
+
+        Raises:
+            ClockError: they have been let go.
+        """
+        if self.env.worlds is not self._mastered:
+            raise ClockError("this master has been released: make another TimeMaster")
+        worlds: _Worlds = self._mastered.worlds
+        return worlds
+
+    def check_turn(self, what: str) -> None:
+        """Refuse whoever is not the master.
+
+        Raises:
+            TickRefusedError: `what` was called on the environment itself.
+        """
+        if not self._is_turn:
+            raise TickRefusedError(
+                f"{what}() of an environment that has a time master: call TimeMaster.{what}(), or "
+                "let the environment go first (TimeMaster.release)"
+            )
+
+    def check_follower(self, follower: TimeFollower) -> None:
+        """Refuse somebody who does not follow any more.
+
+        Raises:
+            ClockError: it has left, or the master was released.
+        """
+        if follower not in self._followers:
+            raise ClockError(f"'{follower.name}' follows no more: join again (TimeMaster.follow)")
+
+    def advance(self, worlds: _Worlds, commands: Commands) -> None:
+        """One step of the worlds: look for drift, wait for its time, step, count."""
+        self.look_for_drift()
+        self._pacer.wait(self.time_s)
+        if self._trace is not None:
+            self._trace.begin()
+        worlds.step(commands)
+        self._last = commands
+        self._left = worlds.ticks()
+        self.tick += self._per_step
+
+    def set_back(self, worlds: _Worlds) -> None:
+        """Worlds have begun anew, by the master."""
+        self._left = worlds.ticks()
+        self._last = None
+
+    def look_for_drift(self) -> None:
+        """Notice worlds that are not where the last step has left them.
+
+        Raises:
+            ClockDriftError: there are some, and `on_drift` is `error`.
+        """
+        found = self._mine().ticks()
+        if (found == self._left).all():
+            return
+        (drifted,) = np.nonzero(found != self._left)
+        world = int(drifted[0])
+        extra = int(found[world] - self._left[world])
+        self.drifts += 1
+        self._keep(ClockEvent(self.tick, "drift", "", extra))
+        self.drift_ticks += int(found[0] - self._left[0])
+        left, self._left = self._left, found
+        if self._on_drift == "error":
+            raise ClockDriftError(
+                f"world {world} is at tick {found[world]}, but its time master left it at "
+                f"{left[world]}: somebody else ticks it; let that follow the master, or ask for "
+                "on_drift = record"
+            )
+
+    def tick_for(self, follower: TimeFollower) -> bool:
+        """A follower wants to tick by itself; whether the world has advanced.
+
+        Raises:
+            TickRefusedError: `own_ticks` is `refuse`.
+        """
+        self.own_ticks += 1
+        self._keep(ClockEvent(self.tick, "own_tick", follower.name, self._per_step))
+        if self._answer == "refuse":
+            raise TickRefusedError(
+                f"follower '{follower.name}' ticks by itself at {self.time_s:g} s: only the time "
+                "master ticks; switch its own ticks off, or ask for own_ticks = ignore"
+            )
+        if self._answer == "ignore" or self._last is None:
+            return False
+        self._mine().step(self._last)
+        return True
+
+    def _keep(self, event: ClockEvent) -> None:
+        if len(self.events) < KEPT_EVENTS:
+            self.events.append(event)

@@ -1,0 +1,1 @@
+"""Compiled loops: driver models, lanes, junctions, motion, contacts."""

@@ -1,0 +1,163 @@
+"""Who approaches which link: every vehicle announces itself to the link it is on and to the next.
+
+The lists lie together in memory and carry what the right of way asks of a foe.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cavmarl.core.math.buckets import add, forget, lay_out
+from cavmarl.core.numba import inlined_kernel, kernel
+from cavmarl.core.numba.prefetch import SOON, prefetch
+from cavmarl.core.records.arrays import RoadArrays, Scratch, Travel
+from cavmarl.core.records.codes import DRIVER_SCRIPTED
+from cavmarl.core.records.rows import FORK_BEYOND_M, is_lost
+from cavmarl.driving.kernels.announcing import announced_m
+from cavmarl.driving.kernels.ways import leave, next_step, own_step
+
+__all__ = [
+    "APPROACH",
+    "MAX_LINKS_AHEAD",
+    "register_links",
+]
+
+MAX_LINKS_AHEAD = 2
+BLOCK = 64  # rows that are still near in memory when they are looked at again
+
+APPROACH = np.dtype(
+    [
+        ("link", np.int32),
+        ("row", np.int32),  # VEHICLE row
+        ("dist", np.float64),  # of its centre to the stop line, m; negative beyond it
+        ("speed", np.float64),  # m/s
+        ("half", np.float64),  # half its length, m
+        ("id", np.int64),
+    ],
+    align=True,
+)
+
+
+@kernel
+def register_links(
+    roads: RoadArrays,
+    travel: Travel,
+    rows: NDArray[np.void],
+    num: int,
+    step: NDArray[np.void],
+    step_at: NDArray[np.int64],
+    scratch: Scratch,
+) -> None:
+    """List for every link the vehicles that are on it or will reach it, into `scratch.approach`.
+
+    Only links with conflicts list those that approach.
+
+    Args:
+        roads: the road arrays.
+        travel: the ways.
+        rows: VEHICLE (C,), of which `num` live.
+        num: live rows.
+        step: PLAN (C,) of each row the step of its lane; written where it is another one.
+        step_at: (C,) which one that is, see `Worlds`; written.
+        scratch: the lists by link and approach are written.
+    """
+    pairs = 0
+    for first in range(0, num, BLOCK):
+        last = min(first + BLOCK, num)
+        # One look for all that follows: in a city the steps lie far apart, each is a cache miss,
+        # and a loop that does nothing else has many of them under way at once. And most rows are
+        # where they were a tick before, with the same vehicle on the same lane.
+        for i in range(first, last):
+            if i + SOON < num:
+                prefetch(roads.lanes, rows[i + SOON]["lane"], 0)
+            if rows[i]["driver"] == DRIVER_SCRIPTED:
+                continue
+            at = own_step(roads, rows[i])
+            if at + 1 != step_at[i] or at >= travel.num_fixed:
+                step[i] = travel.steps[at]
+                step_at[i] = at + 1
+            prefetch(roads.lanes, step[i]["next"], 0)
+            prefetch(roads.links, step[i]["link"], 0)
+            prefetch(roads.links, step[i]["link"], 1)
+        for i in range(first, last):
+            if rows[i]["driver"] == DRIVER_SCRIPTED:
+                pairs = _announce_claims(travel, rows[i], i, pairs, scratch)
+                continue
+            if is_lost(rows[i]):
+                continue
+            pairs = _announce(roads, travel, rows[i], i, step[i], pairs, scratch)
+    end = scratch.link_end
+    forget(scratch.links)
+    for k in range(pairs):
+        add(scratch.links, scratch.pairs[k]["link"])
+    lay_out(scratch.links)
+    for k in range(pairs):
+        link = scratch.pairs[k]["link"]
+        scratch.approach[end[link]] = scratch.pairs[k]
+        end[link] += 1
+
+
+@inlined_kernel
+def _note(scratch: Scratch, pairs: int, link: int, row: np.void, i: int, dist: float) -> int:
+    pair = scratch.pairs[pairs]
+    pair["link"] = link
+    pair["row"] = i
+    pair["dist"] = dist
+    pair["speed"] = row["speed"]
+    pair["half"] = 0.5 * row["length"]
+    pair["id"] = row["id"]
+    return pairs + 1
+
+
+@kernel
+def _announce_claims(travel: Travel, row: np.void, i: int, pairs: int, scratch: Scratch) -> int:
+    """`_announce` for a row that follows a script, which says where it will be."""
+    frame = travel.scripts.frames[row["goal"]]
+    for c in range(frame["first_claim"], frame["first_claim"] + frame["num_claims"]):
+        claim = travel.scripts.claims[c]
+        pairs = _note(scratch, pairs, claim["link"], row, i, claim["dist"])
+    return pairs
+
+
+@inlined_kernel
+def _announce(
+    roads: RoadArrays,
+    travel: Travel,
+    row: np.void,
+    i: int,
+    step: np.void,
+    pairs: int,
+    scratch: Scratch,
+) -> int:
+    """Append row i's entries; returns the new number of pairs. `step` is its own one."""
+    lane = row["lane"]
+    here = roads.lanes[lane]
+    s = row["s"]
+    if here["internal"]:
+        pairs = _note(scratch, pairs, here["link"], row, i, -(here["link_offset_m"] + s))
+    elif row["link"] >= 0 and s - 0.5 * row["length"] < FORK_BEYOND_M:
+        # Its centre has left the junction, its rear has not, or not the fork before it.
+        left = roads.links[row["link"]]
+        rear = s - 0.5 * row["length"]
+        if left["to_lane"] == lane and (rear < 0.0 or left["length_m"] + rear < left["fork_m"]):
+            pairs = _note(scratch, pairs, row["link"], row, i, -(left["length_m"] + s))
+    reach = announced_m(row["speed"])
+    distance = here["length_m"] - s
+    way = row["way"]
+    found = 0
+    while distance < reach:
+        if lane == row["lane"] and way == row["way"]:
+            lane, way, link = leave(roads, step, lane, way)
+        else:
+            lane, way, link = next_step(roads, travel, lane, way)
+        if lane < 0:
+            break
+        if link >= 0:
+            if roads.links[link]["num_conflicts"] > 0:
+                pairs = _note(scratch, pairs, link, row, i, max(distance, 0.0))
+            found += 1
+            if found == MAX_LINKS_AHEAD:
+                break
+        distance += roads.lanes[lane]["length_m"]
+    return pairs

@@ -1,0 +1,103 @@
+"""The kinematic bicycle: how a car moves under acceleration and steering.
+
+Polack, Altché, d'Andréa-Novel, de La Fortelle: "The kinematic bicycle model: a consistent model for
+planning feasible trajectories for autonomous vehicles?", IV 2017; integrated as highway-env's
+`Vehicle.step`, with the same limits.
+"""
+
+from __future__ import annotations
+
+import math
+
+from cavmarl.core.math.geometry import wrap_angle
+from cavmarl.core.numba import kernel
+
+__all__ = ["MAX_SPEED_MPS", "MIN_SPEED_MPS", "bicycle_step", "clip_control"]
+
+MAX_SPEED_MPS = 40.0  # beyond it the engine gives way
+MIN_SPEED_MPS = -40.0
+
+
+@kernel
+def bicycle_step(
+    x: float,
+    y: float,
+    heading: float,
+    speed: float,
+    accel: float,
+    steering: float,
+    length: float,
+    dt: float,
+) -> tuple[float, float, float, float, float]:
+    """Move a car for one tick; place and heading with the speed before it, explicit Euler.
+
+        slip    = atan(tan(steering) / 2)
+        x      += speed · cos(heading + slip) · dt
+        y      += speed · sin(heading + slip) · dt
+        heading += speed · sin(slip) / (length / 2) · dt
+        speed  += accel · dt
+
+    Args:
+        x: m, of the centre.
+        y: m, of the centre.
+        heading: rad.
+        speed: m/s along the heading, negative backwards.
+        accel: m/s².
+        steering: angle of the front wheels in rad, within (-pi/2, pi/2), positive to the left.
+        length: of the car, m; its half is the distance from the centre to each axle.
+        dt: s.
+
+    Returns:
+        x, y, heading, speed after the tick, and the yaw rate during it in rad/s. The heading
+        is kept in (-pi, pi]; highway-env lets it grow.
+    """
+    # Sine and cosine of the slip angle without inverse functions: tan(slip) is known.
+    tan_slip = 0.5 * math.tan(steering)
+    cos_slip = 1.0 / math.sqrt(1.0 + tan_slip * tan_slip)
+    sin_slip = tan_slip * cos_slip
+    cos_heading = math.cos(heading)
+    sin_heading = math.sin(heading)
+    step_m = speed * dt
+    yaw_rate = speed * sin_slip / (0.5 * length)
+    return (
+        x + step_m * (cos_heading * cos_slip - sin_heading * sin_slip),
+        y + step_m * (sin_heading * cos_slip + cos_heading * sin_slip),
+        wrap_angle(heading + yaw_rate * dt),
+        speed + accel * dt,
+        yaw_rate,
+    )
+
+
+@kernel
+def clip_control(
+    speed: float,
+    accel: float,
+    steering: float,
+    crashed: bool,
+    min_speed: float,
+    max_speed: float,
+) -> tuple[float, float]:
+    """The control that a car obeys: highway-env's `Vehicle.clip_actions`.
+
+    A crashed car comes to rest with straight wheels, with a time constant of 1 s. A car beyond
+    what its engine can do falls back to that with the same time constant.
+
+    Args:
+        speed: m/s.
+        accel: commanded, m/s².
+        steering: commanded, rad.
+        crashed: whether the car has collided.
+        min_speed: m/s, negative; `MIN_SPEED_MPS` in highway-env.
+        max_speed: m/s; `MAX_SPEED_MPS` in highway-env.
+
+    Returns:
+        acceleration in m/s² and steering in rad.
+    """
+    if crashed:
+        steering = 0.0
+        accel = -speed
+    if speed > max_speed:
+        accel = min(accel, max_speed - speed)
+    elif speed < min_speed:
+        accel = max(accel, min_speed - speed)
+    return accel, steering

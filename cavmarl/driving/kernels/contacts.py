@@ -1,0 +1,107 @@
+"""Who touches whom: oriented boxes that overlap in the plane and in height."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cavmarl.core.math.geometry import boxes_overlap
+from cavmarl.core.math.neighbors import Grid, cell_at, cell_columns, cell_rows
+from cavmarl.core.numba import inlined_kernel, kernel
+
+__all__ = ["find_contacts"]
+
+
+@kernel
+def _bodies_touch(one: np.void, other: np.void) -> bool:
+    """Whether two VEHICLE records overlap: their rectangles share area and their heights overlap.
+
+    Vehicles on and under a bridge do not touch: their `z` differ by half the sum of their heights.
+    """
+    if not abs(one["z"] - other["z"]) < 0.5 * (one["height"] + other["height"]):
+        return False
+    return boxes_overlap(
+        one["x"],
+        one["y"],
+        math.cos(one["heading"]),
+        math.sin(one["heading"]),
+        0.5 * one["length"],
+        0.5 * one["width"],
+        other["x"],
+        other["y"],
+        math.cos(other["heading"]),
+        math.sin(other["heading"]),
+        0.5 * other["length"],
+        0.5 * other["width"],
+    )
+
+
+@kernel
+def find_contacts(rows: NDArray[np.void], num: int, grid: Grid, hit: NDArray[np.int64]) -> bool:
+    """For each vehicle the smallest id of those that it touches; whether any two do.
+
+    One pass: each vehicle looks at those that are in the cells already and joins them.
+
+    Args:
+        rows: VEHICLE (C,).
+        num: live rows of the world; at most the grid's capacity.
+        grid: its `newest` and `spots` are overwritten.
+        hit: (C,) by VEHICLE row, overwritten up to `num`: an id, or -1.
+    """
+    grid.newest[:] = -1
+    largest = 0.0
+    found = False
+    for i in range(num):
+        hit[i] = -1
+        row = rows[i]
+        half_length = 0.5 * row["length"]
+        half_width = 0.5 * row["width"]
+        radius = math.sqrt(half_length * half_length + half_width * half_width)
+        largest = max(largest, radius)
+        spot = grid.spots[i]
+        spot["x"] = row["x"]
+        spot["y"] = row["y"]
+        spot["radius"] = radius
+        found |= _touches_earlier(rows, i, spot, radius + largest, grid, hit)
+        cell = cell_at(grid, row["x"], row["y"])
+        spot["next"] = grid.newest[cell]
+        grid.newest[cell] = i
+    return found
+
+
+@inlined_kernel
+def _touches_earlier(
+    rows: NDArray[np.void],
+    i: int,
+    spot: np.void,
+    reach: float,
+    grid: Grid,
+    hit: NDArray[np.int64],
+) -> bool:
+    """Note whom of those in the cells row i touches."""
+    found = False
+    first_column, last_column = cell_columns(grid, spot["x"], reach)
+    first_row, last_row = cell_rows(grid, spot["y"], reach)
+    for j in range(first_row, last_row + 1):
+        for cell in range(j * grid.num_x + first_column, j * grid.num_x + last_column + 1):
+            k = grid.newest[cell]
+            while k >= 0:
+                other = grid.spots[k]
+                dx = spot["x"] - other["x"]
+                dy = spot["y"] - other["y"]
+                near = spot["radius"] + other["radius"]
+                if dx * dx + dy * dy < near * near and _bodies_touch(rows[i], rows[k]):
+                    _note(hit, i, rows[k]["id"])
+                    _note(hit, k, rows[i]["id"])
+                    found = True
+                k = other["next"]
+    return found
+
+
+@kernel
+def _note(hit: NDArray[np.int64], row: int, vehicle_id: int) -> None:
+    """Keep the smallest id seen."""
+    if hit[row] < 0 or vehicle_id < hit[row]:
+        hit[row] = vehicle_id

@@ -1,0 +1,67 @@
+"""Room for who has to change lanes: those who follow on the lane that it changes to make it."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cavmarl.core.numba import kernel
+from cavmarl.core.records.arrays import RoadArrays, Scratch, Travel
+from cavmarl.driving.kernels.following import accel_behind
+from cavmarl.driving.kernels.lane_choice import LOOK_BACK_M, SIDE_GAP_M
+from cavmarl.driving.kernels.lane_index import behind_on, beside_s, comes_over
+
+__all__ = ["COURTESY_DECEL", "let_merge"]
+
+COURTESY_DECEL = 3.0  # m/s², the hardest braking to let somebody merge, or to fall in behind
+
+
+@kernel
+def let_merge(
+    roads: RoadArrays, travel: Travel, rows: NDArray[np.void], row: np.void, scratch: Scratch
+) -> None:
+    """Soften the way of who follows on the lane that a vehicle needs to change to.
+
+    Where that lane is free behind it, these are the next ones on all lanes that lead there.
+    """
+    lane = roads.lanes[row["lane"]]
+    target = lane["left"] if row["blinker"] > 0 else lane["right"]
+    if target < 0:
+        return
+    s = beside_s(roads, row["lane"], target, row["s"])
+    k = behind_on(scratch, target, s, row["id"])
+    if k >= 0:
+        _soften(roads, travel, rows, row, target, k, s - scratch.entries[k]["s"], scratch)
+        return
+    first = roads.lanes[target]["first_into"]
+    for n in range(first, first + roads.lanes[target]["num_into"]):
+        k, apart = comes_over(
+            roads, scratch, roads.into[n], s, row["id"], LOOK_BACK_M, travel.view_m
+        )
+        if k >= 0:
+            _soften(roads, travel, rows, row, target, k, apart, scratch)
+
+
+@kernel
+def _soften(
+    roads: RoadArrays,
+    travel: Travel,
+    rows: NDArray[np.void],
+    row: np.void,
+    target: int,
+    k: int,
+    apart: float,
+    scratch: Scratch,
+) -> None:
+    """Soften the way of a follower, an entry so far behind `row` on its way to lane `target`."""
+    follower = scratch.entries[k]
+    gap = apart - 0.5 * row["length"] - follower["half"]
+    if follower["side"] or gap < SIDE_GAP_M or apart > LOOK_BACK_M:
+        return
+    other = rows[follower["row"]]
+    kind = travel.types[other["vtype"]]
+    desired = roads.lanes[target]["speed_mps"] * other["speed_factor"]
+    decel = travel.types[row["vtype"]]["decel"]
+    accel = accel_behind(kind, follower["speed"], desired, gap, row["speed"], decel)
+    i = follower["row"]
+    scratch.accel[i] = min(scratch.accel[i], max(accel, -COURTESY_DECEL))

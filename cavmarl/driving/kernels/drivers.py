@@ -1,0 +1,478 @@
+"""Background drivers: what each wants to do in this tick, from the committed state alone.
+
+Car following is IDM or Krauss's model, as the vehicle's type says, lane changing MOBIL; this file
+finds what they are applied to: the leader across lane and junction borders, the lower speed limit
+ahead, the stop line of a signal or of a right of way, the end of a lane, the vehicle that wants to
+merge, the lane that the route needs.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cavmarl.core.math.geometry import wrap_angle
+from cavmarl.core.math.rng import STREAM_DRIVER, quick_uniform
+from cavmarl.core.numba import inlined_kernel, kernel
+from cavmarl.core.numba.prefetch import SOON, prefetch
+from cavmarl.core.records.arrays import RoadArrays, Scratch, Travel
+from cavmarl.core.records.codes import DRIVER_AGENT, DRIVER_BACKGROUND, HOLD_NONE, MODEL_KRAUSS
+from cavmarl.core.records.rows import is_lost
+from cavmarl.driving.kernels.courtesy import COURTESY_DECEL, let_merge
+from cavmarl.driving.kernels.following import (
+    LINE_MARGIN_M,
+    before_line,
+    behind,
+    no_press,
+    response,
+    wish,
+)
+from cavmarl.driving.kernels.junctions import may_enter, press_inside, waits_inside
+from cavmarl.driving.kernels.lane_choice import choose_lane, needed_change, thinks_of_lanes
+from cavmarl.driving.kernels.lane_index import VIEW_M, ahead_on, beside_s, last_on
+from cavmarl.driving.kernels.stopping import way_to_stop
+from cavmarl.driving.kernels.ways import leave, next_step
+
+__all__ = ["decide", "look_ahead_m", "see_line_m"]
+
+SEE_LINE_M = 8.0
+NEAR_M = 8.0  # to a leader so near the corner between matters,
+ASKEW_RAD = 0.7  # if it turns by so much,
+ASKEW_M = 2.5  # which takes this off the gap
+NEXT_LINE_M = 5.0  # and braking way: so near a line is minded by who has a leader on its own lane
+STOP_LINE_M = 5.0  # standing with the front nearer than this counts as standing at the line
+LIMIT_DECEL = 2.0  # m/s², how a driver slows for a lower limit ahead,
+LIMIT_LEAD_S = 1.0  # to be down this time before it, as the model lags behind what is allowed
+FALL_IN_M = 100.0  # before the place where a lane change must be made
+# A driver that has to leave a lane waits this far before its end to change right, and a vehicle's
+# length further back to change left: two that want to swap do not stand side by side for ever.
+MERGE_ROOM_M = 2.0
+SWAP_ROOM_M = 3.0
+MERGE_ROOM_SHARE = 0.25  # to the right at most this share of the lane's length
+LATERAL_ACCEL = 2.5  # m/s², with which a steered car takes a bend: where a lane turns
+MIN_BEND_RAD = 0.2  # by more than this
+BEND_M = 6.0  # within this length
+ROW_LINES = 3  # of a VEHICLE row that drivers ask for
+RETURN_MPS = 5.0  # at which who is lost looks for its lane
+
+
+@inlined_kernel
+def look_ahead_m(kind: np.void, speed: float) -> float:
+    """How far ahead of its centre a driver looks, in m: IDM reacts earlier and more softly."""
+    if kind["model"] == MODEL_KRAUSS:
+        way = 45.0 + speed * (1.0 + kind["tau"]) + 0.5 * speed * speed / kind["decel"]
+    else:
+        way = 30.0 + 2.0 * speed + 0.2 * speed * speed
+    return float(min(way, VIEW_M))
+
+
+@inlined_kernel
+def see_line_m(kind: np.void, speed: float) -> float:
+    """How far before its front a driver asks whether it may pass a line, in m.
+
+    IDM asks as soon as it sees the line; Krauss's driver when it may soon have to brake.
+    """
+    if kind["model"] == MODEL_KRAUSS:
+        braking = 0.6 * speed * speed / kind["decel"]
+        return float(SEE_LINE_M + speed * (1.0 + kind["tau"]) + braking)
+    return VIEW_M
+
+
+@inlined_kernel
+def _slowing_to(kind: np.void, limit: float, distance: float, speed: float, dt: float) -> float:
+    """The speed in m/s from which a driver gets down to a limit `distance` m ahead."""
+    decel = LIMIT_DECEL
+    lead_s = LIMIT_LEAD_S
+    if kind["model"] == MODEL_KRAUSS:
+        decel = kind["decel"]
+        lead_s = dt
+    return math.sqrt(limit * limit + 2.0 * decel * max(distance - lead_s * speed, 0.0))
+
+
+@kernel
+def _bend_speed(roads: RoadArrays, lane: int, distance: float) -> float:
+    """The speed in m/s, now, with which a steered car can take all bends of a lane in comfort.
+
+    `distance` is the way to the start of the lane in m, negative on it.
+    """
+    row = roads.lanes[lane]
+    first = row["first_point"]
+    last = first + row["num_points"] - 1
+    slowest = math.inf
+    for k in range(first + 1, last):
+        to_bend = distance + roads.points[k]["s"]
+        if to_bend < -BEND_M:
+            continue
+        before = roads.points[k - 1]
+        m = k
+        while m < last - 1 and roads.points[m + 1]["s"] - roads.points[k]["s"] < BEND_M:
+            m += 1
+        after = roads.points[m]
+        bend = abs(
+            math.atan2(
+                before["cos"] * after["sin"] - before["sin"] * after["cos"],
+                before["cos"] * after["cos"] + before["sin"] * after["sin"],
+            )
+        )
+        if bend > MIN_BEND_RAD:
+            squared = LATERAL_ACCEL * BEND_M / bend + 2.0 * LIMIT_DECEL * max(to_bend, 0.0)
+            slowest = min(slowest, math.sqrt(squared))
+    return slowest
+
+
+@kernel
+def _shared_start(
+    roads: RoadArrays,
+    kind: np.void,
+    row: np.void,
+    lane: int,
+    chosen: int,
+    distance: float,
+    scratch: Scratch,
+) -> float:
+    """How vehicles press that have just turned off from the same lane into another link."""
+    press = no_press(kind)
+    first = roads.lanes[lane]["first_link"]
+    for link in range(first, first + roads.lanes[lane]["num_links"]):
+        if link == chosen:
+            continue
+        for k in range(scratch.link_start[link], scratch.link_end[link]):
+            other = scratch.approach[k]
+            place = -other["dist"]
+            if place > max(-distance, 0.0) and place - other["half"] < roads.links[link]["fork_m"]:
+                gap = distance + place - 0.5 * row["length"] - other["half"]
+                press = max(press, behind(kind, row["speed"], gap, other["speed"], kind["decel"]))
+    return press
+
+
+@inlined_kernel
+def _behind_entry(kind: np.void, speed: float, gap: float, leader: np.void) -> float:
+    return behind(kind, speed, gap, leader["speed"], leader["decel"])
+
+
+@kernel
+def _is_askew(row: np.void, leader: np.void) -> bool:
+    """Whether a leader around a corner stands so that its flank is nearer than its rear."""
+    askew: bool = abs(wrap_angle(leader["heading"] - row["heading"])) > ASKEW_RAD
+    return askew
+
+
+@kernel
+def _lane_end(
+    roads: RoadArrays,
+    travel: Travel,
+    row: np.void,
+    kind: np.void,
+    lane: int,
+    way: int,
+    distance: float,
+    merge_room_m: float,
+    dt: float,
+) -> float:
+    """How the end of a lane presses from which the way goes on only after a lane change."""
+    step = travel.steps[way + lane]
+    if step["to_go"] < math.inf and step["change"] == 0:
+        return no_press(kind)
+    # Stop with room enough to swing out, but on this lane and not before it.
+    length = roads.lanes[lane]["length_m"]
+    half = 0.5 * row["length"]
+    room = min(merge_room_m, MERGE_ROOM_SHARE * length)
+    if step["change"] > 0 and merge_room_m > 0.0:
+        room += row["length"] + SWAP_ROOM_M
+    place = max(length - half - room, min(2.0 * LINE_MARGIN_M, 0.5 * length))
+    return before_line(kind, row["speed"], distance - length + place, dt)
+
+
+@kernel
+def _at_line(
+    roads: RoadArrays,
+    travel: Travel,
+    rows: NDArray[np.void],
+    i: int,
+    kind: np.void,
+    link: int,
+    distance: float,
+    way: int,
+    phase: NDArray[np.int32],
+    dt: float,
+    scratch: Scratch,
+) -> tuple[float, int, bool]:
+    """How the end of a lane presses, `distance` m ahead of row i: (press, HOLD_*, it stops)."""
+    row = rows[i]
+    speed = row["speed"]
+    front = distance - 0.5 * row["length"]
+    to_line = front - roads.lanes[roads.links[link]["from_lane"]]["stop_back_m"]
+    if to_line <= 0.0:
+        # Its front is over the line: it does not wait there any more.
+        press, hold = press_inside(roads, travel, rows, i, link, -distance, way, phase, dt, scratch)
+        return press, hold, False
+    hold = may_enter(roads, travel, rows, i, link, distance, way, phase, scratch)
+    if hold != HOLD_NONE:
+        return before_line(kind, speed, to_line, dt), hold, True
+    waits = waits_inside(roads, travel, rows, i, link, distance, way, phase, scratch)
+    if waits != HOLD_NONE:
+        to_wait = front + roads.links[link]["wait_m"]
+        return before_line(kind, speed, to_wait, dt), HOLD_NONE, False
+    return no_press(kind), HOLD_NONE, False
+
+
+@inlined_kernel
+def _road_ahead(
+    roads: RoadArrays,
+    travel: Travel,
+    rows: NDArray[np.void],
+    k: int,
+    step: np.void,
+    phase: NDArray[np.int32],
+    merge_room_m: float,
+    dt: float,
+    scratch: Scratch,
+) -> tuple[float, float, int, int]:
+    """Walk the way of entry k: (press, allowed speed, why it holds, link near its line).
+
+    `step` is its own one.
+
+    Who stands close behind its leader, too far from the line to look at it, need not: nothing that
+    lies further ahead could make it stay more. Before the end of a lane that its way does not
+    follow it stops `merge_room_m` early.
+    """
+    own = scratch.entries[k]
+    i = own["row"]
+    row = rows[i]
+    kind = travel.types[row["vtype"]]
+    speed = row["speed"]
+    half = own["half"]
+    steered = row["driver"] == DRIVER_AGENT
+    lane = row["lane"]
+    here = roads.lanes[lane]
+    distance = here["length_m"] - row["s"]
+    queues = speed == 0.0 and kind["model"] == MODEL_KRAUSS and not here["internal"]
+    if queues and k + 1 < scratch.lane_end[lane] and distance >= half + NEXT_LINE_M:
+        leader = scratch.entries[k + 1]
+        gap = leader["s"] - row["s"] - half - leader["half"]
+        press = _behind_entry(kind, speed, gap, leader)
+        if press == 0.0:
+            return press, 0.0, HOLD_NONE, -1
+    limit = min(here["speed_mps"], kind["desired_max_speed"])
+    allowed = min(limit * row["speed_factor"], kind["max_speed"])
+    if steered:
+        allowed = min(allowed, _bend_speed(roads, lane, -row["s"]))
+    press = no_press(kind)
+    hold = HOLD_NONE
+    link_ahead = -1
+    if here["internal"]:
+        place = here["link_offset_m"] + row["s"]
+        before = roads.links[here["link"]]["from_lane"]
+        fork = _shared_start(roads, kind, row, before, here["link"], -place, scratch)
+        press, hold = press_inside(
+            roads, travel, rows, i, here["link"], place, row["way"], phase, dt, scratch
+        )
+        press = max(press, fork)
+    look = min(look_ahead_m(kind, speed), travel.view_m)
+    see = min(see_line_m(kind, speed) + half, travel.see_m)
+    # Behind a leader on its own lane a driver minds the next line only where it could not stop
+    # any more once the leader has passed it.
+    if k + 1 < scratch.lane_end[lane] and (scratch.entries[k + 1]["s"] - row["s"] <= travel.view_m):
+        leader = scratch.entries[k + 1]
+        press = max(
+            press,
+            _behind_entry(kind, speed, leader["s"] - row["s"] - half - leader["half"], leader),
+        )
+        look = min(look, half + NEXT_LINE_M + speed + 0.5 * speed * speed / kind["decel"])
+    way = row["way"]
+    while distance < look:
+        before = lane
+        before_way = way
+        if before == row["lane"] and before_way == row["way"]:
+            lane, way, link = leave(roads, step, before, way)
+        else:
+            lane, way, link = next_step(roads, travel, before, way)
+        if lane < 0:
+            end = _lane_end(
+                roads, travel, row, kind, before, before_way, distance, merge_room_m, dt
+            )
+            press = max(press, end)
+            break
+        stops = False
+        if link >= 0 and distance < see:
+            if distance - half - roads.lanes[before]["stop_back_m"] < STOP_LINE_M:
+                link_ahead = link if link_ahead < 0 else link_ahead
+            fork = _shared_start(roads, kind, row, before, link, distance, scratch)
+            at_line, found, stops = _at_line(
+                roads, travel, rows, i, kind, link, distance, way, phase, dt, scratch
+            )
+            press = max(press, fork, at_line)
+            hold = found if found != HOLD_NONE else hold
+        ahead = roads.lanes[lane]
+        limit = ahead["speed_mps"] * row["speed_factor"]
+        if steered:
+            allowed = min(allowed, _bend_speed(roads, lane, distance))
+        if limit < allowed:
+            allowed = min(allowed, _slowing_to(kind, limit, distance, speed, dt))
+        j = last_on(scratch, lane, row["id"], distance, travel.view_m)
+        if j >= 0:
+            leader = scratch.entries[j]
+            gap = distance + leader["s"] - half - leader["half"]
+            if gap < NEAR_M and _is_askew(row, rows[leader["row"]]):
+                gap -= ASKEW_M
+            press = max(press, _behind_entry(kind, speed, gap, leader))
+        if j >= 0 or stops:
+            break
+        distance += ahead["length_m"]
+    return press, allowed, hold, link_ahead
+
+
+@kernel
+def _beside(
+    roads: RoadArrays, travel: Travel, kind: np.void, row: np.void, lane: int, scratch: Scratch
+) -> float:
+    """How the leader on a neighbour lane presses that the body covers, or is about to."""
+    beside = roads.lanes[lane]
+    s = beside_s(roads, row["lane"], lane, row["s"])
+    half = 0.5 * row["length"]
+    j = ahead_on(scratch, lane, s, row["id"], travel.view_m)
+    if j >= 0:
+        leader = scratch.entries[j]
+        return _behind_entry(kind, row["speed"], leader["s"] - s - half - leader["half"], leader)
+    # Beyond the end of that lane, whichever way others have gone there.
+    press = no_press(kind)
+    for link in range(beside["first_link"], beside["first_link"] + beside["num_links"]):
+        distance = beside["length_m"] - s
+        beyond = roads.links[link]["next_lane"]
+        j = last_on(scratch, beyond, row["id"], distance, travel.view_m)
+        while j < 0 and roads.lanes[beyond]["internal"]:
+            distance += roads.lanes[beyond]["length_m"]
+            beyond = roads.lanes[beyond]["successor"]
+            j = last_on(scratch, beyond, row["id"], distance, travel.view_m)
+        if j >= 0:
+            leader = scratch.entries[j]
+            gap = distance + leader["s"] - half - leader["half"]
+            press = max(press, _behind_entry(kind, row["speed"], gap, leader))
+    return press
+
+
+@inlined_kernel
+def _prefetch_first(
+    roads: RoadArrays, rows: NDArray[np.void], i: int, step: NDArray[np.void], scratch: Scratch
+) -> None:
+    """What row i asks about first: itself, and where it goes next."""
+    for line in range(ROW_LINES):
+        prefetch(rows, i, line)
+    link, ahead = step[i]["link"], step[i]["next"]
+    prefetch(roads.links, link, 0)
+    prefetch(roads.links, link, 1)
+    prefetch(scratch.link_start, link, 0)
+    prefetch(roads.lanes, ahead, 0)
+    prefetch(scratch.lane_start, ahead, 0)
+
+
+@inlined_kernel
+def _prefetch_further(roads: RoadArrays, step: np.void, scratch: Scratch) -> None:
+    """What it asks about then: foes on the junction, and the lane behind it."""
+    link = step["link"]
+    if link < 0 or link >= roads.links.shape[0]:  # who follows a script has no step
+        return
+    first = roads.links[link]["first_conflict"]
+    prefetch(roads.conflicts, first, 0)
+    prefetch(roads.conflicts, first, 1)
+    ahead = roads.lanes[roads.links[link]["next_lane"]]["successor"]
+    prefetch(roads.lanes, ahead, 0)
+    prefetch(scratch.lane_start, ahead, 0)
+
+
+@kernel
+def decide(
+    roads: RoadArrays,
+    travel: Travel,
+    rows: NDArray[np.void],
+    num: int,
+    driver: int,
+    tick: int,
+    dt: float,
+    phase: NDArray[np.int32],
+    step: NDArray[np.void],
+    scratch: Scratch,
+) -> None:
+    """Decide acceleration and lane change of all vehicles of one kind of driver in one world.
+
+    Args:
+        roads: the road arrays.
+        travel: types and ways.
+        rows: VEHICLE (C,), the committed state; not written.
+        num: rows to decide for, the first of `rows`; all rows stand in the indices.
+        driver: DRIVER_* whose rows are decided for.
+        tick: of the committed state.
+        dt: seconds of a tick.
+        phase: (num_signals,) PHASE rows that are on.
+        step: PLAN (C,) of each row the step of its lane.
+        scratch: with the lane and link indices of this tick; accel (m/s²), lane_change, blinker,
+            hold and link_ahead are written.
+    """
+    total = scratch.lane_start[roads.lanes.shape[0]]
+    for k in range(total):
+        if k + SOON < total:
+            first, further = scratch.entries[k + SOON]["row"], scratch.entries[k + SOON // 2]["row"]
+            if first < num:
+                _prefetch_first(roads, rows, first, step, scratch)
+            if further < num:
+                _prefetch_further(roads, step[further], scratch)
+        i = scratch.entries[k]["row"]
+        if scratch.entries[k]["side"] or i >= num or rows[i]["driver"] != driver:
+            continue
+        row = rows[i]
+        kind = travel.types[row["vtype"]]
+        speed = row["speed"]
+        press, allowed, hold, link_ahead = _road_ahead(
+            roads, travel, rows, k, step[i], phase, MERGE_ROOM_M, dt, scratch
+        )
+        to_stop = way_to_stop(roads, travel, row)
+        if to_stop < math.inf:
+            press = max(press, before_line(kind, speed, to_stop + LINE_MARGIN_M, dt))
+        if row["side_lane"] >= 0:
+            press = max(press, _beside(roads, travel, kind, row, row["side_lane"], scratch))
+        needed = needed_change(roads, travel, row, step[i])
+        change = 0
+        if thinks_of_lanes(row, needed, tick, dt):
+            own_wish = wish(kind, speed, allowed, press)
+            change = choose_lane(roads, travel, rows, i, tick, needed, own_wish, scratch)
+        if change != 0 and driver == DRIVER_AGENT:
+            # A steered vehicle on its way into a neighbour lane still minds its own lane, to the
+            # very end, and already the leader in the other one.
+            lane = roads.lanes[row["lane"]]
+            press, allowed, _, _ = _road_ahead(
+                roads, travel, rows, k, step[i], phase, 0.0, dt, scratch
+            )
+            target = lane["left"] if change > 0 else lane["right"]
+            press = max(press, _beside(roads, travel, kind, row, target, scratch))
+        share = 0.0
+        if kind["sigma"] > 0.0:
+            share = quick_uniform(row["rng_key"], row["id"], tick, STREAM_DRIVER)
+        accel = response(kind, speed, allowed, press, share, dt)
+        if needed != 0 and change == 0 and driver == DRIVER_BACKGROUND:
+            lane = roads.lanes[row["lane"]]
+            target = lane["left"] if needed > 0 else lane["right"]
+            room = step[i]["room"] - row["s"]
+            if target >= 0 and room < FALL_IN_M:
+                # Fall in behind whom it wants to follow on the other lane.
+                fall_in = wish(
+                    kind, speed, allowed, _beside(roads, travel, kind, row, target, scratch)
+                )
+                accel = min(accel, max(fall_in, -COURTESY_DECEL))
+        scratch.accel[i] = accel
+        scratch.lane_change[i] = change
+        scratch.blinker[i] = needed
+        scratch.hold[i] = hold
+        scratch.link_ahead[i] = link_ahead
+    if driver == DRIVER_AGENT:
+        for i in range(num):
+            if is_lost(rows[i]):
+                kind = travel.types[rows[i]["vtype"]]
+                speed = rows[i]["speed"]
+                scratch.accel[i] = response(kind, speed, RETURN_MPS, no_press(kind), 0.0, dt)
+                scratch.lane_change[i] = 0
+    for k in range(total):
+        entry = scratch.entries[k]
+        if entry["blinker"] != 0 and not entry["side"]:
+            let_merge(roads, travel, rows, rows[entry["row"]], scratch)

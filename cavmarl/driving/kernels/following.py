@@ -1,0 +1,135 @@
+"""What stands ahead, a leader or a line, and what a driver of either model makes of it.
+
+Every obstacle *presses*; of several the one that presses hardest decides. A press is comparable
+only between obstacles of one driver: for IDM it is the interaction that is taken off the free
+acceleration (m/s²), for Krauss the safe speed with its sign turned (-m/s).
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from cavmarl.core.math.scalars import clamp
+from cavmarl.core.numba import kernel
+from cavmarl.core.records.codes import MODEL_KRAUSS
+from cavmarl.driving.kernels.car_following import ACCEL_LIMIT, idm_free, idm_interaction
+from cavmarl.driving.kernels.krauss import dawdle, safe_speed
+
+__all__ = [
+    "LINE_MARGIN_M",
+    "REFERENCE_LENGTH_M",
+    "accel_behind",
+    "before_line",
+    "behind",
+    "no_press",
+    "response",
+    "speed_behind",
+    "wish",
+]
+
+# IDM's distances are measured between the centres of two cars of this length, as highway-env does.
+REFERENCE_LENGTH_M = 5.0
+LINE_MARGIN_M = 1.0  # a driver stops with its front this far before a line
+
+
+@kernel
+def no_press(kind: np.void) -> float:
+    """What nothing ahead presses."""
+    return -math.inf if kind["model"] == MODEL_KRAUSS else 0.0
+
+
+@kernel
+def behind(
+    kind: np.void, speed: float, gap: float, front_speed: float, front_decel: float
+) -> float:
+    """How a leader presses.
+
+    Args:
+        kind: VTYPE of the driver.
+        speed: of the driver, m/s.
+        gap: between the bumpers, m.
+        front_speed: of the leader, m/s.
+        front_decel: with which the leader can brake in comfort, m/s².
+    """
+    if kind["model"] == MODEL_KRAUSS:
+        room = gap - kind["min_gap"]
+        return -safe_speed(room, front_speed, kind["decel"], front_decel, kind["tau"])
+    return idm_interaction(
+        speed,
+        max(gap, 0.1) + REFERENCE_LENGTH_M,
+        front_speed,
+        kind["accel"],
+        kind["decel"],
+        kind["min_gap"] + REFERENCE_LENGTH_M,
+        kind["tau"],
+    )
+
+
+@kernel
+def before_line(kind: np.void, speed: float, gap: float, dt: float) -> float:
+    """How a line presses that is `gap` m ahead of the front."""
+    if kind["model"] == MODEL_KRAUSS:
+        return -safe_speed(gap - LINE_MARGIN_M, 0.0, kind["decel"], kind["decel"], dt)
+    jam = kind["min_gap"] + REFERENCE_LENGTH_M
+    distance = max(gap - LINE_MARGIN_M, 0.1 - kind["min_gap"]) + jam
+    return idm_interaction(speed, distance, 0.0, kind["accel"], kind["decel"], jam, kind["tau"])
+
+
+@kernel
+def wish(kind: np.void, speed: float, allowed: float, press: float) -> float:
+    """The acceleration in m/s² that a driver would like, as lane changes weigh it.
+
+    Krauss's drivers reach their next speed within a reaction time, whatever the tick is.
+    """
+    if kind["model"] == MODEL_KRAUSS:
+        wanted = min(-press, allowed, speed + kind["accel"] * kind["tau"])
+        return float((wanted - speed) / kind["tau"])
+    return idm_free(speed, allowed, kind["accel"]) - press
+
+
+@kernel
+def accel_behind(
+    kind: np.void, speed: float, allowed: float, gap: float, front_speed: float, front_decel: float
+) -> float:
+    """`wish` behind one leader."""
+    return wish(kind, speed, allowed, behind(kind, speed, gap, front_speed, front_decel))
+
+
+@kernel
+def speed_behind(kind: np.void, gap: float, front_speed: float, front_decel: float) -> float:
+    """The speed in m/s at which `gap` m between bumpers is just what a driver wants."""
+    if kind["model"] == MODEL_KRAUSS:
+        room = gap - kind["min_gap"]
+        return safe_speed(room, front_speed, kind["decel"], front_decel, kind["tau"])
+    # The positive root of jam + v·tau + v·(v - front) / (2·sqrt(a·b)) = gap.
+    scale = 2.0 * math.sqrt(kind["accel"] * kind["decel"])
+    linear = kind["tau"] - front_speed / scale
+    room = gap - kind["min_gap"]
+    if room <= 0.0:
+        return 0.0
+    root = math.sqrt(linear * linear + 4.0 * room / scale)
+    return float(max(0.5 * scale * (root - linear), 0.0))
+
+
+@kernel
+def response(
+    kind: np.void, speed: float, allowed: float, press: float, share: float, dt: float
+) -> float:
+    """The acceleration in m/s² of the coming tick.
+
+    Args:
+        kind: VTYPE of the driver.
+        speed: m/s.
+        allowed: the speed that limits and the vehicle allow, m/s.
+        press: of all that stands ahead.
+        share: a random number in [0, 1), for Krauss's imperfection.
+        dt: seconds of the tick.
+    """
+    if kind["model"] == MODEL_KRAUSS:
+        wanted = min(-press, allowed, speed + kind["accel"] * dt)
+        wanted = dawdle(max(wanted, 0.0), kind["accel"], kind["sigma"], share, dt)
+        return float(max((wanted - speed) / dt, -kind["emergency_decel"]))
+    accel = idm_free(speed, allowed, kind["accel"]) - press
+    return clamp(accel, -ACCEL_LIMIT, ACCEL_LIMIT)

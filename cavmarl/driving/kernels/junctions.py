@@ -1,0 +1,447 @@
+"""Right of way: whether a driver may enter a link, or go on from a waiting position inside.
+
+A driver enters a link if no foe is in the shared area when it would be, if it gives way to those it
+must give way to, and if there is room behind the junction. Where the map lets drivers wait inside
+the junction (for oncoming traffic before a left turn), what lies beyond that place is asked there.
+All questions are minima and any-ofs over the foes: the order of rows plays no part.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cavmarl.core.numba import kernel
+from cavmarl.core.records.arrays import RoadArrays, Scratch, Travel
+from cavmarl.core.records.codes import (
+    DRIVER_AGENT,
+    HOLD_EXIT_BLOCKED,
+    HOLD_NONE,
+    HOLD_SIGNAL,
+    HOLD_YIELD,
+    SIGNAL_GREEN_MAJOR,
+    SIGNAL_NONE,
+    SIGNAL_OFF,
+    SIGNAL_RED,
+    SIGNAL_RED_YELLOW,
+    SIGNAL_STOP_THEN_GO,
+    SIGNAL_YELLOW_MAJOR,
+    SIGNAL_YELLOW_MINOR,
+)
+from cavmarl.driving.kernels.announcing import IMPATIENT_S, STANDING_MPS, is_let_stand
+from cavmarl.driving.kernels.following import LINE_MARGIN_M, before_line, behind, no_press
+from cavmarl.driving.kernels.ways import next_step
+
+__all__ = [
+    "STOP_SIGN_S",
+    "link_signal",
+    "may_enter",
+    "press_inside",
+    "waits_inside",
+]
+
+FOE_ACCEL = 2.5  # m/s², how a driver thinks that others speed up over a junction,
+OWN_ACCEL = 1.8  # and, to be safe, itself
+COMFORT_STOP = 3.0  # m/s², a driver stops for yellow where this braking is enough
+HARD_STOP = 5.0  # m/s², a vehicle that needs more to stop before the line will not stop
+GAP_S = 1.0  # s between the last of one and the first of the other in a shared area
+STEERED_MPS = 5.0  # a steered car is taken to turn no faster than this
+LAST_CHANCE_M = 3.0  # with the front this near to the line
+ROOM_M = 3.0  # free way left behind a vehicle that clears a junction
+EXIT_LANES = 4  # looked along for room,
+EXIT_LOOK_M = 75.0  # and no further than this: ten cars stand there
+IMPATIENCE_S = 180.0  # after which one who gives way makes others brake
+FORCED_STOP = 4.5  # m/s², and how hard; less in proportion after less time
+STOP_SIGN_S = 0.5  # how long one stands at a stop sign, and before a tie is broken
+WAIT_SLACK_M = 0.5  # a front this far beyond a waiting position still waits there
+STATE_STOP = ord("s")
+STATE_ALLWAY_STOP = ord("w")
+
+
+@kernel
+def link_signal(roads: RoadArrays, link: int, phase: NDArray[np.int32]) -> int:
+    """The letter that a link's signal shows, as a SIGNAL_* code; `phase` (num_signals,)."""
+    signal = roads.links[link]["signal"]
+    if signal < 0:
+        return SIGNAL_NONE
+    first = roads.phases[phase[signal]]["first_state"]
+    return int(roads.phase_states[first + roads.links[link]["signal_index"]])
+
+
+@kernel
+def _earliest(distance: float, speed: float, limit: float, accel: float) -> float:
+    """Time in s to drive `distance` m when speeding up with `accel` m/s² to `limit` m/s."""
+    if distance <= 0.0:
+        return 0.0
+    limit = max(limit, speed, 0.1)
+    ramp = (limit * limit - speed * speed) / (2.0 * accel)
+    if distance < ramp:
+        return (math.sqrt(speed * speed + 2.0 * accel * distance) - speed) / accel
+    return (limit - speed) / accel + (distance - ramp) / limit
+
+
+@kernel
+def _ignores(row: np.void, foe: np.void, link: int, signal: int) -> bool:
+    """Whether a driver at `link` need not wait for an approaching foe that has the right of way.
+
+    `signal` is what the foe's own signal shows.
+    """
+    if signal == SIGNAL_RED or signal == SIGNAL_RED_YELLOW:
+        return True
+    if signal == SIGNAL_YELLOW_MINOR or signal == SIGNAL_YELLOW_MAJOR:
+        return True  # who cannot stop any more has been looked at before
+    if is_let_stand(foe):
+        return True
+    if foe["speed"] > STANDING_MPS or foe["hold"] != HOLD_YIELD:
+        return False
+    # Both wait for somebody: who has stood longer goes first, and then goes on.
+    if row["hold"] == HOLD_NONE and row["stopped_at"] == link:
+        return True
+    if row["wait_s"] < STOP_SIGN_S or row["speed"] > STANDING_MPS:
+        return False
+    longer: bool = row["wait_s"] > foe["wait_s"]
+    return longer or (row["wait_s"] == foe["wait_s"] and row["id"] < foe["id"])
+
+
+@kernel
+def _is_harmless(
+    roads: RoadArrays,
+    rows: NDArray[np.void],
+    row: np.void,
+    link: int,
+    conflict: np.void,
+    foe: np.void,
+    front: float,
+    apart: float,
+    gives_way: bool,
+    phase: NDArray[np.int32],
+) -> bool:
+    """Whether an APPROACH need not be minded, whenever it comes to the shared area.
+
+    Its `front` has so many m to where it can still stop; its rear leaves the shared area `apart` m
+    before the own one.
+    """
+    if front <= 0.0:
+        # Who stands on the junction before the shared area is kept from it by somebody else.
+        before_area = foe["dist"] + conflict["foe_enter_m"] - foe["half"] > 0.0
+        if before_area and foe["speed"] < STANDING_MPS and rows[foe["row"]]["wait_s"] > IMPATIENT_S:
+            return True
+        # Behind one that is faster and leads into the same lane, one can follow.
+        follows: bool = conflict["merging"] and apart > ROOM_M and row["speed"] <= foe["speed"]
+        return follows
+    committed = foe["speed"] * foe["speed"] > 2.0 * HARD_STOP * max(front, 0.01)
+    if committed:
+        return False
+    if not (gives_way and conflict["must_yield"]):
+        return True
+    if _ignores(row, rows[foe["row"]], link, link_signal(roads, conflict["foe"], phase)):
+        return True
+    patience = min(row["wait_s"] / IMPATIENCE_S, 1.0)
+    if row["hold"] == HOLD_NONE and row["stopped_at"] == link:
+        patience = 1.0  # it has been let in and goes on
+    brakes: bool = foe["speed"] * foe["speed"] < 2.0 * FORCED_STOP * patience * front
+    return brakes
+
+
+@kernel
+def _foe_blocks(
+    roads: RoadArrays,
+    rows: NDArray[np.void],
+    row: np.void,
+    link: int,
+    distance: float,
+    limit: float,
+    conflict: np.void,
+    foe: np.void,
+    gives_way: bool,
+    phase: NDArray[np.int32],
+) -> bool:
+    """Whether one APPROACH is, or will be, in the shared area while `row` is, or goes first."""
+    to_clear = foe["dist"] + conflict["foe_leave_m"] + foe["half"]
+    if to_clear <= 0.0:
+        return False
+    foe_link = roads.links[conflict["foe"]]
+    foe_lane = roads.lanes[foe_link["from_lane"]]
+    # Its front before the line that it can still stop at: the stop line, or, where the shared
+    # area lies beyond that, its waiting position inside.
+    front = foe["dist"] - foe["half"] - foe_lane["stop_back_m"]
+    wait_m = foe_link["wait_m"]
+    if front <= 0.0 and conflict["foe_enter_m"] >= wait_m - LINE_MARGIN_M:
+        front += wait_m + WAIT_SLACK_M
+    half = 0.5 * row["length"]
+    apart = distance + conflict["leave_m"] - half - to_clear
+    if _is_harmless(roads, rows, row, link, conflict, foe, front, apart, gives_way, phase):
+        return False
+    cleared = to_clear / max(foe["speed"], 0.1)
+    time_in = _earliest(distance + conflict["enter_m"] - half, row["speed"], limit, FOE_ACCEL)
+    if front <= 0.0:
+        inside: bool = cleared + 0.5 * GAP_S > time_in
+        return inside
+    if cleared + GAP_S < time_in:
+        return False
+    time_out = _earliest(distance + conflict["leave_m"] + half, row["speed"], limit, OWN_ACCEL)
+    to_area = foe["dist"] + conflict["foe_enter_m"] - foe["half"]
+    arrives = _earliest(to_area, foe["speed"], foe_lane["speed_mps"], FOE_ACCEL)
+    return arrives < time_out + GAP_S
+
+
+@kernel
+def _blocked_by_foes(
+    roads: RoadArrays,
+    rows: NDArray[np.void],
+    i: int,
+    link: int,
+    distance: float,
+    wait_m: float,
+    inside: bool,
+    gives_way: bool,
+    phase: NDArray[np.int32],
+    scratch: Scratch,
+) -> bool:
+    """Whether a foe is, or will be, where row i would be on `link`, `distance` m from its line.
+
+    Asks about the shared areas before `wait_m`, or, from `inside`, about those beyond.
+    """
+    row = rows[i]
+    limit = roads.lanes[roads.links[link]["next_lane"]]["speed_mps"]
+    if row["driver"] == DRIVER_AGENT:
+        limit = min(limit, STEERED_MPS)
+    first = roads.links[link]["first_conflict"]
+    for c in range(first, first + roads.links[link]["num_conflicts"]):
+        conflict = roads.conflicts[c]
+        begin = scratch.link_start[conflict["foe"]]
+        end = scratch.link_end[conflict["foe"]]
+        if begin == end or (conflict["enter_m"] >= wait_m - LINE_MARGIN_M) != inside:
+            continue
+        for k in range(begin, end):
+            foe = scratch.approach[k]
+            if foe["row"] != i and _foe_blocks(
+                roads, rows, row, link, distance, limit, conflict, foe, gives_way, phase
+            ):
+                return True
+    return False
+
+
+@kernel
+def _exit_blocked(
+    roads: RoadArrays, travel: Travel, row: np.void, link: int, way: int, scratch: Scratch
+) -> bool:
+    """Whether a row could not clear the junction behind the last standing vehicle on its way.
+
+    Who still moves in between will need room as well. Nobody counts who is more than `EXIT_LOOK_M`
+    beyond the junction.
+    """
+    target = roads.links[link]
+    room = 0.0
+    lane = target["next_lane"]
+    while roads.lanes[lane]["internal"]:
+        for k in range(scratch.lane_start[lane], scratch.lane_end[lane]):
+            other = scratch.entries[k]
+            if other["id"] != row["id"]:
+                room -= 2.0 * other["half"] + ROOM_M
+        lane = roads.lanes[lane]["successor"]
+    needed = row["length"] + ROOM_M
+    beyond = 0.0
+    for _ in range(EXIT_LANES):
+        for k in range(scratch.lane_start[lane], scratch.lane_end[lane]):
+            other = scratch.entries[k]
+            if beyond + other["s"] > EXIT_LOOK_M:
+                return False
+            if other["speed"] < STANDING_MPS:
+                room += other["s"] - other["half"]
+                blocked: bool = room < needed
+                return blocked
+            room -= 2.0 * other["half"] + ROOM_M
+        room += roads.lanes[lane]["length_m"]
+        beyond += roads.lanes[lane]["length_m"]
+        if room >= needed or beyond > EXIT_LOOK_M:
+            return False
+        lane, way, _ = next_step(roads, travel, lane, way)
+        if lane < 0:
+            return False
+    return False
+
+
+@kernel
+def may_enter(
+    roads: RoadArrays,
+    travel: Travel,
+    rows: NDArray[np.void],
+    i: int,
+    link: int,
+    distance: float,
+    way: int,
+    phase: NDArray[np.int32],
+    scratch: Scratch,
+) -> int:
+    """Whether row i may drive into `link`: HOLD_NONE, or why it has to stop at the line.
+
+    Args:
+        roads: the road arrays.
+        travel: the ways.
+        rows: VEHICLE (C,).
+        i: the row that asks.
+        link: LINK row.
+        distance: of its centre to the end of its lane in m.
+        way: of the row beyond the junction.
+        phase: (num_signals,) PHASE rows that are on.
+        scratch: with the lane and link indices of this tick.
+    """
+    row = rows[i]
+    signal = link_signal(roads, link, phase)
+    back = roads.lanes[roads.links[link]["from_lane"]]["stop_back_m"]
+    front = max(distance - 0.5 * row["length"] - back, 0.01)
+    needed = row["speed"] * row["speed"] / (2.0 * front)
+    if signal == SIGNAL_RED or signal == SIGNAL_RED_YELLOW:
+        return HOLD_SIGNAL
+    if (signal == SIGNAL_YELLOW_MINOR or signal == SIGNAL_YELLOW_MAJOR) and needed < COMFORT_STOP:
+        # Who gave way at the line all through green goes now, as the others stop.
+        if row["hold"] != HOLD_YIELD or front > LAST_CHANCE_M:
+            return HOLD_SIGNAL
+    target = roads.links[link]
+    if target["num_conflicts"] == 0:
+        return HOLD_NONE
+    state = target["state"]
+    must_stop = signal == SIGNAL_STOP_THEN_GO or (
+        signal == SIGNAL_NONE and (state == STATE_STOP or state == STATE_ALLWAY_STOP)
+    )
+    if must_stop and row["stopped_at"] != link:
+        return HOLD_YIELD
+    gives_way = signal != SIGNAL_GREEN_MAJOR and signal != SIGNAL_OFF
+    if _blocked_by_foes(
+        roads, rows, i, link, distance, target["wait_m"], False, gives_way, phase, scratch
+    ):
+        return HOLD_YIELD
+    if _exit_blocked(roads, travel, row, link, way, scratch):
+        return HOLD_EXIT_BLOCKED
+    return HOLD_NONE
+
+
+@kernel
+def waits_inside(
+    roads: RoadArrays,
+    travel: Travel,
+    rows: NDArray[np.void],
+    i: int,
+    link: int,
+    distance: float,
+    way: int,
+    phase: NDArray[np.int32],
+    scratch: Scratch,
+) -> int:
+    """Whether row i has to stop at the waiting position of `link`, if there is one: HOLD_*.
+
+    Arguments as in `may_enter`; the distance is negative inside.
+    """
+    wait_m = roads.links[link]["wait_m"]
+    if wait_m == math.inf:
+        return HOLD_NONE
+    signal = link_signal(roads, link, phase)
+    gives_way = signal != SIGNAL_GREEN_MAJOR and signal != SIGNAL_OFF
+    if _blocked_by_foes(roads, rows, i, link, distance, wait_m, True, gives_way, phase, scratch):
+        return HOLD_YIELD
+    if _exit_blocked(roads, travel, rows[i], link, way, scratch):
+        return HOLD_EXIT_BLOCKED
+    return HOLD_NONE
+
+
+@kernel
+def press_inside(
+    roads: RoadArrays,
+    travel: Travel,
+    rows: NDArray[np.void],
+    i: int,
+    link: int,
+    place: float,
+    way: int,
+    phase: NDArray[np.int32],
+    dt: float,
+    scratch: Scratch,
+) -> tuple[float, int]:
+    """How foes on the same junction press row i, whose front is beyond its stop line.
+
+    Of two vehicles in conflict the one that is nearer to the shared area goes first; at equal
+    distance the smaller id. Where both lead into one lane, the other follows it there. At a
+    waiting position inside, row i waits until it may go on.
+
+    Args:
+        roads: the road arrays.
+        travel: types and ways.
+        rows: VEHICLE (C,).
+        i: the row that asks.
+        link: that it drives on.
+        place: of its centre, m beyond the end of the lane that it comes from.
+        way: of the row beyond the junction.
+        phase: (num_signals,) PHASE rows that are on.
+        dt: seconds a tick.
+        scratch: with the lane and link indices of this tick.
+
+    Returns:
+        press, and why it holds at the waiting position (HOLD_*).
+    """
+    row = rows[i]
+    kind = travel.types[row["vtype"]]
+    half = 0.5 * row["length"]
+    front = place + half
+    press = no_press(kind)
+    target = roads.links[link]
+    wait_m = target["wait_m"]
+    if front <= wait_m + WAIT_SLACK_M:
+        hold = waits_inside(roads, travel, rows, i, link, -place, way, phase, scratch)
+        if hold != HOLD_NONE:
+            return before_line(kind, row["speed"], wait_m - front, dt), hold
+    first = target["first_conflict"]
+    for c in range(first, first + target["num_conflicts"]):
+        conflict = roads.conflicts[c]
+        if place - half > conflict["leave_m"]:
+            continue
+        for k in range(scratch.link_start[conflict["foe"]], scratch.link_end[conflict["foe"]]):
+            foe = scratch.approach[k]
+            if foe["row"] != i:
+                press = max(press, _press_of(roads, kind, row, conflict, foe, place, dt))
+    return press, HOLD_NONE
+
+
+@kernel
+def _press_of(
+    roads: RoadArrays,
+    kind: np.void,
+    row: np.void,
+    conflict: np.void,
+    foe: np.void,
+    place: float,
+    dt: float,
+) -> float:
+    """How one APPROACH presses a row on the same junction, `place` m beyond its stop line."""
+    half = 0.5 * row["length"]
+    front = place + half
+    foe_front = foe["half"] - foe["dist"]
+    foe_rear = -foe["half"] - foe["dist"]
+    wait_m = roads.links[foe["link"]]["wait_m"]
+    waits = (
+        foe_front <= wait_m + WAIT_SLACK_M
+        and conflict["foe_enter_m"] >= wait_m - LINE_MARGIN_M
+        and foe["speed"] < STANDING_MPS
+    )
+    if foe_front <= 0.0 or foe_rear > conflict["foe_leave_m"] or waits:
+        return no_press(kind)
+    to_area = conflict["enter_m"] - front
+    foe_to_area = conflict["foe_enter_m"] - foe_front
+    # How much further the one has to go to be out of the shared area than the other's rear.
+    gap = (conflict["leave_m"] - front) - (conflict["foe_leave_m"] - foe_rear)
+    if to_area >= 0.0:
+        if foe_to_area > to_area or (foe_to_area == to_area and foe["id"] > row["id"]):
+            return no_press(kind)
+        if conflict["merging"] and gap > to_area:
+            return behind(kind, row["speed"], gap, foe["speed"], kind["decel"])
+        return before_line(kind, row["speed"], to_area, dt)
+    # Both are in it side by side: who is nearer to its end goes on, the other stays behind.
+    if foe_to_area > 0.0:
+        return no_press(kind)
+    rest = conflict["leave_m"] - front
+    foe_rest = conflict["foe_leave_m"] - foe_front
+    if foe_rest > rest or (foe_rest == rest and foe["id"] > row["id"]):
+        return no_press(kind)
+    return behind(kind, row["speed"], gap, foe["speed"], kind["decel"])

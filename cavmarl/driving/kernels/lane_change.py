@@ -1,0 +1,66 @@
+"""MOBIL: whether a lane change pays and imposes no hard braking.
+
+Kesting, Treiber, Helbing: "General lane-changing model MOBIL for car-following models",
+Transportation Research Record 1999, 2007, with highway-env's defaults (`IDMVehicle.mobil`).
+"""
+
+from __future__ import annotations
+
+from cavmarl.core.numba import kernel
+
+__all__ = [
+    "LANE_CHANGE_DELAY_S",
+    "MAX_BRAKING_IMPOSED",
+    "MIN_ACCEL_GAIN",
+    "MIN_SPEED_MPS",
+    "POLITENESS",
+    "mobil_accepts",
+]
+
+POLITENESS = 0.0  # weight of the followers' gains, from 0 (selfish) to 1
+MIN_ACCEL_GAIN = 0.2  # m/s², a change that gains less is not worth it
+MAX_BRAKING_IMPOSED = 2.0  # m/s², harder braking makes a change unsafe
+LANE_CHANGE_DELAY_S = 1.0  # s between two decisions of a driver
+MIN_SPEED_MPS = 1.0  # m/s, slower cars do not change lanes
+
+
+@kernel
+def mobil_accepts(
+    own_accel: float,
+    own_accel_after: float,
+    new_follower_accel: float,
+    new_follower_accel_after: float,
+    old_follower_accel: float,
+    old_follower_accel_after: float,
+    mandatory: bool,
+    max_braking: float = MAX_BRAKING_IMPOSED,
+) -> bool:
+    """Whether to change into a lane; all accelerations from the car-following model, in m/s².
+
+    Args:
+        own_accel: of the car that considers the change, now.
+        own_accel_after: of the same car after the change.
+        new_follower_accel: of the car that would be behind, now; 0 if there is none.
+        new_follower_accel_after: of that car after the change; 0 if there is none.
+        old_follower_accel: of the car that is behind, now; 0 if there is none.
+        old_follower_accel_after: of that car after the change; 0 if there is none.
+        mandatory: the route needs the change, so it only has to be safe for both. The caller sees
+            to it that the lane lies on the route's side.
+        max_braking: m/s², harder braking makes the change unsafe.
+    """
+    if new_follower_accel_after < -max_braking:
+        return False
+    if mandatory:
+        return own_accel_after >= -max_braking
+    gain = (
+        own_accel_after
+        - own_accel
+        + POLITENESS
+        * (
+            new_follower_accel_after
+            - new_follower_accel
+            + old_follower_accel_after
+            - old_follower_accel
+        )
+    )
+    return gain >= MIN_ACCEL_GAIN

@@ -1,0 +1,223 @@
+"""Which lane a driver wants, for its way or to drive faster, and whether it may change now.
+
+The question is MOBIL's (`lane_change`); this file finds whom it concerns, and when a way needs it.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cavmarl.core.numba import inlined_kernel, kernel
+from cavmarl.core.records.arrays import RoadArrays, Scratch, Travel
+from cavmarl.core.records.codes import DRIVER_AGENT
+from cavmarl.driving.kernels.following import accel_behind, no_press, wish
+from cavmarl.driving.kernels.lane_change import (
+    LANE_CHANGE_DELAY_S,
+    MAX_BRAKING_IMPOSED,
+    MIN_ACCEL_GAIN,
+    mobil_accepts,
+)
+from cavmarl.driving.kernels.lane_index import ahead_on, beside_s, last_on, neighbor_behind
+from cavmarl.driving.kernels.stopping import STAY, lane_to_stop
+from cavmarl.driving.kernels.ways import next_step
+
+__all__ = ["LOOK_BACK_M", "SIDE_GAP_M", "choose_lane", "needed_change", "thinks_of_lanes"]
+
+LOOK_BACK_M = 60.0  # how far back a lane change looks for followers
+CHANGE_EARLY_M = 80.0  # a change that the route needs is made this far before it must be,
+CHANGE_EARLY_S = 12.0  # plus the way of this time
+MAX_BRAKING_ACCEPTED = 4.0  # m/s², harder braking behind the new leader is never worth it
+MAX_BRAKING_NEEDED = 4.0  # m/s², what a change that the way needs may ask of the one behind
+CREEP_MPS = 1.0  # so slow, a driver that has to change does so to the very end of its lane
+SIDEWAYS_S = 2.5  # a lane change takes about this long, and has to end before the lane does
+BRAKE_TIME_S = 0.5  # a braking that ends within this time is not felt
+SIDE_GAP_M = 1.0  # m between bumpers, the least with which a lane change starts
+
+
+@inlined_kernel
+def needed_change(roads: RoadArrays, travel: Travel, row: np.void, step: np.void) -> int:
+    """The side that a vehicle's way needs it to change to by now: 1 left, -1 right, 0 none.
+
+    `step` is its own one.
+    """
+    lane = row["lane"]
+    if roads.lanes[lane]["internal"]:
+        return 0
+    to_stop = lane_to_stop(roads, travel, row)
+    if to_stop != 0:
+        return to_stop if to_stop != STAY else 0
+    if step["change"] == 0:
+        return 0
+    early = (CHANGE_EARLY_M + CHANGE_EARLY_S * row["speed"]) * step["changes"]
+    return int(step["change"]) if step["room"] - row["s"] <= early else 0
+
+
+@inlined_kernel
+def _desired(roads: RoadArrays, kind: np.void, row: np.void, lane: int) -> float:
+    """The speed in m/s that a driver wants on a lane."""
+    limit = min(roads.lanes[lane]["speed_mps"], kind["desired_max_speed"])
+    return float(min(limit * row["speed_factor"], kind["max_speed"]))
+
+
+@kernel
+def _change_is_safe(
+    roads: RoadArrays,
+    travel: Travel,
+    rows: NDArray[np.void],
+    i: int,
+    target: int,
+    own_wish: float,
+    mandatory: bool,
+    scratch: Scratch,
+) -> bool:
+    """MOBIL's question for row i and lane `target`, with the gaps that it takes for granted."""
+    row = rows[i]
+    kind = travel.types[row["vtype"]]
+    speed = row["speed"]
+    half = 0.5 * row["length"]
+    lane = roads.lanes[target]
+    s = beside_s(roads, row["lane"], target, row["s"])
+    desired = _desired(roads, kind, row, target)
+    ahead = 0.0
+    j = ahead_on(scratch, target, s, row["id"], travel.view_m)
+    if j >= 0:
+        ahead = scratch.entries[j]["s"] - s
+    else:
+        ahead = lane["length_m"] - s
+        beyond, way, _ = next_step(roads, travel, target, row["way"])
+        while beyond >= 0:
+            j = last_on(scratch, beyond, row["id"], ahead, travel.view_m)
+            if j >= 0:
+                ahead += scratch.entries[j]["s"]
+            if j >= 0 or not roads.lanes[beyond]["internal"]:
+                break
+            ahead += roads.lanes[beyond]["length_m"]
+            beyond, way, _ = next_step(roads, travel, beyond, way)
+    after = wish(kind, speed, desired, no_press(kind))
+    if j >= 0:
+        leader = scratch.entries[j]
+        net = ahead - half - leader["half"]
+        if net < SIDE_GAP_M:
+            return False
+        after = accel_behind(kind, speed, desired, net, leader["speed"], leader["decel"])
+    follower_before = 0.0
+    follower_after = 0.0
+    k, gap = neighbor_behind(roads, scratch, target, s, row["id"], LOOK_BACK_M, travel.view_m)
+    if k >= 0:
+        follower = scratch.entries[k]
+        other = rows[follower["row"]]
+        if gap < half + follower["half"] + SIDE_GAP_M:
+            return False
+        theirs = travel.types[other["vtype"]]
+        pace = follower["speed"]
+        limit = _desired(roads, theirs, other, target)
+        follower_before = wish(theirs, pace, limit, no_press(theirs))
+        if j >= 0:
+            leader = scratch.entries[j]
+            net = gap + ahead - follower["half"] - leader["half"]
+            follower_before = accel_behind(
+                theirs, pace, limit, net, leader["speed"], leader["decel"]
+            )
+        net = gap - follower["half"] - half
+        follower_after = accel_behind(theirs, pace, limit, net, speed, kind["decel"])
+        # Who stands or creeps cannot brake for long, whatever the model answers at short distances.
+        follower_after = max(follower_after, -pace / BRAKE_TIME_S)
+    after = max(after, -speed / BRAKE_TIME_S)
+    if after < -MAX_BRAKING_ACCEPTED:
+        return False
+    return mobil_accepts(
+        own_wish,
+        after,
+        follower_before,
+        follower_after,
+        0.0,
+        0.0,
+        mandatory,
+        MAX_BRAKING_NEEDED if mandatory else MAX_BRAKING_IMPOSED,
+    )
+
+
+@inlined_kernel
+def _may_change(
+    roads: RoadArrays,
+    travel: Travel,
+    rows: NDArray[np.void],
+    i: int,
+    side: int,
+    needed: int,
+    own_wish: float,
+    scratch: Scratch,
+) -> bool:
+    """Whether row i wants to and can change to one side: for its way, or to drive faster."""
+    row = rows[i]
+    lane = roads.lanes[row["lane"]]
+    target = lane["left"] if side > 0 else lane["right"]
+    if lane["internal"] or target < 0 or (needed != 0 and needed != side):
+        return False
+    rest = lane["length_m"] - row["s"] - SIDEWAYS_S * row["speed"]
+    if rest < (0.5 * row["length"] if needed == 0 or row["speed"] > CREEP_MPS else 0.0):
+        return False
+    if needed == 0:
+        if row["speed"] < 1.0 or lane_to_stop(roads, travel, row) == STAY:
+            return False
+        # Not even an empty lane would be worth it.
+        kind = travel.types[row["vtype"]]
+        desired = _desired(roads, kind, row, target)
+        if wish(kind, row["speed"], desired, no_press(kind)) - own_wish < MIN_ACCEL_GAIN:
+            return False
+        beyond = travel.steps[row["way"] + target]
+        if beyond["to_go"] == math.inf:
+            return False
+        early = (CHANGE_EARLY_M + CHANGE_EARLY_S * row["speed"]) * beyond["changes"]
+        if beyond["change"] != 0 and beyond["room"] - row["s"] < 2.0 * early:
+            return False
+    return _change_is_safe(roads, travel, rows, i, target, own_wish, needed != 0, scratch)
+
+
+@inlined_kernel
+def thinks_of_lanes(row: np.void, needed: int, tick: int, dt: float) -> bool:
+    """Whether a driver thinks of a lane change in this tick.
+
+    Each does so once in LANE_CHANGE_DELAY_S for either side, not all in the same ticks; always, if
+    its way needs the change and it does not stand. A suggestion for an agent is made anew at each
+    step.
+    """
+    if row["driver"] == DRIVER_AGENT or (needed != 0 and row["speed"] > 0.0):
+        return True
+    turns = max(1, round(0.5 * LANE_CHANGE_DELAY_S / dt))
+    turn: bool = (tick // 2 + row["id"]) % turns == 0
+    return turn
+
+
+@inlined_kernel
+def choose_lane(
+    roads: RoadArrays,
+    travel: Travel,
+    rows: NDArray[np.void],
+    i: int,
+    tick: int,
+    needed: int,
+    own_wish: float,
+    scratch: Scratch,
+) -> int:
+    """The lane change that row i makes now: 1 left, -1 right, 0 none.
+
+    In even ticks background drivers may only change to the left, in odd ones to the right: two of
+    them never take the same gap from both sides in one tick, whoever is asked first. A suggestion
+    for an agent binds nobody, so it has no such rule.
+    """
+    row = rows[i]
+    if row["driver"] == DRIVER_AGENT:
+        for side in (1, -1):
+            if _may_change(roads, travel, rows, i, side, needed, own_wish, scratch):
+                return side
+        return 0
+    side = 1 if tick % 2 == 0 else -1
+    if row["side_lane"] < 0 and _may_change(
+        roads, travel, rows, i, side, needed, own_wish, scratch
+    ):
+        return side
+    return 0

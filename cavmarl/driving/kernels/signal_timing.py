@@ -1,0 +1,60 @@
+"""When a signal will show something else, as roadside units broadcast it (SPaT, SAE J2735)."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cavmarl.core.numba import kernel
+from cavmarl.core.records.arrays import RoadArrays
+from cavmarl.roads.kernels.signal_phases import program_at
+
+__all__ = ["time_to_change"]
+
+
+@kernel
+def time_to_change(
+    roads: RoadArrays,
+    controllers: NDArray[np.void],
+    link: int,
+    phase: NDArray[np.int32],
+    time: float,
+    dt: float,
+) -> float:
+    """Seconds until the signal of a link shows another letter; a whole cycle if it never does.
+
+    Of an actuated program it is the soonest time: phases that may be prolonged last their shortest.
+
+    Args:
+        roads: the road arrays.
+        controllers: CONTROLLER (num_controllers,), the state of the actuated programs.
+        link: LINK row that has a signal.
+        phase: (num_signals,) PHASE rows that are on.
+        time: s since the world's reset.
+        dt: seconds of a tick.
+    """
+    index = roads.links[link]["signal_index"]
+    signal = roads.links[link]["signal"]
+    program = roads.programs[program_at(roads, signal, time, dt)]
+    actuated = program["controller"] >= 0
+    row = phase[signal]
+    letter = roads.phase_states[roads.phases[row]["first_state"] + index]
+    if actuated:
+        left = 1e-3 * controllers[program["controller"]]["since_ms"] - time
+    else:
+        left = -((time - program["offset_s"]) % program["cycle_s"])
+        for earlier in range(program["first_phase"], row):
+            left += roads.phases[earlier]["duration_s"]
+    # From the beginning of the phase that is on to that of the first with another letter.
+    for _ in range(program["num_phases"]):
+        if roads.phase_states[roads.phases[row]["first_state"] + index] != letter:
+            return float(max(left, 0.0))
+        if actuated:
+            left += 1e-3 * roads.phases[row]["min_ms"]
+            row = roads.phases[row]["following"]
+        else:
+            left += roads.phases[row]["duration_s"]
+            row += 1
+            if row == program["first_phase"] + program["num_phases"]:
+                row = program["first_phase"]
+    return float(program["cycle_s"])

@@ -1,0 +1,106 @@
+"""How an action becomes throttle and steering: meta-actions, and the controllers behind them."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cavmarl.core.math.geometry import lane_pose, project, wrap_angle
+from cavmarl.core.numba import kernel
+from cavmarl.core.records.arrays import RoadArrays
+from cavmarl.core.records.codes import (
+    ACTION_FASTER,
+    ACTION_LANE_LEFT,
+    ACTION_LANE_RIGHT,
+    ACTION_SLOWER,
+)
+from cavmarl.driving.kernels.highway_control import PURSUIT_S, steering_control
+
+__all__ = ["nearest_speed", "steer_to_lane", "take_meta_action"]
+
+CHORD_M = 1.5  # real lanes have corners: their direction is that of a chord, this far to both sides
+
+
+@kernel
+def nearest_speed(target_speeds: NDArray[np.float64], speed: float) -> int:
+    """Index of the target speed nearest to `speed`; of two, the lower one."""
+    best = 0
+    for k in range(1, target_speeds.shape[0]):
+        if abs(target_speeds[k] - speed) < abs(target_speeds[best] - speed):
+            best = k
+    return best
+
+
+@kernel
+def take_meta_action(
+    roads: RoadArrays, row: np.void, action: int, target_speeds: NDArray[np.float64]
+) -> None:
+    """Set target lane and target speed of a vehicle as highway-env's `MDPVehicle` does.
+
+    FASTER and SLOWER step from the present target speed; a lane change asks for the neighbour of
+    the present lane and is ignored where there is none.
+    """
+    k = nearest_speed(target_speeds, row["target_speed"])
+    if action == ACTION_FASTER:
+        k = min(k + 1, target_speeds.shape[0] - 1)
+    elif action == ACTION_SLOWER:
+        k = max(k - 1, 0)
+    elif action == ACTION_LANE_LEFT and roads.lanes[row["lane"]]["left"] >= 0:
+        row["target_lane"] = roads.lanes[row["lane"]]["left"]
+    elif action == ACTION_LANE_RIGHT and roads.lanes[row["lane"]]["right"] >= 0:
+        row["target_lane"] = roads.lanes[row["lane"]]["right"]
+    row["target_speed"] = target_speeds[k]
+
+
+@kernel
+def steer_to_lane(
+    roads: RoadArrays, plans: NDArray[np.void], row: np.void, target_lane: int
+) -> float:
+    """The steering angle in rad that brings a vehicle to the middle of a lane.
+
+    A target that is neither the vehicle's lane nor a neighbour of it counts as the lane it is on.
+    Beyond the lane's end the lane that the plan names goes on.
+    """
+    lane = row["lane"]
+    here = roads.lanes[lane]
+    if target_lane >= 0 and (target_lane == here["left"] or target_lane == here["right"]):
+        lane = target_lane
+        here = roads.lanes[lane]
+    s, d, _, _ = project(roads.points, here["first_point"], here["num_points"], row["x"], row["y"])
+    ahead = s + row["speed"] * PURSUIT_S
+    following = plans[row["goal"], lane]["next"]
+    if s > here["length_m"] and following >= 0:
+        ahead -= here["length_m"]
+        lane = following
+        here = roads.lanes[lane]
+        _, d, _, _ = project(
+            roads.points, here["first_point"], here["num_points"], row["x"], row["y"]
+        )
+    direction = _direction_at(roads, plans, row["goal"], lane, ahead)
+    return steering_control(row["speed"], d, wrap_angle(direction - row["heading"]), row["length"])
+
+
+@kernel
+def _point_at(
+    roads: RoadArrays, plans: NDArray[np.void], goal: int, lane: int, s: float
+) -> tuple[float, float]:
+    """The place at `s` of a lane, beyond its end on the one that the plan names."""
+    here = roads.lanes[lane]
+    following = plans[goal, lane]["next"]
+    if s > here["length_m"] and following >= 0:
+        s -= here["length_m"]
+        here = roads.lanes[following]
+    x, y, _, _, _, _ = lane_pose(roads.points, here["first_point"], here["num_points"], s)
+    return x, y
+
+
+@kernel
+def _direction_at(
+    roads: RoadArrays, plans: NDArray[np.void], goal: int, lane: int, s: float
+) -> float:
+    """Direction of the way around place `s` of a lane in rad."""
+    x0, y0 = _point_at(roads, plans, goal, lane, s - CHORD_M)
+    x1, y1 = _point_at(roads, plans, goal, lane, s + CHORD_M)
+    return math.atan2(y1 - y0, x1 - x0)

@@ -1,0 +1,80 @@
+"""Stops on the way: buses at bus stops, deliveries, and whatever else a demand file orders."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from cavmarl.core.numba import inlined_kernel
+from cavmarl.core.records.arrays import RoadArrays, Travel
+from cavmarl.core.records.codes import UNTIL_DEPARTURE
+
+__all__ = ["STAY", "lane_to_stop", "make_stop", "way_to_stop"]
+
+STANDING_MPS = 0.1
+STOPPED_M = 3.0  # a front this far before the place has reached it
+PASSED_M = 1.0  # a front this far beyond it will not stop there any more
+STAY = 2  # answer of `lane_to_stop`
+LANE_EARLY_M = 100.0  # this far before it the driver wants its lane
+
+
+@inlined_kernel
+def way_to_stop(roads: RoadArrays, travel: Travel, row: np.void) -> float:
+    """Metres from a vehicle's front to its next stop if that is on this edge ahead, or inf."""
+    if row["stop"] < 0 or row["stop"] == row["stops_end"]:
+        return np.inf
+    stop = travel.stops[row["stop"]]
+    lane = roads.lanes[row["lane"]]
+    place = roads.lanes[stop["lane"]]
+    if place["edge"] != lane["edge"]:
+        return np.inf
+    left = float(
+        stop["end"] * lane["length_m"] / place["length_m"] - row["s"] - 0.5 * row["length"]
+    )
+    return left if left > -PASSED_M else np.inf
+
+
+@inlined_kernel
+def lane_to_stop(roads: RoadArrays, travel: Travel, row: np.void) -> int:
+    """The side to which a vehicle has to change for its next stop: 1 left, -1 right, 0 none.
+
+    `STAY` where it is on that lane already.
+    """
+    if way_to_stop(roads, travel, row) > LANE_EARLY_M:
+        return 0
+    stop = travel.stops[row["stop"]]
+    if stop["lane"] == row["lane"]:
+        return STAY
+    return 1 if stop["lane"] > row["lane"] else -1
+
+
+@inlined_kernel
+def make_stop(roads: RoadArrays, travel: Travel, row: np.void, lane_before: int, dt: float) -> None:
+    """Count the time of a vehicle at its stop, and let it go when that is over.
+
+    A stop that the vehicle could not make any more is left out.
+
+    Args:
+        roads: the road arrays.
+        travel: with the stops.
+        row: VEHICLE after the tick, written.
+        lane_before: LANE that it was on before.
+        dt: seconds a tick.
+    """
+    if row["stop"] < 0 or row["stop"] == row["stops_end"]:
+        return
+    stop = travel.stops[row["stop"]]
+    edge = roads.lanes[stop["lane"]]["edge"]
+    left = way_to_stop(roads, travel, row)
+    if left <= STOPPED_M and row["speed"] < STANDING_MPS:
+        row["stopped_s"] += dt
+        row["wait_s"] = 0.0
+        now = travel.begin_s + row["tick"] * dt
+        until = stop["until"]
+        if until >= 0.0 and stop["until_from"] == UNTIL_DEPARTURE:
+            until += travel.begin_s + row["departed"] * dt
+        if row["stopped_s"] >= stop["duration"] and now >= until:
+            row["stop"] += 1
+            row["stopped_s"] = 0.0
+    elif roads.lanes[lane_before]["edge"] == edge and left == np.inf:
+        row["stop"] += 1
+        row["stopped_s"] = 0.0

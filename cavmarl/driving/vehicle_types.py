@@ -1,0 +1,192 @@
+"""`VTYPE`: what sets one type of vehicle apart, and SUMO's values by vehicle class.
+
+The numbers are those of SUMO 1.28 (Vehicle_Type_Parameter_Defaults in its documentation), read back
+from a running SUMO in the tests.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cavmarl.core.records.codes import MODEL_IDM, MODEL_KRAUSS
+from cavmarl.driving.kernels.car_following import (
+    ACCEL_LIMIT,
+    ACCEL_MAX,
+    DECEL_COMFORT,
+    JAM_DISTANCE_M,
+    TIME_HEADWAY_S,
+)
+from cavmarl.driving.kernels.motion import MAX_SPEED_MPS
+from cavmarl.roads.network import VEHICLE_CLASSES
+
+__all__ = [
+    "ALL_PERMISSIONS",
+    "CLASS_DEFAULTS",
+    "DEFAULT_TYPES",
+    "NEAREST_CLASS",
+    "NEAREST_MODEL",
+    "NO_ROAD_CLASSES",
+    "VTYPE",
+    "ClassDefaults",
+    "generated_types",
+]
+
+# A vehicle of SUMO's class "ignoring" heeds no permission.
+ALL_PERMISSIONS = (1 << 32) - 1
+
+VTYPE = np.dtype(
+    [
+        ("vclass", np.int32),  # index in VEHICLE_CLASSES
+        ("permissions", np.uint32),  # bits of LANE["permissions"] of which one must be set
+        ("model", np.int32),  # MODEL_*
+        ("length", np.float64),  # m
+        ("width", np.float64),  # m
+        ("height", np.float64),  # m
+        ("accel", np.float64),  # m/s², the most it accelerates
+        ("decel", np.float64),  # m/s², the most it brakes at will, positive
+        ("emergency_decel", np.float64),  # m/s², the most it can brake, at least decel
+        ("tau", np.float64),  # s, the headway its driver wants
+        ("min_gap", np.float64),  # m, between bumpers at rest
+        ("max_speed", np.float64),  # m/s, of the machine
+        ("desired_max_speed", np.float64),  # m/s, of the driver, times the speed factor
+        ("sigma", np.float64),  # imperfection of the driver (Krauss), in [0, 1]
+        ("speed_factor", np.float64),  # mean of the desired speed over the limit
+        ("speed_dev", np.float64),  # its standard deviation
+        ("min_speed_factor", np.float64),  # the normal distribution is cut here
+        ("max_speed_factor", np.float64),
+        (
+            "reroute",
+            np.float64,
+        ),  # chance that such a vehicle looks for its way itself; -1: not said
+        ("reroute_period_ms", np.int64),  # how often; 0: once, -1: not said
+    ],
+    align=True,
+)
+
+
+class ClassDefaults(NamedTuple):
+    """The values of a type of which only the class is known, named and measured as in `VTYPE`."""
+
+    length: float
+    width: float
+    height: float
+    min_gap: float
+    accel: float
+    decel: float
+    emergency_decel: float
+    max_speed: float
+    sigma: float
+    speed_dev: float
+    desired_max_speed: float = 10000.0 / 3.6
+
+
+_KMH = 1.0 / 3.6
+_CAR = ClassDefaults(5.0, 1.8, 1.5, 2.5, 2.6, 4.5, 9.0, 200.0 * _KMH, 0.5, 0.1)
+_VAN = _CAR._replace(length=6.5, width=2.16, height=2.86, speed_dev=0.05)
+_OFFICIAL = _CAR._replace(speed_dev=0.0)
+
+CLASS_DEFAULTS = {
+    "passenger": _CAR,
+    "private": _CAR,
+    "hov": _CAR,
+    "vip": _CAR,
+    "evehicle": _CAR,
+    "custom1": _CAR,
+    "custom2": _CAR,
+    "ignoring": _OFFICIAL,
+    "authority": _OFFICIAL,
+    "army": _OFFICIAL,
+    "taxi": _CAR._replace(speed_dev=0.05),
+    "delivery": _VAN,
+    "emergency": _VAN._replace(speed_dev=0.0),
+    "bus": ClassDefaults(12.0, 2.5, 3.4, 2.5, 1.2, 4.0, 7.0, 100.0 * _KMH, 0.5, 0.0),
+    "coach": ClassDefaults(14.0, 2.6, 4.0, 2.5, 2.0, 4.0, 7.0, 100.0 * _KMH, 0.5, 0.05),
+    "truck": ClassDefaults(7.1, 2.4, 2.4, 2.5, 1.3, 4.0, 7.0, 130.0 * _KMH, 0.5, 0.05),
+    "trailer": ClassDefaults(16.5, 2.55, 4.0, 2.5, 1.1, 4.0, 7.0, 130.0 * _KMH, 0.5, 0.05),
+    "tram": ClassDefaults(22.0, 2.4, 3.2, 2.5, 1.0, 3.0, 7.0, 80.0 * _KMH, 0.0, 0.0),
+    "motorcycle": ClassDefaults(2.2, 0.9, 1.5, 2.5, 6.0, 10.0, 10.0, 200.0 * _KMH, 0.5, 0.1),
+    "moped": ClassDefaults(2.1, 0.78, 1.7, 2.5, 1.1, 7.0, 10.0, 60.0 * _KMH, 0.5, 0.1),
+    "bicycle": ClassDefaults(
+        1.6, 0.65, 1.7, 0.5, 1.2, 3.0, 7.0, 50.0 * _KMH, 0.5, 0.1, desired_max_speed=20.0 * _KMH
+    ),
+    "scooter": ClassDefaults(1.2, 0.5, 1.7, 0.5, 1.2, 3.0, 7.0, 25.0 * _KMH, 0.5, 0.1),
+}
+
+# Classes of SUMO whose lanes a road network here does not tell from those of another class.
+NEAREST_CLASS = {name: name for name in VEHICLE_CLASSES} | {
+    "private": "passenger",
+    "hov": "passenger",
+    "vip": "passenger",
+    "evehicle": "passenger",
+    "custom1": "passenger",
+    "custom2": "passenger",
+    "ignoring": "passenger",
+    "authority": "passenger",
+    "army": "passenger",
+    "coach": "bus",
+    "trailer": "truck",
+    "moped": "motorcycle",
+    "scooter": "bicycle",
+}
+
+# Classes of SUMO that drive on no road: their vehicles are left out.
+NO_ROAD_CLASSES = frozenset(
+    "pedestrian wheelchair rail_urban rail rail_electric rail_fast subway ship container cable_car "
+    "aircraft drone".split()
+)
+
+# Types that SUMO knows before it has read a file, by their class.
+DEFAULT_TYPES = {
+    "DEFAULT_VEHTYPE": "passenger",
+    "DEFAULT_TAXITYPE": "taxi",
+    "DEFAULT_BIKETYPE": "bicycle",
+    "DEFAULT_PEDTYPE": "pedestrian",
+    "DEFAULT_CONTAINERTYPE": "container",
+    "DEFAULT_RAILTYPE": "rail",
+}
+
+# SUMO's car-following models by the one of ours whose equations are nearest.
+NEAREST_MODEL = {
+    "Krauss": MODEL_KRAUSS,
+    "KraussOrig1": MODEL_KRAUSS,
+    "KraussPS": MODEL_KRAUSS,
+    "KraussX": MODEL_KRAUSS,
+    "SmartSK": MODEL_KRAUSS,
+    "Daniel1": MODEL_KRAUSS,
+    "PWagner2009": MODEL_KRAUSS,
+    "BKerner": MODEL_KRAUSS,
+    "Wiedemann": MODEL_KRAUSS,
+    "W99": MODEL_KRAUSS,
+    "Rail": MODEL_KRAUSS,
+    "IDM": MODEL_IDM,
+    "IDMM": MODEL_IDM,
+    "EIDM": MODEL_IDM,
+    "ACC": MODEL_IDM,
+    "CACC": MODEL_IDM,
+    "CC": MODEL_IDM,
+}
+
+
+def generated_types() -> NDArray[np.void]:
+    """VTYPE (1,): the passenger car of the generator and of agents.
+
+    It drives by IDM with highway-env's defaults and has that car's size (5 m × 2 m).
+    """
+    types = np.zeros(1, dtype=VTYPE)
+    car = types[0]
+    car["vclass"] = VEHICLE_CLASSES.index("passenger")
+    car["permissions"] = 1 << VEHICLE_CLASSES.index("passenger")
+    car["model"] = MODEL_IDM
+    car["length"], car["width"], car["height"] = 5.0, 2.0, 1.6
+    car["accel"] = ACCEL_MAX
+    car["decel"] = DECEL_COMFORT
+    car["emergency_decel"] = ACCEL_LIMIT
+    car["tau"] = TIME_HEADWAY_S
+    car["min_gap"] = JAM_DISTANCE_M - car["length"]
+    car["max_speed"] = car["desired_max_speed"] = MAX_SPEED_MPS
+    car["speed_factor"] = 1.0
+    types.setflags(write=False)
+    return types

@@ -1,0 +1,1 @@
+"""Compiled loops over the results and the actions of all agents."""

@@ -1,0 +1,87 @@
+"""Actions of all agents at once: whether each is in range, and what it means."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cavmarl.core.numba import kernel
+from cavmarl.core.records.codes import ACTION_IDLE, ACTION_SLOWER
+
+__all__ = ["decode_choices", "decode_pairs"]
+
+
+@kernel
+def decode_pairs(
+    actions: NDArray[Any],
+    mask: NDArray[np.bool_],
+    acceleration_mps2: float,
+    steering_rad: float,
+    last: NDArray[np.float64],
+    controls: NDArray[np.float64],
+) -> bool:
+    """Decode shares of the largest throttle and steering angle; nothing if one is out of range.
+
+    Args:
+        actions: (W, A, 2) floats.
+        mask: (W, A) whose are read; those of others count as 0.
+        acceleration_mps2: what a throttle of 1 means.
+        steering_rad: what a steering of 1 means.
+        last: (W, A, 2) is written, the actions themselves.
+        controls: (W, A, 2) is written, what they mean.
+
+    Returns:
+        whether all are within [-1, 1]; False of what is no number, too.
+    """
+    for w in range(mask.shape[0]):
+        for agent in range(mask.shape[1]):
+            if mask[w, agent]:
+                for k in range(2):
+                    if not abs(actions[w, agent, k]) <= 1.0:
+                        return False
+    for w in range(mask.shape[0]):
+        for agent in range(mask.shape[1]):
+            throttle = 0.0
+            steering = 0.0
+            if mask[w, agent]:
+                throttle = float(actions[w, agent, 0])
+                steering = float(actions[w, agent, 1])
+            last[w, agent, 0] = throttle
+            last[w, agent, 1] = steering
+            controls[w, agent, 0] = throttle * acceleration_mps2
+            controls[w, agent, 1] = steering * steering_rad
+    return True
+
+
+@kernel
+def decode_choices(
+    actions: NDArray[Any],
+    mask: NDArray[np.bool_],
+    last: NDArray[np.int64],
+    meta_actions: NDArray[np.int64],
+) -> bool:
+    """Take over meta-actions; nothing if one is none.
+
+    Args:
+        actions: (W, A) whole numbers.
+        mask: (W, A) whose are read; others stay idle.
+        last: (W, A) is written.
+        meta_actions: (W, A) is written, too.
+
+    Returns:
+        whether all are ACTION_* codes.
+    """
+    for w in range(mask.shape[0]):
+        for agent in range(mask.shape[1]):
+            if mask[w, agent] and not 0 <= actions[w, agent] <= ACTION_SLOWER:
+                return False
+    for w in range(mask.shape[0]):
+        for agent in range(mask.shape[1]):
+            chosen = ACTION_IDLE
+            if mask[w, agent]:
+                chosen = actions[w, agent]
+            last[w, agent] = chosen
+            meta_actions[w, agent] = chosen
+    return True

@@ -1,0 +1,129 @@
+"""What worlds report of a step, beside the observations, in one pass over their agents.
+
+A step writes some ten small arrays. One by one that is some thirty calls of NumPy, and each of them
+waits for memory: the kernels before it have filled the caches with vehicles.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cavmarl.core.numba import kernel
+from cavmarl.core.records.arrays import Gate, Outputs
+from cavmarl.core.records.codes import COUNT_ARRIVED, EVENTS_THAT_END
+
+__all__ = ["Results", "keep_last", "report", "report_who_goes_on"]
+
+
+class Results(NamedTuple):
+    """See `stepping.arrays.StepArrays`, of which these are some."""
+
+    rewards: NDArray[np.float32]  # (W, A)
+    terms: NDArray[np.float32]  # (W, A, T)
+    terminations: NDArray[np.bool_]  # (W, A)
+    truncations: NDArray[np.bool_]  # (W, A)
+    acted: NDArray[np.bool_]  # (W, A)
+    vehicle_done: NDArray[np.bool_]  # (W, A)
+    vehicle_ids: NDArray[np.int64]  # (W, A)
+    mask: NDArray[np.bool_]  # (W, A)
+    arrivals: NDArray[np.int64]  # (W,)
+    episode_over: NDArray[np.bool_]  # (W,)
+
+
+@kernel
+def report(outputs: Outputs, steps: NDArray[np.int64], horizon: int, results: Results) -> bool:
+    """Write what the agents have got, all but who acts next.
+
+    Args:
+        outputs: of the step.
+        steps: (W,) since each world's reset; are counted.
+        horizon: steps of an episode.
+        results: are written.
+
+    Returns:
+        whether the trip of some vehicle has ended.
+    """
+    ended = False
+    for w in range(steps.size):
+        steps[w] += 1
+        at_horizon = steps[w] >= horizon
+        for agent in range(outputs.present.shape[1]):
+            terminated = outputs.terminated[w, agent]
+            acted = outputs.acted[w, agent]
+            results.rewards[w, agent] = outputs.rewards[w, agent]
+            results.vehicle_ids[w, agent] = outputs.vehicle_ids[w, agent]
+            results.acted[w, agent] = acted
+            results.terminations[w, agent] = terminated
+            results.truncations[w, agent] = acted and at_horizon and not terminated
+            results.vehicle_done[w, agent] = outputs.events[w, agent] & EVENTS_THAT_END != 0
+            for k in range(outputs.terms.shape[2]):
+                results.terms[w, agent, k] = outputs.terms[w, agent, k]
+            ended |= terminated
+    return ended
+
+
+@kernel
+def report_who_goes_on(
+    outputs: Outputs, gate: Gate, steps: NDArray[np.int64], horizon: int, results: Results
+) -> bool:
+    """Write who acts next and which episodes are over, once those who are through are gone.
+
+    An episode is over at its horizon, and when no agent is there and none waits to enter.
+
+    Args:
+        outputs: of the step.
+        gate: who waits, and how many have arrived.
+        steps: (W,) since each world's reset.
+        horizon: steps of an episode.
+        results: are written.
+
+    Returns:
+        whether an episode is over.
+    """
+    some_over = False
+    for w in range(steps.size):
+        results.arrivals[w] = gate.counts[w, COUNT_ARRIVED]
+        goes_on = False
+        for agent in range(outputs.present.shape[1]):
+            acts = outputs.present[w, agent] and not outputs.terminated[w, agent]
+            results.mask[w, agent] = acts
+            goes_on |= acts
+        for n in range(gate.num_queue[w]):
+            goes_on |= gate.queue[w, n]["agent"] >= 0
+        over = steps[w] >= horizon or not goes_on
+        results.episode_over[w] = over
+        some_over |= over
+    return some_over
+
+
+@kernel
+def keep_last(
+    results: Results,
+    observations: NDArray[np.float32],
+    final_observations: NDArray[np.float32],
+    in_next_step: bool,
+) -> None:
+    """Keep what those saw last who have ended.
+
+    Args:
+        results: who has ended, and which episodes are over.
+        observations: (W, A, D); those of agents who are gone become 0, unless worlds begin anew in
+            the next step.
+        final_observations: (W, A, D) where something has ended, what they were; written.
+        in_next_step: when worlds begin anew.
+    """
+    for w in range(observations.shape[0]):
+        ended = results.episode_over[w]
+        for agent in range(observations.shape[1]):
+            ended |= results.terminations[w, agent]
+        if not ended:
+            continue
+        for agent in range(observations.shape[1]):
+            is_gone = results.terminations[w, agent] and not in_next_step
+            for k in range(observations.shape[2]):
+                final_observations[w, agent, k] = observations[w, agent, k]
+                if is_gone:
+                    observations[w, agent, k] = 0.0

@@ -1,0 +1,78 @@
+"""`MountedSensors`: lets the rig of all agents sense after each tick, as an `Attached` part."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cavmarl.driving.vehicle_types import generated_types
+from cavmarl.engine.component import Host
+from cavmarl.sensors.mounted.backdrop import make_backdrop
+from cavmarl.sensors.mounted.mounted_sensor import Platform, Scene
+from cavmarl.sensors.mounted.sensor_rig import Rig
+from cavmarl.shards.shard import Commands
+
+__all__ = ["MountedSensors"]
+
+
+class MountedSensors:
+    """The rig of an environment; see `Attached`.
+
+    Args:
+        host: what it is attached to.
+
+    Attributes:
+        rig: all of its sensors.
+        platform: what the sensors are mounted on.
+    """
+
+    def __init__(self, host: Host) -> None:
+        config = host.config
+        self.platform = Platform(
+            host.network,
+            generated_types()[0],
+            host.num_worlds,
+            config.population.num_ids,
+            config.clock.sim_dt_s,
+            config.clock.ticks_per_step,
+            host.shards[0].worlds.rows.shape[1],
+            make_backdrop(host.network, host.travel.types),
+        )
+        ids = host.zeros((host.num_worlds, config.population.num_ids), dtype=np.int64)
+        ids[...] = -1
+        self._host = host
+        self.rig = Rig(config.rig, self.platform, host.frames, ids)
+
+    def reset(self, chosen: NDArray[np.bool_]) -> None:
+        """Take the samples that are due at the reset of the chosen worlds (W,)."""
+        self.rig.reset(self.scenes(), chosen)
+
+    def begin(self, commands: Commands) -> None:
+        """Note how everybody moves before the tick."""
+        self.rig.begin(self.scenes())
+
+    def end(self) -> None:
+        """Take the samples of the tick."""
+        self.rig.end(self.scenes())
+
+    def arrays(self) -> Iterator[NDArray[Any]]:
+        """The samples."""
+        return self.rig.arrays()
+
+    def scenes(self) -> list[Scene]:
+        """What the agents of each zone can see now."""
+        return [
+            Scene(
+                shard.roads,
+                shard.lane_grid,
+                shard.plans,
+                shard.travel,
+                shard.worlds,
+                shard.grid,
+                self.rig.before,
+            )
+            for shard in self._host.shards
+        ]

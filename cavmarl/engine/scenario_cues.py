@@ -1,0 +1,50 @@
+"""`Cues`: says when the cues come that the scripts of a scenario wait for."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cavmarl.core.numba.repeated import repeated
+from cavmarl.driving.kernels.scripted_rows import note_cues
+from cavmarl.handoff.division import Division
+from cavmarl.shards.shard import Commands, Shard
+
+__all__ = ["Cues"]
+
+
+class Cues:
+    """Looks at the agents of all zones at the beginning of each tick; `Attached` to the worlds.
+
+    Which cues have come is among what all shards have in common, `Worlds.cues`.
+
+    Args:
+        cues: CUE (T,) of the scene.
+        shards: one a zone.
+        division: all of them together.
+    """
+
+    def __init__(self, cues: NDArray[np.void], shards: Sequence[Shard], division: Division) -> None:
+        self._cues = cues
+        self._worlds = shards[0].worlds
+        self._division = division
+        self._note_cues = repeated(note_cues)
+
+    def reset(self, chosen: NDArray[np.bool_]) -> None:
+        """Nothing to do: with the actors of an episode no cue has come yet."""
+
+    def begin(self, commands: Commands) -> None:
+        """Note whose time has come, and whom an agent is near."""
+        zoned, worlds = self._division.zoned, self._worlds
+        rows = zoned.rows[self._division.side]
+        self._note_cues(self._cues, rows, zoned.num_owned, worlds.ticks, worlds.cues)
+
+    def end(self) -> None:
+        """Nothing to do: rows follow their scripts as they move."""
+
+    def arrays(self) -> Iterator[NDArray[Any]]:
+        """None of its own."""
+        return iter(())

@@ -1,0 +1,74 @@
+"""`Commons`: what no zone of a world can do alone, its signals and what agents get."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cavmarl.config.env import TERMS, EnvConfig
+from cavmarl.core.huge_pages import huge_zeros
+from cavmarl.core.memory import Zeros
+from cavmarl.core.numba.repeated import repeated
+from cavmarl.core.records.arrays import Worlds
+from cavmarl.roads.kernels.signal_phases import switch_signals
+from cavmarl.roads.network import RoadNetwork
+from cavmarl.sensors.kernels.output_reset import clear_outputs, settle_outputs
+from cavmarl.shards.agent_outputs import make_outputs
+
+__all__ = ["Commons"]
+
+
+class Commons:
+    """What all shards of W worlds share, and the steps that are taken once for all of them.
+
+    Args:
+        config: the environment.
+        network: the roads of the whole map.
+        num_worlds: W.
+        observations: (W, A, D) where the agents' are written; None: made for them.
+        zeros: makes all other outputs.
+
+    Attributes:
+        outputs: of all agents; every shard writes at the indices of its own ones.
+    """
+
+    def __init__(
+        self,
+        config: EnvConfig,
+        network: RoadNetwork,
+        num_worlds: int,
+        observations: NDArray[np.float32] | None = None,
+        zeros: Zeros = huge_zeros,
+    ) -> None:
+        self.outputs = make_outputs(config, num_worlds, observations, zeros)
+        self._roads = network.arrays
+        self._sim_dt_s = config.clock.sim_dt_s
+        self._weights = np.array([config.terms.weights.get(name, 0.0) for name in TERMS])
+        self._team_share = config.terms.team_share
+        self._switch_signals = repeated(switch_signals)
+        self._clear_outputs = repeated(clear_outputs)
+        self._settle_outputs = repeated(settle_outputs)
+
+    def switch_signals(self, worlds: Worlds) -> None:
+        """Bring the signals to the present tick, after `detect` of all shards.
+
+        Args:
+            worlds: of any shard; the arrays of signals are those of all.
+        """
+        if self._roads.signals.size > 0:
+            self._switch_signals(
+                self._roads,
+                worlds.ticks,
+                worlds.detected_s,
+                self._sim_dt_s,
+                worlds.controllers,
+                worlds.signal_phase,
+            )
+
+    def clear_outputs(self, chosen: NDArray[np.bool_]) -> None:
+        """Make all agents of the chosen worlds (W,) absent, before `sense` of all shards."""
+        self._clear_outputs(self.outputs, chosen)
+
+    def settle_outputs(self, chosen: NDArray[np.bool_]) -> None:
+        """Finish the outputs of the chosen worlds (W,) after `sense`, before `credit`."""
+        self._settle_outputs(self.outputs, self._weights, self._team_share, chosen)

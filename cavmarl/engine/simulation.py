@@ -1,0 +1,671 @@
+"""`Simulation`: W worlds of one environment, stepped together."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import suppress
+from functools import partial
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cavmarl.config.env import EnvConfig
+from cavmarl.core.errors import (
+    CapacityError,
+    ConfigError,
+    LostTickError,
+    ReproducerError,
+    SumoError,
+    V2xError,
+    ZoneError,
+)
+from cavmarl.core.huge_pages import huge_zeros
+from cavmarl.core.math.rng import world_key
+from cavmarl.core.memory import Zeros
+from cavmarl.core.records.arrays import Common, Gate, Outputs, Worlds
+from cavmarl.core.records.codes import ACTION_IDLE
+from cavmarl.driving.vehicles import blank_vehicle
+from cavmarl.engine import world_snapshot as snapshot
+from cavmarl.engine.compilation import first_compilation
+from cavmarl.engine.component import Attached, Host
+from cavmarl.engine.component_setup import attach
+from cavmarl.engine.rig_component import MountedSensors
+from cavmarl.engine.shard_clock import ShardClock
+from cavmarl.engine.shared_outputs import Commons
+from cavmarl.engine.state_digest import digest_world
+from cavmarl.engine.tick import Tick
+from cavmarl.engine.traffic_stats import TrafficStats, count_traffic
+from cavmarl.engine.v2x_component import Messaging
+from cavmarl.handoff.coordinator.coordinator import Referee
+from cavmarl.handoff.coordinator.coordinator_setup import Run, make_refereeing
+from cavmarl.handoff.coordinator.handoff_log import BorderBook
+from cavmarl.handoff.division import ZoneLoads
+from cavmarl.handoff.fault_injection.committed_store import CommittedStore
+from cavmarl.handoff.fault_injection.recovery import Recovery, Revival
+from cavmarl.handoff.fault_injection.reproducer_file import Reproducer
+from cavmarl.handoff.fault_injection.reproducer_recording import Keeper, Moment, sources_of
+from cavmarl.handoff.repartitioning import Recut, Recutter
+from cavmarl.handoff.shard_setup import divide
+from cavmarl.handoff.zone_view import ZoneView, view_zones
+from cavmarl.ownership.messages import Switch
+from cavmarl.ownership.transfers import TransferLog
+from cavmarl.roads.network import RoadNetwork
+from cavmarl.sensors.mounted.catalogue import frame_layout, frames_in
+from cavmarl.sensors.mounted.frames import Frames
+from cavmarl.shards.executor import SerialExecutor, Together
+from cavmarl.shards.shard import Commands, Shard
+from cavmarl.traffic.demand import DemandFile
+from cavmarl.traffic.departure_queue import make_gate
+from cavmarl.traffic.native import NativeTraffic
+from cavmarl.traffic.scenarios.library import plan_scene
+from cavmarl.traffic.scenarios.scene import Scene
+from cavmarl.traffic.sumo.sumo_demand import SumoDemand
+from cavmarl.traffic.sumo.sumo_traffic import SumoTraffic
+from cavmarl.v2x.bus import Bus
+from cavmarl.zones.partition.zone_layouts import cut_map
+from cavmarl.zones.partition.zone_partition import ZonePartition
+from cavmarl.zones.reach import longest_move_m
+
+__all__ = ["Simulation"]
+
+# Fields of `Gate` that outlive a tick.
+KEPT_BY_GATE = (
+    "next_order", "queue", "num_queue", "next_id", "num_entered", "counts", "sums", "num_passing",
+    "lane_taken",
+)  # fmt: skip
+
+
+class Simulation:
+    """W worlds of one environment on one map.
+
+    Args:
+        config: the environment.
+        network: its roads.
+        num_worlds: W.
+        demand: whose vehicles drive beside the generator's; of a file, or SUMO's.
+        partition: the zones; None: cut as `config.zones` says.
+        observations: (W, A, D) float32, where the agents' are written; None: made for them.
+        frames: where the samples of their rigs are written; None: made for them.
+        warm: call every kernel now, so that none is loaded in a step.
+        zeros: makes the arrays that shards write.
+        like: worlds of the same environment, whose tables are used; None: they are made.
+        runs: what coordinators are to go by, one a world; None: as `config.zones` says.
+
+    Attributes:
+        everywhere: (W,) all of the worlds.
+        frames: what the rigs of the agents have sensed; arrays that the next step overwrites.
+    """
+
+    def __init__(
+        self,
+        config: EnvConfig,
+        network: RoadNetwork,
+        num_worlds: int = 1,
+        demand: DemandFile | SumoDemand | None = None,
+        partition: ZonePartition | None = None,
+        *,
+        observations: NDArray[np.float32] | None = None,
+        frames: Frames | None = None,
+        warm: bool = False,
+        zeros: Zeros = huge_zeros,
+        like: Simulation | None = None,
+        runs: Sequence[Run] | None = None,
+    ) -> None:
+        self.config = config
+        self.network = network
+        self.demand = demand
+        self.num_worlds = num_worlds
+        self.partition = _cut(config, network) if partition is None else partition
+        self._seed = 0
+        self._first_world = 0
+        self._episodes = np.zeros(num_worlds, dtype=np.int64)
+        self.everywhere = np.ones(num_worlds, dtype=np.bool_)
+        self.frames: Frames = _frames(config, num_worlds, zeros) if frames is None else frames
+        self.transfers: tuple[TransferLog, ...] = ()
+        with first_compilation() as is_first:
+            blank = blank_vehicle()
+            sumo = demand if isinstance(demand, SumoDemand) else None
+            traffic: NativeTraffic = (
+                NativeTraffic(
+                    network,
+                    config.traffic,
+                    config.population,
+                    blank,
+                    config.clock.sim_dt_s,
+                    config.horizon_s,
+                    None if isinstance(demand, SumoDemand) else demand,
+                    num_worlds,
+                    zeros,
+                    plan_scene(config.scenario, network),
+                    sumo,
+                )
+                if like is None
+                else like._tick.traffic.for_worlds(num_worlds)
+            )
+            commons = Commons(config, network, num_worlds, observations, zeros)
+            self._shards, division = divide(
+                config, network, self.partition, traffic, commons.outputs, num_worlds, zeros
+            )
+            self._shard = self._shards[0]
+            attached = attach(
+                Host(
+                    config,
+                    network,
+                    num_worlds,
+                    self._shards,
+                    division,
+                    self._shard.travel,
+                    commons.outputs,
+                    zeros,
+                    self.frames,
+                )
+            )
+            gate = make_gate(num_worlds, traffic.capacity, network.arrays, blank.dtype)
+            self._tick: Tick = Tick(self._shards, division, traffic, commons, gate, attached)
+            self._recovery: Recovery | None = None
+            self._keeper: Keeper | None = None
+            self._recutter: Recutter | None = None
+            if is_first or warm:
+                self._call_every_kernel()
+            if sumo is not None:
+                travel = traffic.travel
+                self._tick.sumo = SumoTraffic(
+                    sumo, network, travel, travel.num_fixed, division.zoned, blank
+                )
+            zones = config.zones
+            watched = zones.journal or zones.check or zones.faults or zones.reproducers
+            if self.partition.count > 1 or watched:
+                self._let_coordinate(runs)
+            coordination = self._tick.coordination
+            if zones.recut_steps and self.partition.count > 1 and coordination is not None:
+                self._recutter = Recutter(
+                    network,
+                    division,
+                    coordination,
+                    zones.recut_steps,
+                    zones.recut_tolerance,
+                )
+
+    def _let_coordinate(self, runs: Sequence[Run] | None) -> None:
+        """Let coordinators say who owns what; nobody asks where all is one zone."""
+        tick = self._tick
+        refereeing = make_refereeing(
+            self.config.zones,
+            self._shards,
+            tick.division,
+            self._shared_arrays,
+            longest_move_m(self.network, tick.traffic.travel, self.config.clock.sim_dt_s),
+            runs=runs,
+        )
+        tick.coordination = refereeing.coordination
+        self._recovery = refereeing.recovery
+        tick.hosts_may_die = refereeing.recovery is not None
+        self.transfers = refereeing.transfers
+        if refereeing.phases is not None:
+            tick.executor = refereeing.phases
+        if refereeing.store is not None:
+            sources = sources_of(self.network, self.demand, self.partition)
+            (coordinator,) = self.coordinators
+            self._keeper = Keeper(self.config, sources, refereeing.store, coordinator)
+
+    def _shared_arrays(self) -> Iterator[NDArray[Any]]:
+        """What a tick changes beside the shards' own and what they have in common."""
+        tick = self._tick
+        gate = tick.gate
+        for name in KEPT_BY_GATE:
+            yield getattr(gate, name)
+        yield from self.outputs
+        if tick.traffic.rerouting is not None:
+            yield from tick.traffic.rerouting.arrays()
+        for part in tick.attached:
+            yield from part.arrays()
+
+    def _call_every_kernel(self) -> None:
+        """Run one step of a world that the first reset forgets."""
+        tick = self._tick
+        shape = self.outputs.present.shape
+        controls = np.zeros((*shape, 2))
+        self._populate(self.everywhere)
+        self.suggest(controls)
+        self.step(Commands(controls, np.full(shape, ACTION_IDLE, dtype=np.int64)))
+        # Once more what is only called when somebody leaves or waits.
+        tick.let_in(all_phases=True)
+        tick.executor.each("retire", tick.gate)
+        tick.executor.each("forget", tick.gate)
+        tick.executor.each("gather", *tick.division.gathering)
+        tick.division.rehearse_gathering()
+        tick.traffic.settle(tick.gate, self._shard.worlds)
+        tick.division.near(0, everybody=True)
+        with suppress(ZoneError):
+            tick.division.hand_over(0, Switch(-1, 0, 0, 0, False), None)
+        book = BorderBook(tick.division, 0)
+        book.release(book.hand_over(True, sum(tick.division.counts(0)), ()))
+        book.reset(0)
+        self._episodes[:] = 0
+
+    @property
+    def shards(self) -> Sequence[Shard]:
+        """One a zone, for who runs their phases."""
+        return self._shards
+
+    @property
+    def capacity(self) -> int:
+        """How many vehicles a world can hold."""
+        return int(self._shard.worlds.rows.shape[1])
+
+    @property
+    def outputs(self) -> Outputs:
+        """What the agents got at the end of the last step; arrays that the next step overwrites."""
+        return self._tick.commons.outputs
+
+    @property
+    def messages(self) -> Bus:
+        """What vehicles and roadside units tell each other.
+
+        Raises:
+            V2xError: they tell each other nothing.
+        """
+        for part in self._tick.attached:
+            if isinstance(part, Messaging):
+                return part.bus
+        raise V2xError("nobody says anything here: set v2x.enabled to true")
+
+    @property
+    def gate(self) -> Gate:
+        """Who waits to enter each world, and counts since its reset; a reset may replace it."""
+        return self._tick.gate
+
+    def listen(self, config: EnvConfig) -> tuple[Bus, Callable[[], None]]:
+        """A bus beside the world, for tools that measure: nobody in the world hears of it.
+
+        Args:
+            config: whose `v2x` it is of.
+
+        Returns:
+            the bus, and what lets it send and receive in the present tick.
+        """
+        worlds = self._shard.worlds
+        common = Common(*(getattr(worlds, name) for name in Common._fields))
+        types, zoned = self._shard.travel.types, self._tick.division.zoned
+        bus = Bus(config, self.network, types, zoned, common)
+        return bus, lambda: bus.exchange(self._tick.division.side)
+
+    @property
+    def goal_edges(self) -> NDArray[np.int32]:
+        """EDGE rows of the goals, by `VEHICLE["goal"]`."""
+        return self._tick.traffic.goal_edges
+
+    @property
+    def types(self) -> NDArray[np.void]:
+        """VTYPE (num_types,), by `VEHICLE["vtype"]`."""
+        return self._shard.travel.types
+
+    @property
+    def scene(self) -> Scene | None:
+        """What is played to the agent of each world."""
+        return self._tick.traffic.scene
+
+    @property
+    def plans(self) -> NDArray[np.void]:
+        """PLAN (G, L): the ways of agents, by `VEHICLE["goal"]`."""
+        return self._tick.traffic.plans
+
+    def vehicles(self, world: int = 0) -> NDArray[np.void]:
+        """The live vehicles of one world, VEHICLE records in no order.
+
+        A view, or, where the world is divided, a copy.
+        """
+        return self._tick.division.vehicles(world)
+
+    def zone_loads(self) -> ZoneLoads:
+        """What each zone holds now."""
+        return self._tick.division.loads()
+
+    def zone_view(self, world: int = 0) -> ZoneView:
+        """Who owns and sees which vehicles of one world now."""
+        halo_m, coordination = self.zone_loads().halo_m, self._tick.coordination
+        transfers = () if coordination is None else coordination.in_flight(world)
+        return view_zones(self._shards, self.partition, halo_m, world, transfers)
+
+    def running(self) -> NDArray[np.int64]:
+        """(W,) vehicles of each world."""
+        return self._tick.division.running()
+
+    def ghosts(self, zone: int, world: int = 0) -> NDArray[np.void]:
+        """What a zone sees of other zones' vehicles: VEHICLE (n,), a view that cannot be written.
+
+        It shows the present tick, until the next one.
+        """
+        return self._tick.division.ghosts(world, zone)
+
+    @property
+    def migrations(self) -> int:
+        """How many vehicles have changed their owner since the worlds were made."""
+        return sum(coordinator.switched for coordinator in self.coordinators)
+
+    @property
+    def coordinators(self) -> tuple[Referee, ...]:
+        """Who says who owns what, one a world; none where all is one zone."""
+        return () if self._tick.coordination is None else self._tick.coordination.coordinators
+
+    @property
+    def attached(self) -> tuple[Attached, ...]:
+        """What acts in each tick beside the traffic."""
+        return self._tick.attached
+
+    @property
+    def worlds(self) -> Worlds:
+        """The vehicles and signals of all worlds, for tools that measure; each tick swaps them.
+
+        A copy where worlds are divided.
+        """
+        return self._tick.division.whole()
+
+    @property
+    def mounted(self) -> MountedSensors | None:
+        """The rigs of the agents; None: they have none."""
+        rigs = (part for part in self._tick.attached if isinstance(part, MountedSensors))
+        return next(rigs, None)
+
+    def signal_phases(self, world: int = 0) -> NDArray[np.int32]:
+        """PHASE rows that are on, (num_signals,)."""
+        phases: NDArray[np.int32] = self._shard.worlds.signal_phase[world]
+        return phases
+
+    def ticks(self) -> NDArray[np.int64]:
+        """(W,) ticks since each world's reset."""
+        return self._shard.worlds.ticks
+
+    def seed(self, seed: int, first_world: int = 0) -> None:
+        """Set the root of all random numbers; the next reset of each world is its first episode.
+
+        Args:
+            seed: the root.
+            first_world: number of the first of these worlds among all worlds of the seed.
+        """
+        self._seed = seed
+        self._first_world = first_world
+        self._episodes[:] = 0
+
+    @property
+    def revivals(self) -> Sequence[Revival]:
+        """What it took to go on after each death; see `zones.faults`."""
+        return () if self._recovery is None else self._recovery.revivals
+
+    def reset(self, chosen: NDArray[np.bool_] | None = None) -> None:
+        """Begin a new episode in the chosen worlds (W,), all by default, and sense.
+
+        World w's episode is a function of (seed, first_world + w, its resets since `seed`).
+
+        Raises:
+            CapacityError: the map has no room for that many agents of a closed world.
+        """
+        chosen = self.everywhere if chosen is None else np.ascontiguousarray(chosen, dtype=np.bool_)
+        self._populate(chosen)
+        agents = self.config.population.agents
+        seated = self.outputs.present[chosen].sum(axis=1)
+        if self.config.population.mode == "closed" and (seated < agents).any():
+            raise CapacityError(
+                f"population.agents = {agents}: the map '{self.network.name}' has free places for "
+                f"{int(seated.min())}; use fewer agents, or population.mode = entering or seats, "
+                "where the others wait until there is room"
+            )
+
+    def _populate(self, chosen: NDArray[np.bool_]) -> None:
+        tick = self._tick
+        worlds = self._shard.worlds
+        for w in np.flatnonzero(chosen):
+            number = self._first_world + int(w)
+            worlds.keys[w] = world_key(self._seed, number, int(self._episodes[w]))
+            worlds.ticks[w] = 0
+        self._episodes[chosen] += 1
+        tick.gate = tick.traffic.draw_orders(tick.gate, worlds, chosen)
+        tick.traffic.populate(tick.gate, worlds, chosen)
+        if tick.sumo is not None:
+            tick.sumo.reset(chosen, worlds)
+        tick.division.distribute(chosen)
+        if tick.coordination is not None:
+            tick.coordination.reset(chosen)
+        tick.switch_signals()
+        for part in tick.attached:
+            part.reset(chosen)
+        tick.sense(chosen)
+        if tick.coordination is not None:
+            tick.coordination.save()
+
+    def step(self, commands: Commands) -> None:
+        """One agent step: its ticks, then what the agents sense.
+
+        Raises:
+            LostTickError: as of `run_tick`.
+            SumoError: SUMO cannot go on; the worlds are as they were before the step.
+        """
+        if self._tick.sumo is None:
+            self._run_ticks(commands)
+            return
+        before = [array.copy() for array in self.save()]
+        try:
+            self._run_ticks(commands)
+        except SumoError:
+            self._put_back(before)
+            raise
+
+    def _run_ticks(self, commands: Commands) -> None:
+        ticks = self.config.clock.ticks_per_step
+        for number in range(ticks):
+            self.run_tick(commands, number == 0, number == ticks - 1)
+        if self._recutter is not None:
+            partition = self._recutter.after_step(self.partition)
+            if partition is not None:
+                self.partition = partition
+                self._tick.executor = SerialExecutor(self._shards)
+
+    @property
+    def recuts(self) -> Sequence[Recut]:
+        """When other zones have been made while the worlds ran; see `zones.recut_steps`."""
+        return () if self._recutter is None else self._recutter.recuts
+
+    def run_tick(self, commands: Commands, is_first: bool, is_last: bool) -> None:
+        """One tick of a step, begun again as often as it takes where hosts may die.
+
+        Args:
+            commands: of the agents, the same in all ticks of a step.
+            is_first: whether it begins the step.
+            is_last: whether it ends it.
+
+        Raises:
+            LostTickError: every host of a zone, or every coordinator, died of it.
+        """
+        if self._recovery is None:
+            self._tick.run(commands, is_first, is_last)
+            return
+        try:
+            self._recovery.run(partial(self._tick.run, commands, is_first, is_last))
+        except LostTickError as error:
+            if self._keeper is not None:
+                episode = int(self._episodes[0])
+                moment = (self._seed, self._first_world, episode, commands, is_first, is_last)
+                error.reproducer = self._keeper.keep(error, Moment(*moment))
+            raise
+
+    def resume(self, kept: Reproducer) -> None:
+        """Go to the committed tick of a reproducer; `run_tick` runs the next one.
+
+        No further reproducers are written.
+
+        Raises:
+            ReproducerError: it is of other worlds.
+        """
+        if self._tick.sumo is not None:
+            raise ReproducerError("a world with SUMO beside it cannot be taken up in its middle")
+        self._keeper = None
+        self.seed(kept.seed, kept.first_world)
+        self._episodes[:] = kept.episode - 1
+        self.reset()
+        self._tick.division.align()
+        notes = CommittedStore(self._shards, self._shared_arrays).adopt(kept.image)
+        if self._tick.coordination is not None:
+            self._tick.coordination.take_up(kept.records, notes)
+            self._tick.coordination.save()
+
+    def instrument(self, wrap: Callable[[Any], Any]) -> None:
+        """Put `wrap(part)` in the place of each part that phases are calls of, to time them."""
+        self._refuse_recutting("measuring the phases of a tick")
+        self._tick.instrument(wrap)
+
+    def trace(self, wrap: Callable[[Any], Any], note: Callable[[str], None]) -> None:
+        """Let `wrap(executor)` note the phases of a tick, and attached parts name theirs to `note`.
+
+        A part that has phases of its own (another simulator's step, say) has a method `trace`.
+        """
+        self._tick.trace(wrap, note)
+
+    def host(
+        self,
+        make: Callable[[Sequence[Shard], tuple[float, float]], Together],
+        gathers: bool = True,
+    ) -> None:
+        """From now on let others run the phases of the shards, as `make` returns them.
+
+        Args:
+            make: called with the shards, and with what the phase `gather` is called with.
+            gathers: whether that phase is his, too.
+
+        Raises:
+            ConfigError: zones become others, and nobody would tell him.
+        """
+        self._refuse_recutting("the zones of one world over workers")
+        self._tick.host(make, gathers)
+
+    def time_shards(self, every: int = 1) -> ShardClock:
+        """From now on run phases zone by zone, with a clock on each.
+
+        Args:
+            every: one tick of so many; the others as ever.
+
+        Raises:
+            ConfigError: hosts die by plan, and what is repeated would be counted, too.
+        """
+        if self._recovery is not None:
+            raise ConfigError("zones.faults: shards are timed where no host dies; leave it out")
+        self._refuse_recutting("measuring what each zone costs")
+        clock = ShardClock(self._shards, every)
+        self._tick.executor = clock
+        return clock
+
+    def _refuse_recutting(self, what: str) -> None:
+        if self._recutter is not None:
+            raise ConfigError(f"zones.recut_steps: {what} needs zones that stay; leave one out")
+
+    @property
+    def sumo(self) -> SumoTraffic | None:
+        """SUMO beside these worlds; None where `traffic.source` is native."""
+        return self._tick.sumo
+
+    def close(self) -> None:
+        """End the processes that the worlds have."""
+        if self._tick.sumo is not None:
+            self._tick.sumo.close()
+
+    def retire_agents(self) -> None:
+        """Take out the agents whose trip ended in the last step; to be called after it is read."""
+        if not self.outputs.terminated.any():
+            return
+        self._tick.retire_agents()
+
+    def save(self) -> list[NDArray[Any]]:
+        """All that the next step depends on, between two steps; views, to be copied."""
+        roots = np.array([self._seed, self._first_world], dtype=np.int64)
+        return [roots, self._episodes, *snapshot.save(self._parts())]
+
+    def load(self, saved: Sequence[NDArray[Any]]) -> None:
+        """Go on from what `save` gave, in worlds of the same environment.
+
+        Raises:
+            SumoStateError: SUMO moves vehicles there, and what it was told is not on record; see
+                `SumoTraffic.keep_logs`.
+        """
+        self._put_back(saved)
+        if self._tick.sumo is not None:
+            self._tick.sumo.catch_up(self._shard.worlds)
+
+    def _put_back(self, saved: Sequence[NDArray[Any]]) -> None:
+        roots, episodes, *rest = saved
+        self.seed(*roots.tolist())
+        self._episodes[:] = episodes
+        self._tick.gate = snapshot.load(self._parts(), rest)
+
+    def share_of(self, world: int) -> list[NDArray[Any]]:
+        """What `save` would give if there were no world but one; views, to be copied."""
+        roots = np.array([self._seed, self._first_world + world], dtype=np.int64)
+        episodes = self._episodes[world : world + 1]
+        return [roots, episodes, *snapshot.share_of(self._parts(), world)]
+
+    def join(self, shares: Sequence[Sequence[NDArray[Any]]]) -> list[NDArray[Any]]:
+        """What `load` takes, of worlds of which each share has been one by itself.
+
+        Args:
+            shares: what `share_of` gave, of worlds that follow each other.
+        """
+        episodes = np.concatenate([share[1] for share in shares])
+        return [
+            shares[0][0], episodes, *snapshot.join(self._parts(), [share[2:] for share in shares])
+        ]  # fmt: skip
+
+    def _parts(self) -> snapshot.Parts:
+        tick = self._tick
+        return snapshot.Parts(
+            self._shard.worlds,
+            tick.division,
+            tick.gate,
+            tick.traffic,
+            self.outputs,
+            tick.coordination,
+            self.config.sensors.stack > 1,
+            tick.attached,
+            tick.sumo,
+        )
+
+    def agents_to_come(self) -> NDArray[np.bool_]:
+        """(W,) whether an agent waits to enter."""
+        tick = self._tick
+        longest = int(tick.gate.num_queue.max(initial=0))
+        if longest == 0:
+            return np.zeros(self.num_worlds, dtype=np.bool_)
+        waiting = np.arange(longest) < tick.gate.num_queue[:, None]
+        found = np.any(waiting & (tick.gate.queue["agent"][:, :longest] >= 0), axis=1)
+        return np.asarray(found, dtype=np.bool_)
+
+    def suggest(self, out: NDArray[np.float64]) -> None:
+        """Write what the built-in driver would do in the agents' place into `out` (W, A, 2)."""
+        self._tick.executor.each("suggest", out)
+
+    def state_hash(self, world: int = 0) -> str:
+        """Hex digest of a world's state.
+
+        Over all vehicles in the order of their ids, the queue, the signals, the tick and the key of
+        all random numbers; not over where a record lives, nor over what a view keeps (steps to the
+        horizon, held actions).
+        """
+        return digest_world(self._parts(), world)
+
+    def traffic_stats(self, world: int = 0) -> TrafficStats:
+        """Counts and means since the world's reset."""
+        return count_traffic(self._tick.gate, self._tick.division, world)
+
+
+def _frames(config: EnvConfig, num_worlds: int, zeros: Zeros) -> Frames:
+    layout = frame_layout(config, num_worlds)
+    return frames_in({name: zeros(shape, dtype=kind) for name, (kind, shape) in layout.items()})
+
+
+def _cut(config: EnvConfig, network: RoadNetwork) -> ZonePartition:
+    settings = config.zones
+    return cut_map(
+        network,
+        settings.layout,
+        settings.count,
+        avoid_junctions=settings.avoid_junctions,
+        weight=settings.weight,
+    )

@@ -1,0 +1,231 @@
+"""Spaces: pure functions of the config. No world is built to learn a shape."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from gymnasium import spaces
+from numpy.typing import DTypeLike, NDArray
+
+from cavmarl.config.env import ActionConfig, EnvConfig, SensorsConfig
+from cavmarl.config.rig import samples_per_step
+from cavmarl.sensors.mounted.catalogue import type_of
+from cavmarl.sensors.mounted.frames import Frames
+from cavmarl.sensors.observed import SENSORS, Feature, layout
+
+__all__ = [
+    "STATE_FEATURES",
+    "ObservationPart",
+    "action_space",
+    "flat_observation",
+    "flat_observation_space",
+    "frames_space",
+    "named_observation",
+    "observation_parts",
+    "observation_space",
+    "observation_table",
+    "sensed_observation",
+    "state_space",
+    "write_sensed",
+]
+
+# Features of one vehicle in the global state: present, x, y, cos, sin, speed.
+STATE_FEATURES = 6
+NUM_META_ACTIONS = 5
+
+
+def _box(size: int) -> spaces.Box:
+    return spaces.Box(-1.0, 1.0, (size,), np.float32)
+
+
+def flat_observation_space(config: EnvConfig) -> spaces.Box:
+    """All features of all sensors in one Box, whatever `observation.kind` says.
+
+    Within [-1, 1], but for features that are left unscaled. With `sensors.stack` the frames follow
+    one another, oldest first. In the mode `sensors`, the samples of the rig in its order.
+    """
+    if config.observation.mode == "sensors":
+        boxes = [_frame_box(config, name) for name in config.rig]
+        low = np.concatenate([box.low.ravel() for box in boxes]).astype(np.float32)
+        high = np.concatenate([box.high.ravel() for box in boxes]).astype(np.float32)
+        return spaces.Box(low, high, dtype=np.float32)
+    features = [feature for sensor in SENSORS for feature in sensor.features(config.sensors)]
+    stack = config.sensors.stack
+    return _feature_box(features * stack, (stack * len(features),), np.float32)
+
+
+def frames_space(config: EnvConfig) -> spaces.Dict:
+    """The latest samples of each sensor of the rig, one Box each.
+
+    A sensor that takes several samples in a step has them as the first axis.
+    """
+    return spaces.Dict({name: _frame_box(config, name) for name in config.rig})
+
+
+def _frame_box(config: EnvConfig, name: str) -> spaces.Box:
+    sensor, clock = config.rig[name], config.clock
+    kind = type_of(name, sensor)
+    slots = samples_per_step(sensor, clock.sim_dt_s, clock.ticks_per_step)
+    shape = (slots, *sensor.shape) if slots > 1 else sensor.shape
+    dtype = np.dtype(kind.dtype).type
+    low, high = (np.broadcast_to(bound, shape).astype(dtype) for bound in kind.bounds(sensor))
+    return spaces.Box(low, high, shape, dtype)
+
+
+def observation_space(config: EnvConfig) -> spaces.Box | spaces.Dict:
+    """What one agent observes: a flat Box, or a Dict with one Box a sensor.
+
+    With `sensors.stack` the Boxes of a Dict have the frames as their first axis.
+    """
+    if config.observation.kind == "dict" and config.observation.mode == "sensors":
+        return frames_space(config)
+    if config.observation.kind == "flat":
+        return flat_observation_space(config)
+    sensors = {sensor.name: sensor for sensor in SENSORS}
+    return spaces.Dict(
+        {
+            name: _feature_box(
+                sensors[name].features(config.sensors) * config.sensors.stack,
+                part.shape,
+                part.dtype,
+            )
+            for name, part in observation_parts(config.sensors).items()
+        }
+    )
+
+
+def _feature_box(
+    features: Sequence[Feature], shape: tuple[int, ...], dtype: DTypeLike
+) -> spaces.Box:
+    low = np.array([feature.low for feature in features], dtype=dtype)
+    high = np.array([feature.high for feature in features], dtype=dtype)
+    return spaces.Box(low.reshape(shape), high.reshape(shape), dtype=low.dtype.type)
+
+
+@dataclass(frozen=True)
+class ObservationPart:
+    """One sensor's part of an observation.
+
+    Attributes:
+        place: where its features lie in each frame of a flat observation.
+        shape: in a Dict observation; the frames of a stack are its first axis.
+        dtype: in a Dict observation.
+    """
+
+    place: slice
+    shape: tuple[int, ...]
+    dtype: DTypeLike
+
+
+def observation_parts(config: SensorsConfig) -> dict[str, ObservationPart]:
+    """The sensors that are on, in the order of their features."""
+    places = layout(config)
+    parts = {}
+    for sensor in SENSORS:
+        if sensor.name in places:
+            place = places[sensor.name]
+            shape = sensor.shape(config)
+            if shape == (-1,):
+                shape = (place.stop - place.start,)
+            if config.stack > 1:
+                shape = (config.stack, *shape)
+            parts[sensor.name] = ObservationPart(place, shape, sensor.dtype(config))
+    return parts
+
+
+def sensed_observation(frames: Frames) -> dict[str, NDArray[Any]]:
+    """The frames of W worlds as observations of mode `sensors`: views (W, A, …) by sensor."""
+    return {
+        name: sensor.data if sensor.data.shape[2] > 1 else sensor.data[:, :, 0]
+        for name, sensor in frames.items()
+    }
+
+
+def named_observation(
+    parts: Mapping[str, ObservationPart], frames: NDArray[np.float32]
+) -> dict[str, NDArray[Any]]:
+    """Flat observations by sensor: views of them, but for images, which become bytes.
+
+    Args:
+        parts: of `observation_parts`.
+        frames: (…, stack, frame size): flat observations, reshaped.
+
+    Returns:
+        an array (…, *shape) a sensor.
+    """
+    before = frames.shape[:-2]
+    return {
+        name: frames[..., part.place].reshape(*before, *part.shape).astype(part.dtype, copy=False)
+        for name, part in parts.items()
+    }
+
+
+def flat_observation(
+    names: Iterable[str], named: Mapping[str, NDArray[Any]], stack: int
+) -> NDArray[np.float32]:
+    """The flat observation (stack · frame size,) of one that is named by sensor.
+
+    Args:
+        names: of the sensors in the order of the flat observation.
+        named: an array a sensor, in any order.
+        stack: frames in an observation.
+    """
+    frames = [np.asarray(named[name], np.float32).reshape(stack, -1) for name in names]
+    return np.concatenate(frames, axis=1).ravel()
+
+
+def write_sensed(
+    frames: Frames, chosen: NDArray[np.bool_], observations: NDArray[np.float32]
+) -> None:
+    """Write the frames of the chosen worlds (W,) into flat observations (W, A, D)."""
+    start = 0
+    for sensor in frames.values():
+        flat = sensor.data.reshape(*sensor.fresh.shape, -1)
+        observations[chosen, :, start : start + flat.shape[2]] = flat[chosen]
+        start += flat.shape[2]
+
+
+def action_space(config: ActionConfig) -> spaces.Box | spaces.Discrete:
+    """What one agent does: (throttle, steering) in [-1, 1], or one of five meta-actions."""
+    if config.kind == "continuous":
+        return spaces.Box(-1.0, 1.0, (2,), np.float32)
+    return spaces.Discrete(NUM_META_ACTIONS)
+
+
+def state_space(capacity: int) -> spaces.Box:
+    """The global state: `STATE_FEATURES` numbers for each vehicle that the world can hold."""
+    return _box(capacity * STATE_FEATURES)
+
+
+def observation_table(config: SensorsConfig) -> str:
+    """A Markdown table of a frame, index by index, for the cards of `envs/`.
+
+    Features that repeat (points, neighbours, rays, cells) are folded into one line. Frame `k` of a
+    stack, 0 the oldest, begins at `k` times the size of a frame.
+    """
+    lines = ["| index | sensor | feature | meaning | 1.0 is |", "|---|---|---|---|---|"]
+    places = layout(config)
+    for sensor in SENSORS:
+        if sensor.name in places:
+            start = places[sensor.name].start
+            lines += _lines(sensor.name, start, sensor.features(config))
+    return "\n".join(lines)
+
+
+def _lines(sensor: str, start: int, features: list[Feature]) -> list[str]:
+    """One line for each name without its numbers; the first of its features says what it means."""
+    groups: dict[str, list[int]] = {}
+    for k, feature in enumerate(features):
+        groups.setdefault(re.sub(r"(_\d+)+$", "", feature.name), []).append(k)
+    lines = []
+    for name, members in groups.items():
+        index = ", ".join(str(start + k) for k in members[:2])
+        if len(members) > 2:
+            index += f" … {start + members[-1]}"
+        first = features[members[0]]
+        lines.append(f"| {index} | {sensor} | {name} | {first.meaning} | {first.scale or '-'} |")
+    return lines

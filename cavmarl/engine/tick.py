@@ -1,0 +1,262 @@
+"""`Tick`: what happens to W worlds in a tick, phase by phase. The order is written here, once."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cavmarl.core.math.tallies import count_tick, occasions
+from cavmarl.core.numba.repeated import repeated
+from cavmarl.core.records.arrays import Gate
+from cavmarl.engine.component import Attached
+from cavmarl.engine.shared_outputs import Commons
+from cavmarl.engine.step_trace import MIRROR, SUMO, Traced
+from cavmarl.handoff.coordinator.coordinators import Coordination
+from cavmarl.handoff.division import Division
+from cavmarl.shards.executor import Executor, SerialExecutor, Together
+from cavmarl.shards.shard import Commands, Shard
+from cavmarl.traffic.native import NativeTraffic
+from cavmarl.traffic.sumo.sumo_traffic import SumoTraffic
+
+__all__ = ["Tick"]
+
+
+class Tick:
+    """The phases of a tick in their order, and the parts whose calls they are.
+
+    Args:
+        shards: one a zone.
+        division: of all shards.
+        traffic: what comes.
+        commons: what all shards share.
+        gate: through which vehicles come and go.
+        attached: what acts in each tick beside the traffic.
+
+    Attributes:
+        shards: one a zone.
+        division: of all shards.
+        traffic: what comes.
+        commons: what all shards share.
+        gate: through which vehicles come and go; a reset may replace it.
+        attached: what acts in each tick beside the traffic.
+        executor: runs the phases of the shards, whoever hosts them.
+        coordination: says who owns what; None: nobody asks where all is one zone.
+        sumo: beside these worlds; None: there is none.
+        hosts_may_die: in any phase, so also those are gone through in which nothing is to be done.
+    """
+
+    def __init__(
+        self,
+        shards: Sequence[Shard],
+        division: Division,
+        traffic: NativeTraffic,
+        commons: Commons,
+        gate: Gate,
+        attached: tuple[Attached, ...],
+    ) -> None:
+        self.shards = shards
+        self.division = division
+        self.traffic = traffic
+        self.commons = commons
+        self.gate = gate
+        self.attached = attached
+        self.executor: Executor = SerialExecutor(shards)
+        self.coordination: Coordination | None = None
+        self.sumo: SumoTraffic | None = None
+        self.hosts_may_die = False
+        self._shard = shards[0]
+        self._everywhere = np.ones(len(self._shard.worlds.ticks), dtype=np.bool_)
+        self._has_agents = self._shard.config.population.agents > 0
+        self._meet: Callable[[], None] = _there
+        self._gathers = False
+        self._note_phase: Callable[[str], None] = _pass_over
+        self._count_tick = repeated(count_tick)
+        self._occasions = repeated(occasions)
+
+    def run(self, commands: Commands, is_first: bool, is_last: bool) -> None:
+        """Begin → attached → begin the step → advance … signals → attached → sense → end.
+
+        Args:
+            commands: of the agents, the same in all ticks of a step.
+            is_first: whether it begins the step.
+            is_last: whether it ends it.
+        """
+        if self.coordination is not None:
+            self.coordination.begin(commands)
+        for part in self.attached:
+            part.begin(commands)
+        if is_first:
+            self.executor.each("begin_step", commands)
+        self._advance(commands)
+        if self.attached:
+            self._meet()
+        for part in self.attached:
+            part.end()
+        if is_last:
+            self.sense(self._everywhere)
+        self._meet()
+        if self.coordination is not None:
+            self.coordination.end()
+
+    def _advance(self, commands: Commands) -> None:
+        """Advance → leave → exchange → resolve → enter → commit → signals."""
+        self.executor.each("advance", commands)
+        if self.sumo is not None:
+            self._follow_sumo(self.sumo)
+        self.leave()
+        self.division.exchange()
+        self.executor.each("resolve")
+        if self._gathers:
+            self.division.note_gathered()  # others may still be about their contacts
+        self._enter()
+        self.executor.each("commit")
+        self._count_tick(self._shard.worlds.ticks)
+        self.switch_signals()
+
+    def _follow_sumo(self, sumo: SumoTraffic) -> None:
+        """SUMO takes its step; who is its own stands where it is then, or leaves."""
+        gate, worlds, side = self.gate, self._shard.worlds, self.division.next_side
+        self._note_phase(SUMO)
+        sumo.step(worlds, side)
+        if not sumo.drives:
+            sumo.send_on(gate, worlds, side)
+            return
+        self._note_phase(MIRROR)
+        if sumo.mirror(worlds, side):
+            for shard in self.shards:
+                shard.dismiss(gate)
+            self._note_left()
+            sumo.forgive(gate)
+            self.traffic.settle(gate, worlds)
+
+    def switch_signals(self) -> None:
+        """Detect → switch."""
+        if self.sumo is not None:
+            self.sumo.show(self._shard.worlds)
+            return
+        self.executor.each("detect")
+        self.commons.switch_signals(self._shard.worlds)
+
+    def sense(self, chosen: NDArray[np.bool_]) -> None:
+        """Clear → sense → settle → credit, in the chosen worlds (W,)."""
+        if not self._has_agents:
+            return
+        self.commons.clear_outputs(chosen)
+        self.executor.each("sense", chosen)
+        self.commons.settle_outputs(chosen)
+        self.executor.each("credit", chosen)
+
+    def leave(self) -> None:
+        """Who needs it picks another goal, who has arrived leaves, who looks for a way finds it."""
+        traffic, gate, worlds = self.traffic, self.gate, self._shard.worlds
+        begins_second, some_arrived = self._occasions(
+            worlds.ticks, traffic.ticks_per_s, self._shard.zoned.num_through
+        )
+        if begins_second:
+            self.executor.each("choose_goals", traffic.demand, len(traffic.plans), gate)
+        if some_arrived or self.hosts_may_die:
+            self.executor.each("leave", gate)
+            if any(gate.num_passing.tolist()):
+                self._note_left()
+                traffic.settle(gate, worlds)
+        if begins_second and traffic.rerouting is not None:
+            with self.division.everybody_next() as everybody:
+                traffic.rerouting.act(gate, everybody)
+
+    def _note_left(self) -> None:
+        if self.coordination is not None:
+            self.coordination.left(self.gate)
+
+    def _enter(self) -> None:
+        """Those who wait and find a gap enter `next_rows`."""
+        traffic, gate, worlds = self.traffic, self.gate, self._shard.worlds
+        if self.sumo is not None:
+            self._meet()
+            if not self.sumo.drives:
+                self.sumo.order(gate, worlds)
+            elif self.sumo.let_in(gate, worlds):
+                self._admit()
+        traffic.call_orders(gate, worlds)
+        if any(gate.num_queue.tolist()):
+            self.let_in(all_phases=self.hosts_may_die)
+
+    def let_in(self, all_phases: bool) -> None:
+        """Rank → assign → propose, and if anybody has found a gap, accept → admit.
+
+        Args:
+            all_phases: go through the last two in any case.
+        """
+        traffic, gate, worlds = self.traffic, self.gate, self._shard.worlds
+        self.executor.each("rank_lanes", gate)
+        traffic.assign_lanes(gate, worlds)
+        self.executor.each("propose", traffic.demand, gate)
+        if not (all_phases or any(gate.num_passing.tolist())):
+            return
+        traffic.accept(gate, self.division.running())
+        self._admit()
+
+    def _admit(self) -> None:
+        """Those who have been let in become rows of the zones that they are in."""
+        self.executor.each("admit", self.gate)
+        if self.coordination is not None:
+            self.coordination.entered(self.gate)
+        self.gate.num_passing[:] = 0
+
+    def retire_agents(self) -> None:
+        """Between two steps: take out the agents whose trip ended in the last one."""
+        gate = self.gate
+        self.executor.each("retire", gate)
+        if any(gate.num_passing.tolist()):
+            self._note_left()
+            self.executor.each("forget", gate)
+            self.traffic.settle(gate, self._shard.worlds)
+            if self.coordination is not None:
+                self.coordination.save()
+
+    def instrument(self, wrap: Callable[[Any], Any]) -> None:
+        """Put `wrap(part)` in the place of each part that phases are calls of, to time them."""
+        self.executor = wrap(self.executor)
+        self.division = wrap(self.division)
+        self.traffic = wrap(self.traffic)
+        self.commons = wrap(self.commons)
+        if self.coordination is not None:
+            self.coordination = wrap(self.coordination)
+        if self.sumo is not None:
+            self.sumo = wrap(self.sumo)
+
+    def trace(self, wrap: Callable[[Any], Any], note: Callable[[str], None]) -> None:
+        """Let `wrap(executor)` note the phases, and attached parts name theirs to `note`.
+
+        A part that has phases of its own (another simulator's step, say) has a method `trace`.
+        """
+        self.executor = wrap(self.executor)
+        self._note_phase = note
+        for part in self.attached:
+            if isinstance(part, Traced):
+                part.trace(note)
+
+    def host(
+        self,
+        make: Callable[[Sequence[Shard], tuple[float, float]], Together],
+        gathers: bool,
+    ) -> None:
+        """From now on let others run the phases of the shards, as `make` returns them.
+
+        Args:
+            make: called with the shards, and with what the phase `gather` is called with.
+            gathers: whether that phase is his, too.
+        """
+        team = make(self.shards, self.division.gathering)
+        self.executor, self._meet = team, team.meet
+        self._gathers = gathers and self.division.let_gather(team)
+
+
+def _there() -> None:
+    """Nobody is waited for where one process runs all phases."""
+
+
+def _pass_over(phase: str) -> None:
+    """What is done with the names of phases where nobody asks for them."""

@@ -1,0 +1,74 @@
+"""`TrafficStats`: what has become of the traffic of one world."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from cavmarl.core.records.arrays import Gate
+from cavmarl.core.records.codes import (
+    COUNT_ARRIVED,
+    COUNT_DEPARTED,
+    COUNT_REMOVED,
+    COUNT_REROUTED,
+    SUM_DELAY_S,
+    SUM_DISTANCE_M,
+    SUM_TIME_S,
+)
+from cavmarl.handoff.division import Division
+
+__all__ = ["TrafficStats", "count_traffic"]
+
+
+@dataclass(frozen=True)
+class TrafficStats:
+    """Traffic of one world since its reset; agents count as vehicles.
+
+    Attributes:
+        departed: vehicles that have entered, those placed at reset included.
+        waiting: departures that wait for a safe gap.
+        running: vehicles in the world.
+        arrived: vehicles that reached their goal.
+        contacts: vehicles that began to touch another one.
+        removed: agents taken out after a collision or off the road.
+        rerouted: vehicles that took another way; one that did so twice counts twice.
+        mean_speed_mps: over the vehicles in the world now.
+        mean_trip_m: over the arrived ones.
+        mean_trip_s: over the arrived ones.
+        mean_delay_s: over the arrived ones, time above what the way takes at the speed that
+            limit and driver allow.
+    """
+
+    departed: int
+    waiting: int
+    running: int
+    arrived: int
+    contacts: int
+    removed: int
+    rerouted: int
+    mean_speed_mps: float
+    mean_trip_m: float
+    mean_trip_s: float
+    mean_delay_s: float
+
+
+def count_traffic(gate: Gate, division: Division, world: int) -> TrafficStats:
+    """Counts and means of one world since its reset."""
+    counts, sums = gate.counts[world], gate.sums[world]
+    rows = division.vehicles(world)
+    arrived = int(counts[COUNT_ARRIVED])
+    trips = max(arrived, 1)
+    return TrafficStats(
+        departed=int(counts[COUNT_DEPARTED]),
+        waiting=int(gate.num_queue[world]),
+        running=len(rows),
+        arrived=arrived,
+        contacts=int(division.contacts()[world]),
+        removed=int(counts[COUNT_REMOVED]),
+        rerouted=int(counts[COUNT_REROUTED]),
+        mean_speed_mps=float(np.sort(rows["speed"]).mean()) if len(rows) else 0.0,
+        mean_trip_m=float(sums[SUM_DISTANCE_M]) / trips,
+        mean_trip_s=float(sums[SUM_TIME_S]) / trips,
+        mean_delay_s=float(sums[SUM_DELAY_S]) / trips,
+    )

@@ -1,0 +1,64 @@
+"""`Messaging`: the bus of messages as a part that acts in each tick."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cavmarl.core.records.arrays import Common
+from cavmarl.shards.shard import Commands
+from cavmarl.v2x.bus import Bus
+
+if TYPE_CHECKING:
+    from cavmarl.engine.component import Host
+
+__all__ = ["Messaging"]
+
+
+class Messaging:
+    """Lets the stations of W worlds send and receive at the end of each tick; an `Attached`.
+
+    What is received in a tick is in the inboxes when agents sense, at its end.
+
+    Args:
+        host: what it is attached to.
+
+    Attributes:
+        bus: the messages.
+    """
+
+    def __init__(self, host: Host) -> None:
+        worlds = host.shards[0].worlds
+        self._division = host.division
+        self._ticks = worlds.ticks
+        self._ticks_per_step = host.config.clock.ticks_per_step
+        self.bus = Bus(
+            host.config,
+            host.network,
+            host.travel.types,
+            host.division.zoned,
+            Common(*(getattr(worlds, name) for name in Common._fields)),
+            host.zeros,
+        )
+        for shard in host.shards:
+            shard.mail = self.bus.mail
+
+    def reset(self, chosen: NDArray[np.bool_]) -> None:
+        """Nobody has said anything yet."""
+        self.bus.reset(chosen)
+
+    def begin(self, commands: Commands) -> None:
+        """Take what agents tell others of in this step; they say it once, in its first tick."""
+        if commands.declared.size and self._ticks.item(0) % self._ticks_per_step == 0:
+            self.bus.declare(commands.declared)
+
+    def end(self) -> None:
+        """Send and receive."""
+        self.bus.exchange(self._division.side)
+
+    def arrays(self) -> Iterator[NDArray[Any]]:
+        """The inboxes, the counts, and what is in flight."""
+        return self.bus.arrays()

@@ -1,0 +1,232 @@
+"""From a name to what a world is made of: config and roads."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from cavmarl.config.env import EnvConfig
+from cavmarl.config.registry import (
+    load_config,
+    resolve_buildings,
+    resolve_demand,
+    resolve_map,
+    resolve_programs,
+    resolve_zones,
+)
+from cavmarl.core.errors import ConfigError
+from cavmarl.maps.buildings import with_buildings
+from cavmarl.maps.netconvert import map_file
+from cavmarl.roads.cache import load_network
+from cavmarl.roads.network import RoadNetwork
+from cavmarl.roads.sumo_net.signal_plans import with_outages, with_programs
+from cavmarl.traffic.demand import DemandFile, read_demand
+from cavmarl.traffic.native import capacity_of
+from cavmarl.traffic.scenarios.library import plan_scene
+from cavmarl.traffic.sumo.sumo_demand import SumoDemand, read_sumo_demand
+from cavmarl.traffic.sumo.sumo_input import read_input
+from cavmarl.zones.partition.zone_file import zones_for
+from cavmarl.zones.partition.zone_layouts import cut_map
+from cavmarl.zones.partition.zone_partition import ZonePartition
+
+__all__ = [
+    "World",
+    "check_agents",
+    "check_hosts",
+    "check_workers",
+    "find_map",
+    "leads_hosts",
+    "load_roads",
+    "load_world",
+    "load_zones",
+    "make_world",
+]
+
+
+class World(NamedTuple):
+    """What a world is made of.
+
+    Attributes:
+        config: the environment.
+        network: its roads.
+        demand: whose vehicles drive beside the generator's; of a file, or SUMO's.
+        partition: its zones.
+    """
+
+    config: EnvConfig
+    network: RoadNetwork
+    demand: DemandFile | SumoDemand | None
+    partition: ZonePartition
+
+    @property
+    def capacity(self) -> int:
+        """How many vehicles it can hold."""
+        config = self.config
+        dt, horizon_s = config.clock.sim_dt_s, config.horizon_s
+        room = capacity_of(self.network, config.population, self.demand, dt, horizon_s)
+        scene = plan_scene(config.scenario, self.network)
+        return room + (0 if scene is None else len(scene.actors))
+
+
+def load_world(
+    env: str | Path,
+    *,
+    zones: int | None = None,
+    agents: int | None = None,
+    background: int | None = None,
+    max_cycles: int | None = None,
+    overrides: Mapping[str, Any] | None = None,
+) -> World:
+    """What an entry, a folder or a map file describes; keywords as in `parallel_env`.
+
+    Raises:
+        ConfigError: a key, value or combination that cannot work.
+        ZoneError: zones that cannot be, or not on this map.
+        MapError: the map cannot be read or driven.
+        DemandError: a demand file is missing, broken or another map's.
+        RouteError: its routes do not connect.
+        ZoneError: the zones do not fit the map.
+    """
+    config, base_dir = load_config(
+        env,
+        zones=zones,
+        agents=agents,
+        background=background,
+        max_cycles=max_cycles,
+        overrides=overrides,
+    )
+    return make_world(config, base_dir)
+
+
+def make_world(config: EnvConfig, base_dir: Path) -> World:
+    """What a configuration describes.
+
+    Args:
+        config: of the environment.
+        base_dir: the folder that relative files start from.
+
+    Raises:
+        CavmarlError: as of `load_world`.
+    """
+    network = load_roads(config, base_dir)
+    files = resolve_demand(config, base_dir)
+    demand: DemandFile | SumoDemand | None = None
+    if config.traffic.source != "native":
+        network = with_programs(network, read_input(files).additional_files)
+        path = map_file(resolve_map(config, base_dir)).resolve()
+        demand = read_sumo_demand(config, network, path, files)
+    elif files:
+        demand = read_demand(files, network, on_bad_route=config.traffic.on_bad_route)
+    scene = plan_scene(config.scenario, network)
+    if scene is not None and scene.outages:
+        network = with_outages(network, dict(scene.outages))
+    return World(config, network, demand, load_zones(config, base_dir, network))
+
+
+def load_roads(config: EnvConfig, base_dir: Path) -> RoadNetwork:
+    """The roads of a configuration, with the buildings and the signal programs that it names.
+
+    Args:
+        config: of the environment.
+        base_dir: the folder that relative files start from.
+
+    Raises:
+        MapError: the map or a file of buildings or programs cannot be read, or they do not fit.
+    """
+    network = load_network(map_file(resolve_map(config, base_dir)))
+    buildings = resolve_buildings(config, base_dir)
+    if buildings is not None:
+        network = with_buildings(network, buildings)
+    return with_programs(network, resolve_programs(config, base_dir), config.map.program)
+
+
+def load_zones(config: EnvConfig, base_dir: Path, network: RoadNetwork) -> ZonePartition:
+    """The zones of a configuration.
+
+    Args:
+        config: of the environment.
+        base_dir: the folder that relative files start from.
+        network: its roads.
+
+    Raises:
+        ConfigError: a zone file that cannot be read, or more zones than the map can hold.
+        ZoneError: a zone file of another number of zones, or of another map.
+    """
+    settings = config.zones
+    path = resolve_zones(config, base_dir)
+    if path is not None:
+        return zones_for(network, path, settings.count)
+    return cut_map(
+        network,
+        settings.layout,
+        settings.count,
+        avoid_junctions=settings.avoid_junctions,
+        weight=settings.weight,
+    )
+
+
+def find_map(env: str | Path) -> Path:
+    """The SUMO network of an entry, a folder or a map file.
+
+    Raises:
+        UnknownEnvironmentError: nothing of that name.
+        MapError: the map cannot be read.
+    """
+    return map_file(resolve_map(*load_config(env))).resolve()
+
+
+def check_workers(workers: int | None) -> int:
+    """How many worker processes share some worlds out; 0: none, the caller's process runs them.
+
+    Raises:
+        ConfigError: no whole number from 0.
+    """
+    if workers is None:
+        return 0
+    if isinstance(workers, bool) or not isinstance(workers, (int, np.integer)):
+        raise ConfigError(f"workers = {workers!r}: must be a whole number")
+    if workers < 0:
+        raise ConfigError(f"workers = {workers}: must be a number from 0")
+    return int(workers)
+
+
+def check_hosts(workers: int | str | None, hosts: str | None) -> bool:
+    """Whether workers run on the machines of a Ray cluster.
+
+    Raises:
+        ConfigError: another name, no number, or no workers to be hosted.
+    """
+    if hosts not in (None, "ray"):
+        raise ConfigError(f"hosts = {hosts!r}: must be 'ray', or None for this machine")
+    if isinstance(workers, str) and workers != "ray":
+        raise ConfigError(f"workers = {workers!r}: must be a whole number, or 'ray'")
+    if not isinstance(workers, str):
+        check_workers(workers)
+    if hosts and workers in (None, 0):
+        raise ConfigError("hosts = 'ray' without workers: say how many, or workers='ray'")
+    return "ray" in (workers, hosts)
+
+
+def leads_hosts(num_worlds: int, workers: int | str | None, hosts: str | None) -> bool:
+    """Whether this process leads the worlds, and hosts run their zones; arguments as checked.
+
+    Args:
+        num_worlds: W.
+        workers: how many; "ray": as many as are of use for whole worlds.
+        hosts: "ray": they are on the machines of a Ray cluster.
+    """
+    is_number = workers is not None and not isinstance(workers, str)
+    return hosts is not None and is_number and int(workers or 0) > num_worlds
+
+
+def check_agents(config: EnvConfig) -> None:
+    """Refuse a world without agents where somebody wants to drive one.
+
+    Raises:
+        ConfigError: `population.agents` is 0.
+    """
+    if config.population.agents == 0:
+        raise ConfigError("population.agents = 0: an environment needs at least one agent")

@@ -1,0 +1,191 @@
+"""What the next tick of W worlds depends on, as a list of arrays, for whoever goes on with them.
+
+Who owns what is not part of it: that changes no result. Whoever goes on with a divided world gives
+each vehicle to the zone that it is in, as at a reset.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cavmarl.core.records.arrays import Gate, Outputs, Worlds
+from cavmarl.engine.component import Attached
+from cavmarl.handoff.coordinator.coordinators import Coordination
+from cavmarl.handoff.division import Division
+from cavmarl.shards.shard import COMMON
+from cavmarl.traffic.native import NativeTraffic
+from cavmarl.traffic.sumo.sumo_traffic import SumoTraffic
+
+__all__ = ["Parts", "join", "load", "save", "share_of"]
+
+Array = NDArray[Any]
+
+# Fields of `Gate` that outlive a tick, beside its queue. Between two steps nobody is passing it.
+_OF_GATE = ("next_order", "num_queue", "next_id", "num_entered", "counts", "sums")
+
+
+class Parts(NamedTuple):
+    """Who keeps the state of W worlds.
+
+    Attributes:
+        worlds: of the first shard.
+        division: of all shards.
+        gate: through which vehicles come and go.
+        traffic: what comes.
+        outputs: what agents have got; the frames of the next observation, too.
+        coordination: who says who owns what; None: all is one zone.
+        has_frames: an observation has frames of the ones before.
+        attached: what acts in each tick beside the traffic.
+        sumo: beside the worlds; None: there is none.
+    """
+
+    worlds: Worlds
+    division: Division
+    gate: Gate
+    traffic: NativeTraffic
+    outputs: Outputs
+    coordination: Coordination | None
+    has_frames: bool
+    attached: tuple[Attached, ...]
+    sumo: SumoTraffic | None
+
+
+def save(parts: Parts) -> list[Array]:
+    """The arrays; some of them are views, to be copied before the next tick."""
+    worlds, gate = parts.worlds, parts.gate
+    waiting = int(gate.num_queue.max(initial=0))
+    return [
+        *_fixed(parts),
+        gate.queue[:, :waiting],
+        parts.division.contacts(),
+        *_of_rerouting(parts),
+        *(
+            parts.division.owned(w, zone)
+            for w in range(len(worlds.ticks))
+            for zone in range(parts.division.count)
+        ),
+    ]
+
+
+def load(parts: Parts, saved: Sequence[Array]) -> Gate:
+    """Put everything in its place.
+
+    Args:
+        parts: of worlds of the same environment, as many as there were.
+        saved: what `save` gave.
+
+    Returns:
+        the gate, or a larger one.
+    """
+    everywhere = np.ones(len(parts.worlds.ticks), dtype=np.bool_)
+    rest = iter(saved)
+    parts.division.align()
+    for array in _fixed(parts):
+        array[...] = next(rest)
+    # What is ordered follows from the keys; what has been ordered so far is in the gate.
+    gate = parts.traffic.draw_orders(parts.gate, parts.worlds, everywhere)
+    queue, contacts = next(rest), next(rest)
+    gate.queue[:, : queue.shape[1]] = queue
+    gate.num_passing[:] = 0
+    for array in _of_rerouting(parts):
+        _put(array, next(rest))
+    zones = range(parts.division.count)
+    vehicles = [np.concatenate([next(rest) for _ in zones]) for _ in everywhere]
+    parts.division.place(vehicles, contacts)
+    if parts.coordination is not None:
+        parts.coordination.reset(everywhere)
+    return gate
+
+
+def share_of(parts: Parts, w: int) -> list[Array]:
+    """What `save` would give if there were no world but one; some are views, to be copied."""
+    gate, rerouting = parts.gate, parts.traffic.rerouting
+    waiting = gate.queue[w : w + 1, : gate.num_queue.item(w)]
+    owned = [parts.division.owned(w, zone) for zone in range(parts.division.count)]
+    if parts.sumo is not None:
+        waiting, owned = waiting.copy(), [rows.copy() for rows in owned]
+        for rows in (waiting, *owned):
+            parts.sumo.shift(rows, -w)
+    if rerouting is not None:
+        owned = [rows.copy() for rows in owned]
+        for rows in owned:
+            rows["way"] = rerouting.ways_of_first_world(rows["way"], w)
+    return [
+        *(array[w : w + 1] for array in _fixed(parts)),
+        waiting,
+        parts.division.contacts()[w : w + 1],
+        *(() if rerouting is None else rerouting.arrays_of(w)),
+        *owned,
+    ]
+
+
+def join(parts: Parts, shares: Sequence[Sequence[Array]]) -> list[Array]:
+    """What `save` would give of worlds of which each share has been one.
+
+    Args:
+        parts: of as many worlds.
+        shares: what `share_of` gave, in the order in which the worlds are to be.
+    """
+    zones, rerouting = parts.division.count, parts.traffic.rerouting
+    if parts.sumo is not None:
+        shares = [_shifted(parts, parts.sumo, share, w) for w, share in enumerate(shares)]
+    fields = zip(*(share[:-zones] for share in shares), strict=True)
+    joined = [_stacked(arrays) for arrays in fields]
+    for w, share in enumerate(shares):
+        for owned in share[-zones:]:
+            rows = owned.copy()
+            if rerouting is not None:
+                rows["way"] = rerouting.ways_of_world(rows["way"], w)
+            joined.append(rows)
+    return joined
+
+
+def _shifted(
+    parts: Parts, sumo: SumoTraffic, share: Sequence[Array], worlds: int
+) -> Sequence[Array]:
+    """A share whose rows and queue are those of so many worlds later."""
+    found = list(share)
+    queue = sum(1 for _ in _fixed(parts))
+    for n in (queue, *range(len(found) - parts.division.count, len(found))):
+        found[n] = found[n].copy()
+        sumo.shift(found[n], worlds)
+    return found
+
+
+def _stacked(arrays: Sequence[Array]) -> Array:
+    """Rows of one world each below one another, shorter ones with zeros behind."""
+    if arrays[0].ndim < 2:
+        return np.concatenate(arrays)
+    longest = max(array.shape[1] for array in arrays)
+    stacked = np.zeros((len(arrays), longest, *arrays[0].shape[2:]), dtype=arrays[0].dtype)
+    for row, array in zip(stacked, arrays, strict=True):
+        row[: array.shape[1]] = array[0]
+    return stacked
+
+
+def _fixed(parts: Parts) -> Iterator[Array]:
+    """The arrays whose shapes follow from the environment, (W, …)."""
+    for name in COMMON:
+        yield getattr(parts.worlds, name)
+    for name in _OF_GATE:
+        yield getattr(parts.gate, name)
+    for name, array in parts.outputs._asdict().items():
+        if name != "observations" or parts.has_frames:
+            yield array
+    for part in parts.attached:
+        yield from part.arrays()
+
+
+def _of_rerouting(parts: Parts) -> Iterator[Array]:
+    if parts.traffic.rerouting is not None:
+        yield from parts.traffic.rerouting.arrays()
+
+
+def _put(target: Array, saved: Array) -> None:
+    """Copy what both have: room for the orders of an episode grows as it is needed."""
+    shared = tuple(slice(min(pair)) for pair in zip(target.shape, saved.shape, strict=True))
+    target[shared] = saved[shared]

@@ -1,0 +1,54 @@
+"""`DeclaredEvents`: what agents want to tell others of, until the next step takes it."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from cavmarl.config.env import EnvConfig
+from cavmarl.core.errors import UnknownAgentError, V2xError
+from cavmarl.shards.shard import Commands
+from cavmarl.v2x.v2x_messages import cause_code
+
+__all__ = ["DeclaredEvents"]
+
+
+class DeclaredEvents:
+    """At most one event an agent and step; a later one takes the place of an earlier one.
+
+    Args:
+        config: the environment.
+        num_worlds: W.
+    """
+
+    def __init__(self, config: EnvConfig, num_worlds: int) -> None:
+        self._enabled = config.v2x.enabled
+        self._causes = np.zeros((num_worlds, config.population.num_ids), dtype=np.int32)
+        self._are_any = False
+
+    def declare(self, world: int, agent: int, cause: str) -> None:
+        """Note an event.
+
+        Raises:
+            UnknownAgentError: no such world or agent.
+            V2xError: no such cause, or nobody says anything in this environment.
+        """
+        if not self._enabled:
+            raise V2xError("nobody says anything here: set v2x.enabled to true")
+        num_worlds, num_agents = self._causes.shape
+        if not (0 <= world < num_worlds and 0 <= agent < num_agents):
+            raise UnknownAgentError(
+                f"agent {agent} of world {world}: there are {num_agents} in each of {num_worlds}"
+            )
+        self._causes[world, agent] = cause_code(cause)
+        self._are_any = True
+
+    def add_to(self, commands: Commands) -> Commands:
+        """Commands of a step with all that has been declared for it."""
+        if not self._are_any:
+            return commands
+        declared = self._causes.copy()
+        self._causes[:] = 0
+        self._are_any = False
+        return replace(commands, declared=declared)

@@ -1,0 +1,453 @@
+"""`CavEnv`: one world as a PettingZoo parallel environment, a view on the batched simulation."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from itertools import compress
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from gymnasium import spaces
+from numpy.typing import NDArray
+from pettingzoo import ParallelEnv
+
+from cavmarl.config.env import TERMS
+from cavmarl.config.registry import load_config
+from cavmarl.core.errors import ConfigError, EpisodeEndedError, ResetNeededError, UnknownAgentError
+from cavmarl.core.seeds import check_seed, first_seed
+from cavmarl.engine.simulation import Simulation
+from cavmarl.engine.spaces import (
+    STATE_FEATURES,
+    action_space,
+    named_observation,
+    observation_parts,
+    observation_space,
+    sensed_observation,
+    state_space,
+)
+from cavmarl.engine.world_setup import check_agents, check_hosts, leads_hosts, make_world
+from cavmarl.env.actions import ActionDecoder
+from cavmarl.env.declared_events import DeclaredEvents
+from cavmarl.parallel.backends import make_worlds
+from cavmarl.parallel.step_arrays import SteppedWorlds
+from cavmarl.render.world_view import WorldView
+from cavmarl.sensors.mounted.frames import SensorFrames
+
+__all__ = ["CavEnv", "parallel_env"]
+
+RENDER_MODES = ("human", "rgb_array")
+
+# What an agent's info holds, in this order.
+_ABSENT = dict.fromkeys((*TERMS, "active", "vehicle_done", "vehicle_id"), 0.0)
+_ACTIVE = _ABSENT | {"active": 1.0}
+
+Observation = NDArray[np.float32] | dict[str, NDArray[Any]]
+
+
+def parallel_env(
+    env: str | Path = "merge",
+    *,
+    zones: int | None = None,
+    workers: int | Literal["ray"] | None = None,
+    hosts: Literal["ray"] | None = None,
+    sensor_workers: int | None = None,
+    agents: int | None = None,
+    background: int | None = None,
+    seed: int | None = None,
+    max_cycles: int | None = None,
+    render_mode: str | None = None,
+    overrides: Mapping[str, Any] | None = None,
+) -> CavEnv:
+    """Make a PettingZoo parallel environment.
+
+    Args:
+        env: name of an entry of `envs/`, a folder with an env.yaml, or a map file.
+        zones: shadows zones.count, how many shards run the world; results do not depend on it.
+        workers: processes that the zones are shared out over; 0: the caller's process runs them.
+            Results do not depend on it. "ray": as with hosts="ray", as many as are of use.
+        hosts: "ray" runs the workers on the machines of a Ray cluster (docs/cluster.md). None: on
+            this one.
+        sensor_workers: shadows workers.sensors, how many processes the sensors of `rig` are shared
+            out over (docs/sensor_workers.md). Results do not depend on it.
+        agents: shadows population.agents.
+        background: shadows population.background.
+        seed: of the first reset, if that is given none.
+        max_cycles: steps until truncation; shadows horizon_s.
+        render_mode: `human`, `rgb_array` or None.
+        overrides: values for any other key, such as `{"sensors.lidar.rays": 32}`.
+
+    Raises:
+        ConfigError: a key, value or combination that cannot work.
+        MapError: the map cannot be read or driven.
+        WorkerError: worker processes cannot be started, or have no memory.
+        MissingExtraError: hosts on Ray without Ray.
+    """
+    check_hosts(workers, hosts)
+    first_seed = None if seed is None else check_seed(seed)
+    if render_mode is not None:
+        _check_rendering(render_mode, 0 if leads_hosts(1, workers, hosts) else workers)
+    config, base_dir = load_config(
+        env,
+        zones=zones,
+        sensor_workers=sensor_workers,
+        agents=agents,
+        background=background,
+        max_cycles=max_cycles,
+        overrides=overrides,
+    )
+    check_agents(config)
+    world = make_world(config, base_dir)
+    worlds = make_worlds(world, base_dir, 1, workers, hosts, in_next_step=True)
+    return CavEnv(worlds, seed=first_seed, render_mode=render_mode)
+
+
+def _check_rendering(render_mode: str, workers: int | str | None) -> None:
+    """Refuse what cannot be drawn.
+
+    Raises:
+        ConfigError: an unknown mode, or a world that only other processes have.
+    """
+    if render_mode not in RENDER_MODES:
+        raise ConfigError(
+            f"render_mode = {render_mode!r}: must be {' or '.join(RENDER_MODES)}, or None"
+        )
+    if workers:
+        raise ConfigError(
+            f"render_mode = {render_mode!r} with workers = {workers!r}: only a world of the "
+            "caller's process can be drawn; use workers=0"
+        )
+
+
+def _flags(agents: list[str], flags: NDArray[np.bool_]) -> dict[str, bool]:
+    """One flag an agent; in most steps nobody's is set."""
+    if not flags.any():
+        return dict.fromkeys(agents, False)
+    return dict(zip(agents, flags.tolist(), strict=True))
+
+
+class CavEnv(ParallelEnv[str, Any, Any]):  # type: ignore[misc] # PettingZoo is not typed
+    """One world.
+
+    Observations, actions and rewards are described in docs/environments.md. The infos of each agent
+    hold every term by its name, and `active` (it has a vehicle), `vehicle_done` (that vehicle's
+    trip ended in this step) and `vehicle_id`; all are plain numbers.
+
+    The world runs in this process, or its zones are shared out over worker processes
+    (docs/workers.md): what comes out is the same bit for bit.
+
+    Args:
+        worlds: the one world; it begins anew in the next step, which never comes: a reset does.
+        seed: of the first reset, if that is given none.
+        render_mode: `human`, `rgb_array` or None.
+    """
+
+    metadata: dict[str, Any] = {  # noqa: RUF012 - PettingZoo declares it as an instance's attribute
+        "name": "cavmarl",
+        "render_modes": list(RENDER_MODES),
+        "render_fps": 10,
+        "is_parallelizable": True,
+    }
+
+    def __init__(
+        self, worlds: SteppedWorlds, *, seed: int | None = None, render_mode: str | None = None
+    ) -> None:
+        self.worlds = worlds
+        self.config = config = worlds.world.config
+        self.network = worlds.world.network
+        self.render_mode = render_mode
+        self.ghosts_of: int | None = None
+        self.metadata = {
+            **self.metadata,
+            "name": f"cavmarl/{config.name}-v{config.version}",
+            "render_fps": max(1, round(1.0 / config.clock.ctrl_dt_s)),
+        }
+        self.possible_agents = [f"car_{k}" for k in range(config.population.num_ids)]
+        self._rows: NDArray[np.intp]
+        self._listed: NDArray[np.intp] | slice  # the same
+        self._list(np.zeros(0, dtype=np.intp))
+        self.max_cycles = config.max_steps
+        one_observation, one_action = observation_space(config), action_space(config.action)
+        self.observation_spaces = dict.fromkeys(self.possible_agents, one_observation)
+        self.action_spaces = dict.fromkeys(self.possible_agents, one_action)
+        self._seats = config.population.mode == "seats"
+        self._stack = config.sensors.stack
+        self._parts = (
+            observation_parts(config.sensors)
+            if config.observation.kind == "dict" and config.observation.mode != "sensors"
+            else None
+        )
+        self.state_space = state_space(worlds.arrays.states.shape[1] // STATE_FEATURES)
+        self._decoder = ActionDecoder(config.action, 1, self.possible_agents)
+        self._events = DeclaredEvents(config, 1)
+        self._first_seed = seed
+        self._steps = -1
+        self._view: WorldView | None = None
+
+    @property
+    def step_s(self) -> float:
+        """Seconds a step."""
+        return self.config.clock.ctrl_dt_s
+
+    @property
+    def simulation(self) -> Simulation:
+        """The world behind this view, for tools that draw or measure it.
+
+        Raises:
+            ConfigError: it lives in worker processes.
+        """
+        return self.worlds.simulation
+
+    def observation_space(self, agent: str) -> spaces.Space[Any]:
+        """The same object at each call and for each agent."""
+        return self.observation_spaces[agent]
+
+    def action_space(self, agent: str) -> spaces.Space[Any]:
+        """The same object at each call and for each agent."""
+        return self.action_spaces[agent]
+
+    def reset(
+        self, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[dict[str, Observation], dict[str, dict[str, float]]]:
+        """Begin an episode.
+
+        Args:
+            seed: root of all random numbers; None goes on with the next episode of the last seed.
+            options: not used; accepted because the API has it.
+        """
+        if seed is not None or self._steps < 0:
+            seed = first_seed(seed, self._first_seed)
+        arrays = self.worlds.arrays
+        arrays.chosen[:] = True
+        self.worlds.reset(seed, 0)
+        self._decoder.forget(arrays.chosen)
+        self._steps = 0
+        self._list(np.flatnonzero(arrays.mask[0] | self._seats))
+        if not self.agents:
+            self._wait_for_agents()
+        return self._observations(), self._infos()
+
+    def step(
+        self, actions: Mapping[str, Any]
+    ) -> tuple[
+        dict[str, Observation],
+        dict[str, float],
+        dict[str, bool],
+        dict[str, bool],
+        dict[str, dict[str, float]],
+    ]:
+        """Let every agent act and the world go on for `step_s` seconds.
+
+        Agents that enter during the step are in the results, with reward 0. When everybody has left
+        and more are to come, the world goes on until one enters.
+
+        Raises:
+            ResetNeededError: before the first reset.
+            EpisodeEndedError: actions after everybody has left.
+            ActionError: a refused action; nothing has changed and the step can be repeated.
+        """
+        if self._steps < 0:
+            raise ResetNeededError("step() before reset(): call env.reset(seed=…) first")
+        if not self.agents:
+            if actions:
+                raise EpisodeEndedError("the episode is over: call env.reset()")
+            return {}, {}, {}, {}, {}
+        active = self.worlds.arrays.mask[0, self._listed]
+        needed = self.agents if active.all() else list(compress(self.agents, active.tolist()))
+        commands = self._decoder.from_dict(actions, self.agents, needed)
+        self.worlds.step(self._events.add_to(commands))
+        self._steps += 1
+        return self._report()
+
+    def _report(
+        self,
+    ) -> tuple[
+        dict[str, Observation],
+        dict[str, float],
+        dict[str, bool],
+        dict[str, bool],
+        dict[str, dict[str, float]],
+    ]:
+        """What the agents get after a step; decides who stays."""
+        arrays = self.worlds.arrays
+        truncated = self._steps >= self.max_cycles
+        if not truncated:
+            entered = arrays.vehicle_ids[0] >= 0
+            entered[self._listed] = False
+            if entered.any():
+                self._list(np.concatenate([self._rows, np.flatnonzero(entered)]))
+        shown = self.agents
+        ended = arrays.terminations[0, self._listed] & (not self._seats)
+        observations, infos = self._observations(), self._infos()
+        rewards = dict(zip(shown, arrays.rewards[0, self._listed].tolist(), strict=True))
+        terminations = _flags(shown, ended)
+        truncations = _flags(shown, ~ended & truncated)
+        if truncated:
+            self._list(self._rows[:0])
+        elif ended.any():
+            self._list(self._rows[~ended])
+        if not self.agents and not truncated:
+            self._wait_for_agents()
+            observations |= self._observations()
+            infos |= self._infos()
+            rewards |= dict.fromkeys(self.agents, 0.0)
+            terminations |= dict.fromkeys(self.agents, False)
+            truncations |= dict.fromkeys(self.agents, False)
+        if self.render_mode == "human":
+            self.render()
+        return observations, rewards, terminations, truncations, infos
+
+    def _list(self, rows: NDArray[np.intp]) -> None:
+        """Make these agents, by their index, the ones in the episode."""
+        self._rows = rows
+        self.agents = [self.possible_agents[k] for k in rows.tolist()]
+        # The first ones in their order, which is the usual case, can be taken without a copy.
+        in_order = bool((rows == np.arange(rows.size)).all())
+        self._listed = slice(rows.size) if in_order else rows
+
+    def _wait_for_agents(self) -> None:
+        """Let an empty world go on until an agent enters; ends without one at the horizon."""
+        arrays = self.worlds.arrays
+        while not arrays.episode_over[0]:
+            self.worlds.step(self._decoder.idle())
+            self._steps += 1
+            if arrays.mask.any():
+                self._list(np.flatnonzero(arrays.mask[0]))
+                break
+
+    def _observations(self) -> dict[str, Observation]:
+        form = self.config.observation
+        if form.mode == "sensors" and form.kind == "dict":
+            sensed = {
+                name: data[0, self._listed].copy()
+                for name, data in sensed_observation(self.worlds.arrays.frames).items()
+            }
+            return {
+                agent: {name: data[k] for name, data in sensed.items()}
+                for k, agent in enumerate(self.agents)
+            }
+        found = self.worlds.arrays.observations[0].copy()[self._listed]
+        if self._parts is None:
+            return dict(zip(self.agents, found, strict=True))
+        named = named_observation(
+            self._parts, found.reshape(len(found), self._stack, found.shape[1] // self._stack)
+        )
+        return {
+            agent: {name: part[k] for name, part in named.items()}
+            for k, agent in enumerate(self.agents)
+        }
+
+    def _infos(self) -> dict[str, dict[str, float]]:
+        arrays, listed = self.worlds.arrays, self._listed
+        done, ids = arrays.vehicle_done[0, listed], arrays.vehicle_ids[0, listed]
+        active = (ids >= 0) & ~done
+        terms = arrays.terms[0, listed].T
+        # Most are 0 for everybody: no accident, no red light.
+        columns = [(TERMS[k], terms[k]) for k in np.flatnonzero(terms.any(axis=1)).tolist()]
+        columns.append(("vehicle_id", ids))
+        usual = _ACTIVE
+        if not active.all():
+            usual = _ABSENT
+            columns.append(("active", active.astype(np.float64)))
+            columns.append(("vehicle_done", done.astype(np.float64)))
+        infos = [usual.copy() for _ in self.agents]
+        for name, column in columns:
+            for info, number in zip(infos, column.tolist(), strict=True):
+                info[name] = number
+        return dict(zip(self.agents, infos, strict=True))
+
+    def declare_event(self, agent: str, cause: str) -> None:
+        """Let an agent's vehicle tell others of an event in the next step (docs/v2x.md).
+
+        Args:
+            agent: which has a vehicle.
+            cause: `collision`, `obstacle`, `stationary` or `hard_braking`.
+
+        Raises:
+            UnknownAgentError: no such agent, or it has left.
+            V2xError: no such cause, or nobody says anything in this environment.
+        """
+        if agent not in self.agents:
+            raise UnknownAgentError(f"declare_event('{agent}', …): it is not in the episode")
+        self._events.declare(0, self.possible_agents.index(agent), cause)
+
+    def frames(self, agent: str) -> dict[str, SensorFrames]:
+        """What the sensors of an agent's `rig` have got in the last step, by name.
+
+        The arrays are those of `SensorFrames` without the axes of worlds and agents.
+
+        Raises:
+            UnknownAgentError: there is no such agent.
+        """
+        if agent not in self.possible_agents:
+            raise UnknownAgentError(
+                f"no agent {agent!r}: there are {self.possible_agents[0]} to "
+                f"{self.possible_agents[-1]}"
+            )
+        k = self.possible_agents.index(agent)
+        return {name: sensor.of(0, k) for name, sensor in self.worlds.arrays.frames.items()}
+
+    def check_action(self, agent: str, action: Any) -> None:
+        """Refuse an action that `step` would refuse, before anything is kept of it.
+
+        Raises:
+            InvalidActionError: wrong shape, dtype or value.
+        """
+        self._decoder.check(agent, action)
+
+    def state(self) -> NDArray[np.float32]:
+        """The global state, within `state_space`: see `engine.global_state`."""
+        self.worlds.write_states()
+        state: NDArray[np.float32] = self.worlds.arrays.states[0].copy()
+        return state
+
+    def state_hash(self) -> str:
+        """Hex digest over all live vehicles in id order, signals, queue and random keys."""
+        return self.worlds.state_hash(0)
+
+    def traffic_stats(self) -> dict[str, float]:
+        """Traffic since reset: departed, waiting, running, arrived, contacts, mean speed and more.
+
+        All fields of `runtime.traffic_stats.TrafficStats`, and how many actions were clipped, held
+        and ignored.
+        """
+        return {**self.worlds.traffic_stats(0), **self._decoder.tolerated()}
+
+    def suggest_actions(self) -> dict[str, Any]:
+        """What the built-in driver (IDM, MOBIL, lane controller) would do in each agent's place."""
+        self.worlds.suggest()
+        batch = self._decoder.encode(self.worlds.arrays.suggested)[0]
+        return dict(zip(self.agents, batch[self._rows], strict=True))
+
+    def render(self) -> NDArray[np.uint8] | None:
+        """A frame (height, width, 3) for `rgb_array`; None and a window for `human`.
+
+        A divided world is shown with its zones and owners, and with `ghosts_of` set to a zone,
+        what that one sees of the others.
+
+        Raises:
+            ConfigError: no render_mode, or no zone of that number.
+            ResetNeededError: before the first reset.
+        """
+        if self.render_mode is None:
+            raise ConfigError("render() without a render_mode: make the environment with one")
+        if self._steps < 0:
+            raise ResetNeededError("render() before reset(): call env.reset(seed=…) first")
+        if self._view is None:
+            self._view = WorldView(
+                self.simulation,
+                self.render_mode,
+                self.metadata["name"],
+                self.metadata["render_fps"],
+            )
+        return self._view.show(self.ghosts_of)
+
+    def close(self) -> None:
+        """Close the window and end the worker processes, if there are any.
+
+        Without workers the environment can be used on.
+        """
+        if self._view is not None:
+            self._view.close()
+            self._view = None
+        self.worlds.close()

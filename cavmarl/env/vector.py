@@ -1,0 +1,424 @@
+"""`CavVectorEnv`: many worlds, arrays in and out."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, Literal, TypeAlias
+
+import numpy as np
+from gymnasium.vector import AutoresetMode
+from gymnasium.vector.utils import batch_space
+from numpy.typing import NDArray
+
+from cavmarl.balance.balance_plan import Plan
+from cavmarl.balance.plan_text import describe_plan
+from cavmarl.config.registry import load_config
+from cavmarl.core.errors import ConfigError, ResetNeededError
+from cavmarl.core.seeds import check_seed, first_seed
+from cavmarl.engine.simulation import Simulation
+from cavmarl.engine.spaces import (
+    action_space,
+    flat_observation_space,
+    frames_space,
+    sensed_observation,
+)
+from cavmarl.engine.world_setup import check_agents, check_hosts, make_world
+from cavmarl.env.actions import ActionDecoder
+from cavmarl.env.declared_events import DeclaredEvents
+from cavmarl.parallel.backends import make_worlds
+from cavmarl.parallel.step_arrays import SteppedWorlds
+from cavmarl.sensors.mounted.frames import SensorFrames
+from cavmarl.shards.shard import Commands
+
+__all__ = ["CavVectorEnv", "make_vec"]
+
+MAX_WORLDS = 65_536
+
+Observations: TypeAlias = Any
+"""(W, A, D) float32, or an array (W, A, …) a sensor of the rig."""
+
+StepResult = tuple[
+    Observations,
+    NDArray[np.float32],
+    NDArray[np.bool_],
+    NDArray[np.bool_],
+    dict[str, NDArray[Any]],
+]
+
+
+def make_vec(
+    env: str | Path = "merge",
+    *,
+    num_envs: int = 1,
+    zones: int | None = None,
+    workers: int | Literal["ray"] | None = None,
+    hosts: Literal["ray"] | None = None,
+    sensor_workers: int | None = None,
+    agents: int | None = None,
+    background: int | None = None,
+    seed: int | None = None,
+    max_cycles: int | None = None,
+    autoreset_mode: AutoresetMode | str = AutoresetMode.SAME_STEP,
+    copy: bool = True,
+    overrides: Mapping[str, Any] | None = None,
+) -> CavVectorEnv:
+    """Make `num_envs` worlds of one environment that are stepped together.
+
+    Args:
+        env: name of an entry of `envs/`, a folder with an env.yaml, or a map file.
+        num_envs: number of worlds.
+        zones: shadows zones.count, how many shards run the world; results do not depend on it.
+        workers: processes that the worlds are shared out over, whole worlds each; where there are
+            more of them than worlds, the zones of each world. 0: all run in the caller's process.
+            Results do not depend on it. "ray": as with hosts="ray", as many as CPUs and worlds.
+        hosts: "ray" runs the workers on the machines of a Ray cluster (docs/cluster.md). None: on
+            this one.
+        sensor_workers: shadows workers.sensors, how many processes the sensors of `rig` are shared
+            out over (docs/sensor_workers.md). Results do not depend on it.
+        agents: shadows population.agents.
+        background: shadows population.background.
+        seed: of the first reset, if that is given none.
+        max_cycles: steps until truncation; shadows horizon_s.
+        autoreset_mode: when a world that is over begins anew, in the `SameStep` or in the
+            `NextStep`; see `CavVectorEnv`.
+        copy: False returns observations without a copy; see `CavVectorEnv`.
+        overrides: values for any other key.
+
+    Raises:
+        ConfigError: a key, value or combination that cannot work.
+        MapError: the map cannot be read or driven.
+        WorkerError: worker processes cannot be started, or have no memory.
+        MissingExtraError: hosts on Ray without Ray.
+    """
+    if isinstance(num_envs, bool) or not isinstance(num_envs, (int, np.integer)):
+        raise ConfigError(f"num_envs = {num_envs!r}: must be a whole number")
+    if not 1 <= num_envs <= MAX_WORLDS:
+        raise ConfigError(f"num_envs = {num_envs}: must be from 1 to {MAX_WORLDS}")
+    num_envs = int(num_envs)
+    check_hosts(workers, hosts)
+    in_next_step = _in_next_step(autoreset_mode)
+    first_seed = None if seed is None else check_seed(seed)
+    config, base_dir = load_config(
+        env,
+        zones=zones,
+        sensor_workers=sensor_workers,
+        agents=agents,
+        background=background,
+        max_cycles=max_cycles,
+        overrides=overrides,
+    )
+    check_agents(config)
+    world = make_world(config, base_dir)
+    worlds = make_worlds(world, base_dir, num_envs, workers, hosts, in_next_step)
+    return CavVectorEnv(worlds, seed=first_seed, copy=copy)
+
+
+def _in_next_step(mode: AutoresetMode | str) -> bool:
+    """Whether worlds begin anew in the next step; an error for a mode that means no reset."""
+    try:
+        found = AutoresetMode(mode)
+    except ValueError:
+        found = AutoresetMode.DISABLED
+    if found is AutoresetMode.DISABLED:
+        raise ConfigError(
+            f"autoreset_mode = {mode!r}: must be 'SameStep' or 'NextStep'; reset() takes "
+            "options={'reset_mask': …} to begin some worlds anew earlier"
+        )
+    return found is AutoresetMode.NEXT_STEP
+
+
+class CavVectorEnv:
+    """W worlds with A agent seats each; ground truth is flat, whatever `observation.kind` says.
+
+    With `observation.mode: sensors` and `observation.kind: dict`, observations are dicts: an array
+    (num_envs, num_agents, …) a sensor of the rig.
+
+    Arrays have the shape (num_envs, num_agents, …). `infos["mask"]` says which agents have a
+    vehicle and will be asked for the next action; the others' observations are 0 and their actions
+    are not read. A world whose episode is over (truncated, or all agents gone and none to come) is
+    begun anew by itself, as Gymnasium's `AutoresetMode` says:
+
+    - `SAME_STEP`: in the same step. The observations returned are those of the new episode,
+      `infos["final_observations"]` keeps the last ones of the old, and of each agent that left.
+    - `NEXT_STEP`: in the next step. The observations returned are the last ones, those of agents
+      that leave too; in the next step the world's actions are not read, its rewards are 0 and the
+      observations are those of the new episode.
+
+    The worlds run in this process, or shared out over worker processes (docs/workers.md): what
+    comes out is the same bit for bit.
+
+    Args:
+        worlds: that are stepped.
+        seed: of the first reset, if that is given none.
+        copy: False returns observations as a read-only view that the next step or reset overwrites;
+            large ones are copied for longer than they are made.
+
+    Attributes:
+        simulated_s: time that all steps have taken up to now, without that for checking actions and
+            copying what comes out.
+    """
+
+    def __init__(
+        self, worlds: SteppedWorlds, *, seed: int | None = None, copy: bool = True
+    ) -> None:
+        self.worlds = worlds
+        self.config = config = worlds.world.config
+        self.network = worlds.world.network
+        self.num_envs = num_envs = len(worlds.arrays.mask)
+        self.possible_agents = [f"car_{k}" for k in range(config.population.num_ids)]
+        self.num_agents = len(self.possible_agents)
+        form = config.observation
+        self._senses = form.mode == "sensors" and form.kind == "dict"
+        self.single_observation_space: Any = (
+            frames_space(config) if self._senses else flat_observation_space(config)
+        )
+        self.single_action_space = action_space(config.action)
+        self.observation_space = batch_space(
+            batch_space(self.single_observation_space, self.num_agents), num_envs
+        )
+        self.action_space = batch_space(
+            batch_space(self.single_action_space, self.num_agents), num_envs
+        )
+        self.max_cycles = config.max_steps
+        self.metadata = {
+            "name": f"cavmarl/{config.name}-v{config.version}",
+            "autoreset_mode": (
+                AutoresetMode.NEXT_STEP if worlds.in_next_step else AutoresetMode.SAME_STEP
+            ),
+        }
+        arrays = worlds.arrays
+        commands = Commands(arrays.controls, arrays.meta_actions)
+        self._decoder = ActionDecoder(config.action, num_envs, self.possible_agents, commands)
+        self._view = arrays.observations.view()
+        self._view.flags.writeable = False
+        self._mask = np.zeros((num_envs, self.num_agents), dtype=np.bool_)
+        self._events = DeclaredEvents(config, num_envs)
+        self._first_seed = None if seed is None else check_seed(seed)
+        self._copy = copy
+        self._ready = False
+        self.simulated_s = 0.0
+
+    @property
+    def step_s(self) -> float:
+        """Seconds a step."""
+        return self.config.clock.ctrl_dt_s
+
+    @property
+    def state_size(self) -> int:
+        """Numbers in the global state of a world."""
+        return int(self.worlds.arrays.states.shape[1])
+
+    @property
+    def simulation(self) -> Simulation:
+        """The worlds behind this view, for tools that draw or measure them.
+
+        Raises:
+            ConfigError: they live in worker processes.
+        """
+        return self.worlds.simulation
+
+    @property
+    def plans(self) -> tuple[Plan, ...]:
+        """Which worker hosts which worlds, or zones of each world; empty without workers.
+
+        See docs/balance.md; where worlds or zones move, it is the present plan.
+        """
+        return self.worlds.plans
+
+    def plan_text(self) -> str:
+        """The plans as tables; each full reset logs them (`cavmarl.workers`, INFO)."""
+        return "\n\n".join(map(describe_plan, self.plans))
+
+    def reset(
+        self, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Observations, dict[str, NDArray[Any]]]:
+        """Begin an episode in every world, or in some.
+
+        Args:
+            seed: root of all random numbers; world w's episodes depend on (seed, w) alone. None
+                goes on with the next episodes of the last seed.
+            options: `first_world`, with a seed: these are the worlds from that number on, so that
+                many worlds can be run a part at a time. `reset_mask`, without one: (W,) which
+                worlds begin anew; the others stay as they are. Others are not used.
+
+        Returns:
+            observations (W, A, D) and infos.
+
+        Raises:
+            ConfigError: a reset_mask of another shape or dtype, or one that comes with a seed.
+            ResetNeededError: a reset_mask before the first reset.
+        """
+        options = options or {}
+        chosen = self._chosen(options.get("reset_mask"), seed)
+        first_world = int(options.get("first_world", 0))
+        if seed is not None or not self._ready:
+            seed = first_seed(seed, self._first_seed)
+        self.worlds.arrays.chosen[:] = chosen
+        self.worlds.reset(seed, first_world)
+        self._decoder.forget(chosen)
+        self._mask = self.worlds.arrays.mask.copy()
+        self._ready = True
+        return self._observations(), {"mask": self._mask.copy()}
+
+    def _chosen(self, reset_mask: Any, seed: int | None) -> NDArray[np.bool_]:
+        """(W,) the worlds that a reset begins anew."""
+        if reset_mask is None:
+            return np.ones(self.num_envs, dtype=np.bool_)
+        chosen = np.asarray(reset_mask)
+        if chosen.shape != (self.num_envs,) or chosen.dtype != np.bool_:
+            raise ConfigError(
+                f"reset_mask has shape {chosen.shape} and dtype {chosen.dtype}: must be "
+                f"({self.num_envs},) and bool, one a world"
+            )
+        if seed is not None:
+            raise ConfigError(
+                "reset_mask with a seed: a seed is that of all worlds; leave one of the two out"
+            )
+        if not self._ready:
+            raise ResetNeededError("reset_mask before the first reset: call vec.reset(seed=…)")
+        return chosen
+
+    def step(self, actions: NDArray[Any]) -> StepResult:
+        """Let every agent of every world act.
+
+        Args:
+            actions: (W, A, 2) floats in [-1, 1], or (W, A) meta-actions. Not read where the mask is
+                False.
+
+        Returns:
+            observations (W, A, D), rewards (W, A), terminations (W, A): the agent's vehicle ended;
+            truncations (W, A): the episode was cut at the horizon; and infos: `mask` (W, A) who
+            acts next; `acted` (W, A) who acted in this step, so whose reward counts; `terms` (W, A,
+            T) in the order of `config.TERMS`; `arrivals` (W,) vehicles that reached their goal
+            since the reset, agents included; `episode_over` (W,) which worlds are over;
+            `final_observations` (W, A, D) before a reset and with the last ones of those who
+            left: the same array as the observations in a step where nobody did.
+
+        Raises:
+            ResetNeededError: before the first reset.
+            InvalidActionError: wrong shape, dtype or value; nothing has changed.
+        """
+        if not self._ready:
+            raise ResetNeededError("step() before reset(): call vec.reset(seed=…) first")
+        commands = self._decoder.from_array(actions, self._mask)
+        began = time.perf_counter()
+        self.worlds.step(self._events.add_to(commands))
+        self.simulated_s += time.perf_counter() - began
+        arrays = self.worlds.arrays
+        over = arrays.episode_over.copy()
+        terminations = arrays.terminations.copy()
+        observations = final_observations = self._observations()
+        if np.count_nonzero(over) or np.count_nonzero(terminations):
+            final_observations = self._final_observations(over | terminations.any(axis=1))
+            self._decoder.forget(over)
+        self._mask = arrays.mask.copy()
+        infos: dict[str, NDArray[Any]] = {
+            "acted": arrays.acted.copy(),
+            "terms": arrays.terms.copy(),
+            "vehicle_done": arrays.vehicle_done.copy(),
+            "final_observations": final_observations,
+            "arrivals": arrays.arrivals.copy(),
+            "mask": self._mask.copy(),
+            "episode_over": over,
+        }
+        return observations, arrays.rewards.copy(), terminations, arrays.truncations.copy(), infos
+
+    def _observations(self) -> Observations:
+        arrays = self.worlds.arrays
+        if not self._senses:
+            return arrays.observations.copy() if self._copy else self._view
+        left = arrays.terminations & ~arrays.episode_over[:, None]
+        if self.worlds.in_next_step or not left.any():
+            sensed = sensed_observation(arrays.frames)
+            return {name: self._given(data) for name, data in sensed.items()}
+        found = {name: data.copy() for name, data in sensed_observation(arrays.frames).items()}
+        for data in found.values():
+            data[left] = 0
+        return found
+
+    def _given(self, array: NDArray[Any]) -> NDArray[Any]:
+        """A copy, or a view that cannot be written."""
+        if self._copy:
+            return array.copy()
+        view = array.view()
+        view.flags.writeable = False
+        return view
+
+    def declare_event(self, world: int, agent: int, cause: str) -> None:
+        """Let the vehicle of an agent, by index, tell others of an event in the next step.
+
+        Args:
+            world: in which it drives.
+            agent: index in `possible_agents`.
+            cause: as of `CavEnv.declare_event`.
+
+        Raises:
+            UnknownAgentError: no such agent.
+            V2xError: no such cause, or nobody says anything in this environment.
+        """
+        self._events.declare(world, agent, cause)
+
+    def _final_observations(self, ended: NDArray[np.bool_]) -> Observations:
+        """The observations, and of the worlds (W,) where something ended those before that."""
+        arrays = self.worlds.arrays
+        if not self._senses:
+            return _with_rows(arrays.observations, arrays.final_observations, ended)
+        last = sensed_observation(arrays.final_frames)
+        return {
+            name: _with_rows(data, last[name], ended)
+            for name, data in sensed_observation(arrays.frames).items()
+        }
+
+    def frames(self) -> dict[str, SensorFrames]:
+        """What the sensors of `rig` have got in the last step, by name; see docs/sensors.md.
+
+        Agents whose vehicle ended in the step have its last samples. Of a world that begins anew in
+        the same step it is what the new episode begins with. With `copy=False` they are arrays that
+        the next step overwrites.
+        """
+        frames = self.worlds.arrays.frames
+        return {name: sensor.copy() if self._copy else sensor for name, sensor in frames.items()}
+
+    def final_frames(self) -> dict[str, SensorFrames]:
+        """As `frames`, of the worlds where something ended in the last step, before the reset.
+
+        Those of other worlds are older, or zeros.
+        """
+        frames = self.worlds.arrays.final_frames
+        return {name: sensor.copy() for name, sensor in frames.items()}
+
+    def suggest_actions(self) -> NDArray[Any]:
+        """What the built-in driver (IDM, MOBIL, lane controller) would do in each agent's place."""
+        self.worlds.suggest()
+        return self._decoder.encode(self.worlds.arrays.suggested)
+
+    def state(self) -> NDArray[np.float32]:
+        """The global states (W, S), each as `CavEnv.state`; what a central critic may see.
+
+        Of a world that begins anew in the same step it is the new episode's.
+        """
+        self.worlds.write_states()
+        return self.worlds.arrays.states.copy()
+
+    def state_hash(self, world: int = 0) -> str:
+        """Hex digest of one world, as `CavEnv.state_hash`."""
+        return self.worlds.state_hash(world)
+
+    def traffic_stats(self, world: int = 0) -> dict[str, float]:
+        """Traffic of one world since its reset, as `CavEnv.traffic_stats`."""
+        return {**self.worlds.traffic_stats(world), **self._decoder.tolerated(world)}
+
+    def close(self) -> None:
+        """End the worker processes, if there are any; arrays that were returned stay."""
+        self.worlds.close()
+
+
+def _with_rows(
+    array: NDArray[Any], others: NDArray[Any], chosen: NDArray[np.bool_]
+) -> NDArray[Any]:
+    """A copy of an array (W, …) with the chosen rows (W,) of another one."""
+    found = array.copy()
+    found[chosen] = others[chosen]
+    return found

@@ -1,0 +1,1 @@
+"""Compiled loops over what is recorded of a run."""

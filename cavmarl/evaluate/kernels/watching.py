@@ -1,0 +1,146 @@
+"""What evaluation reads from the traffic after each step: where agents are, who just missed whom.
+
+A conflict area is the stretch that the paths of two movements over a junction share (a CONFLICT
+row). Post-encroachment time is what passes between the moment at which the first vehicle's rear
+leaves it and the moment at which the second one's front enters it from the other path (Allen, Shin
+and Cooper 1978).
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cavmarl.core.numba import kernel
+from cavmarl.core.records.arrays import RoadArrays
+
+__all__ = ["locate_agents", "watch_encroachments"]
+
+MIN_SPEED_MPS = 1.0  # of a front that is followed back to where it entered
+
+
+@kernel
+def locate_agents(
+    rows: NDArray[np.void], num_rows: NDArray[np.int64], out: NDArray[np.float64]
+) -> None:
+    """Write the places of the agents' vehicles.
+
+    Args:
+        rows: VEHICLE (W, C).
+        num_rows: (W,) live rows of each world.
+        out: (W, A, 2) x and y in m; those of absent agents are left as they are.
+    """
+    for w in range(rows.shape[0]):
+        for i in range(num_rows[w]):
+            row = rows[w, i]
+            if row["agent"] >= 0:
+                out[w, row["agent"], 0] = row["x"]
+                out[w, row["agent"], 1] = row["y"]
+
+
+@kernel
+def _place_on_link(roads: RoadArrays, row: np.void) -> tuple[int, float]:
+    """The link that a vehicle is on, or has just left, and its centre's way from the stop line.
+
+    (-1, 0) before the stop line and one length behind the junction.
+    """
+    lane = roads.lanes[row["lane"]]
+    if lane["internal"]:
+        return lane["link"], lane["link_offset_m"] + row["s"]
+    link = row["link"]
+    if link >= 0 and roads.links[link]["to_lane"] == row["lane"] and row["s"] < row["length"]:
+        return link, roads.links[link]["length_m"] + row["s"]
+    return -1, 0.0
+
+
+@kernel
+def _stay(conflict: np.void, row: np.void, centre_m: float, dt: float) -> tuple[float, float]:
+    """Since when and for how long from now a vehicle covers an area, in s; (-1, -1) if it does not.
+
+    At its present speed, and within the step: what lies further off is another observation's. Only
+    a vehicle whose centre has just passed the stop line may have entered earlier with its front.
+    """
+    half = 0.5 * row["length"]
+    ahead = centre_m + half - conflict["enter_m"]
+    behind = conflict["leave_m"] - (centre_m - half)
+    if not (ahead > 0.0 and behind > 0.0):
+        return -1.0, -1.0
+    speed = max(row["speed"], MIN_SPEED_MPS)
+    since = ahead / speed
+    if centre_m > speed * dt:
+        since = min(since, dt)
+    return since, min(behind / speed, dt)
+
+
+@kernel
+def watch_encroachments(
+    roads: RoadArrays,
+    mirror: NDArray[np.int32],
+    rows: NDArray[np.void],
+    num_rows: NDArray[np.int64],
+    chosen: NDArray[np.bool_],
+    agent_ids: NDArray[np.int64],
+    now_s: float,
+    dt: float,
+    seen_s: NDArray[np.float64],
+    seen_id: NDArray[np.int64],
+    seen_agent: NDArray[np.int32],
+    least_s: NDArray[np.float64],
+) -> None:
+    """Take in one step: lower the agents' least post-encroachment times where somebody passed.
+
+    First all vehicles leave their mark on the areas that they cover, then each looks at the marks
+    of the other paths: so the order of rows does not matter. Vehicles that are in an area together
+    have a time of 0.
+
+    Args:
+        roads: the road arrays.
+        mirror: (num_conflicts,) the same area's row from the other path, -1: not watched.
+        rows: VEHICLE (W, C).
+        num_rows: (W,) live rows.
+        chosen: (W,) worlds to watch.
+        agent_ids: (W, A) id of each agent's vehicle, -1: none.
+        now_s: time of this step, rising from call to call.
+        dt: s, between calls.
+        seen_s: (W, num_conflicts) when an area was last covered from this path; -inf: never.
+        seen_id: (W, num_conflicts) by which vehicle.
+        seen_agent: (W, num_conflicts) the agent that drove it, -1: none.
+        least_s: (W, A) lowered.
+    """
+    for w in range(rows.shape[0]):
+        if not chosen[w]:
+            continue
+        for i in range(num_rows[w]):
+            row = rows[w, i]
+            link, centre_m = _place_on_link(roads, row)
+            if link < 0:
+                continue
+            first = roads.links[link]["first_conflict"]
+            for c in range(first, first + roads.links[link]["num_conflicts"]):
+                _, rest_s = _stay(roads.conflicts[c], row, centre_m, dt)
+                until = now_s + rest_s
+                if rest_s < 0.0 or until < seen_s[w, c]:
+                    continue
+                if until > seen_s[w, c] or row["id"] < seen_id[w, c]:
+                    seen_s[w, c] = until
+                    seen_id[w, c] = row["id"]
+                    seen_agent[w, c] = row["agent"]
+        for i in range(num_rows[w]):
+            row = rows[w, i]
+            link, centre_m = _place_on_link(roads, row)
+            if link < 0:
+                continue
+            first = roads.links[link]["first_conflict"]
+            for c in range(first, first + roads.links[link]["num_conflicts"]):
+                other = mirror[c]
+                since_s, _ = _stay(roads.conflicts[c], row, centre_m, dt)
+                if other < 0 or since_s < 0.0 or seen_s[w, other] == -math.inf:
+                    continue
+                passed = max(now_s - since_s - seen_s[w, other], 0.0)
+                if row["agent"] >= 0:
+                    least_s[w, row["agent"]] = min(least_s[w, row["agent"]], passed)
+                agent = seen_agent[w, other]
+                if agent >= 0 and agent_ids[w, agent] == seen_id[w, other]:
+                    least_s[w, agent] = min(least_s[w, agent], passed)

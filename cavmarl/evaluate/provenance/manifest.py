@@ -1,0 +1,210 @@
+"""The manifest of an evaluation: what a result is made with, on record before there is one.
+
+`open_manifest` writes it before the first step, `close_manifest` when all results lie beside it,
+with their hashes. A process that dies in between leaves an open one. `read_closed` is the door
+through which every report goes: results without a closed manifest that knows them are refused.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import sys
+from collections.abc import Mapping
+from dataclasses import asdict
+from datetime import UTC, datetime
+from os.path import isfile
+from pathlib import Path
+from typing import Any
+
+from cavmarl.config.env import EnvConfig
+from cavmarl.core.errors import ManifestError
+from cavmarl.core.numba import kernel_cache_dir
+from cavmarl.evaluate.provenance.machine import describe_code, describe_hardware, describe_software
+from cavmarl.policies.policy import policy_files
+from cavmarl.roads.network import RoadNetwork
+from cavmarl.traffic.demand import DemandFile
+from cavmarl.traffic.sumo.sumo_demand import SumoDemand
+from cavmarl.zones.partition.zone_partition import ZonePartition
+
+__all__ = [
+    "MANIFEST_FILE",
+    "close_manifest",
+    "describe_policies",
+    "describe_world",
+    "hash_of_file",
+    "open_manifest",
+    "read_closed",
+    "write_text",
+]
+
+MANIFEST_FILE = "manifest.json"
+SCHEMA = 1
+
+Document = dict[str, Any]
+
+
+def describe_world(
+    config: EnvConfig,
+    network: RoadNetwork,
+    demand: DemandFile | SumoDemand | None,
+    partition: ZonePartition,
+) -> Document:
+    """The environment whole; its roads, its demand, its zones and the kernels by their hashes."""
+    resolved = asdict(config)
+    text = json.dumps(resolved, sort_keys=True)
+    return {
+        "environment": f"{config.name}-v{config.version}",
+        "config": resolved,
+        "config_sha256": hashlib.sha256(text.encode()).hexdigest(),
+        "map": network.name,
+        "map_source_sha256": network.source_hash,
+        "map_content_sha256": network.content_hash,
+        "demand_content_sha256": None if demand is None else demand.content_hash,
+        "sumo": demand.version if isinstance(demand, SumoDemand) else None,
+        "kernels": kernel_cache_dir().name,
+        "zones": partition.count,
+        "zones_content_sha256": partition.content_hash,
+        "channel": "none: there are no messages between vehicles",
+    }
+
+
+def describe_policies(policies: Mapping[str, str]) -> Document:
+    """Each policy's name or path as given, and the hashes of its files."""
+    return {
+        name: {
+            "given": given,
+            "sha256": {file.name: hash_of_file(file) for file in policy_files(given)},
+        }
+        for name, given in policies.items()
+    }
+
+
+def open_manifest(folder: Path, document: Mapping[str, Any]) -> Document:
+    """Write the manifest of results that are about to be made into `folder`.
+
+    Args:
+        folder: of the results; it exists and holds no manifest.
+        document: what this evaluation is; machine, versions, commit and time are added.
+
+    Raises:
+        ManifestError: there is a manifest already.
+    """
+    path = folder / MANIFEST_FILE
+    if path.exists():
+        raise ManifestError(f"{path}: there are results of another run here; give a new folder")
+    opened = {
+        "schema": SCHEMA,
+        "status": "open",
+        "started": _now(),
+        "ended": None,
+        "command": [Path(sys.argv[0]).name, *sys.argv[1:]],
+        **document,
+        "hardware": describe_hardware(),
+        "software": describe_software(),
+        "code": describe_code(),
+        "results_sha256": {},
+    }
+    write_text(path, json.dumps(opened, indent=2) + "\n")
+    return opened
+
+
+def close_manifest(
+    folder: Path, files: list[str], document: Mapping[str, Any] | None = None
+) -> Document:
+    """Mark the manifest as closed.
+
+    Args:
+        folder: of the results.
+        files: that lie beside it; their hashes are put down.
+        document: what is only known now.
+    """
+    path = folder / MANIFEST_FILE
+    closed: Document = {
+        **_read(path),
+        **(document or {}),
+        "status": "closed",
+        "ended": _now(),
+        "results_sha256": {name: hash_of_file(folder / name) for name in files},
+    }
+    write_text(path, json.dumps(closed, indent=2) + "\n")
+    return closed
+
+
+def read_closed(folder: Path) -> Document:
+    """The manifest of a folder of results that can be trusted to belong to it.
+
+    Raises:
+        ManifestError: no manifest, an open one, or results that it does not know.
+    """
+    path = folder / MANIFEST_FILE
+    if not path.is_file():
+        raise ManifestError(
+            f"{folder}: no {MANIFEST_FILE}: nobody can say what these results were made with; "
+            "make them with `cavmarl evaluate … --out FOLDER`"
+        )
+    document = _read(path)
+    if document["status"] != "closed":
+        raise ManifestError(
+            f"{path}: open since {document['started']}: that evaluation has not ended, or it died; "
+            f"run it again into a new folder: {' '.join(document['command'])}"
+        )
+    for name, known in document["results_sha256"].items():
+        file = folder / name
+        if not isfile(file):  # unlike Path's, it takes names that no file can have
+            raise ManifestError(f"{file}: is missing, though {path} lists it; run it again")
+        if hash_of_file(file) != known:
+            raise ManifestError(
+                f"{file}: is not the file that {path} was closed with; restore it, or run it again"
+            )
+    return document
+
+
+def hash_of_file(path: Path) -> str:
+    """SHA-256 of a file, hex."""
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+def write_text(path: Path, text: str) -> None:
+    """Write a file that is there whole or not at all."""
+    rough = path.with_name(f".{path.name}.{os.getpid()}")
+    with rough.open("w", encoding="utf-8") as file:
+        file.write(text)
+        file.flush()
+        os.fsync(file.fileno())
+    rough.replace(path)
+
+
+def _is_typed(document: Document) -> bool:
+    """Whether the keys that are read again hold what they are written with."""
+    command, known = document["command"], document["results_sha256"]
+    return (
+        isinstance(command, list)
+        and all(isinstance(word, str) for word in command)
+        and isinstance(known, dict)
+        and all(isinstance(digest, str) for digest in known.values())
+    )
+
+
+def _read(path: Path) -> Document:
+    try:
+        document = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError, RecursionError) as error:
+        raise ManifestError(
+            f"{path}: cannot be read ({error}); run the evaluation again"
+        ) from error
+    needed = {"schema", "status", "started", "command", "results_sha256"}
+    if not isinstance(document, dict) or not needed <= document.keys() or not _is_typed(document):
+        raise ManifestError(f"{path}: not a manifest of an evaluation; run it again")
+    if document["schema"] != SCHEMA:
+        raise ManifestError(
+            f"{path}: schema {document['schema']}, but this version reads {SCHEMA}; use the "
+            "version of cavmarl that wrote it"
+        )
+    return document
+
+
+def _now() -> str:
+    return datetime.now(UTC).isoformat(timespec="seconds")

@@ -1,0 +1,77 @@
+"""The manifest of a training run: what a driver was trained with, beside its checkpoint.
+
+It is written before the first update and closed after the last one, with the hashes of what the run
+left; a run that died has an open one.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from cavmarl.balance.balance_plan import Plan
+from cavmarl.balance.plan_file import PLACEMENT, PLACEMENT_AT_END
+from cavmarl.core.errors import ManifestError
+from cavmarl.engine.simulation import Simulation
+from cavmarl.engine.world_setup import World
+from cavmarl.evaluate.provenance.manifest import (
+    MANIFEST_FILE,
+    close_manifest,
+    describe_world,
+    open_manifest,
+    read_closed,
+)
+
+__all__ = ["begin_training", "end_training", "is_trained"]
+
+
+def begin_training(
+    folder: Path,
+    program: str,
+    settings: Mapping[str, Any],
+    world: World | Simulation,
+    plans: Sequence[Plan] = (),
+) -> None:
+    """Put on record what is about to be trained, in place of the record of an earlier run there.
+
+    Args:
+        folder: of the run; it exists.
+        program: that trains.
+        settings: its own, whole; `seed` is one of them.
+        world: that it learns in, or many of it.
+        plans: which worker hosts what; `cavmarl plan --again FOLDER/manifest.json` makes them
+            again.
+    """
+    (folder / MANIFEST_FILE).unlink(missing_ok=True)
+    open_manifest(
+        folder,
+        {
+            "program": program,
+            "settings": dict(settings),
+            "seeds": [settings["seed"]],
+            "world": describe_world(world.config, world.network, world.demand, world.partition),
+            PLACEMENT: [plan.to_dict() for plan in plans],
+        },
+    )
+
+
+def end_training(folder: Path, files: Sequence[str], plans: Sequence[Plan] = ()) -> None:
+    """Close the record.
+
+    Args:
+        folder: of the run.
+        files: that the run left there; their hashes are put down.
+        plans: which worker hosted what at the end.
+    """
+    placement = {PLACEMENT_AT_END: [plan.to_dict() for plan in plans]}
+    close_manifest(folder, list(files), placement)
+
+
+def is_trained(folder: Path) -> bool:
+    """Whether a run has ended there and its files are what it left."""
+    try:
+        read_closed(folder)
+    except ManifestError:
+        return False
+    return True

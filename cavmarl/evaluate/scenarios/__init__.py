@@ -1,0 +1,1 @@
+"""Scenarios as tests: criticality, verdicts, films, sweeps over maps."""

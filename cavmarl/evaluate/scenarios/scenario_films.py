@@ -1,0 +1,100 @@
+"""`ScenarioCamera`: a scenario seen from above, as a video and as a picture of its worst moment."""
+
+from __future__ import annotations
+
+import math
+from contextlib import ExitStack
+from pathlib import Path
+from types import TracebackType
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from cavmarl.core.errors import ConfigError
+from cavmarl.core.records.codes import DRIVER_SCRIPTED
+from cavmarl.env.vector import CavVectorEnv
+from cavmarl.render.canvas import load_pygame, pixels
+from cavmarl.render.topdown import TopDownRenderer
+from cavmarl.render.video import VideoWriter
+
+if TYPE_CHECKING:
+    from pygame import Surface
+
+__all__ = ["ScenarioCamera"]
+
+SIZE = (1280, 720)
+HALF_M = (64.0, 36.0)  # of what is shown around the middle of the scene
+
+
+class ScenarioCamera:
+    """Films the first world of a vector environment; use it in a `with` block.
+
+    Args:
+        vec: the worlds, run in this process, after `make_scenario`.
+        picture: where the moment goes in which an agent was closest to an actor that has moved;
+            None: nowhere.
+        video: where everything goes; None: nowhere.
+
+    Raises:
+        ConfigError: a picture that is no `.png`, or a path that cannot be written.
+    """
+
+    def __init__(self, vec: CavVectorEnv, picture: Path | None, video: Path | None) -> None:
+        scene = vec.simulation.scene
+        if scene is None:
+            raise ConfigError("scenario.name = '': there is no scenario to film in this world")
+        if picture is not None and picture.suffix != ".png":
+            raise ConfigError(f"{picture}: a picture's name ends in .png")
+        focus = (scene.x - HALF_M[0], scene.y - HALF_M[1], scene.x + HALF_M[0], scene.y + HALF_M[1])
+        self._vec = vec
+        self._renderer = TopDownRenderer(vec.network, SIZE, focus)
+        self._picture = picture
+        self._stack = ExitStack()
+        self._writer: VideoWriter | None = None
+        if video is not None:
+            self._writer = self._stack.enter_context(VideoWriter(video, 1.0 / vec.step_s))
+        self._closest_m = math.inf
+        self._best: Surface | None = None
+
+    def __enter__(self) -> ScenarioCamera:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self._stack.close()
+        if self._picture is not None and self._best is not None:
+            self._save(self._picture, self._best)
+
+    def look(self) -> None:
+        """Take in the present moment."""
+        simulation, config = self._vec.simulation, self._vec.config
+        rows = simulation.vehicles()
+        agents = rows[rows["agent"] >= 0][:, None]
+        actors = rows[(rows["driver"] == DRIVER_SCRIPTED) & (rows["distance_m"] > 0.0)]
+        off_m = np.hypot(actors["x"] - agents["x"], actors["y"] - agents["y"])
+        apart_m = off_m.min(initial=math.inf)
+        is_closest = self._picture is not None and apart_m < self._closest_m
+        if self._writer is None and not is_closest:
+            return
+        surface = self._renderer.draw(
+            rows,
+            simulation.signal_phases(),
+            title=f"{config.scenario.name} on {config.name}",
+            clock_s=float(simulation.ticks()[0]) * config.clock.sim_dt_s,
+            zones=simulation.zone_view() if simulation.partition.count > 1 else None,
+        )
+        if is_closest:
+            self._closest_m, self._best = float(apart_m), surface
+        if self._writer is not None:
+            self._writer.write(pixels(surface))
+
+    def _save(self, path: Path, surface: Surface) -> None:
+        try:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            load_pygame().image.save(surface, str(path))
+        except OSError as error:
+            raise ConfigError(f"{path}: cannot be written ({error.strerror or error})") from error

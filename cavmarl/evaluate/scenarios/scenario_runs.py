@@ -1,0 +1,284 @@
+"""A scenario, played to agents of one driver: how critical it was, and whether all have passed."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import asdict, dataclass
+from itertools import product
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cavmarl.core.errors import ConfigError
+from cavmarl.core.records.codes import (
+    DRIVER_BACKGROUND,
+    DRIVER_SCRIPTED,
+    EVENT_ARRIVED,
+    EVENT_COLLIDED,
+    EVENT_OFF_ROAD,
+    EVENT_RED_LIGHT,
+    EVENTS_THAT_END,
+)
+from cavmarl.engine.world_setup import load_world
+from cavmarl.env.vector import CavVectorEnv, make_vec
+from cavmarl.evaluate.scenarios.criticality import (
+    TRACE,
+    post_encroachment_s,
+    time_to_collision_s,
+    trace_of,
+)
+from cavmarl.policies.policy import load_policy
+
+__all__ = ["DENSITIES", "ScenarioRun", "make_scenario", "run_scenario"]
+
+DENSITIES = {"none": 0.0, "low": 2.0, "high": 8.0}
+"""Background vehicles a kilometre of lane."""
+
+HORIZON_S = 180.0
+
+VERDICTS = {
+    "collided": EVENT_COLLIDED,
+    "off road": EVENT_OFF_ROAD,
+    "stuck": 0,
+    "passed": EVENT_ARRIVED,
+}
+"""From the worst on, with the event that says so."""
+
+
+@dataclass(frozen=True)
+class ScenarioRun:
+    """What became of one run.
+
+    Attributes:
+        scenario: its name.
+        environment: whose map it was played on.
+        place: where.
+        driver: of the agents.
+        seed: of place and traffic.
+        zones: into which the world was divided.
+        agents: how many.
+        background: vehicles beside the agents and the actors.
+        verdict: `passed` (all through, and nobody hurt), or what became of the worst of the
+            agents: `collided`, `off road`, or `stuck`.
+        verdicts: of each agent, that to whom the scene is played first.
+        min_ttc_s: least time to collision of an agent with an actor, 0 after a collision with
+            anybody; None: they were never about to.
+        pet_s: least post-encroachment time likewise; None: no place was used by both.
+        collisions: vehicles and actors that began to touch another one, agents among them.
+        red_lights: steps in which an agent entered a junction at red.
+        delay_s: of the first agent, above what its way takes at the speed that it started with.
+        longest_wait_s: for which any other vehicle had stood when the run was over.
+        time_s: the run took.
+        state_hash: of the world at the end.
+    """
+
+    scenario: str
+    environment: str
+    place: str
+    driver: str
+    seed: int
+    zones: int
+    agents: int
+    background: int
+    verdict: str
+    verdicts: tuple[str, ...]
+    min_ttc_s: float | None
+    pet_s: float | None
+    collisions: int
+    red_lights: int
+    delay_s: float
+    longest_wait_s: float
+    time_s: float
+    state_hash: str
+
+    @property
+    def passed(self) -> bool:
+        """Whether all agents came through and hurt nobody."""
+        return self.verdict == "passed"
+
+    def to_dict(self) -> dict[str, Any]:
+        """For JSON."""
+        return asdict(self)
+
+
+def make_scenario(
+    scenario: str,
+    env: str | Path = "grid4x4",
+    *,
+    params: Mapping[str, bool | float] | None = None,
+    place: str = "",
+    density: str = "none",
+    seed: int = 0,
+    zones: int | None = None,
+    agents: int = 1,
+    overrides: Mapping[str, Any] | None = None,
+) -> CavVectorEnv:
+    """One world in which a scenario is played to its agents, who steer and accelerate.
+
+    Args:
+        scenario: name, or path of a file.
+        env: name, folder or map file of an environment.
+        params: of the scenario.
+        place: where; empty: drawn by the seed.
+        density: of the other traffic, of `DENSITIES`.
+        seed: draws the place, and is that of the first reset.
+        zones: into which the world is divided; None: as the environment says.
+        agents: how many: the first is in the conflict, the others come after it.
+        overrides: values for any other key.
+
+    Raises:
+        ScenarioError: no such scenario, no place for it on the map, or no room for the agents.
+        ConfigError: a parameter, a density or a key that cannot work.
+    """
+    if density not in DENSITIES:
+        raise ConfigError(f"density = {density!r}: must be one of {', '.join(DENSITIES)}")
+    background = 0
+    if density != "none":
+        lanes = load_world(env, agents=1, background=0).network.lanes
+        lane_km = float(lanes["length_m"][~lanes["internal"]].sum()) / 1000.0
+        background = round(DENSITIES[density] * lane_km)
+    keys: dict[str, Any] = {
+        "scenario.name": scenario,
+        "scenario.place": place,
+        "scenario.seed": seed,
+        "scenario.params": dict(params or {}),
+        "population.mode": "closed",
+        "population.budget": None,
+        "action.kind": "continuous",
+        "horizon_s": HORIZON_S,
+        **(overrides or {}),
+    }
+    return make_vec(
+        env,
+        zones=zones,
+        agents=agents,
+        background=background,
+        seed=seed,
+        autoreset_mode="NextStep",
+        overrides=keys,
+    )
+
+
+def run_scenario(
+    vec: CavVectorEnv,
+    driver: str = "idm",
+    seed: int = 0,
+    look: Callable[[], None] | None = None,
+) -> ScenarioRun:
+    """Play the scenario of a world once, from its reset to its end.
+
+    Args:
+        vec: as `make_scenario` returns it, run in this process.
+        driver: a name or a path of a policy.
+        seed: of the reset, and of a driver that draws.
+        look: called after each step, while an agent is there.
+    """
+    policy = load_policy(driver, vec)
+    observations, infos = vec.reset(seed=seed)
+    policy.reset(seed)
+    record = _Record(vec)
+    mask = infos["mask"]
+    while True:
+        record.take()
+        if look is not None:
+            look()
+        results = vec.step(policy.act_batch(observations, mask))
+        observations, mask = results[0], results[4]["mask"]
+        record.note()
+        if results[4]["episode_over"][0]:
+            return record.finish(driver, seed)
+
+
+class _Record:
+    """What is kept of a run, step by step."""
+
+    def __init__(self, vec: CavVectorEnv) -> None:
+        simulation = vec.simulation
+        if simulation.scene is None:
+            raise ConfigError("scenario.name = '': there is no scenario to play in this world")
+        self._vec, self._simulation, self._scene = vec, simulation, simulation.scene
+        rows = simulation.vehicles()
+        agents = np.sort(rows[rows["agent"] >= 0], order="agent")
+        self._agents = agents["id"].tolist()
+        self._actors = rows["id"][rows["driver"] == DRIVER_SCRIPTED].tolist()
+        self._traces: dict[int, list[tuple[float, ...]]] = {}
+        self._events = np.zeros(len(agents), np.int64)
+        self._driven_m, self._left_s = 0.0, 0.0
+        self._red_lights = 0
+
+    def take(self) -> None:
+        """Note where agents and actors are."""
+        now_s = self._now_s()
+        rows = self._simulation.vehicles()
+        for row in rows[np.isin(rows["id"], [*self._agents, *self._actors])]:
+            self._traces.setdefault(int(row["id"]), []).append(trace_of(row, now_s))
+        for row in rows[rows["id"] == self._agents[0]]:
+            self._driven_m = float(row["distance_m"])
+        self._red_lights += int(np.count_nonzero(self._now() & EVENT_RED_LIGHT))
+
+    def note(self) -> None:
+        """Note what the step that is just over has brought."""
+        if not self._events[0] & EVENTS_THAT_END:
+            self._left_s = self._now_s()
+        self._events |= self._now()
+
+    def finish(self, driver: str, seed: int) -> ScenarioRun:
+        """What became of the run, after its last step."""
+        config, simulation = self._vec.config, self._simulation
+        verdicts = tuple(map(self._verdict, range(len(self._agents))))
+        verdict = min(verdicts, key=list(VERDICTS).index)
+        traces = {vehicle: np.array(t, TRACE) for vehicle, t in self._traces.items()}
+        own = [traces.pop(agent) for agent in self._agents]
+        touched = verdict == "collided"
+        pets = [post_encroachment_s(one, other) for one in own for other in traces.values()]
+        rows = simulation.vehicles()
+        waits = rows["wait_s"][rows["driver"] == DRIVER_BACKGROUND]
+        return ScenarioRun(
+            scenario=config.scenario.name,
+            environment=config.name,
+            place=self._scene.place,
+            driver=driver,
+            seed=seed,
+            zones=simulation.partition.count,
+            agents=len(self._agents),
+            background=config.population.background,
+            verdict=verdict,
+            verdicts=verdicts,
+            min_ttc_s=0.0 if touched else _finite(_least_ttc_s(own, traces.values())),
+            pet_s=0.0 if touched else _finite(min(pets, default=math.inf)),
+            collisions=simulation.traffic_stats().contacts,
+            red_lights=self._red_lights,
+            delay_s=self._left_s - self._driven_m / self._scene.seat.speed_mps,
+            longest_wait_s=float(waits.max(initial=0.0)),
+            time_s=self._now_s(),
+            state_hash=self._vec.state_hash(),
+        )
+
+    def _now_s(self) -> float:
+        return float(self._simulation.ticks()[0]) * self._vec.config.clock.sim_dt_s
+
+    def _now(self) -> NDArray[np.int64]:
+        """EVENT_* of each agent in the last step."""
+        found: NDArray[np.int64] = self._simulation.outputs.events[0].astype(np.int64)
+        return found
+
+    def _verdict(self, agent: int) -> str:
+        events = int(self._events[agent])
+        return next((name for name, event in VERDICTS.items() if events & event), "stuck")
+
+
+def _least_ttc_s(own: Iterable[NDArray[np.void]], others: Iterable[NDArray[np.void]]) -> float:
+    """Over all agents and actors, and all moments in which both are there."""
+    least = math.inf
+    for one, other in product(own, others):
+        _, here, there = np.intersect1d(one["time_s"], other["time_s"], return_indices=True)
+        for i, j in zip(here.tolist(), there.tolist(), strict=True):
+            least = min(least, time_to_collision_s(one[i], other[j]))
+    return least
+
+
+def _finite(value: float) -> float | None:
+    return value if math.isfinite(value) else None

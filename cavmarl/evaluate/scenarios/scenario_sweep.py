@@ -1,0 +1,101 @@
+"""All scenarios on several maps and seeds: who passes where, as `cavmarl scenario sweep` prints it.
+
+One driver is to pass, another one, that heeds nobody, is not: a scenario that lets it pass asks
+nothing of a driver.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from contextlib import closing
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from cavmarl.core.errors import NoPlaceError
+from cavmarl.evaluate.scenarios.scenario_runs import ScenarioRun, make_scenario, run_scenario
+
+__all__ = ["SweepRow", "sweep_scenarios"]
+
+
+class SweepRow(NamedTuple):
+    """One scenario on one map.
+
+    Attributes:
+        scenario: its name.
+        environment: name, folder or map file.
+        passing: runs of the driver that is to pass; none where the map has no place for it.
+        failing: runs of the one that is not.
+    """
+
+    scenario: str
+    environment: str
+    passing: list[ScenarioRun]
+    failing: list[ScenarioRun]
+
+    @property
+    def holds(self) -> bool:
+        """Whether the one has passed all runs, and the other none."""
+        return all(run.passed for run in self.passing) and not any(
+            run.passed for run in self.failing
+        )
+
+    @staticmethod
+    def verdicts(runs: Sequence[ScenarioRun]) -> str:
+        """How often which verdict was given, as in `5 passed`."""
+        counts = Counter(run.verdict for run in runs)
+        return ", ".join(f"{number} {verdict}" for verdict, number in sorted(counts.items()))
+
+    def least(self, name: str) -> float | None:
+        """The least of a measure over the runs that are to pass; None: it was never defined."""
+        values = [getattr(run, name) for run in self.passing]
+        return min((value for value in values if value is not None), default=None)
+
+    def to_dict(self) -> dict[str, Any]:
+        """For JSON."""
+        return {
+            "scenario": self.scenario,
+            "environment": self.environment,
+            "holds": self.holds,
+            "passing": [run.to_dict() for run in self.passing],
+            "failing": [run.to_dict() for run in self.failing],
+        }
+
+
+def sweep_scenarios(
+    scenarios: Sequence[str],
+    maps: Sequence[str | Path],
+    seeds: Sequence[int],
+    *,
+    passes: str = "idm",
+    fails: str = "never_yield",
+    density: str = "none",
+    agents: int = 1,
+) -> Iterator[SweepRow]:
+    """Play each scenario on each map once with each seed, to two drivers.
+
+    Args:
+        scenarios: names, or paths of files.
+        maps: names, folders or map files of environments.
+        seeds: of place and traffic.
+        passes: the driver that is to pass.
+        fails: the one that is not.
+        density: of the other traffic.
+        agents: how many each time.
+
+    Raises:
+        ScenarioError: an unknown scenario, or no room for the agents.
+        ConfigError: as of `make_scenario`.
+    """
+    for scenario in scenarios:
+        for env in maps:
+            row = SweepRow(scenario, str(env), [], [])
+            for seed in seeds:
+                try:
+                    vec = make_scenario(scenario, env, density=density, seed=seed, agents=agents)
+                except NoPlaceError:
+                    break
+                with closing(vec):
+                    row.passing.append(run_scenario(vec, passes, seed))
+                    row.failing.append(run_scenario(vec, fails, seed))
+            yield row

@@ -1,0 +1,1 @@
+"""Our traffic beside SUMO's, measured by one meter."""

@@ -1,0 +1,106 @@
+"""Our run of a demand, measured by the meter that measures SUMO's."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from cavmarl.core.records.codes import ACTION_IDLE
+from cavmarl.engine.simulation import Simulation
+from cavmarl.engine.world_setup import World, load_world
+from cavmarl.evaluate.traffic.traffic_metrics import TrafficCounts, TrafficMeter, TrafficRun
+from cavmarl.render.ground import signal_codes
+from cavmarl.shards.shard import Commands
+from cavmarl.traffic.sumo.sumo_input import read_input
+
+__all__ = ["advance", "idle_commands", "load_demand", "make_world", "run_native"]
+
+
+def load_demand(
+    map_file: Path,
+    demand: Sequence[Path],
+    seconds: int,
+    dt_s: float,
+    overrides: Mapping[str, Any] | None = None,
+) -> World:
+    """What a world with background traffic and nobody to train is made of.
+
+    Args:
+        map_file: a SUMO network.
+        demand: what drives on it, and the signal programs that its additional files have.
+        seconds: how long.
+        dt_s: seconds a tick.
+        overrides: values for other keys.
+
+    Raises:
+        ConfigError: a demand or a tick that cannot work.
+        DemandError: a demand that cannot be, or not on this map.
+        MapError: the map cannot be driven.
+    """
+    own = {
+        "clock.sim_dt_s": dt_s,
+        "clock.ctrl_dt_s": dt_s,
+        "horizon_s": float(seconds),
+        "traffic.demand": [str(path.resolve()) for path in demand],
+        "map.programs": [str(path) for path in read_input(demand).additional_files],
+    }
+    return load_world(map_file, agents=0, background=0, overrides={**own, **(overrides or {})})
+
+
+def make_world(
+    map_file: Path, demand: Sequence[Path], seconds: int, seed: int, dt_s: float
+) -> Simulation:
+    """The world of `load_demand` at the start of an episode.
+
+    Args:
+        map_file: a SUMO network.
+        demand: what drives on it.
+        seconds: how long.
+        seed: root of all random numbers.
+        dt_s: seconds a tick.
+
+    Raises:
+        ConfigError: see `load_demand`.
+        DemandError: see `load_demand`.
+        MapError: see `load_demand`.
+    """
+    config, network, file, partition = load_demand(map_file, demand, seconds, dt_s)
+    simulation = Simulation(config, network, demand=file, partition=partition)
+    simulation.seed(seed)
+    simulation.reset()
+    return simulation
+
+
+def advance(simulation: Simulation, commands: Commands) -> None:
+    """One tick."""
+    simulation.step(commands)
+
+
+def idle_commands(simulation: Simulation) -> Commands:
+    """Room for the commands of `advance`."""
+    shape = simulation.outputs.present.shape
+    return Commands(np.zeros((*shape, 2)), np.full(shape, ACTION_IDLE, dtype=np.int64))
+
+
+def run_native(simulation: Simulation, seconds: int) -> TrafficRun:
+    """Run and measure it.
+
+    Args:
+        simulation: of `make_world`; a whole number of its ticks is a second.
+        seconds: how long.
+    """
+    meter = TrafficMeter(simulation.network)
+    commands = idle_commands(simulation)
+    ticks_per_s = round(1.0 / simulation.config.clock.sim_dt_s)
+    for tick in range(1, seconds * ticks_per_s + 1):
+        advance(simulation, commands)
+        rows = simulation.vehicles()
+        meter.see(rows)
+        if tick % ticks_per_s == 0:
+            meter.sample(rows, signal_codes(simulation.network, simulation.signal_phases()))
+    stats = simulation.traffic_stats()
+    delay = stats.mean_delay_s if stats.arrived else None
+    return meter.result(TrafficCounts(stats.departed, stats.waiting, stats.arrived, delay))

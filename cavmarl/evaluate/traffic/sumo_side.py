@@ -1,0 +1,215 @@
+"""SUMO's own run of a demand, measured by the meter that measures ours.
+
+libsumo holds one simulation a process, and a second start silently replaces the first; so every run
+has a process of its own.
+"""
+
+from __future__ import annotations
+
+import math
+import tempfile
+from collections.abc import Iterator
+from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
+from contextlib import contextmanager
+from dataclasses import dataclass
+from multiprocessing import get_context
+from pathlib import Path
+from typing import Any
+
+import defusedxml.ElementTree
+import numpy as np
+from numpy.typing import NDArray
+
+from cavmarl.core.errors import ConfigError, require
+from cavmarl.core.records.codes import SIGNAL_NONE
+from cavmarl.driving.vehicles import VEHICLE, blank_vehicle
+from cavmarl.evaluate.traffic.traffic_metrics import TrafficCounts, TrafficMeter, TrafficRun
+from cavmarl.roads.cache import load_network
+from cavmarl.roads.network import SIGNAL_STATES, RoadNetwork
+from cavmarl.traffic.sumo.sumo_input import SumoInput
+from cavmarl.traffic.sumo.sumo_options import command_words, free_libsumo
+
+__all__ = ["SumoJob", "run_sumo", "start_sumo", "sumo_process"]
+
+
+@dataclass(frozen=True)
+class SumoJob:
+    """One run.
+
+    Attributes:
+        map_file: a SUMO network.
+        demand: what drives on it.
+        seconds: how long, from `demand.begin_s`.
+        dt_s: step length.
+        seed: of SUMO's random numbers.
+        teleports: whether SUMO may put vehicles elsewhere that stand for too long (300 s unless
+            the demand's configuration says otherwise).
+    """
+
+    map_file: Path
+    demand: SumoInput
+    seconds: int
+    dt_s: float
+    seed: int
+    teleports: bool = True
+
+
+def run_sumo(job: SumoJob) -> TrafficRun:
+    """Run and measure it in a process of its own.
+
+    Raises:
+        ConfigError: SUMO refuses the demand on this map; the message is SUMO's.
+        MissingExtraError: SUMO is not installed.
+    """
+    with sumo_process(job) as process:
+        return process.submit(_measure, job).result()
+
+
+@contextmanager
+def sumo_process(job: SumoJob) -> Iterator[ProcessPoolExecutor]:
+    """A fresh process for one simulation of SUMO's; what is submitted runs there.
+
+    Raises:
+        ConfigError: SUMO ended the process.
+        MissingExtraError: SUMO is not installed.
+    """
+    require("libsumo", "sumo")
+    with ProcessPoolExecutor(1, get_context("spawn")) as process:
+        try:
+            yield process
+        except BrokenProcessPool as error:
+            raise ConfigError(f"{job.map_file}: SUMO ended its process on this demand") from error
+
+
+def start_sumo(job: SumoJob, folder: Path, *more: str) -> Any:
+    """Load the job into this process's libsumo and return it.
+
+    Args:
+        job: what to run.
+        folder: for SUMO's log and for copies of additional files.
+        more: options.
+
+    Raises:
+        ConfigError: SUMO refuses it.
+        SumoBusyError: a simulation runs in this process.
+    """
+    libsumo: Any = free_libsumo()
+    log = folder / "errors.log"
+    options = {"error-log": str(log)}
+    if not job.teleports:
+        options["time-to-teleport"] = "-1"
+    words = command_words(job.map_file, job.demand, folder, job.dt_s, job.seed, options)
+    try:
+        libsumo.start(["sumo", *words, *more])
+    except libsumo.TraCIException as error:
+        raise _refusal(job, log, error) from None  # SUMO's own cannot leave this process
+    return libsumo
+
+
+def _refusal(job: SumoJob, log: Path, error: Exception) -> ConfigError:
+    """What SUMO complained about, in its words."""
+    said = log.read_text(encoding="utf-8", errors="replace") if log.exists() else ""
+    lines = [line.removeprefix("Error: ") for line in said.splitlines() if line.strip()]
+    own = f", {job.demand.net_file}" if job.demand.net_file else ""
+    return ConfigError(
+        f"{job.map_file}: SUMO refuses this demand: {' '.join(lines) or error}\n"
+        f"Cure: give demand that was made for this map, or the map that it was made for{own}"
+    )
+
+
+def _measure(job: SumoJob) -> TrafficRun:
+    network = load_network(job.map_file)
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        trips = folder / "trips.xml"
+        libsumo = start_sumo(job, folder, f"--tripinfo-output={trips}")
+        meter = TrafficMeter(network)
+        reader = _VehicleReader(libsumo, network)
+        departed = arrived = teleports = 0
+        ticks_per_s = round(1.0 / job.dt_s)
+        try:
+            for tick in range(1, job.seconds * ticks_per_s + 1):
+                libsumo.simulationStep()
+                departed += libsumo.simulation.getDepartedNumber()
+                arrived += libsumo.simulation.getArrivedNumber()
+                teleports += libsumo.simulation.getStartingTeleportNumber()
+                rows = reader.rows()
+                meter.see(rows)
+                if tick % ticks_per_s == 0:
+                    reader.fill_lanes(rows)
+                    meter.sample(rows, reader.signal_codes())
+        except libsumo.TraCIException as error:
+            raise _refusal(job, folder / "errors.log", error) from None
+        waiting = len(libsumo.simulation.getPendingVehicles())
+        libsumo.close()
+        delays = [
+            float(trip.attrib["timeLoss"])
+            for trip in defusedxml.ElementTree.parse(trips).iter("tripinfo")
+        ]
+    delay = math.fsum(delays) / len(delays) if delays else None
+    return meter.result(TrafficCounts(departed, waiting, arrived, delay, teleports))
+
+
+class _VehicleReader:
+    """SUMO's vehicles as VEHICLE records.
+
+    SUMO speaks of the middle of the front bumper and of degrees clockwise from north.
+    """
+
+    def __init__(self, libsumo: Any, network: RoadNetwork) -> None:
+        self._libsumo = libsumo
+        self._network = network
+        self._lane_row = {name: row for row, name in enumerate(network.lane_ids)}
+        self._known: dict[str, NDArray[np.void]] = {}
+        self._names: list[str] = []
+
+    def rows(self) -> NDArray[np.void]:
+        """VEHICLE rows with place, heading and size of all that are on the road now."""
+        vehicle = self._libsumo.vehicle
+        self._names = list(vehicle.getIDList())
+        rows = np.zeros(len(self._names), VEHICLE)
+        if not self._names:
+            return rows
+        places = np.empty((len(self._names), 4))
+        for i, name in enumerate(self._names):
+            rows[i] = self._blank(name)[0]
+            places[i, :3] = vehicle.getPosition3D(name)
+            places[i, 3] = vehicle.getAngle(name)
+        heading = 0.5 * math.pi - np.radians(places[:, 3])
+        rows["heading"] = np.arctan2(np.sin(heading), np.cos(heading))
+        rows["x"] = places[:, 0] - 0.5 * rows["length"] * np.cos(heading)
+        rows["y"] = places[:, 1] - 0.5 * rows["length"] * np.sin(heading)
+        rows["z"] = places[:, 2]
+        return rows
+
+    def fill_lanes(self, rows: NDArray[np.void]) -> None:
+        """Add speed and the place on the lane to what `rows()` gave last."""
+        vehicle = self._libsumo.vehicle
+        for i, name in enumerate(self._names):
+            rows[i]["speed"] = vehicle.getSpeed(name)
+            rows[i]["lane"] = self._lane_row.get(vehicle.getLaneID(name), -1)
+            rows[i]["s"] = vehicle.getLanePosition(name) - 0.5 * rows[i]["length"]
+
+    def signal_codes(self) -> NDArray[np.uint8]:
+        """(num_links,) what the links' signals show now."""
+        links = self._network.links
+        codes = np.full(len(links), SIGNAL_NONE, dtype=np.uint8)
+        for row, name in enumerate(self._network.signal_ids):
+            state = self._libsumo.trafficlight.getRedYellowGreenState(name)
+            letters = np.array([SIGNAL_STATES.index(letter) for letter in state], dtype=np.uint8)
+            mine = np.flatnonzero(links["signal"] == row)
+            codes[mine] = letters[links["signal_index"][mine]]
+        return codes
+
+    def _blank(self, name: str) -> NDArray[np.void]:
+        """VEHICLE (1,) that this vehicle starts from, with a number for its name."""
+        if name not in self._known:
+            vehicle = self._libsumo.vehicle
+            row = blank_vehicle()
+            row["id"] = len(self._known)
+            row["length"] = vehicle.getLength(name)
+            row["width"] = vehicle.getWidth(name)
+            row["height"] = vehicle.getHeight(name)
+            self._known[name] = row
+        return self._known[name]

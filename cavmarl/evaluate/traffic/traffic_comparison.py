@@ -1,0 +1,110 @@
+"""Ours and SUMO's run of the same demand, side by side."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from cavmarl.core.errors import ConfigError
+from cavmarl.engine.world_setup import find_map
+from cavmarl.evaluate.traffic.native_side import make_world, run_native
+from cavmarl.evaluate.traffic.sumo_side import SumoJob, run_sumo
+from cavmarl.evaluate.traffic.traffic_metrics import EDGE_MINUTE, TrafficRun
+from cavmarl.traffic.demand import DemandFile
+from cavmarl.traffic.sumo.sumo_input import read_input
+
+__all__ = ["TrafficComparison", "compare_traffic"]
+
+MAX_SECONDS = 100_000
+RATIOS = ("departed", "waiting", "arrived", "mean_speed_mps", "mean_delay_s", "queue")
+
+
+@dataclass(frozen=True)
+class TrafficComparison:
+    """Result of the comparison.
+
+    Attributes:
+        map_name: the map's name.
+        seconds: how long both ran.
+        dt_s: step length of both.
+        seed: of both.
+        ours: our run.
+        sumo: SUMO's.
+        tolerated: what ours left out of the demand or took for something near, with counts.
+    """
+
+    map_name: str
+    seconds: int
+    dt_s: float
+    seed: int
+    ours: TrafficRun
+    sumo: TrafficRun
+    tolerated: tuple[str, ...] = ()
+
+    def ratio(self, figure: str) -> float | None:
+        """Ours over SUMO's; None where that says nothing: SUMO's is zero or one has none."""
+        ours, sumo = getattr(self.ours.figures, figure), getattr(self.sumo.figures, figure)
+        return ours / sumo if figure in RATIOS and ours is not None and sumo else None
+
+    def to_dict(self) -> dict[str, Any]:
+        """As plain types, for JSON."""
+        sides = {
+            name: {
+                "figures": run.figures.to_dict(),
+                "locks_s": run.locks_s,
+                "edge_minutes": {
+                    key: run.edge_minutes[key].tolist() for key in EDGE_MINUTE.names or ()
+                },
+            }
+            for name, run in (("ours", self.ours), ("sumo", self.sumo))
+        }
+        run = {"map": self.map_name, "seconds": self.seconds, "dt_s": self.dt_s, "seed": self.seed}
+        ratios = {name: self.ratio(name) for name in RATIOS}
+        return run | sides | {"ratios": ratios, "tolerated": list(self.tolerated)}
+
+
+def compare_traffic(
+    map_name: str | Path,
+    demand: Sequence[Path],
+    *,
+    seconds: int = 900,
+    dt_s: float = 0.1,
+    seed: int = 0,
+    teleports: bool = True,
+    progress: Callable[[str], None] = lambda text: None,
+) -> TrafficComparison:
+    """Run both and measure both alike.
+
+    Args:
+        map_name: an environment's name or folder, or a map file.
+        demand: files of routes and additional files, or one `.sumocfg`.
+        seconds: how long, from the demand's beginning.
+        dt_s: step length; a second is a whole number of steps.
+        seed: of both.
+        teleports: whether SUMO may put vehicles elsewhere that stand for too long.
+        progress: told what is going on.
+
+    Raises:
+        ConfigError: a number that cannot work, or a demand that SUMO refuses.
+        DemandError: a demand that cannot be, or not on this map.
+        MapError: the map cannot be read or driven.
+        MissingExtraError: SUMO is not installed.
+    """
+    if not 1 <= seconds <= MAX_SECONDS:
+        raise ConfigError(f"seconds = {seconds}: must be from 1 to {MAX_SECONDS}")
+    if not 0.0 < dt_s <= 1.0 or abs(1.0 / dt_s - round(1.0 / dt_s)) > 1e-6:
+        raise ConfigError(f"dt = {dt_s:g}: a second must be a whole number of steps; try 0.1")
+    given = read_input(demand)
+    path = find_map(map_name)
+    progress("the demand")
+    # Ours first: it names file and line of what neither can drive.
+    world = make_world(path, demand, seconds, seed, dt_s)
+    progress("SUMO's run")
+    sumo = run_sumo(SumoJob(path, given, seconds, dt_s, seed, teleports))
+    progress("our run")
+    ours = run_native(world, seconds)
+    name = path.name.removesuffix(".gz").removesuffix(".net.xml")
+    tolerated = world.demand.report.lines() if isinstance(world.demand, DemandFile) else []
+    return TrafficComparison(name, seconds, dt_s, seed, ours, sumo, tuple(tolerated))

@@ -1,0 +1,201 @@
+"""What traffic is measured by, the same for every simulator: it takes VEHICLE records.
+
+The meter is shown the vehicles after every tick, to see them touch, and once a simulated second,
+for everything else. Definitions stand with the fields of `TrafficFigures`.
+"""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cavmarl.evaluate.traffic.junction_locks import JunctionLocks
+from cavmarl.evaluate.traffic.touching import TouchCounter
+from cavmarl.roads.network import RoadNetwork
+
+__all__ = [
+    "EDGE_MINUTE",
+    "SAMPLES_PER_S",
+    "STANDING_MPS",
+    "TrafficCounts",
+    "TrafficFigures",
+    "TrafficMeter",
+    "TrafficRun",
+]
+
+STANDING_MPS = 0.1  # slower is standing, as in SUMO's waiting time
+SAMPLES_PER_S = 1
+MINUTE_S = 60
+
+EDGE_MINUTE = np.dtype(
+    [
+        ("edge", np.int32),  # EDGE row, none inside junctions
+        ("minute", np.int32),  # since the beginning
+        ("length_m", np.float64),  # of the edge
+        ("density_per_km", np.float64),  # vehicles on a kilometre of one lane
+        ("flow_per_h", np.float64),  # vehicles an hour on one lane
+        ("speed_mps", np.float64),  # flow over density
+    ],
+    align=True,
+)
+
+
+@dataclass(frozen=True)
+class TrafficCounts:
+    """What only the simulator itself can count, from the beginning to the end.
+
+    Attributes:
+        departed: vehicles that have entered.
+        waiting: vehicles whose time to depart has come and that have not entered.
+        arrived: vehicles that reached the end of their trip.
+        mean_delay_s: over the arrived ones, time above that of the same way at the speed which the
+            driver wants there; None where none arrived.
+        teleports: vehicles that were put elsewhere because they stood for too long.
+    """
+
+    departed: int
+    waiting: int
+    arrived: int
+    mean_delay_s: float | None
+    teleports: int = 0
+
+
+@dataclass(frozen=True)
+class TrafficFigures:
+    """One simulator's row of the table.
+
+    Attributes:
+        departed: see `TrafficCounts`.
+        waiting: see `TrafficCounts`.
+        arrived: see `TrafficCounts`.
+        mean_delay_s: see `TrafficCounts`.
+        teleports: see `TrafficCounts`.
+        mean_speed_mps: over all vehicles of all samples; None where there was none.
+        queue: vehicles that stand (below 0.1 m/s) on lanes that end at a signal, mean of the
+            samples.
+        contacts: pairs of vehicles whose rectangles began to overlap on the same level.
+        longest_lock_s: the longest lock of any junction, see `JunctionLocks`.
+        locked_junction: whose that was; empty where no junction was ever locked.
+    """
+
+    departed: int
+    waiting: int
+    arrived: int
+    mean_speed_mps: float | None
+    mean_delay_s: float | None
+    queue: float
+    contacts: int
+    longest_lock_s: float
+    locked_junction: str
+    teleports: int
+
+    def to_dict(self) -> dict[str, Any]:
+        """As plain types, for JSON."""
+        return asdict(self)
+
+
+@dataclass(frozen=True)
+class TrafficRun:
+    """What came out of one run.
+
+    Attributes:
+        figures: the row of the table.
+        locks_s: junction → its longest lock in seconds, of those that had one.
+        edge_minutes: EDGE_MINUTE rows of all edges and minutes with a vehicle.
+    """
+
+    figures: TrafficFigures
+    locks_s: dict[str, float]
+    edge_minutes: NDArray[np.void]
+
+
+class TrafficMeter:
+    """Measures one world on one map.
+
+    Args:
+        network: the map that the vehicles' `lane` speaks of.
+    """
+
+    def __init__(self, network: RoadNetwork) -> None:
+        self._network = network
+        self._touches = TouchCounter(network.extent_m)
+        self._locks = JunctionLocks(network)
+        signalled = network.links["from_lane"][network.links["signal"] >= 0]
+        self._ends_at_signal = np.zeros(len(network.lanes), dtype=np.bool_)
+        self._ends_at_signal[signalled] = True
+        self._samples = 0
+        self._seen = 0
+        self._speed_sum = 0.0
+        self._queue_sum = 0
+        self._seconds: list[NDArray[np.int64]] = []
+        self._metres: list[NDArray[np.float64]] = []
+
+    def see(self, rows: NDArray[np.void]) -> None:
+        """Look for contacts after a tick.
+
+        Args:
+            rows: VEHICLE (num_vehicles,).
+        """
+        self._touches.see(rows)
+
+    def sample(self, rows: NDArray[np.void], codes: NDArray[np.uint8]) -> None:
+        """Take the sample of a second that is over.
+
+        Args:
+            rows: VEHICLE (num_vehicles,); a `lane` of -1 is one that the map does not have.
+            codes: (num_links,) what the links' signals show, as from `signal_codes`.
+        """
+        on_map = rows[rows["lane"] >= 0]
+        lanes = on_map["lane"]
+        standing = on_map["speed"] < STANDING_MPS
+        self._seen += len(rows)
+        self._speed_sum += float(rows["speed"].sum())
+        self._queue_sum += int((standing & self._ends_at_signal[lanes]).sum())
+        self._locks.sample(on_map, standing, codes)
+        edges = self._network.lanes["edge"][lanes]
+        if self._samples % (MINUTE_S * SAMPLES_PER_S) == 0:
+            self._seconds.append(np.zeros(len(self._network.edges), dtype=np.int64))
+            self._metres.append(np.zeros(len(self._network.edges)))
+        self._seconds[-1] += np.bincount(edges, minlength=len(self._network.edges))
+        self._metres[-1] += np.bincount(edges, on_map["speed"], len(self._network.edges))
+        self._samples += 1
+
+    def result(self, counts: TrafficCounts) -> TrafficRun:
+        """Everything measured so far."""
+        locks = self._locks.longest_s()
+        worst = max(locks, key=lambda junction: locks[junction], default="")
+        figures = TrafficFigures(
+            **asdict(counts),
+            mean_speed_mps=self._speed_sum / self._seen if self._seen else None,
+            queue=self._queue_sum / max(self._samples, 1),
+            contacts=self._touches.count,
+            longest_lock_s=locks.get(worst, 0.0),
+            locked_junction=worst,
+        )
+        return TrafficRun(figures, locks, self._edge_minutes())
+
+    def _edge_minutes(self) -> NDArray[np.void]:
+        """Flow and density of lanes by Edie's definitions.
+
+        Over an area of road and time, density is the time that vehicles spend in it and flow the
+        distance that they cover in it, each over the area (Edie: "Discussion of traffic stream
+        measurements and definitions", 1963).
+        """
+        edges = self._network.edges
+        lane_km = edges["length_m"] * edges["num_lanes"] / 1000.0
+        parts = []
+        for minute, (seconds, metres) in enumerate(zip(self._seconds, self._metres, strict=True)):
+            chosen = np.flatnonzero((seconds > 0) & ~edges["internal"])
+            samples = min(self._samples - minute * MINUTE_S, MINUTE_S)
+            part = np.zeros(len(chosen), EDGE_MINUTE)
+            part["edge"] = chosen
+            part["minute"] = minute
+            part["length_m"] = edges["length_m"][chosen]
+            part["density_per_km"] = seconds[chosen] / samples / lane_km[chosen]
+            part["speed_mps"] = metres[chosen] / seconds[chosen]
+            part["flow_per_h"] = 3.6 * part["speed_mps"] * part["density_per_km"]
+            parts.append(part)
+        return np.concatenate(parts) if parts else np.zeros(0, EDGE_MINUTE)

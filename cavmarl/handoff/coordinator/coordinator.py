@@ -1,0 +1,159 @@
+"""`Referee`: what a coordinator of one world is, however it reaches its zones.
+
+It says who advances which vehicle to the next tick, and sees it done. How rows change hands is done
+by the division.
+
+There are two: `coordinator.Coordinator` sends messages, which may be lost, to hosts that may die;
+`direct.DirectCoordinator` lives in the process of all of its zones.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections import Counter
+from collections.abc import Callable, Iterable
+from typing import NamedTuple, Protocol
+
+from cavmarl.handoff.coordinator.journal import AnyJournal
+from cavmarl.ownership.directory import Directory
+from cavmarl.ownership.messages import Birth, Message, Record, Removed, Switch
+
+__all__ = ["Entry", "Near", "Referee", "Watcher"]
+
+
+class Near(NamedTuple):
+    """A vehicle that another zone has to be told of; see `kernels.borders.NEAR`."""
+
+    vehicle: int
+    source: int
+    row: int
+    target: int
+    crossed: bool
+    depth_m: float
+
+
+class Entry(NamedTuple):
+    """A vehicle that changes its owner now, with the state that the new one has been sent of it.
+
+    None: nothing has been sent; the new owner takes the old one's row as it is.
+    """
+
+    switch: Switch
+    state: bytes | None
+
+
+class Watcher(Protocol):
+    """Is told what happens, as `ownership.trace.Trace` is."""
+
+    def logged(self, records: Iterable[Record]) -> None:
+        """Records, in the order of the journal."""
+        ...
+
+    def delivered(self, destination: int, message: Message) -> None:
+        """A message that has arrived."""
+        ...
+
+
+class Referee(ABC):
+    """Says who owns what, tick by tick: `begin`, then the zones' work, then `end`.
+
+    Args:
+        directory: who owns what.
+        journal: takes the records; None: nobody keeps them.
+
+    Attributes:
+        journal: what takes the records.
+        switched: vehicles that have changed their owner.
+    """
+
+    def __init__(self, directory: Directory, journal: AnyJournal | None) -> None:
+        self._directory = directory
+        self.journal = journal
+        self.switched = 0
+        self._watchers: tuple[Watcher, ...] = ()
+        self._births: list[Birth] = []
+        self._gone: list[Removed] = []  # between two ticks
+        self._removed: list[Removed] = []  # in the tick
+
+    @property
+    def directory(self) -> Directory:
+        """Who owns what."""
+        return self._directory
+
+    @property
+    def tick(self) -> int:
+        """The committed tick, of the run."""
+        return self._directory.table.tick
+
+    @property
+    @abstractmethod
+    def is_open(self) -> bool:
+        """Whether a tick has been begun and is not committed."""
+
+    def watch(self, watcher: Watcher) -> None:
+        """Tell one more of all that happens from now on."""
+        self._watchers = (*self._watchers, watcher)
+
+    def notes(self) -> tuple[tuple[Birth, ...], tuple[Removed, ...]]:
+        """Who is new since the last BEGIN, and who is gone since the last COMMIT."""
+        return tuple(self._births), tuple(self._gone)
+
+    def resume(self, births: Iterable[Birth] = (), gone: Iterable[Removed] = ()) -> None:
+        """Know again what `notes` told."""
+        self._births, self._gone, self._removed = list(births), list(gone), []
+
+    def entered(self, vehicles: Iterable[tuple[int, int]]) -> None:
+        """(id, zone) of vehicles that are new since the last BEGIN."""
+        self._births.extend(Birth(vehicle, zone, b"") for vehicle, zone in vehicles)
+
+    def left(self, vehicles: Iterable[tuple[int, int]]) -> None:
+        """(id, reason) of vehicles that have left the world."""
+        place = self._removed if self.is_open else self._gone
+        place.extend(Removed(vehicle, reason) for vehicle, reason in vehicles)
+
+    @abstractmethod
+    def reset(self) -> None:
+        """Begin an episode without vehicles."""
+
+    @abstractmethod
+    def begin(self, everybody: bool, inputs: bytes = b"") -> None:
+        """Decide the way to the next tick, and let rows change hands.
+
+        Args:
+            everybody: look at all rows: they have changed since the ghosts were renewed.
+            inputs: digest of the actions.
+
+        Raises:
+            LedgerError: a vehicle was lost or doubled.
+            ProtocolError: it cannot be decided, or a zone does not answer.
+            ZoneError: a zone has not seen who enters it.
+        """
+
+    @abstractmethod
+    def end(self, rows: Callable[[int], int], stored: Callable[[int], int] | None = None) -> None:
+        """Commit the tick, through which every zone is.
+
+        Args:
+            rows: zone → digest of its rows.
+            stored: zone → digest of its rows in the store; None: where `rows` are is the store.
+
+        Raises:
+            LedgerError: a vehicle was lost or doubled.
+            StoreError: the store holds other rows than a zone told of.
+            ProtocolError: a zone does not answer.
+        """
+
+    @abstractmethod
+    def in_flight(self) -> list[tuple[int, int, int, str]]:
+        """(vehicle, owner, zone that it was offered to, how it stands), between two ticks."""
+
+    @abstractmethod
+    def dropped(self) -> Counter[tuple[str, str]]:
+        """(kind, reason) → messages or entries that did not count, at any of the parties."""
+
+    def _record(self, *records: Record) -> None:
+        """Write records down."""
+        if self.journal is not None:
+            self.journal.append(records)
+        for watcher in self._watchers:
+            watcher.logged(records)

@@ -1,0 +1,241 @@
+"""`Coordination`: the coordinators of W worlds, and the rows that change hands as they say."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from hashlib import blake2b
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cavmarl.core.errors import ProtocolError
+from cavmarl.core.records.arrays import Gate
+from cavmarl.handoff.coordinator.coordinator import Entry, Near, Referee
+from cavmarl.handoff.coordinator.invariant_monitor import Monitor
+from cavmarl.handoff.coordinator.row_digests import RowDigests
+from cavmarl.handoff.division import Division
+from cavmarl.handoff.fault_injection.committed_store import CommittedStore, Notes
+from cavmarl.handoff.fault_injection.message_coordinator import Coordinator
+from cavmarl.handoff.surroundings import NearBorders
+from cavmarl.handoff.zone_view import TransferInFlight
+from cavmarl.ownership.messages import Record
+from cavmarl.shards.shard import Commands
+from cavmarl.zones.kernels.zone_lookup import zones_of
+
+__all__ = ["Coordination", "RowStates"]
+
+
+class RowStates:
+    """States of one world's vehicles at the committed tick, read from the rows of their owners.
+
+    Args:
+        division: of all worlds.
+        world: which one.
+
+    Attributes:
+        borders: who was near a border when the tick began.
+    """
+
+    def __init__(self, division: Division, world: int) -> None:
+        self.borders = NearBorders(division, world)
+        self._division = division
+        self._world = world
+        self._known: dict[int, bytes] = {}
+
+    def forget(self) -> None:
+        """Another tick is committed."""
+        self._known.clear()
+
+    def look(self, everybody: bool) -> list[Near]:
+        """Who is near a border; see `Division.near`."""
+        found = self._division.near(self._world, everybody)
+        self.borders.near = found
+        return found
+
+    def change(self, entries: Sequence[Entry]) -> None:
+        """Let rows change hands, of vehicles that `look` has found."""
+        if entries:
+            rows = {entry.vehicle: entry.row for entry in self.borders.near}
+            self.borders.places = {
+                switch.vehicle: self._division.hand_over(
+                    self._world, switch, state, rows.get(switch.vehicle, 0)
+                )
+                for switch, state in entries
+            }
+
+    def near(self, entry: Near) -> bytes:
+        """Of a vehicle near a border, whose row is known."""
+        found = self._known.get(entry.vehicle)
+        if found is None:
+            found = self._division.state(self._world, entry.source, entry.row)
+            self._known[entry.vehicle] = found
+        return found
+
+    def state(self, vehicle: int) -> bytes:
+        """Of any vehicle."""
+        found = self._known.get(vehicle)
+        if found is None:
+            found = self._division.state(self._world, *self._division.find(self._world, vehicle))
+            self._known[vehicle] = found
+        return found
+
+
+class Coordination:
+    """Who advances which vehicle, in all worlds.
+
+    Args:
+        division: whose rows change hands.
+        coordinators: one a world.
+        states: of the vehicles of each world, as the coordinators read them.
+        digests: of zones' rows; None: nobody asks for them.
+        store: keeps what is committed; None: nobody can die apart from the others.
+        monitor: looks at every tick that is committed; None: nobody does.
+    """
+
+    def __init__(
+        self,
+        division: Division,
+        coordinators: Sequence[Referee],
+        states: Sequence[RowStates],
+        digests: RowDigests | None = None,
+        store: CommittedStore | None = None,
+        monitor: Monitor | None = None,
+    ) -> None:
+        self.coordinators = tuple(coordinators)
+        self._division = division
+        self._states = tuple(states)
+        self._digests = digests
+        self._store = store
+        self._monitor = monitor
+        self._rows = [self._live(w) for w in range(len(self.coordinators))]
+        self._in_store = [self._stored(w) for w in range(len(self.coordinators))]
+        # Worlds whose rows have changed since their ghosts were renewed.
+        self._stirred = [True] * len(self.coordinators)
+
+    def reset(self, chosen: NDArray[np.bool_]) -> None:
+        """Begin an episode in the chosen worlds (W,), with the vehicles that are there."""
+        for w, coordinator in enumerate(self.coordinators):
+            if chosen[w]:
+                coordinator.reset()
+                coordinator.entered(self._division.owners(w))
+                self._stirred[w] = True
+                if self._monitor is not None:
+                    self._monitor.begin(w, coordinator.notes()[0])
+
+    def cut(self) -> None:
+        """Zones are others, between two ticks: at the next one everybody is looked at."""
+        for w, coordinator in enumerate(self.coordinators):
+            births, gone = coordinator.notes()
+            coordinator.resume(self._division.settle_newborn(w, births), gone)
+            self._stirred[w] = True
+
+    def begin(self, commands: Commands) -> None:
+        """Lease the next tick, and hand over whose owner changes.
+
+        Args:
+            commands: what the agents do in it; a journal keeps their digest.
+        """
+        for w, coordinator in enumerate(self.coordinators):
+            everybody, self._stirred[w] = self._stirred[w], False
+            coordinator.begin(
+                everybody, b"" if coordinator.journal is None else _digest(commands, w)
+            )
+
+    def end(self) -> None:
+        """Commit the tick that all zones have computed."""
+        if self._store is not None:
+            self._store.write(tuple((c.notes()[0], ()) for c in self.coordinators))
+        for w, coordinator in enumerate(self.coordinators):
+            coordinator.end(self._rows[w], self._in_store[w])
+        if self._store is not None:
+            self._store.flip()
+        if self._monitor is not None:
+            self.check()
+
+    def check(self) -> None:
+        """Look whether the invariants hold in the tick that has been committed.
+
+        Raises:
+            InvariantError: one does not.
+        """
+        if self._monitor is not None:
+            for w, coordinator in enumerate(self.coordinators):
+                self._monitor.end(w, coordinator.notes()[0])
+
+    def save(self) -> None:
+        """What has changed between two ticks is committed."""
+        if self._store is not None:
+            self._store.write(tuple(coordinator.notes() for coordinator in self.coordinators))
+            self._store.flip()
+
+    def in_flight(self, w: int) -> list[TransferInFlight]:
+        """Who of a world is on the way from one zone to another."""
+        return [TransferInFlight(*entry) for entry in self.coordinators[w].in_flight()]
+
+    def load(self) -> None:
+        """Take everything back to what is committed.
+
+        Raises:
+            ProtocolError: nobody keeps it.
+        """
+        if self._store is None:
+            raise ProtocolError("nobody keeps what is committed")
+        self._division.align()
+        for w, notes in enumerate(self._store.load()):
+            self.coordinators[w].resume(*notes)
+            self._stirred[w] = True
+
+    def take_up(self, records: Sequence[Record], notes: Sequence[Notes]) -> None:
+        """Go on in the one world where others have stopped.
+
+        Args:
+            records: of their coordinator.
+            notes: what has happened since its last BEGIN.
+
+        Raises:
+            ProtocolError: they sent messages, and its own coordinator sends none.
+        """
+        (coordinator,) = self.coordinators
+        if not isinstance(coordinator, Coordinator):
+            raise ProtocolError("a coordinator without messages cannot go on in the middle of one")
+        coordinator.take_up(records)
+        coordinator.resume(*notes[0])
+        self._stirred[0] = True
+
+    def left(self, gate: Gate) -> None:
+        """Those in `gate.passing` have left their worlds."""
+        for w, coordinator in enumerate(self.coordinators):
+            gone = gate.passing[w, : gate.num_passing[w]]
+            if len(gone):
+                coordinator.left(zip(gone["id"].tolist(), gone["events"].tolist(), strict=True))
+                self._stirred[w] |= not coordinator.is_open
+
+    def entered(self, gate: Gate) -> None:
+        """Those in `gate.passing` have come into their worlds."""
+        for w, coordinator in enumerate(self.coordinators):
+            new = gate.passing[w, : gate.num_passing[w]]
+            if len(new):
+                zones = np.empty(len(new), dtype=np.int32)
+                zones_of(self._division.zones, new, len(new), zones)
+                coordinator.entered(zip(new["id"].tolist(), zones.tolist(), strict=True))
+
+    def _live(self, w: int) -> Callable[[int], int]:
+        digests = self._digests
+        if digests is None:
+            return lambda zone: 0
+        return lambda zone: digests.of(self._division.owned(w, zone))
+
+    def _stored(self, w: int) -> Callable[[int], int] | None:
+        digests, store = self._digests, self._store
+        if digests is None or store is None:
+            return None
+        return lambda zone: digests.of(store.written(zone, w))
+
+
+def _digest(commands: Commands, w: int) -> bytes:
+    """Digest of what the agents of a world do, 16 bytes."""
+    digest = blake2b(commands.controls[w].tobytes(), digest_size=16)
+    digest.update(commands.meta_actions[w].tobytes())
+    if commands.declared.any():
+        digest.update(commands.declared[w].tobytes())
+    return digest.digest()

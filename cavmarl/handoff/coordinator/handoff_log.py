@@ -1,0 +1,133 @@
+"""`BorderBook`: changes of owner of one world whose zones share a process, and who is about to."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from time import perf_counter
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cavmarl.core.errors import LedgerError, ZoneError
+from cavmarl.handoff.division import Division
+from cavmarl.ownership.messages import Birth
+from cavmarl.zones.kernels.handoff import NOT_OWNED
+
+__all__ = ["BorderBook", "Change"]
+
+
+class Change(NamedTuple):
+    """A change of owner; see `kernels.handing_over.CHANGE`."""
+
+    tick: int
+    vehicle: int
+    source: int
+    target: int
+    epoch: int
+    place: int
+    approached: int
+    prepare_depth_m: float
+    switch_depth_m: float
+    release_depth_m: float
+    ms: float
+
+
+class BorderBook:
+    """Gives vehicles to the zones that they are in, and keeps what came of it until it is read.
+
+    Args:
+        division: of all worlds.
+        world: which one.
+    """
+
+    def __init__(self, division: Division, world: int) -> None:
+        self._division = division
+        self._world = world
+        self._book = division.book
+        self._hand_over = division.call_hand_over
+        self._release = division.call_release
+
+    def hand_over(self, everybody: bool, vehicles: int, newborn: Sequence[Birth]) -> int:
+        """Let vehicles change their owner, by the committed rows.
+
+        Args:
+            everybody: look at all rows: they have changed since the ghosts were renewed.
+            vehicles: how many there have to be.
+            newborn: who of them has entered since the last tick began; they stay where they are.
+
+        Returns:
+            how many have changed.
+
+        Raises:
+            LedgerError: there are more or fewer vehicles.
+            ZoneError: a zone has not seen who enters it.
+        """
+        division, book, w = self._division, self._book, self._world
+        changed = 0
+        if everybody or book.num_crossed.item(w):
+            if newborn:
+                book.newborn[w, : len(newborn)] = [birth.vehicle for birth in newborn]
+            changed = self._hand_over(
+                division.zones, division.borders, division.zoned, division.side,
+                w, everybody, len(newborn), book,
+            )  # fmt: skip
+            if changed < 0:
+                self._refuse(changed)
+        # Who entered after the ghosts were renewed has not been looked at.
+        if book.owned.item(w) != (vehicles if everybody else vehicles - len(newborn)):
+            raise LedgerError(f"zones own {division.counts(w)} vehicles, not {vehicles}")
+        book.ms[w] = 1e3 * perf_counter()
+        return changed
+
+    def _refuse(self, why: int) -> None:
+        change = Change(*self._book.changes[self._world, len(self)].item())
+        if why == NOT_OWNED:
+            raise ZoneError(f"zone {change.source} does not own vehicle {change.vehicle}")
+        raise self._division.unseen(change.vehicle, change.target)
+
+    def release(self, changed: int) -> None:
+        """The tick is over in which the newest so many have changed."""
+        division = self._division
+        self._release(
+            division.zones, division.zoned, division.side,
+            self._world, changed, 1e3 * perf_counter(), self._book,
+        )  # fmt: skip
+
+    def __len__(self) -> int:
+        """How many changes have not been read."""
+        return self._book.num_changes.item(self._world)
+
+    def newest(self, count: int) -> list[Change]:
+        """The newest changes."""
+        last = len(self)
+        found = self._book.changes[self._world, last - count : last]
+        return [Change(*change) for change in found.tolist()]
+
+    def take(self, but: int = 0) -> NDArray[np.void]:
+        """CHANGE (n,), all but so many of the newest, which are kept."""
+        last = len(self)
+        changes = self._book.changes[self._world]
+        taken: NDArray[np.void] = changes[: last - but].copy()
+        changes[:but] = changes[last - but : last].copy()
+        self._book.num_changes[self._world] = but
+        return taken
+
+    def take_counts(self) -> tuple[int, int]:
+        """(vehicles that were near, of all ticks; that have turned away) since this was asked."""
+        acknowledged, aborted = self._book.acknowledged, self._book.aborted
+        counts = acknowledged.item(self._world), aborted.item(self._world)
+        acknowledged[self._world] = aborted[self._world] = 0
+        return counts
+
+    def coming(self) -> list[tuple[int, int]]:
+        """(vehicle, zone that it has been offered to), of the tick that is over."""
+        book, w = self._book, self._world
+        turn = 1 - book.turn.item(w)
+        entries = book.coming[w, turn, : book.num_coming[w, turn]]
+        return list(zip(entries["vehicle"].tolist(), entries["target"].tolist(), strict=True))
+
+    def reset(self, tick: int) -> None:
+        """Another episode begins at a tick."""
+        self._book.num_changes[self._world] = 0
+        self._book.tick[self._world] = tick

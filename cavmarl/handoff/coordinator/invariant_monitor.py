@@ -1,0 +1,230 @@
+"""`Monitor`: the invariants of ownership, looked at after every tick of every world.
+
+What it needs of the vehicles is taken in one compiled look at their rows (`kernels.monitor`), which
+tells who has come and gone; what it knows of owners comes from the coordinators' records, and costs
+what changes in them. The words of an error are found when there is one (`runtime.violations`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cavmarl.core.errors import InvariantError
+from cavmarl.core.numba.repeated import repeated
+from cavmarl.driving.vehicles import GHOST_FIELDS
+from cavmarl.handoff.coordinator.handoff_log import Change
+from cavmarl.handoff.coordinator.row_digests import digest_tables
+from cavmarl.handoff.coordinator.violations import Violations
+from cavmarl.handoff.division import Division
+from cavmarl.handoff.kernels.invariant_checks import (
+    FINDING,
+    KIND_NONE,
+    TALLY,
+    Clock,
+    make_kept,
+    make_strays,
+    owner_hash,
+    watch,
+)
+from cavmarl.ownership.limits import Limits
+from cavmarl.ownership.messages import Birth, Commit, Item, Message, Record, Reset
+from cavmarl.ownership.trace import LOG, Entry, describe
+from cavmarl.ownership.trace_check import Owner, TraceChecker
+
+__all__ = ["Monitor", "OwnersOnRecord"]
+
+WORD = 1 << 64
+
+
+def _add(sums: NDArray[np.uint64], zone: int, term: int) -> None:
+    sums[zone] = (int(sums[zone]) + term) % WORD
+
+
+def _nothing() -> None:
+    """Nobody owes any records."""
+
+
+class OwnersOnRecord:
+    """Who owns what by the records of a coordinator, whose trace is judged on the way.
+
+    It is told what a `Trace` is told, and by coordinators that make records later, who changes its
+    owner meanwhile.
+
+    Args:
+        zones: how many.
+        limits: deadlines.
+        is_direct: there are records alone; see `TraceChecker`.
+
+    Attributes:
+        entered: vehicles that zones have begun to own, since the reset.
+        left: vehicles that have been removed.
+        ask: lets the coordinator make the records that it still owes.
+    """
+
+    def __init__(self, zones: int, limits: Limits, is_direct: bool = False) -> None:
+        self.entered = self.left = 0
+        self._checker = TraceChecker(limits.longest_deferral, limits.lifetime, is_direct)
+        self._sums = np.zeros(zones, dtype=np.uint64)
+        self._current = self._sums  # with what records that are still to come add to them
+        self.ask: Callable[[], None] = _nothing
+
+    @property
+    def owners(self) -> dict[int, Owner]:
+        """Vehicle → (zone, epoch) as of the committed tick."""
+        self.ask()
+        return self._checker.owners
+
+    def logged(self, records: Iterable[Record]) -> None:
+        """Note records.
+
+        Raises:
+            InvariantError: one that a correct run does not leave here.
+        """
+        for record in records:
+            self._take(LOG, record)
+            if isinstance(record, Reset):
+                self.entered = self.left = 0
+                self._current = self._sums = np.zeros_like(self._sums)
+            elif isinstance(record, Commit):
+                self._commit()
+
+    def delivered(self, destination: int, message: Message) -> None:
+        """Note a message that has arrived.
+
+        Raises:
+            InvariantError: one that a correct run does not leave here.
+        """
+        self._take(destination, message)
+
+    def foretold(self, changes: Iterable[Change]) -> None:
+        """Changes of owner of the committed tick, of which records will tell later."""
+        sums = self._current = self._current.copy()
+        for change in changes:
+            _add(sums, change.source, -int(owner_hash(change.vehicle, change.epoch - 1)))
+            _add(sums, change.target, int(owner_hash(change.vehicle, change.epoch)))
+
+    def sums(self, births: Sequence[Birth]) -> NDArray[np.uint64]:
+        """(k,) by zone the sum of `owner_hash` of its vehicles, with those not on record yet."""
+        if not births:
+            return self._current
+        sums = self._current.copy()
+        for vehicle, zone, _ in births:
+            _add(sums, zone, int(owner_hash(vehicle, 0)))
+        return sums
+
+    def _take(self, destination: int, item: Item) -> None:
+        entry = Entry(destination, item)
+        try:
+            self._checker.take(entry)
+        except InvariantError as error:
+            raise InvariantError(
+                f"tick {item.tick}: order of records and messages: {describe(entry)}: {error}"
+            ) from None
+
+    def _commit(self) -> None:
+        sums = self._current = self._sums  # who was foretold is on record by the end of these
+        for vehicle, before, after in self._checker.changes:
+            if before is None:
+                self.entered += 1
+            else:
+                _add(sums, before[0], -int(owner_hash(vehicle, before[1])))
+            if after is None:
+                self.left += 1
+            else:
+                _add(sums, after[0], int(owner_hash(vehicle, after[1])))
+
+
+class Monitor:
+    """Raises InvariantError after the first tick in which an invariant does not hold.
+
+    Its memory is as large as the worlds are, however long they run.
+
+    Args:
+        division: whose rows are looked at.
+        records: of the coordinator of each world.
+        longest_move_m: no vehicle moves further in a tick.
+    """
+
+    def __init__(
+        self, division: Division, records: Sequence[OwnersOnRecord], longest_move_m: float
+    ) -> None:
+        self._division = division
+        self._records = tuple(records)
+        self._limit_m = longest_move_m
+        _, count, num_worlds, capacity = division.zoned.rows.shape
+        self._ticks = [0] * num_worlds
+        self._vehicles: list[set[int]] = [set() for _ in range(num_worlds)]
+        # What the last look has written, and the last but one.
+        self._kept = [
+            (make_kept(count, capacity), make_kept(count, capacity)) for _ in range(num_worlds)
+        ]
+        self._strays = make_strays(count, capacity)
+        self._masks, self._factors = digest_tables(GHOST_FIELDS)
+        self._words = division.zoned.rows.view(np.uint64).reshape(
+            *division.zoned.rows.shape, len(self._masks)
+        )
+        self._tallies = np.zeros(division.count, dtype=TALLY)
+        self._found = np.zeros(1, dtype=FINDING)
+        self._watch = repeated(watch)
+
+    def begin(self, w: int, births: Sequence[Birth]) -> None:
+        """Look at a world that has been reset.
+
+        Args:
+            w: which one.
+            births: who is there.
+
+        Raises:
+            InvariantError: an invariant does not hold.
+        """
+        self._ticks[w] = 0
+        self._kept[w][0].num[:] = 0
+        self._vehicles[w].clear()
+        self._look(w, births, new_late=0)
+
+    def end(self, w: int, births: Sequence[Birth]) -> None:
+        """Look at a world after a tick.
+
+        Args:
+            w: which one.
+            births: who entered in the tick, and is not in the records yet.
+
+        Raises:
+            InvariantError: an invariant does not hold.
+        """
+        self._ticks[w] += 1
+        self._look(w, births, new_late=1)
+
+    def _look(self, w: int, births: Sequence[Birth], new_late: int) -> None:
+        division, record = self._division, self._records[w]
+        clock = Clock(self._ticks[w], new_late, self._limit_m)
+        before, now = self._kept[w]
+        kind = self._watch(
+            division.zones, division.halo, division.zoned, self._words, division.side, w, clock,
+            self._masks, self._factors, before, now, self._strays,
+            record.entered + len(births) - record.left, record.sums(births),
+            self._tallies, self._found,
+        )  # fmt: skip
+        self._kept[w] = now, before
+        holds = (
+            kind == KIND_NONE
+            and self._are_single(w)
+            and all(tick == clock.tick for tick in division.ticks(w))
+        )
+        if not holds:
+            vehicle = int(self._found["vehicle"][0])
+            violations = Violations(division, w, clock, before)
+            violations.explain(kind, vehicle, record.owners, births)
+
+    def _are_single(self, w: int) -> bool:
+        """Note who has come and gone; whether nobody has come who was there."""
+        entered = self._strays.entered[: self._found["entered"].item()].tolist()
+        left = self._strays.left[: self._found["left"].item()].tolist()
+        vehicles = self._vehicles[w]
+        vehicles.difference_update(left)
+        total = len(vehicles) + len(entered)
+        vehicles.update(entered)
+        return len(vehicles) == total

@@ -1,0 +1,275 @@
+"""The coordinator's log on disk: what has been decided is there before anybody hears of it.
+
+A line is a record of `ownership.records`. Nothing is kept in memory, and an append is one write: a
+process that dies leaves whole lines, and at most one that is cut short. `MemoryJournal` takes the
+same calls and keeps the records in a list.
+"""
+
+from __future__ import annotations
+
+import os
+import sys
+import weakref
+from collections.abc import Iterable, Iterator, Sequence
+from pathlib import Path
+from types import TracebackType
+from typing import Literal, Self, TypeAlias, get_args
+
+from cavmarl.core.errors import ConfigError, CorruptJournalError, JournalError, TornJournalError
+from cavmarl.ownership.log_records import record_from_line, record_to_line
+from cavmarl.ownership.messages import Record
+
+if sys.platform != "win32":
+    import fcntl
+
+__all__ = ["AnyJournal", "Journal", "JournalReader", "MemoryJournal", "Sync"]
+
+Sync: TypeAlias = Literal["flush", "fsync"]
+
+
+class JournalReader:
+    """The records of a file, one after the other.
+
+    Args:
+        path: of the file.
+        drop_torn: whether a last line that is cut short ends the log instead of being an error: it
+            was never acted upon.
+
+    Attributes:
+        lines: whole lines that have been read.
+        size: bytes of them.
+        torn: the number of the line that was dropped and how it begins, or nothing.
+    """
+
+    def __init__(self, path: Path, *, drop_torn: bool = False) -> None:
+        self.path = path
+        self.lines, self.size, self.torn = 0, 0, ""
+        self._drop_torn = drop_torn
+
+    def __iter__(self) -> Iterator[Record]:
+        """From the first line on.
+
+        Raises:
+            TornJournalError: the last line is cut short.
+            CorruptJournalError: a line is damaged, missing or out of order.
+            JournalError: the file cannot be read.
+        """
+        self.lines, self.size, self.torn = 0, 0, ""
+        try:
+            with self.path.open("rb") as file:
+                for line in file:
+                    if not line.endswith(b"\n"):
+                        self._end_torn(line)
+                        return
+                    yield self._record(line)
+        except OSError as error:
+            raise JournalError(f"{self.path}: cannot be read ({error.strerror})") from error
+
+    def _record(self, line: bytes) -> Record:
+        try:
+            record = record_from_line(line, self.lines)
+        except CorruptJournalError as error:
+            raise CorruptJournalError(f"{self.path}: {error}") from error
+        self.lines += 1
+        self.size += len(line)
+        return record
+
+    def _end_torn(self, line: bytes) -> None:
+        self.torn = f"line {self.lines + 1} is cut short: {line[:40]!r}"
+        if not self._drop_torn:
+            raise TornJournalError(f"{self.path}: {self.torn}; it was never acted upon")
+
+
+class Journal:
+    """A file that records are appended to, by one run at a time.
+
+    Args:
+        path: of the file; without `resume` it must not exist.
+        resume: go on behind what is there. All of it is read, and a last line that is cut short is
+            dropped.
+        anew: the file may exist, and is begun anew: by a run that does again what is in it.
+        sync: when an append returns, its lines have been given to the operating system ("flush"),
+            so that they outlive the process, or have been written out ("fsync"), so that they
+            outlive the machine.
+
+    Attributes:
+        path: of the file.
+        sequence: the number of the next line.
+        dropped: the line that was dropped, or nothing.
+
+    Raises:
+        ConfigError: no such `sync`.
+        JournalError: the file exists, or does not, or cannot be opened, or another run writes it.
+        CorruptJournalError: what is there is damaged.
+    """
+
+    def __init__(
+        self, path: Path, *, resume: bool = False, anew: bool = False, sync: Sync = "flush"
+    ) -> None:
+        if sync not in get_args(Sync):
+            raise ConfigError(f"sync is {sync!r}: it has to be one of {get_args(Sync)}")
+        self.path = path
+        self.sequence, self.dropped = 0, ""
+        self._fsync = sync == "fsync"
+        if resume and not path.is_file():
+            raise JournalError(f"{path}: is no file to go on with; begin one without resume")
+        try:
+            self._file = path.open("ab" if resume or anew else "xb", buffering=0)
+        except FileExistsError as error:
+            raise JournalError(
+                f"{path}: exists; go on with it (resume), or choose another path"
+            ) from error
+        except OSError as error:
+            raise self._unwritable(error) from error
+        # Worlds are not closed: their journal is, when nobody has it any more.
+        weakref.finalize(self, self._file.close)
+        try:
+            self._lock()
+            if resume:
+                self._read()
+            elif anew:
+                self._file.truncate(0)
+        except JournalError:
+            self._file.close()
+            raise
+
+    def append(self, records: Iterable[Record]) -> None:
+        """Write records down; when it returns, messages may be sent.
+
+        Raises:
+            JournalError: not all of it could be written, or the journal is closed. After the first
+                of these it is closed; what was written of the last line is dropped on `resume`.
+        """
+        lines = [record_to_line(record, self.sequence + k) for k, record in enumerate(records)]
+        if not lines:
+            return
+        if self._file.closed:
+            raise JournalError(f"{self.path}: the journal is closed")
+        left = memoryview("".join(lines).encode())
+        try:
+            while left:
+                left = left[self._file.write(left) :]
+            if self._fsync:
+                os.fsync(self._file.fileno())
+        except OSError as error:
+            self._file.close()
+            raise self._unwritable(error) from error
+        self.sequence += len(lines)
+
+    def close(self) -> None:
+        """Close the file; once more does nothing."""
+        self._file.close()
+
+    def read(self) -> Iterator[Record]:
+        """What has been written, from the first line on; errors as of `JournalReader`."""
+        return iter(JournalReader(self.path))
+
+    def reopened(self) -> Journal:
+        """What another process finds when the one that wrote here has died."""
+        self.close()
+        sync: Sync = "fsync" if self._fsync else "flush"
+        return Journal(self.path, resume=True, sync=sync)
+
+    def tear(self, records: Sequence[Record]) -> None:
+        """Write as a process does that dies meanwhile: half of the first line."""
+        line = record_to_line(records[0], self.sequence).encode()
+        self._file.write(line[: len(line) // 2])
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self.close()
+
+    def _lock(self) -> None:
+        """Keep all others from writing here, as long as the file is open."""
+        if sys.platform == "win32":  # there an open file can be shared, and nothing says by whom
+            return
+        try:
+            fcntl.flock(self._file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError as error:
+            raise JournalError(
+                f"{self.path}: another run is writing this journal; choose another path, or wait "
+                "until it has ended"
+            ) from error
+        except OSError as error:
+            raise self._unwritable(error) from error
+
+    def _read(self) -> None:
+        """Find the end of what is there, and cut off what follows it."""
+        reader = JournalReader(self.path, drop_torn=True)
+        for _ in reader:
+            pass
+        self.sequence, self.dropped = reader.lines, reader.torn
+        if self.dropped:
+            try:
+                os.truncate(self.path, reader.size)
+            except OSError as error:
+                raise self._unwritable(error) from error
+
+    def _unwritable(self, error: OSError) -> JournalError:
+        return JournalError(
+            f"{self.path}: the journal cannot be written ({error.strerror}); "
+            "make room there, or choose another path"
+        )
+
+
+class MemoryJournal:
+    """A journal for tests, and for runs that nobody replays.
+
+    Attributes:
+        records: all of them.
+    """
+
+    def __init__(self) -> None:
+        self.records: list[Record] = []
+        self._closed = False
+
+    @property
+    def sequence(self) -> int:
+        """The number of the next record."""
+        return len(self.records)
+
+    def append(self, records: Iterable[Record]) -> None:
+        """Keep records.
+
+        Raises:
+            JournalError: the journal is closed.
+        """
+        if self._closed:
+            raise JournalError("the journal is closed")
+        self.records += records
+
+    def close(self) -> None:
+        """Refuse further records."""
+        self._closed = True
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self.close()
+
+    def read(self) -> Iterator[Record]:
+        """What has been written, from the first record on."""
+        return iter(self.records)
+
+    def reopened(self) -> MemoryJournal:
+        """What another process finds when the one that wrote here has died."""
+        return self
+
+    def tear(self, records: Sequence[Record]) -> None:
+        """Half of a record is none."""
+
+
+AnyJournal: TypeAlias = Journal | MemoryJournal

@@ -1,0 +1,287 @@
+"""`DirectCoordinator`: the referee of a world whose zones all live in its own process.
+
+There nothing is lost, nobody is late, and nobody dies alone. What `Coordinator` and the hosts of
+its zones tell each other is known to all of them at once, so no message is made: a vehicle over a
+border is offered, acknowledged and handed over in one call, the new owner takes the old one's row
+as it is, and a lease is the call that advances a shard. What is decided and written down is the
+same, record by record, as over messages of which none is lost.
+
+The table of owners is brought up to date every now and then, and when somebody asks. Records are
+made only where somebody reads them: all of them, at once, for a journal, and for watchers those of
+ticks in which a vehicle has entered, left, or changed its owner, as the table comes to know of it.
+Whoever has to know of changes in their own tick gives himself to `foretell`.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable, Iterable, Mapping
+from itertools import repeat
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cavmarl.core.errors import LedgerError
+from cavmarl.handoff.coordinator.coordinator import Referee
+from cavmarl.handoff.coordinator.handoff_log import BorderBook, Change
+from cavmarl.handoff.coordinator.journal import AnyJournal
+from cavmarl.ownership.directory import Directory
+from cavmarl.ownership.ledger import world_digest
+from cavmarl.ownership.messages import Begin, Birth, Commit, Removed, Switch, ZoneLedger
+from cavmarl.ownership.transfers import Transfer, TransferLog
+from cavmarl.zones.kernels.handoff import LATE
+
+__all__ = ["DirectCoordinator"]
+
+
+class _News(NamedTuple):
+    """Who has entered and who has left by the end of a tick."""
+
+    births: tuple[Birth, ...] = ()
+    removed: tuple[Removed, ...] = ()
+
+
+_NO_NEWS = _News()
+
+
+class DirectCoordinator(Referee):
+    """Says who owns what, without messages.
+
+    Args:
+        directory: who owns what.
+        journal: takes the records; None: nobody keeps them.
+        book: hands rows over.
+        counts: how many vehicles each zone owns now, by its rows.
+        transfers: told of all that goes on.
+
+    Attributes:
+        foretell: told at once of changes of owner that records tell of later.
+    """
+
+    def __init__(
+        self,
+        directory: Directory,
+        journal: AnyJournal | None,
+        book: BorderBook,
+        counts: Callable[[], list[int]],
+        transfers: TransferLog,
+    ) -> None:
+        super().__init__(directory, journal)
+        self._book = book
+        self._counts = counts
+        self._transfers = transfers
+        transfers.ask = self.catch_up
+        self.foretell: Callable[[Iterable[Change]], None] | None = None
+        self._is_open = False
+        self._tick = 0
+        self._vehicles = 0
+        self._changed = 0  # in the tick in progress
+        self._late = 0  # changes that the table does not know
+        self._new: tuple[Birth, ...] = ()
+        self._news: dict[int, _News] = {}  # by ticks, of those that the table does not know
+
+    @property
+    def directory(self) -> Directory:
+        """Who owns what, as of the committed tick."""
+        self.catch_up()
+        return self._directory
+
+    @property
+    def tick(self) -> int:
+        """The committed tick, of the run."""
+        return self._tick
+
+    @property
+    def is_open(self) -> bool:
+        """Whether a tick has been begun and is not committed."""
+        return self._is_open
+
+    def entered(self, vehicles: Iterable[tuple[int, int]]) -> None:
+        """(id, zone) of vehicles that are new since the last BEGIN."""
+        known = len(self._births)
+        super().entered(vehicles)
+        self._vehicles += len(self._births) - known
+
+    def left(self, vehicles: Iterable[tuple[int, int]]) -> None:
+        """(id, reason) of vehicles that have left the world."""
+        gone = list(vehicles)
+        super().left(gone)
+        self._vehicles -= len(gone)
+
+    def reset(self) -> None:
+        """Begin an episode without vehicles."""
+        directory = self.directory
+        self.resume()
+        self._is_open, self._changed, self._vehicles = False, 0, 0
+        self._book.reset(self._tick)
+        records = directory.reset().records
+        self._transfers.logged(records)
+        self._record(*records)
+        for zone, (_, incarnation) in directory.table.hosts.items():
+            if incarnation == 0:
+                self._record(*directory.host(zone, worker=0).records)
+
+    def begin(self, everybody: bool, inputs: bytes = b"") -> None:
+        """Hand over whoever is in another zone than its owner's, as `Referee.begin` says."""
+        births = self._births
+        try:
+            changed = self._book.hand_over(everybody, self._vehicles, births)
+        except LedgerError:
+            self._check(births)
+            raise
+        self._is_open, self._changed = True, changed
+        self.switched += changed
+        self._new = ()
+        if births:
+            self._new, self._births = tuple(sorted(births)), []
+        if self._removed:
+            self._removed = []
+        if self.journal is not None:
+            switches = tuple(map(_switch, self._book.newest(changed)))
+            episode = self._directory.table.episode
+            self._record(Begin(episode, self._tick + 1, switches, (), self._new, inputs))
+
+    def end(self, rows: Callable[[int], int], stored: Callable[[int], int] | None = None) -> None:
+        """Commit, if the zones own what they should, as `Referee.end` says."""
+        changed, self._is_open = self._changed, False
+        self._tick += 1
+        if changed:
+            self._changed = 0
+            self._late += changed
+            self._book.release(changed)
+        removed: tuple[Removed, ...] = ()
+        if self._gone or self._removed:
+            removed = tuple(sorted((*self._gone, *self._removed)))
+            self._gone = []
+        has_news = bool(self._new or removed)
+        if has_news:
+            self._news[self._tick] = _News(self._new, removed)
+        is_late = self._late >= LATE or len(self._news) >= LATE
+        if self.journal is not None or is_late or (has_news and self._watchers):
+            self.catch_up()
+            self._check(self._births)
+            if self.journal is not None:
+                self._record(self._committed(removed, rows))
+        elif changed and self.foretell is not None:
+            self.foretell(self._book.newest(changed))
+
+    def catch_up(self) -> None:
+        """Let the table and the rows of transfers say what has come of the ticks up to now."""
+        table = self._directory.table
+        if table.tick == self._tick:
+            return
+        changes = self._book.take(but=self._changed)
+        news, self._news, self._late = self._news, {}, 0
+        if self.journal is None and self._watchers:
+            ticks = changes["tick"]
+            for tick in sorted({*ticks.tolist(), *news}):
+                these = changes[ticks == tick]
+                self._settle(tick, these, news.get(tick, _NO_NEWS), is_told=True)
+        elif len(changes) or news:
+            births = tuple(birth for tick in news.values() for birth in tick.births)
+            removed = tuple(entry for tick in news.values() for entry in tick.removed)
+            self._settle(self._tick, changes, _News(births, removed), is_told=False)
+        table.settle(self._tick)
+        if len(changes):
+            left = {entry.vehicle: tick for tick, those in news.items() for entry in those.removed}
+            removed_now = _removed_with(changes, left)
+            episode = table.episode
+            self._transfers.add_later(
+                len(changes), sum(removed_now), lambda: _rows(changes, episode, removed_now)
+            )
+        acknowledged, aborted = self._book.take_counts()
+        self._transfers.count(acknowledged=acknowledged, aborted=aborted)
+
+    def _settle(self, tick: int, changes: NDArray[np.void], news: _News, is_told: bool) -> None:
+        """Put what came of one tick, or of all up to one, on the table, and tell watchers of it.
+
+        Raises:
+            LedgerError: a vehicle changed its owner that belonged to somebody else.
+            SpawnError: a vehicle entered that has been there.
+        """
+        table = self._directory.table
+        columns = (changes[name].tolist() for name in ("vehicle", "source", "target", "epoch"))
+        switches = tuple(map(Switch, *columns, repeat(False)))
+        if is_told:
+            self._record(Begin(table.episode, tick, switches, (), news.births))
+        if news.births:
+            self._directory.check_births(news.births)
+        table.settle(tick, switches, news.births, news.removed)
+        if is_told:
+            self._record(self._committed(news.removed, _no_digest))
+
+    def _committed(self, removed: tuple[Removed, ...], rows: Callable[[int], int]) -> Commit:
+        table = self._directory.table
+        zones = tuple(
+            ZoneLedger(zone, table.hosts[zone][1], tally, rows(zone))
+            for zone, tally in table.tallies.items()
+        )
+        world = world_digest(ledger.rows for ledger in zones)
+        return Commit(table.episode, table.tick, removed, zones, world)
+
+    def in_flight(self) -> list[tuple[int, int, int, str]]:
+        """(vehicle, owner, zone that knows that it comes, `prepared`), between two ticks."""
+        owners = self.directory.table.owners
+        return sorted(
+            (vehicle, owners[vehicle][0], target, "prepared")
+            for vehicle, target in self._book.coming()
+            if vehicle in owners
+        )
+
+    def dropped(self) -> Counter[tuple[str, str]]:
+        """Nothing: there are no messages."""
+        return Counter()
+
+    def _check(self, births: Iterable[Birth]) -> None:
+        """Compare what zones should own with their rows, where all that have left are on record.
+
+        Args:
+            births: who is in the rows, and will be on record in the next tick.
+
+        Raises:
+            LedgerError: a zone has more or fewer.
+        """
+        owned = list(self.directory.table.counts.values())
+        for birth in births:
+            owned[birth.zone] += 1
+        counts = self._counts()
+        if counts != owned:
+            raise LedgerError(f"at tick {self.tick} zones own {counts} vehicles, not {owned}")
+
+
+def _no_digest(zone: int) -> int:
+    """Of a zone's rows, where nobody takes one."""
+    return 0
+
+
+def _switch(change: Change) -> Switch:
+    return Switch(change.vehicle, change.source, change.target, change.epoch, False)
+
+
+def _removed_with(changes: NDArray[np.void], left: Mapping[int, int]) -> list[bool]:
+    """Whether each vehicle left the world in the tick in which it changed.
+
+    Args:
+        changes: CHANGE (n,).
+        left: vehicle → tick, of those that have left.
+    """
+    if not left:
+        return [False] * len(changes)
+    pairs = zip(changes["vehicle"].tolist(), changes["tick"].tolist(), strict=True)
+    return [left.get(vehicle) == tick for vehicle, tick in pairs]
+
+
+def _rows(changes: NDArray[np.void], episode: int, removed: list[bool]) -> list[Transfer]:
+    found = (Change(*change) for change in changes.tolist())
+    return [_row(change, episode, gone) for change, gone in zip(found, removed, strict=True)]
+
+
+def _row(change: Change, episode: int, removed: bool) -> Transfer:
+    release_m = change.release_depth_m
+    return Transfer(
+        episode, change.tick, change.vehicle, change.source, change.target, change.epoch,
+        False, removed, change.approached, 0, change.tick - change.approached, 0,
+        change.prepare_depth_m, change.switch_depth_m,
+        None if release_m != release_m else release_m, change.ms,
+    )  # fmt: skip

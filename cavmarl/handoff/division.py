@@ -1,0 +1,459 @@
+"""`Division`: the shards of one set of worlds, and the rows that go between them.
+
+Ghosts go each tick to every zone that may see them (decision 012). A vehicle changes its owner
+between two ticks, when the coordinator says so: its old shard keeps it as a ghost, the new one has
+had it as a ghost already, and goes on with the state that it was sent.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cavmarl.core.errors import ZoneError
+from cavmarl.core.math.tallies import totals
+from cavmarl.core.numba.repeated import repeated
+from cavmarl.core.records.arrays import Worlds, Zoned
+from cavmarl.handoff.coordinator.coordinator import Near
+from cavmarl.ownership.messages import Birth, Switch
+from cavmarl.shards.executor import Executor
+from cavmarl.shards.shard import Shard
+from cavmarl.shards.vehicle_codec import TransferCodec
+from cavmarl.zones.kernels.borders import Borders, pass_on
+from cavmarl.zones.kernels.ghost_exchange import exchange, note_gathered, take_own
+from cavmarl.zones.kernels.handoff import Book, hand_over, look, make_book, release
+from cavmarl.zones.kernels.zone_lookup import Halo, ZoneArrays, zone_of
+from cavmarl.zones.partition.zone_partition import ZonePartition
+from cavmarl.zones.partition.zone_statistics import imbalance
+from cavmarl.zones.visibility import Sight
+
+__all__ = ["Division", "ZoneLoads"]
+
+
+class ZoneLoads(NamedTuple):
+    """What the zones of W worlds hold.
+
+    Attributes:
+        owned: (k, W) vehicles.
+        ghosts: (k, W) copies of other zones' vehicles.
+        halo_m: how far zones see over their borders.
+    """
+
+    owned: NDArray[np.int64]
+    ghosts: NDArray[np.int64]
+    halo_m: float
+
+    def imbalance(self) -> NDArray[np.float64]:
+        """(W,) maximum over mean of the vehicles that zones own."""
+        return np.array([imbalance(owned) for owned in self.owned.T.tolist()])
+
+
+class Division:
+    """Who owns what, and who sees what.
+
+    Args:
+        shards: one a zone, in the order of zones.
+        zoned: their rows.
+        zones: of the partition.
+        halo: whom each zone sees over its borders.
+        sight: what says so for other zones.
+        touching_m: no ghost further outside of a zone can touch one of its vehicles.
+        borders: when a vehicle is near one.
+        codec: of vehicles' states.
+
+    Attributes:
+        zones: of the partition.
+        borders: when a vehicle is near one.
+        codec: of vehicles' states.
+        book: who is near a border.
+        gathering: what shards are called with that `gather` their ghosts: how far outside of a zone
+            a ghost can be that touches somebody in it, and how far inside one is at a border, m.
+        call_hand_over: the kernel, with the types of all worlds' arrays found out once.
+        call_release: the same.
+    """
+
+    def __init__(
+        self,
+        shards: Sequence[Shard],
+        zoned: Zoned,
+        zones: ZoneArrays,
+        halo: Halo,
+        sight: Sight,
+        touching_m: float,
+        borders: Borders,
+        codec: TransferCodec,
+    ) -> None:
+        self.zones = zones
+        self.borders = borders
+        self.codec = codec
+        self.book = make_book(*shards[0].worlds.rows.shape)
+        self._shards = tuple(shards)
+        self._zoned = zoned
+        self._first_side = shards[0].worlds.rows
+        self._halo = halo
+        self._sight = sight
+        self._touching_m = touching_m
+        self.gathering = (touching_m, borders.max_speed_mps * borders.ahead_s)
+        self._gatherers: Executor | None = None
+        self._ids, self._x, self._y = (zoned.rows[name] for name in ("id", "x", "y"))
+        self._rects: list[list[float]] = zones.rects.tolist()
+        self._call_exchange = repeated(exchange)
+        self._note_gathered = repeated(note_gathered)
+        self._look = repeated(look)
+        self._pass_on = repeated(pass_on)
+        self._totals = repeated(totals)
+        self.call_hand_over = repeated(hand_over)
+        self.call_release = repeated(release)
+
+    @property
+    def count(self) -> int:
+        """How many zones."""
+        return len(self._shards)
+
+    @property
+    def num_worlds(self) -> int:
+        """W."""
+        return len(self._shards[0].worlds.ticks)
+
+    def distribute(self, chosen: NDArray[np.bool_]) -> None:
+        """Give every shard its vehicles of the chosen worlds (W,), which are all in the first."""
+        if len(self._shards) == 1:
+            return
+        first = self._shards[0].worlds
+        for w in np.flatnonzero(chosen).tolist():
+            everybody = first.rows[w, : first.num_owned[w]].copy()
+            for shard in self._shards:
+                worlds = shard.worlds
+                worlds.num_owned[w] = take_own(
+                    self.zones, shard.zone, everybody, len(everybody), worlds.rows[w]
+                )
+                worlds.num_contacts[w] = 0
+                worlds.num_outer[w] = -1
+            self._forget_offers(w)
+            self._exchange(first.rows, w, w + 1)
+
+    def cut(self, partition: ZonePartition) -> None:
+        """Divide the plane otherwise, between two ticks: owners stay, ghosts are those of now.
+
+        Whoever is in another zone than its owner's changes its owner as at any border.
+
+        Args:
+            partition: as many zones as before.
+        """
+        zones, halo = partition.arrays, self._sight.halo(partition)
+        self.zones, self._halo, self._rects = zones, halo, zones.rects.tolist()
+        for shard in self._shards:
+            shard.cut(zones, halo)
+        self._zoned.num_outer[...] = -1
+        book = self.book
+        tick = book.tick.copy()
+        for w in range(self.num_worlds):
+            self._forget_offers(w)
+        self._exchange(self._shards[0].worlds.rows, 0, self.num_worlds)
+        book.tick[:] = tick  # of the rows that have been looked at once more
+
+    def settle_newborn(self, w: int, births: Sequence[Birth]) -> list[Birth]:
+        """Give vehicles that nobody has on record yet to the zones that they are in now."""
+        settled = []
+        for vehicle, zone, state in births:
+            _, row = self.find(w, vehicle)
+            place = self.owned(w, zone)[row]
+            target = zone_of(self.zones, place["x"], place["y"])
+            if target != zone:
+                self.hand_over(w, Switch(vehicle, zone, target, 0, False), None, row)
+            settled.append(Birth(vehicle, target, state))
+        return settled
+
+    def _forget_offers(self, w: int) -> None:
+        """Whoever was near a border before is not to be counted again."""
+        for known in (self.book.num_near, self.book.num_coming, self.book.known):
+            known[w] = 0
+
+    def exchange(self) -> None:
+        """Renew all ghosts from the owned `next_rows`.
+
+        Where shards `gather` them, `note_gathered` has to follow before the tick is over.
+        """
+        if self._gatherers is not None:
+            self._gatherers.each("gather", *self.gathering)
+            return
+        worlds = self._shards[0].worlds
+        self._exchange(worlds.next_rows, 0, len(worlds.ticks))
+
+    def let_gather(self, executor: Executor) -> bool:
+        """From now on let shards `exchange` as a phase, if they run side by side; whether they do.
+
+        A shard that gathers asks all others, so not where there are some that it never sees.
+        """
+        if len(self._halo.near) == self.count**2:
+            self._gatherers = executor
+        return self._gatherers is not None
+
+    def note_gathered(self) -> None:
+        """Note who is near a border, after all shards have gathered."""
+        self._note_those_near(self.book)
+
+    def rehearse_gathering(self) -> None:
+        """Call what is called after shards have gathered, and forget what it has found."""
+        self._note_those_near(make_book(*self._first_side.shape))
+
+    def _note_those_near(self, book: Book) -> None:
+        self._note_gathered(self.zones, self.borders, self._zoned, self.next_side, book)
+
+    def _exchange(self, rows: NDArray[np.void], first: int, last: int) -> None:
+        """Renew the ghosts of some worlds; `rows` are the first shard's rows or next ones."""
+        self._call_exchange(
+            self.zones,
+            self._halo,
+            self._touching_m,
+            self.borders,
+            self._zoned,
+            self._side(rows),
+            first,
+            last,
+            self.book,
+        )
+
+    def _side(self, rows: NDArray[np.void]) -> int:
+        return 0 if rows is self._first_side else 1
+
+    def place(self, vehicles: Sequence[NDArray[np.void]], contacts: NDArray[np.int64]) -> None:
+        """Give every vehicle to the zone that it is in, whoever has owned it before.
+
+        Args:
+            vehicles: VEHICLE (n,) of each world.
+            contacts: (W,) of each, as `contacts` counts them.
+        """
+        first = self._shards[0].worlds
+        # Who has died in the middle of a tick may have left a step that is not what this says.
+        self._zoned.step_at[...] = 0
+        for w, rows in enumerate(vehicles):
+            first.rows[w, : len(rows)] = rows
+            first.num_owned[w] = first.num_rows[w] = len(rows)
+            if len(self._shards) > 1:
+                first.rows["epoch"][w, : len(rows)] = 0
+        self.distribute(np.ones(len(vehicles), dtype=np.bool_))
+        first.num_contacts[:] = contacts
+
+    def contacts(self) -> NDArray[np.int64]:
+        """(W,) vehicles that began to touch another, since each world's reset."""
+        return _total([shard.worlds.num_contacts for shard in self._shards])
+
+    def align(self) -> None:
+        """Let all shards keep their rows on the same side, whatever a tick has come to."""
+        for shard in self._shards:
+            shard.align()
+
+    def near(self, w: int, everybody: bool) -> list[Near]:
+        """Who of a world is near a border, by its committed rows.
+
+        Args:
+            w: which world.
+            everybody: look at all of them: rows have changed since the ghosts were renewed.
+        """
+        if everybody:
+            self._look(self.zones, self.borders, self._zoned, self.side, w, True, 0, self.book)
+        num = self.book.num_near.item(w)
+        if num == 0:
+            return []
+        return [Near(*entry) for entry in self.book.near[w, :num].tolist()]
+
+    def find(self, w: int, vehicle: int) -> tuple[int, int]:
+        """The zone that owns a vehicle, and its committed row there.
+
+        Raises:
+            ZoneError: nobody owns it.
+        """
+        for shard in self._shards:
+            worlds = shard.worlds
+            found = np.flatnonzero(worlds.rows["id"][w, : worlds.num_owned[w]] == vehicle)
+            if len(found):
+                return shard.zone, int(found[0])
+        raise ZoneError(f"vehicle {vehicle} is in no zone of world {w}")
+
+    def state(self, w: int, zone: int, row: int) -> bytes:
+        """The whole state of an owned vehicle of a zone, by its committed row."""
+        worlds = self._shards[zone].worlds
+        return self.codec.pack(worlds.rows, w, row, int(worlds.ticks[w]))
+
+    def hand_over(self, w: int, switch: Switch, state: bytes | None, hint: int = 0) -> int:
+        """Let a vehicle change its owner, by its committed row.
+
+        Args:
+            w: in which world.
+            switch: who, from where, to where.
+            state: what the new owner goes on with; None: the old one's row as it is.
+            hint: the row where the old one probably keeps it.
+
+        Returns:
+            the row where the new one keeps it.
+
+        Raises:
+            ZoneError: the old owner does not have it, or the new one has not seen it come.
+        """
+        place = self._pass_on(
+            switch.vehicle, switch.source, hint, switch.target, switch.epoch,
+            self._zoned, self._side(self._shards[0].worlds.rows), w,
+        )  # fmt: skip
+        if place == -1:
+            raise ZoneError(f"zone {switch.source} does not own vehicle {switch.vehicle}")
+        if place == -2:
+            raise self.unseen(switch.vehicle, switch.target)
+        if state is not None:
+            target = self._shards[switch.target].worlds
+            tick = int(target.ticks[w])
+            self.codec.unpack(state, switch.vehicle, tick, target.rows, w, place)
+            row = target.rows[w, place]
+            row["owner"], row["epoch"] = switch.target, switch.epoch
+        return place
+
+    @staticmethod
+    def unseen(vehicle: int, zone: int) -> ZoneError:
+        """What is wrong where a zone has no ghost of a vehicle that enters it."""
+        return ZoneError(
+            f"vehicle {vehicle} entered zone {zone}, which has not seen it come: the halo is too "
+            "narrow"
+        )
+
+    def depth_m(self, w: int, vehicle: int, zone: int, outside: int, hint: int) -> float | None:
+        """How far outside of a zone a vehicle is, by its committed row.
+
+        Args:
+            w: in which world.
+            vehicle: its id.
+            zone: that owns it.
+            outside: of which zone.
+            hint: the row where its owner probably keeps it.
+
+        Returns:
+            the distance in m, 0 inside; None: its owner does not have it.
+        """
+        place = (self.side, zone, w, hint)
+        num = self._zoned.num_owned.item(zone, w)
+        if hint >= num or self._ids.item(place) != vehicle:
+            found = np.flatnonzero(self._ids[self.side, zone, w, :num] == vehicle)
+            if not len(found):
+                return None
+            place = (self.side, zone, w, int(found[0]))
+        x, y = self._x.item(place), self._y.item(place)
+        min_x, min_y, max_x, max_y = self._rects[outside]
+        dx, dy = max(min_x - x, 0.0, x - max_x), max(min_y - y, 0.0, y - max_y)
+        return math.sqrt(dx * dx + dy * dy)  # as `kernels.handing_over.release` does
+
+    def owned(self, w: int, zone: int) -> NDArray[np.void]:
+        """VEHICLE (n,), the committed rows that a zone owns; a view."""
+        worlds = self._shards[zone].worlds
+        rows: NDArray[np.void] = worlds.rows[w, : worlds.num_owned[w]]
+        return rows
+
+    def ghosts(self, w: int, zone: int) -> NDArray[np.void]:
+        """VEHICLE (n,), the committed copies that a zone has of others' vehicles.
+
+        A view that cannot be written: nobody but its owner changes a vehicle.
+        """
+        worlds = self._shards[zone].worlds
+        rows: NDArray[np.void] = worlds.rows[w, worlds.num_owned[w] : worlds.num_rows[w]]
+        rows.flags.writeable = False
+        return rows
+
+    def ticks(self, w: int) -> list[int]:
+        """What the zones' clocks say: ticks since the world's reset."""
+        return [shard.worlds.ticks.item(w) for shard in self._shards]
+
+    @property
+    def zoned(self) -> Zoned:
+        """The rows of all zones."""
+        return self._zoned
+
+    @property
+    def halo(self) -> Halo:
+        """How far each zone sees over its borders."""
+        return self._halo
+
+    @property
+    def side(self) -> int:
+        """On which side of `zoned.rows` the committed rows are."""
+        return self._side(self._shards[0].worlds.rows)
+
+    @property
+    def next_side(self) -> int:
+        """On which side the next rows are."""
+        return self._side(self._shards[0].worlds.next_rows)
+
+    def owners(self, w: int) -> list[tuple[int, int]]:
+        """(id, zone) of all vehicles of a world."""
+        return [
+            (vehicle, shard.zone)
+            for shard in self._shards
+            for vehicle in shard.worlds.rows["id"][w, : shard.worlds.num_owned[w]].tolist()
+        ]
+
+    def counts(self, w: int) -> list[int]:
+        """How many vehicles of a world each zone owns."""
+        counts: list[int] = self._zoned.num_owned[:, w].tolist()
+        return counts
+
+    def running(self) -> NDArray[np.int64]:
+        """(W,) vehicles of each world."""
+        running = np.empty(self.num_worlds, dtype=np.int64)
+        self._totals(self._zoned.num_owned, running)
+        return running
+
+    def loads(self) -> ZoneLoads:
+        """What each zone holds."""
+        owned = np.array([shard.worlds.num_owned for shard in self._shards])
+        rows = np.array([shard.worlds.num_rows for shard in self._shards])
+        return ZoneLoads(owned, rows - owned, self._halo.halo_m)
+
+    def vehicles(self, world: int) -> NDArray[np.void]:
+        """All live vehicles of a world: of several shards a copy, of one a view."""
+        parts = [s.worlds.rows[world, : s.worlds.num_owned[world]] for s in self._shards]
+        return parts[0] if len(parts) == 1 else np.concatenate(parts)
+
+    @contextmanager
+    def everybody_next(self) -> Iterator[Worlds]:
+        """All owned `next_rows` as one shard would hold them; what is changed there goes back."""
+        first = self._shards[0].worlds
+        if len(self._shards) == 1:
+            yield first
+            return
+        running = self.running()
+        parts = [
+            [s.worlds.next_rows[w, : s.worlds.num_owned[w]] for s in self._shards]
+            for w in range(running.size)
+        ]
+        rows = np.empty((running.size, running.max(initial=0)), dtype=first.next_rows.dtype)
+        for w, owned in enumerate(parts):
+            np.concatenate(owned, out=rows[w, : running[w]])
+        yield first._replace(rows=rows, next_rows=rows, num_owned=running, num_rows=running)
+        for w, owned in enumerate(parts):
+            place = 0
+            for part in owned:
+                part[:] = rows[w, place : place + len(part)]
+                place += len(part)
+
+    def whole(self) -> Worlds:
+        """All worlds as one shard would hold them, without its `next_rows`: of several, a copy."""
+        first = self._shards[0].worlds
+        if len(self._shards) == 1:
+            return first
+        rows = np.zeros_like(first.rows)
+        running = self.running()
+        for w, num in enumerate(running.tolist()):
+            rows[w, :num] = self.vehicles(w)
+        return first._replace(
+            rows=rows,
+            next_rows=rows,
+            num_owned=running,
+            num_rows=running,
+            num_contacts=self.contacts(),
+        )
+
+
+def _total(counts: list[NDArray[np.int64]]) -> NDArray[np.int64]:
+    return np.asarray(np.sum(counts, axis=0), dtype=np.int64)

@@ -1,0 +1,171 @@
+"""`CommittedStore`: all that a tick changes, as of the committed tick, and room for the next one.
+
+A tick works on the shards' arrays and on those that they share. `write` copies what it has led to,
+`flip` makes that the truth, `load` takes everything back to the truth. So whatever becomes of a
+tick that is not committed, it can be begun again.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cavmarl.core.errors import ProtocolError, ReproducerError
+from cavmarl.ownership.messages import Birth, Removed
+from cavmarl.ownership.safeguards import ALL_ON, Safeguards
+from cavmarl.shards.shard import COMMON, Shard
+
+__all__ = ["COUNTS", "CommittedStore", "Image", "Notes"]
+
+# Counts of `Worlds` that each shard has of its own.
+COUNTS = ("num_owned", "num_rows", "num_through", "num_touching", "num_contacts")
+
+Array = NDArray[Any]
+Arrays = list[Array]
+Notes = tuple[tuple[Birth, ...], tuple[Removed, ...]]
+"""What has happened since the last BEGIN: who is new, and who is gone."""
+
+
+class Image(NamedTuple):
+    """A copy of everything.
+
+    Attributes:
+        counts: by shard, those of `COUNTS`.
+        rows: by shard and world, VEHICLE (n,), owned rows and ghosts.
+        shared: what the shards have in common, and what is kept beside them.
+        notes: by world.
+    """
+
+    counts: list[Arrays]
+    rows: list[Arrays]
+    shared: Arrays
+    notes: tuple[Notes, ...]
+
+
+class CommittedStore:
+    """Two copies of the worlds.
+
+    Args:
+        shards: whose rows are kept.
+        shared: the arrays beside theirs that a tick changes, as they are now.
+        safeguards: remedies of the protocol; without `double_buffer` there is one copy only.
+    """
+
+    def __init__(
+        self,
+        shards: Sequence[Shard],
+        shared: Callable[[], Iterable[Array]],
+        safeguards: Safeguards = ALL_ON,
+    ) -> None:
+        self._has_two = safeguards.double_buffer
+        self._shards = tuple(shards)
+        self._others = shared
+        self._committed: Image | None = None
+        self._next: Image | None = None
+
+    def write(self, notes: tuple[Notes, ...]) -> None:
+        """Copy what there is now; the truth stays what it was.
+
+        Args:
+            notes: by world.
+        """
+        counts: list[Arrays] = []
+        rows: list[Arrays] = []
+        for shard in self._shards:
+            worlds = shard.worlds
+            counts.append([getattr(worlds, name).copy() for name in COUNTS])
+            rows.append([worlds.rows[w, :num].copy() for w, num in enumerate(worlds.num_rows)])
+        shared = [array.copy() for array in self.shared()]
+        self._next = Image(counts, rows, shared, notes)
+        if not self._has_two:
+            self._committed = self._next
+
+    def flip(self) -> None:
+        """Make what was written last the truth.
+
+        Raises:
+            ProtocolError: nothing has been written since.
+        """
+        if self._next is None:
+            raise ProtocolError("nothing has been written to the store since it was flipped")
+        self._committed, self._next = self._next, None
+
+    def load(self) -> tuple[Notes, ...]:
+        """Take the worlds back to the truth; the notes of each."""
+        image = self.truth()
+        for shard, counts, rows in zip(self._shards, image.counts, image.rows, strict=True):
+            worlds = shard.worlds
+            for name, kept in zip(COUNTS, counts, strict=True):
+                getattr(worlds, name)[:] = kept
+            for w, own in enumerate(rows):
+                worlds.rows[w, : len(own)] = own
+        for array, kept in zip(self.shared(), image.shared, strict=True):
+            array[...] = kept
+        return image.notes
+
+    def adopt(self, image: Image) -> tuple[Notes, ...]:
+        """Take the worlds to what another store has kept of such worlds; the notes of each.
+
+        Raises:
+            ReproducerError: those worlds were not such ones.
+        """
+        shared = list(self.shared())
+        if (len(image.rows), len(image.shared)) != (len(self._shards), len(shared)):
+            raise ReproducerError(
+                f"{len(image.rows)} zones with {len(image.shared)} arrays were kept, and here are "
+                f"{len(self._shards)} with {len(shared)}; use the version that wrote them"
+            )
+        for shard, counts, rows in zip(self._shards, image.counts, image.rows, strict=True):
+            worlds = shard.worlds
+            for name, kept in zip(COUNTS, counts, strict=True):
+                _put(kept, getattr(worlds, name), name)
+            for w, own in enumerate(rows):
+                _put(own, worlds.rows[w, : len(own)], "rows")
+        for number, (array, kept) in enumerate(zip(shared, image.shared, strict=True)):
+            _put(kept, array, f"array {number} beside the rows")
+        return image.notes
+
+    def written(self, zone: int, world: int) -> NDArray[np.void]:
+        """VEHICLE (n,), a zone's owned rows as they were written last.
+
+        Raises:
+            ProtocolError: nothing has been written since the store was flipped.
+        """
+        if self._next is None:
+            raise ProtocolError("nothing has been written to the store since it was flipped")
+        num = int(self._next.counts[zone][COUNTS.index("num_owned")][world])
+        rows: NDArray[np.void] = self._next.rows[zone][world][:num]
+        return rows
+
+    def shared(self) -> Iterator[Array]:
+        """What is kept beside the shards' own, as it is now."""
+        worlds = self._shards[0].worlds
+        for name in COMMON:
+            yield getattr(worlds, name)
+        yield from self._others()
+
+    def truth(self) -> Image:
+        """What is committed; not to be changed.
+
+        Raises:
+            ProtocolError: nothing is.
+        """
+        if self._committed is None:
+            raise ProtocolError("nothing is committed: reset the worlds first")
+        return self._committed
+
+
+def _put(kept: Array, array: Array, what: str) -> None:
+    """Write what was kept into an array of the same meaning, which may have less room to spare.
+
+    Raises:
+        ReproducerError: it has another type or fewer places.
+    """
+    if kept.dtype != array.dtype:
+        raise ReproducerError(f"{what}: kept in another layout; use the version that wrote them")
+    if kept.ndim != array.ndim or any(a < b for a, b in zip(kept.shape, array.shape, strict=True)):
+        raise ReproducerError(f"{what}: {kept.shape} were kept, and here are {array.shape}")
+    array[...] = kept[tuple(slice(length) for length in array.shape)]

@@ -1,0 +1,1 @@
+"""Compiled loops: digests of rows and checks of invariants."""

@@ -1,0 +1,41 @@
+"""Digests of vehicles' rows that know neither zones nor the order of rows.
+
+The digest of a set of rows is the sum of the rows' own, so zones can be added up (invariant I10).
+It tells of any accidental difference; it does not stop anybody who looks for two rows of one
+digest.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cavmarl.core.math.rng import mix
+from cavmarl.core.numba import kernel
+
+__all__ = ["digest_rows"]
+
+
+@kernel
+def digest_rows(
+    words: NDArray[np.uint64], num: int, masks: NDArray[np.uint64], factors: NDArray[np.uint64]
+) -> tuple[np.uint64, np.uint64]:
+    """Upper and lower half of the sum of the digests of `words[:num]`, modulo 2**128.
+
+    Args:
+        words: (C, n) the records of vehicles as whole words.
+        num: how many count.
+        masks: (n,) which bits of each word count.
+        factors: (n,) odd random numbers.
+    """
+    upper = np.uint64(0)
+    lower = np.uint64(0)
+    for i in range(num):
+        total = np.uint64(0)
+        for n in range(words.shape[1]):
+            total += (words[i, n] & masks[n]) * factors[n]
+        part = mix(total)
+        lower += part
+        if lower < part:
+            upper += np.uint64(1)
+    return upper, lower

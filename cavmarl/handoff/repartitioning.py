@@ -1,0 +1,99 @@
+"""`Recutter`: cuts worlds anew while they run, where their vehicles have gathered in a few zones.
+
+An extension, off by default: the paper's zones are fixed. Between two ticks the plane is divided
+otherwise; in the next one each vehicle that is in another zone than its owner's is handed over as
+at any border. So no result depends on it.
+"""
+
+from __future__ import annotations
+
+import time
+from typing import NamedTuple
+
+import numpy as np
+
+from cavmarl.handoff.coordinator.coordinators import Coordination
+from cavmarl.handoff.division import Division
+from cavmarl.handoff.repartition_plan import propose_zones
+from cavmarl.roads.network import RoadNetwork
+from cavmarl.zones.partition.zone_partition import ZonePartition
+
+__all__ = ["Recut", "Recutter"]
+
+
+class Recut(NamedTuple):
+    """Worlds have been cut anew.
+
+    Attributes:
+        step: after which one, of all that these worlds have made.
+        before: maximum over mean of the zones' vehicles.
+        after: the same in the new zones.
+        moved: vehicles that are in a zone of another number.
+        ms: that it took; handing them over is part of the next tick.
+    """
+
+    step: int
+    before: float
+    after: float
+    moved: int
+    ms: float
+
+
+class Recutter:
+    """Looks every so many steps whether other zones would share out the vehicles better.
+
+    Args:
+        network: the map.
+        division: of the worlds.
+        coordination: of the worlds.
+        every: steps from one look to the next.
+        tolerance: by which share of the mean the fullest zone has to become emptier.
+
+    Attributes:
+        recuts: what has been done.
+    """
+
+    def __init__(
+        self,
+        network: RoadNetwork,
+        division: Division,
+        coordination: Coordination,
+        every: int,
+        tolerance: float,
+    ) -> None:
+        self.recuts: list[Recut] = []
+        self._network = network
+        self._division = division
+        self._coordination = coordination
+        self._every = every
+        self._tolerance = tolerance
+        self._steps = 0
+
+    def after_step(self, partition: ZonePartition) -> ZonePartition | None:
+        """Note that a step is over; the new zones, if there are any.
+
+        Args:
+            partition: the zones as they are.
+        """
+        self._steps += 1
+        if self._steps % self._every:
+            return None
+        began = time.perf_counter()
+        division = self._division
+        rows = [division.vehicles(w) for w in range(division.num_worlds)]
+        places = np.concatenate([np.column_stack([own["x"], own["y"]]) for own in rows])
+        counts = division.loads().owned.sum(axis=1)
+        proposal = propose_zones(
+            self._network, partition, places, counts.tolist(), tolerance=self._tolerance
+        )
+        if proposal is None:
+            return None
+        self.cut(proposal.partition)
+        ms = 1e3 * (time.perf_counter() - began)
+        self.recuts.append(Recut(self._steps, proposal.before, proposal.after, proposal.moved, ms))
+        return proposal.partition
+
+    def cut(self, partition: ZonePartition) -> None:
+        """Divide the worlds into these zones, as many as before."""
+        self._division.cut(partition)
+        self._coordination.cut()

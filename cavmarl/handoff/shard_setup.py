@@ -1,0 +1,172 @@
+"""Makes the shards of a map, and says how far they have to see over their borders."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+from cavmarl.config.env import EnvConfig, ZonesConfig
+from cavmarl.core.huge_pages import huge_zeros
+from cavmarl.core.memory import Zeros
+from cavmarl.core.records.arrays import Outputs
+from cavmarl.driving.kernels.motion import MAX_SPEED_MPS
+from cavmarl.handoff.division import Division
+from cavmarl.ownership.distances import Distances, check_coverage, needed_overlap_m
+from cavmarl.ownership.limits import DeadlinePolicy, Limits
+from cavmarl.roads.network import RoadNetwork
+from cavmarl.sensors.mounted.catalogue import rig_reach_m
+from cavmarl.sensors.observed import largest_radius_m, sensing_reach_m
+from cavmarl.shards.shard import Shard, make_zoned
+from cavmarl.shards.vehicle_codec import TransferCodec
+from cavmarl.traffic.native import NativeTraffic
+from cavmarl.zones.kernels.borders import Borders
+from cavmarl.zones.partition.zone_partition import ZonePartition
+from cavmarl.zones.reach import driving_reach_m, longest_move_m
+from cavmarl.zones.visibility import Sight
+
+__all__ = ["divide", "halo_m", "limits_of"]
+
+# Added to the halo, so that no rounding of its sum can make it too narrow.
+_ROUNDING_M = 1e-6
+
+
+def divide(
+    config: EnvConfig,
+    network: RoadNetwork,
+    partition: ZonePartition,
+    traffic: NativeTraffic,
+    outputs: Outputs,
+    num_worlds: int,
+    zeros: Zeros = huge_zeros,
+) -> tuple[list[Shard], Division]:
+    """One shard a zone, and the division that knows them all.
+
+    Args:
+        config: the environment.
+        network: its roads.
+        partition: its zones.
+        traffic: who drives where.
+        outputs: where all agents get what they sense.
+        num_worlds: how many worlds are stepped together.
+        zeros: makes the arrays that shards write.
+
+    Raises:
+        CoverageError: `zones.halo_m` is less than exactness needs.
+    """
+    settings, dt = config.zones, config.clock.sim_dt_s
+    radius_m = largest_radius_m(traffic.travel.types)
+    sensing_m = max(sensing_reach_m(config.sensors, radius_m), rig_reach_m(config.rig, radius_m))
+    reach_m = max(driving_reach_m(network, traffic.travel), sensing_m)
+    fastest_mps = longest_move_m(network, traffic.travel, dt) / dt
+    wide_m = halo_m(config, reach_m, partition.count, fastest_mps)
+    touching_m = _needed_m(config, 2.0 * radius_m, fastest_mps)
+    # Agents alone sense.
+    sensed_m = _needed_m(config, sensing_m, fastest_mps) if config.population.agents else 0.0
+    near_m = max(touching_m, sensed_m, _approach_m(config, fastest_mps))
+    sight = Sight(
+        network,
+        traffic.travel,
+        wide_m,
+        near_m if _goes_by_roads(config, traffic) else wide_m,
+        _needed_m(config, 0.0, fastest_mps),
+    )
+    halo = sight.halo(partition)
+    zoned = make_zoned(partition.count, num_worlds, traffic.capacity, zeros)
+    shards: list[Shard] = []
+    for zone in range(partition.count):
+        shard = Shard(
+            config,
+            network,
+            traffic.plans,
+            traffic.travel,
+            zoned,
+            outputs,
+            zone,
+            partition.arrays,
+            halo,
+            shards[0] if shards else None,
+            zeros,
+        )
+        shards.append(shard)
+    division = Division(
+        shards,
+        zoned,
+        partition.arrays,
+        halo,
+        sight,
+        touching_m,
+        Borders(settings.hysteresis_m, settings.approach_ticks * dt, MAX_SPEED_MPS),
+        TransferCodec.of(shards[0].worlds, outputs, config.sensors.stack),
+    )
+    return shards, division
+
+
+def halo_m(
+    config: EnvConfig, reach_m: float, zones: int, fastest_mps: float = MAX_SPEED_MPS
+) -> float:
+    """How far zones see over their borders.
+
+    Args:
+        config: `zones.halo_m` is taken if it is given.
+        reach_m: the farthest that anybody looks.
+        zones: how many there are.
+        fastest_mps: the way of a tick over its length, with what vehicles jump on the map.
+
+    Raises:
+        CoverageError: that is less than exactness needs, with all numbers.
+    """
+    settings, dt = config.zones, config.clock.sim_dt_s
+    wide_m = settings.halo_m
+    if wide_m is None:
+        wide_m = _needed_m(config, reach_m, fastest_mps)
+    if zones > 1:
+        check_coverage(
+            Distances(_approach_m(config, fastest_mps), settings.hysteresis_m, wide_m),
+            _limits_at_borders(settings),
+            reach_m=reach_m,
+            v_max_mps=fastest_mps,
+            dt_s=dt,
+        )
+    return wide_m
+
+
+def _goes_by_roads(config: EnvConfig, traffic: NativeTraffic) -> bool:
+    """Whether all that drivers look at can be found along the roads.
+
+    Scripts put vehicles beside them, SUMO where it likes; and whoever names a halo wants it whole.
+    """
+    free = traffic.scene is not None or traffic.sumo is not None
+    return config.zones.halo_m is None and not free
+
+
+def limits_of(settings: ZonesConfig, schema: int = 1) -> Limits:
+    """Deadlines of the protocol; `schema` is the version of vehicles' states."""
+    return Limits(
+        deferral=settings.max_deferred_ticks,
+        policy=DeadlinePolicy(settings.policy),
+        grace=settings.grace_ticks,
+        backoff=settings.backoff_ticks,
+        schema=schema,
+    )
+
+
+def _limits_at_borders(settings: ZonesConfig) -> Limits:
+    """Deadlines of hand-overs; where nothing is lost nobody is late (decision 013)."""
+    limits = limits_of(settings)
+    may_be_late = settings.faults or settings.reproducers
+    if may_be_late:
+        return limits
+    return replace(limits, deferral=0, policy=DeadlinePolicy.FORCE, grace=0)
+
+
+def _approach_m(config: EnvConfig, fastest_mps: float) -> float:
+    """From so far away a vehicle can be offered: as far as it drives, or jumps in a tick."""
+    dt = config.clock.sim_dt_s
+    return max(config.zones.approach_ticks * MAX_SPEED_MPS * dt, fastest_mps * dt)
+
+
+def _needed_m(config: EnvConfig, reach_m: float, fastest_mps: float) -> float:
+    limits = _limits_at_borders(config.zones)
+    needed_m = needed_overlap_m(
+        reach_m, config.zones.hysteresis_m, limits, fastest_mps, config.clock.sim_dt_s
+    )
+    return needed_m + _ROUNDING_M

@@ -1,0 +1,76 @@
+"""`ZoneView`: who owns, sees and hands over what in one divided world, to look at."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cavmarl.shards.shard import Shard
+from cavmarl.zones.partition.zone_partition import ZonePartition
+
+__all__ = ["TransferInFlight", "ZoneView", "view_zones"]
+
+
+class TransferInFlight(NamedTuple):
+    """A vehicle that is on its way from one zone to another.
+
+    Attributes:
+        vehicle: its id.
+        source: the zone that owns it.
+        target: the zone that it is offered or switched to.
+        state: of the protocol, for people to read.
+    """
+
+    vehicle: int
+    source: int
+    target: int
+    state: str
+
+
+@dataclass(frozen=True)
+class ZoneView:
+    """One world's zones between two ticks.
+
+    Attributes:
+        partition: where the zones are.
+        halo_m: how far each sees over its borders.
+        owners: (n,) the zone that owns each vehicle, in the order of `Simulation.vehicles`.
+        ghosts: of each zone, the ids of other zones' vehicles that it sees.
+        transfers: in flight.
+    """
+
+    partition: ZonePartition
+    halo_m: float
+    owners: NDArray[np.int64]
+    ghosts: tuple[NDArray[np.int64], ...]
+    transfers: tuple[TransferInFlight, ...] = ()
+
+
+def view_zones(
+    shards: Sequence[Shard],
+    partition: ZonePartition,
+    halo_m: float,
+    world: int = 0,
+    transfers: Sequence[TransferInFlight] = (),
+) -> ZoneView:
+    """What the shards hold of one world.
+
+    Args:
+        shards: one a zone, in the order of zones.
+        partition: where the zones are.
+        halo_m: how far each sees over its borders.
+        world: which.
+        transfers: in flight in that world.
+    """
+    held = [shard.worlds for shard in shards]
+    owned = [int(worlds.num_owned[world]) for worlds in held]
+    ghosts = tuple(
+        worlds.rows[world, num : worlds.num_rows[world]]["id"].copy()
+        for worlds, num in zip(held, owned, strict=True)
+    )
+    owners = np.repeat(np.arange(len(owned)), owned)
+    return ZoneView(partition, halo_m, owners, ghosts, tuple(transfers))

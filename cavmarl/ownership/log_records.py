@@ -1,0 +1,189 @@
+"""Log records as JSON lines, and back.
+
+A line is an object with the keys `schema` ("cavmarl.ownership/1"), `sequence` (0, 1, 2, …),
+`kind` (RESET, BEGIN, COMMIT, FENCE, HOST), `episode`, `tick`, the fields of that kind, and
+`checksum`: BLAKE2b of 8 bytes, in hex, over the line as it would be without that key. Bytes are
+written in hex, digests of rows and sets too. A list of entries is a list of lists.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Iterable
+from dataclasses import fields
+from functools import partial
+from hashlib import blake2b
+from typing import Any, get_args, get_origin, get_type_hints
+
+from cavmarl.core.errors import CorruptJournalError, JournalError, TornJournalError
+from cavmarl.ownership.messages import Begin, Commit, Fence, Host, Record, Reset
+from cavmarl.ownership.table import Table
+
+SCHEMA = "cavmarl.ownership/1"
+KINDS: dict[str, type[Record]] = {
+    "RESET": Reset,
+    "BEGIN": Begin,
+    "COMMIT": Commit,
+    "FENCE": Fence,
+    "HOST": Host,
+}
+_NAMES = {kind: name for name, kind in KINDS.items()}
+_LARGEST = 1 << 63
+_WIDE = frozenset({"world", "rows", "digest"})
+
+
+def record_to_dict(record: Record, sequence: int) -> dict[str, Any]:
+    """A record as plain values, with its checksum."""
+    return sealed(_content(record, sequence))
+
+
+def sealed(line: dict[str, Any]) -> dict[str, Any]:
+    """A line with the checksum of what stands in it."""
+    content = {key: value for key, value in line.items() if key != "checksum"}
+    return content | {"checksum": _checksum(_json(content))}
+
+
+def record_from_dict(line: dict[str, Any], sequence: int) -> Record:
+    """The record of a line.
+
+    Raises:
+        CorruptJournalError: another schema or sequence number, a wrong checksum or content.
+    """
+    where = f"line {sequence + 1} of the log"
+    if line.get("schema") != SCHEMA:
+        raise CorruptJournalError(f"{where} has schema {line.get('schema')!r}, not {SCHEMA!r}")
+    if line.get("checksum") != sealed(line)["checksum"]:
+        raise CorruptJournalError(f"{where} does not match its checksum")
+    if line.get("sequence") != sequence:
+        raise CorruptJournalError(f"{where} has number {line.get('sequence')}: lines are missing")
+    kind = KINDS.get(str(line.get("kind")))
+    if kind is None:
+        raise CorruptJournalError(f"{where} is of kind {line.get('kind')!r}, which is none")
+    try:
+        values = [parse(line[name]) for name, parse in _PARSE[kind]]
+    except (KeyError, TypeError, ValueError) as error:
+        raise CorruptJournalError(f"{where}: {error!r}") from error
+    return kind(*values)
+
+
+def record_to_line(record: Record, sequence: int) -> str:
+    """A line of the log, with its end."""
+    body = _json(_content(record, sequence))
+    return f'{body[:-1]},"checksum":"{_checksum(body)}"}}\n'
+
+
+def record_from_line(line: str | bytes, sequence: int) -> Record:
+    """The record of a line of the log.
+
+    Raises:
+        CorruptJournalError: the line is damaged, or another one.
+    """
+    try:
+        content = json.loads(line)
+    except (ValueError, RecursionError) as error:
+        raise CorruptJournalError(f"line {sequence + 1} of the log: {error}") from error
+    if not isinstance(content, dict):
+        raise CorruptJournalError(f"line {sequence + 1} of the log is no JSON object")
+    return record_from_dict(content, sequence)
+
+
+def records_from_lines(text: str) -> tuple[Record, ...]:
+    """The records of a whole log.
+
+    Raises:
+        TornJournalError: the last line is cut short. `whole_lines` gives the text before it.
+        CorruptJournalError: a line is damaged, missing or out of order.
+    """
+    records = []
+    for sequence, line in enumerate(text.splitlines(keepends=True)):
+        if not line.endswith("\n"):
+            raise TornJournalError(f"line {sequence + 1} of the log is cut short: {line[:40]!r}")
+        records.append(record_from_line(line, sequence))
+    return tuple(records)
+
+
+def whole_lines(text: str) -> str:
+    """A log without what follows its last whole line: a torn record was never acted upon."""
+    return text[: text.rfind("\n") + 1]
+
+
+def replay(records: Iterable[Record]) -> Table:
+    """The table that a log leads to, for any number of zones.
+
+    Raises:
+        JournalError: the records cannot have been written in this order.
+    """
+    log = tuple(records)
+    if not log or not isinstance(log[0], Reset):
+        raise JournalError("a log begins with a RESET, which names the run")
+    table = Table({record.zone for record in log if isinstance(record, Host)})
+    for record in log:
+        table.apply(record)
+    return table
+
+
+def _content(record: Record, sequence: int) -> dict[str, Any]:
+    line: dict[str, Any] = {"schema": SCHEMA, "sequence": sequence, "kind": _NAMES[type(record)]}
+    for name, plain in _PLAIN[type(record)]:
+        value = getattr(record, name)
+        line[name] = value if plain is None else plain(value)
+    return line
+
+
+def _plain(name: str, hint: Any) -> Callable[[Any], Any] | None:
+    """What makes plain values of a field's; None: they are."""
+    if hint is bytes:
+        return bytes.hex
+    if hint is int and name in _WIDE:
+        return "{:x}".format
+    if get_origin(hint) is tuple:
+        entry = _plain(name, get_args(hint)[0])
+        return None if entry is None else lambda entries: [entry(value) for value in entries]
+    if hint in (int, bool):
+        return None
+    parts = [_plain(field, inner) for field, inner in get_type_hints(hint).items()]
+    if not any(parts):
+        return None
+    return lambda entry: [
+        value if part is None else part(value) for part, value in zip(parts, entry, strict=True)
+    ]
+
+
+def _parse(name: str, hint: Any) -> Callable[[Any], Any]:
+    """What makes a field's value of plain ones."""
+    if hint is bytes:
+        return bytes.fromhex
+    if hint is int and name in _WIDE:
+        return partial(int, base=16)
+    if get_origin(hint) is tuple:
+        entry = _parse(name, get_args(hint)[0])
+        return lambda values: tuple(entry(value) for value in values)
+    if hint in (int, bool):
+        return partial(_checked, name, hint)
+    parts = [_parse(field, inner) for field, inner in get_type_hints(hint).items()]
+    return lambda values: hint(*(part(value) for part, value in zip(parts, values, strict=True)))
+
+
+def _checked(name: str, kind: type[int], value: Any) -> int:
+    if type(value) is not kind or abs(value) >= _LARGEST:
+        raise TypeError(f"{name} is {value!r}")
+    return value
+
+
+def _checksum(body: str) -> str:
+    return blake2b(body.encode(), digest_size=8).hexdigest()
+
+
+_json = json.JSONEncoder(separators=(",", ":")).encode
+_HINTS = {
+    kind: {field.name: get_type_hints(kind)[field.name] for field in fields(kind)}
+    for kind in KINDS.values()
+}
+_PLAIN = {
+    kind: [(name, _plain(name, hint)) for name, hint in hints.items()]
+    for kind, hints in _HINTS.items()
+}
+_PARSE = {
+    kind: [(name, _parse(name, hint)) for name, hint in hints.items()]
+    for kind, hints in _HINTS.items()
+}

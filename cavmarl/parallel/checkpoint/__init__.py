@@ -1,0 +1,1 @@
+"""What survives a worker: checkpoints of worlds and logs of actions since."""

@@ -1,0 +1,99 @@
+"""`Tape`: all that some worlds were told since they were made, for whoever has to begin anew.
+
+A diary keeps images, and who owned what is in none of them: a successor gives each vehicle to the
+zone that it is in. That changes no result, but a journal would tell of it, and a plan of faults
+would strike others. So the successor of such worlds goes through everything again.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cavmarl.core.errors import WorkerError
+from cavmarl.shards.shard import Commands
+
+__all__ = ["Entry", "Tape"]
+
+_COMMANDS = ("controls", "meta_actions", "declared")
+_READ_AT_ONCE = 64  # entries
+
+
+class Entry(NamedTuple):
+    """One order.
+
+    Attributes:
+        is_reset: or else a step.
+        seed: of a reset; None: none was given.
+        first_world: of a reset, as the order has it.
+        chosen: (W,) which worlds a reset is about.
+        commands: of the agents in a step.
+    """
+
+    is_reset: bool
+    seed: int | None
+    first_world: int
+    chosen: NDArray[np.bool_]
+    commands: Commands
+
+
+class Tape:
+    """Entries one behind the other, in memory that outlives those who write it.
+
+    Args:
+        fd: of that memory, which grows.
+        like: what agents do, in arrays of the shapes and dtypes that they always have.
+    """
+
+    def __init__(self, fd: int, like: Commands) -> None:
+        self._fd = fd
+        worlds = len(like.controls)
+        fields: list[tuple[str, str, tuple[int, ...]]] = [
+            ("is_reset", "|b1", ()),
+            ("has_seed", "|b1", ()),
+            ("seed", "<i8", ()),
+            ("first_world", "<i8", ()),
+            ("chosen", "|b1", (worlds,)),
+        ]
+        for name in _COMMANDS:
+            array = getattr(like, name)
+            fields.append((name, array.dtype.str, array.shape))
+        self._row = np.zeros(1, dtype=np.dtype(fields))
+        self._commands = Commands(*(np.zeros_like(getattr(like, name)) for name in _COMMANDS))
+
+    def write(self, number: int, entry: Entry) -> None:
+        """Put down an entry, in the place of that and all later ones.
+
+        Raises:
+            WorkerError: there is no more memory.
+        """
+        row = self._row
+        row["is_reset"], row["has_seed"] = entry.is_reset, entry.seed is not None
+        row["seed"], row["first_world"] = entry.seed or 0, entry.first_world
+        row["chosen"] = entry.chosen
+        for name in _COMMANDS:
+            row[name] = getattr(entry.commands, name)
+        try:
+            os.pwrite(self._fd, row.tobytes(), number * row.itemsize)
+        except OSError as error:
+            raise WorkerError(
+                f"no memory for what worlds with a journal or faults are told ({error.strerror}): "
+                "make the environment anew now and then, or use workers=0"
+            ) from error
+
+    def read(self, count: int) -> Iterator[Entry]:
+        """The first so many entries; the commands of one are overwritten by the next."""
+        size = self._row.itemsize
+        for first in range(0, count, _READ_AT_ONCE):
+            some = min(count - first, _READ_AT_ONCE)
+            raw = os.pread(self._fd, some * size, first * size)
+            for row in np.frombuffer(raw, dtype=self._row.dtype):
+                for name in _COMMANDS:  # whose arrays kernels know: aligned and writable
+                    getattr(self._commands, name)[...] = row[name]
+                seed = int(row["seed"]) if row["has_seed"] else None
+                is_reset, first_world = bool(row["is_reset"]), int(row["first_world"])
+                yield Entry(is_reset, seed, first_world, row["chosen"], self._commands)

@@ -1,0 +1,112 @@
+"""`DiaryJob`: what a worker does that runs some of the worlds and keeps a diary of them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from time import perf_counter
+from typing import Any
+
+from numpy.typing import NDArray
+
+from cavmarl.core.errors import SumoStateError
+from cavmarl.parallel.checkpoint.checkpoint_log import Diary
+from cavmarl.parallel.local_worlds import LocalWorlds
+from cavmarl.parallel.worlds_job import Task, WorldsJob
+
+__all__ = ["DiaryJob"]
+
+AGAIN_S = 0.04  # a successor goes through no more steps again than take that long
+
+
+class DiaryJob(WorldsJob):
+    """Some of the worlds, next to each other.
+
+    Args:
+        worlds: that write their part of the shared arrays.
+        first: number of the first one among all.
+        diary: in which they leave their state behind.
+    """
+
+    def __init__(self, worlds: LocalWorlds, first: int, diary: Diary) -> None:
+        super().__init__(worlds, first)
+        self._diary = diary
+        self._logs = worlds.keep_logs()
+        self._is_behind = False  # it is where the diary begins, and not where that ends
+        self._lost: SumoStateError | None = None  # why it cannot get there
+        self._again_s = 0.0  # that the steps of the diary take
+
+    def perform(self, task: int, letter: Any) -> Any:
+        """Do a task; the answer of those that have one."""
+        self._catch_up(task)
+        if task not in (Task.STEP, Task.RESET):
+            return super().perform(task, letter)
+        if task == Task.RESET:
+            super().perform(task, letter)
+            self._begin_anew()
+            return None
+        self._note_step()
+        began_s = perf_counter()
+        super().perform(task, letter)
+        self._again_s += perf_counter() - began_s
+        return None
+
+    def afterwards(self) -> None:
+        """Write the image that the diary begins anew with, if it is due: nobody waits for it.
+
+        Not in the order in which it began anew the last time: what is committed may still begin
+        with the image before, whose place this one would take.
+        """
+        diary = self._diary
+        is_there = not self._is_behind and self._lost is None
+        if self._is_due and is_there and not diary.is_prepared and len(diary) > 1:
+            diary.prepare(self._worlds.save(), self._logs)
+
+    @property
+    def _is_due(self) -> bool:
+        """Whether the diary has to begin anew with the next step."""
+        return self._diary.is_full or self._again_s > AGAIN_S
+
+    def _note_step(self) -> None:
+        """Write down what the agents are about to do, in a diary that begins anew if it is due."""
+        if self._is_due:
+            self._begin_anew(self._diary.is_prepared)
+        self._diary.note(self._commands)
+
+    def _begin_anew(self, is_prepared: bool = False) -> None:
+        """Let the diary begin with the present state, unless that is written already."""
+        if not is_prepared:
+            self._diary.prepare(self._worlds.save(), self._logs)
+        self._diary.begin()
+        self._again_s = 0.0
+
+    def _catch_up(self, task: int) -> None:
+        """Go through the steps of the diary, if they are not behind it.
+
+        Raises:
+            SumoStateError: as of `Simulation.load`; but all worlds may be reset.
+        """
+        if self._lost is not None:
+            error, self._lost = self._lost, None
+            if task != Task.RESET or not self._worlds.arrays.chosen.all():
+                raise error
+        elif self._is_behind:
+            self._is_behind = False
+            began_s = perf_counter()
+            for commands in self._diary.steps():
+                self._worlds.step(commands)
+            self._again_s = perf_counter() - began_s
+
+    def save(self) -> list[NDArray[Any]]:
+        """Where to begin in the diary."""
+        return [self._diary.place]
+
+    def load(self, saved: Sequence[NDArray[Any]]) -> None:
+        """Go on from what `save` gave; the steps since the last image wait for a task."""
+        diary, worlds = self._diary, self._worlds
+        diary.go_to(saved[0])
+        diary.read_logs(self._logs)
+        self._is_behind = True
+        try:
+            worlds.load(diary.state(worlds.save()))
+        except SumoStateError as error:
+            self._lost, self._is_behind = error, False

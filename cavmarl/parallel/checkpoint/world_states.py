@@ -1,0 +1,94 @@
+"""Cases: worlds that one host leaves for another, as bytes, and what the caller says of them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cavmarl.parallel.processes.state_image import Image
+
+__all__ = ["Move", "buffers", "moves_of", "pack", "unpack"]
+
+Array = NDArray[Any]
+Bytes = NDArray[np.uint8]
+
+
+class Move(NamedTuple):
+    """What becomes of the worlds of one host, which follow each other before and after.
+
+    Attributes:
+        first: of those that it keeps, as it has counted up to now.
+        last: the one after the last that it keeps.
+        before: how many come that stand before those.
+        coming: how many come.
+        bytes: of their cases.
+    """
+
+    first: int
+    last: int
+    before: int = 0
+    coming: int = 0
+    bytes: int = 0
+
+
+def moves_of(before: Sequence[int], after: Sequence[int]) -> list[Move]:
+    """What each host keeps, and how many worlds come to it.
+
+    Args:
+        before: (m + 1,) the first world of each host, and the end of the last one's.
+        after: the same, when all have moved.
+    """
+    moves = []
+    for k in range(len(before) - 1):
+        own, wanted = range(*before[k : k + 2]), range(*after[k : k + 2])
+        first, last = max(own.start, wanted.start), min(own.stop, wanted.stop)
+        if first >= last:  # it keeps none; all that come stand before nothing
+            moves.append(Move(0, 0, len(wanted), len(wanted)))
+        else:
+            coming = len(wanted) - (last - first)
+            moves.append(Move(first - own.start, last - own.start, first - wanted.start, coming))
+    return moves
+
+
+def buffers(count: int, size: int) -> tuple[NDArray[np.int64], Bytes]:
+    """Room for some cases: the bytes of each, and all of them one behind the other."""
+    return np.empty(count, dtype=np.int64), np.empty(size, dtype=np.uint8)
+
+
+def pack(image: Image, worlds: Sequence[Sequence[Array]]) -> tuple[NDArray[np.int64], Bytes]:
+    """Cases of some worlds, as `buffers` has room for.
+
+    Args:
+        image: to write each into.
+        worlds: arrays of each, of the same dtypes.
+    """
+    cases = []
+    for arrays in worlds:
+        image.write(arrays)
+        cases.append(image.content().copy())
+    sizes = np.array([case.size for case in cases], dtype=np.int64)
+    return sizes, np.concatenate([np.empty(0, dtype=np.uint8), *cases])
+
+
+def unpack(
+    image: Image, sizes: NDArray[np.int64], content: Bytes, dtypes: Sequence[np.dtype[Any]]
+) -> list[list[Array]]:
+    """The arrays of each of some worlds.
+
+    Args:
+        image: to read each from.
+        sizes: of the cases.
+        content: their bytes.
+        dtypes: of the arrays of each.
+
+    Raises:
+        WorkerError: they are not what was packed.
+    """
+    worlds = []
+    for case in np.split(content, np.cumsum(sizes)[:-1]) if sizes.size else []:
+        image.put(case)
+        worlds.append([array.copy() for array in image.read(dtypes)])
+    return worlds

@@ -1,0 +1,156 @@
+"""`OrderedWorlds`: worlds that live elsewhere, and do what they are told."""
+
+from __future__ import annotations
+
+import logging
+from abc import ABC, abstractmethod
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+import cavmarl.core.errors
+from cavmarl.balance.balance_plan import Plan
+from cavmarl.balance.plan_text import describe_plan
+from cavmarl.core.errors import CavmarlError, WorkerDeathError, WorkerFailureError
+from cavmarl.parallel.driven_vehicles import Driven
+from cavmarl.parallel.mover import Mover
+from cavmarl.parallel.step_arrays import StepArrays
+from cavmarl.parallel.step_placement import Placement
+from cavmarl.parallel.work_shares import Part
+from cavmarl.parallel.worlds_job import Task
+from cavmarl.shards.shard import Commands
+
+__all__ = ["OrderedWorlds", "own_error"]
+
+ASKED_AT_ONCE = 500  # agents: an answer is one message
+
+log = logging.getLogger("cavmarl.workers")
+
+
+class OrderedWorlds(ABC):
+    """What is the same wherever the worlds live; see `arrays.SteppedWorlds`.
+
+    Attributes:
+        arrays: what goes in and comes out.
+        placement: who hosts what.
+        mover: has that changed; None: it does not change.
+    """
+
+    arrays: StepArrays
+    placement: Placement
+    mover: Mover | None = None
+    _steps = 0  # since the last reset of all
+
+    @property
+    def plans(self) -> tuple[Plan, ...]:
+        """Who hosts what now."""
+        return self.placement.plans
+
+    @abstractmethod
+    def _pids(self) -> Mapping[int, int]:
+        """Of the workers' processes, as far as this machine can look at them."""
+
+    @abstractmethod
+    def _settle(self, parts: list[Part]) -> None:
+        """Note who runs what from now on."""
+
+    @abstractmethod
+    def _send(self, task: Task, letter: Any, commits: bool) -> None:
+        """Let all workers do a task.
+
+        Args:
+            task: which.
+            letter: what it needs to know.
+            commits: whether it changes the worlds.
+
+        Raises:
+            WorkerFailureError: one has raised an error.
+            WorkerDeathError: one has died of it too often.
+        """
+
+    @abstractmethod
+    def _ask(self, task: Task, world: int, more: Any = None) -> Any:
+        """Let the worker of a world answer.
+
+        Args:
+            task: what is asked.
+            world: its number; numbers from the end count as they do for arrays.
+            more: than the world that the worker has to know.
+        """
+
+    def reset(self, seed: int | None, first_world: int) -> None:
+        """Begin an episode in the worlds of `chosen`."""
+        self._order(Task.RESET, {"seed": seed, "first_world": first_world})
+        if self.arrays.chosen.all():
+            self._steps = 0
+            log.info("%s", "\n\n".join(map(describe_plan, self.plans)))
+
+    def step(self, commands: Commands) -> None:
+        """Let the agents act, and reset the worlds whose episode is over, now or a step later.
+
+        Before that worlds or zones change their worker, if it is time.
+        """
+        parts = None if self.mover is None else self.mover.before_step(self._order, self._pids)
+        if parts is not None:
+            self._settle(parts)
+        arrays = self.arrays
+        if commands.controls is not arrays.controls:  # where `CavVectorEnv` decodes them
+            arrays.controls[:] = commands.controls
+            arrays.meta_actions[:] = commands.meta_actions
+        arrays.declared[:] = commands.declared if commands.declared.size else 0
+        self._order(Task.STEP)
+        self._steps += 1
+
+    def suggest(self) -> None:
+        """Write what the built-in driver would do in the agents' place."""
+        self._order(Task.SUGGEST, commits=False)
+
+    def write_states(self) -> None:
+        """Write the global state of each world."""
+        self._order(Task.WRITE_STATES, commits=False)
+
+    def ticks(self) -> NDArray[np.int64]:
+        """(W,) ticks since each world's reset."""
+        return self.arrays.ticks.copy()
+
+    def state_hash(self, world: int) -> str:
+        """Hex digest of one world."""
+        return str(self._ask(Task.STATE_HASH, world))
+
+    def traffic_stats(self, world: int) -> dict[str, float]:
+        """Traffic of one world since its reset."""
+        found: dict[str, float] = self._ask(Task.TRAFFIC_STATS, world)
+        return found
+
+    def driven(self, world: int, agents: Sequence[int]) -> list[Driven]:
+        """The vehicles of some agents of one world, in no order."""
+        found = []
+        for first in range(0, len(agents), ASKED_AT_ONCE):
+            some = list(agents[first : first + ASKED_AT_ONCE])
+            found += [Driven(*row) for row in self._ask(Task.DRIVEN, world, some)]
+        return found
+
+    def signal_phases(self, world: int) -> NDArray[np.int32]:
+        """(num_signals,) PHASE rows that are on in one world."""
+        return np.array(self._ask(Task.SIGNAL_PHASES, world), dtype=np.int32)
+
+    def _order(self, task: Task, letter: Any = None, commits: bool = True) -> None:
+        """`_send`, with the errors that the worlds would raise in this process."""
+        try:
+            self._send(task, letter, commits)
+        except WorkerFailureError as failure:
+            raise own_error(failure) from failure
+        except WorkerDeathError as death:
+            death.add_note(f"in step {self._steps + 1} since the reset")
+            raise
+
+
+def own_error(failure: WorkerFailureError) -> CavmarlError:
+    """An error that the worlds raise on purpose, as they would raise it in this process."""
+    kind = getattr(cavmarl.core.errors, failure.kind, None)
+    if not isinstance(kind, type) or not issubclass(kind, CavmarlError):
+        return failure
+    takes_text = "__init__" not in vars(kind)
+    return kind(failure.text) if takes_text else failure

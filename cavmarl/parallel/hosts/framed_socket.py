@@ -1,0 +1,266 @@
+"""`Wire`: frames over a connection.
+
+A frame is a head of fixed size, a letter (mostly a few numbers, as the dialect writes them: between
+hosts as JSON) and data (bytes of arrays, which both ends know the shapes of). Nothing in it is ever
+run: whoever sends one can say numbers.
+
+    head    magic, version, kind, order, bytes of the letter, bytes of the data,
+            checksum of the data, checksum of the head and the letter
+    letter  nothing if there is nothing to say
+    data    arrays one behind the other, as they lie in memory (little-endian)
+"""
+
+from __future__ import annotations
+
+import json
+import socket
+import struct
+import zlib
+from collections.abc import Callable, Sequence
+from enum import IntEnum
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cavmarl.core.errors import CorruptMessageError, UnknownVersionError
+
+__all__ = [
+    "HOSTS",
+    "MAGIC",
+    "MAX_DATA",
+    "MAX_LETTER",
+    "VERSION",
+    "Dialect",
+    "Frame",
+    "Kind",
+    "Wire",
+]
+
+Array = NDArray[Any]
+
+MAGIC = b"cavW"
+VERSION = 1
+MAX_LETTER = 1 << 17
+MAX_DATA = 1 << 34
+MAX_PIECES = 512  # buffers in one call of the system
+
+_HEAD = struct.Struct("<4sHHQIQI")
+_SUM = struct.Struct("<I")
+_HEAD_BYTES = _HEAD.size + _SUM.size
+
+
+class Kind(IntEnum):
+    """What a frame says."""
+
+    ORDER = 0  # do this
+    READY = 1  # a host can be given orders
+    BEAT = 2  # it is working
+    DONE = 3  # what has come out
+    FAILED = 4  # an exception: its class, its words, its traceback
+
+
+class Dialect(NamedTuple):
+    """What both ends of a connection agree on.
+
+    Attributes:
+        magic: four bytes that every frame begins with.
+        version: of everything that is said.
+        kinds: of frames.
+        max_letter: bytes of the longest letter.
+        max_data: bytes of the most data.
+        write: a letter's bytes.
+        read: the letter again; a ValueError says that it is none.
+        cure: what to do about another version.
+    """
+
+    magic: bytes
+    version: int
+    kinds: type[IntEnum]
+    max_letter: int
+    max_data: int
+    write: Callable[[Any], bytes]
+    read: Callable[[bytes], Any]
+    cure: str
+
+
+def _as_json(letter: Any) -> bytes:
+    return json.dumps(letter).encode()
+
+
+HOSTS = Dialect(
+    MAGIC,
+    VERSION,
+    Kind,
+    MAX_LETTER,
+    MAX_DATA,
+    _as_json,
+    json.loads,
+    "install the same cavmarl on all machines",
+)
+
+
+class Frame(NamedTuple):
+    """What stands before a frame's data.
+
+    Attributes:
+        kind: what it says.
+        order: which order it belongs to.
+        letter: as the dialect reads it; None: nothing.
+        size: bytes of data.
+        checksum: of them.
+    """
+
+    kind: IntEnum
+    order: int
+    letter: Any
+    size: int
+    checksum: int
+
+
+class Wire:
+    """One end of a connection; everything blocks, at most as long as the socket's timeout.
+
+    Args:
+        connection: a socket of a stream, which the wire owns from here on.
+        dialect: that both ends speak.
+
+    Attributes:
+        is_torn: a frame was begun and not ended, so what follows cannot be understood.
+    """
+
+    def __init__(self, connection: socket.socket, dialect: Dialect = HOSTS) -> None:
+        if connection.family != socket.AF_UNIX:
+            connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        self._socket = connection
+        self._dialect = dialect
+        self._frame: Frame | None = None
+        self.is_torn = False
+
+    def fileno(self) -> int:
+        """The socket's descriptor."""
+        return self._socket.fileno()
+
+    def send(
+        self, kind: IntEnum, order: int, letter: Any = None, arrays: Sequence[Array] = ()
+    ) -> None:
+        """Send one frame.
+
+        Args:
+            kind: what it says.
+            order: which order it belongs to.
+            letter: as the dialect can write it.
+            arrays: contiguous.
+
+        Raises:
+            OSError: the other end is gone, or does not read.
+        """
+        dialect = self._dialect
+        text = b"" if letter is None else dialect.write(letter)
+        data = [array.data.cast("B") for array in arrays if array.nbytes]
+        checksum = _checksum(data)
+        size = sum(len(piece) for piece in data)
+        head = _HEAD.pack(dialect.magic, dialect.version, kind, order, len(text), size, checksum)
+        start = b"".join((head, _SUM.pack(zlib.crc32(text, zlib.crc32(head))), text))
+        self.is_torn = True
+        self._send_all([memoryview(start), *data])
+        self.is_torn = False
+
+    def receive(self) -> Frame:
+        """What stands before the next frame's data, which then has to be taken or skipped.
+
+        Raises:
+            EOFError: the other end has ended.
+            OSError: it is gone, or sends nothing.
+            MessageError: this is no frame.
+        """
+        dialect = self._dialect
+        self.is_torn = True
+        raw = self._read(_HEAD_BYTES)
+        head = bytes(raw[: _HEAD.size])
+        magic, version, kind, order, letter_size, size, checksum = _HEAD.unpack(head)
+        if magic != dialect.magic:
+            raise CorruptMessageError(f"{head[:4]!r} begins no frame")
+        if version != dialect.version:
+            raise UnknownVersionError(
+                f"a frame of version {version}, this is {dialect.version}: {dialect.cure}"
+            )
+        if letter_size > dialect.max_letter or size > dialect.max_data:
+            raise CorruptMessageError(f"a frame of {letter_size} + {size} bytes is none")
+        text = bytes(self._read(letter_size))
+        if _SUM.unpack(raw[_HEAD.size :])[0] != zlib.crc32(text, zlib.crc32(head)):
+            raise CorruptMessageError("the head of a frame is not what was sent")
+        self._frame = _frame(dialect, kind, order, text, size, checksum)
+        return self._frame
+
+    def take(self, arrays: Sequence[Array]) -> None:
+        """Read the data of the frame that was received.
+
+        Args:
+            arrays: contiguous; they are filled one after the other.
+
+        Raises:
+            EOFError: the other end has ended.
+            OSError: it is gone, or sends no more.
+            MessageError: these are not the data that were sent, or as many.
+        """
+        frame = self._frame
+        assert frame is not None
+        pieces = [array.data.cast("B") for array in arrays if array.nbytes]
+        room = sum(len(piece) for piece in pieces)
+        if room != frame.size:
+            raise CorruptMessageError(f"{frame.size} bytes of data: {room} were to come")
+        for piece in pieces:
+            self._fill(piece)
+        if frame.checksum != _checksum(pieces):
+            raise CorruptMessageError("the data of a frame are not what was sent")
+        self._frame, self.is_torn = None, False
+
+    def skip(self) -> None:
+        """Read the data of the frame that was received, and forget them."""
+        assert self._frame is not None
+        self.take([np.empty(self._frame.size, dtype=np.uint8)])
+
+    def close(self) -> None:
+        """End the connection."""
+        self._socket.close()
+
+    def _send_all(self, pieces: list[memoryview]) -> None:
+        while pieces:
+            sent = self._socket.sendmsg(pieces[:MAX_PIECES])
+            while pieces and sent >= len(pieces[0]):
+                sent -= len(pieces.pop(0))
+            if sent:
+                pieces[0] = pieces[0][sent:]
+
+    def _read(self, size: int) -> bytearray:
+        raw = bytearray(size)
+        self._fill(memoryview(raw))
+        return raw
+
+    def _fill(self, piece: memoryview) -> None:
+        while piece:
+            got = self._socket.recv_into(piece)
+            if not got:
+                raise EOFError("the connection has ended")
+            piece = piece[got:]
+
+
+def _frame(dialect: Dialect, kind: int, order: int, text: bytes, size: int, checksum: int) -> Frame:
+    """The same, understood.
+
+    Raises:
+        CorruptMessageError: it says nothing that is known.
+    """
+    try:
+        letter = dialect.read(text) if text else None
+        return Frame(dialect.kinds(kind), order, letter, size, checksum)
+    except ValueError as error:
+        raise CorruptMessageError(f"a frame that says nothing: {error}") from error
+
+
+def _checksum(pieces: Sequence[memoryview]) -> int:
+    found = 0
+    for piece in pieces:
+        found = zlib.crc32(piece, found)
+    return found

@@ -1,0 +1,101 @@
+"""What hosts run, an order under way, and what is committed."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cavmarl.core.errors import WorkerFailureError
+
+__all__ = ["Arrays", "HostProgram", "OpenOrder", "Say", "Truth"]
+
+Array = NDArray[Any]
+Arrays = Sequence[Array]
+Say = Callable[[int, bool], tuple[Any, Arrays]]
+"""Part, whether its host knows what is committed → the letter to it, and its arrays."""
+
+
+@dataclass(frozen=True)
+class HostProgram:
+    """What hosts run.
+
+    Attributes:
+        parts: of the job, in words.
+        sizes: of each part to begin with, as the job counts.
+        tasks: names of the job's tasks.
+        noted: the task whose inputs are noted, in the place of an image.
+        code: what all machines have to have in common.
+    """
+
+    parts: tuple[str, ...]
+    sizes: tuple[int, ...]
+    tasks: tuple[str, ...]
+    noted: int
+    code: str
+
+
+@dataclass
+class OpenOrder:
+    """An order that is being carried out.
+
+    Attributes:
+        number: of the order.
+        task: of the job.
+        say: what is said to each part.
+        outputs: part, answer → arrays that what comes out is written to.
+        sizes: of the parts once it has been carried out.
+        saves: an image is to come of each part.
+        ordered_s: when it was given, by `time.monotonic`.
+        first_death: how many hosts had died before.
+        pending: parts that have not carried it out.
+        is_void: it was interrupted, and only has to come to its end.
+        answers: of the parts that have.
+        images: of theirs.
+        failure: the exception of the first part that had one.
+    """
+
+    number: int
+    task: int
+    say: Say
+    outputs: Callable[[int, Any], Arrays]
+    sizes: Sequence[int]
+    saves: bool
+    ordered_s: float
+    first_death: int
+    pending: set[int]
+    is_void: bool = False
+    answers: dict[int, Any] = field(default_factory=dict)
+    images: dict[int, Array] = field(default_factory=dict)
+    failure: WorkerFailureError | None = None
+
+
+@dataclass
+class Truth:
+    """What is committed of one part.
+
+    Attributes:
+        size: of the part, as the job counts.
+        image: (n,) bytes of an image of its state; none: it has not begun yet.
+        since: (n,) bytes of the inputs of each order since.
+    """
+
+    size: int
+    image: Array = field(default_factory=lambda: np.zeros(0, dtype=np.uint8))
+    since: list[Array] = field(default_factory=list)
+
+    def after(self, order: OpenOrder, part: int) -> Truth:
+        """What is committed of a part once an order has been carried out."""
+        if order.saves:
+            return Truth(order.sizes[part], order.images[part])
+        return Truth(self.size, self.image, [*self.since, _bytes_of(order.say(part, True)[1])])
+
+
+def _bytes_of(arrays: Arrays) -> Array:
+    """(n,) A copy of the bytes of arrays, one behind the other."""
+    return np.concatenate(
+        [np.zeros(0, dtype=np.uint8), *(array.reshape(-1).view(np.uint8) for array in arrays)]
+    )

@@ -1,0 +1,204 @@
+"""What runs in a host: a job, order by order, for a caller on another machine."""
+
+from __future__ import annotations
+
+import os
+import socket
+import threading
+import time
+from collections.abc import Callable, Sequence
+from contextlib import suppress
+from typing import Any, NamedTuple, NoReturn, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cavmarl.core.errors import MessageError
+from cavmarl.parallel.hosts.framed_socket import Frame, Kind, Wire
+from cavmarl.parallel.hosts.listener import knock
+from cavmarl.parallel.processes.shared_memory import Segment
+from cavmarl.parallel.processes.state_image import Image, load_kernels
+from cavmarl.parallel.processes.worker_loop import NOTHING, OUT_OF_MEMORY, describe
+
+__all__ = ["BEAT_S", "Order", "Outcome", "RemoteJob", "serve"]
+
+Array = NDArray[Any]
+
+BEAT_S = 0.1
+_FIRST_IMAGE_BYTES = 1 << 12
+
+
+class Order(NamedTuple):
+    """The letter of an order; its data are an image, what was done since, and what to do now.
+
+    Attributes:
+        task: what to do.
+        letter: what is said to it.
+        size: of the part that it is about, before it.
+        image: bytes of the image to begin from; 0: go on from where you are.
+        repeats: how often what was done since has to be done again; each has data of its own.
+        repeated: the task that is.
+        saves: an image is to be sent of what comes out.
+    """
+
+    task: int
+    letter: Any
+    size: int
+    image: int
+    repeats: int
+    repeated: int
+    saves: bool
+
+
+class Outcome(NamedTuple):
+    """What comes out of a task.
+
+    Attributes:
+        answer: what the caller is to know, as JSON knows it; mostly nothing.
+        arrays: that it is sent; of what shapes follows from the task and the answer.
+    """
+
+    answer: Any
+    arrays: Sequence[Array]
+
+
+class RemoteJob(Protocol):
+    """What a host does; every host can take up every part of it."""
+
+    @property
+    def code(self) -> str:
+        """What has to be the same on all machines for the same to come out."""
+        ...
+
+    def fit(self, size: int) -> None:
+        """Be ready for a part of that size."""
+        ...
+
+    def inputs(self, task: int, letter: Any) -> Sequence[Array]:
+        """Arrays that an order of this task fills, as many as its letter says."""
+        ...
+
+    def perform(self, task: int, letter: Any) -> Outcome:
+        """Do a task; raises what it likes."""
+        ...
+
+    def save(self) -> Sequence[Array]:
+        """All that another host needs to go on from here."""
+        ...
+
+    def load(self, saved: Sequence[Array]) -> None:
+        """Go on from what `save` has given."""
+        ...
+
+
+def serve(
+    make_job: Callable[[], RemoteJob], place: tuple[str, int], secret: bytes, number: int
+) -> NoReturn:
+    """The whole life of a host; its process ends with the connection.
+
+    Args:
+        make_job: with every kernel loaded.
+        place: where the caller listens.
+        secret: of those who belong to it.
+        number: of this host.
+
+    Raises:
+        OSError: the caller cannot be reached.
+        EOFError: whoever listens there does not want us.
+        ForeignRunError: it is not the caller.
+    """
+    line = _Line(knock(place, secret, number))
+    with suppress(EOFError, OSError, MessageError):  # the caller is gone, or wants us no more
+        try:
+            job = make_job()
+            load_kernels()
+        except Exception as error:
+            line.reply(Kind.FAILED, describe(error))
+        else:
+            told = {"pid": os.getpid(), "machine": socket.gethostname(), "code": job.code}
+            line.reply(Kind.READY, told)
+        taken, given = (Image(Segment.make(_FIRST_IMAGE_BYTES)) for _ in range(2))
+        while True:
+            frame, data = line.hear()
+            try:
+                letter, arrays = _carry_out(job, Order(*frame.letter), data, taken, given)
+            except MemoryError:
+                os._exit(OUT_OF_MEMORY)
+            except Exception as error:
+                line.reply(Kind.FAILED, describe(error))
+            else:
+                line.reply(Kind.DONE, letter, arrays)
+    os._exit(0)
+
+
+def _carry_out(
+    job: RemoteJob, order: Order, data: Array, taken: Image, given: Image
+) -> tuple[dict[str, Any], Sequence[Array]]:
+    """Do what an order asks for, from where it says that one should begin."""
+    if order.task == NOTHING:
+        return {"answer": None, "image": 0}, []
+    job.fit(order.size)
+    if order.image:
+        taken.put(data[: order.image])
+        job.load(list(taken.read([array.dtype for array in job.save()])))
+    at = order.image
+    for _ in range(order.repeats):
+        at = _fill(job.inputs(order.repeated, None), data, at)
+        job.perform(order.repeated, None)
+    _fill(job.inputs(order.task, order.letter), data, at)
+    answer, arrays = job.perform(order.task, order.letter)
+    if not order.saves:
+        return {"answer": answer, "image": 0}, arrays
+    given.write(job.save())
+    saved = given.content()
+    return {"answer": answer, "image": saved.nbytes}, [*arrays, saved]
+
+
+def _fill(arrays: Sequence[Array], data: Array, at: int) -> int:
+    """Fill arrays with bytes that lie one behind the other; where the rest begins."""
+    for array in arrays:
+        flat = array.reshape(-1).view(np.uint8)
+        flat[:] = data[at : at + flat.size]
+        at += flat.size
+    return at
+
+
+class _Line:
+    """The connection, over which the caller also hears that this process is at work.
+
+    A thread says so as long as the other one uses the processor. A process that is stopped says
+    nothing, and neither does one that sleeps where it should work.
+
+    Args:
+        wire: to the caller.
+    """
+
+    def __init__(self, wire: Wire) -> None:
+        self._wire = wire
+        self._lock = threading.Lock()
+        self._order = -1  # that is being carried out
+        self._clock = time.pthread_getcpuclockid(threading.get_ident())
+        threading.Thread(target=self._beat, daemon=True).start()
+
+    def hear(self) -> tuple[Frame, Array]:
+        """The next order, and its data."""
+        frame = self._wire.receive()
+        self._order = frame.order
+        data = np.empty(frame.size, dtype=np.uint8)
+        self._wire.take([data])
+        return frame, data
+
+    def reply(self, kind: Kind, letter: Any, arrays: Sequence[Array] = ()) -> None:
+        """Say what has become of it."""
+        with self._lock:
+            order, self._order = max(self._order, 0), -1
+            self._wire.send(kind, order, letter, arrays)
+
+    def _beat(self) -> NoReturn:
+        spent = 0
+        while True:
+            time.sleep(BEAT_S)
+            before, spent = spent, time.clock_gettime_ns(self._clock)
+            with self._lock, suppress(OSError):  # the other thread hears of it, too
+                if self._order >= 0 and spent > before:
+                    self._wire.send(Kind.BEAT, self._order)

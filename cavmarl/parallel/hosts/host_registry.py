@@ -1,0 +1,223 @@
+"""`Company`: the hosts that are there, from their call at the door to their end."""
+
+from __future__ import annotations
+
+import selectors
+import socket
+import time
+from contextlib import suppress
+from dataclasses import dataclass
+from typing import Protocol
+
+from cavmarl.core.errors import MessageError, WorkerFailureError, WorkerStartError
+from cavmarl.parallel.hosts.framed_socket import Kind, Wire
+from cavmarl.parallel.hosts.listener import MAX_GUESTS, Door, Guest
+
+__all__ = ["ENDED", "SILENCE_S", "Company", "Host", "Launcher"]
+
+ENDED = (EOFError, ConnectionError)  # of a connection, as it does when the process at its end dies
+
+SILENCE_S = 0.8  # of a host that is at work, and tells so every `host.BEAT_S`
+
+
+class Launcher(Protocol):
+    """Who starts hosts, and starts those again that die.
+
+    Attributes:
+        address: of this machine, under which they reach it.
+    """
+
+    address: str
+
+    def start(self, place: tuple[str, int], secret: bytes) -> None:
+        """Start all of them; each runs `host.serve`.
+
+        Raises:
+            WorkerStartError: they cannot be started.
+        """
+        ...
+
+    def restart(self, number: int) -> None:
+        """End one that may still run, and start it again."""
+        ...
+
+    def trouble(self) -> str | None:
+        """Why a host does not come, in words."""
+        ...
+
+    def close(self) -> None:
+        """End all of them."""
+        ...
+
+
+@dataclass
+class Host:
+    """One host.
+
+    Attributes:
+        wire: to it.
+        number: of those that were started.
+        pid: of its process, on its machine.
+        machine: its name.
+        is_ready: it can be given orders.
+        is_gone: its connection has ended, and nobody has missed it yet.
+        knows: its memory is what is committed.
+        part: that it has; -1: none.
+        given_s: when it was given its last order, by `time.monotonic`.
+        heard_s: when something was heard of it.
+    """
+
+    wire: Wire
+    number: int
+    pid: int = 0
+    machine: str = ""
+    is_ready: bool = False
+    is_gone: bool = False
+    knows: bool = False
+    part: int = -1
+    given_s: float = 0.0
+    heard_s: float = 0.0
+
+    def __str__(self) -> str:
+        return f"host {self.number} on {self.machine or 'its machine'}"
+
+
+class Company:
+    """Lets hosts in and watches all connections at once.
+
+    Args:
+        launcher: starts them.
+        code: what they have to have in common with this process; see `host.RemoteJob`.
+
+    Attributes:
+        free: hosts that are ready and have no part.
+
+    Raises:
+        WorkerStartError: nobody can listen, or hosts cannot be started.
+    """
+
+    def __init__(self, launcher: Launcher, code: str) -> None:
+        self.free: list[Host] = []
+        self._launcher = launcher
+        self._code = code
+        self._hosts: dict[int, Host] = {}
+        self._guests: list[Guest] = []
+        self._door = Door(launcher.address)
+        self._selector = selectors.DefaultSelector()
+        self._selector.register(self._door, selectors.EVENT_READ, self._door)
+        try:
+            launcher.start(self._door.place, self._door.secret)
+        except BaseException:
+            self.close()
+            raise
+
+    def look(self, wait_s: float) -> list[Host]:
+        """Wait until something has happened.
+
+        Args:
+            wait_s: at most so long.
+
+        Returns:
+            hosts with a part that have something to say, or have ended.
+
+        Raises:
+            WorkerFailureError: an exception in one before it was ready.
+            WorkerStartError: one is of another version.
+        """
+        speaking: list[Host] = []
+        for key, _ in self._selector.select(wait_s):
+            match key.data:
+                case Door():
+                    self._welcome()
+                case Guest():
+                    self._listen(key.data)
+                case Host() as host if host.part >= 0:
+                    speaking.append(host)
+                case Host() as host:
+                    self._wake(host)
+        now = time.monotonic()
+        for guest in [guest for guest in self._guests if guest.until_s < now]:
+            self._show_out(guest)
+        return speaking
+
+    def drop(self, host: Host, restart: bool) -> None:
+        """Forget a host.
+
+        Args:
+            host: the one.
+            restart: its process may still run.
+        """
+        self.mute(host)
+        host.wire.close()
+        if self._hosts.get(host.number) is host:
+            del self._hosts[host.number]
+        if host in self.free:
+            self.free.remove(host)
+        if restart:
+            self._launcher.restart(host.number)
+
+    def mute(self, host: Host) -> None:
+        """Hear no more of a host whose connection has ended."""
+        with suppress(KeyError):
+            self._selector.unregister(host.wire)
+        host.is_gone = True
+
+    def close(self) -> None:
+        """End all hosts, and let nobody in any more."""
+        self._launcher.close()
+        self._door.close()
+        for guest in self._guests:
+            guest.close()
+        for host in self._hosts.values():
+            host.wire.close()
+        self._selector.close()
+
+    def _welcome(self) -> None:
+        guest = self._door.open()
+        if guest is not None and len(self._guests) == MAX_GUESTS:
+            guest.close()
+        elif guest is not None:
+            self._guests.append(guest)
+            self._selector.register(guest, selectors.EVENT_READ, guest)
+
+    def _listen(self, guest: Guest) -> None:
+        try:
+            connection = guest.listen()
+        except (EOFError, OSError, MessageError):  # a stranger: that is no news
+            self._show_out(guest)
+            return
+        if connection is not None:
+            self._guests.remove(guest)
+            self._selector.unregister(guest)
+            self._admit(connection, guest.number)
+
+    def _show_out(self, guest: Guest) -> None:
+        self._guests.remove(guest)
+        self._selector.unregister(guest)
+        guest.close()
+
+    def _admit(self, connection: socket.socket, number: int) -> None:
+        if number in self._hosts and self._hosts[number].part < 0:
+            self.drop(self._hosts[number], restart=False)
+        connection.settimeout(SILENCE_S)
+        host = self._hosts[number] = Host(Wire(connection), number)
+        self._selector.register(host.wire, selectors.EVENT_READ, host)
+
+    def _wake(self, host: Host) -> None:
+        """Hear of a host without a part whether it is ready, or has ended."""
+        try:
+            frame = host.wire.receive()
+            host.wire.skip()
+        except (EOFError, OSError, MessageError) as error:
+            self.drop(host, restart=not isinstance(error, ENDED))
+            return
+        if frame.kind == Kind.FAILED:
+            raise WorkerFailureError(host.number, str(host), **frame.letter)
+        host.pid, host.machine = frame.letter["pid"], frame.letter["machine"]
+        if frame.letter["code"] != self._code:
+            raise WorkerStartError(
+                f"{host} runs {frame.letter['code']}, this machine {self._code}: install the same "
+                "versions on all machines, or results would differ"
+            )
+        host.is_ready = True
+        self.free.append(host)

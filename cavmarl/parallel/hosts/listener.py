@@ -1,0 +1,175 @@
+"""Who may be a host: a door that only those come through who know the secret.
+
+The caller listens on one port, and hosts call there; they listen nowhere. Both prove that they know
+the secret, which Ray has handed to the host, without sending it: each answers the other's random
+number with its HMAC. Until that is done nothing else is read, and no more than a few bytes.
+
+    host → caller   HELLO: magic, version, number of the host, random number
+    caller → host   random number, proof
+    host → caller   proof
+"""
+
+from __future__ import annotations
+
+import hmac
+import secrets
+import socket
+import struct
+import time
+
+from cavmarl.core.errors import ForeignRunError, UnknownVersionError, WorkerStartError
+from cavmarl.parallel.hosts.framed_socket import MAGIC, VERSION, Wire
+
+__all__ = ["MAX_GUESTS", "Door", "Guest", "knock"]
+
+NONCE = 16  # bytes of a random number
+PROOF = 32  # of an HMAC
+SECRET = 32
+GREETING_S = 5.0  # for a guest to prove who it is
+CALL_S = 5.0  # for the system to connect
+MAX_GUESTS = 64  # who are not known yet
+_HELLO = struct.Struct(f"<4sHI{NONCE}s")
+
+
+class Guest:
+    """Who has called and not proved who it is.
+
+    Args:
+        connection: to it.
+        secret: that it has to know.
+
+    Attributes:
+        until_s: for so long it may take, by `time.monotonic`.
+        number: that it says it has; -1: it has said nothing.
+    """
+
+    def __init__(self, connection: socket.socket, secret: bytes) -> None:
+        connection.setblocking(False)
+        self.until_s = time.monotonic() + GREETING_S
+        self.number = -1
+        self._socket = connection
+        self._secret = secret
+        self._heard = b""
+        self._expected = b""
+
+    def fileno(self) -> int:
+        """The socket's descriptor."""
+        return self._socket.fileno()
+
+    def listen(self) -> socket.socket | None:
+        """Take what it says; its connection, once it has proved that it knows the secret.
+
+        Raises:
+            OSError: it is gone.
+            EOFError: it has ended.
+            MessageError: it is a stranger, or of another version.
+        """
+        wanted = PROOF if self._expected else _HELLO.size
+        heard = self._socket.recv(wanted - len(self._heard))
+        if not heard:
+            raise EOFError("the connection has ended")
+        self._heard += heard
+        if len(self._heard) < wanted:
+            return None
+        said, self._heard = self._heard, b""
+        if not self._expected:
+            self._answer(said)
+            return None
+        if not hmac.compare_digest(said, self._expected):
+            raise ForeignRunError("somebody who does not know the secret has called")
+        return self._socket
+
+    def close(self) -> None:
+        """Let it go."""
+        self._socket.close()
+
+    def _answer(self, hello: bytes) -> None:
+        magic, version, self.number, _ = _HELLO.unpack(hello)
+        if magic != MAGIC:
+            raise ForeignRunError(f"somebody who says {hello[:4]!r} has called")
+        if version != VERSION:
+            raise UnknownVersionError(
+                f"host {self.number} speaks version {version}, this is {VERSION}: install the same "
+                "cavmarl on all machines"
+            )
+        ours = secrets.token_bytes(NONCE)
+        self._expected = _proof(self._secret, b"host", hello + ours)
+        self._socket.sendall(ours + _proof(self._secret, b"caller", hello + ours))
+
+
+class Door:
+    """Listens.
+
+    Args:
+        address: of this machine, under which hosts reach it.
+
+    Attributes:
+        place: address and port.
+        secret: that hosts have to know.
+
+    Raises:
+        WorkerStartError: nobody can listen there.
+    """
+
+    def __init__(self, address: str) -> None:
+        self.secret = secrets.token_bytes(SECRET)
+        try:
+            self._listener = socket.create_server((address, 0), backlog=MAX_GUESTS)
+        except OSError as error:
+            raise WorkerStartError(f"cannot listen on {address}: {error}") from error
+        self._listener.setblocking(False)
+        self.place: tuple[str, int] = self._listener.getsockname()[:2]
+
+    def fileno(self) -> int:
+        """The socket's descriptor."""
+        return self._listener.fileno()
+
+    def open(self) -> Guest | None:
+        """Let in who has called; None: it is gone already."""
+        try:
+            connection, _ = self._listener.accept()
+        except OSError:
+            return None
+        return Guest(connection, self.secret)
+
+    def close(self) -> None:
+        """Nobody can call any more."""
+        self._listener.close()
+
+
+def knock(place: tuple[str, int], secret: bytes, number: int) -> Wire:
+    """Call as a host; the caller may be busy for long before it answers.
+
+    Args:
+        place: address and port of the door.
+        secret: of those who belong here.
+        number: of the host.
+
+    Raises:
+        OSError: nobody listens there.
+        EOFError: whoever listens there does not want us.
+        ForeignRunError: it does not know the secret.
+    """
+    connection = socket.create_connection(place, CALL_S)
+    try:
+        connection.settimeout(None)
+        hello = _HELLO.pack(MAGIC, VERSION, number, secrets.token_bytes(NONCE))
+        connection.sendall(hello)
+        heard = b""
+        while len(heard) < NONCE + PROOF:
+            more = connection.recv(NONCE + PROOF - len(heard))
+            if not more:
+                raise EOFError(f"who listens at {place} has ended the connection")
+            heard += more
+        nonce, proof = heard[:NONCE], heard[NONCE:]
+        if not hmac.compare_digest(proof, _proof(secret, b"caller", hello + nonce)):
+            raise ForeignRunError(f"who listens at {place} does not know the secret")
+        connection.sendall(_proof(secret, b"host", hello + nonce))
+    except BaseException:
+        connection.close()
+        raise
+    return Wire(connection)
+
+
+def _proof(secret: bytes, who: bytes, said: bytes) -> bytes:
+    return hmac.digest(secret, who + said, "sha256")

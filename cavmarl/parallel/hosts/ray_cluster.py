@@ -1,0 +1,159 @@
+"""The Ray cluster that hosts run on: joining it, and which node is given which host."""
+
+from __future__ import annotations
+
+import os
+import socket
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+from cavmarl.balance.load_score import Candidate, Utilisation, select
+from cavmarl.core.errors import ConfigError, WorkerStartError, require
+
+__all__ = ["Node", "choose_nodes", "join", "leave", "nodes", "nodes_with"]
+
+ADDRESS = "RAY_ADDRESS"  # the environment's variable that Ray itself reads
+CALL_S = 5.0
+RELEASE_S = 2.0  # Ray hears of an actor's end by and by
+_RESOURCES = ("CPU", "memory", "GPU")
+_joined = 0  # how many have joined by `join`, where the program itself had not
+
+
+@dataclass(frozen=True)
+class Node:
+    """A node of the cluster; shares are those that somebody has reserved with Ray.
+
+    Attributes:
+        name: its id.
+        cpus: free ones.
+        use: what is reserved.
+        hosted: how many hosts it has been given.
+    """
+
+    name: str
+    cpus: int
+    use: Utilisation
+    hosted: int = 0
+
+
+def join() -> bool:
+    """Join the cluster that this program belongs to, or start one on this machine.
+
+    A program that has called `ray.init` is a member already. Else it is the cluster of
+    `RAY_ADDRESS`, the one that `ray start` has started here, or a new one that ends with its last
+    user.
+
+    Returns:
+        whether `leave` has to be called.
+
+    Raises:
+        MissingExtraError: Ray is not installed.
+        ConfigError: the program is only a client of a cluster.
+        WorkerStartError: there is no cluster at the address.
+    """
+    global _joined
+    ray = require("ray", "ray")
+    address = os.environ.get(ADDRESS, "")
+    if address.startswith("ray://") or ray.util.client.ray.is_connected():
+        raise ConfigError(
+            "hosts send their frames to this program, so it has to run on a node of the cluster: "
+            "start it there (ray job submit, or ray exec), without ray:// in its address"
+        )
+    if ray.is_initialized() and not _joined:
+        return False
+    if not ray.is_initialized():
+        try:
+            _call(address)
+            ray.init(include_dashboard=False, log_to_driver=False, logging_level="ERROR")
+        except (OSError, RuntimeError, ValueError) as error:
+            raise WorkerStartError(
+                f"no Ray cluster at {address or 'the address that ray start has left'}: {error}. "
+                f"Start one (ray start --head), or unset {ADDRESS} for one on this machine"
+            ) from error
+    _joined += 1
+    return True
+
+
+def _call(address: str) -> None:
+    """See whether somebody listens there: Ray would try for minutes.
+
+    Raises:
+        OSError: nobody does.
+    """
+    host, colon, port = address.rpartition(":")
+    if colon and port.isdigit():
+        socket.create_connection((host, int(port)), CALL_S).close()
+
+
+def leave() -> None:
+    """Leave the cluster, if nobody else of this program needs it; a new one ends."""
+    global _joined
+    _joined -= 1
+    ray = require("ray", "ray")
+    if _joined == 0 and ray.is_initialized():
+        ray.shutdown()
+
+
+def nodes() -> list[Node]:
+    """The nodes that are alive, this one first."""
+    ray = require("ray", "ray")
+    from ray._private.state import available_resources_per_node  # Ray has no public name for it
+
+    free: dict[str, dict[str, float]] = available_resources_per_node()
+    here = ray.get_runtime_context().get_node_id()
+    alive = [one for one in ray.nodes() if one["Alive"] and one["NodeID"] in free]
+    alive.sort(key=lambda one: (one["NodeID"] != here, one["NodeManagerAddress"], one["NodeID"]))
+    return [_node(one["NodeID"], one["Resources"], free[one["NodeID"]]) for one in alive]
+
+
+def nodes_with(cpus: int) -> list[Node]:
+    """The nodes, after a short wait for CPUs that have just been given back."""
+    until_s = time.monotonic() + RELEASE_S
+    while True:
+        known = nodes()
+        if sum(node.cpus for node in known) >= cpus or time.monotonic() > until_s:
+            return known
+        time.sleep(0.1)
+
+
+def choose_nodes(known: Sequence[Node], workers: int) -> list[str]:
+    """A node for each host: admissible, of the lowest LoadScore, with the fewest hosts so far.
+
+    Args:
+        known: all nodes.
+        workers: hosts with a CPU of their own.
+
+    Returns:
+        names of nodes.
+
+    Raises:
+        ConfigError: more workers than free CPUs.
+        NoAdmissibleWorkerError: the rest of the CPUs is on nodes that are too busy.
+    """
+    free = sum(node.cpus for node in known)
+    if workers > free:
+        raise ConfigError(
+            f"workers = {workers}: the Ray cluster has {free} free CPUs on {len(known)} nodes; use "
+            "fewer workers, or add nodes (ray start --address=…); ray status tells who uses them"
+        )
+    left = list(known)
+    chosen: list[str] = []
+    for _ in range(workers):
+        candidates = [
+            Candidate(k, node.use, node.hosted, available=node.cpus > 0)
+            for k, node in enumerate(left)
+        ]
+        k = select(candidates).worker
+        left[k] = replace(left[k], cpus=left[k].cpus - 1, hosted=left[k].hosted + 1)
+        chosen.append(left[k].name)
+    return chosen
+
+
+def _node(name: str, total: dict[str, Any], free: dict[str, Any]) -> Node:
+    shares = []
+    for resource in _RESOURCES:
+        has = total.get(resource, 0.0)
+        shares.append(min(max(1.0 - free.get(resource, 0.0) / has, 0.0), 1.0) if has else 0.0)
+    return Node(name, int(free.get("CPU", 0.0)), Utilisation(*shares))

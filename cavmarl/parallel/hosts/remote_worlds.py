@@ -1,0 +1,228 @@
+"""`RemoteWorlds`: worlds shared out over the machines of a Ray cluster."""
+
+from __future__ import annotations
+
+import json
+from bisect import bisect_right
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict
+from itertools import accumulate, pairwise
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cavmarl.core.errors import ConfigError, WorkerFailureError
+from cavmarl.engine.compilation import compiled_before
+from cavmarl.engine.simulation import Simulation
+from cavmarl.engine.world_setup import World
+from cavmarl.parallel.checkpoint.world_states import Move, buffers, moves_of
+from cavmarl.parallel.commanded_worlds import OrderedWorlds, own_error
+from cavmarl.parallel.hosts.host_commands import Arrays, HostProgram
+from cavmarl.parallel.hosts.host_pool import HostPool
+from cavmarl.parallel.hosts.hosted_worlds_job import code_stamp, host_worlds, inputs_of, results_of
+from cavmarl.parallel.hosts.ray_actors import RayActors
+from cavmarl.parallel.journaled_worlds import refuse_watched
+from cavmarl.parallel.mover import Mover
+from cavmarl.parallel.processes.worker_pool import Death
+from cavmarl.parallel.step_arrays import StepArrays, layout_of
+from cavmarl.parallel.step_placement import Placement
+from cavmarl.parallel.work_shares import Part, parts_of
+from cavmarl.parallel.worlds_job import Task, fingerprint
+
+__all__ = ["RemoteWorlds"]
+
+Array = NDArray[np.uint8]
+
+
+class RemoteWorlds(OrderedWorlds):
+    """W worlds over m hosts, whole worlds each.
+
+    Args:
+        world: what each is made of.
+        base_dir: the folder that its relative files start from, on every machine.
+        num_worlds: W.
+        workers: m, from 1 to W; None: as many as the cluster has free CPUs.
+        in_next_step: when worlds begin anew; see `SteppedWorlds`.
+
+    Attributes:
+        world: what each is made of.
+        arrays: of this process; what hosts send is written to them.
+        pool: the hosts.
+        in_next_step: when worlds begin anew.
+        placement: who hosts what.
+        mover: has that changed; None: it does not change.
+
+    Raises:
+        MissingExtraError: Ray is not installed.
+        ConfigError: a setting that worlds elsewhere cannot have, more hosts than worlds, or than
+            CPUs.
+        WorkerError: no cluster, or no host comes.
+    """
+
+    def __init__(
+        self,
+        world: World,
+        base_dir: Path,
+        num_worlds: int,
+        workers: int | None,
+        in_next_step: bool = False,
+    ) -> None:
+        self.world = world
+        self.in_next_step = in_next_step
+        config = world.config
+        refuse_watched(
+            config.zones, "of worlds on hosts", "run them on this machine; leave out hosts"
+        )
+        if config.workers.watch:
+            raise ConfigError(
+                "workers.watch = True, hosts = 'ray': only this machine is looked at; leave it out "
+                "(Ray tells what is reserved on each node), or leave out the hosts"
+            )
+        if config.workers.sensors:
+            raise ConfigError(
+                f"workers.sensors = {config.workers.sensors}, hosts = 'ray': sensor workers are on "
+                "the machine of the worlds; leave it 0, or leave out the hosts"
+            )
+        if not compiled_before():
+            Simulation(config, world.network, 1, world.demand, world.partition)
+        layout = layout_of(config, world.capacity, num_worlds).items()
+        self.arrays = StepArrays.of({name: np.zeros(shape, kind) for name, (kind, shape) in layout})
+        recipe = {
+            "config": asdict(config),
+            "base_dir": str(base_dir.resolve()),
+            "fingerprint": fingerprint(world),
+            "in_next_step": in_next_step,
+            "measures": bool(config.workers.balance_steps),
+        }
+
+        def told(count: int) -> str:
+            return json.dumps({**recipe, "size": -(-num_worlds // count)})
+
+        actors = RayActors(host_worlds, told, workers, num_worlds)
+        self.placement = Placement(world, num_worlds, actors.workers)
+        parts = parts_of(self.placement.plans, world.partition.count)
+        self._spent_s = np.zeros((num_worlds, 1))
+        if config.workers.balance_steps and actors.workers > 1:
+            every, zones = config.workers.balance_steps, world.partition.count
+            self.mover = Mover(self.placement, zones, every, self._spent_s)
+        program = HostProgram(
+            _names(parts),
+            tuple(part.last - part.first for part in parts),
+            tuple(task.name.lower().replace("_", " ") for task in Task),
+            Task.STEP,
+            code_stamp(),
+        )
+        try:
+            self.pool = HostPool(actors, program, config.workers.timeout_s, config.workers.repeats)
+        except WorkerFailureError as failure:
+            raise own_error(failure) from failure
+        self._cases: dict[int, Array] = {}  # worlds that are on their way
+        self._look()
+
+    @property
+    def simulation(self) -> Simulation:
+        """Refused: the worlds live elsewhere.
+
+        Raises:
+            ConfigError: always.
+        """
+        raise ConfigError("the worlds live on other machines: use workers=0 to look into them")
+
+    @property
+    def deaths(self) -> list[Death]:
+        """Of hosts, up to now."""
+        return self.pool.deaths
+
+    def close(self) -> None:
+        """End the hosts, and the cluster if it was started for them."""
+        self.pool.close()
+
+    def _pids(self) -> Mapping[int, int]:
+        return dict.fromkeys(range(len(self._mine)), 0)  # nobody looks: they run elsewhere
+
+    def _settle(self, parts: list[Part]) -> None:
+        self.pool.rename(_names(parts))
+
+    def _look(self) -> None:
+        """Note where worlds are by what is committed, whatever was interrupted before."""
+        self._sizes = self.pool.sizes
+        self._bounds = [0, *accumulate(self._sizes)]
+        self._mine = [self.arrays.part(*bounds) for bounds in pairwise(self._bounds)]
+
+    def _send(self, task: Task, letter: Any, commits: bool) -> None:
+        if self.pool.sizes != self._sizes:
+            self._look()
+        if task == Task.PACK:
+            self._pack(letter)
+        elif task == Task.UNPACK:
+            self._unpack(letter)
+        else:
+            self._carry_out(task, letter, commits)
+
+    def _carry_out(self, task: Task, letter: Any, commits: bool) -> None:
+        measures = task == Task.STEP and self.world.config.workers.balance_steps > 0
+        spent_s = [np.zeros(size) for size in self._sizes] if measures else []
+
+        def outputs(k: int, ended: Any) -> Arrays:
+            return [*results_of(task, self._mine[k], ended), *spent_s[k : k + 1]]
+
+        letters = [letter] * len(self._mine)
+        if task == Task.RESET:  # a host counts its worlds from 0
+            firsts = [letter["first_world"] + first for first in self._bounds[:-1]]
+            letters = [{**letter, "first_world": first} for first in firsts]
+        inputs = [inputs_of(task, arrays) for arrays in self._mine]
+        self.pool.run(task, letters, inputs, outputs, commits)
+        if measures:
+            self._spent_s[:, 0] += np.concatenate(spent_s)
+
+    def _pack(self, bounds: Sequence[int]) -> None:
+        """Let hosts send the worlds that are to be another's."""
+        moves = moves_of(self._bounds, bounds)
+        found = [buffers(0, 0) for _ in moves]
+
+        def outputs(k: int, answer: Any) -> Arrays:
+            found[k] = buffers(*answer)
+            return found[k]
+
+        nothing: list[Arrays] = [()] * len(moves)
+        self.pool.run(Task.PACK, moves, nothing, outputs, commits=False)
+        self._cases = {}
+        for move, (first, last), (sizes, content) in zip(
+            moves, pairwise(self._bounds), found, strict=True
+        ):
+            kept = range(first + move.first, first + move.last)
+            leaving = [world for world in range(first, last) if world not in kept]
+            cases = np.split(content, np.cumsum(sizes)[:-1]) if leaving else []
+            self._cases.update(zip(leaving, cases, strict=True))
+
+    def _unpack(self, bounds: Sequence[int]) -> None:
+        """Let hosts go on with the worlds that are theirs from now on."""
+        moves: list[Move] = []
+        inputs: list[Arrays] = []
+        for k, move in enumerate(moves_of(self._bounds, bounds)):
+            own = range(*self._bounds[k : k + 2])
+            kept = own[move.first : move.last]
+            wanted = range(*bounds[k : k + 2])
+            cases = [self._cases[world] for world in wanted if world not in kept]
+            sizes = np.array([case.size for case in cases], dtype=np.int64)
+            moves.append(move._replace(bytes=int(sizes.sum())))
+            inputs.append([sizes, *cases])
+        after = [last - first for first, last in pairwise(bounds)]
+        self.pool.run(Task.UNPACK, moves, inputs, lambda k, answer: (), sizes=after)
+        self._cases = {}
+        self._look()
+
+    def _ask(self, task: Task, world: int, more: Any = None) -> Any:
+        if self.pool.sizes != self._sizes:
+            self._look()
+        number = range(len(self.arrays.mask))[world]
+        k = bisect_right(self._bounds, number) - 1
+        number -= self._bounds[k]
+        return self.pool.ask(k, task, number if more is None else [number, more])
+
+
+def _names(parts: Sequence[Part]) -> tuple[str, ...]:
+    """What each host runs, in words."""
+    return tuple(part.names[0] for part in parts)

@@ -1,0 +1,103 @@
+"""The jobs of all workers that run worlds, made where they are forked."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping, Sequence
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from cavmarl.config.env import EnvConfig
+from cavmarl.core.errors import WorkerStartError
+from cavmarl.engine.world_setup import make_world
+from cavmarl.handoff.coordinator.coordinator_setup import Run
+from cavmarl.parallel.checkpoint.action_log import Tape
+from cavmarl.parallel.checkpoint.action_log_job import TapeJob
+from cavmarl.parallel.checkpoint.checkpoint_job import DiaryJob
+from cavmarl.parallel.checkpoint.checkpoint_log import Diary
+from cavmarl.parallel.checkpoint.moving_job import MovingJob
+from cavmarl.parallel.journaled_worlds import runs_of, unwatched
+from cavmarl.parallel.local_worlds import LocalWorlds
+from cavmarl.parallel.processes.shared_huge_pages import huge_shared_zeros
+from cavmarl.parallel.processes.shared_memory import Segment, arrays_in
+from cavmarl.parallel.processes.state_image import Image
+from cavmarl.parallel.processes.worker_loop import Job
+from cavmarl.parallel.sensor_workers.sensor_worker_setup import farm_of
+from cavmarl.parallel.step_arrays import StepArrays, layout_of
+from cavmarl.parallel.team.team_job import LeaderJob
+from cavmarl.parallel.work_shares import Part
+from cavmarl.parallel.worlds_job import commands_of, fingerprint
+
+__all__ = ["make_jobs"]
+
+
+def make_jobs(recipe: Mapping[str, Any]) -> list[Job]:
+    """The jobs of all workers, every kernel loaded.
+
+    Args:
+        recipe: what `pooled.PooledWorlds` writes.
+
+    Raises:
+        WorkerStartError: a file is not what it was.
+    """
+    from cavmarl.config.io import validate  # pydantic is slow to import
+
+    config = validate(EnvConfig, recipe["config"], "the environment")
+    world = make_world(config, Path(recipe["base_dir"]))
+    if fingerprint(world) != recipe["fingerprint"]:
+        raise WorkerStartError(
+            f"the files of '{config.name}' have changed while workers were started: try again"
+        )
+    layout = layout_of(config, recipe["capacity"], recipe["num_worlds"])
+    arrays = StepArrays.of(arrays_in(Segment(recipe["arrays"], 0).map(), layout))
+    one = LocalWorlds(unwatched(world), 1, warm=True)
+    parts = [Part(*given) for given in recipe["parts"]]
+
+    def make(first: int, last: int, runs: Sequence[Run] | None = None) -> LocalWorlds:
+        part, in_next_step = arrays.part(first, last), recipe["in_next_step"]
+        count = last - first
+        return LocalWorlds(world, count, part, in_next_step=in_next_step, like=one, runs=runs)
+
+    def make_watched(part: Part) -> LocalWorlds:
+        return hire(make(part.first, part.last, runs_of(recipe["runs"], part)), part)
+
+    def hire(worlds: LocalWorlds, part: Part) -> LocalWorlds:
+        if config.workers.sensors:
+            memory = Segment(os.dup(recipe["arrays"]), 0)
+            bounds = (part.first, part.last)
+            base_dir, num_worlds = Path(recipe["base_dir"]), recipe["num_worlds"]
+            worlds.hire(farm_of(world, base_dir, memory, bounds, num_worlds))
+        return worlds
+
+    mover = recipe["mover"]
+    spent_s = None
+    if mover is not None:
+        spent_s = arrays_in(Segment(mover["spent"], 0).map(), mover["layout"])["spent_s"]
+        cases = [Image(Segment(fd, 0)) for fd in mover["cases"]]
+        if cases:
+            bounds = [part.first for part in parts] + [parts[-1].last]
+            whole_s = spent_s[:, 0]
+            return [MovingJob(make, bounds, k, cases, whole_s) for k in range(len(parts))]
+    jobs: list[Job] = []
+    for part, descriptors in zip(parts, recipe["diaries"], strict=True):
+        if recipe["runs"]:
+            (tape,) = descriptors
+            commands = commands_of(arrays.part(part.first, part.last))
+            jobs.append(TapeJob(partial(make_watched, part), part.first, Tape(tape, commands)))
+            continue
+        diary = Diary(config, part.last - part.first, descriptors)
+        if len(part.zones) > 1:
+            worlds = LocalWorlds(
+                world,
+                1,
+                arrays.part(part.first, part.last),
+                in_next_step=recipe["in_next_step"],
+                zeros=huge_shared_zeros,
+            )
+            theirs = None if spent_s is None else spent_s[part.first]
+            leader = LeaderJob(hire(worlds, part), part.first, part.zones, diary, theirs)
+            jobs += [leader, *leader.followers()]
+        else:
+            jobs.append(DiaryJob(hire(make(part.first, part.last), part), part.first, diary))
+    return jobs

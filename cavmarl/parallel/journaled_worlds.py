@@ -1,0 +1,100 @@
+"""Worlds with a journal or a plan of faults: where they can be run, and what workers are told."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+from cavmarl.config.env import ZonesConfig
+from cavmarl.core.errors import ConfigError
+from cavmarl.engine.world_setup import World
+from cavmarl.handoff.coordinator.coordinator_setup import Run, check_faults, prepare_runs
+from cavmarl.parallel.work_shares import Part
+
+__all__ = [
+    "RunText",
+    "check_watched",
+    "is_watched",
+    "refuse_watched",
+    "runs_as_text",
+    "runs_of",
+    "unwatched",
+]
+
+RunText = tuple[str, str]  # the run in hex, and its journal; empty: it has none
+
+
+def is_watched(zones: ZonesConfig) -> bool:
+    """Whether what coordinators do is written down or struck by faults, beside the results."""
+    return bool(zones.journal or zones.faults)
+
+
+def unwatched(world: World) -> World:
+    """The same world without that, to make tables or load kernels with."""
+    zones = replace(world.config.zones, journal="", faults="", reproducers="")
+    return world._replace(config=replace(world.config, zones=zones))
+
+
+def refuse_watched(zones: ZonesConfig, where: str, cure: str) -> None:
+    """Refuse what only the workers of whole worlds on this machine can have.
+
+    Raises:
+        ConfigError: a journal or faults.
+    """
+    for name in ("journal", "faults"):
+        if getattr(zones, name):
+            raise ConfigError(f"zones.{name} = {getattr(zones, name)!r} {where}: {cure}")
+
+
+def check_watched(world: World, parts: Sequence[Part], may_change: bool) -> None:
+    """See that worlds with a journal or faults can be run by these workers.
+
+    Args:
+        world: what each is made of.
+        parts: what each team of workers runs.
+        may_change: whether worlds move from worker to worker.
+
+    Raises:
+        ConfigError: a world is divided among workers, or moves; or the faults cannot be.
+    """
+    zones = world.config.zones
+    if not is_watched(zones):
+        return
+    num_worlds = parts[-1].last
+    if any(len(part.zones) > 1 for part in parts):
+        refuse_watched(
+            zones,
+            "of one world over several workers",
+            "its coordinator has to share a process with all zones; use at most "
+            f"workers={num_worlds}",
+        )
+    if may_change:
+        refuse_watched(
+            zones,
+            "of worlds that move from worker to worker",
+            "a journal stays in its process; leave workers.balance_steps 0",
+        )
+    check_faults(zones, world.partition.count, num_worlds)
+
+
+def runs_as_text(zones: ZonesConfig, num_worlds: int) -> list[RunText]:
+    """What the workers are told of all worlds; journals are begun.
+
+    Raises:
+        JournalError: one cannot be.
+    """
+    if not is_watched(zones):
+        return []
+    return [
+        (run.hex(), "" if journal is None else str(journal))
+        for run, journal in prepare_runs(zones, num_worlds)
+    ]
+
+
+def runs_of(texts: Sequence[RunText], part: Part) -> list[Run]:
+    """The same of the worlds of one worker."""
+    return [
+        Run(bytes.fromhex(run), Path(journal) if journal else None)
+        for run, journal in texts[part.first : part.last]
+    ]

@@ -1,0 +1,1 @@
+"""Compiled copies between replicas of shared arrays."""

@@ -1,0 +1,269 @@
+"""`LocalWorlds`: worlds of this process, with autoreset."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import asdict
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cavmarl.balance.balance_plan import Plan
+from cavmarl.core.huge_pages import huge_zeros
+from cavmarl.core.memory import Zeros
+from cavmarl.core.numba.repeated import repeated
+from cavmarl.engine.global_state import global_state
+from cavmarl.engine.kernels.step_results import Results, keep_last, report, report_who_goes_on
+from cavmarl.engine.simulation import Simulation
+from cavmarl.engine.spaces import state_space, write_sensed
+from cavmarl.engine.world_setup import World
+from cavmarl.handoff.coordinator.coordinator_setup import Run
+from cavmarl.parallel.driven_vehicles import Driven, driven_by
+from cavmarl.parallel.sensor_workers.sensor_pool import SensorFarm
+from cavmarl.parallel.step_arrays import StepArrays, layout_of
+from cavmarl.sensors.mounted.catalogue import frame_layout
+from cavmarl.shards.shard import Commands
+from cavmarl.traffic.sumo.sumo_history import ToldLog
+
+__all__ = ["LocalWorlds"]
+
+
+class LocalWorlds:
+    """W worlds of one environment; no loop of Python runs over agents or vehicles in a step.
+
+    Args:
+        world: what each is made of.
+        num_worlds: W.
+        arrays: where to write; None: arrays of its own.
+        warm: have all kernels ready now.
+        in_next_step: when worlds begin anew; see `SteppedWorlds`.
+        zeros: makes the arrays that shards write.
+        like: worlds of the same environment, whose tables are used; None: they are made.
+        runs: see `Simulation`.
+
+    Attributes:
+        world: what each is made of.
+        arrays: what goes into a step, and what comes out.
+        simulation: the worlds.
+        in_next_step: when worlds begin anew.
+        farm: its sensor workers; None: there are none.
+    """
+
+    def __init__(
+        self,
+        world: World,
+        num_worlds: int,
+        arrays: StepArrays | None = None,
+        warm: bool = False,
+        in_next_step: bool = False,
+        zeros: Zeros = huge_zeros,
+        like: LocalWorlds | None = None,
+        runs: Sequence[Run] | None = None,
+    ) -> None:
+        self.world = world
+        self.in_next_step = in_next_step
+        self.farm: SensorFarm | None = None
+        form = world.config.observation
+        self._senses = form.mode == "sensors"
+        self._is_flat = form.kind == "flat"
+        self.simulation: Simulation = Simulation(
+            world.config,
+            world.network,
+            num_worlds,
+            world.demand,
+            world.partition,
+            observations=None if arrays is None or self._senses else arrays.observations,
+            frames=None if arrays is None else arrays.frames,
+            warm=warm,
+            zeros=zeros,
+            like=None if like is None else like.simulation,
+            runs=runs,
+        )
+        if arrays is None:
+            arrays = _own_arrays(self.simulation, num_worlds)
+            if not self._senses:
+                arrays = arrays._replace(observations=self.simulation.outputs.observations)
+        self.arrays = arrays
+        self._horizon = world.config.max_steps
+        self._steps = np.zeros(num_worlds, dtype=np.int64)
+        self._waiting = np.zeros(num_worlds, dtype=np.bool_)  # over, and not begun anew yet
+        self._results = Results(*(getattr(arrays, name) for name in Results._fields))
+        self._report = repeated(report)
+        self._report_who_goes_on = repeated(report_who_goes_on)
+        self._keep_last = repeated(keep_last)
+        if warm:
+            self._write_results()
+            self._write_who_goes_on()
+            self._keep_observations()
+            self._steps[:] = 0
+
+    def reset(self, seed: int | None, first_world: int) -> None:
+        """Begin an episode in the worlds of `chosen`."""
+        arrays, chosen = self.arrays, self.arrays.chosen
+        if seed is not None:
+            self.simulation.seed(seed, first_world)
+        self._begin(chosen)
+        outputs = self.simulation.outputs
+        arrays.mask[chosen] = outputs.present[chosen]
+        arrays.vehicle_ids[chosen] = outputs.vehicle_ids[chosen]
+        arrays.vehicle_done[chosen] = False
+        arrays.terms[chosen] = outputs.terms[chosen]
+        arrays.ticks[:] = self.simulation.ticks()
+        goes_on = arrays.mask.any(axis=1) | self.simulation.agents_to_come()
+        arrays.episode_over[chosen] = ~goes_on[chosen]
+        if not chosen.all():
+            arrays.observations[~arrays.mask] = 0.0
+
+    def step(self, commands: Commands) -> None:
+        """Let the agents act, and reset the worlds whose episode is over, now or a step later."""
+        simulation, arrays = self.simulation, self.arrays
+        simulation.step(commands)
+        self._show(simulation.everywhere)
+        if self.in_next_step and self._waiting.any():
+            waiting = self._waiting.copy()
+            self._begin(waiting)
+            self._steps[waiting] = -1  # what they have done in this step counts for nothing
+        some_ended = self._write_results()
+        if some_ended:
+            simulation.retire_agents()
+        some_over = self._write_who_goes_on()
+        if some_over or some_ended:
+            self._end(arrays.episode_over, some_over)
+        arrays.ticks[:] = simulation.ticks()
+
+    def _write_results(self) -> bool:
+        """Write what the agents have got; whether the trip of some vehicle has ended."""
+        outputs = self.simulation.outputs
+        return self._report(outputs, self._steps, self._horizon, self._results)
+
+    def _write_who_goes_on(self) -> bool:
+        """Write who acts next and what is over; whether an episode is."""
+        simulation = self.simulation
+        return self._report_who_goes_on(
+            simulation.outputs, simulation.gate, self._steps, self._horizon, self._results
+        )
+
+    def _end(self, over: NDArray[np.bool_], some_over: bool) -> None:
+        """Keep what those saw last who have ended, and begin the new episodes."""
+        arrays = self.arrays
+        self._keep_observations()
+        if arrays.frames:
+            ended = over | arrays.terminations.any(axis=1)
+            for name, frames in arrays.frames.items():
+                for final, array in zip(arrays.final_frames[name], frames, strict=True):
+                    final[ended] = array[ended]
+        if self.in_next_step:
+            self._waiting[over] = True
+            arrays.mask[over] = False
+        elif some_over:
+            self._begin(over)
+            arrays.mask[over] = self.simulation.outputs.present[over]
+
+    def _keep_observations(self) -> None:
+        """Of those who have ended."""
+        arrays = self.arrays
+        self._keep_last(
+            self._results, arrays.observations, arrays.final_observations, self.in_next_step
+        )
+
+    def _begin(self, chosen: NDArray[np.bool_]) -> None:
+        self.simulation.reset(chosen)
+        self._show(chosen)
+        self._steps[chosen] = 0
+        self._waiting[chosen] = False
+
+    def _show(self, chosen: NDArray[np.bool_]) -> None:
+        """Make what sensors have got in the chosen worlds (W,) what the agents observe."""
+        if self._senses and self._is_flat:
+            write_sensed(self.arrays.frames, chosen, self.arrays.observations)
+
+    def suggest(self) -> None:
+        """Write what the built-in driver would do in the agents' place."""
+        self.arrays.suggested[:] = 0.0
+        self.simulation.suggest(self.arrays.suggested)
+
+    def write_states(self) -> None:
+        """Write what `CavEnv.state` is of each world."""
+        simulation, space = self.simulation, state_space(self.simulation.capacity)
+        for world, state in enumerate(self.arrays.states):
+            state[:] = global_state(self.world.network, simulation.vehicles(world), space)
+
+    def ticks(self) -> NDArray[np.int64]:
+        """(W,) ticks since each world's reset."""
+        return self.simulation.ticks().copy()
+
+    def state_hash(self, world: int) -> str:
+        """Hex digest of one world."""
+        return self.simulation.state_hash(world)
+
+    def traffic_stats(self, world: int) -> dict[str, float]:
+        """Traffic of one world since its reset."""
+        stats = asdict(self.simulation.traffic_stats(world))
+        if self.world.config.v2x.enabled:
+            stats |= self.simulation.messages.statistics(world).to_dict()
+        return stats
+
+    def driven(self, world: int, agents: Sequence[int]) -> list[Driven]:
+        """The vehicles of some agents of one world, in no order."""
+        return driven_by(self.simulation, world, agents)
+
+    def signal_phases(self, world: int) -> NDArray[np.int32]:
+        """(num_signals,) PHASE rows that are on in one world; a view."""
+        return self.simulation.signal_phases(world)
+
+    def save(self) -> list[NDArray[Any]]:
+        """All that the next step depends on; views, to be copied."""
+        return [self._steps, self._waiting, *self.simulation.save()]
+
+    def load(self, saved: Sequence[NDArray[Any]]) -> None:
+        """Go on from what `save` gave; errors as of `Simulation.load`."""
+        self._steps[:], self._waiting[:] = saved[:2]
+        self.simulation.load(saved[2:])
+
+    def keep_logs(self) -> tuple[ToldLog, ...]:
+        """Keep what SUMO is told, which `load` needs: one log a world; see `SumoTraffic`."""
+        sumo = self.simulation.sumo
+        return () if sumo is None else sumo.keep_logs()
+
+    def share_of(self, world: int) -> list[NDArray[Any]]:
+        """What `save` would give if there were no world but one; views, to be copied."""
+        only = slice(world, world + 1)
+        return [self._steps[only], self._waiting[only], *self.simulation.share_of(world)]
+
+    def join(self, shares: Sequence[Sequence[NDArray[Any]]]) -> list[NDArray[Any]]:
+        """What `load` takes, of worlds of which each share has been one by itself."""
+        ended = [np.concatenate([share[n] for share in shares]) for n in range(2)]
+        return [*ended, *self.simulation.join([share[2:] for share in shares])]
+
+    @property
+    def num_parts(self) -> int:
+        """Arrays at the end of `save` that are there once a zone of each world."""
+        return len(self._steps) * self.world.partition.count
+
+    @property
+    def plans(self) -> tuple[Plan, ...]:
+        """None: there are no workers."""
+        return ()
+
+    def hire(self, farm: SensorFarm) -> None:
+        """From now on let others sense for the rigs; what they write is in `arrays`."""
+        mounted = self.simulation.mounted
+        assert mounted is not None
+        mounted.rig.sense = farm
+        self.farm = farm
+
+    def close(self) -> None:
+        """End the processes that the worlds have."""
+        if self.farm is not None:
+            self.farm.close()
+        self.simulation.close()
+
+
+def _own_arrays(simulation: Simulation, num_worlds: int) -> StepArrays:
+    layout = layout_of(simulation.config, simulation.capacity, num_worlds)
+    there = frame_layout(simulation.config, num_worlds)
+    made = {
+        name: np.zeros(shape, dtype) for name, (dtype, shape) in layout.items() if name not in there
+    }
+    return StepArrays.of(made)._replace(frames=simulation.frames)

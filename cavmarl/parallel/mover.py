@@ -1,0 +1,83 @@
+"""`Mover`: lets worlds, or zones of split worlds, change their worker while worlds are stepped."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cavmarl.parallel.step_placement import Placement
+from cavmarl.parallel.work_shares import Part, parts_of
+from cavmarl.parallel.worlds_job import Task
+
+__all__ = ["Mover"]
+
+Run = Callable[[Task, Any, bool], None]
+
+
+class Mover:
+    """Measures shards, plans anew from time to time, and has moved what the plans move.
+
+    Args:
+        placement: the plans.
+        num_zones: of each world.
+        every: so many steps from one round to the next.
+        spent_s: (W, zones) processor time of each shard from the start on, which others add up;
+            whole worlds count as one zone.
+
+    Attributes:
+        moves: of shards, up to now.
+        moved_s: how long they have taken together.
+    """
+
+    def __init__(
+        self, placement: Placement, num_zones: int, every: int, spent_s: NDArray[np.float64]
+    ) -> None:
+        self._placement = placement
+        self._num_zones = num_zones
+        self._every = every
+        self._spent_s = spent_s
+        self._steps = 0
+        self.moves = 0
+        self.moved_s = 0.0
+
+    def before_step(self, run: Run, pids: Callable[[], Mapping[int, int]]) -> list[Part] | None:
+        """Count a step; if it is time, plan anew and move.
+
+        Args:
+            run: lets all workers do a task.
+            pids: tells those of their processes.
+
+        Returns:
+            who runs what now; None: what they did before.
+        """
+        if self._steps < self._every:
+            self._steps += 1
+            return None
+        before = self._placement.plans
+        moves = self._placement.round(self._spent_s, self._steps, pids())
+        self._steps = 1
+        if not moves:
+            return None
+        parts = parts_of(self._placement.plans, self._num_zones)
+        began = time.perf_counter()
+        try:
+            self._order(run, parts)
+        except BaseException:
+            self._placement.take_back(before)
+            raise
+        lasted_s = time.perf_counter() - began
+        self.moves += self._placement.moved(lasted_s)
+        self.moved_s += lasted_s
+        return parts
+
+    def _order(self, run: Run, parts: list[Part]) -> None:
+        if not self._placement.in_row:
+            run(Task.HOST, [part.zones for part in parts], True)
+            return
+        bounds = [part.first for part in parts] + [parts[-1].last]
+        run(Task.PACK, bounds, False)
+        run(Task.UNPACK, bounds, True)

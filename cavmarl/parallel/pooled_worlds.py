@@ -1,0 +1,191 @@
+"""`PooledWorlds`: worlds shared out over worker processes."""
+
+from __future__ import annotations
+
+import warnings
+from dataclasses import asdict
+from itertools import accumulate, pairwise
+from pathlib import Path
+from typing import Any
+
+from cavmarl.core.errors import ConfigError, WorkerFailureError, WorkerStartError
+from cavmarl.engine.compilation import compiled_before
+from cavmarl.engine.simulation import Simulation
+from cavmarl.engine.world_setup import World
+from cavmarl.parallel.checkpoint.checkpoint_log import make_segments
+from cavmarl.parallel.checkpoint.moving_memory import MovingMemory
+from cavmarl.parallel.commanded_worlds import OrderedWorlds, own_error
+from cavmarl.parallel.journaled_worlds import check_watched, is_watched, runs_as_text, unwatched
+from cavmarl.parallel.mover import Mover
+from cavmarl.parallel.processes.process_barrier import usable_cores
+from cavmarl.parallel.processes.shared_memory import Segment, arrays_in, size_of
+from cavmarl.parallel.processes.worker_pool import Death, Pool, Program
+from cavmarl.parallel.sensor_workers.sensor_worker_setup import warn_if_crowded
+from cavmarl.parallel.step_arrays import StepArrays, layout_of
+from cavmarl.parallel.step_placement import Placement
+from cavmarl.parallel.work_shares import Part, parts_of
+from cavmarl.parallel.worlds_job import Task, fingerprint
+
+__all__ = ["PooledWorlds"]
+
+PROGRAM = "cavmarl.parallel.world_worker"
+
+
+class PooledWorlds(OrderedWorlds):
+    """W worlds over m worker processes.
+
+    Args:
+        world: what each is made of.
+        base_dir: the folder that its relative files start from.
+        num_worlds: W.
+        workers: m, from 1 to W times the zones of each; more than W divide the worlds.
+        in_next_step: when worlds begin anew; see `SteppedWorlds`.
+        program: that the processes run; None: the one that runs worlds.
+
+    Attributes:
+        world: what each is made of.
+        arrays: in shared memory; each worker writes those of its worlds.
+        pool: the processes.
+        in_next_step: when worlds begin anew.
+        placement: who hosts what.
+        mover: has that changed; None: it does not change.
+
+    Raises:
+        ConfigError: a setting that worlds of several processes cannot have, or more of those than
+            zones.
+        WorkerError: no process, or no memory.
+    """
+
+    def __init__(
+        self,
+        world: World,
+        base_dir: Path,
+        num_worlds: int,
+        workers: int,
+        in_next_step: bool = False,
+        program: str | None = None,
+    ) -> None:
+        self.world = world
+        self.in_next_step = in_next_step
+        config = world.config
+        self.placement = Placement(world, num_worlds, workers)
+        parts = parts_of(self.placement.plans, world.partition.count)
+        may_change = bool(config.workers.balance_steps) and workers > 1 and self.placement.in_row
+        check_watched(world, parts, may_change)
+        cores = len(usable_cores())
+        if workers > cores:
+            warnings.warn(
+                f"workers = {workers}: there are {cores} cores; more workers than cores do not "
+                "make it faster",
+                RuntimeWarning,
+                stacklevel=4,
+            )
+        if not compiled_before():
+            plain = unwatched(world)
+            Simulation(plain.config, world.network, 1, world.demand, world.partition)
+        capacity = world.capacity
+        layout = layout_of(config, capacity, num_worlds)
+        segment = Segment.make(size_of(layout))
+        try:
+            self.arrays = StepArrays.of(arrays_in(segment.map(), layout))
+        except WorkerStartError:
+            segment.close()
+            raise
+        memory = self._make_mover(num_worlds, workers)
+        may_change = self.mover is not None and self.placement.in_row
+        if may_change and config.workers.sensors:
+            segment.close()
+            raise ConfigError(
+                f"workers.balance_steps = {config.workers.balance_steps} with workers.sensors = "
+                f"{config.workers.sensors}: sensor workers belong to the worlds of one worker, "
+                "which would change; leave one of the two 0"
+            )
+        warn_if_crowded(config.workers.sensors, len(parts))
+        diaries = [
+            []
+            if may_change
+            else [Segment.make(0)]
+            if is_watched(config.zones)
+            else make_segments(config, part.last - part.first)
+            for part in parts
+        ]
+        recipe = {
+            "config": asdict(config),
+            "base_dir": str(base_dir.resolve()),
+            "fingerprint": fingerprint(world),
+            "num_worlds": num_worlds,
+            "capacity": capacity,
+            "arrays": segment.fd,
+            "in_next_step": in_next_step,
+            "parts": parts,
+            "diaries": [[one.fd for one in diary] for diary in diaries],
+            "runs": runs_as_text(config.zones, num_worlds),
+            "mover": None if memory is None else memory.recipe,
+        }
+        tasks = tuple(task.name.lower().replace("_", " ") for task in Task)
+        leaders = [0, *accumulate(len(part.zones) for part in parts)]
+        teams = tuple(tuple(range(*bounds)) for bounds in pairwise(leaders))
+        moving = () if memory is None else memory.segments
+        segments = (segment, *(one for diary in diaries for one in diary), *moving)
+        pins = config.workers.pin
+        what = Program(program or PROGRAM, recipe, _names(parts), segments, tasks, pins, teams)
+        try:
+            self.pool = Pool(what, config.workers.timeout_s, config.workers.repeats)
+        except WorkerFailureError as failure:
+            raise own_error(failure) from failure
+        self._asked = _leaders(parts)
+        self.placement.watch(self._pids())
+
+    def _make_mover(self, num_worlds: int, workers: int) -> MovingMemory | None:
+        """What the workers are to share for it; None: nothing moves."""
+        every = self.world.config.workers.balance_steps
+        if not every or workers == 1:
+            return None
+        num_zones, in_row = self.world.partition.count, self.placement.in_row
+        memory = MovingMemory(num_worlds, *((1, workers) if in_row else (num_zones, 0)))
+        self.mover = Mover(self.placement, num_zones, every, memory.spent_s)
+        return memory
+
+    @property
+    def simulation(self) -> Simulation:
+        """Refused: the worlds live in other processes.
+
+        Raises:
+            ConfigError: always.
+        """
+        raise ConfigError("the worlds live in worker processes: use workers=0 to look into them")
+
+    @property
+    def deaths(self) -> list[Death]:
+        """Of worker processes, up to now."""
+        return self.pool.deaths
+
+    def close(self) -> None:
+        """End the processes."""
+        self.pool.close()
+
+    def _settle(self, parts: list[Part]) -> None:
+        self._asked = _leaders(parts)
+        self.pool.rename(_names(parts))
+
+    def _pids(self) -> dict[int, int]:
+        return dict(enumerate(self.pool.pids))
+
+    def _send(self, task: Task, letter: Any, commits: bool) -> None:
+        self.pool.run(task, letter, commits)
+
+    def _ask(self, task: Task, world: int, more: Any = None) -> Any:
+        number = range(len(self.arrays.mask))[world]
+        letter = number if more is None else [number, more]
+        return self.pool.ask(self._asked[number], task, letter)
+
+
+def _names(parts: list[Part]) -> tuple[str, ...]:
+    """What each worker runs, in words."""
+    return tuple(name for part in parts for name in part.names)
+
+
+def _leaders(parts: list[Part]) -> list[int]:
+    """Who answers for each world."""
+    firsts = [0, *accumulate(len(part.zones) for part in parts)]
+    return [k for k, part in zip(firsts, parts, strict=False) for _ in range(part.first, part.last)]

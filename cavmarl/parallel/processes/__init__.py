@@ -1,0 +1,1 @@
+"""Worker processes of this machine: forked, watched, replaced, with memory that they share."""

@@ -1,0 +1,214 @@
+"""`ForkServer`: the process that forks a pool's workers, as the pool sees it."""
+
+from __future__ import annotations
+
+import json
+import os
+import select
+import signal
+import socket
+import subprocess
+import sys
+import threading
+from collections.abc import Mapping
+from contextlib import suppress
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from cavmarl.core.errors import WorkerFailureError, WorkerStartError
+from cavmarl.parallel.processes.process_barrier import WAKE
+from cavmarl.parallel.processes.worker_loop import MAIL, MAX_MESSAGE
+
+__all__ = ["ForkServer", "Process", "ServerGoneError"]
+
+ANSWER_MS = 2_000  # for a fork or a burial; who takes longer is stopped or broken
+END_S = 1.0  # for all to end by themselves
+
+# One thread a worker: the processes share the cores out among themselves.
+_ONE_THREAD = dict.fromkeys(
+    ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "VECLIB_MAXIMUM_THREADS"), "1"
+)
+
+
+class ServerGoneError(Exception):
+    """The forking process does not answer any more."""
+
+
+@dataclass
+class Process:
+    """One worker's process.
+
+    Attributes:
+        pid: its number, which nobody else gets until it is buried.
+        pidfd: readable when it has ended.
+        wire: socket to it.
+        mail: what it has sent and nobody has read.
+    """
+
+    pid: int
+    pidfd: int
+    wire: socket.socket
+    mail: list[bytes] = field(default_factory=list)
+
+    def collect(self) -> None:
+        """Take what has come through the wire; calls to wake up are forgotten."""
+        with suppress(BlockingIOError, ConnectionResetError):
+            while self.take():
+                pass
+
+    def take(self) -> bool:
+        """Take one message; False: the other end is closed.
+
+        Raises:
+            BlockingIOError: none has come.
+            ConnectionResetError: the other end was closed before it had read all.
+        """
+        message = self.wire.recv(MAX_MESSAGE, socket.MSG_DONTWAIT)
+        if message and message != WAKE:
+            self.mail.append(message[len(MAIL) :])
+        return bool(message)
+
+    def kill(self) -> None:
+        """See to it that it is dead, whatever it was doing."""
+        with suppress(ProcessLookupError):
+            signal.pidfd_send_signal(self.pidfd, signal.SIGKILL)
+        select.select([self.pidfd], [], [])
+
+    def release(self) -> None:
+        """Give its descriptors back."""
+        os.close(self.pidfd)
+        self.wire.close()
+
+
+class ForkServer:
+    """Starts the process and asks it for workers.
+
+    Args:
+        program: module that is run, and calls `worker.serve`.
+        start: what it is told, as JSON knows it; descriptors by number.
+        descriptors: that it and its workers get.
+
+    Raises:
+        WorkerStartError: it did not come up.
+        WorkerFailureError: an exception in it.
+    """
+
+    def __init__(
+        self, program: str, start: Mapping[str, Any], descriptors: tuple[int, ...]
+    ) -> None:
+        ours, theirs = _wires()
+        told = {
+            **start,
+            "pool": theirs.fileno(),
+            "parent": os.getpid(),
+            "dies_with_thread": threading.current_thread() is threading.main_thread(),
+        }
+        self._wire = ours
+        try:
+            self._process = subprocess.Popen(
+                [sys.executable, "-P", "-m", program, json.dumps(told)],
+                stdin=subprocess.DEVNULL,
+                pass_fds=(theirs.fileno(), *descriptors),
+                env={**os.environ, **_ONE_THREAD, "PYTHONPATH": _python_path()},
+            )
+        except OSError as error:
+            ours.close()
+            raise WorkerStartError(f"{sys.executable}: {error}") from error
+        finally:
+            theirs.close()
+        try:
+            self._greet()
+        except BaseException:
+            self.close()
+            raise
+
+    @property
+    def pid(self) -> int:
+        """Of the process."""
+        return self._process.pid
+
+    def fork(self, number: int) -> Process:
+        """A new process for a worker.
+
+        Raises:
+            ServerGoneError: nobody answers.
+            WorkerStartError: this process has no descriptors left.
+        """
+        ours, theirs = _wires()
+        try:
+            pid = int(self._ask({"fork": number}, theirs.fileno())["pid"])
+            return Process(pid, os.pidfd_open(pid), ours)
+        except (ServerGoneError, ProcessLookupError) as error:
+            ours.close()
+            raise ServerGoneError from error
+        finally:
+            theirs.close()
+
+    def bury(self, process: Process) -> int:
+        """Let a process that is dead be forgotten.
+
+        Returns:
+            its exit status; of one that was killed, minus the signal.
+
+        Raises:
+            ServerGoneError: nobody answers.
+        """
+        return int(self._ask({"bury": process.pid})["status"])
+
+    def close(self) -> None:
+        """End the process, and with it all workers."""
+        self._wire.close()
+        try:
+            self._process.wait(END_S)
+        except subprocess.TimeoutExpired:
+            self._process.kill()  # the system kills the workers
+            self._process.wait()
+
+    def _greet(self) -> None:
+        """Wait until it is ready."""
+        message = self._wire.recv(MAX_MESSAGE)
+        if not message:
+            status = self._process.wait()
+            raise WorkerStartError(
+                f"the process that starts workers ended with {status} before it was ready; what it "
+                "printed stands on standard error"
+            )
+        answer = json.loads(message)
+        if "ready" not in answer:
+            raise WorkerFailureError(
+                -1, "the process that starts them", answer["kind"], answer["text"],
+                answer["traceback"],
+            )  # fmt: skip
+
+    def _ask(self, question: Mapping[str, Any], descriptor: int | None = None) -> dict[str, Any]:
+        descriptors = [] if descriptor is None else [descriptor]
+        try:
+            socket.send_fds(self._wire, [json.dumps(question).encode()], descriptors)
+            poll = select.poll()
+            poll.register(self._wire, select.POLLIN)
+            message = self._wire.recv(MAX_MESSAGE) if poll.poll(ANSWER_MS) else b""
+        except OSError as error:
+            raise ServerGoneError from error
+        if not message:
+            raise ServerGoneError
+        answer: dict[str, Any] = json.loads(message)
+        return answer
+
+
+def _wires() -> tuple[socket.socket, socket.socket]:
+    """The two ends of a wire that carries messages.
+
+    Raises:
+        WorkerStartError: no descriptors are left.
+    """
+    try:
+        return socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+    except OSError as error:
+        raise WorkerStartError(f"no socket: {error}") from error
+
+
+def _python_path() -> str:
+    """Where the process finds this package, whatever has been done to `sys.path`."""
+    here = str(Path(__file__).resolve().parents[3])
+    return os.pathsep.join([here, *(path for path in sys.path if path)])

@@ -1,0 +1,297 @@
+"""How a process waits for another: it looks for a moment, then it sleeps.
+
+Each side has a line of 64-bit words that only itself writes. Word `NUMBER` counts what it has done;
+word `ASLEEP` says whether it has to be woken. To wait is to look at the other's number for a while
+in a compiled loop, which costs a fraction of a microsecond, and then to sleep on a socket, which
+costs no processor at all.
+
+All words are read and written sequentially consistent, so of two that write one word and read the
+other's, at least one sees what the other wrote: who is about to sleep sees the number, or who has
+written the number sees that somebody sleeps. And whoever sees a number sees all that was written
+before it.
+"""
+
+from __future__ import annotations
+
+import os
+import platform
+import socket
+import time
+from contextlib import suppress
+from typing import Any
+
+import numba.core.config
+import numpy as np
+from llvmlite import ir
+from numba.core import cgutils, types
+from numba.extending import intrinsic
+from numpy.typing import NDArray
+
+from cavmarl.core.numba import kernel
+from cavmarl.core.numba.repeated import repeated
+
+__all__ = [
+    "ASLEEP",
+    "LONG_WORK_S",
+    "NUMBER",
+    "WORDS",
+    "Meeting",
+    "Words",
+    "load_kernels",
+    "post",
+    "present_core",
+    "usable_cores",
+    "wait_for",
+]
+
+Words = NDArray[np.int64]
+
+WORDS = 8  # of a line; of a cache line, too
+NUMBER, ASLEEP = 0, 1  # words of either side; the others are the pool's
+
+SHORT_S = 20e-6  # that anybody looks before it sleeps
+LONG_S = 200e-6  # that it looks where the last time has not been longer
+LONG_WORK_S = 500e-6  # after which nobody looks for so long
+PAUSES = 4  # looks before it lets others run
+ROUNDS = 16  # of those before it looks at the clock
+ALONE_S = 300e-6  # that who waits so, and has a core for itself, looks without a break
+AWAKE_S = 10e-3  # that who waits for a part of an order lets others run between two looks
+NAP_S = 100e-6  # that it sleeps between them from then on
+WAKE = b"!"
+
+_PAUSE = {"x86_64": "llvm.x86.sse2.pause", "AMD64": "llvm.x86.sse2.pause"}.get(platform.machine())
+_settings: Any = numba.core.config
+_IS_PYTHON = bool(_settings.DISABLE_JIT)
+
+
+def usable_cores() -> set[int]:
+    """The cores that this process may run on."""
+    if hasattr(os, "sched_getaffinity"):
+        return os.sched_getaffinity(0)
+    return set(range(os.cpu_count() or 1))
+
+
+_external: Any = types.ExternalFunction
+_intrinsic: Any = intrinsic
+_function: Any = cgutils.get_or_insert_function
+_let_others_run = _external("sched_yield", types.int32())
+_core = _external("sched_getcpu", types.int32())
+
+
+@_intrinsic  # type: ignore[untyped-decorator]
+def _load(typing: Any, words: Any, at: Any) -> Any:
+    """`words[at]`, read anew, after all that this thread has written."""
+
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        array = context.make_array(signature.args[0])(context, builder, arguments[0])
+        place = builder.gep(array.data, [arguments[1]])
+        return builder.load_atomic(place, "seq_cst", 8)
+
+    return types.int64(words, types.intp), generate
+
+
+@_intrinsic  # type: ignore[untyped-decorator]
+def _store(typing: Any, words: Any, at: Any, value: Any) -> Any:
+    """`words[at] = value`, seen by others after all that was written before."""
+
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        array = context.make_array(signature.args[0])(context, builder, arguments[0])
+        place = builder.gep(array.data, [arguments[1]])
+        builder.store_atomic(arguments[2], place, "seq_cst", 8)
+        return context.get_dummy_value()
+
+    return types.void(words, types.intp, types.int64), generate
+
+
+@_intrinsic  # type: ignore[untyped-decorator]
+def _pause(typing: Any) -> Any:
+    """Tell the processor that this is a loop of waiting."""
+
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        if _PAUSE is not None:
+            nothing = ir.FunctionType(ir.VoidType(), [])
+            builder.call(_function(builder.module, nothing, _PAUSE), [])
+        return context.get_dummy_value()
+
+    return types.void(), generate
+
+
+@kernel
+def _compiled_has(theirs: Words, number: int) -> bool:
+    return _load(theirs, NUMBER) >= number  # type: ignore[no-any-return]
+
+
+@kernel
+def _compiled_set(mine: Words, at: int, value: int, theirs: Words) -> int:
+    """Write a word, then read whether the other side sleeps."""
+    _store(mine, at, value)
+    return _load(theirs, ASLEEP)  # type: ignore[no-any-return]
+
+
+@kernel
+def _compiled_look(theirs: Words, number: int, yields: bool) -> bool:
+    """Whether the other side comes to a number within some rounds."""
+    for _ in range(ROUNDS):
+        for _ in range(PAUSES):
+            if _load(theirs, NUMBER) >= number:
+                return True
+            _pause()
+        if yields:
+            _let_others_run()
+    return False
+
+
+@kernel
+def _compiled_pass() -> None:
+    _let_others_run()
+
+
+@kernel
+def _compiled_core() -> int:
+    return _core()  # type: ignore[no-any-return]
+
+
+def _plain_core() -> int:
+    return -1
+
+
+def _plain_pass() -> None:
+    pass
+
+
+def _plain_has(theirs: Words, number: int) -> bool:
+    return bool(theirs[NUMBER] >= number)
+
+
+def _plain_set(mine: Words, at: int, value: int, theirs: Words) -> int:
+    mine[at] = value
+    return int(theirs[ASLEEP])
+
+
+def _plain_look(theirs: Words, number: int, yields: bool) -> bool:
+    return bool(theirs[NUMBER] >= number)
+
+
+_has, _set, _look, _pass, present_core = (
+    (_plain_has, _plain_set, _plain_look, _plain_pass, _plain_core)
+    if _IS_PYTHON
+    else (
+        repeated(_compiled_has),
+        repeated(_compiled_set),
+        repeated(_compiled_look),
+        repeated(_compiled_pass),
+        repeated(_compiled_core),
+    )
+)
+
+
+def load_kernels() -> None:
+    """Have the loops ready, for this process and those that it forks."""
+    words = np.zeros(WORDS, dtype=np.int64)
+    _set(words, NUMBER, 1, words)
+    _has(words, 1)
+    _look(words, 1, True)
+    _pass()
+    present_core()
+
+
+def post(mine: Words, number: int) -> None:
+    """Come to a number, for those who never sleep until it is there."""
+    _set(mine, NUMBER, number, mine)
+
+
+def wait_for(theirs: Words, number: int, is_apart: bool = False) -> None:
+    """Return when the other side comes to a number, which it does soon unless it is dead.
+
+    Args:
+        theirs: (WORDS,) that the other side writes.
+        number: to wait for.
+        is_apart: the other side was on another core when it was seen last. Then nobody is let in
+            for a while: of other programs that have the same core, one that is may keep it for
+            milliseconds.
+    """
+    if _look(theirs, number, False):
+        return
+    now = time.perf_counter()
+    alone, end = now + is_apart * ALONE_S, now + AWAKE_S
+    while not _look(theirs, number, now >= alone):
+        now = time.perf_counter()
+        if now > end:
+            time.sleep(NAP_S)
+
+
+class Meeting:
+    """One side of a place where two processes wait for each other.
+
+    Args:
+        mine: (WORDS,) that this side writes.
+        theirs: (WORDS,) that the other one writes.
+        wire: socket to the other side; who sleeps is woken through it.
+        crowded: more processes take part than there are cores, so who looks lets others run.
+    """
+
+    def __init__(self, mine: Words, theirs: Words, wire: socket.socket, crowded: bool) -> None:
+        self.mine = mine
+        self.theirs = theirs
+        self.wire = wire
+        self._crowded = crowded
+
+    def post(self, number: int) -> None:
+        """Tell the other side that this one has come to a number."""
+        if self.announce(number):
+            self.wake()
+        if self._crowded:
+            _pass()  # the other side may look from this core, or wake up on it
+
+    def announce(self, number: int) -> int:
+        """Come to a number; not 0: the other side sleeps, and has to be woken."""
+        return _set(self.mine, NUMBER, number, self.theirs)
+
+    def wake(self) -> None:
+        """Wake the other side."""
+        with suppress(BrokenPipeError, ConnectionResetError):  # who is gone need not be woken
+            self.wire.send(WAKE)
+
+    def has(self, number: int) -> bool:
+        """Whether the other side has come to a number."""
+        return _has(self.theirs, number)
+
+    def watch(self, number: int, last_s: float, work_s: float = 0.0, is_soon: bool = False) -> bool:
+        """Look for a moment whether the other side comes to a number.
+
+        Who has had to wait for long the last time does not look for long, nor who has worked for
+        long: the system puts those who wake up on free cores, and leaves those who look where they
+        are, two on one core if it comes to that.
+
+        Args:
+            number: to wait for.
+            last_s: how long it has had to wait the last time.
+            work_s: since this side waited last.
+            is_soon: it is known that it does not take long.
+        """
+        if _look(self.theirs, number, self._crowded):
+            return True
+        if last_s > LONG_WORK_S and not is_soon:
+            return False
+        is_soon |= last_s < LONG_S and work_s < LONG_WORK_S
+        end = time.perf_counter() + (LONG_S if is_soon else SHORT_S)
+        while time.perf_counter() < end:
+            if _look(self.theirs, number, self._crowded):
+                return True
+        return False
+
+    def lie_down_first(self) -> None:
+        """Say that this side sleeps when it comes to its next number: it will have to wait long."""
+        self.mine[ASLEEP] = 1  # seen with that number, or before
+
+    def lie_down(self, number: int) -> bool:
+        """Say that this side sleeps from here on; False: there is no need any more."""
+        _set(self.mine, ASLEEP, 1, self.theirs)
+        if self.has(number):
+            self.get_up()
+            return False
+        return True
+
+    def get_up(self) -> None:
+        """Say that this side is awake."""
+        _set(self.mine, ASLEEP, 0, self.theirs)

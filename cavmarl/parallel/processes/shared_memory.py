@@ -1,0 +1,149 @@
+"""Memory that processes share: without a name, so that nothing can be left behind.
+
+A segment is known by its descriptor alone, which a process is given when it is started. It goes
+when the last process that has it open or mapped ends, however it ends.
+"""
+
+from __future__ import annotations
+
+import mmap
+import os
+import tempfile
+from collections.abc import Mapping
+from math import prod
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import DTypeLike, NDArray
+
+from cavmarl.core.errors import WorkerStartError
+
+__all__ = ["Layout", "Segment", "arrays_in", "shared_zeros", "size_of"]
+
+Layout = Mapping[str, tuple[str, tuple[int, ...]]]
+"""Arrays of a segment: name → dtype as text, shape."""
+
+_LINE = 64  # bytes of a cache line: no two arrays share one
+
+
+class Segment:
+    """Memory of a number of bytes, all of them had.
+
+    Args:
+        fd: descriptor, which the segment owns from here on.
+        size: bytes.
+
+    Attributes:
+        fd: to be passed to other processes.
+        size: bytes.
+    """
+
+    def __init__(self, fd: int, size: int) -> None:
+        self.fd = fd
+        self.size = size
+
+    @classmethod
+    def make(cls, size: int) -> Segment:
+        """A new one, of zeros.
+
+        Raises:
+            WorkerStartError: there is not so much memory.
+        """
+        try:
+            free = _free_bytes()
+            if free is not None and size > free:
+                raise WorkerStartError(_too_much(size, f"{free / 1e9:.1f} GB are free"))
+            segment = cls(_anonymous(), 0)
+        except OSError as error:
+            raise WorkerStartError(f"no shared memory: {error}") from error
+        try:
+            segment.grow(size)
+        except OSError as error:
+            segment.close()
+            raise WorkerStartError(_too_much(size, str(error))) from error
+        return segment
+
+    def grow(self, size: int) -> None:
+        """Make it larger, if it is smaller; memory that cannot be had is noticed here.
+
+        Raises:
+            OSError: there is not so much.
+        """
+        if size > self.size:
+            os.posix_fallocate(self.fd, 0, size)
+            self.size = size
+
+    def map(self) -> mmap.mmap:
+        """Its bytes, as many as there are by now, as this process reads and writes them.
+
+        Raises:
+            WorkerStartError: there is no room for them in this process.
+        """
+        self.size = os.fstat(self.fd).st_size
+        try:
+            return mmap.mmap(self.fd, self.size)
+        except OSError as error:
+            raise WorkerStartError(f"shared memory cannot be mapped: {error}") from error
+
+    def close(self) -> None:
+        """Give the descriptor back; what is mapped stays until nobody looks at it any more."""
+        os.close(self.fd)
+
+
+def size_of(layout: Layout) -> int:
+    """Bytes of all arrays."""
+    return max(_LINE, sum(_room(dtype, shape) for dtype, shape in layout.values()))
+
+
+def arrays_in(memory: mmap.mmap, layout: Layout) -> dict[str, NDArray[Any]]:
+    """The arrays in a segment's bytes, each at the start of a cache line."""
+    found: dict[str, NDArray[Any]] = {}
+    at = 0
+    for name, (dtype, shape) in layout.items():
+        flat = np.frombuffer(memory, dtype=dtype, count=prod(shape), offset=at)
+        found[name] = flat.reshape(shape)
+        at += _room(dtype, shape)
+    return found
+
+
+def shared_zeros(shape: int | tuple[int, ...], dtype: DTypeLike = np.float64) -> NDArray[Any]:
+    """As `numpy.zeros`, but this process shares the array with those that it forks.
+
+    Memory that is never written is never taken.
+    """
+    kind = np.dtype(dtype)
+    sides = (shape,) if isinstance(shape, int) else shape
+    memory = mmap.mmap(-1, max(1, prod(sides) * kind.itemsize))
+    return np.frombuffer(memory, dtype=kind, count=prod(sides)).reshape(sides)
+
+
+def _room(dtype: str, shape: tuple[int, ...]) -> int:
+    return -(-np.dtype(dtype).itemsize * prod(shape) // _LINE) * _LINE
+
+
+def _anonymous() -> int:
+    """Descriptor of an empty file that has no name."""
+    if hasattr(os, "memfd_create"):
+        return os.memfd_create("cavmarl", os.MFD_CLOEXEC)
+    fd, path = tempfile.mkstemp(prefix="cavmarl-")
+    os.unlink(path)
+    return fd
+
+
+def _free_bytes() -> int | None:
+    """Memory that is free, where the system tells it."""
+    info = Path("/proc/meminfo")
+    if not info.is_file():
+        return None
+    for line in info.read_text(encoding="ascii").splitlines():
+        if line.startswith("MemAvailable:"):
+            return int(line.split()[1]) * 1024
+    return None
+
+
+def _too_much(size: int, why: str) -> str:
+    return (
+        f"no {size / 1e9:.2f} GB of shared memory ({why}): use a smaller num_envs, fewer agents or "
+        "smaller observations"
+    )

@@ -1,0 +1,223 @@
+"""`Image`: arrays in a segment, with a checksum; what a worker's successor begins from."""
+
+from __future__ import annotations
+
+import mmap
+import zlib
+from collections.abc import Iterator, Sequence
+from operator import is_
+from typing import Any, NamedTuple
+
+import numba.core.config
+import numpy as np
+from numpy.typing import NDArray
+
+from cavmarl.core.errors import WorkerError
+from cavmarl.core.numba import kernel
+from cavmarl.core.numba.repeated import repeated
+from cavmarl.parallel.processes.shared_memory import Segment
+
+__all__ = ["Arrays", "Image", "load_kernels"]
+
+Array = NDArray[Any]
+Arrays = Sequence[Array]
+
+_WORD = 8
+_HEAD = 3  # words: of everything, checksum, how many arrays
+_settings: Any = numba.core.config
+_IS_PYTHON = bool(_settings.DISABLE_JIT)
+
+
+class _Place(NamedTuple):
+    """Where an array goes in an image.
+
+    Attributes:
+        shape: of the array.
+        end: of it, in words from the image's begin.
+        target: the place itself, as raw items.
+    """
+
+    shape: tuple[int, ...]
+    end: int
+    target: Array
+
+
+class Image:
+    """Arrays as they were at one moment.
+
+    Args:
+        segment: that holds it; it grows as the arrays do.
+    """
+
+    def __init__(self, segment: Segment) -> None:
+        self._segment = segment
+        self._memory: mmap.mmap | None = None
+        self._map_words(np.zeros(0, dtype=np.int64))
+        self._begin = 0  # of the first array
+        self._places: list[_Place] = []
+        self._written: Arrays = ()  # the last time
+        self._copies: list[tuple[Array, Array]] = []  # to where, from where
+
+    def write(self, arrays: Arrays) -> None:
+        """Copy arrays into it, of the same dtypes as the last time.
+
+        Raises:
+            OSError: there is no memory for them.
+        """
+        if len(arrays) != len(self._written) or not all(map(is_, arrays, self._written)):
+            self._find_places(arrays)
+        for target, source in self._copies:
+            target[...] = source
+        if _IS_PYTHON:
+            self._words[1] = _checksum(self._words[2 : self._words.item(0)])
+        else:
+            _seal(self._unsigned)
+
+    def _find_places(self, arrays: Arrays) -> None:
+        """Say what has to be copied where."""
+        shapes = [array.shape for array in arrays]
+        same = _num_same(shapes, self._places)
+        if len(arrays) != len(self._places):
+            self._lay_out(arrays, 0)
+        elif same < len(arrays):
+            self._lay_out(arrays, same)
+        self._written = tuple(arrays)
+        self._copies = [
+            (place.target, array.view(place.target.dtype))
+            for array, place in zip(arrays, self._places, strict=True)
+        ]
+
+    def _lay_out(self, arrays: Arrays, same: int) -> None:
+        """Say where each array goes; the first ones go where they went the last time.
+
+        Most arrays have the same shape every time, and are saved before those that have not.
+        """
+        head = [array.ndim for array in arrays]
+        for array in arrays:
+            head.extend(array.shape)
+        begin = _HEAD + len(head)
+        size = begin + sum(map(_num_words, arrays))
+        if self._make_room(_WORD * size) or begin != self._begin:
+            same = 0
+        self._begin = begin
+        words = self._words
+        words[0], words[2] = size, len(arrays)
+        words[_HEAD:begin] = head
+        del self._places[same:]
+        at = self._places[-1].end if same else begin
+        for array in arrays[same:]:
+            end = at + _num_words(array)
+            if array.nbytes:
+                words[end - 1] = 0  # what rounds it up
+            raw = np.dtype((np.void, array.itemsize))  # NumPy copies records field by field
+            place = words[at:end].view(np.uint8)[: array.nbytes]
+            target = place.view(raw).reshape(array.shape)
+            self._places.append(_Place(array.shape, end, target))
+            at = end
+
+    def read(self, dtypes: Sequence[np.dtype[Any]]) -> Iterator[Array]:
+        """The arrays, in their order, as views.
+
+        Args:
+            dtypes: of each.
+
+        Raises:
+            WorkerError: they are not what was written.
+        """
+        self._map_all()
+        words = self._words
+        size = int(words[0]) if len(words) else 0
+        if not _HEAD <= size <= len(words) or words[1] != _checksum(words[2:size]):
+            raise WorkerError("the state that a worker has left behind is not what it wrote")
+        ranks = words[_HEAD : _HEAD + len(dtypes)].tolist()
+        shape_at = _HEAD + len(ranks)
+        at = shape_at + sum(ranks)
+        for dtype, rank in zip(dtypes, ranks, strict=True):
+            shape = words[shape_at : shape_at + rank].tolist()
+            shape_at += rank
+            num_bytes = int(np.prod(shape, dtype=np.int64)) * dtype.itemsize
+            end = at + -(-num_bytes // _WORD)
+            yield words[at:end].view(np.uint8)[:num_bytes].view(dtype).reshape(shape)
+            at = end
+
+    def content(self) -> NDArray[np.uint8]:
+        """(n,) What has been written, as bytes; a view."""
+        return self._words[: self._words[0]].view(np.uint8)
+
+    def put(self, content: NDArray[np.uint8]) -> None:
+        """Take over the content of another image, perhaps from another machine.
+
+        Raises:
+            OSError: there is no memory for it.
+        """
+        self._make_room(content.size)
+        self._places.clear()  # its arrays may lie elsewhere
+        self._written = ()
+        self._words.view(np.uint8)[: content.size] = content
+
+    def _make_room(self, size: int) -> bool:
+        """Whether it lies elsewhere from here on, because it was too small."""
+        if size <= _WORD * len(self._words):
+            return False
+        self._segment.grow(-(-size * 5 // 4 // mmap.PAGESIZE) * mmap.PAGESIZE)
+        self._map_all()
+        return True
+
+    def _map_all(self) -> None:
+        """Map the segment as large as it is by now, whoever has made it so."""
+        self._memory = self._segment.map()
+        self._map_words(np.frombuffer(self._memory, dtype=np.int64))
+
+    def _map_words(self, words: NDArray[np.int64]) -> None:
+        self._words = words
+        self._unsigned = words.view(np.uint64)
+
+
+@kernel
+def _mixed(words: NDArray[np.uint64]) -> np.uint64:
+    """FNV-1a over whole words, in four rows side by side: a changed word always changes it."""
+    prime = np.uint64(0x100000001B3)
+    a = b = c = d = np.uint64(0xCBF29CE484222325)
+    fours = words.size // 4 * 4
+    for n in range(0, fours, 4):
+        a = (a ^ words[n]) * prime
+        b = (b ^ words[n + 1]) * prime
+        c = (c ^ words[n + 2]) * prime
+        d = (d ^ words[n + 3]) * prime
+    for n in range(fours, words.size):
+        a = (a ^ words[n]) * prime
+    return (((((a * prime) ^ b) * prime) ^ c) * prime) ^ d
+
+
+@kernel
+def _sealed(words: NDArray[np.uint64]) -> None:
+    """Write the checksum of an image into it."""
+    words[1] = _mixed(words[2 : int(words[0])])
+
+
+_mix, _seal = repeated(_mixed), repeated(_sealed)
+
+
+def _num_words(array: Array) -> int:
+    return -(-array.nbytes // _WORD)
+
+
+def _num_same(shapes: Sequence[tuple[int, ...]], places: Sequence[_Place]) -> int:
+    """How many of the first arrays have the shapes that they had before."""
+    for n, (shape, place) in enumerate(zip(shapes, places, strict=False)):
+        if shape != place.shape:
+            return n
+    return min(len(shapes), len(places))
+
+
+def _checksum(words: NDArray[np.int64]) -> int:
+    if _IS_PYTHON:
+        return zlib.crc32(words.data)
+    return int(np.uint64(_mix(words.view(np.uint64))).view(np.int64))
+
+
+def load_kernels() -> None:
+    """Have the checksum ready, for this process and those that it forks."""
+    words = np.full(_HEAD, _HEAD, dtype=np.int64)
+    _checksum(words)
+    _seal(words.view(np.uint64))

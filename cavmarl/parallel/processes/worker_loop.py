@@ -1,0 +1,317 @@
+"""What runs in the processes of a pool: one that forks, and the workers that it forks.
+
+The pool starts one process as a program. That one makes every worker's job ready, with all kernels
+loaded, and has no threads; then it forks a worker whenever the pool asks for one. So a worker that
+has died is replaced in milliseconds, and its successor begins with what is ready.
+
+Nobody outlives the pool: the forking process ends when the pool's process does, or when it hears
+no more of it, and the system kills the workers with the process that forked them.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import faulthandler
+import gc
+import json
+import os
+import select
+import signal
+import socket
+import sys
+import threading
+import time
+import traceback
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
+from typing import Any, NoReturn, Protocol
+
+import numpy as np
+
+from cavmarl.parallel.processes import process_barrier as barrier
+from cavmarl.parallel.processes import state_image as images
+from cavmarl.parallel.processes.process_barrier import NUMBER, WAKE, WORDS, Meeting, present_core
+from cavmarl.parallel.processes.shared_huge_pages import collapse_heap
+from cavmarl.parallel.processes.shared_memory import Segment
+from cavmarl.parallel.processes.state_image import Arrays, Image
+
+__all__ = [
+    "ANSWER",
+    "ANSWERED",
+    "CORE",
+    "FAILED",
+    "LETTER",
+    "LOADS",
+    "MAIL",
+    "MAX_MESSAGE",
+    "NOTHING",
+    "OUT_OF_MEMORY",
+    "SILENT",
+    "SLOT",
+    "TASK",
+    "TRUTH",
+    "Job",
+    "describe",
+    "die_with_parent",
+    "serve",
+]
+
+# Words of the pool's line, behind those of `barrier`.
+TASK, LETTER, SLOT, TRUTH, LOADS = 2, 3, 4, 5, 6
+# Words of the worker's line: how its order ended, and on which core it has begun with it.
+ANSWER, CORE = 2, 3
+SILENT, ANSWERED, FAILED = 0, 1, 2
+
+NOTHING = -1  # a task: to be there
+OUT_OF_MEMORY = 77  # exit status
+MAX_MESSAGE = 1 << 17
+MAIL = b"="  # begins a message with something in it
+MAX_TRACEBACK = 16_000  # characters, six bytes each at most; the end of a longer one is sent
+
+_PR_SET_PDEATHSIG = 1
+
+
+class Job(Protocol):
+    """What one worker does."""
+
+    def perform(self, task: int, letter: Any) -> Any:
+        """Do a task.
+
+        Args:
+            task: which one; numbers from 0 on are the job's own.
+            letter: what the pool has to say to it, as JSON knows it; mostly nothing.
+
+        Returns:
+            what the pool is to know, as JSON knows it; mostly nothing.
+        """
+        ...
+
+    def save(self) -> Arrays:
+        """All that a successor needs to go on from here; nothing if there is no such thing."""
+        ...
+
+    def load(self, arrays: Sequence[Any]) -> None:
+        """Go on from what `save` has given."""
+        ...
+
+    def afterwards(self) -> None:
+        """Called when an order is carried out and the pool knows: for what nobody waits for.
+
+        What it makes must not be needed before another order is carried out: that one may be
+        carried out by a successor, which finds what was committed.
+        """
+        ...
+
+    def prepare(self) -> None:
+        """Called where workers are forked, before each fork that is to do this job.
+
+        Whoever has done it is dead; so are those that it shares memory with, if it is their first.
+        """
+        ...
+
+
+MakeJobs = Callable[[Mapping[str, Any]], Sequence[Job]]
+
+
+def die_with_parent() -> None:
+    """Let the system kill this process when the thread that started it ends."""
+    ctypes.CDLL(None, use_errno=True).prctl(_PR_SET_PDEATHSIG, int(signal.SIGKILL), 0, 0, 0)
+
+
+def serve(make_jobs: MakeJobs) -> NoReturn:
+    """The whole life of the forking process.
+
+    Args:
+        make_jobs: from what the pool says about them.
+    """
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the pool, which sees to the rest
+    faulthandler.enable()
+    start = json.loads(sys.argv[1])
+    pool = socket.socket(fileno=start["pool"])
+    if start["dies_with_thread"]:
+        die_with_parent()
+    parent = os.pidfd_open(start["parent"])
+    if os.getppid() != start["parent"]:
+        os._exit(0)
+    try:
+        recipe = _read(start["recipe"], start["recipe_bytes"])
+        jobs = make_jobs(recipe)
+        barrier.load_kernels()
+        images.load_kernels()
+        _refuse_threads()
+    except Exception as error:
+        pool.send(_failure(error))
+        os._exit(1)
+    gc.collect()
+    gc.freeze()  # what is ready is not moved around by workers
+    collapse_heap()
+    pool.send(json.dumps({"ready": len(jobs)}).encode())
+    _fork_on_demand(pool, parent, jobs, start)
+
+
+def _refuse_threads() -> None:
+    """A process with threads must not fork.
+
+    Raises:
+        RuntimeError: there are some.
+    """
+    threads = len(os.listdir("/proc/self/task"))
+    if threads > 1:
+        names = [thread.name for thread in threading.enumerate()]
+        raise RuntimeError(f"a process that forks has {threads} threads, of Python's: {names}")
+
+
+def _read(fd: int, size: int) -> Any:
+    return json.loads(os.pread(fd, size, 0))
+
+
+def describe(error: BaseException) -> dict[str, str]:
+    """An exception in words, not too many: its class, its message, its traceback."""
+    text = "".join(traceback.format_exception(error))[-MAX_TRACEBACK:]
+    message = str(error)[: MAX_TRACEBACK // 4]
+    return {"kind": type(error).__name__, "text": message, "traceback": text}
+
+
+def _failure(error: BaseException) -> bytes:
+    return json.dumps(describe(error)).encode()
+
+
+def _fork_on_demand(
+    pool: socket.socket, parent: int, jobs: Sequence[Job], start: Mapping[str, Any]
+) -> NoReturn:
+    """Fork and bury workers as the pool asks; end with it."""
+    poll = select.poll()
+    poll.register(pool, select.POLLIN)
+    poll.register(parent, select.POLLIN)
+    alive: set[int] = set()
+    while True:
+        if any(fd == parent for fd, _ in poll.poll()):
+            _end(alive)
+        message, descriptors, _, _ = socket.recv_fds(pool, MAX_MESSAGE, 1)
+        if not message:
+            _end(alive)
+        order = json.loads(message)
+        if "bury" in order:
+            pid = order["bury"]
+            _, status = os.waitpid(pid, 0)
+            alive.discard(pid)
+            pool.send(json.dumps({"status": os.waitstatus_to_exitcode(status)}).encode())
+            continue
+        number, (wire,) = order["fork"], descriptors
+        jobs[number].prepare()
+        mother = os.getpid()
+        pid = os.fork()
+        if pid == 0:
+            die_with_parent()
+            if os.getppid() != mother:
+                os._exit(0)
+            pool.close()
+            os.close(parent)
+            _work(number, jobs[number], socket.socket(fileno=wire), start)
+        os.close(wire)
+        alive.add(pid)
+        pool.send(json.dumps({"pid": pid}).encode())
+
+
+def _end(alive: set[int]) -> NoReturn:
+    """The pool is closed: nothing is left behind, not even a zombie."""
+    for pid in alive:
+        os.kill(pid, signal.SIGKILL)
+    for pid in alive:
+        os.waitpid(pid, 0)
+    os._exit(0)
+
+
+def _work(number: int, job: Job, wire: socket.socket, start: Mapping[str, Any]) -> NoReturn:
+    """The whole life of a worker."""
+    cores = start["cores"]
+    if cores:
+        os.sched_setaffinity(0, {cores[number % len(cores)]})
+    orders = np.frombuffer(Segment(start["orders"], 0).map(), dtype=np.int64)
+    theirs = orders[number * WORDS : (number + 1) * WORDS]
+    mine = np.frombuffer(Segment(start["statuses"][number], 0).map(), dtype=np.int64)[:WORDS]
+    slots = [Image(Segment(fd, 0)) for fd in start["images"][number]]
+    meeting = Meeting(mine, theirs, wire, start["crowded"])
+    meeting.get_up()  # a predecessor may have died asleep
+    with suppress(BrokenPipeError, ConnectionResetError):  # the pool is gone
+        _obey(job, meeting, slots)
+    os._exit(0)
+
+
+def _obey(job: Job, meeting: Meeting, slots: Sequence[Image]) -> NoReturn:
+    """Carry out one order after the other."""
+    mine, theirs = meeting.mine, meeting.theirs
+    is_new = True
+    wait_s = 0.0
+    began = time.perf_counter()
+    while True:
+        order = int(mine[NUMBER]) + 1
+        wait_s = _await(meeting, order, wait_s, time.perf_counter() - began)
+        began = time.perf_counter()
+        core = present_core()
+        number, _, task, has_letter, slot, truth, loads, _ = theirs.tolist()
+        letter = _receive(meeting.wire) if has_letter else None
+        try:
+            if (is_new or loads) and truth >= 0:
+                dtypes = [array.dtype for array in job.save()]
+                if dtypes:
+                    job.load(list(slots[truth].read(dtypes)))
+            is_new = False
+            answer = None
+            if task != NOTHING:
+                answer = job.perform(task, letter)
+            if slot >= 0 and (saved := job.save()):
+                slots[slot].write(saved)
+        except MemoryError:
+            os._exit(OUT_OF_MEMORY)
+        except Exception as error:
+            mine[ANSWER] = FAILED
+            meeting.wire.send(MAIL + _failure(error))
+        else:
+            mine[ANSWER] = SILENT if answer is None else ANSWERED
+            if answer is not None:
+                meeting.wire.send(MAIL + json.dumps(answer).encode())
+        mine[CORE] = core  # now, and not before: the pool looks at this line all the time
+        meeting.post(number)
+        if mine[ANSWER] != FAILED:
+            try:
+                job.afterwards()
+            except MemoryError:
+                os._exit(OUT_OF_MEMORY)
+
+
+def _await(meeting: Meeting, order: int, last_s: float, work_s: float) -> float:
+    """Return when there is an order; end with the pool.
+
+    Args:
+        meeting: with the pool.
+        order: its number.
+        last_s: how long the last wait was that was one.
+        work_s: how long was worked since.
+
+    Returns:
+        how long the last wait was, which may be this one.
+    """
+    if meeting.has(order):
+        return last_s
+    began = time.perf_counter()
+    if not meeting.watch(order, last_s, work_s):
+        while meeting.lie_down(order):
+            # A letter may come before its order: it is left where it is.
+            message = meeting.wire.recv(len(WAKE), socket.MSG_PEEK)
+            meeting.get_up()
+            if not message:
+                os._exit(0)
+            if message == WAKE:
+                meeting.wire.recv(len(WAKE))
+    return time.perf_counter() - began
+
+
+def _receive(wire: socket.socket) -> Any:
+    """The letter that came with an order."""
+    while True:
+        message = wire.recv(MAX_MESSAGE)
+        if not message:
+            os._exit(0)
+        if message != WAKE:
+            return json.loads(message[len(MAIL) :])

@@ -1,0 +1,296 @@
+"""`Pool`: worker processes that do one job together, order by order, and survive their deaths.
+
+Every worker keeps its state in its own memory, and leaves an image of it behind with every order
+that changes it. There are two images of each: the one that is committed, and the one that is being
+written. When all workers have carried out an order, the pool commits it. A worker that dies before
+that is replaced: its successor reads the committed image and carries the order out again. It reads
+the same, so it does the same.
+"""
+
+from __future__ import annotations
+
+import json
+import time
+import weakref
+from dataclasses import dataclass
+from math import isnan, nan
+from typing import Any
+
+from cavmarl.core.errors import WorkerDeathError, WorkerError, WorkerFailureError
+from cavmarl.parallel.processes.process_barrier import LONG_WORK_S
+from cavmarl.parallel.processes.watchdog import CHECK_S, Watchdog, processor_s
+from cavmarl.parallel.processes.worker_loop import FAILED, MAIL, MAX_MESSAGE, NOTHING, TASK
+from cavmarl.parallel.processes.worker_processes import Crew, Program
+from cavmarl.parallel.team.team import LeftAloneError
+
+__all__ = ["Death", "Pool", "Program"]
+
+
+@dataclass
+class Death:
+    """What became of one process and of what it did; times are those of `time.monotonic`.
+
+    Attributes:
+        worker: whose process it was.
+        order: that was to be carried out.
+        cause: signal or exit status, or why it was taken for dead.
+        ordered_s: when the order was given.
+        noticed_s: when that was noticed.
+        replaced_s: when its successor had its order.
+        done_s: when that was carried out; nan: not yet.
+    """
+
+    worker: int
+    order: int
+    cause: str
+    ordered_s: float
+    noticed_s: float
+    replaced_s: float
+    done_s: float = nan
+
+
+class Pool:
+    """m worker processes.
+
+    Args:
+        program: what they run.
+        timeout_s: for so long a worker may be busy with one order.
+        repeats: how often an order is begun again because a worker has died.
+
+    Attributes:
+        deaths: all that there were.
+
+    Raises:
+        WorkerStartError: no process, or no memory.
+        WorkerFailureError: an exception while the jobs were made.
+    """
+
+    def __init__(self, program: Program, timeout_s: float, repeats: int) -> None:
+        self.deaths: list[Death] = []
+        self._program = program
+        self._timeout_s = timeout_s
+        self._repeats = repeats
+        self._all = tuple(range(len(program.parts)))
+        self._truth = -1  # the slot of the committed images
+        self._open: tuple[int, ...] = ()  # workers with an order that is not committed
+        self._stale = [False] * len(program.parts)  # whose memory is not what is committed
+        self._ordered_s = 0.0
+        self._lasted: dict[int, float] = {}  # how long each task has taken the last time, s
+        self._crew = Crew(program)
+        self._finalizer = weakref.finalize(self, self._crew.release)
+
+    @property
+    def pids(self) -> list[int]:
+        """Of the workers' processes."""
+        return [process.pid for process in self._crew.processes.values()]
+
+    @property
+    def server_pid(self) -> int:
+        """Of the process that forks them."""
+        return self._crew.server_pid
+
+    def team_of(self, worker: int) -> tuple[int, ...]:
+        """Who is replaced with a worker, itself among them."""
+        return self._program.team_of(worker)
+
+    def processor_s(self) -> list[float]:
+        """Processor time that each worker's process has taken."""
+        return [processor_s(pid) for pid in self.pids]
+
+    def run(self, task: int, letter: Any = None, commits: bool = True) -> list[Any]:
+        """Let all workers do a task.
+
+        Args:
+            task: of the job.
+            letter: what is said to all, as JSON knows it.
+            commits: the task changes their state.
+
+        Returns:
+            what each has answered.
+
+        Raises:
+            WorkerDeathError: too many processes died of it; the pool is closed.
+            WorkerFailureError: an exception in a worker; all are as they were before.
+        """
+        return self._command(self._all, task, letter, commits)
+
+    def ask(self, worker: int, task: int, letter: Any = None) -> Any:
+        """Let one worker do a task that changes nothing; raises as `run`."""
+        return self._command((worker,), task, letter, False)[0]
+
+    def ping(self) -> None:
+        """Let all workers do nothing: an empty barrier."""
+        self.run(NOTHING, commits=False)
+
+    def rename(self, parts: tuple[str, ...]) -> None:
+        """Say anew what each worker hosts, in words."""
+        self._program = self._program._replace(parts=parts)
+
+    def close(self) -> None:
+        """End all processes and give the memory back; what is mapped stays readable."""
+        self._finalizer()
+
+    def _command(
+        self, workers: tuple[int, ...], task: int, letter: Any, commits: bool
+    ) -> list[Any]:
+        if not self._finalizer.alive:
+            raise WorkerError("the workers are closed: make the environment anew")
+        if self._open:
+            self._settle()
+        mail = None if letter is None else MAIL + json.dumps(letter).encode()
+        if mail is not None and len(mail) > MAX_MESSAGE:
+            raise WorkerError(f"a letter of {len(mail)} bytes: at most {MAX_MESSAGE} can be sent")
+        slot = 1 - max(self._truth, 0) if commits else -1
+        self._open = workers
+        self._ordered_s = time.monotonic()
+        head = (task, mail is not None, slot, self._truth)
+        expected_s = self._lasted.get(task, 0.0)
+        sleeps = expected_s > LONG_WORK_S
+        if workers == self._all:
+            self._crew.keep_apart()  # where they were with the last order
+        self._crew.order(workers, head, self._stale, mail, sleeps)
+        self._await(workers, mail, expected_s, sleeps)
+        self._lasted[task] = time.monotonic() - self._ordered_s
+        answers = self._read(workers)
+        for k in workers:
+            self._stale[k] = False
+        if commits:
+            self._truth = slot
+        self._open = ()
+        return answers
+
+    def _settle(self) -> None:
+        """Let an order come to its end that was interrupted, or failed; it is not committed."""
+        for k in self._open:
+            watchdog = Watchdog(self._crew.processes[k].pid, self._timeout_s)
+            while not self._crew.settle(k, CHECK_S):
+                if watchdog.verdict() is not None or self._crew.is_left_alone(k):
+                    self._crew.processes[k].kill()
+            self._stale[k] = True
+        self._open = ()
+
+    def _await(
+        self, workers: tuple[int, ...], mail: bytes | None, expected_s: float, sleeps: bool
+    ) -> None:
+        """Return when all workers have carried out their order.
+
+        Args:
+            workers: who has one.
+            mail: that came with it.
+            expected_s: how long it has taken the last time.
+            sleeps: they know that nobody looks.
+
+        Raises:
+            WorkerDeathError: too many processes died of it; the pool is closed.
+        """
+        pending = list(workers)
+        if not sleeps:
+            pending = [k for k in workers if not self._crew.watch(k, expected_s)]
+        if pending:
+            self._await_asleep(pending, mail, sleeps)
+
+    def _await_asleep(self, pending: list[int], mail: bytes | None, is_lying: bool) -> None:
+        dead = self._crew.sleep(pending, CHECK_S, is_lying)
+        first = len(self.deaths)
+        guard = _Guard(self._crew, self._timeout_s, self._ordered_s)
+        while pending or dead:
+            asked = pending
+            pending = self._pending()
+            if pending and len(pending) < len(asked):
+                # Orders are shared out so that all end together.
+                self._crew.forget_calls()
+                pending = [k for k in pending if not self._crew.watch(k, is_soon=True)]
+            self._note_done(first, pending)
+            if not (pending or dead):
+                break
+            suspects = dict.fromkeys(dead, "") or guard.hanging(pending)
+            suspected = {k: self._crew.processes[k] for k in suspects} | dead
+            for k, cause in suspects.items():
+                if self._crew.processes[k] is suspected[k]:  # not replaced with another one's
+                    self._replace(k, cause, mail)
+            pending = self._pending()
+            for k in pending:
+                team = self.team_of(k)
+                causes = [death.cause for death in self.deaths[first:] if death.worker in team]
+                if len(causes) > self._repeats:
+                    self._give_up(k, causes)
+            dead = self._crew.sleep(pending, CHECK_S) if pending else {}
+        self._note_done(first, pending)
+
+    def _note_done(self, first: int, pending: list[int]) -> None:
+        """Of deaths from a number on: when the successors are through."""
+        for death in self.deaths[first:]:
+            if death.worker not in pending and isnan(death.done_s):
+                death.done_s = time.monotonic()
+
+    def _pending(self) -> list[int]:
+        """Who has not carried out the present order."""
+        return [k for k in self._open if not self._crew.has(k)]
+
+    def _replace(self, k: int, cause: str, mail: bytes | None) -> None:
+        """A worker's process is dead, or taken for it: another one goes on in its place."""
+        noticed_s = time.monotonic()
+        try:
+            found = self._crew.replace(k, mail, self._open)
+        except BaseException:
+            self.close()
+            raise
+        number = self._crew.number(k)
+        now = time.monotonic()
+        self.deaths.append(Death(k, number, cause or found, self._ordered_s, noticed_s, now))
+
+    def _give_up(self, k: int, causes: list[str]) -> None:
+        self.close()
+        task = self._crew.orders.item(k, TASK)
+        what = "nothing" if task == NOTHING else self._program.tasks[task]
+        part, number = self._program.parts[k], self._crew.number(k)
+        raise WorkerDeathError(k, part, number, what, causes)
+
+    def _read(self, workers: tuple[int, ...]) -> list[Any]:
+        """What the workers have answered.
+
+        Raises:
+            WorkerFailureError: of the first in which something went wrong, not because of another.
+        """
+        answers: list[Any] = []
+        failure: WorkerFailureError | None = None
+        for k in workers:
+            kind, answer = self._crew.answer(k)
+            if kind == FAILED and (failure is None or failure.kind == LeftAloneError.__name__):
+                failure = WorkerFailureError(k, self._program.parts[k], **answer)
+            answers.append(answer)
+        if failure is not None:
+            raise failure
+        return answers
+
+
+class _Guard:
+    """Looks at those who are waited for, from time to time.
+
+    Args:
+        crew: they belong to.
+        timeout_s: for so long each may be busy.
+        since_s: when they were given their order, by `time.monotonic`.
+    """
+
+    def __init__(self, crew: Crew, timeout_s: float, since_s: float) -> None:
+        self._crew = crew
+        self._timeout_s = timeout_s
+        self._watchdogs: dict[int, Watchdog] = {}
+        self._next_s = since_s + CHECK_S
+
+    def hanging(self, pending: list[int]) -> dict[int, str]:
+        """Who of them does not go on, and why one thinks so."""
+        now = time.monotonic()
+        if now < self._next_s:
+            return {}
+        self._next_s = now + CHECK_S
+        found: dict[int, str] = {}
+        for k in pending:
+            pid = self._crew.processes[k].pid
+            if pid not in self._watchdogs:
+                self._watchdogs[pid] = Watchdog(pid, self._timeout_s)
+            verdict = self._watchdogs[pid].verdict()
+            if verdict is not None:
+                found[k] = verdict
+        return found

@@ -1,0 +1,413 @@
+"""`Crew`: the processes of a pool, one a worker, and the words that are exchanged with them."""
+
+from __future__ import annotations
+
+import json
+import os
+import select
+import signal
+from collections.abc import Callable, Collection, Mapping, Sequence
+from contextlib import suppress
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from cavmarl.core.errors import WorkerStartError
+from cavmarl.parallel.processes.core_placement import keep_apart
+from cavmarl.parallel.processes.fork_server import ForkServer, Process, ServerGoneError
+from cavmarl.parallel.processes.process_barrier import (
+    NUMBER,
+    WORDS,
+    Meeting,
+    present_core,
+    usable_cores,
+)
+from cavmarl.parallel.processes.shared_memory import Segment
+from cavmarl.parallel.processes.worker_loop import ANSWER, CORE, LOADS, OUT_OF_MEMORY, SILENT, TASK
+
+__all__ = ["Crew", "Program"]
+
+_LINE_BYTES = WORDS * 8
+_FIRST_IMAGE_BYTES = 1 << 12
+
+
+class Program(NamedTuple):
+    """What the workers of a pool run.
+
+    Attributes:
+        module: that is run as a program and calls `worker.serve`.
+        recipe: from which it makes the jobs, as JSON knows it.
+        parts: what each worker hosts, in words.
+        segments: that the jobs share with the pool, and the pool gives back; the recipe names their
+            descriptors.
+        tasks: what each task is called, by its number.
+        pins: each worker stays on a core of its own, as far as there are so many.
+        teams: workers that share their state, by rising numbers: none of them can go on without the
+            others. Who is in no team is alone.
+    """
+
+    module: str
+    recipe: Mapping[str, Any]
+    parts: tuple[str, ...]
+    segments: tuple[Segment, ...]
+    tasks: tuple[str, ...]
+    pins: bool = False
+    teams: tuple[tuple[int, ...], ...] = ()
+
+    def team_of(self, worker: int) -> tuple[int, ...]:
+        """Who shares its state with a worker, itself among them."""
+        return next((team for team in self.teams if worker in team), (worker,))
+
+
+class Crew:
+    """m worker processes and the one that forks them.
+
+    Args:
+        program: what they run.
+
+    Attributes:
+        orders: (m, WORDS) the lines that this side writes.
+
+    Raises:
+        WorkerStartError: no process, or no memory.
+        WorkerFailureError: an exception while the jobs were made.
+    """
+
+    def __init__(self, program: Program) -> None:
+        self._program = program
+        self._count = len(program.parts)
+        self._crowded = self._count + 1 > len(usable_cores())
+        self._poll = select.poll()
+        self._held = _Held(list(program.segments))
+        self._meetings: dict[int, Meeting] = {}
+        self._owners: dict[int, tuple[int, bool]] = {}  # descriptor → worker, whether of its death
+        self._heard: set[int] = set()  # workers whose messages have woken this side, and lie there
+        try:
+            if not hasattr(os, "pidfd_open"):
+                raise WorkerStartError("workers need Linux 5.3 or later: use workers=0")
+            self._make_memory()
+            self._start()
+        except BaseException:
+            self._held.release()
+            raise
+
+    @property
+    def release(self) -> Callable[[], None]:
+        """Ends the processes and gives all back, also when the crew is forgotten."""
+        return self._held.release
+
+    @property
+    def processes(self) -> dict[int, Process]:
+        """By number of the worker; none when all have been given back."""
+        return self._held.processes
+
+    @property
+    def server_pid(self) -> int:
+        """Of the process that forks them."""
+        server = self._held.server
+        return 0 if server is None else server.pid
+
+    def order(
+        self,
+        workers: Sequence[int],
+        head: tuple[int, ...],
+        stale: Sequence[bool],
+        mail: bytes | None,
+        sleeps: bool = False,
+    ) -> None:
+        """Give workers their next order; that one is dead is noticed later.
+
+        Those who look for it have it before anybody is woken, and whoever may take the core that
+        this process is on is woken last.
+
+        Args:
+            workers: which ones.
+            head: words of the order, from TASK to TRUTH.
+            stale: of all workers, whose memory is not what is committed.
+            mail: what goes with it.
+            sleeps: this side goes to sleep at once: what it does from here on it does on a core on
+                which a worker waits to begin.
+        """
+        if sleeps:
+            for k in workers:
+                self._meetings[k].lie_down_first()
+        asleep = []
+        for k in workers:
+            words = self.orders[k]
+            words[TASK : LOADS + 1] = (*head, stale[k])
+            if mail is not None:
+                self._send(k, mail)
+            if self._meetings[k].announce(words.item(NUMBER) + 1):
+                asleep.append(k)
+        if len(asleep) > 1:
+            here = present_core()
+            asleep.sort(key=lambda k: self._statuses[k].item(CORE) == here)
+        for k in asleep:
+            self._meetings[k].wake()
+
+    def number(self, k: int) -> int:
+        """Of the last order that a worker was given."""
+        return self.orders.item(k, NUMBER)
+
+    def has(self, k: int) -> bool:
+        """Whether a worker has carried it out."""
+        return self._meetings[k].has(self.number(k))
+
+    def watch(self, k: int, last_s: float = 0.0, is_soon: bool = False) -> bool:
+        """The same, but look for a moment; a longer one if it cannot take long.
+
+        Args:
+            k: which worker.
+            last_s: how long such an order has taken the last time.
+            is_soon: it is known that it does not take long.
+        """
+        return self._meetings[k].watch(self.number(k), last_s, is_soon=is_soon)
+
+    def sleep(
+        self, pending: Sequence[int], limit_s: float, is_lying: bool = False
+    ) -> dict[int, Process]:
+        """Sleep until one of those is done, or anybody is dead, but not for ever.
+
+        Args:
+            pending: who is waited for.
+            limit_s: for no longer than that.
+            is_lying: they know it from `order`.
+
+        Returns:
+            the dead, by worker.
+        """
+        ready: list[tuple[int, int]] = []
+        if self._hears_nobody(pending) if is_lying else self._lie_down(pending):
+            ready = self._poll.poll(1000.0 * limit_s)
+        for k in pending:
+            self._meetings[k].get_up()
+        if not ready:
+            return {}
+        found = [self._owners[fd] for fd, _ in ready]
+        self._heard.update(k for k, is_dead in found if not is_dead)
+        return {k: self.processes[k] for k, is_dead in found if is_dead}
+
+    def _lie_down(self, pending: Sequence[int]) -> bool:
+        """Say that this side sleeps; False: somebody is through by now, or is heard already."""
+        self.forget_calls()
+        # Of several it is enough that one of them is through: who is up is woken by nobody.
+        return all(self._meetings[k].lie_down(self.number(k)) for k in pending)
+
+    def forget_calls(self) -> None:
+        """Take what has been heard out of the wires, so that it wakes nobody again.
+
+        Mostly it is one message; whoever finds another one there hears it then.
+        """
+        for k in self._heard:
+            with suppress(BlockingIOError, ConnectionResetError):
+                self.processes[k].take()
+        self._heard.clear()
+
+    def _hears_nobody(self, pending: Sequence[int]) -> bool:
+        """Forget also who has called while this side was about to get up; False: one is through.
+
+        Only once they have their order, so that nobody waits for it: of a call that is forgotten
+        too much, the number is there before it.
+        """
+        for fd, _ in self._poll.poll(0):
+            k, is_dead = self._owners[fd]
+            if not is_dead:
+                self._heard.add(k)
+        self.forget_calls()
+        return not any(map(self.has, pending))
+
+    def settle(self, k: int, limit_s: float) -> bool:
+        """Whether a worker has carried out its order or has died of it, after a while at most."""
+        process = self.processes[k]
+        if select.select([process.pidfd], [], [], 0.0 if self.has(k) else limit_s)[0]:
+            self._statuses[k][NUMBER] = self.number(k)  # nobody else writes there any more
+        process.collect()
+        process.mail.clear()
+        return self.has(k)
+
+    def is_left_alone(self, k: int) -> bool:
+        """Whether somebody is dead without whom a worker cannot go on."""
+        others = [self.processes[j].pidfd for j in self._program.team_of(k) if j != k]
+        return bool(select.select(others, [], [], 0.0)[0])
+
+    def keep_apart(self) -> None:
+        """Give those who have been on one core different ones, unless each has its own for good."""
+        cores = [status.item(CORE) for status in self._statuses]
+        if len(set(cores)) < len(cores) and not self._program.pins:
+            keep_apart([process.pid for process in self.processes.values()], cores)
+
+    def answer(self, k: int) -> tuple[int, Any]:
+        """How a worker's order ended, as its line says, and what it has answered."""
+        kind = self._statuses[k].item(ANSWER)
+        if kind == SILENT:
+            return kind, None
+        process = self.processes[k]
+        process.collect()
+        return kind, json.loads(process.mail.pop(0))
+
+    def replace(self, k: int, mail: bytes | None, ordered: Collection[int]) -> str:
+        """Give a worker's team new processes, and those the order, if it is not carried out yet.
+
+        Args:
+            k: the worker.
+            mail: that came with the order.
+            ordered: all workers that were given it.
+
+        Returns:
+            what the old process of the worker died of, if nothing else is known.
+        """
+        team = self._program.team_of(k)
+        old = {j: self.processes[j] for j in team}
+        for process in old.values():
+            self._dismiss(process)
+        self._take_back(team, ordered)
+        server = self._held.server
+        assert server is not None
+        try:
+            statuses = {j: server.bury(process) for j, process in old.items()}
+            cause = _say(statuses[k])
+            for j in team:
+                self._fork(j)
+        except ServerGoneError:
+            cause = "the process that starts workers ended"
+            old = self._start_anew(old, ordered)
+        for j, process in old.items():
+            self._hand_over(j, process, mail)
+        return cause
+
+    def _dismiss(self, process: Process) -> None:
+        process.kill()
+        for fd in (process.pidfd, process.wire.fileno()):
+            self._poll.unregister(fd)
+            del self._owners[fd]
+        process.collect()
+
+    def _take_back(self, team: tuple[int, ...], ordered: Collection[int]) -> None:
+        """Let a team, all of it dead, do an order again together that not all have carried out."""
+        asked = [j for j in team if j in ordered]
+        if not all(self.has(j) for j in asked):
+            for j in asked:
+                self._statuses[j][NUMBER] = self.number(j) - 1  # nobody else writes there
+
+    def _hand_over(self, k: int, old: Process, mail: bytes | None) -> None:
+        """To a new process, what has come from the old one, or what that one was sent."""
+        if self.has(k):
+            self.processes[k].mail = old.mail
+        else:
+            self._send(k, mail)
+        old.release()
+
+    def _start_anew(self, dead: dict[int, Process], ordered: Collection[int]) -> dict[int, Process]:
+        """The process that forks is gone, or hangs: another one, and new workers for all.
+
+        Args:
+            dead: processes that have been dismissed.
+            ordered: all workers that were given the present order.
+
+        Returns:
+            the old processes of all workers.
+        """
+        assert self._held.server is not None
+        self._held.server.close()
+        for k, process in self.processes.items():
+            if process is dead.get(k):
+                continue
+            self._dismiss(process)
+            if k in dead:  # its successor is of no use, either
+                process.release()
+        old = {**self.processes, **dead}
+        for team in {self._program.team_of(k) for k in old}:
+            self._take_back(team, ordered)
+        self._start()
+        return old
+
+    def _send(self, k: int, mail: bytes | None) -> None:
+        if mail is not None:
+            with suppress(BrokenPipeError, ConnectionResetError):
+                self.processes[k].wire.send(mail)
+
+    def _make_memory(self) -> None:
+        held = self._held
+        orders = held.hold(Segment.make(self._count * _LINE_BYTES))
+        statuses = [held.hold(Segment.make(_LINE_BYTES)) for _ in range(self._count)]
+        images = [
+            [held.hold(Segment.make(_FIRST_IMAGE_BYTES)) for _ in range(2)]
+            for _ in range(self._count)
+        ]
+        text = json.dumps(self._program.recipe).encode()
+        recipe = held.hold(Segment.make(len(text)))
+        os.pwrite(recipe.fd, text, 0)
+        self.orders = np.frombuffer(orders.map(), dtype=np.int64).reshape(-1, WORDS)
+        self._statuses = [np.frombuffer(s.map(), dtype=np.int64)[:WORDS] for s in statuses]
+        self._told = {
+            "recipe": recipe.fd,
+            "recipe_bytes": len(text),
+            "orders": orders.fd,
+            "statuses": [segment.fd for segment in statuses],
+            "images": [[image.fd for image in pair] for pair in images],
+            "crowded": self._crowded,
+            "cores": sorted(os.sched_getaffinity(0)) if self._program.pins else [],
+        }
+
+    def _start(self) -> None:
+        """Start the process that forks, and a process for every worker."""
+        fds = tuple(segment.fd for segment in self._held.segments)
+        self._held.server = ForkServer(self._program.module, self._told, fds)
+        try:
+            for k in range(self._count):
+                self._fork(k)
+        except ServerGoneError as error:
+            raise WorkerStartError(
+                "the process that starts workers ended before it had started all"
+            ) from error
+
+    def _fork(self, k: int) -> None:
+        assert self._held.server is not None
+        process = self._held.server.fork(k)
+        self.processes[k] = process
+        for fd, is_dead in ((process.pidfd, True), (process.wire.fileno(), False)):
+            self._poll.register(fd, select.POLLIN)
+            self._owners[fd] = k, is_dead
+        self._meetings[k] = Meeting(self.orders[k], self._statuses[k], process.wire, self._crowded)
+
+
+def _say(status: int) -> str:
+    """What an exit status means."""
+    if status == OUT_OF_MEMORY:
+        return "out of memory"
+    if status >= 0:
+        return f"exit status {status}"
+    return signal.Signals(-status).name
+
+
+class _Held:
+    """What has to be given back, whoever forgets to.
+
+    Args:
+        segments: of the program.
+    """
+
+    def __init__(self, segments: list[Segment]) -> None:
+        self.segments = segments
+        self.server: ForkServer | None = None
+        self.processes: dict[int, Process] = {}
+        self._pid = os.getpid()
+
+    def hold(self, segment: Segment) -> Segment:
+        """Give it back with the others."""
+        self.segments.append(segment)
+        return segment
+
+    def release(self) -> None:
+        """End the processes; a fork of the pool's process has no right to."""
+        if os.getpid() != self._pid:
+            return
+        for process in self.processes.values():
+            process.kill()
+        if self.server is not None:
+            self.server.close()
+        for process in self.processes.values():
+            process.release()
+        for segment in self.segments:
+            segment.close()
+        self.processes.clear()

@@ -1,0 +1,1 @@
+"""The sensing of one world in processes of its own."""

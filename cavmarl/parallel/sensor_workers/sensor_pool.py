@@ -1,0 +1,320 @@
+"""`SensorFarm`: processes that sense for the worlds of this one, whose state stays where it is."""
+
+from __future__ import annotations
+
+import weakref
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, fields
+from time import perf_counter
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cavmarl.config.env import WorkersConfig
+from cavmarl.core.errors import SensorFrameError
+from cavmarl.core.numba.repeated import repeated
+from cavmarl.parallel.processes.shared_memory import Segment, size_of
+from cavmarl.parallel.processes.worker_pool import Death, Pool, Program
+from cavmarl.parallel.sensor_workers.line_costs import LineCosts
+from cavmarl.parallel.sensor_workers.sensor_job import SensorTask
+from cavmarl.parallel.sensor_workers.sensor_scene import NEVER, SceneArrays, SceneShape
+from cavmarl.parallel.sensor_workers.sensor_shares import (
+    Shares,
+    cut,
+    divide,
+    share_by_cost,
+    share_in_turn,
+)
+from cavmarl.sensors.kernels.sensor_share import gather_rows
+from cavmarl.sensors.mounted.mounted_sensor import Scene
+from cavmarl.sensors.mounted.sensor_rig import Turn, sense_here
+
+__all__ = ["FarmPlan", "FarmTimes", "SensorFarm"]
+
+SHARED_ANEW = 32  # ticks from one sharing out to the next; at first 1, 2, 4, … until there are more
+NEW_COST = 0.5  # weight of the latest costs from then on; what is first measured is of cold caches
+
+
+class FarmPlan(NamedTuple):
+    """What processes are made of.
+
+    Attributes:
+        module: that they run.
+        recipe: from which it makes its jobs; `shape` and `scene` are added.
+        frames: memory that samples are written to; it goes with the farm.
+        shape: of what is shared.
+        num_lines: (S,) into how many lines a frame of each sensor can be divided.
+        workers: how they are watched, and how sensing is shared out.
+    """
+
+    module: str
+    recipe: Mapping[str, Any]
+    frames: Segment
+    shape: SceneShape
+    num_lines: tuple[int, ...]
+    workers: WorkersConfig
+
+
+@dataclass
+class FarmTimes:
+    """Sums over all ticks in which sensors were due.
+
+    Attributes:
+        publish_s: writing down what there is to see, and who senses what.
+        own_s: sensing what stays here.
+        wait_s: from the order until all frames were there.
+        busy_s: of that, while the busiest worker sensed.
+        ticks: how many.
+        sent_bytes: that the workers were given to read.
+        got_bytes: of frames that they have written.
+        messages: orders and answers.
+    """
+
+    publish_s: float = 0.0
+    own_s: float = 0.0
+    wait_s: float = 0.0
+    busy_s: float = 0.0
+    ticks: int = 0
+    sent_bytes: int = 0
+    got_bytes: int = 0
+    messages: int = 0
+
+    def since(self, before: FarmTimes) -> FarmTimes:
+        """What has come to it since it was a copy of `before`."""
+        return FarmTimes(
+            *(getattr(self, field.name) - getattr(before, field.name) for field in fields(self))
+        )
+
+
+class _Sharing:
+    """Who senses what of the same sensors, and what that has taken since it was so.
+
+    Attributes:
+        shares: who senses what.
+        uses: ticks, in all.
+        spent_s: (n, S) processor time since then, of each worker for each sensor.
+        agents: that have been sensed for, summed over these ticks.
+    """
+
+    def __init__(self, shares: Shares, sensors: int) -> None:
+        self.shares = shares
+        self.uses = 0
+        self.spent_s = np.zeros((shares.workers, sensors))
+        self.agents = 0
+
+    def note(self, spent_s: NDArray[np.float64], agents: int) -> None:
+        """Add what a tick has taken."""
+        self.uses += 1
+        self.spent_s += spent_s
+        self.agents += agents
+
+    @property
+    def is_settled(self) -> bool:
+        """Whether it has been measured often enough to be kept for long."""
+        return self.uses >= SHARED_ANEW
+
+    @property
+    def is_over(self) -> bool:
+        """Whether it is time to look at what has been measured."""
+        often = self.uses % SHARED_ANEW == 0 if self.is_settled else self.uses.bit_count() == 1
+        return often and self.agents > 0
+
+    def forget(self) -> None:
+        """Begin to measure anew."""
+        self.spent_s[:] = 0.0
+        self.agents = 0
+
+
+class SensorFarm:
+    """n sensor workers; it lets them sense as `rig.Sense` describes.
+
+    It starts them when it is called for the first time, so it may be made before a fork. A call
+    returns when each sensor that is due has delivered the frame of this tick. Who is late is waited
+    for; who dies is replaced, and its successor senses the same again.
+
+    Args:
+        plan: what the processes are made of.
+
+    Attributes:
+        times: where the time has gone.
+        shared: with the processes, once they have been started.
+    """
+
+    shared: SceneArrays
+
+    def __init__(self, plan: FarmPlan) -> None:
+        self.times = FarmTimes()
+        self._plan = plan
+        self._pool: Pool | None = None
+        self._unused = weakref.finalize(self, plan.frames.close)
+        self._costs_s = np.zeros(plan.shape.sensors)
+        self._line_costs = LineCosts(plan.num_lines)
+        self._sharings: dict[tuple[int, ...], _Sharing] = {}
+        self._written: Shares | None = None
+        self._gather = repeated(gather_rows)
+
+    @property
+    def pool(self) -> Pool | None:
+        """The processes, if they have been started."""
+        return self._pool
+
+    @property
+    def deaths(self) -> list[Death]:
+        """Of sensor workers, up to now."""
+        return [] if self._pool is None else self._pool.deaths
+
+    @property
+    def costs_s(self) -> NDArray[np.float64]:
+        """(S,) processor time of one agent's frame of each sensor, as it is of late."""
+        return self._costs_s.copy()
+
+    def __call__(self, scenes: Sequence[Scene], turns: Sequence[Turn]) -> None:
+        """Write the samples of all turns.
+
+        Raises:
+            SensorFrameError: a frame is not that of the tick.
+            WorkerError: workers cannot be started, or die again and again.
+        """
+        theirs = [turn for turn in turns if not turn.sensor.stamps_itself]
+        if not theirs:
+            sense_here(scenes, turns)
+            return
+        pool = self._started()
+        began = perf_counter()
+        sharing = self._share(tuple(turn.place for turn in theirs))
+        self._publish(scenes, theirs)
+        published = perf_counter()
+        sense_here(scenes, [turn for turn in turns if turn.sensor.stamps_itself])
+        sensed = perf_counter()
+        pool.run(SensorTask.SENSE, commits=False)
+        self.check(theirs)
+        ended = perf_counter()
+        sharing.note(self.shared.spent_s, int(self.shared.num_agents.sum()))
+        self._note(began, published, sensed, ended, theirs)
+
+    def close(self) -> None:
+        """End the processes."""
+        self._unused()
+        if self._pool is not None:
+            self._pool.close()
+
+    def _started(self) -> Pool:
+        if self._pool is None:
+            self._pool = self._start()
+            self._unused.detach()  # the pool gives the memory back
+        return self._pool
+
+    def _start(self) -> Pool:
+        plan = self._plan
+        scene = Segment.make(size_of(plan.shape.layout))
+        self.shared = SceneArrays.of(scene, plan.shape)
+        told = {"shape": plan.shape, "scene": scene.fd, "frames": plan.frames.fd}
+        recipe = {**plan.recipe, **told}
+        names = tuple(f"sensor worker {k}" for k in range(plan.shape.workers))
+        tasks = tuple(task.name.lower() for task in SensorTask)
+        program = Program(plan.module, recipe, names, (scene, plan.frames), tasks, plan.workers.pin)
+        return Pool(program, plan.workers.timeout_s, plan.workers.repeats)
+
+    def _publish(self, scenes: Sequence[Scene], turns: Sequence[Turn]) -> None:
+        """Write down what there is to see; the rows of all zones, each once."""
+        shared, worlds = self.shared, scenes[0].worlds
+        shared.num_rows[:] = 0
+        for scene in scenes:
+            self._gather(scene.worlds, True, shared.rows, shared.num_rows)
+        shared.num_agents[:] = shared.num_rows
+        for scene in scenes:
+            self._gather(scene.worlds, False, shared.rows, shared.num_rows)
+        shared.ticks[:] = worlds.ticks
+        shared.keys[:] = worlds.keys
+        shared.signal_phase[:] = worlds.signal_phase
+        shared.before[:] = scenes[0].before
+        shared.due[:, 0] = 0
+        for turn in turns:
+            shared.due[turn.place] = turn.due
+        shared.delivered[:] = NEVER
+        shared.spent_s[:] = 0.0
+
+    def check(self, turns: Sequence[Turn]) -> None:
+        """See that every worker has delivered every frame that is due, of this tick.
+
+        Raises:
+            SensorFrameError: the first that is not.
+        """
+        shared = self.shared
+        wrong = (shared.delivered != shared.ticks) & (shared.due[:, 0] > 0)  # (n, S, W)
+        if not wrong.any():
+            return
+        for turn in turns:
+            for worker, world in np.argwhere(wrong[:, turn.place]).tolist():
+                found = shared.delivered[worker, turn.place, world]
+                raise SensorFrameError(turn.sensor.name, int(shared.ticks[world]), int(found))
+
+    def _share(self, sensors: tuple[int, ...]) -> _Sharing:
+        """Who senses what of some sensors, written for the workers."""
+        sharing = self._sharings.get(sensors)
+        if sharing is None:
+            sharing = _Sharing(self._share_anew(sensors), self._plan.shape.sensors)
+            self._sharings[sensors] = sharing
+        elif sharing.is_over:
+            self._learn(sharing)
+            if self._by_cost:
+                sharing.shares = self._share_anew(sensors)
+        if sharing.shares is not self._written:
+            self._written = sharing.shares
+            lines = self.shared.lines
+            self._written.write(lines.reshape(*lines.shape[:2], -1, 2))
+        return sharing
+
+    @property
+    def _by_cost(self) -> bool:
+        return self._plan.workers.sensor_placement == "cost"
+
+    def _share_anew(self, sensors: tuple[int, ...]) -> Shares:
+        plan, shape = self._plan, self._plan.shape
+        lines = {sensor: plan.num_lines[sensor] for sensor in sensors}
+        units = cut(lines, shape.worlds * shape.agents, shape.workers)
+        unknown = not self._costs_s[list(sensors)].all()
+        costs = [
+            float(unknown or self._costs_s[unit.sensor]) * (unit.last - unit.first)
+            for unit in units
+        ]
+        if not self._by_cost:
+            return share_in_turn(units, costs, shape.workers)
+        shares = share_by_cost(units, costs, shape.workers)
+        return shares if unknown else divide(shares, self._line_costs)
+
+    def _learn(self, sharing: _Sharing) -> None:
+        """Take over what has been measured: what a frame costs, and which of its lines."""
+        costs_s = sharing.spent_s.sum(axis=0) / sharing.agents
+        weight = NEW_COST if sharing.is_settled else 1.0
+        known = np.where(self._costs_s > 0.0, self._costs_s, costs_s)
+        self._costs_s = np.where(costs_s > 0.0, known + weight * (costs_s - known), self._costs_s)
+        for sensor, parts in sharing.shares.divided.items():
+            spent_s = [float(sharing.spent_s[home, sensor]) for home, _ in parts]
+            self._line_costs.learn(sensor, [lines for _, lines in parts], spent_s)
+        sharing.forget()
+
+    def _note(
+        self,
+        began: float,
+        published: float,
+        sensed: float,
+        ended: float,
+        turns: Sequence[Turn],
+    ) -> None:
+        """Add up what a tick has taken; times are those of `time.perf_counter`."""
+        times, shared = self.times, self.shared
+        times.publish_s += published - began
+        times.own_s += sensed - published
+        times.wait_s += ended - sensed
+        times.busy_s += float(shared.busy_s.max())
+        times.ticks += 1
+        times.sent_bytes += int(shared.num_rows.sum()) * shared.rows.itemsize + sum(
+            array.nbytes for array in (shared.before, shared.due, shared.signal_phase)
+        )
+        for turn in turns:
+            frames = turn.frames.data
+            one = frames.nbytes // (frames.shape[0] * frames.shape[2])  # of all agents of a world
+            times.got_bytes += int(turn.due.num.sum()) * one
+        times.messages += 2 * self._plan.shape.workers

@@ -1,0 +1,121 @@
+"""Sensor workers of some worlds: what they are told, and the jobs that they make of it."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Mapping
+from dataclasses import asdict, replace
+from pathlib import Path
+from typing import Any
+
+from cavmarl.config.env import EnvConfig, WorkersConfig, ZonesConfig
+from cavmarl.engine.simulation import Simulation
+from cavmarl.engine.world_setup import World, make_world
+from cavmarl.parallel.local_worlds import LocalWorlds
+from cavmarl.parallel.processes.process_barrier import usable_cores
+from cavmarl.parallel.processes.shared_memory import Segment, arrays_in, size_of
+from cavmarl.parallel.sensor_workers.sensor_job import SensorJob
+from cavmarl.parallel.sensor_workers.sensor_pool import FarmPlan, SensorFarm
+from cavmarl.parallel.sensor_workers.sensor_scene import SceneArrays, SceneShape
+from cavmarl.parallel.step_arrays import StepArrays, layout_of
+from cavmarl.sensors.mounted.catalogue import type_of
+
+__all__ = ["farm_of", "local_worlds", "make_sensor_jobs", "warn_if_crowded"]
+
+PROGRAM = "cavmarl.parallel.sensor_workers.sensor_worker"
+
+
+def local_worlds(
+    world: World, base_dir: Path, num_worlds: int, in_next_step: bool = False
+) -> LocalWorlds:
+    """Worlds of this process, with as many sensor workers as `workers.sensors` says.
+
+    Args:
+        world: what each is made of.
+        base_dir: the folder that its relative files start from.
+        num_worlds: W.
+        in_next_step: when worlds begin anew; see `SteppedWorlds`.
+
+    Raises:
+        WorkerError: there is no memory that processes could share.
+    """
+    config = world.config
+    if not config.workers.sensors:
+        return LocalWorlds(world, num_worlds, in_next_step=in_next_step)
+    warn_if_crowded(config.workers.sensors, 1)
+    layout = layout_of(config, world.capacity, num_worlds)
+    segment = Segment.make(size_of(layout))
+    arrays = StepArrays.of(arrays_in(segment.map(), layout))
+    worlds = LocalWorlds(world, num_worlds, arrays, in_next_step=in_next_step)
+    worlds.hire(farm_of(world, base_dir, segment, (0, num_worlds), num_worlds))
+    return worlds
+
+
+def warn_if_crowded(sensor_workers: int, times: int) -> None:
+    """Warn of more sensor workers than cores; `times` processes have so many each."""
+    cores = len(usable_cores())
+    if sensor_workers * times > cores:
+        warnings.warn(
+            f"{sensor_workers * times} sensor workers: there are {cores} cores; more workers than "
+            "cores do not make it faster",
+            RuntimeWarning,
+            stacklevel=5,
+        )
+
+
+def farm_of(
+    world: World, base_dir: Path, arrays: Segment, part: tuple[int, int], num_worlds: int
+) -> SensorFarm:
+    """The sensor workers of some worlds, to be started when they are needed.
+
+    Args:
+        world: what each is made of.
+        base_dir: the folder that its relative files start from.
+        arrays: the memory of the `StepArrays` of all worlds; it goes with the farm.
+        part: the first of its worlds, and the one after the last.
+        num_worlds: in all.
+    """
+    config = world.config
+    first, last = part
+    shape = SceneShape(
+        worlds=last - first,
+        capacity=world.capacity,
+        agents=config.population.num_ids,
+        signals=len(world.network.signals),
+        sensors=len(config.rig),
+        workers=config.workers.sensors,
+    )
+    recipe = {
+        "config": asdict(_undivided(config)),
+        "base_dir": str(base_dir.resolve()),
+        "part": part,
+        "num_worlds": num_worlds,
+    }
+    lines = tuple(type_of(name, sensor).num_lines(sensor) for name, sensor in config.rig.items())
+    return SensorFarm(FarmPlan(PROGRAM, recipe, arrays, shape, lines, config.workers))
+
+
+def make_sensor_jobs(recipe: Mapping[str, Any]) -> list[SensorJob]:
+    """The jobs of all sensor workers of a farm, every kernel loaded.
+
+    Args:
+        recipe: of `farm_of`, with what the farm has added.
+    """
+    from cavmarl.config.io import validate  # pydantic is slow to import
+
+    config = validate(EnvConfig, recipe["config"], "the environment")
+    world = make_world(config, Path(recipe["base_dir"]))
+    shape = SceneShape(*recipe["shape"])
+    layout = layout_of(config, shape.capacity, recipe["num_worlds"])
+    arrays = StepArrays.of(arrays_in(Segment(recipe["frames"], 0).map(), layout))
+    frames = arrays.part(*recipe["part"]).frames
+    shared = SceneArrays.of(Segment(recipe["scene"], 0), shape)
+    simulation = Simulation(config, world.network, shape.worlds, world.demand, world.partition)
+    jobs = [SensorJob(simulation, shared, frames, number) for number in range(shape.workers)]
+    jobs[0].warm()
+    return jobs
+
+
+def _undivided(config: EnvConfig) -> EnvConfig:
+    """The same environment with all zones in one, and nobody who senses elsewhere."""
+    return replace(config, zones=ZonesConfig(), workers=WorkersConfig())

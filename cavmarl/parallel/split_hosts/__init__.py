@@ -1,0 +1,1 @@
+"""The zones of one world on several machines."""

@@ -1,0 +1,253 @@
+"""`DividedWorlds`: worlds whose zones are run on the machines of a Ray cluster."""
+
+from __future__ import annotations
+
+import json
+import logging
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import asdict
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cavmarl.balance.balance_plan import Plan
+from cavmarl.balance.plan_text import describe_plan
+from cavmarl.core.errors import ConfigError, SumoError, WorkerError, WorkerFailureError
+from cavmarl.engine.simulation import Simulation
+from cavmarl.engine.world_setup import World
+from cavmarl.handoff.coordinator.coordinator_setup import check_faults
+from cavmarl.parallel.commanded_worlds import own_error
+from cavmarl.parallel.driven_vehicles import Driven
+from cavmarl.parallel.hosts.host_commands import HostProgram
+from cavmarl.parallel.hosts.host_pool import HostPool
+from cavmarl.parallel.hosts.hosted_worlds_job import code_stamp
+from cavmarl.parallel.hosts.ray_actors import RayActors
+from cavmarl.parallel.mover import Mover
+from cavmarl.parallel.processes.worker_pool import Death
+from cavmarl.parallel.split_hosts.zone_leader import ZoneLeader
+from cavmarl.parallel.split_hosts.zones_job import host_zones, make_replicated
+from cavmarl.parallel.step_placement import Placement
+from cavmarl.parallel.work_shares import Part, parts_of
+from cavmarl.parallel.worlds_job import Task, fingerprint
+from cavmarl.shards.shard import Commands, Shard
+
+__all__ = ["DividedWorlds"]
+
+log = logging.getLogger("cavmarl.workers")
+
+
+class DividedWorlds:
+    """W worlds that this process leads, and m hosts that run their zones, the same of all worlds.
+
+    Args:
+        world: what each is made of.
+        base_dir: the folder that its relative files start from, on every machine.
+        num_worlds: W.
+        workers: m, from 2 to the zones of a world.
+        in_next_step: when worlds begin anew; see `SteppedWorlds`.
+
+    Attributes:
+        world: what each is made of.
+        arrays: of this process.
+        pool: the hosts.
+        in_next_step: when worlds begin anew.
+        placement: which host has which zones.
+        leader: runs the phases.
+        spent_s: (1, zones) processor time of each zone of all worlds, if hosts measure it.
+        mover: has that changed; None: it does not change.
+
+    Raises:
+        MissingExtraError: Ray is not installed.
+        ConfigError: a setting that such worlds cannot have, more hosts than zones, or than CPUs.
+        WorkerError: no cluster, or no host comes.
+    """
+
+    def __init__(
+        self,
+        world: World,
+        base_dir: Path,
+        num_worlds: int,
+        workers: int,
+        in_next_step: bool = False,
+    ) -> None:
+        _check(world, num_worlds, workers)
+        config = world.config
+        self.world = world
+        self.in_next_step = in_next_step
+        self.placement = Placement(world, 1, workers)
+        (part,) = parts_of(self.placement.plans, world.partition.count)
+        self._worlds, memory, inputs = make_replicated(world, num_worlds, in_next_step, warm=True)
+        self.arrays = self._worlds.arrays
+        self._is_torn = False
+        self.spent_s = np.zeros((1, world.partition.count))
+        self.mover: Mover | None = None
+        if every := config.workers.balance_steps:
+            self.mover = Mover(self.placement, world.partition.count, every, self.spent_s)
+
+        def lead(shards: Sequence[Shard], gathering: tuple[float, float]) -> ZoneLeader:
+            self.leader = ZoneLeader(shards, memory, inputs, part.zones, self.spent_s[0])
+            return self.leader
+
+        simulation = self._worlds.simulation
+        simulation.host(lead, gathers=False)
+        if simulation.mounted is not None:
+            simulation.mounted.rig.sense = self.leader.sense
+        recipe = {
+            "config": asdict(config),
+            "base_dir": str(base_dir.resolve()),
+            "fingerprint": fingerprint(world),
+            "in_next_step": in_next_step,
+            "num_worlds": num_worlds,
+            "measures": self.mover is not None,
+        }
+        actors = RayActors(host_zones, lambda count: json.dumps(recipe), workers, workers)
+        program = HostProgram(_names(part), (1,) * workers, ("phase",), -1, code_stamp())
+        try:
+            self.pool = HostPool(actors, program, config.workers.timeout_s, config.workers.repeats)
+        except WorkerFailureError as failure:
+            raise own_error(failure) from failure
+        self.leader.let_work(self.pool)
+
+    @property
+    def simulation(self) -> Simulation:
+        """The worlds: this process has all of them between two phases."""
+        return self._worlds.simulation
+
+    @property
+    def plans(self) -> tuple[Plan, ...]:
+        """Which host has which zones, of each world."""
+        return self.placement.plans
+
+    @property
+    def deaths(self) -> list[Death]:
+        """Of hosts, up to now."""
+        return self.pool.deaths
+
+    def reset(self, seed: int | None, first_world: int) -> None:
+        """Begin an episode in the worlds of `chosen`.
+
+        Raises:
+            WorkerError: as of `step`; all worlds may be reset after an interruption.
+        """
+        everywhere = bool(self.arrays.chosen.all())
+        with self._whole(begins_anew=everywhere):
+            self._worlds.reset(seed, first_world)
+        if everywhere:
+            log.info("%s", "\n\n".join(map(describe_plan, self.plans)))
+
+    def step(self, commands: Commands) -> None:
+        """Let the agents act, and reset the worlds whose episode is over, now or a step later.
+
+        Raises:
+            WorkerError: hosts cannot go on, or a step before was interrupted in its middle.
+        """
+        if self.mover is not None:
+            self.mover.before_step(self._host, self._pids)
+        with self._whole():
+            self._worlds.step(commands)
+
+    def _host(self, task: Task, zones: Sequence[Sequence[Sequence[int]]], commits: bool) -> None:
+        """Let zones have other hosts: they are sent whole with the next phase."""
+        self.leader.host(zones[0])
+        (part,) = parts_of(self.placement.plans, self.world.partition.count)
+        self.pool.rename(_names(part))
+
+    def _pids(self) -> dict[int, int]:
+        return dict.fromkeys(range(len(self.pool.sizes)), 0)  # nobody looks: they run elsewhere
+
+    def suggest(self) -> None:
+        """Write what the built-in driver would do in the agents' place."""
+        with self._whole():
+            self._worlds.suggest()
+
+    def write_states(self) -> None:
+        """Write the global state of each world."""
+        self._worlds.write_states()
+
+    def ticks(self) -> NDArray[np.int64]:
+        """(W,) ticks since each world's reset."""
+        return self._worlds.ticks()
+
+    def state_hash(self, world: int) -> str:
+        """Hex digest of one world."""
+        return self._worlds.state_hash(world)
+
+    def traffic_stats(self, world: int) -> dict[str, float]:
+        """Traffic of one world since its reset."""
+        return self._worlds.traffic_stats(world)
+
+    def driven(self, world: int, agents: Sequence[int]) -> list[Driven]:
+        """The vehicles of some agents of one world, in no order."""
+        return self._worlds.driven(world, agents)
+
+    def signal_phases(self, world: int) -> NDArray[np.int32]:
+        """(num_signals,) PHASE rows that are on in one world."""
+        return self._worlds.signal_phases(world)
+
+    def close(self) -> None:
+        """End the hosts, and the cluster if it was started for them."""
+        self.pool.close()
+        self._worlds.close()
+
+    @contextmanager
+    def _whole(self, begins_anew: bool = False) -> Iterator[None]:
+        """The time in which worlds change; who is interrupted then leaves them half changed.
+
+        Raises:
+            WorkerError: so it is.
+        """
+        if self._is_torn and not begins_anew:
+            raise WorkerError(
+                "the worlds were interrupted in the middle of a step: reset all of them"
+            )
+        self._is_torn = True
+        try:
+            yield
+        except SumoError:  # the worlds have been put back
+            self._is_torn = begins_anew
+            raise
+        except WorkerFailureError as failure:
+            raise own_error(failure) from failure
+        self._is_torn = False
+
+
+def _names(part: Part) -> tuple[str, ...]:
+    """What each host runs, in words."""
+    return tuple(
+        f"{'zone' if len(zones) == 1 else 'zones'} {', '.join(map(str, zones))}"
+        for zones in part.zones
+    )
+
+
+def _check(world: World, num_worlds: int, workers: int) -> None:
+    """Refuse what such worlds cannot have.
+
+    Raises:
+        ConfigError: so it is.
+    """
+    config, count = world.config, world.partition.count
+    if workers > count:
+        raise ConfigError(
+            f"workers = {workers}, hosts = 'ray': {num_worlds} world(s) of {count} zone(s) each: "
+            "more hosts than worlds run the same zones of all worlds, so at most as many as zones; "
+            "use fewer workers, more zones or more worlds"
+        )
+    if config.workers.watch:
+        raise ConfigError(
+            "workers.watch = True, hosts = 'ray': only this machine is looked at; leave it out "
+            "(Ray tells what is reserved on each node), or leave out the hosts"
+        )
+    if config.workers.sensors:
+        raise ConfigError(
+            f"workers.sensors = {config.workers.sensors}, hosts = 'ray': sensor workers are on the "
+            "machine of the worlds; leave it 0, or leave out the hosts"
+        )
+    _, deaths = check_faults(config.zones, count, num_worlds)
+    if deaths:
+        raise ConfigError(
+            f"zones.faults = {config.zones.faults!r}, zones.reproducers = "
+            f"{config.zones.reproducers!r}: hosts of zones die by plan in one process only; use "
+            "workers=0"
+        )

@@ -1,0 +1,245 @@
+"""`ZonePhases`: what phases read and write that hosts run, each on its zones in its own memory.
+
+A host has the rows of its own zones and their ghosts, and what all zones have in common. Before a
+phase it is sent what has changed of that; after it, it sends what has changed of what its zones
+write. What a phase writes it has been sent before, so that both ends tell changes from the same.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from enum import IntEnum
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cavmarl.core.numba.repeated import repeated
+from cavmarl.core.records.arrays import Common
+from cavmarl.parallel.kernels.replica_copies import mark_agents
+from cavmarl.parallel.split_hosts.replica_memory import Place, Replica, ReplicaMemory
+from cavmarl.sensors.kernels.rig_frames import POSE
+from cavmarl.sensors.kernels.rig_schedule import Due
+from cavmarl.sensors.mounted.frames import Frames
+from cavmarl.shards.shard import Commands, Shard
+
+__all__ = ["PhaseInputs", "ZonePhase", "ZonePhases", "ZoneTurn"]
+
+Array = NDArray[Any]
+
+
+class ZonePhase(IntEnum):
+    """What hosts run together."""
+
+    MOVE = 0
+    RESOLVE = 1
+    SENSE = 2
+    SUGGEST = 3
+    MOUNTED = 4  # the sensors of the rig
+
+
+# Fields of `Zoned` (k, W), of `Mail` that agents read, of `Outputs` that zones write.
+NUMBERS = (
+    "num_owned", "num_rows", "num_near", "num_through", "num_touching", "num_contacts", "num_outer",
+)  # fmt: skip
+INBOXES = ("objects", "events", "signals")
+SENSED = (
+    "observations", "terms", "terminated", "present", "acted", "events", "vehicle_ids",
+)  # fmt: skip
+
+CLEARED = 1 << 16  # words that are made 0 at once
+
+
+class PhaseInputs(NamedTuple):
+    """What phases are called with, at the same place in all processes.
+
+    Attributes:
+        commands: of the agents.
+        chosen: (W,) worlds in which agents sense.
+        suggested: (W, A, 2) what the built-in driver would do.
+        before: POSE (W, A) of all agents in the tick before.
+        due: (S, 3, W) of each sensor of the rig, see `Due`.
+        frames: what the rigs sense.
+    """
+
+    commands: Commands
+    chosen: NDArray[np.bool_]
+    suggested: NDArray[np.float64]
+    before: NDArray[np.void]
+    due: NDArray[np.int64]
+    frames: Frames
+
+    @classmethod
+    def make(
+        cls,
+        memory: ReplicaMemory,
+        commands: Commands,
+        suggested: NDArray[np.float64],
+        frames: Frames,
+    ) -> PhaseInputs:
+        """With arrays of the memory for the rest."""
+        agents = commands.meta_actions.shape
+        return cls(
+            commands,
+            memory.zeros(agents[0], np.bool_),
+            suggested,
+            memory.zeros(agents, POSE),
+            memory.zeros((len(frames), len(Due._fields), agents[0]), np.int64),
+            frames,
+        )
+
+
+class ZoneTurn(NamedTuple):
+    """One phase on some zones.
+
+    Attributes:
+        phase: which one.
+        zones: on which, rising.
+        side: where their rows are.
+        next_side: where the next ones are.
+        begins_step: before it moves, the accounts of a step are opened.
+        sensors: of the rig, by number, that are due.
+    """
+
+    phase: ZonePhase
+    zones: NDArray[np.int64]
+    side: int
+    next_side: int
+    begins_step: bool = False
+    sensors: tuple[int, ...] = ()
+
+
+class _Rows(NamedTuple):
+    """An array (k, W, C), of which each zone of each world has the first few."""
+
+    place: Place
+    strides: NDArray[np.int64]
+
+
+class _OfAgents(NamedTuple):
+    """An array (W, A, …)."""
+
+    place: Place
+    size: int  # bytes of each agent
+
+
+class ZonePhases:
+    """What is sent before and after the phases of some worlds.
+
+    Args:
+        shards: one a zone.
+        memory: in which the arrays lie that they write.
+        inputs: what phases are called with.
+
+    Attributes:
+        inputs: the same.
+        pieces: of a stream there are at most so many that do not lie next to each other.
+    """
+
+    def __init__(self, shards: Sequence[Shard], memory: ReplicaMemory, inputs: PhaseInputs) -> None:
+        first = shards[0]
+        self.inputs = inputs
+        self._memory = memory
+        self._zoned = zoned = first.zoned
+        self._marks = np.zeros(inputs.commands.meta_actions.shape, dtype=np.bool_)
+        self._mark_agents = repeated(mark_agents)
+        common = [
+            *(getattr(first.worlds, name) for name in Common._fields if name != "pending"),
+            *(array for array in _ways_on_the_way(first) if memory.find(array) is not None),
+        ]
+        numbers = [getattr(zoned, name) for name in NUMBERS]
+        inboxes = [] if first.mail is None else [getattr(first.mail, name) for name in INBOXES]
+        acts = inputs.commands.meta_actions if first.discrete else inputs.commands.controls
+        reads = {
+            ZonePhase.MOVE: [*common, *numbers, acts],
+            ZonePhase.RESOLVE: numbers,
+            ZonePhase.SENSE: [*common, *numbers, inputs.chosen, *inboxes],
+            ZonePhase.SUGGEST: [*common, *numbers],
+            ZonePhase.MOUNTED: [*common, *numbers, inputs.before, inputs.due],
+        }
+        of_agents = {
+            ZonePhase.MOVE: [first.worlds.pending],
+            ZonePhase.SENSE: [
+                array
+                for array in (getattr(first.outputs, name) for name in SENSED)
+                if memory.find(array)
+                is not None  # with `observation.mode: sensors` nobody sees some
+            ],
+            ZonePhase.SUGGEST: [inputs.suggested],
+            ZonePhase.MOUNTED: [frames.data for frames in inputs.frames.values()],
+        }
+        rows = [*zoned.rows, zoned.outer]
+        self._numbers = memory.spans_of(numbers)
+        self._reads = {phase: memory.spans_of(arrays) for phase, arrays in reads.items()}
+        self._rows = [self._rows_of(array) for array in zoned.rows]
+        self._outer = self._rows_of(zoned.outer)
+        self._of_agents = {
+            phase: [_OfAgents(memory.place_of(array), array.strides[1]) for array in arrays]
+            for phase, arrays in of_agents.items()
+        }
+        everything = [*rows]
+        for arrays in (*reads.values(), *of_agents.values()):
+            everything += arrays
+        self._everything = memory.spans_of(everything)
+        agents = self._marks.size * sum(map(len, of_agents.values()))
+        self.pieces = len(everything) + 4 * zoned.num_owned.size + agents
+
+    def _rows_of(self, array: Array) -> _Rows:
+        strides = np.array(array.strides[:3], dtype=np.int64)
+        return _Rows(self._memory.place_of(array), strides)
+
+    def clear(self) -> None:
+        """Make all that is ever sent 0: the other end takes this process for a new one."""
+        for arena, bounds in self._everything:
+            words = self._memory.arenas[arena]
+            for begin, end in bounds.tolist():
+                last = -(-end // words.itemsize)
+                for first in range(begin // words.itemsize, last, CLEARED):
+                    some = words[first : min(first + CLEARED, last)]
+                    if some.any():  # memory that is never written is never taken
+                        some[:] = 0
+
+    def note_inputs(self, replica: Replica, turn: ZoneTurn) -> None:
+        """Note what has changed of what a host reads and writes."""
+        zoned, zones, phase = self._zoned, turn.zones, turn.phase
+        replica.begin()
+        replica.note(self._reads[phase])
+        side = turn.next_side if phase == ZonePhase.RESOLVE else turn.side
+        replica.note_rows(*self._rows[side], zones, zoned.num_rows)
+        if phase == ZonePhase.MOVE:
+            replica.note_rows(*self._outer, zones, zoned.num_owned)
+            if turn.next_side != side:
+                replica.note_rows(*self._rows[turn.next_side], zones, zoned.num_owned)
+        self._note_agents(replica, turn)
+
+    def note_results(self, replica: Replica, turn: ZoneTurn) -> None:
+        """Note what has changed of what a host writes; called there."""
+        zoned, zones, phase = self._zoned, turn.zones, turn.phase
+        replica.begin()
+        if phase in (ZonePhase.MOVE, ZonePhase.RESOLVE):
+            replica.note(self._numbers)
+            replica.note_rows(*self._rows[turn.next_side], zones, zoned.num_owned)
+        if phase == ZonePhase.MOVE:
+            replica.note_rows(*self._outer, zones, zoned.num_outer)
+            if turn.begins_step and turn.next_side != turn.side:
+                replica.note_rows(*self._rows[turn.side], zones, zoned.num_owned)
+        self._note_agents(replica, turn)
+
+    def _note_agents(self, replica: Replica, turn: ZoneTurn) -> None:
+        """Note what has changed of the agents that the zones own."""
+        arrays = self._of_agents.get(turn.phase, [])
+        if turn.phase == ZonePhase.MOUNTED:
+            arrays = [arrays[place] for place in turn.sensors]
+        if not arrays:
+            return
+        zoned = self._zoned
+        self._mark_agents(zoned.rows[turn.side], zoned.num_owned, turn.zones, self._marks)
+        for place, size in arrays:
+            replica.note_agents(place, size, self._marks)
+
+
+def _ways_on_the_way(shard: Shard) -> Iterator[Array]:
+    """Ways and stops that are written while worlds run."""
+    travel = shard.travel
+    yield travel.steps[travel.num_fixed :]
+    yield travel.stops

@@ -1,0 +1,232 @@
+"""`ZonesJob`: what a host does that runs some zones of worlds which a caller elsewhere leads."""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Sequence
+from functools import partial
+from pathlib import Path
+from typing import Any, NamedTuple, NoReturn
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cavmarl.config.env import EnvConfig
+from cavmarl.core.errors import WorkerStartError
+from cavmarl.engine.world_setup import World, make_world
+from cavmarl.parallel.hosts.host_process import Outcome, serve
+from cavmarl.parallel.hosts.hosted_worlds_job import code_stamp
+from cavmarl.parallel.journaled_worlds import unwatched
+from cavmarl.parallel.local_worlds import LocalWorlds
+from cavmarl.parallel.split_hosts.replica_memory import Replica, ReplicaMemory
+from cavmarl.parallel.split_hosts.zone_phases import PhaseInputs, ZonePhase, ZonePhases, ZoneTurn
+from cavmarl.parallel.step_arrays import StepArrays, layout_of
+from cavmarl.parallel.team.hosted_zones import HostedZones
+from cavmarl.parallel.worlds_job import commands_of, fingerprint
+from cavmarl.sensors.kernels.rig_schedule import Due
+from cavmarl.sensors.mounted.sensor_rig import Turn, sense_here
+
+__all__ = ["PhaseOrder", "ZonesJob", "host_zones", "make_replicated"]
+
+Array = NDArray[Any]
+
+
+class PhaseOrder(NamedTuple):
+    """The letter of an order: a phase on some zones, and how much has changed before it.
+
+    Attributes:
+        is_new: the host is to forget what it has.
+        words: of changes.
+        phase: a `ZonePhase`.
+        zones: see `ZoneTurn`, as the rest.
+        side: where the rows are.
+        next_side: where the next ones are.
+        begins_step: whether a step begins.
+        sensors: that are due.
+    """
+
+    is_new: bool
+    words: int
+    phase: int
+    zones: list[int]
+    side: int
+    next_side: int
+    begins_step: bool
+    sensors: list[int]
+
+
+def host_zones(recipe: str, place: tuple[str, int], secret: bytes, number: int) -> NoReturn:
+    """The whole life of a process that hosts zones; see `hosts.host.serve`.
+
+    Args:
+        recipe: what `divided.DividedWorlds` writes.
+        place: where it listens.
+        secret: of its hosts.
+        number: of this one.
+    """
+    serve(partial(ZonesJob, json.loads(recipe)), place, secret, number)
+
+
+def make_replicated(
+    world: World, num_worlds: int, in_next_step: bool, warm: bool
+) -> tuple[LocalWorlds, ReplicaMemory, PhaseInputs]:
+    """Worlds whose arrays lie at the same places wherever they are made.
+
+    Args:
+        world: what each is made of.
+        num_worlds: W.
+        in_next_step: when worlds begin anew; see `SteppedWorlds`.
+        warm: have all kernels ready now.
+    """
+    memory = ReplicaMemory()
+    config = world.config
+    layout = layout_of(config, world.capacity, num_worlds).items()
+    arrays = StepArrays.of({name: memory.zeros(shape, kind) for name, (kind, shape) in layout})
+    inputs = PhaseInputs.make(memory, commands_of(arrays), arrays.suggested, arrays.frames)
+    worlds = LocalWorlds(
+        world, num_worlds, arrays, warm=warm, in_next_step=in_next_step, zeros=memory.zeros
+    )
+    return worlds, memory, inputs
+
+
+class ZonesJob:
+    """Some zones of all worlds; which ones, each order says.
+
+    Args:
+        recipe: environment, and how many worlds there are.
+
+    Raises:
+        WorkerStartError: this machine's files are not the caller's.
+        CavmarlError: they cannot be read.
+    """
+
+    def __init__(self, recipe: dict[str, Any]) -> None:
+        from cavmarl.config.io import validate  # pydantic is slow to import
+
+        config = validate(EnvConfig, recipe["config"], "the environment")
+        world = make_world(config, Path(recipe["base_dir"]))
+        if fingerprint(world) != recipe["fingerprint"]:
+            raise WorkerStartError(
+                f"the files of '{config.name}' in {recipe['base_dir']} are not the caller's: copy "
+                "them to all machines"
+            )
+        self._worlds, memory, self._inputs = make_replicated(
+            unwatched(world), recipe["num_worlds"], recipe["in_next_step"], warm=True
+        )
+        simulation = self._worlds.simulation
+        shards = simulation.shards
+        self._mounted = simulation.mounted
+        self._phases = ZonePhases(shards, memory, self._inputs)
+        self._caller = Replica(memory, self._phases.pieces)
+        self._spent_s = np.zeros(len(shards)) if recipe["measures"] else None
+        self._hosted = HostedZones(shards, (), self._spent_s)
+        self._zones: list[int] = []
+        self._coming: Array = np.zeros(0, dtype=np.uint64)
+        self._rehearse(np.arange(len(shards)))
+
+    @property
+    def code(self) -> str:
+        """What has to be the same on all machines for the same to come out."""
+        return code_stamp()
+
+    def fit(self, size: int) -> None:
+        """Nothing to do: each order says how much it is about."""
+
+    def inputs(self, task: int, letter: Any) -> list[Array]:
+        """Where the changes of an order go."""
+        self._coming = np.empty(PhaseOrder(*letter).words, dtype=np.uint64)
+        return [self._coming]
+
+    def perform(self, task: int, letter: Any) -> Outcome:
+        """Run a phase.
+
+        The answer is how many words of changes come out; where that is asked for, also the
+        processor time of each zone, in s.
+        """
+        order = PhaseOrder(*letter)
+        if order.is_new:
+            self._phases.clear()
+            self._caller.forget()
+        if order.is_new or order.zones != self._zones:
+            self._zones = order.zones
+            self._hosted.take(order.zones)
+        self._caller.take(self._coming)
+        turn = ZoneTurn(
+            ZonePhase(order.phase), np.array(order.zones, dtype=np.int64), order.side,
+            order.next_side, order.begins_step, tuple(order.sensors),
+        )  # fmt: skip
+        self._run(turn)
+        self._phases.note_results(self._caller, turn)
+        stream = self._caller.stream
+        return Outcome([stream.size, *self._costs(turn.zones)], [stream])
+
+    def _costs(self, zones: NDArray[np.int64]) -> list[float]:
+        """Processor time of each zone since it was asked for last."""
+        if self._spent_s is None:
+            return []
+        costs: list[float] = self._spent_s[zones].tolist()
+        self._spent_s[:] = 0.0
+        return costs
+
+    def _run(self, turn: ZoneTurn) -> None:
+        hosted, inputs = self._hosted, self._inputs
+        hosted.face(turn.side, turn.next_side)
+        match turn.phase:
+            case ZonePhase.MOVE:
+                if turn.begins_step:
+                    hosted.each("begin_step", inputs.commands)
+                hosted.each("move", inputs.commands)
+            case ZonePhase.RESOLVE:
+                hosted.each("resolve")
+            case ZonePhase.SENSE:
+                hosted.each("sense", inputs.chosen)
+            case ZonePhase.SUGGEST:
+                hosted.each("suggest", inputs.suggested)
+            case ZonePhase.MOUNTED:
+                self._sense(turn.sensors)
+
+    def _sense(self, places: Sequence[int]) -> None:
+        """Let the sensors of the rig write the frames of the agents that are here."""
+        mounted, inputs = self._mounted, self._inputs
+        assert mounted is not None
+        scenes = mounted.scenes()
+        scenes = [scenes[zone]._replace(before=inputs.before) for zone in self._zones]
+        sensors = mounted.rig.sensors
+        turns = [
+            Turn(k, sensors[k], Due(*inputs.due[k]), inputs.frames[sensors[k].name]) for k in places
+        ]
+        if self._spent_s is None:
+            sense_here(scenes, turns)
+            return
+        for zone, scene in zip(self._zones, scenes, strict=True):
+            began_ns = time.thread_time_ns()
+            sense_here([scene], turns)
+            self._spent_s[zone] += 1e-9 * (time.thread_time_ns() - began_ns)
+
+    def save(self) -> list[Array]:
+        """Nothing: the caller keeps all of it."""
+        return []
+
+    def load(self, saved: Sequence[Array]) -> None:
+        """Nothing to do."""
+
+    def close(self) -> None:
+        """End the processes that the worlds have."""
+        self._worlds.close()
+
+    def _rehearse(self, zones: NDArray[np.int64]) -> None:
+        """Do all once: the first time takes longer, and is none of a death's business.
+
+        Nothing of it stays, since a caller begins with a new host.
+        """
+        worlds = self._worlds
+        worlds.arrays.chosen[:] = True
+        worlds.reset(0, 0)
+        worlds.step(self._inputs.commands)
+        worlds.suggest()
+        worlds.close()  # SUMO, if there is one, is the caller's
+        turn = ZoneTurn(ZonePhase.MOVE, zones, 0, 0)
+        self._phases.note_inputs(self._caller, turn)
+        self._caller.take(self._caller.stream.copy())
+        self._phases.note_results(self._caller, turn)

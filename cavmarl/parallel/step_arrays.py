@@ -1,0 +1,163 @@
+"""`StepArrays`: what goes into a step of W worlds and what comes out, wherever they are run."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cavmarl.balance.balance_plan import Plan
+from cavmarl.config.env import TERMS, EnvConfig
+from cavmarl.engine.simulation import Simulation
+from cavmarl.engine.spaces import flat_observation_space, state_space
+from cavmarl.engine.world_setup import World
+from cavmarl.parallel.driven_vehicles import Driven
+from cavmarl.parallel.processes.shared_memory import Layout
+from cavmarl.sensors.mounted.catalogue import frame_layout, frames_in
+from cavmarl.sensors.mounted.frames import Frames
+from cavmarl.shards.shard import Commands
+
+__all__ = ["StepArrays", "SteppedWorlds", "layout_of"]
+
+
+FINAL_FRAMES = "final_rig."  # begins their names in a layout
+
+
+class StepArrays(NamedTuple):
+    """Arrays of W worlds with A agents each; the next step overwrites them.
+
+    T is the number of terms, D the size of a flat observation, S that of a global state.
+    """
+
+    observations: NDArray[np.float32]  # (W, A, D) for the next action
+    final_observations: NDArray[np.float32]  # (W, A, D) where something ended, before that
+    rewards: NDArray[np.float32]  # (W, A)
+    terminations: NDArray[np.bool_]  # (W, A) the vehicle ended
+    truncations: NDArray[np.bool_]  # (W, A) the horizon ended it
+    acted: NDArray[np.bool_]  # (W, A) who has acted
+    vehicle_done: NDArray[np.bool_]  # (W, A)
+    vehicle_ids: NDArray[np.int64]  # (W, A) of the vehicle at the end of the step; -1: it had none
+    mask: NDArray[np.bool_]  # (W, A) who acts next
+    terms: NDArray[np.float32]  # (W, A, T)
+    arrivals: NDArray[np.int64]  # (W,) since each world's reset
+    ticks: NDArray[np.int64]  # (W,) the same
+    episode_over: NDArray[np.bool_]  # (W,) which worlds were reset, or will be in the next step
+    chosen: NDArray[np.bool_]  # (W,) which worlds are to be reset
+    controls: NDArray[np.float64]  # (W, A, 2) what agents do, as in `Commands`
+    meta_actions: NDArray[np.int64]  # (W, A)
+    declared: NDArray[np.int32]  # (W, A)
+    suggested: NDArray[np.float64]  # (W, A, 2) what the built-in driver would do
+    states: NDArray[np.float32]  # (W, S) global states, of when they were last asked for
+    frames: Frames  # what the rigs have sensed
+    final_frames: Frames  # the same where something ended, before that
+
+    @classmethod
+    def of(cls, arrays: Mapping[str, NDArray[Any]]) -> StepArrays:
+        """Made of arrays that are named as by `layout_of`."""
+        fields: dict[str, Any] = {name: arrays[name] for name in cls._fields if name in arrays}
+        return cls(**fields, frames=frames_in(arrays), final_frames=frames_in(arrays, FINAL_FRAMES))
+
+    def part(self, first: int, last: int) -> StepArrays:
+        """Those of some of the worlds, as views."""
+        *arrays, frames, final_frames = self
+        parts: list[Any] = [array[first:last] for array in arrays]
+        for rig in (frames, final_frames):
+            parts.append({name: sensor.part(first, last) for name, sensor in rig.items()})
+        return StepArrays(*parts)
+
+
+def layout_of(config: EnvConfig, capacity: int, num_worlds: int) -> Layout:
+    """Name → dtype and shape of the `StepArrays` of W worlds that hold so many vehicles each."""
+    agents = (num_worlds, config.population.num_ids)
+    observations = ("<f4", (*agents, flat_observation_space(config).shape[0]))
+    flags = ("|b1", agents)
+    return {
+        "observations": observations,
+        "final_observations": observations,
+        "rewards": ("<f4", agents),
+        **dict.fromkeys(("terminations", "truncations", "acted", "vehicle_done", "mask"), flags),
+        "vehicle_ids": ("<i8", agents),
+        "terms": ("<f4", (*agents, len(TERMS))),
+        "arrivals": ("<i8", (num_worlds,)),
+        "ticks": ("<i8", (num_worlds,)),
+        "episode_over": ("|b1", (num_worlds,)),
+        "chosen": ("|b1", (num_worlds,)),
+        "controls": ("<f8", (*agents, 2)),
+        "meta_actions": ("<i8", agents),
+        "declared": ("<i4", agents),
+        "suggested": ("<f8", (*agents, 2)),
+        "states": ("<f4", (num_worlds, *state_space(capacity).shape)),
+        **frame_layout(config, num_worlds),
+        **frame_layout(config, num_worlds, FINAL_FRAMES),
+    }
+
+
+class SteppedWorlds(Protocol):
+    """W worlds that begin a new episode by themselves, as `CavVectorEnv` describes it.
+
+    Attributes:
+        world: what each is made of.
+        arrays: what goes into a step, and what comes out.
+        in_next_step: a new episode begins in the step after the one in which the old one ends.
+    """
+
+    world: World
+    arrays: StepArrays
+    in_next_step: bool
+
+    @property
+    def simulation(self) -> Simulation:
+        """The worlds themselves, where they live in this process."""
+        ...
+
+    @property
+    def plans(self) -> tuple[Plan, ...]:
+        """Which worker hosts what, one plan of all worlds, or one a world; none without workers."""
+        ...
+
+    def reset(self, seed: int | None, first_world: int) -> None:
+        """Begin an episode in the worlds of `chosen`; writes `observations` and `mask`.
+
+        Args:
+            seed: root of all random numbers; None goes on with those of the last seed.
+            first_world: number of the first of these worlds among all worlds of the seed.
+        """
+        ...
+
+    def step(self, commands: Commands) -> None:
+        """Let the agents act; writes all that comes out."""
+        ...
+
+    def suggest(self) -> None:
+        """Write `suggested`."""
+        ...
+
+    def write_states(self) -> None:
+        """Write `states`."""
+        ...
+
+    def ticks(self) -> NDArray[np.int64]:
+        """(W,) ticks since each world's reset."""
+        ...
+
+    def state_hash(self, world: int) -> str:
+        """Hex digest of one world."""
+        ...
+
+    def traffic_stats(self, world: int) -> dict[str, float]:
+        """Traffic of one world since its reset."""
+        ...
+
+    def driven(self, world: int, agents: Sequence[int]) -> list[Driven]:
+        """The vehicles of some agents of one world, in no order."""
+        ...
+
+    def signal_phases(self, world: int) -> NDArray[np.int32]:
+        """(num_signals,) PHASE rows that are on in one world."""
+        ...
+
+    def close(self) -> None:
+        """Give back what they hold."""
+        ...

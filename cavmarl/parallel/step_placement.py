@@ -1,0 +1,129 @@
+"""`Placement`: which worker hosts which shard of worlds that are stepped, round by round."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cavmarl.balance.balance_plan import Plan
+from cavmarl.balance.balancer import Balancer
+from cavmarl.balance.load_snapshot import Snapshot, idle_snapshot
+from cavmarl.balance.problem import BalanceRule, ShardCost
+from cavmarl.engine.world_setup import World
+from cavmarl.parallel.work_shares import make_plans
+
+if TYPE_CHECKING:
+    from cavmarl.balance.probe import Watch
+
+__all__ = ["Placement"]
+
+Floats = NDArray[np.float64]
+
+
+class Placement:
+    """The plans of all workers: one of all worlds, or one of the zones of each world.
+
+    Args:
+        world: what each is made of.
+        num_worlds: W.
+        workers: how many.
+
+    Raises:
+        ConfigError: more workers than zones of all worlds.
+        NoAdmissibleWorkerError: workers are too busy.
+    """
+
+    def __init__(self, world: World, num_worlds: int, workers: int) -> None:
+        settings = world.config.workers
+        self._rule = BalanceRule(tolerance=settings.tolerance, max_moves=settings.max_moves)
+        self._ticks_per_step = world.config.clock.ticks_per_step
+        self._watches = settings.watch
+        seen = _present_snapshot(workers) if settings.watch else None
+        plans = make_plans(world, num_worlds, workers, seen, self._rule)
+        self._balancers = [Balancer(plan.problem) for plan in plans]
+        self._watch: Watch | None = None
+        self._pids: Mapping[int, int] = {}
+        self._before_s: Floats = np.zeros((num_worlds, 1 if self.in_row else world.partition.count))
+
+    @property
+    def in_row(self) -> bool:
+        """Whether whole worlds are placed."""
+        return self._balancers[0].plan.problem.in_row
+
+    @property
+    def plans(self) -> tuple[Plan, ...]:
+        """The present ones."""
+        return tuple(balancer.plan for balancer in self._balancers)
+
+    def watch(self, pids: Mapping[int, int]) -> None:
+        """Look at the machine from now on, if that is wanted.
+
+        Args:
+            pids: of the workers' processes.
+        """
+        if self._watches:
+            from cavmarl.balance.probe import Watch  # psutil is only needed here
+
+            self._watch, self._pids = Watch(pids), dict(pids)
+
+    def round(self, spent_s: Floats, steps: int, pids: Mapping[int, int]) -> bool:
+        """Plan anew by what shards have cost since the last round.
+
+        Args:
+            spent_s: (W, zones) processor time of each shard from the start on; whole worlds count
+                as one zone.
+            steps: since the last round.
+            pids: of the workers' processes.
+
+        Returns:
+            whether something has to be moved.
+        """
+        seen = self._snapshot(pids)
+        cost_s = (spent_s - self._before_s) / (steps * self._ticks_per_step)
+        self._before_s = spent_s.copy()
+        for balancer in self._balancers:
+            problem = balancer.plan.problem
+            numbers = {candidate.worker for candidate in problem.snapshot.workers}
+            if len(numbers) == 1:
+                continue
+            balancer.measure(
+                ShardCost(shard.world, shard.zone, cost_s.item(shard.world, shard.zone))
+                for shard in problem.shards
+            )
+            theirs = tuple(one for one in seen.workers if one.worker in numbers)
+            balancer.round(replace(seen, workers=theirs), rule=self._rule)
+        return any(plan.moves for plan in self.plans)
+
+    def take_back(self, plans: Sequence[Plan]) -> None:
+        """Everything is where it was by these plans."""
+        for balancer, plan in zip(self._balancers, plans, strict=True):
+            balancer.plan = plan
+
+    def moved(self, lasted_s: float) -> int:
+        """Note how long it took to make the present plans true: later moves have to be worth that.
+
+        Returns:
+            how many shards have moved.
+        """
+        moves = sum(len(plan.moves) for plan in self.plans)
+        self._rule = replace(self._rule, move_s=lasted_s / moves)
+        return moves
+
+    def _snapshot(self, pids: Mapping[int, int]) -> Snapshot:
+        """How busy workers are; idle where nobody looks, and where one was replaced meanwhile."""
+        watch, before = self._watch, self._pids
+        self.watch(pids)
+        if watch is None or before != pids:
+            return idle_snapshot(len(pids))
+        return watch.snapshot()
+
+
+def _present_snapshot(workers: int) -> Snapshot:
+    """How busy this machine is before the workers are started."""
+    from cavmarl.balance.probe import take_snapshot
+
+    return take_snapshot(dict.fromkeys(range(workers)))

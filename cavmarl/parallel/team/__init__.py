@@ -1,0 +1,1 @@
+"""Worker processes that run the phases of one world together."""

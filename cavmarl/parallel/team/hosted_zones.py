@@ -1,0 +1,76 @@
+"""`HostedZones`: the zones of one world that one worker of a team runs; they may become others."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cavmarl.shards.shard import Shard
+from cavmarl.shards.shard_group import ShardGroup
+
+__all__ = ["HostedZones"]
+
+TIMED = 16  # one tick of so many is run zone by zone, with a clock
+
+
+class HostedZones:
+    """Runs phases on some shards of a world.
+
+    Args:
+        shards: all of the world, one a zone; every process knows them.
+        zones: that are run here; none is fine, too.
+        spent_s: (k,) where the processor time of each zone is added up; None: nobody asks for it.
+    """
+
+    def __init__(
+        self,
+        shards: Sequence[Shard],
+        zones: Sequence[int],
+        spent_s: NDArray[np.float64] | None = None,
+    ) -> None:
+        self._all = shards
+        self._spent_s = spent_s
+        self._ticks = 0
+        self._collect(zones)
+
+    def _collect(self, zones: Sequence[int]) -> None:
+        self._shards = [self._all[zone] for zone in sorted(zones)]
+        self._together = [ShardGroup(self._shards)] if self._shards else []
+        self._alone: list[ShardGroup] = []
+        self._rehearsal = -1
+        self._sides: tuple[int, int] | None = None  # as far as they have been told here
+
+    def take(self, zones: Sequence[int]) -> None:
+        """Run these zones from now on, and no others."""
+        self._collect(zones)
+
+    def face(self, side: int, next_side: int) -> None:
+        """Say on which side the rows are, and the next ones; where others call the phases."""
+        if self._sides != (side, next_side):
+            self._sides = side, next_side
+            for shard in self._shards:
+                shard.face(side, next_side)
+
+    def each(self, name: str, *arguments: Any) -> None:
+        """Run a phase on all shards."""
+        self._ticks += name == "move"
+        if self._spent_s is not None and self._ticks % TIMED == 0:
+            self._time_each(self._spent_s, name, *arguments)
+            return
+        for group in self._together:
+            group.each(name, *arguments)
+
+    def _time_each(self, spent_s: NDArray[np.float64], name: str, *arguments: Any) -> None:
+        """The same zone by zone; the clock's time stands for all ticks until the next timed one."""
+        if not self._alone:
+            self._alone = [ShardGroup([shard]) for shard in self._shards]
+            self._rehearsal = self._ticks  # it makes ready what later ones use
+        for shard, group in zip(self._shards, self._alone, strict=True):
+            began_ns = time.thread_time_ns()
+            group.each(name, *arguments)
+            if self._ticks != self._rehearsal:
+                spent_s[shard.zone] += TIMED * 1e-9 * (time.thread_time_ns() - began_ns)

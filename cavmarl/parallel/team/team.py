@@ -1,0 +1,256 @@
+"""`Team`: the worker processes of one world, which run the phases of its ticks together.
+
+The first of them leads: it runs the tick as one process would. Each phase that is mostly done zone
+by zone it announces to the others, the followers, runs it on its own zones, and goes on when they
+have run it on theirs. What is in between, gate, signals and owners, it does alone.
+
+All arrays that shards write are shared (`shared_huge_pages`), and each row has one writer at a
+time. A follower keeps nothing from one phase to the next but room to work in: what a phase needs to
+know beside the arrays stands in the leader's line.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from operator import is_
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cavmarl.parallel.processes.process_barrier import (
+    NUMBER,
+    WORDS,
+    Words,
+    post,
+    present_core,
+    usable_cores,
+    wait_for,
+)
+from cavmarl.parallel.processes.shared_memory import shared_zeros
+from cavmarl.parallel.team.hosted_zones import HostedZones
+from cavmarl.shards.executor import Phase
+from cavmarl.shards.shard import Shard
+from cavmarl.shards.shard_group import ShardGroup
+
+__all__ = ["Follower", "Leader", "LeftAloneError", "Team"]
+
+# Words of the leader's line, behind those of `barrier`: what is called with even numbers, and what
+# with odd ones.
+CALLS = (2, 3)
+# A word of a follower's line.
+FAILED = 2
+CORE = 5  # a word of both: where the process was when it began with a phase
+
+# Methods of `ShardGroup` and `Shard` that are run together, by their code.
+TOGETHER = ("begin_step", "move", "gather", "resolve", "sense", "credit", "suggest")
+END = len(TOGETHER)
+# After which the next phase only asks that it has been run on the same zone: nobody waits before
+# somebody looks at what other zones have made of it.
+WAITED_FOR_LATER = ("begin_step", "resolve")
+# What the leader runs on all zones, and what asks for nothing that those write.
+AT_ANY_TIME = ("commit", "detect")
+
+
+class LeftAloneError(Exception):
+    """Another worker of the same world could not run a phase; that one says why."""
+
+
+class Team:
+    """Who hosts which zones of one world; made before the processes that it is about.
+
+    Args:
+        shards: one a zone, in the order of zones; their arrays are shared.
+        zones: of each worker, to begin with; the first leads.
+        known: what phases are called with that are run together, by their names: for each phase all
+            that there is to choose from; the arrays among it are shared.
+        spent_s: (k,) where the processor time of each zone is added up; None: nobody asks for it.
+    """
+
+    def __init__(
+        self,
+        shards: Sequence[Shard],
+        zones: Sequence[Sequence[int]],
+        known: Mapping[str, Sequence[tuple[Any, ...]]],
+        spent_s: NDArray[np.float64] | None = None,
+    ) -> None:
+        self.known = {name: tuple(known.get(name, ((),))) for name in TOGETHER}
+        self.everybody = ShardGroup(shards)
+        self.hosts = [HostedZones(shards, hosted, spent_s) for hosted in zones]
+        lines = shared_zeros((len(zones), WORDS), np.int64)
+        self.lines: list[Words] = list(lines)
+
+    def forget(self) -> None:
+        """Begin to count anew: whoever has counted is dead."""
+        for line in self.lines:
+            line[:] = 0
+
+
+class Leader:
+    """Runs each phase on all shards of a world, with the help of the followers; an `Executor`.
+
+    Args:
+        team: that it leads.
+    """
+
+    def __init__(self, team: Team) -> None:
+        self._known = team.known
+        self._everybody = team.everybody
+        self._own = team.hosts[0]
+        self._line, *self._others = team.lines
+        self._codes = {name: code for code, name in enumerate(TOGETHER)}
+        self._leads = False
+        self._last = ""
+        self._is_ahead = False  # a phase is announced that nobody has waited for
+
+    @contextmanager
+    def order(self) -> Iterator[None]:
+        """The time of an order, in which the followers wait for phases.
+
+        Raises:
+            LeftAloneError: one of them has failed.
+        """
+        self._wait()
+        self._leads, self._last, self._is_ahead = True, "", False
+        try:
+            yield
+        finally:
+            self._dismiss()
+
+    def end_after(self, phase: Phase | str) -> None:
+        """Let the followers end the order with the next phase of that name that they run."""
+        self._last = phase
+
+    def _dismiss(self) -> None:
+        """The followers need not wait any more."""
+        if self._leads:
+            self._leads = False
+            self._wait()
+            self._announce(END)
+
+    def take(self, zones: Sequence[int]) -> None:
+        """From now on these zones are its own; the others are the followers'."""
+        self._own.take(zones)
+
+    def each(self, phase: Phase, *arguments: Any) -> None:
+        """Run a phase on every shard.
+
+        Raises:
+            LeftAloneError: a follower has failed.
+        """
+        name: str = phase
+        if phase == "advance":
+            self._everybody.turn()
+            name = "move"
+        which = self._which(name, arguments)
+        is_late = name in WAITED_FOR_LATER
+        if (which < 0 and name not in AT_ANY_TIME) or is_late:
+            self.meet()
+        if which < 0:
+            self._everybody.each(name, *arguments)
+            return
+        self._announce(self._codes[name], which)
+        self._is_ahead = True
+        self._own.each(name, *arguments)
+        if is_late:
+            return
+        self.meet()
+        if name == self._last:
+            self._dismiss()
+
+    def meet(self) -> None:
+        """Wait until the followers are through with the last phase, whatever it was.
+
+        Raises:
+            LeftAloneError: a follower has failed.
+        """
+        if not self._is_ahead:
+            return
+        self._wait()
+        self._is_ahead = False
+        for line in self._others:
+            if line.item(FAILED):
+                raise LeftAloneError
+
+    def _which(self, name: str, arguments: tuple[Any, ...]) -> int:
+        """Which of what the followers know a phase is called with; -1: none, or nobody follows."""
+        if self._leads and name in self._codes:
+            for number, known in enumerate(self._known[name]):
+                if all(map(is_, arguments, known)):
+                    return number
+        return -1
+
+    def _announce(self, code: int, which: int = 0) -> None:
+        line = self._line
+        number = line.item(NUMBER) + 1
+        side, next_side = self._everybody.sides
+        line[CALLS[number % 2]] = which << 16 | code << 2 | side << 1 | next_side
+        line[CORE] = present_core()
+        post(line, number)
+
+    def _wait(self) -> None:
+        number, core = self._line.item(NUMBER), self._line.item(CORE)
+        for line in self._others:
+            wait_for(line, number, line.item(CORE) != core)
+
+
+class Follower:
+    """Runs the phases that the leader announces on its own shards.
+
+    Args:
+        team: that it belongs to.
+        number: in the team, from 1.
+    """
+
+    def __init__(self, team: Team, number: int) -> None:
+        self._known = team.known
+        self._own = team.hosts[number]
+        self._leader = team.lines[0]
+        self._line = team.lines[number]
+        self._before = team.lines[:number]
+        self._cores = usable_cores()
+
+    def follow(self) -> None:
+        """Run all phases of one order."""
+        line, leader = self._line, self._leader
+        line[FAILED] = 0
+        failure: Exception | None = None
+        while True:
+            number = line.item(NUMBER) + 1
+            wait_for(leader, number, leader.item(CORE) != line.item(CORE))
+            call = leader.item(CALLS[number % 2])
+            code = call >> 2 & 0xFF
+            if code != END:
+                try:
+                    self._run(TOGETHER[code], call)
+                except Exception as error:
+                    failure = error
+                    line[FAILED] = 1
+            post(line, number)
+            if code == END:
+                break
+        if failure is not None:
+            raise failure
+
+    def take(self, zones: Sequence[int]) -> None:
+        """From now on these zones are its own."""
+        self._own.take(zones)
+
+    def _get_out_of_the_way(self) -> None:
+        """Leave the core of those before in the team: they wait for this one, and it for them.
+
+        Systems put processes that are woken together on one core, and take milliseconds to notice.
+        """
+        core = present_core()
+        taken = {line.item(CORE) for line in self._before}
+        if core in taken and self._cores - taken:
+            os.sched_setaffinity(0, self._cores - taken)
+            core = present_core()
+        self._line[CORE] = core
+
+    def _run(self, name: str, call: int) -> None:
+        self._get_out_of_the_way()
+        self._own.face(call >> 1 & 1, call & 1)
+        self._own.each(name, *self._known[name][call >> 16])

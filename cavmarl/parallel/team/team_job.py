@@ -1,0 +1,164 @@
+"""What the workers of one world do: `LeaderJob` runs it, `FollowerJob` helps."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cavmarl.parallel.checkpoint.checkpoint_job import DiaryJob
+from cavmarl.parallel.checkpoint.checkpoint_log import Diary
+from cavmarl.parallel.local_worlds import LocalWorlds
+from cavmarl.parallel.team.team import Follower, Leader, Team
+from cavmarl.parallel.worlds_job import Task, WorldsJob
+from cavmarl.shards.shard import Shard
+
+__all__ = ["FollowerJob", "LeaderJob"]
+
+# Phases that end a task for the followers; what comes after them the leader does alone, and one of
+# the followers wakes the caller in the meantime.
+LAST = {Task.STEP: "sense", Task.SUGGEST: "suggest"}
+# Tasks of the leader, of which no follower hears.
+ALONE = (Task.STATE_HASH, Task.TRAFFIC_STATS, Task.DRIVEN, Task.SIGNAL_PHASES)
+
+
+class LeaderJob(DiaryJob):
+    """One world that several workers run, of whom this one leads.
+
+    Args:
+        worlds: the one; what its shards write is shared.
+        first: its number among all.
+        zones: that each worker hosts, to begin with; the leader's first.
+        diary: in which it leaves the state behind.
+        spent_s: (k,) where the processor time of each zone is added up; None: nobody asks for it.
+    """
+
+    def __init__(
+        self,
+        worlds: LocalWorlds,
+        first: int,
+        zones: Sequence[Sequence[int]],
+        diary: Diary,
+        spent_s: NDArray[np.float64] | None = None,
+    ) -> None:
+        super().__init__(worlds, first, diary)
+        self._zones = zones
+        self._hosts = _hosts(zones)
+        self._spent_s = spent_s
+        worlds.simulation.host(self._lead)
+
+    def _lead(self, shards: Sequence[Shard], gathering: tuple[float, float]) -> Leader:
+        """Let a team run the phases."""
+        commands = [(self._commands,), *((entry,) for entry in self._diary.entries)]
+        chosen = [(self._worlds.simulation.everywhere,)]
+        known: dict[str, Sequence[tuple[Any, ...]]] = {
+            "begin_step": commands,
+            "move": commands,
+            "gather": [gathering],
+            "sense": chosen,
+            "credit": chosen,
+            "suggest": [(self._worlds.arrays.suggested,)],
+        }
+        self._team = Team(shards, self._zones, known, self._spent_s)
+        self._leader = Leader(self._team)
+        return self._leader
+
+    def followers(self) -> Iterator[FollowerJob]:
+        """The jobs of the other workers."""
+        for number in range(1, len(self._zones)):
+            follower = Follower(self._team, number)
+            yield FollowerJob(follower, self._first, number, self._hosts.copy())
+
+    def prepare(self) -> None:
+        """Whoever has led is dead, and so are those who followed."""
+        self._team.forget()
+
+    def perform(self, task: int, letter: Any) -> Any:
+        """Do a task; the answer of those that have one."""
+        if task in ALONE:
+            return super().perform(task, letter)
+        if task == Task.HOST:
+            self._host(_hosts(letter[self._first]))
+            return None
+        with self._leader.order():
+            self._catch_up(task)
+            if task == Task.STEP:
+                self._note_step()
+            self._leader.end_after(LAST.get(Task(task), ""))
+            WorldsJob.perform(self, task, letter)
+        if task == Task.RESET:
+            self._begin_anew()
+        return None
+
+    def _host(self, hosts: NDArray[np.int64]) -> None:
+        """Let zones be run by these workers from now on."""
+        self._hosts[:] = hosts
+        self._leader.take(np.flatnonzero(hosts == 0).tolist())
+
+    def save(self) -> list[NDArray[Any]]:
+        """Where to begin in the diary, and who hosts which zone."""
+        return [*super().save(), self._hosts]
+
+    def load(self, saved: Sequence[NDArray[Any]]) -> None:
+        """Go on from what `save` gave; the steps since the last image wait for a task."""
+        place, hosts = saved
+        self._host(hosts)
+        super().load([place])
+
+
+class FollowerJob:
+    """Some zones of one world, of which other workers have the rest.
+
+    Args:
+        follower: that runs their phases.
+        world: the world's number among all.
+        number: in the team, from 1.
+        hosts: (k,) number in the team of each zone's worker.
+    """
+
+    def __init__(
+        self, follower: Follower, world: int, number: int, hosts: NDArray[np.int64]
+    ) -> None:
+        self._follower = follower
+        self._world = world
+        self._number = number
+        self._hosts = hosts
+
+    def afterwards(self) -> None:
+        """Nothing to do."""
+
+    def prepare(self) -> None:
+        """Nothing to do."""
+
+    def perform(self, task: int, letter: Any) -> None:
+        """Help the leader with a task."""
+        if task == Task.HOST:
+            self._host(_hosts(letter[self._world]))
+        else:
+            self._follower.follow()
+
+    def _host(self, hosts: NDArray[np.int64]) -> None:
+        self._hosts[:] = hosts
+        self._follower.take(np.flatnonzero(hosts == self._number).tolist())
+
+    def save(self) -> list[NDArray[Any]]:
+        """Who hosts which zone; the leader keeps the rest of the state."""
+        return [self._hosts]
+
+    def load(self, saved: Sequence[NDArray[Any]]) -> None:
+        """Go on from what `save` gave."""
+        self._host(saved[0])
+
+
+def _hosts(zones: Sequence[Sequence[int]]) -> NDArray[np.int64]:
+    """(k,) number in the team of each zone's worker.
+
+    Args:
+        zones: of each worker.
+    """
+    hosts = np.zeros(sum(map(len, zones)), dtype=np.int64)
+    for number, hosted in enumerate(zones):
+        hosts[list(hosted)] = number
+    return hosts

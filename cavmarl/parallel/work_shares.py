@@ -1,0 +1,133 @@
+"""Which worker runs what: whole worlds each, or zones of one world."""
+
+from __future__ import annotations
+
+from bisect import bisect_left
+from collections.abc import Sequence
+from dataclasses import replace
+from itertools import pairwise
+from typing import NamedTuple
+
+from cavmarl.balance.balance_plan import Plan, make_plan
+from cavmarl.balance.load_snapshot import Snapshot, idle_snapshot
+from cavmarl.balance.problem import BalanceRule, Problem, ShardCost, equal_costs
+from cavmarl.core.errors import ConfigError
+from cavmarl.engine.world_setup import World
+from cavmarl.zones.partition.zone_statistics import zone_statistics
+
+__all__ = ["Part", "make_plans", "parts_of", "share_out"]
+
+# Of a zone in which no lane lies, as a length of lanes: it is looked at in every tick.
+_EMPTY_KM = 0.01
+_EQUAL = "number"
+_LANES = "length of lanes"
+
+
+class Part(NamedTuple):
+    """What the workers of one team run; most teams are one worker.
+
+    Attributes:
+        first: world.
+        last: the one after the last; where there are several workers it is the next.
+        zones: that each worker hosts.
+    """
+
+    first: int
+    last: int
+    zones: list[list[int]]
+
+    @property
+    def names(self) -> list[str]:
+        """Of what each worker runs, in words."""
+        if self.last - self.first > 1:
+            return [f"worlds {self.first} to {self.last - 1}"]
+        if len(self.zones) == 1:
+            return [f"world {self.first}"]
+        return [
+            f"world {self.first}, {'zone' if len(zones) == 1 else 'zones'} "
+            f"{', '.join(map(str, zones))}"
+            for zones in self.zones
+        ]
+
+
+def make_plans(
+    world: World,
+    num_worlds: int,
+    workers: int,
+    snapshot: Snapshot | None = None,
+    rule: BalanceRule | None = None,
+) -> list[Plan]:
+    """Worlds to workers as evenly as may be; those are divided of which there are too few.
+
+    Args:
+        world: what each is made of.
+        num_worlds: how many there are.
+        workers: how many, at least 1.
+        snapshot: how busy they are; None: they are idle.
+        rule: of the plans.
+
+    Returns:
+        one plan of all worlds, or one of the zones of each world.
+
+    Raises:
+        ConfigError: more workers than zones of all worlds.
+        NoAdmissibleWorkerError: workers are too busy.
+    """
+    count = world.partition.count
+    if workers > count * num_worlds:
+        raise ConfigError(
+            f"workers = {workers}: {num_worlds} world(s) of {count} zone(s) each can be shared out "
+            f"over at most {count * num_worlds}; use fewer workers, more zones or more worlds"
+        )
+    seen, rule = snapshot or idle_snapshot(workers), rule or BalanceRule()
+    if workers <= num_worlds:
+        whole = equal_costs(num_worlds, 1)
+        problem = Problem(whole, ((),), seen, rule, in_row=True, cost_source=_EQUAL)
+        return [make_plan(problem)]
+    firsts = [workers * n // num_worlds for n in range(num_worlds + 1)]
+    return [
+        _of_zones(world, number, replace(seen, workers=seen.workers[first:last]), rule)
+        for number, (first, last) in enumerate(pairwise(firsts))
+    ]
+
+
+def share_out(world: World, num_worlds: int, workers: int) -> list[Part]:
+    """What idle workers run; arguments and errors as of `make_plans`."""
+    return parts_of(make_plans(world, num_worlds, workers), world.partition.count)
+
+
+def parts_of(plans: Sequence[Plan], num_zones: int) -> list[Part]:
+    """What the workers of each team run.
+
+    Args:
+        plans: of all worlds; see `make_plans`.
+        num_zones: of each world.
+    """
+    parts = []
+    for plan in plans:
+        numbers = [candidate.worker for candidate in plan.problem.snapshot.workers]
+        if plan.problem.in_row:
+            ends = [bisect_left(plan.homes, number) for number in (*numbers, numbers[-1] + 1)]
+            zones = list(range(num_zones))
+            parts += [Part(first, last, [zones]) for first, last in pairwise(ends)]
+            continue
+        world = plan.problem.shards[0].world
+        hosted = [[z for z, home in enumerate(plan.homes) if home == k] for k in numbers]
+        parts.append(Part(world, world + 1, hosted))
+    return parts
+
+
+def _of_zones(world: World, number: int, seen: Snapshot, rule: BalanceRule) -> Plan:
+    """The zones of one world to some workers, neighbours together; by length of lanes."""
+    partition = world.partition
+    lane_km = zone_statistics(partition, world.network).lane_km
+    costs = tuple(ShardCost(number, zone, km + _EMPTY_KM) for zone, km in enumerate(lane_km))
+    problem = Problem(costs, partition.side_neighbors, seen, rule, cost_source=_LANES)
+    plan = make_plan(problem)
+    hosted = list(plan.homes)
+    excluded = {rejection.worker for rejection in plan.rejections}
+    for worker in (candidate.worker for candidate in seen.workers):
+        if worker not in hosted and worker not in excluded:  # nobody is to be idle
+            fullest = max(hosted, key=hosted.count)
+            hosted[len(hosted) - 1 - hosted[::-1].index(fullest)] = worker
+    return make_plan(replace(problem, present=tuple(hosted))) if hosted != [*plan.homes] else plan

@@ -1,0 +1,105 @@
+"""`WorldsJob`: what a worker does that runs some of the worlds."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from enum import IntEnum
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cavmarl.engine.world_setup import World
+from cavmarl.parallel.local_worlds import LocalWorlds
+from cavmarl.parallel.step_arrays import StepArrays
+from cavmarl.shards.shard import Commands
+
+__all__ = ["Task", "WorldsJob", "commands_of", "fingerprint"]
+
+
+class Task(IntEnum):
+    """What a worker can be asked for."""
+
+    STEP = 0
+    RESET = 1
+    SUGGEST = 2
+    STATE_HASH = 3
+    TRAFFIC_STATS = 4
+    PACK = 5
+    UNPACK = 6
+    HOST = 7
+    WRITE_STATES = 8
+    DRIVEN = 9
+    SIGNAL_PHASES = 10
+
+
+class WorldsJob:
+    """Some of the worlds, next to each other.
+
+    Args:
+        worlds: that write their part of the shared arrays.
+        first: number of the first one among all.
+    """
+
+    def __init__(self, worlds: LocalWorlds, first: int) -> None:
+        self._take(worlds, first)
+
+    def _take(self, worlds: LocalWorlds, first: int) -> None:
+        self._worlds = worlds
+        self._first = first
+        self._commands = commands_of(worlds.arrays)
+
+    def afterwards(self) -> None:
+        """Nothing to do."""
+
+    def prepare(self) -> None:
+        """Nothing to do."""
+
+    def perform(self, task: int, letter: Any) -> Any:
+        """Do a task; the answer of those that have one."""
+        worlds = self._worlds
+        if task == Task.STEP:
+            worlds.step(self._commands)
+        elif task == Task.RESET:
+            worlds.reset(letter["seed"], letter["first_world"] + self._first)
+        elif task == Task.SUGGEST:
+            worlds.suggest()
+        elif task == Task.WRITE_STATES:
+            worlds.write_states()
+        elif task == Task.STATE_HASH:
+            return worlds.state_hash(letter - self._first)
+        elif task == Task.TRAFFIC_STATS:
+            return worlds.traffic_stats(letter - self._first)
+        elif task == Task.DRIVEN:
+            return worlds.driven(letter[0] - self._first, letter[1])
+        elif task == Task.SIGNAL_PHASES:
+            return worlds.signal_phases(letter - self._first).tolist()
+        return None
+
+    def timed_step(self) -> NDArray[np.float64]:
+        """Step; (W,) the processor time of each world, which share it by their vehicles."""
+        began_ns = time.thread_time_ns()
+        self._worlds.step(self._commands)
+        spent_s = 1e-9 * (time.thread_time_ns() - began_ns)
+        vehicles = self._worlds.simulation.running() + 1
+        return np.asarray(vehicles * (spent_s / float(vehicles.sum())), dtype=np.float64)
+
+    def save(self) -> list[NDArray[Any]]:
+        """All that the next step depends on."""
+        return self._worlds.save()
+
+    def load(self, saved: Sequence[NDArray[Any]]) -> None:
+        """Go on from what `save` gave."""
+        self._worlds.load(saved)
+
+
+def commands_of(arrays: StepArrays) -> Commands:
+    """What agents do in the next step; views."""
+    return Commands(arrays.controls, arrays.meta_actions, arrays.declared)
+
+
+def fingerprint(world: World) -> str:
+    """What tells two readings of the same files apart, if somebody has changed one between."""
+    made_of = (world.network, world.demand, world.partition)
+    return " ".join("none" if part is None else part.content_hash for part in made_of)

@@ -1,0 +1,4 @@
+"""Drivers for agents' vehicles, and the networks that trained ones need.
+
+Stands on `env`.
+"""

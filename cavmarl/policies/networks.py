@@ -1,0 +1,277 @@
+"""The networks that training and evaluation share, and how they lie on disk.
+
+Importing this module loads torch; nothing that `import cavmarl` loads imports it.
+
+A driver's folder holds `model.safetensors` (weights, no code) and `config.json` (a `NetworkConfig`:
+what the driver was made for, so that a seat that does not fit is refused and not driven badly).
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+from dataclasses import asdict, dataclass
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import torch
+from safetensors import SafetensorError
+from safetensors.torch import load_file, save_file
+from torch import Tensor, nn
+
+from cavmarl.config.env import ActionConfig, SensorsConfig
+from cavmarl.config.io import validate
+from cavmarl.core.errors import ConfigError, PolicyError
+
+__all__ = [
+    "CONFIG_FILE",
+    "WEIGHTS_FILE",
+    "ActorCritic",
+    "NetworkConfig",
+    "load_network",
+    "save_network",
+]
+
+WEIGHTS_FILE = "model.safetensors"
+CONFIG_FILE = "config.json"
+
+CONTINUOUS_ACTIONS = 2
+META_ACTIONS = 5
+MAX_LAYERS = 8
+MAX_WIDTH = 4096
+MAX_OBSERVATION_SIZE = 65_536
+MAX_STATE_SIZE = 1_048_576
+MAX_DEVIATIONS = 5.0  # observations further from the mean are cut
+LOG_2_PI = math.log(2.0 * math.pi)
+
+
+@dataclass(frozen=True)
+class NetworkConfig:
+    """What a trained driver is and what it was made for.
+
+    Attributes:
+        environment: entry that it was trained on.
+        observation_size: numbers in one flat observation.
+        sensors: what those numbers are.
+        action: what its actions mean.
+        hidden: widths of the hidden layers, of the actor and of the critic.
+        seed: of its training.
+        agent_steps: decisions that it learned from.
+        state_size: numbers of the world's state that its critic sees beside the observation. The
+            driver itself never does.
+    """
+
+    environment: str
+    observation_size: int
+    sensors: SensorsConfig
+    action: ActionConfig
+    hidden: tuple[int, ...] = (128, 128)
+    seed: int = 0
+    agent_steps: int = 0
+    state_size: int = 0
+
+    def __post_init__(self) -> None:
+        if not 1 <= self.observation_size <= MAX_OBSERVATION_SIZE:
+            raise ConfigError(
+                f"observation_size = {self.observation_size}: must be from 1 to "
+                f"{MAX_OBSERVATION_SIZE}"
+            )
+        if not 0 <= self.state_size <= MAX_STATE_SIZE:
+            raise ConfigError(f"state_size = {self.state_size}: must be from 0 to {MAX_STATE_SIZE}")
+        if not 1 <= len(self.hidden) <= MAX_LAYERS or not all(
+            1 <= width <= MAX_WIDTH for width in self.hidden
+        ):
+            raise ConfigError(
+                f"hidden = {list(self.hidden)}: must be 1 to {MAX_LAYERS} widths from 1 to "
+                f"{MAX_WIDTH}"
+            )
+
+    @property
+    def num_weights(self) -> int:
+        """How many numbers an `ActorCritic` learns, with the scaling of its observations."""
+        continuous = self.action.kind == "continuous"
+        actions = CONTINUOUS_ACTIONS if continuous else META_ACTIONS
+        deviations = actions if continuous else 0
+        scaling = 2 * self.observation_size
+        return (
+            scaling
+            + deviations
+            + sum(
+                (inputs + 1) * outputs
+                for sizes in (
+                    (self.observation_size, *self.hidden, actions),
+                    (self.observation_size + self.state_size, *self.hidden, 1),
+                )
+                for inputs, outputs in pairwise(sizes)
+            )
+        )
+
+
+class ActorCritic(nn.Module):
+    """A policy and a value function, each a small tanh network of its own.
+
+    Both see observations less their `mean`, over their `deviation`: buffers that training fills and
+    a checkpoint keeps. With a `state_size` the value function is a central critic, which also sees
+    the state of the whole world (Yu et al. 2022).
+
+    Continuous actions are normal around the actor's output, with one learned deviation an action:
+    the environment gets them clipped to [-1, 1], learning the raw ones. Discrete actions are
+    categorical.
+
+    Args:
+        config: sizes and kind of action.
+        initial_std: standard deviations of continuous actions before learning: throttle, steering.
+    """
+
+    mean: Tensor
+    deviation: Tensor
+
+    def __init__(
+        self, config: NetworkConfig, initial_std: tuple[float, float] = (0.5, 0.5)
+    ) -> None:
+        super().__init__()
+        self.continuous = config.action.kind == "continuous"
+        self.state_size = config.state_size
+        actions = CONTINUOUS_ACTIONS if self.continuous else META_ACTIONS
+        self.register_buffer("mean", torch.zeros(config.observation_size))
+        self.register_buffer("deviation", torch.ones(config.observation_size))
+        # Small last weights: the first policy does nothing in particular (Andrychowicz et al.
+        # 2021).
+        size = config.observation_size
+        self.actor = _perceptron((size, *config.hidden, actions), last_gain=0.01)
+        self.critic = _perceptron((size + config.state_size, *config.hidden, 1), last_gain=1.0)
+        if self.continuous:
+            self.log_std = nn.Parameter(torch.tensor(initial_std).log())
+
+    def forward(self, observations: Tensor) -> Tensor:
+        """The policy's numbers: means (N, 2) of actions, or log-weights (N, 5) of meta-actions."""
+        output: Tensor = self.actor(self._normal(observations))
+        return output
+
+    def value(self, observations: Tensor, states: Tensor | None = None) -> Tensor:
+        """Expected return (N,) of observations (N, D), for a central critic in states (N, S)."""
+        seen = self._normal(observations)
+        if self.state_size and states is not None:
+            seen = torch.cat([seen, states], dim=-1)
+        values: Tensor = self.critic(seen).squeeze(-1)
+        return values
+
+    def best(self, observations: Tensor) -> Tensor:
+        """The most likely actions: (N, 2) within [-1, 1], or (N,) meta-actions."""
+        output = self.forward(observations)
+        return output.clamp(-1.0, 1.0) if self.continuous else output.argmax(-1)
+
+    def sample(
+        self, observations: Tensor, generator: torch.Generator | None = None
+    ) -> tuple[Tensor, Tensor]:
+        """Random actions, continuous ones not clipped, and their log probabilities (N,)."""
+        output = self.forward(observations)
+        noise = torch.empty_like(output)
+        if self.continuous:
+            actions = output + noise.normal_(generator=generator) * self.log_std.exp()
+        else:
+            # The largest of log-weights plus Gumbel noise is a draw by these weights.
+            noise = noise.exponential_(generator=generator).log()
+            actions = (output - noise).argmax(-1)
+        return actions, self._log_prob(output, actions)
+
+    def evaluate(self, observations: Tensor, actions: Tensor) -> tuple[Tensor, Tensor]:
+        """Log probabilities (N,) of what `sample` gave, and entropies (N,)."""
+        output = self.forward(observations)
+        if self.continuous:
+            entropy = (0.5 + 0.5 * LOG_2_PI + self.log_std).sum().expand(output.shape[0])
+        else:
+            log_probs = output.log_softmax(-1)
+            entropy = -(log_probs.exp() * log_probs).sum(-1)
+        return self._log_prob(output, actions), entropy
+
+    def distance(self, observations: Tensor, actions: Tensor) -> Tensor:
+        """How far (N,) the policy is from given actions: squares, or surprise at meta-actions."""
+        output = self.forward(observations)
+        if self.continuous:
+            return (output - actions).square().sum(-1)
+        return nn.functional.cross_entropy(output, actions, reduction="none")
+
+    def _normal(self, observations: Tensor) -> Tensor:
+        normal: Tensor = (observations - self.mean) / self.deviation
+        return normal.clamp(-MAX_DEVIATIONS, MAX_DEVIATIONS)
+
+    def _log_prob(self, output: Tensor, actions: Tensor) -> Tensor:
+        if self.continuous:
+            scaled = (actions - output) * (-self.log_std).exp()
+            return (-0.5 * (scaled * scaled + LOG_2_PI) - self.log_std).sum(-1)
+        return output.log_softmax(-1).gather(-1, actions.unsqueeze(-1)).squeeze(-1)
+
+
+def _perceptron(sizes: tuple[int, ...], last_gain: float) -> nn.Sequential:
+    """Linear layers with tanh between them, orthogonal weights."""
+    layers: list[nn.Module] = []
+    last = len(sizes) - 2
+    for k, (inputs, outputs) in enumerate(pairwise(sizes)):
+        layer = nn.Linear(inputs, outputs)
+        nn.init.orthogonal_(layer.weight, last_gain if k == last else math.sqrt(2.0))
+        nn.init.zeros_(layer.bias)
+        layers += [layer] if k == last else [layer, nn.Tanh()]
+    return nn.Sequential(*layers)
+
+
+def save_network(folder: Path, network: ActorCritic, config: NetworkConfig) -> None:
+    """Write weights and config into `folder`; an interrupted write leaves the old files whole."""
+    folder.mkdir(parents=True, exist_ok=True)
+    weights = folder / f".{WEIGHTS_FILE}"
+    save_file({name: tensor.contiguous() for name, tensor in network.state_dict().items()}, weights)
+    text = folder / f".{CONFIG_FILE}"
+    text.write_text(json.dumps(asdict(config), indent=2) + "\n", encoding="utf-8")
+    os.replace(weights, folder / WEIGHTS_FILE)
+    os.replace(text, folder / CONFIG_FILE)
+
+
+def load_network(folder: Path) -> tuple[ActorCritic, NetworkConfig]:
+    """Read what `save_network` wrote.
+
+    Raises:
+        PolicyError: a file is missing, broken, or does not fit the other; or weights are not
+            finite.
+    """
+    for name in (WEIGHTS_FILE, CONFIG_FILE):
+        if not (folder / name).is_file():
+            raise PolicyError(f"no {name} in {folder}: is this the folder of a trained driver?")
+    config = _read_config(folder / CONFIG_FILE)
+    path = folder / WEIGHTS_FILE
+    try:
+        weights = load_file(path)
+    except (OSError, SafetensorError) as error:
+        raise _unreadable(path, error) from error
+    held = sum(tensor.numel() for tensor in weights.values())
+    if held != config.num_weights:  # before a network is made that may be far larger than the file
+        raise PolicyError(
+            f"{path}: does not fit {CONFIG_FILE}: {held} weights, not {config.num_weights}"
+        )
+    network = ActorCritic(config)
+    try:
+        network.load_state_dict(weights)
+    except RuntimeError as error:
+        lines = [line.strip() for line in str(error).splitlines()[1:]]
+        raise PolicyError(f"{path}: does not fit {CONFIG_FILE} ({'; '.join(lines)})") from error
+    for name, tensor in weights.items():
+        if not bool(torch.isfinite(tensor).all()):
+            raise PolicyError(f"{path}: '{name}' holds numbers that are not finite")
+    return network.eval(), config
+
+
+def _read_config(path: Path) -> NetworkConfig:
+    try:
+        raw: Any = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError, RecursionError) as error:  # not all of JSON's are its own
+        raise _unreadable(path, error) from error
+    try:
+        return validate(NetworkConfig, raw, str(path))
+    except ConfigError as error:
+        raise PolicyError(str(error)) from error
+
+
+def _unreadable(path: Path, error: Exception) -> PolicyError:
+    reason = error.strerror if isinstance(error, OSError) else None  # its text repeats the path
+    return PolicyError(f"{path}: cannot be read ({reason or error})")

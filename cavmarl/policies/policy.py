@@ -1,0 +1,253 @@
+"""Policies: what maps observations to actions, and how a name or a path becomes one.
+
+`agents/` holds the policies that come with cavmarl: `NAME.py` defines `make_policy(env)`; a folder
+holds the weights of a trained network. Both are files that are read, not modules that are imported.
+"""
+
+from __future__ import annotations
+
+import difflib
+import importlib.util
+import inspect
+from abc import ABC, abstractmethod
+from collections.abc import Iterable, Mapping
+from operator import attrgetter
+from os.path import isdir, isfile
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+from pettingzoo import ParallelEnv
+
+from cavmarl.config.env import EnvConfig, SensorsConfig
+from cavmarl.config.registry import agent_entries
+from cavmarl.core.errors import PolicyError, require
+from cavmarl.engine.spaces import flat_observation, flat_observation_space, observation_parts
+from cavmarl.env.parallel import CavEnv
+from cavmarl.env.vector import CavVectorEnv
+
+if TYPE_CHECKING:
+    from cavmarl.policies.networks import ActorCritic, NetworkConfig
+
+__all__ = ["NetworkPolicy", "Policy", "load_policy", "policy_files"]
+
+Environment = CavEnv | CavVectorEnv
+
+
+class Policy(ABC):
+    """Drives the agents of one environment.
+
+    Args:
+        env: where it drives; a `CavEnv` is driven by `act`, a `CavVectorEnv` by `act_batch`.
+    """
+
+    def __init__(self, env: Environment) -> None:
+        self.env = env
+
+    def reset(self, seed: int | None = None) -> None:  # noqa: B027 - most have nothing to reset
+        """Begin anew; `seed` roots the random numbers of a policy that draws any."""
+
+    @abstractmethod
+    def act_batch(self, observations: NDArray[np.float32], mask: NDArray[np.bool_]) -> NDArray[Any]:
+        """Actions of all agents of all worlds.
+
+        Args:
+            observations: (W, A, D) flat.
+            mask: (W, A) who acts; the others' actions are not read.
+
+        Returns:
+            (W, A, 2) float32 within [-1, 1], or (W, A) int64 meta-actions.
+        """
+
+    def act(self, observations: Mapping[str, Any]) -> dict[str, Any]:
+        """Actions of the agents of a `CavEnv`, from what its `reset` or `step` returned.
+
+        Agents that have just left are among the observations and get no action.
+
+        Args:
+            observations: by agent, flat or by sensor.
+        """
+        env = self.env
+        if not isinstance(env, CavEnv):
+            raise PolicyError("act() drives a parallel_env; a make_vec is driven by act_batch()")
+        index = {agent: k for k, agent in enumerate(env.possible_agents)}
+        live = [agent for agent in env.agents if agent in observations]
+        size = flat_observation_space(env.config).shape[0]
+        names: Iterable[str] = observation_parts(env.config.sensors)
+        stack = env.config.sensors.stack
+        if env.config.observation.mode == "sensors":
+            names, stack = env.config.rig, 1
+        batch = np.zeros((1, len(index), size), dtype=np.float32)
+        mask = np.zeros((1, len(index)), dtype=np.bool_)
+        for agent in live:
+            seen = observations[agent]
+            batch[0, index[agent]] = (
+                flat_observation(names, seen, stack) if isinstance(seen, Mapping) else seen
+            )
+            mask[0, index[agent]] = True
+        actions = self.act_batch(batch, mask)[0]
+        return {agent: actions[index[agent]] for agent in live}
+
+
+class NetworkPolicy(Policy):
+    """A trained network, driving by its most likely actions.
+
+    Args:
+        env: where it drives.
+        network: maps flat observations to actions.
+    """
+
+    def __init__(self, env: Environment, network: ActorCritic) -> None:
+        super().__init__(env)
+        self.network = network
+
+    def act_batch(self, observations: NDArray[np.float32], mask: NDArray[np.bool_]) -> NDArray[Any]:
+        """The network's most likely actions where `mask`, 0 elsewhere."""
+        import torch
+
+        threads = torch.get_num_threads()
+        torch.set_num_threads(1)  # for so small a network, more cost many times what they bring
+        try:
+            with torch.inference_mode():
+                best = self.network.best(torch.from_numpy(observations[mask])).numpy()
+        finally:
+            torch.set_num_threads(threads)
+        actions = np.zeros((*mask.shape, *best.shape[1:]), dtype=best.dtype)
+        actions[mask] = best
+        return actions
+
+
+def load_policy(policy: str | Path, env: Environment) -> Policy:
+    """Seat a policy in an environment.
+
+    Args:
+        policy: a name of `agents/`, a folder with model.safetensors and config.json, or a `.py`
+            file that defines `make_policy(env)`.
+        env: a `CavEnv`, also wrapped, or a `CavVectorEnv`.
+
+    Raises:
+        PolicyError: nothing of that name, a broken file, or a network made for other observations
+            or actions than this environment's.
+        MissingExtraError: a network, without torch.
+    """
+    if isinstance(env, ParallelEnv):
+        env = env.unwrapped
+    if not isinstance(env, CavEnv | CavVectorEnv):
+        raise PolicyError(
+            f"env is a {type(env).__name__}: pass what parallel_env() or make_vec() returned"
+        )
+    path = _find(policy)
+    if path.is_dir():
+        return _load_network_policy(path, env)
+    return _load_script(path, env)
+
+
+def policy_files(policy: str | Path) -> tuple[Path, ...]:
+    """The files that make a policy what it is: its script, or its weights and their description.
+
+    Raises:
+        PolicyError: nothing of that name, or a folder without them.
+        MissingExtraError: a network, without torch.
+    """
+    path = _find(policy)
+    if not path.is_dir():
+        return (path,)
+    require("torch", "torch")
+    require("safetensors", "torch")
+    from cavmarl.policies.networks import CONFIG_FILE, WEIGHTS_FILE
+
+    files = (path / WEIGHTS_FILE, path / CONFIG_FILE)
+    for file in files:
+        if not file.is_file():
+            raise PolicyError(f"no {file.name} in {path}: not the folder of a trained driver")
+    return files
+
+
+def _find(policy: str | Path) -> Path:
+    """The file or folder that `policy` means."""
+    if not isinstance(policy, str | Path):
+        raise PolicyError(f"policy = {policy!r}: must be the name of a driver, or a path")
+    known = agent_entries()
+    if isinstance(policy, str) and policy in known:
+        return known[policy]
+    path = Path(policy)
+    if isdir(path):  # unlike Path's, it takes names that no folder can have
+        return path
+    if isfile(path) and path.suffix == ".py":
+        return path
+    if isfile(path):
+        raise PolicyError(
+            f"{path}: no policy; give a folder with model.safetensors, or a .py with make_policy"
+        )
+    close = difflib.get_close_matches(str(policy), known, n=3)
+    meant = f"did you mean {' or '.join(close)}? " if close else ""
+    raise PolicyError(
+        f"no policy, folder or file '{policy}'; {meant}There are: {', '.join(known) or 'none'}"
+    )
+
+
+def _load_script(path: Path, env: Environment) -> Policy:
+    """Run a `.py` file and let its `make_policy` seat the policy."""
+    spec = importlib.util.spec_from_file_location(f"cavmarl_policy_{path.stem}", path)
+    if spec is None or spec.loader is None:
+        raise PolicyError(f"{path}: not a Python file")
+    module = importlib.util.module_from_spec(spec)
+    try:
+        spec.loader.exec_module(module)
+    except Exception as error:  # the file is the user's: it may raise anything
+        raise PolicyError(f"{path}: {type(error).__name__}: {error}") from error
+    make_policy = getattr(module, "make_policy", None)
+    if not inspect.isfunction(make_policy):
+        raise PolicyError(f"{path}: defines no function make_policy(env)")
+    policy = make_policy(env)
+    if not isinstance(policy, Policy):
+        raise PolicyError(
+            f"{path}: make_policy returned a {type(policy).__name__}, not a cavmarl.Policy"
+        )
+    return policy
+
+
+def _load_network_policy(folder: Path, env: Environment) -> NetworkPolicy:
+    require("torch", "torch")
+    require("safetensors", "torch")
+    from cavmarl.policies.networks import load_network
+
+    network, config = load_network(folder)
+    name, here = folder.name, env.config
+    size = flat_observation_space(here).shape[0]
+    if unlike := _differences(config, here):
+        lines = (f"{key} is {there} there, {ours} here" for key, (there, ours) in unlike.items())
+        cure = {key: there for key, (there, _) in unlike.items()}
+        raise PolicyError(
+            f"{name} does not fit {here.name}: {'; '.join(lines)} ({config.observation_size} "
+            f"numbers observed there, {size} here); make the environment with overrides={cure}"
+        )
+    if config.observation_size != size:
+        raise PolicyError(
+            f"{name}: observes {config.observation_size} numbers, but its sensors give {size} in "
+            "this version: train it again"
+        )
+    return NetworkPolicy(env, network)
+
+
+def _differences(config: NetworkConfig, here: EnvConfig) -> dict[str, tuple[Any, Any]]:
+    """Keys that make observations or actions mean something else: (in training, here)."""
+    from cavmarl.config.io import dotted_keys  # pydantic is slow to import
+
+    kind = config.action.kind
+    scales = {
+        "continuous": ("acceleration_mps2", "steering_rad"),
+        "discrete": ("target_speeds_mps",),
+    }[kind]
+    found: dict[str, tuple[Any, Any]] = {}
+    for key in ("kind", *scales):
+        there, ours = getattr(config.action, key), getattr(here.action, key)
+        if there != ours:
+            found[f"action.{key}"] = (there, ours)
+    for key in dotted_keys(SensorsConfig):
+        value = attrgetter(key)
+        there, ours = value(config.sensors), value(here.sensors)
+        if there != ours:
+            found[f"sensors.{key}"] = (there, ours)
+    return found

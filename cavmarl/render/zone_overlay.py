@@ -1,0 +1,129 @@
+"""Zones over a map: a wash of colour, the halo that others see of them, borders, numbers."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cavmarl.render.canvas import blank, lettering, load_pygame
+from cavmarl.render.ground import draw_ground
+from cavmarl.render.overlay import Overlay
+from cavmarl.render.palette import INK, ink_on, zone_color
+from cavmarl.render.shapes import road_shapes
+from cavmarl.render.viewport import Camera, suitable_size
+from cavmarl.roads.network import RoadNetwork
+from cavmarl.zones.partition.zone_partition import ZonePartition
+
+if TYPE_CHECKING:
+    from pygame import Rect, Surface
+
+__all__ = ["draw_sight", "draw_zones", "zone_picture"]
+
+WASH_ALPHA = 20
+HALO_ALPHA = 52
+BORDER_PX = 2
+SIGHT_PX = 4
+NUMBER_PX = 26
+NUMBER_PADDING_PX = 7
+MARGIN_PX = 50.0
+DETAIL = 4
+
+
+def zone_picture(
+    network: RoadNetwork, partition: ZonePartition, halo_m: float, title: str
+) -> Surface:
+    """A map with its zones.
+
+    Args:
+        network: the map.
+        partition: of the map.
+        halo_m: how far zones see over their borders; each is darker where another sees it.
+        title: for the upper left corner.
+
+    Raises:
+        MissingExtraError: pygame-ce is not installed.
+    """
+    size = suitable_size(partition.bounds)
+    camera = Camera.fit(partition.bounds, size, MARGIN_PX)
+    surface = draw_ground(road_shapes(network), camera, DETAIL)
+    draw_zones(surface, partition, halo_m, camera)
+    overlay = Overlay()
+    overlay.title(surface, title, f"{partition.count} zones   halo {halo_m:g} m")
+    overlay.scale_bar(surface, camera)
+    return surface
+
+
+def draw_zones(surface: Surface, partition: ZonePartition, halo_m: float, camera: Camera) -> None:
+    """Draw zones over what is there.
+
+    Args:
+        surface: where to.
+        partition: of the map.
+        halo_m: as in `zone_picture`.
+        camera: the view.
+    """
+    pygame = load_pygame()
+    wash = blank(surface.get_size(), transparent=True)
+    shown = _clipped(partition.reaching, camera)
+    inner = partition.reaching + np.array([halo_m, halo_m, -halo_m, -halo_m])
+    for zone, (outer, core) in enumerate(zip(shown, _clipped(inner, camera), strict=True)):
+        color = zone_color(zone)
+        pygame.draw.rect(wash, (*color, HALO_ALPHA), _pixels(outer, camera))
+        if (core[:2] < core[2:]).all():
+            pygame.draw.rect(wash, (*color, WASH_ALPHA), _pixels(core, camera))
+    surface.blit(wash, (0, 0))
+    for zone, outer in enumerate(shown):
+        left, top, width, height = _pixels(outer, camera)
+        pygame.draw.rect(
+            surface, INK, (left - 1, top - 1, width + BORDER_PX, height + BORDER_PX), BORDER_PX
+        )
+        _number(surface, zone, pygame.Rect(left, top, width, height))
+
+
+def draw_sight(
+    surface: Surface, partition: ZonePartition, halo_m: float, zone: int, camera: Camera
+) -> None:
+    """Draw how far a zone sees: the line at the end of its halo, in its colour.
+
+    Args:
+        surface: where to.
+        partition: of the map.
+        halo_m: as in `zone_picture`.
+        zone: which.
+        camera: the view.
+    """
+    pygame = load_pygame()
+    seen = partition.reaching[[zone]] + np.array([-halo_m, -halo_m, halo_m, halo_m])
+    # Far enough out of view for the round corners of what is clipped to stay there.
+    beyond = halo_m + 2.0 * SIGHT_PX / camera.scale
+    box = _pixels(_clipped(seen, camera, beyond)[0], camera)
+    radius = round(halo_m * camera.scale)
+    for width, color in ((SIGHT_PX + 2, INK), (SIGHT_PX, zone_color(zone))):
+        pygame.draw.rect(surface, color, box, width, border_radius=radius)
+
+
+def _clipped(
+    rects: NDArray[np.float64], camera: Camera, beyond_m: float = 0.0
+) -> NDArray[np.float64]:
+    """Rectangles (k, 4) without what is further than `beyond_m` out of view."""
+    low, high = np.array(camera.bounds).reshape(2, 2) + np.array([[-beyond_m], [beyond_m]])
+    return np.clip(rects, np.tile(low, 2), np.tile(high, 2))
+
+
+def _pixels(rect: NDArray[np.float64], camera: Camera) -> tuple[int, int, int, int]:
+    """A rectangle in metres as left, top, width and height in pixels."""
+    (left, bottom), (right, top) = np.rint(camera.to_pixels(rect.reshape(2, 2))).astype(int)
+    return int(left), int(top), int(right - left), int(bottom - top)
+
+
+def _number(surface: Surface, zone: int, room: Rect) -> None:
+    """The zone's number in the middle of what is seen of it, if there is room."""
+    pygame = load_pygame()
+    color = zone_color(zone)
+    text = lettering(str(zone), NUMBER_PX, ink_on(color))
+    plate = text.get_rect(center=room.center).inflate(2 * NUMBER_PADDING_PX, NUMBER_PADDING_PX)
+    if room.contains(plate):
+        pygame.draw.rect(surface, color, plate, border_radius=NUMBER_PADDING_PX)
+        surface.blit(text, text.get_rect(center=room.center))

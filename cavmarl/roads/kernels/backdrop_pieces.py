@@ -1,0 +1,159 @@
+"""What stands on a map for ever: its lanes in pieces and its buildings, and those near a vehicle.
+
+Items lie cell by cell in an index, so what is near a vehicle is always found in the same order.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cavmarl.core.math.neighbors import Grid, cell_columns, cell_rows
+from cavmarl.core.numba import kernel
+
+__all__ = ["WALL", "Backdrop", "gather_quads", "gather_walls"]
+
+WALL = np.dtype(
+    [
+        ("ax", np.float64),  # its ends, m
+        ("ay", np.float64),
+        ("bx", np.float64),
+        ("by", np.float64),
+        ("height", np.float64),  # m over the ground
+        ("building", np.int64),
+    ],
+    align=True,
+)
+
+
+class Backdrop(NamedTuple):
+    """What stands on a map for ever, in its frame, and how types of vehicles look.
+
+    Items lie cell by cell, by their middles; of an index, `start` counts them and `largest` is half
+    the length of the longest.
+    """
+
+    semantics: NDArray[np.uint8]  # (num_types,) class of each VTYPE row
+    strips: NDArray[np.float64]  # (num_strips, 4, 2) lanes in pieces: right and left start, left
+    lined: NDArray[np.float64]  # and right end; (num_strips,) 1: its sides are lane lines
+    strip_index: Grid
+    walls: NDArray[np.void]  # WALL (num_walls,)
+    wall_index: Grid
+    roofs: NDArray[np.float64]  # (num_roofs, 4, 2) corners of convex parts of footprints
+    roof_height: NDArray[np.float64]  # (num_roofs,) m over the ground
+    roof_index: Grid
+
+
+@kernel
+def gather_walls(
+    ego: np.void,
+    walls: NDArray[np.void],
+    index: Grid,
+    reach_m: float,
+    out: NDArray[np.void],
+) -> int:
+    """The walls around a vehicle, always in the same order.
+
+    Args:
+        ego: VEHICLE record of the one that looks.
+        walls: WALL (num_walls,) in the frame of the map.
+        index: of the walls.
+        reach_m: walls that are farther away are left out.
+        out: WALL (num_walls,), overwritten up to the returned number.
+
+    Returns:
+        how many there are.
+    """
+    cos = math.cos(ego["heading"])
+    sin = math.sin(ego["heading"])
+    far = reach_m + index.largest[0]
+    first_column, last_column = cell_columns(index, ego["x"], far)
+    first_row, last_row = cell_rows(index, ego["y"], far)
+    found = 0
+    for j in range(first_row, last_row + 1):
+        begin = index.start[j * index.num_x + first_column]
+        end = index.start[j * index.num_x + last_column + 1]
+        for k in range(begin, end):
+            ax = walls[k]["ax"] - ego["x"]
+            ay = walls[k]["ay"] - ego["y"]
+            bx = walls[k]["bx"] - ego["x"]
+            by = walls[k]["by"] - ego["y"]
+            if not _comes_near(ax, ay, bx, by, reach_m):
+                continue
+            wall = out[found]
+            wall["ax"] = ax * cos + ay * sin
+            wall["ay"] = ay * cos - ax * sin
+            wall["bx"] = bx * cos + by * sin
+            wall["by"] = by * cos - bx * sin
+            wall["height"] = walls[k]["height"]
+            wall["building"] = walls[k]["building"]
+            found += 1
+    return found
+
+
+@kernel
+def _comes_near(ax: float, ay: float, bx: float, by: float, reach_m: float) -> bool:
+    """Whether the segment from a to b comes within `reach_m` of the origin."""
+    ex = bx - ax
+    ey = by - ay
+    squared = ex * ex + ey * ey
+    share = 0.0
+    if squared > 0.0:
+        share = min(max(-(ax * ex + ay * ey) / squared, 0.0), 1.0)
+    x = ax + share * ex
+    y = ay + share * ey
+    return x * x + y * y <= reach_m * reach_m
+
+
+@kernel
+def gather_quads(
+    ego: np.void,
+    corners: NDArray[np.float64],
+    values: NDArray[np.float64],
+    index: Grid,
+    reach_m: float,
+    out_corners: NDArray[np.float64],
+    out_values: NDArray[np.float64],
+) -> int:
+    """The quads around a vehicle, and some that are a little too far, always in the same order.
+
+    Args:
+        ego: VEHICLE record of the one that looks.
+        corners: (num_quads, 4, 2) in the frame of the map.
+        values: (num_quads,) what else is known of each.
+        index: of the quads, by their middles; `largest` is the largest half diagonal.
+        reach_m: all quads of which a part is so near are found.
+        out_corners: (num_quads, 4, 2) in the vehicle's frame, overwritten.
+        out_values: (num_quads,), overwritten.
+
+    Returns:
+        how many there are.
+    """
+    cos = math.cos(ego["heading"])
+    sin = math.sin(ego["heading"])
+    far = reach_m + index.largest[0]
+    first_column, last_column = cell_columns(index, ego["x"], far)
+    first_row, last_row = cell_rows(index, ego["y"], far)
+    found = 0
+    for j in range(first_row, last_row + 1):
+        begin = index.start[j * index.num_x + first_column]
+        end = index.start[j * index.num_x + last_column + 1]
+        for k in range(begin, end):
+            x = -ego["x"]
+            y = -ego["y"]
+            for c in range(4):
+                x += 0.25 * corners[k, c, 0]
+                y += 0.25 * corners[k, c, 1]
+            if x * x + y * y > far * far:
+                continue
+            for c in range(4):
+                x = corners[k, c, 0] - ego["x"]
+                y = corners[k, c, 1] - ego["y"]
+                out_corners[found, c, 0] = x * cos + y * sin
+                out_corners[found, c, 1] = y * cos - x * sin
+            out_values[found] = values[k]
+            found += 1
+    return found

@@ -1,0 +1,197 @@
+"""Lane-level plans: for one goal, what to do next from every lane of the map.
+
+Dijkstra's algorithm backwards from the goal's lanes over the lane graph. Driving along a lane costs
+the time it takes at the speed limit; a lane change costs the more time the shorter the lane is, so
+that it is made early and where there is room.
+"""
+
+from __future__ import annotations
+
+import heapq
+import math
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cavmarl.core.numba import allocating_kernel, kernel
+from cavmarl.core.records.arrays import RoadArrays
+
+__all__ = ["LANE_CHANGE_COST_S", "change_cost", "plan_goal"]
+
+LANE_CHANGE_COST_S = 5.0  # what a lane change is worth in travel time on a long lane, s;
+LANE_CHANGE_M = 250.0  # twice as much on a lane of this length, which is hardly enough for one
+TURNAROUND = ord("t")
+
+
+@kernel
+def _is_allowed(roads: RoadArrays, link: int) -> bool:
+    """Whether plans use a link: turnarounds only where the road ends."""
+    if roads.links[link]["direction"] != TURNAROUND:
+        return True
+    edge = roads.edges[roads.lanes[roads.links[link]["from_lane"]]["edge"]]
+    for lane in range(edge["first_lane"], edge["first_lane"] + edge["num_lanes"]):
+        row = roads.lanes[lane]
+        for other in range(row["first_link"], row["first_link"] + row["num_links"]):
+            if roads.links[other]["direction"] != TURNAROUND:
+                return False
+    return True
+
+
+@kernel
+def _leads_to(roads: RoadArrays, before: int, lane: int) -> bool:
+    """Whether an allowed movement goes from the end of lane `before` to the start of `lane`."""
+    row = roads.lanes[before]
+    if row["internal"]:
+        return True
+    for link in range(row["first_link"], row["first_link"] + row["num_links"]):
+        if roads.links[link]["next_lane"] == lane and _is_allowed(roads, link):
+            return True
+    return False
+
+
+@kernel
+def change_cost(roads: RoadArrays, lane: int, weight: float) -> float:
+    """Cost in s of leaving a lane sideways: plans change lanes where there is room to.
+
+    Inside junctions nobody changes lanes.
+    """
+    if roads.lanes[lane]["internal"]:
+        return math.inf
+    return (
+        weight * LANE_CHANGE_COST_S * (1.0 + LANE_CHANGE_M / float(roads.lanes[lane]["length_m"]))
+    )
+
+
+@kernel
+def _lane_cost(roads: RoadArrays, lane: int, cost: NDArray[np.float64]) -> tuple[float, int, int]:
+    """Least cost from the start of `lane` without changing it: (cost, next lane, link)."""
+    row = roads.lanes[lane]
+    best = math.inf
+    best_next = -1
+    best_link = -1
+    if row["internal"]:
+        best_next = row["successor"]
+        best = cost[best_next]
+    else:
+        for link in range(row["first_link"], row["first_link"] + row["num_links"]):
+            candidate = roads.links[link]["next_lane"]
+            if cost[candidate] < best and _is_allowed(roads, link):
+                best = cost[candidate]
+                best_next = candidate
+                best_link = link
+    if best == math.inf:
+        return math.inf, -1, -1
+    return row["length_m"] / row["speed_mps"] + best, best_next, best_link
+
+
+@kernel
+def _settle(
+    roads: RoadArrays,
+    lane: int,
+    goal_edge: int,
+    change_weight: float,
+    cost: NDArray[np.float64],
+    plan: NDArray[np.void],
+) -> None:
+    """Write the plan of a lane whose cost, and that of all cheaper lanes, is final."""
+    row = roads.lanes[lane]
+    step = plan[lane]
+    length = row["length_m"]
+    if row["edge"] == goal_edge:
+        step["to_go"] = length
+        step["room"] = length
+        return
+    through, next_lane, link = _lane_cost(roads, lane, cost)
+    step["next"] = next_lane
+    step["link"] = link
+    best = through
+    change = 0
+    beside = -1
+    sideways = change_cost(roads, lane, change_weight)
+    if row["left"] >= 0 and cost[row["left"]] + sideways < best:
+        best = cost[row["left"]] + sideways
+        change = 1
+        beside = row["left"]
+    if row["right"] >= 0 and cost[row["right"]] + sideways < best:
+        change = -1
+        beside = row["right"]
+    step["change"] = change
+    if change == 0:
+        step["turnarounds"] = plan[next_lane]["turnarounds"]
+        if link >= 0 and roads.links[link]["direction"] == TURNAROUND:
+            step["turnarounds"] += 1
+        step["room"] = length + plan[next_lane]["room"]
+        step["to_go"] = length + plan[next_lane]["to_go"]
+    else:
+        step["turnarounds"] = plan[beside]["turnarounds"]
+        step["changes"] = 1 + plan[beside]["changes"]
+        step["room"] = length
+        step["to_go"] = plan[beside]["to_go"]
+
+
+@allocating_kernel
+def plan_goal(
+    roads: RoadArrays,
+    goal_edge: int,
+    permission: int,
+    change_weight: float,
+    plan: NDArray[np.void],
+) -> None:
+    """Fill the plan of one goal.
+
+    Args:
+        roads: the road arrays.
+        goal_edge: EDGE row to reach.
+        change_weight: what lane changes cost, over the usual; large: only where nothing else leads.
+        permission: bit of LANE["permissions"] that a lane needs.
+        plan: PLAN records (L,), written whole. Lanes from which the goal cannot be reached get
+            to_go = inf and next = -1.
+    """
+    num_lanes = roads.lanes.shape[0]
+    cost = np.full(num_lanes, math.inf)
+    settled = np.zeros(num_lanes, dtype=np.bool_)
+    for lane in range(num_lanes):
+        step = plan[lane]
+        step["next"] = -1
+        step["link"] = -1
+        step["change"] = 0
+        step["changes"] = 0
+        step["turnarounds"] = 0
+        step["shift"] = 0
+        step["room"] = 0.0
+        step["to_go"] = math.inf
+    heap: list[tuple[float, Any]] = [(0.0, -1)]  # tells the compiler the type; -1 is no lane
+    edge = roads.edges[goal_edge]
+    for lane in range(edge["first_lane"], edge["first_lane"] + edge["num_lanes"]):
+        row = roads.lanes[lane]
+        if row["permissions"] & permission:
+            cost[lane] = row["length_m"] / row["speed_mps"]
+            heapq.heappush(heap, (cost[lane], lane))
+    while len(heap) > 0:
+        here, lane = heapq.heappop(heap)
+        if lane < 0 or settled[lane]:
+            continue
+        settled[lane] = True
+        _settle(roads, lane, goal_edge, change_weight, cost, plan)
+        row = roads.lanes[lane]
+        for k in range(row["first_into"], row["first_into"] + row["num_into"]):
+            before = roads.into[k]
+            other = roads.lanes[before]
+            if settled[before] or not other["permissions"] & permission:
+                continue
+            if not _leads_to(roads, before, lane):
+                continue
+            reached = here + other["length_m"] / other["speed_mps"]
+            if reached < cost[before]:
+                cost[before] = reached
+                heapq.heappush(heap, (reached, np.int64(before)))
+        for beside in (row["left"], row["right"]):
+            if beside < 0 or settled[beside]:
+                continue
+            if not roads.lanes[beside]["permissions"] & permission:
+                continue
+            reached = here + change_cost(roads, beside, change_weight)
+            if reached < cost[beside]:
+                cost[beside] = reached
+                heapq.heappush(heap, (reached, np.int64(beside)))

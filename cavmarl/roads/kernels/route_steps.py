@@ -1,0 +1,213 @@
+"""Explicit routes: for a sequence of edges, what to do next from every lane of each of them."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cavmarl.core.numba import kernel
+from cavmarl.core.records.arrays import RoadArrays
+from cavmarl.roads.kernels.plans import change_cost
+
+__all__ = ["follow_plan", "plan_route", "trace_edges"]
+
+
+@kernel
+def plan_route(
+    roads: RoadArrays,
+    edges: NDArray[np.int32],
+    permission: int,
+    first_step: int,
+    steps: NDArray[np.void],
+    cost: NDArray[np.float64],
+) -> int:
+    """Fill the steps of one route, edge after edge.
+
+    Each edge's lanes have their steps together; a vehicle's way on the edge is the place of the
+    first one minus the edge's first lane. Costs are those of `kernels.plans`, over the route only.
+
+    Args:
+        roads: the road arrays.
+        edges: (n,) EDGE rows, each connected to the one before.
+        permission: bits of LANE["permissions"], one of which a lane needs.
+        first_step: where in `steps` the route begins.
+        steps: PLAN; written from `first_step`. Lanes from which the route cannot be followed get
+            to_go = inf.
+        cost: room, as long as `steps`.
+
+    Returns:
+        how many steps were written.
+    """
+    end = first_step
+    for n in range(edges.shape[0]):
+        end += roads.edges[edges[n]]["num_lanes"]
+    begin = end
+    way_after = 0
+    for n in range(edges.shape[0] - 1, -1, -1):
+        edge = roads.edges[edges[n]]
+        first = edge["first_lane"]
+        begin -= edge["num_lanes"]
+        way = begin - first
+        last = n == edges.shape[0] - 1
+        for lane in range(first, first + edge["num_lanes"]):
+            _begin_step(steps[way + lane])
+            cost[way + lane] = math.inf
+            if not roads.lanes[lane]["permissions"] & permission:
+                continue
+            if last:
+                steps[way + lane]["to_go"] = roads.lanes[lane]["length_m"]
+                steps[way + lane]["room"] = roads.lanes[lane]["length_m"]
+                cost[way + lane] = roads.lanes[lane]["length_m"] / roads.lanes[lane]["speed_mps"]
+            else:
+                _go_through(roads, lane, way, edges[n + 1], way_after, steps, cost)
+        # Changes spread over the lanes of an edge, to the left and then to the right.
+        for lane in range(first + 1, first + edge["num_lanes"]):
+            _go_sideways(roads, lane, -1, permission, way, steps, cost)
+        for lane in range(first + edge["num_lanes"] - 2, first - 1, -1):
+            _go_sideways(roads, lane, 1, permission, way, steps, cost)
+        way_after = way
+    return end - first_step
+
+
+@kernel
+def _begin_step(step: np.void) -> None:
+    step["next"] = -1
+    step["link"] = -1
+    step["shift"] = 0
+    step["change"] = 0
+    step["changes"] = 0
+    step["turnarounds"] = 0
+    step["room"] = 0.0
+    step["to_go"] = math.inf
+
+
+@kernel
+def _go_through(
+    roads: RoadArrays,
+    lane: int,
+    way: int,
+    edge_after: int,
+    way_after: int,
+    steps: NDArray[np.void],
+    cost: NDArray[np.float64],
+) -> None:
+    """Take the cheapest link from a lane to the next edge of the route, if there is one."""
+    row = roads.lanes[lane]
+    for link in range(row["first_link"], row["first_link"] + row["num_links"]):
+        target = roads.links[link]
+        to_lane = target["to_lane"]
+        if roads.lanes[to_lane]["edge"] != edge_after:
+            continue
+        reached = row["length_m"] / row["speed_mps"] + cost[way_after + to_lane]
+        if reached < cost[way + lane]:
+            step = steps[way + lane]
+            beyond = steps[way_after + to_lane]
+            cost[way + lane] = reached
+            step["next"] = target["next_lane"]
+            step["link"] = link
+            step["shift"] = way_after - way
+            step["room"] = row["length_m"] + target["length_m"] + beyond["room"]
+            step["to_go"] = row["length_m"] + target["length_m"] + beyond["to_go"]
+
+
+@kernel
+def _go_sideways(
+    roads: RoadArrays,
+    lane: int,
+    side: int,
+    permission: int,
+    way: int,
+    steps: NDArray[np.void],
+    cost: NDArray[np.float64],
+) -> None:
+    """Leave a lane to one side where that is cheaper than what its step says so far."""
+    row = roads.lanes[lane]
+    beside = row["left"] if side > 0 else row["right"]
+    if beside < 0 or not row["permissions"] & permission:
+        return
+    reached = cost[way + beside] + change_cost(roads, lane, 1.0)
+    if reached < cost[way + lane]:
+        step = steps[way + lane]
+        better = steps[way + beside]
+        cost[way + lane] = reached
+        step["next"] = -1
+        step["link"] = -1
+        step["shift"] = 0
+        step["change"] = side
+        step["changes"] = better["changes"] + 1
+        step["room"] = row["length_m"]
+        step["to_go"] = better["to_go"]
+
+
+@kernel
+def trace_edges(
+    roads: RoadArrays, plan: NDArray[np.void], first_edge: int, out: NDArray[np.int32]
+) -> int:
+    """The edges that a plan leads along, from the lane of an edge from which it is shortest.
+
+    Args:
+        roads: the road arrays.
+        plan: PLAN (L,) of one goal.
+        first_edge: EDGE row.
+        out: room for the EDGE rows, the first one included.
+
+    Returns:
+        how many edges, 0 where the plan has no way, -1 where `out` is too short.
+    """
+    edge = roads.edges[first_edge]
+    lane = -1
+    for candidate in range(edge["first_lane"], edge["first_lane"] + edge["num_lanes"]):
+        if plan[candidate]["to_go"] < math.inf:
+            if lane < 0 or _is_better(plan, candidate, lane):
+                lane = candidate
+    if lane < 0:
+        return 0
+    return follow_plan(roads, plan, lane, out)
+
+
+@kernel
+def follow_plan(
+    roads: RoadArrays, plan: NDArray[np.void], lane: int, out: NDArray[np.int32]
+) -> int:
+    """The edges that a plan leads along from a lane.
+
+    Args:
+        roads: the road arrays.
+        plan: PLAN (L,) of one goal, with a way from that lane.
+        lane: LANE row outside junctions.
+        out: room for the EDGE rows, that of the lane included.
+
+    Returns:
+        how many edges, -1 where `out` is too short.
+    """
+    out[0] = roads.lanes[lane]["edge"]
+    found = 1
+    while True:
+        step = plan[lane]
+        if step["change"] > 0:
+            lane = roads.lanes[lane]["left"]
+        elif step["change"] < 0:
+            lane = roads.lanes[lane]["right"]
+        elif step["next"] >= 0:
+            lane = step["next"]
+            if not roads.lanes[lane]["internal"]:
+                if found == out.shape[0]:
+                    return -1
+                out[found] = roads.lanes[lane]["edge"]
+                found += 1
+        else:
+            return found
+
+
+@kernel
+def _is_better(plan: NDArray[np.void], lane: int, other: int) -> bool:
+    """Whether a plan needs fewer lane changes from one lane than from another, or a shorter way."""
+    one = plan[lane]
+    two = plan[other]
+    if one["changes"] != two["changes"]:
+        fewer: bool = one["changes"] < two["changes"]
+        return fewer
+    shorter: bool = one["to_go"] < two["to_go"]
+    return shorter

@@ -1,0 +1,225 @@
+"""Signals: which phase is on, of fixed-time programs and of actuated ones.
+
+A fixed-time program is a function of the tick. An actuated one is SUMO's gap-based control: a green
+phase that may be prolonged is, while vehicles follow one another over its detectors, until its
+longest duration. Its times are whole milliseconds, as SUMO's, and its state is in the world: the
+phase, when it began, when to look next, and when each detector was last under a body.
+
+Source: SUMO's documentation, Simulation/Traffic Lights ("actuated"), and what libsumo 1.28 does.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cavmarl.core.numba import kernel
+from cavmarl.core.records.arrays import RoadArrays
+from cavmarl.core.records.rows import is_off_lanes
+
+__all__ = [
+    "DETECTOR_REACH_M",
+    "detect",
+    "program_at",
+    "switch_signals",
+]
+
+# From a detector to the centre of any vehicle that is over it or has left it in this tick.
+DETECTOR_REACH_M = 30.0
+
+SECOND_MS = 1000  # SUMO prolongs phases to whole seconds, and looks no sooner after a switch
+
+
+@kernel
+def detect(
+    lane_place: NDArray[np.int32],
+    places: NDArray[np.void],
+    rows: NDArray[np.void],
+    num_owned: NDArray[np.int64],
+    ticks: NDArray[np.int64],
+    dt: float,
+    detected_s: NDArray[np.float64],
+) -> None:
+    """Note when bodies were over the detectors: now, or when their rear left in this tick.
+
+    The latest counts, so that neither the order of rows nor who owns them matters.
+
+    Args:
+        lane_place: (L,) see `RoadArrays`.
+        places: PLACE (num_places,).
+        rows: VEHICLE (W, C), the committed ones of the tick.
+        num_owned: (W,) rows to look at.
+        ticks: (W,) since reset.
+        dt: seconds of the tick.
+        detected_s: (W, D), written; begun afresh at a reset.
+    """
+    for w in range(ticks.size):
+        if ticks[w] == 0:
+            # As in SUMO, time since the beginning counts as time since a vehicle.
+            detected_s[w] = 0.0
+        for i in range(num_owned[w]):
+            row = rows[w, i]
+            if is_off_lanes(row):
+                continue
+            place = lane_place[row["lane"]]
+            while place >= 0:
+                at = places[place]
+                ahead = row["s"] - at["s_m"]
+                if abs(ahead) < DETECTOR_REACH_M:
+                    _note(row, ahead, ticks[w] * dt, dt, at["detector"], detected_s[w])
+                place = at["next"]
+
+
+@kernel
+def switch_signals(
+    roads: RoadArrays,
+    ticks: NDArray[np.int64],
+    detected_s: NDArray[np.float64],
+    dt: float,
+    controllers: NDArray[np.void],
+    signal_phase: NDArray[np.int32],
+) -> None:
+    """Bring every signal to the worlds' ticks; once more at the same tick changes nothing.
+
+    Args:
+        roads: the road arrays.
+        ticks: (W,) since reset.
+        detected_s: (W, D) what bodies of all shards did up to these ticks.
+        dt: seconds of the tick.
+        controllers: CONTROLLER (W, num_controllers), written.
+        signal_phase: (W, num_signals), written.
+    """
+    for w in range(ticks.size):
+        time = ticks[w] * dt
+        if controllers.shape[1] > 0:
+            if ticks[w] == 0:
+                _start(roads, controllers[w], dt)
+            _control(roads, ticks[w], detected_s[w], dt, controllers[w])
+        for k in range(roads.signals.shape[0]):
+            program = program_at(roads, k, time, dt)
+            controller = roads.programs[program]["controller"]
+            if controller >= 0:
+                signal_phase[w, k] = controllers[w, controller]["phase"]
+            else:
+                signal_phase[w, k] = _fixed_phase(roads, program, time, dt)
+
+
+@kernel
+def program_at(roads: RoadArrays, k: int, time: float, dt: float) -> int:
+    """The program of a signal that is on at `time`."""
+    signal = roads.signals[k]
+    program = signal["program"]
+    for row in range(signal["first_switch"], signal["first_switch"] + signal["num_switches"]):
+        if roads.switches[row]["at_s"] > time + 0.5 * dt:
+            break
+        program = roads.switches[row]["program"]
+    return int(program)
+
+
+@kernel
+def _fixed_phase(roads: RoadArrays, program: int, time: float, dt: float) -> int:
+    """The PHASE row of a fixed-time program at `time`."""
+    row = roads.programs[program]
+    left = (time - row["offset_s"]) % row["cycle_s"]
+    phase = row["first_phase"]
+    last = phase + row["num_phases"] - 1
+    # Half a tick of slack: sums of ticks are not exact.
+    while phase < last and left + 0.5 * dt >= roads.phases[phase]["duration_s"]:
+        left -= roads.phases[phase]["duration_s"]
+        phase += 1
+    return int(phase)
+
+
+@kernel
+def _start(roads: RoadArrays, controllers: NDArray[np.void], dt: float) -> None:
+    """Begin every actuated program with the phase that its offset names, afresh."""
+    for program in range(roads.programs.shape[0]):
+        controller = roads.programs[program]["controller"]
+        if controller >= 0:
+            state = controllers[controller]
+            state["phase"] = _fixed_phase(roads, program, 0.0, dt)
+            state["since_ms"] = 0
+            state["next_ms"] = roads.phases[state["phase"]]["min_ms"]
+
+
+@kernel
+def _note(
+    row: np.void,
+    ahead: float,
+    time: float,
+    dt: float,
+    detector: int,
+    detected_s: NDArray[np.float64],
+) -> None:
+    """Note when a body was over a detector that its centre is `ahead` m of."""
+    rear = ahead - 0.5 * row["length"]
+    if ahead + 0.5 * row["length"] >= 0.0 and rear <= row["speed"] * dt:
+        # The tick was driven at the speed at its end (semi-implicit Euler).
+        since = rear / row["speed"] if rear > 0.0 else 0.0
+        detected_s[detector] = max(detected_s[detector], time - since)
+
+
+@kernel
+def _control(
+    roads: RoadArrays,
+    tick: int,
+    detected_s: NDArray[np.float64],
+    dt: float,
+    controllers: NDArray[np.void],
+) -> None:
+    """Let every actuated program of a world look, as often as is due before the next tick."""
+    now_ms = _milliseconds(tick * dt)
+    end_ms = _milliseconds((tick + 1) * dt)
+    for program in range(roads.programs.shape[0]):
+        controller = roads.programs[program]["controller"]
+        if controller >= 0:
+            state = controllers[controller]
+            gap_s = roads.programs[program]["detector_gap_s"]
+            while state["next_ms"] < end_ms:
+                state["next_ms"] += _look(roads, state, detected_s, gap_s, now_ms)
+
+
+@kernel
+def _look(
+    roads: RoadArrays,
+    state: np.void,
+    detected_s: NDArray[np.float64],
+    detector_gap_s: float,
+    now_ms: int,
+) -> int:
+    """Prolong the phase or go on to the next; ms until to look again."""
+    phase = roads.phases[state["phase"]]
+    lasted = now_ms - state["since_ms"]
+    gap = math.inf
+    if phase["green"] and lasted < phase["max_ms"]:
+        gap = _gap(roads, phase, detected_s, now_ms)
+    if gap < math.inf:
+        # Until the last vehicle has come from its detector to the stop line.
+        more = max(phase["min_ms"] - lasted, _milliseconds(detector_gap_s - gap), 1)
+        if more % SECOND_MS != 0:
+            more = ((more + lasted) // SECOND_MS + 1) * SECOND_MS - lasted
+        return int(min(more, phase["max_ms"] - lasted))
+    if phase["following"] != state["phase"]:
+        state["phase"] = phase["following"]
+        state["since_ms"] = now_ms
+        lasted = 0
+    return int(max(SECOND_MS, roads.phases[state["phase"]]["min_ms"] - lasted))
+
+
+@kernel
+def _gap(roads: RoadArrays, phase: np.void, detected_s: NDArray[np.float64], now_ms: int) -> float:
+    """Seconds since a vehicle was on the phase's detectors; inf if longer than each one's gap."""
+    gap = math.inf
+    for k in range(phase["first_detector"], phase["first_detector"] + phase["num_detectors"]):
+        detector = roads.phase_detectors[k]
+        since = now_ms / SECOND_MS - detected_s[detector]
+        if since < roads.detectors[detector]["max_gap_s"]:
+            gap = min(gap, since)
+    return gap
+
+
+@kernel
+def _milliseconds(seconds: float) -> int:
+    return math.floor(seconds * 1e3 + 0.5)

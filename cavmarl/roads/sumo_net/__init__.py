@@ -1,0 +1,1 @@
+"""Reads SUMO networks: lanes, links, conflicts, signals and their programs."""

@@ -1,0 +1,203 @@
+"""Signal programs as SUMO's XML states them: <tlLogic> with its phases, and <WAUT> timetables.
+
+The same elements stand in networks and in additional files; one reader serves both.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+from xml.sax.handler import ContentHandler
+
+from cavmarl.core.errors import MapError
+from cavmarl.roads.sumo_net.xml_source import read_xml
+
+__all__ = ["OFF", "Phase", "Program", "ProgramReader", "Timetable", "read_programs"]
+
+# The program that every signal has: nothing is lit, the right of way alone rules.
+OFF = "off"
+
+_REQUIRED = {
+    "tlLogic": ("id", "type", "programID"),
+    "phase": ("duration", "state"),
+    "WAUT": ("id", "startProg"),
+    "wautSwitch": ("time", "to"),
+    "wautJunction": ("wautID", "junctionID"),
+}
+
+
+@dataclass(frozen=True)
+class Phase:
+    """One <phase>.
+
+    Attributes:
+        duration_s, min_s, max_s: stated; SUMO's defaults fill in what is not.
+        state: a letter for every link of the signal.
+        following: phases that may come next, by number; empty: the one behind it.
+    """
+
+    duration_s: float
+    min_s: float
+    max_s: float
+    state: str
+    following: tuple[int, ...] = ()
+
+
+@dataclass(frozen=True)
+class Program:
+    """One <tlLogic>.
+
+    Attributes:
+        signal_id, program_id: together the program's name.
+        kind: SUMO's type: `static`, `actuated`, `delay_based`, `NEMA`, …
+        offset_s: by which all phases are late.
+        phases: in their order.
+        params: <param> by key.
+        place: file and line, for complaints.
+    """
+
+    signal_id: str
+    program_id: str
+    kind: str
+    offset_s: float
+    place: str
+    phases: list[Phase] = field(default_factory=list)
+    params: dict[str, str] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class Timetable:
+    """One <WAUT>: which program the signals that follow it run when.
+
+    Attributes:
+        start: the program at the beginning.
+        switches: (seconds since the beginning, program), in the file's order.
+        signal_ids: who follows it.
+        place: file and line, for complaints.
+    """
+
+    start: str
+    place: str
+    switches: list[tuple[float, str]] = field(default_factory=list)
+    signal_ids: list[str] = field(default_factory=list)
+
+
+class ProgramReader:
+    """Gathers programs and timetables from the elements of a file.
+
+    Args:
+        path: of the file, for complaints.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.programs: list[Program] = []
+        self.timetables: dict[str, Timetable] = {}
+        self._path = path
+        self._reference_s = 0.0
+        self._program: Program | None = None
+        self._timetable: Timetable | None = None
+
+    def start(self, name: str, attrs: Mapping[str, str], line: int) -> None:
+        """Take an element in; others than those of signals are passed over.
+
+        Raises:
+            MapError: an attribute is missing or no number, or it stands in the wrong place.
+        """
+        place = f"{self._path}, line {line}: <{name}>"
+        if missing := [key for key in _REQUIRED.get(name, ()) if key not in attrs]:
+            raise MapError(f"{place} has no attribute '{missing[0]}': add it")
+        if name == "tlLogic":
+            self._open_program(attrs, place)
+        elif name == "phase" and self._program is not None:
+            self._program.phases.append(_phase(attrs, place))
+        elif name == "param" and self._program is not None:
+            self._program.params[attrs.get("key", "")] = attrs.get("value", "")
+        elif name == "WAUT":
+            self._reference_s = _seconds(attrs, "refTime", place, 0.0)
+            self._timetable = Timetable(attrs["startProg"], place)
+            self.timetables[attrs["id"]] = self._timetable
+        elif name == "wautSwitch" and self._timetable is not None:
+            time = self._reference_s + _seconds(attrs, "time", place)
+            self._timetable.switches.append((time, attrs["to"]))
+        elif name == "wautJunction":
+            if attrs["wautID"] not in self.timetables:
+                raise MapError(f"{place} names the unknown WAUT '{attrs['wautID']}': define it")
+            self.timetables[attrs["wautID"]].signal_ids.append(attrs["junctionID"])
+
+    def end(self, name: str) -> None:
+        """Note that an element has ended."""
+        if name == "tlLogic":
+            self._program = None
+        elif name == "WAUT":
+            self._timetable = None
+
+    def _open_program(self, attrs: Mapping[str, str], place: str) -> None:
+        offset = 0.0 if attrs.get("offset") == "begin" else _seconds(attrs, "offset", place, 0.0)
+        self._program = Program(attrs["id"], attrs["programID"], attrs["type"], offset, place)
+        self.programs.append(self._program)
+
+
+def read_programs(path: Path) -> ProgramReader:
+    """Read the signal programs and timetables of an additional file (`.add.xml`, also gzipped).
+
+    Raises:
+        MapError: hostile or broken XML, or an element that `ProgramReader.start` refuses.
+    """
+    handler = _AdditionalHandler(path)
+    read_xml(path, handler)
+    return handler.reader
+
+
+class _AdditionalHandler(ContentHandler):
+    def __init__(self, path: Path) -> None:
+        super().__init__()
+        self.reader = ProgramReader(path)
+        self._locator: Any = None
+
+    def startElement(self, name: str, attrs: Any) -> None:
+        self.reader.start(name, attrs, self._locator.getLineNumber())
+
+    def endElement(self, name: str) -> None:
+        self.reader.end(name)
+
+
+def _phase(attrs: Mapping[str, str], place: str) -> Phase:
+    duration = _seconds(attrs, "duration", place)
+    # As SUMO reads it: who states only the shortest duration leaves the longest open.
+    longest = math.inf if "minDur" in attrs else duration
+    try:
+        following = tuple(int(number) for number in attrs.get("next", "").split())
+    except ValueError as error:
+        raise MapError(f"{place} has next='{attrs['next']}', which are no phases") from error
+    return Phase(
+        duration,
+        _seconds(attrs, "minDur", place, duration),
+        _seconds(attrs, "maxDur", place, longest),
+        attrs["state"],
+        following,
+    )
+
+
+def _seconds(attrs: Mapping[str, str], key: str, place: str, default: float | None = None) -> float:
+    if key not in attrs and default is not None:
+        return default
+    text = attrs[key]
+    try:
+        value = _clock(text)
+    except ValueError:
+        value = math.nan
+    if not math.isfinite(value):
+        raise MapError(f"{place} has {key}='{text}', which is no finite number of seconds: mend it")
+    return value
+
+
+def _clock(text: str) -> float:
+    """Seconds as SUMO writes them: `90`, `00:01:30` or `1:00:00:00` with days."""
+    parts = [float(part) for part in text.split(":")]
+    if len(parts) not in (1, 3, 4):
+        raise ValueError(text)
+    days, hours, minutes, seconds = [0.0] * (4 - len(parts)) + parts
+    return ((days * 24.0 + hours) * 60.0 + minutes) * 60.0 + seconds

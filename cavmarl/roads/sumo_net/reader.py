@@ -1,0 +1,355 @@
+"""SUMO networks as `RoadNetwork`: sumolib reads the file, this module fills the arrays."""
+
+from __future__ import annotations
+
+import hashlib
+import math
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cavmarl.core.errors import MapError
+from cavmarl.core.math.geometry import project
+from cavmarl.core.records.rows import FORK_BEYOND_M
+from cavmarl.roads.network import EDGE, JUNCTION, LANE, LINK, GeoReference, RoadNetwork
+from cavmarl.roads.polylines import clean_shape, extend_stubs, point_rows
+from cavmarl.roads.sumo_net.conflicts import LinkPath, sample_path
+from cavmarl.roads.sumo_net.detectors import DetectorRoads, place_detectors
+from cavmarl.roads.sumo_net.forks import fork_lengths
+from cavmarl.roads.sumo_net.programs import Program
+from cavmarl.roads.sumo_net.right_of_way import conflict_rows
+from cavmarl.roads.sumo_net.selection import Movement, Selection, permission_bits, select
+from cavmarl.roads.sumo_net.signal_rows import SignalRows, read_signals
+from cavmarl.roads.sumo_net.stop_lines import stop_back
+
+__all__ = ["map_name", "read_network", "source_hash"]
+
+APPROACH_M = 12.0  # before a junction, where bodies still stand askew to those who wait
+_ENDINGS = (".gz", ".xml", ".net", ".osm", ".xodr")
+
+
+def map_name(path: Path) -> str:
+    """The file's name without the endings of map files."""
+    name = path.name
+    for ending in _ENDINGS:
+        name = name.removesuffix(ending)
+    return name
+
+
+def source_hash(path: Path) -> str:
+    """SHA-256 of a file, hex.
+
+    Raises:
+        MapError: the file cannot be read.
+    """
+    try:
+        with path.open("rb") as stream:
+            return hashlib.file_digest(stream, "sha256").hexdigest()
+    except OSError as error:
+        raise MapError(f"{path}: cannot be read ({error.strerror or error})") from error
+
+
+def read_network(path: str | Path) -> RoadNetwork:
+    """Read a SUMO network file (`.net.xml`, `.net.xml.gz`).
+
+    Lane lengths are those of the polylines; EDGE["length_m"] is the length that the map states.
+
+    Raises:
+        MapError: the file is broken, hostile or inconsistent, or nothing in it can be driven.
+    """
+    # sumolib is only loaded where the cache has no network yet.
+    from cavmarl.roads.sumo_net.sumo_xml import parse_net
+
+    path = Path(path)
+    digest = source_hash(path)
+    try:
+        return _assemble(*parse_net(path), map_name(path), digest)
+    except MapError as error:
+        if str(error).startswith(str(path)):
+            raise
+        raise MapError(f"{path}: {error}") from error
+
+
+def _assemble(net: Any, programs: list[Program], name: str, digest: str) -> RoadNetwork:
+    chosen = select(net)
+    if not chosen.edges:
+        raise MapError(
+            "no lane that a road vehicle may use: check the lanes' permissions, or what "
+            "netconvert kept (--keep-edges.by-vclass)"
+        )
+    lane_row = {id(lane): row for row, lane in enumerate(chosen.lanes)}
+    signal_rows = read_signals(programs)
+    nodes = net.getNodes()
+    node_row = {id(node): row for row, node in enumerate(nodes)}
+
+    before = _before(chosen, lane_row)
+    num_normal = sum(lane.getEdge().getFunction() == "" for lane in chosen.lanes)
+    lane_ids = tuple(lane.getID() for lane in chosen.lanes)
+    shapes = [clean_shape(lane.getShape3D()) for lane in chosen.lanes]
+    extend_stubs(shapes, before, lane_ids, num_normal)
+    points, first_point = point_rows(shapes)
+
+    edges = _edge_rows(chosen, net, node_row)
+    lanes = _lane_rows(chosen, edges, points, first_point)
+    links = _link_rows(chosen.movements, lane_row, lanes, node_row, signal_rows)
+    into = _connect(lanes, links, chosen.movements, lane_row)
+    paths = [_path(move, lane_row, lanes, points) for move in chosen.movements]
+    conflicts, first_conflict = conflict_rows(chosen.movements, paths)
+    fork_m = fork_lengths(links["from_lane"].tolist(), paths)
+    links["fork_m"] = np.minimum(fork_m, links["length_m"] + FORK_BEYOND_M)
+    _map_neighbors(lanes, points)
+    lanes["stop_back_m"] = stop_back(
+        _lane_ends(lanes, points),
+        lanes["edge"],
+        links["from_lane"].tolist(),
+        links["junction"].tolist(),
+        paths,
+        [_path(move, lane_row, lanes, points, APPROACH_M) for move in chosen.movements],
+    )
+    links["first_conflict"] = first_conflict[:-1]
+    links["num_conflicts"] = np.diff(first_conflict)
+    junctions, kinds = _junction_rows(nodes, links)
+    detectors, phase_detectors = place_detectors(
+        signal_rows, DetectorRoads(lanes, edges, links, conflicts, into, lane_ids)
+    )
+    return RoadNetwork(
+        name=name,
+        source_hash=digest,
+        points=points,
+        lanes=lanes,
+        edges=edges,
+        links=links,
+        conflicts=conflicts,
+        junctions=junctions,
+        into=into,
+        **signal_rows.arrays()._asdict(),
+        detectors=detectors,
+        phase_detectors=phase_detectors,
+        lane_ids=lane_ids,
+        edge_ids=tuple(edge.getID() for edge in chosen.edges),
+        junction_ids=tuple(node.getID() for node in nodes),
+        signal_ids=tuple(signal_rows.ids),
+        junction_kinds=kinds,
+        geo=_geo_reference(net),
+    )
+
+
+def _geo_reference(net: Any) -> GeoReference | None:
+    """Where the map lies on the earth, if its `location` says it."""
+    try:
+        if not net.hasGeoProj():
+            return None
+    except KeyError:  # there is no location
+        return None
+    try:
+        offset_x_m, offset_y_m = net.getLocationOffset()
+    except ValueError:
+        offset_x_m = offset_y_m = math.nan
+    if not (math.isfinite(offset_x_m) and math.isfinite(offset_y_m)):
+        raise MapError("netOffset of its location: must be two numbers, x,y in m")
+    return GeoReference(net._location["projParameter"], offset_x_m, offset_y_m)
+
+
+def _before(chosen: Selection, lane_row: dict[int, int]) -> dict[int, int]:
+    """The lane row that leads into each internal lane row, in driving order."""
+    before: dict[int, int] = {}
+    for movement in chosen.movements:
+        source = lane_row[id(movement.connection.getFromLane())]
+        for lane in movement.chain:
+            before[lane_row[id(lane)]] = source
+            source = lane_row[id(lane)]
+    return before
+
+
+def _edge_rows(chosen: Selection, net: Any, node_row: dict[int, int]) -> NDArray[np.void]:
+    counts: dict[int, int] = {}
+    for lane in chosen.lanes:
+        counts[id(lane.getEdge())] = counts.get(id(lane.getEdge()), 0) + 1
+    edges = np.zeros(len(chosen.edges), EDGE)
+    first = 0
+    for row, edge in enumerate(chosen.edges):
+        num_lanes = counts[id(edge)]
+        edges[row] = (
+            first,
+            num_lanes,
+            edge.getFunction() == "internal",
+            _node_row(edge, edge.getFromNode(), node_row),
+            _node_row(edge, edge.getToNode(), node_row),
+            edge.getLength(),
+            max(lane.getSpeed() for lane in chosen.lanes[first : first + num_lanes]),
+        )
+        first += num_lanes
+    return edges
+
+
+def _node_row(edge: Any, node: Any, node_row: dict[int, int]) -> int:
+    if node is None or node._coord is None:
+        raise MapError(
+            f"edge '{edge.getID()}' has an end at no known junction: build the network again with "
+            "netconvert"
+        )
+    return node_row[id(node)]
+
+
+def _lane_rows(
+    chosen: Selection,
+    edges: NDArray[np.void],
+    points: NDArray[np.void],
+    first_point: NDArray[np.int32],
+) -> NDArray[np.void]:
+    lanes = np.zeros(len(chosen.lanes), LANE)
+    lanes["edge"] = np.repeat(np.arange(len(edges)), edges["num_lanes"])
+    lanes["index"] = np.arange(len(lanes)) - edges["first_lane"][lanes["edge"]]
+    lanes["internal"] = edges["internal"][lanes["edge"]]
+    lanes["first_point"] = first_point[:-1]
+    lanes["num_points"] = np.diff(first_point)
+    lanes["length_m"] = points["s"][first_point[1:] - 1]
+    lanes["width_m"] = [lane.getWidth() for lane in chosen.lanes]
+    lanes["speed_mps"] = [lane.getSpeed() for lane in chosen.lanes]
+    lanes["permissions"] = [permission_bits(lane.getPermissions()) for lane in chosen.lanes]
+    for axis in ("x", "y"):
+        lanes[f"min_{axis}"] = np.minimum.reduceat(points[axis], first_point[:-1])
+        lanes[f"max_{axis}"] = np.maximum.reduceat(points[axis], first_point[:-1])
+
+    for field in ("left", "right", "successor", "link"):
+        lanes[field] = -1
+    position = np.array([lane.getIndex() for lane in chosen.lanes])
+    # Lanes cut by an internal junction have parts of unlike lengths: they do not run side by side.
+    uncut = {id(move.chain[0]) for move in chosen.movements if len(move.chain) == 1}
+    beside = np.array(
+        [not lane.getID().startswith(":") or id(lane) in uncut for lane in chosen.lanes]
+    )
+    pair = (lanes["edge"][:-1] == lanes["edge"][1:]) & (position[:-1] + 1 == position[1:])
+    pair &= beside[:-1] & beside[1:]
+    right = np.flatnonzero(pair)
+    lanes["left"][right] = right + 1
+    lanes["right"][right + 1] = right
+    return lanes
+
+
+def _link_rows(
+    movements: Sequence[Movement],
+    lane_row: dict[int, int],
+    lanes: NDArray[np.void],
+    node_row: dict[int, int],
+    signals: SignalRows,
+) -> NDArray[np.void]:
+    links = np.zeros(len(movements), LINK)
+    for link, movement in zip(links, movements, strict=True):
+        connection = movement.connection
+        chain = [lane_row[id(lane)] for lane in movement.chain]
+        link["from_lane"] = lane_row[id(connection.getFromLane())]
+        link["to_lane"] = lane_row[id(connection.getToLane())]
+        link["first_internal"] = chain[0] if chain else -1
+        link["next_lane"] = chain[0] if chain else link["to_lane"]
+        link["length_m"] = lanes["length_m"][chain].sum()
+        # netconvert cuts a path in two where drivers wait inside the junction.
+        link["wait_m"] = lanes["length_m"][chain[0]] if len(chain) > 1 else np.inf
+        link["junction"] = node_row[id(movement.node)]
+        link["index"] = movement.index
+        link["signal"], link["signal_index"] = signals.find(connection, movement.node.getType())
+        link["direction"] = ord(connection.getDirection()[0])
+        link["state"] = ord(connection.getState()[0])
+    return links
+
+
+def _map_neighbors(lanes: NDArray[np.void], points: NDArray[np.void]) -> None:
+    """Fill where the points of each lane lie on its neighbours, in driving order."""
+    for row in lanes:
+        own = points[row["first_point"] : row["first_point"] + row["num_points"]]
+        for side in ("left", "right"):
+            if row[side] < 0:
+                continue
+            other = lanes[row[side]]
+            first, number = int(other["first_point"]), int(other["num_points"])
+            reached = 0.0
+            for point in own:
+                s, _, _, _ = project(points, first, number, point["x"], point["y"])
+                reached = max(reached, min(float(s), float(other["length_m"])))
+                point[f"{side}_s"] = reached
+
+
+def _lane_ends(lanes: NDArray[np.void], points: NDArray[np.void]) -> NDArray[np.float64]:
+    """(L, 4) x, y, z of each lane's last point and its direction there."""
+    last = points[lanes["first_point"] + lanes["num_points"] - 1]
+    heading = np.arctan2(last["sin"], last["cos"])
+    return np.stack([last["x"], last["y"], last["z"], heading], axis=1)
+
+
+def _connect(
+    lanes: NDArray[np.void],
+    links: NDArray[np.void],
+    movements: Sequence[Movement],
+    lane_row: dict[int, int],
+) -> NDArray[np.int32]:
+    """Fill what joins lanes: links out of them, successors of internal lanes, lanes into them."""
+    rows = np.arange(len(lanes))
+    lanes["first_link"] = np.searchsorted(links["from_lane"], rows, side="left")
+    lanes["num_links"] = np.searchsorted(links["from_lane"], rows, side="right")
+    lanes["num_links"] -= lanes["first_link"]
+
+    steps: list[tuple[int, int]] = []
+    for number, (link, movement) in enumerate(zip(links, movements, strict=True)):
+        offset = 0.0
+        source = int(link["from_lane"])
+        for lane in movement.chain:
+            row = lane_row[id(lane)]
+            steps.append((row, source))
+            lanes["link"][row] = number
+            lanes["link_offset_m"][row] = offset
+            offset += lanes["length_m"][row]
+            source = row
+        steps.append((int(link["to_lane"]), source))
+    steps.sort()
+    target, into = np.array(steps, dtype=np.int32).reshape(-1, 2).T
+    internal = lanes["internal"][into]
+    lanes["successor"][into[internal]] = target[internal]
+    lanes["first_into"] = np.searchsorted(target, rows, side="left")
+    lanes["num_into"] = np.searchsorted(target, rows, side="right") - lanes["first_into"]
+    return np.ascontiguousarray(into)
+
+
+def _path(
+    movement: Movement,
+    lane_row: dict[int, int],
+    lanes: NDArray[np.void],
+    points: NDArray[np.void],
+    approach_m: float = 0.0,
+) -> LinkPath | None:
+    """The sampled path of a link along its chain of internal lanes.
+
+    It may begin `approach_m` before the junction, with places below zero.
+    """
+    if not movement.chain:
+        return None
+    s, xyz = [], []
+    if approach_m > 0.0:
+        row = lanes[lane_row[id(movement.connection.getFromLane())]]
+        part = points[row["first_point"] : row["first_point"] + row["num_points"]]
+        begin = max(row["length_m"] - approach_m, 0.0)
+        at = np.append(begin, part["s"][part["s"] > begin])
+        s.append(at - row["length_m"])
+        xyz.append(np.stack([np.interp(at, part["s"], part[axis]) for axis in "xyz"], axis=1))
+    for lane in movement.chain:
+        row = lanes[lane_row[id(lane)]]
+        part = points[row["first_point"] : row["first_point"] + row["num_points"]]
+        s.append(part["s"] + row["link_offset_m"])
+        xyz.append(np.stack([part["x"], part["y"], part["z"]], axis=1))
+    return sample_path(np.concatenate(s), np.concatenate(xyz))
+
+
+def _junction_rows(
+    nodes: Sequence[Any], links: NDArray[np.void]
+) -> tuple[NDArray[np.void], tuple[str, ...]]:
+    kinds = tuple(sorted({node.getType() or "" for node in nodes}))
+    junctions = np.zeros(len(nodes), JUNCTION)
+    for junction, node in zip(junctions, nodes, strict=True):
+        x, y, z = node.getCoord3D() or (0.0, 0.0, 0.0)
+        junction["x"], junction["y"], junction["z"] = x, y, z
+        junction["kind"] = kinds.index(node.getType() or "")
+    junctions["signal"] = -1
+    junctions["signal"][links["junction"]] = links["signal"]
+    return junctions, kinds

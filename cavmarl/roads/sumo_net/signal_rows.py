@@ -1,0 +1,247 @@
+"""Signals and their programs as SIGNAL, PROGRAM, PHASE and SWITCH rows.
+
+Rows are only ever appended, so programs of additional files join those of a map that is read.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cavmarl.core.errors import MapError
+from cavmarl.roads.network import PHASE, PROGRAM, SIGNAL, SIGNAL_STATES, SWITCH, RoadNetwork
+from cavmarl.roads.sumo_net.programs import Phase, Program
+
+__all__ = ["SignalArrays", "SignalRows", "parameter", "read_signals"]
+
+# Trains switch these; no train runs here, so their links are read as links without a signal.
+RAIL_KINDS = ("rail_signal", "rail_crossing")
+
+MAX_MS = 10**12  # SUMO's time beyond all times: 30 years
+
+# SUMO's default way from detector to stop line, in seconds at the limit.
+DETECTOR_GAP_S = 2.0
+
+# What an actuated program may ask for and does not get; `map check` names such programs.
+_UNMODELLED = ("linkMaxDur:", "linkMinDur:", "jam-threshold", "vTypes", "coordinated", "file-")
+
+
+class SignalArrays(NamedTuple):
+    """What a `RoadNetwork` keeps of signals, but for detectors."""
+
+    signals: NDArray[np.void]  # SIGNAL (num_signals,)
+    programs: NDArray[np.void]  # PROGRAM (num_programs,)
+    phases: NDArray[np.void]  # PHASE (num_phases,)
+    phase_states: NDArray[np.uint8]  # (num_letters,)
+    switches: NDArray[np.void]  # SWITCH (num_switches,)
+    program_ids: tuple[str, ...]
+
+
+class SignalRows:
+    """The signals of a map: rows, letters, and the row of every id."""
+
+    def __init__(self) -> None:
+        self.ids: list[str] = []
+        self.signals: list[list[int]] = []  # program, num_links
+        self.programs: list[tuple[Any, ...]] = []
+        self.program_ids: list[str] = []
+        self.phases: list[tuple[Any, ...]] = []
+        self.letters: list[int] = []
+        self.switches: list[tuple[int, float, int]] = []
+        self.row: dict[str, int] = {}
+        self.program_row: dict[tuple[str, str], int] = {}
+        self.num_controllers = 0
+        self.phase_detectors: list[int] = []
+        self.specs: dict[int, Program] = {}  # by row; of actuated programs that need detectors
+
+    @classmethod
+    def of(cls, network: RoadNetwork) -> SignalRows:
+        """The rows of a network, to append more."""
+        rows = cls()
+        rows.ids = list(network.signal_ids)
+        rows.row = {name: row for row, name in enumerate(rows.ids)}
+        rows.signals = [[int(s["program"]), int(s["num_links"])] for s in network.signals]
+        rows.programs = network.programs.tolist()
+        rows.program_ids = list(network.program_ids)
+        rows.program_row = {
+            (rows.ids[program["signal"]], name): row
+            for row, (program, name) in enumerate(
+                zip(network.programs, network.program_ids, strict=True)
+            )
+        }
+        rows.phases = network.phases.tolist()
+        rows.letters = network.phase_states.tolist()
+        rows.switches = network.switches.tolist()
+        rows.num_controllers = network.num_controllers
+        rows.phase_detectors = network.phase_detectors.tolist()
+        return rows
+
+    def add(self, program: Program) -> None:
+        """Append a program; of several the last is on, as in SUMO.
+
+        Raises:
+            MapError: no phases, phases of different lengths, an unknown letter, a cycle of no time,
+                a name that is taken.
+        """
+        signal_id = program.signal_id
+        cycle = sum(phase.duration_s for phase in program.phases)
+        if not program.phases or not program.phases[0].state or cycle <= 0.0:
+            raise _error(signal_id, "has a program without phases or without duration")
+        if (signal_id, program.program_id) in self.program_row:
+            raise _error(signal_id, f"has two programs '{program.program_id}'")
+        if signal_id not in self.row:
+            self.row[signal_id] = len(self.ids)
+            self.ids.append(signal_id)
+            self.signals.append([-1, len(program.phases[0].state)])
+        signal = self.row[signal_id]
+        row = len(self.programs)
+        first = len(self.phases)
+        for number, phase in enumerate(program.phases):
+            self._add_phase(program, phase, number, first, self.signals[signal][1])
+        actuated = program.kind == "actuated"
+        if actuated:
+            self.specs[row] = program
+        self.programs.append(
+            (
+                signal,
+                first,
+                len(program.phases),
+                program.offset_s,
+                cycle,
+                self._next_controller() if actuated else -1,
+                parameter(program, "detector-gap", DETECTOR_GAP_S) if actuated else 0.0,
+                _simplified(program),
+            )
+        )
+        self.program_ids.append(program.program_id)
+        self.program_row[signal_id, program.program_id] = row
+        self.signals[signal][0] = row
+
+    def _next_controller(self) -> int:
+        self.num_controllers += 1
+        return self.num_controllers - 1
+
+    def _add_phase(
+        self, program: Program, phase: Phase, number: int, first: int, num_links: int
+    ) -> None:
+        signal_id = program.signal_id
+        if len(phase.state) != num_links:
+            raise _error(signal_id, "has phases for different numbers of links")
+        if phase.duration_s < 0 or phase.min_s < 0 or phase.max_s < 0:
+            raise _error(signal_id, "has a phase of negative duration")
+        if unknown := set(phase.state) - set(SIGNAL_STATES):
+            raise _error(signal_id, f"has the unknown states {sorted(unknown)}")
+        following = phase.following[0] if phase.following else (number + 1) % len(program.phases)
+        if not 0 <= following < len(program.phases):
+            raise _error(signal_id, f"has a phase that leads to phase {following}, which is none")
+        green = bool(set(phase.state) & set("gG")) and not set(phase.state) & set("yY")
+        self.phases.append(
+            (
+                phase.duration_s,
+                _milliseconds(phase.min_s),
+                _milliseconds(phase.max_s),
+                first + following,
+                green,
+                len(self.letters),
+                0,
+                0,
+            )
+        )
+        self.letters.extend(map(SIGNAL_STATES.index, phase.state))
+
+    def set_detectors(self, program: int, phase: int, detectors: list[int]) -> None:
+        """Say which DETECTOR rows prolong the phase of this number in a program."""
+        row = int(self.programs[program][1]) + phase
+        self.phases[row] = (*self.phases[row][:-2], len(self.phase_detectors), len(detectors))
+        self.phase_detectors += detectors
+
+    def find(self, connection: Any, junction_kind: str) -> tuple[int, int]:
+        """The SIGNAL row and state letter of a connection, (-1, -1) without a signal.
+
+        Raises:
+            MapError: the connection's signal has no program or no letter for it.
+        """
+        signal_id = connection.getTLSID()
+        if not signal_id or (signal_id not in self.row and junction_kind in RAIL_KINDS):
+            return -1, -1
+        if signal_id not in self.row:
+            raise _error(signal_id, "controls connections but has no program")
+        row = self.row[signal_id]
+        index = int(connection.getTLLinkIndex())
+        if not 0 <= index < self.signals[row][1]:
+            raise _error(signal_id, f"has no state for link {index}")
+        return row, index
+
+    def arrays(self) -> SignalArrays:
+        """The rows as record arrays."""
+        signals = np.zeros(len(self.signals), SIGNAL)
+        switches = np.zeros(len(self.switches), SWITCH)
+        switches[:] = sorted(self.switches)
+        for row, (program, num_links) in enumerate(self.signals):
+            first, end = np.searchsorted(switches["signal"], [row, row + 1])
+            signals[row] = (program, num_links, first, end - first)
+        programs = np.zeros(len(self.programs), PROGRAM)
+        programs[:] = self.programs
+        phases = np.zeros(len(self.phases), PHASE)
+        phases[:] = self.phases
+        letters = np.array(self.letters, dtype=np.uint8)
+        return SignalArrays(signals, programs, phases, letters, switches, tuple(self.program_ids))
+
+
+def read_signals(programs: list[Program]) -> SignalRows:
+    """The programs of a network's traffic lights.
+
+    Raises:
+        MapError: see `SignalRows.add`.
+    """
+    rows = SignalRows()
+    for program in programs:
+        rows.add(program)
+    return rows
+
+
+def _simplified(program: Program) -> bool:
+    """Whether SUMO would run the program in another way than this package does."""
+    chooses = any(len(phase.following) > 1 for phase in program.phases)
+    if program.kind != "actuated":
+        jumps = any(
+            phase.following not in ((), ((number + 1) % len(program.phases),))
+            for number, phase in enumerate(program.phases)
+        )
+        return program.kind != "static" or jumps
+    return chooses or any(
+        key.startswith(_UNMODELLED) and value not in ("", "-1")
+        for key, value in program.params.items()
+    )
+
+
+def parameter(program: Program, key: str, default: float) -> float:
+    """A parameter of a program in seconds.
+
+    Raises:
+        MapError: no number from 0.
+    """
+    text = program.params.get(key)
+    if text is None:
+        return default
+    try:
+        value = float(text)
+    except ValueError:
+        value = math.nan
+    if not (math.isfinite(value) and value >= 0.0):
+        raise MapError(f"{program.place} has {key}='{text}': must be a number of seconds from 0")
+    return value
+
+
+def _milliseconds(seconds: float) -> int:
+    return MAX_MS if seconds * 1e3 >= MAX_MS else round(seconds * 1e3)
+
+
+def _error(signal_id: str, problem: str) -> MapError:
+    return MapError(
+        f"signal '{signal_id}' {problem}: mend its <tlLogic> or build it again "
+        "(netconvert --tls.rebuild)"
+    )

@@ -1,0 +1,145 @@
+"""SUMO's network files, read by sumolib, with the checks that sumolib leaves out.
+
+sumolib merges edges of the same name, takes NaN for a speed and stumbles over missing attributes
+with a bare KeyError. Here every element is checked first; a complaint has a place and a cure.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+from xml.sax.handler import ContentHandler
+
+from sumolib.net import NetReader
+
+from cavmarl.core.errors import MapError
+from cavmarl.roads.sumo_net.programs import Program, ProgramReader
+from cavmarl.roads.sumo_net.xml_source import read_xml
+
+__all__ = ["parse_net"]
+
+_REQUIRED = {
+    "edge": ("id",),
+    "lane": ("id", "speed", "length", "shape"),
+    "junction": ("id", "type", "x", "y", "incLanes", "intLanes"),
+    "connection": ("from", "to", "fromLane", "toLane", "dir", "state"),
+    "request": ("index", "response", "foes"),
+}
+_FINITE = {
+    "lane": ("speed", "length", "width"),
+    "junction": ("x", "y", "z"),
+}
+_POSITIVE = {("lane", "speed"), ("lane", "length"), ("lane", "width")}
+_VERSION = re.compile(r"[0-9]+\.[0-9]+(\.[0-9]+)?")
+_BITS = re.compile(r"[01]+")
+
+
+class _CheckedReader(ContentHandler):
+    """Hands every element that holds what it must to sumolib's own reader."""
+
+    def __init__(self, path: Path) -> None:
+        super().__init__()
+        self.reader = NetReader(withInternal=True, withFoes=True)
+        self.programs = ProgramReader(path)
+        self._path = path
+        self._seen: set[tuple[str, str]] = set()
+        self._edge = ""
+        self._next_lane = 0
+        self._root = ""
+        self._locator: Any = None
+
+    def startElement(self, name: str, attrs: Any) -> None:
+        if not self._root:
+            self._root = name
+            if name != "net":
+                raise self._error(name, attrs, "is not the root of a SUMO network, which is <net>")
+            self._check_version(attrs)
+        self._check(name, attrs)
+        self.programs.start(name, attrs, self._locator.getLineNumber())
+        try:
+            self.reader.startElement(name, attrs)
+        except (KeyError, ValueError, IndexError, AttributeError, TypeError) as error:
+            problem = f"does not fit the elements before it ({type(error).__name__}: {error})"
+            raise self._error(name, attrs, problem) from error
+
+    def endElement(self, name: str) -> None:
+        self.programs.end(name)
+        try:
+            self.reader.endElement(name)
+        except KeyError as error:
+            raise self._error(name, {}, f"refers to an unknown edge {error}") from error
+
+    def _error(self, name: str, attrs: Mapping[str, str], problem: str) -> MapError:
+        known = f' id="{attrs["id"]}"' if "id" in attrs else ""
+        return MapError(
+            f"{self._path}, line {self._locator.getLineNumber()}: <{name}{known}> {problem}: "
+            "build the network again with netconvert or mend this element"
+        )
+
+    def _check(self, name: str, attrs: Mapping[str, str]) -> None:
+        for key in _REQUIRED.get(name, ()):
+            if key not in attrs:
+                raise self._error(name, attrs, f"has no attribute '{key}'")
+        for key in _FINITE.get(name, ()):
+            if key in attrs:
+                self._check_number(name, key, attrs)
+        if name in ("edge", "junction"):
+            self._check_unique(name, attrs)
+        if name == "edge":
+            self._edge, self._next_lane = attrs["id"], 0
+        elif name == "lane":
+            self._check_lane(attrs)
+        elif name == "request":
+            for key in ("response", "foes"):
+                if not _BITS.fullmatch(attrs[key]):
+                    raise self._error(name, attrs, f"has {key}='{attrs[key]}', which are no bits")
+
+    def _check_version(self, attrs: Mapping[str, str]) -> None:
+        if "version" not in attrs:
+            raise self._error("net", attrs, "has no version attribute: not a SUMO network")
+        if not _VERSION.fullmatch(attrs["version"]):
+            raise self._error("net", attrs, f"has version='{attrs['version']}', none of SUMO's")
+
+    def _check_number(self, name: str, key: str, attrs: Mapping[str, str]) -> None:
+        try:
+            value = float(attrs[key])
+        except ValueError:
+            value = math.nan
+        if not math.isfinite(value):
+            raise self._error(name, attrs, f"has {key}='{attrs[key]}', which is no finite number")
+        if (name, key) in _POSITIVE and value <= 0.0:
+            raise self._error(name, attrs, f"has {key}='{attrs[key]}', which must be positive")
+
+    def _check_unique(self, name: str, attrs: Mapping[str, str]) -> None:
+        if (name, attrs["id"]) in self._seen:
+            raise self._error(name, attrs, "occurs twice: ids must be unique")
+        self._seen.add((name, attrs["id"]))
+
+    def _check_lane(self, attrs: Mapping[str, str]) -> None:
+        expected = f"{self._edge}_{self._next_lane}"
+        if attrs["id"] != expected:
+            raise self._error("lane", attrs, f"stands where '{expected}' should")
+        self._next_lane += 1
+        for point in attrs["shape"].split():
+            try:
+                numbers = [float(part) for part in point.split(",")]
+            except ValueError:
+                numbers = [math.nan]
+            if len(numbers) not in (2, 3) or not all(map(math.isfinite, numbers)):
+                raise self._error("lane", attrs, f"has the point '{point}', not finite x,y[,z]")
+
+
+def parse_net(path: Path) -> tuple[Any, list[Program]]:
+    """Read a SUMO network (`.net.xml`, `.net.xml.gz`): a `sumolib.net.Net` and signal programs.
+
+    Raises:
+        MapError: hostile or broken XML, a root other than <net>, missing attributes, numbers that
+            are not finite, speeds, lengths or widths that are not positive, ids that occur twice,
+            lanes out of order, references to nothing. The message names the place and the cure.
+    """
+    handler = _CheckedReader(path)
+    read_xml(path, handler)
+    return handler.reader.getNet(), handler.programs.programs

@@ -1,1 +1,0 @@
-"""The worlds that run: the tick, its executor, and the first compilation."""

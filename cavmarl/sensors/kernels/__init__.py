@@ -1,0 +1,1 @@
+"""Compiled loops: observations, rays, pictures, schedules and errors of sensors."""

@@ -1,0 +1,217 @@
+"""What a camera sees: the sky, the ground, roads, and the faces of bodies and walls."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cavmarl.core.math.spans import row_span
+from cavmarl.core.numba import kernel
+from cavmarl.sensors.kernels.faces import (
+    Camera,
+    Faces,
+    Picture,
+    add_face,
+    draw_faces,
+    ground_at,
+    set_corner,
+)
+from cavmarl.sensors.kernels.panorama import Counts, Panorama
+from cavmarl.sensors.kernels.semantics import BUILDING, GROUND, NOTHING, ROAD
+
+__all__ = [
+    "GROUND_FACE",
+    "ROAD_FACE",
+    "SKY_FACE",
+    "find_faces",
+    "look",
+    "make_camera",
+    "make_picture",
+]
+
+# Faces that every picture has; those of bodies and buildings follow.
+SKY_FACE = 0
+GROUND_FACE = 1
+ROAD_FACE = 2
+FIRST_FACE = 3
+
+_FACES_OF_PRISM = 6
+_SEEN_OF_PRISM = 3  # at most
+
+# With 12 bytes each they stay in a core's second-level cache, beside what is delivered of them.
+BAND_PIXELS = 1 << 14
+
+
+def make_camera(mount: NDArray[np.float64], width: int, fov_rad: float, range_m: float) -> Camera:
+    """A camera.
+
+    Args:
+        mount: (3, 4) axes and place in the vehicle's frame.
+        width: pixels.
+        fov_rad: horizontal opening, less than pi.
+        range_m: deeper places are not seen.
+    """
+    focal = 0.5 * width / math.tan(0.5 * fov_rad)
+    return Camera(mount, focal, range_m, np.zeros((5, 4)), np.zeros((4, 3)))
+
+
+def make_picture(width: int, height: int, panorama: Panorama) -> Picture:
+    """Room for a picture of such a panorama, some rows at a time."""
+    faces = FIRST_FACE + _FACES_OF_PRISM * len(panorama.prisms) + len(panorama.walls)
+    semantic = np.zeros(faces, np.uint8)
+    semantic[:FIRST_FACE] = NOTHING, GROUND, ROAD
+    seen = len(panorama.strips) + _SEEN_OF_PRISM * len(panorama.prisms) + len(panorama.walls)
+    rows = min(height, max(1, BAND_PIXELS // width))
+    return Picture(
+        height,
+        np.zeros((rows, width)),
+        np.zeros((rows, width), np.int32),
+        semantic,
+        np.ones(faces),
+        Faces(
+            np.zeros((seen, 5, 4)),
+            np.zeros((seen, 3)),
+            np.zeros((seen, 2), np.int32),
+            np.zeros(seen, np.int32),
+            np.zeros(seen, np.bool_),
+        ),
+    )
+
+
+@kernel
+def _clear(camera: Camera, picture: Picture, first: int, last: int) -> None:
+    """Sky, and the ground as far as the camera sees it, in the rows [first, last)."""
+    width = picture.face.shape[1]
+    mount = camera.mount
+    picture.closeness[: last - first] = 0.0
+    picture.face[: last - first] = SKY_FACE
+    if mount[2, 3] <= 0.0:
+        return
+    ground_at(camera, width, picture.height)
+    camera.edges[4, 0] -= 1.0 / camera.range_m
+    for j in range(first, last):
+        begin, end = row_span(camera.edges[4:], 1, j, width)
+        picture.face[j - first, begin:end] = GROUND_FACE
+
+
+@kernel
+def _corner_of(prism: np.void, along: float, across: float) -> tuple[float, float]:
+    """A corner of a body's outline."""
+    x = along * prism["half_length"]
+    y = across * prism["half_width"]
+    cos = prism["cos"]
+    sin = prism["sin"]
+    return prism["x"] + x * cos - y * sin, prism["y"] + x * sin + y * cos
+
+
+@kernel
+def _add_prism(camera: Camera, picture: Picture, num: int, prism: np.void, first: int) -> int:
+    """Add the faces of a body that turn to the camera: at most two sides and one end."""
+    cos = prism["cos"]
+    sin = prism["sin"]
+    dx = camera.mount[0, 3] - prism["x"]
+    dy = camera.mount[1, 3] - prism["y"]
+    ahead = dx * cos + dy * sin
+    left = dy * cos - dx * sin
+    bottom = prism["bottom"]
+    top = prism["top"]
+    for side in range(4):
+        # Front, left, rear, right: outwards is (along, across).
+        along = 1.0 if side == 0 else (-1.0 if side == 2 else 0.0)
+        across = 1.0 if side == 1 else (-1.0 if side == 3 else 0.0)
+        out = ahead * along + left * across
+        if out <= (prism["half_length"] if across == 0.0 else prism["half_width"]):
+            continue
+        x1, y1 = _corner_of(prism, along + across, across - along)
+        x2, y2 = _corner_of(prism, along - across, across + along)
+        set_corner(camera, 0, x1, y1, bottom)
+        set_corner(camera, 1, x2, y2, bottom)
+        set_corner(camera, 2, x2, y2, top)
+        set_corner(camera, 3, x1, y1, top)
+        picture.semantic[first + side] = prism["semantic"]
+        picture.light[first + side] = _light(along * cos - across * sin, along * sin + across * cos)
+        num = add_face(camera, picture, num, first + side, False)
+    z = camera.mount[2, 3]
+    if z > top or z < bottom:
+        level = top if z > top else bottom
+        for corner in range(4):
+            along = 1.0 if corner in (0, 3) else -1.0
+            across = 1.0 if corner in (0, 1) else -1.0
+            x, y = _corner_of(prism, along, across)
+            set_corner(camera, corner, x, y, level)
+        number = first + (4 if z > top else 5)
+        picture.semantic[number] = prism["semantic"]
+        picture.light[number] = 1.0 if z > top else 0.3
+        num = add_face(camera, picture, num, number, False)
+    return num
+
+
+@kernel
+def _light(x: float, y: float) -> float:
+    """How bright an upright face is that looks to (x, y); light comes from ahead on the left."""
+    return 0.7 + 0.15 * (x + y)
+
+
+@kernel
+def _add_wall(camera: Camera, picture: Picture, num: int, wall: np.void, number: int) -> int:
+    """Add a wall, which looks the same from both sides."""
+    ax, ay, bx, by = wall["ax"], wall["ay"], wall["bx"], wall["by"]
+    height = wall["height"]
+    set_corner(camera, 0, ax, ay, 0.0)
+    set_corner(camera, 1, bx, by, 0.0)
+    set_corner(camera, 2, bx, by, height)
+    set_corner(camera, 3, ax, ay, height)
+    picture.semantic[number] = BUILDING
+    length = math.hypot(bx - ax, by - ay)
+    if length > 0.0:
+        x, y = (by - ay) / length, (ax - bx) / length
+        # The side that is seen.
+        away = x * (camera.mount[0, 3] - ax) + y * (camera.mount[1, 3] - ay)
+        picture.light[number] = _light(math.copysign(x, x * away), math.copysign(y, y * away))
+    return add_face(camera, picture, num, number, False)
+
+
+@kernel
+def find_faces(camera: Camera, panorama: Panorama, counts: Counts, picture: Picture) -> int:
+    """Find the faces that a picture shows.
+
+    Args:
+        camera: where it looks from.
+        panorama: what stands around the vehicle, prisms ordered by id.
+        counts: how many things of each kind there are.
+        picture: its faces are overwritten.
+
+    Returns:
+        how many there are.
+    """
+    num = 0
+    if camera.mount[2, 3] > 0.0:
+        for k in range(counts.strips):
+            for c in range(4):
+                set_corner(camera, c, panorama.strips[k, c, 0], panorama.strips[k, c, 1], 0.0)
+            num = add_face(camera, picture, num, ROAD_FACE, True)
+    for n in range(counts.prisms):
+        k = panorama.order[n]
+        first = FIRST_FACE + _FACES_OF_PRISM * k
+        num = _add_prism(camera, picture, num, panorama.prisms[k], first)
+    first = FIRST_FACE + _FACES_OF_PRISM * panorama.prisms.size
+    for k in range(counts.walls):
+        num = _add_wall(camera, picture, num, panorama.walls[k], first + k)
+    return num
+
+
+@kernel
+def look(camera: Camera, picture: Picture, num: int, first: int, last: int) -> None:
+    """Take the rows [first, last) of a picture.
+
+    Args:
+        camera: where it looks from.
+        picture: with faces; its rows are overwritten from the first on.
+        num: how many faces there are.
+        first: row.
+        last: the one after the last; as many as there is room for, at most.
+    """
+    _clear(camera, picture, first, last)
+    draw_faces(picture, num, first, last)

@@ -1,0 +1,236 @@
+"""Flat convex faces in the picture of a pinhole camera.
+
+One over the depth of a face is linear over the picture, and so are the sides of its edges: a face
+is drawn row by row, from the first to the last column of the row inside it, with one addition a
+pixel, and the nearest face stays. That is exact for every direction of the camera, roll included,
+and no ray is cast.
+
+A picture is drawn some rows at a time: so many as stay in the processor's own cache with all that
+is noted of a pixel. No row depends on which others are drawn with it, and memory that cores share
+gets only what is delivered.
+
+Depth is along the optical axis. The camera's axes are those of its mount: ahead, left, up; pixel
+rows go down, columns to the right, and pixels are square.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cavmarl.core.math.spans import row_span
+from cavmarl.core.numba import kernel
+
+__all__ = ["Camera", "Faces", "Picture", "add_face", "draw_faces", "ground_at", "set_corner"]
+
+# Of a face with a corner nearer than this, or behind the camera, all rows are tried.
+NEAR_M = 0.01
+
+
+class Camera(NamedTuple):
+    """Where a camera looks from and how."""
+
+    mount: NDArray[np.float64]  # (3, 4) axes (ahead, left, up) and place in the vehicle's frame
+    focal: float  # pixels
+    range_m: float  # of depths
+    edges: NDArray[np.float64]  # (5, 4) room for those of one face
+    face: NDArray[np.float64]  # (4, 3) room for its corners in the camera's frame
+
+
+class Faces(NamedTuple):
+    """The faces of one picture that can be seen, in the order in which they are drawn."""
+
+    edges: NDArray[np.float64]  # (F, 5, 4) of each, the fifth being the range
+    plane: NDArray[np.float64]  # (F, 3) its closeness: constant, by column, by row
+    rows: NDArray[np.int32]  # (F, 2) [first, last) that it can be in
+    number: NDArray[np.int32]  # (F,) which face it is
+    flat: NDArray[np.bool_]  # (F,) it lies on the ground, and covers whatever was there
+
+
+class Picture(NamedTuple):
+    """What some rows of pixels show, R at a time from top to bottom, and what is drawn."""
+
+    height: int  # of the whole picture, pixels
+    closeness: NDArray[np.float64]  # (R, W) one over the depth in m; 0: no body and no building
+    face: NDArray[np.int32]  # (R, W) a face
+    semantic: NDArray[np.uint8]  # (all faces,) of each face
+    light: NDArray[np.float64]  # (all faces,) how bright each face is, in [0, 1]
+    faces: Faces
+
+
+@kernel
+def set_corner(camera: Camera, c: int, x: float, y: float, z: float) -> None:
+    """Bring a corner of the face from the vehicle's frame into the camera's."""
+    mount = camera.mount
+    dx = x - mount[0, 3]
+    dy = y - mount[1, 3]
+    dz = z - mount[2, 3]
+    for axis in range(3):
+        camera.face[c, axis] = dx * mount[0, axis] + dy * mount[1, axis] + dz * mount[2, axis]
+
+
+@kernel
+def _set_edge(
+    camera: Camera, k: int, x: float, y: float, z: float, width: int, height: int
+) -> None:
+    """Edge k: the pixels whose direction (1, -u', -v') has no negative product with (x, y, z)."""
+    by_column = -y / camera.focal
+    by_row = -z / camera.focal
+    edges = camera.edges
+    edges[k, 0] = x - 0.5 * width * by_column - 0.5 * height * by_row
+    edges[k, 1] = by_column
+    edges[k, 2] = by_row
+    edges[k, 3] = 1.0 / by_column if by_column != 0.0 else 0.0
+
+
+@kernel
+def _is_aside(camera: Camera, width: int, height: int) -> bool:
+    """Whether all corners of the face are behind the camera, or beside one edge of the picture."""
+    face = camera.face
+    slope_x = 0.5 * width / camera.focal
+    slope_z = 0.5 * height / camera.focal
+    behind = left = right = over = under = True
+    for c in range(4):
+        behind &= face[c, 0] <= 0.0
+        left &= face[c, 1] > slope_x * face[c, 0]
+        right &= -face[c, 1] > slope_x * face[c, 0]
+        over &= face[c, 2] > slope_z * face[c, 0]
+        under &= -face[c, 2] > slope_z * face[c, 0]
+    return behind | left | right | over | under
+
+
+@kernel
+def _set_face(camera: Camera, width: int, height: int) -> tuple[int, int, float, float, float]:
+    """Set the edges of the face whose corners are set, the fifth being the range.
+
+    Returns:
+        the rows [first, last) that it can be in, and the closeness of the plane that it lies in:
+        constant, by column, by row. No rows for a face that cannot be seen.
+    """
+    if _is_aside(camera, width, height):
+        return 0, 0, 0.0, 0.0, 0.0
+    face = camera.face
+    ax, ay, az = face[1, 0] - face[0, 0], face[1, 1] - face[0, 1], face[1, 2] - face[0, 2]
+    bx, by, bz = face[3, 0] - face[0, 0], face[3, 1] - face[0, 1], face[3, 2] - face[0, 2]
+    nx, ny, nz = ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx
+    volume = nx * face[0, 0] + ny * face[0, 1] + nz * face[0, 2]
+    if volume == 0.0:
+        return 0, 0, 0.0, 0.0, 0.0
+    sign = math.copysign(1.0, volume)
+    low = np.inf
+    high = -np.inf
+    in_front = True
+    for c in range(4):
+        d = c + 1 if c < 3 else 0
+        px, py, pz = face[c, 0], face[c, 1], face[c, 2]
+        qx, qy, qz = face[d, 0], face[d, 1], face[d, 2]
+        _set_edge(
+            camera,
+            c,
+            sign * (py * qz - pz * qy),
+            sign * (pz * qx - px * qz),
+            sign * (px * qy - py * qx),
+            width,
+            height,
+        )
+        if px > NEAR_M:
+            low = min(low, -pz / px)
+            high = max(high, -pz / px)
+        else:
+            in_front = False
+    _set_edge(camera, 4, nx / volume, ny / volume, nz / volume, width, height)
+    edges = camera.edges
+    constant, by_column, by_row = edges[4, 0], edges[4, 1], edges[4, 2]
+    edges[4, 0] -= 1.0 / camera.range_m
+    if not in_front:
+        return 0, height, constant, by_column, by_row
+    # One row more than needed: the edges tell.
+    first = max(math.floor(max(low * camera.focal + 0.5 * height, 0.0) - 1.0), 0)
+    last = min(math.ceil(min(high * camera.focal + 0.5 * height, float(height)) + 1.0), height)
+    return first, last, constant, by_column, by_row
+
+
+@kernel
+def add_face(camera: Camera, picture: Picture, num: int, number: int, flat: bool) -> int:
+    """Put the face whose corners are set behind the `num` that are drawn before it.
+
+    Returns:
+        how many there are now: no more if it cannot be seen.
+    """
+    width = picture.face.shape[1]
+    first, last, constant, by_column, by_row = _set_face(camera, width, picture.height)
+    if first >= last:
+        return num
+    faces = picture.faces
+    for k in range(5):
+        for n in range(4):
+            faces.edges[num, k, n] = camera.edges[k, n]
+    faces.plane[num, 0] = constant
+    faces.plane[num, 1] = by_column
+    faces.plane[num, 2] = by_row
+    faces.rows[num, 0] = first
+    faces.rows[num, 1] = last
+    faces.number[num] = number
+    faces.flat[num] = flat
+    return num + 1
+
+
+@kernel
+def draw_faces(picture: Picture, num: int, first: int, last: int) -> None:
+    """Draw the first `num` faces over what is farther away, in the rows [first, last)."""
+    faces = picture.faces
+    for k in range(num):
+        begin_row = max(first, faces.rows[k, 0])
+        end_row = min(last, faces.rows[k, 1])
+        if begin_row < end_row and faces.flat[k]:
+            _draw_flat(picture, k, first, begin_row, end_row)
+        elif begin_row < end_row:
+            _draw(picture, k, first, begin_row, end_row)
+
+
+@kernel
+def _draw(picture: Picture, k: int, first: int, begin_row: int, end_row: int) -> None:
+    """Draw a face over what is farther away; row `first` is the first that there is room for."""
+    width = picture.face.shape[1]
+    edges = picture.faces.edges[k]
+    plane = picture.faces.plane[k]
+    constant, by_column, by_row = plane[0], plane[1], plane[2]
+    number = picture.faces.number[k]
+    for j in range(begin_row, end_row):
+        begin, end = row_span(edges, 5, j, width)
+        start = constant + by_row * (j + 0.5) + by_column * 0.5
+        closeness = picture.closeness[j - first]
+        face = picture.face[j - first]
+        for i in range(begin, end):
+            value = start + by_column * i
+            nearer = value > closeness[i]
+            closeness[i] = value if nearer else closeness[i]
+            face[i] = number if nearer else face[i]
+
+
+@kernel
+def _draw_flat(picture: Picture, k: int, first: int, begin_row: int, end_row: int) -> None:
+    """Draw a face over whatever was there."""
+    width = picture.face.shape[1]
+    edges = picture.faces.edges[k]
+    number = picture.faces.number[k]
+    for j in range(begin_row, end_row):
+        begin, end = row_span(edges, 5, j, width)
+        picture.face[j - first, begin:end] = number
+
+
+@kernel
+def ground_at(camera: Camera, width: int, height: int) -> tuple[float, float, float]:
+    """The closeness of the ground: constant, by column, by row. Overwrites edge 4.
+
+    A camera on the ground does not see it.
+    """
+    mount = camera.mount
+    z = -mount[2, 3]
+    if z >= 0.0:
+        return 0.0, 0.0, 0.0
+    _set_edge(camera, 4, mount[2, 0] / z, mount[2, 1] / z, mount[2, 2] / z, width, height)
+    return camera.edges[4, 0], camera.edges[4, 1], camera.edges[4, 2]

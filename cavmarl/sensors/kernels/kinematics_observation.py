@@ -1,0 +1,146 @@
+"""highway-env's `KinematicObservation`: a table of the vehicles near one, by features.
+
+Vehicles within `PERCEPTION_M` and not more than two own lengths behind, in the order of their
+distance along the own lane, whose line goes on straight beyond its ends. The own vehicle is the
+first row and always in the world's frame.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cavmarl.core.math.geometry import project
+from cavmarl.core.math.neighbors import LEVEL_HEIGHT_M, Grid, cell_columns, cell_rows
+from cavmarl.core.math.rng import STREAM_SENSOR, below
+from cavmarl.core.math.scalars import clamp
+from cavmarl.core.numba import kernel
+from cavmarl.core.records.arrays import RoadArrays
+from cavmarl.sensors.kernels.sensor_arrays import KinematicsSensor
+from cavmarl.sensors.kernels.vehicle_features import in_range, make_relative, vehicle_features
+
+__all__ = ["PERCEPTION_M", "observe_kinematics"]
+
+PERCEPTION_M = 200.0  # AbstractEnv.PERCEPTION_DISTANCE
+
+
+@kernel
+def _find_near(
+    roads: RoadArrays, rows: NDArray[np.void], i: int, grid: Grid, sensor: KinematicsSensor
+) -> int:
+    """Fill `near_body` with the vehicles that are shown, sorted; returns how many there are."""
+    ego = rows[i]
+    lane = roads.lanes[ego["lane"]]
+    first_point, num_points = lane["first_point"], lane["num_points"]
+    own_s, _, _, _ = project(roads.points, first_point, num_points, ego["x"], ego["y"])
+    bodies = grid.bodies
+    keys = sensor.near_key
+    most = sensor.vehicles - 1
+    found = 0
+    first_column, last_column = cell_columns(grid, ego["x"], PERCEPTION_M)
+    first_row, last_row = cell_rows(grid, ego["y"], PERCEPTION_M)
+    for j in range(first_row, last_row + 1):
+        begin = grid.start[j * grid.num_x + first_column]
+        end = grid.start[j * grid.num_x + last_column + 1]
+        for b in range(begin, end):
+            body = bodies[b]
+            dx = body["x"] - ego["x"]
+            dy = body["y"] - ego["y"]
+            if (
+                not dx * dx + dy * dy < PERCEPTION_M * PERCEPTION_M
+                or body["row"] == i
+                or abs(body["z"] - ego["z"]) > LEVEL_HEIGHT_M
+            ):
+                continue
+            s, _, _, _ = project(roads.points, first_point, num_points, body["x"], body["y"])
+            along = s - own_s
+            if not (sensor.see_behind or along > -2.0 * ego["length"]):
+                continue
+            # Unsorted, highway-env takes vehicles in the order of their creation: that of ids.
+            key = 0.0 if sensor.shuffled else abs(along)
+            place = found
+            while place > 0 and (
+                key < keys[place - 1]
+                or (
+                    key == keys[place - 1]
+                    and body["id"] < bodies[sensor.near_body[place - 1]]["id"]
+                )
+            ):
+                place -= 1
+            if place == most:
+                continue
+            if found < most:
+                found += 1
+            for m in range(found - 1, place, -1):
+                sensor.near_body[m] = sensor.near_body[m - 1]
+                keys[m] = keys[m - 1]
+            sensor.near_body[place] = b
+            keys[place] = key
+    return found
+
+
+@kernel
+def _write(sensor: KinematicsSensor, table_row: int, out: NDArray[np.float32]) -> None:
+    """Put the chosen features of `sensor.values` into a row of the table."""
+    num = sensor.features.size
+    at = sensor.at + table_row * num
+    for f in range(num):
+        feature = sensor.features[f]
+        value = in_range(sensor.values[feature], sensor.ranges, feature)
+        if sensor.clip and not np.isnan(sensor.ranges[feature, 0]):
+            value = clamp(value, -1.0, 1.0)
+        out[at + f] = value
+
+
+@kernel
+def _shuffle(sensor: KinematicsSensor, ego: np.void, out: NDArray[np.float32]) -> None:
+    """Put all rows but the first, empty ones too, in random order (Fisher and Yates)."""
+    num = sensor.features.size
+    for last in range(sensor.vehicles - 1, 1, -1):
+        other = 1 + below(ego["rng_key"], ego["id"], ego["tick"], STREAM_SENSOR + last, last)
+        for f in range(num):
+            a = sensor.at + last * num + f
+            b = sensor.at + other * num + f
+            out[a], out[b] = out[b], out[a]
+
+
+@kernel
+def observe_kinematics(
+    roads: RoadArrays,
+    rows: NDArray[np.void],
+    i: int,
+    grid: Grid,
+    sensor: KinematicsSensor,
+    out: NDArray[np.float32],
+) -> None:
+    """Write the table of one vehicle, row by row; rows without a vehicle are left as they are.
+
+    Where two vehicles are equally far along the lane, the one with the smaller id comes first.
+
+    Args:
+        roads: the road arrays.
+        rows: VEHICLE (C,).
+        i: the vehicle that looks.
+        grid: filled for this tick from these rows.
+        sensor: settings and room; ranges in the frame of `vehicle_features`.
+        out: an observation, zeros from `sensor.at` on.
+    """
+    ego = rows[i]
+    vehicle_features(roads.lanes, roads.points, ego, sensor.destinations, True, sensor.values)
+    _write(sensor, 0, out)
+    found = _find_near(roads, rows, i, grid, sensor)
+    for k in range(found):
+        other = rows[grid.bodies[sensor.near_body[k]]["row"]]
+        vehicle_features(
+            roads.lanes,
+            roads.points,
+            other,
+            sensor.destinations,
+            sensor.observe_intentions,
+            sensor.values,
+        )
+        if not sensor.absolute:
+            make_relative(sensor.values, ego)
+        _write(sensor, 1 + k, out)
+    if sensor.shuffled:
+        _shuffle(sensor, ego, out)

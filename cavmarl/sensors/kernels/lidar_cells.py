@@ -1,0 +1,172 @@
+"""highway-env's `LidarObservation`: distance and radial speed in equal sectors around a vehicle.
+
+The sectors do not turn with the vehicle: the middle of cell k lies k steps clockwise from east (the
+frame of `kernels.vehicle_features`). It differs from our `lidar`, whose rays meet bodies exactly
+and turn with the vehicle, in ways that are kept here: a vehicle is seen if its centre is in range;
+it is also drawn into the cell of its centre, at its distance less half its width; within a body
+distances are negative; and speeds are divided by the range in metres, as distances are. Cells
+without a vehicle have the range as distance and as speed.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cavmarl.core.math.neighbors import LEVEL_HEIGHT_M, Grid, cell_columns, cell_rows
+from cavmarl.core.numba import kernel
+from cavmarl.sensors.kernels.sensor_arrays import LidarCells
+
+__all__ = ["cell_directions", "observe_lidar_cells"]
+
+TWO_PI = 2.0 * math.pi
+
+
+def cell_directions(cells: int) -> NDArray[np.float64]:
+    """Cosine and sine (cells, 2) of the middle of each cell, from east to south."""
+    angles = np.arange(cells) * (2.0 * np.pi / max(cells, 1))
+    return np.stack([np.cos(angles), np.sin(angles)], axis=1)
+
+
+@kernel
+def _cell_of(x: float, y: float, cells: int) -> tuple[int, float]:
+    """The cell of a direction, and the angle that highway-env finds it by."""
+    step = TWO_PI / cells
+    angle = math.atan2(y, x) + 0.5 * step
+    return math.floor(angle / step) % cells, angle
+
+
+@kernel
+def _axis_interval(start: float, size: float, slope: float) -> tuple[float, float]:
+    """Where a ray is between two parallel lines: from and to which share of its length."""
+    if slope == 0.0:
+        return (-math.inf, math.inf) if start < 0.0 < start + size else (math.inf, math.inf)
+    near = start / slope
+    far = (start + size) / slope
+    return (near, far) if slope > 0.0 else (far, near)
+
+
+@kernel
+def _overlap(low_1: float, high_1: float, low_2: float, high_2: float) -> bool:
+    """Whether two intervals share a point."""
+    gap = low_2 - high_1 if low_1 < low_2 else low_1 - high_2
+    return gap <= 0.0
+
+
+@kernel
+def _ray_to_body(
+    x: float, y: float, cos: float, sin: float, body: np.void, ray_x: float, ray_y: float
+) -> float:
+    """Distance along a ray, in units of its length, to a body; negative inside, inf if missed.
+
+    Args:
+        x: of the body's centre.
+        y: of the body's centre.
+        cos: of the body's heading.
+        sin: of the body's heading.
+        body: for its size.
+        ray_x: the ray, as long as it reaches.
+        ray_y: see `ray_x`.
+    """
+    length = 2.0 * body["half_length"]
+    width = 2.0 * body["half_width"]
+    # From the origin to the rear corner of smaller lateral offset, along both axes of the body.
+    along = x * cos + y * sin - body["half_length"]
+    across = y * cos - x * sin - body["half_width"]
+    enter_1, leave_1 = _axis_interval(across, width, ray_y * cos - ray_x * sin)
+    enter_2, leave_2 = _axis_interval(along, length, ray_x * cos + ray_y * sin)
+    if (
+        _overlap(enter_1, leave_1, enter_2, leave_2)
+        and _overlap(0.0, 1.0, enter_1, leave_1)
+        and _overlap(0.0, 1.0, enter_2, leave_2)
+    ):
+        return max(enter_1, enter_2)
+    return math.inf
+
+
+@kernel
+def _cells_over(
+    x: float, y: float, cos: float, sin: float, body: np.void, cells: int
+) -> tuple[int, int]:
+    """The first and the last cell that highway-env tests for a body, clockwise."""
+    smallest, largest = math.inf, -math.inf
+    for side in range(4):
+        along = body["half_length"] if side >= 2 else -body["half_length"]
+        across = body["half_width"] if side % 2 == 1 else -body["half_width"]
+        _, angle = _cell_of(x + along * cos - across * sin, y + along * sin + across * cos, cells)
+        smallest = min(smallest, angle)
+        largest = max(largest, angle)
+    if smallest < -0.5 * math.pi and largest > 0.5 * math.pi:
+        smallest, largest = largest, smallest + TWO_PI
+    step = TWO_PI / cells
+    return math.floor(smallest / step) % cells, math.floor(largest / step) % cells
+
+
+@kernel
+def _record(echo: np.void, distance: float, speed: float, vehicle_id: int) -> None:
+    """Keep the nearest; of equally near ones the larger id, which highway-env draws last."""
+    if distance < echo["distance"] or (distance == echo["distance"] and vehicle_id >= echo["id"]):
+        echo["distance"] = distance
+        echo["speed"] = speed
+        echo["id"] = vehicle_id
+
+
+@kernel
+def _trace(ego: np.void, ego_cos: float, ego_sin: float, body: np.void, sensor: LidarCells) -> None:
+    """Draw one body into the cells."""
+    x = body["x"] - ego["x"]
+    y = ego["y"] - body["y"]
+    distance = math.sqrt(x * x + y * y)
+    if distance > sensor.range_m:
+        return
+    cos, sin = body["cos"], -body["sin"]
+    velocity_x = body["speed"] * cos - ego["speed"] * ego_cos
+    velocity_y = body["speed"] * sin - ego["speed"] * ego_sin
+    cell, _ = _cell_of(x, y, sensor.cells)
+    speed = velocity_x * sensor.directions[cell, 0] + velocity_y * sensor.directions[cell, 1]
+    _record(sensor.echoes[cell], distance - body["half_width"], speed, body["id"])
+    cell, last = _cells_over(x, y, cos, sin, body, sensor.cells)
+    count = last - cell + 1 if cell < last else sensor.cells - cell + last + 1
+    for _ in range(count):
+        ray_x, ray_y = sensor.directions[cell, 0], sensor.directions[cell, 1]
+        share = _ray_to_body(x, y, cos, sin, body, sensor.range_m * ray_x, sensor.range_m * ray_y)
+        speed = velocity_x * ray_x + velocity_y * ray_y
+        _record(sensor.echoes[cell], share * sensor.range_m, speed, body["id"])
+        cell = cell + 1 if cell + 1 < sensor.cells else 0
+
+
+@kernel
+def observe_lidar_cells(
+    rows: NDArray[np.void], i: int, grid: Grid, sensor: LidarCells, out: NDArray[np.float32]
+) -> None:
+    """Write distance and speed of each cell.
+
+    Args:
+        rows: VEHICLE (C,).
+        i: the vehicle that looks.
+        grid: filled for this tick from these rows.
+        sensor: settings and room.
+        out: an observation; 2 · cells numbers from `sensor.at` on are written.
+    """
+    ego = rows[i]
+    ego_cos = math.cos(ego["heading"])
+    ego_sin = -math.sin(ego["heading"])
+    for k in range(sensor.cells):
+        echo = sensor.echoes[k]
+        echo["distance"] = sensor.range_m
+        echo["speed"] = sensor.range_m
+        echo["id"] = -1
+    first_column, last_column = cell_columns(grid, ego["x"], sensor.range_m)
+    first_row, last_row = cell_rows(grid, ego["y"], sensor.range_m)
+    for j in range(first_row, last_row + 1):
+        begin = grid.start[j * grid.num_x + first_column]
+        end = grid.start[j * grid.num_x + last_column + 1]
+        for b in range(begin, end):
+            body = grid.bodies[b]
+            if body["row"] != i and abs(body["z"] - ego["z"]) <= LEVEL_HEIGHT_M:
+                _trace(ego, ego_cos, ego_sin, body, sensor)
+    for k in range(sensor.cells):
+        out[sensor.at + 2 * k] = sensor.echoes[k]["distance"] / sensor.scale
+        out[sensor.at + 2 * k + 1] = sensor.echoes[k]["speed"] / sensor.scale

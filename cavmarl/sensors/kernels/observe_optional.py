@@ -1,0 +1,70 @@
+"""The sensors that most environments leave off: highway-env's, pufferlib's, and road points."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cavmarl.core.math.neighbors import Grid, fill_grid
+from cavmarl.core.numba import kernel
+from cavmarl.core.records.arrays import LaneGrid, RoadArrays, Worlds
+from cavmarl.core.records.codes import DRIVER_AGENT
+from cavmarl.sensors.kernels.kinematics_observation import observe_kinematics
+from cavmarl.sensors.kernels.lidar_cells import observe_lidar_cells
+from cavmarl.sensors.kernels.nearest_road_points import observe_roadgraph
+from cavmarl.sensors.kernels.occupancy import observe_occupancy
+from cavmarl.sensors.kernels.puffer_drive_kernel import observe_puffer_drive
+from cavmarl.sensors.kernels.sensor_arrays import FurtherSensors
+from cavmarl.sensors.kernels.stacking import newest_frame
+
+__all__ = ["observe_further"]
+
+
+@kernel
+def observe_further(
+    roads: RoadArrays,
+    lane_grid: LaneGrid,
+    worlds: Worlds,
+    grid: Grid,
+    further: FurtherSensors,
+    stack: int,
+    chosen: NDArray[np.bool_],
+    observations: NDArray[np.float32],
+) -> None:
+    """Write these sensors' parts of every agent's newest frame in the chosen worlds.
+
+    Args:
+        roads: the road arrays.
+        lane_grid: which lanes lie near a place.
+        worlds: committed rows at the end of the step.
+        grid: room for the spatial index of one world.
+        further: settings and room; sensors that are off write nothing.
+        stack: frames in an observation.
+        chosen: (W,) which worlds.
+        observations: (W, A, D), the parts 0 before.
+    """
+    kinematics, occupancy, lidar_cells, roadgraph, puffer_drive = further
+    for w in range(chosen.size):
+        if not chosen[w]:
+            continue
+        rows = worlds.rows[w]
+        is_filled = False  # many zones have no agents
+        for i in range(worlds.num_owned[w]):
+            row = rows[i]
+            if row["driver"] != DRIVER_AGENT:
+                continue
+            if not is_filled:
+                fill_grid(rows, worlds.num_rows[w], grid)
+                is_filled = True
+            seen = observations[w, row["agent"]]
+            out = seen[newest_frame(seen, stack) :]
+            if kinematics.vehicles > 0:
+                observe_kinematics(roads, rows, i, grid, kinematics, out)
+            if occupancy.features.size > 0:
+                observe_occupancy(roads, lane_grid, rows, i, grid, occupancy, out)
+            if lidar_cells.cells > 0:
+                observe_lidar_cells(rows, i, grid, lidar_cells, out)
+            if roadgraph.num_points > 0:
+                observe_roadgraph(row, roadgraph, out)
+            if puffer_drive.on:
+                observe_puffer_drive(rows, i, grid, puffer_drive, out)

@@ -1,0 +1,250 @@
+"""What the `lanes` sensor writes: who drives ahead and behind on the lanes around, and who crosses.
+
+The nearest vehicles in the plane (`neighbors`) leave it to the policy to find out which of them are
+in its way; here places are told along lanes, as car-following models take them. Of two that are
+equally near, the slower one is told: the order of rows plays no part.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cavmarl.core.math.neighbors import LEVEL_HEIGHT_M, Grid, cell_columns, cell_rows
+from cavmarl.core.math.scalars import clamp
+from cavmarl.core.numba import kernel
+from cavmarl.core.records.arrays import RoadArrays, Sensors, Travel
+from cavmarl.core.records.codes import SIGNAL_RED, SIGNAL_RED_YELLOW
+from cavmarl.core.records.rows import is_off_lanes
+from cavmarl.driving.kernels.junctions import link_signal
+from cavmarl.driving.kernels.ways import next_step
+
+__all__ = ["HALF_M", "LANES_AHEAD", "LANES_FEATURES", "SLOWEST_MPS", "observe_lanes"]
+
+OWN = 0  # slots of two features each: a gap and a speed
+LEFT = 1  # ahead; behind in the slot after it
+RIGHT = 3
+CROSSING = 10  # where the features of the crossing vehicle begin
+LANES_FEATURES = 14
+SPEED_SCALE = 40.0  # m/s
+HALF_M = 10.0  # a way of this length is a closeness of 0.5
+LANES_AHEAD = 8  # that a way is followed over, at most
+SLOWEST_MPS = 1.0  # that a vehicle is taken to cross with
+
+
+@kernel
+def _closeness(way: float) -> np.float32:
+    """1 where two touch, 0.5 at `HALF_M`, 0 far away: metres count where they are few."""
+    return np.float32(HALF_M / (HALF_M + max(way, 0.0)))
+
+
+@kernel
+def _scaled_speed(speed: float) -> np.float32:
+    return np.float32(clamp(speed / SPEED_SCALE, -1.0, 1.0))
+
+
+@kernel
+def _way_between(
+    roads: RoadArrays,
+    travel: Travel,
+    lane: int,
+    way: int,
+    s: float,
+    target: int,
+    target_s: float,
+) -> float:
+    """Metres along a way from `s` of `lane` to `target_s` of lane `target`; inf: not on it."""
+    start = -s
+    for _ in range(LANES_AHEAD):
+        if lane == target:
+            return start + target_s
+        start += roads.lanes[lane]["length_m"]
+        lane, way, _ = next_step(roads, travel, lane, way)
+        if lane < 0:
+            break
+    return math.inf
+
+
+@kernel
+def _note_gap(out: NDArray[np.float32], slot: int, gap: float, speed: float) -> None:
+    """Keep the nearest vehicle of a slot."""
+    at = 2 * slot
+    closeness = _closeness(gap)
+    scaled = _scaled_speed(speed)
+    if closeness > out[at] or (closeness == out[at] and scaled < out[at + 1]):
+        out[at] = closeness
+        out[at + 1] = scaled
+
+
+@kernel
+def _observe_gap(
+    roads: RoadArrays,
+    travel: Travel,
+    row: np.void,
+    other: np.void,
+    lane: int,
+    slot: int,
+    range_m: float,
+    out: NDArray[np.float32],
+) -> None:
+    """Note `other` in `slot` if it is ahead on the way from `lane`, in the next one if behind."""
+    s = row["s"] * roads.lanes[lane]["length_m"] / roads.lanes[row["lane"]]["length_m"]
+    half = 0.5 * (row["length"] + other["length"])
+    faster = other["speed"] - row["speed"]
+    ahead = math.inf
+    for on in (other["lane"], other["side_lane"]):
+        if on >= 0:
+            way = _way_between(roads, travel, lane, row["way"], s, on, other["s"])
+            if way >= 0.0:
+                ahead = min(ahead, way)
+    if ahead - half < range_m:
+        _note_gap(out, slot, ahead - half, faster)
+    elif slot != OWN:
+        behind = _way_between(roads, travel, other["lane"], other["way"], other["s"], lane, s)
+        if behind > 0.0 and behind - half < range_m:
+            _note_gap(out, slot + 1, behind - half, faster)
+
+
+@kernel
+def _next_link(
+    roads: RoadArrays, travel: Travel, row: np.void, range_m: float
+) -> tuple[int, float]:
+    """The link that a vehicle is on or comes to next, -1: none, and the way to its stop line."""
+    lane = row["lane"]
+    here = roads.lanes[lane]
+    if here["internal"]:
+        return here["link"], -(here["link_offset_m"] + row["s"])
+    way = row["way"]
+    distance = -row["s"]
+    for _ in range(LANES_AHEAD):
+        distance += roads.lanes[lane]["length_m"]
+        lane, way, link = next_step(roads, travel, lane, way)
+        if lane < 0 or distance > range_m:
+            break
+        if link >= 0:
+            return link, distance
+    return -1, 0.0
+
+
+@kernel
+def _observe_crossing(
+    roads: RoadArrays,
+    row: np.void,
+    other: np.void,
+    link: int,
+    distance: float,
+    foe_link: int,
+    foe_distance: float,
+    foe_held: bool,
+    soonest: float,
+    out: NDArray[np.float32],
+) -> float:
+    """Note `other` if it comes to a place that both links share before all others so far.
+
+    Those inside count, and those that have the right of way and are not held by a red signal.
+    Returns the time in s in which the soonest does, `soonest` or less.
+    """
+    first = roads.links[link]["first_conflict"]
+    for c in range(first, first + roads.links[link]["num_conflicts"]):
+        conflict = roads.conflicts[c]
+        if conflict["foe"] != foe_link:
+            continue
+        if foe_distance > 0.0 and (foe_held or not conflict["must_yield"]):
+            continue
+        half = 0.5 * row["length"]
+        foe_half = 0.5 * other["length"]
+        if foe_distance + conflict["foe_leave_m"] + foe_half < 0.0:
+            continue
+        if distance + conflict["leave_m"] + half < 0.0:
+            continue
+        way = foe_distance + conflict["foe_enter_m"] - foe_half
+        time = way / max(other["speed"], SLOWEST_MPS)
+        found = (
+            _closeness(distance + conflict["enter_m"] - half),
+            _closeness(way),
+            _scaled_speed(other["speed"]),
+        )
+        noted = (out[CROSSING + 1], out[CROSSING + 2], out[CROSSING + 3])
+        if time < soonest or (time == soonest and found < noted):
+            soonest = time
+            out[CROSSING] = 1.0
+            out[CROSSING + 1], out[CROSSING + 2], out[CROSSING + 3] = found
+    return soonest
+
+
+@kernel
+def _held(roads: RoadArrays, link: int, phase: NDArray[np.int32]) -> bool:
+    signal = link_signal(roads, link, phase)
+    return signal == SIGNAL_RED or signal == SIGNAL_RED_YELLOW
+
+
+@kernel
+def observe_lanes(
+    roads: RoadArrays,
+    travel: Travel,
+    rows: NDArray[np.void],
+    i: int,
+    grid: Grid,
+    phase: NDArray[np.int32],
+    sensors: Sensors,
+    observation: NDArray[np.float32],
+) -> None:
+    """Gaps and relative speeds on the lanes around, and who comes first where ways cross.
+
+    Args:
+        roads: the road arrays.
+        travel: the ways of all.
+        rows: VEHICLE (C,).
+        i: row of the agent's vehicle.
+        grid: filled from these rows.
+        phase: (num_signals,) PHASE rows that are on.
+        sensors: range and place of the sensor; a range of 0 switches it off.
+        observation: (D,), of which `LANES_FEATURES` numbers are written; 0 before.
+    """
+    range_m = sensors.lanes_range_m
+    if range_m == 0.0:
+        return
+    out = observation[sensors.lanes_at : sensors.lanes_at + LANES_FEATURES]
+    row = rows[i]
+    here = roads.lanes[row["lane"]]
+    link, distance = _next_link(roads, travel, row, range_m)
+    soonest = math.inf
+    first_column, last_column = cell_columns(grid, row["x"], range_m)
+    first_row, last_row = cell_rows(grid, row["y"], range_m)
+    for j in range(first_row, last_row + 1):
+        begin = grid.start[j * grid.num_x + first_column]
+        end = grid.start[j * grid.num_x + last_column + 1]
+        for b in range(begin, end):
+            body = grid.bodies[b]
+            dx = body["x"] - row["x"]
+            dy = body["y"] - row["y"]
+            if body["row"] == i or dx * dx + dy * dy > range_m * range_m:
+                continue
+            if abs(body["z"] - row["z"]) > LEVEL_HEIGHT_M:
+                continue
+            other = rows[body["row"]]
+            if is_off_lanes(other):
+                continue
+            _observe_gap(roads, travel, row, other, row["lane"], OWN, range_m, out)
+            if here["left"] >= 0:
+                _observe_gap(roads, travel, row, other, here["left"], LEFT, range_m, out)
+            if here["right"] >= 0:
+                _observe_gap(roads, travel, row, other, here["right"], RIGHT, range_m, out)
+            if link >= 0:
+                foe_link, foe_distance = _next_link(roads, travel, other, range_m)
+                if foe_link >= 0:
+                    held = _held(roads, foe_link, phase)
+                    soonest = _observe_crossing(
+                        roads,
+                        row,
+                        other,
+                        link,
+                        distance,
+                        foe_link,
+                        foe_distance,
+                        held,
+                        soonest,
+                        out,
+                    )

@@ -1,0 +1,213 @@
+"""What an agent observes of its inboxes: vehicles, events, and the next signal on its route."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cavmarl.core.math.scalars import clamp
+from cavmarl.core.numba import kernel
+from cavmarl.core.records.arrays import RoadArrays, Worlds
+from cavmarl.core.records.codes import DRIVER_AGENT, SIGNAL_GREEN_MAJOR, SIGNAL_GREEN_MINOR
+from cavmarl.sensors.kernels.stacking import newest_frame
+from cavmarl.v2x.kernels.v2x_records import (
+    CAUSE_COLLISION,
+    CAUSE_HARD_BRAKING,
+    CAUSE_STATIONARY,
+    KIND_CAM,
+    Mail,
+)
+
+__all__ = [
+    "ACCEL_SCALE",
+    "AGE_SCALE_S",
+    "EVENT_FEATURES",
+    "OBJECT_FEATURES",
+    "SIGNAL_FEATURES",
+    "SPEED_SCALE",
+    "observe_messages",
+]
+
+OBJECT_FEATURES = 11
+EVENT_FEATURES = 8
+SIGNAL_FEATURES = 4
+SPEED_SCALE = 40.0  # m/s
+ACCEL_SCALE = 10.0  # m/s²
+LENGTH_SCALE = 20.0  # m
+AGE_SCALE_S = 1.0
+EVENT_AGE_SCALE_S = 10.0
+SOON_S = 5.0  # a change after this time is a soonness of 0.5
+SIGNAL_RANGE_M = 300.0  # of the way on which the next signal is looked for
+
+
+@kernel
+def _unit(number: float) -> np.float32:
+    return np.float32(clamp(number, -1.0, 1.0))
+
+
+@kernel
+def _observe_place(
+    report: np.void, row: np.void, cos: float, sin: float, scale_m: float, out: NDArray[np.float32]
+) -> None:
+    """Presence and place in the ego frame."""
+    dx = report["x"] - row["x"]
+    dy = report["y"] - row["y"]
+    out[0] = 1.0
+    out[1] = _unit((dx * cos + dy * sin) / scale_m)
+    out[2] = _unit((dy * cos - dx * sin) / scale_m)
+
+
+@kernel
+def _observe_object(
+    report: np.void,
+    row: np.void,
+    cos: float,
+    sin: float,
+    scale_m: float,
+    tick_s: float,
+    out: NDArray[np.float32],
+) -> None:
+    """What is known of one vehicle, relative to the own one."""
+    _observe_place(report, row, cos, sin, scale_m, out)
+    turned = report["heading"] - row["heading"]
+    turned_cos = math.cos(turned)
+    turned_sin = math.sin(turned)
+    out[3] = _unit((report["speed"] * turned_cos - row["speed"]) / SPEED_SCALE)
+    out[4] = _unit(report["speed"] * turned_sin / SPEED_SCALE)
+    out[5] = _unit(turned_cos)
+    out[6] = _unit(turned_sin)
+    out[7] = _unit(report["accel"] / ACCEL_SCALE)
+    out[8] = _unit(report["length"] / LENGTH_SCALE)
+    out[9] = _unit((row["tick"] - report["tick"]) * tick_s / AGE_SCALE_S)
+    out[10] = 1.0 if report["kind"] == KIND_CAM else 0.0
+
+
+@kernel
+def _observe_event(
+    report: np.void,
+    row: np.void,
+    cos: float,
+    sin: float,
+    scale_m: float,
+    tick_s: float,
+    out: NDArray[np.float32],
+) -> None:
+    """Where something has happened, how long ago, and which of the causes it is."""
+    _observe_place(report, row, cos, sin, scale_m, out)
+    out[3] = _unit((row["tick"] - report["tick"]) * tick_s / EVENT_AGE_SCALE_S)
+    if report["code"] == CAUSE_COLLISION:
+        out[4] = 1.0
+    elif report["code"] == CAUSE_HARD_BRAKING:
+        out[5] = 1.0
+    elif report["code"] == CAUSE_STATIONARY:
+        out[6] = 1.0
+    else:
+        out[7] = 1.0
+
+
+@kernel
+def _next_signal(roads: RoadArrays, plans: NDArray[np.void], row: np.void) -> int:
+    """The first link with a signal on a vehicle's route, or -1."""
+    lane = row["lane"]
+    distance = -row["s"]
+    while True:
+        distance += roads.lanes[lane]["length_m"]
+        step = plans[row["goal"], lane]
+        if distance > SIGNAL_RANGE_M or step["next"] < 0:
+            return -1
+        if step["link"] >= 0 and roads.links[step["link"]]["signal"] >= 0:
+            return int(step["link"])
+        lane = step["next"]
+
+
+@kernel
+def _observe_signal(
+    roads: RoadArrays,
+    link: int,
+    signals: NDArray[np.void],
+    tick: int,
+    tick_s: float,
+    out: NDArray[np.float32],
+) -> None:
+    """What the roadside unit at a link has said of it, if it was heard."""
+    for k in range(signals.size):
+        report = signals[k]
+        if report["sender"] < 0:
+            return
+        if report["subject"] == roads.links[link]["signal"]:
+            age_s = (tick - report["tick"]) * tick_s
+            first = roads.phases[report["code"]]["first_state"]
+            letter = roads.phase_states[first + roads.links[link]["signal_index"]]
+            out[0] = 1.0
+            if letter == SIGNAL_GREEN_MAJOR or letter == SIGNAL_GREEN_MINOR:
+                out[1] = 1.0
+            out[2] = np.float32(SOON_S / (SOON_S + max(report["left_s"] - age_s, 0.0)))
+            out[3] = _unit(age_s / AGE_SCALE_S)
+            return
+
+
+@kernel
+def observe_messages(
+    roads: RoadArrays,
+    plans: NDArray[np.void],
+    worlds: Worlds,
+    mail: Mail,
+    at: int,
+    objects: int,
+    events: int,
+    signal: bool,
+    scale_m: float,
+    tick_s: float,
+    stack: int,
+    chosen: NDArray[np.bool_],
+    observations: NDArray[np.float32],
+) -> None:
+    """Write what the owned agents of the chosen worlds have in their inboxes.
+
+    Args:
+        roads: the road arrays.
+        plans: PLAN (G, L), the ways of agents.
+        worlds: committed rows at the end of the step.
+        mail: the inboxes.
+        at: where the sensor's part begins in a frame.
+        objects: vehicles that are shown.
+        events: likewise.
+        signal: whether the next signal is shown.
+        scale_m: what a place of 1 stands for.
+        tick_s: seconds a tick.
+        stack: frames in an observation.
+        chosen: (W,) which worlds.
+        observations: (W, A, D), the part of the newest frame is 0 before.
+    """
+    for w in range(chosen.size):
+        if not chosen[w]:
+            continue
+        for i in range(worlds.num_owned[w]):
+            row = worlds.rows[w, i]
+            if row["driver"] != DRIVER_AGENT:
+                continue
+            agent = row["agent"]
+            seen = observations[w, agent]
+            out = seen[newest_frame(seen, stack) + at :]
+            cos = math.cos(row["heading"])
+            sin = math.sin(row["heading"])
+            for k in range(objects):
+                report = mail.objects[w, agent, k]
+                if report["sender"] < 0:
+                    break
+                part = out[k * OBJECT_FEATURES :]
+                _observe_object(report, row, cos, sin, scale_m, tick_s, part)
+            out = out[objects * OBJECT_FEATURES :]
+            for k in range(events):
+                report = mail.events[w, agent, k]
+                if report["sender"] < 0:
+                    break
+                part = out[k * EVENT_FEATURES :]
+                _observe_event(report, row, cos, sin, scale_m, tick_s, part)
+            if signal:
+                link = _next_signal(roads, plans, row)
+                if link >= 0:
+                    part = out[events * EVENT_FEATURES :]
+                    _observe_signal(roads, link, mail.signals[w, agent], row["tick"], tick_s, part)

@@ -1,0 +1,103 @@
+"""What concerns the outputs of all agents at once, whichever shards own them.
+
+The order at the end of a step: `clear_outputs`, `sense` of every shard, `settle_outputs`, `credit`
+of every shard. Sums go in agent order, so that nobody can tell who wrote what.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cavmarl.core.numba import kernel
+from cavmarl.core.records.arrays import Outputs
+from cavmarl.core.records.codes import DRIVER_AGENT
+from cavmarl.rewards.kernels.terms import NUM_TERMS
+
+__all__ = ["clear_outputs", "credit", "settle_outputs"]
+
+
+@kernel
+def clear_outputs(outputs: Outputs, chosen: NDArray[np.bool_]) -> None:
+    """Make all agents of the chosen worlds (W,) absent; the observations stay for the stacks."""
+    for w in range(chosen.size):
+        if not chosen[w]:
+            continue
+        outputs.terms[w] = 0.0
+        outputs.rewards[w] = 0.0
+        outputs.terminated[w] = False
+        outputs.present[w] = False
+        outputs.acted[w] = False
+        outputs.events[w] = 0
+        outputs.vehicle_ids[w] = -1
+
+
+@kernel
+def settle_outputs(
+    outputs: Outputs, weights: NDArray[np.float64], team_share: float, chosen: NDArray[np.bool_]
+) -> None:
+    """Finish the outputs that all shards have written.
+
+    Args:
+        outputs: rewards are written, and the observations of absent agents become 0.
+        weights: (NUM_TERMS,) of the reward.
+        team_share: share of the reward that is the mean over the agents that acted.
+        chosen: (W,) which worlds.
+    """
+    for w in range(chosen.size):
+        if chosen[w]:
+            _zero_absent(outputs, w)
+            _reward(outputs, w, weights, team_share)
+
+
+@kernel
+def _zero_absent(outputs: Outputs, w: int) -> None:
+    for agent in range(outputs.present.shape[1]):
+        if not outputs.present[w, agent]:
+            outputs.observations[w, agent] = 0.0
+
+
+@kernel
+def _reward(outputs: Outputs, w: int, weights: NDArray[np.float64], team_share: float) -> None:
+    """Weighted sums of the terms, mixed with the team's mean; summed in agent order."""
+    team = 0.0
+    acted = 0
+    for agent in range(outputs.rewards.shape[1]):
+        if outputs.acted[w, agent]:
+            own = 0.0
+            for k in range(NUM_TERMS):
+                own += weights[k] * outputs.terms[w, agent, k]
+            outputs.rewards[w, agent] = own
+            team += own
+            acted += 1
+    if acted == 0:
+        return
+    team /= acted
+    for agent in range(outputs.rewards.shape[1]):
+        if outputs.acted[w, agent]:
+            own = outputs.rewards[w, agent]
+            outputs.rewards[w, agent] = (1.0 - team_share) * own + team_share * team
+
+
+@kernel
+def credit(
+    rows: NDArray[np.void],
+    num_owned: NDArray[np.int64],
+    rewards: NDArray[np.float32],
+    chosen: NDArray[np.bool_],
+) -> None:
+    """Add the rewards of the step to what owned agents have got in their episode.
+
+    Args:
+        rows: VEHICLE (W, C); episode_return of agents' rows is written.
+        num_owned: (W,) rows of the shard's own.
+        rewards: (W, A).
+        chosen: (W,) which worlds.
+    """
+    for w in range(chosen.size):
+        if not chosen[w]:
+            continue
+        for i in range(num_owned[w]):
+            row = rows[w, i]
+            if row["driver"] == DRIVER_AGENT:
+                row["episode_return"] += rewards[w, row["agent"]]

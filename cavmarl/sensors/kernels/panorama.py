@@ -1,0 +1,209 @@
+"""What stands around one vehicle, in its own frame: the world as its imaging sensors see it.
+
+The frame has its origin at the vehicle's place on the road, x ahead, y to the left, z up and
+square to the road under the vehicle: it turns with the heading and the pitch. In it the ground is
+the plane z = 0, bodies are upright prisms over oriented rectangles, and buildings are walls that
+stand on the ground. So slopes are seen as far as they go on evenly; the ground never hides a body.
+As for every sensor here, bodies more than `LEVEL_HEIGHT_M` above or below are not seen.
+
+The records do not say in which row a body lies or which zone owns it.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cavmarl.core.math.neighbors import LEVEL_HEIGHT_M, Grid, cell_columns, cell_rows
+from cavmarl.core.numba import kernel
+from cavmarl.roads.kernels.backdrop_pieces import Backdrop, gather_quads, gather_walls
+
+__all__ = [
+    "PRISM",
+    "Counts",
+    "Panorama",
+    "gather",
+    "make_panorama",
+]
+
+PRISM = np.dtype(
+    [
+        ("id", np.int64),  # of the vehicle or pedestrian
+        ("semantic", np.int64),  # see kernels.semantics
+        ("x", np.float64),  # centre, m
+        ("y", np.float64),
+        ("bottom", np.float64),  # z, m
+        ("top", np.float64),
+        ("cos", np.float64),  # of its heading in the frame
+        ("sin", np.float64),
+        ("half_length", np.float64),  # m
+        ("half_width", np.float64),
+        ("radius", np.float64),  # half the diagonal, m
+        ("speed", np.float64),  # over the ground along its heading, m/s
+    ],
+    align=True,
+)
+
+
+class Panorama(NamedTuple):
+    """Room for what stands around one vehicle; `gather` says how much of it is filled."""
+
+    prisms: NDArray[np.void]  # PRISM (C,)
+    order: NDArray[np.int32]  # (C,) prisms by id
+    walls: NDArray[np.void]  # WALL (num_walls,)
+    roofs: NDArray[np.float64]  # (num_roofs, 4, 2)
+    roof_height: NDArray[np.float64]  # (num_roofs,)
+    strips: NDArray[np.float64]  # (num_strips, 4, 2)
+    lined: NDArray[np.float64]  # (num_strips,)
+
+
+class Counts(NamedTuple):
+    """How many things of each kind a panorama holds."""
+
+    prisms: int
+    walls: int
+    roofs: int
+    strips: int
+
+
+def make_panorama(backdrop: Backdrop, capacity: int) -> Panorama:
+    """Room before such a backdrop, for so many bodies."""
+    return Panorama(
+        np.zeros(capacity, PRISM),
+        np.zeros(capacity, np.int32),
+        np.zeros_like(backdrop.walls),
+        np.zeros_like(backdrop.roofs),
+        np.zeros_like(backdrop.roof_height),
+        np.zeros_like(backdrop.strips),
+        np.zeros_like(backdrop.lined),
+    )
+
+
+@kernel
+def _fill_prism(
+    prism: np.void, body: np.void, ego: np.void, axes: tuple[float, float, float, float]
+) -> None:
+    """Bring a body into the frame whose cosines and sines of heading and pitch are `axes`."""
+    cos, sin, pitch_cos, pitch_sin = axes
+    dx = body["x"] - ego["x"]
+    dy = body["y"] - ego["y"]
+    dz = body["z"] - ego["z"]
+    ahead = dx * cos + dy * sin
+    bottom = dz * pitch_cos - ahead * pitch_sin
+    prism["id"] = body["id"]
+    prism["x"] = ahead * pitch_cos + dz * pitch_sin
+    prism["y"] = dy * cos - dx * sin
+    prism["bottom"] = bottom
+    prism["top"] = bottom + body["height"]
+    prism["cos"] = body["cos"] * cos + body["sin"] * sin
+    prism["sin"] = body["sin"] * cos - body["cos"] * sin
+    prism["half_length"] = body["half_length"]
+    prism["half_width"] = body["half_width"]
+    prism["radius"] = body["radius"]
+    prism["speed"] = body["speed"]
+
+
+@kernel
+def _gather_prisms(
+    rows: NDArray[np.void],
+    row: int,
+    grid: Grid,
+    semantics: NDArray[np.uint8],
+    reach_m: float,
+    out: NDArray[np.void],
+) -> int:
+    """The bodies around a vehicle, in no order that counts.
+
+    Args:
+        rows: VEHICLE (C,).
+        row: the vehicle that looks; it does not see itself.
+        grid: filled for this tick from these rows.
+        semantics: (num_types,) class of each type of vehicle.
+        reach_m: bodies that are farther away in the plane are left out.
+        out: PRISM (C,), overwritten up to the returned number.
+
+    Returns:
+        how many there are.
+    """
+    ego = rows[row]
+    axes = (
+        math.cos(ego["heading"]),
+        math.sin(ego["heading"]),
+        math.cos(ego["pitch"]),
+        math.sin(ego["pitch"]),
+    )
+    far = reach_m + grid.largest[0]
+    first_column, last_column = cell_columns(grid, ego["x"], far)
+    first_row, last_row = cell_rows(grid, ego["y"], far)
+    found = 0
+    for j in range(first_row, last_row + 1):
+        begin = grid.start[j * grid.num_x + first_column]
+        end = grid.start[j * grid.num_x + last_column + 1]
+        for b in range(begin, end):
+            body = grid.bodies[b]
+            dx = body["x"] - ego["x"]
+            dy = body["y"] - ego["y"]
+            limit = reach_m + body["radius"]
+            if (
+                dx * dx + dy * dy < limit * limit
+                and body["row"] != row
+                and abs(body["z"] - ego["z"]) <= LEVEL_HEIGHT_M
+            ):
+                _fill_prism(out[found], body, ego, axes)
+                out[found]["semantic"] = semantics[rows[body["row"]]["vtype"]]
+                found += 1
+    return found
+
+
+@kernel
+def _sort_by_id(prisms: NDArray[np.void], num: int, order: NDArray[np.int32]) -> None:
+    """Write into `order` (C,) which of the first `num` prisms is the next by id."""
+    for k in range(num):
+        place = k
+        while place > 0 and prisms[k]["id"] < prisms[order[place - 1]]["id"]:
+            order[place] = order[place - 1]
+            place -= 1
+        order[place] = k
+
+
+@kernel
+def gather(
+    rows: NDArray[np.void],
+    row: int,
+    grid: Grid,
+    backdrop: Backdrop,
+    reach_m: float,
+    with_faces: bool,
+    out: Panorama,
+) -> Counts:
+    """Gather what stands around a vehicle, in its frame.
+
+    Args:
+        rows: VEHICLE (C,).
+        row: the vehicle that looks; it does not see itself.
+        grid: filled for this tick from these rows.
+        backdrop: of the map.
+        reach_m: what is farther away in the plane is left out.
+        with_faces: also roofs and strips, and bodies in the order of their ids.
+        out: overwritten.
+    """
+    ego = rows[row]
+    prisms = _gather_prisms(rows, row, grid, backdrop.semantics, reach_m, out.prisms)
+    walls = roofs = strips = 0
+    if backdrop.walls.size > 0:
+        walls = gather_walls(ego, backdrop.walls, backdrop.wall_index, reach_m, out.walls)
+    if with_faces:
+        _sort_by_id(out.prisms, prisms, out.order)
+        strips = gather_quads(
+            ego, backdrop.strips, backdrop.lined, backdrop.strip_index, reach_m, out.strips,
+            out.lined,
+        )  # fmt: skip
+        if backdrop.roof_height.size > 0:
+            roofs = gather_quads(
+                ego, backdrop.roofs, backdrop.roof_height, backdrop.roof_index, reach_m, out.roofs,
+                out.roof_height,
+            )  # fmt: skip
+    return Counts(prisms, walls, roofs, strips)

@@ -1,0 +1,168 @@
+"""What lidars and radars on agents' vehicles sense."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cavmarl.core.math.neighbors import Grid, fill_grid
+from cavmarl.core.numba import kernel
+from cavmarl.core.records.arrays import Worlds
+from cavmarl.core.records.codes import DRIVER_AGENT
+from cavmarl.roads.kernels.backdrop_pieces import Backdrop
+from cavmarl.sensors.kernels.panorama import Panorama, gather
+from cavmarl.sensors.kernels.radar_targets import detect
+from cavmarl.sensors.kernels.ray_fan import Fan, cast
+from cavmarl.sensors.kernels.rig_noise import Noise, error_of, sensor_key
+from cavmarl.sensors.kernels.rig_schedule import Due
+
+__all__ = ["measure_lidar", "measure_radar", "reach_of"]
+
+# Rays that are written together, a cache line of them: with 1,024 or more in a layer the same place
+# of all layers is kept in one set of the cache, which does not hold them.
+BLOCK = 16
+
+
+@kernel
+def reach_of(fan: Fan) -> float:
+    """How far from the vehicle's place something can be that a ray meets, m."""
+    return fan.range_m + math.hypot(fan.mount[0, 3], fan.mount[1, 3])
+
+
+@kernel
+def measure_lidar(
+    worlds: Worlds,
+    grid: Grid,
+    backdrop: Backdrop,
+    due: Due,
+    lines: NDArray[np.int32],
+    noise: Noise,
+    fan: Fan,
+    panorama: Panorama,
+    hits: NDArray[np.void],
+    data: NDArray[np.float32],
+) -> None:
+    """Write what is due of the owned agents.
+
+    Args:
+        worlds: committed rows.
+        grid: room for the index of one world.
+        backdrop: of the map.
+        due: in this tick.
+        lines: (W, agents, 2) columns [first, last) of each agent's rays that are written.
+        noise: of the sensor; what meets nothing has none.
+        fan: its rays.
+        panorama: room.
+        hits: HIT (A, E), room.
+        data: (W, agents, S, E, A) distances in m.
+    """
+    reach_m = reach_of(fan)
+    noisy = noise.noise[0] > 0.0 or noise.bias[0] > 0.0
+    for w in range(worlds.ticks.size):
+        if due.num[w] == 0:
+            continue
+        rows = worlds.rows[w]
+        fill_grid(rows, worlds.num_rows[w], grid)
+        for i in range(worlds.num_owned[w]):
+            row = rows[i]
+            if row["driver"] != DRIVER_AGENT:
+                continue
+            counts = gather(rows, i, grid, backdrop, reach_m, False, panorama)
+            first, last = lines[w, row["agent"], 0], lines[w, row["agent"], 1]
+            cast(
+                fan, panorama.prisms, counts.prisms, panorama.walls, counts.walls, first, last,
+                hits,
+            )  # fmt: skip
+            out = data[w, row["agent"], due.slot[w]]
+            for begin in range(first, last, BLOCK):
+                end = min(begin + BLOCK, last)
+                for e in range(hits.shape[1]):
+                    for a in range(begin, end):
+                        out[e, a] = hits[a, e]["distance"]
+            if noisy:
+                _add_noise(noise, row, worlds.ticks[w], fan.range_m, first, last, out)
+
+
+@kernel
+def _add_noise(
+    noise: Noise,
+    row: np.void,
+    tick: int,
+    range_m: float,
+    first: int,
+    last: int,
+    out: NDArray[np.float32],
+) -> None:
+    """Make the distances (E, A) that are less than the range wrong, from 0 to the range.
+
+    In the columns [first, last).
+    """
+    key = sensor_key(row, noise.stream)
+    layers, rays = out.shape
+    for e in range(layers):
+        for a in range(first, last):
+            if out[e, a] < range_m:
+                error = error_of(noise, key, row["id"], tick, e * rays + a, 0)
+                out[e, a] = min(max(out[e, a] + error, 0.0), range_m)
+
+
+@kernel
+def measure_radar(
+    worlds: Worlds,
+    grid: Grid,
+    backdrop: Backdrop,
+    due: Due,
+    noise: Noise,
+    fan: Fan,
+    panorama: Panorama,
+    hits: NDArray[np.void],
+    targets: NDArray[np.void],
+    order: NDArray[np.int32],
+    data: NDArray[np.float32],
+) -> None:
+    """Write what is due of the owned agents.
+
+    Args:
+        worlds: committed rows.
+        grid: room for the index of one world.
+        backdrop: of the map.
+        due: in this tick.
+        noise: of the sensor.
+        fan: its rays, of one channel.
+        panorama: room.
+        hits: HIT (A, 1), room.
+        targets: TARGET (A,), room.
+        order: (A,), room.
+        data: (W, agents, S, targets, 3) range in m, azimuth in rad, radial speed in m/s.
+    """
+    reach_m = reach_of(fan)
+    for w in range(worlds.ticks.size):
+        if due.num[w] == 0:
+            continue
+        rows = worlds.rows[w]
+        fill_grid(rows, worlds.num_rows[w], grid)
+        for i in range(worlds.num_owned[w]):
+            row = rows[i]
+            if row["driver"] != DRIVER_AGENT:
+                continue
+            counts = gather(rows, i, grid, backdrop, reach_m, False, panorama)
+            cast(
+                fan, panorama.prisms, counts.prisms, panorama.walls, counts.walls, 0,
+                hits.shape[0], hits,
+            )  # fmt: skip
+            found = detect(fan, panorama, row, hits, targets, order)
+            out = data[w, row["agent"], due.slot[w]]
+            out[:] = 0.0
+            key = sensor_key(row, noise.stream)
+            for n in range(min(found, out.shape[0])):
+                target = targets[order[n]]
+                out[n, 0] = target["range"]
+                out[n, 1] = target["azimuth"]
+                out[n, 2] = target["speed"]
+                for channel in range(3):
+                    draw = 3 * n + channel
+                    out[n, channel] += error_of(
+                        noise, key, row["id"], worlds.ticks[w], draw, channel
+                    )

@@ -1,0 +1,155 @@
+"""From the map to the earth and back: WGS 84 latitude and longitude in degrees, height in m.
+
+A map that says how it is projected is taken at its word; one that does not is put onto the plane
+that touches the earth at an origin. z is taken for the height above the origin's.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cavmarl.config.rig import GnssConfig
+from cavmarl.core.errors import MapError, require
+from cavmarl.roads.network import GeoReference, RoadNetwork
+
+__all__ = ["Geodesy", "ProjectedMap", "TangentPlane", "geodesy_of"]
+
+Points = NDArray[np.float64]
+
+# WGS 84: semi-major axis in m, flattening, and the square of the first eccentricity.
+_AXIS_M = 6_378_137.0
+_FLATTENING = 1.0 / 298.257223563
+_SQUARED_ECCENTRICITY = _FLATTENING * (2.0 - _FLATTENING)
+_OF_HEIGHTS = ("+geoidgrids=", "+geoid_crs=", "+vunits=", "+vto_meter=")
+_ROUNDS = 6  # of the height's fixed point, each good for two digits and more
+
+
+class Geodesy(Protocol):
+    """Where a map lies on the earth."""
+
+    def to_earth(self, points: Points) -> Points:
+        """Latitude, longitude, height (n, 3) of places x, y, z (n, 3) of the map."""
+        ...
+
+    def to_map(self, places: Points) -> Points:
+        """x, y, z (n, 3) of latitudes, longitudes, heights (n, 3)."""
+        ...
+
+
+def geodesy_of(network: RoadNetwork, config: GnssConfig) -> Geodesy:
+    """Where a map lies: as it says itself, else where the sensor's settings put it.
+
+    Raises:
+        MissingExtraError: the map is projected, and pyproj is not installed.
+        MapError: PROJ does not know the projection.
+    """
+    if network.geo is not None:
+        return ProjectedMap(network.geo, config.origin_height_m)
+    return TangentPlane(config.origin_lat_deg, config.origin_lon_deg, config.origin_height_m)
+
+
+class ProjectedMap:
+    """A map with a projection.
+
+    Args:
+        geo: how it is projected.
+        height_m: of z = 0 above the ellipsoid.
+    """
+
+    def __init__(self, geo: GeoReference, height_m: float) -> None:
+        pyproj: Any = require("pyproj", "maps")
+        try:
+            self._project = pyproj.Proj(projparams=_in_the_plane(geo.projection))
+        except pyproj.exceptions.ProjError as error:
+            raise MapError(f"projection {geo.projection!r}: {error}") from error
+        self._offset_m = np.array([geo.offset_x_m, geo.offset_y_m, -height_m])
+
+    def to_earth(self, points: Points) -> Points:
+        """See `Geodesy`."""
+        x, y, height_m = (points - self._offset_m).T
+        longitude, latitude = self._project(x, y, inverse=True)
+        return np.stack([latitude, longitude, height_m], axis=1)
+
+    def to_map(self, places: Points) -> Points:
+        """See `Geodesy`."""
+        latitude, longitude, height_m = places.T
+        x, y = self._project(longitude, latitude)
+        found: Points = np.stack([x, y, height_m], axis=1) + self._offset_m
+        return found
+
+
+class TangentPlane:
+    """A map on the plane that touches the ellipsoid at an origin, x east and y north.
+
+    By way of earth-centred coordinates (Hofmann-Wellenhof, Lichtenegger, Wasle: "GNSS", 2008,
+    chapter 8).
+
+    Args:
+        latitude_deg: of the map's (0, 0).
+        longitude_deg: of the map's (0, 0).
+        height_m: of z = 0 there, above the ellipsoid.
+    """
+
+    def __init__(self, latitude_deg: float, longitude_deg: float, height_m: float) -> None:
+        origin = np.array([[latitude_deg, longitude_deg, height_m]])
+        self._origin_m = _to_centred(origin)
+        sin_lat, cos_lat = _sin_cos(latitude_deg)
+        sin_lon, cos_lon = _sin_cos(longitude_deg)
+        self._axes = np.array(
+            [
+                [-sin_lon, cos_lon, 0.0],
+                [-sin_lat * cos_lon, -sin_lat * sin_lon, cos_lat],
+                [cos_lat * cos_lon, cos_lat * sin_lon, sin_lat],
+            ]
+        )
+
+    def to_earth(self, points: Points) -> Points:
+        """See `Geodesy`."""
+        return _from_centred(points @ self._axes + self._origin_m)
+
+    def to_map(self, places: Points) -> Points:
+        """See `Geodesy`."""
+        found: Points = (_to_centred(places) - self._origin_m) @ self._axes.T
+        return found
+
+
+def _in_the_plane(projection: str) -> str:
+    """A PROJ string without what it says of heights, for which PROJ may need files of its own."""
+    words = projection.split()
+    return " ".join(word for word in words if not word.startswith(_OF_HEIGHTS))
+
+
+def _sin_cos(angle_deg: float) -> tuple[float, float]:
+    return math.sin(math.radians(angle_deg)), math.cos(math.radians(angle_deg))
+
+
+def _to_centred(places: Points) -> Points:
+    """Earth-centred x, y, z (n, 3) in m of latitudes, longitudes, heights (n, 3)."""
+    latitude, longitude = np.radians(places[:, 0]), np.radians(places[:, 1])
+    height_m = places[:, 2]
+    normal_m = _normal_m(latitude)
+    across_m = (normal_m + height_m) * np.cos(latitude)
+    polar_m = (normal_m * (1.0 - _SQUARED_ECCENTRICITY) + height_m) * np.sin(latitude)
+    return np.stack([across_m * np.cos(longitude), across_m * np.sin(longitude), polar_m], axis=1)
+
+
+def _from_centred(points: Points) -> Points:
+    """The inverse of `_to_centred`, for places away from the poles."""
+    x, y, polar_m = points.T
+    across_m = np.hypot(x, y)
+    latitude = np.arctan2(polar_m, across_m * (1.0 - _SQUARED_ECCENTRICITY))
+    for _ in range(_ROUNDS):
+        raised_m = polar_m + _SQUARED_ECCENTRICITY * _normal_m(latitude) * np.sin(latitude)
+        latitude = np.arctan2(raised_m, across_m)
+    height_m = across_m / np.cos(latitude) - _normal_m(latitude)
+    return np.stack([np.degrees(latitude), np.degrees(np.arctan2(y, x)), height_m], axis=1)
+
+
+def _normal_m(latitude: Points) -> Points:
+    """Radius of curvature across the meridian."""
+    found: Points = _AXIS_M / np.sqrt(1.0 - _SQUARED_ECCENTRICITY * np.sin(latitude) ** 2)
+    return found

@@ -1,0 +1,150 @@
+"""`MountedSensor`: what every type of sensor is made of; one file a type."""
+
+from __future__ import annotations
+
+import hashlib
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
+from typing import Any, ClassVar, Generic, NamedTuple, TypeVar
+
+import numpy as np
+from numpy.typing import DTypeLike, NDArray
+
+from cavmarl.config.rig import MountedConfig, SampledConfig
+from cavmarl.core.math.neighbors import Grid
+from cavmarl.core.records.arrays import LaneGrid, RoadArrays, Travel, Worlds
+from cavmarl.roads.kernels.backdrop_pieces import Backdrop
+from cavmarl.roads.network import RoadNetwork
+from cavmarl.sensors.kernels.rig_noise import Noise
+from cavmarl.sensors.kernels.rig_schedule import Due
+from cavmarl.sensors.mounted.frames import SensorFrames
+from cavmarl.sensors.mounted.mount_transforms import SENSOR_FRAME, check_place, mount_of
+
+__all__ = ["Bounds", "MountedSensor", "Platform", "Scene", "noise_of", "stream_of"]
+
+Bounds = tuple[NDArray[Any], NDArray[Any]]
+C = TypeVar("C", bound=MountedConfig)
+
+
+class Scene(NamedTuple):
+    """What the agents of one zone can see, in the present tick.
+
+    Attributes:
+        roads: of the whole map.
+        lane_grid: which lanes lie near a place.
+        plans: PLAN (G, L), the ways of agents.
+        travel: types of vehicles.
+        worlds: the committed rows: first the zone's own, then ghosts.
+        grid: room for the spatial index of one world; whoever asks it fills it.
+        before: POSE (W, A) of all agents in the tick before.
+    """
+
+    roads: RoadArrays
+    lane_grid: LaneGrid
+    plans: NDArray[np.void]
+    travel: Travel
+    worlds: Worlds
+    grid: Grid
+    before: NDArray[np.void]
+
+
+class Platform(NamedTuple):
+    """What sensors are mounted on.
+
+    Attributes:
+        network: the roads.
+        body: VTYPE of agents' vehicles.
+        num_worlds: W.
+        num_agents: A.
+        sim_dt_s: seconds a tick.
+        ticks_per_step: ticks a step.
+        capacity: the most rows of a world.
+        backdrop: what cameras and rays meet of the map.
+    """
+
+    network: RoadNetwork
+    body: np.void
+    num_worlds: int
+    num_agents: int
+    sim_dt_s: float
+    ticks_per_step: int
+    capacity: int
+    backdrop: Backdrop
+
+
+class MountedSensor(ABC, Generic[C]):
+    """One sensor of the rig, on the vehicles of all agents of W worlds.
+
+    Args:
+        name: in the rig.
+        config: its settings.
+        platform: what it is mounted on.
+
+    Attributes:
+        name: in the rig.
+        config: its settings.
+        mount: where on the vehicle.
+        frame: name of the frame that its directions are in.
+        lines: (W, A, 2) which lines [first, last) of each agent's frame `sense` writes: all,
+            unless others write the rest.
+    """
+
+    dtype: ClassVar[DTypeLike]
+    stamps_itself: ClassVar[bool] = False  # it has no rate: it also writes stamps and counts
+
+    def __init__(self, name: str, config: C, platform: Platform) -> None:
+        self.name = name
+        self.config = config
+        self.mount = mount_of(config)
+        self.frame = SENSOR_FRAME.format(name=name)
+        self.lines = np.zeros((platform.num_worlds, platform.num_agents, 2), dtype=np.int32)
+        self.lines[..., 1] = self.num_lines(config)
+        check_place(name, config, platform.body)
+
+    @staticmethod
+    @abstractmethod
+    def bounds(config: C) -> Bounds:
+        """The least and the largest value of the numbers of a sample, broadcast to its shape."""
+
+    @staticmethod
+    def reach_m(config: C, largest_radius_m: float) -> float:
+        """How far from the vehicle's centre the centre of another can be that it can tell.
+
+        Args:
+            config: its settings.
+            largest_radius_m: half the diagonal of the largest body.
+        """
+        return 0.0
+
+    @staticmethod
+    def num_lines(config: C) -> int:
+        """Into how many lines a frame can be divided, each of which can be written by itself."""
+        return 1
+
+    @abstractmethod
+    def sense(self, scenes: Sequence[Scene], due: Due, frames: SensorFrames) -> None:
+        """Write the data of all samples that are due, for the agents that the scenes own.
+
+        What is written may depend on the agent's row, the others' rows within reach and the tick,
+        and on nothing else: not on how rows are ordered, nor on which zone asks.
+
+        Args:
+            scenes: one a zone.
+            due: how many samples, and to which slots.
+            frames: `data` is written; stamps, counts and losses are the rig's business.
+        """
+
+
+def stream_of(name: str) -> np.uint64:
+    """The stream of a sensor's random numbers: of its name, whatever else is mounted."""
+    return np.uint64(int.from_bytes(hashlib.blake2b(name.encode(), digest_size=8).digest()))
+
+
+def noise_of(name: str, config: SampledConfig) -> Noise:
+    """What kernels take of `noise` and `bias`, one number a channel."""
+    channels = len(config.units)
+    return Noise(
+        stream_of(name),
+        np.broadcast_to(np.array(config.noise), channels).copy(),
+        np.broadcast_to(np.array(config.bias), channels).copy(),
+    )

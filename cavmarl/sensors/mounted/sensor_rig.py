@@ -1,0 +1,202 @@
+"""`Rig`: all mounted sensors of W worlds, and what is due of them in each tick."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from typing import Any, NamedTuple, TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cavmarl.config.rig import MountedConfig, SampledConfig, cadence
+from cavmarl.core.numba.repeated import repeated
+from cavmarl.sensors.kernels.rig_frames import POSE, call_roll, deliver, note_poses
+from cavmarl.sensors.kernels.rig_schedule import Due, Schedule, call_due
+from cavmarl.sensors.mounted.catalogue import mount
+from cavmarl.sensors.mounted.frames import Frames, SensorFrames
+from cavmarl.sensors.mounted.mounted_sensor import MountedSensor, Platform, Scene, stream_of
+
+__all__ = ["Rig", "Sense", "Turn", "sense_here"]
+
+
+class Turn(NamedTuple):
+    """What a sensor has to do in the present tick.
+
+    Attributes:
+        place: its number in the rig.
+        sensor: itself.
+        due: how many samples, and to which slots.
+        frames: where they go.
+    """
+
+    place: int
+    sensor: MountedSensor[Any]
+    due: Due
+    frames: SensorFrames
+
+
+Sense: TypeAlias = Callable[[Sequence[Scene], Sequence[Turn]], None]
+"""Writes the samples of all turns, as `MountedSensor.sense` does, before it returns."""
+
+
+def sense_here(scenes: Sequence[Scene], turns: Sequence[Turn]) -> None:
+    """One sensor after the other, in this process."""
+    for turn in turns:
+        turn.sensor.sense(scenes, turn.due, turn.frames)
+
+
+class Rig:
+    """The sensors of all agents of W worlds.
+
+    Args:
+        settings: of the sensors, by name.
+        platform: what they are mounted on.
+        frames: where their samples go.
+        ids: (W, A) int64, the vehicle whose samples each agent's are; kept from tick to tick.
+
+    Attributes:
+        sense: who senses what is due.
+    """
+
+    def __init__(
+        self,
+        settings: Mapping[str, MountedConfig],
+        platform: Platform,
+        frames: Frames,
+        ids: NDArray[np.int64],
+    ) -> None:
+        self._platform = platform
+        self._ids = ids
+        self._now = ids.copy()
+        self._before = np.zeros(ids.shape, dtype=POSE)
+        self._mounted = [
+            _Mounted(place, sensor, frames[sensor.name], platform)
+            for place, sensor in enumerate(mount(settings, platform))
+        ]
+        self.sense: Sense = sense_here
+        self._is_new = True
+        self._everywhere = np.ones(len(ids), dtype=np.bool_)
+        self._call_roll = repeated(call_roll)
+        self._note_poses = repeated(note_poses)
+
+    @property
+    def sensors(self) -> list[MountedSensor[Any]]:
+        """All of them, in the order of the rig."""
+        return [mounted.turn.sensor for mounted in self._mounted]
+
+    @property
+    def before(self) -> NDArray[np.void]:
+        """POSE (W, A) of the tick before."""
+        return self._before
+
+    def begin(self, scenes: Sequence[Scene]) -> None:
+        """Note where everybody is before the tick."""
+        self._before["id"] = -1
+        for scene in scenes:
+            self._note_poses(scene.worlds, self._before)
+
+    def reset(self, scenes: Sequence[Scene], chosen: NDArray[np.bool_]) -> None:
+        """Forget what there was in the chosen worlds (W,), and take what is due at the reset."""
+        if self._is_new:  # kernels are loaded now, and not in the first tick that asks for them
+            self._is_new = False
+            for mounted in self._mounted:
+                mounted.rehearse(scenes)
+        self._before["id"][chosen] = -1
+        for mounted in self._mounted:
+            mounted.clear(chosen)
+        self._ids[chosen] = -1
+        self._take(scenes, chosen)
+
+    def end(self, scenes: Sequence[Scene]) -> None:
+        """Take what is due in the present tick."""
+        ticks = scenes[0].worlds.ticks
+        begins = (ticks - 1) % self._platform.ticks_per_step == 0
+        if begins.any():
+            for mounted in self._mounted:
+                mounted.frames.fresh[begins] = 0
+        self._take(scenes, self._everywhere)
+
+    def _take(self, scenes: Sequence[Scene], chosen: NDArray[np.bool_]) -> None:
+        self._now[:] = -1
+        for scene in scenes:
+            self._call_roll(scene.worlds, self._now)
+        changed = self._now != self._ids
+        if changed.any():
+            self._ids[:] = self._now
+            for mounted in self._mounted:
+                mounted.clear(changed)
+        ticks = scenes[0].worlds.ticks
+        due = [mounted for mounted in self._mounted if mounted.is_due(ticks, chosen)]
+        self.sense(scenes, [mounted.turn for mounted in due])
+        for mounted in due:
+            mounted.deliver(scenes)
+
+    def arrays(self) -> Iterator[NDArray[Any]]:
+        """All that outlives a tick."""
+        yield self._ids
+        for mounted in self._mounted:
+            yield from mounted.frames
+
+
+class _Mounted:
+    """A sensor, its schedule and its frames."""
+
+    def __init__(
+        self, place: int, sensor: MountedSensor[Any], frames: SensorFrames, platform: Platform
+    ) -> None:
+        self.frames = frames
+        due = Due(*(np.zeros(platform.num_worlds, dtype=np.int64) for _ in Due._fields))
+        self.turn = Turn(place, sensor, due, frames)
+        self._schedule = _schedule_of(sensor.config, platform, frames.lost.shape[2])
+        self._sim_dt_s = platform.sim_dt_s
+        self._stream = stream_of(sensor.name)
+        self._bytes = frames.data.reshape((*frames.lost.shape, -1)).view(np.uint8)
+        self._call_due = repeated(call_due)
+        self._deliver = repeated(deliver)
+
+    def clear(self, chosen: NDArray[np.bool_]) -> None:
+        """Write zeros for some worlds (W,), or agents (W, A)."""
+        for array in self.frames:
+            array[chosen] = 0
+
+    def rehearse(self, scenes: Sequence[Scene]) -> None:
+        """Take a sample in every world, and leave everything as it was."""
+        kept = self.frames.copy()
+        for array, value in zip(self.turn.due, (1, 0, 0), strict=True):
+            array[:] = value
+        sense_here(scenes, [self.turn])
+        self.deliver(scenes)
+        for array, before in zip(self.frames, kept, strict=True):
+            array[...] = before
+
+    def is_due(self, ticks: NDArray[np.int64], chosen: NDArray[np.bool_]) -> bool:
+        """Whether anything is, in the chosen worlds (W,); how much is noted in its turn."""
+        return self._call_due(self._schedule, ticks, chosen, self.turn.due)
+
+    def deliver(self, scenes: Sequence[Scene]) -> None:
+        """Stamp and count what it has sensed, and lose some of it."""
+        sensor, frames = self.turn.sensor, self.frames
+        if sensor.stamps_itself:
+            return
+        for scene in scenes:
+            self._deliver(
+                scene.worlds,
+                self._schedule,
+                self.turn.due,
+                self._sim_dt_s,
+                self._stream,
+                sensor.config.dropout,
+                frames.stamp_s,
+                frames.lost,
+                frames.fresh,
+                self._bytes,
+            )
+
+
+def _schedule_of(config: MountedConfig, platform: Platform, slots: int) -> Schedule:
+    """Of a sensor with a rate; without one it is asked in every tick."""
+    ticks_per_step = platform.ticks_per_step
+    if isinstance(config, SampledConfig):
+        rate = cadence(config.rate_hz, platform.sim_dt_s)
+        return Schedule(rate.numerator, rate.denominator, config.phase_ticks, ticks_per_step, slots)
+    return Schedule(1, 1, 0, ticks_per_step, slots)

@@ -1,0 +1,182 @@
+"""The sensors: what each adds to an observation, and how far it looks.
+
+One file a sensor; a new one is a file here, a kernel that writes its numbers, which `kernels/sense`
+or, if most environments leave it off, `kernels/observe_further` calls, and its line in `SENSORS`.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cavmarl.config.env import SensorsConfig
+from cavmarl.core.records.arrays import Sensors
+from cavmarl.rewards.kernels.terms import TTC_REACH_M
+from cavmarl.roads.network import RoadNetwork
+from cavmarl.sensors.kernels.sensor_arrays import FurtherSensors
+from cavmarl.sensors.observed import (
+    ego,
+    lidar_observation,
+    occupancy_grid,
+    puffer_drive,
+    roadgraph,
+    route,
+)
+from cavmarl.sensors.observed import highway_kinematics as kinematics
+from cavmarl.sensors.observed import lane_neighbors as lanes
+from cavmarl.sensors.observed import lidar_rays as lidar
+from cavmarl.sensors.observed import nearest_vehicles as neighbors
+from cavmarl.sensors.observed import next_signal as signal
+from cavmarl.sensors.observed import received_messages as messages
+from cavmarl.sensors.observed.feature import Feature, Sensor
+from cavmarl.sensors.observed.highway import goal_places
+
+__all__ = [
+    "SENSORS",
+    "Feature",
+    "Sensor",
+    "frame_size",
+    "further_arrays",
+    "largest_radius_m",
+    "layout",
+    "sensing_reach_m",
+    "sensor_arrays",
+]
+
+# In the order of their features in a frame.
+SENSORS: tuple[Sensor, ...] = (
+    Sensor("ego", ego.features, ego.reach_m),
+    Sensor("route", route.features, route.reach_m),
+    Sensor("neighbors", neighbors.features, neighbors.reach_m),
+    Sensor("signal", signal.features, signal.reach_m),
+    Sensor("lanes", lanes.features, lanes.reach_m),
+    Sensor("lidar", lidar.features, lidar.reach_m, sees_bodies=True),
+    Sensor("kinematics", kinematics.features, kinematics.reach_m, kinematics.shape),
+    Sensor(
+        "occupancy_grid",
+        occupancy_grid.features,
+        occupancy_grid.reach_m,
+        occupancy_grid.shape,
+        occupancy_grid.dtype,
+    ),
+    Sensor(
+        "lidar_observation",
+        lidar_observation.features,
+        lidar_observation.reach_m,
+        lidar_observation.shape,
+    ),
+    Sensor("roadgraph", roadgraph.features, roadgraph.reach_m, roadgraph.shape),
+    Sensor("messages", messages.features, messages.reach_m),
+    Sensor("puffer_drive", puffer_drive.features, puffer_drive.reach_m),
+)
+
+# Those that `observe_further` writes.
+FURTHER = frozenset(
+    ("kinematics", "occupancy_grid", "lidar_observation", "roadgraph", "puffer_drive")
+)
+
+# The last of them, and the one that writes its zeros itself: most of a large frame is written once.
+FILLS_ITS_PART = SENSORS[-1].name
+
+
+def layout(config: SensorsConfig) -> dict[str, slice]:
+    """Where each sensor's features lie in a frame; sensors that are off are left out."""
+    places: dict[str, slice] = {}
+    start = 0
+    for sensor in SENSORS:
+        size = len(sensor.features(config))
+        if size:
+            places[sensor.name] = slice(start, start + size)
+        start += size
+    return places
+
+
+def frame_size(config: SensorsConfig) -> int:
+    """Numbers in one frame; a flat observation holds `config.stack` of them."""
+    return sum(place.stop - place.start for place in layout(config).values())
+
+
+def largest_radius_m(types: NDArray[np.void]) -> float:
+    """Half the diagonal of the largest body, in m: no part of one is further from its centre.
+
+    Args:
+        types: VTYPE (num_types,), `Travel.types`: those of agents and of all others.
+    """
+    return 0.5 * float(np.hypot(types["length"], types["width"]).max())
+
+
+def sensing_reach_m(config: SensorsConfig, largest_radius_m: float) -> float:
+    """How far from an agent's centre the centre of a vehicle can be that it can tell, in m.
+
+    Whoever is further away changes no number of an observation and no term. Sensors that ask for
+    centres reach as far as they look, `lanes` too: it takes none that is further away in the plane.
+    Rays end at bodies, whose centres are up to half a diagonal behind. Of the terms, time to
+    collision alone looks at others; it is always on.
+
+    Args:
+        config: the sensors.
+        largest_radius_m: half the diagonal of the largest body.
+    """
+    reaches = (sensor.reach_of_centres_m(config, largest_radius_m) for sensor in SENSORS)
+    return max(TTC_REACH_M, *reaches)
+
+
+def _starts(config: SensorsConfig) -> dict[str, int]:
+    """Where each sensor begins in a frame; 0 for those that are off."""
+    places = layout(config)
+    return {
+        sensor.name: places[sensor.name].start if sensor.name in places else 0 for sensor in SENSORS
+    }
+
+
+def sensor_arrays(config: SensorsConfig) -> Sensors:
+    """The settings and the room that `sense` takes."""
+    places = layout(config)
+    starts = _starts(config)
+    return Sensors(
+        stack=config.stack,
+        cleared=starts[FILLS_ITS_PART] if FILLS_ITS_PART in places else frame_size(config),
+        ego="ego" in places,
+        route_at=starts["route"],
+        route_points=config.route.points,
+        route_spacing_m=config.route.spacing_m,
+        neighbors_at=starts["neighbors"],
+        neighbors=config.neighbors.count,
+        neighbors_range_m=config.neighbors.range_m,
+        signal="signal" in places,
+        signal_at=starts["signal"],
+        signal_range_m=config.signal.range_m,
+        signal_timing=config.signal.timing,
+        lanes_at=starts["lanes"],
+        lanes_range_m=config.lanes.range_m,
+        lidar_at=starts["lidar"],
+        lidar_rays=config.lidar.rays,
+        lidar_range_m=config.lidar.range_m,
+        lidar_speeds=config.lidar.speeds,
+        rays=lidar.directions(config),
+        echoes=lidar.room(config),
+        **neighbors.room(config),
+    )
+
+
+def further_arrays(
+    config: SensorsConfig, network: RoadNetwork, plans: NDArray[np.void]
+) -> FurtherSensors | None:
+    """What `observe_further` takes; None if all of its sensors are off.
+
+    Args:
+        config: the sensors.
+        network: the roads.
+        plans: PLAN (G, L).
+    """
+    if FURTHER.isdisjoint(layout(config)):
+        return None
+    starts = _starts(config)
+    goals = goal_places(network, plans)
+    return FurtherSensors(
+        kinematics=kinematics.settings(config, starts["kinematics"], network, goals),
+        occupancy=occupancy_grid.settings(config, starts["occupancy_grid"], network, goals),
+        lidar_cells=lidar_observation.settings(config, starts["lidar_observation"]),
+        roadgraph=roadgraph.settings(config, starts["roadgraph"], network),
+        puffer_drive=puffer_drive.settings(config, starts["puffer_drive"], network, goals),
+    )

@@ -1,0 +1,119 @@
+"""What highway-env's features of a vehicle mean, and the ranges that they are mapped from."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cavmarl.config.sensors import GRID_FEATURES, VEHICLE_FEATURES
+from cavmarl.roads.network import RoadNetwork
+from cavmarl.sensors.observed.feature import Feature
+
+__all__ = [
+    "MAX_RELATIVE_MPS",
+    "codes",
+    "default_ranges",
+    "goal_places",
+    "range_table",
+    "vehicle_feature",
+]
+
+MAX_SPEED_MPS = 40.0  # Vehicle.MAX_SPEED
+LANE_WIDTH_M = 4.0  # AbstractLane.DEFAULT_WIDTH
+
+# No velocities differ by more: driving/kernels/motion.py keeps speeds from 0 to 60 m/s.
+MAX_RELATIVE_MPS = 120.0
+
+_MEANINGS = {
+    "presence": ("1 if there is one", ""),
+    "x": ("place, to the east", "m"),
+    "y": ("place, to the south", "m"),
+    "vx": ("velocity, to the east", "m/s"),
+    "vy": ("velocity, to the south", "m/s"),
+    "heading": ("heading, clockwise from east", "rad"),
+    "cos_h": ("cosine of its heading", ""),
+    "sin_h": ("sine of its heading, clockwise from east", ""),
+    "cos_d": ("cosine of the direction to its goal", ""),
+    "sin_d": ("sine of the direction to its goal, clockwise from east", ""),
+    "long_off": ("way along its lane", "m"),
+    "lat_off": ("place beside its lane's middle, right positive", "m"),
+    "ang_off": ("heading minus its lane's direction, right positive", "rad"),
+}
+
+# What features that are not mapped can be.
+_LIMITS = {
+    "presence": (0.0, 1.0),
+    "vx": (-MAX_RELATIVE_MPS, MAX_RELATIVE_MPS),
+    "vy": (-MAX_RELATIVE_MPS, MAX_RELATIVE_MPS),
+    "heading": (-math.pi, math.pi),
+    "ang_off": (-math.pi, math.pi),
+    **dict.fromkeys(("cos_h", "sin_h", "cos_d", "sin_d"), (-1.0, 1.0)),
+}
+_NO_LIMIT = (-math.inf, math.inf)
+
+
+def default_ranges(network: RoadNetwork) -> dict[str, tuple[float, ...]]:
+    """highway-env's ranges where none are set.
+
+    There, `y` spans the lanes of the road on which the first observation is made, and stays so. A
+    constant of the map stands for that here: the lanes of its widest road.
+    """
+    outside = network.edges[~network.edges["internal"]]
+    y = LANE_WIDTH_M * float(outside["num_lanes"].max())
+    speed = 2.0 * MAX_SPEED_MPS
+    return {
+        "x": (-5.0 * MAX_SPEED_MPS, 5.0 * MAX_SPEED_MPS),
+        "y": (-y, y),
+        "vx": (-speed, speed),
+        "vy": (-speed, speed),
+    }
+
+
+def range_table(ranges: Mapping[str, tuple[float, ...]]) -> NDArray[np.float64]:
+    """(NUM_VEHICLE_FEATURES, 2) by code, nan where there is no range."""
+    table = np.full((len(VEHICLE_FEATURES), 2), np.nan)
+    for name, bounds in ranges.items():
+        table[VEHICLE_FEATURES.index(name)] = bounds
+    return table
+
+
+def codes(features: tuple[str, ...]) -> NDArray[np.int64]:
+    """FEATURE_* codes."""
+    return np.array([GRID_FEATURES.index(name) for name in features], dtype=np.int64)
+
+
+def goal_places(network: RoadNetwork, plans: NDArray[np.void]) -> NDArray[np.float64]:
+    """(G, 2) x and y of each goal in m: the end of the rightmost lane of its edge."""
+    places = np.zeros((len(plans), 2))
+    for place, plan in zip(places, plans, strict=True):
+        reached = np.isfinite(plan["to_go"]) & (plan["next"] < 0) & (plan["change"] == 0)
+        goal = int(np.flatnonzero(reached)[0])
+        place[:] = network.lane_polyline(goal)[-1, :2]
+    return places
+
+
+def vehicle_feature(
+    name: str, label: str, subject: str, ranges: Mapping[str, tuple[float, ...]], clip: bool
+) -> Feature:
+    """One feature of a vehicle.
+
+    Args:
+        name: one of `VEHICLE_FEATURES`.
+        label: the name that it gets.
+        subject: whose it is; begins the meaning.
+        ranges: what is mapped to [-1, 1].
+        clip: whether what was mapped is clipped.
+    """
+    meaning, unit = _MEANINGS[name]
+    text = f"{subject}: {meaning}"
+    if name not in ranges:
+        low, high = _LIMITS.get(name, _NO_LIMIT)
+        return Feature(label, text, f"1 {unit}" if unit else "", low, high)
+    start, end = ranges[name]
+    low, high = (-1.0, 1.0) if clip else _NO_LIMIT
+    if start == -end:
+        return Feature(label, text, f"{end:g} {unit}".strip(), low, high)
+    return Feature(label, text, f"{end:g} {unit}; -1 is {start:g}".replace(" ;", ";"), low, high)

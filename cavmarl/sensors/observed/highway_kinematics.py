@@ -1,0 +1,82 @@
+"""highway-env's `Kinematics`: a table of the vehicles near one, the own one first."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cavmarl.config.env import SensorsConfig
+from cavmarl.roads.network import RoadNetwork
+from cavmarl.sensors.kernels.kinematics_observation import PERCEPTION_M
+from cavmarl.sensors.kernels.sensor_arrays import KinematicsSensor
+from cavmarl.sensors.observed.feature import Feature
+from cavmarl.sensors.observed.highway import (
+    codes,
+    default_ranges,
+    range_table,
+    vehicle_feature,
+)
+
+__all__ = ["features", "reach_m", "settings", "shape"]
+
+# The range of y is the map's; whatever it is, it becomes [-1, 1].
+_DEFAULT_RANGES = {
+    "x": (-200.0, 200.0), "y": (-4.0, 4.0), "vx": (-80.0, 80.0), "vy": (-80.0, 80.0)
+}  # fmt: skip
+
+_RELATIVE = ("x", "y", "vx", "vy")
+
+
+def features(config: SensorsConfig) -> list[Feature]:
+    """Row by row; rows without a vehicle are 0."""
+    kinematics = config.kinematics
+    ranges = kinematics.features_range or _DEFAULT_RANGES
+    if not kinematics.normalize:
+        ranges = {}
+    found = []
+    for row in range(kinematics.vehicles_count):
+        for name in kinematics.features:
+            subject = f"vehicle {row}"
+            if name in _RELATIVE and not kinematics.absolute:
+                subject += " (0 itself, others less its own)"
+            feature = vehicle_feature(name, f"{name}_{row}", subject, ranges, kinematics.clip)
+            if name == "y" and ranges is _DEFAULT_RANGES:
+                feature = replace(feature, scale="4 m · lanes of the widest road")
+            found.append(feature)
+    return found
+
+
+def shape(config: SensorsConfig) -> tuple[int, ...]:
+    """(vehicles, features)."""
+    return config.kinematics.vehicles_count, len(config.kinematics.features)
+
+
+def reach_m(config: SensorsConfig) -> float:
+    """highway-env's perception distance, if it is on."""
+    return PERCEPTION_M if config.kinematics.vehicles_count else 0.0
+
+
+def settings(
+    config: SensorsConfig, at: int, network: RoadNetwork, goals: NDArray[np.float64]
+) -> KinematicsSensor:
+    """What the kernel takes; `goals` are the places of `highway.goal_places`."""
+    kinematics = config.kinematics
+    ranges = kinematics.features_range or default_ranges(network)
+    table = range_table(ranges if kinematics.normalize else {})
+    return KinematicsSensor(
+        at=at,
+        vehicles=kinematics.vehicles_count,
+        features=codes(kinematics.features),
+        ranges=table,
+        absolute=kinematics.absolute,
+        shuffled=kinematics.order == "shuffled",
+        clip=kinematics.clip,
+        see_behind=kinematics.see_behind,
+        observe_intentions=kinematics.observe_intentions,
+        destinations=goals,
+        near_body=np.zeros(max(kinematics.vehicles_count, 1), dtype=np.int64),
+        near_key=np.zeros(max(kinematics.vehicles_count, 1)),
+        values=np.zeros(len(table)),
+    )

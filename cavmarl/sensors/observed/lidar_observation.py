@@ -1,0 +1,76 @@
+"""highway-env's `LidarObservation`: distance and radial speed in sectors around the vehicle."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from cavmarl.config.env import SensorsConfig
+from cavmarl.sensors.kernels.lidar_cells import cell_directions
+from cavmarl.sensors.kernels.lidar_fan import ECHO
+from cavmarl.sensors.kernels.sensor_arrays import LidarCells
+from cavmarl.sensors.observed.feature import Feature
+from cavmarl.sensors.observed.highway import MAX_RELATIVE_MPS
+
+__all__ = ["features", "reach_m", "settings", "shape"]
+
+# Within a body distances are negative, by no more than its length.
+LONGEST_BODY_M = 30.0
+
+
+def features(config: SensorsConfig) -> list[Feature]:
+    """Distance and speed of each cell in turn."""
+    lidar = config.lidar_observation
+    scale = _scale(config)
+    reach = lidar.maximum_range_m / scale
+    inside = max(lidar.maximum_range_m, LONGEST_BODY_M) / scale
+    speed = max(MAX_RELATIVE_MPS, lidar.maximum_range_m) / scale
+    found = []
+    for cell in range(lidar.cells):
+        where = f"{cell * 360.0 / lidar.cells:g}° clockwise from east"
+        found += [
+            Feature(
+                f"distance_{cell}",
+                f"distance {where}; the range where nothing is",
+                f"{scale:g} m",
+                -inside,
+                reach,
+            ),
+            Feature(
+                f"speed_{cell}",
+                f"velocity of what is {where} minus the own one, away from here; "
+                "the range where nothing is",
+                f"{scale:g} m/s",
+                -speed,
+                speed,
+            ),
+        ]
+    return found
+
+
+def shape(config: SensorsConfig) -> tuple[int, ...]:
+    """(cells, distance and speed)."""
+    return config.lidar_observation.cells, 2
+
+
+def reach_m(config: SensorsConfig) -> float:
+    """Its range, if it is on."""
+    lidar = config.lidar_observation
+    return lidar.maximum_range_m if lidar.cells else 0.0
+
+
+def settings(config: SensorsConfig, at: int) -> LidarCells:
+    """What the kernel takes."""
+    lidar = config.lidar_observation
+    return LidarCells(
+        at=at,
+        cells=lidar.cells,
+        range_m=lidar.maximum_range_m,
+        scale=_scale(config),
+        directions=cell_directions(lidar.cells),
+        echoes=np.zeros(lidar.cells, dtype=ECHO),
+    )
+
+
+def _scale(config: SensorsConfig) -> float:
+    lidar = config.lidar_observation
+    return lidar.maximum_range_m if lidar.normalize else 1.0

@@ -1,0 +1,95 @@
+"""highway-env's `OccupancyGrid`: layers of cells around the vehicle."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import DTypeLike, NDArray
+
+from cavmarl.config.env import SensorsConfig
+from cavmarl.config.sensors import OccupancyGridConfig
+from cavmarl.roads.network import RoadNetwork
+from cavmarl.sensors.kernels.sensor_arrays import OccupancyGrid
+from cavmarl.sensors.observed.feature import Feature
+from cavmarl.sensors.observed.highway import codes, range_table, vehicle_feature
+
+__all__ = ["dtype", "features", "reach_m", "settings", "shape"]
+
+_DEFAULT_RANGES = {"vx": (-80.0, 80.0), "vy": (-80.0, 80.0)}
+
+
+def features(config: SensorsConfig) -> list[Feature]:
+    """Layer by layer; in a layer column by column from west to east, in a column to the south."""
+    grid = config.occupancy_grid
+    columns, rows = grid.shape
+    ranges = grid.features_range or _DEFAULT_RANGES
+    found = []
+    for name in grid.features:
+        for column in range(columns):
+            for row in range(rows):
+                label = f"{name}_{column}_{row}"
+                subject = f"cell {column}, {row}"
+                if name == "on_road":
+                    feature = Feature(label, f"{subject}: 1 if a lane's middle is in it", "", 0.0)
+                else:
+                    feature = vehicle_feature(name, label, f"vehicle in {subject}", ranges, False)
+                found.append(_bounded(feature, grid))
+    return found
+
+
+def _bounded(feature: Feature, grid: OccupancyGridConfig) -> Feature:
+    """The feature with the bounds and the scale that clipping and images give it."""
+    if grid.as_image:
+        scale = f"255 is {feature.scale}" if feature.scale else "255 is 1"
+        return Feature(feature.name, feature.meaning, scale, 0.0, 255.0)
+    if grid.clip:
+        low, high = max(feature.low, -1.0), min(feature.high, 1.0)
+        return Feature(feature.name, feature.meaning, feature.scale, low, high)
+    return feature
+
+
+def shape(config: SensorsConfig) -> tuple[int, ...]:
+    """(layers, columns along x, rows along y)."""
+    return len(config.occupancy_grid.features), *config.occupancy_grid.shape
+
+
+def dtype(config: SensorsConfig) -> DTypeLike:
+    """Bytes for images."""
+    return np.uint8 if config.occupancy_grid.as_image else np.float32
+
+
+def reach_m(config: SensorsConfig) -> float:
+    """To the furthest corner, if it is on."""
+    grid = config.occupancy_grid
+    if not grid.features:
+        return 0.0
+    return math.hypot(*(max(abs(low), abs(high)) for low, high in grid.grid_size_m))
+
+
+def settings(
+    config: SensorsConfig, at: int, network: RoadNetwork, goals: NDArray[np.float64]
+) -> OccupancyGrid:
+    """What the kernel takes; `goals` are the places of `highway.goal_places`."""
+    grid = config.occupancy_grid
+    columns, rows = grid.shape
+    table = range_table(grid.features_range or _DEFAULT_RANGES)
+    return OccupancyGrid(
+        at=at,
+        features=codes(grid.features),
+        ranges=table,
+        min_x=grid.grid_size_m[0][0],
+        min_y=grid.grid_size_m[1][0],
+        step_x=grid.grid_step_m[0],
+        step_y=grid.grid_step_m[1],
+        num_x=columns,
+        num_y=rows,
+        radius_m=reach_m(config),
+        aligned=grid.align_to_vehicle_axes,
+        clip=grid.clip,
+        as_image=grid.as_image,
+        destinations=goals,
+        cell_body=np.zeros(columns * rows, dtype=np.int64),
+        lane_seen=np.zeros(len(network.lanes) + 1, dtype=np.int64),
+        values=np.zeros(len(table)),
+    )

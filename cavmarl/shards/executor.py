@@ -1,0 +1,58 @@
+"""How the phases of a tick reach the shards."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, Literal, Protocol
+
+from cavmarl.shards.shard import Shard
+from cavmarl.shards.shard_group import ShardGroup
+
+__all__ = ["Executor", "Phase", "SerialExecutor", "Together"]
+
+# What a tick is made of: a name and its arguments can be sent anywhere.
+Phase = Literal[
+    "begin_step",
+    "advance",
+    "choose_goals",
+    "leave",
+    "gather",
+    "resolve",
+    "rank_lanes",
+    "propose",
+    "admit",
+    "commit",
+    "detect",
+    "sense",
+    "credit",
+    "suggest",
+    "retire",
+    "forget",
+]
+
+
+class Executor(Protocol):
+    """Runs one phase on all shards and returns when all are through with it."""
+
+    def each(self, phase: Phase, *arguments: Any) -> None:
+        """Run the phase on every shard with the same arguments; see `ShardGroup`."""
+        ...
+
+
+class Together(Executor, Protocol):
+    """Several that run phases side by side; after some the first of them does not wait."""
+
+    def meet(self) -> None:
+        """Wait until all shards are through with the last phase."""
+        ...
+
+
+class SerialExecutor:
+    """Shards in the caller's process, all of them or some, as one group."""
+
+    def __init__(self, shards: Sequence[Shard]) -> None:
+        self._group = ShardGroup(shards)
+
+    def each(self, phase: Phase, *arguments: Any) -> None:
+        """Run the phase on every shard."""
+        self._group.each(phase, *arguments)

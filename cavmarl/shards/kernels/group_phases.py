@@ -1,0 +1,336 @@
+"""Phases of a tick in several zones of one process, each in one call.
+
+A call takes some sixty arrays from Python, which in a small zone takes longer than what is done
+with them. So the kernels of one zone are called from here, one zone after the other, with views of
+`Zoned`. What a zone does depends on its own rows alone, whoever is called with it.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cavmarl.core.math.neighbors import Grid
+from cavmarl.core.numba import inlined_kernel, kernel
+from cavmarl.core.records.arrays import (
+    Common,
+    Demand,
+    Gate,
+    LaneGrid,
+    Outputs,
+    RoadArrays,
+    Scratch,
+    Sensors,
+    Travel,
+    Worlds,
+    Zoned,
+)
+from cavmarl.core.records.codes import DRIVER_AGENT
+from cavmarl.roads.kernels.signal_phases import detect
+from cavmarl.sensors.kernels.output_reset import credit
+from cavmarl.sensors.kernels.sense import sense
+from cavmarl.shards.kernels.world_phases import advance, begin_step, resolve
+from cavmarl.traffic.kernels.admission import admit, propose, rank_lanes
+from cavmarl.traffic.kernels.demand_generator import choose_goals
+from cavmarl.traffic.kernels.leaving import drop_ghosts, leave
+from cavmarl.zones.kernels.ghost_exchange import gather
+from cavmarl.zones.kernels.zone_lookup import Halo, ZoneArrays
+
+__all__ = [
+    "FRAME",
+    "Members",
+    "admit_each",
+    "advance_each",
+    "begin_step_each",
+    "choose_goals_each",
+    "credit_each",
+    "detect_each",
+    "forget_each",
+    "gather_each",
+    "propose_each",
+    "rank_lanes_each",
+    "resolve_each",
+    "retire_each",
+    "sense_each",
+]
+
+FRAME = np.dtype(
+    [
+        ("min_x", np.float64),  # see `neighbors.Grid`
+        ("min_y", np.float64),
+        ("cells_per_m", np.float64),
+        ("num_x", np.int64),
+        ("num_y", np.int64),
+    ],
+    align=True,
+)
+
+
+class Members(NamedTuple):
+    """The zones that are called together."""
+
+    numbers: NDArray[np.int64]  # (n,) which ones, rising
+    frames: NDArray[np.void]  # FRAME (n,) of the spatial index of each
+    zones: ZoneArrays  # of the partition
+    halo: Halo
+    zoned: Zoned
+    common: Common
+
+
+@inlined_kernel
+def _worlds(members: Members, zone: int, side: int, next_side: int) -> Worlds:
+    """A zone's part of all worlds, its rows on one side and its next ones on another."""
+    zoned = members.zoned
+    common = members.common
+    return Worlds(
+        zoned.rows[side, zone],
+        zoned.rows[next_side, zone],
+        zoned.num_owned[zone],
+        zoned.num_rows[zone],
+        common.ticks,
+        common.keys,
+        common.signal_phase,
+        common.controllers,
+        common.detected_s,
+        zoned.num_through[zone],
+        common.pending,
+        zoned.num_near[zone],
+        zoned.num_touching[zone],
+        zoned.num_contacts[zone],
+        zoned.step[zone],
+        zoned.step_at[zone],
+        zoned.outer[zone],
+        zoned.num_outer[zone],
+        common.cues,
+    )
+
+
+@inlined_kernel
+def _grid(frame: np.void, room: Grid) -> Grid:
+    """A zone's spatial index, in the room of the largest one."""
+    cells = frame["num_x"] * frame["num_y"]
+    return Grid(
+        frame["min_x"],
+        frame["min_y"],
+        frame["cells_per_m"],
+        frame["num_x"],
+        frame["num_y"],
+        room.start[: cells + 1],
+        room.bodies,
+        room.cell,
+        room.largest,
+        room.newest[:cells],
+        room.spots,
+    )
+
+
+@kernel
+def advance_each(
+    members: Members,
+    side: int,
+    next_side: int,
+    roads: RoadArrays,
+    plans: NDArray[np.void],
+    travel: Travel,
+    lane_grid: LaneGrid,
+    scratch: Scratch,
+    commands: NDArray[np.float64],
+    discrete: bool,
+    accel_limit: float,
+    steering_limit: float,
+    dt: float,
+) -> int:
+    """`advance` in each zone, in place if the sides are the same; how many have arrived in all."""
+    arrived = 0
+    for zone in members.numbers:
+        arrived += advance(
+            roads,
+            plans,
+            travel,
+            lane_grid,
+            _worlds(members, zone, side, next_side),
+            members.halo.inner[zone],
+            scratch,
+            commands,
+            discrete,
+            accel_limit,
+            steering_limit,
+            dt,
+            side == next_side,
+        )
+    return arrived
+
+
+@kernel
+def gather_each(members: Members, side: int, touching_m: float, border_m: float) -> None:
+    """`gather` in each zone; who is called with it may run beside others."""
+    for w in range(members.common.ticks.size):
+        for zone in members.numbers:
+            gather(
+                members.zones,
+                members.halo,
+                touching_m,
+                border_m,
+                members.zoned,
+                side,
+                zone,
+                w,
+            )
+
+
+@kernel
+def resolve_each(members: Members, side: int, next_side: int, scratch: Scratch, room: Grid) -> None:
+    """`resolve` in each zone."""
+    for n in range(members.numbers.size):
+        worlds = _worlds(members, members.numbers[n], side, next_side)
+        resolve(worlds, scratch, _grid(members.frames[n], room))
+
+
+@kernel
+def begin_step_each(
+    members: Members,
+    side: int,
+    roads: RoadArrays,
+    discrete: bool,
+    meta_actions: NDArray[np.int64],
+    target_speeds: NDArray[np.float64],
+) -> None:
+    """`begin_step` in each zone."""
+    for zone in members.numbers:
+        worlds = _worlds(members, zone, side, side)
+        begin_step(roads, worlds, discrete, meta_actions, target_speeds)
+
+
+@kernel
+def detect_each(members: Members, side: int, roads: RoadArrays, dt: float) -> None:
+    """`detect` in each zone."""
+    for zone in members.numbers:
+        worlds = _worlds(members, zone, side, side)
+        detect(
+            roads.lane_place,
+            roads.places,
+            worlds.rows,
+            worlds.num_owned,
+            worlds.ticks,
+            dt,
+            worlds.detected_s,
+        )
+
+
+@kernel
+def sense_each(
+    members: Members,
+    side: int,
+    roads: RoadArrays,
+    plans: NDArray[np.void],
+    travel: Travel,
+    room: Grid,
+    sensors: Sensors,
+    tick_s: float,
+    ticks_per_step: int,
+    chosen: NDArray[np.bool_],
+    outputs: Outputs,
+) -> None:
+    """`sense` in each zone."""
+    for n in range(members.numbers.size):
+        worlds = _worlds(members, members.numbers[n], side, side)
+        grid = _grid(members.frames[n], room)
+        sense(
+            roads,
+            plans,
+            travel,
+            worlds,
+            grid,
+            sensors,
+            tick_s,
+            ticks_per_step,
+            chosen,
+            outputs,
+        )
+
+
+@kernel
+def credit_each(
+    members: Members, side: int, rewards: NDArray[np.float32], chosen: NDArray[np.bool_]
+) -> None:
+    """`credit` in each zone."""
+    for zone in members.numbers:
+        worlds = _worlds(members, zone, side, side)
+        credit(worlds.rows, worlds.num_owned, rewards, chosen)
+
+
+@kernel
+def choose_goals_each(
+    members: Members,
+    side: int,
+    next_side: int,
+    demand: Demand,
+    roads: RoadArrays,
+    travel: Travel,
+    num_goals: int,
+    gate: Gate,
+    dt: float,
+) -> None:
+    """`choose_goals` in each zone."""
+    for zone in members.numbers:
+        worlds = _worlds(members, zone, side, next_side)
+        choose_goals(demand, roads, travel, num_goals, gate, worlds, dt)
+
+
+@kernel
+def rank_lanes_each(
+    members: Members,
+    side: int,
+    next_side: int,
+    roads: RoadArrays,
+    travel: Travel,
+    gate: Gate,
+    scratch: Scratch,
+) -> None:
+    """`rank_lanes` in each zone."""
+    for zone in members.numbers:
+        worlds = _worlds(members, zone, side, next_side)
+        rank_lanes(roads, travel, members.zones, zone, gate, worlds, scratch)
+
+
+@kernel
+def propose_each(
+    members: Members,
+    side: int,
+    next_side: int,
+    demand: Demand,
+    roads: RoadArrays,
+    travel: Travel,
+    gate: Gate,
+    scratch: Scratch,
+) -> None:
+    """`propose` in each zone."""
+    for zone in members.numbers:
+        worlds = _worlds(members, zone, side, next_side)
+        propose(demand, roads, travel, members.zones, zone, gate, worlds, scratch)
+
+
+@kernel
+def admit_each(members: Members, side: int, next_side: int, gate: Gate) -> None:
+    """`admit` in each zone."""
+    for zone in members.numbers:
+        worlds = _worlds(members, zone, side, next_side)
+        admit(members.zones, members.halo, zone, gate, worlds)
+
+
+@kernel
+def retire_each(members: Members, side: int, gate: Gate, ticks_per_step: int) -> None:
+    """Let the agents of each zone whose trip has ended `leave`."""
+    for zone in members.numbers:
+        worlds = _worlds(members, zone, side, side)
+        leave(gate, worlds, worlds.rows, DRIVER_AGENT, ticks_per_step)
+
+
+@kernel
+def forget_each(members: Members, side: int, gate: Gate) -> None:
+    """`drop_ghosts` in each zone."""
+    for zone in members.numbers:
+        worlds = _worlds(members, zone, side, side)
+        drop_ghosts(gate, worlds, worlds.rows)

@@ -1,0 +1,353 @@
+"""The phases of one tick over many worlds: decide and move, find contacts, take out, let in.
+
+Drivers decide from the committed rows alone; then these become the next ones, one by one. No phase
+depends on the order of rows.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cavmarl.core.math.neighbors import Grid
+from cavmarl.core.math.scalars import clamp
+from cavmarl.core.numba import inlined_kernel, kernel
+from cavmarl.core.numba.prefetch import SOON, prefetch
+from cavmarl.core.records.arrays import LaneGrid, RoadArrays, Scratch, Travel, Worlds
+from cavmarl.core.records.codes import (
+    ACTION_FASTER,
+    ACTION_IDLE,
+    ACTION_LANE_LEFT,
+    ACTION_LANE_RIGHT,
+    ACTION_SLOWER,
+    DRIVER_AGENT,
+    DRIVER_BACKGROUND,
+    DRIVER_SCRIPTED,
+    EVENT_ARRIVED,
+    EVENT_COLLIDED,
+    EVENTS_THAT_END,
+)
+from cavmarl.core.records.rows import is_lost
+from cavmarl.driving.kernels.approach import register_links
+from cavmarl.driving.kernels.contacts import find_contacts
+from cavmarl.driving.kernels.drivers import decide
+from cavmarl.driving.kernels.highway_control import speed_control
+from cavmarl.driving.kernels.junctions import STOP_SIGN_S
+from cavmarl.driving.kernels.lane_choice import needed_change
+from cavmarl.driving.kernels.lane_index import index_lanes
+from cavmarl.driving.kernels.motion import move_agent, move_background
+from cavmarl.driving.kernels.scripted_rows import follow_script
+from cavmarl.driving.kernels.steering import nearest_speed, steer_to_lane, take_meta_action
+from cavmarl.driving.kernels.ways import own_step
+from cavmarl.zones.kernels.zone_lookup import is_inside, note_outer
+
+__all__ = ["advance", "begin_step", "resolve", "suggest"]
+
+
+@kernel
+def begin_step(
+    roads: RoadArrays,
+    worlds: Worlds,
+    discrete: bool,
+    meta_actions: NDArray[np.int64],
+    target_speeds: NDArray[np.float64],
+) -> None:
+    """Clear the accounts of the step and, with discrete actions, set the controllers' targets.
+
+    Args:
+        roads: the road arrays.
+        worlds: the rows of agents are written.
+        discrete: whether actions are meta-actions.
+        meta_actions: (W, A), ACTION_*; not read for continuous actions.
+        target_speeds: m/s, rising.
+    """
+    for w in range(worlds.ticks.shape[0]):
+        for i in range(worlds.num_owned[w]):
+            row = worlds.rows[w, i]
+            row["events"] = 0
+            row["step_to_go"] = row["to_go"]
+            row["step_jerk"] = 0.0
+            if discrete and row["driver"] == DRIVER_AGENT:
+                take_meta_action(roads, row, meta_actions[w, row["agent"]], target_speeds)
+
+
+@kernel
+def _any_driver(rows: NDArray[np.void], num: int, driver: int) -> bool:
+    for i in range(num):
+        if rows[i]["driver"] == driver:
+            return True
+    return False
+
+
+@kernel
+def _keep_order(owned: int, scratch: Scratch) -> None:
+    """The owned rows as they lie."""
+    for i in range(owned):
+        scratch.order[i] = i
+
+
+@kernel
+def _order_by_lane(roads: RoadArrays, rows: NDArray[np.void], owned: int, scratch: Scratch) -> None:
+    """The owned rows in the order of the index: neighbours on the road become so in memory."""
+    found = 0
+    for i in range(owned):
+        # Who follows a script may stand in many lists, or in none.
+        if rows[i]["driver"] == DRIVER_SCRIPTED or is_lost(rows[i]):
+            scratch.order[found] = i
+            found += 1
+    for k in range(scratch.lane_start[roads.lanes.shape[0]]):
+        entry = scratch.entries[k]
+        if not entry["side"] and entry["row"] < owned:
+            scratch.order[found] = entry["row"]
+            found += 1
+
+
+@inlined_kernel
+def _delay(
+    pending: NDArray[np.float64], w: int, agent: int, tick: int, throttle: float, steering: float
+) -> tuple[float, float]:
+    """Put an agent's command behind those that wait, and take out the one that is due."""
+    slots = pending.shape[2]
+    last = (tick + slots - 1) % slots
+    pending[w, agent, last, 0] = throttle
+    pending[w, agent, last, 1] = steering
+    due = tick % slots
+    return pending[w, agent, due, 0], pending[w, agent, due, 1]
+
+
+@inlined_kernel
+def _drive_agent(
+    roads: RoadArrays,
+    plans: NDArray[np.void],
+    travel: Travel,
+    lane_grid: LaneGrid,
+    worlds: Worlds,
+    w: int,
+    row: np.void,
+    commands: NDArray[np.float64],
+    discrete: bool,
+    accel_limit: float,
+    steering_limit: float,
+    dt: float,
+) -> None:
+    """Move an agent's vehicle by its command or by the controllers, unless its trip is over."""
+    if row["events"] & EVENTS_THAT_END:
+        row["tick"] += 1
+        return
+    throttle = commands[w, row["agent"], 0]
+    steering = commands[w, row["agent"], 1]
+    if discrete:
+        throttle = speed_control(row["speed"], row["target_speed"])
+        steering = steer_to_lane(roads, plans, row, row["target_lane"])
+    throttle = clamp(throttle, -accel_limit, accel_limit)
+    steering = clamp(steering, -steering_limit, steering_limit)
+    throttle, steering = _delay(
+        worlds.pending, w, row["agent"], worlds.ticks[w], throttle, steering
+    )
+    move_agent(roads, plans, lane_grid, row, throttle, steering, worlds.signal_phase[w], dt)
+    # The indicator is automatic: drivers behind make room for who has to change lanes.
+    row["blinker"] = needed_change(roads, travel, row, travel.steps[own_step(roads, row)])
+
+
+@kernel
+def advance(
+    roads: RoadArrays,
+    plans: NDArray[np.void],
+    travel: Travel,
+    lane_grid: LaneGrid,
+    worlds: Worlds,
+    inner: NDArray[np.float64],
+    scratch: Scratch,
+    commands: NDArray[np.float64],
+    discrete: bool,
+    accel_limit: float,
+    steering_limit: float,
+    dt: float,
+    in_place: bool,
+) -> int:
+    """Decide all controls from the committed rows, then move every owned row into `next_rows`.
+
+    Args:
+        roads: the road arrays.
+        plans: PLAN (G, L).
+        travel: types and ways.
+        lane_grid: which lanes lie near a place.
+        worlds: next_rows is written.
+        inner: the part of the zone that no other one sees; see `Halo`.
+        scratch: room.
+        commands: (W, A, 2) throttle in m/s² and steering in rad of continuous actions.
+        discrete: whether agents are driven by the controllers instead.
+        accel_limit: m/s², of the agents' throttle.
+        steering_limit: rad, of the agents' front wheels.
+        dt: seconds of the tick.
+        in_place: whether `next_rows` is `rows`; if not, rows are put in the order of the lanes.
+
+    Returns:
+        how many background vehicles have arrived, in all worlds.
+    """
+    arrived = 0
+    for w in range(worlds.ticks.shape[0]):
+        rows = worlds.rows[w]
+        step = worlds.step[w]
+        owned = worlds.num_owned[w]
+        drivers = _any_driver(rows, owned, DRIVER_BACKGROUND)
+        if drivers:
+            phase = worlds.signal_phase[w]
+            index_lanes(roads, travel, rows, worlds.num_rows[w], scratch)
+            register_links(
+                roads, travel, rows, worlds.num_rows[w], step, worlds.step_at[w], scratch
+            )
+            decide(
+                roads,
+                travel,
+                rows,
+                owned,
+                DRIVER_BACKGROUND,
+                worlds.ticks[w],
+                dt,
+                phase,
+                step,
+                scratch,
+            )
+        if drivers and not in_place:
+            _order_by_lane(roads, rows, owned, scratch)
+        else:
+            _keep_order(owned, scratch)
+        through = 0
+        outer = 0
+        touching = 0
+        for k in range(owned):
+            if k + SOON < owned:  # a place on a lane is found among its points
+                prefetch(roads.lanes, rows[scratch.order[k + SOON]]["lane"], 0)
+                near = roads.lanes[rows[scratch.order[k + SOON // 2]]["lane"]]
+                prefetch(roads.points, near["first_point"], 0)
+                prefetch(roads.points, near["first_point"], 1)
+            i = scratch.order[k]
+            if not in_place:
+                worlds.next_rows[w, k] = rows[i]
+            row = worlds.next_rows[w, k]
+            touching += row["hit"] >= 0
+            if row["driver"] == DRIVER_BACKGROUND:
+                row["events"] = 0
+                row["hold"] = scratch.hold[i]
+                row["blinker"] = scratch.blinker[i]
+                if scratch.link_ahead[i] >= 0 and row["wait_s"] >= STOP_SIGN_S:
+                    row["stopped_at"] = scratch.link_ahead[i]
+                accel, change = scratch.accel[i], scratch.lane_change[i]
+                move_background(roads, travel, row, step[i], accel, change, dt)
+                through += row["events"] & EVENT_ARRIVED
+            elif row["driver"] == DRIVER_SCRIPTED:
+                row["events"] = 0
+                follow_script(roads, travel, worlds.cues[w], row, dt)
+            elif row["driver"] == DRIVER_AGENT:
+                _drive_agent(
+                    roads,
+                    plans,
+                    travel,
+                    lane_grid,
+                    worlds,
+                    w,
+                    row,
+                    commands,
+                    discrete,
+                    accel_limit,
+                    steering_limit,
+                    dt,
+                )
+            if not is_inside(inner, row["x"], row["y"]):
+                note_outer(worlds.outer[w, outer], row, k)
+                outer += 1
+        worlds.num_outer[w] = outer
+        worlds.num_through[w] = through
+        worlds.num_touching[w] = touching
+        arrived += through
+    return arrived
+
+
+@kernel
+def resolve(worlds: Worlds, scratch: Scratch, grid: Grid) -> None:
+    """Mark in `next_rows` who touches whom.
+
+    Args:
+        worlds: events and hit of the owned next_rows are written; num_contacts rises by one for
+            each vehicle when it begins to touch another.
+        scratch: room.
+        grid: spatial index over the vehicles of one world, filled here as far as it is needed.
+    """
+    for w in range(worlds.ticks.shape[0]):
+        rows = worlds.next_rows[w]
+        touch = find_contacts(rows, worlds.num_near[w], grid, scratch.hit)
+        if not touch and worlds.num_touching[w] == 0:
+            continue
+        for i in range(worlds.num_owned[w]):
+            row = rows[i]
+            other = scratch.hit[i]
+            if other >= 0:
+                if row["hit"] < 0:
+                    worlds.num_contacts[w] += 1
+                row["events"] |= EVENT_COLLIDED
+            row["hit"] = other
+
+
+@kernel
+def suggest(
+    roads: RoadArrays,
+    plans: NDArray[np.void],
+    travel: Travel,
+    worlds: Worlds,
+    scratch: Scratch,
+    discrete: bool,
+    target_speeds: NDArray[np.float64],
+    lookahead_s: float,
+    dt: float,
+    out: NDArray[np.float64],
+) -> None:
+    """What the built-in driver would do in the agents' place.
+
+    Args:
+        roads: the road arrays.
+        plans: PLAN (G, L).
+        travel: types and ways.
+        worlds: not written.
+        scratch: room.
+        discrete: whether to answer with meta-actions.
+        target_speeds: m/s, rising; discrete only.
+        lookahead_s: horizon in which a target speed is to be reached; discrete only.
+        dt: seconds of a tick.
+        out: (W, A, 2): throttle in m/s² and steering in rad, or the meta-action in [..., 0]. Rows
+            of absent agents are left as they are.
+    """
+    for w in range(worlds.ticks.shape[0]):
+        rows = worlds.rows[w]
+        owned = worlds.num_owned[w]
+        phase = worlds.signal_phase[w]
+        index_lanes(roads, travel, rows, worlds.num_rows[w], scratch)
+        step = worlds.step[w]
+        register_links(roads, travel, rows, worlds.num_rows[w], step, worlds.step_at[w], scratch)
+        decide(roads, travel, rows, owned, DRIVER_AGENT, worlds.ticks[w], dt, phase, step, scratch)
+        for i in range(owned):
+            row = rows[i]
+            if row["driver"] != DRIVER_AGENT:
+                continue
+            agent = row["agent"]
+            lane = roads.lanes[row["lane"]]
+            target = row["lane"]
+            change = scratch.lane_change[i]
+            if change > 0:
+                target = lane["left"]
+            elif change < 0:
+                target = lane["right"]
+            out[w, agent, 0] = scratch.accel[i]
+            out[w, agent, 1] = steer_to_lane(roads, plans, row, target)
+            if discrete:
+                wanted = nearest_speed(
+                    target_speeds, max(row["speed"] + scratch.accel[i] * lookahead_s, 0.0)
+                )
+                present = nearest_speed(target_speeds, row["target_speed"])
+                out[w, agent, 0] = ACTION_IDLE
+                if wanted > present:
+                    out[w, agent, 0] = ACTION_FASTER
+                elif wanted < present:
+                    out[w, agent, 0] = ACTION_SLOWER
+                elif change != 0:
+                    out[w, agent, 0] = ACTION_LANE_LEFT if change > 0 else ACTION_LANE_RIGHT

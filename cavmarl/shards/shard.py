@@ -1,0 +1,338 @@
+"""`Shard`: the running sub-worlds of one zone, W of them side by side.
+
+It owns the arrays of its vehicles and knows its part of the map, its sensors and its terms, and
+neither the coordinator nor another shard. Its ticks are run by a `ShardGroup`, alone or with others
+of its process.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cavmarl.config.env import EnvConfig
+from cavmarl.core.huge_pages import huge_zeros
+from cavmarl.core.math.buckets import make_lists
+from cavmarl.core.math.neighbors import make_grid
+from cavmarl.core.memory import Zeros
+from cavmarl.core.numba.repeated import repeated
+from cavmarl.core.records.arrays import (
+    Common,
+    Gate,
+    LaneGrid,
+    Outputs,
+    RoadArrays,
+    Scratch,
+    Travel,
+    Worlds,
+    Zoned,
+)
+from cavmarl.core.records.codes import DRIVER_BACKGROUND, DRIVER_SUMO
+from cavmarl.driving.controllers import CONTROLLER
+from cavmarl.driving.kernels.approach import APPROACH
+from cavmarl.driving.kernels.lane_index import ENTRY
+from cavmarl.driving.vehicles import VEHICLE
+from cavmarl.roads.network import RoadNetwork
+from cavmarl.roads.routing import PLAN, lane_grid
+from cavmarl.sensors.kernels.observe_optional import observe_further
+from cavmarl.sensors.kernels.observing_messages import observe_messages
+from cavmarl.sensors.kernels.stacking import fill_stacks
+from cavmarl.sensors.observed import further_arrays, layout, sensor_arrays
+from cavmarl.shards.kernels.world_phases import suggest
+from cavmarl.traffic.kernels.leaving import leave
+from cavmarl.v2x.kernels.v2x_records import Mail
+from cavmarl.zones.kernels.zone_lookup import OUTER, Halo, ZoneArrays
+
+__all__ = ["Commands", "Shard", "make_worlds", "make_zoned"]
+
+CELL_M = 25.0  # of the spatial index over vehicles
+COMMON = Common._fields
+TICKS_IN_ORDER = 32  # for so long rows that have been put in the order of the lanes nearly stay so
+SUGGESTED_HORIZON_S = 1.0  # in which a suggested target speed is to be reached
+
+
+@dataclass(frozen=True)
+class Commands:
+    """Decoded actions of one step.
+
+    Attributes:
+        controls: (W, A, 2) throttle in m/s² and steering in rad; continuous actions.
+        meta_actions: (W, A) ACTION_* codes; discrete actions.
+        declared: (W, A) CAUSE_* of events that agents tell others of, 0: none; (0, 0): nobody does.
+    """
+
+    controls: NDArray[np.float64]
+    meta_actions: NDArray[np.int64]
+    declared: NDArray[np.int32] = field(default_factory=lambda: np.zeros((0, 0), np.int32))
+
+
+class Shard:
+    """The sub-worlds of one zone.
+
+    Args:
+        config: the environment.
+        network: the roads.
+        plans: PLAN (G, L), the ways of agents.
+        travel: types and ways.
+        zoned: the rows of all zones.
+        outputs: where the agents of all shards get what they sense, each at its own index.
+        zone: which one.
+        zones: of the partition.
+        halo: how far it sees over its borders.
+        first: the first shard of this process, whose clock, keys, signals and room to work in this
+            one shares; None: this is it.
+        zeros: makes what all zones have in common.
+
+    Attributes:
+        worlds: what it has.
+        sides: VEHICLE (W, C), the two memories that rows are kept in by turns.
+        side: in which of them the committed rows are.
+        next_side: where the next ones come; the same, but in ticks that put rows in order.
+        mail: what agents have been told over the air; None: nobody says anything.
+    """
+
+    def __init__(
+        self,
+        config: EnvConfig,
+        network: RoadNetwork,
+        plans: NDArray[np.void],
+        travel: Travel,
+        zoned: Zoned,
+        outputs: Outputs,
+        zone: int,
+        zones: ZoneArrays,
+        halo: Halo,
+        first: Shard | None = None,
+        zeros: Zeros = np.zeros,
+    ) -> None:
+        self.zone = zone
+        self.zoned = zoned
+        self.config = config
+        self.roads: RoadArrays = network.arrays
+        self.plans = plans
+        self.travel = travel
+        self.lane_grid: LaneGrid = lane_grid(network)
+        self.sensors = sensor_arrays(config.sensors)
+        self._further = further_arrays(config.sensors, network, plans)
+        num_worlds, capacity = zoned.rows.shape[2:]
+        self._extent_m = network.extent_m
+        self.cut(zones, halo)
+        # One after the other works in it: what the last one has left is still near in memory.
+        self.scratch: Scratch = (
+            _make_scratch(len(network.lanes), len(network.links), capacity, travel.scripts.room)
+            if first is None
+            else first.scratch
+        )
+        self.worlds: Worlds = make_worlds(
+            num_worlds,
+            capacity,
+            network,
+            config.population.num_ids,
+            config.clock.control_latency_ticks,
+            zoned,
+            zone,
+            None if first is None else first.worlds,
+            zeros,
+            len(travel.scripts.cues),
+        )
+        self.sides = (self.worlds.rows, zoned.rows[1, zone])
+        self.side = self.next_side = 0
+        self.outputs = outputs
+        self.mail: Mail | None = None
+        self._messages_at = layout(config.sensors).get("messages")
+        self.target_speeds = np.array(config.action.target_speeds_mps)
+        self.discrete = config.action.kind == "discrete"
+        self._call_leave = repeated(leave)
+        self._call_observe_further = repeated(observe_further)
+        self._call_observe_messages = repeated(observe_messages)
+        self._call_fill_stacks = repeated(fill_stacks)
+
+    def cut(self, zones: ZoneArrays, halo: Halo) -> None:
+        """Say where its zone and the others are; a group has to be made anew after it."""
+        self.zones = zones
+        self.halo = halo
+        seen = _seen(self._extent_m, zones, self.zone, halo.halo_m)
+        self.grid = make_grid(seen, CELL_M, self.zoned.rows.shape[3])
+
+    def turn(self) -> None:
+        """Let the next rows be on the other side, for a tick that puts rows in order."""
+        self.face(self.side, 1 - self.side)
+
+    def leave(self, gate: Gate) -> None:
+        """Hand the background vehicles of `next_rows` that have arrived to the gate."""
+        if not self.worlds.num_through.any():
+            return
+        self._call_leave(gate, self.worlds, self.worlds.next_rows, DRIVER_BACKGROUND, 1)
+
+    def dismiss(self, gate: Gate) -> None:
+        """Hand SUMO's vehicles of `next_rows` that it has no more to the gate."""
+        self._call_leave(gate, self.worlds, self.worlds.next_rows, DRIVER_SUMO, 0)
+
+    def commit(self) -> None:
+        """Make the next rows the committed state."""
+        self.face(self.next_side, self.next_side)
+
+    def align(self) -> None:
+        """Keep the rows on the first side, wherever a tick that is given up has them."""
+        self.face(0, 0)
+
+    def face(self, side: int, next_side: int) -> None:
+        """Say on which side the rows are, and the next ones."""
+        self.side, self.next_side = side, next_side
+        self.worlds = self.worlds._replace(rows=self.sides[side], next_rows=self.sides[next_side])
+
+    def complete_observations(self, chosen: NDArray[np.bool_]) -> None:
+        """Write what `sense` has left: messages, sensors of other projects, and earlier frames."""
+        observations, stack = self.outputs.observations, self.config.sensors.stack
+        if self._further is not None:
+            self._call_observe_further(
+                self.roads,
+                self.lane_grid,
+                self.worlds,
+                self.grid,
+                self._further,
+                stack,
+                chosen,
+                observations,
+            )
+        if self.mail is not None and self._messages_at is not None:
+            messages = self.config.sensors.messages
+            self._call_observe_messages(
+                self.roads, self.plans, self.worlds, self.mail, self._messages_at.start,
+                messages.objects, messages.events, messages.signal, messages.range_m,
+                self.config.clock.sim_dt_s, stack, chosen, observations,
+            )  # fmt: skip
+        if stack > 1:
+            ticks_per_step = self.config.clock.ticks_per_step
+            self._call_fill_stacks(self.worlds, ticks_per_step, stack, chosen, observations)
+
+    def suggest(self, out: NDArray[np.float64]) -> None:
+        """Write what the built-in driver would do in the agents' place into `out` (W, A, 2)."""
+        suggest(
+            self.roads,
+            self.plans,
+            self.travel,
+            self.worlds,
+            self.scratch,
+            self.discrete,
+            self.target_speeds,
+            SUGGESTED_HORIZON_S,
+            self.config.clock.sim_dt_s,
+            out,
+        )
+
+
+def make_worlds(
+    num_worlds: int,
+    capacity: int,
+    network: RoadNetwork,
+    num_agents: int = 0,
+    latency_ticks: int = 0,
+    zoned: Zoned | None = None,
+    zone: int = 0,
+    common: Worlds | None = None,
+    zeros: Zeros = np.zeros,
+    num_cues: int = 0,
+) -> Worlds:
+    """Arrays of W worlds that hold `capacity` vehicles each, all of them empty.
+
+    Agents' commands take effect `latency_ticks` later, scripts wait for `num_cues` cues. The rows
+    are those of a zone of `zoned`, if it is given. What all zones of a world have in common (ticks,
+    keys, signals, what detectors saw, cues) are the arrays of `common`, if it is given; if not,
+    `zeros` makes them.
+    """
+    if zoned is None:
+        zoned = make_zoned(1, num_worlds, capacity)
+    rows = zoned.rows[0, zone]
+    worlds = Worlds(
+        rows=rows,
+        next_rows=rows,
+        num_owned=zoned.num_owned[zone],
+        num_rows=zoned.num_rows[zone],
+        ticks=zeros(num_worlds, dtype=np.int64),
+        keys=zeros(num_worlds, dtype=np.uint64),
+        signal_phase=zeros((num_worlds, len(network.signals)), dtype=np.int32),
+        controllers=zeros((num_worlds, network.num_controllers), dtype=CONTROLLER),
+        detected_s=zeros((num_worlds, len(network.detectors)), dtype=np.float64),
+        num_through=zoned.num_through[zone],
+        pending=zeros((num_worlds, num_agents, latency_ticks + 1, 2)),
+        num_near=zoned.num_near[zone],
+        num_touching=zoned.num_touching[zone],
+        num_contacts=zoned.num_contacts[zone],
+        step=zoned.step[zone],
+        step_at=zoned.step_at[zone],
+        outer=zoned.outer[zone],
+        num_outer=zoned.num_outer[zone],
+        cues=zeros((num_worlds, num_cues), dtype=np.int64),
+    )
+    if common is None:
+        return worlds
+    return worlds._replace(**{name: getattr(common, name) for name in COMMON})
+
+
+def make_zoned(num_zones: int, num_worlds: int, capacity: int, zeros: Zeros = np.zeros) -> Zoned:
+    """Room for the rows of k zones of W worlds that hold `capacity` vehicles each."""
+    # Memory that is never written is never taken.
+    numbers = zeros((8, num_zones, num_worlds), dtype=np.int64)
+    numbers[7] = -1
+    everybody = (num_zones, num_worlds, capacity)
+    return Zoned(
+        rows=zeros((2, *everybody), dtype=VEHICLE),
+        num_owned=numbers[0],
+        num_rows=numbers[1],
+        num_near=numbers[2],
+        num_through=numbers[3],
+        num_touching=numbers[4],
+        num_contacts=numbers[5],
+        step=zeros(everybody, dtype=PLAN),
+        step_at=zeros(everybody, dtype=np.int64),
+        outer=zeros(everybody, dtype=OUTER),
+        num_outer=numbers[7],
+        border=zeros(everybody, dtype=np.int32),
+        num_border=numbers[6],
+        spare=np.zeros(1, dtype=VEHICLE),
+    )
+
+
+def _seen(
+    extent_m: tuple[float, float, float, float], zones: ZoneArrays, zone: int, halo_m: float
+) -> tuple[float, float, float, float]:
+    """The part of the map where a zone has vehicles or ghosts."""
+    min_x, min_y, max_x, max_y = extent_m
+    left, low, right, high = zones.rects[zone].tolist()
+    return (
+        max(min_x, left - halo_m),
+        max(min_y, low - halo_m),
+        min(max_x, right + halo_m),
+        min(max_y, high + halo_m),
+    )
+
+
+def _make_scratch(num_lanes: int, num_links: int, capacity: int, covers: int = 0) -> Scratch:
+    def integers(size: int) -> NDArray[np.int32]:
+        return huge_zeros(size, dtype=np.int32)
+
+    def floats(size: int) -> NDArray[np.float64]:
+        return huge_zeros(size, dtype=np.float64)
+
+    lanes, links = make_lists(num_lanes + 1, huge_zeros), make_lists(num_links, huge_zeros)
+    return Scratch(
+        lanes=lanes,
+        lane_start=lanes.bounds[:, 0],
+        lane_end=lanes.bounds[:, 1],
+        entries=huge_zeros(2 * capacity + covers, dtype=ENTRY),
+        links=links,
+        link_start=links.bounds[:, 0],
+        link_end=links.bounds[:, 1],
+        approach=huge_zeros(3 * capacity, dtype=APPROACH),
+        pairs=huge_zeros(3 * capacity, dtype=APPROACH),
+        order=integers(capacity),
+        accel=floats(capacity),
+        link_ahead=integers(capacity),
+        lane_change=integers(capacity),
+        blinker=integers(capacity),
+        hold=integers(capacity),
+        hit=huge_zeros(capacity, dtype=np.int64),
+    )

@@ -1,0 +1,223 @@
+"""`ShardGroup`: the shards of one process, which runs each phase of a tick on all of them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cavmarl.core.numba.repeated import repeated
+from cavmarl.core.records.arrays import Common, Demand, Gate
+from cavmarl.shards.kernels.group_phases import (
+    FRAME,
+    Members,
+    admit_each,
+    advance_each,
+    begin_step_each,
+    choose_goals_each,
+    credit_each,
+    detect_each,
+    forget_each,
+    gather_each,
+    propose_each,
+    rank_lanes_each,
+    resolve_each,
+    retire_each,
+    sense_each,
+)
+from cavmarl.shards.shard import TICKS_IN_ORDER, Commands, Shard
+
+__all__ = ["ShardGroup"]
+
+
+class ShardGroup:
+    """Runs the phases of some shards, whichever they are: one, those of a worker, or all.
+
+    Phases that every tick has are one call for all shards, with what does not change put together
+    once. Others, and those which have nothing to do in most ticks, go from shard to shard.
+
+    Args:
+        shards: of one process, by rising zones; they share clock and room.
+    """
+
+    def __init__(self, shards: Sequence[Shard]) -> None:
+        self._shards = tuple(shards)
+        first = shards[0]
+        self._first = first
+        self._config = first.config
+        self._roads = first.roads
+        self._travel = first.travel
+        self._scratch = first.scratch
+        grids = [shard.grid for shard in shards]
+        self._room = max(grids, key=lambda grid: grid.newest.size)
+        frames = [tuple(getattr(grid, name) for name in FRAME.names or ()) for grid in grids]
+        self._members = Members(
+            np.array([shard.zone for shard in shards]),
+            np.array(frames, dtype=FRAME),
+            first.zones,
+            first.halo,
+            first.zoned,
+            Common(*(getattr(first.worlds, name) for name in Common._fields)),
+        )
+        self._controls = np.zeros_like(first.worlds.pending[:, :, 0])
+        self._advance = repeated(advance_each)
+        self._gather = repeated(gather_each)
+        self._resolve = repeated(resolve_each)
+        self._choose_goals = repeated(choose_goals_each)
+        self._rank_lanes = repeated(rank_lanes_each)
+        self._propose = repeated(propose_each)
+        self._admit = repeated(admit_each)
+        self._meta_actions = np.zeros(self._controls.shape[:2], dtype=np.int64)
+        self._begin_step = repeated(begin_step_each)
+        self._detect = repeated(detect_each)
+        self._sense = repeated(sense_each)
+        self._credit = repeated(credit_each)
+        self._retire = repeated(retire_each)
+        self._forget = repeated(forget_each)
+
+    @property
+    def sides(self) -> tuple[int, int]:
+        """Where the rows are, and the next ones."""
+        return self._first.side, self._first.next_side
+
+    def each(self, phase: str, *arguments: Any) -> None:
+        """Run a phase on every shard: a method of this class or of `Shard`, by its name."""
+        together = getattr(self, phase, None)
+        if together is not None:
+            together(*arguments)
+            return
+        for shard in self._shards:
+            getattr(shard, phase)(*arguments)
+
+    def begin_step(self, commands: Commands) -> None:
+        """Open the accounts of a step and take its meta-actions."""
+        if self._config.population.agents == 0:
+            return
+        first = self._first
+        np.copyto(self._meta_actions, commands.meta_actions)
+        self._begin_step(
+            self._members, first.side, self._roads,
+            first.discrete, self._meta_actions, first.target_speeds,
+        )  # fmt: skip
+
+    def advance(self, commands: Commands) -> None:
+        """Decide every control from the committed rows and move the owned ones into next ones."""
+        self.turn()
+        self.move(commands)
+
+    def turn(self) -> None:
+        """Let the next rows be on the other side, in a tick that puts rows in order."""
+        # Where a host may die alone, a store keeps tick t whole (docs/ownership.md).
+        if self._first.worlds.ticks[0] % TICKS_IN_ORDER == 0:
+            for shard in self._shards:
+                shard.turn()
+
+    def face(self, side: int, next_side: int) -> None:
+        """Say on which side the rows are, and the next ones."""
+        if self.sides != (side, next_side):
+            for shard in self._shards:
+                shard.face(side, next_side)
+
+    def move(self, commands: Commands) -> None:
+        """`advance`, where the rows' sides are known."""
+        first, action = self._first, self._config.action
+        if self._controls.size:
+            np.copyto(self._controls, commands.controls)
+        self._advance(
+            self._members,
+            first.side,
+            first.next_side,
+            self._roads,
+            first.plans,
+            self._travel,
+            first.lane_grid,
+            self._scratch,
+            self._controls,
+            action.kind == "discrete",
+            action.acceleration_mps2,
+            action.steering_rad,
+            self._config.clock.sim_dt_s,
+        )
+
+    def gather(self, touching_m: float, border_m: float) -> None:
+        """Renew the ghosts of the next rows, as `kernels.exchange.gather` says."""
+        self._gather(self._members, self._first.next_side, touching_m, border_m)
+
+    def resolve(self) -> None:
+        """Find who touches whom in the next rows."""
+        first = self._first
+        self._resolve(self._members, first.side, first.next_side, self._scratch, self._room)
+
+    def choose_goals(self, demand: Demand, num_goals: int, gate: Gate) -> None:
+        """Give the vehicles of the next rows that need it another goal."""
+        first, dt = self._first, self._config.clock.sim_dt_s
+        self._choose_goals(
+            self._members, first.side, first.next_side,
+            demand, self._roads, self._travel, num_goals, gate, dt,
+        )  # fmt: skip
+
+    def leave(self, gate: Gate) -> None:
+        """Hand the background vehicles of the next rows that have arrived to the gate."""
+        if not any(map(any, self._first.zoned.num_through.tolist())):
+            return
+        for shard in self._shards:
+            shard.leave(gate)
+
+    def rank_lanes(self, gate: Gate) -> None:
+        """Count who is around the places of these zones where departures may enter."""
+        first = self._first
+        self._rank_lanes(
+            self._members, first.side, first.next_side,
+            self._roads, self._travel, gate, self._scratch,
+        )  # fmt: skip
+
+    def propose(self, demand: Demand, gate: Gate) -> None:
+        """Tell the gate which departures find a safe gap in these zones."""
+        first = self._first
+        self._propose(
+            self._members, first.side, first.next_side,
+            demand, self._roads, self._travel, gate, self._scratch,
+        )  # fmt: skip
+
+    def admit(self, gate: Gate) -> None:
+        """Take in those whom the gate has accepted, as owned or as ghosts."""
+        first = self._first
+        self._admit(self._members, first.side, first.next_side, gate)
+
+    def commit(self) -> None:
+        """Make the next rows the committed state."""
+        if self._first.next_side != self._first.side:
+            for shard in self._shards:
+                shard.commit()
+
+    def detect(self) -> None:
+        """Note when owned bodies were over the detectors of actuated signals."""
+        if self._first.worlds.controllers.shape[1] == 0:
+            return
+        self._detect(self._members, self._first.side, self._roads, self._config.clock.sim_dt_s)
+
+    def sense(self, chosen: NDArray[np.bool_]) -> None:
+        """Write observations and terms of the chosen worlds' owned agents into the outputs."""
+        first, clock = self._first, self._config.clock
+        self._sense(
+            self._members, first.side, self._roads, first.plans, self._travel, self._room,
+            first.sensors, clock.sim_dt_s, clock.ticks_per_step, chosen, first.outputs,
+        )  # fmt: skip
+        for shard in self._shards:
+            shard.complete_observations(chosen)
+
+    def credit(self, chosen: NDArray[np.bool_]) -> None:
+        """Add the step's rewards to the episode's of the chosen worlds' owned agents."""
+        first = self._first
+        self._credit(self._members, first.side, first.outputs.rewards, chosen)
+
+    def retire(self, gate: Gate) -> None:
+        """Hand the agents' vehicles of the committed rows whose trip has ended to the gate."""
+        ticks = self._config.clock.ticks_per_step
+        self._retire(self._members, self._first.side, gate, ticks)
+
+    def forget(self, gate: Gate) -> None:
+        """Drop the ghosts of those who have been retired."""
+        self._forget(self._members, self._first.side, gate)

@@ -1,0 +1,242 @@
+"""`TransferCodec`: the state of one vehicle as bytes, whole: who unpacks it goes on bit for bit.
+
+    4 bytes  "CVMV"      2 × 2 bytes  version, major and minor
+    8 bytes  tick of the state          8 bytes  the vehicle's id
+    8 bytes  digest of the record's layout
+    3 × 4 bytes  lengths of what follows: the record, its agent's delayed commands, the frames that
+                 its agent's next observation repeats; the last two are 0 without an agent
+
+All is little-endian. The map, the types of vehicles and the table of ways are the same wherever a
+world is run, so the record names their rows; readings of sensors are made anew.
+
+A record is understood by those alone who have the same fields at the same places: its layout has a
+digest, and a change of it is a new major version (`RECORD_VERSION`). A minor version may put more
+behind the frames, nothing that a next tick reads: who does not know it skips it, who misses it does
+without. So every minor version reads every other.
+"""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Mapping
+from hashlib import blake2b
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cavmarl.core.errors import (
+    ForeignTransferError,
+    TransferError,
+    TransferLayoutError,
+    TransferVersionError,
+    TruncatedTransferError,
+)
+from cavmarl.core.records.arrays import Outputs, Worlds
+from cavmarl.core.records.codes import AUTHORITATIVE
+from cavmarl.driving.vehicles import RECORD_VERSION
+
+__all__ = ["GROUPS", "MAGIC", "MINOR_VERSION", "TransferCodec", "TransferHeader", "layout_text"]
+
+MAGIC = b"CVMV"
+MINOR_VERSION = 0
+
+# The groups of the contract of a transfer, and the fields of VEHICLE that each consists of.
+GROUPS: dict[str, tuple[str, ...]] = {
+    group: tuple(fields.split())
+    for group, fields in {
+        "identity and ownership": "id agent order owner source_zone target_zone epoch",
+        "kinematics": "x y z heading pitch speed accel yaw_rate jerk",
+        "control and route": "throttle steering target_speed target_lane blinker "
+        "lane side_lane s d link goal way leg stop stops_end to_go",
+        "actor configuration": "driver vtype length width height sensor_phase",
+        "synchronization": "tick departed transfer",
+        "agent logic": "rng_key speed_factor hold wait_s stopped_at stopped_s last_change hit "
+        "events step_to_go step_jerk distance_m free_s episode_return memory",
+    }.items()
+}
+
+_HEADER = struct.Struct("<4sHHqq8sIII")
+_LONG = struct.Struct("<q")
+_INT = struct.Struct("<i")
+
+
+class TransferHeader(NamedTuple):
+    """What stands before a state; lengths are in bytes."""
+
+    magic: bytes
+    major: int
+    minor: int
+    tick: int
+    vehicle: int
+    layout: bytes
+    record: int
+    commands: int
+    frames: int
+
+
+class TransferCodec:
+    """Packs and unpacks the vehicles of one set of worlds.
+
+    Args:
+        record: dtype of a vehicle's record.
+        commands: (W, A, …) float64, the delayed commands of agents: `Worlds.pending`.
+        frames: (W, A, F) float32, what the next observation of an agent takes from the last one.
+
+    Attributes:
+        schema: a number in [0, 2^63) that is the same where the other's states can be unpacked.
+
+    Raises:
+        TransferLayoutError: the record has padding, whose bytes nobody sets.
+    """
+
+    def __init__(
+        self,
+        record: np.dtype[np.void],
+        commands: NDArray[np.float64],
+        frames: NDArray[np.float32],
+    ) -> None:
+        text = layout_text(record)
+        if sum(kind.itemsize for _, kind, _ in _fields(record)) != record.itemsize:
+            raise TransferLayoutError(f"the record of a vehicle has padding: {text}")
+        self._layout = blake2b(text.encode(), digest_size=8).digest()
+        self._size = record.itemsize
+        self._bytes = np.dtype((np.void, record.itemsize))
+        self._commands, self._frames = commands, frames
+        self._slots = commands.shape[:2]
+        self._lengths = (
+            record.itemsize,
+            commands[0, :1].nbytes if commands.size else 0,
+            frames[0, :1].nbytes if frames.size else 0,
+        )
+        at = {name: place for name, _, place in _fields(record)}
+        self._id_at, self._agent_at, self._transfer_at = at["id"], at["agent"], at["transfer"]
+        same = f"{RECORD_VERSION} {text} {self._lengths}".encode()
+        self.schema = int.from_bytes(blake2b(same, digest_size=8).digest()) >> 1
+
+    @classmethod
+    def of(cls, worlds: Worlds, outputs: Outputs, stack: int) -> TransferCodec:
+        """The codec of a shard's worlds, whose observations hold `stack` frames."""
+        oldest = outputs.observations.shape[2] // stack
+        return cls(worlds.rows.dtype, worlds.pending, outputs.observations[:, :, oldest:])
+
+    def pack(self, rows: NDArray[np.void], world: int, i: int, tick: int) -> bytes:
+        """The state of a vehicle.
+
+        Args:
+            rows: VEHICLE (W, C).
+            world: number of the world.
+            i: the row.
+            tick: of the state, as `unpack` will be asked for it. `VEHICLE["tick"]` is one less in
+                those who entered after the reset.
+        """
+        record: bytes = rows[world, i : i + 1].tobytes()
+        (vehicle,) = _LONG.unpack_from(record, self._id_at)
+        (agent,) = _INT.unpack_from(record, self._agent_at)
+        before = (MAGIC, RECORD_VERSION, MINOR_VERSION, tick, vehicle, self._layout)
+        if agent < 0:
+            return _HEADER.pack(*before, self._size, 0, 0) + record
+        commands, frames = self._commands[world, agent], self._frames[world, agent]
+        header = _HEADER.pack(*before, *self._lengths)
+        return b"".join((header, record, commands.tobytes(), frames.tobytes()))
+
+    def unpack(
+        self, data: bytes, vehicle: int, tick: int, rows: NDArray[np.void], world: int, i: int
+    ) -> None:
+        """Write a state into `rows[world, i]`, and what its agent keeps; nothing if it is refused.
+
+        Args:
+            data: as `pack` returns it.
+            vehicle: whose state it has to be.
+            tick: of which tick.
+            rows: VEHICLE (W, C).
+            world: number of the world.
+            i: the row.
+
+        Raises:
+            TransferError: these bytes are no state, or none of this vehicle and tick, or of another
+                version, build or environment; the type says which.
+        """
+        header = self.header(data)
+        if (header.vehicle, header.tick) != (vehicle, tick):
+            raise ForeignTransferError(
+                f"the state is that of vehicle {header.vehicle} at tick {header.tick}; "
+                f"expected is vehicle {vehicle} at tick {tick}"
+            )
+        first = _HEADER.size
+        end = first + self._size
+        agent = self._check_record(header, data)
+        rows.view(self._bytes)[world, i] = data[first:end]
+        if agent < 0:
+            return
+        commands, frames = self._commands[world, agent], self._frames[world, agent]
+        room = commands.size
+        commands[:] = np.frombuffer(data, commands.dtype, room, end).reshape(commands.shape)
+        frames[:] = np.frombuffer(data, frames.dtype, frames.size, end + header.commands)
+
+    def header(self, data: bytes) -> TransferHeader:
+        """What stands before a state, once it is seen that the state is whole and of this layout.
+
+        Raises:
+            TransferError: it is not; the type says why.
+        """
+        if len(data) < _HEADER.size:
+            raise TruncatedTransferError(
+                f"a state of {len(data)} bytes has no room for its header of {_HEADER.size}"
+            )
+        header = TransferHeader._make(_HEADER.unpack_from(data))
+        if header.magic != MAGIC:
+            raise TransferError(f"a state begins with {MAGIC!r}, not with {header.magic!r}")
+        if header.major != RECORD_VERSION:
+            raise TransferVersionError(
+                f"a state of version {header.major}.{header.minor}; this build reads "
+                f"{RECORD_VERSION}.*: run the same cavmarl everywhere"
+            )
+        more = len(data) - _HEADER.size - header.record - header.commands - header.frames
+        if more < 0 or (more > 0 and header.minor <= MINOR_VERSION):
+            raise TruncatedTransferError(
+                f"a state of {len(data)} bytes: its header tells of {len(data) - more}"
+            )
+        if header.layout != self._layout or header.record != self._size:
+            raise TransferLayoutError(
+                f"a record of {header.record} bytes and layout {header.layout.hex()}; here it has "
+                f"{self._size} and {self._layout.hex()}: run the same cavmarl everywhere"
+            )
+        return header
+
+    def _check_record(self, header: TransferHeader, data: bytes) -> int:
+        """The agent of a record that can be taken over."""
+        first = _HEADER.size
+        (vehicle,) = _LONG.unpack_from(data, first + self._id_at)
+        if vehicle != header.vehicle:
+            raise ForeignTransferError(
+                f"the header names vehicle {header.vehicle}, its record vehicle {vehicle}"
+            )
+        (status,) = _INT.unpack_from(data, first + self._transfer_at)
+        if status != AUTHORITATIVE:
+            raise TransferError(f"vehicle {vehicle} has the unknown transfer status {status}")
+        (agent,) = _INT.unpack_from(data, first + self._agent_at)
+        if agent >= self._slots[1]:
+            raise TransferLayoutError(
+                f"vehicle {vehicle} is driven by agent {agent}; here are {self._slots[1]}"
+            )
+        expected = self._lengths[1:] if agent >= 0 else (0, 0)
+        if (header.commands, header.frames) != expected:
+            raise TransferLayoutError(
+                f"vehicle {vehicle} has {header.commands} bytes of delayed commands and "
+                f"{header.frames} of frames; here these are {expected[0]} and {expected[1]}: "
+                "clock.control_latency_ticks or sensors differ"
+            )
+        return int(agent)
+
+
+def layout_text(record: np.dtype[np.void]) -> str:
+    """Names, formats and places of a record's fields, one after the other."""
+    named = (f"{name}:{kind.str}@{place}" for name, kind, place in _fields(record))
+    return f"{record.itemsize} {' '.join(named)}"
+
+
+def _fields(record: np.dtype[np.void]) -> list[tuple[str, np.dtype[np.generic], int]]:
+    """Name, format and place of each field."""
+    entries: Mapping[str, Any] = record.fields or {}
+    return [(name, entries[name][0], int(entries[name][1])) for name in record.names or ()]

@@ -1,1 +1,0 @@
-"""Many worlds with autoreset, in this process or shared out over worker processes."""

@@ -1,0 +1,245 @@
+"""`Collector`: takes definitions as they are read and keeps little of each.
+
+Names are resolved when all files are read: SUMO's rule that a definition stands before its use is
+not needed here. What occurs often is kept once: routes, types, and lists of stops become numbers at
+once; of a vehicle one row of figures is left.
+"""
+
+from __future__ import annotations
+
+import math
+from array import array
+from collections.abc import Iterable
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cavmarl.core.errors import CapacityError
+from cavmarl.traffic.demand.demand_records import (
+    CODES,
+    ELEMENT,
+    LANE_CURRENT,
+    LANE_FIRST,
+    POS_BASE,
+    POS_GIVEN,
+    POS_MAX,
+    SPEED_CURRENT,
+    SPEED_GIVEN,
+)
+from cavmarl.traffic.demand.demand_report import DemandReport
+from cavmarl.traffic.demand.element import Element
+from cavmarl.traffic.demand.rerouting_device import device
+from cavmarl.traffic.demand.timing import Timing, flow_timing, single_timing
+from cavmarl.traffic.demand.xml_files import STOPPING_PLACES
+
+__all__ = ["Collector"]
+
+_NO_DEPARTURE = ("triggered", "containerTriggered", "split", "now")
+_WAY = ("from", "to", "via", "fromJunction", "toJunction", "viaJunctions", "fromTaz", "toTaz")
+_OFF_MAP = ("fromXY", "toXY", "viaXY", "fromLonLat", "toLonLat", "viaLonLat")
+_UNUSED = ("departEdge", "arrivalEdge", "departPosLat", "arrivalPosLat", "insertionChecks")
+# Attributes of routes and stops that do not say where they lead.
+_LOOKS = frozenset(("color", "cost", "savings", "exitTimes", "routeLength", "reason"))
+# Old names of SUMO's that its own files still hold.
+_RENAMED = {"beginLane": "departLane", "beginPos": "departPos", "beginSpeed": "departSpeed"}
+
+
+class Collector:
+    """Definitions by id, and one row for each vehicle, trip and flow.
+
+    Attributes:
+        named: elements by kind and id: vType, route, their distributions, stopping places,
+            rerouters.
+        routes: elements that say a route, one for each way of saying: a <route>, or a trip.
+        types: the name of each type that is used, by first use.
+        stops: lists of <stop> elements, equal lists once.
+        ids: of vehicles, trips and flows, by row.
+    """
+
+    def __init__(
+        self, report: DemandReport, begin_ms: int, end_ms: int, max_departures: int
+    ) -> None:
+        self.report = report
+        self.named: dict[str, dict[str, Element]] = {}
+        self.routes: dict[tuple[object, ...], Element] = {}
+        self.types: dict[str, Element] = {}
+        self.stops: dict[tuple[object, ...], list[Element]] = {}
+        self.ids: list[str] = []
+        self._route_number: dict[tuple[object, ...], int] = {}
+        self._stops_number: dict[tuple[object, ...], int] = {}
+        self._type_number: dict[str, int] = {}
+        self._seen: set[tuple[bool, str]] = set()
+        self._rows = array("d")
+        self._begin_ms, self._end_ms = begin_ms, end_ms
+        self._max_departures = max_departures
+        self._departures = 0.0
+        self._latest_ms: dict[str, int] = {}  # by file
+
+    def take(self, element: Element) -> None:
+        """Keep one definition.
+
+        Raises:
+            DemandError: an attribute is missing or wrong, an id occurs twice.
+            CapacityError: more departures than the cap.
+        """
+        if element.name in ("vehicle", "trip", "flow"):
+            self._take_vehicles(element)
+            return
+        kind = "stopping place" if element.name in STOPPING_PLACES else element.name
+        self._name(kind, element)
+        if element.name == "vTypeDistribution":
+            for child in element.children:
+                if child.name == "vType" and "refId" not in child.attrs:
+                    self._name("vType", child)
+        elif element.name == "routeDistribution":
+            for child in element.children:
+                if child.name == "route" and "id" in child.attrs:
+                    self._name("route", child)
+
+    def elements(self) -> NDArray[np.void]:
+        """ELEMENT (num_elements,); `types`, `routes`, `first_stop` count this object's lists."""
+        table = np.frombuffer(self._rows, dtype=np.float64).reshape(-1, len(ELEMENT.names or ()))
+        elements = np.zeros(len(self.ids), dtype=ELEMENT)
+        for column, name in enumerate(ELEMENT.names or ()):
+            elements[name] = table[:, column]
+        return elements
+
+    def _name(self, kind: str, element: Element) -> None:
+        name = element.text("id")
+        # Types and their distributions share names, and so do routes and theirs.
+        for other in (kind, f"{kind}Distribution", kind.removesuffix("Distribution")):
+            known = self.named.get(other, {}).get(name)
+            if known is not None:
+                raise element.error(
+                    f"has the id of the <{known.name}> in {known.place}", "ids must be unique"
+                )
+        self.named.setdefault(kind, {})[name] = element
+
+    def _take_vehicles(self, element: Element) -> None:
+        name = element.text("id")
+        flow = element.name == "flow"
+        if (flow, name) in self._seen:
+            raise element.error("occurs twice", "ids must be unique")
+        self._seen.add((flow, name))
+        start = element.attrs.get("begin" if flow else "depart", "").strip()
+        if start in _NO_DEPARTURE:
+            what = f"{element.name} that departs '{start}' is left out"
+            self.report.tolerate(what, element.place)
+            return
+        for old, new in _RENAMED.items():
+            if old in element.attrs:
+                element.attrs.setdefault(new, element.attrs.pop(old))
+        for key in _UNUSED:
+            if key in element.attrs:
+                what = f"attribute {key} of {element.name} is not modelled"
+                self.report.tolerate(what, element.place)
+        timing = self._timing(element, flow, start)
+        self._check_room(element, timing)
+        row: Iterable[float] = (
+            self.report.files.index(element.path),
+            element.line,
+            flow,
+            *timing,
+            self._type(element),
+            self._route(element),
+            self._stops(element),
+            0,
+            *device(element),
+            *_how(element),
+        )
+        self.ids.append(name)
+        self._rows.extend(row)
+
+    def _timing(self, element: Element, flow: bool, start: str) -> Timing:
+        if flow:
+            return flow_timing(element, self._end_ms)
+        depart = self._begin_ms if start == "begin" else element.time_ms("depart")
+        latest = self._latest_ms.get(element.path, 0)
+        if depart < latest:
+            what = "departure before that of a vehicle above it: sorted (SUMO drops it)"
+            self.report.tolerate(what, element.place)
+        self._latest_ms[element.path] = max(latest, depart)
+        return single_timing(depart)
+
+    def _check_room(self, element: Element, timing: Timing) -> None:
+        end = self._end_ms if self._end_ms >= 0 else timing.end_ms
+        self._departures += timing.expected(self._begin_ms, end)
+        if self._departures > self._max_departures:
+            raise element.error(
+                f"makes more than {self._max_departures} departures with those before it",
+                "cut the demand, or raise max_departures if there is memory for it",
+                CapacityError,
+            )
+
+    def _type(self, element: Element) -> int:
+        name = element.attrs.get("type", "DEFAULT_VEHTYPE").strip()
+        if name not in self._type_number:
+            self._type_number[name] = len(self.types)
+            self.types[name] = Element(element.name, element.attrs, element.path, element.line)
+        return self._type_number[name]
+
+    def _route(self, element: Element) -> int:
+        inside = [c for c in element.children if c.name in ("route", "routeDistribution")]
+        if len(inside) > 1:
+            raise element.error("holds two routes", "put both into a <routeDistribution>")
+        if inside:
+            source = inside[0]
+            key: tuple[object, ...] = _key(source)
+        elif "route" in element.attrs and element.name != "trip":
+            source = Element(element.name, element.attrs, element.path, element.line)
+            key = ("named", element.text("route"))
+        elif element.name == "vehicle":
+            raise element.error("has no route", "give it the attribute 'route' or a <route> inside")
+        else:
+            source = element
+            stops = self._stops(element) if "via" not in element.attrs else -1
+            key = ("way", stops, *(element.attrs.get(k) for k in (*_WAY, *_OFF_MAP)))
+        if key not in self._route_number:
+            self._route_number[key] = len(self.routes)
+            self.routes[key] = source
+        return self._route_number[key]
+
+    def _stops(self, element: Element) -> int:
+        stops = [child for child in element.children if child.name == "stop"]
+        if not stops:
+            return -1
+        key = tuple(_key(stop) for stop in stops)
+        if key not in self._stops_number:
+            self._stops_number[key] = len(self.stops)
+            self.stops[key] = stops
+        return self._stops_number[key]
+
+
+def _key(element: Element) -> tuple[object, ...]:
+    """What an element says of the way, without the place where it says so."""
+    says = (item for item in element.attrs.items() if item[0] not in _LOOKS)
+    return (element.name, *says, *(_key(child) for child in element.children))
+
+
+def _how(element: Element) -> tuple[float, ...]:
+    """The last fields of ELEMENT: how a vehicle enters and leaves."""
+    return (
+        _lane(element, "departLane", LANE_FIRST),
+        *_coded(element, "departPos", POS_BASE),
+        *_coded(element, "departSpeed", SPEED_GIVEN, least=0.0),
+        _lane(element, "arrivalLane", LANE_CURRENT),
+        *_coded(element, "arrivalPos", POS_MAX),
+        *_coded(element, "arrivalSpeed", SPEED_CURRENT, least=0.0),
+        element.number("speedFactor", math.nan, above=0.0),
+    )
+
+
+def _lane(element: Element, key: str, default: int) -> int:
+    code = CODES[key].get(element.attrs.get(key, ""))
+    return element.whole(key, default, least=0) if code is None else code
+
+
+def _coded(element: Element, key: str, default: int, least: float = -math.inf) -> tuple[int, float]:
+    """The code of a word, or the code of a given number and the number."""
+    if key not in element.attrs:
+        return default, 0.0
+    code = CODES[key].get(element.attrs[key])
+    if code is not None:
+        return code, 0.0
+    # POS_GIVEN and SPEED_GIVEN are one number.
+    return POS_GIVEN, element.number(key, 0.0, least=least)

@@ -1,0 +1,83 @@
+"""`DEPARTURE`: a vehicle that has been ordered and waits to enter; and the gate it waits at."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from cavmarl.core.records.arrays import Gate, RoadArrays
+from cavmarl.core.records.codes import NUM_COUNTS, NUM_SUMS
+
+__all__ = ["DEPARTURE", "make_gate", "with_room"]
+
+DEPARTURE = np.dtype(
+    [
+        ("id", np.int64),  # of the vehicle; the queue is in this order
+        ("due", np.int64),  # tick
+        ("way", np.int64),  # as VEHICLE["way"], on its first edge
+        ("agent", np.int32),  # index of the agent that will drive it, or -1
+        ("order", np.int32),  # its own row in `Gate.orders`; -1: of the generator
+        ("vtype", np.int32),  # VTYPE row
+        ("goal", np.int32),  # row of the plans' table, or -1: the end of its route
+        ("lane", np.int32),  # LANE where it enters, or any lane of that edge
+        ("stop", np.int32),  # STOP rows [stop, stops_end)
+        ("stops_end", np.int32),
+        ("lane_code", np.int8),  # LANE_*
+        ("pos_code", np.int8),  # POS_*
+        ("speed_code", np.int8),  # SPEED_*
+        ("pos", np.float64),  # of the front bumper, m; negative: from the end of the lane
+        ("speed", np.float64),  # m/s
+        ("speed_factor", np.float64),  # desired speed over the limit
+    ],
+    align=True,
+)
+
+
+def make_gate(
+    num_worlds: int, capacity: int, roads: RoadArrays, vehicle: np.dtype[np.void]
+) -> Gate:
+    """The empty gates of `num_worlds` worlds that hold `capacity` records of vehicles each."""
+    return Gate(
+        orders=np.zeros((num_worlds, 0), dtype=DEPARTURE),
+        num_orders=np.zeros(num_worlds, dtype=np.int64),
+        next_order=np.zeros(num_worlds, dtype=np.int64),
+        queue=np.zeros((num_worlds, capacity), dtype=DEPARTURE),
+        num_queue=np.zeros(num_worlds, dtype=np.int64),
+        next_id=np.zeros(num_worlds, dtype=np.int64),
+        num_entered=np.zeros(num_worlds, dtype=np.int64),
+        counts=np.zeros((num_worlds, NUM_COUNTS), dtype=np.int64),
+        sums=np.zeros((num_worlds, NUM_SUMS), dtype=np.float64),
+        num_passing=np.zeros(num_worlds, dtype=np.int64),
+        lane_taken=np.zeros(len(roads.lanes), dtype=np.bool_),
+        spare=np.zeros(1, dtype=vehicle),
+        **_room(num_worlds, capacity, int(roads.edges["num_lanes"].max()), vehicle),
+    )
+
+
+def _room(
+    num_worlds: int, waiting: int, num_lanes: int, vehicle: np.dtype[np.void]
+) -> dict[str, Any]:
+    """What the gate needs for each that may wait."""
+    return {
+        "passing": np.zeros((num_worlds, waiting), dtype=vehicle),
+        "places": np.zeros((num_worlds, waiting), dtype=np.int64),
+        "tries": np.zeros((num_worlds, waiting), dtype=np.int32),
+        "ranks": np.zeros((num_worlds, waiting, num_lanes), dtype=np.int64),
+        "last_s": np.zeros((num_worlds, waiting, num_lanes)),
+    }
+
+
+def with_room(gate: Gate, num_orders: int) -> Gate:
+    """The gate with room for at least so many orders, all of which may wait at once."""
+    num_worlds, present = gate.orders.shape
+    more = num_orders - present
+    if more <= 0:
+        return gate
+    room = np.zeros((num_worlds, more), dtype=DEPARTURE)
+    queue = np.concatenate([gate.queue, room], axis=1)
+    return gate._replace(
+        orders=np.concatenate([gate.orders, room], axis=1),
+        queue=queue,
+        **_room(num_worlds, queue.shape[1], gate.ranks.shape[2], gate.passing.dtype),
+    )

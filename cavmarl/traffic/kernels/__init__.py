@@ -1,0 +1,1 @@
+"""Compiled loops: who departs, enters, leaves and looks for another way."""

@@ -1,0 +1,301 @@
+"""How waiting departures enter: the gate says which lane each takes, the shards who finds a gap.
+
+One tick lets at most one vehicle try on each lane, in the order of the queue. Five calls make it:
+`rank_lanes` (each shard: how crowded lanes are), `assign_lanes` (the gate), `propose` (each shard:
+who finds a safe gap at a place of its own zone), `accept` (the gate: in the order of the queue, as
+long as there is room) and `admit` (each shard: into its rows or among its ghosts).
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cavmarl.core.math.geometry import boxes_overlap, lane_pose
+from cavmarl.core.math.neighbors import LEVEL_HEIGHT_M
+from cavmarl.core.numba import kernel
+from cavmarl.core.records.arrays import Demand, Gate, RoadArrays, Scratch, Travel, Worlds
+from cavmarl.core.records.codes import COUNT_DEPARTED, LANE_FIRST, LANE_GIVEN, LANE_RANDOM, POS_LAST
+from cavmarl.driving.kernels.lane_index import index_lanes
+from cavmarl.traffic.kernels.demand_generator import enter
+from cavmarl.traffic.kernels.entering import (
+    crowd,
+    entry_lane,
+    entry_place,
+    entry_speed,
+    follower_brakes,
+)
+from cavmarl.zones.kernels.zone_lookup import Halo, ZoneArrays, is_seen, squared_distance, zone_of
+
+__all__ = ["accept", "admit", "assign_lanes", "propose", "rank_lanes"]
+
+ENTER_ROOM_M = 0.3  # free on all sides of a vehicle that enters
+
+
+@kernel
+def _zone_on(roads: RoadArrays, zones: ZoneArrays, lane: int, s: float) -> int:
+    """The zone of a place on a lane."""
+    row = roads.lanes[lane]
+    x, y, _, _, _, _ = lane_pose(roads.points, row["first_point"], row["num_points"], s)
+    return zone_of(zones, x, y)
+
+
+@kernel
+def rank_lanes(
+    roads: RoadArrays,
+    travel: Travel,
+    zones: ZoneArrays,
+    zone: int,
+    gate: Gate,
+    worlds: Worlds,
+    scratch: Scratch,
+) -> None:
+    """Count who is around the places in this zone where departures may enter that choose a lane.
+
+    Who enters behind the last vehicle of a lane is told its place by the zone where the lane
+    starts: it alone sees all who could be the last.
+
+    Args:
+        roads: the road arrays.
+        travel: types and ways.
+        zones: of the partition.
+        zone: the shard's own.
+        gate: `ranks` and `last_s` are written where a place, or a lane's start, lies in this zone.
+        worlds: `next_rows` is read.
+        scratch: room.
+    """
+    for w in range(worlds.ticks.shape[0]):
+        indexed = False
+        for q in range(gate.num_queue[w]):
+            departure = gate.queue[w, q]
+            code = departure["lane_code"]
+            chooses = not (code == LANE_GIVEN or code == LANE_FIRST or code == LANE_RANDOM)
+            last = departure["pos_code"] == POS_LAST
+            if not (chooses or last):
+                continue
+            edge = roads.edges[roads.lanes[departure["lane"]]["edge"]]
+            first = edge["first_lane"]
+            s = max(departure["pos"], 0.0)
+            for lane in range(first, first + edge["num_lanes"]):
+                on_lane = min(s, roads.lanes[lane]["length_m"])
+                ranked = chooses and _zone_on(roads, zones, lane, on_lane) == zone
+                placed = last and _zone_on(roads, zones, lane, 0.0) == zone
+                if (ranked or placed) and not indexed:
+                    rows = worlds.next_rows[w]
+                    index_lanes(roads, travel, rows, worlds.num_rows[w], scratch)
+                    indexed = True
+                if ranked:
+                    gate.ranks[w, q, lane - first] = crowd(scratch, lane, s, travel.view_m)
+                if placed:
+                    kind = travel.types[departure["vtype"]]
+                    gate.last_s[w, q, lane - first] = entry_place(
+                        roads,
+                        worlds.keys[w],
+                        departure,
+                        kind,
+                        lane,
+                        worlds.ticks[w],
+                        scratch,
+                        travel.view_m,
+                    )
+
+
+@kernel
+def assign_lanes(roads: RoadArrays, travel: Travel, gate: Gate, worlds: Worlds) -> None:
+    """Say on which lane each departure of the queue tries, -1: on none.
+
+    A lane is taken whether or not there is room: who waits longer goes first.
+
+    Args:
+        roads: the road arrays.
+        travel: types and ways.
+        gate: `tries` and `lane_taken` are written.
+        worlds: keys.
+    """
+    for w in range(worlds.ticks.shape[0]):
+        if gate.num_queue[w] == 0:
+            continue
+        gate.lane_taken[:] = False
+        for q in range(gate.num_queue[w]):
+            departure = gate.queue[w, q]
+            lane = entry_lane(
+                roads, travel, worlds.keys[w], departure, gate.ranks[w, q], gate.lane_taken
+            )
+            gate.tries[w, q] = lane
+            if lane >= 0:
+                gate.lane_taken[lane] = True
+
+
+@kernel
+def _touches(own: np.void, other: np.void) -> bool:
+    """Whether a vehicle that enters, with some room around it, touches another one."""
+    half_length = 0.5 * own["length"] + ENTER_ROOM_M
+    half_width = 0.5 * own["width"] + ENTER_ROOM_M
+    dx = other["x"] - own["x"]
+    dy = other["y"] - own["y"]
+    reach = half_length + half_width + 0.5 * (other["length"] + other["width"])
+    if dx * dx + dy * dy > reach * reach or abs(other["z"] - own["z"]) > LEVEL_HEIGHT_M:
+        return False
+    return boxes_overlap(
+        own["x"],
+        own["y"],
+        math.cos(own["heading"]),
+        math.sin(own["heading"]),
+        half_length,
+        half_width,
+        other["x"],
+        other["y"],
+        math.cos(other["heading"]),
+        math.sin(other["heading"]),
+        0.5 * other["length"],
+        0.5 * other["width"],
+    )
+
+
+@kernel
+def _touches_any(rows: NDArray[np.void], num: int, own: np.void) -> bool:
+    for j in range(num):
+        if _touches(own, rows[j]):
+            return True
+    return False
+
+
+@kernel
+def propose(
+    demand: Demand,
+    roads: RoadArrays,
+    travel: Travel,
+    zones: ZoneArrays,
+    zone: int,
+    gate: Gate,
+    worlds: Worlds,
+    scratch: Scratch,
+) -> None:
+    """Put the departures that find a safe gap in this zone into `gate.passing`.
+
+    Args:
+        demand: the generator's tables.
+        roads: the road arrays.
+        travel: types and ways.
+        zones: of the partition.
+        zone: the shard's own.
+        gate: `passing` and `places` are written.
+        worlds: `next_rows` is read.
+        scratch: room.
+    """
+    for w in range(worlds.ticks.shape[0]):
+        if gate.num_queue[w] == 0:
+            continue
+        rows = worlds.next_rows[w]
+        num = worlds.num_rows[w]
+        key = worlds.keys[w]
+        indexed = False
+        for q in range(gate.num_queue[w]):
+            lane = gate.tries[w, q]
+            if lane < 0:
+                continue
+            departure = gate.queue[w, q]
+            kind = travel.types[departure["vtype"]]
+            if departure["pos_code"] == POS_LAST:
+                edge = roads.edges[roads.lanes[lane]["edge"]]
+                s = gate.last_s[w, q, lane - edge["first_lane"]]
+            else:
+                s = entry_place(
+                    roads, key, departure, kind, lane, worlds.ticks[w], scratch, travel.view_m
+                )
+            if _zone_on(roads, zones, lane, s) != zone:
+                continue
+            if not indexed:
+                index_lanes(roads, travel, rows, num, scratch)
+                indexed = True
+            speed = entry_speed(roads, travel, key, departure, kind, lane, s, scratch)
+            if speed < 0.0:
+                continue
+            if follower_brakes(roads, travel, rows, departure, kind, lane, s, speed, scratch):
+                continue
+            n = gate.num_passing[w]
+            row = gate.passing[w, n]
+            gate.passing[w, n] = demand.blank[0]
+            enter(roads, travel, worlds, w, departure, lane, s, speed, row)
+            if not _touches_any(rows, num, row):
+                gate.places[w, n] = q
+                gate.num_passing[w] = n + 1
+
+
+@kernel
+def accept(gate: Gate, running: NDArray[np.int64], capacity: int) -> None:
+    """Take the proposals in the order of the queue; the rest stays in it.
+
+    Args:
+        gate: `passing` keeps those taken; queue and counts are written.
+        running: (W,) vehicles of each world, in all zones.
+        capacity: most that a world can hold.
+    """
+    for w in range(running.size):
+        proposed = gate.num_passing[w]
+        taken = 0
+        for n in range(proposed):
+            found = n
+            for m in range(n + 1, proposed):
+                if gate.places[w, m] < gate.places[w, found]:
+                    found = m
+            q = gate.places[w, found]
+            gate.spare[0] = gate.passing[w, found]
+            gate.places[w, found] = gate.places[w, n]
+            gate.passing[w, found] = gate.passing[w, n]
+            row = gate.spare[0]
+            if running[w] + taken == capacity or _touches_any(gate.passing[w], taken, row):
+                continue
+            gate.passing[w, taken] = row
+            gate.places[w, taken] = q
+            taken += 1
+        gate.num_passing[w] = taken
+        gate.counts[w, COUNT_DEPARTED] += taken
+        _take_from_queue(gate, w, taken)
+
+
+@kernel
+def _take_from_queue(gate: Gate, w: int, taken: int) -> None:
+    """Close the gaps that the accepted ones, whose places rise, leave in the queue."""
+    if taken == 0:
+        return
+    kept = gate.places[w, 0]
+    n = 0
+    for q in range(kept, gate.num_queue[w]):
+        if n < taken and gate.places[w, n] == q:
+            n += 1
+            continue
+        gate.queue[w, kept] = gate.queue[w, q]
+        kept += 1
+    gate.num_queue[w] = kept
+
+
+@kernel
+def admit(zones: ZoneArrays, halo: Halo, zone: int, gate: Gate, worlds: Worlds) -> None:
+    """Write who has been accepted into `next_rows`: as owned in its zone, as ghost near it.
+
+    Args:
+        zones: of the partition.
+        halo: how far this zone sees.
+        zone: the shard's own.
+        gate: `passing` is read.
+        worlds: `next_rows` and how many they are.
+    """
+    for w in range(worlds.ticks.shape[0]):
+        rows = worlds.next_rows[w]
+        for n in range(gate.num_passing[w]):
+            row = gate.passing[w, n]
+            num = worlds.num_rows[w]
+            if zone_of(zones, row["x"], row["y"]) == zone:
+                owned = worlds.num_owned[w]
+                rows[num] = rows[owned]  # a ghost moves back
+                rows[owned] = row
+                rows[owned]["owner"] = zone
+                worlds.num_owned[w] = owned + 1
+            elif is_seen(halo, zone, row, squared_distance(zones.rects, zone, row["x"], row["y"])):
+                rows[num] = row
+            else:
+                continue
+            worlds.num_rows[w] = num + 1

@@ -1,0 +1,364 @@
+"""Who enters and who leaves: the seeded demand generator and the queue before the gates.
+
+A departure is numbered and drawn when it is ordered, and enters when there is a safe gap at its
+place; until then it waits in the queue, in the order of ids. None is dropped.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cavmarl.core.math.rng import (
+    STREAM_ORIGIN,
+    STREAM_PLACE,
+    STREAM_ROUTE,
+    STREAM_SPEED_FACTOR,
+    below,
+    uniform,
+)
+from cavmarl.core.numba import kernel
+from cavmarl.core.records.arrays import Demand, Gate, RoadArrays, Travel, Worlds
+from cavmarl.core.records.codes import (
+    COUNT_ARRIVED,
+    COUNT_DEPARTED,
+    COUNT_REMOVED,
+    COUNT_REROUTED,
+    DRIVER_AGENT,
+    DRIVER_BACKGROUND,
+    EVENT_ARRIVED,
+    LANE_GIVEN,
+    POS_GIVEN,
+    SPEED_MAX,
+    SUM_DELAY_S,
+    SUM_DISTANCE_M,
+    SUM_TIME_S,
+)
+from cavmarl.driving.kernels.motion import place_on_lane
+from cavmarl.driving.kernels.ways import own_step, way_left
+from cavmarl.traffic.kernels.entering import (
+    speed_at,
+)
+
+__all__ = ["call_orders", "choose_goals", "enter", "populate", "settle"]
+
+PLACE_TRIES = 24  # places tried for a vehicle at reset before it has to queue
+PLACE_GAP_M = 10.0  # m between bumpers of vehicles placed at reset
+END_ROOM_M = 12.0  # nobody starts nearer than this to the end of a lane, unless it is shorter
+PLACE_SHARE = 0.7  # of the speed limit, with which vehicles drive that are placed at reset
+WANDER_M = 150.0  # nearer to its goal than this a vehicle of a closed world picks another
+GOAL_TRIES = 8
+REROUTE_S = 45.0  # one on a route so long
+GIVE_UP_S = 10.0  # a driver that waits longer than this to change lanes takes another way
+
+
+@kernel
+def _order(
+    demand: Demand,
+    roads: RoadArrays,
+    gate: Gate,
+    worlds: Worlds,
+    w: int,
+    agent: int,
+    trips: NDArray[np.int32],
+) -> None:
+    """Number and draw one departure and put it at the end of the queue."""
+    vehicle = gate.next_id[w]
+    gate.next_id[w] = vehicle + 1
+    key = worlds.keys[w]
+    trip = below(key, vehicle, 0, STREAM_ORIGIN, trips.shape[0])
+    departure = gate.queue[w, gate.num_queue[w]]
+    gate.num_queue[w] += 1
+    departure["id"] = vehicle
+    departure["agent"] = agent
+    departure["order"] = -1
+    departure["vtype"] = demand.blank[0]["vtype"]
+    departure["stop"] = -1
+    departure["stops_end"] = -1
+    departure["lane_code"] = LANE_GIVEN
+    departure["pos_code"] = POS_GIVEN
+    departure["speed_code"] = SPEED_MAX
+    departure["due"] = worlds.ticks[w]
+    _send(roads, departure, trips[trip, 0], trips[trip, 1])
+    spread = 2.0 * uniform(key, vehicle, 0, STREAM_SPEED_FACTOR) - 1.0
+    departure["speed_factor"] = 1.0 + demand.speed_factor_spread * spread
+    length = roads.lanes[departure["lane"]]["length_m"]
+    body = demand.blank[0]["length"]
+    departure["pos"] = body + 1.0
+    if agent >= 0 or not demand.enter_at_start:
+        free = max(length - body - END_ROOM_M, 0.0)
+        departure["pos"] += free * uniform(key, vehicle, 0, STREAM_PLACE)
+
+
+@kernel
+def _send(roads: RoadArrays, departure: np.void, lane: int, goal: int) -> None:
+    """Set where a departure of the generator starts and where it goes."""
+    departure["lane"] = lane
+    departure["goal"] = goal
+    departure["way"] = goal * roads.lanes.shape[0]
+
+
+@kernel
+def enter(
+    roads: RoadArrays,
+    travel: Travel,
+    worlds: Worlds,
+    w: int,
+    departure: np.void,
+    lane: int,
+    s: float,
+    speed: float,
+    row: np.void,
+) -> None:
+    """Write the record of a vehicle that enters; `row` already holds the blank."""
+    kind = travel.types[departure["vtype"]]
+    row["id"] = departure["id"]
+    row["agent"] = departure["agent"]
+    row["driver"] = DRIVER_BACKGROUND
+    if departure["agent"] >= 0:
+        row["driver"] = DRIVER_AGENT
+        worlds.pending[w, departure["agent"]] = 0.0
+    row["order"] = departure["order"]
+    row["vtype"] = departure["vtype"]
+    row["length"] = kind["length"]
+    row["width"] = kind["width"]
+    row["height"] = kind["height"]
+    row["goal"] = departure["goal"]
+    row["way"] = departure["way"]
+    row["stop"] = departure["stop"]
+    row["stops_end"] = departure["stops_end"]
+    row["lane"] = lane
+    row["target_lane"] = lane
+    row["s"] = s
+    row["speed"] = speed
+    row["target_speed"] = speed
+    row["speed_factor"] = departure["speed_factor"]
+    row["rng_key"] = worlds.keys[w]
+    row["departed"] = worlds.ticks[w]
+    row["tick"] = worlds.ticks[w]
+    row["heading"] = place_on_lane(roads, travel, row)
+    row["to_go"] = way_left(roads, row, travel.steps[own_step(roads, row)])
+    row["step_to_go"] = row["to_go"]
+
+
+@kernel
+def _is_free(rows: NDArray[np.void], num: int, lane: int, s: float, half: float) -> bool:
+    for j in range(num):
+        if rows[j]["lane"] == lane:
+            if abs(rows[j]["s"] - s) < half + 0.5 * rows[j]["length"] + PLACE_GAP_M:
+                return False
+    return True
+
+
+@kernel
+def populate(
+    demand: Demand,
+    roads: RoadArrays,
+    travel: Travel,
+    gate: Gate,
+    worlds: Worlds,
+    chosen: NDArray[np.bool_],
+) -> None:
+    """Fill the chosen worlds at reset: agents first, then the background, each at a free place.
+
+    A vehicle for which `PLACE_TRIES` places were taken waits in the queue.
+
+    Args:
+        demand: the generator's tables.
+        roads: the road arrays.
+        travel: types and ways.
+        gate: written where chosen.
+        worlds: written where chosen; ticks and keys are already those of the new episode.
+        chosen: (W,) which worlds.
+    """
+    half = 0.5 * demand.blank[0]["length"]
+    for w in range(worlds.ticks.shape[0]):
+        if not chosen[w]:
+            continue
+        worlds.num_owned[w] = 0
+        worlds.num_rows[w] = 0
+        worlds.num_contacts[w] = 0
+        gate.num_queue[w] = 0
+        gate.next_order[w] = 0
+        gate.next_id[w] = 0
+        gate.counts[w, :] = 0
+        gate.sums[w, :] = 0.0
+        gate.num_entered[w] = demand.num_agents
+        for n in range(demand.num_agents + demand.num_background):
+            agent = n if n < demand.num_agents else -1
+            trips = demand.agent_trips if agent >= 0 else demand.start_trips
+            _order(demand, roads, gate, worlds, w, agent, trips)
+            departure = gate.queue[w, gate.num_queue[w] - 1]
+            vehicle = departure["id"]
+            kind = travel.types[departure["vtype"]]
+            for attempt in range(PLACE_TRIES):
+                trip = below(worlds.keys[w], vehicle, 0, STREAM_ORIGIN + attempt, trips.shape[0])
+                lane = trips[trip, 0]
+                _send(roads, departure, lane, trips[trip, 1])
+                length = roads.lanes[lane]["length_m"]
+                share = uniform(worlds.keys[w], vehicle, 0, STREAM_PLACE + attempt)
+                s = half + 1.0 + share * max(length - 2.0 * half - END_ROOM_M, 0.0)
+                departure["pos"] = s + half
+                num = worlds.num_rows[w]
+                if _is_free(worlds.rows[w], num, lane, s, half):
+                    worlds.rows[w, num] = demand.blank[0]
+                    limit = PLACE_SHARE * roads.lanes[lane]["speed_mps"]
+                    speed = speed_at(roads, kind, lane, s, limit)
+                    row = worlds.rows[w, num]
+                    enter(roads, travel, worlds, w, departure, lane, s, speed, row)
+                    gate.counts[w, COUNT_DEPARTED] += 1
+                    worlds.num_rows[w] = num + 1
+                    worlds.num_owned[w] = num + 1
+                    gate.num_queue[w] -= 1
+                    break
+
+
+@kernel
+def _needs_goal(demand: Demand, roads: RoadArrays, travel: Travel, row: np.void) -> bool:
+    """Whether a background vehicle picks another goal: near it in a closed world, or stuck.
+
+    Stuck is who has stood for `GIVE_UP_S` at the end of a lane that its way does not follow.
+    """
+    if row["driver"] != DRIVER_BACKGROUND:
+        return False
+    if row["order"] >= 0:
+        return row["goal"] >= 0 and _is_stuck(roads, travel, row, REROUTE_S)
+    if not demand.reenter and row["to_go"] <= WANDER_M:
+        return True
+    return _is_stuck(roads, travel, row, GIVE_UP_S)
+
+
+@kernel
+def _is_stuck(roads: RoadArrays, travel: Travel, row: np.void, patience_s: float) -> bool:
+    if row["wait_s"] <= patience_s or roads.lanes[row["lane"]]["internal"]:
+        return False
+    step = travel.steps[row["way"] + row["lane"]]
+    stuck: bool = step["next"] < 0 and step["change"] != 0
+    return stuck
+
+
+@kernel
+def _take_detour(roads: RoadArrays, travel: Travel, row: np.void) -> bool:
+    """Send a vehicle of the demand file on to its goal without the lane change it waits for."""
+    way = travel.first_detour + row["goal"] * roads.lanes.shape[0]
+    step = travel.steps[way + row["lane"]]
+    if step["next"] < 0 or way == row["way"]:
+        return False
+    row["way"] = way
+    row["leg"] += 1
+    row["to_go"] = step["to_go"] - row["s"]
+    return True
+
+
+@kernel
+def choose_goals(
+    demand: Demand,
+    roads: RoadArrays,
+    travel: Travel,
+    num_goals: int,
+    gate: Gate,
+    worlds: Worlds,
+    dt: float,
+) -> None:
+    """Give the background vehicles of `next_rows` that need it another goal, if one is in reach.
+
+    Asked about once a second.
+    """
+    turns = max(1, round(1.0 / dt))
+    for w in range(worlds.ticks.shape[0]):
+        if worlds.ticks[w] % turns != 0:
+            continue
+        for i in range(worlds.num_owned[w]):
+            row = worlds.next_rows[w, i]
+            if not _needs_goal(demand, roads, travel, row):
+                continue
+            lane = row["lane"]
+            if row["order"] >= 0:
+                gate.counts[w, COUNT_REROUTED] += _take_detour(roads, travel, row)
+                continue
+            if roads.lanes[lane]["internal"]:
+                continue
+            for attempt in range(GOAL_TRIES):
+                goal = below(
+                    row["rng_key"], row["id"], row["tick"], STREAM_ROUTE + attempt, num_goals
+                )
+                way = goal * roads.lanes.shape[0]
+                step = travel.steps[way + lane]
+                to_go = step["to_go"] - row["s"]
+                if to_go < math.inf and to_go > WANDER_M and step["change"] == 0:
+                    row["goal"] = goal
+                    row["way"] = way
+                    row["leg"] += 1
+                    row["to_go"] = to_go
+                    row["events"] &= ~EVENT_ARRIVED
+                    break
+
+
+@kernel
+def _next_leaving(gate: Gate, w: int, first: int) -> int:
+    """Where in `gate.passing` the smallest id stands of those from `first` on."""
+    found = first
+    for n in range(first + 1, gate.num_passing[w]):
+        if gate.passing[w, n]["id"] < gate.passing[w, found]["id"]:
+            found = n
+    return found
+
+
+@kernel
+def settle(demand: Demand, roads: RoadArrays, gate: Gate, worlds: Worlds, dt: float) -> None:
+    """Count the vehicles that have left, and order those that follow.
+
+    They go in the order of their ids, so that who follows gets the same number wherever the rows
+    lay.
+
+    Args:
+        demand: the generator's tables.
+        roads: the road arrays.
+        gate: counts, sums and queue are written; `passing` holds those that left, and is emptied.
+        worlds: keys and ticks.
+        dt: seconds of a tick.
+    """
+    for w in range(worlds.ticks.shape[0]):
+        for n in range(gate.num_passing[w]):
+            # Nobody looks at those before n any more.
+            found = _next_leaving(gate, w, n)
+            row = gate.passing[w, found]
+            agent = row["agent"]
+            ordered = row["order"] >= 0
+            if row["events"] & EVENT_ARRIVED:
+                time = (row["tick"] - row["departed"]) * dt
+                gate.counts[w, COUNT_ARRIVED] += 1
+                gate.sums[w, SUM_DISTANCE_M] += row["distance_m"]
+                gate.sums[w, SUM_TIME_S] += time
+                gate.sums[w, SUM_DELAY_S] += max(time - row["free_s"], 0.0)
+            else:
+                gate.counts[w, COUNT_REMOVED] += 1
+            gate.passing[w, found] = gate.passing[w, n]
+            if not demand.reenter or ordered:
+                continue
+            if agent < 0:
+                _order(demand, roads, gate, worlds, w, -1, demand.enter_trips)
+            elif demand.seats:
+                _order(demand, roads, gate, worlds, w, agent, demand.agent_trips)
+            elif gate.num_entered[w] < demand.num_ids:
+                follower = gate.num_entered[w]
+                gate.num_entered[w] = follower + 1
+                _order(demand, roads, gate, worlds, w, follower, demand.agent_trips)
+        gate.num_passing[w] = 0
+
+
+@kernel
+def call_orders(gate: Gate, worlds: Worlds) -> None:
+    """Put the ordered departures that are due by the coming tick at the end of the queue."""
+    for w in range(worlds.ticks.shape[0]):
+        n = gate.next_order[w]
+        while n < gate.num_orders[w] and gate.orders[w, n]["due"] <= worlds.ticks[w] + 1:
+            departure = gate.queue[w, gate.num_queue[w]]
+            gate.queue[w, gate.num_queue[w]] = gate.orders[w, n]
+            departure["id"] = gate.next_id[w]
+            gate.next_id[w] += 1
+            gate.num_queue[w] += 1
+            n += 1
+        gate.next_order[w] = n

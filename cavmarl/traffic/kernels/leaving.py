@@ -1,0 +1,97 @@
+"""Vehicles that are through leave their shard; the gate settles with them (`departures.settle`)."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cavmarl.core.numba import kernel
+from cavmarl.core.records.arrays import Gate, Worlds
+from cavmarl.core.records.codes import (
+    DRIVER_AGENT,
+    DRIVER_BACKGROUND,
+    EVENT_ARRIVED,
+    EVENTS_THAT_END,
+)
+from cavmarl.zones.kernels.zone_lookup import note_outer
+
+__all__ = ["drop_ghosts", "leave"]
+
+
+@kernel
+def _is_through(row: np.void, driver: int, ticks_per_step: int) -> bool:
+    """Whether a vehicle of one kind of driver leaves now."""
+    ending = EVENTS_THAT_END if driver == DRIVER_AGENT else EVENT_ARRIVED
+    if row["driver"] != driver or not row["events"] & ending:
+        return False
+    acted: bool = row["departed"] <= row["tick"] - ticks_per_step
+    return driver == DRIVER_BACKGROUND or acted
+
+
+@kernel
+def _strike(worlds: Worlds, w: int, rows: NDArray[np.void], i: int, last: int) -> None:
+    """Of the rows that other zones may see row i is gone, and what has been row `last` is row i."""
+    outer = worlds.outer[w]
+    num = worlds.num_outer[w]
+    place = 0
+    while place < num and outer[place]["row"] < i:
+        place += 1
+    if place < num and outer[place]["row"] == i:
+        num -= 1
+        for n in range(place, num):
+            outer[n] = outer[n + 1]
+    if place < num and outer[num - 1]["row"] == last:
+        for n in range(num - 1, place, -1):
+            outer[n] = outer[n - 1]
+        note_outer(outer[place], rows[i], i)
+    worlds.num_outer[w] = num
+
+
+@kernel
+def leave(
+    gate: Gate, worlds: Worlds, rows: NDArray[np.void], driver: int, ticks_per_step: int
+) -> None:
+    """Move the owned vehicles of one kind of driver that are through into `gate.passing`.
+
+    Background vehicles are through when they have arrived; agents that have acted also after a
+    collision or off the road.
+
+    Args:
+        gate: `passing` is written.
+        worlds: how many rows there are is written.
+        rows: VEHICLE (W, C), the rows to take from.
+        driver: DRIVER_*.
+        ticks_per_step: ticks a step; agents that entered within the last of them have not acted.
+    """
+    for w in range(worlds.ticks.shape[0]):
+        if driver == DRIVER_BACKGROUND and worlds.num_through[w] == 0:
+            continue
+        i = 0
+        while i < worlds.num_owned[w]:
+            if not _is_through(rows[w, i], driver, ticks_per_step):
+                i += 1
+                continue
+            gate.passing[w, gate.num_passing[w]] = rows[w, i]
+            gate.num_passing[w] += 1
+            last_owned = worlds.num_owned[w] - 1
+            last = worlds.num_rows[w] - 1
+            rows[w, i] = rows[w, last_owned]
+            rows[w, last_owned] = rows[w, last]  # a ghost moves up
+            worlds.num_owned[w] = last_owned
+            worlds.num_rows[w] = last
+            if worlds.num_outer[w] >= 0:
+                _strike(worlds, w, rows[w], i, last_owned)
+
+
+@kernel
+def drop_ghosts(gate: Gate, worlds: Worlds, rows: NDArray[np.void]) -> None:
+    """Forget the ghosts of vehicles that stand in `gate.passing`."""
+    for w in range(worlds.ticks.shape[0]):
+        for n in range(gate.num_passing[w]):
+            vehicle = gate.passing[w, n]["id"]
+            for i in range(worlds.num_owned[w], worlds.num_rows[w]):
+                if rows[w, i]["id"] == vehicle:
+                    last = worlds.num_rows[w] - 1
+                    rows[w, i] = rows[w, last]
+                    worlds.num_rows[w] = last
+                    break

@@ -1,0 +1,283 @@
+"""SUMO's vehicles as rows: each stands where SUMO says it is, at the same tick.
+
+SUMO speaks of the middle of the front bumper, of degrees clockwise from north and of the place of
+the front on its lane; a row is about the centre of the body.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cavmarl.core.math.geometry import lane_pose, wrap_angle
+from cavmarl.core.numba import inlined_kernel, kernel
+from cavmarl.core.records.arrays import Gate, RoadArrays, Travel, Zoned
+from cavmarl.core.records.codes import COUNT_DEPARTED, DRIVER_SUMO, EVENT_ARRIVED
+from cavmarl.driving.kernels.motion import account, before_tick, lane_before
+from cavmarl.driving.kernels.tracking import side_lane
+from cavmarl.driving.kernels.ways import own_step, way_left
+
+__all__ = ["Paths", "greet", "list_others", "mirror", "send_on"]
+
+BODY_LANES = 8  # that lie between a front and its body's centre
+BLINKS_RIGHT = 1  # bits of SUMO's vehicle signals
+BLINKS_LEFT = 2
+EDGES_BEHIND = 2  # so many edges before that of its front, at most, a centre is, or one after it
+
+
+class Paths(NamedTuple):
+    """Routes of SUMO's as ways of ours, one a route and class of vehicles."""
+
+    first: NDArray[np.int64]  # (P + 1,) rows [first[p], first[p + 1]) of what follows
+    edges: NDArray[np.int32]  # EDGE rows, -1: not of this map
+    ways: NDArray[np.int64]  # VEHICLE["way"] on that edge
+    nowhere: int  # the way of who is on no edge of its route
+
+
+@kernel
+def mirror(
+    roads: RoadArrays,
+    travel: Travel,
+    paths: Paths,
+    seen: NDArray[np.void],
+    zoned: Zoned,
+    side: int,
+    w: int,
+    dt: float,
+) -> int:
+    """Bring a world's mirrored rows, in all zones, to where SUMO says they are.
+
+    Args:
+        roads: the road arrays.
+        travel: types and ways.
+        paths: of the world.
+        seen: SEEN (n,) by rising numbers, with paths in the place of routes.
+        zoned: the owned rows of `side` are written; those whom SUMO has no more have arrived.
+        side: 0 or 1.
+        w: which world.
+        dt: seconds of the tick.
+
+    Returns:
+        how many have arrived.
+    """
+    gone = 0
+    for zone in range(zoned.num_owned.shape[0]):
+        found = False
+        for i in range(zoned.num_owned[zone, w]):
+            row = zoned.rows[side, zone, w, i]
+            if row["driver"] != DRIVER_SUMO:
+                continue
+            found = True
+            before = before_tick(row)
+            place = _find(seen, row["order"])
+            row["events"] = 0
+            if place < 0:
+                row["events"] = EVENT_ARRIVED
+                row["tick"] += 1
+                gone += 1
+                continue
+            _stand_in(roads, travel, paths, seen[place], row)
+            row["throttle"] = (row["speed"] - before.speed) / dt
+            account(row, before, roads, 1.0, dt)
+        if found:
+            zoned.num_outer[zone, w] = -1
+    return gone
+
+
+@kernel
+def greet(
+    roads: RoadArrays,
+    travel: Travel,
+    paths: Paths,
+    seen: NDArray[np.void],
+    departed: NDArray[np.int64],
+    speed_factors: NDArray[np.float64],
+    blank: NDArray[np.void],
+    gate: Gate,
+    w: int,
+    tick: int,
+    key: np.uint64,
+) -> None:
+    """Put a row for each vehicle that SUMO has let in into `gate.passing`, with a new id.
+
+    Args:
+        roads: the road arrays.
+        travel: types and ways.
+        paths: of the world.
+        seen: as of `mirror`.
+        departed: their numbers, rising.
+        speed_factors: theirs.
+        blank: VEHICLE (1,).
+        gate: passing, ids and counts are written.
+        w: which world.
+        tick: that they enter in.
+        key: the root of all random numbers.
+    """
+    for n in range(departed.size):
+        place = _find(seen, departed[n])
+        row = gate.passing[w, gate.num_passing[w]]
+        gate.passing[w, gate.num_passing[w]] = blank[0]
+        gate.num_passing[w] += 1
+        row["id"] = gate.next_id[w]
+        gate.next_id[w] += 1
+        gate.counts[w, COUNT_DEPARTED] += 1
+        kind = travel.types[seen[place]["vtype"]]
+        row["driver"] = DRIVER_SUMO
+        row["order"] = departed[n]
+        row["vtype"] = seen[place]["vtype"]
+        row["length"] = kind["length"]
+        row["width"] = kind["width"]
+        row["height"] = kind["height"]
+        row["speed_factor"] = speed_factors[n]
+        row["goal"] = -1
+        row["rng_key"] = key
+        row["departed"] = tick
+        row["tick"] = tick
+        _stand_in(roads, travel, paths, seen[place], row)
+        row["target_speed"] = row["speed"]
+        row["step_to_go"] = row["to_go"]
+
+
+@kernel
+def list_others(zoned: Zoned, side: int, w: int, out: NDArray[np.void]) -> int:
+    """Copy all owned rows that SUMO does not move into `out`; how many they are."""
+    found = 0
+    for zone in range(zoned.num_owned.shape[0]):
+        for i in range(zoned.num_owned[zone, w]):
+            if zoned.rows[side, zone, w, i]["driver"] != DRIVER_SUMO:
+                out[found] = zoned.rows[side, zone, w, i]
+                found += 1
+    return found
+
+
+@kernel
+def send_on(
+    roads: RoadArrays,
+    paths: Paths,
+    numbers: NDArray[np.int64],
+    chosen: NDArray[np.int64],
+    zoned: Zoned,
+    side: int,
+    w: int,
+) -> int:
+    """Give drivers of ours the other routes that SUMO has found for them.
+
+    Who is on no edge of its new route keeps the old one.
+
+    Args:
+        roads: the road arrays.
+        paths: of the world.
+        numbers: (n,) VEHICLE["order"] of those who are meant, rising.
+        chosen: (n,) their new paths.
+        zoned: the owned rows of `side` are written.
+        side: 0 or 1.
+        w: which world.
+
+    Returns:
+        how many have taken it.
+    """
+    taken = 0
+    for zone in range(zoned.num_owned.shape[0]):
+        for i in range(zoned.num_owned[zone, w]):
+            row = zoned.rows[side, zone, w, i]
+            n = np.searchsorted(numbers, row["order"])
+            if row["order"] < 0 or n == numbers.size or numbers[n] != row["order"]:
+                continue
+            edge = _edge_to_be(roads, row["lane"])
+            for k in range(paths.first[chosen[n]], paths.first[chosen[n] + 1]):
+                if paths.edges[k] == edge:
+                    row["way"] = paths.ways[k]
+                    row["leg"] += 1
+                    taken += 1
+                    break
+    return taken
+
+
+@inlined_kernel
+def _find(seen: NDArray[np.void], number: int) -> int:
+    """Where a number stands among rising ones, or -1."""
+    low = 0
+    high = seen.shape[0]
+    while low < high:
+        middle = (low + high) // 2
+        if seen[middle]["number"] < number:
+            low = middle + 1
+        else:
+            high = middle
+    if low < seen.shape[0] and seen[low]["number"] == number:
+        return low
+    return -1
+
+
+@inlined_kernel
+def _stand_in(roads: RoadArrays, travel: Travel, paths: Paths, seen: np.void, row: np.void) -> None:
+    """Write where a vehicle is and how it moves."""
+    half = 0.5 * row["length"]
+    heading = wrap_angle(0.5 * math.pi - math.radians(seen["angle"]))
+    row["heading"] = heading
+    row["x"] = seen["x"] - half * math.cos(heading)
+    row["y"] = seen["y"] - half * math.sin(heading)
+    row["speed"] = seen["speed"]
+    _place_centre(roads, seen, row)
+    lane = roads.lanes[row["lane"]]
+    _, _, _, _, _, slope = lane_pose(
+        roads.points, lane["first_point"], lane["num_points"], row["s"]
+    )
+    row["z"] = seen["z"] - half * slope
+    row["pitch"] = math.atan(slope)
+    row["side_lane"] = side_lane(roads.lanes, row["lane"], row["d"], row["width"])
+    row["target_lane"] = row["lane"]
+    signals = seen["signals"]
+    row["blinker"] = 0
+    if signals & BLINKS_LEFT:
+        row["blinker"] = 1
+    elif signals & BLINKS_RIGHT:
+        row["blinker"] = -1
+    row["way"] = _way_at(roads, paths, seen["route"], seen["at"], row["lane"])
+    row["to_go"] = way_left(roads, row, travel.steps[own_step(roads, row)])
+
+
+@inlined_kernel
+def _place_centre(roads: RoadArrays, seen: np.void, row: np.void) -> None:
+    """Lane, s and d of the centre, which may be on a lane before that of the front."""
+    lane = seen["lane"]
+    here = roads.lanes[lane]
+    if here["internal"]:
+        row["link"] = here["link"]
+    # SUMO's lanes have a length of their own, which need not be that of their polyline.
+    s = seen["pos"] * here["length_m"] / roads.edges[here["edge"]]["length_m"]
+    s -= 0.5 * row["length"]
+    for _ in range(BODY_LANES):
+        if s >= 0.0:
+            break
+        before = lane_before(roads, lane, row["link"])
+        if before < 0:
+            break
+        lane = before
+        s += roads.lanes[lane]["length_m"]
+    row["lane"] = lane
+    row["s"] = min(max(s, 0.0), roads.lanes[lane]["length_m"])
+    row["d"] = seen["lat"]
+
+
+@inlined_kernel
+def _edge_to_be(roads: RoadArrays, lane: int) -> int:
+    """The edge of a lane; inside a junction the one that it leads to."""
+    if roads.lanes[lane]["internal"]:
+        lane = roads.links[roads.lanes[lane]["link"]]["to_lane"]
+    return int(roads.lanes[lane]["edge"])
+
+
+@inlined_kernel
+def _way_at(roads: RoadArrays, paths: Paths, path: int, at: int, lane: int) -> int:
+    """The way of a vehicle whose front is on the `at`-th edge of its route."""
+    edge = _edge_to_be(roads, lane)
+    first = paths.first[path]
+    num = paths.first[path + 1] - first
+    for k in range(max(at - EDGES_BEHIND, 0), min(at + 2, num)):
+        if paths.edges[first + k] == edge:
+            return int(paths.ways[first + k])
+    return paths.nowhere

@@ -1,0 +1,258 @@
+"""Ways of single vehicles: who asks for one, what it takes, and where it is kept.
+
+A way that was found while the world runs is kept in a slot: room for one way's steps at the end of
+`Travel.steps`. Slots belong to a world; which of them are free is seen from its vehicles.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cavmarl.core.numba import kernel
+from cavmarl.core.records.arrays import RoadArrays, Travel
+from cavmarl.core.records.codes import DRIVER_BACKGROUND, EVENT_ARRIVED
+from cavmarl.roads.kernels.plans import change_cost
+from cavmarl.roads.kernels.route_steps import follow_plan, plan_route
+
+__all__ = [
+    "find_asking",
+    "find_way",
+    "has_room",
+    "mark_slots",
+    "put_on_way",
+    "take_slot",
+    "time_left",
+]
+
+REACTION_S = 1.0  # at its speed, before a driver brakes for another turn
+CHANGE_ROOM_M = 30.0  # that every lane change before the next junction needs
+
+
+@kernel
+def find_asking(
+    roads: RoadArrays,
+    rows: NDArray[np.void],
+    num: int,
+    tick: int,
+    has_rules: NDArray[np.bool_],
+    looks: NDArray[np.void],
+    asking: NDArray[np.int64],
+) -> int:
+    """The vehicles that ask for their way in this second, by rising id.
+
+    These are background vehicles of the demand on a road, without a stop to make, whose time to
+    look has come or who have come to an edge with rerouters.
+
+    Args:
+        roads: the road arrays.
+        rows: VEHICLE.
+        num: how many of them count.
+        tick: of the world.
+        has_rules: (num_edges,) where rerouters stand.
+        looks: LOOK, by VEHICLE["order"]; edges without rerouters are noted as seen.
+        asking: room for their rows.
+
+    Returns:
+        how many.
+    """
+    found = 0
+    for i in range(num):
+        row = rows[i]
+        if row["driver"] != DRIVER_BACKGROUND or row["order"] < 0:
+            continue
+        look = looks[row["order"]]
+        lane = roads.lanes[row["lane"]]
+        if not look["may_leave"] or lane["internal"] or row["events"] & EVENT_ARRIVED:
+            continue
+        if row["stop"] >= 0 and row["stop"] < row["stops_end"]:
+            continue
+        edge = lane["edge"]
+        if not has_rules[edge]:
+            look["seen"] = edge
+        if tick >= look["next"] or look["seen"] != edge:
+            k = found
+            while k > 0 and rows[asking[k - 1]]["id"] > row["id"]:
+                asking[k] = asking[k - 1]
+                k -= 1
+            asking[k] = i
+            found += 1
+    return found
+
+
+@kernel
+def find_way(
+    roads: RoadArrays,
+    plan: NDArray[np.void],
+    lane: int,
+    permission: int,
+    edges: NDArray[np.int32],
+    steps: NDArray[np.void],
+    cost: NDArray[np.float64],
+) -> int:
+    """Write the steps of the way that a plan leads along from a lane.
+
+    Args:
+        roads: the road arrays, with the speeds that count now.
+        plan: PLAN (L,) of the goal, made with the same speeds.
+        lane: LANE row outside junctions.
+        permission: bits of the class that drives.
+        edges: room for EDGE rows.
+        steps: PLAN, room for the steps; those of the lane's edge come first.
+        cost: room, as long as `steps`.
+
+    Returns:
+        how many steps were written; 0 where there is no way or it is too long for the room.
+    """
+    if plan[lane]["to_go"] == math.inf:
+        return 0
+    number = follow_plan(roads, plan, lane, edges)
+    if number < 0:
+        return 0
+    total = 0
+    for n in range(number):
+        total += roads.edges[edges[n]]["num_lanes"]
+    if total > steps.shape[0]:
+        return 0
+    return plan_route(roads, edges[:number], permission, 0, steps, cost)
+
+
+@kernel
+def time_left(roads: RoadArrays, steps: NDArray[np.void], way: int, lane: int) -> float:
+    """Seconds from the start of a lane to the end of its way, lane changes counted in.
+
+    Args:
+        roads: the road arrays, with the speeds that count.
+        steps: PLAN, where the way lies.
+        way: VEHICLE["way"].
+        lane: LANE row.
+    """
+    total: float = 0.0
+    while True:
+        row = roads.lanes[lane]
+        if row["internal"]:
+            total += row["length_m"] / row["speed_mps"]
+            lane = row["successor"]
+            continue
+        step = steps[way + lane]
+        if step["to_go"] == math.inf:
+            return math.inf
+        if step["change"] != 0:
+            total += change_cost(roads, lane, 1.0)
+            lane = row["left"] if step["change"] > 0 else row["right"]
+            continue
+        total += row["length_m"] / row["speed_mps"]
+        if step["next"] < 0:
+            return total
+        way += step["shift"]
+        lane = step["next"]
+
+
+@kernel
+def has_room(
+    roads: RoadArrays, travel: Travel, row: np.void, steps: NDArray[np.void], way: int
+) -> bool:
+    """Whether a vehicle can still follow another way from its lane on without braking hard.
+
+    Args:
+        roads: the road arrays.
+        travel: types, and the way that it has.
+        row: VEHICLE outside junctions.
+        steps: PLAN, where the other way lies.
+        way: where in it, as VEHICLE["way"].
+    """
+    step = steps[way + row["lane"]]
+    present = travel.steps[row["way"] + row["lane"]]
+    if step["change"] == 0 and present["change"] == 0 and step["link"] == present["link"]:
+        return True
+    speed = row["speed"]
+    brake = speed * speed / (2.0 * travel.types[row["vtype"]]["decel"])
+    left = roads.lanes[row["lane"]]["length_m"] - row["s"] - 0.5 * row["length"]
+    enough: bool = left >= brake + REACTION_S * speed + CHANGE_ROOM_M * step["changes"]
+    return enough
+
+
+@kernel
+def mark_slots(
+    roads: RoadArrays,
+    rows: NDArray[np.void],
+    num: int,
+    first_slot: int,
+    slot_steps: int,
+    used: NDArray[np.bool_],
+) -> None:
+    """Which slots of a world hold the way of a vehicle.
+
+    Args:
+        roads: the road arrays.
+        rows: VEHICLE.
+        num: how many of them count.
+        first_slot: PLAN row of the world's first slot.
+        slot_steps: steps of a slot.
+        used: (num_slots,), written.
+    """
+    used[:] = False
+    for i in range(num):
+        slot = slot_of(roads, rows[i], first_slot, slot_steps)
+        if slot >= 0:
+            used[slot] = True
+
+
+@kernel
+def slot_of(roads: RoadArrays, row: np.void, first_slot: int, slot_steps: int) -> int:
+    """The slot of a vehicle's way, or -1 where all may drive on that way."""
+    lane = row["lane"]
+    if roads.lanes[lane]["internal"]:
+        lane = roads.links[roads.lanes[lane]["link"]]["to_lane"]
+    place = row["way"] + lane - first_slot
+    slot: int = place // slot_steps if place >= 0 else -1
+    return slot
+
+
+@kernel
+def take_slot(
+    roads: RoadArrays,
+    travel: Travel,
+    row: np.void,
+    found: NDArray[np.void],
+    first_slot: int,
+    slot_steps: int,
+    used: NDArray[np.bool_],
+) -> bool:
+    """Put the steps of a new way into a slot, and the vehicle on it.
+
+    Args:
+        roads: the road arrays.
+        travel: its steps from `first_slot` on are written.
+        row: VEHICLE, written.
+        found: PLAN, the steps; those of the vehicle's edge come first.
+        first_slot: PLAN row of the world's first slot.
+        slot_steps: steps of a slot.
+        used: (num_slots,) which are taken, written.
+
+    Returns:
+        whether there was a slot.
+    """
+    slot = slot_of(roads, row, first_slot, slot_steps)
+    if slot < 0:
+        slot = 0
+        while slot < used.shape[0] and used[slot]:
+            slot += 1
+        if slot == used.shape[0]:
+            return False
+        used[slot] = True
+    begin = first_slot + slot * slot_steps
+    for n in range(found.shape[0]):
+        travel.steps[begin + n] = found[n]
+    put_on_way(travel, row, begin - roads.edges[roads.lanes[row["lane"]]["edge"]]["first_lane"])
+    return True
+
+
+@kernel
+def put_on_way(travel: Travel, row: np.void, way: int) -> None:
+    """Let a vehicle outside junctions follow another way from its lane on."""
+    row["way"] = way
+    row["leg"] += 1
+    row["to_go"] = travel.steps[way + row["lane"]]["to_go"] - row["s"]

@@ -1,0 +1,152 @@
+"""`Cast`: the actors of a scene as rows of a world."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cavmarl.core.math.geometry import lane_pose
+from cavmarl.core.records.arrays import Gate, RoadArrays, Scripts, Travel, Worlds
+from cavmarl.core.records.codes import COUNT_DEPARTED, DRIVER_SCRIPTED
+from cavmarl.driving.kernels.scripted_rows import stand_at
+from cavmarl.roads.network import RoadNetwork
+from cavmarl.traffic.departure_queue import DEPARTURE
+from cavmarl.traffic.kernels.demand_generator import enter
+from cavmarl.traffic.scenarios.movement_scripts import actor_types, bodies_of, compile_scripts
+from cavmarl.traffic.scenarios.scene import Scene, Seat
+from cavmarl.traffic.scenarios.seats import take_seats
+from cavmarl.traffic.scenarios.streets import Streets
+
+__all__ = ["Cast"]
+
+SEAT_CLEAR_M = 30.0  # around the seat of an agent that is not the first
+
+
+@dataclass(frozen=True)
+class Cast:
+    """The actors of a scene, ready to enter worlds.
+
+    Attributes:
+        scene: what is played.
+        scripts: its tables.
+        firsts: FRAME of each actor at the beginning.
+        types: VTYPE rows of all bodies.
+        vtypes: (n,) VTYPE row of each actor, among all types of a world.
+        seats: of the agents.
+        goal: of all of them, a row of the plans' table.
+    """
+
+    scene: Scene
+    scripts: Scripts
+    firsts: list[int]
+    types: NDArray[np.void]
+    vtypes: list[int]
+    seats: list[Seat]
+    goal: int
+
+    @staticmethod
+    def of(
+        scene: Scene,
+        network: RoadNetwork,
+        goals: Mapping[int, int],
+        first_type: int,
+        dt: float,
+        num_agents: int = 1,
+    ) -> Cast:
+        """The cast of a scene.
+
+        Args:
+            scene: what is played.
+            network: the roads.
+            goals: row of the plans' table by EDGE.
+            first_type: how many types of vehicles there are without the actors'.
+            dt: seconds a tick.
+            num_agents: of a world.
+
+        Raises:
+            ScenarioError: the scene has no room for so many agents.
+        """
+        seats = take_seats(Streets(network), scene, num_agents)
+        scripts, firsts = compile_scripts(network, scene.actors, scene.cues, goals, dt)
+        vtypes = [first_type + number for number in bodies_of(scene.actors)]
+        goal = goals[scene.seat.goal_edge]
+        return Cast(scene, scripts, firsts, actor_types(), vtypes, seats, goal)
+
+    def enter(
+        self,
+        roads: RoadArrays,
+        travel: Travel,
+        gate: Gate,
+        worlds: Worlds,
+        w: int,
+        blank: NDArray[np.void],
+    ) -> None:
+        """Put the agents and the actors into a world that has just been populated.
+
+        Whoever else stands in the scene is left out. Agents keep their ids, actors get the next
+        ones.
+
+        Args:
+            roads: the road arrays.
+            travel: types and ways.
+            gate: written.
+            worlds: the rows of world w are written; nobody has divided it yet.
+            w: which world.
+            blank: VEHICLE (1,), the record that every vehicle starts from.
+        """
+        rows = worlds.rows[w]
+        others = rows[: worlds.num_owned[w]]
+        others = others[(others["agent"] < 0) & self._is_clear(roads, others)].copy()
+        queue = gate.queue[w, : gate.num_queue[w]]
+        queue = queue[queue["agent"] < 0].copy()
+        gate.queue[w, : len(queue)] = queue
+        gate.num_queue[w] = len(queue)
+        for agent, seat in enumerate(self.seats):
+            row = rows[agent]
+            rows[agent] = blank[0]
+            departure = self._departure(roads, agent, seat)
+            enter(roads, travel, worlds, w, departure, seat.lane, seat.s, seat.speed_mps, row)
+        num = len(self.seats)
+        rows[num : num + len(others)] = others
+        num += len(others)
+        for first, vtype in zip(self.firsts, self.vtypes, strict=True):
+            row = rows[num]
+            rows[num] = blank[0]
+            row["id"] = gate.next_id[w]
+            row["driver"] = DRIVER_SCRIPTED
+            row["vtype"], row["goal"] = vtype, first
+            for name in ("length", "width", "height"):
+                row[name] = travel.types[name][vtype]
+            row["rng_key"], row["departed"], row["tick"] = (
+                worlds.keys[w], worlds.ticks[w], worlds.ticks[w],
+            )  # fmt: skip
+            stand_at(self.scripts.frames[first], row)
+            gate.next_id[w] += 1
+            num += 1
+        gate.counts[w, COUNT_DEPARTED] = num
+        worlds.num_owned[w] = worlds.num_rows[w] = num
+
+    def _is_clear(self, roads: RoadArrays, rows: NDArray[np.void]) -> NDArray[np.bool_]:
+        """(n,) which vehicles stand neither in the scene nor where an agent begins."""
+        clear: NDArray[np.bool_] = (
+            np.hypot(rows["x"] - self.scene.x, rows["y"] - self.scene.y) > self.scene.clear_m
+        )
+        for seat in self.seats[1:]:
+            lane = roads.lanes[seat.lane]
+            x, y, *_ = lane_pose(roads.points, lane["first_point"], lane["num_points"], seat.s)
+            clear &= np.hypot(rows["x"] - x, rows["y"] - y) > SEAT_CLEAR_M
+        return clear
+
+    def _departure(self, roads: RoadArrays, agent: int, seat: Seat) -> np.void:
+        """What an agent's entry takes of a DEPARTURE."""
+        departure: np.void = np.zeros(1, DEPARTURE)[0]
+        for name in ("order", "stop", "stops_end"):
+            departure[name] = -1
+        departure["id"] = departure["agent"] = agent
+        departure["goal"] = self.goal
+        departure["way"] = self.goal * len(roads.lanes)
+        departure["speed_factor"] = seat.speed_mps / roads.lanes["speed_mps"][seat.lane]
+        return departure

@@ -1,0 +1,125 @@
+"""Scenarios: one file each, in this folder or anywhere.
+
+A file's docstring says what happens. It defines
+
+- `NEEDS`, what a map must have for it, in words;
+- `Parameters`, a frozen dataclass of `settings.setting`s and `settings.switch`es;
+- `places(streets, parameters)`, by name where on a map it can be played;
+- `stage(streets, place, parameters)`, the `Scene` at one of these places.
+"""
+
+from __future__ import annotations
+
+import importlib
+import importlib.util
+import sys
+from difflib import get_close_matches
+from functools import cache, lru_cache
+from pathlib import Path
+from pkgutil import iter_modules
+from types import ModuleType
+from typing import Any
+
+import numpy as np
+
+from cavmarl.config.scenario import ScenarioConfig
+from cavmarl.core.errors import NoPlaceError, ScenarioError
+from cavmarl.core.math.rng import STREAM_PLACE, below, world_key
+from cavmarl.roads.network import RoadNetwork
+from cavmarl.traffic.scenarios.scenario_parameters import checked
+from cavmarl.traffic.scenarios.scene import Scene
+from cavmarl.traffic.scenarios.streets import Streets
+
+__all__ = ["load_scenario", "plan_scene", "scenario_names", "summary_of"]
+
+PARTS = ("NEEDS", "Parameters", "places", "stage")
+
+
+def scenario_names() -> list[str]:
+    """Those that come with cavmarl, by name."""
+    return sorted(module.name for module in iter_modules(__path__))
+
+
+@cache
+def load_scenario(name: str) -> Any:
+    """The module of a scenario.
+
+    Args:
+        name: one of `scenario_names`, or the path of a `.py` file.
+
+    Raises:
+        ScenarioError: nothing of that name, or a file that is no scenario.
+    """
+    if name in scenario_names():
+        return importlib.import_module(f"{__name__}.{name}")
+    path = Path(name)
+    if path.suffix != ".py" or not path.is_file():
+        close = get_close_matches(name, scenario_names(), n=1)
+        hint = f"did you mean {close[0]}? " if close else ""
+        raise ScenarioError(
+            f"no scenario or file '{name}'; {hint}There are: {', '.join(scenario_names())}"
+        )
+    module = _run(path)
+    if missing := [part for part in PARTS if not hasattr(module, part)]:
+        raise ScenarioError(f"{path}: no scenario, it does not define {', '.join(missing)}")
+    return module
+
+
+def _run(path: Path) -> ModuleType:
+    spec = importlib.util.spec_from_file_location(f"cavmarl_scenario_{path.stem}", path)
+    if spec is None or spec.loader is None:
+        raise ScenarioError(f"{path}: not a Python file")
+    module = importlib.util.module_from_spec(spec)
+    sys.modules[spec.name] = module  # where its dataclass looks for what its annotations name
+    try:
+        spec.loader.exec_module(module)
+    except Exception as error:  # the file is the user's: it may raise anything
+        del sys.modules[spec.name]
+        raise ScenarioError(f"{path}: {type(error).__name__}: {error}") from error
+    return module
+
+
+def summary_of(name: str) -> str:
+    """The first sentence about a scenario."""
+    text = load_scenario(name).__doc__ or ""
+    return " ".join(text.strip().split("\n\n")[0].split())
+
+
+def plan_scene(config: ScenarioConfig, network: RoadNetwork) -> Scene | None:
+    """What is played on a map; None without a scenario.
+
+    Raises:
+        ScenarioError: no such scenario, or no such place on the map.
+        NoPlaceError: the map has none at all.
+        ConfigError: a parameter that it does not have, or a value out of range.
+    """
+    if not config.name:
+        return None
+    scenario = load_scenario(config.name)
+    parameters = checked(scenario.Parameters, config.params, config.name)
+    places = _places(config.name, network, parameters)
+    if not places:
+        raise NoPlaceError(
+            f"scenario '{config.name}': the map '{network.name}' has no place for it; it needs "
+            f"{scenario.NEEDS}"
+        )
+    name = config.place
+    if not name:
+        key = np.uint64(world_key(config.seed, 0, 0))
+        name = sorted(places)[below(key, 0, 0, STREAM_PLACE, len(places))]
+    if name not in places:
+        close = get_close_matches(name, places, n=1)
+        some = ", ".join(close or sorted(places)[:5])
+        raise ScenarioError(
+            f"scenario.place = {name!r}: not one of the {len(places)} places that the map "
+            f"'{network.name}' has for '{config.name}', such as {some}"
+        )
+    scene: Scene = scenario.stage(Streets(network), places[name], parameters)
+    return scene
+
+
+@lru_cache(maxsize=16)  # several worlds of an environment ask one after the other
+def _places(name: str, network: RoadNetwork, parameters: Any) -> dict[str, Any]:
+    """Where on a map a scenario can be played, by name."""
+    found: dict[str, Any] = load_scenario(name).places(Streets(network), parameters)
+    return found

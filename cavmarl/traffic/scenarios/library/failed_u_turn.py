@@ -1,0 +1,90 @@
+"""An oncoming car turns round, fails at the first attempt and stands across the agent's lane.
+
+It reverses, turns further and drives off in front of the agent: a turn in three parts.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cavmarl.traffic.scenarios.motions import ACCEL_MPS2, Act, Await, Move, Wait, arc
+from cavmarl.traffic.scenarios.movement_scripts import Actor, Cue
+from cavmarl.traffic.scenarios.scenario_parameters import setting
+from cavmarl.traffic.scenarios.scene import Scene, Seat
+from cavmarl.traffic.scenarios.streets import Opposite, Streets
+
+NEEDS = "a straight road of 85 m or more with one lane for the other direction right beside it"
+
+ROAD_M = 85.0
+BEHIND_M = 30.0  # of road beyond the place where the turn begins
+RADIUS_M = 5.0  # of the turning circle
+
+
+@dataclass(frozen=True)
+class Parameters:
+    """What can be said about the turn."""
+
+    speed_mps: float = setting(8.0, 3.0, 12.0, "m/s", "speed of the agent when it starts")
+    turn_mps: float = setting(3.0, 1.0, 4.0, "m/s", "speed of the car that turns")
+    pause_s: float = setting(3.0, 1.0, 20.0, "s", "how long it stands between two parts")
+    lead_s: float = setting(
+        0.5, 0.0, 2.0, "s", "how long before an agent that does not brake it stands in its lane"
+    )
+
+
+def places(streets: Streets, parameters: Parameters) -> dict[str, int]:
+    """Straight lanes beside an oncoming one."""
+    found = {}
+    for lane in streets.straights(ROAD_M):
+        other = streets.opposite(lane, streets.length_m(lane) - BEHIND_M)
+        if other is not None and other.apart_m < 2.0 * RADIUS_M:
+            found[streets.name(lane)] = lane
+    return found
+
+
+def stage(streets: Streets, place: int, parameters: Parameters) -> Scene:
+    """The car stands across when an agent that keeps its speed comes to it."""
+    begin_s = streets.length_m(place) - BEHIND_M
+    other = streets.opposite(place, begin_s)
+    assert other is not None, "a place that `places` has not found"
+    forward, back, away = _parts(streets, other)
+    speed = parameters.turn_mps
+    to_across_s = RADIUS_M * _first_turn(other) / speed + speed / ACCEL_MPS2
+    radius_m = parameters.speed_mps * (to_across_s + parameters.lead_s)
+    acts: list[Act] = [
+        Move(forward[:1], other.lane),
+        Await(0),
+        Move(forward, place, speed),
+        Wait(parameters.pause_s),
+        Move(back, place, speed, backwards=True),
+        Wait(parameters.pause_s),
+        Move(away, place, speed),
+        Wait(0.5),
+    ]
+    across_s = begin_s - RADIUS_M * math.sin(_first_turn(other))
+    x, y, _ = streets.point(place, across_s).tolist()
+    edge = streets.edge(place)
+    seat = Seat(place, max(across_s - radius_m - 20.0, 5.0), parameters.speed_mps, edge)
+    car = Actor("car", acts, edge)
+    return Scene(streets.name(place), x, y, seat, [car], [Cue(x, y, radius_m)])
+
+
+def _first_turn(other: Opposite) -> float:
+    """How far the heading turns in the first part, in rad.
+
+    Three arcs of one radius r through α, π - 2 α and α carry a car 2 r (1 - 2 cos α) aside, which
+    has to be the distance of the lanes.
+    """
+    return math.acos(0.25 * (2.0 - other.apart_m / RADIUS_M))
+
+
+def _parts(streets: Streets, other: Opposite) -> list[NDArray[np.float64]]:
+    """The lines forwards, backwards and forwards again."""
+    first = _first_turn(other)
+    forward = arc(streets.point(other.lane, other.s), RADIUS_M, first)
+    back = arc(forward[-1], RADIUS_M, math.pi - 2.0 * first, backwards=True)
+    return [forward, back, arc(back[-1], RADIUS_M, first)]

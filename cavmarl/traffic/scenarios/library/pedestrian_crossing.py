@@ -1,0 +1,67 @@
+"""A pedestrian steps onto the road off any crosswalk, just as the agent comes.
+
+Where it is occluded, a van that is parked beside the road hides the pedestrian until the last
+moment.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from cavmarl.traffic.scenarios.motions import ACCEL_MPS2, Await, Move
+from cavmarl.traffic.scenarios.movement_scripts import Actor, Cue
+from cavmarl.traffic.scenarios.scenario_parameters import setting, switch
+from cavmarl.traffic.scenarios.scene import Scene, Seat
+from cavmarl.traffic.scenarios.streets import Streets
+
+NEEDS = "a straight road for cars of 85 m or more"
+
+ROAD_M = 85.0
+BEHIND_M = 25.0  # of road beyond the pedestrian
+KERB_M = 1.4  # where the pedestrian stands, and ends, beside the road
+VAN_GAP_M = 0.3  # between road and van
+VAN_M = (6.5, 2.16)
+STEP_M = 1.0  # between van and pedestrian
+
+
+@dataclass(frozen=True)
+class Parameters:
+    """What can be said about the crossing."""
+
+    speed_mps: float = setting(8.0, 3.0, 14.0, "m/s", "speed of the agent when it starts")
+    walk_mps: float = setting(1.4, 0.5, 3.0, "m/s", "speed of the pedestrian")
+    lead_s: float = setting(
+        0.0, -0.5, 2.0, "s", "how long before an agent that does not brake it is in its lane"
+    )
+    occluded: bool = switch(False, "a parked van hides the pedestrian")
+
+
+def places(streets: Streets, parameters: Parameters) -> dict[str, int]:
+    """The rightmost lanes of straight roads."""
+    lanes = streets.network.lanes
+    return {
+        streets.name(lane): lane for lane in streets.straights(ROAD_M) if lanes["right"][lane] < 0
+    }
+
+
+def stage(streets: Streets, place: int, parameters: Parameters) -> Scene:
+    """The pedestrian sets off so that whoever keeps its speed runs into it."""
+    lane, s = place, streets.length_m(place) - BEHIND_M
+    right, left = streets.kerbs_m(lane, s)
+    side = right + KERB_M
+    walk = parameters.walk_mps
+    to_lane_s = side / walk + 0.5 * walk / ACCEL_MPS2
+    radius_m = parameters.speed_mps * (to_lane_s + parameters.lead_s)
+    start, end = streets.point(lane, s, -side), streets.point(lane, s, left + KERB_M)
+    heading = start[2] + 0.5 * np.pi
+    line = np.array([[*start[:2], heading], [*end[:2], heading]])
+    actors = [Actor("pedestrian", [Move(line[:1], lane), Await(0), Move(line, lane, walk)])]
+    if parameters.occluded:
+        d = right + VAN_GAP_M + 0.5 * VAN_M[1]
+        van = streets.point(lane, s - STEP_M - 0.5 * VAN_M[0], -d)
+        actors.append(Actor("van", [Move(van[None, :], lane)]))
+    x, y, _ = streets.point(lane, s).tolist()
+    seat = Seat(lane, max(s - radius_m - 20.0, 5.0), parameters.speed_mps, streets.edge(lane))
+    return Scene(streets.name(lane), x, y, seat, actors, [Cue(x, y, radius_m)])

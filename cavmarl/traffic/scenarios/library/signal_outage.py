@@ -1,0 +1,69 @@
+"""The signals of a junction go dark as the agent comes, on the road that then has to give way.
+
+Cars on the other road do not slow down for it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+from cavmarl.traffic.scenarios.scenario_parameters import setting
+from cavmarl.traffic.scenarios.scene import Outage, Scene
+from cavmarl.traffic.scenarios.streets import Crossing, Streets
+from cavmarl.traffic.stream import meet_stream
+
+NEEDS = (
+    "a signal, and a way straight on that gives way to another one where it is off, with 55 m of "
+    "road before it"
+)
+
+FAR_M = 50.0  # from the agent to the junction in the beginning
+
+
+@dataclass(frozen=True)
+class Parameters:
+    """What can be said about the outage and both sides."""
+
+    speed_mps: float = setting(8.0, 3.0, 10.0, "m/s", "speed of the agent when it starts")
+    passing_mps: float = setting(8.0, 3.0, 14.0, "m/s", "speed of the cars that cross")
+    gap_s: float = setting(1.5, 1.0, 3.0, "s", "between them, from centre to centre")
+    cars: float = setting(3, 1, 6, "", "how many cross")
+    lead_s: float = setting(
+        0.0, -0.4, 0.4, "s", "how long the first is there before an agent that keeps its speed"
+    )
+    dark_s: float = setting(1.0, 0.0, 10.0, "s", "when the signals go dark")
+
+
+def places(streets: Streets, parameters: Parameters) -> dict[str, Crossing]:
+    """Ways straight on that another one crosses, which goes first where the signal is off."""
+    found: dict[str, Crossing] = {}
+    for crossing in streets.crossings("s", yields=True, merges=False):
+        one, other = streets.network.links[[crossing.link, crossing.foe]]
+        if one["signal"] < 0 or one["signal"] != other["signal"] or one["state"] != ord("o"):
+            continue
+        name = streets.name(int(one["from_lane"]))
+        if name not in found and _staged(streets, crossing, parameters) is not None:
+            found[name] = crossing
+    return found
+
+
+def stage(streets: Streets, place: Crossing, parameters: Parameters) -> Scene:
+    """The first car meets an agent that keeps its speed in the dark junction."""
+    scene = _staged(streets, place, parameters)
+    assert scene is not None, "a place that `places` has not found"
+    signal = int(streets.network.links["signal"][place.link])
+    outage = Outage(streets.network.signal_ids[signal], parameters.dark_s)
+    return replace(scene, outages=(outage,))
+
+
+def _staged(streets: Streets, place: Crossing, parameters: Parameters) -> Scene | None:
+    return meet_stream(
+        streets,
+        place,
+        FAR_M,
+        parameters.speed_mps,
+        parameters.passing_mps,
+        cars=parameters.cars,
+        gap_s=parameters.gap_s,
+        lead_s=parameters.lead_s,
+    )

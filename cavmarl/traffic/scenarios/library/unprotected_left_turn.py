@@ -1,0 +1,63 @@
+"""The agent turns left across oncoming cars that do not slow down for it.
+
+No signal phase of its own protects it: it has to find a gap, or to wait until all have passed.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from cavmarl.traffic.scenarios.scenario_parameters import setting
+from cavmarl.traffic.scenarios.scene import Scene
+from cavmarl.traffic.scenarios.streets import Crossing, Streets
+from cavmarl.traffic.stream import meet_stream
+
+NEEDS = "a left turn across an oncoming lane, with 45 m of road before it"
+
+FAR_M = 40.0  # from the agent to the junction in the beginning
+OPPOSITE_RAD = 2.4  # between approaches that face each other
+
+
+@dataclass(frozen=True)
+class Parameters:
+    """What can be said about both sides."""
+
+    speed_mps: float = setting(6.0, 3.0, 10.0, "m/s", "speed of the agent when it starts")
+    oncoming_mps: float = setting(8.0, 3.0, 14.0, "m/s", "speed of the oncoming cars")
+    gap_s: float = setting(1.5, 1.0, 3.0, "s", "between oncoming cars, from centre to centre")
+    cars: float = setting(3, 1, 6, "", "how many come")
+    lead_s: float = setting(
+        0.0, -0.4, 0.4, "s", "how long the first is there before an agent that keeps its speed"
+    )
+
+
+def places(streets: Streets, parameters: Parameters) -> dict[str, Crossing]:
+    """Left turns that have to give way to a lane that comes from the opposite side."""
+    found: dict[str, Crossing] = {}
+    for crossing in streets.crossings("lL", yields=True, merges=False):
+        if streets.turn_rad(crossing.link, crossing.foe) > OPPOSITE_RAD:
+            lane = int(streets.network.links["from_lane"][crossing.link])
+            name = streets.name(lane)
+            if name not in found and _staged(streets, crossing, parameters) is not None:
+                found[name] = crossing
+    return found
+
+
+def stage(streets: Streets, place: Crossing, parameters: Parameters) -> Scene:
+    """The first car meets an agent that keeps its speed where both ways cross."""
+    scene = _staged(streets, place, parameters)
+    assert scene is not None, "a place that `places` has not found"
+    return scene
+
+
+def _staged(streets: Streets, place: Crossing, parameters: Parameters) -> Scene | None:
+    return meet_stream(
+        streets,
+        place,
+        FAR_M,
+        parameters.speed_mps,
+        parameters.oncoming_mps,
+        cars=parameters.cars,
+        gap_s=parameters.gap_s,
+        lead_s=parameters.lead_s,
+    )

@@ -1,0 +1,288 @@
+"""What an actor of a script can do, and where that takes it in each tick."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cavmarl.core.math.geometry import lane_pose
+from cavmarl.driving.kernels.announcing import announced_m
+from cavmarl.driving.kernels.approach import MAX_LINKS_AHEAD
+from cavmarl.roads.network import RoadNetwork
+
+__all__ = ["ACCEL_MPS2", "Act", "Await", "Move", "Pose", "Ride", "Wait", "arc", "path_of"]
+
+ACCEL_MPS2 = 2.5  # how actors speed up and slow down
+CREEP_MPS = 0.2  # on the last centimetres before they stand
+
+
+class Pose(NamedTuple):
+    """Where an actor is in one tick.
+
+    Attributes:
+        x, y: of its centre, m.
+        heading: rad.
+        speed: along it in m/s, negative backwards.
+        pitch: rad.
+        beside: LANE row on whose level it is.
+        on: lane, s and d of who rides along lanes; None: it moves freely.
+        link: LINK row that it is on or has entered last.
+        claims: the distance to the stop line, and the LINK row, of each link that it is on or will
+            be on soon.
+        cue: that it waits for, or -1.
+    """
+
+    x: float
+    y: float
+    heading: float
+    speed: float
+    beside: int
+    pitch: float = 0.0
+    on: tuple[int, float, float] | None = None
+    link: int = -1
+    claims: tuple[tuple[float, int], ...] = ()
+    cue: int = -1
+
+
+@dataclass(frozen=True)
+class Wait:
+    """Stand for some seconds."""
+
+    seconds: float
+
+    def poses(
+        self, network: RoadNetwork, length: float, last: Pose | None, dt: float
+    ) -> Iterator[Pose]:
+        """See `Move.poses`."""
+        assert last is not None, "a script begins with a place"
+        for _ in range(round(self.seconds / dt)):
+            yield last._replace(speed=0.0, cue=-1)
+
+
+@dataclass(frozen=True)
+class Await:
+    """Stay until a cue has come, one of those of the scene, by its number."""
+
+    cue: int
+
+    def poses(
+        self, network: RoadNetwork, length: float, last: Pose | None, dt: float
+    ) -> Iterator[Pose]:
+        """See `Move.poses`."""
+        assert last is not None, "a script begins with a place"
+        yield last._replace(cue=self.cue)
+
+
+@dataclass(frozen=True)
+class Move:
+    """Move freely along a line, from standstill to standstill.
+
+    Attributes:
+        line: (n, 3) x, y and heading, close enough together that straight lines between them will
+            do; a single row is a place to stand at.
+        beside: LANE row of the road on which, or beside which, this is.
+        speed_mps: on the way.
+        backwards: whether a vehicle reverses.
+    """
+
+    line: NDArray[np.float64]
+    beside: int
+    speed_mps: float = 0.0
+    backwards: bool = False
+
+    def poses(
+        self, network: RoadNetwork, length: float, last: Pose | None, dt: float
+    ) -> Iterator[Pose]:
+        """The poses of each tick.
+
+        Args:
+            network: the roads.
+            length: of the body, m.
+            last: the pose before; None: this one begins the script, with a pose of its own.
+            dt: seconds a tick.
+        """
+        line = self.line
+        if last is None:
+            x, y, heading = line[0].tolist()
+            yield Pose(x, y, heading, 0.0, self.beside)
+        if len(line) == 1:
+            return
+        steps = np.hypot(*np.diff(line[:, :2], axis=0).T)
+        along = np.concatenate([[0.0], np.cumsum(steps)])
+        headings = np.unwrap(line[:, 2])
+        for u, speed in _course(float(along[-1]), 0.0, self.speed_mps, 0.0, dt):
+            x, y, heading = (
+                float(np.interp(u, along, column)) for column in (line[:, 0], line[:, 1], headings)
+            )
+            turned = math.remainder(heading, 2.0 * math.pi)
+            yield Pose(x, y, turned, -speed if self.backwards else speed, self.beside)
+
+
+@dataclass(frozen=True)
+class Ride:
+    """Ride along the middle of lanes as built-in drivers do, but heeding nobody.
+
+    Attributes:
+        lanes: LANE rows one after the other, those inside junctions among them.
+        start_m: of the centre, from the start of the first lane.
+        end_m: of the centre, from the start of the first lane.
+        speed_mps: on the way.
+        start_mps: at the beginning.
+        end_mps: at the end.
+    """
+
+    lanes: tuple[int, ...]
+    start_m: float
+    end_m: float
+    speed_mps: float
+    start_mps: float = 0.0
+    end_mps: float = 0.0
+
+    def poses(
+        self, network: RoadNetwork, length: float, last: Pose | None, dt: float
+    ) -> Iterator[Pose]:
+        """See `Move.poses`."""
+        if last is None:
+            yield self._pose(network, length, self.start_m, self.start_mps)
+        far = self.end_m - self.start_m
+        for u, speed in _course(far, self.start_mps, self.speed_mps, self.end_mps, dt):
+            yield self._pose(network, length, self.start_m + u, speed)
+
+    def _pose(self, network: RoadNetwork, length: float, u: float, speed: float) -> Pose:
+        front, rear = (self._point(network, u + side * 0.5 * length) for side in (1.0, -1.0))
+        lane, s = self._place(network, u)
+        _, _, _, _, _, slope = _lane_pose(network, lane, s)
+        return Pose(
+            0.5 * (front[0] + rear[0]),
+            0.5 * (front[1] + rear[1]),
+            math.atan2(front[1] - rear[1], front[0] - rear[0]),
+            speed,
+            lane,
+            math.atan(slope),
+            (lane, s, 0.0),
+            self._entered(network, lane),
+            tuple(self._claims(network, u, speed, length)),
+        )
+
+    def _place(self, network: RoadNetwork, u: float) -> tuple[int, float]:
+        """Lane and s of a place of its way; beyond the ends, on the lines of the end lanes."""
+        for lane in self.lanes[:-1]:
+            here = float(network.lanes["length_m"][lane])
+            if u < here:
+                return lane, u
+            u -= here
+        return self.lanes[-1], u
+
+    def _point(self, network: RoadNetwork, u: float) -> tuple[float, float]:
+        x, y, *_ = _lane_pose(network, *self._place(network, u))
+        return x, y
+
+    def _entered(self, network: RoadNetwork, lane: int) -> int:
+        """The link that is on the way to a lane, and was entered last."""
+        at = self.lanes.index(lane)
+        for before, after in reversed(list(pairwise(self.lanes[: at + 1]))):
+            if (link := _link_between(network, before, after)) >= 0:
+                return link
+        return -1
+
+    def _claims(
+        self, network: RoadNetwork, u: float, speed: float, length: float
+    ) -> Iterator[tuple[float, int]]:
+        """The links that it is on, or will be on soon, as `kernels.approach` lists them."""
+        reach = announced_m(speed)
+        line_m, ahead = 0.0, 0
+        for before, after in pairwise(self.lanes):
+            line_m += float(network.lanes["length_m"][before])
+            link = _link_between(network, before, after)
+            if link < 0:
+                continue
+            dist = line_m - u
+            behind = float(network.links["length_m"][link]) + 0.5 * length
+            if dist > reach or ahead == MAX_LINKS_AHEAD:
+                return
+            if dist > -behind:
+                ahead += dist > 0.0
+                yield dist, link
+
+
+Act = Move | Ride | Wait | Await
+"""One thing that an actor does."""
+
+
+def path_of(network: RoadNetwork, link: int) -> tuple[int, ...]:
+    """The lanes of a link, with the one that it leaves and the one that it reaches."""
+    row = network.links[link]
+    lanes = [int(row["from_lane"]), int(row["next_lane"])]
+    while network.lanes["internal"][lanes[-1]]:
+        lanes.append(int(network.lanes["successor"][lanes[-1]]))
+    return tuple(lanes)
+
+
+def arc(
+    start: Sequence[float] | NDArray[np.float64],
+    radius_m: float,
+    turn_rad: float,
+    *,
+    backwards: bool = False,
+) -> NDArray[np.float64]:
+    """(n, 3) a circular arc of a vehicle's centre, from x, y and heading on.
+
+    Args:
+        start: x, y and heading.
+        radius_m: of the arc.
+        turn_rad: how far the heading turns, positive to the left.
+        backwards: whether the vehicle reverses.
+    """
+    x, y, heading = start
+    # Going forwards the centre of the circle lies on the side that the heading turns to.
+    side = math.copysign(1.0, turn_rad) * (-1.0 if backwards else 1.0)
+    headings = heading + np.linspace(0.0, turn_rad, max(2, int(abs(turn_rad) / 0.05) + 1))
+    middle_x, middle_y = (
+        x - side * radius_m * math.sin(heading),
+        y + side * radius_m * math.cos(heading),
+    )
+    return np.stack(
+        [
+            middle_x + side * radius_m * np.sin(headings),
+            middle_y - side * radius_m * np.cos(headings),
+            headings,
+        ],
+        axis=1,
+    )
+
+
+def _course(
+    far: float, start: float, speed: float, end: float, dt: float
+) -> Iterator[tuple[float, float]]:
+    """Way and speed after each tick on a way of `far` m, the speeds in m/s."""
+    u, present = 0.0, start
+    while u < far:
+        braking = math.sqrt(end * end + 2.0 * ACCEL_MPS2 * (far - u))
+        present = min(present + ACCEL_MPS2 * dt, speed, braking)
+        present = max(present, min(CREEP_MPS, speed))
+        u += present * dt
+        if u >= far:
+            u, present = far, end
+        yield u, present
+
+
+def _link_between(network: RoadNetwork, before: int, after: int) -> int:
+    """The LINK that leads from a lane outside junctions to what follows it, or -1."""
+    row = network.lanes[before]
+    for link in range(row["first_link"], row["first_link"] + row["num_links"]):
+        if network.links["next_lane"][link] == after:
+            return int(link)
+    return -1
+
+
+def _lane_pose(
+    network: RoadNetwork, lane: int, s: float
+) -> tuple[float, float, float, float, float, float]:
+    row = network.lanes[lane]
+    return lane_pose(network.points, row["first_point"], row["num_points"], s)

@@ -1,0 +1,254 @@
+"""Scripts of pedestrians and vehicles, and what kernels take of them: one FRAME a tick.
+
+An actor does one thing after the other: it moves along poses, rides along lanes, waits for a time,
+or waits for a cue. Built-in drivers take a body for an occupant of every lane that any part of it
+covers, and of those that it will cover within `FORESIGHT_S` when it moves freely: it stands there
+for them, so that they brake for who is about to step onto their lane.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cavmarl.core.records.arrays import Scripts
+from cavmarl.core.records.codes import CLASS_PEDESTRIAN, MODEL_IDM
+from cavmarl.driving.vehicle_types import CLASS_DEFAULTS, generated_types
+from cavmarl.roads.network import VEHICLE_CLASSES, RoadNetwork
+from cavmarl.traffic.scenarios.motions import Act, Pose
+from cavmarl.traffic.scenarios.shadows import Shadow, Shadows
+
+__all__ = [
+    "CLAIM",
+    "COVER",
+    "CUE",
+    "FORESIGHT_S",
+    "FRAME",
+    "NO_SCRIPTS",
+    "Actor",
+    "Cue",
+    "actor_types",
+    "bodies_of",
+    "compile_scripts",
+]
+
+FORESIGHT_S = 2.0  # drivers brake for who will be on their lane by then
+
+FRAME = np.dtype(
+    [
+        ("x", np.float64),  # as in VEHICLE
+        ("y", np.float64),
+        ("z", np.float64),
+        ("heading", np.float64),
+        ("pitch", np.float64),
+        ("speed", np.float64),
+        ("s", np.float64),  # on `lane`, which is the nearest one
+        ("d", np.float64),
+        ("lane", np.int32),
+        ("link", np.int32),
+        ("following", np.int32),  # FRAME of the next tick; the last one follows itself
+        ("cue", np.int32),  # CUE without which it stays; -1: it goes on by itself
+        ("released_to", np.int32),  # goal to which a built-in driver takes it from here, or -1
+        ("first_cover", np.int32),  # COVER rows
+        ("num_covers", np.int32),
+        ("first_claim", np.int32),  # CLAIM rows
+        ("num_claims", np.int32),
+    ],
+    align=True,
+)
+
+COVER = np.dtype(
+    [
+        ("s", np.float64),  # middle of the covered part of the lane, m
+        ("half", np.float64),  # and half its length
+        ("speed", np.float64),  # m/s along the lane, not below 0
+        ("lane", np.int32),
+    ],
+    align=True,
+)
+
+CLAIM = np.dtype(
+    [
+        ("dist", np.float64),  # of the centre to the stop line, m; negative beyond it
+        ("link", np.int32),
+    ],
+    align=True,
+)
+
+CUE = np.dtype(
+    [
+        ("x", np.float64),  # an agent's centre is within `radius_m` of this place
+        ("y", np.float64),
+        ("radius_m", np.float64),
+        ("tick", np.int64),  # or this tick has come; -1: it does not matter
+    ],
+    align=True,
+)
+
+NO_SCRIPTS = Scripts(
+    np.zeros(0, FRAME), np.zeros(0, COVER), np.zeros(0, CLAIM), np.zeros(0, CUE), 0, 0.0
+)
+
+
+class Body(NamedTuple):
+    """What an actor is; metres."""
+
+    vclass: int
+    length: float
+    width: float
+    height: float
+
+
+_CAR = generated_types()[0]
+BODIES: Mapping[str, Body] = {
+    "pedestrian": Body(CLASS_PEDESTRIAN, 0.5, 0.5, 1.75),
+    "car": Body(*(_CAR[name].item() for name in Body._fields)),
+    "van": Body(VEHICLE_CLASSES.index("delivery"), *CLASS_DEFAULTS["delivery"][:3]),
+}
+
+
+class Cue(NamedTuple):
+    """What an actor waits for: an agent within `radius_m` of (x, y), or the time `at_s`."""
+
+    x: float = 0.0
+    y: float = 0.0
+    radius_m: float = 0.0
+    at_s: float | None = None
+
+
+@dataclass(frozen=True)
+class Actor:
+    """Somebody who follows a script.
+
+    Attributes:
+        body: what it is: a name of `BODIES`.
+        acts: what it does, one after the other; each begins where the one before ends.
+        released_to: EDGE to which a built-in driver takes it in the end; None: it stays.
+    """
+
+    body: str
+    acts: Sequence[Act]
+    released_to: int | None = None
+
+
+def actor_types() -> NDArray[np.void]:
+    """VTYPE rows of the bodies, in the order of `BODIES`; they drive as the generator's car."""
+    types = generated_types().repeat(len(BODIES))
+    for row, body in zip(types, BODIES.values(), strict=True):
+        for name, value in body._asdict().items():
+            row[name] = value
+    types["model"] = MODEL_IDM
+    return types
+
+
+def bodies_of(actors: Sequence[Actor]) -> list[int]:
+    """Which of the rows of `actor_types` each actor has."""
+    names = list(BODIES)
+    return [names.index(actor.body) for actor in actors]
+
+
+@dataclass
+class _Tables:
+    """Rows that are written one after the other."""
+
+    frames: list[tuple[object, ...]] = field(default_factory=list)
+    covers: list[tuple[float, float, float, int]] = field(default_factory=list)
+    claims: list[tuple[float, int]] = field(default_factory=list)
+    room: int = 0
+    reach_m: float = 0.0
+
+
+def compile_scripts(
+    network: RoadNetwork,
+    actors: Sequence[Actor],
+    cues: Sequence[Cue],
+    goals: Mapping[int, int],
+    dt: float,
+) -> tuple[Scripts, list[int]]:
+    """The frames of all actors, and the first one of each.
+
+    Args:
+        network: the roads.
+        actors: who has a script.
+        cues: by the numbers that `Await` has.
+        goals: row of the plans' table by EDGE, for those who are released.
+        dt: seconds a tick.
+    """
+    tables = _Tables()
+    shadows = Shadows(network)
+    firsts = []
+    for actor in actors:
+        firsts.append(len(tables.frames))
+        goal = -1 if actor.released_to is None else goals[actor.released_to]
+        _write(tables, shadows, BODIES[actor.body], list(_poses(network, actor, dt)), goal, dt)
+    ticks = [-1 if cue.at_s is None else round(cue.at_s / dt) for cue in cues]
+    cue_rows = [(*cue[:3], tick) for cue, tick in zip(cues, ticks, strict=True)]
+    scripts = Scripts(
+        np.array(tables.frames, FRAME),
+        np.array(tables.covers, COVER),
+        np.array(tables.claims, CLAIM),
+        np.array(cue_rows, CUE),
+        tables.room,
+        tables.reach_m,
+    )
+    return scripts, firsts
+
+
+def _poses(network: RoadNetwork, actor: Actor, dt: float) -> Iterator[Pose]:
+    """Where an actor is in each tick, from its first place on."""
+    last: Pose | None = None
+    for act in actor.acts:
+        for pose in act.poses(network, BODIES[actor.body].length, last, dt):
+            last = pose
+            yield pose
+
+
+def _write(
+    tables: _Tables, shadows: Shadows, body: Body, poses: list[Pose], goal: int, dt: float
+) -> None:
+    """Append the rows of one actor."""
+    own = [shadows.of(pose, body.length, body.width) for pose in poses]
+    ahead = round(FORESIGHT_S / dt)
+    most = 0
+    for k, pose in enumerate(poses):
+        lane, s, d = pose.on if pose.on is not None else shadows.nearest(pose)
+        seen = own[k]
+        if pose.on is None:
+            seen = _foreseen(own, poses, k, ahead)
+        first = len(tables.covers)
+        for number, shadow in sorted(seen.items()):
+            speed = own[k][number].speed if number in own[k] else 0.0
+            half = 0.5 * (shadow.end - shadow.start)
+            tables.covers.append((shadow.start + half, half, speed, number))
+            off_m = shadows.distance_m(number, shadow.start + half, pose) + half
+            tables.reach_m = max(tables.reach_m, off_m)
+        first_claim = len(tables.claims)
+        tables.claims += pose.claims
+        is_last = k == len(poses) - 1
+        number = len(tables.frames)
+        tables.frames.append(
+            (
+                pose.x, pose.y, shadows.height_m(lane, s), pose.heading, pose.pitch, pose.speed,
+                s, d, lane, pose.link, number if is_last else number + 1, pose.cue,
+                goal if is_last else -1, first, len(seen), first_claim, len(pose.claims),
+            )
+        )  # fmt: skip
+        most = max(most, len(seen))
+    tables.room += most
+
+
+def _foreseen(
+    own: list[dict[int, Shadow]], poses: list[Pose], k: int, ahead: int
+) -> dict[int, Shadow]:
+    """What an actor covers now or soon, as far as it does not wait for a cue before."""
+    seen = dict(own[k])
+    for later in range(k, min(k + ahead, len(own) - 1)):
+        if poses[later].cue >= 0:
+            break
+        for lane, shadow in own[later + 1].items():
+            seen[lane] = shadow.joined(seen[lane]) if lane in seen else shadow
+    return seen

@@ -1,0 +1,65 @@
+"""A `Scene`: who plays what to an agent, and where it begins. Scenarios make them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+from cavmarl.traffic.scenarios.movement_scripts import Actor, Cue
+
+__all__ = ["Outage", "Scene", "Seat"]
+
+
+@dataclass(frozen=True)
+class Seat:
+    """Where the agent's vehicle begins.
+
+    Attributes:
+        lane: LANE row.
+        s: of its centre on the lane, m.
+        speed_mps: at the beginning, and what its built-in driver would like to keep.
+        goal_edge: EDGE row where its trip ends.
+    """
+
+    lane: int
+    s: float
+    speed_mps: float
+    goal_edge: int
+
+
+class Outage(NamedTuple):
+    """A signal that goes dark: the name of the signal, and when, in s since the beginning."""
+
+    signal: str
+    at_s: float
+
+
+@dataclass(frozen=True)
+class Scene:
+    """One conflict, played to an agent; others may come behind it (`seats`).
+
+    Attributes:
+        place: where, by the map's name.
+        x, y: its middle, m.
+        seat: of the agent.
+        actors: who follows a script.
+        cues: what they wait for, by the numbers of their `Await`s.
+        clear_m: how far around the middle no other vehicle is in the beginning.
+        outages: signals that go dark, and stay so.
+    """
+
+    place: str
+    x: float
+    y: float
+    seat: Seat
+    actors: Sequence[Actor]
+    cues: Sequence[Cue] = ()
+    clear_m: float = 90.0
+    outages: Sequence[Outage] = ()
+
+    @property
+    def goal_edges(self) -> list[int]:
+        """EDGE rows that somebody of it drives to."""
+        released = [a.released_to for a in self.actors if a.released_to is not None]
+        return list(dict.fromkeys([self.seat.goal_edge, *released]))

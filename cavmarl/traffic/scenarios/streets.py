@@ -1,0 +1,231 @@
+"""`Streets`: what scenarios ask about a map to find a place, and to say where things are."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cavmarl.core.math.geometry import lane_pose, project
+from cavmarl.roads.network import VEHICLE_CLASSES, RoadNetwork
+from cavmarl.roads.routing import lane_grid
+
+__all__ = ["Crossing", "Opposite", "Streets"]
+
+CAR = 1 << VEHICLE_CLASSES.index("passenger")
+STRAIGHT_RAD = 0.05  # the most that the direction of a straight lane changes
+BESIDE_M = 8.0  # the farthest between the middles of lanes of one road
+LOOK_MARGIN_M = 0.3
+
+
+class Crossing(NamedTuple):
+    """Two movements over a junction that share an area.
+
+    Attributes:
+        link: LINK row of the one.
+        foe: LINK row of the other.
+        middle_m: of the area, from the stop line of the one.
+        foe_middle_m: of the area, from the stop line of the other.
+    """
+
+    link: int
+    foe: int
+    middle_m: float
+    foe_middle_m: float
+
+
+class Opposite(NamedTuple):
+    """The lane beside another one in the opposite direction.
+
+    Attributes:
+        lane: LANE row.
+        s: on it, m.
+        apart_m: between the middles of both.
+    """
+
+    lane: int
+    s: float
+    apart_m: float
+
+
+class Streets:
+    """Questions about a road network.
+
+    Args:
+        network: the roads.
+    """
+
+    def __init__(self, network: RoadNetwork) -> None:
+        self.network = network
+        self._grid = lane_grid(network)
+
+    def point(self, lane: int, s: float, d: float = 0.0) -> NDArray[np.float64]:
+        """(3,) x, y and heading of a place on a lane, `d` m to the left of its middle."""
+        row = self.network.lanes[lane]
+        x, y, _, cos, sin, _ = lane_pose(
+            self.network.points, row["first_point"], row["num_points"], s
+        )
+        return np.array([x - d * sin, y + d * cos, math.atan2(sin, cos)])
+
+    def edge(self, lane: int) -> int:
+        """EDGE row of a lane."""
+        return int(self.network.lanes["edge"][lane])
+
+    def length_m(self, lane: int) -> float:
+        """Of a lane."""
+        return float(self.network.lanes["length_m"][lane])
+
+    def straights(self, least_m: float) -> list[int]:
+        """LANE rows outside junctions for cars that are straight and at least so long."""
+        lanes = self.network.lanes
+        good = ~lanes["internal"] & (lanes["permissions"] & CAR != 0)
+        good &= lanes["length_m"] >= least_m
+        return [lane for lane in np.flatnonzero(good).tolist() if self._bend(lane) < STRAIGHT_RAD]
+
+    def kerbs_m(self, lane: int, s: float) -> tuple[float, float]:
+        """How far right of the middle of a lane the whole road reaches, and how far left."""
+        lanes = self.network.lanes
+        sides = []
+        for side in ("right", "left"):
+            at, reach = lane, 0.5 * float(lanes["width_m"][lane])
+            while lanes[side][at] >= 0:
+                at = int(lanes[side][at])
+                reach += float(lanes["width_m"][at])
+            sides.append(reach)
+        right, left = sides
+        while (beyond := self._lane_at(self.point(lane, s, left + LOOK_MARGIN_M))) >= 0:
+            left += float(lanes["width_m"][beyond])
+        return right, left
+
+    def opposite(self, lane: int, s: float) -> Opposite | None:
+        """The lane to the left, beyond the middle of the road, that leads back."""
+        here = self.network.lanes[lane]
+        if here["left"] >= 0:
+            return None
+        x, y, heading = self.point(lane, s, 0.5 * float(here["width_m"]) + LOOK_MARGIN_M)
+        other = self._lane_at(np.array([x, y, heading]))
+        if other < 0:
+            return None
+        row = self.network.lanes[other]
+        middle = self.point(lane, s)
+        place, d, cos, sin = project(
+            self.network.points, row["first_point"], row["num_points"], middle[0], middle[1]
+        )
+        along = cos * math.cos(heading) + sin * math.sin(heading)
+        if along > -0.99 or abs(d) > BESIDE_M:
+            return None
+        return Opposite(other, place, abs(d))
+
+    def crossings(self, directions: str, *, yields: bool, merges: bool) -> Iterator[Crossing]:
+        """Pairs of movements of cars that share an area.
+
+        Args:
+            directions: SUMO's letters of the one, as `s` or `lL`.
+            yields: whether it has to give way to the other.
+            merges: whether both lead into one lane.
+        """
+        links, conflicts, lanes = self.network.links, self.network.conflicts, self.network.lanes
+        ends = lanes["permissions"][links["from_lane"]] & lanes["permissions"][links["to_lane"]]
+        for_cars = ends & CAR != 0
+        own = np.repeat(np.arange(len(links)), links["num_conflicts"])
+        foe = conflicts["foe"]
+        good = for_cars[own] & for_cars[foe] & (links["first_internal"][foe] >= 0)
+        good &= np.isin(links["direction"][own], [ord(letter) for letter in directions])
+        good &= links["direction"][foe] == ord("s")
+        good &= (conflicts["merging"] == merges) & (conflicts["must_yield"] == yields)
+        for c in np.flatnonzero(good):
+            row = conflicts[c]
+            yield Crossing(
+                int(own[c]),
+                int(foe[c]),
+                0.5 * float(row["enter_m"] + row["leave_m"]),
+                0.5 * float(row["foe_enter_m"] + row["foe_leave_m"]),
+            )
+
+    def movements(self, directions: str) -> list[int]:
+        """LINK rows over junctions for cars, in SUMO's directions, as `s` or `lL`."""
+        links, lanes = self.network.links, self.network.lanes
+        ends = lanes["permissions"][links["from_lane"]] & lanes["permissions"][links["to_lane"]]
+        good = (ends & CAR != 0) & (links["first_internal"] >= 0)
+        good &= np.isin(links["direction"], [ord(letter) for letter in directions])
+        found: list[int] = np.flatnonzero(good).tolist()
+        return found
+
+    def onward(self, lane: int) -> int | None:
+        """The lane for cars that follows another one beyond a junction, straight on if it can be.
+
+        None where no car can go on.
+        """
+        links, lanes = self.network.links, self.network.lanes
+        first = int(lanes["first_link"][lane])
+        ways = [
+            link for link in range(first, first + int(lanes["num_links"][lane]))
+            if lanes["permissions"][links["to_lane"][link]] & CAR
+        ]  # fmt: skip
+        ways.sort(key=lambda link: (links["direction"][link] != ord("s"), link))
+        return int(links["to_lane"][ways[0]]) if ways else None
+
+    def lanes_beside(self, lane: int) -> list[int]:
+        """A lane and all others of its road that lead the same way, from the right to the left."""
+        lanes = self.network.lanes
+        while lanes["right"][lane] >= 0:
+            lane = int(lanes["right"][lane])
+        found = [lane]
+        while lanes["left"][found[-1]] >= 0:
+            found.append(int(lanes["left"][found[-1]]))
+        return found
+
+    def turn_rad(self, one: int, other: int) -> float:
+        """Between the directions of the ends of the lanes that two links leave, unsigned."""
+        ends = [int(self.network.links["from_lane"][link]) for link in (one, other)]
+        first, second = (self.point(lane, self.length_m(lane))[2] for lane in ends)
+        return abs(math.remainder(first - second, 2.0 * math.pi))
+
+    def upstream(self, lane: int, far_m: float) -> tuple[tuple[int, ...], float] | None:
+        """Lanes that lead to a lane, itself the last, and the way from their start to its end.
+
+        None where there are not `far_m` of them.
+        """
+        found, way_m = [lane], self.length_m(lane)
+        while way_m < far_m:
+            before = self.before(found[0])
+            if before is None or before in found:
+                return None
+            found.insert(0, before)
+            way_m += self.length_m(before)
+        return tuple(found), way_m
+
+    def before(self, lane: int) -> int | None:
+        """The first of the lanes from which cars come onto a lane; None: from nowhere."""
+        lanes, into = self.network.lanes, self.network.into
+        row = lanes[lane]
+        ends = into[row["first_into"] : row["first_into"] + row["num_into"]]
+        return next((k for k in ends.tolist() if lanes["permissions"][k] & CAR), None)
+
+    def name(self, lane: int) -> str:
+        """Of a lane."""
+        return self.network.lane_ids[lane]
+
+    def _bend(self, lane: int) -> float:
+        row = self.network.lanes[lane]
+        points = self.network.points[row["first_point"] : row["first_point"] + row["num_points"]]
+        return float(np.ptp(np.unwrap(points["heading"])))
+
+    def _lane_at(self, place: NDArray[np.float64]) -> int:
+        """The lane outside junctions that a place is on, or -1."""
+        grid, (x, y, _) = self._grid, place.tolist()
+        column, line = int((x - grid.min_x) // grid.cell_m), int((y - grid.min_y) // grid.cell_m)
+        if not (0 <= column < grid.num_x and 0 <= line < grid.num_y):
+            return -1
+        cell = line * grid.num_x + column
+        for lane in grid.cell_lanes[grid.cell_start[cell] : grid.cell_start[cell + 1]].tolist():
+            row = self.network.lanes[lane]
+            if row["internal"]:
+                continue
+            s, d, _, _ = project(self.network.points, row["first_point"], row["num_points"], x, y)
+            if abs(d) < 0.5 * row["width_m"] and 0.0 <= s <= row["length_m"]:
+                return int(lane)
+        return -1

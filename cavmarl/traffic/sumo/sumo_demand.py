@@ -1,0 +1,196 @@
+"""`SumoDemand`: files of SUMO's that are known to fit a map, and what is needed to run them."""
+
+from __future__ import annotations
+
+import hashlib
+import tempfile
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cavmarl.config.env import EnvConfig
+from cavmarl.core.errors import ConfigError, DemandError
+from cavmarl.core.records.codes import MODEL_KRAUSS
+from cavmarl.driving.vehicle_types import NEAREST_CLASS, NO_ROAD_CLASSES, VTYPE, generated_types
+from cavmarl.roads.network import VEHICLE_CLASSES, RoadNetwork
+from cavmarl.roads.sumo_net.xml_source import read_bytes
+from cavmarl.traffic.sumo.sumo_input import SumoInput, read_input
+from cavmarl.traffic.sumo.sumo_options import command_words
+from cavmarl.traffic.sumo.sumo_process import SumoProcess, choose_interface
+
+__all__ = ["SumoDemand", "read_sumo_demand"]
+
+_SAME_NAME = ("length", "width", "height", "min_gap", "accel", "decel", "emergency_decel", "tau",
+              "sigma", "max_speed", "speed_factor", "speed_dev")  # fmt: skip
+
+
+@dataclass(frozen=True, eq=False)
+class SumoDemand:
+    """What a SUMO of this environment is started with.
+
+    Attributes:
+        network: the roads.
+        map_file: the same, as SUMO reads them.
+        given: demand and options.
+        drives: SUMO moves its vehicles (`sumo-traffic`), not only says who departs.
+        max_vehicles: that one world can hold.
+        replay_bytes: for what a world's SUMO is told in an episode.
+        dt_s: seconds a tick.
+        interface: `libsumo` or `traci`.
+        version: of SUMO.
+        types: VTYPE (num_types,) of its vehicles on roads.
+        type_ids: their names; of those on no road at the end.
+        content_hash: of all files.
+    """
+
+    network: RoadNetwork
+    map_file: Path
+    given: SumoInput
+    drives: bool
+    max_vehicles: int
+    replay_bytes: int
+    dt_s: float
+    interface: str
+    version: str
+    types: NDArray[np.void]
+    type_ids: tuple[str, ...]
+    content_hash: str
+
+    def told(self) -> dict[str, Any]:
+        """What its process is told once; types by VTYPE row of the world's table."""
+        return _told(self.network, self.interface) | {
+            "drives": self.drives,
+            "types": {
+                name: row + len(generated_types()) if row < len(self.types) else -1
+                for row, name in enumerate(self.type_ids)
+            },
+        }
+
+    def words(self, folder: Path, seed: int) -> list[str]:
+        """Its command line; `folder` is for files that it reads."""
+        return _words(self.map_file, self.given, folder, self.dt_s, self.max_vehicles, seed)
+
+
+def read_sumo_demand(
+    config: EnvConfig, network: RoadNetwork, map_file: Path, files: Sequence[Path]
+) -> SumoDemand:
+    """Have SUMO read all files of an environment, and keep what it found.
+
+    Args:
+        config: the environment; its `traffic.source` is one of SUMO's.
+        network: the roads.
+        map_file: the same, as SUMO reads them.
+        files: one `.sumocfg`, or files of routes and additional files.
+
+    Raises:
+        DemandError: SUMO refuses them on this map, with its words; or its signals are others.
+        MissingExtraError: SUMO is not installed.
+    """
+    given = read_input(files)
+    interface = choose_interface(config.sumo.interface)
+    process = SumoProcess(_told(network, interface) | {"types": {}, "drives": False})
+    try:
+        with tempfile.TemporaryDirectory() as folder:
+            words = _words(map_file, given, Path(folder), config.clock.sim_dt_s, 1, 0)
+            # All of the demand, not only that of the first minutes.
+            found = process.look_up([*words, "--route-steps=0"])
+    except ConfigError as error:
+        own = f", {given.net_file}" if given.net_file else ""
+        raise DemandError(
+            f"{', '.join(map(str, files))}: {error}\nCure: give demand that was made for the map "
+            f"{map_file}, or the map that it was made for{own}"
+        ) from error
+    finally:
+        process.close()
+    _check_signals(network, found["signals"], files)
+    on_road = {
+        name: kind
+        for name, kind in found["types"].items()
+        if kind["vclass"] not in NO_ROAD_CLASSES and not name.startswith("cavmarl.")
+    }
+    others = [name for name in found["types"] if name not in on_road]
+    return SumoDemand(
+        network,
+        map_file,
+        given,
+        drives=config.traffic.source == "sumo-traffic",
+        max_vehicles=config.sumo.max_vehicles,
+        replay_bytes=config.sumo.replay_mib << 20,
+        dt_s=config.clock.sim_dt_s,
+        interface=interface,
+        version=found["version"],
+        types=_types(list(on_road.values())),
+        type_ids=(*on_road, *others),
+        content_hash=_hash(given),
+    )
+
+
+def _told(network: RoadNetwork, interface: str) -> dict[str, Any]:
+    return {
+        "interface": interface,
+        "lanes": list(network.lane_ids),
+        "edges": list(network.edge_ids),
+        "signals": list(network.signal_ids),
+    }
+
+
+def _words(
+    map_file: Path, given: SumoInput, folder: Path, dt_s: float, most: int, seed: int
+) -> list[str]:
+    puppets = folder / "puppets.add.xml"
+    puppets.write_text(_puppets(), encoding="utf-8")
+    own = int(given.options.get("max-num-vehicles", "-1"))
+    more = {
+        # Who touches whom is judged here, and nobody is taken away for it.
+        "collision.action": "none",
+        "max-num-vehicles": str(min(own, most) if own > 0 else most),
+        "random": "false",  # a seed that nobody knows
+    }
+    return command_words(map_file, given, folder, dt_s, seed, more, (puppets,))
+
+
+def _puppets() -> str:
+    """Types of our vehicles: they drive where they are put, and are never teleported."""
+    kinds = "".join(
+        f'<vType id="cavmarl.{row}" vClass="ignoring" length="{kind["length"]}" '
+        f'width="{kind["width"]}" height="{kind["height"]}" maxSpeed="{kind["max_speed"]}" '
+        'timeToTeleport="1000000"/>'
+        for row, kind in enumerate(generated_types())
+    )
+    return f"<additional>{kinds}</additional>"
+
+
+def _types(described: list[dict[str, Any]]) -> NDArray[np.void]:
+    """VTYPE (n,) of what SUMO says about types; drivers of ours follow by Krauss's model."""
+    types = np.zeros(len(described), dtype=VTYPE)
+    for row, kind in zip(types, described, strict=True):
+        for name in _SAME_NAME:
+            row[name] = kind[name]
+        row["vclass"] = VEHICLE_CLASSES.index(NEAREST_CLASS[kind["vclass"]])
+        row["permissions"] = 1 << int(row["vclass"])
+        row["model"] = MODEL_KRAUSS
+        row["desired_max_speed"] = row["max_speed"]
+        row["max_speed_factor"] = np.inf
+        row["reroute"] = row["reroute_period_ms"] = -1
+    return types
+
+
+def _check_signals(network: RoadNetwork, found: dict[str, int], files: Sequence[Path]) -> None:
+    for name, row in zip(network.signal_ids, network.signals, strict=True):
+        if found.get(name) != row["num_links"]:
+            raise DemandError(
+                f"{', '.join(map(str, files))}: signal '{name}' has {found.get(name, 'no')} "
+                f"letters in SUMO and {row['num_links']} on the map '{network.name}': give files "
+                "that were made for this map"
+            )
+
+
+def _hash(given: SumoInput) -> str:
+    digest = hashlib.sha256(repr((given.begin_s, sorted(given.options.items()))).encode())
+    for path in (*given.route_files, *given.additional_files):
+        digest.update(read_bytes(path))
+    return digest.hexdigest()

@@ -1,0 +1,162 @@
+"""What SUMO is given: a map, demand files, and the options of a `.sumocfg` that change traffic."""
+
+from __future__ import annotations
+
+import gzip
+import re
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from io import BytesIO
+from os.path import isfile
+from pathlib import Path
+from xml.etree.ElementTree import Element, ParseError
+
+import defusedxml.ElementTree
+from defusedxml.common import DefusedXmlException
+
+from cavmarl.core.errors import ConfigError
+from cavmarl.roads.sumo_net.xml_source import read_bytes
+
+__all__ = ["SumoInput", "read_input", "without_outputs"]
+
+_INPUTS = {
+    "net-file": "net-file",
+    "net": "net-file",
+    "n": "net-file",
+    "route-files": "route-files",
+    "routes": "route-files",
+    "r": "route-files",
+    "additional-files": "additional-files",
+    "additional": "additional-files",
+    "a": "additional-files",
+}
+_DROPPED_SECTIONS = ("input", "output", "report", "gui_only", "time", "traci_server")
+_OUTPUT = re.compile(
+    rb"<(?:e[123]Detector|inductionLoop|instantInductionLoop|laneAreaDetector|entryExitDetector|"
+    rb"edgeData|laneData|routeProbe|vTypeProbe|timedEvent)\b[^>]*>"
+)
+_DESTINATION = re.compile(rb"\b(file|dest)=(\"[^\"]*\"|'[^']*')")
+
+
+@dataclass(frozen=True)
+class SumoInput:
+    """Files and options.
+
+    Attributes:
+        route_files: demand that SUMO reads as it goes.
+        additional_files: types, stops, signal programs; read first.
+        begin_s: when the demand begins.
+        options: SUMO's own, of the configuration's sections that change what the traffic does.
+        net_file: the map that a configuration names.
+    """
+
+    route_files: tuple[Path, ...]
+    additional_files: tuple[Path, ...]
+    begin_s: float = 0.0
+    options: dict[str, str] = field(default_factory=dict)
+    net_file: Path | None = None
+
+
+def read_input(demand: Sequence[Path]) -> SumoInput:
+    """Sort demand files by what they are.
+
+    Args:
+        demand: one `.sumocfg`, or files of routes, trips and flows and additional files.
+
+    Raises:
+        ConfigError: no file, one that cannot be read, one that is neither.
+    """
+    if not demand:
+        raise ConfigError("no demand: give --demand FILE (.rou.xml, .add.xml or .sumocfg)")
+    if len(demand) == 1 and demand[0].name.endswith(".sumocfg"):
+        return _read_config(demand[0])
+    routes, additional = [], []
+    for path in demand:
+        root = _root_tag(path)
+        if root == "routes":
+            routes.append(path.resolve())
+        elif root in ("additional", "add", "tlLogics"):
+            additional.append(path.resolve())
+        else:
+            raise ConfigError(
+                f"{path}: <{root}> is no demand: give files of <routes> or <additional>, or one "
+                ".sumocfg alone"
+            )
+    return SumoInput(tuple(routes), tuple(additional))
+
+
+def without_outputs(path: Path, folder: Path) -> Path:
+    """An additional file whose detectors write nothing: a copy in `folder` where there are any."""
+    content = read_bytes(path)
+    silenced = _OUTPUT.sub(lambda tag: _DESTINATION.sub(rb'\1="NUL"', tag[0]), content)
+    if silenced == content:
+        return path
+    copy = folder / f"{len(list(folder.iterdir()))}_{path.name.removesuffix('.gz')}"
+    copy.write_bytes(silenced)
+    return copy
+
+
+def _read_config(path: Path) -> SumoInput:
+    files: dict[str, list[Path]] = {"net-file": [], "route-files": [], "additional-files": []}
+    options: dict[str, str] = {}
+    begin = "0"
+    for section in _root(path):
+        for option in section:
+            value = option.get("value", "")
+            if option.tag in _INPUTS:
+                names = value.replace(" ", ",").split(",")
+                files[_INPUTS[option.tag]] += [path.parent / name for name in names if name]
+            elif section.tag == "time" and option.tag in ("begin", "b"):
+                begin = value
+            elif section.tag not in _DROPPED_SECTIONS:
+                options[option.tag] = value
+    missing = [name for group in files.values() for name in group if not isfile(name)]
+    if missing:
+        raise ConfigError(f"{path}: names {missing[0]}, which is not there")
+    return SumoInput(
+        route_files=tuple(name.resolve() for name in files["route-files"]),
+        additional_files=tuple(name.resolve() for name in files["additional-files"]),
+        begin_s=_seconds(begin, path),
+        options=options,
+        net_file=files["net-file"][0].resolve() if files["net-file"] else None,
+    )
+
+
+def _root(path: Path) -> Element:
+    with _readable(path):
+        root: Element = defusedxml.ElementTree.fromstring(read_bytes(path), forbid_dtd=True)
+    return root
+
+
+def _root_tag(path: Path) -> str:
+    """Only that: demand of a day is too long to read it twice."""
+    with _readable(path):
+        content = BytesIO(read_bytes(path))
+        _, root = next(defusedxml.ElementTree.iterparse(content, ("start",), forbid_dtd=True))
+    return str(root.tag)
+
+
+@contextmanager
+def _readable(path: Path) -> Iterator[None]:
+    """Turn what goes wrong with a file into a ConfigError that names it."""
+    try:
+        yield
+    except ParseError as error:
+        raise ConfigError(f"{path}, line {error.position[0]}: broken XML ({error})") from error
+    except DefusedXmlException as error:
+        raise ConfigError(f"{path}: declares a document type or entities: remove them") from error
+    except (gzip.BadGzipFile, EOFError) as error:
+        raise ConfigError(f"{path}: broken gzip ({error}): make the file again") from error
+    except OSError as error:
+        raise ConfigError(f"{path}: cannot be read ({error.strerror or error})") from error
+
+
+def _seconds(text: str, path: Path) -> float:
+    """SUMO's times: seconds, or [days:]hours:minutes:seconds."""
+    try:
+        parts = [float(part) for part in text.split(":")]
+    except ValueError as error:
+        raise ConfigError(f"{path}: begin = '{text}' is no time") from error
+    weights = (86400.0, 3600.0, 60.0, 1.0)[-len(parts) :]
+    return sum(part * weight for part, weight in zip(parts, weights, strict=True))

@@ -1,0 +1,200 @@
+"""`SumoProcess`: the process of one SUMO, as the world that it belongs to sees it."""
+
+from __future__ import annotations
+
+import json
+import os
+import socket
+import subprocess
+import sys
+import tempfile
+import threading
+import weakref
+from collections.abc import Mapping
+from contextlib import suppress
+from importlib.util import find_spec
+from pathlib import Path
+from typing import IO, Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cavmarl.core.errors import ConfigError, MissingExtraError, SumoDiedError
+from cavmarl.traffic.sumo import sumo_child as child
+from cavmarl.traffic.sumo.sumo_records import MOVED, SEEN
+
+__all__ = ["Answer", "SumoProcess", "choose_interface"]
+
+ANSWER_S = 120.0  # who takes longer for one step hangs
+END_S = 2.0  # for it to end by itself
+LAST_WORDS = 2000  # characters of what it has printed last
+# SUMO follows pointers all over its memory: in pages of 2 MiB a step is up to a sixth faster.
+HUGE_PAGES = "glibc.malloc.hugetlb=1"
+
+
+class Answer(NamedTuple):
+    """What a SUMO says after a step.
+
+    Attributes:
+        seen: SEEN (n,) by rising numbers.
+        letters: codes of characters, of all signals one after the other.
+        line: what is new: `departed`, `teleported`, `routes`.
+    """
+
+    seen: NDArray[np.void]
+    letters: bytes
+    line: dict[str, Any]
+
+
+def choose_interface(wanted: str) -> str:
+    """`libsumo`, or `traci` where that is not installed, unless one is asked for.
+
+    Raises:
+        MissingExtraError: neither is there, or not the one that is wanted.
+    """
+    choices = ("libsumo", "traci") if wanted == "auto" else (wanted,)
+    for name in choices:
+        if find_spec(name) is not None:
+            return name
+    raise MissingExtraError(f"'{choices[0]}' is not installed: pip install 'cavmarl[sumo]'")
+
+
+class SumoProcess:
+    """Starts the process; one order at a time.
+
+    Args:
+        told: what it is told once; the layouts of records are added.
+
+    Attributes:
+        pid: of the process.
+    """
+
+    def __init__(self, told: Mapping[str, Any]) -> None:
+        ours, theirs = socket.socketpair()
+        said = tempfile.TemporaryFile()
+        with_thread = threading.current_thread() is threading.main_thread()
+        words = [str(theirs.fileno()), str(os.getpid()), str(int(with_thread))]
+        path = os.pathsep.join(part for part in sys.path if part)
+        with theirs:
+            process = subprocess.Popen(
+                [sys.executable, "-P", str(Path(child.__file__)), *words],
+                stdin=subprocess.DEVNULL,
+                stdout=said,
+                stderr=said,
+                pass_fds=(theirs.fileno(),),
+                env={
+                    **os.environ,
+                    "PYTHONPATH": path,
+                    "OMP_NUM_THREADS": "1",
+                    "GLIBC_TUNABLES": ":".join([HUGE_PAGES, *_tunables()]),
+                },
+            )
+        ours.settimeout(ANSWER_S)
+        self.pid = process.pid
+        self._wire, self._said, self._process = ours, said, process
+        self._finalizer = weakref.finalize(self, _end, process, ours, said)
+        self._send(child.START, {**told, "seen": SEEN.descr, "moved": MOVED.descr})
+
+    @property
+    def lives(self) -> bool:
+        """Whether it has not been closed."""
+        return self._finalizer.alive
+
+    def look_up(self, words: list[str]) -> dict[str, Any]:
+        """Begin with a command line, and say what its files have.
+
+        Raises:
+            ConfigError: SUMO refuses them.
+            SumoDiedError: the process has ended.
+        """
+        self._send(child.LOOK_UP, {"words": words})
+        return self._receive().line
+
+    def start(self, words: list[str]) -> Answer:
+        """Begin anew with a command line; errors as of `look_up`."""
+        self._send(child.START, {"words": words})
+        return self._receive()
+
+    def begin_step(self, moved: NDArray[np.void]) -> None:
+        """Let it take a step.
+
+        Args:
+            moved: MOVED (n,), where our vehicles are after it.
+
+        Raises:
+            SumoDiedError: the process has ended.
+        """
+        self._send(child.STEP, {}, moved.tobytes())
+
+    def end_step(self) -> Answer:
+        """What came of the step; errors as of `look_up`."""
+        return self._receive()
+
+    def close(self) -> None:
+        """End the process."""
+        self._finalizer()
+
+    def _send(self, kind: int, line: Mapping[str, Any], records: bytes = b"") -> None:
+        text = json.dumps(line).encode() if line else b""
+        head = np.array([(kind, len(records), 0, len(text))], dtype=child.HEAD)
+        try:
+            self._wire.sendall(head.tobytes() + records + text)
+        except OSError as error:
+            raise self._death() from error
+
+    def _receive(self) -> Answer:
+        head = np.frombuffer(self._read(child.HEAD.itemsize), child.HEAD)[0]
+        records = self._read(int(head["records"]))
+        letters = self._read(int(head["letters"]))
+        line: dict[str, Any] = json.loads(self._read(int(head["line"])))
+        if head["kind"] == child.REFUSED:
+            raise ConfigError(f"SUMO refuses: {line['error']}{self._last_words()}")
+        return Answer(np.frombuffer(records, SEEN), bytes(letters), line)
+
+    def _read(self, size: int) -> bytearray:
+        content = bytearray(size)
+        view = memoryview(content)
+        try:
+            while view:
+                got = self._wire.recv_into(view)
+                if got == 0:
+                    raise self._death()
+                view = view[got:]
+        except OSError as error:
+            raise self._death() from error
+        return content
+
+    def _death(self) -> SumoDiedError:
+        """What is to be said of it; whatever is left of it ends."""
+        try:
+            status = self._process.wait(END_S)
+            how = f"ended with {status}"
+        except subprocess.TimeoutExpired:
+            how = f"has not answered for {ANSWER_S:g} s"
+        words = self._last_words()
+        self.close()
+        return SumoDiedError(
+            f"the process of SUMO {how}{words}\nThe world is as it was before the step; reset it "
+            "to go on"
+        )
+
+    def _last_words(self) -> str:
+        self._said.seek(0)
+        text = self._said.read().decode(errors="replace").strip()[-LAST_WORDS:]
+        return f": {text}" if text else ""
+
+
+def _tunables() -> list[str]:
+    """What the user has set of the C library, which comes last and so counts."""
+    own = os.environ.get("GLIBC_TUNABLES")
+    return [own] if own else []
+
+
+def _end(process: subprocess.Popen[bytes], wire: socket.socket, said: IO[bytes]) -> None:
+    wire.close()
+    with suppress(subprocess.TimeoutExpired):
+        process.wait(END_S)
+    if process.poll() is None:
+        process.kill()
+        process.wait()
+    said.close()

@@ -1,0 +1,226 @@
+"""`SumoWorlds`: W worlds of SUMO's beside W of ours, tick by tick.
+
+Each has a process and a seed of its own. A tick that is begun again gets the answer that it has
+had: no SUMO takes a step twice.
+"""
+
+from __future__ import annotations
+
+import logging
+import tempfile
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cavmarl.core.errors import ConfigError, SumoDiedError, SumoStateError
+from cavmarl.traffic.kernels.mirroring import Paths
+from cavmarl.traffic.sumo.route_book import RouteBook
+from cavmarl.traffic.sumo.stop_book import StopBook
+from cavmarl.traffic.sumo.sumo_demand import SumoDemand
+from cavmarl.traffic.sumo.sumo_history import ToldLog
+from cavmarl.traffic.sumo.sumo_process import Answer, SumoProcess
+
+__all__ = ["SumoWorlds", "Tick"]
+
+SEED_BITS = 31
+
+log = logging.getLogger(__name__)
+
+
+class Tick(NamedTuple):
+    """What SUMO says about one tick of one world.
+
+    Attributes:
+        tick: that this is the state of.
+        seen: SEEN (n,) by rising numbers, with paths in the place of routes.
+        letters: of all signals.
+        departed: (m,) numbers of those who have come, rising.
+        speed_factors: (m,) theirs.
+        stops: (m, 2) STOP rows [first, end) that they are to make, -1: none; (0, 2) where SUMO
+            moves them.
+        teleported: numbers of those who have been lifted off the road.
+        rerouted: (r,) numbers of those on another route than a tick before, rising.
+    """
+
+    tick: int
+    seen: NDArray[np.void]
+    letters: bytes
+    departed: NDArray[np.int64]
+    speed_factors: NDArray[np.float64]
+    stops: NDArray[np.int64]
+    teleported: tuple[int, ...]
+    rerouted: NDArray[np.int64]
+
+
+class SumoWorlds:
+    """The processes and what they have said last.
+
+    Args:
+        demand: what they run.
+        book: where their routes are written.
+        stops: where their stops are written.
+        num_worlds: W.
+
+    Attributes:
+        book: of their routes.
+        stops: of their stops.
+        names: by world, SUMO's names of the vehicles by number.
+        teleports: (W,) vehicles that SUMO has put elsewhere since each reset.
+        logs: by world, what SUMO has been told since its reset; none: nobody keeps it.
+    """
+
+    def __init__(
+        self, demand: SumoDemand, book: RouteBook, stops: StopBook, num_worlds: int
+    ) -> None:
+        self.book = book
+        self.stops = stops
+        self.names: list[list[str]] = [[] for _ in range(num_worlds)]
+        self.teleports = np.zeros(num_worlds, dtype=np.int64)
+        self.logs: tuple[ToldLog, ...] = ()
+        self._demand = demand
+        self._tick_ms = round(1000.0 * demand.dt_s)
+        self._begin_ms = round(1000.0 * demand.given.begin_s)
+        self._processes: list[SumoProcess | None] = [None] * num_worlds
+        self._ticks: list[Tick | None] = [None] * num_worlds
+        self._path_of = [np.zeros(0, dtype=np.int32) for _ in range(num_worlds)]
+
+    @property
+    def pids(self) -> tuple[int, ...]:
+        """Of the processes that live."""
+        return tuple(p.pid for p in self._processes if p is not None and p.lives)
+
+    def begin(self, w: int, key: int) -> None:
+        """Start a world's SUMO anew, for an episode.
+
+        Args:
+            w: which world.
+            key: the root of its random numbers.
+
+        Raises:
+            ConfigError: SUMO refuses its files.
+            SumoDiedError: the process ended.
+        """
+        process = self._processes[w]
+        if process is None or not process.lives:
+            process = self._processes[w] = SumoProcess(self._demand.told())
+        self._ticks[w] = None
+        self.book.begin(w)
+        self.stops.begin(w)
+        self.names[w] = []
+        self.teleports[w] = 0
+        if self.logs:
+            self.logs[w].begin()
+        self._path_of[w] = np.zeros(0, dtype=np.int32)
+        seed = key >> (64 - SEED_BITS)
+        # SUMO reads all additional files when it starts.
+        with tempfile.TemporaryDirectory(prefix="cavmarl-sumo-") as folder:
+            answer = process.start(self._demand.words(Path(folder), seed))
+        self._ticks[w] = self._take(w, 0, answer)
+
+    def at(self, w: int) -> Tick:
+        """What is known of a world's present tick."""
+        tick = self._ticks[w]
+        if tick is None:
+            raise SumoDiedError("the process of SUMO has ended: reset the world to go on")
+        return tick
+
+    def paths(self, w: int) -> Paths:
+        """The paths of a world."""
+        return self.book.paths(w)
+
+    def step(self, ticks: Sequence[int], moved: Callable[[int], NDArray[np.void]]) -> None:
+        """Let the SUMOs of all worlds take a step, side by side.
+
+        Args:
+            ticks: (W,) since reset, before the step.
+            moved: MOVED (n,) of a world: where vehicles of ours are after the step.
+
+        Raises:
+            SumoDiedError: a process has ended; its world has to be reset.
+            SumoStateError: a world is not at the tick that its SUMO is at.
+        """
+        asked = []
+        for w, tick in enumerate(ticks):
+            last = self.at(w)
+            if last.tick == tick + 1:  # the tick has been begun before
+                continue
+            if last.tick != tick:
+                raise SumoStateError(f"world {w} is at tick {tick}, its SUMO at {last.tick}")
+            asked.append(w)
+        told = {}
+        try:
+            for w in asked:
+                told[w] = moved(w)
+                self._process(w).begin_step(told[w])
+            for w in asked:
+                self._ticks[w] = self._take(w, ticks[w] + 1, self._process(w).end_step())
+                self._note(w, told[w])
+        except (SumoDiedError, ConfigError) as error:
+            # Others may have taken the step, and their worlds have not.
+            for w in asked:
+                self._ticks[w] = None
+            raise SumoDiedError(f"world {w}: {error}") from error
+
+    def step_one(self, w: int, tick: int, moved: NDArray[np.void]) -> None:
+        """Let the SUMO of one world take a step from a tick; errors as of `step`."""
+        process = self._process(w)
+        process.begin_step(moved)
+        self._ticks[w] = self._take(w, tick + 1, process.end_step())
+        self._note(w, moved)
+
+    def _note(self, w: int, moved: NDArray[np.void]) -> None:
+        if self.logs:
+            self.logs[w].note(moved)
+
+    def close(self) -> None:
+        """End all processes."""
+        for process in self._processes:
+            if process is not None:
+                process.close()
+
+    def _process(self, w: int) -> SumoProcess:
+        process = self._processes[w]
+        if process is None:
+            raise SumoDiedError("SUMO has not been started: reset the world first")
+        return process
+
+    def _take(self, w: int, tick: int, answer: Answer) -> Tick:
+        line, seen = answer.line, answer.seen
+        should_be = self._begin_ms + tick * self._tick_ms
+        if line["time_ms"] != should_be:
+            raise SumoStateError(
+                f"world {w}: SUMO's clock says {line['time_ms']} ms, ours {should_be} ms"
+            )
+        self.book.enter(w, line.get("routes", []))
+        seen["route"] = self.book.look_up(w, seen["route"], seen["vtype"])
+        departed = line.get("departed", [])
+        self.names[w] += [name for _, name, _, _ in departed]
+        stops = [self.stops.enter(w, stops) for *_, stops in departed]
+        lifted = line.get("teleported", [])
+        for number, name in lifted:
+            log.warning("world %d, tick %d: SUMO teleports %s (%d)", w, tick, name, number)
+        self.teleports[w] += len(lifted)
+        return Tick(
+            tick,
+            seen,
+            answer.letters,
+            np.array([number for number, *_ in departed], dtype=np.int64),
+            np.array([factor for _, _, factor, _ in departed], dtype=np.float64),
+            np.array(stops, dtype=np.int64).reshape(-1, 2),
+            tuple(number for number, _ in lifted),
+            self._changed(w, seen),
+        )
+
+    def _changed(self, w: int, seen: NDArray[np.void]) -> NDArray[np.int64]:
+        """Numbers of those whose path is another than before."""
+        numbers = seen["number"]
+        missing = len(self.names[w]) - len(self._path_of[w])
+        known = np.append(self._path_of[w], np.full(missing, -1, dtype=np.int32))
+        self._path_of[w] = known
+        is_other = (known[numbers] >= 0) & (known[numbers] != seen["route"])
+        known[numbers] = seen["route"]
+        changed: NDArray[np.int64] = numbers[is_other].astype(np.int64)
+        return changed

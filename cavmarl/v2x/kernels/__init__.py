@@ -1,0 +1,1 @@
+"""Compiled loops: sending, the channel, receiving, inboxes."""

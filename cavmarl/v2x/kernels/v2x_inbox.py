@@ -1,0 +1,158 @@
+"""An inbox: the nearest subjects that a receiver knows of, each by the newest report."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cavmarl.core.numba import kernel
+
+__all__ = ["empty", "find", "forget", "insert", "is_better", "sort_by_distance"]
+
+
+@kernel
+def empty(box: NDArray[np.void], first: int) -> None:
+    """Take out the reports from place `first` on."""
+    for k in range(first, box.size):
+        report = box[k]
+        report["subject"] = -1
+        report["sender"] = -1
+
+
+@kernel
+def forget(box: NDArray[np.void], tick: int) -> int:
+    """Take out what is too old; returns how many reports are left, at the beginning."""
+    num = 0
+    for k in range(box.size):
+        if box[k]["sender"] < 0:
+            break
+        if box[k]["expires"] >= tick:
+            if num < k:
+                box[num] = box[k]
+            num += 1
+    return num
+
+
+@kernel
+def find(box: NDArray[np.void], num: int, subject: int) -> int:
+    """Where a subject is in the inbox, or -1."""
+    for k in range(num):
+        if box[k]["subject"] == subject:
+            return k
+    return -1
+
+
+@kernel
+def is_better(report: np.void, other: np.void) -> bool:
+    """Whether a report of a subject is to be kept in the place of another: the newest is.
+
+    Of several of one tick it is what the subject says itself, then that of the smallest sender.
+    """
+    if report["tick"] != other["tick"]:
+        return bool(report["tick"] > other["tick"])
+    if report["kind"] != other["kind"]:
+        return bool(report["kind"] < other["kind"])
+    return bool(report["sender"] < other["sender"])
+
+
+@kernel
+def _squared(report: np.void, x: float, y: float) -> float:
+    dx = report["x"] - x
+    dy = report["y"] - y
+    return float(dx * dx + dy * dy)
+
+
+@kernel
+def sort_by_distance(
+    box: NDArray[np.void], num: int, squared: NDArray[np.float64], x: float, y: float
+) -> None:
+    """Put the first `num` reports in order: nearest first, then by subject.
+
+    Args:
+        box: REPORT (N,).
+        num: how many there are.
+        squared: (at least N,) their squared distances from (x, y) in m², overwritten.
+        x: m.
+        y: m.
+    """
+    is_sorted = True
+    for k in range(num):
+        squared[k] = _squared(box[k], x, y)
+        if k > 0 and not _is_before(squared, box, k - 1, squared[k], box[k]["subject"]):
+            is_sorted = False
+    if is_sorted:
+        return
+    # Neighbours change places: the order of the last tick is nearly that of this one.
+    for k in range(1, num):
+        place = k
+        while place > 0 and not _is_before(
+            squared, box, place - 1, squared[place], box[place]["subject"]
+        ):
+            _swap(box, squared, place)
+            place -= 1
+
+
+@kernel
+def _is_before(
+    squared: NDArray[np.float64], box: NDArray[np.void], k: int, other: float, subject: int
+) -> bool:
+    is_nearer = squared[k] < other
+    return bool(is_nearer or (squared[k] == other and box[k]["subject"] < subject))
+
+
+@kernel
+def _swap(box: NDArray[np.void], squared: NDArray[np.float64], place: int) -> None:
+    """Let a report and the one before it change places."""
+    a = box[place - 1]
+    b = box[place]
+    a["subject"], b["subject"] = b["subject"], a["subject"]
+    a["sender"], b["sender"] = b["sender"], a["sender"]
+    a["tick"], b["tick"] = b["tick"], a["tick"]
+    a["expires"], b["expires"] = b["expires"], a["expires"]
+    a["kind"], b["kind"] = b["kind"], a["kind"]
+    a["code"], b["code"] = b["code"], a["code"]
+    a["x"], b["x"] = b["x"], a["x"]
+    a["y"], b["y"] = b["y"], a["y"]
+    a["z"], b["z"] = b["z"], a["z"]
+    a["heading"], b["heading"] = b["heading"], a["heading"]
+    a["speed"], b["speed"] = b["speed"], a["speed"]
+    a["accel"], b["accel"] = b["accel"], a["accel"]
+    a["yaw_rate"], b["yaw_rate"] = b["yaw_rate"], a["yaw_rate"]
+    a["length"], b["length"] = b["length"], a["length"]
+    a["width"], b["width"] = b["width"], a["width"]
+    a["left_s"], b["left_s"] = b["left_s"], a["left_s"]
+    squared[place - 1], squared[place] = squared[place], squared[place - 1]
+
+
+@kernel
+def insert(
+    box: NDArray[np.void],
+    num: int,
+    squared: NDArray[np.float64],
+    report: np.void,
+    x: float,
+    y: float,
+) -> int:
+    """Put a report of a new subject in its place, if it is near enough; returns how many there are.
+
+    Args:
+        box: REPORT (N,), in order.
+        num: how many there are.
+        squared: their squared distances, in m².
+        report: of a subject that is not there.
+        x: m, where the receiver is.
+        y: m.
+    """
+    distance = _squared(report, x, y)
+    place = num
+    while place > 0 and not _is_before(squared, box, place - 1, distance, report["subject"]):
+        place -= 1
+    if place == box.size:
+        return num
+    num = min(num + 1, box.size)
+    for k in range(num - 1, place, -1):
+        box[k] = box[k - 1]
+        squared[k] = squared[k - 1]
+    box[place] = report
+    squared[place] = distance
+    return num

@@ -1,0 +1,223 @@
+"""The schema of messages: fixed records, little-endian, with a version.
+
+They are like those of the standards, and simpler: metres and radians in the world's frame instead
+of degrees and tenths, ticks instead of milliseconds, no encoding rules, no certificates.
+
+| message | after | one of them is |
+|---|---|---|
+| `CAM` | ETSI EN 302 637-2, cooperative awareness | a vehicle about itself |
+| `DENM` | ETSI EN 302 637-3, decentralized notification | an event |
+| `CPM_OBJECT` | ETSI TS 103 324, collective perception | a vehicle that the sender sees |
+| `SPAT` | SAE J2735, signal phase and timing | what a signal shows |
+| `MAP` | SAE J2735, map data | one approach to a signal |
+
+All positions are those of a body's centre, x east, y north, z up; headings are counter-clockwise
+from east. Ticks are those of the world; a station is a vehicle by its id, or roadside unit k by
+`FIRST_ROADSIDE_ID` + k.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cavmarl.core.errors import V2xError
+from cavmarl.v2x.kernels.v2x_records import (
+    CAUSE_COLLISION,
+    CAUSE_HARD_BRAKING,
+    CAUSE_OBSTACLE,
+    CAUSE_STATIONARY,
+    KIND_CAM,
+    KIND_CPM,
+    KIND_DENM,
+    KIND_SPAT,
+)
+
+__all__ = [
+    "CAM",
+    "CAUSES",
+    "CPM_OBJECT",
+    "DENM",
+    "HEADER",
+    "KINDS",
+    "MAP",
+    "SCHEMA_VERSION",
+    "SPAT",
+    "cause_code",
+    "decode",
+    "encode",
+    "messages_of",
+]
+
+SCHEMA_VERSION = 1
+
+HEADER = np.dtype(
+    [
+        ("version", "<u2"),  # SCHEMA_VERSION
+        ("kind", "<u2"),  # 0 CAM, 1 DENM, 2 CPM, 3 SPAT
+        ("count", "<u4"),  # records that follow: 1, of a CPM as many as it tells of
+        ("sender", "<i8"),  # station
+        ("tick", "<i8"),  # when it was sent
+        ("x", "<f8"),  # m, where the sender was
+        ("y", "<f8"),  # m
+    ]
+)
+
+_KINEMATICS = [
+    ("x", "<f8"),  # m
+    ("y", "<f8"),  # m
+    ("z", "<f8"),  # m
+    ("heading", "<f8"),  # rad
+    ("speed", "<f8"),  # m/s, negative backwards
+    ("accel", "<f8"),  # m/s²
+    ("yaw_rate", "<f8"),  # rad/s
+    ("length", "<f8"),  # m
+    ("width", "<f8"),  # m
+]
+
+CAM = np.dtype(
+    [
+        ("sender", "<i8"),
+        ("tick", "<i8"),
+        ("vclass", "<i4"),  # position in roads.network.VEHICLE_CLASSES
+        *_KINEMATICS,
+    ]
+)
+
+CPM_OBJECT = np.dtype(
+    [
+        ("sender", "<i8"),
+        ("tick", "<i8"),
+        ("object", "<i8"),  # the vehicle that is seen
+        ("vclass", "<i4"),
+        *_KINEMATICS,
+    ]
+)
+
+DENM = np.dtype(
+    [
+        ("sender", "<i8"),
+        ("tick", "<i8"),  # when it was so
+        ("expires", "<i8"),  # the last tick in which it is to be believed
+        ("cause", "<i4"),  # ETSI's cause code: 2, 10, 94, 99
+        ("x", "<f8"),  # m, of the event
+        ("y", "<f8"),
+        ("z", "<f8"),
+        ("heading", "<f8"),  # rad, of the traffic that it concerns
+        ("speed", "<f8"),  # m/s, of the vehicle
+    ]
+)
+
+SPAT = np.dtype(
+    [
+        ("sender", "<i8"),
+        ("tick", "<i8"),
+        ("signal", "<i4"),  # SIGNAL row
+        ("phase", "<i4"),  # PHASE row that is on: the letters of all of its links
+        ("left_s", "<f8"),  # s until it ends, at the soonest
+    ]
+)
+
+MAP = np.dtype(
+    [
+        ("sender", "<i8"),
+        ("signal", "<i4"),  # SIGNAL row
+        ("link", "<i4"),  # LINK row: one movement
+        ("letter", "<i4"),  # which letter of the signal's phases is its
+        ("x", "<f8"),  # m, of its stop line
+        ("y", "<f8"),
+        ("heading", "<f8"),  # rad, in which one drives there
+        ("speed_limit", "<f8"),  # m/s
+    ]
+)
+
+KINDS: dict[int, np.dtype[Any]] = {
+    KIND_CAM: CAM,
+    KIND_DENM: DENM,
+    KIND_CPM: CPM_OBJECT,
+    KIND_SPAT: SPAT,
+}
+
+# What an event can be, with ETSI's cause codes.
+CAUSES = {
+    "collision": CAUSE_COLLISION,
+    "obstacle": CAUSE_OBSTACLE,
+    "stationary": CAUSE_STATIONARY,
+    "hard_braking": CAUSE_HARD_BRAKING,
+}
+
+# Where a record's field stands in the bus's own REPORT, if it has another name there.
+_OWN_NAMES = {
+    "vclass": "code",
+    "cause": "code",
+    "phase": "code",
+    "object": "subject",
+    "signal": "subject",
+}
+
+
+def cause_code(cause: str) -> int:
+    """ETSI's code of a cause.
+
+    Raises:
+        V2xError: no cause of that name.
+    """
+    if cause not in CAUSES:
+        raise V2xError(f"cause = {cause!r}: there are {', '.join(CAUSES)}")
+    return CAUSES[cause]
+
+
+def messages_of(kind: int, reports: NDArray[np.void]) -> NDArray[np.void]:
+    """Reports of the bus as records of the schema.
+
+    Args:
+        kind: KIND_*.
+        reports: REPORT (n,) of that kind; places where none is (sender -1) are left out.
+
+    Returns:
+        CAM, DENM, CPM_OBJECT or SPAT (n,).
+    """
+    there = reports[(reports["sender"] >= 0) & (reports["kind"] == kind)]
+    found = np.zeros(len(there), KINDS[kind])
+    for name in KINDS[kind].names or ():
+        found[name] = there[_OWN_NAMES.get(name, name)]
+    return found
+
+
+def encode(packet: np.void, reports: NDArray[np.void]) -> bytes:
+    """A packet as it goes over a wire: the header, then its records.
+
+    Args:
+        packet: PACKET.
+        reports: REPORT (Q,) of its tick.
+    """
+    kind, first, count = int(packet["kind"]), int(packet["first"]), int(packet["count"])
+    header = np.zeros((), HEADER)
+    header["version"], header["kind"], header["count"] = SCHEMA_VERSION, kind, count
+    for name in ("sender", "tick", "x", "y"):
+        header[name] = packet[name]
+    return header.tobytes() + messages_of(kind, reports[first : first + count]).tobytes()
+
+
+def decode(data: bytes) -> tuple[np.void, NDArray[np.void]]:
+    """Header and records of a packet.
+
+    Raises:
+        V2xError: of another version, of an unknown kind, or of the wrong length.
+    """
+    if len(data) < HEADER.itemsize:
+        raise V2xError(f"{len(data)} bytes are no message: a header has {HEADER.itemsize}")
+    header = np.frombuffer(data, HEADER, 1)[0]
+    if header["version"] != SCHEMA_VERSION:
+        raise V2xError(
+            f"message of version {header['version']}: version {SCHEMA_VERSION} is read here"
+        )
+    kind, count = int(header["kind"]), int(header["count"])
+    if kind not in KINDS:
+        raise V2xError(f"message of kind {kind}: there are {', '.join(map(str, KINDS))}")
+    size = HEADER.itemsize + count * KINDS[kind].itemsize
+    if len(data) != size:
+        raise V2xError(f"message of {len(data)} bytes: with {count} records it has {size}")
+    return header, np.frombuffer(data, KINDS[kind], count, HEADER.itemsize)

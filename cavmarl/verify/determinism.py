@@ -1,0 +1,218 @@
+"""Whether the same scenario gives the same bits: three fresh interpreters, step by step.
+
+They differ in `PYTHONHASHSEED` and run at once, with a fourth process beside them that does nothing
+but use the processor. After each step their hashes are compared; at the first difference the three
+are stopped where they are and leave their states, so that a difference that would not come again is
+found too.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import ExitStack, contextmanager
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+import numpy as np
+
+from cavmarl.core import errors
+from cavmarl.core.errors import ConfigError, EvaluationError
+from cavmarl.core.seeds import check_seed
+from cavmarl.verify.differences import Arrays, Difference, find_difference
+
+__all__ = ["Determinism", "FirstDifference", "check_steps", "verify_determinism"]
+
+HASH_SEEDS = ("0", "1", "4294967295")  # of the three processes
+MAX_STEPS = 10_000_000
+
+
+@dataclass(frozen=True)
+class FirstDifference(Difference):
+    """Where two processes first differ.
+
+    Attributes:
+        processes: the numbers of the two; the tick is that of the first.
+    """
+
+    processes: tuple[int, int]
+
+
+@dataclass(frozen=True)
+class Determinism:
+    """What was found.
+
+    Attributes:
+        steps: that were compared.
+        ticks: of the world at the end.
+        hash_seeds: `PYTHONHASHSEED` of the processes.
+        state_hash: of the first process at the end.
+        difference: None if all were equal.
+    """
+
+    steps: int
+    ticks: int
+    hash_seeds: tuple[str, ...]
+    state_hash: str
+    difference: FirstDifference | None
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain values, for JSON."""
+        return asdict(self)
+
+
+def verify_determinism(
+    env: str | Path,
+    policy: str | Path = "idm",
+    *,
+    steps: int = 600,
+    seed: int = 0,
+    agents: int | None = None,
+    background: int | None = None,
+    overrides: Mapping[str, Any] | None = None,
+    progress: Callable[[int, int], None] | None = None,
+) -> Determinism:
+    """Drive one world in three processes and compare everything after each step.
+
+    Args:
+        env: as in `make_vec`, like the other keywords that are not explained here.
+        policy: as in `load_policy`.
+        steps: how many; episodes follow one another.
+        seed: root of all random numbers, also the policy's.
+        agents: shadows population.agents.
+        background: shadows population.background.
+        overrides: values for any other key.
+        progress: called after each step with its number and `steps`.
+
+    Raises:
+        ConfigError: a number or a key that cannot work.
+        PolicyError: the policy cannot be loaded or does not fit.
+        EvaluationError: a process died.
+    """
+    job = {
+        "env": str(env),
+        "policy": str(policy),
+        "steps": check_steps(steps),
+        "seed": check_seed(seed),
+        "world": {
+            "agents": agents,
+            "background": background,
+            "overrides": dict(overrides or {}),
+        },
+    }
+    with ExitStack() as stack:
+        room = Path(stack.enter_context(TemporaryDirectory()))
+        programs = [stack.enter_context(_Program(job, HASH_SEEDS[0]))]
+        # If kernels have to be compiled, one process does it for all.
+        programs[0].wait_for_line()
+        stack.enter_context(_load_beside())
+        programs += [stack.enter_context(_Program(job, key)) for key in HASH_SEEDS[1:]]
+        for step in range(steps + 1):
+            told = [program.read() for program in programs]
+            odd = next((k for k, line in enumerate(told) if line != told[0]), None)
+            if odd is not None or step == steps:
+                break
+            for program in programs:
+                program.write("")
+            if progress is not None:
+                progress(step, steps)
+        difference = None
+        if odd is not None:
+            states = [programs[k].dump(room / f"{k}.npz") for k in (0, odd)]
+            found = find_difference(step, told[0]["tick"], *states)
+            difference = FirstDifference(**vars(found), processes=(0, odd))
+        return Determinism(step, told[0]["tick"], HASH_SEEDS, told[0]["state"], difference)
+
+
+def check_steps(steps: int) -> int:
+    """A number of steps that can be compared.
+
+    Raises:
+        ConfigError: it is none.
+    """
+    if isinstance(steps, bool) or not isinstance(steps, int) or not 1 <= steps <= MAX_STEPS:
+        raise ConfigError(f"steps = {steps!r}: must be a whole number from 1 to {MAX_STEPS}")
+    return steps
+
+
+class _Program:
+    """One of the processes; a context manager that ends it.
+
+    Args:
+        job: for `lockstep`.
+        hash_seed: its PYTHONHASHSEED.
+    """
+
+    def __init__(self, job: dict[str, Any], hash_seed: str) -> None:
+        self._hash_seed = hash_seed
+        self._line = ""
+        self._process = subprocess.Popen(
+            [sys.executable, "-m", "cavmarl.verify.lockstep"],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            text=True,
+            env={**os.environ, "PYTHONHASHSEED": hash_seed},
+        )
+        self.write(json.dumps(job))
+
+    def __enter__(self) -> _Program:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._process.kill()
+        self._process.communicate()
+
+    def write(self, line: str) -> None:
+        """Send one line."""
+        assert self._process.stdin is not None
+        try:
+            self._process.stdin.write(f"{line}\n")
+            self._process.stdin.flush()
+        except BrokenPipeError as error:
+            raise self._died() from error
+
+    def wait_for_line(self) -> None:
+        """Wait until it has told something that `read` returns next."""
+        assert self._process.stdout is not None
+        self._line = self._process.stdout.readline()
+        if not self._line:
+            raise self._died()
+
+    def read(self) -> dict[str, Any]:
+        """The next line."""
+        if not self._line:
+            self.wait_for_line()
+        line, self._line = self._line, ""
+        told: dict[str, Any] = json.loads(line)
+        if "error" in told:
+            raise getattr(errors, told["error"])(told["message"])
+        return told
+
+    def dump(self, path: Path) -> Arrays:
+        """Its state where it stands now, and its end."""
+        self.write(str(path))
+        self.read()
+        with np.load(path) as arrays:
+            return dict(arrays)
+
+    def _died(self) -> EvaluationError:
+        return EvaluationError(
+            f"the process with PYTHONHASHSEED={self._hash_seed} ended with exit code "
+            f"{self._process.wait()}; its own message is above"
+        )
+
+
+@contextmanager
+def _load_beside() -> Iterator[None]:
+    """A process that uses a core and has nothing to do with the rest."""
+    busy = subprocess.Popen([sys.executable, "-c", "while True: pass"])
+    try:
+        yield
+    finally:
+        busy.kill()
+        busy.wait()

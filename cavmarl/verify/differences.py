@@ -1,0 +1,128 @@
+"""Everything that two runs of the same scenario have to agree in, and the first place that differs.
+
+What agents got is compared as bytes and not as numbers: -0.0 is not 0.0 here, and NaN is NaN.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cavmarl.driving.vehicles import STATE_FIELDS
+from cavmarl.env.vector import CavVectorEnv, StepResult
+
+__all__ = [
+    "Arrays",
+    "Difference",
+    "find_difference",
+    "same_bytes",
+    "single_arrays",
+    "snapshot",
+    "step_results",
+]
+
+Arrays = dict[str, NDArray[Any]]
+
+
+@dataclass(frozen=True)
+class Difference:
+    """Where two runs first differ.
+
+    Attributes:
+        step: number of the step, 0 is the reset.
+        tick: the world's tick at its end.
+        what: `vehicle`, the name of another array, or `hidden state`: what hashes cover and
+            neither has (queue and random keys).
+        vehicle: id of the vehicle, the smallest that differs; None where it is none.
+        field: of its record, the first that differs; or the place in the array.
+        values: in the two; None where a vehicle is missing.
+    """
+
+    step: int
+    tick: int
+    what: str
+    vehicle: int | None
+    field: str
+    values: tuple[Any, Any]
+
+
+def step_results(result: StepResult, actions: NDArray[Any]) -> Arrays:
+    """All that a step returned, by name, and the actions that it was given; W worlds first."""
+    observations, rewards, terminations, truncations, infos = result
+    return {
+        "observations": observations,
+        "rewards": rewards,
+        "terminations": terminations,
+        "truncations": truncations,
+        **{f"infos {name}": array for name, array in infos.items()},
+        "actions": actions,
+    }
+
+
+def single_arrays(results: Mapping[str, Any]) -> Iterator[tuple[str, NDArray[Any]]]:
+    """The arrays of results, by name; observations that are named by sensor, one by one."""
+    for name, found in results.items():
+        if isinstance(found, Mapping):
+            yield from ((f"{name} {sensor}", array) for sensor, array in found.items())
+        else:
+            yield name, found
+
+
+def snapshot(vec: CavVectorEnv, results: Mapping[str, NDArray[Any]], world: int = 0) -> Arrays:
+    """One world's vehicles by rising id, its signals, and its part of what agents got in a step."""
+    vehicles = vec.simulation.vehicles(world)
+    return {
+        "vehicles": vehicles[np.argsort(vehicles["id"])],
+        "signals": vec.simulation.signal_phases(world),
+        **{
+            f"frames {name} {field}": array[world]
+            for name, frames in vec.frames().items()
+            for field, array in frames._asdict().items()
+        },
+        **{name: np.atleast_1d(array[world]) for name, array in single_arrays(results)},
+    }
+
+
+def same_bytes(one: Mapping[str, NDArray[Any]], other: Mapping[str, NDArray[Any]]) -> bool:
+    """Whether all arrays of two results are the same."""
+    others = dict(single_arrays(other))
+    return all(array.tobytes() == others[name].tobytes() for name, array in single_arrays(one))
+
+
+def find_difference(step: int, tick: int, one: Arrays, other: Arrays) -> Difference:
+    """The smallest id, and of its record the first field; else the first other array and place.
+
+    Args:
+        step: number of the step.
+        tick: of the world.
+        one: a snapshot.
+        other: another one; both have the same names.
+    """
+
+    def found(what: str, vehicle: int | None, field: str, values: tuple[Any, Any]) -> Difference:
+        return Difference(step, tick, what, vehicle, field, values)
+
+    mine, theirs = ({int(row["id"]): row for row in state["vehicles"]} for state in (one, other))
+    for vehicle in sorted(mine.keys() | theirs.keys()):
+        if vehicle not in mine or vehicle not in theirs:
+            one_id, other_id = (vehicle if vehicle in rows else None for rows in (mine, theirs))
+            return found("vehicle", vehicle, "id", (one_id, other_id))
+        for name in STATE_FIELDS:
+            a, b = mine[vehicle][name], theirs[vehicle][name]
+            if a.tobytes() != b.tobytes():
+                return found("vehicle", vehicle, name, (a.tolist(), b.tolist()))
+    for name in one:
+        if name == "vehicles" or one[name].tobytes() == other[name].tobytes():
+            continue
+        if one[name].shape != other[name].shape:
+            return found(name, None, "shape", (one[name].shape, other[name].shape))
+        arrays = [np.ascontiguousarray(state[name]) for state in (one, other)]
+        raw = [array.view(f"V{array.itemsize}") for array in arrays]
+        place = tuple(int(k) for k in np.argwhere(raw[0] != raw[1])[0])
+        values = (one[name][place].item(), other[name][place].item())
+        return found(name, None, str(list(place)), values)
+    return found("hidden state", None, "queue or random keys", (None, None))

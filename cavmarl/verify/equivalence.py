@@ -1,0 +1,320 @@
+"""Whether a divided world is the undivided one: several divisions beside it, step by step.
+
+All of them go through the public interface: the same seed, a driver of its own for each, and after
+every step the hashes of all worlds and everything that `step` returned.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cavmarl.config.env import MAX_ZONES, ZONE_FILE_SUFFIXES
+from cavmarl.core.errors import ConfigError, ProtocolError, ZoneError
+from cavmarl.core.seeds import check_seed
+from cavmarl.env.vector import CavVectorEnv, make_vec
+from cavmarl.handoff.fault_injection.fault_plan import read_faults
+from cavmarl.policies.policy import load_policy
+from cavmarl.verify.determinism import check_steps
+from cavmarl.verify.differences import (
+    Arrays,
+    Difference,
+    find_difference,
+    same_bytes,
+    snapshot,
+    step_results,
+)
+from cavmarl.verify.fault_figures import FaultFigures, HandOverClock
+from cavmarl.zones.kernels.zone_lookup import zones_of
+from cavmarl.zones.partition.zone_file import read_zones
+
+__all__ = ["ZONES", "Equivalence", "ZoneResult", "verify_zones"]
+
+ZONES = (1, 2, 4, 9)
+
+
+@dataclass(frozen=True)
+class ZoneResult:
+    """What came of one number of zones.
+
+    Attributes:
+        zones: how many.
+        steps: that were compared.
+        crossings: how often a vehicle was in another zone than a step before, in all worlds.
+        vehicles: in all worlds, on average over the steps.
+        world: the first that differs; None if all were equal.
+        difference: in it; None if all were equal.
+        figures: hand-overs, and what faults did to them.
+    """
+
+    zones: int
+    steps: int
+    crossings: int
+    vehicles: float
+    world: int | None
+    difference: Difference | None
+    figures: FaultFigures
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain values, for JSON."""
+        return asdict(replace(self, figures=FaultFigures())) | {"figures": self.figures.to_dict()}
+
+
+@dataclass(frozen=True)
+class Equivalence:
+    """What was found.
+
+    Attributes:
+        env: of which environment.
+        worlds: how many were stepped together.
+        steps: that were asked for.
+        ticks: of the first world's episode at the end.
+        state_hashes: of the undivided worlds at the end.
+        results: one for each number of zones.
+    """
+
+    env: str
+    worlds: int
+    steps: int
+    ticks: int
+    state_hashes: tuple[str, ...]
+    results: tuple[ZoneResult, ...]
+
+    @property
+    def holds(self) -> bool:
+        """Whether all were equal."""
+        return all(result.difference is None for result in self.results)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain values, for JSON."""
+        results = [result.to_dict() for result in self.results]
+        return {**asdict(replace(self, results=())), "results": results, "holds": self.holds}
+
+
+def verify_zones(
+    env: str | Path,
+    zones: Sequence[int] | None = None,
+    *,
+    steps: int = 200,
+    seed: int = 0,
+    layout: str | Path | None = None,
+    policy: str | Path = "idm",
+    worlds: int = 1,
+    agents: int | None = None,
+    background: int | None = None,
+    overrides: Mapping[str, Any] | None = None,
+    faults: str | Path | None = None,
+    check: bool = False,
+    journals: Path | None = None,
+    progress: Callable[[int, int], None] | None = None,
+) -> Equivalence:
+    """Drive divided worlds beside the undivided ones and compare everything after each step.
+
+    Args:
+        env: as in `make_vec`, like the other keywords that are not explained here.
+        zones: numbers of zones; default: as many as a zone file has, otherwise `ZONES`.
+        steps: how many; episodes follow one another.
+        seed: root of all random numbers, also the policy's.
+        layout: shadows zones.layout; a zone file is named from the working directory.
+        policy: as in `load_policy`.
+        worlds: stepped together.
+        agents: shadows population.agents.
+        background: shadows population.background.
+        overrides: values for any other key; those of `zones` count for the divided worlds.
+        faults: what is done to the divided worlds, as `runtime.fault_plan.read_faults` takes it.
+        check: watch the invariants of ownership in the divided worlds.
+        journals: folder for the journals of the divided worlds, one for each number of zones.
+        progress: called after each step with its number and `steps`.
+
+    Raises:
+        ConfigError: a number or a key that cannot work.
+        JournalError: a journal that cannot be begun.
+        PolicyError: the policy cannot be loaded or does not fit.
+        ZoneError: more zones than the map can hold, or a zone file of another number.
+    """
+    check_steps(steps)
+    check_seed(seed)
+    divided = dict(overrides or {})
+    if layout is not None:
+        _shadow(divided, "zones.layout", _layout(layout), "layout")
+    if faults is not None:
+        _shadow(divided, "zones.faults", read_faults(str(faults)).to_json(), "faults")
+    if check:
+        divided["zones.check"] = True
+    plain = {key: value for key, value in divided.items() if not key.startswith("zones.")}
+
+    def run(count: int, settings: Mapping[str, Any]) -> _Run:
+        vec = make_vec(
+            env,
+            num_envs=worlds,
+            zones=count,
+            agents=agents,
+            background=background,
+            overrides=settings,
+        )
+        return _Run(vec, policy, seed)
+
+    whole = run(1, plain)
+    # A world of one zone is as plain as the first: whose hosts die has to be divided.
+    compared = [
+        _Compared(run(count, divided | _journal(journals, count) if count > 1 else plain))
+        for count in _counts(zones, divided)
+    ]
+    for step in range(steps + 1):
+        if step > 0:
+            whole.step()
+        for other in compared:
+            other.follow(step, whole)
+        if progress is not None:
+            progress(step, steps)
+        if all(other.difference is not None for other in compared):
+            break
+    vec = whole.vec
+    return Equivalence(
+        str(env),
+        worlds,
+        steps,
+        int(vec.simulation.ticks()[0]),
+        tuple(vec.state_hash(w) for w in range(worlds)),
+        tuple(other.result() for other in compared),
+    )
+
+
+def _shadow(settings: dict[str, Any], key: str, value: Any, name: str) -> None:
+    if key in settings:
+        raise ConfigError(f"{key} stands in overrides and is given as {name}; use one")
+    settings[key] = value
+
+
+def _journal(folder: Path | None, count: int) -> dict[str, str]:
+    if folder is None:
+        return {}
+    return {"zones.journal": str(folder / f"zones-{count}.jsonl")}
+
+
+def _layout(layout: str | Path) -> str:
+    path = str(layout)
+    return str(Path(path).resolve()) if path.endswith(ZONE_FILE_SUFFIXES) else path
+
+
+def _counts(zones: Sequence[int] | None, settings: Mapping[str, Any]) -> list[int]:
+    """The numbers of zones, each once.
+
+    Raises:
+        ConfigError: one that cannot be, or none.
+    """
+    if zones is None:
+        layout = str(settings.get("zones.layout", ""))
+        zones = (read_zones(layout).count,) if layout.endswith(ZONE_FILE_SUFFIXES) else ZONES
+    for count in zones:
+        if isinstance(count, bool) or not isinstance(count, int) or not 1 <= count <= MAX_ZONES:
+            raise ConfigError(f"zones = {count!r}: must be whole numbers from 1 to {MAX_ZONES}")
+    if not zones:
+        raise ConfigError("zones: name at least one number of them")
+    return list(dict.fromkeys(zones))
+
+
+class _Run:
+    """Some worlds and their driver, from the reset on.
+
+    Args:
+        vec: the worlds.
+        policy: who drives.
+        seed: of both.
+    """
+
+    def __init__(self, vec: CavVectorEnv, policy: str | Path, seed: int) -> None:
+        self.vec = vec
+        self._driver = load_policy(policy, vec)
+        observations, infos = vec.reset(seed=seed)
+        self._driver.reset(seed)
+        self.results: Arrays = {"observations": observations, "infos mask": infos["mask"]}
+
+    def step(self) -> None:
+        """Let the driver act once."""
+        seen, mask = self.results["observations"], self.results["infos mask"]
+        actions = self._driver.act_batch(seen, mask)
+        self.results = step_results(self.vec.step(actions), actions)
+
+
+class _Compared:
+    """One division beside the undivided worlds, up to the first difference.
+
+    Args:
+        run: the divided worlds.
+    """
+
+    def __init__(self, run: _Run) -> None:
+        self._run = run
+        self._clocks = [HandOverClock() for _ in run.vec.simulation.coordinators]
+        for coordinator, clock in zip(run.vec.simulation.coordinators, self._clocks, strict=True):
+            coordinator.watch(clock)
+        self._steps = 0
+        self._crossings = 0
+        self._vehicles = 0
+        self._zones: list[dict[int, int]] = [{} for _ in range(run.vec.num_envs)]
+        self._world: int | None = None
+        self.difference: Difference | None = None
+
+    def follow(self, step: int, whole: _Run) -> None:
+        """Take the step that the undivided worlds have taken, and compare."""
+        if self.difference is not None:
+            return
+        try:
+            if step > 0:
+                self._run.step()
+        except (ProtocolError, ZoneError) as error:
+            tick = int(whole.vec.simulation.ticks()[0])
+            self._world = 0
+            self.difference = Difference(step, tick, "error", None, "", (None, str(error)))
+            return
+        self._steps = step
+        self._count_crossings()
+        self._compare(step, whole)
+
+    def result(self) -> ZoneResult:
+        """What was found up to now."""
+        simulation = self._run.vec.simulation
+        return ZoneResult(
+            simulation.partition.count,
+            self._steps,
+            self._crossings,
+            self._vehicles / (self._steps + 1),
+            self._world,
+            self.difference,
+            FaultFigures.of(simulation, self._clocks),
+        )
+
+    def _compare(self, step: int, whole: _Run) -> None:
+        mine, theirs = self._run, whole
+        same = same_bytes(theirs.results, mine.results)
+        for w in range(mine.vec.num_envs):
+            if same and mine.vec.state_hash(w) == theirs.vec.state_hash(w):
+                continue
+            states = [snapshot(run.vec, run.results, w) for run in (theirs, mine)]
+            tick = int(theirs.vec.simulation.ticks()[w])
+            found = find_difference(step, tick, *states)
+            if found.what == "hidden state" and (
+                mine.vec.state_hash(w) == theirs.vec.state_hash(w)
+            ):
+                continue  # it is another world's results that differ
+            self._world, self.difference = w, found
+            return
+
+    def _count_crossings(self) -> None:
+        simulation = self._run.vec.simulation
+        for w, before in enumerate(self._zones):
+            rows = simulation.vehicles(w)
+            zones: NDArray[np.int32] = np.empty(len(rows), dtype=np.int32)
+            zones_of(simulation.partition.arrays, rows, len(rows), zones)
+            now = dict(zip(rows["id"].tolist(), zones.tolist(), strict=True))
+            self._vehicles += len(rows)
+            self._crossings += sum(
+                zone != before.get(vehicle, zone) for vehicle, zone in now.items()
+            )
+            self._zones[w] = now

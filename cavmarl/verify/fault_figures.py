@@ -1,0 +1,194 @@
+"""What faults did to a divided run, in counts and times: all of it from the run itself."""
+
+from __future__ import annotations
+
+import time
+from collections import Counter
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field, fields
+from typing import Any
+
+import numpy as np
+
+from cavmarl.engine.simulation import Simulation
+from cavmarl.handoff.fault_injection.message_coordinator import Coordinator
+from cavmarl.ownership.messages import Begin, Commit, Message, Need, Record, Reset
+from cavmarl.ownership.transport import Network
+
+__all__ = ["FaultFigures", "HandOverClock", "spread"]
+
+
+class HandOverClock:
+    """A watcher of one world that measures how long hand-overs take.
+
+    Attributes:
+        latency_ms: of each that is committed, from the BEGIN that found its vehicle over the border
+            to the COMMIT.
+        failed: hand-overs that were decided, and neither committed nor still under way.
+        late: vehicles that were over the border before their target was ready.
+        asked: states that a target had not, and asked for.
+    """
+
+    def __init__(self) -> None:
+        self.latency_ms: list[float] = []
+        self.failed = self.late = self.asked = 0
+        self._since: dict[int, float] = {}
+        self._plan: Begin | None = None
+
+    def logged(self, records: Iterable[Record]) -> None:
+        """Records, in the order of the journal."""
+        now = time.perf_counter()
+        for record in records:
+            match record:
+                case Reset():
+                    self._drop_plan()
+                    self._since = {}
+                case Begin():
+                    self._begin(record, now)
+                case Commit() if self._plan is not None:
+                    for switch in self._plan.switches:
+                        self.latency_ms.append(1000.0 * (now - self._since.pop(switch.vehicle)))
+                    self._plan = None
+
+    def delivered(self, destination: int, message: Message) -> None:
+        """A message that has arrived."""
+        if isinstance(message, Need):
+            self.asked += len(message.vehicles)
+
+    def _begin(self, record: Begin, now: float) -> None:
+        self._drop_plan()
+        self._plan = record
+        self.late += sum(ticks == 1 for _, ticks in record.deferred)
+        crossed = [vehicle for vehicle, _ in record.deferred]
+        crossed += [switch.vehicle for switch in record.switches]
+        self._since = {vehicle: self._since.get(vehicle, now) for vehicle in crossed}
+
+    def _drop_plan(self) -> None:
+        if self._plan is not None:
+            self.failed += len(self._plan.switches)
+            self._plan = None
+
+
+@dataclass(frozen=True)
+class FaultFigures:
+    """Figures of one run, or of several that were added up.
+
+    Attributes:
+        zone_deaths: point → hosts of zones that died there.
+        coordinator_deaths: point → coordinators that died there.
+        messages: (kind, fault) → messages that it struck.
+        stale: (kind, reason) → messages or entries that came late or from elsewhere and did not
+            count.
+        hand_overs: `failed`, `switched`, `forced`, `deferred` (ticks), `late` (vehicles), `asked`,
+            `refused`, `aborted`.
+        resent: phase → messages that were sent again for want of an answer, as of `Coordinator`.
+        recovery_ms: of each death, until its tick began again.
+        repeats: of each tick in which somebody died, how often it was begun again.
+        waited_ticks: of each hand-over, from the crossing to the switch.
+        latency_ms: the same in ms, with the tick of the switch.
+        state_bytes: of each hand-over whose state was sent ahead.
+    """
+
+    zone_deaths: Counter[str] = field(default_factory=Counter)
+    coordinator_deaths: Counter[str] = field(default_factory=Counter)
+    messages: Counter[tuple[str, str]] = field(default_factory=Counter)
+    stale: Counter[tuple[str, str]] = field(default_factory=Counter)
+    hand_overs: Counter[str] = field(default_factory=Counter)
+    resent: Counter[str] = field(default_factory=Counter)
+    recovery_ms: list[float] = field(default_factory=list)
+    repeats: list[int] = field(default_factory=list)
+    waited_ticks: list[int] = field(default_factory=list)
+    latency_ms: list[float] = field(default_factory=list)
+    state_bytes: list[int] = field(default_factory=list)
+
+    @classmethod
+    def of(cls, simulation: Simulation, clocks: Sequence[HandOverClock]) -> FaultFigures:
+        """What a simulation's worlds went through.
+
+        Args:
+            simulation: a divided one.
+            clocks: one a world, that have watched it.
+        """
+        found = cls()
+        for revival in simulation.revivals:
+            deaths = found.coordinator_deaths if revival.zone is None else found.zone_deaths
+            deaths[revival.point] += 1
+            found.recovery_ms.append(revival.ms)
+        found.repeats.extend(Counter(revival.tick for revival in simulation.revivals).values())
+        for coordinator in simulation.coordinators:
+            found.stale.update(coordinator.dropped())
+            if not isinstance(coordinator, Coordinator):
+                continue
+            found.resent.update(coordinator.resent)
+            if isinstance(coordinator.post, Network):
+                found.messages.update(coordinator.post.faults)
+        for log in simulation.transfers:
+            found.hand_overs.update(log.counts)
+            found.waited_ticks.extend(row.waited for row in log.rows)
+            found.state_bytes.extend(row.state_bytes for row in log.rows if row.offers)
+        for clock in clocks:
+            found.latency_ms.extend(clock.latency_ms)
+            found.hand_overs.update(failed=clock.failed, late=clock.late, asked=clock.asked)
+        return found
+
+    def add(self, other: FaultFigures) -> None:
+        """Count another run, too."""
+        for entry in fields(self):
+            mine, theirs = getattr(self, entry.name), getattr(other, entry.name)
+            if isinstance(mine, Counter):
+                mine.update(theirs)
+            else:
+                mine.extend(theirs)
+
+    @property
+    def deaths(self) -> int:
+        """Of zones' hosts and coordinators."""
+        return self.zone_deaths.total() + self.coordinator_deaths.total()
+
+    @property
+    def injected(self) -> int:
+        """Faults of all kinds."""
+        return self.deaths + self.messages.total()
+
+    @property
+    def handed_over(self) -> int:
+        """Vehicles that have changed their owner."""
+        return self.hand_overs["switched"] + self.hand_overs["forced"]
+
+    @property
+    def failure_rate(self) -> float:
+        """Share of the hand-overs that were decided and neither committed nor under way."""
+        failed = self.hand_overs["failed"]
+        return failed / max(1, failed + self.handed_over)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain values, for JSON."""
+        return {
+            "zone_deaths": dict(self.zone_deaths),
+            "coordinator_deaths": dict(self.coordinator_deaths),
+            "messages": _nested(self.messages),
+            "stale": _nested(self.stale),
+            "hand_overs": dict(self.hand_overs),
+            "resent": dict(self.resent),
+            "failure_rate": self.failure_rate,
+            "recovery_ms": spread(self.recovery_ms),
+            "tick_begun_again": spread(self.repeats),
+            "latency_ticks": spread(self.waited_ticks),
+            "latency_ms": spread(self.latency_ms),
+            "state_bytes": spread(self.state_bytes),
+        }
+
+
+def spread(values: Sequence[float]) -> dict[str, float] | None:
+    """Median, 95th percentile and maximum; None of no values."""
+    if not values:
+        return None
+    p50, p95 = np.percentile(values, (50.0, 95.0)).tolist()
+    return {"p50": p50, "p95": p95, "max": float(max(values))}
+
+
+def _nested(counts: Counter[tuple[str, str]]) -> dict[str, dict[str, int]]:
+    nested: dict[str, dict[str, int]] = {}
+    for (kind, what), number in sorted(counts.items()):
+        nested.setdefault(kind, {})[what] = number
+    return nested

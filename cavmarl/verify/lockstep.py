@@ -1,0 +1,75 @@
+"""The program that `verify-determinism` starts three times: one world, a hash a step, on demand.
+
+Standard input brings a job as one line of JSON, then one line a step: an empty one to go on, or the
+path of a file to leave the state in before the end. Standard output tells the hashes of each step.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import sys
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+
+from cavmarl.core import errors
+from cavmarl.engine.world_setup import load_world
+from cavmarl.env.vector import CavVectorEnv
+from cavmarl.parallel.local_worlds import LocalWorlds
+from cavmarl.policies.policy import load_policy
+from cavmarl.verify.differences import Arrays, single_arrays, snapshot, step_results
+
+__all__: list[str] = []
+
+
+def _main() -> None:
+    job = json.loads(sys.stdin.readline())
+    try:
+        for told in _steps(job):
+            print(json.dumps(told), flush=True)
+    except errors.CavmarlError as error:
+        print(json.dumps({"error": type(error).__name__, "message": str(error)}), flush=True)
+
+
+def _steps(job: dict[str, Any]) -> Iterator[dict[str, Any]]:
+    """Drive; what is told after the reset and after each step, until a dump is asked for."""
+    vec = CavVectorEnv(LocalWorlds(load_world(job["env"], **job["world"]), 1))
+    driver = load_policy(job["policy"], vec)
+    observations, infos = vec.reset(seed=job["seed"])
+    driver.reset(job["seed"])
+    results = {"observations": observations}
+    for step in range(job["steps"] + 1):
+        yield {
+            "step": step,
+            "tick": int(vec.simulation.ticks()[0]),
+            "state": vec.state_hash(),
+            "seen": _digest(results),
+        }
+        wanted = sys.stdin.readline().strip()
+        if wanted:
+            _dump(wanted, vec, results)
+            return
+        actions = driver.act_batch(observations, infos["mask"])
+        told = vec.step(actions)
+        results = step_results(told, actions)
+        observations, infos = told[0], told[-1]
+
+
+def _digest(arrays: Arrays) -> str:
+    digest = hashlib.blake2b(digest_size=16)
+    for _, array in single_arrays(arrays):
+        digest.update(np.ascontiguousarray(array).tobytes())
+    return digest.hexdigest()
+
+
+def _dump(path: str, vec: CavVectorEnv, results: Arrays) -> None:
+    """Leave everything that the hashes are made of."""
+    arrays: dict[str, Any] = snapshot(vec, results)
+    np.savez(path, **arrays)
+    print(json.dumps({"dumped": path}), flush=True)
+
+
+if __name__ == "__main__":
+    _main()

@@ -1,0 +1,80 @@
+"""A tick that no host survived, run again: does it fail as it did, and does it without faults?"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from tempfile import gettempdir
+
+from cavmarl.config.env import EnvConfig
+from cavmarl.config.io import validate
+from cavmarl.config.registry import find_entry
+from cavmarl.core.errors import ReproducerError
+from cavmarl.engine.simulation import Simulation
+from cavmarl.engine.world_setup import World, make_world
+from cavmarl.handoff.fault_injection.fault_plan import Faults
+from cavmarl.handoff.fault_injection.reproducer_file import Reproducer
+from cavmarl.handoff.fault_injection.reproducer_recording import made_with, sources_of
+
+__all__ = ["changed_versions", "replay_tick", "world_of"]
+
+
+def world_of(kept: Reproducer, env: str | Path | None = None) -> World:
+    """The world that a reproducer is of.
+
+    Args:
+        kept: the reproducer.
+        env: where its roads and its demand are found, as `make_vec` takes it; None: under the name
+            of its environment.
+
+    Raises:
+        ReproducerError: other roads, another demand or other zones than it was made with.
+        CavmarlError: as of `load_world`.
+    """
+    config = validate(EnvConfig, kept.config, "the reproducer")
+    found = find_entry(config.name if env is None else env)
+    world = make_world(config, found if found.is_dir() else found.parent)
+    here = sources_of(world.network, world.demand, world.partition)
+    for name, known in kept.sources.items():
+        if here.get(name) != known:
+            raise ReproducerError(
+                f"the {name} of {found} is not the one that the tick was run with; name the "
+                "environment that has it"
+            )
+    return world
+
+
+def replay_tick(kept: Reproducer, world: World, *, faults: bool = True) -> str:
+    """Run the tick again in this process, and tell the hash of the state that it leads to.
+
+    Args:
+        kept: the tick.
+        world: of `world_of`.
+        faults: with those of its plan, if it had one.
+
+    Raises:
+        LostTickError: every host of a zone, or every coordinator, dies of it again.
+        ReproducerError: it is of another layout.
+        Exception: without faults whatever a zone's code raises, from where it does.
+    """
+    config = world.config
+    if faults:  # hosts may die as they did, wherever the folder was; nothing is written
+        zones = replace(config.zones, reproducers=gettempdir())
+    else:
+        zones = replace(config.zones, reproducers="", faults=Faults().to_json())  # messages alone
+    simulation = Simulation(
+        replace(config, zones=zones), world.network, 1, world.demand, world.partition
+    )
+    simulation.resume(kept)
+    simulation.run_tick(kept.commands, kept.is_first, kept.is_last)
+    return simulation.state_hash()
+
+
+def changed_versions(kept: Reproducer) -> list[str]:
+    """What is not as it was when the tick was run, in words."""
+    here = made_with()
+    return [
+        f"{name} {there}, here {here.get(name)}"
+        for name, there in kept.made_with.items()
+        if here.get(name) != there
+    ]

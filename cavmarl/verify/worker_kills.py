@@ -1,0 +1,315 @@
+"""Whether anybody can tell that workers were killed: worlds whose workers are, beside others."""
+
+from __future__ import annotations
+
+import os
+import random
+import signal
+import socket
+import statistics
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from threading import Timer
+from typing import Any, Literal
+
+from cavmarl.core.errors import ConfigError, EvaluationError
+from cavmarl.core.seeds import check_seed
+from cavmarl.env.vector import CavVectorEnv, make_vec
+from cavmarl.evaluate.provenance.machine import describe_hardware
+from cavmarl.parallel.hosts.host_pool import HostPool
+from cavmarl.parallel.hosts.remote_worlds import RemoteWorlds
+from cavmarl.parallel.pooled_worlds import PooledWorlds
+from cavmarl.parallel.processes.worker_pool import Death, Pool
+from cavmarl.parallel.split_hosts.divided_worlds import DividedWorlds
+from cavmarl.policies.policy import Policy, load_policy
+from cavmarl.verify.differences import same_bytes, step_results
+
+__all__ = ["Kill", "KillReport", "verify_kills"]
+
+FIRST_STEPS = 10  # before anybody is killed, to know how long a step takes
+PINGS = 500
+LATEST = 1.5  # of a step's time: some are killed when they are already waiting for the next one
+STOPS = 0.25  # share of those that are not killed but stopped
+
+
+@dataclass(frozen=True)
+class Kill:
+    """One signal and what became of it.
+
+    Attributes:
+        signal: its name.
+        worker: that got it.
+        step: after which it was noticed.
+        idle: the worker had nothing to do; it was missed when it was to work again.
+        cause: of the death, as the pool saw it.
+        noticed_ms: from the signal, or from the next order to one that was idle, until the pool
+            knew.
+        replaced_ms: from then until the successor had its order.
+        recovered_ms: from when the pool knew until the successor had done what was asked for.
+    """
+
+    signal: str
+    worker: int
+    step: int
+    idle: bool
+    cause: str
+    noticed_ms: float
+    replaced_ms: float
+    recovered_ms: float
+
+
+@dataclass(frozen=True)
+class KillReport:
+    """What was found.
+
+    Attributes:
+        env: of which environment.
+        worlds: that were stepped together.
+        workers: over which they were shared out.
+        steps: that were compared.
+        different: the first step after which anything differed; None: none.
+        kills: all of them.
+        step_ms: median of the steps in which nobody died.
+        ping_us: median of an empty order to all workers, before the first death.
+        state_hashes: of the undisturbed worlds at the end.
+        hardware: that it ran on.
+    """
+
+    env: str
+    worlds: int
+    workers: int
+    steps: int
+    different: int | None
+    kills: tuple[Kill, ...]
+    step_ms: float
+    ping_us: float
+    state_hashes: tuple[str, ...]
+    hardware: dict[str, Any]
+
+    @property
+    def holds(self) -> bool:
+        """Whether nothing differed."""
+        return self.different is None
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain values, for JSON."""
+        return {**asdict(self), "holds": self.holds}
+
+
+def verify_kills(
+    env: str | Path,
+    kills: int,
+    *,
+    workers: int = 2,
+    hosts: Literal["ray"] | None = None,
+    worlds: int | None = None,
+    steps: int | None = None,
+    seed: int = 0,
+    policy: str | Path = "idm",
+    zones: int | None = None,
+    agents: int | None = None,
+    background: int | None = None,
+    overrides: Mapping[str, Any] | None = None,
+    progress: Callable[[int, int], None] | None = None,
+) -> KillReport:
+    """Kill and stop workers at random times and compare everything with undisturbed worlds.
+
+    Args:
+        env: as in `make_vec`.
+        kills: how many signals; three in four are SIGKILL, the others SIGSTOP.
+        workers: over which the worlds are shared out.
+        hosts: "ray": they are actors of a Ray cluster, all on this machine.
+        worlds: stepped together; default: two a worker.
+        steps: how many; default: three a kill.
+        seed: root of all random numbers, those of the kills, too.
+        policy: as in `load_policy`.
+        zones: shadows zones.count.
+        agents: shadows population.agents.
+        background: shadows population.background.
+        overrides: values for any other key.
+        progress: called with steps done and steps in all.
+
+    Raises:
+        ConfigError: numbers that cannot be.
+        WorkerError: workers died that nobody had killed.
+    """
+    check_seed(seed)
+    steps = 3 * kills + FIRST_STEPS if steps is None else steps
+    if kills < 1 or workers < 1:
+        raise ConfigError(f"{kills} kills of {workers} workers: must be at least 1 of each")
+    if steps < kills + FIRST_STEPS:
+        raise ConfigError(f"{steps} steps: {kills} kills need at least {kills + FIRST_STEPS}")
+    worlds = 2 * workers if worlds is None else worlds
+    wanted: dict[str, Any] = {
+        "num_envs": worlds,
+        "zones": zones,
+        "agents": agents,
+        "background": background,
+        "overrides": overrides,
+    }
+    whole, parted = make_vec(env, **wanted), make_vec(env, workers=workers, hosts=hosts, **wanted)
+    try:
+        killer = _Killer(_pool(parted), random.Random(seed))
+        runs = [_Run(vec, load_policy(policy, vec), seed) for vec in (whole, parted)]
+        _refuse_elsewhere(killer.pool)
+        ping_us = _ping_us(killer.pool)
+        struck = set(killer.random.sample(range(FIRST_STEPS, steps), kills))
+        different = None
+        for step in range(steps):
+            first = runs[0].step()
+            second = killer.watch(runs[1].step, step, step in struck)
+            if not same_bytes(first, second) or whole.state_hash(
+                step % worlds
+            ) != parted.state_hash(step % worlds):
+                different = step
+                break
+            if progress is not None:
+                progress(step + 1, steps)
+        killer.finish(steps)
+        hashes = tuple(whole.state_hash(w) for w in range(worlds))
+        if different is None and hashes != tuple(parted.state_hash(w) for w in range(worlds)):
+            different = steps
+    finally:
+        parted.close()
+    return KillReport(
+        str(env), worlds, workers, steps, different, tuple(killer.found), killer.step_ms(), ping_us,
+        hashes, describe_hardware(),
+    )  # fmt: skip
+
+
+def _pool(vec: CavVectorEnv) -> Pool | HostPool:
+    assert isinstance(vec.worlds, PooledWorlds | RemoteWorlds | DividedWorlds)
+    return vec.worlds.pool
+
+
+def _ping_us(pool: Pool | HostPool) -> float:
+    """What an empty order to all workers takes, at the median."""
+    found = []
+    for _ in range(PINGS):
+        began = time.perf_counter()
+        pool.ping()
+        found.append(time.perf_counter() - began)
+    return 1e6 * statistics.median(found)
+
+
+def _refuse_elsewhere(pool: Pool | HostPool) -> None:
+    """Only processes of this machine can be killed.
+
+    Raises:
+        ConfigError: one is elsewhere.
+    """
+    if isinstance(pool, HostPool) and {*pool.machines} != {socket.gethostname()}:
+        raise ConfigError(
+            f"hosts on {', '.join(sorted({*pool.machines}))}: processes are killed on this machine "
+            "only; unset RAY_ADDRESS for a cluster of its own"
+        )
+
+
+class _Run:
+    """Worlds and who drives in them."""
+
+    def __init__(self, vec: CavVectorEnv, driver: Policy, seed: int) -> None:
+        self._vec = vec
+        self._driver = driver
+        self._observations, infos = vec.reset(seed=seed)
+        self._mask = infos["mask"]
+        driver.reset(seed)
+
+    def step(self) -> dict[str, Any]:
+        """All that comes out of one more."""
+        actions = self._driver.act_batch(self._observations, self._mask)
+        result = self._vec.step(actions)
+        self._observations, self._mask = result[0], result[4]["mask"]
+        return step_results(result, actions)
+
+
+class _Killer:
+    """Sends the signals and finds out what became of them.
+
+    Args:
+        pool: whose workers get them.
+        random: says whose and when.
+    """
+
+    def __init__(self, pool: Pool | HostPool, random: random.Random) -> None:
+        self.random = random
+        self.found: list[Kill] = []
+        self.pool = pool
+        self._sent: dict[int, tuple[signal.Signals, float]] = {}  # worker → what and when
+        self._seen = 0
+        self._calm_s: list[float] = []
+
+    def step_ms(self) -> float:
+        """Median of the steps in which nobody died, ms."""
+        return 1000.0 * statistics.median(self._calm_s)
+
+    def watch(self, run: Callable[[], dict[str, Any]], step: int, strikes: bool) -> dict[str, Any]:
+        """One step, with a signal in it or soon after."""
+        timer = None
+        if strikes:
+            if isinstance(self.pool, HostPool):  # one death at a time: Ray takes seconds for a host
+                self.finish(step)
+                self.pool.await_spare()
+            delay_s = self.random.uniform(0.0, LATEST * statistics.median(self._calm_s))
+            timer = Timer(delay_s, self._strike, (self._choose(),))
+            timer.start()
+        began = time.monotonic()
+        result = run()
+        if timer is None and not self._sent:
+            self._calm_s.append(time.monotonic() - began)
+        elif timer is not None:
+            timer.join()
+        self._match(step)
+        return result
+
+    def finish(self, step: int) -> None:
+        """Let those be missed that were struck last."""
+        self.pool.ping()
+        self._match(step)
+
+    def _choose(self) -> tuple[int, signal.Signals]:
+        alive = [k for k in range(len(self.pool.pids)) if k not in self._sent]
+        how = signal.SIGSTOP if self.random.random() < STOPS else signal.SIGKILL
+        return self.random.choice(alive or [0]), how
+
+    def _strike(self, target: tuple[int, signal.Signals]) -> None:
+        worker, how = target
+        self._sent[worker] = how, time.monotonic()
+        if isinstance(self.pool, Pool):
+            os.kill(self.pool.pids[worker], how)
+        elif not self.pool.signal(worker, how):  # it is being replaced
+            del self._sent[worker]
+
+    def _match(self, step: int) -> None:
+        """Say of each new death what it was.
+
+        Raises:
+            EvaluationError: somebody died that nobody had killed.
+        """
+        deaths = self.pool.deaths
+        for death in deaths[self._seen :]:
+            if death.worker not in self._sent:
+                raise EvaluationError(
+                    f"worker {death.worker} died of itself in step {step}: {death.cause}"
+                )
+            how, sent_s = self._sent.pop(death.worker)
+            self.found.append(_kill(death, how, sent_s, step))
+            for worker in self.pool.team_of(death.worker):
+                if worker in self._sent and self._sent[worker][1] < death.replaced_s:
+                    del self._sent[worker]  # it was replaced with the other one
+        self._seen = len(deaths)
+
+
+def _kill(death: Death, how: signal.Signals, sent_s: float, step: int) -> Kill:
+    return Kill(
+        how.name,
+        death.worker,
+        step,
+        sent_s < death.ordered_s,
+        death.cause,
+        1000.0 * (death.noticed_s - max(sent_s, death.ordered_s)),
+        1000.0 * (death.replaced_s - death.noticed_s),
+        1000.0 * (death.done_s - death.noticed_s),
+    )

@@ -1,0 +1,181 @@
+"""Vehicles at the borders of zones: who has crossed, who is about to, and how rows change hands."""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cavmarl.core.numba import inlined_kernel, kernel
+from cavmarl.core.records.arrays import Zoned
+from cavmarl.zones.kernels.zone_lookup import ZoneArrays, squared_distance, zone_of
+
+__all__ = ["NEAR", "Borders", "find_near", "pass_on"]
+
+NEAR = np.dtype(
+    [
+        ("vehicle", np.int64),
+        ("source", np.int64),  # zone that owns it
+        ("row", np.int64),  # where the owner keeps it
+        ("target", np.int64),  # zone that it is in, or will be in
+        ("crossed", np.bool_),  # it is further than the hysteresis outside of its owner's zone
+        ("depth_m", np.float64),  # how far outside of its owner's zone; inside, less than 0: how
+        # far it has to go to the target
+    ],
+    align=True,
+)
+
+
+class Borders(NamedTuple):
+    """When a vehicle is near a border, and when behind it."""
+
+    hysteresis_m: float  # so far outside of its zone a vehicle still stays with it
+    ahead_s: float  # who will be behind one after this time, at its velocity, is near it
+    max_speed_mps: float  # which no vehicle exceeds
+
+
+@kernel
+def find_near(
+    zones: ZoneArrays,
+    borders: Borders,
+    zoned: Zoned,
+    side: int,
+    w: int,
+    everybody: bool,
+    out: NDArray[np.void],
+) -> int:
+    """The owned rows that other zones have to be told of; how many entries there are.
+
+    A vehicle is near a zone that it lies in, further than the hysteresis outside of its own, and
+    one that it would lie in so after `ahead_s` at its present velocity.
+
+    Args:
+        zones: of the partition.
+        borders: when a vehicle is near one.
+        zoned: the rows of all zones.
+        side: whose rows, 0 or 1.
+        w: in which world.
+        everybody: whether to look at all owned rows, and not only at those that `exchange` has
+            found near a border.
+        out: NEAR (2 C,) overwritten: by zones and rows, a crossing before an approach.
+    """
+    found = 0
+    for zone in range(zones.rects.shape[0]):
+        owned = zoned.num_owned[zone, w]
+        for n in range(owned if everybody else zoned.num_border[zone, w]):
+            i = n if everybody else zoned.border[zone, w, n]
+            if i < owned:
+                row = zoned.rows[side, zone, w, i]
+                found = _tell_of(zones, borders, row, zone, i, out, found)
+    return found
+
+
+@inlined_kernel
+def _tell_of(
+    zones: ZoneArrays,
+    borders: Borders,
+    row: np.void,
+    zone: int,
+    i: int,
+    out: NDArray[np.void],
+    found: int,
+) -> int:
+    """Note row i of a zone once for each zone that it is near to; how many entries there are."""
+    rects = zones.rects
+    x = row["x"]
+    y = row["y"]
+    # Whoever lies further inside cannot come out in that time. Infinite rims stay infinite.
+    margin = borders.max_speed_mps * borders.ahead_s
+    if (
+        rects[zone, 0] + margin < x
+        and x < rects[zone, 2] - margin
+        and rects[zone, 1] + margin < y
+        and y < rects[zone, 3] - margin
+    ):
+        return found
+    limit = borders.hysteresis_m * borders.hysteresis_m
+    squared = squared_distance(rects, zone, x, y)
+    here = zone
+    if squared > limit:
+        here = zone_of(zones, x, y)
+        _note(out[found], row["id"], zone, i, here, True, squared)
+        found += 1
+    way = row["speed"] * borders.ahead_s
+    then_x = x + math.cos(row["heading"]) * way
+    then_y = y + math.sin(row["heading"]) * way
+    if squared_distance(rects, zone, then_x, then_y) > limit:
+        there = zone_of(zones, then_x, then_y)
+        if there != here:
+            if squared == 0.0:
+                squared = -squared_distance(rects, there, x, y)
+            _note(out[found], row["id"], zone, i, there, False, squared)
+            found += 1
+    return found
+
+
+@inlined_kernel
+def _note(
+    entry: np.void, vehicle: int, source: int, row: int, target: int, crossed: bool, squared: float
+) -> None:
+    entry["vehicle"] = vehicle
+    entry["source"] = source
+    entry["row"] = row
+    entry["target"] = target
+    entry["crossed"] = crossed
+    entry["depth_m"] = math.copysign(math.sqrt(abs(squared)), squared)
+
+
+@kernel
+def pass_on(
+    vehicle: int, source: int, row: int, target: int, epoch: int, zoned: Zoned, side: int, w: int
+) -> int:
+    """Make a vehicle a ghost of the zone that owned it, and an owned row where it was a ghost.
+
+    The new row says what the old one does, but for its owner and epoch.
+
+    Args:
+        vehicle: its id.
+        source: the zone that owns it.
+        row: where it probably is there.
+        target: the zone that will own it.
+        epoch: from then on.
+        zoned: the rows of all zones, and how many they are.
+        side: whose rows, 0 or 1.
+        w: in which world.
+
+    Returns:
+        its row at the target; -1: the source does not own it; -2: the target has no ghost of it.
+    """
+    old = zoned.rows[side, source, w]
+    new = zoned.rows[side, target, w]
+    owned = zoned.num_owned[source, w]
+    if row >= owned or old[row]["id"] != vehicle:
+        row = 0
+        while row < owned and old[row]["id"] != vehicle:
+            row += 1
+        if row == owned:
+            return -1
+    place = zoned.num_owned[target, w]
+    ghost = place
+    while ghost < zoned.num_rows[target, w] and new[ghost]["id"] != vehicle:
+        ghost += 1
+    if ghost == zoned.num_rows[target, w]:
+        return -2
+    _swap(new, ghost, place, zoned.spare)
+    new[place] = old[row]
+    new[place]["owner"] = target
+    new[place]["epoch"] = epoch
+    zoned.num_owned[target, w] = place + 1
+    _swap(old, row, owned - 1, zoned.spare)
+    zoned.num_owned[source, w] = owned - 1
+    return int(place)
+
+
+@inlined_kernel
+def _swap(rows: NDArray[np.void], i: int, j: int, spare: NDArray[np.void]) -> None:
+    if i != j:
+        spare[0] = rows[i]
+        rows[i] = rows[j]
+        rows[j] = spare[0]

@@ -1,0 +1,314 @@
+"""Rows that go from shard to shard: ghosts, every tick.
+
+A shard's owned rows come first, its ghosts after them. `exchange` renews those of all zones: every
+zone publishes. Where zones are run by several processes, each lets its own ones `gather`, and then
+`note_gathered` is called once. What comes of it is the same, row by row; but `gather` asks every
+zone, near or far.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cavmarl.core.numba import inlined_kernel, kernel
+from cavmarl.core.numba.prefetch import SOON, prefetch
+from cavmarl.core.records.arrays import Zoned
+from cavmarl.core.records.codes import DRIVER_BACKGROUND
+from cavmarl.zones.kernels.borders import Borders
+from cavmarl.zones.kernels.handoff import Book, look_on
+from cavmarl.zones.kernels.zone_lookup import (
+    Halo,
+    ZoneArrays,
+    is_asked_about,
+    is_inside,
+    is_seen,
+    note_outer,
+    squared_distance,
+    zone_of,
+)
+
+__all__ = ["exchange", "gather", "note_gathered", "take_own"]
+
+ROW_LINES = 6  # of memory, that a VEHICLE row takes
+
+
+@kernel
+def exchange(
+    zones: ZoneArrays,
+    halo: Halo,
+    touching_m: float,
+    borders: Borders,
+    zoned: Zoned,
+    side: int,
+    first: int,
+    last: int,
+    book: Book,
+) -> None:
+    """Renew all ghosts of some worlds from the owned rows, and note who is near a border.
+
+    Zone z needs a vehicle if and only if somebody there may ask about it (`zones.is_seen`). A
+    vehicle that has left its own zone's rectangle, because its transfer is late, is published like
+    any other, to the zone that it is in as well.
+
+    Args:
+        zones: of the partition.
+        halo: from `roads.zone_halo.zone_halo`, for the same partition.
+        touching_m: no ghost further outside of a zone can touch one of its vehicles.
+        borders: when a vehicle is near one.
+        zoned: the ghosts and how many there are, border and num_border are written. Of the owned
+            rows those in `outer` are looked at; they are noted here, if nobody has noted them.
+        side: whose rows, 0 or 1.
+        first: the first world.
+        last: the one after the last.
+        book: who is near a border is written.
+    """
+    # Nobody else can be behind a border by then.
+    border_m = borders.max_speed_mps * borders.ahead_s
+    count = zones.rects.shape[0]
+    for w in range(first, last):
+        for zone in range(count):
+            owned = zoned.num_owned[zone, w]
+            zoned.num_rows[zone, w] = owned
+            zoned.num_near[zone, w] = owned
+        if count > 1:
+            for zone in range(count):
+                _publish(zones, halo, touching_m, border_m, zoned, side, zone, w, book.due)
+        look_on(zones, borders, zoned, side, w, book)
+
+
+@kernel
+def gather(
+    zones: ZoneArrays,
+    halo: Halo,
+    touching_m: float,
+    border_m: float,
+    zoned: Zoned,
+    side: int,
+    zone: int,
+    w: int,
+) -> None:
+    """Renew the ghosts of one zone from the owned rows of all others, and note who is at a border.
+
+    It writes what is this zone's alone, and reads of the others what no other call of it writes.
+
+    Args:
+        zones: of the partition.
+        halo: as for `exchange`.
+        touching_m: as for `exchange`.
+        border_m: within that of another zone an owned row is at a border, m.
+        zoned: the ghosts of this zone and how many there are, its border and num_border are
+            written; outer and num_outer stay.
+        side: whose rows, 0 or 1.
+        zone: whose ghosts.
+        w: in which world.
+    """
+    near_limit = touching_m * touching_m
+    border_limit = min(halo.halo_m * halo.halo_m, border_m * border_m)
+    count = zones.rects.shape[0]
+    zoned.num_rows[zone, w] = zoned.num_owned[zone, w]
+    zoned.num_near[zone, w] = zoned.num_owned[zone, w]
+    for source in range(count):
+        if source == zone:
+            continue
+        noted = zoned.num_outer[source, w]
+        for n in range(noted):
+            outer = zoned.outer[source, w, n]
+            squared = squared_distance(zones.rects, zone, outer["x"], outer["y"])
+            if is_seen(halo, zone, outer, squared):
+                near = squared <= near_limit
+                _take_ghost(zoned, side, source, outer["row"], zone, w, near)
+        for i in range(zoned.num_owned[source, w] if noted < 0 else 0):
+            row = zoned.rows[side, source, w, i]
+            squared = squared_distance(zones.rects, zone, row["x"], row["y"])
+            if is_seen(halo, zone, row, squared):
+                _take_ghost(zoned, side, source, i, zone, w, squared <= near_limit)
+    found = 0
+    noted = zoned.num_outer[zone, w]
+    for n in range(noted if noted >= 0 else zoned.num_owned[zone, w]):
+        i = n
+        x = zoned.outer[zone, w, n]["x"]
+        y = zoned.outer[zone, w, n]["y"]
+        if noted >= 0:
+            i = zoned.outer[zone, w, n]["row"]
+        else:
+            x = zoned.rows[side, zone, w, i]["x"]
+            y = zoned.rows[side, zone, w, i]["y"]
+        for other in range(count):
+            if other != zone and squared_distance(zones.rects, other, x, y) <= border_limit:
+                zoned.border[zone, w, found] = i
+                found += 1
+                break
+    zoned.num_border[zone, w] = found
+
+
+@kernel
+def note_gathered(zones: ZoneArrays, borders: Borders, zoned: Zoned, side: int, book: Book) -> None:
+    """All zones have gathered their ghosts: note who is near a border, as `exchange` does.
+
+    Args:
+        zones: of the partition.
+        borders: when a vehicle is near one.
+        zoned: num_outer is written: rows may change from here on.
+        side: whose rows, 0 or 1.
+        book: who is near a border is written.
+    """
+    for w in range(zoned.num_outer.shape[1]):
+        for zone in range(zones.rects.shape[0]):
+            zoned.num_outer[zone, w] = -1
+        look_on(zones, borders, zoned, side, w, book)
+
+
+@inlined_kernel
+def _publish(
+    zones: ZoneArrays,
+    halo: Halo,
+    touching_m: float,
+    border_m: float,
+    zoned: Zoned,
+    side: int,
+    zone: int,
+    w: int,
+    due: NDArray[np.void],
+) -> None:
+    """Copy the owned rows of one zone behind those of all that need them.
+
+    Who needs whom is found first, for as many as `due` holds: nobody can guess it, and so nothing
+    that follows has to wait for it.
+    """
+    near_limit = touching_m * touching_m
+    border_limit = border_m * border_m
+    if zoned.num_outer[zone, w] < 0:
+        _note_all_outer(halo.inner[zone], zoned, side, zone, w)
+    seen_limit = halo.seen_m * halo.seen_m
+    sure_limit = halo.sure_m * halo.sure_m
+    by_lane = halo.watcher_start.size > 1
+    zoned.num_border[zone, w] = 0
+    outers = zoned.outer[zone, w]
+    num_outer = zoned.num_outer[zone, w]
+    num_due = 0
+    for n in range(num_outer):
+        if by_lane and n + 2 * SOON < num_outer:
+            prefetch(halo.watcher_start, outers[n + 2 * SOON]["lane"], 0)
+            prefetch(halo.watchers, halo.watcher_start[outers[n + SOON]["lane"]], 0)
+        if num_due + zones.rects.shape[0] > due.size:
+            _send(zoned, side, zone, w, due, num_due)
+            num_due = 0
+        outer = outers[n]
+        x = outer["x"]
+        y = outer["y"]
+        # Drivers of the background are on their lanes; agents may be anywhere beside them.
+        if by_lane and outer["driver"] == DRIVER_BACKGROUND:
+            lane = outer["lane"]
+            for k in range(halo.watcher_start[lane], halo.watcher_start[lane + 1]):
+                watch = halo.watchers[k]
+                other = watch["zone"]
+                if other == zone:
+                    continue
+                squared = squared_distance(zones.rects, other, x, y)
+                sought = (squared <= sure_limit) | is_asked_about(halo, watch, outer)
+                _note_due(due[num_due], outer, other, squared, near_limit, border_limit)
+                num_due += int((squared <= seen_limit) & sought)
+        else:
+            here = zone
+            if squared_distance(zones.rects, zone, x, y) > 0.0:
+                here = zone_of(zones, x, y)
+            for k in range(halo.near_start[here], halo.near_start[here + 1]):
+                other = halo.near[k]
+                squared = squared_distance(zones.rects, other, x, y)
+                if other != zone and is_seen(halo, other, outer, squared):
+                    _note_due(due[num_due], outer, other, squared, near_limit, border_limit)
+                    num_due += 1
+    _send(zoned, side, zone, w, due, num_due)
+    zoned.num_outer[zone, w] = -1
+
+
+@inlined_kernel
+def _note_due(
+    due: np.void,
+    outer: np.void,
+    zone: int,
+    squared: float,
+    near_limit: float,
+    border_limit: float,
+) -> None:
+    """Note a row for a zone that is so far away, as squares of m; it counts if its place stays."""
+    due["row"] = outer["row"]
+    due["zone"] = zone
+    due["near"] = squared <= near_limit
+    due["at_border"] = squared <= border_limit
+
+
+@kernel
+def _send(zoned: Zoned, side: int, zone: int, w: int, due: NDArray[np.void], num_due: int) -> None:
+    """Copy rows of a zone to those that they are due to, and note which are at a border."""
+    for n in range(num_due):
+        if n + SOON < num_due:
+            later = due[n + SOON]["row"]
+            for line in range(ROW_LINES):
+                prefetch(zoned.rows[side, zone, w], later, line)
+            prefetch(zoned.step[zone, w], later, 0)
+        i = due[n]["row"]
+        _take_ghost(zoned, side, zone, i, due[n]["zone"], w, due[n]["near"])
+        found = zoned.num_border[zone, w]
+        # What a row is due to follows one another.
+        if due[n]["at_border"] and (found == 0 or zoned.border[zone, w, found - 1] != i):
+            zoned.border[zone, w, found] = i
+            zoned.num_border[zone, w] = found + 1
+
+
+@kernel
+def _note_all_outer(inner: NDArray[np.float64], zoned: Zoned, side: int, zone: int, w: int) -> None:
+    """Note a zone's outer rows, as `advance` does, where rows have changed since."""
+    outer = 0
+    for i in range(zoned.num_owned[zone, w]):
+        row = zoned.rows[side, zone, w, i]
+        if not is_inside(inner, row["x"], row["y"]):
+            note_outer(zoned.outer[zone, w, outer], row, i)
+            outer += 1
+    zoned.num_outer[zone, w] = outer
+
+
+@inlined_kernel
+def _take_ghost(
+    zoned: Zoned, side: int, source: int, i: int, zone: int, w: int, near: bool
+) -> None:
+    """Put row i of a zone behind those of another, before ghosts that can touch nobody if it can.
+
+    What its owner knows of its way goes with it: the table of ways is far away in memory.
+    """
+    rows = zoned.rows[side, zone, w]
+    step = zoned.step[zone, w]
+    step_at = zoned.step_at[zone, w]
+    place = zoned.num_rows[zone, w]
+    if near:
+        first_far = zoned.num_near[zone, w]
+        rows[place] = rows[first_far]
+        step[place] = step[first_far]
+        step_at[place] = step_at[first_far]
+        place = first_far
+        zoned.num_near[zone, w] += 1
+    rows[place] = zoned.rows[side, source, w, i]
+    step[place] = zoned.step[source, w, i]
+    step_at[place] = zoned.step_at[source, w, i]
+    zoned.num_rows[zone, w] += 1
+
+
+@kernel
+def take_own(
+    zones: ZoneArrays, zone: int, source: NDArray[np.void], num: int, rows: NDArray[np.void]
+) -> int:
+    """Copy the rows of `source[:num]` that lie in a zone, as its own, to the front of `rows`.
+
+    `source` and `rows` may be the same array.
+
+    Returns:
+        how many.
+    """
+    found = 0
+    for i in range(num):
+        if zone_of(zones, source[i]["x"], source[i]["y"]) == zone:
+            rows[found] = source[i]
+            rows[found]["owner"] = zone
+            found += 1
+    return found

@@ -1,0 +1,391 @@
+"""Where on each lane somebody can be of whom a zone's drivers may ask.
+
+A halo is as wide as the farthest look in any direction. But a driver looks along its way, at those
+beside it, and at who comes to the lines before it; most of the lanes within the halo are none of
+these. This file walks the roads from a zone's own ones and says for every lane from where on, or up
+to where, a vehicle can matter: a place too many is a copy too many, a place too few is an error.
+
+None of this is part of a tick: it is done once for a partition.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cavmarl.core.numba import inlined_kernel, kernel
+from cavmarl.core.records.arrays import RoadArrays
+from cavmarl.core.records.rows import ENTER_REACH_M, FORK_BEYOND_M
+from cavmarl.driving.kernels.announcing import APPROACH_M
+from cavmarl.driving.kernels.junctions import EXIT_LOOK_M
+from cavmarl.driving.kernels.lane_choice import LOOK_BACK_M
+from cavmarl.zones.kernels.zone_lookup import squared_distance
+
+__all__ = ["Room", "farthest_m", "find_looks", "make_room"]
+
+AT_LINE_M = 0.2  # so near before a line somebody may be about to drive over it
+ASIDE_M = 10.0  # places beside each other on lanes of one edge are not further apart, nor more of s
+BACK_M = max(LOOK_BACK_M, ENTER_REACH_M)  # to the end of a lane on which followers are looked for
+ROUNDING_M = 0.1  # more than sums over lanes, and float32, are off
+
+
+class Room(NamedTuple):
+    """What is known of each lane, and of each link, on the way."""
+
+    first: NDArray[np.float64]  # (L,) the zone's own part of a lane, m; inf: it has none
+    last: NDArray[np.float64]  # (L,)
+    ahead: NDArray[np.float64]  # (L,) way from a driver of the zone to the start of a lane, m
+    behind: NDArray[np.float64]  # (L,) way from the end of a lane to one whom followers concern, m
+    to_line: NDArray[np.float64]  # (L,) way from the end of a lane to the line of a foe, m
+    beyond: NDArray[np.float64]  # (L,) way from a junction that is asked about to a lane, m
+    asked: NDArray[np.bool_]  # (K,) links that a driver of the zone may want to enter
+    foe: NDArray[np.bool_]  # (K,) their foes
+    waits: NDArray[np.bool_]  # (L,) to be looked at
+    following: NDArray[np.int32]  # (L,) which lane is to be looked at then
+
+
+def make_room(num_lanes: int, num_links: int) -> Room:
+    """Room for a map."""
+    first, last, ahead, behind, to_line, beyond = np.full((6, num_lanes), np.inf)
+    asked, foe = np.zeros((2, num_links), dtype=np.bool_)
+    waits, following = np.zeros(num_lanes, dtype=np.bool_), np.zeros(num_lanes, dtype=np.int32)
+    return Room(first, last, ahead, behind, to_line, beyond, asked, foe, waits, following)
+
+
+@kernel
+def _within(
+    rect: NDArray[np.float64], x: float, y: float, to_x: float, to_y: float
+) -> tuple[float, float]:
+    """The part of a straight line that lies in a rectangle, as shares of it; (inf, -inf): none."""
+    low = 0.0
+    high = 1.0
+    for axis in range(2):
+        start = x if axis == 0 else y
+        way = to_x - x if axis == 0 else to_y - y
+        near = rect[axis] - start
+        far = rect[axis + 2] - start
+        if way == 0.0:
+            if near > 0.0 or far < 0.0:
+                return math.inf, -math.inf
+            continue
+        low = max(low, min(near / way, far / way))
+        high = min(high, max(near / way, far / way))
+    if low > high:
+        return math.inf, -math.inf
+    return low, high
+
+
+@kernel
+def _find_own(roads: RoadArrays, rect: NDArray[np.float64], room: Room) -> None:
+    """Which part of each lane lies in a rectangle; lanes beside each other have the same."""
+    for lane in range(roads.lanes.shape[0]):
+        room.first[lane] = math.inf
+        room.last[lane] = -math.inf
+        begin = roads.lanes[lane]["first_point"]
+        for k in range(begin, begin + roads.lanes[lane]["num_points"] - 1):
+            point = roads.points[k]
+            after = roads.points[k + 1]
+            low, high = _within(rect, point["x"], point["y"], after["x"], after["y"])
+            if low <= high:
+                long = after["s"] - point["s"]
+                room.first[lane] = min(room.first[lane], point["s"] + low * long)
+                room.last[lane] = max(room.last[lane], point["s"] + high * long)
+    for edge in range(roads.edges.shape[0]):
+        begin = roads.edges[edge]["first_lane"]
+        end = begin + roads.edges[edge]["num_lanes"]
+        first = math.inf
+        last = -math.inf
+        for lane in range(begin, end):
+            first = min(first, room.first[lane])
+            last = max(last, room.last[lane])
+        if first > last:
+            continue
+        for lane in range(begin, end):
+            length = roads.lanes[lane]["length_m"]
+            room.first[lane] = min(max(first - ASIDE_M, 0.0), length)
+            room.last[lane] = min(last + ASIDE_M, length)
+
+
+@inlined_kernel
+def _num_next(roads: RoadArrays, lane: int, forwards: bool) -> int:
+    """How many lanes follow a lane, or lead to it."""
+    row = roads.lanes[lane]
+    if not forwards:
+        return int(row["num_into"])
+    return 1 if row["internal"] else int(row["num_links"])
+
+
+@inlined_kernel
+def _next(roads: RoadArrays, lane: int, forwards: bool, k: int) -> int:
+    """One of them."""
+    row = roads.lanes[lane]
+    if not forwards:
+        return int(roads.into[row["first_into"] + k])
+    if row["internal"]:
+        return int(row["successor"])
+    return int(roads.links[row["first_link"] + k]["next_lane"])
+
+
+@kernel
+def _begin(
+    roads: RoadArrays, lane: int, forwards: bool, way: float, ways: NDArray[np.float64]
+) -> None:
+    """Let ways begin on a lane, `way` m before its end, or behind its start."""
+    for k in range(_num_next(roads, lane, forwards)):
+        other = _next(roads, lane, forwards, k)
+        ways[other] = min(ways[other], way)
+
+
+@kernel
+def _spread(
+    roads: RoadArrays, forwards: bool, limit_m: float, ways: NDArray[np.float64], room: Room
+) -> None:
+    """Shortest ways along the roads, from where they begin to all lanes within a limit.
+
+    Args:
+        roads: the road arrays.
+        forwards: in the direction of driving, to the starts of lanes; if not, back to their ends.
+        limit_m: of a way.
+        ways: (L,) m, finite where ways begin, inf elsewhere; those that are longer are left as
+            they are.
+        room: `waits` and `following` are used.
+    """
+    head = -1
+    tail = -1
+    for lane in range(ways.size):
+        if ways[lane] > limit_m:
+            continue
+        room.waits[lane] = True
+        if head < 0:
+            head = lane
+        else:
+            room.following[tail] = lane
+        tail = lane
+    while head >= 0:
+        lane = head
+        head = room.following[lane] if lane != tail else -1
+        room.waits[lane] = False
+        way = ways[lane] + roads.lanes[lane]["length_m"]
+        if way > limit_m:
+            continue
+        for k in range(_num_next(roads, lane, forwards)):
+            other = _next(roads, lane, forwards, k)
+            if way >= ways[other]:
+                continue
+            ways[other] = way
+            if room.waits[other]:
+                continue
+            room.waits[other] = True
+            if head < 0:
+                head = other
+            else:
+                room.following[tail] = other
+            tail = other
+
+
+@inlined_kernel
+def _widen(looks: NDArray[np.void], lane: int, first: float, last: float, length: float) -> None:
+    """Let who is between two places of a lane be seen."""
+    if first > last or last < 0.0 or first > length:
+        return
+    if first <= 0.0:
+        looks[lane]["head"] = max(looks[lane]["head"], last + ROUNDING_M)
+    elif last >= length:
+        looks[lane]["tail"] = min(looks[lane]["tail"], first - ROUNDING_M)
+    else:
+        looks[lane]["head"] = math.inf
+
+
+@kernel
+def _see(roads: RoadArrays, lane: int, first: float, last: float, looks: NDArray[np.void]) -> None:
+    """The same on all lanes of its edge: who is beside one may be about to change to it."""
+    edge = roads.edges[roads.lanes[lane]["edge"]]
+    for other in range(edge["first_lane"], edge["first_lane"] + edge["num_lanes"]):
+        _widen(looks, other, first, last, roads.lanes[other]["length_m"])
+
+
+@kernel
+def _look_along(
+    roads: RoadArrays, view_m: float, see_m: float, room: Room, looks: NDArray[np.void]
+) -> None:
+    """Leaders ahead, and who follows: on own lanes, and over their starts."""
+    view_m = max(view_m, see_m, LOOK_BACK_M)
+    for lane in range(roads.lanes.shape[0]):
+        room.ahead[lane] = math.inf
+        room.behind[lane] = math.inf
+    for lane in range(roads.lanes.shape[0]):
+        if room.first[lane] <= room.last[lane]:
+            left = roads.lanes[lane]["length_m"] - room.last[lane]
+            _begin(roads, lane, True, left, room.ahead)
+            _begin(roads, lane, False, room.first[lane], room.behind)
+            _see(roads, lane, room.first[lane] - view_m, room.last[lane] + view_m, looks)
+    _spread(roads, True, view_m, room.ahead, room)
+    for lane in range(roads.lanes.shape[0]):
+        if room.ahead[lane] <= view_m:
+            _see(roads, lane, 0.0, view_m - room.ahead[lane], looks)
+    _spread(roads, False, BACK_M, room.behind, room)
+    for lane in range(roads.lanes.shape[0]):
+        if room.behind[lane] <= BACK_M:
+            back = room.behind[lane] + roads.lanes[lane]["length_m"] - ROUNDING_M
+            edge = roads.edges[roads.lanes[lane]["edge"]]
+            for other in range(edge["first_lane"], edge["first_lane"] + edge["num_lanes"]):
+                place = back if other == lane else back - ASIDE_M
+                looks[other]["back"] = min(looks[other]["back"], place)
+
+
+@kernel
+def _find_lines(roads: RoadArrays, see_m: float, room: Room) -> None:
+    """Which links the zone's drivers may ask about, and which are the foes of these."""
+    for link in range(roads.links.shape[0]):
+        room.asked[link] = False
+        room.foe[link] = False
+    for lane in range(roads.lanes.shape[0]):
+        row = roads.lanes[lane]
+        own = room.first[lane] <= room.last[lane]
+        if row["internal"]:
+            if own:
+                _ask(roads, roads.links[row["link"]]["from_lane"], room)
+        elif (own and row["length_m"] - room.last[lane] <= see_m) or (
+            room.ahead[lane] + row["length_m"] <= see_m
+        ):
+            _ask(roads, lane, room)
+    for link in range(roads.links.shape[0]):
+        if room.asked[link]:
+            first = roads.links[link]["first_conflict"]
+            for c in range(first, first + roads.links[link]["num_conflicts"]):
+                room.foe[roads.conflicts[c]["foe"]] = True
+
+
+@kernel
+def _ask(roads: RoadArrays, lane: int, room: Room) -> None:
+    """All links that lead on from the edge of a lane."""
+    edge = roads.edges[roads.lanes[lane]["edge"]]
+    for other in range(edge["first_lane"], edge["first_lane"] + edge["num_lanes"]):
+        first = roads.lanes[other]["first_link"]
+        for link in range(first, first + roads.lanes[other]["num_links"]):
+            room.asked[link] = True
+
+
+@kernel
+def _look_at_junctions(
+    roads: RoadArrays, half_m: float, room: Room, looks: NDArray[np.void]
+) -> None:
+    """Who comes to the lines of foes, who is on a junction, and who stands behind it."""
+    for lane in range(roads.lanes.shape[0]):
+        room.to_line[lane] = math.inf
+        room.beyond[lane] = math.inf
+    for link in range(roads.links.shape[0]):
+        if not (room.asked[link] or room.foe[link]):
+            continue
+        row = roads.links[link]
+        lane = row["next_lane"]
+        while roads.lanes[lane]["internal"]:
+            _see(roads, lane, 0.0, roads.lanes[lane]["length_m"], looks)
+            lane = roads.lanes[lane]["successor"]
+        _see(roads, lane, 0.0, FORK_BEYOND_M + half_m, looks)
+        if room.asked[link] and row["num_conflicts"] > 0:
+            room.beyond[lane] = 0.0
+        if room.foe[link]:
+            edge = roads.edges[roads.lanes[row["from_lane"]]["edge"]]
+            for other in range(edge["first_lane"], edge["first_lane"] + edge["num_lanes"]):
+                room.to_line[other] = 0.0
+    _spread(roads, False, APPROACH_M, room.to_line, room)
+    _spread(roads, True, EXIT_LOOK_M, room.beyond, room)
+    for lane in range(roads.lanes.shape[0]):
+        if room.beyond[lane] <= EXIT_LOOK_M:
+            _see(roads, lane, 0.0, EXIT_LOOK_M - room.beyond[lane], looks)
+        if room.to_line[lane] <= APPROACH_M:
+            edge = roads.edges[roads.lanes[lane]["edge"]]
+            for other in range(edge["first_lane"], edge["first_lane"] + edge["num_lanes"]):
+                line = room.to_line[lane] + roads.lanes[other]["length_m"]
+                looks[other]["line"] = min(looks[other]["line"], line - ROUNDING_M)
+
+
+@kernel
+def find_looks(
+    roads: RoadArrays,
+    rect: NDArray[np.float64],
+    view_m: float,
+    see_m: float,
+    half_m: float,
+    room: Room,
+    looks: NDArray[np.void],
+) -> None:
+    """Say for each lane where vehicles are that matter to the drivers of one zone.
+
+    Args:
+        roads: the road arrays.
+        rect: (4,) min_x, min_y, max_x, max_y in m: where drivers of the zone, and departures that
+            it lets in, can be.
+        view_m: how far anybody looks for others along the road.
+        see_m: how far before a line its centre is when anybody first asks about the junction.
+        half_m: half the length of the longest vehicle.
+        room: see `make_room`.
+        looks: LOOK (L,), overwritten.
+    """
+    for lane in range(roads.lanes.shape[0]):
+        looks[lane]["head"] = -math.inf
+        looks[lane]["tail"] = math.inf
+        looks[lane]["back"] = math.inf
+        looks[lane]["line"] = math.inf
+    _find_own(roads, rect, room)
+    _look_along(roads, view_m, see_m, room, looks)
+    _find_lines(roads, see_m, room)
+    _look_at_junctions(roads, half_m, room, looks)
+
+
+@kernel
+def _farther(
+    near: np.void,
+    far: np.void,
+    first: float,
+    last: float,
+    rects: NDArray[np.float64],
+    zone: int,
+    squared: float,
+) -> float:
+    """The largest of `squared` and the squared distances from a zone of part of a straight piece.
+
+    That part reaches from `first` to `last` m of the lane. Nothing of it is further away than its
+    two ends are.
+    """
+    first = max(first, near["s"])
+    last = min(last, far["s"])
+    if first > last:
+        return squared
+    long = far["s"] - near["s"]
+    for s in (first, last):
+        share = (s - near["s"]) / long if long > 0.0 else 0.0
+        x = near["x"] + share * (far["x"] - near["x"])
+        y = near["y"] + share * (far["y"] - near["y"])
+        squared = max(squared, squared_distance(rects, zone, x, y))
+    return squared
+
+
+@kernel
+def farthest_m(
+    roads: RoadArrays, rects: NDArray[np.float64], zone: int, looks: NDArray[np.void]
+) -> float:
+    """How far outside of a zone the farthest place lies that somebody may ask about.
+
+    Args:
+        roads: the road arrays.
+        rects: (k, 4) all zones, as in `ZoneArrays`.
+        zone: which one.
+        looks: LOOK (L,) what `find_looks` has found for it.
+    """
+    squared = 0.0
+    for lane in range(roads.lanes.shape[0]):
+        look = looks[lane]
+        first = roads.lanes[lane]["first_point"]
+        for k in range(first, first + roads.lanes[lane]["num_points"] - 1):
+            near = roads.points[k]
+            far = roads.points[k + 1]
+            squared = _farther(near, far, -math.inf, look["head"], rects, zone, squared)
+            squared = _farther(near, far, look["tail"], math.inf, rects, zone, squared)
+            announced = min(look["back"], look["line"]) - APPROACH_M
+            squared = _farther(near, far, announced, math.inf, rects, zone, squared)
+    return math.sqrt(squared)

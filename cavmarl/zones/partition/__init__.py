@@ -1,0 +1,1 @@
+"""Maps cut into zones: layouts, the zone file, halos, statistics."""

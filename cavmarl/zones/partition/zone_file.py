@@ -1,0 +1,151 @@
+"""Zone files: a partition that is written before a run and read again, bit for bit.
+
+    {"schema": "cavmarl.zones", "version": 1,
+     "bounds_m": [0.0, 0.0, 200.0, 100.0],
+     "zones": [{"id": 0, "rect_m": [0.0, 0.0, 120.0, 100.0]},
+               {"id": 1, "rect_m": [120.0, 0.0, 200.0, 100.0]}]}
+
+JSON, or the same as YAML. The rectangles (min_x, min_y, max_x, max_y) tile `bounds_m`; sides on it
+reach to infinity. Ids are 0 to k - 1, in any order.
+"""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+
+from cavmarl.config.env import MAX_ZONES, ZONE_FILE_SUFFIXES, ZONE_LAYOUTS
+from cavmarl.core.errors import ConfigError, ZoneError
+from cavmarl.roads.network import RoadNetwork
+from cavmarl.zones.partition.zone_layouts import cut_map
+from cavmarl.zones.partition.zone_partition import Bounds, ZonePartition
+
+__all__ = ["SCHEMA", "VERSION", "named_zones", "read_zones", "write_zones", "zones_for"]
+
+SCHEMA = "cavmarl.zones"
+VERSION = 1
+DEFAULT_COUNT = 4
+
+
+@dataclass(frozen=True)
+class _Zone:
+    id: int
+    rect_m: Bounds
+
+
+@dataclass(frozen=True)
+class _Document:
+    schema: Literal["cavmarl.zones"]
+    version: Literal[1]
+    bounds_m: Bounds
+    zones: tuple[_Zone, ...]
+
+
+def read_zones(path: str | Path) -> ZonePartition:
+    """The partition of a zone file.
+
+    Raises:
+        ConfigError: unreadable, not YAML or JSON, an unknown or a doubled key, a wrong type.
+        ZoneError: a doubled or missing id, too many zones, or rectangles that overlap, leave a gap,
+            leave the bounds or are not finite; names the file, the zones, the place and the cure.
+    """
+    from cavmarl.config.io import read_yaml, validate
+
+    path = Path(path)
+    document = validate(_Document, read_yaml(path), str(path))
+    ids = [zone.id for zone in document.zones]
+    count = len(ids)
+    if count > MAX_ZONES:
+        raise ZoneError(f"{path}: {count} zones: at most {MAX_ZONES} can be")
+    for number in ids:
+        if ids.count(number) > 1:
+            raise ZoneError(f"{path}: id {number} stands {ids.count(number)} times: number anew")
+    missing = sorted(set(range(count)) - set(ids))
+    if missing:
+        raise ZoneError(
+            f"{path}: no zone has the id {missing[0]}: {count} zones have the ids 0 to {count - 1}"
+        )
+    rects = np.array([zone.rect_m for zone in sorted(document.zones, key=lambda zone: zone.id)])
+    try:
+        return ZonePartition(document.bounds_m, rects)
+    except ZoneError as error:
+        raise ZoneError(f"{path}: {error}") from error
+
+
+def zones_for(network: RoadNetwork, path: str | Path, count: int | None) -> ZonePartition:
+    """The partition of a zone file, which has to be of this map and have `count` zones, if given.
+
+    Raises:
+        ConfigError: see `read_zones`.
+        ZoneError: see `read_zones`; another number of zones; roads beyond the bounds.
+    """
+    partition = read_zones(path)
+    if count is not None and partition.count != count:
+        raise ZoneError(
+            f"zones.count = {count}: {path} has {partition.count} zones; use {partition.count}"
+        )
+    extent, bounds = np.array(network.extent_m), np.array(partition.bounds)
+    if (extent[:2] < bounds[:2]).any() or (extent[2:] > bounds[2:]).any():
+        raise ZoneError(
+            f"{path}: bounds_m = {list(partition.bounds)} do not hold the roads of "
+            f"'{network.name}', which reach from {extent[:2].tolist()} to {extent[2:].tolist()}: "
+            "is it another map's? Cut this one with `cavmarl map zones`"
+        )
+    return partition
+
+
+def named_zones(
+    network: RoadNetwork,
+    layout: str,
+    count: int | None,
+    *,
+    avoid_junctions: bool = False,
+    weight: str = "lane_length",
+) -> ZonePartition:
+    """The partition that a layout's name or the path of a zone file stands for.
+
+    Args:
+        network: the map.
+        layout: one of ZONE_LAYOUTS, or a path.
+        count: how many zones; None: as many as the file has, of a layout 4.
+        avoid_junctions: of `cut_map`.
+        weight: of `cut_map`.
+
+    Raises:
+        ConfigError: neither a layout nor a zone file; see `cut_map` and `zones_for`.
+    """
+    if layout in ZONE_LAYOUTS:
+        return cut_map(
+            network,
+            layout,
+            DEFAULT_COUNT if count is None else count,
+            avoid_junctions=avoid_junctions,
+            weight=weight,
+        )
+    if layout.endswith(ZONE_FILE_SUFFIXES):
+        return zones_for(network, layout, count)
+    raise ConfigError(
+        f"layout '{layout}': is none of {', '.join(ZONE_LAYOUTS)}, and no zone file "
+        f"({', '.join(ZONE_FILE_SUFFIXES)})"
+    )
+
+
+def write_zones(path: str | Path, partition: ZonePartition) -> None:
+    """Write a partition as JSON, one zone a line.
+
+    Raises:
+        ZoneError: the file cannot be written.
+    """
+    zones = ",\n".join(
+        "  " + json.dumps({"id": zone, "rect_m": rect})
+        for zone, rect in enumerate(partition.rects.tolist())
+    )
+    head = json.dumps({"schema": SCHEMA, "version": VERSION, "bounds_m": list(partition.bounds)})
+    try:
+        Path(path).write_text(f'{head[:-1]},\n "zones": [\n{zones}]}}\n', encoding="utf-8")
+    except OSError as error:
+        raise ZoneError(f"{path}: cannot be written ({error.strerror or error})") from error

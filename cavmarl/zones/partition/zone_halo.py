@@ -1,0 +1,82 @@
+"""Which zones see over which borders.
+
+Ghosts go by reach and not by contact (decision 012): the halo is a distance, and a zone gets every
+vehicle within it, from neighbours or from far behind them.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cavmarl.core.errors import ZoneError
+from cavmarl.zones.kernels.zone_lookup import LOOK, WATCH, Halo
+from cavmarl.zones.partition.zone_partition import ZonePartition
+
+__all__ = ["inner_parts", "lane_watchers", "zone_halo"]
+
+# Added to the halo, so that no rounding of the sum below can make it too narrow.
+_ROUNDING_M = 1e-6
+
+
+def zone_halo(partition: ZonePartition, halo_m: float) -> Halo:
+    """What `kernels.exchange.exchange` takes, where everybody within the halo is seen.
+
+    Raises:
+        ZoneError: `halo_m` is negative or not finite.
+    """
+    if not (math.isfinite(halo_m) and halo_m >= 0.0):
+        raise ZoneError(f"halo_m = {halo_m!r}: must be a finite number from 0")
+    rects = partition.reaching
+    gaps = np.maximum(rects[:, None, :2] - rects[None, :, 2:], 0.0)
+    gaps = np.maximum(gaps, gaps.swapaxes(0, 1))
+    near = (gaps * gaps).sum(axis=2) <= halo_m * halo_m
+    start = np.concatenate([[0], np.cumsum(near.sum(axis=1))]).astype(np.int32)
+    return Halo(
+        halo_m=float(halo_m),
+        inner=inner_parts(partition, halo_m),
+        near_start=start,
+        near=np.nonzero(near)[1].astype(np.int32),
+        sure_m=float(halo_m),
+        seen_m=float(halo_m),
+        line_m=math.inf,
+        watcher_start=np.zeros(1, dtype=np.int32),
+        watchers=np.zeros(0, dtype=WATCH),
+    )
+
+
+def lane_watchers(
+    partition: ZonePartition, lanes: NDArray[np.void], looks: NDArray[np.void], within_m: float
+) -> tuple[NDArray[np.int32], NDArray[np.void]]:
+    """`watcher_start` and `watchers` of a `Halo`.
+
+    Args:
+        partition: of k zones.
+        lanes: LANE (L,).
+        looks: LOOK (k, L), of whom each zone may ask.
+        within_m: zones that are nearer to a lane's bounding box watch it in any case.
+    """
+    asked = looks["head"] > -np.inf
+    for place in ("tail", "back", "line"):
+        asked |= looks[place] < np.inf
+    min_x, min_y, max_x, max_y = partition.arrays.rects.T[:, :, None]
+    dx = np.maximum(np.maximum(min_x - lanes["max_x"], lanes["min_x"] - max_x), 0.0)
+    dy = np.maximum(np.maximum(min_y - lanes["max_y"], lanes["min_y"] - max_y), 0.0)
+    watching = (asked | (np.hypot(dx, dy) <= within_m + _ROUNDING_M)).T
+    start = np.concatenate([[0], np.cumsum(watching.sum(axis=1))])
+    lane, zone = np.nonzero(watching)
+    watchers = np.zeros(zone.size, dtype=WATCH)
+    watchers["zone"] = zone
+    for place in LOOK.names or ():
+        watchers[place] = looks[place][zone, lane]
+    return start.astype(np.int32), watchers
+
+
+def inner_parts(partition: ZonePartition, seen_m: float) -> NDArray[np.float64]:
+    """(k, 4) the part of each zone in which no other zone sees anybody that sees `seen_m` far."""
+    # A little further in: whoever lies inside is out of every other zone's sight by any rounding.
+    margin = seen_m + _ROUNDING_M
+    inner: NDArray[np.float64] = partition.reaching + np.array([margin, margin, -margin, -margin])
+    return inner

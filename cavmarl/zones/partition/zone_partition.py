@@ -1,0 +1,192 @@
+"""`ZonePartition`: a map divided into rectangles, each place in exactly one of them.
+
+Zones are half-open: [min_x, max_x) by [min_y, max_y). So a place on a border, or where four corners
+meet, belongs to one zone; and as those at the rim reach to infinity, so does every other place.
+`zone_layouts` makes partitions of maps, `zone_file` keeps them, `zone_halo` says how far zones
+must see over their borders, and `zone_statistics` what is in them.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cavmarl.core.errors import ZoneError
+from cavmarl.zones.kernels.zone_lookup import ZoneArrays, zone_of, zones_of
+
+__all__ = ["Bounds", "Neighbor", "ZonePartition"]
+
+Bounds = tuple[float, float, float, float]  # min_x, min_y, max_x, max_y in metres
+
+_PLACE = np.dtype([("x", np.float64), ("y", np.float64)])
+
+
+@dataclass(frozen=True)
+class Neighbor:
+    """A zone that touches another.
+
+    Attributes:
+        zone: which.
+        corner: they share a corner and no more.
+    """
+
+    zone: int
+    corner: bool
+
+
+@dataclass(frozen=True, eq=False)
+class ZonePartition:
+    """k zones, numbered from 0, that cover the plane without overlap.
+
+    Attributes:
+        bounds: the box of the map that was divided. Sides of zones on it count as the rim.
+        rects: (k, 4) min_x, min_y, max_x, max_y in metres, within `bounds` and together all of it;
+            read-only.
+
+    Raises:
+        ZoneError: the rectangles overlap, leave a gap, leave `bounds` or are none; the message
+            names the zones and the place.
+    """
+
+    bounds: Bounds
+    rects: NDArray[np.float64]
+
+    def __post_init__(self) -> None:
+        rects = np.array(self.rects, dtype=np.float64).reshape(-1, 4) + 0.0  # no -0.0 in the hash
+        rects.setflags(write=False)
+        object.__setattr__(self, "rects", rects)
+        _check_rects(rects, self.bounds)
+        self._cells  # noqa: B018 - finds overlaps and gaps
+
+    @property
+    def count(self) -> int:
+        """How many zones there are."""
+        return len(self.rects)
+
+    @cached_property
+    def reaching(self) -> NDArray[np.float64]:
+        """`rects` with the rim at infinity, (k, 4): the zones as they are; read-only."""
+        rim = np.array(self.bounds)
+        endless = np.array([-np.inf, -np.inf, np.inf, np.inf])
+        reaching = np.where(self.rects == rim, endless, self.rects)
+        reaching.setflags(write=False)
+        return reaching
+
+    @cached_property
+    def arrays(self) -> ZoneArrays:
+        """What kernels take."""
+        return ZoneArrays(
+            self._sides(0)[1:-1].copy(), self._sides(1)[1:-1].copy(), self._cells, self.reaching
+        )
+
+    def zone_of(self, x: float, y: float) -> int:
+        """The one zone of a place in metres."""
+        return zone_of(self.arrays, x, y)
+
+    def zones_of(self, xy: NDArray[np.float64]) -> NDArray[np.int32]:
+        """The zones of many places, (n, 2) metres → (n,)."""
+        places = np.ascontiguousarray(xy, dtype=np.float64).reshape(-1, 2).view(_PLACE)[:, 0]
+        zones = np.empty(len(places), np.int32)
+        zones_of(self.arrays, places, len(places), zones)
+        return zones
+
+    def shortest_sides_m(self) -> NDArray[np.float64]:
+        """The shorter side of each zone's part of `bounds`, (k,)."""
+        return np.asarray((self.rects[:, 2:] - self.rects[:, :2]).min(axis=1))
+
+    @cached_property
+    def neighbors(self) -> tuple[tuple[Neighbor, ...], ...]:
+        """For each zone those that touch it, by number; a shared corner counts."""
+        low, high = self.rects[:, None, :2], self.rects[None, :, 2:]
+        # How far two rectangles share each axis: below 0 apart, 0 touching.
+        shared = np.minimum(high, high.swapaxes(0, 1)) - np.maximum(low, low.swapaxes(0, 1))
+        touching = (shared >= 0.0).all(axis=2) & ~np.eye(self.count, dtype=bool)
+        corner = (shared == 0.0).all(axis=2)
+        return tuple(
+            tuple(Neighbor(int(b), bool(corner[a, b])) for b in np.flatnonzero(touching[a]))
+            for a in range(self.count)
+        )
+
+    @property
+    def side_neighbors(self) -> tuple[tuple[int, ...], ...]:
+        """For each zone those that share a side with it: hardly anybody drives over a corner."""
+        return tuple(tuple(near.zone for near in row if not near.corner) for row in self.neighbors)
+
+    @cached_property
+    def content_hash(self) -> str:
+        """SHA-256 of which place belongs to which zone, hex: for manifests."""
+        sides = [[float(side).hex() for side in rect] for rect in self.reaching]
+        return hashlib.sha256(json.dumps({"cavmarl.zones": sides}).encode()).hexdigest()
+
+    def _sides(self, axis: int) -> NDArray[np.float64]:
+        """All coordinates at which a zone begins or ends, rising."""
+        return np.unique(self.rects[:, [axis, axis + 2]])
+
+    @cached_property
+    def _cells(self) -> NDArray[np.int32]:
+        """The zone of each cell between neighbouring sides, (rows, columns)."""
+        sides_x, sides_y = self._sides(0), self._sides(1)
+        cells = np.full((len(sides_y) - 1, len(sides_x) - 1), -1, dtype=np.int32)
+        for zone, (left, low, right, high) in enumerate(self.rects):
+            columns = slice(*np.searchsorted(sides_x, (left, right)))
+            part = cells[slice(*np.searchsorted(sides_y, (low, high))), columns]
+            if (part >= 0).any():
+                other = int(part[part >= 0][0])
+                raise ZoneError(_overlap(other, zone, self.rects))
+            part[:] = zone
+        if (cells < 0).any():
+            row, column = np.argwhere(cells < 0)[0]
+            gap = (*sides_x[column : column + 2], *sides_y[row : row + 2])
+            raise ZoneError(
+                f"no zone covers {_span(*gap)}: every place of bounds_m needs a zone; let a zone "
+                "beside the gap reach over it"
+            )
+        cells.setflags(write=False)
+        return cells
+
+
+def _check_rects(rects: NDArray[np.float64], bounds: Bounds) -> None:
+    """Refuse what is no rectangle, and what lies outside of `bounds`."""
+    if not len(rects):
+        raise ZoneError("there are no zones: at least one has to cover the map")
+    for what, rect in (("bounds_m", np.array(bounds)), *enumerate(rects)):
+        name = what if isinstance(what, str) else f"zone {what}"
+        if not np.isfinite(rect).all():
+            raise ZoneError(
+                f"{name}: {rect.tolist()} must be finite numbers; sides on bounds_m reach to "
+                "infinity by themselves"
+            )
+        if not (rect[:2] < rect[2:]).all():
+            raise ZoneError(
+                f"{name}: {rect.tolist()} is empty: give min_x, min_y, max_x, max_y in m, the "
+                "first two below the last two"
+            )
+    low, high = np.array(bounds[:2]), np.array(bounds[2:])
+    for zone in np.flatnonzero(
+        (rects[:, :2] < low).any(axis=1) | (rects[:, 2:] > high).any(axis=1)
+    ):
+        raise ZoneError(
+            f"zone {zone}: {rects[zone].tolist()} leaves bounds_m = {list(bounds)}: end it there, "
+            "or widen bounds_m"
+        )
+    for axis, side in enumerate(bounds):
+        if side not in rects[:, axis]:
+            edge = ("min_x", "min_y", "max_x", "max_y")[axis]
+            raise ZoneError(
+                f"no zone reaches {edge} = {side:g} of bounds_m: widen the zones there to it"
+            )
+
+
+def _overlap(a: int, b: int, rects: NDArray[np.float64]) -> str:
+    left, low = np.maximum(rects[a, :2], rects[b, :2])
+    right, high = np.minimum(rects[a, 2:], rects[b, 2:])
+    return f"zones {a} and {b} overlap in {_span(left, right, low, high)}: take it from one of them"
+
+
+def _span(left: float, right: float, low: float, high: float) -> str:
+    return f"x {left:.10g} to {right:.10g}, y {low:.10g} to {high:.10g}"

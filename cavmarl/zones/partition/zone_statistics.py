@@ -1,0 +1,148 @@
+"""What is in each zone, and how evenly: lanes, junctions that are cut, vehicles, ghosts."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cavmarl.roads.network import RoadNetwork
+from cavmarl.zones.partition.zone_partition import ZonePartition
+from cavmarl.zones.partition.zone_survey import junction_boxes, lane_segments
+
+__all__ = ["ZoneStatistics", "imbalance", "zone_statistics"]
+
+Floats = NDArray[np.float64]
+
+
+def imbalance(values: Sequence[float]) -> float:
+    """Maximum over mean: 1 where all are equal, k where one of k has all; 1 where nobody has any.
+
+    With a worker for each zone the slowest sets the pace: this is how many times as long it takes
+    as a perfect share.
+    """
+    mean = sum(values) / len(values)
+    return max(values) / mean if mean else 1.0
+
+
+@dataclass(frozen=True)
+class ZoneStatistics:
+    """Figures of a partition; tuples go by zone.
+
+    Attributes:
+        lane_km: length of lanes outside of junctions.
+        junctions: in which ways cross or merge.
+        junctions_cut: of these, in more than one zone.
+        cut_junctions: of the cut ones, how many each zone has a part of.
+        vehicles: owned by place; zeros without positions.
+        ghosts: that each zone is given at most, all within its halo; zeros without positions.
+        narrow: zones with a side shorter than the halo. They are exact; most of what they simulate
+            are ghosts.
+    """
+
+    lane_km: tuple[float, ...]
+    junctions: int
+    junctions_cut: int
+    cut_junctions: tuple[int, ...]
+    vehicles: tuple[int, ...]
+    ghosts: tuple[int, ...]
+    narrow: tuple[int, ...]
+
+    @property
+    def lane_imbalance(self) -> float:
+        """Of `lane_km`."""
+        return imbalance(self.lane_km)
+
+    @property
+    def vehicle_imbalance(self) -> float:
+        """Of `vehicles`."""
+        return imbalance(self.vehicles)
+
+    def to_dict(self) -> dict[str, Any]:
+        """As plain types for JSON."""
+        return asdict(self) | {
+            "lane_imbalance": self.lane_imbalance,
+            "vehicle_imbalance": self.vehicle_imbalance,
+        }
+
+
+def zone_statistics(
+    partition: ZonePartition,
+    network: RoadNetwork,
+    *,
+    halo_m: float = 0.0,
+    positions: Floats | None = None,
+) -> ZoneStatistics:
+    """Count what is in each zone.
+
+    Args:
+        partition: of the map.
+        network: the map.
+        halo_m: how far zones see over their borders.
+        positions: (n, 2) x and y of vehicles in m.
+    """
+    places = np.empty((0, 2)) if positions is None else np.asarray(positions, dtype=np.float64)
+    owners = partition.zones_of(places)
+    boxes = junction_boxes(network)
+    shares = [zones for zones in _zones_of_boxes(partition, boxes) if len(zones) > 1]
+    sides = partition.reaching[:, 2:] - partition.reaching[:, :2]
+    return ZoneStatistics(
+        lane_km=tuple(_lane_km(partition, network).tolist()),
+        junctions=len(boxes),
+        junctions_cut=len(shares),
+        cut_junctions=tuple(
+            sum(zone in zones for zones in shares) for zone in range(partition.count)
+        ),
+        vehicles=tuple(np.bincount(owners, minlength=partition.count).tolist()),
+        ghosts=tuple(
+            int(((owners != zone) & _within(rect, places, halo_m)).sum())
+            for zone, rect in enumerate(partition.reaching)
+        ),
+        narrow=tuple(np.flatnonzero(sides.min(axis=1) < halo_m).tolist()),
+    )
+
+
+def _within(rect: Floats, places: Floats, halo_m: float) -> NDArray[np.bool_]:
+    """Whether places lie within the halo of a rectangle: nobody else is ever seen there."""
+    away = np.maximum(np.maximum(rect[:2] - places, places - rect[2:]), 0.0)
+    return np.asarray((away * away).sum(axis=1) <= halo_m * halo_m)
+
+
+def _zones_of_boxes(partition: ZonePartition, boxes: Floats) -> list[NDArray[np.int32]]:
+    """The zones that each of (n, 4) boxes has a part in."""
+    zones = partition.arrays
+    columns = np.searchsorted(zones.cuts_x, boxes[:, [0, 2]], side="right")
+    rows = np.searchsorted(zones.cuts_y, boxes[:, [1, 3]], side="right")
+    return [
+        np.unique(zones.cells[row[0] : row[1] + 1, column[0] : column[1] + 1])
+        for row, column in zip(rows, columns, strict=True)
+    ]
+
+
+def _lane_km(partition: ZonePartition, network: RoadNetwork) -> Floats:
+    """Lanes outside of junctions, by zone: segments are cut where the zones are."""
+    segments = lane_segments(network)
+    starts, along = segments[:, :2], segments[:, 2:] - segments[:, :2]
+    cuts = [
+        _crossings(starts[:, axis], along[:, axis], lines)
+        for axis, lines in enumerate((partition.arrays.cuts_x, partition.arrays.cuts_y))
+    ]
+    ends = np.broadcast_to([0.0, 1.0], (len(segments), 2))
+    shares = np.sort(np.concatenate([ends, *cuts], axis=1), axis=1)
+    pieces = np.diff(shares, axis=1)
+    middles = shares[:, :-1] + pieces / 2.0
+    lengths = pieces * np.hypot(*along.T)[:, None]
+    kept = lengths > 0.0
+    which = np.nonzero(kept)[0]
+    owners = partition.zones_of(starts[which] + middles[kept][:, None] * along[which])
+    return np.bincount(owners, weights=lengths[kept], minlength=partition.count) / 1e3
+
+
+def _crossings(starts: Floats, along: Floats, lines: Floats) -> Floats:
+    """Where segments meet each of the lines, (n, lines): from 0 at the start to 1 at the end."""
+    steps = np.where(along == 0.0, 1.0, along)[:, None]
+    met = (lines[None, :] - starts[:, None]) / steps
+    return np.where((along == 0.0)[:, None], 0.0, np.clip(met, 0.0, 1.0))

@@ -1,0 +1,115 @@
+"""How far a shard has to see over its borders: the farthest look of drivers, the longest move.
+
+Distances are between centres, in the plane. What is measured along a road is at least as long,
+except over junctions without lanes inside, where vehicles jump.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cavmarl.core.records.arrays import Travel
+from cavmarl.core.records.rows import LOST_M
+from cavmarl.driving.kernels.announcing import APPROACH_M
+from cavmarl.driving.kernels.junctions import EXIT_LOOK_M
+from cavmarl.driving.kernels.motion import CROSSINGS_PER_TICK, LATERAL_MPS, MAX_SPEED_MPS
+from cavmarl.roads.network import RoadNetwork
+
+__all__ = ["driving_reach_m", "longest_move_m", "off_lane_m"]
+
+ASIDE_M = 10.0  # between the centres of neighbour lanes, and of vehicles beside them
+
+
+def driving_reach_m(network: RoadNetwork, travel: Travel) -> float:
+    """The farthest vehicle that a driver's decision can depend on.
+
+    A driver looks `view_m` ahead. With a line within `see_m`, or on a junction, it asks who comes
+    to that junction, within `APPROACH_M` of the ends of the lanes that lead to it or on it, and who
+    stands behind it, within `EXIT_LOOK_M`.
+
+    Args:
+        network: the roads.
+        travel: the types of vehicles, and how far they look.
+    """
+    longest_m = float(network.links["length_m"].max(initial=0.0))
+    junction_m = max(travel.see_m, longest_m)
+    beyond_m = max(APPROACH_M, EXIT_LOOK_M, longest_m)
+    stretch, jump_m = _jumps(network)
+    bodies_m = 2.0 * float(travel.types["length"].max())
+    roads_m = stretch * max(travel.view_m, junction_m + beyond_m) + 2.0 * jump_m
+    return roads_m + _across_m(network) + bodies_m + ASIDE_M + travel.scripts.reach_m
+
+
+def longest_move_m(network: RoadNetwork, travel: Travel, dt: float) -> float:
+    """So far, in m, a vehicle moves in a tick of `dt` seconds, and no further.
+
+    Along its lane at the speed that the dynamics do not exceed, sideways as a lane change goes,
+    over the kinks between the pieces of the map's lines, and over its junctions. In a hairpin the
+    centre of a body leaves the lane for the chord between the bumpers, half its length away.
+    """
+    _, jump_m = _jumps(network)
+    shortest_m = float(network.lanes["length_m"].min())
+    jumps = 1 + min(int(MAX_SPEED_MPS * dt / max(shortest_m, 1e-9)), CROSSINGS_PER_TICK - 1)
+    way_m = float(np.hypot(MAX_SPEED_MPS, LATERAL_MPS)) * dt
+    half_m = 0.5 * float(travel.types["length"].max())
+    return way_m + _kink_m(network) + jumps * jump_m + half_m
+
+
+def off_lane_m(network: RoadNetwork, travel: Travel) -> float:
+    """So far, in m, the centre of a body is from its place in the middle of its lane at most.
+
+    Beside it by a lane's width while it changes, off it by half its length where its bumpers are
+    round a bend, and with the way of a jump between them on a junction without lanes inside. Agents
+    may be further away, but not than `LOST_M`.
+    """
+    _, jump_m = _jumps(network)
+    half_m = 0.5 * float(travel.types["length"].max())
+    return max(LOST_M, float(network.lanes["width_m"].max(initial=0.0)) + half_m + jump_m)
+
+
+def _kink_m(network: RoadNetwork) -> float:
+    """The longest way that a place a lane's width aside jumps where a lane turns at once."""
+    lanes, links = network.lanes, network.links
+    direction = network.points["cos"] + 1j * network.points["sin"]
+    first = lanes["first_point"]
+    last = first + lanes["num_points"] - 2  # of its last piece
+    within = np.ones(len(direction), dtype=bool)
+    within[last + 1] = False  # from there on it is another lane
+    within = np.flatnonzero(within)
+    before = [direction[within], direction[last[links["from_lane"]]]]
+    after = [direction[within + 1], direction[first[links["next_lane"]]]]
+    inside = np.flatnonzero(lanes["internal"])
+    before.append(direction[last[inside]])
+    after.append(direction[first[lanes["successor"][inside]]])
+    turn = np.abs(np.angle(np.concatenate(after) / np.concatenate(before)))
+    return float(2.0 * np.sin(0.5 * turn.max(initial=0.0)) * lanes["width_m"].max(initial=0.0))
+
+
+def _ends(network: RoadNetwork) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """(L, 2) places where each lane starts and where it ends."""
+    first = network.lanes["first_point"]
+    points = np.stack([network.points["x"], network.points["y"]], axis=1)
+    return points[first], points[first + network.lanes["num_points"] - 1]
+
+
+def _across_m(network: RoadNetwork) -> float:
+    """The farthest from the end of a lane at a junction: a foe's lane, or where a way leads out."""
+    links = network.links
+    starts, ends = _ends(network)
+    leaves = ends[links["from_lane"]]
+    through = leaves - starts[links["to_lane"]]
+    own = np.repeat(np.arange(len(links)), links["num_conflicts"])
+    between = leaves[own] - leaves[network.conflicts["foe"]]
+    apart = np.concatenate([through, between])
+    return float(np.hypot(apart[:, 0], apart[:, 1]).max(initial=0.0))
+
+
+def _jumps(network: RoadNetwork) -> tuple[float, float]:
+    """How many times the way along a road the way in the plane can be, and the longest jump."""
+    links = network.links[network.links["first_internal"] < 0]
+    starts, ends = _ends(network)
+    jump = ends[links["from_lane"]] - starts[links["to_lane"]]
+    jump_m = np.hypot(jump[:, 0], jump[:, 1])
+    stretch = 1.0 + jump_m / network.lanes["length_m"][links["from_lane"]]
+    return float(stretch.max(initial=1.0)), float(jump_m.max(initial=0.0))

@@ -1,0 +1,64 @@
+"""`Sight`: whom zones see over their borders, however the map is cut."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from cavmarl.core.huge_pages import huge_copy
+from cavmarl.core.records.arrays import Travel
+from cavmarl.roads.network import RoadNetwork
+from cavmarl.zones.kernels.visibility_tests import AT_LINE_M, farthest_m, find_looks, make_room
+from cavmarl.zones.kernels.zone_lookup import LOOK, Halo
+from cavmarl.zones.partition.zone_halo import inner_parts, lane_watchers, zone_halo
+from cavmarl.zones.partition.zone_partition import ZonePartition
+from cavmarl.zones.reach import off_lane_m
+
+__all__ = ["Sight"]
+
+
+@dataclass(frozen=True, eq=False)
+class Sight:
+    """The distances that sight goes by, and what it takes to know on which roads it ends earlier.
+
+    Attributes:
+        network: the roads.
+        travel: the types of vehicles, and how far they look.
+        halo_m: nobody further away is seen.
+        sure_m: everybody nearer is; from `halo_m` on, roads are not asked.
+        outside_m: how far outside of its zone a vehicle can be whose transfer is late.
+    """
+
+    network: RoadNetwork
+    travel: Travel
+    halo_m: float
+    sure_m: float
+    outside_m: float
+
+    def halo(self, partition: ZonePartition) -> Halo:
+        """Whom each zone of a partition sees."""
+        halo = zone_halo(partition, self.halo_m)
+        if partition.count == 1 or self.sure_m >= self.halo_m:
+            return halo
+        roads = self.network.arrays
+        room = make_room(len(roads.lanes), len(roads.links))
+        half_m = 0.5 * float(self.travel.types["length"].max())
+        aside_m = off_lane_m(self.network, self.travel)
+        wide_m = self.outside_m + aside_m  # its place on its lane is not further away
+        rects = partition.reaching + np.array([-wide_m, -wide_m, wide_m, wide_m])
+        looks = np.zeros((partition.count, len(roads.lanes)), dtype=LOOK)
+        seen_m = self.sure_m
+        for zone, (rect, own) in enumerate(zip(rects, looks, strict=True)):
+            find_looks(roads, rect, self.travel.view_m, self.travel.see_m, half_m, room, own)
+            seen_m = max(seen_m, aside_m + farthest_m(roads, partition.arrays.rects, zone, own))
+        seen_m = min(seen_m, self.halo_m)
+        start, watchers = lane_watchers(partition, roads.lanes, looks, self.sure_m + aside_m)
+        return halo._replace(
+            inner=inner_parts(partition, seen_m),
+            sure_m=float(self.sure_m),
+            seen_m=float(seen_m),
+            line_m=half_m + float(roads.lanes["stop_back_m"].max()) + AT_LINE_M,
+            watcher_start=huge_copy(start),
+            watchers=huge_copy(watchers),
+        )

@@ -1,0 +1,127 @@
+"""The pictures of the README and of the entries' cards.
+
+`python -m docs.pictures.pictures docs/images` draws them anew.
+Each is one moment of a seeded world in which the built-in driver has all seats.
+"""
+
+from __future__ import annotations
+
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from cavmarl.config.env import EnvConfig
+from cavmarl.config.registry import load_config
+from cavmarl.engine.simulation import Simulation
+from cavmarl.engine.world_setup import load_roads
+from cavmarl.render.canvas import load_pygame
+from cavmarl.render.topdown import TopDownRenderer
+from cavmarl.render.viewport import Bounds
+from cavmarl.roads.network import RoadNetwork
+from cavmarl.shards.shard import Commands
+
+if TYPE_CHECKING:
+    from pygame import Surface
+
+__all__ = ["PICTURES", "Picture", "draw_picture", "moment", "write_pictures"]
+
+SEED = 0
+
+
+@dataclass(frozen=True)
+class Picture:
+    """What to draw.
+
+    Attributes:
+        env: the entry.
+        time_s: how long the world has run.
+        size: in pixels; by default what suits the map.
+        focus: the part of the map to show, m; by default all of it.
+        agents: instead of the entry's number.
+        background: instead of the entry's number.
+        ghosts_of: the zone whose ghosts are outlined; a divided world is drawn with its zones.
+        approach_ticks: so many ticks before a crossing the transfer begins.
+    """
+
+    env: str
+    time_s: float
+    size: tuple[int, int] | None = None
+    focus: Bounds | None = None
+    agents: int | None = None
+    background: int | None = None
+    ghosts_of: int | None = None
+    approach_ticks: int = 2
+
+
+PICTURES = {
+    "ring": Picture("ring", 8.0),
+    "merge": Picture("merge", 9.0, (1280, 400), (150.0, -76.0, 660.0, 40.0)),
+    "grid4x4": Picture("grid4x4", 16.0),
+    "town": Picture("town", 20.0, background=250),
+    "rush": Picture("rush", 60.0),
+    "ghosts": Picture(
+        "rush",
+        60.0,
+        (1280, 720),
+        (880.0, 500.0, 1340.0, 760.0),
+        ghosts_of=1,
+        approach_ticks=75,
+    ),
+    "hero": Picture(
+        "town", 30.0, (1280, 720), (1230.0, 560.0, 1720.0, 835.0), agents=60, background=240
+    ),
+}
+
+
+def draw_picture(picture: Picture) -> Surface:
+    """Run the world up to the moment of the picture, and draw it."""
+    config, folder = load_config(
+        picture.env,
+        agents=picture.agents,
+        background=picture.background,
+        overrides={"zones.approach_ticks": picture.approach_ticks},
+    )
+    network = load_roads(config, folder)
+    simulation = moment(config, network, picture.time_s)
+    renderer = TopDownRenderer(network, picture.size, picture.focus, simulation.goal_edges)
+    return renderer.draw(
+        simulation.vehicles(),
+        simulation.signal_phases(),
+        title=config.name,
+        clock_s=float(simulation.ticks()[0]) * config.clock.sim_dt_s,
+        zones=simulation.zone_view() if simulation.partition.count > 1 else None,
+        ghosts_of=picture.ghosts_of,
+    )
+
+
+def moment(config: EnvConfig, network: RoadNetwork, time_s: float) -> Simulation:
+    """A seeded world in which the built-in driver has had all seats for so long."""
+    simulation = Simulation(config, network)
+    simulation.seed(SEED)
+    simulation.reset()
+    suggested = np.zeros((1, config.population.num_ids, 2))
+    for _ in range(round(time_s / config.clock.ctrl_dt_s)):
+        simulation.suggest(suggested)
+        meta = suggested[..., 0].astype(np.int64)
+        simulation.step(Commands(suggested, meta))
+        simulation.retire_agents()
+    return simulation
+
+
+def write_pictures(folder: Path) -> list[Path]:
+    """Draw all `PICTURES` into a folder, one PNG each."""
+    folder.mkdir(parents=True, exist_ok=True)
+    paths = []
+    for name, picture in PICTURES.items():
+        path = folder / f"{name}.png"
+        load_pygame().image.save(draw_picture(picture), str(path))
+        paths.append(path)
+    return paths
+
+
+if __name__ == "__main__":
+    for written in write_pictures(Path(sys.argv[1])):
+        print(written)

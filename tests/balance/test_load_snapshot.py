@@ -1,0 +1,96 @@
+"""What is in use: of this machine, and on record."""
+
+from __future__ import annotations
+
+import json
+import os
+import stat
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from cavmarl.balance.load_score import Candidate, Utilisation
+from cavmarl.balance.load_snapshot import Snapshot, idle_snapshot
+from cavmarl.balance.plan_file import snapshot_from_dict
+from cavmarl.balance.probe import Watch, take_snapshot
+from cavmarl.core.errors import PlacementError
+
+
+def test_a_snapshot_of_this_machine_is_of_shares() -> None:
+    found = take_snapshot({1: os.getpid(), 0: None}, interval_s=0.05)
+    assert [worker.worker for worker in found.workers] == [0, 1]
+    assert all(worker.available for worker in found.workers)
+    assert all(0.0 < worker.use.ram < 1.0 for worker in found.workers)
+    assert found.origin == "measured"
+
+
+def test_without_a_tool_for_gpus_there_is_none(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("PATH", "")
+    found = take_snapshot({0: None}, interval_s=0.01)
+    assert found.gpu_source == "none"
+    assert found.workers[0].use.gpu == 0.0
+
+
+@pytest.mark.parametrize(
+    ("says", "share", "source"),
+    [
+        ("echo 12; echo 55", 0.55, "nvidia-smi"),
+        ("echo '[N/A]'", 0.0, "none"),
+        ("echo 55; exit 9", 0.0, "none"),
+    ],
+)
+def test_the_busiest_gpu_counts(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, says: str, share: float, source: str
+) -> None:
+    tool = tmp_path / "nvidia-smi"
+    tool.write_text(f"#!/bin/sh\n{says}\n", encoding="utf-8")
+    tool.chmod(tool.stat().st_mode | stat.S_IXUSR)
+    monkeypatch.setenv("PATH", f"{tmp_path}:{os.environ['PATH']}")
+    found = take_snapshot({0: None}, interval_s=0.01)
+    assert (found.workers[0].use.gpu, found.gpu_source) == (share, source)
+
+
+def test_a_worker_that_has_died_is_not_available() -> None:
+    with subprocess.Popen([sys.executable, "-c", ""]) as process:
+        process.wait()
+    found = take_snapshot({0: process.pid, 1: None}, interval_s=0.01)
+    assert [worker.available for worker in found.workers] == [False, True]
+
+
+def test_workers_are_not_charged_for_their_own_work() -> None:
+    endless = "while True: pass"
+    with subprocess.Popen([sys.executable, "-c", endless]) as process:
+        try:
+            watches = [Watch({0: process.pid, 1: None}), Watch({0: None, 1: None})]
+            time.sleep(1.0)
+            found = [watch.snapshot() for watch in watches]
+        finally:
+            process.kill()
+    own, other = ([worker.use.cpu for worker in one.workers] for one in found)
+    assert all(mine < theirs for mine, theirs in zip(own, other, strict=True))
+
+
+def test_a_snapshot_goes_to_json_and_back() -> None:
+    taken = Snapshot(
+        (Candidate(1, Utilisation(0.1, 0.2, 0.3), 4), Candidate(0, Utilisation(1 / 3, 0.2))),
+        "none",
+        "measured",
+    )
+    assert [worker.worker for worker in taken.workers] == [0, 1]
+    assert snapshot_from_dict(json.loads(json.dumps(taken.to_dict()))) == taken
+
+
+def test_no_worker_or_one_twice_is_no_snapshot() -> None:
+    with pytest.raises(PlacementError, match="no workers"):
+        idle_snapshot(0)
+    with pytest.raises(PlacementError, match="named twice"):
+        Snapshot(idle_snapshot(1).workers * 2, "none", "")
+
+
+@pytest.mark.parametrize("interval_s", [0.0, -1.0, float("nan")])
+def test_an_interval_is_checked(interval_s: float) -> None:
+    with pytest.raises(PlacementError, match="interval_s"):
+        take_snapshot({0: None}, interval_s=interval_s)

@@ -1,0 +1,196 @@
+"""The benchmark of sensor workers: every run anew, all of them the same, parts that sum up."""
+
+from __future__ import annotations
+
+import csv
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+from typer.testing import CliRunner
+
+from cavmarl.bench import sensor_bench
+from cavmarl.bench.sensor_bench import SensorBench, measure_sensor_workers
+from cavmarl.bench.sensor_load import describe_rig, find_rig, load_rig, scaled
+from cavmarl.bench.sensor_run import PARTS, SensorJob
+from cavmarl.cli import app
+from cavmarl.config.registry import load_config
+from cavmarl.core.errors import ConfigError
+from cavmarl.parallel.processes.process_barrier import usable_cores
+from tests.support.sumo_worlds import MODES, tiny_file
+
+RIG: dict[str, dict[str, Any]] = {
+    "lidar": {"type": "lidar", "rate_hz": 10, "rays": 30, "z_m": 1.6},
+    "picture": {"type": "rgb_camera", "rate_hz": 10, "z_m": 1.5, "width": 32, "height": 18},
+    "grid": {"type": "bev_grid", "rate_hz": 5},
+    "wheels": {"type": "odometry", "rate_hz": 20},
+}
+
+
+@pytest.fixture(scope="module")
+def found() -> SensorBench:
+    return measure_sensor_workers(
+        "grid4x4", RIG, workers=(1, 2), warmup=2, steps=6, repeats=1, background=3
+    )
+
+
+def test_a_load_is_found_beyond_which_sensors_take_much_longer_at_once(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """What does not fit into a cache takes 2.4 times as long: no load is between 10 and 24 ms."""
+
+    def costs_ms(rig: Mapping[str, Any]) -> float:
+        rays = rig["lidar"]["rays"]
+        return rays / 100.0 if rays <= 1000 else 2.4 * rays / 100.0
+
+    def run(job: SensorJob) -> SimpleNamespace:
+        found = costs_ms(job.overrides["rig"])
+        return SimpleNamespace(parts_ms={"sensor compute": [found]}, costs_ms=[found / job.agents])
+
+    monkeypatch.setattr(sensor_bench, "_run", run)
+    said: list[str] = []
+    job = SensorJob("grid4x4", {"rig": {"lidar": RIG["lidar"]}}, 2, 3, 1, 2, 6, 0)
+    loaded = sensor_bench._loaded(job, 20.0, said.append)
+    assert 24.0 <= costs_ms(loaded.overrides["rig"]) <= 30.0
+    tries = [float(text.split()[-2]) for text in said[2:]]
+    assert min(tries) < 20.0, "one was too light,"
+    assert max(tries) > 30.0, "another too heavy"
+
+
+def test_every_run_is_on_record(found: SensorBench) -> None:
+    assert sorted((turn.repeat, turn.workers) for turn in found.turns) == [(1, 1), (1, 2)]
+    assert [turn.place for turn in found.turns] == [1, 2]
+    assert all(len(turn.run.step_ms) == 6 for turn in found.turns)
+    assert found.is_same
+    assert all(len(turn.run.digests) == 3 for turn in found.turns)
+
+
+def test_the_ceiling_of_the_machine_is_measured_beside(found: SensorBench) -> None:
+    if len(usable_cores()) < 2:
+        assert found.ceiling is None
+        return
+    assert found.ceiling is not None
+    assert found.ceiling.programs == 2
+    assert 0.0 < found.ceiling.ratio == found.to_dict()["ceiling"]["ratio"]
+
+
+def test_the_parts_of_a_step_are_within_it(found: SensorBench) -> None:
+    # How much of it they are, the command tells: here that would be a race against other programs.
+    for row in found.rows:
+        parts = found.parts_ms(row.workers)
+        assert tuple(parts) == PARTS
+        assert min(parts.values()) >= 0.0
+        assert 0.0 < sum(parts.values()) <= row.step_ms * (1.0 + 1e-9)
+        assert row.wait_ms < row.step_ms
+
+
+def test_the_time_of_sumo_is_named_apart(found: SensorBench, tmp_path: Path) -> None:
+    """Its own step and waiting for it, in both ways to couple it; elsewhere there is none."""
+    pytest.importorskip("libsumo", reason="needs the extra 'sumo'")
+    assert found.parts_ms(1)["SUMO"] == 0.0
+    for source in MODES:
+        more = {
+            "traffic.source": source,
+            "traffic.demand": [str(tiny_file(tmp_path))],
+            "sensors.signal.timing": False,
+        }
+        coupled = measure_sensor_workers(
+            "grid4x4", RIG, workers=(1,), warmup=1, steps=4, repeats=1, overrides=more
+        )
+        parts = coupled.parts_ms(1)
+        assert parts["SUMO"] > 0.0
+        assert sum(parts.values()) <= coupled.rows[0].step_ms * (1.0 + 1e-9)
+        assert "SUMO" in coupled.to_dict()["parts_ms"][1]
+
+
+def test_resources_are_those_of_all_processes(found: SensorBench) -> None:
+    ticks = 6 * found.turns[0].run.ticks_per_step
+    for number in (1, 2):
+        (window,) = found.windows(number)
+        assert window.steps == 6
+        assert len(window.worker_cpu_s) == len(window.worker_rss_mb) == number
+        assert window.messages == 2 * number * ticks  # to and fro
+        assert window.got_bytes > 6 * 32 * 18 * 3
+
+
+def test_both_placements_are_told(found: SensorBench) -> None:
+    shares = found.shares(2)
+    assert shares["in_turn"].homes == (0, 1, 0, 1)
+    assert max(shares["cost"].loads_s) <= max(shares["in_turn"].loads_s)
+
+
+def test_the_result_is_json_with_every_sensor(found: SensorBench) -> None:
+    told = json.loads(json.dumps(found.to_dict()))
+    sensors = told["turns"][0]["run"]["sensors"]
+    assert [sensor["name"] for sensor in sensors] == list(RIG)
+    assert sensors[1]["resolution"] == [18, 32, 3]
+    assert sensors[1]["placement"]["z_m"] == 1.5
+    assert told["rows"][0]["ci95_between_runs"] is None
+
+
+def test_the_rig_of_ten_lists_what_it_is() -> None:
+    rig = load_rig(find_rig("ten_sensors"))
+    config, _ = load_config("grid4x4", overrides={"rig": rig})
+    told = describe_rig(config)
+    assert len(told) == 10
+    assert all(
+        {"type", "resolution", "lines", "rate_hz", "placement"} <= sensor.keys() for sensor in told
+    )
+
+
+@pytest.mark.parametrize("factor", [0.1, 1.0, 3.0, 1e3, 1e6])
+def test_rigs_of_any_load_can_be(factor: float) -> None:
+    rig = load_rig(find_rig("ten_sensors"))
+    plain, _ = load_config("grid4x4", overrides={"rig": rig, "clock.ctrl_dt_s": 0.05})
+    heavy = scaled(plain, dict.fromkeys(rig, factor), 20.0)
+    config, _ = load_config("grid4x4", overrides={"rig": heavy, "clock.ctrl_dt_s": 0.05})
+    for name, sensor in config.rig.items():
+        before, after = plain.rig[name].shape, sensor.shape
+        grows = [b >= a if factor >= 1.0 else b <= a for a, b in zip(before, after, strict=True)]
+        assert all(grows)
+
+
+def test_the_command_writes_every_step_and_a_figure(tmp_path: Path) -> None:
+    rig = tmp_path / "small.yaml"
+    rig.write_text("wheels: {type: odometry, rate_hz: 20}\n")
+    words = ["bench", "sensors", "grid4x4", "--rig", str(rig), "--workers", "1,2"]
+    words += ["--warmup", "1", "--steps", "3", "--repeats", "1"]
+    words += ["--csv", str(tmp_path / "steps.csv"), "--plot", str(tmp_path / "figure.png")]
+    result = CliRunner().invoke(app, [*words, "--json", str(tmp_path / "found.json")])
+    assert result.exit_code == 0, result.output
+    assert "step by step: the same" in result.output
+    with (tmp_path / "steps.csv").open() as file:
+        lines = list(csv.DictReader(file))
+    assert sorted({line["workers"] for line in lines}) == ["1", "2"]
+    assert len(lines) == 6
+    assert (tmp_path / "figure.png").stat().st_size > 10_000
+    assert json.loads((tmp_path / "found.json").read_text())["is_same"]
+
+
+@pytest.mark.parametrize(
+    "numbers",
+    [
+        {"workers": ()},
+        {"workers": (0, 1)},
+        {"workers": (1, 1)},
+        {"workers": (1, 65)},
+        {"steps": 1},
+        {"repeats": 0},
+        {"warmup": -1},
+        {"load_ms": 0.0},
+    ],
+)
+def test_numbers_that_cannot_be_are_refused(numbers: dict[str, Any]) -> None:
+    with pytest.raises(ConfigError):
+        measure_sensor_workers("grid4x4", RIG, **numbers)
+
+
+def test_a_rig_that_is_none_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match="no rig or file 'nothing'"):
+        find_rig("nothing")
+    (tmp_path / "list.yaml").write_text("wheels: 20\n")
+    with pytest.raises(ConfigError, match="must be sensors by name"):
+        load_rig(tmp_path / "list.yaml")

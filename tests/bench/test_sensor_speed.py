@@ -1,0 +1,27 @@
+from __future__ import annotations
+
+import pytest
+
+from cavmarl.bench.sensor_speed import measure_sensor_speed
+from cavmarl.core.errors import ConfigError
+
+
+@pytest.mark.parametrize("repeats", [0, 101])
+def test_numbers_out_of_range_are_refused(repeats: int) -> None:
+    with pytest.raises(ConfigError, match=f"repeats = {repeats}"):
+        measure_sensor_speed(repeats)
+
+
+@pytest.mark.slow
+def test_every_sensor_of_the_rig_is_measured() -> None:
+    said: list[str] = []
+    found = measure_sensor_speed(2, said.append)
+    assert found.cars_per_km2 == pytest.approx(400.0, abs=8.0)
+    assert len(found.rows) == 11
+    for row in found.rows:
+        assert 0.0 < row.low_us <= row.median_us <= row.high_us
+    assert 0.0 < found.lidar_ns < 250.0
+    assert 0.0 < found.cameras_ms < 2.5
+    assert found.cameras_ms < found.tick_ms < 20.0
+    assert said[-1] == "turn 2 of 2"
+    assert found.to_dict()["repeats"] == 2

@@ -1,0 +1,91 @@
+"""`cavmarl verify --kill` and `cavmarl bench workers`: what they print, write and refuse."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+
+from cavmarl.parallel.processes.worker_loop import TRUTH
+from cavmarl.parallel.processes.worker_processes import Crew
+from tests.cli.test_main import refusal, run
+
+SMALL = ("ring", "--agents", "3", "--background", "4", "--worlds", "2")
+
+
+def test_workers_are_killed_and_nobody_can_tell(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = tmp_path / "kills.json"
+    assert run("verify", *SMALL, "--kill", "4", "--zones", "2", "--json", str(path)) == 0
+    assert "equal in all 22 steps" in capsys.readouterr().out
+    found = json.loads(path.read_text())
+    assert found["holds"]
+    assert len(found["kills"]) == 4
+    assert {kill["signal"] for kill in found["kills"]} <= {"SIGKILL", "SIGSTOP"}
+    assert all(0.0 <= kill["replaced_ms"] <= kill["recovered_ms"] for kill in found["kills"])
+
+
+def test_a_successor_that_forgets_is_found_out(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    replace = Crew.replace
+
+    def without_memory(crew: Crew, k: int, mail: bytes | None, ordered: tuple[int, ...]) -> str:
+        crew.orders[k, TRUTH] = -1
+        return replace(crew, k, mail, ordered)
+
+    monkeypatch.setattr(Crew, "replace", without_memory)
+    assert run("verify", *SMALL, "--kill", "5") == 1
+    assert "different after step" in capsys.readouterr().out
+
+
+def test_the_workers_of_one_world_are_killed(capsys: pytest.CaptureFixture[str]) -> None:
+    town = ("town", "--agents", "4", "--background", "30", "--worlds", "1", "--zones", "4")
+    assert run("verify", *town, "--kill", "12", "--workers", "2") == 0
+    assert "equal in all 46 steps" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("words", "told"),
+    [
+        (("verify", "--kill", "3"), ("--kill", "name an environment")),
+        (("verify", "ring", "--hosts", "ray"), ("--hosts ray", "--kill")),
+        (("verify", "ring", "--kill", "1", "--hosts", "slurm"), ("hosts = 'slurm'", "'ray'")),
+        (("verify", "ring", "--kill", "0"), ("0 kills", "at least 1")),
+        (("verify", "ring", "--kill", "5", "--steps", "7"), ("7 steps", "at least 15")),
+        (("verify", "ring", "--kill", "1", "--zones", "1,2"), ("--zones 1,2", "one number")),
+        (("verify", "ring", "--kill", "1", "--layout", "grid"), ("--layout", "--set")),
+        (("verify", "ring", "--kill", "1", "--workers", "3", "--worlds", "2"), ("workers = 3",)),
+        (("bench", "workers", "ring", "--workers", "1"), ("1 workers", "at least 2")),
+        (("bench", "workers", "ring", "--at-least", "-1"), ("--at-least -1", "above 0")),
+        (("bench", "workers", *SMALL, "--vehicles", "many"), ("--vehicles many", "whole numbers")),
+        (("bench", "workers", *SMALL, "--vehicles", "2"), ("2 vehicles", "agents alone are 3")),
+    ],
+)
+def test_what_cannot_be_is_refused(
+    words: tuple[str, ...], told: tuple[str, ...], capsys: pytest.CaptureFixture[str]
+) -> None:
+    said = refusal(capsys, *words)
+    assert all(word in said for word in told), said
+
+
+def test_bench_workers(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = tmp_path / "speed.json"
+    small = ("--steps", "2", "--repeats", "2", "--vehicles", "9,12", "--json", str(path))
+    assert run("bench", "workers", *SMALL, *small, "--at-least", "100") == 1
+    found = json.loads(path.read_text())
+    assert [row["workers"] for row in found["rows"]] == [0, 1, 2]
+    assert all(len(row["step_ms"]) == 2 for row in found["rows"])
+    assert found["ratio"] > 0.0
+    assert found["barrier_us"][0] <= found["barrier_us"][1] <= found["barrier_us"][3]
+    assert found["hardware"]["usable_cores"] >= 1
+    assert [split["vehicles"] for split in found["splits"]] == [9, 12]
+    assert all(len(split["split_ms"]) == 2 for split in found["splits"])
+    said = capsys.readouterr().out
+    assert "an empty order to all 2" in said
+    assert "one world of 12 vehicles" in said
+    assert "splitting one world" in said
+    assert "in whose worlds nothing happens" in said
+    assert found["vectorization"]["ratios"]["gymnasium"] > 0.0

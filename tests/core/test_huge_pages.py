@@ -1,0 +1,72 @@
+"""Arrays in huge pages are arrays like any others."""
+
+from __future__ import annotations
+
+import gc
+import mmap
+import weakref
+
+import numpy as np
+import pytest
+
+from cavmarl.core.huge_pages import LEAST, PAGE, huge_copy, huge_zeros
+
+RECORD = np.dtype([("x", np.float64), ("on", np.bool_)], align=True)
+
+
+@pytest.mark.parametrize("size", [1, LEAST // 8 - 1, LEAST // 8, PAGE // 8, 3 * PAGE // 8 + 5])
+def test_they_are_zeros_that_share_no_byte(size: int) -> None:
+    """Whatever their size, what is written in one is not read in another."""
+    first, second = huge_zeros(size), huge_zeros((size, 1), dtype=np.int64)
+    assert first.shape == (size,)
+    assert second.shape == (size, 1)
+    assert not first.any()
+    first[:] = 1.0
+    assert not second.any()
+    assert not np.shares_memory(first, second)
+
+
+def test_records_lie_as_they_must() -> None:
+    """Large arrays start on a cache line, and their records are aligned."""
+    for size in (7000, 7001, 300_000):
+        array = huge_zeros(size, dtype=RECORD)
+        assert array.flags.aligned
+        assert array.ctypes.data % 64 == 0
+
+
+def test_a_copy_has_every_byte_and_may_be_written_as_before() -> None:
+    """Padding, too: hashes of maps read it."""
+    array = np.frombuffer(bytes(range(256)) * 16 * 64, dtype=RECORD)
+    copy = huge_copy(array)
+    assert copy.tobytes() == array.tobytes()
+    assert not copy.flags.writeable
+    assert not np.shares_memory(copy, array)
+    small = np.zeros(3)
+    assert huge_copy(small) is small
+
+
+def test_memory_goes_with_its_arrays() -> None:
+    """Nothing but the arrays holds their pages."""
+    array = huge_zeros(4 * PAGE // 8)
+    memory = array
+    while isinstance(memory, np.ndarray):
+        assert memory.base is not None
+        memory = memory.base
+    gone = weakref.ref(_mapping(memory))
+    del memory, array
+    huge_zeros(4 * PAGE // 8)  # the process keeps what is left of the last pages alone
+    gc.collect()
+    assert gone() is None
+
+
+def test_a_system_without_them_has_arrays_all_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
+    """NumPy's own."""
+    monkeypatch.delattr(mmap, "MADV_HUGEPAGE")
+    assert huge_zeros(PAGE).base is None
+
+
+def _mapping(memory: object) -> mmap.mmap:
+    assert isinstance(memory, memoryview | mmap.mmap)
+    found = memory.obj if isinstance(memory, memoryview) else memory
+    assert isinstance(found, mmap.mmap)
+    return found

@@ -1,0 +1,51 @@
+"""To have memory come nearer changes nothing, wherever the place is."""
+
+from __future__ import annotations
+
+import re
+from typing import Any
+
+import numba.core.config
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from cavmarl.core.numba import kernel
+from cavmarl.core.numba.prefetch import prefetch
+
+RECORD = np.dtype([("a", np.float64), ("b", np.int64, (9,))])
+
+
+@kernel
+def total(records: NDArray[np.void], places: NDArray[np.int64], ahead: int) -> float:
+    found = 0.0
+    for k in range(places.size):
+        prefetch(records, places[k] + ahead, 1)
+        found += records[places[k]]["a"]
+    return found
+
+
+@pytest.mark.parametrize("ahead", [0, 1, -1, 10**12, -(10**12)])
+@pytest.mark.parametrize("stride", [1, 3])
+def test_it_changes_nothing(ahead: int, stride: int) -> None:
+    records = np.zeros(60, dtype=RECORD)
+    records["a"] = np.arange(60)
+    view = records[::stride]
+    before = records.tobytes()
+    places = np.random.default_rng(0).permutation(len(view)).astype(np.int64)
+    assert total(view, places, ahead) == view["a"].sum()
+    assert records.tobytes() == before
+
+
+def test_an_array_without_records_has_places_too() -> None:
+    assert total(np.zeros(0, dtype=RECORD), np.zeros(0, dtype=np.int64), 5) == 0.0
+
+
+def test_the_processor_is_told() -> None:
+    settings: Any = numba.core.config
+    if settings.DISABLE_JIT:
+        pytest.skip("without the compiler there is no such instruction")
+    compiled: Any = numba.njit(total.py_func)  # the kernel itself may come from the cache
+    compiled(np.zeros(4, dtype=RECORD), np.arange(4, dtype=np.int64), 1)
+    (code,) = compiled.inspect_asm().values()
+    assert re.search(r"^\s+(prefetcht0|prfm)\s", code, re.MULTILINE)

@@ -1,0 +1,57 @@
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numba.core.config
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from cavmarl.core.numba import kernel
+from cavmarl.core.numba.repeated import repeated
+
+settings: Any = numba.core.config
+compiled_only = pytest.mark.skipif(
+    settings.DISABLE_JIT or settings.BOUNDSCHECK, reason="the kernel itself is called"
+)
+
+
+class Pair(NamedTuple):
+    counts: NDArray[np.int64]
+    step: float
+
+
+@kernel
+def rise(pair: Pair, by: int) -> int:
+    for k in range(pair.counts.size):
+        pair.counts[k] += by
+    return pair.counts[0]
+
+
+def test_it_does_what_the_kernel_does_with_other_arrays_of_the_same_types() -> None:
+    call = repeated(rise)
+    for number in (1, 3):
+        counts = np.arange(number)
+        assert call(Pair(counts, 0.5), 4) == 4
+        assert counts.tolist() == list(range(4, 4 + number))
+
+
+@compiled_only
+def test_types_are_looked_at_in_the_first_call_alone(monkeypatch: pytest.MonkeyPatch) -> None:
+    import numba
+
+    looked = []
+    typeof: Any = numba.typeof
+    monkeypatch.setattr(numba, "typeof", lambda value: looked.append(value) or typeof(value))
+    call = repeated(rise)
+    for _ in range(3):
+        call(Pair(np.arange(2), 0.5), 1)
+    assert len(looked) == 2
+
+
+@pytest.mark.parametrize("setting", ["DISABLE_JIT", "BOUNDSCHECK"])
+def test_where_kernels_are_checked_the_kernel_itself_is_called(
+    setting: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(settings, setting, 1)
+    assert repeated(rise) is rise

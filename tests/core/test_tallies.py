@@ -1,0 +1,31 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from cavmarl.core.math.tallies import begins_second, count_tick, occasions, totals
+
+
+@pytest.mark.parametrize(("ticks", "expected"), [([3, 7], False), ([3, 20], True), ([0, 1], True)])
+def test_a_second_begins_in_some_world(ticks: list[int], expected: bool) -> None:
+    assert begins_second(np.array(ticks), 10) == expected
+
+
+@pytest.mark.parametrize("tick", [4, 20])
+@pytest.mark.parametrize("through", [[[0, 0], [0, 0]], [[0, 0], [3, 0]]])
+def test_what_there_is_to_do_before_the_exchange(tick: int, through: list[list[int]]) -> None:
+    found = occasions(np.array([tick, 7]), 10, np.array(through))
+    assert found == (tick == 20, bool(np.any(through)))
+
+
+def test_ticks_are_counted() -> None:
+    ticks = np.array([0, 41])
+    count_tick(ticks)
+    assert ticks.tolist() == [1, 42]
+
+
+def test_totals_are_sums_over_zones() -> None:
+    counts = np.random.default_rng(0).integers(0, 99, (4, 3))
+    out = np.full(3, -1)
+    totals(counts, out)
+    np.testing.assert_array_equal(out, counts.sum(axis=0))

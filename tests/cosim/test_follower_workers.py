@@ -1,0 +1,177 @@
+"""Followed worlds that worker processes run, with faults and sensor workers: nobody can tell."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import threading
+from collections.abc import Callable
+from contextlib import closing
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+import cavmarl
+from cavmarl.core.errors import ConfigError, FollowerLostError
+from cavmarl.cosim.followers.followed_world import FollowedWorld
+from cavmarl.cosim.followers.follower_client import Follower, Sight
+from cavmarl.engine.step_trace import StepTrace
+from cavmarl.parallel.pooled_worlds import PooledWorlds
+from tests.cosim.conftest import drive, make_env, spawn
+from tests.cosim.test_followed_world import reference
+from tests.cosim.test_killed_followers import DRIVER
+
+STEPS = 8
+RIG: dict[str, dict[str, Any]] = {
+    "lidar": {"type": "lidar", "rate_hz": 10, "rays": 16, "z_m": 1.6, "noise": [0.02]},
+    "wheels": {"type": "odometry", "rate_hz": 20, "noise": [0.1]},
+}
+ROUGH = json.dumps({"seed": 3, "messages": {"Prepare": {"drop": 0.3}}, "crash_rate": 0.01})
+Seen = tuple[list[str], list[Sight]]
+
+
+def pool_of(env: cavmarl.CavEnv) -> Any:
+    worlds = env.worlds.worlds  # type: ignore[attr-defined] # behind their master's guard
+    assert isinstance(worlds, PooledWorlds)
+    return worlds.pool
+
+
+@pytest.mark.parametrize(("zones", "workers"), [(1, 1), (2, 1), (2, 2)])
+def test_killed_workers_are_replaced(
+    address: Path, start: Callable[..., threading.Thread], zones: int, workers: int
+) -> None:
+    env = make_env(zones=zones, workers=workers)
+    with closing(env), FollowedWorld(env, address) as world:
+        start(lambda: drive(address, ["car_1"]))
+        world.wait_for(1, 30.0)
+        world.reset(seed=1)
+        found = []
+        for step in range(STEPS):
+            if step % 3 == 1:
+                os.kill(pool_of(env).pids[step % workers], signal.SIGKILL)
+            world.step()
+            found.append(env.state_hash())
+        assert len(pool_of(env).deaths) == 3
+    assert found == reference(STEPS, {"car_1": None})
+
+
+def test_killed_followers_are_let_go(address: Path) -> None:
+    env = make_env(zones=2, workers=2)
+    with (
+        closing(env),
+        FollowedWorld(env, address) as world,
+        spawn(DRIVER, address, "car_0") as process,
+    ):
+        try:
+            world.wait_for(1, 60.0)
+            world.reset(seed=1)
+            world.step()
+            process.kill()
+            process.wait()
+            os.kill(pool_of(env).pids[0], signal.SIGKILL)
+            with pytest.raises(FollowerLostError):
+                world.step()
+            assert world.seats == ()
+            assert env.state_hash() == reference(2, {"car_0": None})[-1]
+            world.step()
+            assert world.master.world_ticks.tolist() == [3]
+        finally:
+            process.kill()
+
+
+def _steer(sight: Sight) -> dict[str, list[float]]:
+    found = {}
+    for vehicle in sight.snapshot.vehicles:
+        speed = sight.sensors[vehicle]["wheels"].values[-1, 0] if sight.sensors[vehicle] else 0.0
+        found[vehicle] = [0.3 if speed < 6.0 else -0.2, 0.0]
+    return found
+
+
+def _followed(address: Path, start: Callable[..., threading.Thread], **more: Any) -> Seen:
+    """What a follower of two vehicles in town has seen, and the world's hashes."""
+    overrides = {"rig": RIG, "population.mode": "seats", "clock.ctrl_dt_s": 0.05}
+    env = cavmarl.parallel_env(
+        "grid4x4",
+        agents=4,
+        background=40,
+        zones=more.pop("zones", 1),
+        workers=more.pop("workers", 0),
+        sensor_workers=more.pop("sensor_workers", 0),
+        overrides=overrides | more,
+    )
+    sights: list[Sight] = []
+    hashes = []
+
+    def follow() -> None:
+        with Follower(address, ["car_0", "car_2"]) as follower:
+            for sight in follower:
+                sights.append(sight)
+                if not sight.snapshot.is_over:
+                    follower.answer(_steer(sight))
+
+    with closing(env), FollowedWorld(env, address, timeout_s=60.0) as world:
+        thread = start(follow)
+        world.wait_for(1, 30.0)
+        world.reset(seed=4)
+        for _ in range(STEPS):
+            world.step()
+            hashes.append(env.state_hash())
+    thread.join(30.0)
+    return hashes, sights
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory: pytest.TempPathFactory) -> Seen:
+    """The undivided world of one process."""
+    threads = []
+
+    def start(action: Callable[[], None]) -> threading.Thread:
+        threads.append(threading.Thread(target=action))
+        threads[0].start()
+        return threads[0]
+
+    return _followed(tmp_path_factory.mktemp("whole") / "s", start)
+
+
+@pytest.mark.parametrize(
+    "how",
+    [
+        {"zones.faults": ROUGH},
+        {"sensor_workers": 1},
+        {"zones.faults": ROUGH, "sensor_workers": 1},
+        {"workers": 1},
+        {"workers": 2},
+        {"workers": 1, "sensor_workers": 1},
+        {"workers": 1, "sensor_workers": 1, "zones.faults": ROUGH},
+    ],
+    ids=str,
+)
+def test_followers_see_the_same(
+    address: Path,
+    start: Callable[..., threading.Thread],
+    whole: Seen,
+    how: dict[str, Any],
+) -> None:
+    hashes, sights = _followed(address, start, zones=2, **how)
+    assert hashes == whole[0]
+    assert len(sights) == STEPS + 1
+    for found, expected in zip(sights, whole[1], strict=True):
+        assert found.snapshot == expected.snapshot
+        assert list(found.snapshot.vehicles) == ["car_0", "car_2"]
+        for vehicle, sensors in expected.sensors.items():
+            assert found.sensors[vehicle].keys() == sensors.keys()
+            for name, samples in sensors.items():
+                there = found.sensors[vehicle][name]
+                for ours, theirs in zip(vars(there).values(), vars(samples).values(), strict=True):
+                    assert ours.tobytes() == theirs.tobytes()
+
+
+def test_a_trace_needs_the_masters_process(address: Path) -> None:
+    with (
+        closing(make_env(workers=1)) as env,
+        pytest.raises(ConfigError, match="use workers=0"),
+    ):
+        FollowedWorld(env, address, trace=StepTrace())
+    assert not address.exists()

@@ -1,0 +1,213 @@
+"""Whoever calls and says what nobody understands: a typed error, and no harm to the world."""
+
+from __future__ import annotations
+
+import socket
+import threading
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from cavmarl.core.errors import FollowerError, FollowerMessageError
+from cavmarl.cosim.followers import reception
+from cavmarl.cosim.followers.followed_world import FollowedWorld
+from cavmarl.cosim.followers.follower_connection import Line
+from cavmarl.cosim.followers.follower_messages import (
+    FOLLOWERS,
+    ArrayView,
+    Control,
+    Hello,
+    Say,
+    Snapshot,
+    letter_of,
+    read_letter,
+)
+from cavmarl.parallel.hosts.framed_socket import Wire
+from tests.cosim.conftest import hashes, make_env, seated
+from tests.cosim.test_followed_world import reference
+
+
+def call(address: Path) -> socket.socket:
+    connection = socket.socket(socket.AF_UNIX)
+    connection.connect(str(address))
+    connection.settimeout(10.0)
+    return connection
+
+
+def refusal(connection: socket.socket) -> str:
+    """Why the world has hung up."""
+    line = Line(connection, "the world")
+    heard = line.hear(10.0)
+    assert heard.kind is Say.REFUSAL
+    line.close()
+    return str(heard.letter["reason"])
+
+
+def hello_in(version: int) -> bytes:
+    near, far = socket.socketpair()
+    wire = Wire(near, FOLLOWERS._replace(version=version))
+    wire.send(Say.HELLO, 0, letter_of(Hello("x", [])))
+    raw = far.recv(1 << 16)
+    wire.close()
+    far.close()
+    return raw
+
+
+def oversized() -> bytes:
+    raw = bytearray(hello_in(1))
+    raw[16:20] = (1 << 31).to_bytes(4, "little")
+    return bytes(raw)
+
+
+@pytest.mark.parametrize(
+    ("raw", "match"),
+    [
+        (b"GET / HTTP/1.1\r\nHost: localhost\r\n\r\n" + bytes(40), "begins no frame"),
+        (hello_in(2), "a frame of version 2, this is 1: install the same version"),
+        (oversized(), "bytes is none"),
+        (hello_in(1)[:-3] + b"\xff\xff\xff", "not what was sent"),
+    ],
+    ids=["another protocol", "another version", "too large", "damaged"],
+)
+def test_strangers_are_told_why_and_the_world_goes_on(
+    address: Path, raw: bytes, match: str
+) -> None:
+    with FollowedWorld(make_env(), address) as world:
+        world.reset(seed=1)
+        stranger = call(address)
+        stranger.sendall(raw)
+        found = hashes(world, 2)
+        found += hashes(world, 1)
+        assert match in refusal(stranger)
+        assert found == reference(3, {})
+
+
+def test_one_that_says_nothing_is_let_go(address: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(reception, "GREETING_S", 0.0)
+    with FollowedWorld(make_env(), address) as world:
+        world.reset(seed=1)
+        silent = call(address)
+        hashes(world, 3)
+        assert "said nothing" in refusal(silent)
+
+
+def test_one_that_stops_in_the_middle_of_a_word_does_not_hold_the_world_for_long(
+    address: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(reception, "HEARING_S", 0.05)
+    with FollowedWorld(make_env(), address) as world:
+        world.reset(seed=1)
+        half = call(address)
+        half.sendall(hello_in(1)[:20])
+        hashes(world, 3)
+        assert "within 0.05 s" in refusal(half)
+
+
+@pytest.mark.parametrize(
+    ("speak", "match"),
+    [
+        (lambda line: line.say(Say.HELLO, Hello("again", [])), "says HELLO"),
+        (lambda line: line._socket.sendall(b"garbage " * 20), "begins no frame"),
+        (lambda line: line._wire.send(Say.CONTROL, 0, {"frame": "x"}), "no Control"),
+        (lambda line: line._wire.send(Say.CONTROL, 0, None), "no Control"),
+        (
+            lambda line: line._wire.send(Say.CONTROL, 0, {"frame": 0, "controls": {}, "more": 1}),
+            "more",
+        ),
+    ],
+    ids=["hello twice", "garbage", "no number", "nothing", "more than is known"],
+)
+def test_a_follower_that_says_nonsense_is_let_go(
+    address: Path, speak: Callable[[Line], None], match: str
+) -> None:
+    with FollowedWorld(make_env(), address) as world:
+        follower = seated(world, ["car_0"])
+        speak(follower._line)
+        with pytest.raises(FollowerMessageError, match=match):
+            world.reset(seed=1)
+        assert hashes(world, 2) == reference(2, {})
+        follower.close()
+
+
+def test_a_hello_for_too_many_is_refused(address: Path) -> None:
+    with FollowedWorld(make_env(), address) as world:
+        line = Line(call(address), "world")
+        line.say(Say.HELLO, Hello("greedy", ["car_0"] * 5000))
+        world.reset(seed=0)
+        hashes(world, 2)
+        heard = line.hear(10.0)
+        assert "wants 5000 vehicles" in heard.letter["reason"]
+        line.close()
+
+
+@settings(max_examples=60, deadline=None)
+@given(st.binary(max_size=200))
+def test_any_bytes_are_a_frame_or_a_typed_error(raw: bytes) -> None:
+    near, far = socket.socketpair()
+    far.sendall(raw)
+    far.close()
+    line = Line(near, "somebody")
+    try:
+        heard = line.hear(5.0)
+        line.skip(heard)
+    except FollowerError:
+        pass
+    finally:
+        line.close()
+
+
+@settings(deadline=None)  # the first call makes what checks letters
+@given(
+    st.recursive(
+        st.none() | st.booleans() | st.integers() | st.floats() | st.text(max_size=5),
+        lambda inner: st.lists(inner, max_size=3) | st.dictionaries(st.text(max_size=5), inner),
+        max_leaves=8,
+    )
+)
+def test_any_letter_is_a_message_or_a_typed_error(letter: object) -> None:
+    for kind in (Hello, Control, Snapshot):
+        try:
+            read_letter(kind, letter)
+        except FollowerMessageError:
+            pass
+
+
+@pytest.mark.parametrize(
+    ("dtype", "shape", "stamps", "words"),
+    [
+        ("O", [1], 1, "dtype 'O' is none of"),
+        ("<f4,<f4", [1], 1, "dtype '<f4,<f4' is none of"),
+        ("<f4", [], 1, "no array has the shape"),
+        ("<f4", [-1], 1, "no array has the shape"),
+        ("<f4", [0] + [1 << 40] * 2, 0, "no array has the shape"),
+        ("<f4", [1] * 40, 1, "no array has the shape"),
+        ("<f4", [2, 3], 1, "2 samples with 1 stamps"),
+    ],
+)
+def test_arrays_that_cannot_be_are_refused(
+    dtype: str, shape: list[int], stamps: int, words: str
+) -> None:
+    near, far = socket.socketpair()
+    view = ArrayView("car_0", "lidar", dtype, shape, [0.0] * stamps, [False] * stamps)
+    world, line = Line(far, "a follower"), Line(near, "the world")
+    try:
+        world.say(Say.SNAPSHOT, Snapshot(0, 0, 0, 0.0, False, {}, [view]))
+        with pytest.raises(FollowerMessageError, match=words):
+            line.take(line.hear(5.0))
+    finally:
+        line.close()
+        world.close()
+
+
+def test_a_port_of_this_machine_will_do_too() -> None:
+    with FollowedWorld(make_env(), 0) as world:
+        assert isinstance(world.address, int)
+        follower = seated(world, ["car_0"])
+        caller = threading.Thread(target=lambda: [follower.wait(), follower.leave()])
+        caller.start()
+        world.reset(seed=0)
+        caller.join(10.0)
+        assert world.seats == ()

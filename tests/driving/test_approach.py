@@ -1,0 +1,68 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from cavmarl.core.records.arrays import Scratch
+from cavmarl.driving.kernels.approach import register_links
+from cavmarl.engine.simulation import Simulation
+from cavmarl.roads.routing import PLAN
+from tests.naive import approach as naive
+from tests.support.driving import drive, make_traffic, start
+from tests.support.traffic import scratch
+
+CROWDS = {"merge": 30, "grid4x4": 60, "ring": 20}
+
+
+@pytest.fixture(params=CROWDS, scope="module")
+def world(request: pytest.FixtureRequest) -> Simulation:
+    """Traffic, a quarter of a minute after its start."""
+    simulation = make_traffic(request.param, background=CROWDS[request.param])
+    start(simulation, seed=4)
+    for _ in range(round(15.0 / simulation.config.clock.ctrl_dt_s)):
+        drive(simulation)
+    return simulation
+
+
+def listed(simulation: Simulation, rows: NDArray[np.void]) -> Scratch:
+    room = scratch(simulation.network, len(rows))
+    travel = simulation._tick.traffic.travel
+    step, step_at = np.zeros(len(rows), PLAN), np.zeros(len(rows), np.int64)
+    register_links(simulation.network.arrays, travel, rows, len(rows), step, step_at, room)
+    return room
+
+
+def entries(room: Scratch, link: int) -> list[tuple[int, float, float, float]]:
+    """(id, dist, speed, half) of a link, by id."""
+    found = room.approach[room.link_start[link] : room.link_end[link]]
+    assert (found["link"] == link).all()
+    return sorted((int(e["id"]), float(e["dist"]), e["speed"], e["half"]) for e in found)
+
+
+def test_every_link_lists_who_is_on_it_and_who_comes(world: Simulation) -> None:
+    travel, roads = world._tick.traffic.travel, world.network
+    for step in range(12):
+        for _ in range(step):
+            drive(world)
+        rows = world.vehicles()
+        room = listed(world, rows)
+        expected: dict[int, list[tuple[int, float, float, float]]] = {}
+        for row in rows:
+            for link, name, dist in naive.announcements(roads, travel, row):
+                entry = (name, dist, row["speed"], 0.5 * row["length"])
+                expected.setdefault(link, []).append(entry)
+        for link in range(len(roads.links)):
+            twin = sorted(expected.get(link, []))
+            assert len(entries(room, link)) == len(twin), link
+            for mine, other in zip(entries(room, link), twin, strict=True):
+                assert mine == pytest.approx(other)
+
+
+def test_the_order_of_rows_does_not_matter(world: Simulation) -> None:
+    rows = world.vehicles()
+    order = np.random.default_rng(1).permutation(len(rows))
+    tidy, shuffled = listed(world, rows), listed(world, rows[order])
+    np.testing.assert_array_equal(tidy.links.bounds, shuffled.links.bounds)
+    for link in range(len(world.network.links)):
+        assert entries(tidy, link) == entries(shuffled, link)

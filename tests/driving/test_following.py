@@ -1,0 +1,171 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from cavmarl.core.records.codes import MODEL_IDM, MODEL_KRAUSS
+from cavmarl.driving.kernels.following import (
+    LINE_MARGIN_M,
+    accel_behind,
+    before_line,
+    behind,
+    no_press,
+    response,
+    speed_behind,
+    wish,
+)
+from cavmarl.driving.vehicle_types import CLASS_DEFAULTS, VTYPE, generated_types
+from tests.naive import following as naive
+
+DT = 0.1
+IDM = generated_types()[0]
+SPEEDS = st.floats(0.0, 40.0)
+GAPS = st.floats(-2.0, 200.0)
+DECELS = st.floats(1.0, 9.0)
+SHARES = st.floats(0.0, 1.0, exclude_max=True)
+
+
+def krauss(sigma: float = 0.5) -> np.void:
+    """SUMO's passenger car."""
+    car = np.zeros(1, VTYPE)[0]
+    for field, value in CLASS_DEFAULTS["passenger"]._asdict().items():
+        if field in (VTYPE.names or ()):
+            car[field] = value
+    car["model"], car["tau"], car["sigma"] = MODEL_KRAUSS, 1.0, sigma
+    return car
+
+
+KINDS = {"IDM": IDM, "Krauss": krauss(0.0)}
+
+
+def pressed(kind: np.void, speed: float, leaders: list[tuple[float, float, float]]) -> float:
+    press = no_press(kind)
+    for gap, front_speed, front_decel in leaders:
+        press = max(press, behind(kind, speed, gap, front_speed, front_decel))
+    return press
+
+
+LEADERS = st.lists(st.tuples(GAPS, SPEEDS, DECELS), max_size=3)
+
+
+@given(SPEEDS, st.floats(1.0, 40.0), LEADERS)
+def test_idms_response_equals_twin(
+    speed: float, allowed: float, leaders: list[tuple[float, float, float]]
+) -> None:
+    press = pressed(IDM, speed, leaders)
+    twin = naive.idm_response(IDM, speed, allowed, [(gap, front) for gap, front, _ in leaders])
+    assert response(IDM, speed, allowed, press, 0.3, DT) == pytest.approx(twin, abs=1e-9)
+
+
+@given(SPEEDS, st.floats(1.0, 40.0), LEADERS, SHARES, st.floats(0.0, 1.0))
+def test_krauss_response_equals_twin(
+    speed: float,
+    allowed: float,
+    leaders: list[tuple[float, float, float]],
+    share: float,
+    sigma: float,
+) -> None:
+    kind = krauss(sigma)
+    press = pressed(kind, speed, leaders)
+    twin = naive.krauss_response(kind, speed, allowed, leaders, share, DT)
+    assert response(kind, speed, allowed, press, share, DT) == pytest.approx(twin, abs=1e-6)
+
+
+@given(SPEEDS, LEADERS, SHARES)
+def test_krauss_never_brakes_below_a_stand(
+    speed: float, leaders: list[tuple[float, float, float]], share: float
+) -> None:
+    kind = krauss()
+    accel = response(kind, speed, 30.0, pressed(kind, speed, leaders), share, DT)
+    assert speed + accel * DT >= -1e-9
+    assert accel >= -kind["emergency_decel"]
+
+
+@pytest.mark.parametrize("name", KINDS)
+@given(speed=SPEEDS, gap=GAPS, more=st.floats(0.1, 50.0), front=SPEEDS)
+def test_who_is_nearer_presses_no_less(
+    name: str, speed: float, gap: float, more: float, front: float
+) -> None:
+    kind = KINDS[name]
+    near, far = (behind(kind, speed, at, front, kind["decel"]) for at in (gap, gap + more))
+    # IDM's desired gap may be negative behind one that speeds away: its square still presses.
+    desired = kind["tau"] * speed + speed * (speed - front) / 7.8
+    if kind["model"] == MODEL_KRAUSS or desired > -kind["min_gap"]:
+        assert near >= far
+    assert far >= no_press(kind)
+
+
+@pytest.mark.parametrize("name", KINDS)
+@given(gap=st.floats(-5.0, 150.0), front=SPEEDS, front_decel=DECELS)
+def test_at_the_speed_of_a_gap_a_driver_wants_just_that_gap(
+    name: str, gap: float, front: float, front_decel: float
+) -> None:
+    kind = KINDS[name]
+    speed = speed_behind(kind, gap, front, front_decel)
+    assert speed >= 0.0
+    if speed < 1e-3:
+        return
+    press = behind(kind, speed, gap, front, front_decel)
+    if kind["model"] == MODEL_IDM:
+        # The interaction at the desired gap is the largest acceleration.
+        assert press == pytest.approx(kind["accel"], rel=1e-6)
+    else:
+        assert -press == pytest.approx(speed)
+
+
+@pytest.mark.parametrize("name", KINDS)
+def test_a_wish_behind_one_leader_is_that_of_its_press(name: str) -> None:
+    kind = KINDS[name]
+    press = behind(kind, 12.0, 20.0, 9.0, 4.0)
+    assert accel_behind(kind, 12.0, 15.0, 20.0, 9.0, 4.0) == wish(kind, 12.0, 15.0, press)
+    assert wish(kind, 12.0, 15.0, no_press(kind)) > wish(kind, 12.0, 15.0, press)
+
+
+@pytest.mark.parametrize("name", KINDS)
+@pytest.mark.parametrize("dt", [0.05, 0.1, 0.2])
+@pytest.mark.parametrize("speed", [5.0, 14.0, 25.0])
+def test_a_driver_stops_with_its_front_just_before_a_line(
+    name: str, dt: float, speed: float
+) -> None:
+    kind = KINDS[name]
+    gap, hardest, desired = 90.0, 0.0, speed
+    for _ in range(round(60.0 / dt)):
+        accel = response(kind, speed, desired, before_line(kind, speed, gap, dt), 0.0, dt)
+        hardest = max(hardest, -accel)
+        speed = max(speed + accel * dt, 0.0)
+        gap -= speed * dt
+    assert speed < 0.1
+    assert 0.0 < gap < 2.0 * LINE_MARGIN_M
+    assert hardest < 1.25 * kind["decel"], "it can be foreseen"
+
+
+@pytest.mark.parametrize("name", KINDS)
+def test_a_follower_comes_to_stand_behind_who_brakes_hard(name: str) -> None:
+    kind = KINDS[name]
+    speed = front_speed = 14.0
+    gap = 25.0
+    for tick in range(400):
+        press = behind(kind, speed, gap, front_speed, kind["decel"])
+        accel = response(kind, speed, 14.0, press, 0.0, DT)
+        speed = max(speed + accel * DT, 0.0)
+        if tick > 50:
+            front_speed = max(front_speed - kind["decel"] * DT, 0.0)
+        gap += (front_speed - speed) * DT
+        assert gap > 0.5 * kind["min_gap"]
+    assert speed < 0.1
+    assert gap < kind["min_gap"] + 1.5
+
+
+@given(allowed=SPEEDS, further=st.floats(-40.0, 40.0), gap=st.floats(-2.0, 2.4), share=SHARES)
+def test_who_stands_close_behind_a_standing_leader_stays_whatever_lies_ahead(
+    allowed: float, further: float, gap: float, share: float
+) -> None:
+    # `drivers` looks no further then.
+    car = krauss()
+    press = behind(car, 0.0, gap, 0.0, 4.5)
+    assert press == 0.0
+    for whole in (press, max(press, further)):
+        assert response(car, 0.0, allowed, whole, share, DT) == 0.0
+    assert wish(car, 0.0, allowed, press) == wish(car, 0.0, 0.0, press) == 0.0

@@ -1,0 +1,471 @@
+"""Right of way, acted out: a few cars put by hand on the arms of a crossing, and who goes first."""
+
+from __future__ import annotations
+
+import subprocess
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from cavmarl.core.math.geometry import boxes_overlap, lane_pose
+from cavmarl.core.records.codes import DRIVER_AGENT
+from cavmarl.driving.kernels.announcing import STANDING_MPS
+from cavmarl.driving.kernels.junctions import _exit_blocked
+from cavmarl.driving.kernels.lane_index import index_lanes
+from cavmarl.engine.simulation import Simulation
+from cavmarl.roads.network import RoadNetwork
+from cavmarl.roads.sumo_net.reader import read_network
+from tests.support.driving import drive, make_traffic, start
+from tests.support.traffic import network as network_of
+from tests.support.traffic import on_lane, scratch, travel
+
+sumo = pytest.importorskip("sumo", reason="crossings are made by netconvert of the extra 'sumo'")
+
+ARM_M = 150
+NODES = {"W": (-ARM_M, 0), "E": (ARM_M, 0), "S": (0, -ARM_M), "N": (0, ARM_M)}
+
+
+@pytest.fixture(scope="module")
+def crossing(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], Path]:
+    """A west-east main road and a south-north side road that cross, by SUMO's type of the node."""
+    folder = tmp_path_factory.mktemp("crossings")
+
+    def build(kind: str) -> Path:
+        target = folder / f"{kind}.net.xml"
+        if target.exists():
+            return target
+        nodes = "".join(f'<node id="{n}" x="{x}" y="{y}"/>' for n, (x, y) in NODES.items())
+        edges = "".join(
+            f'<edge id="{arm}_{way}" from="{start}" to="{end}" speed="14" priority="{priority}"/>'
+            for arm, priority in (("W", 9), ("E", 9), ("S", 1), ("N", 1))
+            for way, start, end in (("in", arm, "c"), ("out", "c", arm))
+        )
+        (folder / "c.nod.xml").write_text(
+            f'<nodes>{nodes}<node id="c" x="0" y="0" type="{kind}"/></nodes>'
+        )
+        (folder / "c.edg.xml").write_text(f"<edges>{edges}</edges>")
+        binary = Path(sumo.SUMO_HOME) / "bin" / "netconvert"
+        command = [str(binary), "-n", "c.nod.xml", "-e", "c.edg.xml", "-o", target.name]
+        subprocess.run([*command, "--no-turnarounds"], cwd=folder, check=True, capture_output=True)
+        return target
+
+    return build
+
+
+class Scene:
+    """A crossing with the cars that were put on it; goes on tick by tick."""
+
+    def __init__(self, path: Path) -> None:
+        self.simulation: Simulation = make_traffic(
+            path, background=12, renewed=False, overrides={"clock.ctrl_dt_s": 0.05}
+        )
+        traffic = self.simulation._tick.traffic
+        vars(traffic)["demand"] = traffic.demand._replace(num_background=0)
+        start(self.simulation, seed=0)
+        self.names: list[str] = []
+
+    def put(self, name: str, lane: str, to_line_m: float, goal: str, **fields: Any) -> None:
+        """A car whose front is `to_line_m` before a lane's end and that drives to edge `goal`."""
+        network, worlds = self.simulation.network, self.simulation._shard.worlds
+        row = network.lane_ids.index(lane)
+        s = float(network.lanes[row]["length_m"]) - to_line_m - 2.5
+        goals = [network.edge_ids[edge] for edge in self.simulation.goal_edges]
+        travel = self.simulation._tick.traffic.travel
+        car = on_lane(network, row, s, travel, goal=goals.index(goal), **fields)
+        plan = self.simulation._tick.traffic.plans[car[0]["goal"], row]
+        car["to_go"] = plan["to_go"] - s
+        car["id"] = self.simulation.gate.next_id[0]
+        self.simulation.gate.next_id[0] += 1
+        worlds.rows[0, worlds.num_owned[0]] = car[0]
+        worlds.num_owned[0] += 1
+        worlds.num_rows[0] += 1
+        self.names.append(name)
+
+    def clear(self) -> None:
+        """Take all cars out."""
+        worlds = self.simulation._shard.worlds
+        worlds.num_owned[0] = worlds.num_rows[0] = self.simulation.gate.next_id[0] = 0
+        self.names.clear()
+
+    def __getitem__(self, name: str) -> Any:
+        """The record of a car that is still there."""
+        vehicles = self.simulation.vehicles()
+        return vehicles[vehicles["id"] == self.names.index(name)][0]
+
+    def run(self, seconds: float) -> Iterator[float]:
+        """Yields the time after each tick; nobody may touch anybody."""
+        for _ in range(round(seconds / 0.05)):
+            drive(self.simulation)
+            vehicles = self.simulation.vehicles()
+            assert (vehicles["hit"] < 0).all(), "a crash"
+            yield float(self.simulation.ticks()[0]) * 0.05
+
+    def entries(self, seconds: float) -> dict[str, float]:
+        """When each car's front crossed its line."""
+        times: dict[str, float] = {}
+        network = self.simulation.network
+        for time in self.run(seconds):
+            for car in self.simulation.vehicles():
+                name = self.names[car["id"]]
+                lane = network.lanes[car["lane"]]
+                front_is_over = car["s"] + 2.5 > lane["length_m"] and lane["num_links"] > 0
+                if name not in times and (front_is_over or lane["internal"]):
+                    times[name] = time
+        return times
+
+
+@pytest.fixture
+def scene(crossing: Callable[[str], Path]) -> Callable[[str], Scene]:
+    return lambda kind: Scene(crossing(kind))
+
+
+Make = Callable[[str], Scene]
+
+
+def test_alone_on_the_main_road_one_drives_through(scene: Make) -> None:
+    here = scene("priority")
+    here.put("main", "W_in_0", 60.0, "E_out", speed=14.0)
+    lowest = min(float(here["main"]["speed"]) for _ in here.run(8.0))
+    assert lowest > 12.0
+
+
+def test_the_side_road_gives_way_to_the_main_road(scene: Make) -> None:
+    here = scene("priority")
+    here.put("side", "S_in_0", 25.0, "N_out", speed=10.0)
+    here.put("main", "W_in_0", 45.0, "E_out", speed=14.0)
+    times = here.entries(12.0)
+    assert times["main"] < times["side"]
+    assert times["main"] < 4.5, "who has the right of way need not brake"
+
+
+def test_the_side_road_goes_first_where_the_gap_is_large(scene: Make) -> None:
+    here = scene("priority")
+    here.put("side", "S_in_0", 5.0, "N_out", speed=5.0)
+    here.put("main", "W_in_0", 135.0, "E_out", speed=12.0)
+    times = here.entries(15.0)
+    assert times["side"] < 3.0
+    assert times["side"] < times["main"]
+
+
+def test_the_side_road_waits_for_a_whole_column_and_then_goes(scene: Make) -> None:
+    here = scene("priority")
+    here.put("side", "S_in_0", 20.0, "N_out", speed=8.0)
+    for k in range(5):
+        here.put(f"main{k}", "W_in_0", 10.0 + 25.0 * k, "E_out", speed=13.0)
+    times = here.entries(30.0)
+    assert times["side"] > max(times[f"main{k}"] for k in range(5))
+
+
+@pytest.mark.parametrize(("waited_s", "first"), [(0.0, "main"), (30.0, "main"), (170.0, "side")])
+def test_who_has_given_way_for_long_is_let_in_by_who_can_brake(
+    scene: Make, waited_s: float, first: str
+) -> None:
+    here = scene("priority")
+    here.put("side", "S_in_0", 1.0, "N_out", wait_s=waited_s)
+    here.put("main", "W_in_0", 40.0, "E_out", speed=11.0)
+    times = here.entries(25.0)
+    assert set(times) == {"side", "main"}
+    assert min(times, key=lambda name: times[name]) == first
+
+
+def test_patience_does_not_run_into_who_cannot_brake_any_more(scene: Make) -> None:
+    here = scene("priority")
+    here.put("side", "S_in_0", 1.0, "N_out", wait_s=10_000.0)
+    here.put("main", "W_in_0", 12.0, "E_out", speed=13.0)
+    times = here.entries(10.0)  # nobody touches
+    assert times["main"] < times["side"]
+
+
+def test_a_left_turn_gives_way_to_who_comes_straight(scene: Make) -> None:
+    here = scene("priority")
+    here.put("left", "W_in_0", 20.0, "N_out", speed=10.0)
+    here.put("straight", "E_in_0", 30.0, "W_out", speed=13.0)
+    times = here.entries(15.0)
+    assert times["straight"] < times["left"]
+
+
+def test_right_comes_before_left_between_equals(scene: Make) -> None:
+    here = scene("right_before_left")
+    here.put("west", "W_in_0", 30.0, "E_out", speed=10.0)
+    here.put("south", "S_in_0", 30.0, "N_out", speed=10.0)
+    times = here.entries(15.0)
+    assert times["south"] < times["west"], "who comes from the right goes first"
+
+
+def test_four_at_once_between_equals_get_through(scene: Make) -> None:
+    here = scene("right_before_left")
+    ways = {"W": "E", "E": "W", "S": "N", "N": "S"}
+    for arm, goal in ways.items():
+        here.put(arm, f"{arm}_in_0", 30.0, f"{goal}_out", speed=10.0)
+    assert here.entries(40.0).keys() == set(ways)
+
+
+def test_a_stop_sign_makes_one_stand_even_if_nobody_comes(scene: Make) -> None:
+    here = scene("priority_stop")
+    here.put("side", "S_in_0", 40.0, "N_out", speed=12.0)
+    slowest = np.inf
+    stood = 0.0
+    for _ in here.run(20.0):
+        lane = here.simulation.network.lane_ids[here["side"]["lane"]]
+        if lane == "S_in_0":
+            slowest = min(slowest, float(here["side"]["speed"]))
+            stood = max(stood, float(here["side"]["wait_s"]))
+    assert slowest < 0.05
+    assert stood >= 0.5
+    assert here.simulation.network.lane_ids[here["side"]["lane"]] != "S_in_0", "then it goes on"
+
+
+def test_an_all_way_stop_lets_one_after_the_other_through(scene: Make) -> None:
+    here = scene("allway_stop")
+    ways = {"W": "E", "E": "W", "S": "N", "N": "S"}
+    for k, (arm, goal) in enumerate(ways.items()):
+        here.put(arm, f"{arm}_in_0", 30.0 + 10.0 * k, f"{goal}_out", speed=10.0)
+    slowest = dict.fromkeys(ways, np.inf)
+    lanes = here.simulation.network.lane_ids
+    passed = set()
+    for _ in here.run(45.0):
+        for car in here.simulation.vehicles():
+            arm = here.names[car["id"]]
+            if lanes[car["lane"]] == f"{arm}_in_0":
+                slowest[arm] = min(slowest[arm], float(car["speed"]))
+            else:
+                passed.add(arm)
+    assert passed == set(ways)
+    assert max(slowest.values()) < 0.1, "everybody stood"
+
+
+def shown(here: Scene, link: int) -> str:
+    """The letter that a link's signal shows."""
+    network = here.simulation.network
+    row = network.links[link]
+    phase = network.phases[here.simulation.signal_phases()[row["signal"]]]
+    return "rugGysoOY"[network.phase_states[phase["first_state"] + row["signal_index"]]]
+
+
+def test_at_red_one_stops_before_the_line_and_goes_at_green(scene: Make) -> None:
+    here = scene("traffic_light")
+    network = here.simulation.network
+    for arm, goal in (("W", "E_out"), ("S", "N_out")):
+        here.put(arm, f"{arm}_in_0", 60.0, goal, speed=13.0)
+    links = {
+        arm: int(here.simulation._tick.traffic.plans[here[arm]["goal"], here[arm]["lane"]]["link"])
+        for arm in ("W", "S")
+    }
+    stood = set()
+    crossed: dict[str, str] = {}
+    for _ in here.run(100.0):
+        for car in here.simulation.vehicles():
+            arm = here.names[car["id"]]
+            if network.lane_ids[car["lane"]] == f"{arm}_in_0":
+                front = float(network.lanes[car["lane"]]["length_m"] - car["s"] - 2.5)
+                if car["wait_s"] > 1.0 and shown(here, links[arm]) == "r":
+                    stood.add(arm)
+                    assert 0.0 < front < 3.0
+            elif arm not in crossed:
+                crossed[arm] = shown(here, links[arm])
+    assert stood, "one of them met red"
+    assert set(crossed) == {"W", "S"}
+    assert set(crossed.values()) <= set("gG")
+
+
+@pytest.mark.parametrize(("to_line_m", "goes"), [(8.0, True), (60.0, False)])
+def test_at_yellow_one_goes_on_only_if_stopping_would_be_hard(
+    scene: Make, to_line_m: float, goes: bool
+) -> None:
+    here = scene("traffic_light")
+    network = here.simulation.network
+    here.put("probe", "W_in_0", 140.0, "E_out")
+    link = int(
+        here.simulation._tick.traffic.plans[here["probe"]["goal"], here["probe"]["lane"]]["link"]
+    )
+    # On to the first tick of yellow, then put the car where it is to decide.
+    here.clear()
+    for _ in here.run(200.0):
+        if shown(here, link) == "y":
+            break
+    assert shown(here, link) == "y"
+    here.put("car", "W_in_0", to_line_m, "E_out", speed=13.0)
+    crossed_at = None
+    for _ in here.run(8.0):
+        on_arm = network.lane_ids[here["car"]["lane"]] == "W_in_0"
+        if not on_arm and crossed_at is None:
+            crossed_at = shown(here, link)
+    assert (crossed_at == "y") == goes
+    if not goes:
+        assert crossed_at is None
+        assert here["car"]["speed"] < 1.0
+
+
+def test_nobody_enters_where_there_is_no_room_beyond(scene: Make) -> None:
+    here = scene("priority")
+    network = here.simulation.network
+    length = float(network.lanes[network.lane_ids.index("E_out_0")]["length_m"])
+    # A car that stands for ever right behind the junction: its way ends there.
+    here.put("block", "E_out_0", length - 9.0, "E_out", agent=0)
+    here.simulation.vehicles()["driver"] = DRIVER_AGENT
+    here.put("next", "W_in_0", 40.0, "E_out", speed=12.0)
+    here.put("cross", "S_in_0", 60.0, "N_out", speed=10.0)
+    lanes = network.lane_ids
+    seen_cross = False
+    for _ in here.run(25.0):
+        vehicles = here.simulation.vehicles()
+        vehicles["speed"][vehicles["id"] == here.names.index("block")] = 0.0
+        assert lanes[here["next"]["lane"]] == "W_in_0", "it keeps the junction free"
+        crossing = vehicles[vehicles["id"] == here.names.index("cross")]
+        seen_cross |= bool(len(crossing) and lanes[crossing[0]["lane"]] == "N_out_0")
+    assert seen_cross, "so that others can cross"
+
+
+def test_a_left_turn_waits_inside_for_who_comes_and_goes_when_they_are_through(scene: Make) -> None:
+    here = scene("traffic_light")
+    network = here.simulation.network
+    here.put("probe", "W_in_0", 140.0, "N_out")
+    step = here.simulation._tick.traffic.plans[here["probe"]["goal"], here["probe"]["lane"]]
+    link = int(step["link"])
+    wait_m = float(network.links[link]["wait_m"])
+    assert np.isfinite(wait_m), "this turn has a waiting position"
+    here.clear()
+    for _ in here.run(200.0):
+        if shown(here, link) == "g":
+            break
+    assert shown(here, link) == "g"
+    here.put("left", "W_in_0", 10.0, "N_out", speed=8.0)
+    for k in range(4):
+        here.put(f"straight{k}", "E_in_0", 8.0 + 22.0 * k, "W_out", speed=11.0)
+    waited, left_at, through_at = 0.0, np.inf, 0.0
+    for time in here.run(25.0):
+        for car in here.simulation.vehicles():
+            name = here.names[car["id"]]
+            lane = network.lanes[car["lane"]]
+            edge = network.edge_ids[lane["edge"]]
+            if name == "left":
+                if lane["internal"] and car["speed"] < 0.1:
+                    front = lane["link_offset_m"] + car["s"] + 2.5
+                    assert wait_m - 2.0 < front < wait_m + 0.5
+                    waited = max(waited, float(car["wait_s"]))
+                if edge == "N_out":
+                    left_at = min(left_at, time)
+            elif edge != "W_out":
+                through_at = time
+        if left_at < np.inf:
+            break
+    assert waited > 1.0, "it stands on the junction, not before it"
+    assert through_at < left_at < through_at + 8.0
+
+
+def test_who_still_moves_on_the_junction_will_need_room_beyond_it(scene: Make) -> None:
+    here = scene("priority")
+    network = here.simulation.network
+    length = float(network.lanes[network.lane_ids.index("E_out_0")]["length_m"])
+    # Room for one car behind the one that stands for ever.
+    here.put("block", "E_out_0", length - 16.0, "E_out", agent=0)
+    here.simulation.vehicles()["driver"] = DRIVER_AGENT
+    here.put("first", "W_in_0", 15.0, "E_out", speed=10.0)
+    here.put("second", "W_in_0", 30.0, "E_out", speed=10.0)
+    lanes = network.lane_ids
+    for _ in here.run(25.0):
+        vehicles = here.simulation.vehicles()
+        vehicles["speed"][vehicles["id"] == here.names.index("block")] = 0.0
+        assert lanes[here["second"]["lane"]] == "W_in_0"
+    assert lanes[here["first"]["lane"]] == "E_out_0", "for the first one there was room"
+
+
+def test_links_from_one_lane_share_their_way_up_to_the_fork(
+    crossing: Callable[[str], Path],
+) -> None:
+    network = read_network(crossing("priority"))
+    for lane in np.flatnonzero(network.lanes["num_links"] > 1).tolist():
+        row = network.lanes[lane]
+        links = range(int(row["first_link"]), int(row["first_link"] + row["num_links"]))
+        paths = {link: path_of(network, link) for link in links}
+        for link in links:
+            fork = float(network.links[link]["fork_m"])
+            assert 0.0 < fork < network.links[link]["length_m"]
+            others = np.concatenate([paths[k][:, 1:] for k in links if k != link])
+            s, xy = paths[link][:, 0], paths[link][:, 1:]
+            apart = np.hypot(*(xy[:, None] - others[None]).transpose(2, 0, 1)).min(axis=1)
+            assert (apart[s < fork - 0.6] < 2.7).all(), "as near as two cars side by side"
+            beyond = apart[s > fork + 0.6]
+            assert beyond[0] > 2.5
+
+
+def path_of(network: RoadNetwork, link: int) -> NDArray[np.float64]:
+    """(n, 3) s, x and y of a link's way over its junction, every 0.1 m."""
+    rows, lane = [], int(network.links[link]["first_internal"])
+    while network.lanes[lane]["internal"]:
+        here = network.lanes[lane]
+        for s in np.arange(0.0, here["length_m"], 0.1):
+            x, y, *_ = lane_pose(network.points, here["first_point"], here["num_points"], s)
+            rows.append((here["link_offset_m"] + s, x, y))
+        lane = int(here["successor"])
+    return np.array(rows)
+
+
+@pytest.mark.parametrize("kind", ["priority", "right_before_left", "traffic_light"])
+def test_who_stands_at_a_stop_line_is_touched_by_nobody_who_drives_over(
+    crossing: Callable[[str], Path], kind: str
+) -> None:
+    network = read_network(crossing(kind))
+    for lane in np.flatnonzero(network.lanes["num_links"] > 0).tolist():
+        row = network.lanes[lane]
+        back = float(row["stop_back_m"])
+        assert 0.0 <= back <= 8.0
+        s = float(row["length_m"]) - back - 1.0 - 2.5
+        x, y, _, cos, sin, _ = lane_pose(network.points, row["first_point"], row["num_points"], s)
+        for link in range(len(network.links)):
+            other = network.lanes[network.links[link]["from_lane"]]
+            if other["edge"] == row["edge"]:
+                continue
+            path = path_of(network, link)
+            for k in range(2, len(path) - 2, 5):
+                heading = np.arctan2(*(path[k + 2] - path[k - 2])[:0:-1])
+                assert not boxes_overlap(
+                    x, y, cos, sin, 2.5, 1.0,
+                    path[k, 1], path[k, 2], np.cos(heading), np.sin(heading), 2.5, 0.9,
+                )  # fmt: skip
+
+
+@pytest.mark.parametrize(("pace", "brakes"), [(9.0, False), (3.0, True)])
+def test_who_gives_way_follows_a_faster_one_into_the_same_lane_and_waits_for_a_slower_one(
+    scene: Make, pace: float, brakes: bool
+) -> None:
+    here = scene("priority")
+    here.put("main", "W_in_0", -3.0, "E_out", speed=pace)
+    here.put("side", "N_in_0", 8.0, "E_out", speed=6.0)
+    slowest = min(float(here["side"]["speed"]) for _ in here.run(3.0))
+    assert (slowest < 5.9) == brakes
+
+
+@pytest.mark.parametrize(("place_m", "blocked"), [(74.0, True), (76.0, False)])
+def test_nobody_counts_who_stands_farther_beyond_the_junction_than_is_looked(
+    place_m: float, blocked: bool
+) -> None:
+    # A slow queue fills the way up to the one that stands: there is no room, wherever that is.
+    roads, ways = network_of("merge"), travel("merge")
+    link = next(
+        k
+        for k, row in enumerate(roads.links)
+        if roads.lanes["length_m"][_beyond(roads, int(row["next_lane"]))] > 200.0
+    )
+    lane = _beyond(roads, int(roads.links[link]["next_lane"]))
+    queue = [
+        on_lane(roads, lane, 4.0 + 8.0 * k, ways, id=k, speed=2.0 * STANDING_MPS) for k in range(9)
+    ]
+    standing = on_lane(roads, lane, place_m, ways, id=98)
+    before = on_lane(roads, int(roads.links[link]["from_lane"]), 5.0, ways, id=99, speed=10.0)
+    rows = np.concatenate([*queue, standing, before])
+    room = scratch(roads, len(rows))
+    index_lanes(roads.arrays, ways, rows, len(rows), room)
+    way = int(before[0]["way"])
+    assert _exit_blocked(roads.arrays, ways, rows[-1], link, way, room) == blocked
+
+
+def _beyond(roads: RoadNetwork, lane: int) -> int:
+    """The first lane from here on that is not part of a junction."""
+    while roads.lanes["internal"][lane]:
+        lane = int(roads.lanes["successor"][lane])
+    return lane

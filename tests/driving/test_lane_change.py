@@ -1,0 +1,39 @@
+from __future__ import annotations
+
+from hypothesis import given
+from hypothesis import strategies as st
+
+from cavmarl.driving.kernels.lane_change import mobil_accepts
+from tests.naive import lane_change as naive
+
+ACCEL = st.floats(-6.0, 3.0) | st.sampled_from([-2.0, 0.0, 0.2, 2.0])
+PAIR = st.tuples(ACCEL, ACCEL)
+
+
+@given(PAIR, PAIR, PAIR, st.booleans())
+def test_mobil_equals_twin(
+    own: tuple[float, float],
+    new_follower: tuple[float, float],
+    old_follower: tuple[float, float],
+    mandatory: bool,
+) -> None:
+    accepted = mobil_accepts(*own, *new_follower, *old_follower, mandatory)
+    assert accepted == naive.mobil_accepts(own, new_follower, old_follower, mandatory)
+
+
+def test_a_mandatory_change_needs_no_gain_but_safety() -> None:
+    assert mobil_accepts(1.0, -1.5, 0.0, -2.0, 0.0, 0.0, True)
+    assert not mobil_accepts(1.0, -1.5, 0.0, -2.0, 0.0, 0.0, False)
+    assert not mobil_accepts(1.0, -2.1, 0.0, -2.0, 0.0, 0.0, True)
+    assert not mobil_accepts(1.0, -1.5, 0.0, -2.1, 0.0, 0.0, True)
+
+
+def test_how_hard_a_change_may_make_one_brake_can_be_said() -> None:
+    assert mobil_accepts(1.0, -3.9, 0.0, -3.9, 0.0, 0.0, True, 4.0)
+    assert not mobil_accepts(1.0, -4.1, 0.0, -3.9, 0.0, 0.0, True, 4.0)
+    assert not mobil_accepts(1.0, -3.9, 0.0, -4.1, 0.0, 0.0, True, 4.0)
+
+
+def test_the_thresholds_themselves_are_accepted() -> None:
+    assert mobil_accepts(0.0, 0.2, 0.0, -2.0, 0.0, 0.0, False)
+    assert mobil_accepts(0.0, -2.0, 0.0, -2.0, 0.0, 0.0, True)

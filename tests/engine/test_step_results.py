@@ -1,0 +1,92 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from cavmarl.core.records.arrays import Gate, Outputs
+from cavmarl.core.records.codes import EVENT_ARRIVED, EVENT_COLLIDED, NUM_COUNTS
+from cavmarl.driving.vehicles import blank_vehicle
+from cavmarl.engine.kernels.step_results import Results, keep_last, report, report_who_goes_on
+from cavmarl.engine.world_setup import load_world
+from cavmarl.roads.network import RoadNetwork
+from cavmarl.traffic.departure_queue import make_gate
+from tests.naive import step_results as naive
+
+WORLDS, AGENTS, TERMS, HORIZON = 5, 4, 3, 7
+
+
+@pytest.fixture(scope="module")
+def network() -> RoadNetwork:
+    return load_world("merge").network
+
+
+def outputs_of(rng: np.random.Generator) -> Outputs:
+    shape = (WORLDS, AGENTS)
+    present = rng.random(shape) < 0.4
+    return Outputs(
+        observations=np.zeros((*shape, 2), np.float32),
+        terms=rng.random((*shape, TERMS), dtype=np.float32),
+        rewards=rng.random(shape, dtype=np.float32),
+        terminated=present & (rng.random(shape) < 0.2),
+        present=present,
+        acted=present & (rng.random(shape) < 0.8),
+        events=rng.choice([0, 1 << 20, EVENT_COLLIDED, EVENT_ARRIVED], shape).astype(np.int32),
+        vehicle_ids=rng.integers(-1, 99, shape),
+    )
+
+
+def gate_of(rng: np.random.Generator, network: RoadNetwork) -> Gate:
+    gate = make_gate(WORLDS, 6, network.arrays, blank_vehicle().dtype)
+    gate.num_queue[:] = rng.integers(0, 3, WORLDS)
+    gate.queue["agent"] = rng.integers(-1, 2, gate.queue.shape)
+    gate.counts[:] = rng.integers(0, 50, (WORLDS, NUM_COUNTS))
+    return gate
+
+
+def results_of() -> Results:
+    flags = [np.ones((WORLDS, AGENTS), np.bool_) for _ in range(5)]
+    terminations, truncations, acted, done, mask = flags
+    return Results(
+        rewards=np.zeros((WORLDS, AGENTS), np.float32),
+        terms=np.zeros((WORLDS, AGENTS, TERMS), np.float32),
+        terminations=terminations,
+        truncations=truncations,
+        acted=acted,
+        vehicle_done=done,
+        vehicle_ids=np.zeros((WORLDS, AGENTS), np.int64),
+        mask=mask,
+        arrivals=np.zeros(WORLDS, np.int64),
+        episode_over=np.ones(WORLDS, np.bool_),
+    )
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_report_is_that_of_one_array_after_the_other(seed: int, network: RoadNetwork) -> None:
+    rng = np.random.default_rng(seed)
+    outputs, gate = outputs_of(rng), gate_of(rng, network)
+    steps = rng.integers(0, HORIZON + 1, WORLDS)
+    expected_steps, found, expected = steps.copy(), results_of(), results_of()
+    ended = report(outputs, steps, HORIZON, found)
+    assert ended == naive.report(outputs, expected_steps, HORIZON, expected)
+    over = report_who_goes_on(outputs, gate, steps, HORIZON, found)
+    assert over == naive.report_who_goes_on(outputs, gate, expected_steps, HORIZON, expected)
+    np.testing.assert_array_equal(steps, expected_steps)
+    for name in Results._fields:
+        np.testing.assert_array_equal(getattr(found, name), getattr(expected, name), name)
+
+
+@pytest.mark.parametrize("in_next_step", [False, True])
+@pytest.mark.parametrize("seed", range(10))
+def test_what_those_saw_last_who_have_ended(
+    seed: int, in_next_step: bool, network: RoadNetwork
+) -> None:
+    rng = np.random.default_rng(seed)
+    results = results_of()
+    report(outputs_of(rng), np.zeros(WORLDS, np.int64), HORIZON, results)
+    results.episode_over[:] = rng.random(WORLDS) < 0.3
+    seen = rng.random((WORLDS, AGENTS, 6), dtype=np.float32)
+    found, expected = (seen.copy(), np.zeros_like(seen)), (seen.copy(), np.zeros_like(seen))
+    keep_last(results, *found, in_next_step)
+    naive.keep_last(results, *expected, in_next_step)
+    for array, other in zip(found, expected, strict=True):
+        np.testing.assert_array_equal(array, other)

@@ -1,0 +1,88 @@
+"""The names under which Gymnasium and PettingZoo find the entries, and what they give."""
+
+from __future__ import annotations
+
+import gymnasium
+import numpy as np
+import pettingzoo
+import pytest
+
+import cavmarl
+from cavmarl.config.registry import entries
+from cavmarl.core.seeds import check_seed, first_seed
+
+ALL = sorted(entries())
+
+
+@pytest.mark.parametrize("name", ALL)
+def test_every_entry_has_its_ids(name: str) -> None:
+    assert f"cavmarl/{name}-v0" in gymnasium.registry
+    assert f"cavmarl/{name}Agents-v0" in gymnasium.registry
+    if not hasattr(pettingzoo, "make"):
+        pytest.skip("this PettingZoo has no registry")
+    for kind in ("parallel", "aec"):
+        world = pettingzoo.make(kind, f"cavmarl/{name}-v0", max_cycles=3)
+        world.reset(seed=0)
+        assert world.agents
+
+
+def test_the_aec_form_refuses_a_wrong_action_and_goes_on() -> None:
+    world = cavmarl.env("ring", agents=2, background=0)
+    world.reset(seed=0)
+    before = world.agent_selection
+    with pytest.raises(cavmarl.InvalidActionError, match="car_0"):
+        world.step(np.array([np.nan, 0.0]))
+    assert world.agent_selection == before
+    for _ in range(4):
+        world.step(np.zeros(2))
+    assert world.agent_selection == "car_0"
+
+
+@pytest.mark.parametrize("seed", [-1, 1 << 63, True, 1.0, "a"])
+def test_a_wrong_seed_is_refused_when_the_world_is_made(seed: object) -> None:
+    with pytest.raises(cavmarl.ConfigError, match="seed"):
+        cavmarl.parallel_env("ring", seed=seed)
+    with pytest.raises(cavmarl.ConfigError, match="seed"):
+        cavmarl.make_vec("ring", seed=seed)
+
+
+def test_without_a_seed_no_two_first_resets_agree() -> None:
+    assert first_seed(None, None) != first_seed(None, None)
+    assert first_seed(None, 5) == 5
+    assert first_seed(7, 5) == 7
+    assert check_seed(np.uint64(9)) == 9
+
+
+def test_numpy_numbers_are_numbers() -> None:
+    world = cavmarl.parallel_env(
+        "ring",
+        agents=np.int64(3),
+        background=np.int32(2),
+        max_cycles=np.int16(7),
+        overrides={"sensors.lidar.rays": np.uint8(16), "traffic.goals": np.int64(4)},
+    )
+    assert world.config.population.agents == 3
+    assert world.max_cycles == 7
+    assert world.config.sensors.lidar.rays == 16
+
+
+@pytest.mark.parametrize("env", [None, 3, ["ring"]])
+def test_what_is_no_name_is_refused(env: object) -> None:
+    with pytest.raises(cavmarl.UnknownEnvironmentError, match="must be the name"):
+        cavmarl.parallel_env(env)
+
+
+@pytest.mark.parametrize("overrides", [[1, 2], "sensors", 3])
+def test_overrides_are_a_mapping(overrides: object) -> None:
+    with pytest.raises(cavmarl.ConfigError, match="must be a mapping"):
+        cavmarl.parallel_env("ring", overrides=overrides)
+
+
+def test_keys_of_overrides_are_text() -> None:
+    with pytest.raises(cavmarl.ConfigError, match="3 is no key"):
+        cavmarl.parallel_env("ring", overrides={3: 3})
+
+
+def test_a_horizon_is_a_whole_number_of_steps() -> None:
+    with pytest.raises(cavmarl.ConfigError, match=r"horizon_s = 1\.04.*try 1$"):
+        cavmarl.parallel_env("ring", overrides={"horizon_s": 1.04})

@@ -1,0 +1,191 @@
+"""SUMO's side of the comparison, on SUMO's own small maps."""
+
+from __future__ import annotations
+
+import gzip
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from cavmarl.core.errors import ConfigError, MissingExtraError
+from cavmarl.evaluate.traffic.sumo_side import (
+    SumoJob,
+    _VehicleReader,
+    run_sumo,
+    start_sumo,
+    sumo_process,
+)
+from cavmarl.roads.sumo_net.reader import read_network
+from cavmarl.traffic.sumo.sumo_input import SumoInput, read_input, without_outputs
+
+sumo = pytest.importorskip("sumo", reason="needs the extra 'sumo'")
+pytest.importorskip("libsumo", reason="needs the extra 'sumo'")
+
+GAME = Path(sumo.SUMO_HOME) / "tools" / "game"
+MAP = GAME / "kuehne" / "kuehne.net.xml"
+ROUTES = GAME / "kuehne" / "kuehne.rou.xml"
+
+
+def job(demand: SumoInput, map_file: Path = MAP, seconds: int = 60, seed: int = 1) -> SumoJob:
+    return SumoJob(map_file, demand, seconds, dt_s=0.5, seed=seed)
+
+
+def one_car(tmp_path: Path) -> SumoInput:
+    """A car that drives straight on from the first second, at the limit or as fast as it can."""
+    path = tmp_path / "one.rou.xml"
+    path.write_text(
+        '<routes><vType id="steady" sigma="0" speedDev="0" length="4"/>'
+        '<vehicle id="a" type="steady" depart="0" departSpeed="max">'
+        '<route edges="left0A0 A0B0 B0right0"/></vehicle></routes>'
+    )
+    return read_input([path])
+
+
+def test_a_run_is_counted_and_measured() -> None:
+    run = run_sumo(job(read_input([ROUTES]), seconds=120))
+    figures = run.figures
+    # A flow every 2 s and one every 4 s, each of one vehicle at once from second 0.
+    assert figures.departed + figures.waiting == 90
+    assert 0 < figures.arrived < figures.departed
+    assert figures.mean_speed_mps is not None
+    assert 3.0 < figures.mean_speed_mps < 13.0
+    assert figures.mean_delay_s is not None
+    assert figures.mean_delay_s > 0.0
+    assert figures.queue > 0.0
+    assert figures.teleports == 0
+    assert set(np.unique(run.edge_minutes["minute"])) == {0, 1}
+
+
+def test_equal_seeds_give_equal_runs() -> None:
+    demand = read_input([ROUTES])
+    first, second, other = (run_sumo(job(demand, seed=seed)).figures for seed in (1, 1, 2))
+    assert first == second
+    assert first != other
+
+
+def test_one_car_alone(tmp_path: Path) -> None:
+    run = run_sumo(job(one_car(tmp_path), seconds=180))
+    figures = run.figures
+    assert (figures.departed, figures.waiting, figures.arrived) == (1, 0, 1)
+    assert (figures.contacts, figures.teleports) == (0, 0)
+    assert len(set(run.edge_minutes["edge"].tolist())) == 3
+
+
+def test_without_teleports_nobody_is_moved() -> None:
+    cross = read_input([GAME / "cross.sumocfg"])
+    # The signals of this map wait for a player; a vehicle that waits for long would be moved.
+    eager = SumoInput(cross.route_files, cross.additional_files, options={"time-to-teleport": "20"})
+    moved, stuck = (
+        SumoJob(GAME / "cross" / "cross.net.xml", eager, 120, 0.5, 1, teleports)
+        for teleports in (True, False)
+    )
+    assert run_sumo(moved).figures.teleports > 0
+    assert run_sumo(stuck).figures.teleports == 0
+
+
+def test_demand_of_another_map_is_refused_in_sumos_words() -> None:
+    with pytest.raises(ConfigError, match=r"cross\.net\.xml: SUMO refuses this demand: .*edge"):
+        run_sumo(job(read_input([ROUTES]), GAME / "cross" / "cross.net.xml"))
+
+
+def test_a_refusal_names_the_map_of_a_configuration() -> None:
+    with pytest.raises(ConfigError, match=r"the map that it was made for, .*cross\.net\.xml"):
+        run_sumo(job(read_input([GAME / "cross_demo.sumocfg"])))
+
+
+def test_without_sumo_it_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
+    demand = read_input([ROUTES])
+
+    def absent(module: str) -> None:
+        raise ModuleNotFoundError(name=module)
+
+    monkeypatch.setattr("cavmarl.core.errors.importlib.import_module", absent)
+    with pytest.raises(MissingExtraError, match=r"pip install 'cavmarl\[sumo\]'"):
+        run_sumo(job(demand))
+
+
+def test_a_configuration_gives_files_begin_and_options() -> None:
+    found = read_input([GAME / "fokr_bs_demo.sumocfg"])
+    assert found.net_file == GAME / "fokr_bs_demo" / "fokr_bs.net.xml.gz"
+    assert [path.name for path in found.additional_files] == [
+        "vtypes_default.add.xml",
+        "signalPlan.add.xml",
+    ]
+    assert len(found.route_files) == 3
+    assert found.begin_s == 15 * 3600.0
+    assert "pedestrian.striping.stripe-width" in found.options
+    assert not {"step-length", "end", "gui-settings-file", "demo"} & found.options.keys()
+
+
+def test_files_are_sorted_by_what_stands_in_them(tmp_path: Path) -> None:
+    routes, types = tmp_path / "a.xml", tmp_path / "b.xml.gz"
+    routes.write_text("<!-- first --><routes/>")
+    types.write_bytes(gzip.compress(b"<additional/>"))
+    found = read_input([types, routes])
+    assert found == SumoInput((routes,), (types,))
+
+
+@pytest.mark.parametrize(
+    ("text", "says"),
+    [
+        ("<routes", "line 1: broken XML"),
+        ("<net/>", "<net> is no demand"),
+        ("<!DOCTYPE a><routes/>", "document type"),
+    ],
+)
+def test_what_is_no_demand_is_refused(tmp_path: Path, text: str, says: str) -> None:
+    path = tmp_path / "wrong.rou.xml"
+    path.write_text(text)
+    with pytest.raises(ConfigError, match=says):
+        read_input([path])
+
+
+def test_missing_files_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match="no demand"):
+        read_input([])
+    with pytest.raises(ConfigError, match=r"none\.rou\.xml: cannot be read"):
+        read_input([tmp_path / "none.rou.xml"])
+    config = tmp_path / "run.sumocfg"
+    config.write_text(
+        '<configuration><input><net-file value="gone.net.xml"/></input></configuration>'
+    )
+    with pytest.raises(ConfigError, match=r"run\.sumocfg: names .*gone\.net\.xml"):
+        read_input([config])
+
+
+def test_detectors_write_nothing(tmp_path: Path) -> None:
+    path = tmp_path / "detectors.add.xml"
+    path.write_text(
+        '<additional><vType id="a"/>\n<e1Detector id="d" lane="x" file="out.xml" freq="60"/>'
+        '<rerouter id="r" edges="x" file="in.xml"/></additional>'
+    )
+    copies = tmp_path / "copies"
+    copies.mkdir()
+    written = without_outputs(path, copies).read_text()
+    assert 'file="NUL"' in written
+    assert "out.xml" not in written
+    assert 'file="in.xml"' in written
+    path.write_text("<additional/>")
+    assert without_outputs(path, copies) == path
+
+
+def test_places_are_turned_from_front_bumper_and_compass(tmp_path: Path) -> None:
+    """The car drives to the east: heading 0, and its centre half a length behind its front."""
+    with sumo_process(job(one_car(tmp_path))) as process:
+        x, y, heading, length, front = process.submit(
+            _first_place, job(one_car(tmp_path)), tmp_path
+        ).result()
+    assert heading == pytest.approx(0.0, abs=1e-6)
+    assert length == 4.0
+    assert (x, y) == pytest.approx((front[0] - 2.0, front[1]))
+
+
+def _first_place(
+    given: SumoJob, folder: Path
+) -> tuple[float, float, float, float, tuple[float, float]]:
+    libsumo = start_sumo(given, folder)
+    libsumo.simulationStep()
+    row = _VehicleReader(libsumo, read_network(given.map_file)).rows()[0]
+    front = libsumo.vehicle.getPosition("a")
+    return row["x"], row["y"], row["heading"], row["length"], front

@@ -1,0 +1,330 @@
+"""Each invariant of a divided world, violated on purpose, is caught by the monitor at run time."""
+
+from __future__ import annotations
+
+import json
+from typing import Any
+
+import numpy as np
+import pytest
+
+from cavmarl.core.errors import InvariantError
+from cavmarl.engine.simulation import Simulation
+from cavmarl.handoff import shard_setup as dividing
+from cavmarl.handoff.division import Division
+from cavmarl.ownership.messages import Ack, Birth, Done, Message
+from cavmarl.zones.kernels.zone_lookup import is_inside, squared_distance
+from tests.support.driving import drive, make_simulation, start
+
+STEPS = 8
+LOSSES = {"drop": 0.2, "duplicate": 0.2, "delay": 0.2, "reorder": 0.3}
+FAULTS = {
+    "lost messages": {
+        "messages": {
+            "Step": LOSSES,
+            "Done": LOSSES,
+            "Prepare": {**LOSSES, "corrupt": 0.1, "refuse": 0.1},
+            "Ack": LOSSES,
+            "Nack": LOSSES,
+            "Abort": LOSSES,
+        }
+    },
+    "deaths": {"crash_rate": 0.004},
+    "both": {"crash_rate": 0.002, "messages": {"Prepare": LOSSES, "Ack": LOSSES}},
+}
+
+
+def watched(env: str = "grid4x4", worlds: int = 1, **overrides: Any) -> Simulation:
+    simulation = make_simulation(
+        env,
+        mode="seats",
+        agents=4,
+        background=40,
+        num_worlds=worlds,
+        overrides={"zones.count": 4, "zones.check": True, "clock.sim_dt_s": 0.1, **overrides},
+    )
+    start(simulation, seed=1)
+    return simulation
+
+
+@pytest.fixture
+def simulation() -> Simulation:
+    """Some steps old."""
+    found = watched()
+    for _ in range(STEPS):
+        drive(found)
+    return found
+
+
+@pytest.mark.parametrize("env", ["ring", "merge", "grid4x4", "town"])
+def test_a_clean_run_passes(env: str) -> None:
+    simulation = watched(env, worlds=2)
+    for _ in range(25):
+        drive(simulation)
+    simulation.reset(np.array([False, True]))
+    for _ in range(5):
+        drive(simulation)
+
+
+@pytest.mark.parametrize("name", FAULTS)
+def test_a_run_with_faults_passes(name: str) -> None:
+    simulation = watched(**{"zones.faults": json.dumps({"seed": 5, **FAULTS[name]})})
+    for _ in range(60):
+        drive(simulation)
+    assert simulation.migrations > 5
+    assert bool(simulation.revivals) == ("crash_rate" in FAULTS[name])
+
+
+class Meddling:
+    """Puts a hand into the rows just before the monitor looks."""
+
+    def __init__(self, simulation: Simulation, monkeypatch: pytest.MonkeyPatch) -> None:
+        self.simulation, self._patch = simulation, monkeypatch
+        self.division: Division = simulation._tick.division
+
+    def zone(self, zone: int) -> tuple[Any, int, int]:
+        """Rows, owned ones and all of a zone."""
+        worlds = self.simulation._shards[zone].worlds
+        return worlds.rows[0], int(worlds.num_owned[0]), int(worlds.num_rows[0])
+
+    def caught(self, meddle: Any, words: str) -> None:
+        coordination: Any = self.simulation._tick.coordination
+        look = coordination.check
+
+        def check() -> None:
+            meddle()
+            look()
+
+        self._patch.setattr(coordination, "check", check)
+        with pytest.raises(InvariantError, match=words):
+            drive(self.simulation)
+
+
+@pytest.fixture
+def meddling(simulation: Simulation, monkeypatch: pytest.MonkeyPatch) -> Meddling:
+    return Meddling(simulation, monkeypatch)
+
+
+def test_a_vehicle_that_two_zones_own(meddling: Meddling) -> None:
+    def meddle() -> None:
+        rows, owned, _ = meddling.zone(1)
+        others = meddling.simulation._shards[2].worlds
+        rows[owned] = others.rows[0, 0]
+        meddling.simulation._shards[1].worlds.num_owned[0] += 1
+
+    meddling.caught(meddle, r"tick \d+ of world 0: one owner: vehicle \d+ is owned by zones \[1, 2")
+
+
+def test_a_vehicle_that_is_advanced_twice(meddling: Meddling) -> None:
+    def meddle() -> None:
+        meddling.zone(0)[0]["tick"][0] += 1
+
+    meddling.caught(meddle, r"advanced once a tick: vehicle \d+ of zone 0 is at tick \d+, but shou")
+
+
+def test_a_vehicle_that_jumps(meddling: Meddling) -> None:
+    def meddle() -> None:
+        meddling.zone(3)[0]["x"][0] += 40.0
+
+    meddling.caught(meddle, r"continuity: vehicle \d+ of zone 3 moved \d+\.\d+ m in a tick, from")
+
+
+def test_a_vehicle_without_a_place(meddling: Meddling) -> None:
+    def meddle() -> None:
+        meddling.zone(3)[0]["x"][0] = np.nan
+
+    meddling.caught(meddle, r"continuity: vehicle \d+ of zone 3 moved nan m")
+
+
+def test_a_vehicle_that_is_lost(meddling: Meddling) -> None:
+    def meddle() -> None:
+        rows, owned, num = meddling.zone(2)
+        worlds = meddling.simulation._shards[2].worlds
+        rows[owned - 1 : num - 1] = rows[owned:num].copy()
+        worlds.num_owned[0] -= 1
+        worlds.num_rows[0] -= 1
+
+    meddling.caught(meddle, r"population: vehicle \d+ of zone 2, epoch \d+, is lost: \d+ vehicles")
+
+
+def test_a_vehicle_that_has_never_entered(meddling: Meddling) -> None:
+    def meddle() -> None:
+        rows, owned, _ = meddling.zone(2)
+        rows[owned] = rows[0]
+        rows[owned]["id"], rows[owned]["tick"] = 9_999, meddling.simulation.ticks()[0] - 1
+        meddling.simulation._shards[2].worlds.num_owned[0] += 1
+
+    meddling.caught(meddle, r"population: vehicle 9999 of zone 2 has never entered: \d+ vehicles")
+
+
+def test_a_row_whose_epoch_is_not_that_on_record(meddling: Meddling) -> None:
+    def meddle() -> None:
+        meddling.zone(1)[0]["epoch"][0] += 1
+
+    meddling.caught(
+        meddle, r"owner on record: vehicle \d+ is with zone 1 at epoch \d+, but the dir"
+    )
+
+
+def test_a_row_that_is_with_another_zone_than_on_record(meddling: Meddling) -> None:
+    def meddle() -> None:
+        source, target = (meddling.simulation._shards[zone].worlds for zone in (0, 1))
+        own, other = source.rows[0, 0].copy(), target.rows[0, 0].copy()
+        source.rows[0, 0], target.rows[0, 0] = other, own
+
+    meddling.caught(meddle, r"owner on record: vehicle \d+ is with zone \d at epoch \d+, but the d")
+
+
+def test_a_clock_that_is_late(meddling: Meddling) -> None:
+    def meddle() -> None:
+        shard = meddling.simulation._shards[2]
+        shard.worlds = shard.worlds._replace(ticks=shard.worlds.ticks - 1)
+
+    meddling.caught(meddle, r"one clock: zone 2 is at tick \d+, not at \d+")
+
+
+def test_a_ghost_of_the_tick_before(meddling: Meddling) -> None:
+    def meddle() -> None:
+        rows, owned, num = meddling.zone(1)
+        assert num > owned
+        rows[owned]["tick"] -= 1
+
+    meddling.caught(meddle, r"age of ghosts: zone 1 has vehicle \d+ with tick = \d+, but its owner")
+
+
+def test_a_ghost_that_somebody_has_written(meddling: Meddling) -> None:
+    def meddle() -> None:
+        rows, owned, _ = meddling.zone(1)
+        rows[owned]["speed"] += 0.5
+
+    meddling.caught(meddle, r"age of ghosts: zone 1 has vehicle \d+ with speed = ")
+
+
+def test_a_ghost_that_is_not_there(meddling: Meddling) -> None:
+    def meddle() -> None:
+        meddling.simulation._shards[1].worlds.num_rows[0] -= 1
+
+    meddling.caught(meddle, r"ghosts: zone 1 has 0 ghosts of vehicle \d+, not 1: zone \d owns")
+
+
+@pytest.fixture
+def narrow(monkeypatch: pytest.MonkeyPatch) -> Meddling:
+    """Zones that do not see the whole map, and have room for more ghosts."""
+    monkeypatch.setattr(dividing, "halo_m", lambda *_: 60.0)
+    found = watched()
+    drive(found)
+    return Meddling(found, monkeypatch)
+
+
+def test_a_ghost_that_is_there_twice(narrow: Meddling) -> None:
+    def meddle() -> None:
+        rows, owned, num = narrow.zone(1)
+        rows[num] = rows[owned]
+        narrow.simulation._shards[1].worlds.num_rows[0] += 1
+
+    narrow.caught(meddle, r"ghosts: zone 1 has 2 ghosts of vehicle \d+, not 1: zone \d owns it")
+
+
+def test_a_ghost_that_is_of_no_use(narrow: Meddling) -> None:
+    def meddle() -> None:
+        rows, _, num = narrow.zone(1)
+        others, owned, _ = narrow.zone(2)
+        rects = narrow.division.zones.rects
+        away = [squared_distance(rects, 1, row["x"], row["y"]) for row in others[:owned]]
+        rows[num] = others[int(np.argmax(away))]
+        narrow.simulation._shards[1].worlds.num_rows[0] += 1
+
+    narrow.caught(meddle, r"ghosts: zone 1 has 1 ghosts of vehicle \d+, not 0: zone 2 owns it")
+
+
+def test_a_ghost_of_nobody(narrow: Meddling) -> None:
+    def meddle() -> None:
+        rows, _, num = narrow.zone(1)
+        rows[num]["id"] = 7_777
+        narrow.simulation._shards[1].worlds.num_rows[0] += 1
+
+    narrow.caught(meddle, r"ghosts: zone 1 has a ghost of vehicle 7777, which is not there")
+
+
+def test_an_arrival_of_somebody_who_is_there(
+    narrow: Meddling, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """All sums hold: it is said to arrive, deep in a zone where nobody else sees it."""
+    coordination: Any = narrow.simulation._tick.coordination
+    coordinator = coordination.coordinators[0]
+
+    def meddle() -> None:
+        rows, owned, num = narrow.zone(1)
+        rect = narrow.division.halo.inner[1]
+        inside = [is_inside(rect, row["x"], row["y"]) for row in rows[:owned]]
+        rows[owned + 1 : num + 1] = rows[owned:num].copy()
+        rows[owned] = rows[inside.index(True)]
+        rows[owned]["id"] = vehicle = narrow.zone(2)[0][0]["id"]
+        rows[owned]["epoch"], rows[owned]["tick"] = 0, narrow.simulation.ticks()[0] - 1
+        worlds = narrow.simulation._shards[1].worlds
+        worlds.num_owned[0] += 1
+        worlds.num_rows[0] += 1
+        monkeypatch.setattr(coordinator, "notes", lambda: ((Birth(int(vehicle), 1, b""),), ()))
+
+    narrow.caught(meddle, r"one owner: vehicle \d+ is owned by zones \[1, 2\]")
+
+
+def test_an_arrival_that_nobody_has_told_of(monkeypatch: pytest.MonkeyPatch) -> None:
+    simulation = watched(**{"zones.faults": "{}"})
+    coordination: Any = simulation._tick.coordination
+    coordinator = coordination.coordinators[0]
+    coordinator._births.append(Birth(8_888, 0, b""))
+    monkeypatch.setattr(coordinator, "notes", lambda: ((Birth(8_888, 0, b""),), ()))
+    with pytest.raises(InvariantError, match="vehicle 8888 of zone 0, epoch 0, is lost"):
+        drive(simulation)
+
+
+@pytest.mark.parametrize(
+    ("kind", "words"),
+    [(Ack, "without an ACK of tick"), (Done, "has not said DONE")],
+)
+def test_a_step_of_a_transfer_that_is_left_out(kind: type[Message], words: str) -> None:
+    simulation = watched(**{"zones.faults": "{}"})
+    coordination: Any = simulation._tick.coordination
+    coordinator = coordination.coordinators[0]
+    (record,) = coordinator._watchers[1:]
+    heard = record.delivered
+
+    def deaf(destination: int, message: Message) -> None:
+        if not isinstance(message, kind):
+            heard(destination, message)
+
+    record.delivered = deaf
+
+    def long_drive() -> None:
+        for _ in range(60):
+            drive(simulation)
+
+    with pytest.raises(InvariantError, match=rf"tick \d+: order of records and .*{words}"):
+        long_drive()
+
+
+@pytest.mark.parametrize("faults", ["", "{}"], ids=["directly", "by messages"])
+def test_the_monitor_takes_as_much_memory_as_it_began_with(faults: str) -> None:
+    simulation = watched(**{"zones.faults": faults})
+    coordination: Any = simulation._tick.coordination
+    monitor = coordination._monitor
+    kept = {id(part.rows) for part in monitor._kept[0]}
+    for _ in range(100):
+        drive(simulation)
+    assert {id(part.rows) for part in monitor._kept[0]} == kept
+    assert len(monitor._vehicles[0]) <= simulation.capacity
+    checker = coordination.coordinators[0]._watchers[-1]._checker
+    assert len(checker.owners) <= simulation.capacity
+    assert len(checker._born.above) <= simulation.capacity
+    assert len(checker._holdings) <= 18
+    assert sum(map(len, checker._heard.values())) < 2_000
+
+
+def test_ghosts_that_are_handed_out_cannot_be_written(simulation: Simulation) -> None:
+    ghosts = simulation.ghosts(1)
+    assert len(ghosts)
+    with pytest.raises(ValueError, match="read-only"):
+        ghosts["x"][0] = 0.0
+    with pytest.raises(ValueError, match="read-only"):
+        ghosts[0]["x"] = 0.0

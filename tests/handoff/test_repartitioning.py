@@ -1,0 +1,135 @@
+"""Zones that become others while a world runs: nobody can tell, and they are fuller alike."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from cavmarl.bench.recut_speed import measure_recutting
+from cavmarl.core.errors import ConfigError
+from cavmarl.engine.simulation import Simulation
+from cavmarl.env.vector import make_vec
+from tests.support.driving import drive, make_simulation, start
+
+OFTEN = {"zones.recut_steps": 3, "zones.recut_tolerance": 0.0, "zones.check": True}
+
+
+def worlds(env: str, zones: int, mode: str = "seats", **overrides: Any) -> Simulation:
+    made = make_simulation(
+        env, mode=mode, agents=6, background=40, num_worlds=2,
+        overrides={"zones.count": zones, **overrides},
+    )  # fmt: skip
+    start(made, seed=4)
+    return made
+
+
+@pytest.mark.parametrize("zones", [2, 4, 9])
+@pytest.mark.parametrize(("env", "mode"), [("grid4x4", "seats"), ("merge", "entering")])
+def test_a_world_that_is_cut_anew_is_the_undivided_one(env: str, mode: str, zones: int) -> None:
+    whole, recut = worlds(env, 1, mode), worlds(env, zones, mode, **OFTEN)
+    for _ in range(80):
+        drive(whole)
+        drive(recut)
+        for w in range(2):
+            assert whole.state_hash(w) == recut.state_hash(w)
+        for name, expected in whole.outputs._asdict().items():
+            assert expected.tobytes() == getattr(recut.outputs, name).tobytes(), name
+    assert len(recut.recuts) > 2
+    assert recut.migrations > sum(change.moved for change in recut.recuts) // 2 > 0
+
+
+def test_who_enters_in_the_last_tick_before_the_cut_goes_to_its_new_zone() -> None:
+    recut = worlds("merge", 4, "entering", **OFTEN)
+    entered = 0
+    for _ in range(120):
+        drive(recut)
+        pending = [coordinator.notes()[0] for coordinator in recut.coordinators]
+        for w, births in enumerate(pending):
+            for birth in births:
+                zone, row = recut._tick.division.find(w, birth.vehicle)
+                place = recut._tick.division.owned(w, zone)[row]
+                assert zone == birth.zone == recut.partition.zone_of(place["x"], place["y"])
+                entered += len(recut.recuts) > 0
+    assert entered > 0
+
+
+def test_the_journal_of_a_world_that_is_cut_anew_tells_of_each_move(tmp_path: Path) -> None:
+    path = tmp_path / "run.jsonl"
+    recut = make_simulation(
+        "rush", mode="closed", agents=20, background=0,
+        overrides={"zones.count": 4, "zones.journal": str(path), **OFTEN},
+    )  # fmt: skip
+    start(recut, seed=1)
+    for _ in range(30):
+        drive(recut)
+    lines = [json.loads(line) for line in path.read_text().splitlines()]
+    assert sum(len(line.get("switches", ())) for line in lines) == recut.migrations > 20
+
+
+def test_a_crowd_of_fifty_is_shared_out() -> None:
+    found = measure_recutting(
+        "rush", zones=4, every=10, steps=60, seeds=3, overrides={"population.agents": 50}
+    )
+    static, recut = found.rows
+    assert found.vehicles <= 50
+    assert min(static.imbalance) > 2.0
+    assert max(recut.imbalance) < 0.75 * min(static.imbalance)
+    assert (found.ratios < 0.75).all()
+    assert static.recuts == 0 < recut.recuts
+    assert recut.recut_ms is not None
+    assert recut.recut_ms > 0.0
+
+
+def test_zones_that_are_even_stay() -> None:
+    calm = worlds("grid4x4", 2, **{"zones.recut_steps": 3, "zones.recut_tolerance": 0.9})
+    before = calm.partition
+    for _ in range(30):
+        drive(calm)
+    assert calm.recuts == []
+    assert calm.partition is before
+
+
+def test_worlds_of_workers_are_cut_anew_too() -> None:
+    overrides = {"zones.recut_steps": 3, "zones.recut_tolerance": 0.0}
+    alone, shared = (
+        make_vec("grid4x4", num_envs=2, zones=4, workers=workers, overrides=overrides)
+        for workers in (0, 2)
+    )
+    try:
+        for vec in (alone, shared):
+            vec.reset(seed=2)
+        for _ in range(20):
+            actions = alone.suggest_actions()
+            for ours, theirs in zip(alone.step(actions)[:2], shared.step(actions)[:2], strict=True):
+                np.testing.assert_array_equal(ours, theirs)
+        assert [alone.state_hash(w) for w in range(2)] == [shared.state_hash(w) for w in range(2)]
+    finally:
+        shared.close()
+
+
+@pytest.mark.parametrize(
+    ("overrides", "words"),
+    [
+        ({"zones.recut_steps": -1}, "zones.recut_steps"),
+        ({"zones.recut_tolerance": float("nan")}, "zones.recut_tolerance"),
+        ({"zones.recut_steps": 5, "zones.faults": '{"drop": 0.1}'}, "must not be late"),
+    ],
+)
+def test_what_cannot_be_cut_anew_is_refused(overrides: dict[str, Any], words: str) -> None:
+    with pytest.raises(ConfigError, match=words):
+        make_vec("grid4x4", zones=2, overrides=overrides)
+
+
+def test_zones_of_one_world_over_workers_stay() -> None:
+    with pytest.raises(ConfigError, match="over workers needs zones that stay"):
+        make_vec("grid4x4", zones=4, workers=2, overrides={"zones.recut_steps": 5})
+
+
+@pytest.mark.parametrize("wrong", [{"zones": 1}, {"every": 0}, {"steps": 0}, {"seeds": 0}])
+def test_measuring_nothing_is_refused(wrong: dict[str, int]) -> None:
+    with pytest.raises(ConfigError, match="must be at least"):
+        measure_recutting("rush", **wrong)

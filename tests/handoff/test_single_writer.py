@@ -1,0 +1,108 @@
+"""One zone drives a vehicle and senses for it: what others are told of it changes nothing."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from cavmarl.engine.simulation import Simulation
+from cavmarl.handoff.fault_injection.fault_plan import Faults
+from cavmarl.handoff.fault_injection.injected_faults import Crashes, FaultyPhases
+from cavmarl.shards.executor import Executor, Phase
+from cavmarl.shards.shard import Commands, Shard
+from tests.support.driving import drive, make_simulation, start
+
+STEPS = 40
+AGENTS = 12
+
+
+def divided(kind: str) -> Simulation:
+    settings = {"zones.count": 4, "zones.check": True, "action.kind": kind}
+    simulation = make_simulation(
+        "grid4x4", mode="seats", agents=AGENTS, background=40, overrides=settings
+    )
+    start(simulation, seed=3)
+    return simulation
+
+
+class Strict:
+    """Calls shards one after the other, and looks at who commands and who senses.
+
+    Args:
+        simulation: whose phases it runs.
+        strangers: what a zone is commanded for agents that it does not own.
+    """
+
+    def __init__(self, simulation: Simulation, strangers: float) -> None:
+        self.controlled = 0
+        self.sensed: list[set[int]] = []
+        hosts = FaultyPhases(simulation._shards, Crashes(Faults()))._hosts
+        self._hosts = [(simulation._shards[zone], host) for zone, host in hosts]
+        self._strangers = strangers
+
+    def each(self, phase: Phase, *arguments: Any) -> None:
+        for shard, host in self._hosts:
+            if phase in ("begin_step", "advance"):
+                host.each(phase, self._own(shard, *arguments))
+            elif phase == "sense":
+                self._sense(shard, host, *arguments)
+            else:
+                host.each(phase, *arguments)
+
+    def _own(self, shard: Shard, commands: Commands) -> Commands:
+        others = ~np.isin(np.arange(commands.controls.shape[1]), agents_of(shard))
+        controls, meta_actions = commands.controls.copy(), commands.meta_actions.copy()
+        controls[:, others] = self._strangers
+        meta_actions[:, others] = 4
+        self.controlled += int(others.sum())
+        return Commands(controls, meta_actions)
+
+    def _sense(self, shard: Shard, host: Executor, chosen: NDArray[np.bool_]) -> None:
+        """Nobody's outputs but those of owned agents are written."""
+        owned, outputs = agents_of(shard), shard.outputs
+        before = [array.copy() for array in outputs]
+        host.each("sense", chosen)
+        others = ~np.isin(np.arange(outputs.present.shape[1]), owned)
+        for array, old in zip(outputs, before, strict=True):
+            assert array[:, others].tobytes() == old[:, others].tobytes()
+        self.sensed.append(set(owned.tolist()))
+
+
+def agents_of(shard: Shard) -> NDArray[np.int64]:
+    """Agents whose vehicles a zone owns."""
+    agents: NDArray[np.int64] = shard.worlds.rows["agent"][0, : shard.worlds.num_owned[0]]
+    return agents[agents >= 0]
+
+
+@pytest.mark.parametrize(("kind", "strangers"), [("continuous", np.nan), ("discrete", 1e9)])
+def test_a_control_counts_where_the_vehicle_is_owned_and_nowhere_else(
+    kind: str, strangers: float
+) -> None:
+    plain, watched = divided(kind), divided(kind)
+    strict = Strict(watched, strangers)
+    watched._tick.executor = strict
+    for _ in range(STEPS):
+        for simulation in (plain, watched):
+            drive(simulation)
+        assert watched.state_hash() == plain.state_hash()
+        assert watched.outputs.observations.tobytes() == plain.outputs.observations.tobytes()
+        zones = strict.sensed[-4:]
+        assert sum(map(len, zones)) == len(set.union(*zones))
+    assert watched.migrations > 0
+    assert strict.controlled > STEPS * AGENTS
+
+
+def test_a_control_that_its_owner_does_not_get_is_missed() -> None:
+    plain, watched = divided("continuous"), divided("continuous")
+    watched._tick.executor = Strict(watched, 0.0)
+    shard = watched._shards[0]
+    agent = int(agents_of(shard)[0])
+    for simulation in (plain, watched):
+        shape = simulation.outputs.present.shape
+        controls = np.zeros((*shape, 2))
+        controls[0, agent, 0] = 2.0 if simulation is plain else 0.0
+        simulation.step(Commands(controls, np.zeros(shape, dtype=np.int64)))
+    assert watched.state_hash() != plain.state_hash()

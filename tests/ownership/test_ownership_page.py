@@ -1,0 +1,64 @@
+"""docs/ownership.md says what the code does: its tables and diagrams are made from the code."""
+
+from __future__ import annotations
+
+import inspect
+import re
+from dataclasses import fields
+from pathlib import Path
+
+from cavmarl.ownership import safeguards
+from cavmarl.ownership.codec import KINDS as MESSAGES
+from cavmarl.ownership.log_records import KINDS as RECORDS
+from cavmarl.ownership.messages import Message, Record
+from cavmarl.ownership.safeguards import Safeguards
+from cavmarl.ownership.transitions import Party, mermaid
+from tests.ownership import test_rules
+from tests.support.generated import check_block, table
+
+PAGE = Path(__file__).resolve().parents[2] / "docs/ownership.md"
+
+
+def meaning(kind: type) -> str:
+    return " ".join((inspect.getdoc(kind) or "").split("\n\n")[0].split())
+
+
+def own_fields(kind: type, base: type) -> str:
+    inherited = {field.name for field in fields(base)}
+    return ", ".join(f"`{f.name}`" for f in fields(kind) if f.name not in inherited)
+
+
+def test_the_page_lists_every_message() -> None:
+    rows = [(kind.__name__.upper(), meaning(kind), own_fields(kind, Message)) for kind in MESSAGES]
+    check_block(PAGE, "messages", table(("message", "from → to: meaning", "fields"), rows))
+
+
+def test_the_page_lists_every_record() -> None:
+    rows = [(name, meaning(kind), own_fields(kind, Record)) for name, kind in RECORDS.items()]
+    check_block(PAGE, "records", table(("record", "meaning", "fields"), rows))
+
+
+def test_the_page_shows_every_transition() -> None:
+    parts = [f"{party.value.capitalize()}:\n\n```mermaid\n{mermaid(party)}\n```" for party in Party]
+    check_block(PAGE, "diagrams", "\n\n".join(parts))
+
+
+def test_the_page_lists_every_safeguard() -> None:
+    lines = re.findall(r"    (\w+): bool = True  # (.*?): (.*)", inspect.getsource(safeguards))
+    assert [name for name, _, _ in lines] == [field.name for field in fields(Safeguards)]
+    rows = [(hole, remedy, f"`{name}`") for name, hole, remedy in lines]
+    check_block(PAGE, "safeguards", table(("hole", "remedy", "switch"), rows))
+
+
+def test_the_program_of_the_page_runs() -> None:
+    program, *_ = re.findall(r"```python\n(.*?)```", PAGE.read_text(encoding="utf-8"), re.DOTALL)
+    exec(compile(program, str(PAGE), "exec"), {})
+
+
+def test_the_page_and_the_tests_have_the_same_rules() -> None:
+    text = PAGE.read_text(encoding="utf-8")
+    listed = re.findall(r"^\| R(\d+) \|.*\| `(\w+)` \|$", text, re.MULTILINE)
+    tests = [name for name in vars(test_rules) if re.match(r"test_r\d\d_", name)]
+    assert [name for _, name in listed] == [name for name in tests if name in text]
+    assert {number for number, _ in listed} == {str(int(name[6:8])) for name in tests}
+    assert all(name.startswith(f"test_r{int(number):02}_") for number, name in listed)

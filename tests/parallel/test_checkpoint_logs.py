@@ -1,0 +1,105 @@
+"""Workers that die around the step in which their diary begins anew, and diaries by themselves."""
+
+from __future__ import annotations
+
+import os
+import signal
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+import pytest
+
+from cavmarl.engine.world_setup import load_world
+from cavmarl.parallel.checkpoint.checkpoint_log import STEPS, Diary, make_segments
+from cavmarl.parallel.processes.state_image import load_kernels
+from cavmarl.shards.shard import Commands
+from tests.support.vec_runs import Make, drive, pool_of, same
+
+pytestmark = pytest.mark.filterwarnings("ignore:workers = :RuntimeWarning")
+
+WHOLE = {"num_envs": 2}
+SPLIT = {"zones": 4}
+
+
+@pytest.mark.parametrize("kind", [WHOLE, SPLIT])
+@pytest.mark.parametrize("worker", [0, 1])
+def test_a_worker_that_dies_when_the_diary_is_full(
+    make: Make, kind: dict[str, Any], worker: int
+) -> None:
+    wanted = {**kind, "agents": 4, "background": 20, "max_cycles": 60}
+    steps = 2 * STEPS + 4
+    whole = drive(make("grid4x4", **wanted), steps=steps)
+    vec = make("grid4x4", workers=2, **wanted)
+    at = {STEPS - 1, STEPS, STEPS + 1, STEPS + 2, 2 * STEPS, 2 * STEPS + 1}
+
+    def strike(step: int) -> None:
+        if step in at:
+            os.kill(pool_of(vec).pids[worker], signal.SIGKILL)
+
+    assert same(drive(vec, steps=steps, before=strike), whole)
+    assert [death.worker for death in pool_of(vec).deaths] == [worker] * len(at)
+
+
+@pytest.mark.parametrize("kind", [WHOLE, SPLIT])
+def test_worlds_that_are_reset_when_the_diary_is_full(make: Make, kind: dict[str, Any]) -> None:
+    wanted = {**kind, "agents": 4, "background": 20, "max_cycles": 60}
+
+    def run(workers: int) -> list[Any]:
+        vec = make("grid4x4", workers=workers, **wanted)
+
+        def before(step: int) -> None:
+            if step in (STEPS, STEPS + 3):
+                chosen = np.arange(vec.num_envs) == 0
+                vec.reset(options={"reset_mask": chosen})
+            if workers and step in (STEPS, STEPS + 1, STEPS + 3):
+                os.kill(pool_of(vec).pids[0], signal.SIGKILL)
+
+        return drive(vec, steps=STEPS + 6, before=before)
+
+    assert same(run(2), run(0))
+
+
+@pytest.fixture
+def diary() -> Iterator[Diary]:
+    load_kernels()
+    config = load_world("merge").config
+    segments = make_segments(config, 1)
+    yield Diary(config, 1, [segment.fd for segment in segments])
+    for segment in segments:
+        segment.close()
+
+
+def commands_like(entry: Commands, value: int) -> Commands:
+    return Commands(
+        np.full_like(entry.controls, value),
+        np.full_like(entry.meta_actions, value),
+        np.full_like(entry.declared, value),
+    )
+
+
+def noted(diary: Diary) -> list[float]:
+    return [float(entry.controls.flat[0]) for entry in diary.steps()]
+
+
+def state_of(diary: Diary) -> list[float]:
+    (found,) = diary.state([np.zeros(3)])
+    return [float(value) for value in found]
+
+
+def test_what_is_committed_stays_until_the_next_is(diary: Diary) -> None:
+    diary.prepare([np.full(3, 1.0)])
+    diary.begin()
+    for value in range(STEPS):
+        diary.note(commands_like(diary.entries[0], value))
+    assert diary.is_full
+    committed = diary.place.copy()
+    diary.prepare([np.full(3, 2.0)])
+    assert diary.is_prepared
+    assert (state_of(diary), len(diary)) == ([1.0] * 3, STEPS), "nothing has begun anew"
+    diary.begin()
+    diary.note(commands_like(diary.entries[0], 99))
+    assert (state_of(diary), noted(diary)) == ([2.0] * 3, [99.0])
+    diary.go_to(committed)  # the order in which it began anew was not committed
+    assert (state_of(diary), noted(diary)) == ([1.0] * 3, [float(k) for k in range(STEPS)])
+    assert not diary.is_prepared

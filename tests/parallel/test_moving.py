@@ -1,0 +1,261 @@
+"""Worlds and zones that change their worker while they are stepped: nobody can tell."""
+
+from __future__ import annotations
+
+import logging
+import os
+import random
+import signal
+from pathlib import Path
+from threading import Timer
+from typing import Any
+
+import numpy as np
+import pytest
+
+from cavmarl import ConfigError, make_vec
+from cavmarl.balance.balance_plan import replan
+from cavmarl.balance.load_score import Candidate, Utilisation
+from cavmarl.balance.load_snapshot import Snapshot
+from cavmarl.balance.plan_file import plan_from_dict
+from cavmarl.config.registry import entries
+from cavmarl.core.errors import NoAdmissibleWorkerError
+from cavmarl.parallel.pooled_worlds import PooledWorlds
+from cavmarl.parallel.processes.worker_pool import Pool
+from cavmarl.parallel.step_placement import Placement
+from cavmarl.parallel.worlds_job import Task
+from tests.support.rerouting import CARS, DEVICE, FLOW, make_map, write_demand
+from tests.support.sumo_worlds import write_stops
+from tests.support.vec_runs import Make, drive, pool_of, same
+
+pytestmark = pytest.mark.filterwarnings("ignore:workers = :RuntimeWarning")
+
+RESTLESS = {"workers.balance_steps": 2, "workers.tolerance": 0.0, "workers.max_moves": 64}
+
+
+@pytest.fixture
+def uneven(monkeypatch: pytest.MonkeyPatch) -> list[int]:
+    """Costs that are another shard's in every round; how many shards each round has moved."""
+    rng = np.random.default_rng(3)
+    moved: list[int] = []
+    round_ = Placement.round
+
+    def lie(self: Placement, spent_s: Any, steps: int, pids: Any) -> bool:
+        wrong = self._before_s + rng.exponential(1.0, spent_s.shape) ** 3
+        result = round_(self, wrong, steps, pids)
+        moved.append(sum(len(plan.moves) for plan in self.plans))
+        return result
+
+    monkeypatch.setattr(Placement, "round", lie)
+    return moved
+
+
+@pytest.mark.parametrize("zones", [1, 4])
+@pytest.mark.parametrize("env", sorted(entries()))
+def test_worlds_that_move_are_the_same(make: Make, uneven: list[int], env: str, zones: int) -> None:
+    wanted = {"num_envs": 6, "max_cycles": 8, "zones": zones}
+    whole = drive(make(env, **wanted))
+    for workers in (2, 3):
+        uneven.clear()
+        vec = make(env, workers=workers, overrides=RESTLESS, **wanted)
+        assert same(drive(vec), whole), workers
+        assert sum(uneven) > 0
+
+
+STACKED = {"sensors.stack": 3, "population.mode": "seats", "action.kind": "discrete"}
+
+
+@pytest.mark.parametrize("more", [{"autoreset_mode": "NextStep"}, {"overrides": STACKED}])
+def test_whatever_else_is_asked_for(make: Make, uneven: list[int], more: dict[str, Any]) -> None:
+    wanted = {"num_envs": 5, "agents": 3, "background": 10, "max_cycles": 5, **more}
+    whole = drive(make("merge", **wanted), steps=20)
+    wanted["overrides"] = {**wanted.get("overrides", {}), **RESTLESS}
+    assert same(drive(make("merge", workers=3, **wanted), steps=20), whole)
+    assert sum(uneven) > 0
+
+
+def test_vehicles_that_find_their_own_way_keep_it(
+    make: Make, uneven: list[int], tmp_path: Path
+) -> None:
+    files = write_demand(tmp_path, CARS.format(device=DEVICE) + FLOW)
+    overrides = {
+        "traffic.demand": [str(path) for path in files],
+        "clock.sim_dt_s": 0.2,
+        "clock.ctrl_dt_s": 1.0,
+        "horizon_s": 600.0,
+        "population.mode": "seats",
+        **RESTLESS,
+    }
+    wanted = {"num_envs": 4, "agents": 1, "background": 0, "overrides": overrides}
+    net = str(make_map(tmp_path))
+    whole = make(net, **wanted)
+    before = drive(whole, steps=400)
+    assert whole.traffic_stats()["rerouted"] > 0
+    assert same(drive(make(net, workers=2, **wanted), steps=400), before)
+    assert sum(uneven) > 0
+
+
+def test_worlds_with_demand_of_sumos_take_their_ways_along(
+    make: Make, uneven: list[int], tmp_path: Path
+) -> None:
+    """Those who drive and those who wait; ways and stops stand elsewhere in each worker."""
+    pytest.importorskip("libsumo", reason="needs the extra 'sumo'")
+    overrides: dict[str, Any] = {
+        "traffic.source": "sumo-demand",
+        "traffic.demand": [str(path) for path in write_stops(tmp_path)],
+        "sensors.signal.timing": False,
+        "clock.sim_dt_s": 0.2,
+        "clock.ctrl_dt_s": 1.0,
+    }
+    wanted = {"num_envs": 3, "agents": 1, "background": 0}
+    whole = drive(make("merge", overrides=overrides, **wanted), steps=40)
+    vec = make("merge", workers=2, overrides=overrides | RESTLESS, **wanted)
+    assert same(drive(vec, steps=40), whole)
+    assert sum(uneven) > 0
+
+
+def test_chosen_worlds_begin_anew_wherever_they_are(make: Make, uneven: list[int]) -> None:
+    chosen = np.array([False, True, False, True, True])
+    found = []
+    for workers in (0, 2):
+        vec = make("merge", num_envs=5, agents=2, workers=workers, overrides=RESTLESS)
+        drive(vec, steps=9)
+        observations, infos = vec.reset(options={"reset_mask": chosen})
+        vec.step(vec.suggest_actions())
+        found.append([observations, infos["mask"], *(vec.state_hash(w) for w in range(5))])
+    assert same(*found)
+    assert sum(uneven) > 0
+
+
+@pytest.mark.parametrize("how", [signal.SIGKILL, signal.SIGSTOP])
+@pytest.mark.parametrize("split", [False, True])
+def test_workers_that_die_while_something_moves(
+    make: Make, uneven: list[int], monkeypatch: pytest.MonkeyPatch, how: signal.Signals, split: bool
+) -> None:
+    wanted = {"num_envs": 1 if split else 5, "agents": 5, "background": 30, "max_cycles": 9}
+    whole = drive(make("grid4x4", **wanted), steps=40)
+    vec = make("grid4x4", zones=4, workers=2, overrides=RESTLESS, **wanted)
+    rng = random.Random(2)
+    run, timers = Pool.run, []
+
+    def strike(self: Pool, task: int, letter: Any = None, commits: bool = True) -> Any:
+        if task in (Task.PACK, Task.UNPACK, Task.HOST) and len(timers) < 8:
+            pid = self.pids[rng.randrange(2)]
+            timers.append(Timer(rng.uniform(0.0, 0.003), os.kill, (pid, how)))
+            timers[-1].start()
+        return run(self, task, letter, commits)
+
+    monkeypatch.setattr(Pool, "run", strike)
+    assert same(drive(vec, steps=40, before=lambda _: [t.join() for t in timers]), whole)
+    assert len(pool_of(vec).deaths) > 3
+    assert sum(uneven) > 0
+
+
+@pytest.mark.parametrize("split", [False, True])
+def test_who_dies_later_comes_back_with_what_it_had_last(
+    make: Make, uneven: list[int], split: bool
+) -> None:
+    wanted = {"num_envs": 1 if split else 5, "agents": 3, "background": 20, "max_cycles": 30}
+    whole = drive(make("grid4x4", **wanted), steps=45)
+    vec = make("grid4x4", zones=4, workers=2, overrides=RESTLESS, **wanted)
+
+    def strike(step: int) -> None:
+        if step % 9 == 8:
+            os.kill(pool_of(vec).pids[step % 2], signal.SIGKILL)
+        if step == 30:
+            os.kill(pool_of(vec).server_pid, signal.SIGKILL)
+
+    assert same(drive(vec, steps=45, before=strike), whole)
+    assert sum(uneven) > 0
+
+
+def test_a_move_that_fails_has_not_been(
+    make: Make, uneven: list[int], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    wanted = {"num_envs": 5, "agents": 3}
+    whole = drive(make("ring", **wanted))
+    vec = make("ring", workers=2, overrides=RESTLESS, **wanted)
+    run, failed = Pool.run, []
+
+    def interrupt(self: Pool, task: int, letter: Any = None, commits: bool = True) -> Any:
+        if task == Task.UNPACK and not failed:
+            failed.append(task)
+            self._open = self._all  # as if it came while the workers were at it
+            raise KeyboardInterrupt
+        return run(self, task, letter, commits)
+
+    monkeypatch.setattr(Pool, "run", interrupt)
+    step = type(vec).step
+
+    def again(self: Any, actions: Any) -> Any:
+        before = self.worlds.plans
+        try:
+            return step(self, actions)
+        except KeyboardInterrupt:
+            assert self.worlds.plans == before
+            return step(self, actions)
+
+    monkeypatch.setattr(type(vec), "step", again)
+    assert same(drive(vec), whole)
+    assert failed
+    assert sum(uneven) > 0
+
+
+def test_by_what_they_cost_worlds_move(make: Make) -> None:
+    """Half of the worlds are crowded: who hosts them gives some away."""
+    overrides = {"workers.balance_steps": 10, "workers.tolerance": 0.05}
+    vec = make("merge", num_envs=8, agents=1, background=60, workers=2, overrides=overrides)
+    assert isinstance(vec.worlds, PooledWorlds)
+    first = vec.worlds.plans
+    assert [plan.problem.cost_source for plan in first] == ["number"]
+    drive(vec, steps=60)
+    (plan,) = vec.worlds.plans
+    assert plan.problem.cost_source == "measured"
+    assert all(0.0 < shard.cost_s < 1.0 for shard in plan.problem.shards)
+    assert replan(plan, plan.problem.snapshot) == plan
+
+
+def test_the_plan_is_told_at_a_reset(make: Make, caplog: pytest.LogCaptureFixture) -> None:
+    vec = make("ring", num_envs=3, workers=2)
+    with caplog.at_level(logging.INFO, logger="cavmarl.workers"):
+        vec.reset(seed=0)
+        assert caplog.messages == [vec.plan_text()]
+        vec.reset(options={"reset_mask": np.array([True, False, False])})
+        assert len(caplog.messages) == 1
+    assert "3 worlds on 2 workers" in vec.plan_text()
+    assert [plan_from_dict(plan.to_dict()) for plan in vec.plans] == list(vec.plans)
+    assert make("ring").plan_text() == ""
+
+
+@pytest.mark.parametrize(
+    ("key", "value", "words"),
+    [
+        ("balance_steps", -1, "from 0 to 1000000"),
+        ("tolerance", -0.1, "0"),
+        ("tolerance", float("nan"), "from 0 to 100"),
+        ("max_moves", 0, "from 1"),
+    ],
+)
+def test_settings_that_cannot_be(key: str, value: float, words: str) -> None:
+    with pytest.raises(ConfigError, match=rf"workers\.{key}.*{words}"):
+        make_vec("ring", workers=1, overrides={f"workers.{key}": value})
+
+
+def test_workers_that_others_keep_busy(monkeypatch: pytest.MonkeyPatch) -> None:
+    busy = Snapshot(
+        (Candidate(0, Utilisation(0.1, 0.1)), Candidate(1, Utilisation(0.9, 0.1))), "none", ""
+    )
+    monkeypatch.setattr("cavmarl.balance.probe.take_snapshot", lambda workers: busy)
+    with pytest.raises(NoAdmissibleWorkerError, match=r"worker 1.*cpu.*fewer workers"):
+        make_vec("ring", num_envs=4, workers=2, overrides={"workers.watch": True})
+
+
+@pytest.mark.parametrize("env", ["grid4x4", "merge", "town"])
+def test_zones_that_move_are_the_same(make: Make, uneven: list[int], env: str) -> None:
+    wanted = {"agents": 8, "background": 30, "max_cycles": 8}
+    whole = drive(make(env, **wanted))
+    for zones, workers in ((4, 2), (9, 3)):
+        uneven.clear()
+        vec = make(env, zones=zones, workers=workers, overrides=RESTLESS, **wanted)
+        assert same(drive(vec), whole), (zones, workers)
+        assert sum(uneven) > 0

@@ -1,0 +1,101 @@
+"""The parallel environment over worker processes is the one of a single process, whoever dies."""
+
+from __future__ import annotations
+
+import os
+import signal
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+
+from cavmarl import CavEnv, ConfigError, parallel_env
+from cavmarl.core.errors import WorkerError
+from cavmarl.parallel.pooled_worlds import PooledWorlds
+from tests.parallel.test_worker_pool import alive
+
+SMALL = {"zones": 4, "agents": 4, "background": 12, "max_cycles": 20}
+
+
+def settings(mode: str, kind: str = "flat") -> dict[str, Any]:
+    keys = {"population.mode": mode, "population.budget": 7, "observation.kind": kind}
+    return SMALL | {"overrides": keys}
+
+
+def drive(env: CavEnv, before: Callable[[int], None] = lambda step: None) -> list[str]:
+    """All that comes out of two episodes, in words that tell floats apart."""
+    found: list[str] = []
+    rng = np.random.default_rng(3)
+    with np.printoptions(threshold=10**9, floatmode="unique"):
+        for seed in (5, None):
+            found.append(repr(env.reset(seed=seed)))
+            for step in range(10**4):
+                if not env.agents:
+                    break
+                suggested = env.suggest_actions()
+                noise = {agent: rng.normal(0.0, 0.5, 2) for agent in suggested}
+                actions = {
+                    agent: np.clip(action + noise[agent], -1.0, 1.0).astype(np.float32)
+                    for agent, action in suggested.items()
+                }
+                before(step)
+                found.append(repr(env.step(actions)))
+                found += [repr(env.state()), env.state_hash(), repr(env.agents)]
+            found.append(repr(env.traffic_stats()))
+    return found
+
+
+@pytest.mark.parametrize(
+    ("mode", "kind", "workers"),
+    [("closed", "flat", 1), ("closed", "dict", 2), ("entering", "flat", 2), ("seats", "flat", 2)],
+)
+def test_nobody_can_tell(mode: str, kind: str, workers: int) -> None:
+    whole = drive(parallel_env("grid4x4", **settings(mode, kind) | {"zones": 1}))
+    env = parallel_env("grid4x4", workers=workers, **settings(mode, kind))
+    assert drive(env) == whole
+    env.close()
+
+
+def test_workers_that_die_are_not_missed() -> None:
+    whole = drive(parallel_env("grid4x4", **settings("entering")))
+    env = parallel_env("grid4x4", workers=2, **settings("entering"))
+    assert isinstance(env.worlds, PooledWorlds)
+    pool = env.worlds.pool
+
+    def kill(step: int) -> None:
+        if step % 5 == 2:
+            os.kill(pool.pids[step % 2], signal.SIGKILL)
+
+    assert drive(env, before=kill) == whole
+    assert pool.deaths
+    env.close()
+
+
+def test_the_processes_end_with_the_environment() -> None:
+    env = parallel_env("grid4x4", workers=2, **settings("closed"))
+    env.reset(seed=0)
+    assert isinstance(env.worlds, PooledWorlds)
+    pids = env.worlds.pool.pids
+    with pytest.raises(ConfigError, match="workers=0"):
+        _ = env.simulation
+    env.close()
+    assert alive(pids) == []
+    with pytest.raises(WorkerError, match="closed"):
+        env.reset(seed=0)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        ({"hosts": "mars", "workers": 1}, r"hosts = 'mars': must be 'ray'"),
+        ({"hosts": "ray"}, r"hosts = 'ray' without workers"),
+        ({"workers": "two"}, r"workers = 'two': must be a whole number, or 'ray'"),
+        ({"workers": -1, "hosts": "ray"}, r"workers = -1: must be a number from 0"),
+        ({"workers": 5, "hosts": "ray", "zones": 4}, r"workers = 5, .* at most as many as zones"),
+        ({"workers": "ray", "render_mode": "rgb_array"}, r"workers = 'ray': only a world of the"),
+    ],
+)
+def test_hosts_that_cannot_be(arguments: dict[str, Any], words: str) -> None:
+    with pytest.raises(ConfigError, match=words):
+        parallel_env("ring", **arguments)

@@ -1,0 +1,62 @@
+"""Which node is given which host, and clusters that are not there."""
+
+from __future__ import annotations
+
+import pytest
+
+from cavmarl import ConfigError, make_vec
+from cavmarl.balance.load_score import Utilisation
+from cavmarl.core.errors import MissingExtraError, NoAdmissibleWorkerError
+from cavmarl.parallel.hosts.ray_cluster import Node, choose_nodes
+
+IDLE = Utilisation(0.0, 0.0)
+
+
+def test_hosts_go_to_the_nodes_in_turn() -> None:
+    known = [Node("a", 2, IDLE), Node("b", 4, IDLE)]
+    assert choose_nodes(known, 5) == ["a", "b", "a", "b", "b"]
+
+
+def test_hosts_go_where_the_score_is_lowest() -> None:
+    known = [Node("a", 2, Utilisation(0.5, 0.1)), Node("b", 2, Utilisation(0.2, 0.1))]
+    assert choose_nodes(known, 3) == ["b", "b", "a"]
+
+
+def test_nodes_that_are_too_busy_are_given_none() -> None:
+    known = [Node("a", 2, Utilisation(0.9, 0.1)), Node("b", 1, IDLE)]
+    assert choose_nodes(known, 1) == ["b"]
+    with pytest.raises(NoAdmissibleWorkerError, match=r"worker 0: cpu 0\.9"):
+        choose_nodes(known, 2)
+
+
+def test_more_workers_than_cpus() -> None:
+    with pytest.raises(ConfigError, match=r"workers = 4.*3 free CPUs on 2 nodes.*ray start"):
+        choose_nodes([Node("a", 2, IDLE), Node("b", 1, IDLE)], 4)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        ({"workers": 2, "hosts": "slurm"}, r"hosts = 'slurm': must be 'ray'"),
+        ({"workers": "all"}, r"workers = 'all': must be a whole number, or 'ray'"),
+        ({"hosts": "ray"}, "without workers"),
+        ({"workers": 0, "hosts": "ray"}, "without workers"),
+        ({"workers": -1, "hosts": "ray"}, "workers = -1"),
+        ({"workers": 3, "hosts": "ray", "num_envs": 2}, "2 world.s. of 1 zone.s. each: more hosts"),
+        ({"workers": 5, "hosts": "ray", "zones": 4}, "1 world.s. of 4 .* at most as many as zones"),
+        (
+            {"workers": "ray", "sensor_workers": 1, "overrides": {"rig": "ten_sensors"}},
+            "workers.sensors = 1, hosts = 'ray': sensor workers are on the machine",
+        ),
+        ({"workers": "ray", "overrides": {"zones.journal": "a.jsonl"}}, "zones.journal"),
+    ],
+)
+def test_settings_that_cannot_be(arguments: dict[str, object], words: str) -> None:
+    with pytest.raises(ConfigError, match=words):
+        make_vec("ring", **arguments)  # type: ignore[arg-type]
+
+
+def test_ray_is_asked_for_where_it_is_missing(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(__import__("sys").modules, "ray", None)
+    with pytest.raises(MissingExtraError, match=r"'ray'.*pip install 'cavmarl\[ray\]'"):
+        make_vec("ring", workers="ray")

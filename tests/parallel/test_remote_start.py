@@ -1,0 +1,78 @@
+"""Clusters that are started for some worlds, and those that are not there."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import yaml
+
+from cavmarl import ConfigError, make_vec
+from cavmarl.core.errors import WorkerStartError
+
+pytest.importorskip("ray", reason="needs the extra: ray (make libraries)")
+
+pytestmark = pytest.mark.filterwarnings("ignore")  # Ray's warnings of itself are many
+
+ROOT = Path(__file__).resolve().parents[2]
+
+ALONE = """
+import psutil, ray
+from cavmarl import make_vec
+
+if __name__ == "__main__":
+    first, second = (make_vec("ring", workers=1, hosts="ray") for _ in range(2))
+    assert first.reset(seed=0)[0].tobytes() == second.reset(seed=0)[0].tobytes()
+    first.close()
+    second.step(second.suggest_actions())
+    children = psutil.Process().children(recursive=True)
+    second.close()
+    assert not ray.is_initialized()
+    gone, alive = psutil.wait_procs(children, timeout=20)
+    print("left:", [one.cmdline() for one in alive])
+"""
+
+
+def test_a_cluster_that_was_started_for_them_ends_with_the_last_of_them() -> None:
+    done = subprocess.run(
+        [sys.executable, "-c", ALONE], cwd=ROOT, capture_output=True, text=True, timeout=120
+    )
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.strip().endswith("left: []")
+
+
+@pytest.mark.parametrize(
+    "env", [["ring"], ["town", "--worlds", "1", "--zones", "4", "--workers", "2"]]
+)
+def test_hosts_are_killed_and_nobody_can_tell(env: list[str]) -> None:
+    command = ["verify", *env, "--agents", "3", "--background", "4", "--kill", "2"]
+    done = subprocess.run(
+        [sys.executable, "-m", "cavmarl", *command, "--hosts", "ray"],
+        cwd=ROOT, capture_output=True, text=True, timeout=200,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    assert "equal in all 16 steps" in done.stdout
+
+
+def test_a_cluster_that_is_not_there(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("RAY_ADDRESS", "127.0.0.1:1")
+    with pytest.raises(WorkerStartError, match=r"no Ray cluster at 127.0.0.1:1.*ray start --head"):
+        make_vec("ring", workers=1, hosts="ray")
+
+
+def test_ray_understands_the_file_of_machines() -> None:
+    from ray.autoscaler._private.util import prepare_config, validate_config
+
+    path = ROOT / "configs/cluster/machines.yaml"
+    settings = prepare_config(yaml.safe_load(path.read_text(encoding="utf-8")))
+    validate_config(settings)
+    (kind,) = settings["available_node_types"].values()
+    assert kind["max_workers"] == len(settings["provider"]["worker_ips"])
+
+
+def test_a_client_is_no_member(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("RAY_ADDRESS", "ray://127.0.0.1:10001")
+    with pytest.raises(ConfigError, match="on a node of the cluster"):
+        make_vec("ring", workers=1, hosts="ray")

@@ -1,0 +1,292 @@
+"""Worlds on a Ray cluster of two nodes are the worlds of one process, whoever dies in between."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from threading import Timer
+from typing import Any
+
+import numpy as np
+import psutil
+import pytest
+
+from cavmarl import CapacityError, ConfigError, parallel_env
+from cavmarl.core.errors import WorkerError
+from cavmarl.env.vector import CavVectorEnv
+from cavmarl.parallel.hosts.remote_worlds import RemoteWorlds
+from cavmarl.parallel.split_hosts.divided_worlds import DividedWorlds
+from tests.parallel.test_moving import RESTLESS, uneven
+from tests.parallel.test_parallel_worlds import drive as drive_view
+from tests.parallel.test_parallel_worlds import settings
+from tests.support.vec_runs import STEPS, Make, drive, same
+
+ray = pytest.importorskip("ray", reason="needs the extra: ray (make libraries)")
+
+__all__ = ["uneven"]
+
+pytestmark = pytest.mark.filterwarnings("ignore")  # Ray's warnings of itself are many
+
+ROOT = Path(__file__).resolve().parents[2]
+WANTED = {"num_envs": 5, "agents": 4, "background": 12, "max_cycles": 8}
+
+
+@pytest.fixture(scope="module")
+def two_nodes() -> Iterator[Any]:
+    from ray.cluster_utils import Cluster
+
+    made = Cluster(initialize_head=True, head_node_args={"num_cpus": 2, "include_dashboard": False})
+    made.add_node(num_cpus=1)
+    ray.init(address=made.address, log_to_driver=False, logging_level="ERROR")
+    yield made
+    ray.shutdown()
+    made.shutdown()
+
+
+@pytest.fixture
+def cluster(two_nodes: Any) -> Any:
+    """The same, when all that was closed has given its CPUs back."""
+    await_true(lambda: ray.available_resources().get("CPU") == 3.0)
+    return two_nodes
+
+
+@pytest.fixture
+def whole(make: Make) -> Any:
+    return drive(make("grid4x4", **WANTED))
+
+
+def remote(vec: CavVectorEnv) -> RemoteWorlds:
+    assert isinstance(vec.worlds, RemoteWorlds)
+    return vec.worlds
+
+
+def nodes_of(pids: list[int]) -> list[int]:
+    """The raylets that have started these processes."""
+    return [psutil.Process(pid).ppid() for pid in pids]
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        {"env": "grid4x4", "zones": 4},
+        {"env": "merge", "autoreset_mode": "NextStep"},
+        {"env": "town", "overrides": {"population.mode": "seats", "action.kind": "discrete"}},
+    ],
+)
+def test_machines_change_nothing(make: Make, cluster: Any, arguments: dict[str, Any]) -> None:
+    wanted = WANTED | arguments
+    here = drive(make(**wanted))
+    vec = make(workers=2, hosts="ray", **wanted)
+    assert same(drive(vec), here)
+    assert same(drive(vec), here)
+    assert remote(vec).deaths == []
+    assert len(set(nodes_of(remote(vec).pool.pids))) == 2
+
+
+def test_chosen_worlds_begin_anew_on_their_machines(make: Make, cluster: Any) -> None:
+    chosen = np.array([False, True, False, True, True])
+    found = []
+    for arguments in ({}, {"workers": "ray"}):
+        vec = make("grid4x4", **WANTED, **arguments)
+        drive(vec, steps=3)
+        if arguments:
+            assert len(remote(vec).pool.pids) == 3
+            os.kill(remote(vec).pool.pids[0], signal.SIGKILL)
+        observations, infos = vec.reset(options={"reset_mask": chosen})
+        found.append([observations, infos["mask"], *(vec.state_hash(w) for w in range(5))])
+    assert same(*found)
+
+
+@pytest.mark.parametrize("how", [signal.SIGKILL, signal.SIGSTOP])
+def test_an_actor_that_dies_is_not_missed(
+    make: Make, cluster: Any, whole: Any, how: signal.Signals
+) -> None:
+    vec = make("grid4x4", workers=2, hosts="ray", **WANTED)
+    struck: list[int] = []
+    times: list[float] = []
+
+    def strike(step: int) -> None:
+        if step % 6 == 3:
+            struck.append(remote(vec).pool.pids[step // 6])
+            times.append(time.time())
+            os.kill(struck[-1], how)
+
+    assert same(drive(vec, before=strike), whole)
+    assert [death.worker for death in remote(vec).deaths] == [0, 1]
+    assert psutil.Process(remote(vec).pool.pids[0]).create_time() < times[0]  # the spare one
+    await_true(lambda: not any(psutil.pid_exists(pid) for pid in struck), for_s=20.0)
+
+
+def test_an_actor_that_dies_in_the_middle_of_a_step(make: Make, cluster: Any, whole: Any) -> None:
+    vec = make("grid4x4", workers=2, hosts="ray", **WANTED)
+    timers: list[Timer] = []
+
+    def strike(step: int) -> None:
+        if step in (2, 9):
+            pid = remote(vec).pool.pids[step % 2]
+            timers.append(Timer(0.001 * step, os.kill, (pid, signal.SIGKILL)))
+            timers[-1].start()
+
+    assert same(drive(vec, before=strike), whole)
+    for timer in timers:
+        timer.join()
+    remote(vec).pool.ping()
+    assert len(remote(vec).deaths) == 2
+
+
+@pytest.mark.parametrize("more", [{"workers": 1, "hosts": "ray"}, {"workers": "ray"}])
+def test_the_view_of_pettingzoo_is_the_one_of_one_process(
+    cluster: Any, more: dict[str, Any]
+) -> None:
+    whole = drive_view(parallel_env("grid4x4", **settings("entering", "dict")))
+    env = parallel_env("grid4x4", **settings("entering", "dict"), **more)
+    assert isinstance(env.worlds, RemoteWorlds)
+    pool = env.worlds.pool
+
+    def kill(step: int) -> None:
+        if step % 9 == 4:
+            pool.await_spare()
+            os.kill(pool.pids[0], signal.SIGKILL)
+
+    assert drive_view(env, before=kill) == whole
+    assert pool.deaths
+    with pytest.raises(ConfigError, match="workers=0"):
+        _ = env.simulation
+    pids = pool.pids
+    env.close()
+    await_true(lambda: not any(psutil.pid_exists(pid) for pid in pids))
+    with pytest.raises(WorkerError, match="closed"):
+        env.reset(seed=0)
+
+
+def test_worlds_that_move_between_nodes_are_the_same(
+    make: Make, cluster: Any, uneven: list[int]
+) -> None:
+    """The host that dies has worlds by then that it had not been started with."""
+    whole = drive(make("grid4x4", **WANTED), steps=16)
+    vec = make("grid4x4", workers=3, hosts="ray", overrides=RESTLESS, **WANTED)
+    vec.reset(seed=0)
+    assert len(set(nodes_of(remote(vec).pool.pids))) == 2
+
+    def strike(step: int) -> None:
+        if step in (5, 11):
+            remote(vec).pool.await_spare()
+            os.kill(remote(vec).pool.pids[step % 3], signal.SIGKILL)
+
+    assert same(drive(vec, steps=16, before=strike), whole)
+    assert len(remote(vec).deaths) == 2
+    assert sum(uneven) > 0
+
+
+@pytest.mark.parametrize("how", [signal.SIGKILL, signal.SIGSTOP])
+def test_one_world_over_two_nodes(make: Make, cluster: Any, how: signal.Signals) -> None:
+    wanted = WANTED | {"num_envs": 1, "background": 40}
+    whole = drive(make("town", **wanted))
+    vec = make("town", zones=4, workers=2, hosts="ray", **wanted)
+    assert isinstance(vec.worlds, DividedWorlds)
+    pool = vec.worlds.pool
+    vec.reset(seed=0)
+    assert len(set(nodes_of(pool.pids))) == 2
+    timers: list[Timer] = []
+
+    def strike(step: int) -> None:
+        if step in (3, 8):
+            pool.await_spare()
+            timers.append(Timer(0.001 * step, os.kill, (pool.pids[step % 2], how)))
+            timers[-1].start()
+
+    assert same(drive(vec, before=strike), whole)
+    for timer in timers:
+        timer.join()
+    pool.ping()
+    assert [death.worker for death in pool.deaths] == [1, 0]
+    pids = pool.pids
+    vec.close()
+    await_true(lambda: not any(psutil.pid_exists(pid) for pid in pids))
+
+
+def test_the_divided_world_as_pettingzoo_sees_it(cluster: Any) -> None:
+    whole = drive_view(parallel_env("grid4x4", **settings("entering", "dict")))
+    env = parallel_env("grid4x4", workers=2, hosts="ray", **settings("entering", "dict"))
+    assert isinstance(env.worlds, DividedWorlds)
+    assert drive_view(env) == whole
+    env.close()
+
+
+def test_errors_are_those_of_one_process(make: Make, cluster: Any) -> None:
+    with pytest.raises(CapacityError, match=r"population\.agents"):
+        make("ring", num_envs=2, workers=1, hosts="ray", agents=4, background=400)
+    with pytest.raises(ConfigError, match=r"workers = 4.*3 free CPUs on 2 nodes"):
+        make("ring", num_envs=4, workers=4, hosts="ray")
+    vec = make("ring", num_envs=2, workers=1, hosts="ray")
+    with pytest.raises(ConfigError, match="workers=0"):
+        _ = vec.simulation
+
+
+def test_nothing_is_left_behind_and_the_cluster_stays(make: Make, cluster: Any) -> None:
+    vec = make("ring", num_envs=2, workers=2, hosts="ray")
+    vec.reset(seed=0)
+    pids = remote(vec).pool.pids
+    vec.close()
+    await_true(lambda: not any(psutil.pid_exists(pid) for pid in pids))
+    await_true(lambda: ray.available_resources().get("CPU") == 3.0)
+    assert ray.is_initialized()
+
+
+def test_a_node_that_dies_is_not_missed(make: Make, cluster: Any, whole: Any) -> None:
+    """All its processes at once; what it hosted goes on at the other node."""
+    node = cluster.add_node(num_cpus=1)
+    vec = make("grid4x4", workers=4, hosts="ray", **WANTED)
+    raylet = node.all_processes["raylet"][0].process.pid
+    vec.reset(seed=0)
+    pids = remote(vec).pool.pids
+    victim = nodes_of(pids).index(raylet)
+
+    def strike(step: int) -> None:
+        if step == STEPS // 2:
+            cluster.remove_node(node, allow_graceful=False)
+            await_true(lambda: not psutil.pid_exists(pids[victim]))  # it ends with its raylet
+
+    assert same(drive(vec, before=strike), whole)
+    assert victim in {death.worker for death in remote(vec).deaths}
+    assert raylet not in nodes_of(remote(vec).pool.pids)
+
+
+KILLED = """
+import os, signal, sys
+import ray
+from cavmarl import make_vec
+
+if __name__ == "__main__":
+    vec = make_vec("ring", num_envs=2, workers=2, hosts="ray")
+    vec.reset(seed=0)
+    print(*vec.worlds.pool.pids, flush=True)
+    os.kill(os.getpid(), signal.SIGKILL)
+"""
+
+
+def test_nothing_is_left_behind_by_a_program_that_is_killed(cluster: Any) -> None:
+    done = subprocess.run(
+        [sys.executable, "-c", KILLED],
+        cwd=ROOT,
+        env={**os.environ, "RAY_ADDRESS": cluster.address},
+        capture_output=True,
+        text=True,
+        timeout=120,
+    )
+    pids = [int(word) for word in done.stdout.split()]
+    assert len(pids) == 2, done.stderr
+    await_true(lambda: not any(psutil.pid_exists(pid) for pid in pids))
+    await_true(lambda: ray.available_resources().get("CPU") == 3.0)
+
+
+def await_true(holds: Callable[[], bool], for_s: float = 10.0) -> None:
+    until_s = time.monotonic() + for_s
+    while not holds():
+        assert time.monotonic() < until_s
+        time.sleep(0.1)

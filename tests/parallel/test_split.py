@@ -1,0 +1,210 @@
+"""A world that several workers run together is the undivided one, whoever dies in between."""
+
+from __future__ import annotations
+
+import os
+import random
+import signal
+from pathlib import Path
+from threading import Timer
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from cavmarl import ConfigError, make_vec
+from cavmarl.core.errors import WorkerFailureError
+from cavmarl.engine.world_setup import load_world
+from cavmarl.parallel import pooled_worlds as pooled
+from cavmarl.parallel.work_shares import share_out
+from tests.parallel.test_worker_pool import alive
+from tests.support.actuated import actuated_grid
+from tests.support.rerouting import CARS, DEVICE, FLOW, make_map, write_demand
+from tests.support.vec_runs import STEPS, Make, drive, pool_of, same
+
+pytestmark = pytest.mark.filterwarnings("ignore:workers = :RuntimeWarning")
+
+SEATS = {"population.mode": "seats", "action.kind": "discrete"}
+
+
+@pytest.mark.parametrize("zones", [4, 9])
+@pytest.mark.parametrize("env", ["grid4x4", "merge", "town"])
+@pytest.mark.parametrize("overrides", [{}, SEATS])
+def test_nobody_can_tell(make: Make, env: str, zones: int, overrides: dict[str, Any]) -> None:
+    wanted = {"agents": 8, "background": 30, "max_cycles": 8, "overrides": overrides}
+    whole = drive(make(env, **wanted))
+    for workers in (1, 2, 3):
+        assert same(drive(make(env, zones=zones, workers=workers, **wanted)), whole), workers
+
+
+def test_rows_that_change_their_side_do_so_for_all(make: Make) -> None:
+    wanted = {"agents": 3, "background": 60, "max_cycles": 50}
+    whole = drive(make("grid4x4", **wanted), steps=80)
+    assert same(drive(make("grid4x4", zones=4, workers=2, **wanted), steps=80), whole)
+
+
+def test_worlds_that_begin_anew_a_step_later(make: Make) -> None:
+    wanted = {"agents": 4, "background": 10, "max_cycles": 5, "autoreset_mode": "NextStep"}
+    whole = drive(make("town", **wanted))
+    assert same(drive(make("town", zones=4, workers=2, **wanted)), whole)
+
+
+def test_some_worlds_are_divided_and_others_not(make: Make) -> None:
+    wanted = {"num_envs": 2, "agents": 4, "background": 10, "max_cycles": 6}
+    whole = drive(make("grid4x4", **wanted))
+    vec = make("grid4x4", zones=4, workers=3, **wanted)
+    assert same(drive(vec), whole)
+    assert np.array_equal(
+        vec.reset(options={"reset_mask": np.array([False, True])})[1]["mask"],
+        vec.worlds.arrays.mask,
+    )
+
+
+def test_all_that_can_be_checked_is(make: Make) -> None:
+    wanted = {"agents": 5, "background": 30}
+    whole = drive(make("grid4x4", **wanted))
+    checked = make("grid4x4", zones=4, workers=2, overrides={"zones.check": True}, **wanted)
+    assert same(drive(checked), whole)
+
+
+@pytest.mark.parametrize("how", [signal.SIGKILL, signal.SIGSTOP])
+@pytest.mark.parametrize("worker", [0, 1])
+def test_a_worker_that_dies_between_steps(make: Make, worker: int, how: signal.Signals) -> None:
+    wanted = {"agents": 5, "background": 20, "max_cycles": 8}
+    whole = drive(make("grid4x4", **wanted))
+    vec = make("grid4x4", zones=4, workers=2, **wanted)
+
+    def strike(step: int) -> None:
+        if step % 5 == 2:
+            os.kill(pool_of(vec).pids[worker], how)
+
+    assert same(drive(vec, before=strike), whole)
+    assert [death.worker for death in pool_of(vec).deaths] == [worker] * 2
+
+
+@pytest.mark.parametrize("env", ["merge", "town"])
+def test_workers_that_die_at_any_time(make: Make, env: str) -> None:
+    wanted = {"agents": 6, "background": 40, "max_cycles": 30}
+    whole = drive(make(env, **wanted), steps=60)
+    vec = make(env, zones=4, workers=3, **wanted)
+    pids: set[int] = set()
+    timers: list[Timer] = []
+    rng = random.Random(7)
+
+    def strike(step: int) -> None:
+        pids.update(pool_of(vec).pids)
+        if step % 4 == 1:
+            pid = pool_of(vec).pids[rng.randrange(3)]
+            timers.append(Timer(rng.uniform(0.0, 0.01), os.kill, (pid, signal.SIGKILL)))
+            timers[-1].start()
+        elif timers:
+            timers[-1].join()
+
+    assert same(drive(vec, steps=60, before=strike), whole)
+    assert len(pool_of(vec).deaths) == len(timers)
+    left = pool_of(vec).pids
+    vec.close()
+    assert alive([*pids, *left]) == []
+
+
+def test_the_process_that_forks_may_die(make: Make) -> None:
+    wanted = {"agents": 3, "background": 20}
+    whole = drive(make("grid4x4", **wanted))
+    vec = make("grid4x4", zones=4, workers=2, **wanted)
+
+    def strike(step: int) -> None:
+        if step == STEPS // 2:
+            os.kill(pool_of(vec).server_pid, signal.SIGKILL)
+
+    assert same(drive(vec, before=strike), whole)
+
+
+def test_a_follower_that_fails(make: Make, monkeypatch: pytest.MonkeyPatch) -> None:
+    wanted = {"agents": 5, "background": 20}
+    whole = drive(make("grid4x4", **wanted))
+    monkeypatch.setattr(pooled, "PROGRAM", "tests.support.failing_worker")
+    vec = make("grid4x4", zones=4, workers=2, **wanted)
+    failures: list[WorkerFailureError] = []
+    step = vec.step
+
+    def step_again(actions: NDArray[Any]) -> Any:
+        try:
+            return step(actions)
+        except WorkerFailureError as failure:
+            failures.append(failure)
+        return step(actions)
+
+    monkeypatch.setattr(vec, "step", step_again)
+    assert same(drive(vec), whole), "all are as they were before"
+    (failure,) = failures
+    assert (failure.kind, failure.worker) == ("ZeroDivisionError", 1)
+    assert "world 0, zone" in str(failure)
+    assert failure.text == "a follower's own"
+    trace = failure.traceback
+    assert trace.startswith("Traceback (most recent call last)")
+    assert "in perform" in trace
+    assert "failing_worker.py" in trace
+    assert pool_of(vec).deaths == []
+    left = [*pool_of(vec).pids, pool_of(vec).server_pid]
+    vec.close()
+    assert alive(left) == []
+
+
+def test_actuated_signals(make: Make, tmp_path: Path) -> None:
+    wanted = {"agents": 4, "background": 30, "max_cycles": 25}
+    net = actuated_grid(tmp_path)
+    whole = drive(make(net, **wanted), steps=40)
+    assert same(drive(make(net, zones=4, workers=2, **wanted), steps=40), whole)
+
+
+def test_vehicles_that_look_for_another_way(make: Make, tmp_path: Path) -> None:
+    net = make_map(tmp_path)
+    files = write_demand(tmp_path, CARS.format(device=DEVICE) + FLOW)
+    wanted = {
+        "agents": 2,
+        "background": 0,
+        "max_cycles": 500,
+        "overrides": {
+            "population.mode": "seats",
+            "traffic.demand": [str(path) for path in files],
+            "clock.sim_dt_s": 0.2,
+            "clock.ctrl_dt_s": 1.0,
+        },
+    }
+    one = make(net, **wanted)
+    whole = drive(one, steps=300)
+    vec = make(net, zones=3, workers=2, **wanted)
+
+    def strike(step: int) -> None:
+        if step in (140, 221):
+            os.kill(pool_of(vec).pids[step % 2], signal.SIGKILL)
+
+    assert same(drive(vec, steps=300, before=strike), whole)
+    assert len(pool_of(vec).deaths) == 2
+    assert one.traffic_stats()["rerouted"] > 0, "nobody has taken another way"
+
+
+def test_more_workers_than_zones() -> None:
+    with pytest.raises(ConfigError, match=r"workers = 3.*at most 2.*more zones"):
+        make_vec("grid4x4", zones=2, workers=3)
+    with pytest.raises(ConfigError, match=r"workers = 9.*at most 8.*more worlds"):
+        make_vec("grid4x4", num_envs=2, zones=4, workers=9)
+
+
+@pytest.mark.parametrize("name", ["journal", "faults"])
+def test_what_only_one_process_can(name: str) -> None:
+    with pytest.raises(ConfigError, match=f"zones.{name}.*at most workers=1"):
+        make_vec("grid4x4", zones=4, workers=2, overrides={f"zones.{name}": "{}"})
+
+
+@pytest.mark.parametrize(("worlds", "workers"), [(1, 2), (2, 3), (3, 7), (4, 2), (5, 5), (1, 9)])
+def test_everything_has_one_worker(worlds: int, workers: int) -> None:
+    world = load_world("town", zones=9)
+    parts = share_out(world, worlds, workers)
+    assert [w for part in parts for w in range(part.first, part.last)] == list(range(worlds))
+    assert sum(len(part.zones) for part in parts) == workers
+    assert sum(len(part.names) for part in parts) == workers
+    for part in parts:
+        assert sorted(zone for zones in part.zones for zone in zones) == list(range(9))
+        assert all(part.zones)

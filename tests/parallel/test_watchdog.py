@@ -1,0 +1,54 @@
+"""Who waits for a process of its own that works is no sleeper."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import time
+
+import pytest
+
+from cavmarl.parallel.processes import watchdog
+from cavmarl.parallel.processes.watchdog import CHECK_S, STILL_CHECKS, Watchdog
+
+PARENT = """
+import subprocess, sys
+subprocess.run([sys.executable, "-c", sys.argv[1]])
+"""
+
+
+def verdict(child: str) -> str | None:
+    """Of a process that waits for one that runs `child`."""
+    with subprocess.Popen([sys.executable, "-c", PARENT, child]) as process:
+        try:
+            time.sleep(1.0)
+            dog = Watchdog(process.pid, 60.0)
+            found = None
+            for _ in range(3 * STILL_CHECKS):
+                time.sleep(CHECK_S)
+                found = found or dog.verdict()
+            return found
+        finally:
+            process.kill()
+
+
+def test_a_process_that_waits_for_its_own_working_child_is_left_alone() -> None:
+    assert verdict("import os\nwhile os.getppid() > 1: sum(range(100_000))") is None
+
+
+def test_a_process_whose_child_sleeps_too_is_noticed() -> None:
+    found = verdict("import time; time.sleep(8)")
+    assert found is not None
+    assert "asleep" in found
+
+
+@pytest.mark.parametrize(("state", "is_at_work"), [("R", True), ("D", True), ("S", False)])
+def test_a_child_that_waits_for_the_processor_is_at_work(
+    monkeypatch: pytest.MonkeyPatch, state: str, is_at_work: bool
+) -> None:
+    """Other programs may leave it none for seconds; nothing of it sleeps."""
+    monkeypatch.setattr(watchdog, "_look", lambda pid: ("S" if pid == 1 else state, 7))
+    monkeypatch.setattr(watchdog, "_started_by", lambda pid: [2])
+    dog = Watchdog(1, 60.0)
+    found = [dog.verdict() for _ in range(3 * STILL_CHECKS)]
+    assert (found[-1] is None) == is_at_work

@@ -1,0 +1,191 @@
+"""Worlds over worker processes are the worlds of one process, whoever dies in between."""
+
+from __future__ import annotations
+
+import os
+import signal
+from typing import Any
+
+import numpy as np
+import pytest
+
+from cavmarl import CapacityError, ConfigError, InvalidActionError, make_vec
+from cavmarl.config.registry import entries
+from cavmarl.core.errors import WorkerDeathError, WorkerError
+from cavmarl.parallel.processes.worker_processes import Crew
+from tests.support.vec_runs import STEPS, Make, drive, pool_of, same
+
+pytestmark = pytest.mark.filterwarnings("ignore:workers = 3:RuntimeWarning")
+
+
+@pytest.mark.parametrize(("zones", "counts"), [(1, (1, 2, 3)), (4, (2,))])
+@pytest.mark.parametrize("env", sorted(entries()))
+def test_workers_change_nothing(make: Make, env: str, zones: int, counts: tuple[int, ...]) -> None:
+    wanted = {"num_envs": 5, "zones": zones, "max_cycles": 8}
+    whole = drive(make(env, **wanted))
+    for workers in counts:
+        assert same(drive(make(env, workers=workers, **wanted)), whole), workers
+
+
+def test_worlds_begin_anew_in_the_next_step_whoever_dies(make: Make) -> None:
+    wanted = {"num_envs": 3, "agents": 2, "max_cycles": 3, "autoreset_mode": "NextStep"}
+    whole = drive(make("merge", **wanted))
+    vec = make("merge", workers=2, **wanted)
+    pool = pool_of(vec)
+    assert same(drive(vec, before=lambda step: os.kill(pool.pids[step % 2], signal.SIGKILL)), whole)
+    assert len(pool.deaths) == STEPS
+
+
+def test_chosen_worlds_begin_anew_in_their_workers(make: Make) -> None:
+    chosen = np.array([False, True, False, True, True])
+    found = []
+    for workers in (0, 2):
+        vec = make("merge", num_envs=5, agents=2, workers=workers)
+        drive(vec, steps=3)
+        observations, infos = vec.reset(options={"reset_mask": chosen})
+        found.append([observations, infos["mask"], *(vec.state_hash(w) for w in range(5))])
+    assert same(*found)
+
+
+def test_observations_without_a_copy(make: Make) -> None:
+    vec = make("ring", num_envs=2, workers=2, copy=False)
+    observations, _ = vec.reset(seed=1)
+    assert not observations.flags.writeable
+    assert np.shares_memory(observations, vec.worlds.arrays.observations)
+    before = observations.copy()
+    vec.step(vec.suggest_actions())
+    assert not np.array_equal(observations, before)
+
+
+def test_a_tensor_of_the_same_memory_shows_each_step(make: Make) -> None:
+    torch = pytest.importorskip("torch")
+    vec = make("ring", num_envs=2, workers=2)
+    tensor = torch.from_numpy(vec.worlds.arrays.observations)
+    vec.reset(seed=1)
+    for _ in range(3):
+        observations, *_ = vec.step(vec.suggest_actions())
+        assert np.array_equal(tensor.numpy(), observations)
+
+
+def test_what_was_returned_outlives_the_workers(make: Make) -> None:
+    vec = make("ring", num_envs=2, workers=1, copy=False)
+    observations, _ = vec.reset(seed=1)
+    vec.close()
+    assert observations.any()
+    with pytest.raises(WorkerError, match="closed"):
+        vec.reset(seed=1)
+
+
+@pytest.mark.parametrize("zones", [1, 4])
+@pytest.mark.parametrize("how", [signal.SIGKILL, signal.SIGSTOP])
+def test_a_worker_that_dies_between_steps_is_not_missed(
+    make: Make, how: signal.Signals, zones: int
+) -> None:
+    wanted = {"num_envs": 3, "agents": 4, "background": 12, "zones": zones, "max_cycles": 8}
+    whole = drive(make("grid4x4", **wanted))
+    vec = make("grid4x4", workers=2, **wanted)
+
+    def strike(step: int) -> None:
+        if step % 5 == 2:
+            os.kill(pool_of(vec).pids[step % 2], how)
+
+    assert same(drive(vec, before=strike), whole)
+    assert len(pool_of(vec).deaths) == 2
+    assert all(death.done_s - death.noticed_s < 5.0 for death in pool_of(vec).deaths)
+
+
+@pytest.mark.parametrize("env", ["rush", "merge"])
+def test_a_worker_is_replaced_before_every_step(make: Make, env: str) -> None:
+    wanted = {"num_envs": 2, "agents": 6, "background": 10, "max_cycles": 6}
+    whole = drive(make(env, **wanted))
+    vec = make(env, workers=2, **wanted)
+    found = drive(vec, before=lambda step: os.kill(pool_of(vec).pids[step % 2], signal.SIGKILL))
+    assert same(found, whole)
+    assert len(pool_of(vec).deaths) == STEPS
+
+
+def test_the_process_that_forks_may_die(make: Make) -> None:
+    wanted = {"num_envs": 3, "agents": 3, "background": 3}
+    whole = drive(make("ring", **wanted))
+    vec = make("ring", workers=2, **wanted)
+
+    def strike(step: int) -> None:
+        if step == 4:
+            os.kill(pool_of(vec).server_pid, signal.SIGKILL)
+
+    assert same(drive(vec, before=strike), whole)
+
+
+def test_an_action_that_is_refused_changes_nothing(make: Make) -> None:
+    vec = make("ring", num_envs=3, agents=2, workers=2)
+    vec.reset(seed=0)
+    before = [vec.state_hash(w) for w in range(3)]
+    wrong = np.zeros((3, 2, 2))
+    wrong[2, 1, 0] = 3.0
+    with pytest.raises(InvalidActionError, match="world 2, car_1"):
+        vec.step(wrong)
+    assert [vec.state_hash(w) for w in range(3)] == before
+
+
+def test_errors_are_those_of_one_process(make: Make) -> None:
+    with pytest.raises(CapacityError, match=r"population\.agents"):
+        make("ring", num_envs=2, workers=1, agents=4, background=400)
+    with pytest.raises(ConfigError, match="workers=0"):
+        _ = make("ring", num_envs=2, workers=1).simulation
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        ({"workers": 3, "num_envs": 2}, ("workers = 3", "at most 2", "more zones")),
+        ({"workers": -1}, ("workers = -1", "from 0")),
+        ({"workers": 1.5}, ("workers = 1.5", "whole number")),
+        ({"workers": True}, ("workers = True", "whole number")),
+        ({"workers": 1, "overrides": {"workers.repeats": -1}}, ("workers.repeats", "0")),
+        ({"workers": 1, "overrides": {"horizon_s": print}}, ("horizon_s",)),
+    ],
+)
+def test_settings_that_cannot_be(arguments: dict[str, Any], words: tuple[str, ...]) -> None:
+    with pytest.raises(ConfigError) as caught:
+        make_vec("ring", **arguments)
+    assert all(word in str(caught.value) for word in words), caught.value
+
+
+def test_memory_that_cannot_be_had() -> None:
+    with pytest.raises(WorkerError, match="num_envs"):
+        make_vec("rush", num_envs=65_536, workers=2, agents=1000)
+
+
+def test_more_workers_than_cores_are_warned_of(make: Make) -> None:
+    cores = len(os.sched_getaffinity(0))
+    with pytest.warns(RuntimeWarning, match=f"there are {cores} cores"):
+        make("ring", num_envs=cores + 1, workers=cores + 1)
+
+
+def test_workers_may_have_cores_of_their_own(make: Make) -> None:
+    cores = sorted(os.sched_getaffinity(0))
+    vec = make("ring", num_envs=2, workers=2, overrides={"workers.pin": True})
+    vec.reset(seed=0)
+    wanted = [{cores[k % len(cores)]} for k in range(2)]
+    assert [os.sched_getaffinity(pid) for pid in pool_of(vec).pids] == wanted
+
+
+def test_a_step_that_everybody_dies_of(make: Make, monkeypatch: pytest.MonkeyPatch) -> None:
+    vec = make("ring", num_envs=2, workers=2, overrides={"workers.repeats": 1})
+    vec.reset(seed=0)
+    actions = vec.suggest_actions()
+    pool = pool_of(vec)
+    fork = Crew._fork
+
+    def fork_and_kill(self: Crew, k: int) -> None:
+        fork(self, k)
+        os.kill(self.processes[k].pid, signal.SIGKILL)
+
+    monkeypatch.setattr(Crew, "_fork", fork_and_kill)
+    os.kill(pool.pids[1], signal.SIGKILL)
+    with pytest.raises(
+        WorkerDeathError, match=r"worker 1 \(world 1\).*step.*2 .*SIGKILL"
+    ) as caught:
+        vec.step(actions)
+    assert caught.value.__notes__ == ["in step 1 since the reset"]
+    assert pool.pids == []

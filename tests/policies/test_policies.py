@@ -1,0 +1,274 @@
+"""Policies: names and paths, what fits where, and that drivers drive."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import subprocess
+import sys
+from operator import attrgetter
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from cavmarl.config.registry import agent_entries
+from cavmarl.core.errors import MissingExtraError, PolicyError
+from cavmarl.cosim.stack.reference_rig import REFERENCE_RIG
+from cavmarl.env.parallel import CavEnv, parallel_env
+from cavmarl.env.vector import CavVectorEnv, make_vec
+from cavmarl.policies.policy import Policy, load_policy
+
+SCRIPTED = ("idm", "random_actions")
+ACTIONS = ("continuous", "discrete")
+
+
+def small_vec(**overrides: Any) -> CavVectorEnv:
+    keys = {key.replace("__", "."): value for key, value in overrides.items()}
+    return make_vec("merge", num_envs=2, agents=3, background=4, overrides=keys)
+
+
+@pytest.fixture
+def checkpoint(tmp_path: Path) -> Path:
+    """A driver for `merge` that has learned nothing."""
+    pytest.importorskip("torch")
+    return save_driver(tmp_path / "driver", small_vec())
+
+
+def save_driver(folder: Path, vec: CavVectorEnv) -> Path:
+    import torch
+
+    from cavmarl.policies.networks import ActorCritic, NetworkConfig, save_network
+
+    torch.manual_seed(0)
+    config = NetworkConfig(
+        environment=vec.config.name,
+        observation_size=vec.single_observation_space.shape[0],
+        sensors=vec.config.sensors,
+        action=vec.config.action,
+        hidden=(8, 8),
+    )
+    save_network(folder, ActorCritic(config), config)
+    return folder
+
+
+@pytest.mark.parametrize("kind", ACTIONS)
+@pytest.mark.parametrize("name", SCRIPTED)
+def test_scripted_drivers_drive_batches(name: str, kind: str) -> None:
+    vec = small_vec(action__kind=kind)
+    policy = load_policy(name, vec)
+    observations, infos = vec.reset(seed=1)
+    policy.reset(1)
+    for _ in range(5):
+        observations, _, _, _, infos = vec.step(policy.act_batch(observations, infos["mask"]))
+
+
+@pytest.mark.parametrize("mode", ["closed", "entering", "seats"])
+@pytest.mark.parametrize("form", ["flat", "dict"])
+@pytest.mark.parametrize("name", SCRIPTED)
+def test_scripted_drivers_drive_dicts(name: str, form: str, mode: str) -> None:
+    overrides = {"observation.kind": form, "population.mode": mode}
+    env = parallel_env("merge", agents=3, background=2, max_cycles=80, overrides=overrides)
+    drive(env, load_policy(name, env), 80)
+
+
+def drive(env: CavEnv, policy: Policy, steps: int) -> None:
+    observations, _ = env.reset(seed=3)
+    policy.reset(3)
+    for _ in range(steps):
+        if not env.agents:
+            break
+        observations, *_ = env.step(policy.act(observations))
+
+
+@pytest.mark.parametrize("form", ["flat", "dict"])
+def test_a_network_does_the_same_in_dicts_as_in_batches(checkpoint: Path, form: str) -> None:
+    vec = make_vec("merge", num_envs=1, agents=3, background=4)
+    env = parallel_env("merge", agents=3, background=4, overrides={"observation.kind": form})
+    one, many = load_policy(checkpoint, env), load_policy(checkpoint, vec)
+    seen, _ = env.reset(seed=5)
+    batch, infos = vec.reset(seed=5)
+    for _ in range(3):
+        by_agent, by_index = one.act(seen), many.act_batch(batch, infos["mask"])
+        for k, agent in enumerate(env.possible_agents):
+            if infos["mask"][0, k]:
+                np.testing.assert_allclose(by_agent[agent], by_index[0, k], atol=1e-6)
+        seen, *_ = env.step(by_agent)
+        batch, _, _, _, infos = vec.step(by_index)
+
+
+def test_a_network_acts_only_where_the_mask_is_set(checkpoint: Path) -> None:
+    vec = small_vec()
+    policy = load_policy(checkpoint, vec)
+    observations, infos = vec.reset(seed=0)
+    mask = infos["mask"].copy()
+    mask[0] = False
+    actions = policy.act_batch(observations, mask)
+    assert actions.shape == (2, 3, 2)
+    assert not actions[0].any()
+    assert actions[1].any()
+    assert np.abs(actions).max() <= 1.0
+
+
+def test_random_actions_repeat_with_the_seed() -> None:
+    vec = small_vec()
+    policy = load_policy("random_actions", vec)
+    observations, infos = vec.reset(seed=0)
+
+    def draw(seed: int) -> list[float]:
+        policy.reset(seed)
+        return [float(policy.act_batch(observations, infos["mask"]).sum()) for _ in range(3)]
+
+    assert draw(7) == draw(7)
+    assert draw(7) != draw(8)
+
+
+# What a scripted driver asks of an environment.
+NEEDED = {
+    "cacc": {
+        "v2x.enabled": True,
+        "sensors.messages.objects": 4,
+        "sensors.lanes.range_m": 100.0,
+        "sensors.signal.enabled": True,
+    },
+    "reference": {"rig": REFERENCE_RIG},
+}
+
+
+def test_every_driver_of_the_folder_loads_where_it_belongs() -> None:
+    for name, path in agent_entries().items():
+        config = path / "config.json"
+        home = json.loads(config.read_text())["environment"] if path.is_dir() else "merge"
+        policy = load_policy(name, make_vec(home, overrides=NEEDED.get(name)))
+        assert isinstance(policy, Policy)
+
+
+def test_a_wrapped_environment_is_unwrapped() -> None:
+    from pettingzoo.utils.wrappers import BaseParallelWrapper
+
+    env = parallel_env("merge", agents=2, background=0)
+    assert load_policy("idm", BaseParallelWrapper(env)).env is env
+
+
+@pytest.mark.parametrize("wrong", ["merge", None, 3])
+def test_only_our_environments_are_taken(wrong: Any) -> None:
+    with pytest.raises(PolicyError, match=r"pass what parallel_env\(\) or make_vec\(\) returned"):
+        load_policy("idm", wrong)
+
+
+def test_an_unknown_name_is_told_the_nearest_and_all() -> None:
+    with pytest.raises(PolicyError, match=r"'idn'; did you mean idm\? There are: .*random_actions"):
+        load_policy("idn", small_vec())
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("def make_policy(env: object) ->", "SyntaxError"),
+        ("import nowhere_to_be_found", "ModuleNotFoundError"),
+        ("x = 1", r"no function make_policy\(env\)"),
+        ("def make_policy(env): return 3", "returned a int, not a"),
+    ],
+)
+def test_a_broken_script_is_named(tmp_path: Path, text: str, message: str) -> None:
+    path = tmp_path / "mine.py"
+    path.write_text(text)
+    with pytest.raises(PolicyError, match=rf"mine\.py: .*{message}"):
+        load_policy(path, small_vec())
+
+
+@pytest.mark.parametrize("policy", [None, 3, ["idm"]])
+def test_a_policy_is_a_name_or_a_path(policy: Any) -> None:
+    with pytest.raises(PolicyError, match=r"policy = .*: must be"):
+        load_policy(policy, small_vec())
+
+
+def test_a_file_that_is_no_policy_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "model.pkl"
+    path.touch()
+    with pytest.raises(PolicyError, match=r"model\.pkl: no policy"):
+        load_policy(path, small_vec())
+
+
+@pytest.mark.parametrize(
+    ("key", "value"),
+    [
+        ("sensors__lidar__rays", 32),
+        ("sensors__neighbors__range_m", 30.0),
+        ("action__kind", "discrete"),
+        ("action__steering_rad", 0.3),
+    ],
+)
+def test_a_network_refuses_another_seat(checkpoint: Path, key: str, value: Any) -> None:
+    vec = small_vec(**{key: value})
+    name = key.replace("__", ".")
+    with pytest.raises(PolicyError, match=rf"does not fit merge: .*overrides=.*'{name}'") as caught:
+        load_policy(checkpoint, vec)
+    at_home = attrgetter(name)(small_vec().config)
+    assert f"{name} is {at_home} there, {value} here" in str(caught.value)
+    sizes = {seat.single_observation_space.shape[0] for seat in (small_vec(), vec)}
+    assert all(str(size) in str(caught.value) for size in sizes)
+
+
+def test_the_overrides_that_a_refusal_names_make_it_fit(checkpoint: Path) -> None:
+    changed = {"sensors.lidar.rays": 32, "action.kind": "discrete", "sensors.route.points": 2}
+    with pytest.raises(PolicyError) as caught:
+        load_policy(checkpoint, make_vec("merge", overrides=changed))
+    import ast
+
+    cure = ast.literal_eval(str(caught.value).partition("overrides=")[2])
+    load_policy(checkpoint, make_vec("merge", overrides={**changed, **cure}))
+
+
+def test_missing_and_broken_files_are_named(checkpoint: Path, tmp_path: Path) -> None:
+    vec = small_vec()
+    for name in ("model.safetensors", "config.json"):
+        for text in (None, "", "{", "[]", "{}"):
+            broken = tmp_path / "broken"
+            shutil.copytree(checkpoint, broken, dirs_exist_ok=True)
+            (broken / name).unlink()
+            if text is not None:
+                (broken / name).write_text(text)
+            with pytest.raises(PolicyError, match=name.replace(".", r"\.")):
+                load_policy(broken, vec)
+
+
+@pytest.mark.parametrize("hidden", [[9, 8], [], [0], [10**9], "8", [8] * 100])
+def test_a_config_that_does_not_fit_its_weights_is_refused(
+    checkpoint: Path, hidden: object
+) -> None:
+    path = checkpoint / "config.json"
+    path.write_text(json.dumps({**json.loads(path.read_text()), "hidden": hidden}))
+    with pytest.raises(PolicyError, match=r"hidden|does not fit config\.json"):
+        load_policy(checkpoint, small_vec())
+
+
+def test_weights_that_are_not_finite_are_refused(checkpoint: Path) -> None:
+    from safetensors.torch import load_file, save_file
+
+    weights = load_file(checkpoint / "model.safetensors")
+    weights["actor.0.bias"][0] = float("nan")
+    save_file(weights, checkpoint / "model.safetensors")
+    with pytest.raises(PolicyError, match=r"'actor\.0\.bias' holds numbers that are not finite"):
+        load_policy(checkpoint, small_vec())
+
+
+def test_without_torch_a_network_says_what_to_install(
+    checkpoint: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def absent(module: str) -> None:
+        raise ModuleNotFoundError(name=module)
+
+    monkeypatch.setattr("cavmarl.core.errors.importlib.import_module", absent)
+    with pytest.raises(MissingExtraError, match=r"pip install 'cavmarl\[torch\]'"):
+        load_policy(checkpoint, small_vec())
+
+
+def test_scripted_drivers_load_no_torch() -> None:
+    code = (
+        "import sys; from cavmarl import load_policy, make_vec; "
+        "load_policy('idm', make_vec('merge')); print('torch' in sys.modules)"
+    )
+    out = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert out.stdout.strip() == "False"

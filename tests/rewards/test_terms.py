@@ -1,0 +1,120 @@
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+
+from cavmarl.config.env import TERMS
+from cavmarl.core.math.neighbors import fill_grid, make_grid
+from cavmarl.core.records.codes import (
+    EVENT_ARRIVED,
+    EVENT_COLLIDED,
+    EVENT_OFF_ROAD,
+    EVENT_RED_LIGHT,
+    EVENT_WRONG_WAY,
+)
+from cavmarl.rewards.kernels.terms import NUM_TERMS, TTC_HORIZON_S, write_terms
+from tests.naive.terms import time_to_collision
+from tests.support.builders import crowds, vehicles
+from tests.support.traffic import network
+
+STEP_S = 0.1
+
+
+def terms(rows: NDArray[np.void], i: int = 0) -> dict[str, float]:
+    """The terms of row i by name; all drive on lane 0 of the ring."""
+    grid = make_grid((-100.0, -100.0, 100.0, 100.0), 25.0, len(rows))
+    fill_grid(rows, len(rows), grid)
+    out = np.full(NUM_TERMS, np.nan, np.float32)
+    write_terms(network("ring").arrays, rows, i, grid, STEP_S, out)
+    return dict(zip(TERMS, out.tolist(), strict=True))
+
+
+def one(**fields: object) -> NDArray[np.void]:
+    return vehicles([(0.0, 0.0, 0.0)], **fields)
+
+
+LIMIT_MPS = float(network("ring").lanes[0]["speed_mps"])
+
+
+def test_there_is_a_number_for_every_name() -> None:
+    assert len(TERMS) == NUM_TERMS
+    assert all(math.isfinite(value) for value in terms(one()).values())
+
+
+def test_progress_is_the_way_towards_the_goal() -> None:
+    assert terms(one(speed=10.0, step_to_go=80.0, to_go=79.0))["progress"] == 1.0
+    assert terms(one(speed=10.0, step_to_go=79.0, to_go=80.0))["progress"] == -1.0
+
+
+@pytest.mark.parametrize(
+    ("before", "after"), [(80.0, 900.0), (80.0, math.inf), (math.inf, 80.0), (math.inf, math.inf)]
+)
+def test_another_plan_is_no_jump(before: float, after: float) -> None:
+    progress = terms(one(speed=10.0, step_to_go=before, to_go=after))["progress"]
+    assert abs(progress) <= 2.0 * 10.0 * STEP_S + 1e-6
+
+
+def test_speed_and_delay_are_measured_at_the_limit() -> None:
+    slow, right, fast = (terms(one(speed=share * LIMIT_MPS)) for share in (0.5, 1.0, 1.25))
+    assert [round(found["speed"], 6) for found in (slow, right, fast)] == [0.0, 0.0, 0.25]
+    assert slow["delay"] == pytest.approx(0.5 * STEP_S)
+    assert right["delay"] == fast["delay"] == 0.0
+    assert terms(one(speed=0.0))["delay"] == pytest.approx(STEP_S)
+
+
+def test_comfort_is_the_mean_jerk() -> None:
+    # 2 m/s² of acceleration gained and lost within the step: 4 m/s² of |jerk| in 0.1 s.
+    assert terms(one(step_jerk=4.0))["comfort"] == pytest.approx(4.0 / STEP_S / 10.0)
+
+
+@pytest.mark.parametrize(
+    ("bit", "name"),
+    [
+        (EVENT_COLLIDED, "collision"),
+        (EVENT_OFF_ROAD, "off_road"),
+        (EVENT_WRONG_WAY, "wrong_way"),
+        (EVENT_RED_LIGHT, "red_light"),
+        (EVENT_ARRIVED, "arrival"),
+    ],
+)
+def test_events_are_ones(bit: int, name: str) -> None:
+    flags = ("collision", "off_road", "wrong_way", "red_light", "arrival")
+    found = terms(one(events=bit))
+    assert [flag for flag in flags if found[flag] == 1.0] == [name]
+    assert all(found[flag] in (0.0, 1.0) for flag in flags)
+
+
+def test_time_to_collision_of_one_behind_another() -> None:
+    # 10 m/s faster, bumpers 20 m apart: 2 s, half the horizon.
+    rows = vehicles([(0.0, 0.0, 0.0), (25.0, 0.0, 0.0)], speed=[15.0, 5.0])
+    assert terms(rows)["time_to_collision"] == pytest.approx(1.0 - 2.0 / TTC_HORIZON_S)
+    assert terms(rows[::-1], 1)["time_to_collision"] == terms(rows)["time_to_collision"]
+    rows["speed"] = [5.0, 15.0]
+    assert terms(rows)["time_to_collision"] == 0.0
+    rows["speed"] = [15.0, 5.0]
+    rows["z"] = [0.0, 6.0]
+    assert terms(rows)["time_to_collision"] == 0.0, "one on a bridge"
+    rows["z"] = 0.0
+    rows["y"] = [0.0, 3.2]
+    assert terms(rows)["time_to_collision"] == 0.0, "one on the next lane"
+
+
+@given(crowds(), st.integers(0, 11))
+def test_time_to_collision_equals_twin(rows: NDArray[np.void], i: int) -> None:
+    i %= len(rows)
+    found = terms(rows, i)["time_to_collision"]
+    assert 0.0 <= found <= 1.0
+    assert found == pytest.approx(time_to_collision(rows, i), abs=1e-4)
+
+
+@given(crowds(), st.randoms(use_true_random=False))
+def test_the_order_of_rows_does_not_matter(rows: NDArray[np.void], random: object) -> None:
+    order = list(range(len(rows)))
+    random.shuffle(order)  # type: ignore[attr-defined]
+    for i in range(len(rows)):
+        assert terms(rows, i) == terms(rows[order], order.index(i))

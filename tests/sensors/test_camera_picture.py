@@ -1,0 +1,208 @@
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+
+from cavmarl.roads.kernels.backdrop_pieces import WALL
+from cavmarl.sensors.kernels.camera_picture import find_faces, look, make_camera, make_picture
+from cavmarl.sensors.kernels.faces import Camera, Picture
+from cavmarl.sensors.kernels.pixels import (
+    colours,
+    measure_depths,
+    write_classes,
+    write_colours,
+    write_halves,
+)
+from cavmarl.sensors.kernels.semantics import BUILDING, CAR, GROUND, NOTHING, PEDESTRIAN, ROAD
+from tests.naive import imaging as naive
+from tests.support.builders import crowds, vehicles
+from tests.support.imaging import NO_WALLS, backdrop, look_around, mount, mounts, wall_sets
+
+Floats = NDArray[np.float64]
+RIGHT = 0.5 * math.pi
+WIDTH, HEIGHT = 16, 10
+CLASS_OF = {"body": CAR, "wall": BUILDING, "ground": GROUND, "": NOTHING}
+
+
+def shoot(
+    rows: NDArray[np.void],
+    camera: Camera,
+    size: tuple[int, int] = (WIDTH, HEIGHT),
+    walls: NDArray[np.void] = NO_WALLS,
+    strips: Floats | None = None,
+    row: int = 0,
+) -> tuple[NDArray[np.float32], NDArray[np.uint8], Picture]:
+    """Depths and classes."""
+    reach_m = 2.0 * camera.range_m
+    panorama, counts = look_around(rows, row, backdrop(walls, strips), reach_m)
+    picture = make_picture(*size, panorama)
+    num = find_faces(camera, panorama, counts, picture)
+    look(camera, picture, num, 0, size[1])
+    depths = np.zeros(size[::-1], np.float32)
+    classes = np.zeros(size[::-1], np.uint8)
+    write_classes(picture, classes)
+    measure_depths(camera, picture, 0, depths)
+    return depths, classes, picture
+
+
+@given(crowds(most=6), wall_sets(), mounts(), st.integers(1, HEIGHT))
+def test_rows_do_not_depend_on_which_are_taken_together(
+    rows: NDArray[np.void], walls: NDArray[np.void], matrix: Floats, band: int
+) -> None:
+    """Pictures that are too large for the cache are taken in bands; a worker takes some of them."""
+    camera = make_camera(matrix, WIDTH, RIGHT, 60.0)
+    depths, classes, _ = shoot(rows, camera, walls=walls)
+    panorama, counts = look_around(rows, 0, backdrop(walls), 2.0 * camera.range_m)
+    picture = make_picture(WIDTH, HEIGHT, panorama)
+    num = find_faces(camera, panorama, counts, picture)
+    for first in reversed(range(0, HEIGHT, band)):
+        last = min(first + band, HEIGHT)
+        own_depths = np.zeros((last - first, WIDTH), np.float32)
+        own_classes = np.zeros((last - first, WIDTH), np.uint8)
+        look(camera, picture, num, first, last)
+        write_classes(picture, own_classes)
+        measure_depths(camera, picture, first, own_depths)
+        assert (own_classes == classes[first:last]).all()
+        assert (own_depths == depths[first:last]).all()
+
+
+def forward(range_m: float = 60.0, width: int = WIDTH, z_m: float = 1.0) -> Camera:
+    return make_camera(mount((0.0, 0.0, z_m)), width, RIGHT, range_m)
+
+
+@given(
+    crowds(most=6), wall_sets(), mounts(), st.sampled_from([0.5, RIGHT, 2.5]),
+    st.sampled_from([20.0, 60.0]), st.sampled_from([0.0, -0.1]),
+)  # fmt: skip
+def test_pixels_equal_twin(
+    rows: NDArray[np.void],
+    walls: NDArray[np.void],
+    matrix: Floats,
+    fov: float,
+    range_m: float,
+    pitch: float,
+) -> None:
+    rows["pitch"][0] = pitch
+    camera = make_camera(matrix, WIDTH, fov, range_m)
+    depths, classes, _ = shoot(rows, camera, walls=walls)
+    start = matrix[:, 3]
+    for j, i in np.ndindex(HEIGHT, WIDTH):
+        ray = naive.pixel_ray(matrix[:, :3], WIDTH, HEIGHT, fov, j, i)
+        nearer, exact, further = (
+            naive.trace(rows, 0, walls, start, ray, range_m, margin)
+            for margin in (1e-6, 0.0, -1e-6)
+        )
+        if exact.distance < 0.02:
+            continue  # inside of a body, of which a camera sees no face, or with its nose on it
+        if nearer.what == further.what and abs(nearer.distance - further.distance) < 1e-3:
+            assert depths[j, i] == pytest.approx(exact.distance, rel=1e-5, abs=1e-4)
+            assert classes[j, i] == CLASS_OF[exact.what[0]]
+
+
+@given(crowds(), mounts(), st.randoms(use_true_random=False))
+def test_the_order_of_rows_does_not_matter(
+    rows: NDArray[np.void], matrix: Floats, random: object
+) -> None:
+    order = list(range(len(rows)))
+    random.shuffle(order)  # type: ignore[attr-defined]
+    camera = make_camera(matrix, WIDTH, RIGHT, 60.0)
+    for place, row in enumerate(order):
+        once, again = shoot(rows, camera, row=row), shoot(rows[order], camera, row=place)
+        assert once[0].tobytes() == again[0].tobytes()
+        assert once[1].tobytes() == again[1].tobytes()
+
+
+def test_a_wall_at_ten_metres_is_ten_metres_deep_in_every_pixel() -> None:
+    wall = np.array([(10.0, -40.0, 10.0, 40.0, 80.0, 0)], WALL)
+    depths, classes, _ = shoot(vehicles([(0.0, 0.0, 0.0)]), forward(z_m=1.5), walls=wall)
+    above = HEIGHT // 2
+    assert (depths[:above] == 10.0).all()
+    assert (classes[:above] == BUILDING).all()
+    assert (classes[-1] == GROUND).all()
+    # Of the ground: height over slope of the lowest row.
+    slope = (HEIGHT - 0.5 - 0.5 * HEIGHT) / (0.5 * WIDTH)
+    assert depths[-1] == pytest.approx(1.5 / slope)
+
+
+def test_a_long_box_at_ten_metres_is_ten_metres_deep() -> None:
+    rows = vehicles([(0.0, 0.0, 0.0), (11.0, 0.0, RIGHT)], length=60.0, height=4.0)
+    depths, classes, _ = shoot(rows, forward())
+    middle = HEIGHT // 2 - 1
+    assert depths[middle] == pytest.approx(10.0)
+    assert (classes[middle] == CAR).all()
+
+
+def test_the_nearer_one_hides_the_other() -> None:
+    rows = vehicles([(0.0, 0.0, 0.0), (20.0, 0.0, RIGHT), (10.0, 0.0, RIGHT)], length=60.0)
+    rows["vtype"][2] = 1
+    _, classes, _ = shoot(rows, forward(z_m=0.8))
+    middle = HEIGHT // 2 - 1
+    assert (classes[middle] == PEDESTRIAN).all()
+    wall = np.array([(5.0, -40.0, 5.0, 40.0, 8.0, 0)], WALL)
+    _, classes, _ = shoot(rows, forward(z_m=0.8), walls=wall)
+    assert (classes[middle] == BUILDING).all()
+
+
+def test_left_is_left_and_up_is_up() -> None:
+    left = vehicles([(0.0, 0.0, 0.0), (10.0, 6.0, 0.0)])
+    _, classes, _ = shoot(left, forward())
+    seen = np.argwhere(classes == CAR)
+    assert seen[:, 1].max() < WIDTH // 2
+    assert (classes[0] == NOTHING).all()
+    assert (classes[-1] == GROUND).all()
+
+
+def test_a_rolled_camera_sees_the_horizon_upright() -> None:
+    camera = make_camera(mount((0.0, 0.0, 1.0), (0.0, 0.0, RIGHT)), WIDTH, RIGHT, 60.0)
+    _, classes, _ = shoot(vehicles([(0.0, 0.0, 0.0)]), camera)
+    # Its left side is up: the sky is to the left.
+    assert (classes[:, 0] == NOTHING).all()
+    assert (classes[:, -1] == GROUND).all()
+
+
+def test_roads_lie_on_the_ground_and_bodies_stand_on_them() -> None:
+    strip = np.array([[(0.0, -2.0), (0.0, 2.0), (50.0, 2.0), (50.0, -2.0)]])
+    rows = vehicles([(0.0, 0.0, 0.0), (12.0, 0.0, 0.0)])
+    _, classes, _ = shoot(rows, forward(), strips=strip)
+    assert classes[-1, WIDTH // 2] == ROAD
+    assert classes[HEIGHT // 2, 0] == GROUND
+    assert classes[HEIGHT // 2, WIDTH // 2] == CAR
+
+
+def test_neighbouring_faces_leave_no_gap() -> None:
+    """A prism that turns round shows no ground or sky inside of its outline."""
+    for heading in np.linspace(0.0, math.pi, 25):
+        rows = vehicles([(0.0, 0.0, 0.0), (8.0, 0.3, heading)])
+        _, classes, _ = shoot(rows, forward(width=64, z_m=1.6), (64, 40))
+        for line in classes:
+            seen = np.flatnonzero(line == CAR)
+            assert len(seen) == 0 or len(seen) == seen[-1] - seen[0] + 1
+
+
+def test_halves_are_those_of_numpy() -> None:
+    values = np.geomspace(0.01, 300.0, 4001, dtype=np.float32).reshape(1, -1)
+    ties = (np.arange(2048, 4096, dtype=np.float32) / 16.0 + 1.0 / 32.0).reshape(1, -1)
+    for floats in (values, ties):
+        out = np.zeros(floats.shape, np.uint16)
+        write_halves(floats.view(np.uint32), out)
+        assert (out.view(np.float16) == floats.astype(np.float16)).all()
+
+
+def test_colours_are_those_of_the_classes_and_pale_with_the_distance() -> None:
+    rows = vehicles(
+        [(0.0, 0.0, 0.0), (6.0, 0.0, RIGHT), (40.0, 0.0, RIGHT)], length=[5, 3, 120], height=6.0
+    )
+    camera = forward()
+    _, classes, picture = shoot(rows, camera)
+    out = np.zeros((HEIGHT, WIDTH, 3), np.uint8)
+    write_colours(camera, picture, 0, colours(), out)
+    middle = HEIGHT // 2 - 1
+    near, far = out[middle, WIDTH // 2].astype(int), out[middle, 0].astype(int)
+    assert classes[middle, 0] == classes[middle, WIDTH // 2] == CAR
+    assert near[0] - near[2] > far[0] - far[2] > 0
+    assert (out[0, 0] == colours()[NOTHING]).all()

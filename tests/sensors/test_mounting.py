@@ -1,0 +1,82 @@
+"""Mounting transforms, against rotations written as products of matrices."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from cavmarl.config.rig import OdometryConfig
+from cavmarl.core.errors import ConfigError
+from cavmarl.driving.vehicle_types import generated_types
+from cavmarl.driving.vehicles import blank_vehicle
+from cavmarl.sensors.kernels.mount_poses import sensor_pose
+from cavmarl.sensors.mounted.mount_transforms import (
+    check_place,
+    mount_of,
+    sensor_to_vehicle,
+    vehicle_to_sensor,
+    vehicle_to_world,
+    world_to_vehicle,
+)
+
+Matrix = NDArray[np.float64]
+
+
+def _naive_turn(yaw: float, pitch: float, roll: float) -> Matrix:
+    """Yaw about z, then pitch upwards (about -y), then roll about x."""
+    cy, sy, cp, sp, cr, sr = (f(a) for a in (yaw, pitch, roll) for f in (math.cos, math.sin))
+    about_z = np.array([[cy, -sy, 0.0], [sy, cy, 0.0], [0.0, 0.0, 1.0]])
+    about_y = np.array([[cp, 0.0, -sp], [0.0, 1.0, 0.0], [sp, 0.0, cp]])
+    about_x = np.array([[1.0, 0.0, 0.0], [0.0, cr, -sr], [0.0, sr, cr]])
+    turn: Matrix = about_z @ about_y @ about_x
+    return turn
+
+
+def _some(seed: int) -> tuple[OdometryConfig, np.void]:
+    rng = np.random.default_rng(seed)
+    x, y, z, yaw, pitch, roll = rng.uniform(-1, 1, 6).tolist()
+    config = OdometryConfig(
+        rate_hz=10.0, x_m=2 * x, y_m=y, z_m=1 + 0.5 * z,
+        yaw_deg=180 * yaw, pitch_deg=80 * pitch, roll_deg=170 * roll,
+    )  # fmt: skip
+    row = blank_vehicle()[0]
+    for name, value in zip(("x", "y", "z", "heading", "pitch"), rng.uniform(-1, 1, 5), strict=True):
+        row[name] = value
+    return config, row
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_turns_are_yaw_then_pitch_then_roll(seed: int) -> None:
+    config, _ = _some(seed)
+    angles = np.radians([config.yaw_deg, config.pitch_deg, config.roll_deg]).tolist()
+    np.testing.assert_allclose(mount_of(config).turn, _naive_turn(*angles), atol=1e-15)
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_points_come_back_from_the_world(seed: int) -> None:
+    config, row = _some(seed)
+    mount = mount_of(config)
+    points = np.random.default_rng(seed).normal(size=(20, 3))
+    in_world = vehicle_to_world(row, sensor_to_vehicle(mount, points))
+    back = vehicle_to_sensor(mount, world_to_vehicle(row, in_world))
+    np.testing.assert_allclose(back, points, atol=1e-12)
+    body, axes = np.zeros((3, 3)), np.zeros((3, 3))
+    place = sensor_pose(row, mount, body, axes)
+    np.testing.assert_allclose(points @ axes.T + np.array(place), in_world, atol=1e-12)
+
+
+def test_pitch_looks_up_and_uphill() -> None:
+    mount = mount_of(OdometryConfig(rate_hz=10.0, pitch_deg=30.0))
+    ahead = sensor_to_vehicle(mount, np.array([[1.0, 0.0, 0.0]]))[0]
+    assert ahead[2] == pytest.approx(0.5)
+
+
+@pytest.mark.parametrize("place", [{"x_m": 2.6}, {"y_m": -1.1}, {"z_m": 1.7}, {"z_m": -0.1}])
+def test_a_place_outside_of_the_body_is_refused(place: dict[str, float]) -> None:
+    car = generated_types()[0]
+    check_place("a", OdometryConfig(rate_hz=1.0, x_m=2.5, y_m=-1.0, z_m=1.6), car)
+    with pytest.raises(ConfigError, match=r"rig\.a\.[xyz]_m = .*outside of the vehicle"):
+        check_place("a", OdometryConfig(rate_hz=1.0, **place), car)

@@ -1,0 +1,91 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+
+from cavmarl.config.sensors import LanesConfig, SensorsConfig
+from cavmarl.core.math.neighbors import fill_grid, make_grid
+from cavmarl.core.records.codes import SIGNAL_RED, SIGNAL_RED_YELLOW
+from cavmarl.driving.kernels.junctions import link_signal
+from cavmarl.sensors.kernels.observing_lanes import LANES_FEATURES, observe_lanes
+from cavmarl.sensors.observed import layout, sensor_arrays
+from tests.naive import observing_lanes as naive
+from tests.support.traffic import NAMES, crowds_on_lanes, network, on_lane, plans, travel
+
+RANGE_M = 60.0
+CONFIG = SensorsConfig(lanes=LanesConfig(range_m=RANGE_M))
+
+
+def observe(name: str, rows: NDArray[np.void], i: int, phase: NDArray[np.int32]) -> list[float]:
+    roads = network(name)
+    grid = make_grid(roads.extent_m, 25.0, len(rows))
+    fill_grid(rows, len(rows), grid)
+    place = layout(CONFIG)["lanes"]
+    out = np.zeros(place.stop, np.float32)
+    observe_lanes(roads.arrays, travel(name), rows, i, grid, phase, sensor_arrays(CONFIG), out)
+    assert place.stop - place.start == LANES_FEATURES
+    assert not out[: place.start].any()
+    return [float(value) for value in out[place]]
+
+
+def phases(name: str, random: object) -> NDArray[np.int32]:
+    """A phase for every signal."""
+    programs = network(name).programs[network(name).signals["program"]]
+    found = [p["first_phase"] + random.randrange(p["num_phases"]) for p in programs]  # type: ignore[attr-defined]
+    return np.array(found, dtype=np.int32)
+
+
+def red_links(name: str, phase: NDArray[np.int32]) -> set[int]:
+    roads = network(name)
+    red = (SIGNAL_RED, SIGNAL_RED_YELLOW)
+    links = range(len(roads.links))
+    return {link for link in links if link_signal(roads.arrays, link, phase) in red}
+
+
+@st.composite
+def traffic(draw: st.DrawFn, name: str) -> NDArray[np.void]:
+    """Vehicles on lanes that stand where they say, with goals and speeds."""
+    rows = draw(crowds_on_lanes(name, most=10))
+    placed = [on_lane(network(name), row["lane"], row["s"])[0] for row in rows]
+    for row, there in zip(rows, placed, strict=True):
+        row["x"], row["y"], row["heading"] = there["x"], there["y"], there["heading"]
+        row["goal"] = draw(st.integers(0, 3))
+        row["way"] = row["goal"] * len(network(name).lanes)
+        row["speed"] = draw(st.sampled_from([0.0, 3.0, 14.0]))
+    return rows
+
+
+@pytest.mark.parametrize("name", NAMES)
+@settings(deadline=None)
+@given(data=st.data(), random=st.randoms(use_true_random=False))
+def test_lanes_equals_twin_whatever_the_order(
+    name: str, data: st.DataObject, random: object
+) -> None:
+    rows = data.draw(traffic(name))
+    phase = phases(name, random)
+    held = red_links(name, phase)
+    order = data.draw(st.permutations(range(len(rows))))
+    for place, i in enumerate(order):
+        found = observe(name, rows, i, phase)
+        assert found == observe(name, rows[order], place, phase)
+        twin = naive.lanes(network(name), plans(name), rows, i, held, RANGE_M)
+        assert found == pytest.approx(twin, abs=1e-6)
+
+
+def test_gaps_on_a_straight_road() -> None:
+    roads = network("merge")
+    lane = roads.lane_ids.index("main_out_0")
+    left = int(roads.lanes[lane]["left"])
+    cars = [(lane, 100.0, 20.0), (lane, 115.0, 16.0), (lane, 140.0, 10.0), (left, 85.0, 24.0)]
+    rows = np.concatenate([on_lane(roads, at, s, speed=speed) for at, s, speed in cars])
+    rows["goal"] = len(plans("merge")) - 1
+    rows["way"] = rows["goal"] * len(roads.lanes)
+    rows["id"] = np.arange(len(rows))
+    found = observe("merge", rows, 0, np.zeros(0, np.int32))
+    assert found[:2] == pytest.approx([0.5, -0.1])
+    assert found[2:4] == [0.0, 0.0]
+    assert found[4:6] == pytest.approx([0.5, 0.1])
+    assert found[6:] == [0.0] * 8

@@ -1,0 +1,110 @@
+"""Shards do the same whichever of them are called together."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+import pytest
+
+from cavmarl.engine.simulation import Simulation
+from cavmarl.shards.shard import TICKS_IN_ORDER, Shard
+from cavmarl.shards.shard_group import ShardGroup
+from tests.support.driving import drive, idle, make_simulation, start
+
+STEPS = 2 * TICKS_IN_ORDER
+ZONES = 4
+TIMES = {"zones.count": ZONES, "clock.sim_dt_s": 0.1, "clock.ctrl_dt_s": 0.2}
+Parting = Callable[[Sequence[Shard]], list[Sequence[Shard]]]
+
+
+class Groups:
+    """Several groups, called one after the other, as those of several processes are."""
+
+    def __init__(self, parts: Sequence[Sequence[Shard]]) -> None:
+        self._groups = [ShardGroup(part) for part in parts]
+
+    def each(self, phase: str, *arguments: Any) -> None:
+        for group in self._groups:
+            group.each(phase, *arguments)
+
+
+def divided(**overrides: Any) -> Simulation:
+    simulation = make_simulation(
+        "grid4x4", mode="seats", agents=4, background=60, num_worlds=2,
+        overrides={**TIMES, **overrides},
+    )  # fmt: skip
+    start(simulation, seed=3)
+    return simulation
+
+
+def all_rows(simulation: Simulation) -> bytes:
+    """Every row of every zone as it lies, and the counts."""
+    zoned = simulation._tick.division.zoned
+    numbers = (zoned.num_owned, zoned.num_rows, zoned.num_near, zoned.num_contacts)
+    rows = [
+        shard.worlds.rows[w, :num].tobytes()
+        for shard in simulation._shards
+        for w, num in enumerate(shard.worlds.num_rows)
+    ]
+    return b"".join([*(array.tobytes() for array in numbers), *rows])
+
+
+@pytest.mark.parametrize(
+    "part",
+    [
+        lambda shards: [[shard] for shard in shards],
+        lambda shards: [[shards[0], shards[2]], [shards[1], shards[3]]],
+    ],
+    ids=["alone", "in twos"],
+)
+def test_all_together_do_what_parts_of_them_do(part: Parting) -> None:
+    together, apart = divided(), divided()
+    apart._tick.executor = Groups(part(apart._shards))
+    for step in range(STEPS):
+        drive(together)
+        drive(apart)
+        assert all_rows(together) == all_rows(apart), f"step {step}"
+        assert together.state_hash(1) == apart.state_hash(1)
+    assert together.migrations > 10
+    assert together.traffic_stats().departed > 64, "nobody has left and been followed"
+
+
+def test_a_shard_is_stepped_alone() -> None:
+    simulation = divided()
+    shard = simulation._shards[2]
+    others = [other for other in simulation._shards if other is not shard]
+    before = [other.sides[0].tobytes() + other.sides[1].tobytes() for other in others]
+    own = shard.worlds.rows[0, : shard.worlds.num_owned[0]].copy()
+    alone = ShardGroup([shard])
+    for _ in range(2):
+        alone.each("advance", idle(simulation))
+        alone.each("resolve")
+        alone.each("commit")
+    rows = shard.worlds.rows[0, : len(own)]
+    assert sorted(rows["id"]) == sorted(own["id"])
+    assert (rows["tick"] == 2).all()
+    assert [other.sides[0].tobytes() + other.sides[1].tobytes() for other in others] == before
+
+
+def test_who_may_be_seen_elsewhere_is_noted_while_it_is_moved() -> None:
+    simulation = divided()
+    division = simulation._tick.division
+    for _ in range(STEPS):
+        simulation._tick.executor.each("advance", idle(simulation))
+        for shard in simulation._shards:
+            left, low, right, high = division.halo.inner[shard.zone]
+            worlds = shard.worlds
+            for w in range(2):
+                rows = worlds.next_rows[w, : worlds.num_owned[w]]
+                x, y = rows["x"], rows["y"]
+                inside = (left < x) & (x < right) & (low < y) & (y < high)
+                noted = worlds.outer[w, : worlds.num_outer[w]]
+                np.testing.assert_array_equal(noted["row"], np.flatnonzero(~inside))
+                for name in ("x", "y", "s", "speed", "lane"):
+                    np.testing.assert_array_equal(noted[name], rows[name][noted["row"]])
+        simulation._tick.division.exchange()
+        assert (division.zoned.num_outer == -1).all()
+        simulation._tick.executor.each("commit")
+        simulation._shard.worlds.ticks[:] += 1

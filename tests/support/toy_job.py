@@ -1,0 +1,92 @@
+"""A job that adds up, for the processes of a pool; run as a program."""
+
+from __future__ import annotations
+
+import os
+import signal
+import time
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cavmarl.parallel.processes.worker_loop import serve
+
+TASKS = ("add", "total", "fail", "die", "doze", "toil", "run out", "fall")
+ADD, TOTAL, FAIL, DIE, DOZE, TOIL, RUN_OUT, FALL = range(len(TASKS))
+
+POINTS = ("begun", "half done", "done", "image begun")
+
+
+class Fatal(np.ndarray[Any, Any]):
+    """Whoever copies it dies of it."""
+
+    def view(self, *_: Any, **__: Any) -> Any:
+        os.kill(os.getpid(), signal.SIGKILL)
+
+
+class Adder:
+    def __init__(self) -> None:
+        self.numbers = np.zeros(3, dtype=[("a", np.float64), ("b", np.int32)])
+        self.more = np.zeros(0)  # another one each time
+        self.falls_at = ""
+
+    def afterwards(self) -> None:
+        """Nothing to do."""
+
+    def prepare(self) -> None:
+        """Nothing is shared."""
+
+    def perform(self, task: int, letter: Any) -> Any:
+        if task == TOTAL:
+            return [float(self.numbers["a"].sum()), len(self.more)]
+        if task == FALL:
+            self.falls_at = ""
+            with suppress(FileNotFoundError):  # whoever comes first falls, and nobody else
+                os.unlink(letter[1])
+                self.falls_at = POINTS[letter[0]]
+        self.pass_by("begun")
+        self.numbers["a"][0] += 1.0
+        self.pass_by("half done")
+        self.numbers["a"][1:] += 1.0
+        self.more = np.append(self.more, np.ones(1000))
+        if task == FAIL:
+            raise ValueError(f"as told: {letter}")
+        if task == DIE:
+            os.kill(os.getpid(), signal.SIGSEGV if letter is None else letter)
+        if task == DOZE:
+            time.sleep(letter)
+        if task == TOIL:
+            end = time.perf_counter() + letter
+            while time.perf_counter() < end:
+                pass
+        if task == RUN_OUT:
+            raise MemoryError
+        return None
+
+    def pass_by(self, point: str) -> None:
+        if self.falls_at == point:
+            os.kill(os.getpid(), signal.SIGKILL)
+
+    def save(self) -> list[NDArray[Any]]:
+        self.pass_by("done")
+        more = self.more.view(Fatal) if self.falls_at == "image begun" else self.more
+        return [self.numbers, more]
+
+    def load(self, saved: Sequence[NDArray[Any]]) -> None:
+        self.numbers[:] = saved[0]
+        self.more = saved[1].copy()
+
+
+def make_jobs(recipe: Mapping[str, Any]) -> list[Adder]:
+    if "fails" in recipe:
+        raise RuntimeError(recipe["fails"])
+    if "ends" in recipe:
+        os._exit(recipe["ends"])
+    return [Adder() for _ in range(recipe["workers"])]
+
+
+if __name__ == "__main__":
+    serve(make_jobs)

@@ -1,0 +1,28 @@
+"""What zones ask about lanes, zone by zone."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cavmarl.zones.kernels.zone_lookup import LOOK, Halo
+
+__all__ = ["blank_looks", "looks_of"]
+
+
+def blank_looks(shape: int | tuple[int, ...]) -> NDArray[np.void]:
+    """LOOK of drivers who ask about nobody."""
+    looks = np.zeros(shape, dtype=LOOK)
+    looks["head"], looks["tail"], looks["back"], looks["line"] = -np.inf, np.inf, np.inf, np.inf
+    return looks
+
+
+def looks_of(halo: Halo, zone: int) -> NDArray[np.void]:
+    """LOOK (L,) of one zone."""
+    looks = blank_looks(len(halo.watcher_start) - 1)
+    for lane, look in enumerate(looks):
+        watchers = halo.watchers[halo.watcher_start[lane] : halo.watcher_start[lane + 1]]
+        for watch in watchers[watchers["zone"] == zone]:
+            for field in LOOK.names or ():
+                look[field] = watch[field]
+    return looks

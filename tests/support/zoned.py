@@ -1,0 +1,59 @@
+"""Rows of several zones for the kernels that carry them from one to another."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cavmarl.core.records.arrays import Zoned
+from cavmarl.shards.shard import make_zoned
+from cavmarl.zones.kernels.borders import Borders
+from cavmarl.zones.kernels.ghost_exchange import exchange
+from cavmarl.zones.kernels.handoff import Book, make_book
+from cavmarl.zones.partition.zone_halo import zone_halo
+from cavmarl.zones.partition.zone_partition import ZonePartition
+
+SIDE = 1
+NO_BORDERS = Borders(0.0, 0.0, 0.0)
+
+
+def zoned_of(parts: Sequence[NDArray[np.void]], room: int = 0) -> Zoned:
+    """One world whose zones own these rows, with what is no ghost behind them.
+
+    Args:
+        parts: the rows of each zone.
+        room: rows of a zone; default: enough for a ghost of everybody.
+    """
+    zoned = make_zoned(len(parts), 1, room or max(1, sum(map(len, parts))))
+    zoned.rows["id"] = zoned.border[:] = -7
+    for numbers in (zoned.num_rows, zoned.num_near, zoned.num_border):
+        numbers[:] = -7
+    for zone, rows in enumerate(parts):
+        zoned.rows[SIDE, zone, 0, : len(rows)] = rows
+        zoned.num_owned[zone] = len(rows)
+    return zoned
+
+
+def exchanged(
+    partition: ZonePartition,
+    halo_m: float,
+    parts: Sequence[NDArray[np.void]],
+    touching_m: float = 0.0,
+    borders: Borders = NO_BORDERS,
+    book: Book | None = None,
+) -> Zoned:
+    """The same after the zones have exchanged their ghosts."""
+    zoned = zoned_of(parts)
+    if book is None:
+        book = make_book(1, zoned.rows.shape[-1] * partition.count)
+    halo = zone_halo(partition, halo_m)
+    exchange(partition.arrays, halo, touching_m, borders, zoned, SIDE, 0, 1, book)
+    return zoned
+
+
+def ghosts_of(zoned: Zoned, zone: int) -> NDArray[np.void]:
+    """What a zone sees of the others."""
+    first, last = zoned.num_owned[zone, 0], zoned.num_rows[zone, 0]
+    return zoned.rows[SIDE, zone, 0, first:last]

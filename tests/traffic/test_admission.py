@@ -1,0 +1,116 @@
+"""How departures of all zones are agreed at the gate."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from cavmarl.core.records import codes
+from cavmarl.core.records.arrays import Gate
+from cavmarl.driving.vehicles import VEHICLE
+from cavmarl.shards.shard import make_worlds
+from cavmarl.traffic.departure_queue import make_gate
+from cavmarl.traffic.kernels.admission import accept, admit, assign_lanes
+from cavmarl.zones.partition.zone_halo import zone_halo
+from tests.support.builders import vehicles
+from tests.support.partitions import four
+from tests.support.traffic import network, travel
+
+ROADS = network("merge")
+MAIN = [ROADS.lane_ids.index(f"main_in_{k}") for k in range(2)]
+FIRST_ID = 50
+
+
+def gate_of(num_queue: int) -> Gate:
+    """A gate where so many wait; the one at place q has the id 50 + q."""
+    gate = make_gate(1, 12, ROADS.arrays, VEHICLE)
+    gate.queue[0]["id"] = FIRST_ID + np.arange(12)
+    gate.queue[0]["lane"] = MAIN[0]
+    gate.queue[0]["lane_code"] = codes.LANE_GIVEN
+    gate.num_queue[0] = num_queue
+    return gate
+
+
+def offer(gate: Gate, xs: Sequence[tuple[int, float]]) -> None:
+    """Proposals as (place in the queue, x), in the order in which the zones made them."""
+    for n, (q, x) in enumerate(xs):
+        gate.passing[0, n] = vehicles([(x, 0.0, 0.0)], id=FIRST_ID + q)[0]
+        gate.places[0, n] = q
+    gate.num_passing[0] = len(xs)
+
+
+def passing(gate: Gate) -> list[int]:
+    return [int(k) for k in gate.passing[0, : gate.num_passing[0]]["id"]]
+
+
+def waiting(gate: Gate) -> list[int]:
+    return [int(k) for k in gate.queue[0, : gate.num_queue[0]]["id"]]
+
+
+def running(number: int) -> NDArray[np.int64]:
+    return np.array([number], dtype=np.int64)
+
+
+def test_proposals_are_taken_in_the_order_of_the_queue_whichever_zone_made_them() -> None:
+    gate = gate_of(6)
+    offer(gate, [(3, 300.0), (5, 500.0), (0, 0.0), (2, 200.0)])
+    accept(gate, running(0), 100)
+    assert passing(gate) == [50, 52, 53, 55]
+    assert waiting(gate) == [51, 54]
+    assert gate.counts[0, codes.COUNT_DEPARTED] == 4
+
+
+@pytest.mark.parametrize("order", [(1, 0), (0, 1)])
+def test_of_two_that_would_touch_over_a_border_the_first_of_the_queue_enters(
+    order: tuple[int, int],
+) -> None:
+    gate = gate_of(3)
+    offer(gate, [(q, 4.0 * q) for q in order])
+    accept(gate, running(0), 100)
+    assert passing(gate) == [50]
+    assert waiting(gate) == [51, 52]
+
+
+@pytest.mark.parametrize(("present", "enter"), [(8, 2), (9, 1), (10, 0)])
+def test_a_full_world_takes_no_more_than_fit(present: int, enter: int) -> None:
+    gate = gate_of(4)
+    offer(gate, [(3, 300.0), (1, 100.0), (2, 200.0)])
+    accept(gate, running(present), 10)
+    assert passing(gate) == [51, 52][:enter]
+    assert len(waiting(gate)) == 4 - enter
+    assert waiting(gate) == sorted(waiting(gate))
+
+
+def test_one_a_tick_tries_on_each_lane() -> None:
+    gate = gate_of(4)
+    gate.queue[0, :4]["lane"] = [MAIN[0], MAIN[0], MAIN[1], MAIN[0]]
+    worlds = make_worlds(1, 12, ROADS)
+    assign_lanes(ROADS.arrays, travel("merge"), gate, worlds)
+    assert gate.tries[0, :4].tolist() == [MAIN[0], -1, MAIN[1], -1]
+
+
+def test_who_enters_is_owned_in_one_zone_and_a_ghost_near_it() -> None:
+    # Four zones around (10, 20), halo 5 m; three vehicles: in a corner, near a border, far off.
+    partition = four()
+    halo = zone_halo(partition, 5.0)
+    entering = vehicles([(9.0, 19.0, 0.0), (12.0, 40.0, 0.0), (-30.0, -20.0, 0.0)], id=[7, 8, 9])
+    owned: list[list[int]] = []
+    ghosts: list[list[int]] = []
+    for zone in range(4):
+        worlds = make_worlds(1, 12, ROADS)
+        worlds.next_rows[0, :2] = vehicles([(0.0, 0.0, 0.0)] * 2, id=[1, 2])
+        worlds.num_owned[0], worlds.num_rows[0] = 1, 2
+        gate = gate_of(0)
+        gate.passing[0, :3] = entering
+        gate.num_passing[0] = 3
+        admit(partition.arrays, halo, zone, gate, worlds)
+        ids = worlds.next_rows[0, : worlds.num_rows[0]]["id"].tolist()
+        assert ids[0] == 1
+        assert 2 in ids[worlds.num_owned[0] :]
+        owned.append(sorted(ids[1 : worlds.num_owned[0]]))
+        ghosts.append(sorted(set(ids[worlds.num_owned[0] :]) - {2}))
+    assert owned == [[7, 9], [], [], [8]]
+    assert ghosts == [[], [7], [7, 8], [7]]

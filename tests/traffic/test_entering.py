@@ -1,0 +1,220 @@
+"""Each of SUMO's words for where, and how fast, a vehicle enters."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from cavmarl.core.math.rng import world_key
+from cavmarl.core.records import codes
+from cavmarl.core.records.arrays import Scratch, Travel
+from cavmarl.driving.kernels.following import speed_behind
+from cavmarl.driving.kernels.lane_index import VIEW_M, index_lanes
+from cavmarl.driving.vehicle_types import generated_types
+from cavmarl.roads.routing import make_plans
+from cavmarl.traffic.departure_queue import DEPARTURE
+from cavmarl.traffic.kernels.entering import (
+    crowd,
+    entry_lane,
+    entry_place,
+    entry_speed,
+    follower_brakes,
+    speed_at,
+)
+from tests.support.traffic import network, on_lane, scratch, travel_by
+
+ROADS = network("merge")
+PLAN = make_plans(ROADS, [ROADS.edge_ids.index("main_out")])
+TRAVEL = travel_by(PLAN)
+KIND = generated_types()[0]
+KEY = world_key(1, 0, 0)
+# Three lanes, of which the rightmost ends: from there the way goes on after a lane change.
+WEAVE = [ROADS.lane_ids.index(f"weave_{k}") for k in range(3)]
+MAIN = [ROADS.lane_ids.index(f"main_in_{k}") for k in range(2)]
+LENGTH = float(ROADS.lanes["length_m"][MAIN[0]])
+LIMIT = float(ROADS.lanes["speed_mps"][MAIN[0]])
+
+
+def departure(lane: int = MAIN[0], **fields: Any) -> np.void:
+    """A car that waits to enter; its lane, place and speed are given unless `fields` say more."""
+    row = np.zeros(1, DEPARTURE)
+    row["id"], row["agent"], row["lane"], row["speed_factor"] = 50, -1, lane, 1.0
+    for field, value in fields.items():
+        row[field] = value
+    return row[0]
+
+
+def traffic(*places: tuple[int, float, float]) -> tuple[NDArray[np.void], Scratch]:
+    """Cars as (lane, s, speed), ids rising, and their index."""
+    rows = [
+        on_lane(ROADS, lane, s, TRAVEL, speed=speed, id=k)
+        for k, (lane, s, speed) in enumerate(places)
+    ]
+    cars = np.concatenate(rows) if rows else on_lane(ROADS, MAIN[0], 0.0, TRAVEL)[:0]
+    room = scratch(ROADS, max(len(cars), 1))
+    index_lanes(ROADS.arrays, TRAVEL, cars, len(cars), room)
+    return cars, room
+
+
+def lane_of(
+    code: int,
+    room: Scratch,
+    lane: int = WEAVE[0],
+    vehicle: int = 50,
+    *,
+    taken: Sequence[int] = (),
+    travel: Travel = TRAVEL,
+) -> int:
+    waiting = departure(lane, lane_code=code, id=vehicle)
+    edge = ROADS.edges[ROADS.lanes["edge"][lane]]
+    lanes = range(int(edge["first_lane"]), int(edge["first_lane"] + edge["num_lanes"]))
+    ranks = np.array([crowd(room, each, 0.0, VIEW_M) for each in lanes])
+    flags = np.isin(np.arange(len(ROADS.lanes)), taken)
+    return entry_lane(ROADS.arrays, travel, KEY, waiting, ranks, flags)
+
+
+def test_a_given_lane_is_taken_once_a_tick() -> None:
+    _, room = traffic()
+    for lane in WEAVE:
+        assert lane_of(codes.LANE_GIVEN, room, lane) == lane
+    assert lane_of(codes.LANE_GIVEN, room, WEAVE[1], taken=[WEAVE[1]]) == -1
+
+
+def test_first_is_the_rightmost_lane_that_leads_on() -> None:
+    _, room = traffic()
+    assert lane_of(codes.LANE_FIRST, room, WEAVE[2]) == WEAVE[0]
+    assert lane_of(codes.LANE_FIRST, room, WEAVE[2], taken=[WEAVE[0]]) == -1
+
+
+def test_random_takes_each_lane_as_often_and_the_same_again() -> None:
+    _, room = traffic()
+    picked = [lane_of(codes.LANE_RANDOM, room, vehicle=k) for k in range(600)]
+    assert picked == [lane_of(codes.LANE_RANDOM, room, vehicle=k) for k in range(600)]
+    for lane in WEAVE:
+        assert 150 < picked.count(lane) < 250
+    again = [lane_of(codes.LANE_RANDOM, room, vehicle=k, taken=[WEAVE[2]]) for k in range(600)]
+    assert again == [-1 if lane == WEAVE[2] else lane for lane in picked]
+
+
+@pytest.mark.parametrize("code", [codes.LANE_FREE, codes.LANE_ALLOWED])
+def test_free_is_the_emptiest_lane_and_the_right_one_of_two(code: int) -> None:
+    _, room = traffic((WEAVE[0], 20.0, 5.0), (WEAVE[0], 60.0, 5.0), (WEAVE[1], 40.0, 5.0))
+    assert lane_of(code, room) == WEAVE[2]
+    _, room = traffic((WEAVE[0], 20.0, 5.0))
+    assert lane_of(code, room) == WEAVE[1]
+    assert lane_of(code, room, taken=[WEAVE[1]]) == WEAVE[2]
+
+
+def test_best_is_the_emptiest_of_the_lanes_that_need_no_change() -> None:
+    assert PLAN[0][WEAVE[0]]["changes"] > 0
+    _, room = traffic((WEAVE[1], 20.0, 5.0))
+    assert lane_of(codes.LANE_BEST, room) == WEAVE[2]
+    taken = WEAVE[1:]
+    assert lane_of(codes.LANE_BEST, room, taken=taken) == WEAVE[0], "rather that one than none"
+
+
+def test_no_lane_that_leads_nowhere_is_taken() -> None:
+    nowhere = travel_by(make_plans(ROADS, [ROADS.edge_ids.index("ramp")]))
+    _, room = traffic()
+    for code in (codes.LANE_FIRST, codes.LANE_RANDOM, codes.LANE_FREE, codes.LANE_BEST):
+        assert lane_of(code, room, travel=nowhere) == -1
+
+
+def place(room: Scratch, tick: int = 0, **fields: Any) -> float:
+    return entry_place(ROADS.arrays, KEY, departure(**fields), KIND, MAIN[0], tick, room, VIEW_M)
+
+
+def test_given_places_are_of_the_front_bumper_from_either_end() -> None:
+    _, room = traffic()
+    assert place(room, pos_code=codes.POS_GIVEN, pos=40.0) == 37.5
+    assert place(room, pos_code=codes.POS_GIVEN, pos=-40.0) == pytest.approx(LENGTH - 42.5)
+    assert place(room, pos_code=codes.POS_GIVEN, pos=1.0) == 2.5, "the whole body is on the lane"
+    assert place(room, pos_code=codes.POS_GIVEN, pos=LENGTH) == pytest.approx(LENGTH - 2.5)
+
+
+def test_base_puts_the_rear_at_the_start_and_last_a_gap_behind_the_last() -> None:
+    _, room = traffic((MAIN[0], 100.0, 5.0), (MAIN[0], 60.0, 5.0))
+    assert place(room, pos_code=codes.POS_BASE) == 2.5
+    last = place(room, pos_code=codes.POS_LAST)
+    assert last == pytest.approx(60.0 - 2.5 - KIND["min_gap"] - 2.5)
+    _, room = traffic()
+    assert place(room, pos_code=codes.POS_LAST) == pytest.approx(LENGTH - 2.5)
+
+
+@pytest.mark.parametrize("code", [codes.POS_RANDOM, codes.POS_FREE, codes.POS_RANDOM_FREE])
+def test_random_places_are_anywhere_and_others_in_another_tick(code: int) -> None:
+    _, room = traffic()
+    found = np.array([place(room, tick, pos_code=code) for tick in range(400)])
+    assert (found >= 2.5).all()
+    assert (found <= LENGTH - 2.5).all()
+    counts, _ = np.histogram(found, bins=4, range=(0.0, LENGTH))
+    assert counts.min() > 70
+    np.testing.assert_array_equal(found, [place(room, tick, pos_code=code) for tick in range(400)])
+
+
+def speed(room: Scratch, s: float = 20.0, vehicle: int = 50, **fields: Any) -> float:
+    waiting = departure(id=vehicle, **fields)
+    return entry_speed(ROADS.arrays, TRAVEL, KEY, waiting, KIND, MAIN[0], s, room)
+
+
+@pytest.mark.parametrize("factor", [0.8, 1.2])
+def test_on_a_free_lane_each_word_means_its_speed(factor: float) -> None:
+    _, room = traffic()
+    wanted = {"speed_factor": factor}
+    assert speed(room, speed_code=codes.SPEED_GIVEN, speed=5.0, **wanted) == 5.0
+    for code in (codes.SPEED_MAX, codes.SPEED_DESIRED, codes.SPEED_LAST, codes.SPEED_AVERAGE):
+        assert speed(room, speed_code=code, **wanted) == pytest.approx(factor * LIMIT)
+    limit = speed(room, speed_code=codes.SPEED_LIMIT, **wanted)
+    assert limit == pytest.approx(min(factor, 1.0) * LIMIT)
+    drawn = np.array(
+        [speed(room, vehicle=k, speed_code=codes.SPEED_RANDOM, **wanted) for k in range(400)]
+    )
+    assert 0.0 <= drawn.min() < 0.05 * LIMIT
+    assert 0.95 * factor * LIMIT < drawn.max() < factor * LIMIT
+    assert drawn.mean() == pytest.approx(0.5 * factor * LIMIT, rel=0.1)
+
+
+@pytest.mark.parametrize("code", [codes.SPEED_LAST, codes.SPEED_AVERAGE])
+def test_who_takes_the_speed_of_the_last_one_drives_as_it_does(code: int) -> None:
+    _, room = traffic((MAIN[0], 120.0, 6.0))
+    assert speed(room, speed_code=code) == 6.0
+
+
+def test_a_leader_makes_slower_but_a_given_speed_waits() -> None:
+    _, room = traffic((MAIN[0], 50.0, 3.0))
+    safe = speed_behind(KIND, 25.0, 3.0, KIND["decel"])
+    assert 3.0 < safe < LIMIT
+    assert speed(room, speed_code=codes.SPEED_MAX) == pytest.approx(safe)
+    assert speed(room, speed_code=codes.SPEED_GIVEN, speed=0.9 * safe) == 0.9 * safe
+    assert speed(room, speed_code=codes.SPEED_GIVEN, speed=1.1 * safe) == -1.0
+    assert speed(room, s=44.5, speed_code=codes.SPEED_MAX) == -1.0, "no room at all"
+
+
+def test_the_leader_may_be_beyond_the_end_of_the_lane() -> None:
+    # The lane that follows begins inside the junction.
+    beyond = int(PLAN[0][MAIN[0]]["next"])
+    _, room = traffic((beyond, 0.0, 0.0))
+    near = speed(room, s=LENGTH - 12.0, speed_code=codes.SPEED_MAX)
+    assert near == pytest.approx(speed_behind(KIND, 7.0, 0.0, KIND["decel"]))
+
+
+def test_before_the_end_of_a_lane_nobody_enters_fast() -> None:
+    slow = speed_at(ROADS.arrays, KIND, MAIN[0], LENGTH - 6.5, 20.0)
+    assert slow == pytest.approx(np.sqrt(2.0 * 2.0 * 2.0))
+    assert speed_at(ROADS.arrays, KIND, MAIN[0], 10.0, 20.0) == 20.0
+
+
+@pytest.mark.parametrize(
+    ("behind_m", "pace", "brakes"),
+    [(5.5, 0.0, True), (60.0, 15.0, False), (15.0, 25.0, True), (15.0, 0.0, False)],
+)
+def test_who_follows_must_not_brake_hard(behind_m: float, pace: float, brakes: bool) -> None:
+    cars, room = traffic((MAIN[0], 100.0 - behind_m, pace))
+    found = follower_brakes(
+        ROADS.arrays, TRAVEL, cars, departure(), KIND, MAIN[0], 100.0, 10.0, room
+    )
+    assert found == brakes

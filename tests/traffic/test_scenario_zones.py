@@ -1,0 +1,148 @@
+"""A scenario is the same wherever borders of zones run: through its very place, too."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from cavmarl.core.records.codes import DRIVER_SCRIPTED
+from cavmarl.env.vector import CavVectorEnv, make_vec
+from cavmarl.evaluate.scenarios.scenario_runs import make_scenario
+from cavmarl.handoff.fault_injection.fault_plan import Faults
+from cavmarl.policies.policy import load_policy
+from cavmarl.zones.partition.zone_file import write_zones
+from cavmarl.zones.partition.zone_partition import ZonePartition
+from tests.support.faulted import NOISE
+from tests.traffic.test_scenarios import NAMES, ROOMY
+
+STEPS = 75
+CUTS = {2: (2, 1), 4: (2, 2), 9: (3, 3)}  # columns and lines of zones
+
+
+def cut_through(vec: CavVectorEnv, path: Path, count: int) -> Path:
+    """A zone file whose border, or the corner of whose borders, is the middle of the scene."""
+    scene, extent = vec.simulation.scene, vec.network.extent_m
+    assert scene is not None
+    low_x, low_y, high_x, high_y = extent
+    columns, lines = CUTS[count]
+    across = [low_x, scene.x, 0.5 * (scene.x + high_x), high_x]
+    along = [low_y, scene.y, 0.5 * (scene.y + high_y), high_y]
+    across, along = [*across[:columns], high_x], [*along[:lines], high_y]
+    rects = [[x, y, to_x, to_y] for y, to_y in pairwise(along) for x, to_x in pairwise(across)]
+    write_zones(path, ZonePartition(extent, np.array(rects)))
+    return path
+
+
+def hashes(vec: CavVectorEnv, driver: str = "idm", steps: int = STEPS) -> list[str]:
+    """The state after each step, until the agent is gone."""
+    observations, infos = vec.reset(seed=0)
+    policy = load_policy(driver, vec)
+    found = [vec.state_hash()]
+    for _ in range(steps):
+        results = vec.step(policy.act_batch(observations, infos["mask"]))
+        observations, infos = results[0], results[4]
+        found.append(vec.state_hash())
+        if infos["episode_over"][0]:
+            break
+    return found
+
+
+def divided(name: str, path: Path, count: int, whole: CavVectorEnv, **keys: Any) -> CavVectorEnv:
+    file = cut_through(whole, path / f"{count}.json", count)
+    overrides = {"zones.layout": str(file), "zones.check": True, **keys}
+    return make_scenario(name, density="low", zones=count, overrides=overrides)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_a_border_through_the_place_changes_nothing(name: str, tmp_path: Path) -> None:
+    whole = make_scenario(name, density="low")
+    expected = hashes(whole)
+    for count in CUTS:
+        vec = divided(name, tmp_path, count, whole)
+        assert hashes(vec) == expected
+        assert vec.simulation.partition.count == count
+
+
+@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("count", [2, pytest.param(9, marks=pytest.mark.slow)])
+def test_nor_do_hosts_that_die_and_ticks_that_are_begun_again(
+    name: str, count: int, tmp_path: Path
+) -> None:
+    whole = make_scenario(name, density="low")
+    expected = hashes(whole, steps=40)
+    faults = Faults(seed=5, messages=NOISE, crash_rate=0.01)
+    vec = divided(name, tmp_path, count, whole, **{"zones.faults": faults.to_json()})
+    assert hashes(vec, steps=40) == expected
+    assert vec.simulation.revivals
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize(("count", "agents"), [(2, 1), (9, 3)])
+def test_nor_do_workers(name: str, count: int, agents: int, tmp_path: Path) -> None:
+    place = ROOMY.get(name, "")
+    whole = make_scenario(name, density="low", agents=agents, place=place)
+    expected = hashes(whole, steps=60)
+    file = cut_through(whole, tmp_path / f"{count}.json", count)
+    keys = {
+        "zones.layout": str(file), "scenario.name": name,
+        "scenario.seed": whole.config.scenario.seed, "scenario.place": place,
+        "population.mode": "closed", "population.budget": None, "action.kind": "continuous",
+        "horizon_s": whole.config.horizon_s,
+    }  # fmt: skip
+    vec = make_vec(
+        "grid4x4", zones=count, workers=2, agents=agents, overrides=keys,
+        background=whole.config.population.background, autoreset_mode="NextStep",
+    )  # fmt: skip
+    try:
+        assert hashes(vec, steps=60) == expected
+    finally:
+        vec.close()
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_nor_do_several_agents(name: str, tmp_path: Path) -> None:
+    place = ROOMY.get(name, "")
+    whole = make_scenario(name, density="low", agents=3, place=place)
+    expected = hashes(whole, steps=50)
+    file = cut_through(whole, tmp_path / "4.json", 4)
+    overrides = {"zones.layout": str(file), "zones.check": True}
+    vec = make_scenario(name, density="low", agents=3, place=place, zones=4, overrides=overrides)
+    assert hashes(vec, steps=50) == expected
+
+
+def test_who_turns_on_a_border_does_not_flap_between_owners(tmp_path: Path) -> None:
+    """The car goes to and fro where four zones meet: hysteresis keeps it with one of them."""
+    whole = make_scenario("failed_u_turn")
+    steady, restless = (
+        divided("failed_u_turn", tmp_path, 4, whole, **{"zones.hysteresis_m": hysteresis_m})
+        for hysteresis_m in (whole.config.zones.hysteresis_m, 0.0)
+    )
+    owners, crossings = turning(steady)
+    assert crossings >= 2
+    assert len(set(owners)) == 1
+    owners, again = turning(restless)
+    assert again == crossings
+    changes = sum(here != before for before, here in pairwise(owners))
+    assert 2 <= changes <= crossings
+
+
+def turning(vec: CavVectorEnv) -> tuple[list[int], int]:
+    """The owners of the car that turns, step by step, and how often it went over a border."""
+    _, infos = vec.reset(seed=0)
+    policy = load_policy("idm", vec)
+    rows, scene = vec.simulation.vehicles(), vec.simulation.scene
+    assert scene is not None
+    car = int(rows["id"][rows["driver"] == DRIVER_SCRIPTED][0])
+    owners, places = [], []
+    for _ in range(80):
+        vec.step(policy.act_batch(np.zeros((1, 1, 0), np.float32), infos["mask"]))
+        rows = vec.simulation.vehicles()
+        row = rows[rows["id"] == car][0]
+        owners.append(int(row["owner"]))
+        places.append((bool(row["x"] >= scene.x), bool(row["y"] >= scene.y)))
+    return owners, sum(here != before for before, here in pairwise(places))

@@ -1,0 +1,99 @@
+"""Who receives what does not depend on how a world is divided, although messages reach further."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+
+from cavmarl import make_vec
+from cavmarl.verify.equivalence import verify_zones
+from tests.support.faulted import BUSY, ROUGH
+
+FAST = {"clock.sim_dt_s": 0.1, "clock.ctrl_dt_s": 0.2}
+OBSERVED = {
+    "v2x.enabled": True,
+    "sensors.messages.objects": 6,
+    "sensors.messages.events": 2,
+    "sensors.messages.signal": True,
+}
+LOSSY = {
+    "v2x.equipped": 0.7,
+    "v2x.cam.triggered": True,
+    "v2x.perception.rate_hz": 5.0,
+    "v2x.roadside.signals": ["all"],
+    "v2x.roadside.perception_hz": 5.0,
+    "v2x.denm.hard_braking_mps2": 1.0,
+    "v2x.channel.range_m": 250.0,
+    "v2x.channel.path_loss_exponent": 2.75,
+    "v2x.channel.latency_ticks": 2,
+    "v2x.channel.loss": 0.1,
+    "v2x.channel.data_rate_mbps": 0.3,
+}
+
+
+@pytest.mark.parametrize("channel", [{}, LOSSY], ids=["ideal", "lossy"])
+@pytest.mark.parametrize("stack", [1, 3])
+def test_what_agents_are_told_does_not_depend_on_zones(channel: dict[str, Any], stack: int) -> None:
+    settings = FAST | OBSERVED | channel | {"sensors.stack": stack, "population.background": 60}
+    found = verify_zones("grid4x4", (2, 4, 9), steps=30, overrides=settings)
+    for result in found.results:
+        assert result.difference is None, result
+    assert sum(result.crossings for result in found.results) >= 10
+
+
+def everything_said(zones: int) -> list[bytes]:
+    """All inboxes and counts after each step, in the order of the receivers."""
+    overrides = FAST | OBSERVED | LOSSY | {"population.mode": "seats"}
+    env = make_vec("grid4x4", num_envs=2, zones=zones, overrides=overrides)
+    said = []
+    observations, _ = env.reset(seed=4)
+    for _ in range(20):
+        said.append(observations.tobytes())
+        said += [array.tobytes() for array in env.simulation.messages.mail]
+        said.append(env.state_hash(1).encode())
+        observations, *_ = env.step(env.suggest_actions())
+    return said
+
+
+def test_inboxes_are_the_same_byte_for_byte() -> None:
+    whole = everything_said(1)
+    for zones in (2, 4, 9):
+        assert everything_said(zones) == whole
+
+
+def test_worker_processes_say_the_same() -> None:
+    overrides = FAST | OBSERVED | LOSSY | {"population.mode": "seats"}
+
+    def seen(**split: int) -> list[bytes]:
+        env = make_vec("grid4x4", num_envs=1, overrides=overrides, **split)
+        observations, _ = env.reset(seed=4)
+        found = []
+        for _ in range(8):
+            found += [observations.tobytes(), env.state_hash(0).encode()]
+            observations, *_ = env.step(env.suggest_actions())
+        found.append(repr(sorted(env.traffic_stats().items())).encode())
+        env.close()
+        return found
+
+    assert seen(zones=2, workers=2) == seen()
+
+
+@pytest.mark.parametrize("channel", [{}, LOSSY], ids=["ideal", "lossy"])
+def test_ticks_that_are_begun_again_say_the_same(channel: dict[str, Any]) -> None:
+    rates = ("cam.rate_hz", "denm.rate_hz", "perception.rate_hz", "roadside.rate_hz")
+    overrides = dict(BUSY) | OBSERVED | channel | {f"v2x.{rate}": 5.0 for rate in rates}
+    whole = make_vec("grid4x4", overrides=overrides)
+    faults = {"zones.faults": ROUGH.to_json()}
+    harmed = make_vec("grid4x4", zones=4, overrides=overrides | faults)
+    observations = [env.reset(seed=1)[0] for env in (whole, harmed)]
+    for _ in range(25):
+        actions = whole.suggest_actions()
+        assert (actions == harmed.suggest_actions()).all()
+        observations = [env.step(actions)[0] for env in (whole, harmed)]
+        assert observations[0].tobytes() == observations[1].tobytes()
+        assert whole.state_hash() == harmed.state_hash()
+        mails = [env.simulation.messages.arrays() for env in (whole, harmed)]
+        for ours, theirs in zip(*mails, strict=True):
+            assert ours.tobytes() == theirs.tobytes()
+    assert harmed.simulation.revivals

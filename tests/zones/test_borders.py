@@ -1,0 +1,158 @@
+"""Who is near a border, and rows that change hands."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+
+from cavmarl.core.records.arrays import Zoned
+from cavmarl.shards.shard import make_zoned
+from cavmarl.zones.kernels.borders import NEAR, Borders, find_near, pass_on
+from cavmarl.zones.partition.zone_partition import ZonePartition
+from tests.naive import zones as naive
+from tests.support.builders import vehicles
+from tests.support.partitions import four, partitions, places
+from tests.support.zoned import SIDE, exchanged
+
+MAX_SPEED_MPS = 60.0
+BORDERS = Borders(2.0, 1.0, MAX_SPEED_MPS)
+
+
+@given(
+    st.data(),
+    partitions(),
+    st.sampled_from([0.0, 2.0, 7.5]),
+    st.sampled_from([0.1, 0.5]),
+    st.booleans(),
+)
+def test_who_has_crossed_or_soon_will_is_told_of(
+    data: st.DataObject,
+    partition: ZonePartition,
+    hysteresis_m: float,
+    ahead_s: float,
+    everybody: bool,
+) -> None:
+    draw = np.random.default_rng(data.draw(st.integers(0, 1000)))
+    parts = []
+    for zone in range(partition.count):
+        xy = data.draw(places(partition, size=4))
+        headings = draw.uniform(-math.pi, math.pi, len(xy))
+        rows = vehicles(
+            [(x, y, heading) for (x, y), heading in zip(xy.tolist(), headings, strict=True)],
+            speed=draw.uniform(0.0, MAX_SPEED_MPS, len(xy)),
+            id=100 * zone + np.arange(len(xy)),
+        )
+        parts.append(rows)
+    reach_m = MAX_SPEED_MPS * ahead_s  # as far as anybody can drive by then
+    borders = Borders(hysteresis_m, ahead_s, MAX_SPEED_MPS)
+    zoned = exchanged(partition, reach_m, parts, borders=borders)
+    if everybody:
+        zoned.num_border[:] = 0
+    out = np.zeros(2 * zoned.rows.shape[-1] * partition.count, dtype=NEAR)
+    found = find_near(partition.arrays, borders, zoned, SIDE, 0, everybody, out)
+    for zone, rows in enumerate(parts):
+        told = [
+            (int(e["row"]), int(e["target"]), bool(e["crossed"]))
+            for e in out[:found]
+            if e["source"] == zone
+        ]
+        expected = naive.near_borders(partition.reaching, zone, hysteresis_m, ahead_s, rows)
+        margins = _margins(partition, zone, hysteresis_m, ahead_s, rows)
+        clear = {i for i, margin in enumerate(margins) if margin > 1e-6}  # squares round otherwise
+        assert [e for e in told if e[0] in clear] == [e for e in expected if e[0] in clear]
+    for entry in out[:found]:
+        row = parts[entry["source"]][entry["row"]]
+        assert entry["vehicle"] == row["id"]
+        depth_m = naive.distance(partition.reaching[entry["source"]], row["x"], row["y"])
+        if depth_m * depth_m == 0.0:  # so small a distance has no square
+            target = partition.reaching[entry["target"]]
+            depth_m = -naive.distance(target, row["x"], row["y"])
+        assert entry["depth_m"] == pytest.approx(depth_m)
+
+
+def _margins(
+    partition: ZonePartition,
+    zone: int,
+    hysteresis_m: float,
+    ahead_s: float,
+    rows: NDArray[np.void],
+) -> list[float]:
+    """How far each vehicle is from where the answer changes."""
+    rect = partition.reaching[zone]
+    margins = []
+    for row in rows:
+        way = row["speed"] * ahead_s
+        then = row["x"] + math.cos(row["heading"]) * way, row["y"] + math.sin(row["heading"]) * way
+        margins.append(
+            min(
+                abs(naive.distance(rect, x, y) - hysteresis_m)
+                for x, y in ((row["x"], row["y"]), then)
+            )
+        )
+    return margins
+
+
+def test_who_drives_over_a_corner_is_told_to_both_zones() -> None:
+    partition = four()
+    row = vehicles([(13.0, 12.0, math.pi / 2)], speed=10.0)  # of zone 0, 3 m to the east of it
+    none = row[:0]
+    zoned = exchanged(partition, 60.0, [row, none, none, none], borders=BORDERS)
+    out = np.zeros(2, dtype=NEAR)
+    found = find_near(partition.arrays, BORDERS, zoned, SIDE, 0, False, out)
+    assert found == 2
+    assert out["target"].tolist() == [1, 3]
+    assert out["crossed"].tolist() == [True, False]
+
+
+def test_rows_that_are_not_there_any_more_are_not_looked_at() -> None:
+    partition = four()
+    rows = vehicles([(13.0, 12.0, 0.0), (13.0, 12.0, 0.0)])
+    none = rows[:0]
+    zoned = exchanged(partition, 60.0, [rows, none, none, none], borders=BORDERS)
+    zoned.num_owned[0, 0] = 1
+    out = np.zeros(4, dtype=NEAR)
+    found = find_near(partition.arrays, BORDERS, zoned, SIDE, 0, False, out)
+    assert out["row"][:found].tolist() == [0]
+
+
+def two_zones() -> Zoned:
+    """Of three and two vehicles, which see each other's."""
+    zoned = make_zoned(2, 1, 6)
+    zoned.rows["id"][SIDE, 0, 0, :5] = [10, 11, 12, 21, 20]
+    zoned.rows["id"][SIDE, 1, 0, :5] = [20, 21, 12, 10, 11]
+    zoned.num_owned[:, 0] = [3, 2]
+    zoned.num_rows[:, 0] = 5
+    return zoned
+
+
+def ids(zoned: Zoned, zone: int, first: int, last: int) -> set[int]:
+    return set(zoned.rows["id"][SIDE, zone, 0, first:last].tolist())
+
+
+@pytest.mark.parametrize("hint", [0, 1, 2, 4, 99])
+@pytest.mark.parametrize("vehicle", [10, 11, 12])
+def test_who_is_passed_on_is_a_ghost_here_and_owned_there(vehicle: int, hint: int) -> None:
+    zoned = two_zones()
+    assert pass_on(vehicle, 0, hint, 1, 5, zoned, SIDE, 0) == 2
+    assert zoned.num_owned[:, 0].tolist() == [2, 3]
+    assert zoned.num_rows[:, 0].tolist() == [5, 5]
+    assert ids(zoned, 1, 2, 3) == {vehicle}
+    assert ids(zoned, 1, 0, 2) == {20, 21}
+    assert ids(zoned, 1, 3, 5) == {10, 11, 12} - {vehicle}
+    assert ids(zoned, 0, 0, 2) == {10, 11, 12} - {vehicle}
+    assert ids(zoned, 0, 2, 5) == {vehicle, 20, 21}
+
+
+@pytest.mark.parametrize(("vehicle", "why"), [(20, -1), (99, -1), (13, -2)])
+def test_nobody_is_passed_on_who_is_not_owned_or_has_no_ghost(vehicle: int, why: int) -> None:
+    zoned = two_zones()
+    zoned.rows["id"][SIDE, 0, 0, 1] = 13  # whom the other zone has not seen
+    before = zoned.rows.copy()
+    assert pass_on(vehicle, 0, 0, 1, 5, zoned, SIDE, 0) == why
+    assert zoned.num_owned[:, 0].tolist() == [3, 2]
+    assert (zoned.rows == before).all()

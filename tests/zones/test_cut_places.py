@@ -1,0 +1,91 @@
+"""Maps cut through roundabouts, bridges and junctions are still the undivided world."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from xml.etree import ElementTree
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from cavmarl.engine.world_setup import find_map
+from cavmarl.roads.cache import load_network
+from cavmarl.roads.network import RoadNetwork
+from cavmarl.verify.equivalence import verify_zones
+from tests.support.borders import bounds_around, cut_at
+
+FAST = {"clock.sim_dt_s": 0.1, "clock.ctrl_dt_s": 0.2, "population.mode": "seats"}
+BRIDGE_M = 4.0  # one road so far above another,
+NEAR_M = 5.0  # where points of both are as near in the plane
+Place = NDArray[np.float64]
+
+
+def equal_around(place: Place, net: Path, folder: Path, *, crossings: int, steps: int = 60) -> None:
+    """Four zones that meet at the place, and nine whose cuts lie around it."""
+    x, y = (float(v) for v in place[:2])
+    bounds = bounds_around(load_network(net))
+    for name, xs, ys in (
+        ("four", [x], [y]),
+        ("nine", [x - 6.0, x + 6.0], [y - 6.0, y + 6.0]),
+    ):
+        layout = cut_at(folder / f"{name}.json", bounds, xs, ys)
+        found = verify_zones(
+            net, layout=layout, steps=steps, agents=12, background=100, overrides=FAST
+        )
+        (result,) = found.results
+        assert result.difference is None, result
+        assert result.crossings >= crossings
+
+
+def roundabouts(net: Path, network: RoadNetwork) -> list[tuple[float, Place]]:
+    """Radius and middle of each, the largest first."""
+    found = []
+    for element in ElementTree.parse(net).iter("roundabout"):
+        edges = [network.edge_ids.index(name) for name in element.attrib["edges"].split()]
+        lanes = np.flatnonzero(np.isin(network.lanes["edge"], edges)).tolist()
+        points = np.concatenate([network.lane_polyline(lane)[:, :2] for lane in lanes])
+        middle = points.mean(axis=0)
+        found.append((float(np.hypot(*(points - middle).T).mean()), middle))
+    return sorted(found, key=lambda one: -one[0])
+
+
+def bridges(network: RoadNetwork) -> Place:
+    """Places (n, 2) where a lane's point lies over or under another's."""
+    lanes = [network.lane_polyline(lane) for lane in range(len(network.lanes))]
+    points = np.concatenate(lanes)
+    found = []
+    for place in points:
+        near = points[np.hypot(*(points[:, :2] - place[:2]).T) < NEAR_M]
+        if np.ptp(near[:, 2]) > BRIDGE_M:
+            found.append(place[:2])
+    return np.array(found)
+
+
+def test_through_a_roundabout(built_map: Callable[[str], Path], tmp_path: Path) -> None:
+    net = built_map("osm/berlin_siegessaeule.osm.gz")
+    radius, middle = roundabouts(net, load_network(net))[0]
+    assert radius > 40.0
+    equal_around(middle, net, tmp_path, crossings=10)
+
+
+def test_through_a_bridge_and_what_is_under_it(
+    built_map: Callable[[str], Path], tmp_path: Path
+) -> None:
+    net = built_map("xodr/Town04.xodr")
+    places = bridges(load_network(net))
+    assert len(places)
+    equal_around(places[len(places) // 2], net, tmp_path, crossings=5, steps=120)
+
+
+@pytest.mark.parametrize("env", ["grid4x4", "town", "merge"])
+def test_through_the_busiest_junction(env: str, tmp_path: Path) -> None:
+    net = find_map(env)
+    network = load_network(net)
+    internal = np.flatnonzero(network.lanes["internal"])
+    junctions = network.edges["to_junction"][network.lanes["edge"][internal]]
+    busiest = np.bincount(junctions).argmax()
+    lanes = internal[junctions == busiest].tolist()
+    points = np.concatenate([network.lane_polyline(lane)[:, :2] for lane in lanes])
+    equal_around(points.mean(axis=0), net, tmp_path, crossings=5)

@@ -1,0 +1,88 @@
+"""Zones see whom their drivers may ask about, and nobody else far away."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from cavmarl.bench.sharded_worlds import DrivenWorld, world_maker
+from cavmarl.zones.kernels.zone_lookup import Halo
+from cavmarl.zones.partition.zone_partition import ZonePartition
+from cavmarl.zones.visibility import Sight
+from tests.support.netgenerate import netgenerate
+
+STEPS = 40
+
+
+@pytest.fixture(scope="module")
+def blocks(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Streets without signals, so fast that who has the right of way is minded from afar."""
+    return netgenerate(
+        tmp_path_factory.mktemp("blocks") / "blocks.net.xml",
+        "--grid", "--grid.number", "4", "--grid.length", "200", "-L", "2",
+        "--default-junction-type", "priority", "--default.speed", "33",
+    )  # fmt: skip
+
+
+def driven(path: Path, **overrides: object) -> DrivenWorld:
+    """A world of drivers alone, in nine zones."""
+    make = world_maker(
+        str(path),
+        (),
+        layout="bisection",
+        seconds=100,
+        seed=0,
+        agents=0,
+        background=60,
+        overrides=overrides,
+    )
+    world = DrivenWorld(make(9))
+    for _ in range(STEPS):
+        world.step(world.commands())
+    return world
+
+
+def ghosts(world: DrivenWorld) -> int:
+    return int(world.simulation.zone_loads().ghosts.sum())
+
+
+def test_a_named_halo_is_seen_whole_and_nobody_can_tell(blocks: Path) -> None:
+    """More ghosts, the same world."""
+    narrow = driven(blocks)
+    whole = driven(blocks, **{"zones.halo_m": narrow.simulation.zone_loads().halo_m})
+    assert ghosts(narrow) < 0.9 * ghosts(whole)
+    assert narrow.simulation.state_hash() == whole.simulation.state_hash()
+
+
+def test_who_may_have_reached_a_line_is_nearer_than_half_a_body_and_what_is_kept_clear(
+    blocks: Path,
+) -> None:
+    simulation = driven(blocks).simulation
+    kept_m = float(simulation.network.lanes["stop_back_m"].max())
+    half_m = 0.5 * float(simulation._tick.division.owned(0, 0)["length"].max())
+    assert half_m + kept_m < simulation._tick.division.halo.line_m < half_m + kept_m + 5.0
+
+
+def test_the_monitor_asks_for_those_who_are_seen(blocks: Path) -> None:
+    """It would name a ghost too few as well as one too many."""
+    assert ghosts(driven(blocks, **{"zones.check": True})) > 0
+
+
+@pytest.mark.parametrize("field", ["head", "line"])
+def test_a_look_less_makes_another_world(
+    blocks: Path, field: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Leaders ahead, and foes of the right of way: who is not seen is driven into."""
+    seen = Sight.halo
+
+    def blind(sight: Sight, partition: ZonePartition) -> Halo:
+        halo = seen(sight, partition)
+        if partition.count > 1:
+            halo.watchers[field] = -np.inf if field == "head" else np.inf
+        return halo
+
+    whole = driven(blocks).simulation.state_hash()
+    monkeypatch.setattr(Sight, "halo", blind)
+    assert driven(blocks).simulation.state_hash() != whole

@@ -1,0 +1,138 @@
+"""Whom a zone's drivers may ask about: as sets of lanes say, and as one sees on a plain map."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from cavmarl.driving.kernels.announcing import APPROACH_M
+from cavmarl.roads.cache import load_network
+from cavmarl.roads.network import RoadNetwork
+from cavmarl.zones.kernels.visibility_tests import (
+    ASIDE_M,
+    ROUNDING_M,
+    farthest_m,
+    find_looks,
+    make_room,
+)
+from cavmarl.zones.kernels.zone_lookup import LOOK
+from tests.naive.looks import STEP_M, Looks
+from tests.support.traffic import network
+
+VIEW_M, SEE_M, HALF_M = 90.0, 40.0, 6.0
+# Three roads one after the other, of 400 m each, without junctions that anybody could ask about.
+LINE = """<?xml version="1.0" encoding="UTF-8"?>
+<net version="1.20">
+  <location netOffset="0,0" convBoundary="0,0,0,0" origBoundary="0,0,0,0" projParameter="!"/>
+  {edges}
+  <junction id="j0" type="dead_end" x="0" y="0" incLanes="" intLanes="" shape=""/>
+  <junction id="j1" type="priority" x="400" y="0" incLanes="e0_0" intLanes="" shape="">
+    <request index="0" response="0" foes="0" cont="0"/>
+  </junction>
+  <junction id="j2" type="priority" x="800" y="0" incLanes="e1_0" intLanes="" shape="">
+    <request index="0" response="0" foes="0" cont="0"/>
+  </junction>
+  <junction id="j3" type="dead_end" x="1200" y="0" incLanes="e2_0" intLanes="" shape=""/>
+  <connection from="e0" to="e1" fromLane="0" toLane="0" dir="s" state="M"/>
+  <connection from="e1" to="e2" fromLane="0" toLane="0" dir="s" state="M"/>
+</net>"""
+EDGE = """<edge id="e{n}" from="j{n}" to="j{end}">
+    <lane id="e{n}_0" index="0" speed="14" length="400" shape="{start},0,0 {stop},0,0"/>
+  </edge>"""
+
+
+def looks_of(roads: RoadNetwork, rect: tuple[float, float, float, float]) -> NDArray[np.void]:
+    looks = np.zeros(len(roads.lanes), dtype=LOOK)
+    room = make_room(len(roads.lanes), len(roads.links))
+    for _ in range(2):  # what the room held before does not matter
+        find_looks(roads.arrays, np.array(rect), VIEW_M, SEE_M, HALF_M, room, looks)
+    return looks
+
+
+@pytest.mark.parametrize("name", ["merge", "grid4x4"])
+@pytest.mark.parametrize(
+    "part", [(0.0, 0.0, 0.4, 1.0), (0.3, 0.45, 0.8, 0.7), (0.5, 0.5, 0.6, 0.6)]
+)
+def test_kernel_sees_what_sets_of_lanes_see(
+    name: str, part: tuple[float, float, float, float]
+) -> None:
+    """Same heads, tails and lines, as finely as the twin looks at lanes."""
+    roads = network(name)
+    min_x, min_y, max_x, max_y = roads.extent_m
+    low, high = np.array([min_x, min_y] * 2), np.array([max_x, max_y] * 2)
+    rect = tuple((low + np.array(part) * (high - low)).tolist())
+    found, twin = looks_of(roads, rect), Looks(roads, rect, VIEW_M, SEE_M, HALF_M)
+    for field, told in (
+        ("head", twin.head),
+        ("tail", twin.tail),
+        ("back", twin.back),
+        ("line", twin.line),
+    ):
+        expected = np.array([told[lane] for lane in range(len(roads.lanes))])
+        np.testing.assert_allclose(found[field], expected, atol=2.0 * STEP_M, err_msg=field)
+    assert np.isfinite(found["line"]).any() == (name == "grid4x4")
+
+
+@pytest.fixture(scope="module")
+def line(tmp_path_factory: pytest.TempPathFactory) -> RoadNetwork:
+    path = tmp_path_factory.mktemp("line") / "line.net.xml"
+    edges = [EDGE.format(n=n, end=n + 1, start=400 * n, stop=400 * n + 400) for n in range(3)]
+    path.write_text(LINE.format(edges="\n  ".join(edges)), encoding="utf-8")
+    return load_network(path)
+
+
+def test_drivers_look_ahead_and_less_far_back(line: RoadNetwork) -> None:
+    """From a zone at the end of the second road into the third, and back on their own."""
+    before, own, beyond = looks_of(line, (780.0, -10.0, 795.0, 10.0))
+    assert before["head"] == -np.inf
+    assert before["back"] == np.inf, "followers this far behind concern nobody"
+    assert own["tail"] == pytest.approx(380.0 - ASIDE_M - VIEW_M - ROUNDING_M)
+    assert beyond["head"] == pytest.approx(VIEW_M + ROUNDING_M)
+    assert (np.array([before["line"], own["line"], beyond["line"]]) == np.inf).all()
+
+
+def test_who_follows_over_a_border_is_seen(line: RoadNetwork) -> None:
+    """The end of a lane before the zone is near, so who comes on it may be a follower."""
+    before, own, beyond = looks_of(line, (450.0, -10.0, 460.0, 10.0))
+    assert before["tail"] == np.inf
+    assert before["back"] == pytest.approx(400.0 + 50.0 - ASIDE_M - ROUNDING_M)
+    assert own["head"] == pytest.approx(60.0 + ASIDE_M + VIEW_M + ROUNDING_M)
+    assert beyond["head"] == -np.inf
+
+
+def test_a_place_without_roads_asks_about_nobody(line: RoadNetwork) -> None:
+    looks = looks_of(line, (0.0, 50.0, 1200.0, 90.0))
+    assert (looks["head"] == -np.inf).all()
+    assert (looks["tail"] == np.inf).all()
+    assert (looks["back"] == np.inf).all()
+
+
+@pytest.mark.parametrize("part", [(0.0, 0.0, 0.4, 1.0), (0.5, 0.5, 0.6, 0.6)])
+def test_nobody_is_asked_about_further_away_than_the_farthest(
+    part: tuple[float, float, float, float],
+) -> None:
+    """Beside places that lie close together on all lanes."""
+    roads = network("grid4x4")
+    min_x, min_y, max_x, max_y = roads.extent_m
+    low, high = np.array([min_x, min_y] * 2), np.array([max_x, max_y] * 2)
+    rect = low + np.array(part) * (high - low)
+    looks = looks_of(roads, tuple(rect.tolist()))
+    farthest = 0.0
+    for lane, look in zip(roads.lanes, looks, strict=True):
+        points = roads.points[lane["first_point"] :][: lane["num_points"]]
+        s = np.arange(0.0, points["s"][-1], STEP_M)
+        x, y = (np.interp(s, points["s"], points[axis]) for axis in ("x", "y"))
+        asked = (s <= look["head"]) | (s >= look["tail"])
+        asked |= min(look["back"], look["line"]) - s < APPROACH_M
+        dx = np.maximum(np.maximum(rect[0] - x, x - rect[2]), 0.0)
+        dy = np.maximum(np.maximum(rect[1] - y, y - rect[3]), 0.0)
+        farthest = max(farthest, float(np.hypot(dx, dy)[asked].max(initial=0.0)))
+    found = farthest_m(roads.arrays, rect[None, :], 0, looks)
+    assert 0.0 <= found - farthest <= 2.0 * STEP_M
+    assert VIEW_M < found
+
+
+def test_where_nobody_is_asked_about_the_farthest_is_no_distance(line: RoadNetwork) -> None:
+    rect = (0.0, 50.0, 1200.0, 90.0)
+    assert farthest_m(line.arrays, np.array([rect]), 0, looks_of(line, rect)) == 0.0
