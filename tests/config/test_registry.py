@@ -179,6 +179,7 @@ def test_agents_are_single_files_and_folders_with_weights(here: Path) -> None:
 
 
 def test_the_finder_does_not_load_pydantic() -> None:
-    code = "import sys; from cavmarl.config.registry import *; entries(); print('pydantic' in sys.modules)"
+    code = "import sys; from cavmarl.config.registry import *"
+    code += "; entries(); print('pydantic' in sys.modules)"
     out = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert out.stdout.strip() == "False"

@@ -3,11 +3,15 @@
 from __future__ import annotations
 
 import ast
+import os
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
+from numba.core import config
 
-from cavmarl.core import numba as kernels
+from cavmarl.core.numba import kernel_cache as kernels
 
 SOURCES = kernels._sources()
 PACKAGE = Path(kernels.__file__).parents[2]
@@ -44,7 +48,7 @@ def test_a_change_moves_the_kernels_that_call_what_has_changed_and_no_others(
     assert moved.isdisjoint({"core.math.rng", "driving.kernels.krauss", "core.math.buckets"})
 
 
-@pytest.mark.parametrize("changed", ["core.numba", "core.numba.compiler"])
+@pytest.mark.parametrize("changed", kernels._SHARED)
 def test_flags_and_the_compiler_concern_all(monkeypatch: pytest.MonkeyPatch, changed: str) -> None:
     before, after = _folders(monkeypatch), _folders(monkeypatch, changed)
     assert all(before[name] != after[name] for name in SOURCES)
@@ -65,3 +69,43 @@ def test_every_import_of_another_file_is_seen(name: str) -> None:
         elif isinstance(node, ast.Import):
             assert not any(alias.name.startswith("cavmarl") for alias in node.names)
     assert found == imported
+
+
+ADD = """
+from cavmarl.core.math.bearings import rough_atan2
+print(rough_atan2(1.0, 2.0), sum(rough_atan2.stats.cache_hits.values()))
+"""
+
+
+@pytest.mark.skipif(config.DISABLE_JIT, reason="nothing is compiled")
+@pytest.mark.parametrize("harm", [None, b"", b"cut", b"flipped"])
+def test_what_is_damaged_is_compiled_anew(tmp_path: Path, harm: bytes | None) -> None:
+    def run() -> list[str]:
+        there = {
+            **os.environ,
+            "CAVMARL_CACHE_DIR": str(tmp_path),
+            "PYTHONPATH": str(PACKAGE.parent),
+        }
+        told = subprocess.run(
+            [sys.executable, "-c", ADD], env=there, check=True, capture_output=True, text=True
+        )
+        return told.stdout.split()
+
+    first = run()
+    assert first[1] == "0"
+    files = [*tmp_path.rglob("*.nbi"), *tmp_path.rglob("*.nbc")]
+    assert files
+    for file in files if harm is not None else ():
+        content = file.read_bytes()
+        middle = len(content) // 2
+        file.write_bytes(
+            {
+                b"": b"",
+                b"cut": content[:middle],
+                b"flipped": content[:middle]
+                + bytes([content[middle] ^ 255])
+                + content[middle + 1 :],
+            }[harm]
+        )
+    assert run() == [first[0], "1" if harm is None else "0"]
+    assert run() == [first[0], "1"]

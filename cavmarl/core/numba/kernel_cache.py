@@ -1,0 +1,156 @@
+"""Where compiled kernels are kept: by the content of their sources, wherever those lie.
+
+Each file of kernels has a folder, named after its content and that of the files that it imports:
+Numba itself only watches the file that defines a function, not the functions which that one calls,
+and would use stale code. Checkouts and virtual environments with the same sources share a folder.
+What is read back is compared with its checksum; a damaged file is compiled anew.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import pickle
+import re
+from collections.abc import Callable
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numba
+import numba.core.config
+from numba.core import caching as numba_caching
+
+__all__ = ["KernelCache", "cache_dir", "kernel_cache_dir"]
+
+caching: Any = numba_caching  # has no types
+
+# Every import of one file of kernels by another; a test holds that there is no other form of it.
+_IMPORT = re.compile(rb"^from cavmarl\.([\w.]+) import ", re.MULTILINE)
+_PACKAGE = Path(__file__).parents[2]
+_SHARED = ("core.numba", "core.numba.compiler", "core.numba.kernel_cache")  # concern all kernels
+_DIGEST_BYTES = 32
+
+
+def cache_dir() -> Path:
+    """The folder for everything cavmarl keeps between runs (compiled kernels, converted maps)."""
+    home = os.environ.get("CAVMARL_CACHE_DIR")
+    return Path(home) if home else Path.home() / ".cache" / "cavmarl"
+
+
+@cache
+def kernel_cache_dir() -> Path:
+    """The folder that stands for this version: one per content of all kernel sources.
+
+    And one for those that check their indices (`NUMBA_BOUNDSCHECK=1`).
+    """
+    return _folder_of(_sources())
+
+
+@cache
+def _sources() -> dict[str, bytes]:
+    """The content of each file of kernels, by its dotted name within the package."""
+    core = (_PACKAGE / "core" / name for name in ("math", "numba", "records"))
+    folders = (*_PACKAGE.rglob("kernels"), *core)
+    return {_name_of(path): path.read_bytes() for folder in folders for path in folder.glob("*.py")}
+
+
+def _name_of(path: Path) -> str:
+    parts = path.relative_to(_PACKAGE).with_suffix("").parts
+    return ".".join(parts[:-1] if parts[-1] == "__init__" else parts)
+
+
+@cache
+def _cache_dir_of(module: str) -> Path:
+    """Where the kernels of a module are kept; those of a module outside of this package, too."""
+    sources = _sources()
+    name = module.removeprefix("cavmarl.")
+    if name not in sources:
+        return kernel_cache_dir()
+    found, to_read = set(_SHARED), [name]
+    while to_read:
+        name = to_read.pop()
+        if name not in found:
+            found.add(name)
+            to_read += [other.decode() for other in _IMPORT.findall(sources[name])]
+    return _folder_of({name: sources[name] for name in found})
+
+
+def _folder_of(sources: dict[str, bytes]) -> Path:
+    settings: Any = numba.core.config
+    digest = hashlib.sha256(f"{numba.__version__} {settings.BOUNDSCHECK}".encode())
+    for name, content in sorted(sources.items()):
+        digest.update(f"{name}.py".encode() + b"\0" + content)
+    return cache_dir() / "kernels" / digest.hexdigest()[:16]
+
+
+class _Locator(caching._CacheLocator):  # type: ignore[misc]
+    """Says to Numba where the kernels of a file are kept, and whether they are those of it."""
+
+    def __init__(self, function: Any, file: str) -> None:
+        self._file = file
+        self._function = function
+
+    @classmethod
+    def from_function(cls, function: Any, file: str) -> _Locator:
+        return cls(function, file)
+
+    def get_cache_path(self) -> str:
+        return str(_cache_dir_of(self._function.__module__))
+
+    def get_source_stamp(self) -> str:
+        """Kernels of this package: the folder says it; of a module outside, its own content."""
+        if self._function.__module__.startswith("cavmarl."):
+            return ""
+        return hashlib.sha256(Path(self._file).read_bytes()).hexdigest()
+
+    def get_disambiguator(self) -> str:
+        line: int = self._function.__code__.co_firstlineno
+        return f"{self._function.__module__}.{line}"
+
+
+class _Impl(caching.CompileResultCacheImpl):  # type: ignore[misc]
+    _locator_classes = (_Locator,)
+
+
+class _CheckedFile(caching.IndexDataCacheFile):  # type: ignore[misc]
+    """Numba's files of one kernel, each with a checksum before it."""
+
+    def _dump(self, obj: Any) -> bytes:
+        data: bytes = super()._dump(obj)
+        return hashlib.sha256(data).digest() + data
+
+    def _load_index(self) -> dict[Any, str]:
+        try:
+            with open(self._index_path, "rb") as file:
+                version, content = pickle.load(file), file.read()
+        except (OSError, pickle.UnpicklingError, EOFError, ValueError, AttributeError):
+            return {}
+        checked = _checked(content) if version == self._version else None
+        if checked is None:
+            return {}
+        stamp, overloads = pickle.loads(checked)
+        return overloads if stamp == self._source_stamp else {}
+
+    def _load_data(self, name: str) -> Any:
+        checked = _checked(Path(self._data_path(name)).read_bytes())
+        if checked is None:
+            raise OSError(f"{name}: damaged")  # Numba compiles it again
+        return pickle.loads(checked)
+
+
+def _checked(content: bytes) -> bytes | None:
+    digest, data = content[:_DIGEST_BYTES], content[_DIGEST_BYTES:]
+    return data if hashlib.sha256(data).digest() == digest else None
+
+
+class KernelCache(caching.FunctionCache):  # type: ignore[misc]
+    """Numba's cache of one function, in the folder that its sources stand for."""
+
+    _impl_class = _Impl
+
+    def __init__(self, function: Callable[..., Any]) -> None:
+        super().__init__(function)
+        stamp = self._impl.locator.get_source_stamp()
+        file = _CheckedFile(self.cache_path, self._impl.filename_base, stamp)
+        self._cache_file: Any = file
