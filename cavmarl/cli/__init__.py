@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Sequence
+from importlib.metadata import version
+from typing import Annotated
 
 import typer
 
@@ -33,6 +35,7 @@ app = typer.Typer(
     help="Multi-agent reinforcement learning for automated vehicles on real road networks.",
     no_args_is_help=True,
     pretty_exceptions_enable=False,
+    context_settings={"help_option_names": ["-h", "--help"]},
 )
 app.command()(evaluate.evaluate)
 app.command()(evaluate.report)
@@ -52,9 +55,20 @@ app.add_typer(bench.app, name="bench")
 app.add_typer(scenario.app, name="scenario")
 
 
+def _print_version(wanted: bool) -> None:
+    if wanted:
+        typer.echo(f"cavmarl {version('cavmarl')}")
+        raise typer.Exit
+
+
 @app.callback()
-def _exit_codes() -> None:
-    """Exit codes: 0 done, and it held; 1 it did not hold; 2 wrong use or bad input."""
+def _exit_codes(
+    _version: Annotated[
+        bool,
+        typer.Option("--version", help="Show the version.", callback=_print_version, is_eager=True),
+    ] = False,
+) -> None:
+    """Exit codes: 0 success; 1 a check failed; 2 wrong use or bad input."""
 
 
 def main(words: Sequence[str] | None = None) -> None:

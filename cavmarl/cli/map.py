@@ -11,9 +11,10 @@ from rich.table import Table
 from rich.text import Text
 
 from cavmarl.cli import map_zones
-from cavmarl.cli.output import JsonPath, write_json
+from cavmarl.cli.output import Environment, JsonPath, write_json
+from cavmarl.engine.world_setup import find_map
 from cavmarl.maps.check import MapReport, check_map
-from cavmarl.maps.netconvert import Box, BuildResult, build_network, map_file
+from cavmarl.maps.netconvert import Box, BuildResult, build_network
 from cavmarl.roads.sumo_net.reader import map_name
 
 __all__ = ["app"]
@@ -72,11 +73,11 @@ def build(
 
 
 @app.command()
-def check(source: Source, json_path: JsonPath = None) -> None:
+def check(env: Environment, json_path: JsonPath = None) -> None:
     """Say what a map holds and whether it can be driven; exit code 1 if it cannot."""
     console = Console()
-    with console.status(f"checking {source} …"):
-        report = check_map(map_file(source))
+    with console.status(f"checking {env} …"):
+        report = check_map(find_map(env))
     _print_report(console, report)
     write_json(json_path, report.to_dict())
     raise typer.Exit(0 if report.drivable else 1)

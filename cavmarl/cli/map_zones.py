@@ -11,10 +11,10 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from cavmarl.cli.output import JsonPath, write_json
+from cavmarl.cli.output import Environment, JsonPath, write_json
 from cavmarl.config.env import ZONE_LAYOUTS
 from cavmarl.core.errors import ConfigError
-from cavmarl.maps.netconvert import map_file
+from cavmarl.engine.world_setup import find_map
 from cavmarl.roads.cache import load_network
 from cavmarl.roads.network import RoadNetwork
 from cavmarl.zones.partition.zone_file import named_zones, write_zones
@@ -26,15 +26,7 @@ __all__ = ["zones"]
 
 
 def zones(
-    source: Annotated[
-        Path,
-        typer.Argument(
-            metavar="MAP",
-            help="A SUMO network, an OSM or an OpenDRIVE file.",
-            exists=True,
-            dir_okay=False,
-        ),
-    ],
+    env: Environment,
     count: Annotated[
         int | None, typer.Option(help="How many; default: 4, or as many as a zone file has.")
     ] = None,
@@ -59,7 +51,7 @@ def zones(
     """Divide a map into zones; print what is in each, and how evenly lanes are shared out."""
     if picture is not None and picture.suffix != ".png":
         raise typer.BadParameter(f"'{picture}' must end in .png", param_hint="--picture")
-    network = load_network(map_file(source))
+    network = load_network(find_map(env))
     partition = named_zones(network, layout, count, avoid_junctions=avoid_junctions, weight=weight)
     statistics = zone_statistics(partition, network, halo_m=halo)
     console = Console()

@@ -10,6 +10,7 @@ import numpy as np
 
 from cavmarl.config.env import EnvConfig
 from cavmarl.config.registry import (
+    entries,
     load_config,
     resolve_buildings,
     resolve_demand,
@@ -175,6 +176,8 @@ def find_map(env: str | Path) -> Path:
         UnknownEnvironmentError: nothing of that name.
         MapError: the map cannot be read.
     """
+    if str(env) not in entries() and Path(env).is_file():
+        return map_file(env).resolve()
     return map_file(resolve_map(*load_config(env))).resolve()
 
 

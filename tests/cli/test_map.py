@@ -7,7 +7,7 @@ import pytest
 from typer.testing import CliRunner
 
 from cavmarl.cli.map import app
-from cavmarl.core.errors import ConfigError, MapError, ZoneError
+from cavmarl.core.errors import ConfigError, MapError, UnknownEnvironmentError, ZoneError
 
 runner = CliRunner()
 
@@ -125,7 +125,9 @@ def test_a_network_has_a_version(tmp_path: Path, text: str, message: str) -> Non
 
 
 def test_missing_files_and_unknown_options_are_wrong_use(tmp_path: Path) -> None:
-    assert runner.invoke(app, ["check", str(tmp_path / "none.net.xml")]).exit_code == 2
+    missing = runner.invoke(app, ["check", str(tmp_path / "none.net.xml")]).exception
+    assert isinstance(missing, UnknownEnvironmentError)
+    assert "none.net.xml" in str(missing)
     assert runner.invoke(app, ["build", str(tmp_path)]).exit_code == 2
     assert runner.invoke(app, ["check"]).exit_code == 2
     assert runner.invoke(app, ["check", __file__, "--nonsense"]).exit_code == 2
@@ -188,3 +190,13 @@ def test_more_zones_than_the_map_can_hold_are_refused(shared_maps: Path) -> None
     source = str(shared_maps / "net" / "Town10HD.net.xml")
     result = runner.invoke(app, ["zones", source, "--count", "256", "--layout", "strips"])
     assert isinstance(result.exception, ZoneError)
+
+
+@pytest.mark.parametrize("command", ["check", "zones"])
+def test_an_entry_is_taken_by_its_name(command: str) -> None:
+    result = runner.invoke(app, [command, "grid4x4"])
+    assert result.exit_code == 0, result.output
+    assert "grid4x4" in result.output or "map" in result.output
+    missing = runner.invoke(app, [command, "grid5x5"])
+    assert isinstance(missing.exception, UnknownEnvironmentError)
+    assert "grid4x4" in str(missing.exception)
