@@ -73,6 +73,7 @@ maps: $(READY) ## make the maps of ring, merge and grid4x4 anew from the options
 pictures: $(READY) ## draw the pictures of the README, the cards and the pages anew
 	$(BIN)/python -m docs.pictures.pictures docs/images
 	$(BIN)/python -m docs.pictures.sensor_pictures docs/images
+	$(BIN)/python -m docs.pictures.moving docs/images
 
 clean: ## remove .venv, builds and caches; runs/ stays
 	rm -rf .venv $(OLDEST) $(LIBRARIES) fuzz/corpus build dist .mypy_cache .ruff_cache .pytest_cache .hypothesis .import_linter_cache
