@@ -14,8 +14,9 @@ import sys
 from dataclasses import asdict, dataclass
 from fractions import Fraction
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
+from cavmarl.bench.harness import Result
 from cavmarl.core.errors import ConfigError, EvaluationError
 from cavmarl.cosim.followers.followed_world import FollowedWorld
 from cavmarl.cosim.time_master import OwnTicks
@@ -27,7 +28,7 @@ PROGRAM = "cavmarl.cosim.followers.clock_reader"
 ENDS_S = 30.0  # for the follower to end by itself
 JOINS_S = 60.0  # for it to start
 TIMEOUT_S = 60.0
-BEFORE = 20  # steps that the world has gone on before somebody follows
+BEFORE = 20  # steps that the world has gone on before the follower joins
 
 
 @dataclass(frozen=True)
@@ -52,7 +53,7 @@ class DriftRow:
 
 
 @dataclass(frozen=True)
-class ClockDrift:
+class ClockDrift(Result):
     """What was measured.
 
     Attributes:
@@ -63,10 +64,12 @@ class ClockDrift:
         rows: at steps 100, 500, 1000, 5000 and so on, and the last one.
         own_ticks: how often it did, by its own count.
         counted: the same by the master's.
-        drift_events: how often the master has noticed that the world had gone on without him.
-        noticed_ticks: ticks of the master from the first such tick until he noticed; None: there
-            was none, or he did not notice.
+        drift_events: how often the master has noticed that the world had gone on without it.
+        noticed_ticks: ticks of the master from the first such tick until it noticed; None: there
+            was none, or it did not notice.
     """
+
+    DERIVED: ClassVar = ("holds",)
 
     environment: str
     dt_s: float
@@ -84,10 +87,6 @@ class ClockDrift:
         if self.answer == "obey" and self.own_ticks:
             return self.noticed_ticks is not None and self.noticed_ticks <= 1
         return all(row.delta_s == 0.0 and row.ratio == 1.0 for row in self.rows)
-
-    def to_dict(self) -> dict[str, Any]:
-        """As JSON."""
-        return {**asdict(self), "holds": self.holds}
 
 
 def measure_drift(

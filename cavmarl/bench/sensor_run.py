@@ -16,7 +16,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from cavmarl.bench.sensor_load import describe_rig
+from cavmarl.bench.sensor_rig import describe_rig
 from cavmarl.bench.stopwatch import Stopwatch
 from cavmarl.core import errors
 from cavmarl.env.vector import CavVectorEnv, make_vec

@@ -7,18 +7,18 @@ new episodes after 40 s. Each has a process a core for its worlds, and one threa
 
 from __future__ import annotations
 
+import math
 import tempfile
 import time
-from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from statistics import median
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import yaml
 
+from cavmarl.bench.harness import Say, check_range, paired_ratio, silent
 from cavmarl.bench.highway_worlds import (
     THEIR_KINEMATICS,
     highway_env,
@@ -82,7 +82,7 @@ class TrainingSpeed:
         numbers: in an observation.
         end_to_end: PPO, collecting and learning.
         stepping: agent-steps a second of our worlds and sensors alone, of each turn; nothing
-            learns, and nobody decides.
+            learns or decides.
         hardware: that it ran on.
     """
 
@@ -110,7 +110,7 @@ class TrainingSpeed:
 
     def _over(self, one: str, other: str) -> float:
         rates = {row.who: row.rates for row in self.end_to_end}
-        return median(a / b for a, b in zip(rates[one], rates[other], strict=True))
+        return paired_ratio(rates[one], rates[other])
 
     def to_dict(self) -> dict[str, Any]:
         """Plain values, for JSON; each benchmark says of which kind it is."""
@@ -133,7 +133,7 @@ def measure_training(
     worlds: int = 16,
     workers: int = 2,
     repeats: int = 3,
-    say: Callable[[str], None] = lambda text: None,
+    say: Say = silent,
 ) -> TrainingSpeed:
     """Update by turns, after an update of each that does not count.
 
@@ -149,9 +149,9 @@ def measure_training(
         MissingExtraError: highway-env, stable-baselines3 or torch is not installed.
         WorkerError: workers cannot be started.
     """
-    for name, value in {"agents": agents, "workers": workers, "repeats": repeats}.items():
-        if value < 1:
-            raise ConfigError(f"{name} = {value}: must be at least 1")
+    check_range(
+        agents=(agents, 1, math.inf), workers=(workers, 1, math.inf), repeats=(repeats, 1, math.inf)
+    )
     if worlds % workers:
         raise ConfigError(f"{worlds} worlds over {workers} workers: must be the same for each")
     for module, extra in (
