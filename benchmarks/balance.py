@@ -122,12 +122,7 @@ def generated_traces(
     seeds: Sequence[int],
     overrides: Mapping[str, Any],
 ) -> Iterator[LoadTrace]:
-    """A crowd on the environment's map for each seed.
-
-    Raises:
-        ConfigError: settings, which nothing here could follow.
-        ZoneError: more zones than the map can hold.
-    """
+    """A crowd on the environment's map for each seed."""
     if overrides:
         raise ConfigError("--set: a generated crowd has no settings; give --recorded with it")
     network = load_network(find_map(env))

@@ -38,56 +38,32 @@ Verdict = Literal[
 
 @dataclass(frozen=True)
 class StrategyResult:
-    """One way to place shards; means over traces.
+    """One way to place shards; means over traces."""
 
-    Attributes:
-        name: of `STRATEGIES`, or `perfect`: as if shards could be divided at will.
-        ratio: its time over that of the static placement.
-        ratio95: between traces; None: of one trace.
-        beside_balanced: its time over that of `balanced`.
-        beside_balanced95: the same.
-        imbalance: maximum over mean of the workers' ticks, mean over rounds.
-        moves: shards a round.
-        handoffs: vehicles a round that the cutting moved.
-        weights: of the last round's score, mean.
-        verdict: `ratio95` beside 1.
-    """
-
-    name: str
-    ratio: float
-    ratio95: Interval | None
-    beside_balanced: float
-    beside_balanced95: Interval | None
-    imbalance: float
-    moves: float
-    handoffs: float
-    weights: tuple[float, float, float]
-    verdict: Verdict
+    name: str  # of `STRATEGIES`, or `perfect`: as if shards could be divided at will
+    ratio: float  # its time over that of the static placement
+    ratio95: Interval | None  # between traces; None: of one trace
+    beside_balanced: float  # its time over that of `balanced`
+    beside_balanced95: Interval | None  # the same
+    imbalance: float  # maximum over mean of the workers' ticks, mean over rounds
+    moves: float  # shards a round
+    handoffs: float  # vehicles a round that the cutting moved
+    weights: tuple[float, float, float]  # of the last round's score, mean
+    verdict: Verdict  # `ratio95` beside 1
 
 
 @dataclass(frozen=True)
 class BalanceReplay:
-    """Result of `replay_traces`.
+    """Result of `replay_traces`."""
 
-    Attributes:
-        map_name: the map's name.
-        zones: k.
-        workers: m.
-        traces: how many.
-        rounds: of each, those before times count among them.
-        ticks: of a round.
-        rule: when shards move, and what that costs.
-        rows: by strategy.
-    """
-
-    map_name: str
-    zones: int
-    workers: int
-    traces: int
-    rounds: int
-    ticks: int
-    rule: BalanceRule
-    rows: tuple[StrategyResult, ...]
+    map_name: str  # the map's name
+    zones: int  # k
+    workers: int  # m
+    traces: int  # how many
+    rounds: int  # of each, those before times count among them
+    ticks: int  # of a round
+    rule: BalanceRule  # when shards move, and what that costs
+    rows: tuple[StrategyResult, ...]  # by strategy
 
 
 @dataclass(frozen=True)
@@ -102,17 +78,7 @@ class _Totals:
 
 
 def replay_traces(traces: Sequence[LoadTrace], rule: BalanceRule) -> BalanceReplay:
-    """Replay every trace through every strategy.
-
-    Args:
-        traces: of the same map, zones, workers and number of rounds.
-        rule: when shards move.
-
-    Raises:
-        ConfigError: no trace, or too few rounds to learn from.
-        NoAdmissibleWorkerError: at the first plan all workers are excluded.
-        PlacementError: more workers than zones.
-    """
+    """Replay every trace through every strategy."""
     if not traces:
         raise ConfigError("traces: there must be at least one")
     first = traces[0]

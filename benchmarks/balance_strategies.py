@@ -23,19 +23,12 @@ RECUT_EVERY = 10  # rounds
 
 @dataclass(frozen=True)
 class Placed:
-    """Where shards are in one round.
+    """Where shards are in one round."""
 
-    Attributes:
-        partition: the zones.
-        homes: worker of each zone.
-        moved_shards: since the round before.
-        moved_vehicles: that other zones got, since the map was cut anew.
-    """
-
-    partition: ZonePartition
-    homes: tuple[int, ...]
-    moved_shards: int = 0
-    moved_vehicles: int = 0
+    partition: ZonePartition  # the zones
+    homes: tuple[int, ...]  # worker of each zone
+    moved_shards: int = 0  # since the round before
+    moved_vehicles: int = 0  # that other zones got, since the map was cut anew
 
 
 class StaticPlacement:

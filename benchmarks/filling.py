@@ -16,17 +16,7 @@ __all__ = ["write_filling_demand"]
 def write_filling_demand(
     network: RoadNetwork, path: Path, *, seconds: float, period_s: float
 ) -> Path:
-    """Flows from every road into the map to every road out of it.
-
-    Args:
-        network: the map.
-        path: of the file, `….rou.xml`.
-        seconds: that they last.
-        period_s: between two vehicles of one road into the map.
-
-    Raises:
-        ConfigError: the map has no roads into it, or none out of it.
-    """
+    """Flows from every road into the map to every road out of it."""
     ins, outs = _ends(network, "num_into"), _ends(network, "num_links")
     if not (ins and outs):
         raise ConfigError(

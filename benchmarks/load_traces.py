@@ -29,43 +29,26 @@ Floats = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class LoadRound:
-    """One round between two chances to move shards.
+    """One round between two chances to move shards."""
 
-    Attributes:
-        ids: (n,) vehicles.
-        places: (n, 2) where they are, m.
-        agents: (n,) which of them agents drive.
-        vehicle_s: (n,) what each costs, seconds a tick.
-        noise: (k,) measured over true cost of each zone.
-        snapshot: what others use of the workers.
-    """
-
-    ids: NDArray[np.int64]
-    places: Floats
-    agents: NDArray[np.bool_]
-    vehicle_s: Floats
-    noise: Floats
-    snapshot: Snapshot
+    ids: NDArray[np.int64]  # (n,) vehicles
+    places: Floats  # (n, 2) where they are, m
+    agents: NDArray[np.bool_]  # (n,) which of them agents drive
+    vehicle_s: Floats  # (n,) what each costs, seconds a tick
+    noise: Floats  # (k,) measured over true cost of each zone
+    snapshot: Snapshot  # what others use of the workers
 
 
 @dataclass(frozen=True)
 class LoadTrace:
-    """Rounds of one world on one map.
+    """Rounds of one world on one map."""
 
-    Attributes:
-        network: the map.
-        partition: its zones at first.
-        ticks: of a round.
-        migration_s: what a vehicle costs more that has come to its zone since the last round,
-            seconds a tick.
-        rounds: in time.
-    """
-
-    network: RoadNetwork
-    partition: ZonePartition
-    ticks: int
+    network: RoadNetwork  # the map
+    partition: ZonePartition  # its zones at first
+    ticks: int  # of a round
+    # what a vehicle costs more that has come to its zone since the last round, seconds a tick
     migration_s: float
-    rounds: tuple[LoadRound, ...]
+    rounds: tuple[LoadRound, ...]  # in time
 
     def arrivals(self, number: int, partition: ZonePartition) -> NDArray[np.int64]:
         """(k,) vehicles that were in another zone a round before; none in the first round."""
@@ -101,33 +84,19 @@ class LoadTrace:
 
 @dataclass(frozen=True)
 class Crowd:
-    """Vehicles that gather where the city is busy, and the busy place wanders.
+    """Vehicles that gather where the city is busy, and the busy place wanders."""
 
-    Attributes:
-        vehicles: how many.
-        agents: share that agents drive.
-        vehicle_s: seconds a tick of each.
-        agent_s: more of one that senses.
-        migration_s: of one that changes its zone, once.
-        ticks: of a round.
-        pull: how many times as many drive in the middle of the crowd as elsewhere.
-        width: of the crowd, as a share of the map's shorter side.
-        stride: how far its middle wanders a round, as the same share.
-        turnover: share of vehicles that find another place each round.
-        noise: of a measured cost, standard deviation of its logarithm.
-    """
-
-    vehicles: int = 600
-    agents: float = 0.2
-    vehicle_s: float = 1e-6
-    agent_s: float = 4e-6
-    migration_s: float = 2e-5
-    ticks: int = 200
-    pull: float = 15.0
-    width: float = 0.2
-    stride: float = 0.04
-    turnover: float = 0.2
-    noise: float = 0.1
+    vehicles: int = 600  # how many
+    agents: float = 0.2  # share that agents drive
+    vehicle_s: float = 1e-6  # seconds a tick of each
+    agent_s: float = 4e-6  # more of one that senses
+    migration_s: float = 2e-5  # of one that changes its zone, once
+    ticks: int = 200  # of a round
+    pull: float = 15.0  # how many times as many drive in the middle of the crowd as elsewhere
+    width: float = 0.2  # of the crowd, as a share of the map's shorter side
+    stride: float = 0.04  # how far its middle wanders a round, as the same share
+    turnover: float = 0.2  # share of vehicles that find another place each round
+    noise: float = 0.1  # of a measured cost, standard deviation of its logarithm
 
 
 def generated_trace(

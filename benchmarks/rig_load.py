@@ -89,9 +89,6 @@ def loaded(job: SensorJob, load_ms: float, say: Say) -> SensorJob:
     Those that can have any resolution take about as long as each other. What they take does not
     grow in proportion to their resolutions, so once one rig is too light and another too heavy, the
     next one lies between them.
-
-    Raises:
-        ConfigError: they do not.
     """
     even, found_ms = _evened(job, load_ms, say), 0.0
     scale, light, heavy = 1.0, 0.0, math.inf
@@ -147,11 +144,6 @@ def scaled(config: EnvConfig, factors: Mapping[str, float], rate_hz: float) -> R
 
     As far as may be: there is a most of each. Pictures keep the proportions of their sides. Sensors
     that have none of them stay as they are.
-
-    Args:
-        config: of the environment.
-        factors: how many times as many each sensor gets.
-        rate_hz: of all that are scaled.
     """
     return {name: _scaled(sensor, factors[name], rate_hz) for name, sensor in config.rig.items()}
 

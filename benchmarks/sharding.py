@@ -81,21 +81,7 @@ def measure_sharding(
     make_checked: Callable[[int], Simulation] | None = None,
     say: Say = silent,
 ) -> Report:
-    """Measure by turns on one core.
-
-    Args:
-        make: the same world in k zones, at the start of an episode.
-        zones: numbers of zones; the undivided world is measured in any case.
-        after_s: simulated seconds before the first turn.
-        repeats: turns of each world, of `TURN_S` simulated seconds.
-        make_checked: as `make`, with `zones.check`; None: what the monitor costs is not measured.
-        say: told what is going on.
-
-    Raises:
-        ConfigError: a number out of range; no vehicle drives.
-        UnequalWorldsError: a divided world is not the undivided one.
-        ZoneError: more zones than the map can hold.
-    """
+    """Measure by turns on one core."""
     check_numbers(zones, after_s, repeats)
     with one_core():
         say("making the worlds")
@@ -162,11 +148,7 @@ def _report(first: Simulation, rows: list[dict[str, Any]], after_s: int, repeats
 
 
 def check_numbers(zones: Sequence[int], after_s: int, repeats: int) -> None:
-    """Refuse what cannot be measured before a world is made for it.
-
-    Raises:
-        ConfigError: a number out of range, or none.
-    """
+    """Refuse what cannot be measured before a world is made for it."""
     check_range(after=(after_s, 1, 3600), repeats=(repeats, 1, 100))
     if not zones:
         raise ConfigError("zones: name at least one number of zones, as in 1,4,9")

@@ -37,50 +37,29 @@ _PHASE_OF = {phase: phase for phase in PHASES} | {
 
 @dataclass(frozen=True)
 class Turn:
-    """One turn of one world, or a part of it: sums over its steps.
+    """One turn of one world, or a part of it: sums over its steps."""
 
-    Attributes:
-        ns: in steps.
-        steps: how many.
-        vehicles: in the world.
-        ghosts: in all zones.
-        imbalance: maximum over mean of the vehicles that zones own.
-        largest: rows of the zone with most.
-        moves: vehicles that changed their zone, step by step.
-        move_ns: in the phase `migrate`, step by step; 0 without a stopwatch.
-    """
-
-    ns: float
-    steps: int
-    vehicles: int
-    ghosts: int
-    imbalance: float
-    largest: int
-    moves: tuple[int, ...]
-    move_ns: tuple[int, ...]
+    ns: float  # in steps
+    steps: int  # how many
+    vehicles: int  # in the world
+    ghosts: int  # in all zones
+    imbalance: float  # maximum over mean of the vehicles that zones own
+    largest: int  # rows of the zone with most
+    moves: tuple[int, ...]  # vehicles that changed their zone, step by step
+    move_ns: tuple[int, ...]  # in the phase `migrate`, step by step; 0 without a stopwatch
 
 
 @dataclass(frozen=True)
 class Pair:
-    """One turn of all worlds; times in ns a vehicle and tick.
+    """One turn of all worlds; times in ns a vehicle and tick."""
 
-    Attributes:
-        plain: of the world without a stopwatch.
-        timed: of that with one.
-        plain_ns: a tick of the first.
-        timed_ns: a tick of the second, less the stopwatch's own time.
-        checked_ns: a tick of the third, with the monitor; None: there is none.
-        phases: by the names of `PHASES`; their sum is `timed_ns`.
-        calls: by the names of the runtime's calls.
-    """
-
-    plain: Turn
-    timed: Turn
-    plain_ns: float
-    timed_ns: float
-    checked_ns: float | None
-    phases: dict[str, float]
-    calls: dict[str, float]
+    plain: Turn  # of the world without a stopwatch
+    timed: Turn  # of that with one
+    plain_ns: float  # a tick of the first
+    timed_ns: float  # a tick of the second, less the stopwatch's own time
+    checked_ns: float | None  # a tick of the third, with the monitor; None: there is none
+    phases: dict[str, float]  # by the names of `PHASES`; their sum is `timed_ns`
+    calls: dict[str, float]  # by the names of the runtime's calls
 
 
 class TwinWorlds:
@@ -125,11 +104,7 @@ class TwinWorlds:
         self._parts[number].append(_run(self.worlds[number], steps, self._watch))
 
     def end_turn(self) -> Pair:
-        """The turn that has been run; another one begins.
-
-        Raises:
-            ConfigError: no vehicle drives in it.
-        """
+        """The turn that has been run; another one begins."""
         plain, timed, *checked = (_joined(parts) for parts in self._parts)
         watch = self._watch
         watch.forget("suggest", "loads")

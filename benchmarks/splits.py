@@ -71,11 +71,7 @@ def measure(
 
 
 def split_line(found: Sequence[tuple[int, float]]) -> int | None:
-    """The least vehicles from which on every split world was the faster one, if any.
-
-    Args:
-        found: vehicles, and how many times faster the split world was.
-    """
+    """The least vehicles from which on every split world was the faster one, if any."""
     line = None
     for vehicles, ratio in sorted(found, reverse=True):
         if ratio <= 1.0:

@@ -51,11 +51,7 @@ class TrivialJob:
 
 
 def make_jobs(recipe: Mapping[str, Any]) -> list[Job]:
-    """The jobs of all workers.
-
-    Args:
-        recipe: what `pooled.PooledWorlds` writes.
-    """
+    """The jobs of all workers."""
     config = validate(EnvConfig, recipe["config"], "the environment")
     layout = layout_of(config, recipe["capacity"], recipe["num_worlds"])
     arrays = StepArrays.of(arrays_in(Segment(recipe["arrays"], 0).map(), layout))

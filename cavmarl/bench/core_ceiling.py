@@ -26,19 +26,14 @@ START_S = 300.0  # that a program may take until its worlds can be stepped
 
 @dataclass(frozen=True)
 class CoreCeiling(Result):
-    """Programs of their own that step worlds, one at a time and all at once.
-
-    Attributes:
-        programs: how many.
-        alone_ms: of each turn, ms a step of all worlds, one program after the other.
-        together_ms: of each turn, ms a step of the slowest program while all run.
-    """
+    """Programs of their own that step worlds, one at a time and all at once."""
 
     DERIVED: ClassVar = ("ratio",)
 
-    programs: int
+    programs: int  # how many
+    # of each turn, ms a step of all worlds, one program after the other
     alone_ms: tuple[float, ...]
-    together_ms: tuple[float, ...]
+    together_ms: tuple[float, ...]  # of each turn, ms a step of the slowest program while all run
 
     @property
     def ratio(self) -> float:
@@ -57,22 +52,7 @@ def measure_ceiling(
     wanted: Mapping[str, Any] | None = None,
     alike: bool = False,
 ) -> CoreCeiling:
-    """Let programs step as many worlds as workers would, without any command.
-
-    Args:
-        env: as in `make_vec`.
-        worlds: of all programs together.
-        programs: how many, at most as many as worlds.
-        steps: of a turn.
-        repeats: turns.
-        seed: root of all random numbers.
-        wanted: other arguments of `make_vec`: agents, background, overrides.
-        alike: every program steps the same worlds as the first, so that none has more to do.
-
-    Raises:
-        ConfigError: fewer worlds than programs.
-        WorkerError: a program did not come up.
-    """
+    """Let programs step as many worlds as workers would, without any command."""
     if not 1 <= programs <= worlds:
         raise ConfigError(f"{programs} programs, {worlds} worlds: must be at least one world each")
     bounds = [worlds * n // programs for n in range(programs + 1)]
@@ -109,11 +89,7 @@ def _turn(wires: list[Connection], steps: int) -> list[float]:
 
 
 def _hear(wire: Connection) -> float:
-    """What a program says.
-
-    Raises:
-        WorkerError: it has ended, or says nothing.
-    """
+    """What a program says."""
     try:
         if wire.poll(START_S):
             return float(wire.recv())

@@ -50,48 +50,30 @@ CEILING_STEPS, CEILING_TURNS = 10, 7
 
 @dataclass(frozen=True)
 class Turn:
-    """One run: which it was, and what it found.
+    """One run: which it was, and what it found."""
 
-    Attributes:
-        repeat: from 1.
-        place: in the order in which all were run, from 1.
-        workers: sensor workers.
-        run: what was found.
-    """
-
-    repeat: int
-    place: int
-    workers: int
-    run: SensorRun
+    repeat: int  # from 1
+    place: int  # in the order in which all were run, from 1
+    workers: int  # sensor workers
+    run: SensorRun  # what was found
 
 
 @dataclass(frozen=True)
 class SensorBench(Result):
-    """Result of `measure_sensor_workers`.
-
-    Attributes:
-        env: of which environment.
-        agents: vehicles with sensors.
-        background: vehicles without.
-        warmup: steps that did not count.
-        steps: of each run that did.
-        seed: of every run, and of their order.
-        placement: how sensors were shared out: by `cost` or `in_turn`.
-        turns: all runs, in their order.
-        ceiling: how much faster programs that share nothing do the same sensing side by side, as
-            many as the most workers for which there are cores; None: only one.
-    """
+    """Result of `measure_sensor_workers`."""
 
     DERIVED: ClassVar = ("sensing_ms", "costs_ms", "is_same")
 
-    env: str
-    agents: int
-    background: int
-    warmup: int
-    steps: int
-    seed: int
-    placement: str
-    turns: tuple[Turn, ...]
+    env: str  # of which environment
+    agents: int  # vehicles with sensors
+    background: int  # vehicles without
+    warmup: int  # steps that did not count
+    steps: int  # of each run that did
+    seed: int  # of every run, and of their order
+    placement: str  # how sensors were shared out: by `cost` or `in_turn`
+    turns: tuple[Turn, ...]  # all runs, in their order
+    # how much faster programs that share nothing do the same sensing side by side, as many as the
+    # most workers for which there are cores; None: only one
     ceiling: CoreCeiling | None
 
     def of(self, workers: int) -> list[SensorRun]:
@@ -196,23 +178,6 @@ def measure_sensor_workers(
     """Run the same world with each number of sensor workers, in a random order.
 
     Every run has processes of its own, which share nothing with those of another but files.
-
-    Args:
-        env: as in `make_vec`.
-        rig: sensors of each agent, by name.
-        workers: numbers of sensor workers.
-        warmup: steps that do not count.
-        steps: of each run that do.
-        repeats: runs of each number.
-        agents: vehicles with sensors.
-        background: vehicles without.
-        seed: root of all random numbers of every run, and of their order.
-        overrides: values for any other key.
-        say: told what is being done.
-
-    Raises:
-        ConfigError: numbers that cannot be.
-        EvaluationError: a run that was not brought to its end.
     """
     _check(workers, warmup, steps, repeats)
     job = first_job(
@@ -305,12 +270,7 @@ def job_config(job: SensorJob) -> EnvConfig:
 
 
 def run_job(job: SensorJob) -> SensorRun:
-    """A run in a group of processes of its own.
-
-    Raises:
-        CavmarlError: what it raises there.
-        EvaluationError: its process died.
-    """
+    """A run in a group of processes of its own."""
     program = subprocess.Popen(
         [sys.executable, "-W", "ignore", "-m", PROGRAM],
         stdin=subprocess.PIPE,

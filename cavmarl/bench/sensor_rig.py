@@ -20,11 +20,7 @@ _PLACE = ("x_m", "y_m", "z_m", "yaw_deg", "pitch_deg", "roll_deg")
 
 
 def find_rig(rig: str) -> Path:
-    """The file that `rig` means: a path, or a name in `configs/rigs/`.
-
-    Raises:
-        ConfigError: there is none.
-    """
+    """The file that `rig` means: a path, or a name in `configs/rigs/`."""
     if Path(rig).is_file():
         return Path(rig)
     for place in places("configs"):
@@ -35,11 +31,7 @@ def find_rig(rig: str) -> Path:
 
 
 def load_rig(path: Path) -> Rig:
-    """The sensors in a file, as they stand under `rig` of an env.yaml.
-
-    Raises:
-        ConfigError: not YAML, or no mapping of sensors.
-    """
+    """The sensors in a file, as they stand under `rig` of an env.yaml."""
     found = read_yaml(path)
     if not isinstance(found, Mapping) or not all(
         isinstance(sensor, Mapping) for sensor in found.values()

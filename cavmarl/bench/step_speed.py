@@ -56,25 +56,15 @@ THEIRS = (
 
 @dataclass(frozen=True)
 class Row:
-    """One way to step one kind of world.
+    """One way to step one kind of world."""
 
-    Attributes:
-        sensors: `lidar` (and neighbours) or `kinematics`.
-        who: `batched`, `single`, `dicts`, `more`, `highway_env` or `highway_env_raw`.
-        agents: controlled vehicles a world.
-        worlds: stepped together.
-        low: agent-steps a second, the slowest turn.
-        median: over the turns.
-        high: the fastest turn.
-    """
-
-    sensors: str
-    who: str
-    agents: int
-    worlds: int
-    low: float
-    median: float
-    high: float
+    sensors: str  # `lidar` (and neighbours) or `kinematics`
+    who: str  # `batched`, `single`, `dicts`, `more`, `highway_env` or `highway_env_raw`
+    agents: int  # controlled vehicles a world
+    worlds: int  # stepped together
+    low: float  # agent-steps a second, the slowest turn
+    median: float  # over the turns
+    high: float  # the fastest turn
 
     @property
     def agent_step_s(self) -> float:
@@ -84,44 +74,23 @@ class Row:
 
 @dataclass(frozen=True)
 class StepSpeed(Result):
-    """Result of the comparison.
+    """Result of the comparison."""
 
-    Attributes:
-        road_m: length of the road that `agents` vehicles were set out on, on both sides.
-        repeats: turns.
-        rows: what was measured.
-        ratio: with a lidar, `batched` over `highway_env`.
-        ratio_kinematics: without, `batched` over `highway_env`'s default observation.
-        ratio_kinematics_raw: the same over its observation without normalisation.
-        cost_of_more: what an agent costs among `MORE` times as many, over what it costs `batched`.
-        dict_us: what the dict API adds for each agent and step to `single`, in µs.
-    """
-
-    road_m: float
-    repeats: int
-    rows: tuple[Row, ...]
-    ratio: float
-    ratio_kinematics: float
-    ratio_kinematics_raw: float
+    road_m: float  # length of the road that `agents` vehicles were set out on, on both sides
+    repeats: int  # turns
+    rows: tuple[Row, ...]  # what was measured
+    ratio: float  # with a lidar, `batched` over `highway_env`
+    ratio_kinematics: float  # without, `batched` over `highway_env`'s default observation
+    ratio_kinematics_raw: float  # the same over its observation without normalisation
+    # what an agent costs among `MORE` times as many, over what it costs `batched`
     cost_of_more: float
-    dict_us: float
+    dict_us: float  # what the dict API adds for each agent and step to `single`, in µs
 
 
 def measure_step_speed(
     agents: int = 100, worlds: int = 16, repeats: int = 5, progress: Say = silent
 ) -> StepSpeed:
-    """Measure by turns on one core, kernels warm.
-
-    Args:
-        agents: controlled vehicles a world.
-        worlds: of ours, stepped together where they are batched.
-        repeats: turns.
-        progress: told what is going on.
-
-    Raises:
-        ConfigError: a number out of range.
-        MissingExtraError: highway-env is not installed.
-    """
+    """Measure by turns on one core, kernels warm."""
     check_range(agents=(agents, 1, MAX_AGENTS), worlds=(worlds, 1, 1024), repeats=(repeats, 1, 100))
     require("highway_env", "highway")
     with one_core(), tempfile.TemporaryDirectory() as folder:

@@ -37,29 +37,17 @@ TURN_S = 10
 
 @dataclass(frozen=True)
 class TrafficSpeed(Result):
-    """Result of the comparison; rates are vehicle-steps a second of the processor's time.
+    """Result of the comparison; rates are vehicle-steps a second of the processor's time."""
 
-    Attributes:
-        map_name: the map's name.
-        dt_s: step length of both.
-        after_s: simulated seconds before the first turn.
-        repeats: turns of each.
-        our_vehicles: mean number in our world over all turns.
-        sumo_vehicles: the same in SUMO's.
-        ours: our rates.
-        sumo: libsumo's.
-        ratio: of the medians, ours over libsumo's.
-    """
-
-    map_name: str
-    dt_s: float
-    after_s: int
-    repeats: int
-    our_vehicles: float
-    sumo_vehicles: float
-    ours: Spread
-    sumo: Spread
-    ratio: float
+    map_name: str  # the map's name
+    dt_s: float  # step length of both
+    after_s: int  # simulated seconds before the first turn
+    repeats: int  # turns of each
+    our_vehicles: float  # mean number in our world over all turns
+    sumo_vehicles: float  # the same in SUMO's
+    ours: Spread  # our rates
+    sumo: Spread  # libsumo's
+    ratio: float  # of the medians, ours over libsumo's
 
 
 @dataclass(frozen=True)
@@ -81,22 +69,7 @@ def measure_traffic_speed(
     repeats: int = 5,
     progress: Say = silent,
 ) -> TrafficSpeed:
-    """Measure by turns on one core.
-
-    Args:
-        map_name: an environment's name or folder, or a map file.
-        demand: files of routes and additional files, or one `.sumocfg`.
-        dt_s: step length of both.
-        seed: of both.
-        after_s: simulated seconds before the first turn.
-        repeats: turns of each, of 10 simulated seconds.
-        progress: told what is going on.
-
-    Raises:
-        ConfigError: a number, a demand, or a demand on this map that cannot work; an empty road.
-        MapError: the map cannot be read or driven.
-        MissingExtraError: SUMO is not installed.
-    """
+    """Measure by turns on one core."""
     check_range(after=(after_s, 1, 3600), repeats=(repeats, 1, 100))
     path = find_map(map_name)
     job = SumoJob(path, read_input(demand), after_s, dt_s, seed)

@@ -28,44 +28,28 @@ IDLE_S = 1.0
 
 @dataclass(frozen=True)
 class Row:
-    """The same worlds over some number of workers.
+    """The same worlds over some number of workers."""
 
-    Attributes:
-        workers: how many; 0: all in the caller's process.
-        made_s: until they could be reset.
-        step_ms: of each turn, ms a step.
-        busiest_ms: processor time that the busiest worker took for a step, ms.
-    """
-
-    workers: int
-    made_s: float
-    step_ms: tuple[float, ...]
-    busiest_ms: float | None
+    workers: int  # how many; 0: all in the caller's process
+    made_s: float  # until they could be reset
+    step_ms: tuple[float, ...]  # of each turn, ms a step
+    busiest_ms: float | None  # processor time that the busiest worker took for a step, ms
 
 
 @dataclass(frozen=True)
 class WorkerSpeed(Result):
-    """What was measured.
-
-    Attributes:
-        env: of which environment.
-        worlds: that were stepped together.
-        steps: of a turn.
-        rows: no worker, one, and those that were asked for.
-        barrier_us: of each empty command to all workers, µs: quantiles 5, 50, 95 and 99 %.
-        idle_s: processor time that idle workers took in a second, s.
-        hardware: that it ran on.
-    """
+    """What was measured."""
 
     DERIVED: ClassVar = ("ratio", "processor_ratio", "cost_of_one", "is_crowded")
 
-    env: str
-    worlds: int
-    steps: int
-    rows: tuple[Row, ...]
+    env: str  # of which environment
+    worlds: int  # that were stepped together
+    steps: int  # of a turn
+    rows: tuple[Row, ...]  # no worker, one, and those that were asked for
+    # of each empty command to all workers, µs: quantiles 5, 50, 95 and 99 %
     barrier_us: tuple[float, float, float, float]
-    idle_s: float
-    hardware: dict[str, Any]
+    idle_s: float  # processor time that idle workers took in a second, s
+    hardware: dict[str, Any]  # that it ran on
 
     @property
     def ratio(self) -> float:
@@ -104,20 +88,6 @@ def measure_workers(
 
     The agents do what the built-in driver would; that is not timed. Observations are read where
     they lie, as a trainer with tensors of the same memory does.
-
-    Args:
-        env: as in `make_vec`.
-        worlds: stepped together.
-        workers: how many are compared with one.
-        steps: of a turn.
-        repeats: turns of each.
-        seed: root of all random numbers.
-        wanted: other arguments of `make_vec`: agents, background, overrides.
-        say: told what is being done.
-
-    Raises:
-        ConfigError: numbers that cannot be.
-        WorkerError: workers cannot be started.
     """
     if workers < 2 or steps < 1 or repeats < 1:
         raise ConfigError(
