@@ -38,8 +38,8 @@ check: $(READY) ## style, types, and the direction of imports
 	$(BIN)/mypy
 	$(BIN)/lint-imports
 
-bench: $(READY) ## agent-steps a second, next to highway-env
-	$(BIN)/cavmarl bench step
+bench: $(READY) ## run a benchmark, as NAME=step ARGS='--agents 10'; without a NAME: list them
+	$(BIN)/python -m benchmarks $(NAME) $(ARGS)
 
 bounds: $(READY) ## the tests with every index of the kernels checked
 	NUMBA_BOUNDSCHECK=1 $(BIN)/pytest -m "not slow"
@@ -77,7 +77,7 @@ pictures: $(READY) ## draw the pictures of the README, the cards and the pages a
 
 clean: ## remove .venv, builds and caches; runs/ stays
 	rm -rf .venv $(OLDEST) $(LIBRARIES) fuzz/corpus build dist .mypy_cache .ruff_cache .pytest_cache .hypothesis .import_linter_cache
-	find cavmarl agents train tests -name __pycache__ -prune -exec rm -rf {} +
+	find cavmarl agents benchmarks train tests -name __pycache__ -prune -exec rm -rf {} +
 
 # torch comes first and alone, so that a CPU build that pip is told of (PIP_EXTRA_INDEX_URL,
 # PIP_FIND_LINKS) is taken instead of several GB of CUDA libraries.

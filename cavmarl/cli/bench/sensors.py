@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import csv
-import math
 from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -13,6 +12,7 @@ from rich import box
 from rich.console import Console
 from rich.table import Table
 
+from cavmarl.bench.harness import check_positive, make_table, measuring, numbers_of
 from cavmarl.cli.output import JsonPath, Seed, Settings, parse_settings, write_json
 from cavmarl.core.errors import ConfigError
 
@@ -30,22 +30,16 @@ def sensors(
         str, typer.Argument(metavar="[ENV]", help="Name, folder or map file of an environment.")
     ] = "town",
     workers: Annotated[
-        str, typer.Option(metavar="N,…", help="Numbers of sensor workers.")
+        str, typer.Option(metavar="N,…", help="Numbers of sensor workers to compare.")
     ] = "1,2,3,4",
-    warmup: Annotated[int, typer.Option(help="Steps that do not count.")] = 40,
-    steps: Annotated[int, typer.Option(help="Of each run that do.")] = 150,
-    repeats: Annotated[int, typer.Option(help="Runs of each number.")] = 5,
+    warmup: Annotated[int, typer.Option(help="Steps before the measured ones.")] = 40,
+    steps: Annotated[int, typer.Option(help="Measured steps of each run.")] = 150,
+    repeats: Annotated[int, typer.Option(help="Runs of each number of sensor workers.")] = 5,
     rig: Annotated[
         str, typer.Option(help="Sensors: a name in configs/rigs/, or a .yaml.")
     ] = "ten_sensors",
     agents: Annotated[int, typer.Option(help="Vehicles with sensors.")] = 1,
-    background: Annotated[int, typer.Option(help="Vehicles without.")] = 0,
-    load: Annotated[
-        float | None,
-        typer.Option(
-            metavar="MS", help="Raise resolutions and rates until sensing takes so long a tick."
-        ),
-    ] = None,
+    background: Annotated[int, typer.Option(help="Vehicles without sensors.")] = 0,
     seed: Seed = 0,
     settings: Settings = None,
     csv_path: Annotated[
@@ -55,7 +49,10 @@ def sensors(
         Path | None, typer.Option(help="Write the figure here (.png, .svg, .pdf).")
     ] = None,
     at_least: Annotated[
-        float | None, typer.Option(help="Exit with 1 if the second is not so many times faster.")
+        float | None,
+        typer.Option(
+            help="Exit with 1 if the second number is not so many times faster than the first."
+        ),
     ] = None,
     json_path: JsonPath = None,
 ) -> None:
@@ -65,13 +62,12 @@ def sensors(
     """
     from cavmarl.bench.sensor_bench import measure_sensor_workers
     from cavmarl.bench.sensor_figure import plot_sensor_workers
-    from cavmarl.bench.sensor_load import find_rig, load_rig
+    from cavmarl.bench.sensor_rig import find_rig, load_rig
 
-    if at_least is not None and not 0.0 < at_least < math.inf:
-        raise ConfigError(f"--at-least {at_least:g}: must be a number above 0")
-    numbers = _numbers(workers)
+    check_positive("--at-least", at_least)
+    numbers = numbers_of("--workers", workers)
     console = Console()
-    with console.status("") as status:
+    with measuring(console) as say:
         found = measure_sensor_workers(
             env,
             load_rig(find_rig(rig)),
@@ -82,9 +78,8 @@ def sensors(
             agents=agents,
             background=background,
             seed=seed,
-            load_ms=load,
             overrides=parse_settings(settings),
-            say=status.update,
+            say=say,
         )
     rows = found.rows
     for table in (_sensors(found), _scaling(found, rows), _parts(found), _resources(found)):
@@ -101,48 +96,47 @@ def sensors(
         raise typer.Exit(1)
 
 
-def _numbers(text: str) -> list[int]:
-    try:
-        return [int(word) for word in text.split(",")]
-    except ValueError:
-        raise ConfigError(f"--workers {text}: must be whole numbers with commas between") from None
-
-
 def _sensors(found: SensorBench) -> Table:
-    """What was sensed, what it costs, and who does it either way."""
-    table = Table("sensor", "type", "sample", "Hz", "x, y, z m; yaw °", "ms", title="the rig")
+    """What was sensed, what it costs, and which worker does it either way."""
     shared = [number for number in found.numbers if number > 1]
-    for number in shared:
-        table.add_column(f"in turn / by cost, {number}", justify="right")
     plans = [found.shares(number) for number in shared]
     homes = [{name: _homes(plan) for name, plan in both.items()} for both in plans]
+    rows: list[tuple[str, ...] | None] = []
     for place, (sensor, cost_ms) in enumerate(
         zip(found.turns[0].run.sensors, found.costs_ms, strict=True)
     ):
         at = sensor["placement"]
-        table.add_row(
-            sensor["name"],
-            sensor["type"],
-            " by ".join(map(str, sensor["resolution"])),
-            "" if sensor["rate_hz"] is None else f"{sensor['rate_hz']:g}",
-            f"{at['x_m']:g}, {at['y_m']:g}, {at['z_m']:g}; {at['yaw_deg']:g}",
-            f"{cost_ms:.3f}",
-            *(
-                f"{both['in_turn'].get(place, '-')} / {both['cost'].get(place, '-')}"
-                for both in homes
-            ),
+        rows.append(
+            (
+                sensor["name"],
+                sensor["type"],
+                " by ".join(map(str, sensor["resolution"])),
+                "" if sensor["rate_hz"] is None else f"{sensor['rate_hz']:g}",
+                f"{at['x_m']:g}, {at['y_m']:g}, {at['z_m']:g}; {at['yaw_deg']:g}",
+                f"{cost_ms:.3f}",
+                *(
+                    " / ".join(both[n].get(place, "-") for n in ("in_turn", "cost"))
+                    for both in homes
+                ),
+            )
         )
-    table.add_section()
     slowest = (
         " / ".join(f"{1e3 * max(both[name].loads_s):.2f}" for name in ("in_turn", "cost"))
         for both in plans
     )
-    table.add_row("all; the slowest", "", "", "", "", f"{sum(found.costs_ms):.3f}", *slowest)
-    return table
+    rows += [None, ("all; the slowest", "", "", "", "", f"{sum(found.costs_ms):.3f}", *slowest)]
+    return make_table(
+        "the rig",
+        (
+            "sensor", "type", "sample", "Hz", "x, y, z m; yaw °", "ms",
+            *(f"in turn / by cost, {number}" for number in shared),
+        ),
+        rows,
+    )  # fmt: skip
 
 
 def _homes(plan: Shares) -> dict[int, str]:
-    """Who writes the frames of each sensor, or parts of them."""
+    """Workers that write the frames of each sensor, or parts of them."""
     homes: dict[int, list[str]] = {}
     for unit, home in zip(plan.units, plan.homes, strict=True):
         homes.setdefault(unit.sensor, []).append(str(home))
@@ -183,40 +177,36 @@ def _scaling(found: SensorBench, rows: list[ScalingRow]) -> Table:
 
 def _parts(found: SensorBench) -> Table:
     """Where a step goes."""
-    table = Table("ms a step", title="parts of a step, each with a clock of its own")
-    columns = []
-    for row in found.rows:
-        table.add_column(f"{row.workers}", justify="right")
-        columns.append((found.parts_ms(row.workers), row.step_ms))
-    for name in columns[0][0]:
-        if name == "SUMO" and not any(parts[name] for parts, _ in columns):
-            continue  # no world has one
-        table.add_row(name, *(f"{parts[name]:.3f}" for parts, _ in columns))
-    table.add_section()
+    columns = [(found.parts_ms(row.workers), row.step_ms) for row in found.rows]
+    rows: list[tuple[str, ...] | None] = [
+        (name, *(f"{parts[name]:.3f}" for parts, _ in columns))
+        for name in columns[0][0]
+        if name != "SUMO" or any(parts[name] for parts, _ in columns)
+    ]
     sums = (f"{sum(parts.values()) / step_ms:.1%}" for parts, step_ms in columns)
-    table.add_row("sum, of the step", *sums)
-    return table
+    rows += [None, ("sum, of the step", *sums)]
+    head = ("ms a step", *(str(row.workers) for row in found.rows))
+    return make_table("parts of a step, each with a clock of its own", head, rows)
+
+
+_RESOURCES: dict[str, Callable[[Window], float]] = {
+    "processor, state, ms": lambda w: 1e3 * w.leader_cpu_s / w.steps,
+    "processor, sensor workers, ms": lambda w: 1e3 * sum(w.worker_cpu_s) / w.steps,
+    "memory, state, MB": lambda w: w.leader_rss_mb,
+    "memory, largest sensor worker, MB": lambda w: max(w.worker_rss_mb),
+    "to sensor workers, kB": lambda w: 1e-3 * w.sent_bytes / w.steps,
+    "frames, kB": lambda w: 1e-3 * w.got_bytes / w.steps,
+    "messages": lambda w: w.messages / w.steps,
+}
 
 
 def _resources(found: SensorBench) -> Table:
     """What all processes took a step, in the last run of each number."""
-    table = Table("a step", title="resources")
-    columns = []
-    for number in found.numbers:
-        table.add_column(f"{number}", justify="right")
-        columns.append(found.windows(number))
-    lines: dict[str, Callable[[Window], float]] = {
-        "processor, state, ms": lambda w: 1e3 * w.leader_cpu_s / w.steps,
-        "processor, sensor workers, ms": lambda w: 1e3 * sum(w.worker_cpu_s) / w.steps,
-        "memory, state, MB": lambda w: w.leader_rss_mb,
-        "memory, largest sensor worker, MB": lambda w: max(w.worker_rss_mb),
-        "to sensor workers, kB": lambda w: 1e-3 * w.sent_bytes / w.steps,
-        "frames, kB": lambda w: 1e-3 * w.got_bytes / w.steps,
-        "messages": lambda w: w.messages / w.steps,
-    }
-    for name, value in lines.items():
-        table.add_row(name, *(f"{value(windows[-1]):,.1f}" for windows in columns))
-    return table
+    last = [found.windows(number)[-1] for number in found.numbers]
+    rows = [
+        (name, *(f"{value(window):,.1f}" for window in last)) for name, value in _RESOURCES.items()
+    ]
+    return make_table("resources", ("a step", *map(str, found.numbers)), rows)
 
 
 def _say(console: Console, found: SensorBench, rows: list[ScalingRow]) -> None:
