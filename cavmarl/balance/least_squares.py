@@ -7,7 +7,7 @@ from itertools import combinations
 import numpy as np
 from numpy.typing import NDArray
 
-from cavmarl.core.errors import PlacementError
+from cavmarl.core.errors import ConfigError
 
 __all__ = ["MAX_COLUMNS", "fit_non_negative"]
 
@@ -27,15 +27,15 @@ def fit_non_negative(rows: Floats, values: Floats) -> Floats:
         values: (n,).
 
     Raises:
-        PlacementError: no rows, too many columns, or something that is no number.
+        ConfigError: no rows, too many columns, or something that is no number.
     """
     rows, values = np.asarray(rows, dtype=np.float64), np.asarray(values, dtype=np.float64)
     if rows.ndim != 2 or not len(rows) or len(rows) != len(values):
-        raise PlacementError(f"a fit of {rows.shape} rows to {values.shape}: one value a row")
+        raise ConfigError(f"a fit of {rows.shape} rows to {values.shape}: one value a row")
     if rows.shape[1] > MAX_COLUMNS:
-        raise PlacementError(f"a fit of {rows.shape[1]} columns: at most {MAX_COLUMNS}")
+        raise ConfigError(f"a fit of {rows.shape[1]} columns: at most {MAX_COLUMNS}")
     if not (np.isfinite(rows).all() and np.isfinite(values).all()):
-        raise PlacementError("a fit to values that are not finite: leave these rows out")
+        raise ConfigError("a fit to values that are not finite: leave these rows out")
     columns = range(rows.shape[1])
     best, least = np.zeros(len(columns)), float(values @ values)
     for size in range(1, len(columns) + 1):

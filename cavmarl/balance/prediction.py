@@ -18,7 +18,7 @@ from typing import NamedTuple
 import numpy as np
 
 from cavmarl.balance.least_squares import fit_non_negative
-from cavmarl.core.errors import PlacementError
+from cavmarl.core.errors import ConfigError
 
 __all__ = ["CostModel", "ShardContent", "fit_costs"]
 
@@ -63,10 +63,10 @@ def fit_costs(contents: Sequence[ShardContent], costs_s: Sequence[float]) -> Cos
     """The model that fits logged rows best.
 
     Raises:
-        PlacementError: no rows, not one cost each, or something that is no number.
+        ConfigError: no rows, not one cost each, or something that is no number.
     """
     if not contents or len(contents) != len(costs_s):
-        raise PlacementError(f"{len(contents)} contents and {len(costs_s)} costs: one each")
+        raise ConfigError(f"{len(contents)} contents and {len(costs_s)} costs: one each")
     rows = np.column_stack([np.ones(len(contents)), np.array(contents)])
     scale = np.abs(rows).max(axis=0)
     scale[scale == 0.0] = 1.0  # of what never was there

@@ -118,9 +118,8 @@ def replay_traces(traces: Sequence[LoadTrace], rule: BalanceRule) -> BalanceRepl
         rule: when shards move.
 
     Raises:
-        ConfigError: no trace, or too few rounds to learn from.
+        ConfigError: no trace, or too few rounds to learn from; more workers than zones.
         NoAdmissibleWorkerError: at the first plan all workers are excluded.
-        PlacementError: more workers than zones.
     """
     if not traces:
         raise ConfigError("traces: there must be at least one")

@@ -33,8 +33,7 @@ def generated_traces(
     """A crowd on the environment's map for each seed.
 
     Raises:
-        ConfigError: settings, which nothing here could follow.
-        ZoneError: more zones than the map can hold.
+        ConfigError: settings, which nothing here could follow; more zones than the map can hold.
     """
     if overrides:
         raise ConfigError("--set: a generated crowd has no settings; give --recorded with it")

@@ -19,7 +19,7 @@ from typing import Any
 from cavmarl.bench.sharding_turns import Turn, TwinWorlds
 from cavmarl.bench.step_speed import one_core
 from cavmarl.config.env import MAX_ZONES
-from cavmarl.core.errors import ConfigError, UnequalWorldsError
+from cavmarl.core.errors import ConfigError, EvaluationError
 from cavmarl.engine.simulation import Simulation
 
 __all__ = ["TURN_S", "ShardingSpeed", "ZoneCost", "check_numbers", "measure_sharding"]
@@ -120,9 +120,8 @@ def measure_sharding(
         progress: told what is going on.
 
     Raises:
-        ConfigError: a number out of range; nobody drives.
-        UnequalWorldsError: a divided world is not the undivided one.
-        ZoneError: more zones than the map can hold.
+        ConfigError: a number out of range; nobody drives; more zones than the map can hold.
+        EvaluationError: a divided world is not the undivided one.
     """
     check_numbers(zones, after_s, repeats)
     counts = sorted({1, *zones})
@@ -180,7 +179,7 @@ def _check_equal(worlds: Sequence[TwinWorlds]) -> None:
     """Refuse to compare what is not the same world.
 
     Raises:
-        UnequalWorldsError: states differ.
+        EvaluationError: states differ.
     """
     first = worlds[0].plain.simulation
     expected = first.state_hash()
@@ -188,7 +187,7 @@ def _check_equal(worlds: Sequence[TwinWorlds]) -> None:
         for world in own.worlds:
             found = world.simulation.state_hash()
             if found != expected:
-                raise UnequalWorldsError(
+                raise EvaluationError(
                     f"'{first.network.name}' after {int(first.ticks()[0])} ticks: {own.zones} "
                     f"zones have the state {found}, the undivided world has {expected}; times of "
                     "different worlds are not compared"

@@ -14,7 +14,7 @@ from cavmarl.balance.calibration import Calibration, LoggedTick, calibrate
 from cavmarl.balance.least_squares import fit_non_negative
 from cavmarl.balance.load_score import WEIGHTS, Utilisation
 from cavmarl.balance.prediction import CostModel, ShardContent, fit_costs
-from cavmarl.core.errors import PlacementError
+from cavmarl.core.errors import ConfigError
 from cavmarl.engine.world_setup import find_map
 from cavmarl.handoff.repartition_plan import propose_zones
 from cavmarl.roads.cache import load_network
@@ -77,13 +77,13 @@ def test_what_never_was_there_costs_nothing() -> None:
 
 
 def test_a_fit_needs_a_cost_for_each_row() -> None:
-    with pytest.raises(PlacementError, match="1 contents and 0 costs"):
+    with pytest.raises(ConfigError, match="1 contents and 0 costs"):
         fit_costs([ShardContent(1, 1, 1)], [])
-    with pytest.raises(PlacementError, match="not finite"):
+    with pytest.raises(ConfigError, match="not finite"):
         fit_costs([ShardContent(1, 1, 1)], [float("nan")])
-    with pytest.raises(PlacementError, match="one value a row"):
+    with pytest.raises(ConfigError, match="one value a row"):
         fit_non_negative(np.ones((2, 2)), np.ones(3))
-    with pytest.raises(PlacementError, match="at most 8"):
+    with pytest.raises(ConfigError, match="at most 8"):
         fit_non_negative(np.ones((2, 9)), np.ones(2))
 
 
@@ -151,5 +151,5 @@ def test_zones_stay_where_they_are_good_enough(town: tuple[object, np.ndarray]) 
 @pytest.mark.parametrize("costs", [[1.0] * 3, [1.0, 1.0, 1.0, float("nan")], [1.0, 1.0, 1.0, -1.0]])
 def test_zones_need_a_cost_each(town: tuple[object, np.ndarray], costs: list[float]) -> None:
     network, places = town
-    with pytest.raises(PlacementError, match="one a zone of 4"):
+    with pytest.raises(ConfigError, match="one a zone of 4"):
         propose_zones(network, cut_map(network, "grid", 4), places, costs)  # type: ignore[arg-type]

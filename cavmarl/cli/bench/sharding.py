@@ -23,7 +23,7 @@ from cavmarl.cli.output import (
     write_json,
 )
 from cavmarl.config.env import ZONE_LAYOUTS
-from cavmarl.core.errors import ConfigError, UnequalWorldsError
+from cavmarl.core.errors import ConfigError, EvaluationError
 
 if TYPE_CHECKING:
     from cavmarl.bench.sharding_speed import ShardingSpeed
@@ -87,7 +87,7 @@ def sharding(
                 make_checked=maker(**{"zones.check": True}) if check else None,
                 progress=status.update,
             )
-        except UnequalWorldsError as error:
+        except EvaluationError as error:
             print_error(str(error))
             raise typer.Exit(1) from error
     console.print(_loads(found))
