@@ -22,7 +22,7 @@ from benchmarks.harness import Report, Say, about, check_range, numbers_of, one_
 from benchmarks.sharding_turns import Pair, Turn, TwinWorlds
 from cavmarl.cli.output import Agents, Background, Seed, Settings, parse_settings
 from cavmarl.config.env import MAX_ZONES, ZONE_LAYOUTS
-from cavmarl.core.errors import ConfigError, UnequalWorldsError
+from cavmarl.core.errors import ConfigError, EvaluationError
 from cavmarl.engine.simulation import Simulation
 from cavmarl.evaluate.driven_worlds import world_maker
 
@@ -164,7 +164,7 @@ def _check_equal(worlds: Sequence[TwinWorlds]) -> None:
         for world in own.worlds:
             found = world.simulation.state_hash()
             if found != expected:
-                raise UnequalWorldsError(
+                raise EvaluationError(
                     f"'{first.network.name}' after {int(first.ticks()[0])} ticks: {own.zones} "
                     f"zones have the state {found}, the undivided world has {expected}; times of "
                     "different worlds are not compared"

@@ -14,10 +14,9 @@ from cavmarl.config.env import EnvConfig
 from cavmarl.core.errors import (
     CapacityError,
     ConfigError,
+    JournalError,
     LostTickError,
-    ReproducerError,
     SumoError,
-    ZoneError,
 )
 from cavmarl.core.huge_pages import huge_zeros
 from cavmarl.core.math.rng import world_key
@@ -201,7 +200,7 @@ class Simulation(WorldViews):
         tick.division.rehearse_gathering()
         tick.traffic.settle(tick.gate, self._shard.worlds)
         tick.division.near(0, everybody=True)
-        with suppress(ZoneError):
+        with suppress(ConfigError):
             tick.division.hand_over(0, Switch(-1, 0, 0, 0, False), None)
         book = BorderBook(tick.division, 0)
         book.release(book.hand_over(True, sum(tick.division.counts(0)), ()))
@@ -316,10 +315,10 @@ class Simulation(WorldViews):
         No further reproducers are written.
 
         Raises:
-            ReproducerError: it is of other worlds.
+            JournalError: it is of other worlds.
         """
         if self._tick.sumo is not None:
-            raise ReproducerError("a world with SUMO beside it cannot be taken up in its middle")
+            raise JournalError("a world with SUMO beside it cannot be taken up in its middle")
         self._keeper = None
         self.seed(kept.seed, kept.first_world)
         self._episodes[:] = kept.episode - 1
@@ -399,7 +398,7 @@ class Simulation(WorldViews):
         """Go on from what `save` gave, in worlds of the same environment.
 
         Raises:
-            SumoStateError: SUMO moves vehicles there, and what it was told is not on record; see
+            SumoError: SUMO moves vehicles there, and what it was told is not on record; see
                 `SumoTraffic.keep_logs`.
         """
         self._put_back(saved)

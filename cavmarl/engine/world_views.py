@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from cavmarl.config.env import EnvConfig
 from cavmarl.core.errors import (
-    V2xError,
+    ConfigError,
 )
 from cavmarl.core.records.arrays import Common, Gate, Outputs, Worlds
 from cavmarl.engine.component import Attached
@@ -74,12 +74,12 @@ class WorldViews:
         """What vehicles and roadside units tell each other.
 
         Raises:
-            V2xError: they tell each other nothing.
+            ConfigError: they tell each other nothing.
         """
         for part in self._tick.attached:
             if isinstance(part, Messaging):
                 return part.bus
-        raise V2xError("nobody says anything here: set v2x.enabled to true")
+        raise ConfigError("nobody says anything here: set v2x.enabled to true")
 
     @property
     def gate(self) -> Gate:

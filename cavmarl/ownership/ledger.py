@@ -12,7 +12,7 @@ from functools import lru_cache
 from hashlib import blake2b
 from typing import NamedTuple
 
-from cavmarl.core.errors import LedgerError
+from cavmarl.core.errors import ProtocolError
 
 _ID = struct.Struct("<q")
 _WORLD = 1 << 128
@@ -59,7 +59,7 @@ class Tally(NamedTuple):
         """Compare with what somebody else counted.
 
         Raises:
-            LedgerError: the sets differ.
+            ProtocolError: the sets differ.
         """
         if self == other:
             return
@@ -68,7 +68,7 @@ class Tally(NamedTuple):
             if self.vehicles != other.vehicles
             else f"{self.vehicles} vehicles, but not the expected ones or not at their epochs"
         )
-        raise LedgerError(f"{where}: {what}")
+        raise ProtocolError(f"{where}: {what}")
 
 
 def member(run: bytes, vehicle: int, epoch: int) -> int:

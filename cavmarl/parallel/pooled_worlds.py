@@ -8,7 +8,7 @@ from itertools import accumulate, pairwise
 from pathlib import Path
 from typing import Any
 
-from cavmarl.core.errors import ConfigError, WorkerFailureError, WorkerStartError
+from cavmarl.core.errors import ConfigError, WorkerError, WorkerFailureError
 from cavmarl.engine.compilation import compiled_before
 from cavmarl.engine.simulation import Simulation
 from cavmarl.engine.world_setup import World
@@ -88,7 +88,7 @@ class PooledWorlds(OrderedWorlds):
         segment = Segment.make(size_of(layout))
         try:
             self.arrays = StepArrays.of(arrays_in(segment.map(), layout))
-        except WorkerStartError:
+        except WorkerError:
             segment.close()
             raise
         memory = self._make_mover(num_worlds, workers)

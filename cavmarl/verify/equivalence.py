@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cavmarl.config.env import MAX_ZONES, ZONE_FILE_SUFFIXES
-from cavmarl.core.errors import ConfigError, ProtocolError, ZoneError
+from cavmarl.core.errors import ConfigError, ProtocolError
 from cavmarl.core.seeds import check_seed
 from cavmarl.env.vector import CavVectorEnv, make_vec
 from cavmarl.handoff.fault_injection.fault_plan import read_faults
@@ -132,10 +132,10 @@ def verify_zones(
         progress: called after each step with its number and `steps`.
 
     Raises:
-        ConfigError: a number or a key that cannot work.
+        ConfigError: a number or a key that cannot work; more zones than the map can hold, or a zone
+            file of another number.
         JournalError: a journal that cannot be begun.
         PolicyError: the policy cannot be loaded or does not fit.
-        ZoneError: more zones than the map can hold, or a zone file of another number.
     """
     check_steps(steps)
     check_seed(seed)
@@ -268,7 +268,7 @@ class _Compared:
         try:
             if step > 0:
                 self._run.step()
-        except (ProtocolError, ZoneError) as error:
+        except (ProtocolError, ConfigError) as error:
             tick = int(whole.vec.simulation.ticks()[0])
             self._world = 0
             self.difference = Difference(step, tick, "error", None, "", (None, str(error)))

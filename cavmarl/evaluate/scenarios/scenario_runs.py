@@ -130,8 +130,8 @@ def make_scenario(
         overrides: values for any other key.
 
     Raises:
-        ScenarioError: no such scenario, no place for it on the map, or no room for the agents.
-        ConfigError: a parameter, a density or a key that cannot work.
+        ConfigError: no such scenario, no place for it on the map, or no room for the agents; a
+            parameter, a density or a key that cannot work.
     """
     if density not in DENSITIES:
         raise ConfigError(f"density = {density!r}: must be one of {', '.join(DENSITIES)}")

@@ -92,7 +92,7 @@ def start_sumo(job: SumoJob, folder: Path, *more: str) -> Any:
 
     Raises:
         ConfigError: SUMO refuses it.
-        SumoBusyError: a simulation runs in this process.
+        SumoError: a simulation runs in this process.
     """
     libsumo: Any = free_libsumo()
     log = folder / "errors.log"

@@ -124,9 +124,9 @@ class Referee(ABC):
             inputs: digest of the actions.
 
         Raises:
-            LedgerError: a vehicle was lost or doubled.
-            ProtocolError: it cannot be decided, or a zone does not answer.
-            ZoneError: a zone has not seen who enters it.
+            ProtocolError: a vehicle was lost or doubled; it cannot be decided, or a zone does not
+                answer.
+            ConfigError: a zone has not seen who enters it.
         """
 
     @abstractmethod
@@ -138,9 +138,8 @@ class Referee(ABC):
             stored: zone → digest of its rows in the store; None: where `rows` are is the store.
 
         Raises:
-            LedgerError: a vehicle was lost or doubled.
+            ProtocolError: a vehicle was lost or doubled; a zone does not answer.
             StoreError: the store holds other rows than a zone told of.
-            ProtocolError: a zone does not answer.
         """
 
     @abstractmethod

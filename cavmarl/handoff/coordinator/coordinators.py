@@ -156,7 +156,7 @@ class Coordination:
         """Look whether the invariants hold in the tick that has been committed.
 
         Raises:
-            InvariantError: one does not.
+            ProtocolError: one does not.
         """
         if self._monitor is not None:
             for w, coordinator in enumerate(self.coordinators):

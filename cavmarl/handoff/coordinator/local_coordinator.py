@@ -22,7 +22,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from cavmarl.core.errors import LedgerError
+from cavmarl.core.errors import ProtocolError
 from cavmarl.handoff.coordinator.coordinator import Referee
 from cavmarl.handoff.coordinator.handoff_log import BorderBook, Change
 from cavmarl.handoff.coordinator.journal import AnyJournal
@@ -127,7 +127,7 @@ class DirectCoordinator(Referee):
         births = self._births
         try:
             changed = self._book.hand_over(everybody, self._vehicles, births)
-        except LedgerError:
+        except ProtocolError:
             self._check(births)
             raise
         self._is_open, self._changed = True, changed
@@ -197,8 +197,8 @@ class DirectCoordinator(Referee):
         """Put what came of one tick, or of all up to one, on the table, and tell watchers of it.
 
         Raises:
-            LedgerError: a vehicle changed its owner that belonged to somebody else.
-            SpawnError: a vehicle entered that has been there.
+            ProtocolError: a vehicle changed its owner that belonged to somebody else; a vehicle
+                entered that has been there.
         """
         table = self._directory.table
         columns = (changes[name].tolist() for name in ("vehicle", "source", "target", "epoch"))
@@ -240,14 +240,14 @@ class DirectCoordinator(Referee):
             births: who is in the rows, and will be on record in the next tick.
 
         Raises:
-            LedgerError: a zone has more or fewer.
+            ProtocolError: a zone has more or fewer.
         """
         owned = list(self.directory.table.counts.values())
         for birth in births:
             owned[birth.zone] += 1
         counts = self._counts()
         if counts != owned:
-            raise LedgerError(f"at tick {self.tick} zones own {counts} vehicles, not {owned}")
+            raise ProtocolError(f"at tick {self.tick} zones own {counts} vehicles, not {owned}")
 
 
 def _no_digest(zone: int) -> int:

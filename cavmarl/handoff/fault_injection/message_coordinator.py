@@ -165,9 +165,8 @@ class Coordinator(Referee):
             stored: zone → digest of its rows in the store; None: where `rows` are is the store.
 
         Raises:
-            LedgerError: a vehicle was lost or doubled.
+            ProtocolError: a vehicle was lost or doubled; a zone does not answer.
             StoreError: the store holds other rows than a zone told of.
-            ProtocolError: a zone does not answer.
         """
         self._complete(rows)
         self._until("DONE", self.directory.waiting_for, self.directory.resend)

@@ -30,7 +30,7 @@ def make_segments(config: EnvConfig, num_worlds: int) -> list[Segment]:
     """Memory for the diary of some worlds, which outlives those who write it.
 
     Raises:
-        WorkerStartError: there is none.
+        WorkerError: there is none.
     """
     images = [Segment.make(_FIRST_IMAGE_BYTES) for _ in range(2)]
     steps = Segment.make(size_of(_layout(config, num_worlds)))

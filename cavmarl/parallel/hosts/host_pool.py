@@ -24,7 +24,6 @@ from cavmarl.core.errors import (
     WorkerDeathError,
     WorkerError,
     WorkerFailureError,
-    WorkerStartError,
 )
 from cavmarl.parallel.hosts.framed_socket import Frame, Kind
 from cavmarl.parallel.hosts.host_commands import Arrays, HostProgram, OpenOrder, Say, Truth
@@ -53,7 +52,7 @@ class HostPool:
         deaths: all that there were of hosts with a part.
 
     Raises:
-        WorkerStartError: they do not come.
+        WorkerError: they do not come.
         WorkerFailureError: an exception while they made their jobs.
     """
 
@@ -137,7 +136,7 @@ class HostPool:
 
         Raises:
             WorkerDeathError: too many hosts died of it; the pool is closed.
-            WorkerStartError: there is no host left, and none comes; the pool is closed.
+            WorkerError: there is no host left, and none comes; the pool is closed.
             WorkerFailureError: an exception in a host; all are as they were before.
         """
         return self._command(self._all, task, _said(letters, inputs), outputs, commits, sizes)
@@ -173,7 +172,7 @@ class HostPool:
         """Return when there is a host that would take up a part at once.
 
         Raises:
-            WorkerStartError: none comes; the pool is closed.
+            WorkerError: none comes; the pool is closed.
         """
         began = time.monotonic()
         nothing = OpenOrder(
@@ -344,7 +343,7 @@ class HostPool:
 
         Raises:
             WorkerDeathError: too many have died.
-            WorkerStartError: there is no host left, and none comes.
+            WorkerError: there is no host left, and none comes.
         """
         now = time.monotonic()
         for k in sorted(order.pending):
@@ -373,14 +372,14 @@ class HostPool:
         """Give up if nobody will come.
 
         Raises:
-            WorkerStartError: so it is.
+            WorkerError: so it is.
         """
         trouble = self._launcher.trouble()
         if trouble is None and waited_s > COMES_S:
             trouble = f"none has come within {COMES_S:g} s; ray status tells what Ray waits for"
         if trouble is not None:
             self.close()
-            raise WorkerStartError(f"no host ({where}): {trouble}")
+            raise WorkerError(f"no host ({where}): {trouble}")
 
 
 def _said(letters: Sequence[Any], inputs: Sequence[Arrays]) -> Say:

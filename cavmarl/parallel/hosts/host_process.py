@@ -105,7 +105,7 @@ def serve(
     Raises:
         OSError: the caller cannot be reached.
         EOFError: whoever listens there does not want us.
-        ForeignRunError: it is not the caller.
+        MessageError: it is not the caller.
     """
     line = _Line(knock(place, secret, number))
     with suppress(EOFError, OSError, MessageError):  # the caller is gone, or wants us no more

@@ -61,7 +61,7 @@ class Pool:
         deaths: all that there were.
 
     Raises:
-        WorkerStartError: no process, or no memory.
+        WorkerError: no process, or no memory.
         WorkerFailureError: an exception while the jobs were made.
     """
 

@@ -19,7 +19,7 @@ from typing import IO, Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from cavmarl.core.errors import ConfigError, MissingExtraError, SumoDiedError
+from cavmarl.core.errors import ConfigError, MissingExtraError, SumoError
 from cavmarl.traffic.sumo import sumo_child as child
 from cavmarl.traffic.sumo.sumo_records import MOVED, SEEN
 
@@ -105,7 +105,7 @@ class SumoProcess:
 
         Raises:
             ConfigError: SUMO refuses them.
-            SumoDiedError: the process has ended.
+            SumoError: the process has ended.
         """
         self._send(child.LOOK_UP, {"words": words})
         return self._receive().line
@@ -122,7 +122,7 @@ class SumoProcess:
             moved: MOVED (n,), where our vehicles are after it.
 
         Raises:
-            SumoDiedError: the process has ended.
+            SumoError: the process has ended.
         """
         self._send(child.STEP, {}, moved.tobytes())
 
@@ -164,7 +164,7 @@ class SumoProcess:
             raise self._death() from error
         return content
 
-    def _death(self) -> SumoDiedError:
+    def _death(self) -> SumoError:
         """What is to be said of it; whatever is left of it ends."""
         try:
             status = self._process.wait(END_S)
@@ -173,7 +173,7 @@ class SumoProcess:
             how = f"has not answered for {ANSWER_S:g} s"
         words = self._last_words()
         self.close()
-        return SumoDiedError(
+        return SumoError(
             f"the process of SUMO {how}{words}\nThe world is as it was before the step; reset it "
             "to go on"
         )
