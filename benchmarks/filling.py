@@ -27,6 +27,7 @@ def write_filling_demand(
         f'period="{period_s * len(outs):g}" departLane="free" departSpeed="desired"/>'
         for a in ins
         for n, b in enumerate(outs)
+        if period_s * n < seconds
     )
     path.write_text(f"<routes>\n{flows}\n</routes>\n", encoding="utf-8")
     return path

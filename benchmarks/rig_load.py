@@ -49,16 +49,9 @@ def measure(
     """Find resolutions at which a rig takes so long a tick, and write it as a file."""
     if not 0.0 < load <= 1e4:
         raise ConfigError(f"load {load:g} ms: must be above 0 and at most 10000")
-    job = first_job(
-        env,
-        load_rig(find_rig(rig)),
-        warmup=TRIED_STEPS,
-        steps=TRIED_STEPS,
-        agents=agents,
-        background=background,
-        seed=seed,
-        overrides=parse_settings(settings),
-    )
+    sensors, vehicles = load_rig(find_rig(rig)), (agents, background)
+    steps = (TRIED_STEPS, TRIED_STEPS)
+    job = first_job(env, sensors, parse_settings(settings), vehicles, steps, seed)
     found = loaded(job, load, say)
     try:
         out.write_text(yaml.safe_dump(_plain(found.overrides["rig"])), encoding="utf-8")

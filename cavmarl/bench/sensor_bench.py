@@ -34,14 +34,7 @@ from cavmarl.parallel.sensor_workers.sensor_shares import (
     share_in_turn,
 )
 
-__all__ = [
-    "SensorBench",
-    "Turn",
-    "first_job",
-    "job_config",
-    "measure_sensor_workers",
-    "run_job",
-]
+__all__ = ["SensorBench", "first_job", "job_config", "measure_sensor_workers", "run_job"]
 
 MAX_WORKERS = 64
 PROGRAM = "cavmarl.bench.sensor_run"
@@ -180,17 +173,7 @@ def measure_sensor_workers(
     Every run has processes of its own, which share nothing with those of another but files.
     """
     _check(workers, warmup, steps, repeats)
-    job = first_job(
-        env,
-        rig,
-        warmup=warmup,
-        steps=steps,
-        agents=agents,
-        background=background,
-        seed=seed,
-        overrides=overrides or {},
-    )
-    config = job_config(job)
+    job = first_job(env, rig, overrides or {}, (agents, background), (warmup, steps), seed)
     order = [(repeat, number) for repeat in range(1, repeats + 1) for number in workers]
     random.Random(seed).shuffle(order)
     turns = []
@@ -205,7 +188,7 @@ def measure_sensor_workers(
         warmup=warmup,
         steps=steps,
         seed=seed,
-        placement=config.workers.sensor_placement,
+        placement=job_config(job).workers.sensor_placement,
         turns=tuple(turns),
         ceiling=_ceiling(job, workers, say),
     )
@@ -224,11 +207,7 @@ def _ceiling(job: SensorJob, workers: Sequence[int], say: Say) -> CoreCeiling | 
         steps=CEILING_STEPS,
         repeats=CEILING_TURNS,
         seed=job.seed,
-        wanted={
-            "agents": job.agents,
-            "background": job.background,
-            "overrides": job.overrides,
-        },
+        wanted={name: getattr(job, name) for name in ("agents", "background", "overrides")},
         alike=True,
     )
 
@@ -248,17 +227,23 @@ def _check(workers: Sequence[int], warmup: int, steps: int, repeats: int) -> Non
 def first_job(
     env: str | Path,
     rig: Rig,
-    *,
-    warmup: int,
-    steps: int,
-    agents: int,
-    background: int,
-    seed: int,
     overrides: Mapping[str, Any],
+    vehicles: tuple[int, int],
+    steps: tuple[int, int],
+    seed: int,
 ) -> SensorJob:
-    """The run with one sensor worker; no episode ends in it, whatever a step is."""
-    given = {"horizon_s": float(10 * (warmup + steps + 1)), **overrides, "rig": rig}
-    return SensorJob(str(env), given, agents, background, 1, warmup, steps, seed)
+    """The run with one sensor worker; no episode ends in it, whatever a step is.
+
+    Args:
+        env: as in `make_vec`.
+        rig: sensors of each agent, by name.
+        overrides: values for any other key.
+        vehicles: agents, which have the sensors, and others.
+        steps: of the warm-up, and those that count.
+        seed: root of all random numbers.
+    """
+    given = {"horizon_s": float(10 * (sum(steps) + 1)), **overrides, "rig": rig}
+    return SensorJob(str(env), given, *vehicles, 1, *steps, seed)
 
 
 def job_config(job: SensorJob) -> EnvConfig:

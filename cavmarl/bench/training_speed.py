@@ -11,14 +11,14 @@ import math
 import tempfile
 import time
 from contextlib import ExitStack
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import yaml
 
-from cavmarl.bench.harness import Say, check_range, paired_ratio, silent
+from cavmarl.bench.harness import Result, Say, check_range, paired_ratio, silent
 from cavmarl.bench.highway_worlds import (
     THEIR_KINEMATICS,
     highway_env,
@@ -67,7 +67,7 @@ class TrainingRow:
 
 
 @dataclass(frozen=True)
-class TrainingSpeed:
+class TrainingSpeed(Result):
     """What was measured: two kinds of benchmark, whose numbers are never mixed."""
 
     agents: int  # of a world
@@ -99,7 +99,7 @@ class TrainingSpeed:
 
     def to_dict(self) -> dict[str, Any]:
         """Plain values, for JSON; each benchmark says of which kind it is."""
-        plain = asdict(self)
+        plain = super().to_dict()
         return {
             **plain,
             "end_to_end": {
@@ -126,11 +126,8 @@ def measure_training(
     )
     if worlds % workers:
         raise ConfigError(f"{worlds} worlds over {workers} workers: must be the same for each")
-    for module, extra in (
-        ("torch", "torch"),
-        ("highway_env", "highway"),
-        ("stable_baselines3", "sb3"),
-    ):
+    needs = {"torch": "torch", "highway_env": "highway", "stable_baselines3": "sb3"}
+    for module, extra in needs.items():
         require(module, extra)
     with ExitStack() as stack:
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory()))

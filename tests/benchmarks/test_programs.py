@@ -13,6 +13,7 @@ from benchmarks.__main__ import KEPT, main, programs
 from benchmarks.harness import Report, run
 from cavmarl.cli.bench import app
 from cavmarl.core.errors import ConfigError
+from tests.support.sumo_worlds import tiny_file
 
 
 def test_all_are_listed(capsys: pytest.CaptureFixture[str]) -> None:
@@ -77,11 +78,10 @@ def test_weights_of_the_score_are_studied() -> None:
         selection.measure(choices=0)
 
 
-def test_a_coupled_world_is_measured_beside_libsumo() -> None:
-    sumolib = pytest.importorskip("sumo", reason="needs the extra 'sumo'")
-    game = Path(sumolib.SUMO_HOME) / "tools" / "game" / "cross"
-    demand = [game / "cross_demo.sumocfg"]
-    found = sumo.measure(str(game / "cross.net.xml"), demand, after=5, repeats=1, agents=1)
+@pytest.mark.slow
+def test_a_coupled_world_is_measured_beside_libsumo(tmp_path: Path) -> None:
+    pytest.importorskip("libsumo", reason="needs the extra 'sumo'")
+    found = sumo.measure("grid4x4", [tiny_file(tmp_path)], after=5, repeats=1, agents=1)
     alone, coupled = found.rows
     assert 0.0 < alone["low_ms"] <= alone["high_ms"]
     assert coupled["median_ms"] > 0.0

@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
-from rich import box
 from rich.console import Console
 from rich.table import Table
 
@@ -143,36 +142,26 @@ def _homes(plan: Shares) -> dict[int, str]:
     return {sensor: "+".join(own) for sensor, own in homes.items()}
 
 
+_FIGURES = {
+    "FPS": "fps",
+    "tick +\nsensors\nms": "step_ms", "SD\nms": "sd_within_run", "wait\nms": "wait_ms",
+    "speedup": "speedup", "effi-\nciency\n%": "efficiency_pct", "CV\n%": "cv_pct",
+    "wait\n%": "wait_share_pct", "rest\nms": "rest_ms",
+}  # fmt: skip
+
+
 def _scaling(found: SensorBench, rows: list[ScalingRow]) -> Table:
-    table = Table(
-        title=(
-            f"{Path(found.env).stem}, {found.agents} vehicle{'s' if found.agents > 1 else ''} with "
-            f"sensors, {found.warmup} + {found.steps} steps, placed by {found.placement}"
-        ),
-        caption="bold: the best of those measured; SD: of the steps of a run",
-        box=box.SIMPLE_HEAD,
-        pad_edge=False,
-    )
-    for column in (
-        "sensor\nworkers", "FPS", "tick +\nsensors\nms", "SD\nms", "wait\nms", "speedup",
-        "effi-\nciency\n%", "CV\n%", "wait\n%", "rest\nms",
-    ):  # fmt: skip
-        table.add_column(column, justify="right", no_wrap=True)
+    cells = []
     for row in rows:
-        table.add_row(
-            str(row.workers),
-            f"{row.fps:.2f}",
-            f"{row.step_ms:.2f}",
-            f"{row.sd_within_run:.2f}",
-            f"{row.wait_ms:.2f}",
-            f"{row.speedup:.2f}",
-            f"{row.efficiency_pct:.1f}",
-            f"{row.cv_pct:.1f}",
-            f"{row.wait_share_pct:.1f}",
-            f"{row.rest_ms:.2f}",
-            style="bold" if row.is_best else None,
-        )
-    return table
+        values = (f"{getattr(row, name):.2f}" for name in _FIGURES.values())
+        cells.append((f"{row.workers}{' (best)' if row.is_best else ''}", *values))
+    return make_table(
+        f"{Path(found.env).stem}, {found.agents} vehicles with sensors, {found.warmup} + "
+        f"{found.steps} steps, placed by {found.placement}",
+        ("sensor\nworkers", *_FIGURES),
+        cells,
+        "best: of those measured; SD: of the steps of a run",
+    )
 
 
 def _parts(found: SensorBench) -> Table:
@@ -211,37 +200,34 @@ def _resources(found: SensorBench) -> Table:
 
 def _say(console: Console, found: SensorBench, rows: list[ScalingRow]) -> None:
     from cavmarl.bench.sensor_scaling import MIN_RUNS
+    from cavmarl.parallel.processes.process_barrier import usable_cores
 
     best = next(row for row in rows if row.is_best)
-    console.print(
-        f"the best of those measured: [bold]{best.workers}[/] sensor workers, {best.speedup:.2f} "
-        f"times {rows[0].workers}; sensing takes {found.sensing_ms:.2f} ms a tick on "
-        f"{rows[0].workers}",
-        highlight=False,
-    )
-    if found.ceiling is not None:
-        console.print(
-            f"{found.ceiling.programs} programs that share nothing and do the same, side by side: "
-            f"[bold]{found.ceiling.ratio:.2f}[/] times one after the other: more this machine does "
-            "not give",
-            highlight=False,
-        )
-    intervals = (
+    intervals = [
         f"{row.workers}: {row.ci95_between_runs.low:.2f} to {row.ci95_between_runs.high:.2f} ms"
         for row in rows
         if row.ci95_between_runs is not None
-    )
-    console.print(
+    ]
+    lines = [
+        f"the best of those measured: [bold]{best.workers}[/] sensor workers, {best.speedup:.2f} "
+        f"times {rows[0].workers}; sensing takes {found.sensing_ms:.2f} ms a tick on "
+        f"{rows[0].workers}",
         f"95 % between runs: {'; '.join(intervals) or f'none, it takes {MIN_RUNS} runs'}",
-        highlight=False,
-    )
-    same = "the same" if found.is_same else "[red]not the same[/]"
-    console.print(f"states and frames of all runs, step by step: {same}")
-    cores = found.to_dict()["hardware"]["usable_cores"]
-    console.print(f"cores: {cores}; runs in this order: {[turn.workers for turn in found.turns]}")
+        "states and frames of all runs, step by step: "
+        + ("the same" if found.is_same else "[red]not the same[/]"),
+    ]
+    if found.ceiling is not None:
+        lines.append(
+            f"{found.ceiling.programs} programs that share nothing and do the same, side by side: "
+            f"[bold]{found.ceiling.ratio:.2f}[/] times one after the other: more this machine does "
+            "not give"
+        )
+    cores = len(usable_cores())
+    lines.append(f"cores: {cores}; runs in this order: {[turn.workers for turn in found.turns]}")
     crowded = [number for number in found.numbers if number > cores]
     if crowded:
-        console.print(f"note: {crowded} are more sensor workers than cores", style="yellow")
+        lines.append(f"[yellow]note: {crowded} are more sensor workers than cores[/]")
+    console.print("\n".join(lines), highlight=False)
 
 
 def _write_csv(path: Path, found: SensorBench) -> None:
