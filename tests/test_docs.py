@@ -122,10 +122,19 @@ def test_files_of_code_that_a_page_names_exist(page: Path) -> None:
             assert named in names_of_code(), named
 
 
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
+def test_benchmarks_that_a_page_names_exist(page: Path) -> None:
+    text = page.read_text(encoding="utf-8")
+    for name in re.findall(r"python -m benchmarks\.(\w+)", text):
+        assert (ROOT / f"benchmarks/{name}.py").is_file(), name
+    for name in re.findall(r"`cavmarl bench (\w+)", text):
+        assert (ROOT / f"cavmarl/cli/bench/{name}.py").is_file(), name
+
+
 @cache
 def names_of_code() -> frozenset[str]:
     """The names of all Python files of the repository."""
-    folders = ("agents", "cavmarl", "docs", "fuzz", "tests", "train")
+    folders = ("agents", "benchmarks", "cavmarl", "docs", "fuzz", "tests", "train")
     return frozenset(path.name for folder in folders for path in (ROOT / folder).rglob("*.py"))
 
 
