@@ -102,6 +102,14 @@ def test_lines_are_short(page: Path) -> None:
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
+def test_pages_name_the_thing(page: Path) -> None:
+    """They say vehicle, zone or worker; what is generated from the code is its own matter."""
+    text = re.sub(r"<!-- [\w ]+ -->.*?<!-- end -->", "", page.read_text("utf-8"), flags=re.DOTALL)
+    words = r"\b(?:nobody|somebody|anybody|everybody|whoever)\b.*"
+    assert not re.findall(words, text, re.IGNORECASE)
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
 def test_files_of_code_that_a_page_names_exist(page: Path) -> None:
     """By their path from the root, from `cavmarl/` or from the page, or by their name alone."""
     for named in re.findall(r"`([\w./-]+\.py)`", page.read_text(encoding="utf-8")):
@@ -114,10 +122,19 @@ def test_files_of_code_that_a_page_names_exist(page: Path) -> None:
             assert named in names_of_code(), named
 
 
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
+def test_benchmarks_that_a_page_names_exist(page: Path) -> None:
+    text = page.read_text(encoding="utf-8")
+    for name in re.findall(r"python -m benchmarks\.(\w+)", text):
+        assert (ROOT / f"benchmarks/{name}.py").is_file(), name
+    for name in re.findall(r"`cavmarl bench (\w+)", text):
+        assert (ROOT / f"cavmarl/cli/bench/{name}.py").is_file(), name
+
+
 @cache
 def names_of_code() -> frozenset[str]:
     """The names of all Python files of the repository."""
-    folders = ("agents", "cavmarl", "docs", "fuzz", "tests", "train")
+    folders = ("agents", "benchmarks", "cavmarl", "docs", "fuzz", "tests", "train")
     return frozenset(path.name for folder in folders for path in (ROOT / folder).rglob("*.py"))
 
 
