@@ -220,7 +220,6 @@ class Simulation:
             yield from part.arrays()
 
     def _call_every_kernel(self) -> None:
-        """Run one step of a world that the first reset forgets."""
         tick = self._tick
         shape = self.outputs.present.shape
         controls = np.zeros((*shape, 2))
@@ -244,12 +243,10 @@ class Simulation:
 
     @property
     def shards(self) -> Sequence[Shard]:
-        """One a zone, for who runs their phases."""
         return self._shards
 
     @property
     def capacity(self) -> int:
-        """How many vehicles a world can hold."""
         return int(self._shard.worlds.rows.shape[1])
 
     @property
@@ -291,7 +288,6 @@ class Simulation:
 
     @property
     def goal_edges(self) -> NDArray[np.int32]:
-        """EDGE rows of the goals, by `VEHICLE["goal"]`."""
         return self._tick.traffic.goal_edges
 
     @property
@@ -301,7 +297,6 @@ class Simulation:
 
     @property
     def scene(self) -> Scene | None:
-        """What is played to the agent of each world."""
         return self._tick.traffic.scene
 
     @property
@@ -317,7 +312,6 @@ class Simulation:
         return self._tick.division.vehicles(world)
 
     def zone_loads(self) -> ZoneLoads:
-        """What each zone holds now."""
         return self._tick.division.loads()
 
     def zone_view(self, world: int = 0) -> ZoneView:
@@ -349,7 +343,6 @@ class Simulation:
 
     @property
     def attached(self) -> tuple[Attached, ...]:
-        """What acts in each tick beside the traffic."""
         return self._tick.attached
 
     @property
