@@ -80,7 +80,6 @@ class Plan:
 
     @cached_property
     def rejections(self) -> tuple[Rejection, ...]:
-        """Why which workers are given nothing."""
         return workers_of(self.problem)[1]
 
     @cached_property

@@ -45,7 +45,6 @@ class Snapshot:
         object.__setattr__(self, "workers", tuple(ordered))
 
     def to_dict(self) -> dict[str, Any]:
-        """Plain values, for JSON."""
         return asdict(self) | {"workers": [asdict(worker) for worker in self.workers]}
 
 

@@ -113,7 +113,6 @@ class _Watched:
 
 
 def _busy_s() -> list[float]:
-    """Seconds that each core was in use, up to now."""
     return [
         sum(core) - core.idle - getattr(core, "iowait", 0.0) - getattr(core, "guest", 0.0)
         for core in psutil.cpu_times(percpu=True)

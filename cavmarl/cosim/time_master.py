@@ -51,13 +51,9 @@ class Steppable(Protocol):
     config: EnvConfig
     worlds: Any
 
-    def step(self, actions: Any) -> Any:
-        """Let agents act."""
-        ...
+    def step(self, actions: Any) -> Any: ...
 
-    def reset(self, seed: int | None = None, options: dict[str, Any] | None = None) -> Any:
-        """Begin an episode."""
-        ...
+    def reset(self, seed: int | None = None, options: dict[str, Any] | None = None) -> Any: ...
 
 
 class ClockEvent(NamedTuple):
@@ -109,7 +105,6 @@ class TimeFollower:
         return self.master.tick_for(self)
 
     def leave(self) -> None:
-        """Follow no longer."""
         self.master.let_go(self)
 
 
@@ -212,7 +207,6 @@ class TimeMaster:
         return follower
 
     def let_go(self, follower: TimeFollower) -> None:
-        """Let it follow no longer."""
         self._followers.remove(follower)
 
     def step(self, actions: Any) -> Any:

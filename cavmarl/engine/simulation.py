@@ -185,7 +185,6 @@ class Simulation(WorldViews):
             yield from part.arrays()
 
     def _call_every_kernel(self) -> None:
-        """Run one step of a world that the first reset forgets."""
         tick = self._tick
         shape = self.outputs.present.shape
         controls = np.zeros((*shape, 2))

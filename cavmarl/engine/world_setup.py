@@ -64,7 +64,6 @@ class World(NamedTuple):
 
     @property
     def capacity(self) -> int:
-        """How many vehicles it can hold."""
         config = self.config
         dt, horizon_s = config.clock.sim_dt_s, config.horizon_s
         room = capacity_of(self.network, config.population, self.demand, dt, horizon_s)

@@ -34,7 +34,6 @@ _WIDE = frozenset({"rows", "digest"})  # sums of hashes: up to 16 bytes
 
 
 def encode(message: Message) -> bytes:
-    """The wire form of a message."""
     parts = [_HEADER.pack(MAGIC, VERSION, KINDS.index(type(message)), 0)]
     for name, hint in _HINTS[type(message)]:
         _write(parts, name, hint, getattr(message, name))
@@ -101,7 +100,6 @@ class _Reader:
         self._body = body
 
     def value(self, name: str, hint: Any) -> Any:
-        """The next field."""
         if hint is bytes:
             return self._take(self._length())
         if hint is bool:

@@ -67,7 +67,6 @@ def record_from_dict(line: dict[str, Any], sequence: int) -> Record:
 
 
 def record_to_line(record: Record, sequence: int) -> str:
-    """A line of the log, with its end."""
     body = _json(_content(record, sequence))
     return f'{body[:-1]},"checksum":"{_checksum(body)}"}}\n'
 

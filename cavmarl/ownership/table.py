@@ -65,7 +65,6 @@ class Table:
 
     @property
     def tallies(self) -> dict[int, Tally]:
-        """Zone → what it owned at the committed tick."""
         tallies, run = self._tallies, self.run
         if len(self._moves) > len(self.owners):
             tallies.update(dict.fromkeys(self.hosts, Tally()))

@@ -117,7 +117,6 @@ class TraceChecker:
         }  # fmt: skip
 
     def take(self, entry: Entry) -> None:
-        """The next entry."""
         item = entry.item
         judge = self._judges.get(type(item))
         if isinstance(item, Record):
@@ -273,7 +272,6 @@ class TraceChecker:
 
     @staticmethod
     def _planned(begun: Begin) -> dict[int, Owner | None]:
-        """Who changes owner by a plan, and to whom."""
         changed: dict[int, Owner | None] = {s.vehicle: (s.target, s.epoch) for s in begun.switches}
         changed.update((b.vehicle, (b.zone, 0)) for b in begun.births)
         return changed

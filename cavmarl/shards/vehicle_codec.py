@@ -201,7 +201,6 @@ class TransferCodec:
         return header
 
     def _check_record(self, header: TransferHeader, data: bytes) -> int:
-        """The agent of a record that can be taken over."""
         first = _HEADER.size
         (vehicle,) = _LONG.unpack_from(data, first + self._id_at)
         if vehicle != header.vehicle:
@@ -233,6 +232,5 @@ def layout_text(record: np.dtype[np.void]) -> str:
 
 
 def _fields(record: np.dtype[np.void]) -> list[tuple[str, np.dtype[np.generic], int]]:
-    """Name, format and place of each field."""
     entries: Mapping[str, Any] = record.fields or {}
     return [(name, entries[name][0], int(entries[name][1])) for name in record.names or ()]

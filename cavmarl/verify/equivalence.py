@@ -61,7 +61,6 @@ class ZoneResult:
     figures: FaultFigures
 
     def to_dict(self) -> dict[str, Any]:
-        """Plain values, for JSON."""
         return asdict(replace(self, figures=FaultFigures())) | {"figures": self.figures.to_dict()}
 
 
@@ -87,11 +86,9 @@ class Equivalence:
 
     @property
     def holds(self) -> bool:
-        """Whether all were equal."""
         return all(result.difference is None for result in self.results)
 
     def to_dict(self) -> dict[str, Any]:
-        """Plain values, for JSON."""
         results = [result.to_dict() for result in self.results]
         return {**asdict(replace(self, results=())), "results": results, "holds": self.holds}
 
@@ -236,7 +233,6 @@ class _Run:
         self.results: Arrays = {"observations": observations, "infos mask": infos["mask"]}
 
     def step(self) -> None:
-        """Let the driver act once."""
         seen, mask = self.results["observations"], self.results["infos mask"]
         actions = self._driver.act_batch(seen, mask)
         self.results = step_results(self.vec.step(actions), actions)
@@ -278,7 +274,6 @@ class _Compared:
         self._compare(step, whole)
 
     def result(self) -> ZoneResult:
-        """What was found up to now."""
         simulation = self._run.vec.simulation
         return ZoneResult(
             simulation.partition.count,

@@ -74,7 +74,6 @@ class LineResult:
     figures: FaultFigures = field(default_factory=FaultFigures)
 
     def to_dict(self) -> dict[str, Any]:
-        """Plain values, for JSON."""
         return {**vars(self), "injected": self.figures.injected, "figures": self.figures.to_dict()}
 
 
@@ -106,14 +105,12 @@ class Campaign:
         return not any(line.failures for line in self.lines)
 
     def total(self) -> FaultFigures:
-        """Of all runs."""
         figures = FaultFigures()
         for line in self.lines:
             figures.add(line.figures)
         return figures
 
     def to_dict(self) -> dict[str, Any]:
-        """Plain values, for JSON."""
         total = self.total()
         return {
             "env": self.env,
@@ -174,7 +171,6 @@ def run_campaign(
 def _run_matrix(
     stage: _Stage, campaign: Campaign, seeds: int, progress: Callable[[int, int], None] | None
 ) -> None:
-    """All lines, with all numbers of zones."""
     lines = []
     for count in campaign.zones:
         seen = stage.rehearse(count)
@@ -337,7 +333,6 @@ class _Healing:
         self._last = None if until is None else until + deferral + 2
 
     def logged(self, records: Iterable[Record]) -> None:
-        """Records, in the order of the journal."""
         for record in records:
             if isinstance(record, Begin) and record.tick == self._last:
                 assert self._until is not None

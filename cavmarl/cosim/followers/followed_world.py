@@ -97,7 +97,6 @@ class FollowedWorld:
         self._is_closed = False
 
     def __enter__(self) -> Self:
-        """The world."""
         return self
 
     def __exit__(
@@ -106,7 +105,6 @@ class FollowedWorld:
         error: BaseException | None,
         traceback: TracebackType | None,
     ) -> None:
-        """Close it."""
         self.close()
 
     @property
@@ -116,7 +114,6 @@ class FollowedWorld:
 
     @property
     def is_over(self) -> bool:
-        """The episode has ended, or none has begun."""
         return not self.env.agents
 
     def wait_for(self, followers: int, within_s: float) -> None:
@@ -202,13 +199,11 @@ class FollowedWorld:
         self.master.release()
 
     def close_reception(self) -> None:
-        """Let nobody call any more."""
         self._reception.close()
         if not isinstance(self.address, int):
             Path(self.address).unlink(missing_ok=True)
 
     def _admit(self, within_s: float) -> None:
-        """Give seats to those who have called."""
         for line, hello in self._reception.callers(within_s):
             try:
                 self._seat(line, hello)
@@ -248,7 +243,6 @@ class FollowedWorld:
         return [self.env.possible_agents[k] for k in agents]
 
     def _drop(self, seat: Seat) -> None:
-        """Go on without a follower."""
         seat.line.close()
         self._seats.remove(seat)
         if seat.clock in self.master.followers:

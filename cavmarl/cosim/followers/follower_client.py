@@ -96,7 +96,6 @@ class Follower:
         self._frame: int | None = None
 
     def __enter__(self) -> Self:
-        """The follower."""
         return self
 
     def __exit__(
@@ -105,7 +104,6 @@ class Follower:
         error: BaseException | None,
         traceback: TracebackType | None,
     ) -> None:
-        """Leave."""
         self.close()
 
     def __iter__(self) -> Iterator[Sight]:
@@ -167,7 +165,6 @@ class Follower:
         self._line.close()
 
     def close(self) -> None:
-        """Hang up."""
         self._line.close()
 
     def _expect(self, within_s: float | None, *kinds: Say) -> Heard:
@@ -192,6 +189,5 @@ def sight_of(snapshot: Snapshot, arrays: Sequence[NDArray[Any]]) -> Sight:
 
 
 def _plain(given: Any) -> list[float] | int:
-    """A control as msgpack writes it."""
     array = np.asarray(given)
     return int(array) if array.ndim == 0 else [float(number) for number in array]

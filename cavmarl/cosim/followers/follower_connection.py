@@ -178,7 +178,6 @@ class Line:
         return snapshot, arrays
 
     def close(self) -> None:
-        """End the connection."""
         self._wire.close()
 
     def _take(self, arrays: list[Array]) -> None:

@@ -66,7 +66,6 @@ class Reception:
         self._dismiss_the_silent()
 
     def turn_away(self, line: Line, reason: str) -> None:
-        """Say why, and hang up."""
         self.turned_away += 1
         refuse(line, reason)
 

@@ -52,7 +52,6 @@ class SweepRow(NamedTuple):
         return min((value for value in values if value is not None), default=None)
 
     def to_dict(self) -> dict[str, Any]:
-        """For JSON."""
         return {
             "scenario": self.scenario,
             "environment": self.environment,

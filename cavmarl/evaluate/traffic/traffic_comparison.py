@@ -51,7 +51,6 @@ class TrafficComparison:
         return ours / sumo if figure in RATIOS and ours is not None and sumo else None
 
     def to_dict(self) -> dict[str, Any]:
-        """As plain types, for JSON."""
         sides = {
             name: {
                 "figures": run.figures.to_dict(),

@@ -95,11 +95,9 @@ class BorderBook:
         )  # fmt: skip
 
     def __len__(self) -> int:
-        """How many changes have not been read."""
         return self._book.num_changes.item(self._world)
 
     def newest(self, count: int) -> list[Change]:
-        """The newest changes."""
         last = len(self)
         found = self._book.changes[self._world, last - count : last]
         return [Change(*change) for change in found.tolist()]

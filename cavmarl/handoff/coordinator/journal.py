@@ -231,7 +231,6 @@ class MemoryJournal:
 
     @property
     def sequence(self) -> int:
-        """The number of the next record."""
         return len(self.records)
 
     def append(self, records: Iterable[Record]) -> None:
@@ -245,7 +244,6 @@ class MemoryJournal:
         self.records += records
 
     def close(self) -> None:
-        """Refuse further records."""
         self._closed = True
 
     def __enter__(self) -> Self:

@@ -83,13 +83,11 @@ class DirectCoordinator(Referee):
 
     @property
     def directory(self) -> Directory:
-        """Who owns what, as of the committed tick."""
         self.catch_up()
         return self._directory
 
     @property
     def tick(self) -> int:
-        """The committed tick, of the run."""
         return self._tick
 
     @property
@@ -230,7 +228,6 @@ class DirectCoordinator(Referee):
         )
 
     def dropped(self) -> Counter[tuple[str, str]]:
-        """Nothing: there are no messages."""
         return Counter()
 
     def _check(self, births: Iterable[Birth]) -> None:

@@ -34,9 +34,7 @@ PATIENCE = 10_000
 class States(Protocol):
     """Rows of vehicles at the committed tick."""
 
-    def forget(self) -> None:
-        """Another tick is committed."""
-        ...
+    def forget(self) -> None: ...
 
     def look(self, everybody: bool) -> Sequence[Near]:
         """Who is near a border; see `Division.near`."""
@@ -46,13 +44,9 @@ class States(Protocol):
         """The whole state of a vehicle near a border, whose row is known."""
         ...
 
-    def state(self, vehicle: int) -> bytes:
-        """The whole state of any vehicle."""
-        ...
+    def state(self, vehicle: int) -> bytes: ...
 
-    def change(self, entries: Sequence[Entry]) -> None:
-        """Let rows change hands."""
-        ...
+    def change(self, entries: Sequence[Entry]) -> None: ...
 
 
 class Coordinator(Referee):
@@ -178,7 +172,6 @@ class Coordinator(Referee):
         self._gone = []
 
     def _complete(self, rows: Callable[[int], int]) -> None:
-        """End the leases that are still open."""
         table = self.directory.table
         owner, owners = table.planned.owner, table.owners
         removed: defaultdict[int, list[Removed]] = defaultdict(list)
@@ -293,7 +286,6 @@ class Coordinator(Referee):
             self.post.send(reaction.messages)
 
     def _do(self, output: Output) -> None:
-        """Write down, then send."""
         if output.records:
             self._write(output)
         if output.messages:

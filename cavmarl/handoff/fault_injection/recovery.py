@@ -158,7 +158,6 @@ class Recovery:
         return is_done
 
     def _lose(self, shard: Shard) -> None:
-        """What the process of a host had in its memory."""
         worlds = shard.worlds
         for array in (*shard.sides, *(getattr(worlds, name) for name in COUNTS)):
             array.view(np.uint8)[...] = GARBAGE

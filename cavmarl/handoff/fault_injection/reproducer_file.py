@@ -164,7 +164,6 @@ def _descr(plain: Any) -> Any:
 
 
 def _image_to_plain(image: Image) -> dict[str, Any]:
-    """Of one world, as its rows are."""
     return {
         "counts": [
             dict(zip(COUNTS, (int(array[0]) for array in counts), strict=True))

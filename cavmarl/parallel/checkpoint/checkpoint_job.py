@@ -97,7 +97,6 @@ class DiaryJob(WorldsJob):
             self._again_s = perf_counter() - began_s
 
     def save(self) -> list[NDArray[Any]]:
-        """Where to begin in the diary."""
         return [self._diary.place]
 
     def load(self, saved: Sequence[NDArray[Any]]) -> None:

@@ -66,7 +66,6 @@ class Diary:
         self.entries = tuple(map(Commands, *(arrays[name] for name in _COMMANDS)))
 
     def __len__(self) -> int:
-        """How many steps follow its image."""
         return self.place.item(1)
 
     @property
@@ -125,7 +124,6 @@ class Diary:
             log.take_up(kept.read())
 
     def steps(self) -> tuple[Commands, ...]:
-        """What the agents have done since."""
         first = self.place.item(0) * STEPS
         return self.entries[first : first + len(self)]
 

@@ -222,7 +222,6 @@ class Wire:
         self.take([np.empty(self._frame.size, dtype=np.uint8)])
 
     def close(self) -> None:
-        """End the connection."""
         self._socket.close()
 
     def _send_all(self, pieces: list[memoryview]) -> None:

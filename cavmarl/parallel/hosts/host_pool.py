@@ -85,12 +85,10 @@ class HostPool:
 
     @property
     def machines(self) -> list[str]:
-        """Names of those that the parts are on."""
         return [self._hosts[k].machine for k in self._all]
 
     @property
     def sizes(self) -> tuple[int, ...]:
-        """Of the parts, by what is committed."""
         return tuple(truth.size for truth in self._truths)
 
     def rename(self, names: Sequence[str]) -> None:
@@ -185,7 +183,6 @@ class HostPool:
             self._complain(time.monotonic() - began, "to spare")
 
     def close(self) -> None:
-        """End all hosts."""
         self._finalizer()
 
     def _command(
@@ -233,7 +230,6 @@ class HostPool:
         self._open = None
 
     def _await(self, order: OpenOrder) -> None:
-        """Return when the order has been carried out everywhere."""
         next_s = order.ordered_s + CHECK_S
         while order.pending:
             for k in sorted(order.pending - self._hosts.keys()):
@@ -285,7 +281,6 @@ class HostPool:
                 death.replaced_s = host.given_s
 
     def _hear(self, order: OpenOrder, host: Host) -> None:
-        """Take what a host says."""
         k = host.part
         try:
             frame = host.wire.receive()
@@ -383,7 +378,6 @@ class HostPool:
 
 
 def _said(letters: Sequence[Any], inputs: Sequence[Arrays]) -> Say:
-    """What is said to each part, whoever has it."""
     return lambda k, knows: (letters[k], inputs[k])
 
 

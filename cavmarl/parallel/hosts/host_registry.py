@@ -45,9 +45,7 @@ class Launcher(Protocol):
         """Why a host does not come, in words."""
         ...
 
-    def close(self) -> None:
-        """End all of them."""
-        ...
+    def close(self) -> None: ...
 
 
 @dataclass

@@ -80,7 +80,6 @@ class Guest:
         return self._socket
 
     def close(self) -> None:
-        """Let it go."""
         self._socket.close()
 
     def _answer(self, hello: bytes) -> None:
@@ -133,7 +132,6 @@ class Door:
         return Guest(connection, self.secret)
 
     def close(self) -> None:
-        """Nobody can call any more."""
         self._listener.close()
 
 

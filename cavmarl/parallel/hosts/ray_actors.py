@@ -22,7 +22,6 @@ class RayHost:
     def run(
         self, main: Main, recipe: str, place: tuple[str, int], secret: bytes, number: int
     ) -> None:
-        """Be a host."""
         main(recipe, place, secret, number)
 
 

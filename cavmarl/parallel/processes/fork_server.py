@@ -76,7 +76,6 @@ class Process:
         select.select([self.pidfd], [], [])
 
     def release(self) -> None:
-        """Give its descriptors back."""
         os.close(self.pidfd)
         self.wire.close()
 
@@ -125,7 +124,6 @@ class ForkServer:
 
     @property
     def pid(self) -> int:
-        """Of the process."""
         return self._process.pid
 
     def fork(self, number: int) -> Process:
@@ -166,7 +164,6 @@ class ForkServer:
             self._process.wait()
 
     def _greet(self) -> None:
-        """Wait until it is ready."""
         message = self._wire.recv(MAX_MESSAGE)
         if not message:
             status = self._process.wait()

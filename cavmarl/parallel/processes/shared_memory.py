@@ -92,7 +92,6 @@ class Segment:
 
 
 def size_of(layout: Layout) -> int:
-    """Bytes of all arrays."""
     return max(_LINE, sum(_room(dtype, shape) for dtype, shape in layout.values()))
 
 
@@ -123,7 +122,6 @@ def _room(dtype: str, shape: tuple[int, ...]) -> int:
 
 
 def _anonymous() -> int:
-    """Descriptor of an empty file that has no name."""
     if hasattr(os, "memfd_create"):
         return os.memfd_create("cavmarl", os.MFD_CLOEXEC)
     fd, path = tempfile.mkstemp(prefix="cavmarl-")
@@ -132,7 +130,6 @@ def _anonymous() -> int:
 
 
 def _free_bytes() -> int | None:
-    """Memory that is free, where the system tells it."""
     info = Path("/proc/meminfo")
     if not info.is_file():
         return None

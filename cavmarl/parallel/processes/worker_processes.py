@@ -103,7 +103,6 @@ class Crew:
 
     @property
     def server_pid(self) -> int:
-        """Of the process that forks them."""
         server = self._held.server
         return 0 if server is None else server.pid
 
@@ -372,7 +371,6 @@ class Crew:
 
 
 def _say(status: int) -> str:
-    """What an exit status means."""
     if status == OUT_OF_MEMORY:
         return "out of memory"
     if status >= 0:
@@ -394,7 +392,6 @@ class _Held:
         self._pid = os.getpid()
 
     def hold(self, segment: Segment) -> Segment:
-        """Give it back with the others."""
         self.segments.append(segment)
         return segment
 

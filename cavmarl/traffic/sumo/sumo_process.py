@@ -97,7 +97,6 @@ class SumoProcess:
 
     @property
     def lives(self) -> bool:
-        """Whether it has not been closed."""
         return self._finalizer.alive
 
     def look_up(self, words: list[str]) -> dict[str, Any]:
@@ -131,7 +130,6 @@ class SumoProcess:
         return self._receive()
 
     def close(self) -> None:
-        """End the process."""
         self._finalizer()
 
     def _send(self, kind: int, line: Mapping[str, Any], records: bytes = b"") -> None:
@@ -165,7 +163,6 @@ class SumoProcess:
         return content
 
     def _death(self) -> SumoError:
-        """What is to be said of it; whatever is left of it ends."""
         try:
             status = self._process.wait(END_S)
             how = f"ended with {status}"

@@ -89,7 +89,6 @@ class SumoWorlds:
 
     @property
     def pids(self) -> tuple[int, ...]:
-        """Of the processes that live."""
         return tuple(p.pid for p in self._processes if p is not None and p.lives)
 
     def begin(self, w: int, key: int) -> None:
@@ -128,7 +127,6 @@ class SumoWorlds:
         return tick
 
     def paths(self, w: int) -> Paths:
-        """The paths of a world."""
         return self.book.paths(w)
 
     def step(self, ticks: Sequence[int], moved: Callable[[int], NDArray[np.void]]) -> None:
@@ -176,7 +174,6 @@ class SumoWorlds:
             self.logs[w].note(moved)
 
     def close(self) -> None:
-        """End all processes."""
         for process in self._processes:
             if process is not None:
                 process.close()
@@ -215,7 +212,6 @@ class SumoWorlds:
         )
 
     def _changed(self, w: int, seen: NDArray[np.void]) -> NDArray[np.int64]:
-        """Numbers of those whose path is another than before."""
         numbers = seen["number"]
         missing = len(self.names[w]) - len(self._path_of[w])
         known = np.append(self._path_of[w], np.full(missing, -1, dtype=np.int32))

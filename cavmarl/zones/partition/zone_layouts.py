@@ -146,7 +146,6 @@ def _even_cuts(area: _Area, axis: int, parts: int) -> list[float]:
 
 
 def _bisected(area: _Area, rect: Rect, samples: Floats | None, count: int) -> list[Rect]:
-    """Cut `rect`, which holds `samples`, into `count` parts."""
     if count == 1:
         return [rect]
     size = (rect[2] - rect[0], rect[3] - rect[1])

@@ -65,7 +65,6 @@ class ZonePartition:
 
     @property
     def count(self) -> int:
-        """How many zones there are."""
         return len(self.rects)
 
     @cached_property
@@ -79,7 +78,6 @@ class ZonePartition:
 
     @cached_property
     def arrays(self) -> ZoneArrays:
-        """What kernels take."""
         return ZoneArrays(
             self._sides(0)[1:-1].copy(), self._sides(1)[1:-1].copy(), self._cells, self.reaching
         )
@@ -124,7 +122,6 @@ class ZonePartition:
         return hashlib.sha256(json.dumps({"cavmarl.zones": sides}).encode()).hexdigest()
 
     def _sides(self, axis: int) -> NDArray[np.float64]:
-        """All coordinates at which a zone begins or ends, rising."""
         return np.unique(self.rects[:, [axis, axis + 2]])
 
     @cached_property

@@ -120,6 +120,5 @@ def plan_scene(config: ScenarioConfig, network: RoadNetwork) -> Scene | None:
 
 @lru_cache(maxsize=16)  # several worlds of an environment ask one after the other
 def _places(name: str, network: RoadNetwork, parameters: Any) -> dict[str, Any]:
-    """Where on a map a scenario can be played, by name."""
     found: dict[str, Any] = load_scenario(name).places(Streets(network), parameters)
     return found
