@@ -8,6 +8,13 @@ from pathlib import Path
 
 import pytest
 
+from tests.support.cpu_time import CpuTimes
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    """Count what the tests cost."""
+    config.pluginmanager.register(CpuTimes(), "cpu_times")
+
 
 @pytest.fixture(scope="session")
 def shared_maps() -> Path:
