@@ -58,7 +58,9 @@ bench: $(READY) ## agent-steps a second, next to highway-env
 	$(BIN)/cavmarl bench step
 
 bounds: $(READY) ## the tests with every index of the kernels checked
-	NUMBA_BOUNDSCHECK=1 $(BIN)/pytest -m "not slow"
+	NUMBA_BOUNDSCHECK=1 $(BIN)/python $(KERNELS)
+	NUMBA_BOUNDSCHECK=1 $(BIN)/pytest $(TWO) -m "not slow and not alone"
+	NUMBA_BOUNDSCHECK=1 $(BIN)/pytest -m "alone and not slow"
 
 soak: $(READY) ## the slow tests: long episodes, memory, the wheel
 	$(BIN)/pytest -m slow

@@ -78,6 +78,10 @@ class ProcessWatch:
         self._started = False
         sys.addaudithook(self._look)
 
+    def pytest_runtest_logstart(self) -> None:
+        """A test begins."""
+        self._started = False
+
     @pytest.hookimpl(wrapper=True)
     def pytest_runtest_makereport(self, item: pytest.Item) -> Iterator[Any]:
         """A phase of a test is over: its report carries whether it was what its tier says."""
