@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import tempfile
 import time
+from collections.abc import Callable
 from enum import StrEnum
 from functools import partial
 from pathlib import Path
@@ -70,7 +71,7 @@ def measure(
             sumo.submit(turn_of_sumo, warm).result()
             say(f"the coupled world's first {after} s")
             _turn_of_ours(ours, warm)
-            sides = {
+            sides: dict[str, Callable[[], Turn]] = {
                 "libsumo alone": lambda: sumo.submit(turn_of_sumo, ticks).result(),
                 "coupled world": partial(_turn_of_ours, ours, ticks),
             }

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import tempfile
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -82,7 +82,7 @@ def measure_traffic_speed(
         sumo.submit(turn_of_sumo, warm).result()
         progress(f"our first {after_s} s")
         _our_turn(simulation, warm)
-        sides = {
+        sides: dict[str, Callable[[], Turn]] = {
             "ours": partial(_our_turn, simulation, steps),
             "sumo": lambda: sumo.submit(turn_of_sumo, steps).result(),
         }
