@@ -54,8 +54,8 @@ check: $(READY) ## style, types, and the direction of imports
 	$(BIN)/mypy
 	$(BIN)/lint-imports
 
-bench: $(READY) ## agent-steps a second, next to highway-env
-	$(BIN)/cavmarl bench step
+bench: $(READY) ## run a benchmark, as NAME=step ARGS='--agents 10'; without a NAME: list them
+	$(BIN)/python -m benchmarks $(NAME) $(ARGS)
 
 bounds: $(READY) ## the tests with every index of the kernels checked
 	NUMBA_BOUNDSCHECK=1 $(BIN)/python $(KERNELS)
@@ -91,10 +91,11 @@ maps: $(READY) ## make the maps of ring, merge and grid4x4 anew from the options
 pictures: $(READY) ## draw the pictures of the README, the cards and the pages anew
 	$(BIN)/python -m docs.pictures.pictures docs/images
 	$(BIN)/python -m docs.pictures.sensor_pictures docs/images
+	$(BIN)/python -m docs.pictures.moving docs/images
 
 clean: ## remove .venv, builds and caches; runs/ stays
 	rm -rf .venv $(OLDEST) $(LIBRARIES) $(RAY) fuzz/corpus build dist .mypy_cache .ruff_cache .pytest_cache .hypothesis .import_linter_cache
-	find cavmarl agents train tests -name __pycache__ -prune -exec rm -rf {} +
+	find cavmarl agents benchmarks train tests -name __pycache__ -prune -exec rm -rf {} +
 
 # torch comes first and alone, so that a CPU build that pip is told of (PIP_EXTRA_INDEX_URL,
 # PIP_FIND_LINKS) is taken instead of several GB of CUDA libraries.

@@ -23,7 +23,7 @@ from typing import Any
 
 import msgpack
 
-from cavmarl.core.errors import FollowerError, FollowerMessageError, TickRefusedError
+from cavmarl.core.errors import ClockError, FollowerError
 from cavmarl.cosim.followers.follower_barrier import Barrier, Seat
 from cavmarl.cosim.followers.follower_client import Follower
 from cavmarl.cosim.followers.follower_connection import Line, listen
@@ -72,7 +72,7 @@ def _packed(content: bytes) -> bytes:
     """The frames that lines of JSON say.
 
     Raises:
-        FollowerMessageError: they say none.
+        FollowerError: they say none.
     """
     frames = []
     for line in content.splitlines():
@@ -84,7 +84,7 @@ def _packed(content: bytes) -> bytes:
                 HEAD.pack(FOLLOWERS.magic, FOLLOWERS.version, kind, 0, len(words), size, 0)
             )
         except (ValueError, TypeError, OverflowError, RecursionError, struct.error) as error:
-            raise FollowerMessageError(f"no frame: {error}") from error
+            raise FollowerError(f"no frame: {error}") from error
         frames += [bytes(CRC_BYTES), words, data]
     return b"".join(frames)
 
@@ -122,7 +122,7 @@ def _a_world_hears(said: bytes) -> None:
             caller.shutdown(socket.SHUT_WR)
             found = [*reception.callers(WITHIN_S), *reception.callers(WITHIN_S)]
             if not found:
-                raise FollowerMessageError("the caller was turned away")
+                raise FollowerError("the caller was turned away")
             line, hello = found[0]
             seat = Seat(line, master.follow(hello.name), tuple(range(len(AGENTS))))
             barrier = Barrier(env, WITHIN_S, "error")
@@ -152,7 +152,7 @@ def _a_follower_hears(said: bytes) -> None:
                 for sight in follower:
                     controls = {vehicle: [0.0, 0.0] for vehicle in sight.snapshot.vehicles}
                     follower.answer(controls)
-        except TickRefusedError:
+        except ClockError:
             pass  # understood
         except FollowerError as error:
             if type(error) is not FollowerError:  # else it was refused, and knows why

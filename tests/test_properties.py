@@ -18,7 +18,7 @@ from hypothesis.extra import numpy as npst
 
 from cavmarl import CavEnv, CavVectorEnv, make_vec, parallel_env
 from cavmarl.config.env import EnvConfig
-from cavmarl.core.errors import ActionError, CavmarlError, EpisodeEndedError
+from cavmarl.core.errors import ActionError, CavmarlError, EpisodeError
 
 # Configurations
 
@@ -160,7 +160,7 @@ def test_any_action_is_done_or_refused_without_a_trace(env: CavEnv, data: st.Dat
     before = env.state_hash(), env.traffic_stats(), list(env.agents)
     try:
         env.step(actions)
-    except (ActionError, EpisodeEndedError):
+    except (ActionError, EpisodeError):
         assert (env.state_hash(), env.traffic_stats(), env.agents) == before
         return
     assert isinstance(actions, Mapping)

@@ -81,7 +81,6 @@ def _place(problem: Problem, workers: Workers) -> tuple[Placement, str]:
 
 
 def _rebalance(placement: Placement, method: str) -> tuple[Placement, str]:
-    """One bounded round, if it is worth it."""
     rule = placement.problem.rule
     if placement.imbalance <= 1.0 + rule.tolerance:
         return placement, method

@@ -11,7 +11,7 @@ from cavmarl.balance.load_score import Rejection
 from cavmarl.balance.load_snapshot import Snapshot
 from cavmarl.balance.problem import Problem
 from cavmarl.balance.shard_placement import Placement
-from cavmarl.core.errors import PlacementError
+from cavmarl.core.errors import ConfigError
 
 __all__ = ["Move", "Plan", "WorkerLoad", "make_plan", "replan"]
 
@@ -63,7 +63,7 @@ class Plan:
         method: how it was found, in words.
 
     Raises:
-        PlacementError: not one home a shard, or one that does not answer.
+        ConfigError: not one home a shard, or one that does not answer.
     """
 
     problem: Problem
@@ -73,14 +73,13 @@ class Plan:
     def __post_init__(self) -> None:
         answering = {one.worker for one in self.problem.snapshot.workers if one.available}
         if len(self.homes) != len(self.problem.shards) or not answering.issuperset(self.homes):
-            raise PlacementError(
+            raise ConfigError(
                 f"homes {self.homes}: must be one a shard of {len(self.problem.shards)}, among "
                 f"the workers that answer, {sorted(answering)}"
             )
 
     @cached_property
     def rejections(self) -> tuple[Rejection, ...]:
-        """Why which workers are given nothing."""
         return workers_of(self.problem)[1]
 
     @cached_property

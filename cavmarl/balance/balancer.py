@@ -9,7 +9,7 @@ from cavmarl.balance.balance_plan import Plan, make_plan
 from cavmarl.balance.load_snapshot import Snapshot
 from cavmarl.balance.problem import MEASURED_COSTS, BalanceRule, Problem, ShardCost
 from cavmarl.balance.smoothing import SmoothCosts
-from cavmarl.core.errors import PlacementError
+from cavmarl.core.errors import ConfigError
 
 __all__ = ["Balancer"]
 
@@ -41,12 +41,12 @@ class Balancer:
         """Take in what all shards have cost lately, in any order.
 
         Raises:
-            PlacementError: not the shards of the plan.
+            ConfigError: not the shards of the plan.
         """
         rows = sorted(measured)
         names = [(shard.world, shard.zone) for shard in rows]
         if names != [(shard.world, shard.zone) for shard in self.plan.problem.shards]:
-            raise PlacementError(f"measured shards {names}: must be those of the plan, each once")
+            raise ConfigError(f"measured shards {names}: must be those of the plan, each once")
         self._costs = self._smooth.update(rows)
 
     def round(
@@ -65,7 +65,7 @@ class Balancer:
 
         Raises:
             NoAdmissibleWorkerError: a worker is lost, and all others are excluded.
-            PlacementError: more workers than shards, or a cost that is none.
+            ConfigError: more workers than shards, or a cost that is none.
         """
         before = self.plan
         self.plan = make_plan(

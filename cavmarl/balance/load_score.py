@@ -16,7 +16,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Literal, NamedTuple
 
-from cavmarl.core.errors import NoAdmissibleWorkerError, PlacementError
+from cavmarl.core.errors import ConfigError, NoAdmissibleWorkerError
 
 __all__ = [
     "RESOURCES",
@@ -52,7 +52,7 @@ Outcome = Literal[
 def _check_share(name: str, value: float) -> None:
     if not 0.0 <= value <= 1.0:  # NaN is not, either
         cure = f"; percent? use {value / 100.0:g}" if 1.0 < value <= 100.0 else ""
-        raise PlacementError(f"{name} = {value}: must be a share from 0 to 1{cure}")
+        raise ConfigError(f"{name} = {value}: must be a share from 0 to 1{cure}")
 
 
 @dataclass(frozen=True)
@@ -65,7 +65,7 @@ class Utilisation:
         gpu: of the GPU; 0 where there is none.
 
     Raises:
-        PlacementError: a value outside of [0, 1], or none.
+        ConfigError: a value outside of [0, 1], or none.
     """
 
     cpu: float
@@ -87,7 +87,7 @@ class LoadRule:
         margin: a preferred worker is kept while its score is at most this above the best one.
 
     Raises:
-        PlacementError: a weight below 0, weights that do not sum to 1, a threshold outside of
+        ConfigError: a weight below 0, weights that do not sum to 1, a threshold outside of
             [0, 1], thresholds that would leave nothing of a worker, a margin below 0.
     """
 
@@ -98,19 +98,19 @@ class LoadRule:
     def __post_init__(self) -> None:
         for name, weight in zip(RESOURCES, self.weights, strict=True):
             if not (math.isfinite(weight) and weight >= 0.0):
-                raise PlacementError(f"weight {name} = {weight}: must be a number from 0 to 1")
+                raise ConfigError(f"weight {name} = {weight}: must be a number from 0 to 1")
         total = math.fsum(self.weights)
         if abs(total - 1.0) > SUM_ERROR:
-            raise PlacementError(f"weights {self.weights} sum to {total:g}: they must sum to 1")
+            raise ConfigError(f"weights {self.weights} sum to {total:g}: they must sum to 1")
         for name, threshold in zip(RESOURCES, self.thresholds, strict=True):
             _check_share(f"threshold {name}", threshold)
         if load_score(Utilisation(*self.thresholds), self.weights) >= 1.0:
-            raise PlacementError(
+            raise ConfigError(
                 f"thresholds {self.thresholds}: a worker may be used up and still be admissible; "
                 "lower one that has a weight"
             )
         if not (math.isfinite(self.margin) and self.margin >= 0.0):
-            raise PlacementError(f"margin = {self.margin}: must be a number from 0 up")
+            raise ConfigError(f"margin = {self.margin}: must be a number from 0 up")
 
 
 def load_score(use: Utilisation, weights: tuple[float, float, float] = WEIGHTS) -> float:
@@ -207,11 +207,11 @@ def admissible(
 
     Raises:
         NoAdmissibleWorkerError: there is none.
-        PlacementError: two candidates are the same worker.
+        ConfigError: two candidates are the same worker.
     """
     numbers = [candidate.worker for candidate in candidates]
     if len(set(numbers)) != len(numbers):
-        raise PlacementError(f"workers {sorted(numbers)}: one of them is named twice")
+        raise ConfigError(f"workers {sorted(numbers)}: one of them is named twice")
     out = {rejection.worker for rejection in rejections}
     left = [candidate for candidate in candidates if candidate.worker not in out]
     if not left:
@@ -241,11 +241,11 @@ def select(
 
     Raises:
         NoAdmissibleWorkerError: all are excluded; the error holds every reason.
-        PlacementError: the preferred worker is none of them.
+        ConfigError: the preferred worker is none of them.
     """
     known = {candidate.worker for candidate in candidates}
     if preferred is not None and preferred not in known:
-        raise PlacementError(f"preferred worker {preferred}: there are {sorted(known)}")
+        raise ConfigError(f"preferred worker {preferred}: there are {sorted(known)}")
     rejections = find_rejections(candidates, rule)
     left = admissible(candidates, rejections)
     scores = {candidate.worker: load_score(candidate.use, rule.weights) for candidate in left}

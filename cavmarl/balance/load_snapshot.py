@@ -10,7 +10,7 @@ from dataclasses import asdict, dataclass
 from typing import Any
 
 from cavmarl.balance.load_score import Candidate, Utilisation
-from cavmarl.core.errors import PlacementError
+from cavmarl.core.errors import ConfigError
 
 __all__ = ["NO_GPU", "SUPPOSED_IDLE", "Snapshot", "idle_snapshot"]
 
@@ -28,7 +28,7 @@ class Snapshot:
         origin: where the shares come from, in words: `measured`, `supposed idle`, `generated`.
 
     Raises:
-        PlacementError: no worker, or one twice.
+        ConfigError: no worker, or one twice.
     """
 
     workers: tuple[Candidate, ...]
@@ -38,14 +38,13 @@ class Snapshot:
     def __post_init__(self) -> None:
         numbers = [candidate.worker for candidate in self.workers]
         if not numbers:
-            raise PlacementError("a snapshot of no workers: there must be at least one")
+            raise ConfigError("a snapshot of no workers: there must be at least one")
         if len(set(numbers)) != len(numbers):
-            raise PlacementError(f"workers {sorted(numbers)}: one of them is named twice")
+            raise ConfigError(f"workers {sorted(numbers)}: one of them is named twice")
         ordered = sorted(self.workers, key=lambda one: one.worker)
         object.__setattr__(self, "workers", tuple(ordered))
 
     def to_dict(self) -> dict[str, Any]:
-        """Plain values, for JSON."""
         return asdict(self) | {"workers": [asdict(worker) for worker in self.workers]}
 
 

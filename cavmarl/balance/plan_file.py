@@ -11,7 +11,7 @@ from cavmarl.balance.balance_plan import SCHEMA, VERSION, Plan
 from cavmarl.balance.load_score import RESOURCES, Candidate, LoadRule, Utilisation
 from cavmarl.balance.load_snapshot import Snapshot
 from cavmarl.balance.problem import MEASURED_COSTS, BalanceRule, Problem, ShardCost
-from cavmarl.core.errors import PlacementError
+from cavmarl.core.errors import ConfigError
 
 __all__ = [
     "PLACEMENT",
@@ -33,11 +33,11 @@ def read_plan(path: Path) -> Plan:
     """The plan of a file.
 
     Raises:
-        PlacementError: it cannot be read, or holds no plan of this version, or more than one.
+        ConfigError: it cannot be read, or holds no plan of this version, or more than one.
     """
     plans = read_plans(path)
     if len(plans) != 1:
-        raise PlacementError(f"{path}: {len(plans)} plans, of which one is needed")
+        raise ConfigError(f"{path}: {len(plans)} plans, of which one is needed")
     return plans[0]
 
 
@@ -45,12 +45,12 @@ def read_plans(path: Path) -> list[Plan]:
     """The plan of a file, or those of a manifest: when the run began, then when it ended.
 
     Raises:
-        PlacementError: it cannot be read, or holds no plan of this version.
+        ConfigError: it cannot be read, or holds no plan of this version.
     """
     try:
         document = json.loads(path.read_text(encoding="utf-8"))
     except (OSError, ValueError, RecursionError) as error:
-        raise PlacementError(f"{path}: cannot be read ({error}); make the plan anew") from error
+        raise ConfigError(f"{path}: cannot be read ({error}); make the plan anew") from error
     try:
         if not isinstance(document, dict) or PLACEMENT not in document:
             return [plan_from_dict(document)]
@@ -60,22 +60,22 @@ def read_plans(path: Path) -> list[Plan]:
             for row in _list(document.get(name, []), name)
         ]
         if not rows:
-            raise PlacementError("a manifest of a run without workers: there is no plan")
+            raise ConfigError("a manifest of a run without workers: there is no plan")
         return [plan_from_dict(row) for row in rows]
-    except PlacementError as error:
-        raise PlacementError(f"{path}: {error}") from error
+    except ConfigError as error:
+        raise ConfigError(f"{path}: {error}") from error
 
 
 def plan_from_dict(document: Mapping[str, Any]) -> Plan:
     """The plan of a document; what follows from the rest is not read.
 
     Raises:
-        PlacementError: not a plan of this version, or a value in it is none.
+        ConfigError: not a plan of this version, or a value in it is none.
     """
     if not isinstance(document, Mapping) or document.get("schema") != SCHEMA:
-        raise PlacementError(f"not a plan: there is no schema '{SCHEMA}'")
+        raise ConfigError(f"not a plan: there is no schema '{SCHEMA}'")
     if document.get("version") != VERSION:
-        raise PlacementError(
+        raise ConfigError(
             f"a plan of version {document.get('version')!r}, but this cavmarl reads {VERSION}"
         )
     get = document.get
@@ -105,7 +105,7 @@ def snapshot_from_dict(document: Mapping[str, Any]) -> Snapshot:
     """The snapshot of a document.
 
     Raises:
-        PlacementError: a key is missing, or a value is none.
+        ConfigError: a key is missing, or a value is none.
     """
     rows = _list(document.get("workers"), "workers")
     return Snapshot(
@@ -189,7 +189,7 @@ def _real(value: object, name: str) -> float:
     return float(_whole(value, name))
 
 
-def _none(name: str, value: object, needed: str) -> PlacementError:
+def _none(name: str, value: object, needed: str) -> ConfigError:
     said = repr(value)
     shown = said if len(said) <= LONGEST else f"{said[:LONGEST]}…"
-    return PlacementError(f"not a plan: {name} is {shown}, must be {needed}")
+    return ConfigError(f"not a plan: {name} is {shown}, must be {needed}")

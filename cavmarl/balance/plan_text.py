@@ -74,7 +74,6 @@ def _cost(plan: Plan, cost_s: float) -> str:
 
 
 def _over_mean(costs: Sequence[float]) -> float:
-    """The imbalance that zones would have with a worker each."""
     total = math.fsum(costs)
     return max(costs) * len(costs) / total if total else 1.0
 

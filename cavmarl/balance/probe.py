@@ -12,7 +12,7 @@ import psutil
 
 from cavmarl.balance.load_score import Candidate, Utilisation
 from cavmarl.balance.load_snapshot import NO_GPU, Snapshot
-from cavmarl.core.errors import PlacementError
+from cavmarl.core.errors import ConfigError
 
 __all__ = ["MEASURED", "Watch", "take_snapshot"]
 
@@ -31,10 +31,10 @@ def take_snapshot(workers: Mapping[int, int | None], interval_s: float = INTERVA
         interval_s: for how long; this call takes as long.
 
     Raises:
-        PlacementError: no worker, or an interval that is none.
+        ConfigError: no worker, or an interval that is none.
     """
     if not interval_s > 0.0:
-        raise PlacementError(f"interval_s = {interval_s}: must be above 0")
+        raise ConfigError(f"interval_s = {interval_s}: must be above 0")
     watch = Watch(workers)
     time.sleep(interval_s)
     return watch.snapshot()
@@ -62,7 +62,7 @@ class Watch:
         """How busy others kept each worker's part of the machine.
 
         Raises:
-            PlacementError: no worker.
+            ConfigError: no worker.
         """
         elapsed_s = max(time.perf_counter() - self._began_s, SHORTEST_S)
         foreign = [
@@ -113,7 +113,6 @@ class _Watched:
 
 
 def _busy_s() -> list[float]:
-    """Seconds that each core was in use, up to now."""
     return [
         sum(core) - core.idle - getattr(core, "iowait", 0.0) - getattr(core, "guest", 0.0)
         for core in psutil.cpu_times(percpu=True)

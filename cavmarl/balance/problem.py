@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 from cavmarl.balance.load_score import LoadRule
 from cavmarl.balance.load_snapshot import Snapshot
-from cavmarl.core.errors import PlacementError
+from cavmarl.core.errors import ConfigError
 
 __all__ = ["MEASURED_COSTS", "BalanceRule", "Problem", "ShardCost", "equal_costs"]
 
@@ -53,7 +53,7 @@ class BalanceRule:
             ticks.
 
     Raises:
-        PlacementError: a tolerance or a price below 0, no move a round, or no tick.
+        ConfigError: a tolerance or a price below 0, no move a round, or no tick.
     """
 
     load: LoadRule = field(default_factory=LoadRule)
@@ -66,10 +66,10 @@ class BalanceRule:
         for name in ("tolerance", "move_s"):
             value = getattr(self, name)
             if not (math.isfinite(value) and value >= 0.0):
-                raise PlacementError(f"{name} = {value}: must be a number from 0 up")
+                raise ConfigError(f"{name} = {value}: must be a number from 0 up")
         for name in ("max_moves", "payback_ticks"):
             if getattr(self, name) < 1:
-                raise PlacementError(f"{name} = {getattr(self, name)}: must be at least 1")
+                raise ConfigError(f"{name} = {getattr(self, name)}: must be at least 1")
 
 
 @dataclass(frozen=True)
@@ -87,7 +87,7 @@ class Problem:
         cost_source: where costs come from; if it is not `measured`, they only compare shards.
 
     Raises:
-        PlacementError: no shard, one twice, a cost below 0 or none, a zone without a row in
+        ConfigError: no shard, one twice, a cost below 0 or none, a zone without a row in
             `neighbors`, neighbours that are not each other's, more workers than shards, not one
             present worker a shard, present workers that are not in a row though they have to be.
     """
@@ -105,12 +105,12 @@ class Problem:
         _check_neighbors(self.neighbors)
         workers = len(self.snapshot.workers)
         if workers > len(self.shards):
-            raise PlacementError(
+            raise ConfigError(
                 f"{workers} workers for {len(self.shards)} shards: use at most as many workers as "
                 "there are shards, or more zones or worlds"
             )
         if self.present is not None and len(self.present) != len(self.shards):
-            raise PlacementError(
+            raise ConfigError(
                 f"{len(self.present)} present workers of {len(self.shards)} shards: name one each"
             )
         order = sorted(range(len(self.shards)), key=lambda n: self.shards[n])
@@ -118,7 +118,7 @@ class Problem:
         if self.present is not None:
             object.__setattr__(self, "present", tuple(self.present[n] for n in order))
         if self.in_row and list(self.present or ()) != sorted(self.present or ()):
-            raise PlacementError(f"present workers {self.present}: must be in a row, by number")
+            raise ConfigError(f"present workers {self.present}: must be in a row, by number")
 
     @cached_property
     def pairs(self) -> tuple[tuple[int, int], ...]:
@@ -138,18 +138,18 @@ class Problem:
 
 def _check_shards(shards: Sequence[ShardCost], zones: int) -> None:
     if not shards:
-        raise PlacementError("no shards: there must be at least one")
+        raise ConfigError("no shards: there must be at least one")
     names = [(shard.world, shard.zone) for shard in shards]
     if len(set(names)) != len(names):
         twice = next(name for name in names if names.count(name) > 1)
-        raise PlacementError(f"world {twice[0]}, zone {twice[1]}: is named twice")
+        raise ConfigError(f"world {twice[0]}, zone {twice[1]}: is named twice")
     for shard in shards:
         if not 0 <= shard.zone < zones:
-            raise PlacementError(
+            raise ConfigError(
                 f"world {shard.world}, zone {shard.zone}: there are neighbours of {zones} zones"
             )
         if not 0.0 <= shard.cost_s <= MAX_COST_S:  # NaN is not, either
-            raise PlacementError(
+            raise ConfigError(
                 f"world {shard.world}, zone {shard.zone}: cost_s = {shard.cost_s}: must be "
                 f"seconds from 0 to {MAX_COST_S:g}; measure it again"
             )
@@ -159,6 +159,6 @@ def _check_neighbors(neighbors: Sequence[Sequence[int]]) -> None:
     for zone, row in enumerate(neighbors):
         for other in row:
             if not (0 <= other < len(neighbors) and zone in neighbors[other] and zone != other):
-                raise PlacementError(
+                raise ConfigError(
                     f"zone {zone} names {other} as its neighbour, which does not name it"
                 )

@@ -69,11 +69,9 @@ class Placement:
         self.homes = list(homes)
 
     def copy(self) -> Placement:
-        """The same, to be changed."""
         return Placement(self.problem, self.workers, self.homes)
 
     def on(self, worker: int) -> list[int]:
-        """The shards of a worker."""
         return [shard for shard, home in enumerate(self.homes) if home == worker]
 
     def load_s(self, worker: int) -> float:
@@ -90,7 +88,6 @@ class Placement:
 
     @property
     def makespan_s(self) -> float:
-        """How long the slowest takes."""
         return float(self.ticks_s().max())
 
     @property
@@ -107,7 +104,6 @@ class Placement:
 
     @property
     def cut_pairs(self) -> int:
-        """Neighbouring shards on two workers."""
         return sum(self.homes[a] != self.homes[b] for a, b in self.problem.pairs)
 
     def excess_s(self) -> float:

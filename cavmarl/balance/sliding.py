@@ -95,7 +95,6 @@ def _give(placement: Placement, homes: list[int], giver: int, step: int) -> bool
 
 
 def _worst_s(placement: Placement, homes: list[int], first: int, last: int) -> float:
-    """How long the slowest of some neighbours would take."""
     shards, speeds = placement.problem.shards, placement.workers.speeds
     between = range(min(first, last), max(first, last) + 1)
     return max(

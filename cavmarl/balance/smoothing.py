@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 
 from cavmarl.balance.problem import ShardCost
-from cavmarl.core.errors import PlacementError
+from cavmarl.core.errors import ConfigError
 
 __all__ = ["NEWEST", "SmoothCosts"]
 
@@ -19,12 +19,12 @@ class SmoothCosts:
         newest: weight of the newest measurement; the first one of a shard counts whole.
 
     Raises:
-        PlacementError: a weight that is not above 0 and at most 1.
+        ConfigError: a weight that is not above 0 and at most 1.
     """
 
     def __init__(self, newest: float = NEWEST) -> None:
         if not 0.0 < newest <= 1.0:
-            raise PlacementError(f"newest = {newest}: must be above 0 and at most 1")
+            raise ConfigError(f"newest = {newest}: must be above 0 and at most 1")
         self._newest = newest
         self._mean_s: dict[tuple[int, int], float] = {}
 

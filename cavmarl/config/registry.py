@@ -22,7 +22,6 @@ from cavmarl.core.errors import (
     DemandError,
     MapError,
     UnknownEnvironmentError,
-    ZoneError,
     require,
 )
 
@@ -240,7 +239,7 @@ def resolve_zones(config: EnvConfig, base_dir: Path) -> Path | None:
     layout = config.zones.layout
     if layout in ZONE_LAYOUTS:
         return None
-    return _resolve("zones.layout", layout, base_dir, ZoneError)
+    return _resolve("zones.layout", layout, base_dir, ConfigError)
 
 
 def _resolve(key: str, source: str, base_dir: Path, failure: type[CavmarlError]) -> Path:

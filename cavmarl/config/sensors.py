@@ -25,7 +25,6 @@ __all__ = [
     "MessagesConfig",
     "NeighborsConfig",
     "OccupancyGridConfig",
-    "PufferDriveConfig",
     "RoadgraphConfig",
     "RouteAheadConfig",
     "SensorsConfig",
@@ -331,32 +330,6 @@ class MessagesConfig:
 
 
 @dataclass(frozen=True)
-class PufferDriveConfig:
-    """The observation of pufferlib's `drive`: 1,847 numbers with its own settings.
-
-    Attributes:
-        enabled: true switches the sensor on.
-        partners: others within 50 m that are shown, by id.
-        segments: road segments that are shown, of the cells around the vehicle from its own one
-            outwards.
-        spacing_m: longest segment that a line of the road is cut into.
-    """
-
-    enabled: bool = False
-    partners: int = 63
-    segments: int = 200
-    spacing_m: float = 2.0
-
-    def __post_init__(self) -> None:
-        key = "sensors.puffer_drive"
-        check(0 <= self.partners <= 256, f"{key}.partners", self.partners, "must be from 0 to 256")
-        check(
-            0 <= self.segments <= 2048, f"{key}.segments", self.segments, "must be from 0 to 2048"
-        )
-        check_finite(f"{key}.spacing_m", self.spacing_m, 0.25, 50.0)
-
-
-@dataclass(frozen=True)
 class SensorsConfig:
     """The sensors of every agent; counts and ranges of 0 switch one off.
 
@@ -376,7 +349,6 @@ class SensorsConfig:
     lidar_observation: LidarObservationConfig = field(default_factory=LidarObservationConfig)
     roadgraph: RoadgraphConfig = field(default_factory=RoadgraphConfig)
     messages: MessagesConfig = field(default_factory=MessagesConfig)
-    puffer_drive: PufferDriveConfig = field(default_factory=PufferDriveConfig)
 
     def __post_init__(self) -> None:
         check(1 <= self.stack <= 64, "sensors.stack", self.stack, "must be from 1 to 64")
@@ -394,7 +366,6 @@ class SensorsConfig:
             self.messages.objects,
             self.messages.events,
             self.messages.signal,
-            self.puffer_drive.enabled,
         )
         check(any(counts), "sensors", "all off", "an agent must observe something; switch one on")
 
@@ -409,7 +380,6 @@ class SensorsConfig:
             kinematics=replace(self.kinematics, vehicles_count=0),
             occupancy_grid=replace(self.occupancy_grid, features=()),
             lidar_observation=replace(self.lidar_observation, cells=0),
-            puffer_drive=replace(self.puffer_drive, enabled=False),
         )
 
 

@@ -1,70 +1,31 @@
 """Every error that cavmarl raises on purpose.
 
     CavmarlError
-    ├── ConfigError            a key, a value or a combination that cannot work
-    │   ├── UnknownEnvironmentError   no entry, path or map of that name
-    │   ├── ZoneError                 zones that overlap, leak or do not fit the map
-    │   ├── CoverageError         a zone sees less than its vehicles may need
-    │   └── PlacementError        loads, weights or workers that no shard can be placed by
+    ├── ConfigError            a key, a value, a combination or a division that cannot work
+    │   └── UnknownEnvironmentError   no entry, path or map of that name
+    ├── ScenarioError          a map without a place for a scenario
     ├── MapError               a map that cannot be read, built or driven
-    │   └── RouteError         no way from here to there
+    │   └── RouteError            no way from here to there
     ├── DemandError            a file of traffic that cannot be read or does not fit its map
-    ├── ScenarioError          a scenario that is none, or has no room for so many agents
-    │   └── NoPlaceError       a map without a place for it
-    ├── ActionError            refused before any state has changed
-    │   ├── InvalidActionError    wrong shape, dtype or value
-    │   ├── MissingActionError    a live agent without an action
-    │   └── UnknownAgentError     an action for nobody
-    ├── EpisodeError           the call does not fit the state of the episode
-    │   ├── ResetNeededError      step before reset
-    │   └── EpisodeEndedError     step after the end
-    ├── CapacityError          more vehicles or seats than the world can take
-    ├── EvaluationError        an evaluation that could not be brought to its end
-    │   ├── ManifestError         results whose origin is not on record
-    │   └── UnequalWorldsError    divided and undivided worlds that are not the same
-    ├── ProtocolError          the hand-off protocol was broken, or cannot go on
-    │   ├── TransitionError       an event that its state does not know
-    │   ├── SpawnError            a vehicle id that has been used, or a zone that is none
-    │   ├── LedgerError           a vehicle lost, doubled, or at another epoch
-    │   ├── StoreError            what is stored is not what the zones say they stored
-    │   ├── ZoneStepError         a tick that every host of a zone died of
-    │   ├── ReproducerError       a file from which no tick can be run again
-    │   ├── InvariantError        what always holds did not hold
-    │   ├── MessageError          bytes that are no message of this run
-    │   │   ├── TruncatedMessageError
-    │   │   ├── CorruptMessageError
-    │   │   ├── UnknownVersionError
-    │   │   └── ForeignRunError
-    │   ├── TransferError         bytes from which no vehicle can go on here
-    │   │   ├── TruncatedTransferError
-    │   │   ├── TransferVersionError
-    │   │   ├── TransferLayoutError   of another build, or of another environment
-    │   │   └── ForeignTransferError  of another vehicle or tick
-    │   └── JournalError          a log that cannot be written or replayed
-    │       ├── TornJournalError     only its last line is cut short
-    │       └── CorruptJournalError  a line is damaged, missing or out of order
-    ├── ClockError             time that somebody else than its master advances, or wants to
-    │   ├── SecondMasterError     there is a time master already
-    │   ├── TickRefusedError      who follows does not tick
-    │   └── ClockDriftError       a world is not where its master has left it
-    ├── FollowerError          an external stack with which it cannot go on
-    │   ├── FollowerLostError     it, or the connection to it, has ended
-    │   │   └── FollowerTimeoutError   it has not answered in time
-    │   ├── FollowerMessageError  what it says cannot be understood
-    │   └── ControlError          controls that cannot be carried out
-    ├── NoAdmissibleWorkerError   every worker is too busy to be given a shard
-    ├── WorkerError            worker processes that cannot go on
-    │   ├── WorkerStartError      no process, or no memory for it
-    │   ├── WorkerDeathError      every process that took up a step died of it
-    │   ├── SensorFrameError      a frame that is not of the present tick
-    │   └── WorkerFailureError    an exception in a worker, with its traceback
-    ├── V2xError               a message that cannot be read, or an impossible reception
-    ├── SumoError              SUMO as global traffic that cannot go on
-    │   ├── SumoBusyError         a second simulation in one process
-    │   ├── SumoDiedError         its process ended, or hangs
-    │   └── SumoStateError        it says what does not fit the world
     ├── PolicyError            a policy that cannot be loaded or does not fit
-    └── MissingExtraError      an optional dependency is not installed
+    ├── MissingExtraError      an optional dependency is not installed
+    ├── ActionError            refused before any state has changed
+    ├── EpisodeError           the call does not fit the state of the episode: reset first
+    ├── CapacityError          more vehicles or seats than the world can take
+    ├── EvaluationError        an evaluation that failed, or worlds that differ and must not
+    │   └── ManifestError         results whose origin is not on record
+    ├── ProtocolError          the hand-off protocol was broken, or cannot go on
+    │   ├── LostTickError         a tick that every process died of
+    │   ├── MessageError          bytes that are no message or vehicle of this run
+    │   └── JournalError          a log, or a file of a lost tick, that cannot be written or read
+    ├── WorkerError            worker processes that cannot start or go on
+    │   ├── WorkerDeathError      every process that took up a step died of it
+    │   ├── WorkerFailureError    an exception in a worker, with its traceback
+    │   └── NoAdmissibleWorkerError   every worker is too busy to be given a shard
+    ├── ClockError             time that another than its master advances, or wants to
+    ├── FollowerError          an external stack with which the world cannot go on
+    │   └── FollowerLostError     it has ended, or has not answered in time
+    └── SumoError              SUMO as global traffic that cannot go on
 
 A message names the thing, the place and the cure.
 """
@@ -79,66 +40,29 @@ __all__ = [
     "ActionError",
     "CapacityError",
     "CavmarlError",
-    "ClockDriftError",
     "ClockError",
     "ConfigError",
-    "ControlError",
-    "CorruptJournalError",
-    "CorruptMessageError",
-    "CoverageError",
     "DemandError",
-    "EpisodeEndedError",
     "EpisodeError",
     "EvaluationError",
     "FollowerError",
     "FollowerLostError",
-    "FollowerMessageError",
-    "FollowerTimeoutError",
-    "ForeignRunError",
-    "ForeignTransferError",
-    "InvalidActionError",
-    "InvariantError",
     "JournalError",
-    "LedgerError",
+    "LostTickError",
     "ManifestError",
     "MapError",
     "MessageError",
-    "MissingActionError",
     "MissingExtraError",
     "NoAdmissibleWorkerError",
-    "PlacementError",
     "PolicyError",
     "ProtocolError",
-    "ReproducerError",
-    "ResetNeededError",
     "RouteError",
-    "SecondMasterError",
-    "SensorFrameError",
-    "SpawnError",
-    "StoreError",
-    "SumoBusyError",
-    "SumoDiedError",
+    "ScenarioError",
     "SumoError",
-    "SumoStateError",
-    "TickRefusedError",
-    "TornJournalError",
-    "TransferError",
-    "TransferLayoutError",
-    "TransferVersionError",
-    "TransitionError",
-    "TruncatedMessageError",
-    "TruncatedTransferError",
-    "UnequalWorldsError",
-    "UnknownAgentError",
     "UnknownEnvironmentError",
-    "UnknownVersionError",
-    "V2xError",
     "WorkerDeathError",
     "WorkerError",
     "WorkerFailureError",
-    "WorkerStartError",
-    "ZoneError",
-    "ZoneStepError",
     "missing",
     "require",
 ]
@@ -149,30 +73,18 @@ class CavmarlError(Exception):
 
 
 class ConfigError(CavmarlError):
-    """A configuration that cannot work: unknown key, wrong value, impossible combination."""
+    """A configuration that cannot work: unknown key, wrong value, impossible combination.
+
+    So are zones that overlap or see less far than exactness needs, loads or workers by which no
+    shard can be placed, and scenarios that are unknown or broken.
+    """
 
 
 class UnknownEnvironmentError(ConfigError):
     """No environment, folder or map file of that name."""
 
 
-class ZoneError(ConfigError):
-    """Zones that overlap, leave a gap, do not fit the map or see less far than exactness needs."""
-
-
-class CoverageError(ConfigError):
-    """A zone would see less than a vehicle may need before it is handed over."""
-
-
-class PlacementError(ConfigError):
-    """Loads, weights or workers by which no shard can be placed."""
-
-
 class ScenarioError(CavmarlError):
-    """No scenario of that name, a broken file of one, or no room for so many agents."""
-
-
-class NoPlaceError(ScenarioError):
     """A map that has no place for a scenario."""
 
 
@@ -188,97 +100,70 @@ class DemandError(CavmarlError):
     """A file of traffic demand that cannot be read, contradicts itself or does not fit its map."""
 
 
+class PolicyError(CavmarlError):
+    """A policy that cannot be found, loaded, or seated in this environment."""
+
+
+class MissingExtraError(CavmarlError, ImportError):
+    """An optional dependency is not installed; the message is the command that installs it."""
+
+
 class ActionError(CavmarlError):
-    """An action that was refused; no state has changed and the step can be repeated."""
+    """An action of the wrong shape, dtype or value, for an unknown agent, or none for a live one.
 
-
-class InvalidActionError(ActionError):
-    """An action of the wrong shape, dtype or value."""
-
-
-class MissingActionError(ActionError):
-    """A live agent was given no action."""
-
-
-class UnknownAgentError(ActionError):
-    """An action for an agent that is not in the world."""
+    No state has changed and the step can be repeated.
+    """
 
 
 class EpisodeError(CavmarlError):
-    """A call that does not fit the state of the episode."""
+    """A call that does not fit the state of the episode.
 
-
-class ResetNeededError(EpisodeError):
-    """`step` before the first `reset`."""
-
-
-class EpisodeEndedError(EpisodeError):
-    """`step` after every agent has left."""
+    `step` before the first `reset`, or after every agent has left.
+    """
 
 
 class CapacityError(CavmarlError):
     """More vehicles, agents or points than this world can take."""
 
 
-class V2xError(CavmarlError):
-    """Bytes that are no message, an unknown cause, or a network simulator that answers nonsense."""
-
-
 class EvaluationError(CavmarlError):
-    """A process of an evaluation died, or did something else than it was asked to."""
+    """A process of an evaluation died, or worlds differ that should be the same bit for bit."""
 
 
 class ManifestError(EvaluationError):
     """Results without a manifest, with one that was never closed, or with one of other results."""
 
 
-class UnequalWorldsError(EvaluationError):
-    """Worlds of different division that should be the same bit for bit and are not."""
-
-
 class ProtocolError(CavmarlError):
-    """The hand-off protocol was broken, or cannot go on."""
+    """The hand-off protocol was broken, or cannot go on.
 
-
-class TransitionError(ProtocolError):
-    """An event that the state does not know."""
-
-
-class SpawnError(ProtocolError):
-    """A vehicle whose id has been in the episode before, or whose zone does not exist."""
-
-
-class LedgerError(ProtocolError):
-    """A vehicle was lost, doubled, or is at another epoch than planned."""
-
-
-class StoreError(ProtocolError):
-    """What is stored is not what the zones say they stored.
-
-    Attributes:
-        zones: those that have to be hosted anew and step again.
+    An event that a state does not know, a vehicle lost, doubled, born twice or at another epoch
+    than planned, an invariant that does not hold.
     """
-
-    def __init__(self, zones: tuple[int, ...]) -> None:
-        super().__init__(f"zones {list(zones)} stored other rows than they told: host them anew")
-        self.zones = zones
 
 
 class LostTickError(ProtocolError):
-    """A tick that everybody died of who tried to reach it: it is not tried for ever.
+    """A tick that every host of a zone, or every coordinator, died of: it is not tried for ever.
 
     Attributes:
         tick: the tick.
-        zone: whose hosts died; None: the coordinators.
+        zone: the zone whose hosts died; None: the coordinators.
+        cause: what the last host died of, where that is known; the point at which coordinators did.
         reproducer: the file from which `cavmarl verify --replay` runs that tick again, or why there
             is none; nothing if none was asked for.
     """
 
     reproducer: Path | str = ""
 
-    def __init__(self, tick: int, zone: int | None, words: str) -> None:
+    def __init__(self, tick: int, deaths: int, zone: int | None = None, cause: str = "") -> None:
+        if zone is None:
+            words = f"the coordinator could not reach tick {tick}: {deaths} of them died"
+            words += f" at '{cause}'"
+        else:
+            words = f"zone {zone} could not reach tick {tick}: {deaths} hosts in a row died"
+            words += f", the last one {cause}" if cause else ""
         super().__init__(words)
-        self.tick, self.zone = tick, zone
+        self.tick, self.zone, self.cause = tick, zone, cause
 
     def __str__(self) -> str:
         """With the way to see it again."""
@@ -292,146 +177,20 @@ class LostTickError(ProtocolError):
         return super().__str__() + again
 
 
-class ZoneStepError(LostTickError):
-    """Every host of a zone died of a tick.
-
-    Attributes:
-        cause: what the last one died of; nothing if nobody knows.
-    """
-
-    def __init__(self, zone: int, tick: int, hosts: int, cause: str = "") -> None:
-        of = f", the last one {cause}" if cause else ""
-        words = f"zone {zone} could not reach tick {tick}: {hosts} hosts in a row died{of}"
-        super().__init__(tick, zone, words)
-        self.cause = cause
-
-
-class CoordinatorStepError(LostTickError):
-    """Every coordinator died of a tick, at the same point."""
-
-    def __init__(self, tick: int, coordinators: int, point: str) -> None:
-        words = (
-            f"the coordinator could not reach tick {tick}: {coordinators} of them died at '{point}'"
-        )
-        super().__init__(tick, None, words)
-
-
-class ReproducerError(ProtocolError):
-    """A file from which no tick can be run again: damaged, of another build or of another world."""
-
-
-class InvariantError(ProtocolError):
-    """What always holds did not hold."""
-
-
 class MessageError(ProtocolError):
-    """Bytes that are no message of this run."""
+    """Bytes that are no message of this run, or from which no vehicle can go on here.
 
-
-class TruncatedMessageError(MessageError):
-    """A message that ends too early, or goes on after its end."""
-
-
-class CorruptMessageError(MessageError):
-    """A message whose checksum or content is wrong."""
-
-
-class UnknownVersionError(MessageError):
-    """A message of another version of the wire form."""
-
-
-class ForeignRunError(MessageError):
-    """A message of another run."""
-
-
-class TransferError(ProtocolError):
-    """Bytes from which no vehicle can go on here."""
-
-
-class TruncatedTransferError(TransferError):
-    """The state of a vehicle that ends too early, or goes on after its end."""
-
-
-class TransferVersionError(TransferError):
-    """The state of a vehicle in another major version."""
-
-
-class TransferLayoutError(TransferError):
-    """The state of a vehicle from another build, or from another environment."""
-
-
-class ForeignTransferError(TransferError):
-    """The state of another vehicle, or of another tick."""
+    They are cut short, damaged, of another version, build, environment, run, vehicle or tick. So is
+    an answer of a network simulator that fits no packet.
+    """
 
 
 class JournalError(ProtocolError):
-    """A log that cannot be written or replayed."""
-
-
-class TornJournalError(JournalError):
-    """Only the last line of the log is cut short: what precedes it is whole."""
-
-
-class CorruptJournalError(JournalError):
-    """A line of the log is damaged, missing or out of order."""
-
-
-class ClockError(CavmarlError):
-    """Time that somebody else than its master advances, or wants to."""
-
-
-class SecondMasterError(ClockError):
-    """An environment that has a time master was given another."""
-
-
-class TickRefusedError(ClockError):
-    """Somebody who is not the time master wanted to advance the world."""
-
-
-class ClockDriftError(ClockError):
-    """A world is not at the tick at which its time master has left it."""
-
-
-class FollowerError(CavmarlError):
-    """An external stack with which it cannot go on; the world is whole and can be stepped on."""
-
-
-class FollowerLostError(FollowerError):
-    """A follower, or the connection to it, has ended."""
-
-
-class FollowerTimeoutError(FollowerLostError):
-    """A follower has not answered in time."""
-
-
-class FollowerMessageError(FollowerError):
-    """A follower has sent what cannot be understood, or is not due."""
-
-
-class ControlError(FollowerError):
-    """Controls of a follower that cannot be carried out: not numbers, out of range, missing."""
-
-
-class NoAdmissibleWorkerError(CavmarlError):
-    """Every worker is too busy, or does not answer.
-
-    Attributes:
-        rejections: (worker, resource, value, threshold) of each reason; see `balance.load_score`.
-    """
-
-    def __init__(
-        self, message: str, rejections: tuple[tuple[int, str, float | None, float | None], ...]
-    ) -> None:
-        super().__init__(message)
-        self.rejections = rejections
+    """A log, or the file of a lost tick, that cannot be written, read or replayed."""
 
 
 class WorkerError(CavmarlError):
-    """Worker processes that cannot go on."""
-
-
-class WorkerStartError(WorkerError):
-    """No process could be started, or there is no memory for it."""
+    """Worker processes that cannot be started, or cannot go on."""
 
 
 class WorkerDeathError(WorkerError):
@@ -454,23 +213,6 @@ class WorkerDeathError(WorkerError):
         self.worker, self.part, self.order, self.causes = worker, part, order, tuple(causes)
 
 
-class SensorFrameError(WorkerError):
-    """A sensor worker has delivered a frame that is not of the present tick.
-
-    Attributes:
-        sensor: its name in the rig.
-        tick: that was to be sensed.
-        found: tick of the frame; -1: there is none.
-    """
-
-    def __init__(self, sensor: str, tick: int, found: int) -> None:
-        super().__init__(
-            f"rig.{sensor}: the frame of tick {tick} is not there, but one of tick {found}; "
-            "sensor_workers=0 senses in this process"
-        )
-        self.sensor, self.tick, self.found = sensor, tick, found
-
-
 class WorkerFailureError(WorkerError):
     """An exception in a worker, with its traceback.
 
@@ -486,28 +228,52 @@ class WorkerFailureError(WorkerError):
         self.worker, self.kind, self.text, self.traceback = worker, kind, text, traceback
 
 
+class NoAdmissibleWorkerError(WorkerError):
+    """Every worker is too busy, or does not answer.
+
+    Attributes:
+        rejections: (worker, resource, value, threshold) of each reason; see `balance.load_score`.
+    """
+
+    def __init__(
+        self, message: str, rejections: tuple[tuple[int, str, float | None, float | None], ...]
+    ) -> None:
+        super().__init__(message)
+        self.rejections = rejections
+
+
+class ClockError(CavmarlError):
+    """Time that another than its master advances, or a second master.
+
+    Also a world that is not at the tick at which its time master has left it.
+    """
+
+
+class FollowerError(CavmarlError):
+    """An external stack with which it cannot go on; the world is whole and can be stepped on.
+
+    It has sent what cannot be understood or carried out, or is not due.
+    """
+
+
+class FollowerLostError(FollowerError):
+    """A follower, or the connection to it, has ended, or has not answered in time.
+
+    Attributes:
+        is_late: it may still be there, but has not answered in time.
+    """
+
+    def __init__(self, message: str, is_late: bool = False) -> None:
+        super().__init__(message)
+        self.is_late = is_late
+
+
 class SumoError(CavmarlError):
-    """SUMO as global traffic cannot go on."""
+    """SUMO as global traffic cannot go on.
 
-
-class SumoBusyError(SumoError):
-    """A second simulation in a process that holds one already."""
-
-
-class SumoDiedError(SumoError):
-    """The process of SUMO ended, or does not answer; the message ends with its last output."""
-
-
-class SumoStateError(SumoError):
-    """SUMO says what does not fit the world: another time, an unknown signal state."""
-
-
-class PolicyError(CavmarlError):
-    """A policy that cannot be found, loaded, or seated in this environment."""
-
-
-class MissingExtraError(CavmarlError, ImportError):
-    """An optional dependency is not installed; the message is the command that installs it."""
+    A second simulation in one process, a SUMO that has ended or hangs, or one that says what does
+    not fit the world.
+    """
 
 
 def missing(error: ModuleNotFoundError, extra: str) -> MissingExtraError:

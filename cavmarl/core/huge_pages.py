@@ -64,7 +64,6 @@ def huge_copy(array: NDArray[Any]) -> NDArray[Any]:
 
 
 def _map(size: int) -> NDArray[np.uint8]:
-    """Memory of this process, from the start of a page on."""
     memory = mmap.mmap(-1, size + PAGE, flags=mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS)
     try:
         memory.madvise(mmap.MADV_HUGEPAGE)

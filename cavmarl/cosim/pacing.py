@@ -75,7 +75,6 @@ class RealTime:
         self._sum_s = self._worst_s = 0.0
 
     def wait(self, elapsed_s: float) -> None:
-        """Sleep until the step is due."""
         now = self._now()
         if self._origin is None:
             self._origin = now - elapsed_s / self._factor
@@ -92,7 +91,6 @@ class RealTime:
 
     @property
     def lateness(self) -> Lateness:
-        """Of all steps up to now."""
         mean_s = self._sum_s / max(self._steps, 1)
         return Lateness(self._steps, self._late, mean_s, self._worst_s)
 
@@ -109,5 +107,4 @@ class Stepwise:
         self._ask = ask
 
     def wait(self, elapsed_s: float) -> None:
-        """Ask."""
         self._ask(elapsed_s)

@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cavmarl.config.env import EnvConfig
-from cavmarl.core.errors import ClockDriftError, ClockError, SecondMasterError, TickRefusedError
+from cavmarl.core.errors import ClockError
 from cavmarl.cosim.pacing import Pacer, Unpaced
 from cavmarl.engine.simulation import Simulation
 from cavmarl.engine.step_trace import StepTrace
@@ -51,13 +51,9 @@ class Steppable(Protocol):
     config: EnvConfig
     worlds: Any
 
-    def step(self, actions: Any) -> Any:
-        """Let agents act."""
-        ...
+    def step(self, actions: Any) -> Any: ...
 
-    def reset(self, seed: int | None = None, options: dict[str, Any] | None = None) -> Any:
-        """Begin an episode."""
-        ...
+    def reset(self, seed: int | None = None, options: dict[str, Any] | None = None) -> Any: ...
 
 
 class ClockEvent(NamedTuple):
@@ -102,15 +98,13 @@ class TimeFollower:
         """Try to advance the world; whether it has advanced.
 
         Raises:
-            TickRefusedError: the master refuses; see `TimeMaster`.
-            ClockError: it is no follower any more.
+            ClockError: the master refuses; see `TimeMaster`; it is no follower any more.
         """
         self.master.check_follower(self)
         self.own_ticks += 1
         return self.master.tick_for(self)
 
     def leave(self) -> None:
-        """Follow no longer."""
         self.master.let_go(self)
 
 
@@ -156,7 +150,7 @@ class TimeMaster:
         drift_ticks: by how many ticks the first world has gone on without the master.
 
     Raises:
-        SecondMasterError: the environment has a master.
+        ClockError: the environment has a master.
         ConfigError: a trace of worlds in other processes.
     """
 
@@ -170,7 +164,7 @@ class TimeMaster:
         trace: StepTrace | None = None,
     ) -> None:
         if isinstance(env.worlds, _Mastered):
-            raise SecondMasterError(
+            raise ClockError(
                 "this environment has a time master already: follow it (TimeMaster.follow), or let "
                 "it go first (TimeMaster.release)"
             )
@@ -213,14 +207,13 @@ class TimeMaster:
         return follower
 
     def let_go(self, follower: TimeFollower) -> None:
-        """Let it follow no longer."""
         self._followers.remove(follower)
 
     def step(self, actions: Any) -> Any:
         """Advance the environment by one step; returns what its `step` returns.
 
         Raises:
-            ClockDriftError: a world is not where the last step has left it.
+            ClockError: a world is not where the last step has left it.
         """
         with self._turn():
             return self.env.step(actions)
@@ -259,10 +252,10 @@ class TimeMaster:
         """Refuse whoever is not the master.
 
         Raises:
-            TickRefusedError: `what` was called on the environment itself.
+            ClockError: `what` was called on the environment itself.
         """
         if not self._is_turn:
-            raise TickRefusedError(
+            raise ClockError(
                 f"{what}() of an environment that has a time master: call TimeMaster.{what}(), or "
                 "let the environment go first (TimeMaster.release)"
             )
@@ -296,7 +289,7 @@ class TimeMaster:
         """Notice worlds that are not where the last step has left them.
 
         Raises:
-            ClockDriftError: there are some, and `on_drift` is `error`.
+            ClockError: there are some, and `on_drift` is `error`.
         """
         found = self._mine().ticks()
         if (found == self._left).all():
@@ -309,7 +302,7 @@ class TimeMaster:
         self.drift_ticks += int(found[0] - self._left[0])
         left, self._left = self._left, found
         if self._on_drift == "error":
-            raise ClockDriftError(
+            raise ClockError(
                 f"world {world} is at tick {found[world]}, but its time master left it at "
                 f"{left[world]}: somebody else ticks it; let that follow the master, or ask for "
                 "on_drift = record"
@@ -319,12 +312,12 @@ class TimeMaster:
         """A follower wants to tick by itself; whether the world has advanced.
 
         Raises:
-            TickRefusedError: `own_ticks` is `refuse`.
+            ClockError: `own_ticks` is `refuse`.
         """
         self.own_ticks += 1
         self._keep(ClockEvent(self.tick, "own_tick", follower.name, self._per_step))
         if self._answer == "refuse":
-            raise TickRefusedError(
+            raise ClockError(
                 f"follower '{follower.name}' ticks by itself at {self.time_s:g} s: only the time "
                 "master ticks; switch its own ticks off, or ask for own_ticks = ignore"
             )

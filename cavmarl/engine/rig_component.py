@@ -55,11 +55,9 @@ class MountedSensors:
         self.rig.begin(self.scenes())
 
     def end(self) -> None:
-        """Take the samples of the tick."""
         self.rig.end(self.scenes())
 
     def arrays(self) -> Iterator[NDArray[Any]]:
-        """The samples."""
         return self.rig.arrays()
 
     def scenes(self) -> list[Scene]:

@@ -54,7 +54,6 @@ class StepTrace:
         return [tuple(cycle) for cycle in self._cycles]
 
     def begin(self) -> None:
-        """Begin a cycle."""
         self._cycles.append([])
 
     def note(self, phase: str) -> None:

@@ -47,7 +47,6 @@ class Messaging:
             shard.mail = self.bus.mail
 
     def reset(self, chosen: NDArray[np.bool_]) -> None:
-        """Nobody has said anything yet."""
         self.bus.reset(chosen)
 
     def begin(self, commands: Commands) -> None:
@@ -56,7 +55,6 @@ class Messaging:
             self.bus.declare(commands.declared)
 
     def end(self) -> None:
-        """Send and receive."""
         self.bus.exchange(self._division.side)
 
     def arrays(self) -> Iterator[NDArray[Any]]:

@@ -64,7 +64,6 @@ class World(NamedTuple):
 
     @property
     def capacity(self) -> int:
-        """How many vehicles it can hold."""
         config = self.config
         dt, horizon_s = config.clock.sim_dt_s, config.horizon_s
         room = capacity_of(self.network, config.population, self.demand, dt, horizon_s)
@@ -84,12 +83,11 @@ def load_world(
     """What an entry, a folder or a map file describes; keywords as in `parallel_env`.
 
     Raises:
-        ConfigError: a key, value or combination that cannot work.
-        ZoneError: zones that cannot be, or not on this map.
+        ConfigError: a key, value or combination that cannot work; zones that cannot be, or not on
+            this map; the zones do not fit the map.
         MapError: the map cannot be read or driven.
         DemandError: a demand file is missing, broken or another map's.
         RouteError: its routes do not connect.
-        ZoneError: the zones do not fit the map.
     """
     config, base_dir = load_config(
         env,
@@ -153,8 +151,8 @@ def load_zones(config: EnvConfig, base_dir: Path, network: RoadNetwork) -> ZoneP
         network: its roads.
 
     Raises:
-        ConfigError: a zone file that cannot be read, or more zones than the map can hold.
-        ZoneError: a zone file of another number of zones, or of another map.
+        ConfigError: a zone file that cannot be read, or more zones than the map can hold; a zone
+            file of another number of zones, or of another map.
     """
     settings = config.zones
     path = resolve_zones(config, base_dir)

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cavmarl.config.env import ActionConfig
-from cavmarl.core.errors import InvalidActionError, MissingActionError, UnknownAgentError
+from cavmarl.core.errors import ActionError
 from cavmarl.core.numba.repeated import repeated
 from cavmarl.core.records.codes import ACTION_IDLE, ACTION_SLOWER
 from cavmarl.engine.kernels.decoding import decode_choices, decode_pairs
@@ -83,7 +83,7 @@ class ActionDecoder:
         """Refuse an action that cannot be decoded, without decoding it.
 
         Raises:
-            InvalidActionError: wrong shape, dtype or value.
+            ActionError: wrong shape, dtype or value.
         """
         batch = self._idle[:1].copy()
         batch[0, self._index[agent]] = self._stack([action], [agent])[0]
@@ -104,18 +104,18 @@ class ActionDecoder:
             needed: those of them that have a vehicle and must act.
 
         Raises:
-            UnknownAgentError: an id that never was, or has left (unless `late_actions = ignore`).
-            MissingActionError: a needed agent without an action (unless `missing_action = hold`).
-            InvalidActionError: wrong shape, dtype or value.
+            ActionError: an id that never was, or has left (unless `late_actions = ignore`); a
+                needed agent without an action (unless `missing_action = hold`); wrong shape, dtype
+                or value.
         """
         if not isinstance(actions, Mapping):
-            raise InvalidActionError(
+            raise ActionError(
                 f"actions are a {type(actions).__name__}: pass a dict from agent id to action"
             )
         ignored = self._check_ids(actions, live)
         missing = [agent for agent in needed if agent not in actions]
         if missing and self._config.missing_action == "error":
-            raise MissingActionError(
+            raise ActionError(
                 f"no action for {', '.join(missing)}: pass one for each id in env.agents, or set "
                 "action.missing_action = hold"
             )
@@ -138,13 +138,13 @@ class ActionDecoder:
         """Decode the actions of all worlds; entries where `mask` (W, A) is False are not read.
 
         Raises:
-            InvalidActionError: wrong shape, dtype or value.
+            ActionError: wrong shape, dtype or value.
         """
         if self._decode_at_once(actions, mask):
             return self._decoded
         array = self._as_numbers(actions, "actions")
         if array.shape != self._last.shape:
-            raise InvalidActionError(
+            raise ActionError(
                 f"actions have shape {array.shape}: must be {self._last.shape}, "
                 "(num_envs, num_agents" + (", 2)" if self._continuous else ")")
             )
@@ -193,12 +193,12 @@ class ActionDecoder:
             return 0
         strangers = [agent for agent in actions if agent not in self._index]
         if strangers:
-            raise UnknownAgentError(
+            raise ActionError(
                 f"no agent {strangers[0]!r}: the ids are {self._agents[0]} … {self._agents[-1]}"
             )
         late = [agent for agent in actions if agent not in alive]
         if late and self._config.late_actions == "error":
-            raise UnknownAgentError(
+            raise ActionError(
                 f"{', '.join(late)}: not in the world now; pass actions for the ids in env.agents "
                 "only, or set action.late_actions = ignore"
             )
@@ -214,9 +214,7 @@ class ActionDecoder:
         for agent, value in zip(agents, values, strict=True):
             array = self._as_numbers(value, agent)
             if array.shape != shape:
-                raise InvalidActionError(
-                    f"{agent}: the action has shape {array.shape}, must be {shape}"
-                )
+                raise ActionError(f"{agent}: the action has shape {array.shape}, must be {shape}")
             arrays.append(array)
         return np.stack(arrays)
 
@@ -243,9 +241,9 @@ class ActionDecoder:
         try:
             array = np.asarray(value)
         except ValueError as error:
-            raise InvalidActionError(f"{who}: no array of {kind}: {error}") from error
+            raise ActionError(f"{who}: no array of {kind}: {error}") from error
         if array.dtype.kind not in ("fiu" if self._continuous else "iu"):
-            raise InvalidActionError(f"{who}: dtype {array.dtype} given, {kind} needed")
+            raise ActionError(f"{who}: dtype {array.dtype} given, {kind} needed")
         if array.dtype == np.uint64:
             # Cast to int64 the largest ones would wrap around.
             array = np.minimum(array, np.uint64(np.iinfo(np.int64).max)).astype(np.int64)
@@ -277,7 +275,7 @@ class ActionDecoder:
             where = f"world {place[0]}, {where}"
         if len(place) > 2:
             where += f", {('throttle', 'steering')[place[2]]}"
-        raise InvalidActionError(f"{where}: the action is {batch[place]}, {why}")
+        raise ActionError(f"{where}: the action is {batch[place]}, {why}")
 
     def _commands(self, batch: NDArray[Any]) -> Commands:
         decoded = self._decoded

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from cavmarl.config.env import EnvConfig
-from cavmarl.core.errors import UnknownAgentError, V2xError
+from cavmarl.core.errors import ActionError, ConfigError
 from cavmarl.shards.shard import Commands
 from cavmarl.v2x.v2x_messages import cause_code
 
@@ -31,14 +31,14 @@ class DeclaredEvents:
         """Note an event.
 
         Raises:
-            UnknownAgentError: no such world or agent.
-            V2xError: no such cause, or nobody says anything in this environment.
+            ActionError: no such world or agent.
+            ConfigError: no such cause, or nobody says anything in this environment.
         """
         if not self._enabled:
-            raise V2xError("nobody says anything here: set v2x.enabled to true")
+            raise ConfigError("nobody says anything here: set v2x.enabled to true")
         num_worlds, num_agents = self._causes.shape
         if not (0 <= world < num_worlds and 0 <= agent < num_agents):
-            raise UnknownAgentError(
+            raise ActionError(
                 f"agent {agent} of world {world}: there are {num_agents} in each of {num_worlds}"
             )
         self._causes[world, agent] = cause_code(cause)

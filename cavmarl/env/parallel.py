@@ -14,7 +14,7 @@ from pettingzoo import ParallelEnv
 
 from cavmarl.config.env import TERMS
 from cavmarl.config.registry import load_config
-from cavmarl.core.errors import ConfigError, EpisodeEndedError, ResetNeededError, UnknownAgentError
+from cavmarl.core.errors import ActionError, ConfigError, EpisodeError
 from cavmarl.core.seeds import check_seed, first_seed
 from cavmarl.engine.simulation import Simulation
 from cavmarl.engine.spaces import (
@@ -242,15 +242,14 @@ class CavEnv(ParallelEnv[str, Any, Any]):  # type: ignore[misc] # PettingZoo is 
         and more are to come, the world goes on until one enters.
 
         Raises:
-            ResetNeededError: before the first reset.
-            EpisodeEndedError: actions after everybody has left.
+            EpisodeError: before the first reset; actions after everybody has left.
             ActionError: a refused action; nothing has changed and the step can be repeated.
         """
         if self._steps < 0:
-            raise ResetNeededError("step() before reset(): call env.reset(seed=…) first")
+            raise EpisodeError("step() before reset(): call env.reset(seed=…) first")
         if not self.agents:
             if actions:
-                raise EpisodeEndedError("the episode is over: call env.reset()")
+                raise EpisodeError("the episode is over: call env.reset()")
             return {}, {}, {}, {}, {}
         active = self.worlds.arrays.mask[0, self._listed]
         needed = self.agents if active.all() else list(compress(self.agents, active.tolist()))
@@ -364,11 +363,11 @@ class CavEnv(ParallelEnv[str, Any, Any]):  # type: ignore[misc] # PettingZoo is 
             cause: `collision`, `obstacle`, `stationary` or `hard_braking`.
 
         Raises:
-            UnknownAgentError: no such agent, or it has left.
-            V2xError: no such cause, or nobody says anything in this environment.
+            ActionError: no such agent, or it has left.
+            ConfigError: no such cause, or nobody says anything in this environment.
         """
         if agent not in self.agents:
-            raise UnknownAgentError(f"declare_event('{agent}', …): it is not in the episode")
+            raise ActionError(f"declare_event('{agent}', …): it is not in the episode")
         self._events.declare(0, self.possible_agents.index(agent), cause)
 
     def frames(self, agent: str) -> dict[str, SensorFrames]:
@@ -377,10 +376,10 @@ class CavEnv(ParallelEnv[str, Any, Any]):  # type: ignore[misc] # PettingZoo is 
         The arrays are those of `SensorFrames` without the axes of worlds and agents.
 
         Raises:
-            UnknownAgentError: there is no such agent.
+            ActionError: there is no such agent.
         """
         if agent not in self.possible_agents:
-            raise UnknownAgentError(
+            raise ActionError(
                 f"no agent {agent!r}: there are {self.possible_agents[0]} to "
                 f"{self.possible_agents[-1]}"
             )
@@ -391,7 +390,7 @@ class CavEnv(ParallelEnv[str, Any, Any]):  # type: ignore[misc] # PettingZoo is 
         """Refuse an action that `step` would refuse, before anything is kept of it.
 
         Raises:
-            InvalidActionError: wrong shape, dtype or value.
+            ActionError: wrong shape, dtype or value.
         """
         self._decoder.check(agent, action)
 
@@ -427,12 +426,12 @@ class CavEnv(ParallelEnv[str, Any, Any]):  # type: ignore[misc] # PettingZoo is 
 
         Raises:
             ConfigError: no render_mode, or no zone of that number.
-            ResetNeededError: before the first reset.
+            EpisodeError: before the first reset.
         """
         if self.render_mode is None:
             raise ConfigError("render() without a render_mode: make the environment with one")
         if self._steps < 0:
-            raise ResetNeededError("render() before reset(): call env.reset(seed=…) first")
+            raise EpisodeError("render() before reset(): call env.reset(seed=…) first")
         if self._view is None:
             self._view = WorldView(
                 self.simulation,

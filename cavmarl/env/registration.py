@@ -38,7 +38,7 @@ class CheckedActions(wrappers.OrderEnforcingWrapper):  # type: ignore[misc] # no
         """Let the selected agent act.
 
         Raises:
-            InvalidActionError: wrong shape, dtype or value; the agent can act again.
+            ActionError: wrong shape, dtype or value; the agent can act again.
         """
         agent = self.agent_selection
         if action is not None and not (self.terminations[agent] or self.truncations[agent]):

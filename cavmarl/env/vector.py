@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from cavmarl.balance.balance_plan import Plan
 from cavmarl.balance.plan_text import describe_plan
 from cavmarl.config.registry import load_config
-from cavmarl.core.errors import ConfigError, ResetNeededError
+from cavmarl.core.errors import ConfigError, EpisodeError
 from cavmarl.core.seeds import check_seed, first_seed
 from cavmarl.engine.simulation import Simulation
 from cavmarl.engine.spaces import (
@@ -248,7 +248,7 @@ class CavVectorEnv:
 
         Raises:
             ConfigError: a reset_mask of another shape or dtype, or one that comes with a seed.
-            ResetNeededError: a reset_mask before the first reset.
+            EpisodeError: a reset_mask before the first reset.
         """
         options = options or {}
         chosen = self._chosen(options.get("reset_mask"), seed)
@@ -277,7 +277,7 @@ class CavVectorEnv:
                 "reset_mask with a seed: a seed is that of all worlds; leave one of the two out"
             )
         if not self._ready:
-            raise ResetNeededError("reset_mask before the first reset: call vec.reset(seed=…)")
+            raise EpisodeError("reset_mask before the first reset: call vec.reset(seed=…)")
         return chosen
 
     def step(self, actions: NDArray[Any]) -> StepResult:
@@ -297,11 +297,11 @@ class CavVectorEnv:
             left: the same array as the observations in a step where nobody did.
 
         Raises:
-            ResetNeededError: before the first reset.
-            InvalidActionError: wrong shape, dtype or value; nothing has changed.
+            EpisodeError: before the first reset.
+            ActionError: wrong shape, dtype or value; nothing has changed.
         """
         if not self._ready:
-            raise ResetNeededError("step() before reset(): call vec.reset(seed=…) first")
+            raise EpisodeError("step() before reset(): call vec.reset(seed=…) first")
         commands = self._decoder.from_array(actions, self._mask)
         began = time.perf_counter()
         self.worlds.step(self._events.add_to(commands))
@@ -355,8 +355,8 @@ class CavVectorEnv:
             cause: as of `CavEnv.declare_event`.
 
         Raises:
-            UnknownAgentError: no such agent.
-            V2xError: no such cause, or nobody says anything in this environment.
+            ActionError: no such agent.
+            ConfigError: no such cause, or nobody says anything in this environment.
         """
         self._events.declare(world, agent, cause)
 

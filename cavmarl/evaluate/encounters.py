@@ -49,7 +49,6 @@ class Watch:
         self._seen_agent = np.full(shape, -1, dtype=np.int32)
 
     def locate(self) -> None:
-        """Note where the agents are."""
         worlds = self._vec.simulation.worlds
         locate_agents(worlds.rows, worlds.num_owned, self._recorder.places_m)
 

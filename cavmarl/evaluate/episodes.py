@@ -134,7 +134,6 @@ def drive_run(job: Job, progress: Progress | None = None) -> dict[str, RunData]:
 def _drive(
     vec: CavVectorEnv, driver: Policy, name: str, job: Job, progress: Progress | None
 ) -> RunData:
-    """All episodes of one policy, part after part."""
     parts: list[_Part] = []
     clock = _zone_clock(vec)
     count = math.ceil(job.episodes / vec.num_envs)

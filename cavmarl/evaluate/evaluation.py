@@ -179,7 +179,6 @@ def _check_count(name: str, value: Any, most: int) -> None:
 def _named(
     policies: str | Path | Sequence[str | Path] | Mapping[str, str | Path],
 ) -> dict[str, str]:
-    """Policies by the names that results have."""
     if isinstance(policies, Mapping):
         named = {name: str(policy) for name, policy in policies.items()}
     else:
@@ -258,7 +257,6 @@ def _runs(job: Job, seeds: list[int], journal: str, worlds: int) -> list[Job]:
 
 
 def _drive_all(folder: Path, jobs: list[Job], progress: Progress | None, is_divided: bool) -> None:
-    """Drive all runs, leave their tables, close the manifest."""
     runs: list[dict[str, RunData]] = []
     for job in jobs:
         if len(jobs) == 1:

@@ -152,7 +152,6 @@ def plot_distributions(tables: Mapping[str, tuple[Rows, Rows]]) -> str:
 def _sorted_values(
     metric: Metric, tables: Mapping[str, tuple[Rows, Rows]]
 ) -> list[NDArray[np.float64]]:
-    """The values of every policy, rising."""
     values = [metric_values(metric, trips, episodes) for trips, episodes in tables.values()]
     return [np.sort(one[~np.isnan(one)]) for one in values]
 

@@ -120,7 +120,6 @@ class EvaluationReport:
         return self.policies[policy]
 
     def to_dict(self) -> dict[str, Any]:
-        """Plain values, for JSON."""
         document = {**asdict(self), "seeds": list(self.seeds)}
         document["metrics"] = {
             metric.name: {

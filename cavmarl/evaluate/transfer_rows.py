@@ -82,7 +82,6 @@ class TransferRecorder:
 
 
 def transfers_of(rows: NDArray[np.void]) -> list[Transfer]:
-    """What TRANSFER records say."""
     return [
         Transfer._make(None if value != value else value for value in row[1:])
         for row in rows.tolist()

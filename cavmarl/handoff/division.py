@@ -15,7 +15,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from cavmarl.core.errors import ZoneError
+from cavmarl.core.errors import ConfigError
 from cavmarl.core.math.tallies import totals
 from cavmarl.core.numba.repeated import repeated
 from cavmarl.core.records.arrays import Worlds, Zoned
@@ -267,14 +267,14 @@ class Division:
         """The zone that owns a vehicle, and its committed row there.
 
         Raises:
-            ZoneError: nobody owns it.
+            ConfigError: nobody owns it.
         """
         for shard in self._shards:
             worlds = shard.worlds
             found = np.flatnonzero(worlds.rows["id"][w, : worlds.num_owned[w]] == vehicle)
             if len(found):
                 return shard.zone, int(found[0])
-        raise ZoneError(f"vehicle {vehicle} is in no zone of world {w}")
+        raise ConfigError(f"vehicle {vehicle} is in no zone of world {w}")
 
     def state(self, w: int, zone: int, row: int) -> bytes:
         """The whole state of an owned vehicle of a zone, by its committed row."""
@@ -294,14 +294,14 @@ class Division:
             the row where the new one keeps it.
 
         Raises:
-            ZoneError: the old owner does not have it, or the new one has not seen it come.
+            ConfigError: the old owner does not have it, or the new one has not seen it come.
         """
         place = self._pass_on(
             switch.vehicle, switch.source, hint, switch.target, switch.epoch,
             self._zoned, self._side(self._shards[0].worlds.rows), w,
         )  # fmt: skip
         if place == -1:
-            raise ZoneError(f"zone {switch.source} does not own vehicle {switch.vehicle}")
+            raise ConfigError(f"zone {switch.source} does not own vehicle {switch.vehicle}")
         if place == -2:
             raise self.unseen(switch.vehicle, switch.target)
         if state is not None:
@@ -313,9 +313,9 @@ class Division:
         return place
 
     @staticmethod
-    def unseen(vehicle: int, zone: int) -> ZoneError:
+    def unseen(vehicle: int, zone: int) -> ConfigError:
         """What is wrong where a zone has no ghost of a vehicle that enters it."""
-        return ZoneError(
+        return ConfigError(
             f"vehicle {vehicle} entered zone {zone}, which has not seen it come: the halo is too "
             "narrow"
         )

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from cavmarl.core.errors import PlacementError, ZoneError
+from cavmarl.core.errors import ConfigError
 from cavmarl.roads.network import RoadNetwork
 from cavmarl.zones.partition.zone_layouts import cut_map
 from cavmarl.zones.partition.zone_partition import ZonePartition
@@ -72,12 +72,12 @@ def propose_zones(
         tolerance: by which share of the mean the costliest zone has to become cheaper.
 
     Raises:
-        PlacementError: not one cost a zone, or one that is none.
+        ConfigError: not one cost a zone, or one that is none.
     """
     if len(costs_s) != partition.count or not all(
         math.isfinite(cost_s) and cost_s >= 0.0 for cost_s in costs_s
     ):
-        raise PlacementError(
+        raise ConfigError(
             f"costs {list(costs_s)}: must be one a zone of {partition.count}, seconds from 0 up"
         )
     if partition.count == 1 or not len(positions):
@@ -87,7 +87,7 @@ def propose_zones(
     density = np.column_stack([positions, weights])
     try:
         proposed = cut_map(network, "bisection", partition.count, density=density)
-    except ZoneError:
+    except ConfigError:
         return None  # all stand in one place: no cut divides them
     proposed = _renumbered(proposed, zones, proposed.zones_of(positions))
     proposed_zones = proposed.zones_of(positions)

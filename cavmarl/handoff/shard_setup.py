@@ -50,7 +50,7 @@ def divide(
         zeros: makes the arrays that shards write.
 
     Raises:
-        CoverageError: `zones.halo_m` is less than exactness needs.
+        ConfigError: `zones.halo_m` is less than exactness needs.
     """
     settings, dt = config.zones, config.clock.sim_dt_s
     radius_m = largest_radius_m(traffic.travel.types)
@@ -112,7 +112,7 @@ def halo_m(
         fastest_mps: the way of a tick over its length, with what vehicles jump on the map.
 
     Raises:
-        CoverageError: that is less than exactness needs, with all numbers.
+        ConfigError: that is less than exactness needs, with all numbers.
     """
     settings, dt = config.zones, config.clock.sim_dt_s
     wide_m = settings.halo_m

@@ -117,7 +117,6 @@ class Collector:
         self.trips.add(reward, infos["vehicle_done"], cut_off, infos["terms"])
 
     def _evaluate(self, batch: Batch) -> None:
-        """What was to be expected at each decision, and after it."""
         acted, goes_on = batch.acted, batch.goes_on
         batch.values[acted] = self._value(batch.observations[acted], batch.states, acted)
         after, going = torch.zeros(self._mask.shape), goes_on[-1]

@@ -87,7 +87,6 @@ class Learner:
     def _learn(
         self, decisions: _Decisions, chosen: Tensor, share: float, left: float
     ) -> dict[str, float]:
-        """One step of the optimiser by some of the decisions."""
         settings, network = self._settings, self.network
         observations = decisions.observations[chosen]
         log_prob, entropy = network.evaluate(observations, decisions.actions[chosen])

@@ -71,7 +71,6 @@ class Log:
                 self._board.add_scalar(name, value, int(row["agent_steps"]))
 
     def close(self) -> None:
-        """End the files."""
         self._file.close()
         if self._board is not None:
             self._board.close()

@@ -91,7 +91,6 @@ class PpoSettings:
 
     @property
     def folder(self) -> Path:
-        """Where this run lies."""
         if self.resume:
             return Path(self.resume)
         return run_folder(self.runs, self.name, self.env, self.algorithm, self.seed)

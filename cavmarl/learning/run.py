@@ -132,7 +132,6 @@ class Run:
         return row
 
     def _collected(self, left: float) -> Batch:
-        """The batch to learn from, which may be there already."""
         return self._collect(left) if self._next is None else self._next.result()
 
     def _collect(self, left: float) -> Batch:
@@ -147,7 +146,6 @@ class Run:
         )
 
     def close(self) -> None:
-        """End what belongs to the run."""
         if self._aside is not None:
             self._aside.shutdown()
         self.vec.close()

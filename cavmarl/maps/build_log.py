@@ -20,7 +20,6 @@ class BuildLog:
         self._complained = stderr.splitlines()
 
     def errors(self) -> tuple[str, ...]:
-        """The error lines as they are."""
         return self._after("Error: ")
 
     def warnings(self) -> dict[str, int]:

@@ -88,11 +88,9 @@ class MapReport:
 
     @property
     def drivable(self) -> bool:
-        """No problem stands against driving here."""
         return not self.problems
 
     def to_dict(self) -> dict[str, Any]:
-        """As plain types for JSON."""
         return asdict(self) | {"drivable": self.drivable}
 
 
@@ -159,7 +157,6 @@ class _Cars:
         self.links = links[passable]
 
     def largest_component(self) -> int:
-        """How many edges the largest strongly connected part has."""
         if not len(self.edges):
             return 0
         of_lane = self.network.lanes["edge"]

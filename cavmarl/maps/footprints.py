@@ -198,7 +198,6 @@ def _osm_buildings(path: Path, osm: _Reader, geo: GeoReference | None) -> Iterat
 
 
 def _closed(ways: list[list[str]]) -> list[list[str]]:
-    """The closed rings that ways make, joined at their ends."""
     found, open_ways = [], []
     for way in ways:
         if len(way) >= 4 and way[0] == way[-1]:

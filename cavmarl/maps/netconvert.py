@@ -71,7 +71,6 @@ class BuildResult:
     dropped: tuple[str, ...]
 
     def to_dict(self) -> dict[str, Any]:
-        """As plain types for JSON."""
         return asdict(self) | {"path": str(self.path), "source": str(self.source)}
 
 
@@ -164,7 +163,6 @@ def _crop(kind: MapKind, bbox: Box | None) -> tuple[str, ...]:
 def _build(
     kind: MapKind, source: Path, place: Path, options: Sequence[str], timeout_s: float
 ) -> BuildLog:
-    """Put the network in its place, whole or not at all."""
     if place.exists() and place.samefile(source):
         raise MapError(f"{place}: the target is the source: give another target")
     place.parent.mkdir(parents=True, exist_ok=True)

@@ -18,10 +18,7 @@ from enum import IntEnum
 from typing import Any, get_args, get_origin, get_type_hints
 
 from cavmarl.core.errors import (
-    CorruptMessageError,
-    ForeignRunError,
-    TruncatedMessageError,
-    UnknownVersionError,
+    MessageError,
 )
 from cavmarl.ownership.messages import Abort, Ack, Done, Message, Nack, Need, Prepare, Step
 
@@ -37,7 +34,6 @@ _WIDE = frozenset({"rows", "digest"})  # sums of hashes: up to 16 bytes
 
 
 def encode(message: Message) -> bytes:
-    """The wire form of a message."""
     parts = [_HEADER.pack(MAGIC, VERSION, KINDS.index(type(message)), 0)]
     for name, hint in _HINTS[type(message)]:
         _write(parts, name, hint, getattr(message, name))
@@ -53,29 +49,27 @@ def decode(data: bytes, run: bytes | None = None) -> Message:
         run: of the receiver; None accepts all.
 
     Raises:
-        TruncatedMessageError: it ends too early or goes on after its end.
-        UnknownVersionError: another version of this form.
-        CorruptMessageError: the checksum or a field is wrong.
-        ForeignRunError: it belongs to another run.
+        MessageError: it ends too early or goes on after its end; another version of this form; the
+            checksum or a field is wrong; it belongs to another run.
     """
     if len(data) < _HEADER.size + _CRC.size:
-        raise TruncatedMessageError(f"a message of {len(data)} bytes has no room for its header")
+        raise MessageError(f"a message of {len(data)} bytes has no room for its header")
     magic, version, kind, zero = _HEADER.unpack_from(data)
     if magic != MAGIC:
-        raise CorruptMessageError(f"a message begins with {MAGIC!r}, not with {magic!r}")
+        raise MessageError(f"a message begins with {MAGIC!r}, not with {magic!r}")
     if version != VERSION:
-        raise UnknownVersionError(f"version {version} of the messages; known is {VERSION}")
+        raise MessageError(f"version {version} of the messages; known is {VERSION}")
     body = data[: -_CRC.size]
     if zlib.crc32(body) != _CRC.unpack_from(data, len(body))[0]:
-        raise CorruptMessageError(f"the checksum of a message of {len(data)} bytes is wrong")
+        raise MessageError(f"the checksum of a message of {len(data)} bytes is wrong")
     if kind >= len(KINDS) or zero:
-        raise CorruptMessageError(f"kind {kind} of message does not exist")
+        raise MessageError(f"kind {kind} of message does not exist")
     reader = _Reader(body)
     values = {name: reader.value(name, hint) for name, hint in _HINTS[KINDS[kind]]}
     if reader.at != len(body):
-        raise TruncatedMessageError(f"{len(body) - reader.at} bytes follow after the message")
+        raise MessageError(f"{len(body) - reader.at} bytes follow after the message")
     if run is not None and values["run"] != run:
-        raise ForeignRunError(f"a message of run {values['run'].hex()}; this is {run.hex()}")
+        raise MessageError(f"a message of run {values['run'].hex()}; this is {run.hex()}")
     message: Message = KINDS[kind](**values)
     return message
 
@@ -106,7 +100,6 @@ class _Reader:
         self._body = body
 
     def value(self, name: str, hint: Any) -> Any:
-        """The next field."""
         if hint is bytes:
             return self._take(self._length())
         if hint is bool:
@@ -124,18 +117,18 @@ class _Reader:
     def _length(self) -> int:
         length: int = _LENGTH.unpack(self._take(_LENGTH.size))[0]
         if length > len(self._body) - self.at:
-            raise TruncatedMessageError(f"a field of {length} bytes or entries is cut short")
+            raise MessageError(f"a field of {length} bytes or entries is cut short")
         return length
 
     def _take(self, size: int) -> bytes:
         if self.at + size > len(self._body):
-            raise TruncatedMessageError(f"a message ends inside a field of {size} bytes")
+            raise MessageError(f"a message ends inside a field of {size} bytes")
         self.at += size
         return self._body[self.at - size : self.at]
 
     def _one_of(self, number: int, known: tuple[int, ...], make: Callable[[int], Any]) -> Any:
         if number not in known:
-            raise CorruptMessageError(f"{number} is none of {[int(value) for value in known]}")
+            raise MessageError(f"{number} is none of {[int(value) for value in known]}")
         return make(number)
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 from typing import Protocol
 
-from cavmarl.core.errors import ProtocolError, SpawnError
+from cavmarl.core.errors import ProtocolError
 from cavmarl.ownership.ledger import state_digest
 from cavmarl.ownership.limits import Limits
 from cavmarl.ownership.messages import Birth, Deferral, Switch
@@ -65,17 +65,19 @@ class Decisions:
         """See that new vehicles are new.
 
         Raises:
-            SpawnError: an id that the episode has seen, or a zone that does not exist.
+            ProtocolError: an id that the episode has seen, or a zone that does not exist.
         """
         ids = set()
         for vehicle, zone, _ in births:
             if zone not in table.hosts:
-                raise SpawnError(f"vehicle {vehicle} begins in zone {zone}, which does not exist")
+                raise ProtocolError(
+                    f"vehicle {vehicle} begins in zone {zone}, which does not exist"
+                )
             used = vehicle in table.owners or vehicle in ids
             if self._safeguards.removed_is_final:
                 used = used or vehicle in table.seen
             if used or vehicle < 0:
-                raise SpawnError(
+                raise ProtocolError(
                     f"vehicle {vehicle} begins: an episode uses an id once, and none below 0"
                 )
             ids.add(vehicle)

@@ -12,7 +12,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 
-from cavmarl.core.errors import JournalError, ProtocolError, StoreError, ZoneStepError
+from cavmarl.core.errors import JournalError, LostTickError, ProtocolError
 from cavmarl.ownership.decisions import CommittedStates, Decisions
 from cavmarl.ownership.leases import make_step
 from cavmarl.ownership.ledger import world_digest
@@ -43,6 +43,18 @@ from cavmarl.ownership.table import Table
 from cavmarl.ownership.transitions import State
 
 SILENCE = Output()
+
+
+class StoreError(ProtocolError):
+    """What is stored is not what the zones say they stored.
+
+    Attributes:
+        zones: those that have to be hosted anew and step again.
+    """
+
+    def __init__(self, zones: tuple[int, ...]) -> None:
+        super().__init__(f"zones {list(zones)} stored other rows than they told: host them anew")
+        self.zones = zones
 
 
 class Directory:
@@ -120,7 +132,7 @@ class Directory:
         In the middle of a tick the zone has to be fenced first; its STEP is sent again.
 
         Raises:
-            ZoneStepError: this tick has had as many hosts of the zone as are allowed.
+            LostTickError: this tick has had as many hosts of the zone as are allowed.
             ProtocolError: the zone is hosted and a tick is in progress.
         """
         table = self.table
@@ -128,7 +140,7 @@ class Directory:
             if table.states[zone] is State.HOSTED:
                 raise ProtocolError(f"zone {zone} moves in the middle of a tick: fence it first")
             if table.repeats[zone] >= self._limits.repeats and self._safeguards.repeat_limit:
-                raise ZoneStepError(zone, table.plan.record.tick, table.repeats[zone] + 1)
+                raise LostTickError(table.plan.record.tick, table.repeats[zone] + 1, zone)
         incarnation = table.hosts[zone][1] + 1
         output = self._logged(Host(table.episode, table.tick, zone, incarnation, worker))
         return Output(output.records, self.resend((zone,)).messages)
@@ -168,8 +180,8 @@ class Directory:
             payloads: zone → what rides with its STEP.
 
         Raises:
-            ProtocolError: the tick before is not committed, or a mover is unknown.
-            SpawnError: an id that the episode has seen, or a zone that is none.
+            ProtocolError: the tick before is not committed, or a mover is unknown; an id that the
+                episode has seen, or a zone that is none.
         """
         table = self.table
         if table.plan is not None:
@@ -185,7 +197,7 @@ class Directory:
         """See that new vehicles are new.
 
         Raises:
-            SpawnError: an id that the episode has seen, or a zone that does not exist.
+            ProtocolError: an id that the episode has seen, or a zone that does not exist.
         """
         self._decisions.check_births(self.table, births)
 
@@ -232,8 +244,7 @@ class Directory:
             rows: zone → digest of the rows that the store holds for the tick.
 
         Raises:
-            ProtocolError: a zone has not answered.
-            LedgerError: a vehicle was lost or doubled.
+            ProtocolError: a zone has not answered; a vehicle was lost or doubled.
             StoreError: the store holds other rows than a zone told of. Fence and host it anew.
         """
         table = self.table

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from cavmarl.core.errors import ConfigError, CoverageError
+from cavmarl.core.errors import ConfigError
 from cavmarl.ownership.limits import Limits
 from cavmarl.ownership.safeguards import ALL_ON, Safeguards
 
@@ -81,17 +81,17 @@ def check_coverage(
         dt_s: a tick.
 
     Raises:
-        CoverageError: the overlap is too narrow, or the approach is shorter than a tick's way.
+        ConfigError: the overlap is too narrow, or the approach is shorter than a tick's way.
     """
     needed = needed_overlap_m(reach_m, distances.hysteresis_m, limits, v_max_mps, dt_s)
     if distances.overlap_m < needed:
-        raise CoverageError(
+        raise ConfigError(
             f"an overlap of {distances.overlap_m:g} m is too narrow: {needed:g} m = reach "
             f"{reach_m:g} m + hysteresis {distances.hysteresis_m:g} m + "
             f"({limits.longest_deferral} + 1) ticks · {v_max_mps:g} m/s · {dt_s:g} s are needed"
         )
     if distances.approach_m < v_max_mps * dt_s:
-        raise CoverageError(
+        raise ConfigError(
             f"an approach of {distances.approach_m:g} m is shorter than the way of a tick, "
             f"{v_max_mps * dt_s:g} m: vehicles would cross before they are offered"
         )

@@ -70,7 +70,6 @@ class Endpoint:
         self._safeguards = safeguards
 
     def row_state(self, vehicle: int) -> State:
-        """AUTHORITATIVE, RETAINED or NONE."""
         if vehicle in self.owned:
             return State.AUTHORITATIVE
         return State.RETAINED if vehicle in self.retained else State.NONE

@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from typing import Protocol
 
-from cavmarl.core.errors import InvariantError
+from cavmarl.core.errors import ProtocolError
 from cavmarl.ownership.directory import Directory
 from cavmarl.ownership.endpoint import Endpoint
 from cavmarl.ownership.ledger import tally
@@ -26,7 +26,7 @@ class Store(Protocol):
 
 
 class Monitor:
-    """Raises InvariantError at the first invariant that does not hold."""
+    """Raises ProtocolError at the first invariant that does not hold."""
 
     def __init__(self, limits: Limits) -> None:
         self._limits = limits
@@ -38,17 +38,17 @@ class Monitor:
         """I1: in a tick one zone advances a vehicle, and each of its processes once.
 
         Raises:
-            InvariantError: somebody advanced it before.
+            ProtocolError: somebody advanced it before.
         """
         if tick > self._tick:
             self._tick, self._writers = tick, {}
         if self._executed.get((zone, incarnation), -1) >= tick:
-            raise InvariantError(f"I1: zone {zone} executes tick {tick} twice")
+            raise ProtocolError(f"I1: zone {zone} executes tick {tick} twice")
         self._executed[zone, incarnation] = tick
         for vehicle in vehicles:
             writer = self._writers.get(vehicle)
             if writer is not None and writer[0] != zone:
-                raise InvariantError(
+                raise ProtocolError(
                     f"I1: zones {writer[0]} and {zone} both advance vehicle {vehicle} to {tick}"
                 )
             self._writers[vehicle] = (zone, incarnation)
@@ -62,7 +62,7 @@ class Monitor:
             store: the committed store.
 
         Raises:
-            InvariantError: one of them does not hold.
+            ProtocolError: one of them does not hold.
         """
         self._check_copies(directory, store)
         self._check_leases(directory, endpoints)
@@ -70,21 +70,21 @@ class Monitor:
         self._check_ledger(directory)
         for vehicle, ticks in directory.table.deferred.items():
             if ticks > self._limits.longest_deferral:
-                raise InvariantError(f"I5: vehicle {vehicle} waits for {ticks} ticks")
+                raise ProtocolError(f"I5: vehicle {vehicle} waits for {ticks} ticks")
 
     def committed(self, world: int, store: Store) -> None:
         """I10: the digest of the world is the sum of the zones' digests.
 
         Raises:
-            InvariantError: it is not.
+            ProtocolError: it is not.
         """
         if world != store.world():
-            raise InvariantError("I10: the committed world is not what the zones told of")
+            raise ProtocolError("I10: the committed world is not what the zones told of")
 
     def _check_copies(self, directory: Directory, store: Store) -> None:
         if store.committed.keys() != directory.table.owners.keys():
             lost = sorted(directory.table.owners.keys() ^ store.committed.keys())
-            raise InvariantError(f"I2: vehicles {lost} are owned or stored, but not both")
+            raise ProtocolError(f"I2: vehicles {lost} are owned or stored, but not both")
 
     def _check_leases(self, directory: Directory, endpoints: Mapping[int, Endpoint]) -> None:
         leases: dict[int, int] = {}
@@ -93,7 +93,7 @@ class Monitor:
                 continue
             for vehicle in endpoint.owned:
                 if vehicle in leases:
-                    raise InvariantError(
+                    raise ProtocolError(
                         f"I1: zones {leases[vehicle]} and {zone} have a lease for vehicle {vehicle}"
                     )
                 leases[vehicle] = zone
@@ -107,7 +107,7 @@ class Monitor:
             if source is None or source.episode != directory.table.episode:
                 continue
             if switch.vehicle not in source.owned and switch.vehicle not in source.retained:
-                raise InvariantError(
+                raise ProtocolError(
                     f"I3: zone {switch.source} dropped vehicle {switch.vehicle} before the commit"
                 )
 
@@ -116,4 +116,4 @@ class Monitor:
         for zone, expected in table.tallies.items():
             owned = {v: epoch for v, (owner, epoch) in table.owners.items() if owner == zone}
             if tally(table.run, owned) != expected:
-                raise InvariantError(f"I6: the ledger of zone {zone} is not that of its vehicles")
+                raise ProtocolError(f"I6: the ledger of zone {zone} is not that of its vehicles")

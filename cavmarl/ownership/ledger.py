@@ -12,7 +12,7 @@ from functools import lru_cache
 from hashlib import blake2b
 from typing import NamedTuple
 
-from cavmarl.core.errors import LedgerError
+from cavmarl.core.errors import ProtocolError
 
 _ID = struct.Struct("<q")
 _WORLD = 1 << 128
@@ -48,18 +48,16 @@ class Tally(NamedTuple):
     digest: int = 0
 
     def plus(self, run: bytes, vehicle: int, epoch: int) -> Tally:
-        """With one more member."""
         return Tally(self.vehicles + 1, (self.digest + member(run, vehicle, epoch)) % _OWNED)
 
     def minus(self, run: bytes, vehicle: int, epoch: int) -> Tally:
-        """With one member less."""
         return Tally(self.vehicles - 1, (self.digest - member(run, vehicle, epoch)) % _OWNED)
 
     def check(self, other: Tally, where: str) -> None:
         """Compare with what somebody else counted.
 
         Raises:
-            LedgerError: the sets differ.
+            ProtocolError: the sets differ.
         """
         if self == other:
             return
@@ -68,7 +66,7 @@ class Tally(NamedTuple):
             if self.vehicles != other.vehicles
             else f"{self.vehicles} vehicles, but not the expected ones or not at their epochs"
         )
-        raise LedgerError(f"{where}: {what}")
+        raise ProtocolError(f"{where}: {what}")
 
 
 def member(run: bytes, vehicle: int, epoch: int) -> int:
@@ -85,7 +83,6 @@ def member(run: bytes, vehicle: int, epoch: int) -> int:
 
 
 def tally(run: bytes, owned: Mapping[int, int]) -> Tally:
-    """Tally of vehicles → epochs."""
     return Tally(
         len(owned), sum(member(run, vehicle, epoch) for vehicle, epoch in owned.items()) % _OWNED
     )
@@ -105,7 +102,6 @@ class SeenIds:
         return vehicle < self.floor or vehicle in self.above
 
     def add(self, vehicle: int) -> None:
-        """Remember an id."""
         self.above.add(vehicle)
         while self.floor in self.above:
             self.above.remove(self.floor)

@@ -15,7 +15,7 @@ from functools import partial
 from hashlib import blake2b
 from typing import Any, get_args, get_origin, get_type_hints
 
-from cavmarl.core.errors import CorruptJournalError, JournalError, TornJournalError
+from cavmarl.core.errors import JournalError
 from cavmarl.ownership.messages import Begin, Commit, Fence, Host, Record, Reset
 from cavmarl.ownership.table import Table
 
@@ -47,27 +47,26 @@ def record_from_dict(line: dict[str, Any], sequence: int) -> Record:
     """The record of a line.
 
     Raises:
-        CorruptJournalError: another schema or sequence number, a wrong checksum or content.
+        JournalError: another schema or sequence number, a wrong checksum or content.
     """
     where = f"line {sequence + 1} of the log"
     if line.get("schema") != SCHEMA:
-        raise CorruptJournalError(f"{where} has schema {line.get('schema')!r}, not {SCHEMA!r}")
+        raise JournalError(f"{where} has schema {line.get('schema')!r}, not {SCHEMA!r}")
     if line.get("checksum") != sealed(line)["checksum"]:
-        raise CorruptJournalError(f"{where} does not match its checksum")
+        raise JournalError(f"{where} does not match its checksum")
     if line.get("sequence") != sequence:
-        raise CorruptJournalError(f"{where} has number {line.get('sequence')}: lines are missing")
+        raise JournalError(f"{where} has number {line.get('sequence')}: lines are missing")
     kind = KINDS.get(str(line.get("kind")))
     if kind is None:
-        raise CorruptJournalError(f"{where} is of kind {line.get('kind')!r}, which is none")
+        raise JournalError(f"{where} is of kind {line.get('kind')!r}, which is none")
     try:
         values = [parse(line[name]) for name, parse in _PARSE[kind]]
     except (KeyError, TypeError, ValueError) as error:
-        raise CorruptJournalError(f"{where}: {error!r}") from error
+        raise JournalError(f"{where}: {error!r}") from error
     return kind(*values)
 
 
 def record_to_line(record: Record, sequence: int) -> str:
-    """A line of the log, with its end."""
     body = _json(_content(record, sequence))
     return f'{body[:-1]},"checksum":"{_checksum(body)}"}}\n'
 
@@ -76,14 +75,14 @@ def record_from_line(line: str | bytes, sequence: int) -> Record:
     """The record of a line of the log.
 
     Raises:
-        CorruptJournalError: the line is damaged, or another one.
+        JournalError: the line is damaged, or another one.
     """
     try:
         content = json.loads(line)
     except (ValueError, RecursionError) as error:
-        raise CorruptJournalError(f"line {sequence + 1} of the log: {error}") from error
+        raise JournalError(f"line {sequence + 1} of the log: {error}") from error
     if not isinstance(content, dict):
-        raise CorruptJournalError(f"line {sequence + 1} of the log is no JSON object")
+        raise JournalError(f"line {sequence + 1} of the log is no JSON object")
     return record_from_dict(content, sequence)
 
 
@@ -91,13 +90,13 @@ def records_from_lines(text: str) -> tuple[Record, ...]:
     """The records of a whole log.
 
     Raises:
-        TornJournalError: the last line is cut short. `whole_lines` gives the text before it.
-        CorruptJournalError: a line is damaged, missing or out of order.
+        JournalError: the last line is cut short. `whole_lines` gives the text before it; a line is
+            damaged, missing or out of order.
     """
     records = []
     for sequence, line in enumerate(text.splitlines(keepends=True)):
         if not line.endswith("\n"):
-            raise TornJournalError(f"line {sequence + 1} of the log is cut short: {line[:40]!r}")
+            raise JournalError(f"line {sequence + 1} of the log is cut short: {line[:40]!r}")
         records.append(record_from_line(line, sequence))
     return tuple(records)
 

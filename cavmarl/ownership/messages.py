@@ -137,7 +137,6 @@ class Step(Message):
     payload: bytes = b""
 
     def destinations(self) -> tuple[int, ...]:
-        """Its zone."""
         return (self.zone,)
 
 
@@ -165,7 +164,6 @@ class Prepare(Message):
     entries: tuple[Offer, ...]
 
     def destinations(self) -> tuple[int, ...]:
-        """The target."""
         return (self.target,)
 
 
@@ -179,7 +177,6 @@ class Abort(Message):
     entries: tuple[Withdrawn, ...]
 
     def destinations(self) -> tuple[int, ...]:
-        """The target."""
         return (self.target,)
 
 

@@ -89,7 +89,6 @@ class Offers:
         return self._by_target()
 
     def answered(self, ack: Ack) -> None:
-        """Cross off what the target holds."""
         for vehicle, epoch, digest in ack.entries:
             offer = self.owed.get((vehicle, ack.zone))
             if offer is not None and (offer.epoch, offer.digest) == (epoch, digest):

@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 
-from cavmarl.core.errors import LedgerError
+from cavmarl.core.errors import ProtocolError
 from cavmarl.ownership.ledger import Tally
 from cavmarl.ownership.messages import Begin, Confirmed, Done, Out, Removed, Spawn, Switch
 
@@ -77,20 +77,20 @@ def check_done(run: bytes, plan: Plan, done: Done, owners: Mapping[int, tuple[in
     """Compare what a zone did with what was planned.
 
     Raises:
-        LedgerError: it removed what it does not own, did not confirm what came in, or owns
+        ProtocolError: it removed what it does not own, did not confirm what came in, or owns
             something else than it should.
     """
     expected = plan.expected[done.zone]
     for vehicle, _ in done.removed:
         zone, epoch = plan.owner(vehicle, owners)
         if zone != done.zone:
-            raise LedgerError(f"{_where(done)} removed vehicle {vehicle}, which zone {zone} owns")
+            raise ProtocolError(f"{_where(done)} removed vehicle {vehicle}, which zone {zone} owns")
         expected = expected.minus(run, vehicle, epoch)
     planned = tuple(
         Confirmed(entry.vehicle, entry.epoch) for entry in plan.enter.get(done.zone, ())
     )
     if done.confirmed != planned:
-        raise LedgerError(
+        raise ProtocolError(
             f"{_where(done)} confirmed {list(done.confirmed)} instead of {list(planned)}"
         )
     if expected != done.owned:

@@ -17,7 +17,6 @@ class Readiness:
         self._safeguards = safeguards
 
     def note(self, ack: Ack, vehicle: int, epoch: int, digest: bytes) -> None:
-        """Remember an entry of an ACK."""
         self.held[ack.tick][vehicle, ack.zone] = (ack.incarnation, epoch, digest)
 
     def ready(
@@ -42,7 +41,6 @@ class Readiness:
         return min(zones, default=otherwise)
 
     def forget(self, before: int) -> None:
-        """Drop what is older than a tick."""
         if self._safeguards.ack_freshness:
             for tick in [tick for tick in self.held if tick < before]:
                 del self.held[tick]

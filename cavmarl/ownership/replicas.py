@@ -42,7 +42,6 @@ class Replicas:
         self._safeguards = safeguards
 
     def state(self, vehicle: int) -> State:
-        """PREPARED or EMPTY."""
         return State.PREPARED if vehicle in self.held else State.EMPTY
 
     def prepare(self, offer: Offer, tick: int, schema: int) -> Refusal | bool:
@@ -79,7 +78,6 @@ class Replicas:
         return True
 
     def exact(self, vehicle: int, epoch: int, tick: int, digest: bytes) -> bool:
-        """Whether that very state is held."""
         held = self.held.get(vehicle)
         if held is not None and not self._safeguards.exact_promotion:
             return True

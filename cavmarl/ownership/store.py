@@ -29,7 +29,6 @@ class MemoryStore:
         self._safeguards = safeguards
 
     def state(self, vehicle: int) -> bytes:
-        """The state at the committed tick."""
         return self.committed[vehicle]
 
     def write(self, zone: int, incarnation: int, vehicle: int, state: bytes) -> None:
@@ -43,7 +42,6 @@ class MemoryStore:
         self.segments.pop(self._segment(zone, incarnation), None)
 
     def digest(self, zone: int, incarnation: int) -> int:
-        """Digest of the rows of a segment."""
         rows = self.segments.get(self._segment(zone, incarnation), {})
         return world_digest(row_hash(vehicle, state) for vehicle, state in rows.items())
 
@@ -71,7 +69,6 @@ class MemoryStore:
         self.segments.clear()
 
     def world(self) -> int:
-        """Digest of the committed world."""
         return world_digest(row_hash(vehicle, state) for vehicle, state in self.committed.items())
 
     def _segment(self, zone: int, incarnation: int) -> tuple[int, int]:

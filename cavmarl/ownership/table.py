@@ -10,7 +10,7 @@ from collections import Counter
 from collections.abc import Iterable
 from typing import TypeAlias
 
-from cavmarl.core.errors import JournalError, LedgerError, ProtocolError
+from cavmarl.core.errors import JournalError, ProtocolError
 from cavmarl.ownership.ledger import SeenIds, Tally
 from cavmarl.ownership.messages import (
     RUN_BYTES,
@@ -65,7 +65,6 @@ class Table:
 
     @property
     def tallies(self) -> dict[int, Tally]:
-        """Zone → what it owned at the committed tick."""
         tallies, run = self._tallies, self.run
         if len(self._moves) > len(self.owners):
             tallies.update(dict.fromkeys(self.hosts, Tally()))
@@ -113,9 +112,8 @@ class Table:
             removed: who has left the world, of those before and of these.
 
         Raises:
-            ProtocolError: a tick is in progress, or vehicles wait for their transfer.
-            LedgerError: nobody owned one of those who have left, or somebody else one of those who
-                have changed.
+            ProtocolError: a tick is in progress, or vehicles wait for their transfer; nobody owned
+                one of those who have left, or somebody else one of those who have changed.
         """
         if self.plan is not None or self.deferred:
             raise ProtocolError(f"tick {self.tick + 1} is in progress")
@@ -128,7 +126,7 @@ class Table:
         for vehicle, source, target, epoch, _ in switches:
             owner = owners.get(vehicle)
             if owner != (source, epoch - 1):
-                raise LedgerError(
+                raise ProtocolError(
                     f"vehicle {vehicle} changed from zone {source} to {target} by tick {tick}, "
                     f"and its owner on record was {owner}"
                 )
@@ -139,7 +137,7 @@ class Table:
             moves.append((vehicle, target, epoch, True))
         for vehicle, _ in removed:
             if vehicle not in owners:
-                raise LedgerError(f"vehicle {vehicle} has left the world, and nobody owned it")
+                raise ProtocolError(f"vehicle {vehicle} has left the world, and nobody owned it")
             zone, epoch = owners.pop(vehicle)
             counts[zone] -= 1
             moves.append((vehicle, zone, epoch, False))
@@ -157,7 +155,7 @@ class Table:
 
         Raises:
             JournalError: a coordinator would not have written it here.
-            TransitionError: the same, for one vehicle or zone.
+            ProtocolError: the same, for one vehicle or zone.
         """
         match record:  # the frequent ones first
             case Begin():

@@ -48,7 +48,6 @@ class Trace:
     entries: list[Entry] = field(default_factory=list)
 
     def logged(self, records: Iterable[Record]) -> None:
-        """Note records."""
         self.entries.extend(Entry(LOG, record) for record in records)
 
     def delivered(self, destination: int, message: Message) -> None:
@@ -56,12 +55,10 @@ class Trace:
         self.entries.append(Entry(destination, message))
 
     def text(self) -> str:
-        """One line an entry."""
         return "".join(f"{describe(entry)}\n" for entry in self.entries)
 
 
 def describe(entry: Entry) -> str:
-    """An entry in words."""
     item = entry.item
     name = type(item).__name__.upper()
     if isinstance(item, Record):

@@ -15,7 +15,7 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
-from cavmarl.core.errors import InvariantError
+from cavmarl.core.errors import ProtocolError
 from cavmarl.ownership.ledger import SeenIds, Tally, state_digest
 from cavmarl.ownership.messages import (
     COORDINATOR,
@@ -63,23 +63,23 @@ def check_trace(entries: Iterable[Entry], longest_deferral: int, lifetime: int) 
     """Read a trace from its beginning.
 
     Raises:
-        InvariantError: the first entry that a correct run does not leave, and why.
+        ProtocolError: the first entry that a correct run does not leave, and why.
     """
     checker = TraceChecker(longest_deferral, lifetime)
     for number, entry in enumerate(entries, start=1):
         try:
             checker.take(entry)
-        except InvariantError as error:
-            raise InvariantError(f"entry {number}, {describe(entry)}: {error}") from None
+        except ProtocolError as error:
+            raise ProtocolError(f"entry {number}, {describe(entry)}: {error}") from None
 
 
 def _require(holds: bool, otherwise: str) -> None:
     if not holds:
-        raise InvariantError(otherwise)
+        raise ProtocolError(otherwise)
 
 
 class TraceChecker:
-    """Follows a trace entry by entry; `take` raises InvariantError at the first that is wrong.
+    """Follows a trace entry by entry; `take` raises ProtocolError at the first that is wrong.
 
     Args:
         longest_deferral: ticks that a vehicle may be with a zone that does not contain it.
@@ -117,7 +117,6 @@ class TraceChecker:
         }  # fmt: skip
 
     def take(self, entry: Entry) -> None:
-        """The next entry."""
         item = entry.item
         judge = self._judges.get(type(item))
         if isinstance(item, Record):
@@ -248,7 +247,7 @@ class TraceChecker:
     def _commit(self, record: Commit) -> None:
         begun = self._begun
         if begun is None or record.tick != begun.tick:
-            raise InvariantError("commits a tick that was not begun")
+            raise ProtocolError("commits a tick that was not begun")
         told = [ledger.zone for ledger in record.zones]
         _require(told == sorted(self._incarnations), f"tells of zones {told}")
         changed = self._planned(begun)
@@ -273,7 +272,6 @@ class TraceChecker:
 
     @staticmethod
     def _planned(begun: Begin) -> dict[int, Owner | None]:
-        """Who changes owner by a plan, and to whom."""
         changed: dict[int, Owner | None] = {s.vehicle: (s.target, s.epoch) for s in begun.switches}
         changed.update((b.vehicle, (b.zone, 0)) for b in begun.births)
         return changed
@@ -282,7 +280,7 @@ class TraceChecker:
         """What a zone's DONE adds to the changes: whom it removed."""
         done = self._dones.get(zone)
         if done is None:
-            raise InvariantError(f"zone {zone} has not said DONE")
+            raise ProtocolError(f"zone {zone} has not said DONE")
         confirmed = {(entry.vehicle, entry.epoch) for entry in done.confirmed}
         _require(
             confirmed == self._orders[zone].entered, f"zone {zone} did not CONFIRM what came in"

@@ -21,7 +21,6 @@ class Spread(NamedTuple):
 
     @classmethod
     def of(cls, values: Iterable[float]) -> Spread:
-        """Of any values."""
         ordered = sorted(values)
         if not ordered:
             return cls(None, None, None)

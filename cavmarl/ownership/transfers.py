@@ -88,9 +88,7 @@ class Surroundings(Protocol):
         """How far outside of its old zone a vehicle is that has changed; None: it has left."""
         ...
 
-    def now_ms(self) -> float:
-        """Of a clock that never goes back."""
-        ...
+    def now_ms(self) -> float: ...
 
 
 @dataclass(slots=True)
@@ -172,7 +170,6 @@ class TransferLog:
                     self._approaches, self._waited, self._begun = {}, {}, None
 
     def delivered(self, destination: int, message: Message) -> None:
-        """Note a message that arrived."""
         match message:
             case Prepare():
                 for vehicle, epoch, _, state in message.entries:
@@ -268,7 +265,6 @@ class TransferLog:
     def _note(
         self, episode: int, tick: int, switch: Switch, switching: _Switching, removed: bool
     ) -> None:
-        """Write a row."""
         vehicle, source, target, epoch, forced = switch
         found = self._approaches.pop((vehicle, target, epoch - 1), _NEVER)
         began_ms = switching.began_ms if found.began_ms is None else found.began_ms

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from enum import StrEnum
 
-from cavmarl.core.errors import TransitionError
+from cavmarl.core.errors import ProtocolError
 
 
 class _Word(StrEnum):
@@ -100,11 +100,11 @@ def after(party: Party, state: State, event: Event) -> State:
     """The state that follows.
 
     Raises:
-        TransitionError: the table does not list the pair.
+        ProtocolError: the table does not list the pair.
     """
     following = TABLE.get((party, state, event))
     if following is None:
-        raise TransitionError(f"{event} of {party.value}, which is {state}")
+        raise ProtocolError(f"{event} of {party.value}, which is {state}")
     return following
 
 

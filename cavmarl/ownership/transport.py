@@ -153,7 +153,6 @@ class Network:
         return [deliveries[sequence] for _, _, sequence in due]
 
     def in_flight(self) -> int:
-        """Messages that have not arrived."""
         return len(self._flights)
 
     def _send(self, message: Message, destination: int) -> None:

@@ -45,7 +45,6 @@ class OrderedWorlds(ABC):
 
     @property
     def plans(self) -> tuple[Plan, ...]:
-        """Who hosts what now."""
         return self.placement.plans
 
     @abstractmethod
@@ -116,7 +115,6 @@ class OrderedWorlds(ABC):
         return self.arrays.ticks.copy()
 
     def state_hash(self, world: int) -> str:
-        """Hex digest of one world."""
         return str(self._ask(Task.STATE_HASH, world))
 
     def traffic_stats(self, world: int) -> dict[str, float]:

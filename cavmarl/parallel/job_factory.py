@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from cavmarl.config.env import EnvConfig
-from cavmarl.core.errors import WorkerStartError
+from cavmarl.core.errors import WorkerError
 from cavmarl.engine.world_setup import make_world
 from cavmarl.handoff.coordinator.coordinator_setup import Run
 from cavmarl.parallel.checkpoint.action_log import Tape
@@ -39,14 +39,14 @@ def make_jobs(recipe: Mapping[str, Any]) -> list[Job]:
         recipe: what `pooled.PooledWorlds` writes.
 
     Raises:
-        WorkerStartError: a file is not what it was.
+        WorkerError: a file is not what it was.
     """
     from cavmarl.config.io import validate  # pydantic is slow to import
 
     config = validate(EnvConfig, recipe["config"], "the environment")
     world = make_world(config, Path(recipe["base_dir"]))
     if fingerprint(world) != recipe["fingerprint"]:
-        raise WorkerStartError(
+        raise WorkerError(
             f"the files of '{config.name}' have changed while workers were started: try again"
         )
     layout = layout_of(config, recipe["capacity"], recipe["num_worlds"])

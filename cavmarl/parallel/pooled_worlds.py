@@ -8,7 +8,7 @@ from itertools import accumulate, pairwise
 from pathlib import Path
 from typing import Any
 
-from cavmarl.core.errors import ConfigError, WorkerFailureError, WorkerStartError
+from cavmarl.core.errors import ConfigError, WorkerError, WorkerFailureError
 from cavmarl.engine.compilation import compiled_before
 from cavmarl.engine.simulation import Simulation
 from cavmarl.engine.world_setup import World
@@ -88,7 +88,7 @@ class PooledWorlds(OrderedWorlds):
         segment = Segment.make(size_of(layout))
         try:
             self.arrays = StepArrays.of(arrays_in(segment.map(), layout))
-        except WorkerStartError:
+        except WorkerError:
             segment.close()
             raise
         memory = self._make_mover(num_worlds, workers)
@@ -157,11 +157,9 @@ class PooledWorlds(OrderedWorlds):
 
     @property
     def deaths(self) -> list[Death]:
-        """Of worker processes, up to now."""
         return self.pool.deaths
 
     def close(self) -> None:
-        """End the processes."""
         self.pool.close()
 
     def _settle(self, parts: list[Part]) -> None:
@@ -181,11 +179,9 @@ class PooledWorlds(OrderedWorlds):
 
 
 def _names(parts: list[Part]) -> tuple[str, ...]:
-    """What each worker runs, in words."""
     return tuple(name for part in parts for name in part.names)
 
 
 def _leaders(parts: list[Part]) -> list[int]:
-    """Who answers for each world."""
     firsts = [0, *accumulate(len(part.zones) for part in parts)]
     return [k for k, part in zip(firsts, parts, strict=False) for _ in range(part.first, part.last)]

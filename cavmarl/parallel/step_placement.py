@@ -51,12 +51,10 @@ class Placement:
 
     @property
     def in_row(self) -> bool:
-        """Whether whole worlds are placed."""
         return self._balancers[0].plan.problem.in_row
 
     @property
     def plans(self) -> tuple[Plan, ...]:
-        """The present ones."""
         return tuple(balancer.plan for balancer in self._balancers)
 
     def watch(self, pids: Mapping[int, int]) -> None:

@@ -38,7 +38,6 @@ class Part(NamedTuple):
 
     @property
     def names(self) -> list[str]:
-        """Of what each worker runs, in words."""
         if self.last - self.first > 1:
             return [f"worlds {self.first} to {self.last - 1}"]
         if len(self.zones) == 1:

@@ -90,7 +90,6 @@ class WorldsJob:
         return self._worlds.save()
 
     def load(self, saved: Sequence[NDArray[Any]]) -> None:
-        """Go on from what `save` gave."""
         self._worlds.load(saved)
 
 

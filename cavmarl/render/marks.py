@@ -20,12 +20,10 @@ HEAD_PX = 12.0  # from the ring to the tip
 
 
 def opaque(color: Color) -> tuple[int, int, int, int]:
-    """The colour with full alpha."""
     return (*color, 255)
 
 
 def disc(x: float, y: float, radius: float) -> list[Corner]:
-    """A circle around (x, y)."""
     return [
         (x + radius * math.cos(angle), y + radius * math.sin(angle))
         for angle in (2.0 * math.pi * k / _SIDES for k in range(_SIDES))
@@ -38,7 +36,6 @@ def bar(x: float, y: float, width: float, height: float) -> list[Corner]:
 
 
 def pill(x: float, y: float, width: float, height: float) -> list[Corner]:
-    """A rectangle with round ends."""
     radius = height / 2.0
     turns = [math.pi * k / 12 for k in range(13)]
     right = [
@@ -50,7 +47,6 @@ def pill(x: float, y: float, width: float, height: float) -> list[Corner]:
 
 
 def target(x: float, y: float, color: Color) -> list[Part]:
-    """A ring that marks a destination."""
     return [
         (_SHADOW, disc(x + 0.8, y + 0.8, 6.0)),
         (_WHITE, disc(x, y, 5.6)),

@@ -71,7 +71,6 @@ class TopDownRenderer:
 
     @property
     def camera(self) -> Camera:
-        """The view of the last picture."""
         return self._camera
 
     def draw(

@@ -88,7 +88,6 @@ class VideoWriter:
         self.num_frames += 1
 
     def close(self) -> None:
-        """Finish the file."""
         if self._sink is not None:
             self._sink.close()
             self._sink = None

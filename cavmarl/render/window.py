@@ -48,7 +48,6 @@ class Window:
                 return
 
     def close(self) -> None:
-        """Take the window off the screen."""
         if self._window is not None:
             self._window.destroy()
             self._window = None

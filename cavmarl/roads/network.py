@@ -323,7 +323,6 @@ class RoadNetwork:
 
     @cached_property
     def arrays(self) -> RoadArrays:
-        """The arrays that kernels take."""
         own = (
             self.points,
             self.lanes,

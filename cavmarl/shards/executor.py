@@ -54,5 +54,4 @@ class SerialExecutor:
         self._group = ShardGroup(shards)
 
     def each(self, phase: Phase, *arguments: Any) -> None:
-        """Run the phase on every shard."""
         self._group.each(phase, *arguments)

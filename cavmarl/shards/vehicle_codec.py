@@ -26,11 +26,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cavmarl.core.errors import (
-    ForeignTransferError,
-    TransferError,
-    TransferLayoutError,
-    TransferVersionError,
-    TruncatedTransferError,
+    MessageError,
 )
 from cavmarl.core.records.arrays import Outputs, Worlds
 from cavmarl.core.records.codes import AUTHORITATIVE
@@ -87,7 +83,7 @@ class TransferCodec:
         schema: a number in [0, 2^63) that is the same where the other's states can be unpacked.
 
     Raises:
-        TransferLayoutError: the record has padding, whose bytes nobody sets.
+        MessageError: the record has padding, whose bytes nobody sets.
     """
 
     def __init__(
@@ -98,7 +94,7 @@ class TransferCodec:
     ) -> None:
         text = layout_text(record)
         if sum(kind.itemsize for _, kind, _ in _fields(record)) != record.itemsize:
-            raise TransferLayoutError(f"the record of a vehicle has padding: {text}")
+            raise MessageError(f"the record of a vehicle has padding: {text}")
         self._layout = blake2b(text.encode(), digest_size=8).digest()
         self._size = record.itemsize
         self._bytes = np.dtype((np.void, record.itemsize))
@@ -154,12 +150,12 @@ class TransferCodec:
             i: the row.
 
         Raises:
-            TransferError: these bytes are no state, or none of this vehicle and tick, or of another
+            MessageError: these bytes are no state, or none of this vehicle and tick, or of another
                 version, build or environment; the type says which.
         """
         header = self.header(data)
         if (header.vehicle, header.tick) != (vehicle, tick):
-            raise ForeignTransferError(
+            raise MessageError(
                 f"the state is that of vehicle {header.vehicle} at tick {header.tick}; "
                 f"expected is vehicle {vehicle} at tick {tick}"
             )
@@ -178,51 +174,50 @@ class TransferCodec:
         """What stands before a state, once it is seen that the state is whole and of this layout.
 
         Raises:
-            TransferError: it is not; the type says why.
+            MessageError: it is not; the type says why.
         """
         if len(data) < _HEADER.size:
-            raise TruncatedTransferError(
+            raise MessageError(
                 f"a state of {len(data)} bytes has no room for its header of {_HEADER.size}"
             )
         header = TransferHeader._make(_HEADER.unpack_from(data))
         if header.magic != MAGIC:
-            raise TransferError(f"a state begins with {MAGIC!r}, not with {header.magic!r}")
+            raise MessageError(f"a state begins with {MAGIC!r}, not with {header.magic!r}")
         if header.major != RECORD_VERSION:
-            raise TransferVersionError(
+            raise MessageError(
                 f"a state of version {header.major}.{header.minor}; this build reads "
                 f"{RECORD_VERSION}.*: run the same cavmarl everywhere"
             )
         more = len(data) - _HEADER.size - header.record - header.commands - header.frames
         if more < 0 or (more > 0 and header.minor <= MINOR_VERSION):
-            raise TruncatedTransferError(
+            raise MessageError(
                 f"a state of {len(data)} bytes: its header tells of {len(data) - more}"
             )
         if header.layout != self._layout or header.record != self._size:
-            raise TransferLayoutError(
+            raise MessageError(
                 f"a record of {header.record} bytes and layout {header.layout.hex()}; here it has "
                 f"{self._size} and {self._layout.hex()}: run the same cavmarl everywhere"
             )
         return header
 
     def _check_record(self, header: TransferHeader, data: bytes) -> int:
-        """The agent of a record that can be taken over."""
         first = _HEADER.size
         (vehicle,) = _LONG.unpack_from(data, first + self._id_at)
         if vehicle != header.vehicle:
-            raise ForeignTransferError(
+            raise MessageError(
                 f"the header names vehicle {header.vehicle}, its record vehicle {vehicle}"
             )
         (status,) = _INT.unpack_from(data, first + self._transfer_at)
         if status != AUTHORITATIVE:
-            raise TransferError(f"vehicle {vehicle} has the unknown transfer status {status}")
+            raise MessageError(f"vehicle {vehicle} has the unknown transfer status {status}")
         (agent,) = _INT.unpack_from(data, first + self._agent_at)
         if agent >= self._slots[1]:
-            raise TransferLayoutError(
+            raise MessageError(
                 f"vehicle {vehicle} is driven by agent {agent}; here are {self._slots[1]}"
             )
         expected = self._lengths[1:] if agent >= 0 else (0, 0)
         if (header.commands, header.frames) != expected:
-            raise TransferLayoutError(
+            raise MessageError(
                 f"vehicle {vehicle} has {header.commands} bytes of delayed commands and "
                 f"{header.frames} of frames; here these are {expected[0]} and {expected[1]}: "
                 "clock.control_latency_ticks or sensors differ"
@@ -237,6 +232,5 @@ def layout_text(record: np.dtype[np.void]) -> str:
 
 
 def _fields(record: np.dtype[np.void]) -> list[tuple[str, np.dtype[np.generic], int]]:
-    """Name, format and place of each field."""
     entries: Mapping[str, Any] = record.fields or {}
     return [(name, entries[name][0], int(entries[name][1])) for name in record.names or ()]

@@ -58,7 +58,6 @@ def make_gate(
 def _room(
     num_worlds: int, waiting: int, num_lanes: int, vehicle: np.dtype[np.void]
 ) -> dict[str, Any]:
-    """What the gate needs for each that may wait."""
     return {
         "passing": np.zeros((num_worlds, waiting), dtype=vehicle),
         "places": np.zeros((num_worlds, waiting), dtype=np.int64),

@@ -172,7 +172,6 @@ class Rerouting:
             )
 
     def _let_ask(self, worlds: Worlds, w: int, tick: int) -> int:
-        """How many of those who ask take another way."""
         rows, num = worlds.next_rows[w], int(worlds.num_owned[w])
         looks = self._looks[w]
         clock_s = self._travel.begin_s + tick * self._dt

@@ -111,7 +111,6 @@ class Schedule:
 
     @property
     def longest(self) -> int:
-        """Steps of the longest way."""
         return self._longest
 
     def orders(self, key: int, horizon_s: float) -> NDArray[np.void]:

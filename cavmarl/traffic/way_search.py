@@ -124,7 +124,6 @@ class WaySearch:
         return Answer.TAKEN if taken else Answer.NO_WAY
 
     def send_along(self, i: int, way: int) -> Answer:
-        """Put row i on a way of the table."""
         row = self._rows[i]
         if way == row["way"]:
             return Answer.KEPT

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from cavmarl.config.env import EnvConfig
 from cavmarl.config.v2x import V2xConfig, period_ticks
-from cavmarl.core.errors import V2xError
+from cavmarl.core.errors import ConfigError
 from cavmarl.core.math.neighbors import make_grid
 from cavmarl.core.math.walls import make_walls
 from cavmarl.core.numba.repeated import repeated
@@ -104,10 +104,10 @@ class Bus:
         """From now on let a network simulator say who receives what.
 
         Raises:
-            V2xError: the channel is one of our own.
+            ConfigError: the channel is one of our own.
         """
         if not self._config.channel.external:
-            raise V2xError("the channel is our own: set v2x.channel.external to connect another")
+            raise ConfigError("the channel is our own: set v2x.channel.external to connect another")
         self._network = network
 
     def reset(self, chosen: NDArray[np.bool_]) -> None:
@@ -129,14 +129,14 @@ class Bus:
             side: on which side of the zones' rows the committed ones are.
 
         Raises:
-            V2xError: no network simulator is connected where one is due, or it answers nonsense.
+            ConfigError: no network simulator is connected where one is due, or it answers nonsense.
         """
         num_worlds = len(self._common.ticks)
         if not self._config.channel.external:
             self._run(side, 0, num_worlds)
             return
         if self._network is None:
-            raise V2xError(
+            raise ConfigError(
                 "v2x.channel.external: connect a network simulator before the first step"
             )
         for world in range(num_worlds):
@@ -182,17 +182,17 @@ class Bus:
         """The row of `mail.objects[world]` and the like that are a roadside unit's.
 
         Raises:
-            V2xError: there is no such unit.
+            ConfigError: there is no such unit.
         """
         if not 0 <= unit < len(self.units):
-            raise V2xError(f"roadside unit {unit}: there are {len(self.units)}")
+            raise ConfigError(f"roadside unit {unit}: there are {len(self.units)}")
         return self._num_agents + unit
 
     def declare_of_unit(self, world: int, unit: int, cause: str) -> None:
         """Let a roadside unit tell of an event in the next tick.
 
         Raises:
-            V2xError: there is no such unit, or no such cause.
+            ConfigError: there is no such unit, or no such cause.
         """
         self.mail.declared[world, self.receiver_of_unit(unit)] = cause_code(cause)
 

@@ -12,7 +12,7 @@ from typing import NamedTuple, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from cavmarl.core.errors import V2xError
+from cavmarl.core.errors import MessageError
 
 __all__ = ["RECEPTION", "Exchange", "NetworkSimulator", "check_receptions"]
 
@@ -79,23 +79,23 @@ def check_receptions(
         them by receiver, tick and packet, so that the order of the answer does not matter.
 
     Raises:
-        V2xError: another dtype, packets or receivers that are not there, or a delay that is too
+        MessageError: another dtype, packets or receivers that are not there, or a delay that is too
             long or negative.
     """
     if not isinstance(receptions, np.ndarray) or receptions.dtype != RECEPTION:
-        raise V2xError("a network simulator answers with an array of dtype RECEPTION")
+        raise MessageError("a network simulator answers with an array of dtype RECEPTION")
     delay = sent.tick - receptions["tick"]
     if ((delay < 0) | (delay > latency_ticks) | (receptions["tick"] < 1)).any():
-        raise V2xError(
+        raise MessageError(
             f"tick {sent.tick}: a reception of another tick than those from "
             f"{max(1, sent.tick - latency_ticks)} to {sent.tick}; v2x.channel.latency_ticks is the "
             "longest delay"
         )
     number, count = receptions["packet"], num_packets[receptions["tick"] % (latency_ticks + 1)]
     if ((number < 0) | (number >= count)).any():
-        raise V2xError(f"tick {sent.tick}: a reception of a packet that was not sent")
+        raise MessageError(f"tick {sent.tick}: a reception of a packet that was not sent")
     receiver = receptions["receiver"]
     if ((receiver < 0) | (receiver >= len(sent.receivers))).any():
-        raise V2xError(f"tick {sent.tick}: a reception by nobody")
+        raise MessageError(f"tick {sent.tick}: a reception by nobody")
     there = sent.receivers["id"][receiver] >= 0
     return np.sort(receptions[there], order=("receiver", "tick", "packet"))

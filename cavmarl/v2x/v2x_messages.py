@@ -23,7 +23,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from cavmarl.core.errors import V2xError
+from cavmarl.core.errors import ConfigError, MessageError
 from cavmarl.v2x.kernels.v2x_records import (
     CAUSE_COLLISION,
     CAUSE_HARD_BRAKING,
@@ -162,10 +162,10 @@ def cause_code(cause: str) -> int:
     """ETSI's code of a cause.
 
     Raises:
-        V2xError: no cause of that name.
+        ConfigError: no cause of that name.
     """
     if cause not in CAUSES:
-        raise V2xError(f"cause = {cause!r}: there are {', '.join(CAUSES)}")
+        raise ConfigError(f"cause = {cause!r}: there are {', '.join(CAUSES)}")
     return CAUSES[cause]
 
 
@@ -205,19 +205,19 @@ def decode(data: bytes) -> tuple[np.void, NDArray[np.void]]:
     """Header and records of a packet.
 
     Raises:
-        V2xError: of another version, of an unknown kind, or of the wrong length.
+        MessageError: of another version, of an unknown kind, or of the wrong length.
     """
     if len(data) < HEADER.itemsize:
-        raise V2xError(f"{len(data)} bytes are no message: a header has {HEADER.itemsize}")
+        raise MessageError(f"{len(data)} bytes are no message: a header has {HEADER.itemsize}")
     header = np.frombuffer(data, HEADER, 1)[0]
     if header["version"] != SCHEMA_VERSION:
-        raise V2xError(
+        raise MessageError(
             f"message of version {header['version']}: version {SCHEMA_VERSION} is read here"
         )
     kind, count = int(header["kind"]), int(header["count"])
     if kind not in KINDS:
-        raise V2xError(f"message of kind {kind}: there are {', '.join(map(str, KINDS))}")
+        raise MessageError(f"message of kind {kind}: there are {', '.join(map(str, KINDS))}")
     size = HEADER.itemsize + count * KINDS[kind].itemsize
     if len(data) != size:
-        raise V2xError(f"message of {len(data)} bytes: with {count} records it has {size}")
+        raise MessageError(f"message of {len(data)} bytes: with {count} records it has {size}")
     return header, np.frombuffer(data, KINDS[kind], count, HEADER.itemsize)

@@ -62,7 +62,6 @@ class Determinism:
     difference: FirstDifference | None
 
     def to_dict(self) -> dict[str, Any]:
-        """Plain values, for JSON."""
         return asdict(self)
 
 
@@ -168,7 +167,6 @@ class _Program:
         self._process.communicate()
 
     def write(self, line: str) -> None:
-        """Send one line."""
         assert self._process.stdin is not None
         try:
             self._process.stdin.write(f"{line}\n")
@@ -184,7 +182,6 @@ class _Program:
             raise self._died()
 
     def read(self) -> dict[str, Any]:
-        """The next line."""
         if not self._line:
             self.wait_for_line()
         line, self._line = self._line, ""
@@ -194,7 +191,6 @@ class _Program:
         return told
 
     def dump(self, path: Path) -> Arrays:
-        """Its state where it stands now, and its end."""
         self.write(str(path))
         self.read()
         with np.load(path) as arrays:

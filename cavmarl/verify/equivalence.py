@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cavmarl.config.env import MAX_ZONES, ZONE_FILE_SUFFIXES
-from cavmarl.core.errors import ConfigError, ProtocolError, ZoneError
+from cavmarl.core.errors import ConfigError, ProtocolError
 from cavmarl.core.seeds import check_seed
 from cavmarl.env.vector import CavVectorEnv, make_vec
 from cavmarl.handoff.fault_injection.fault_plan import read_faults
@@ -61,7 +61,6 @@ class ZoneResult:
     figures: FaultFigures
 
     def to_dict(self) -> dict[str, Any]:
-        """Plain values, for JSON."""
         return asdict(replace(self, figures=FaultFigures())) | {"figures": self.figures.to_dict()}
 
 
@@ -87,11 +86,9 @@ class Equivalence:
 
     @property
     def holds(self) -> bool:
-        """Whether all were equal."""
         return all(result.difference is None for result in self.results)
 
     def to_dict(self) -> dict[str, Any]:
-        """Plain values, for JSON."""
         results = [result.to_dict() for result in self.results]
         return {**asdict(replace(self, results=())), "results": results, "holds": self.holds}
 
@@ -132,10 +129,10 @@ def verify_zones(
         progress: called after each step with its number and `steps`.
 
     Raises:
-        ConfigError: a number or a key that cannot work.
+        ConfigError: a number or a key that cannot work; more zones than the map can hold, or a zone
+            file of another number.
         JournalError: a journal that cannot be begun.
         PolicyError: the policy cannot be loaded or does not fit.
-        ZoneError: more zones than the map can hold, or a zone file of another number.
     """
     check_steps(steps)
     check_seed(seed)
@@ -236,7 +233,6 @@ class _Run:
         self.results: Arrays = {"observations": observations, "infos mask": infos["mask"]}
 
     def step(self) -> None:
-        """Let the driver act once."""
         seen, mask = self.results["observations"], self.results["infos mask"]
         actions = self._driver.act_batch(seen, mask)
         self.results = step_results(self.vec.step(actions), actions)
@@ -268,7 +264,7 @@ class _Compared:
         try:
             if step > 0:
                 self._run.step()
-        except (ProtocolError, ZoneError) as error:
+        except (ProtocolError, ConfigError) as error:
             tick = int(whole.vec.simulation.ticks()[0])
             self._world = 0
             self.difference = Difference(step, tick, "error", None, "", (None, str(error)))
@@ -278,7 +274,6 @@ class _Compared:
         self._compare(step, whole)
 
     def result(self) -> ZoneResult:
-        """What was found up to now."""
         simulation = self._run.vec.simulation
         return ZoneResult(
             simulation.partition.count,

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from cavmarl.core.errors import ConfigError, ProtocolError, UnequalWorldsError, ZoneStepError
+from cavmarl.core.errors import ConfigError, EvaluationError, LostTickError, ProtocolError
 from cavmarl.core.seeds import check_seed
 from cavmarl.engine.world_setup import load_world
 from cavmarl.env.vector import CavVectorEnv, make_vec
@@ -74,7 +74,6 @@ class LineResult:
     figures: FaultFigures = field(default_factory=FaultFigures)
 
     def to_dict(self) -> dict[str, Any]:
-        """Plain values, for JSON."""
         return {**vars(self), "injected": self.figures.injected, "figures": self.figures.to_dict()}
 
 
@@ -106,14 +105,12 @@ class Campaign:
         return not any(line.failures for line in self.lines)
 
     def total(self) -> FaultFigures:
-        """Of all runs."""
         figures = FaultFigures()
         for line in self.lines:
             figures.add(line.figures)
         return figures
 
     def to_dict(self) -> dict[str, Any]:
-        """Plain values, for JSON."""
         total = self.total()
         return {
             "env": self.env,
@@ -174,7 +171,6 @@ def run_campaign(
 def _run_matrix(
     stage: _Stage, campaign: Campaign, seeds: int, progress: Callable[[int, int], None] | None
 ) -> None:
-    """All lines, with all numbers of zones."""
     lines = []
     for count in campaign.zones:
         seen = stage.rehearse(count)
@@ -237,7 +233,7 @@ class _Stage:
         """A divided run without faults.
 
         Raises:
-            UnequalWorldsError: it is not the undivided one.
+            EvaluationError: it is not the undivided one.
         """
         vec = self._divided(count, Faults(crashes=(Crash(NEVER, PHASES[0], 0),)))
         coordinator = vec.simulation.coordinators[0]
@@ -245,7 +241,7 @@ class _Stage:
         visits = coordinator.crashes.visits = set()
         for step, is_equal in self._drive(vec):
             if not is_equal:
-                raise UnequalWorldsError(
+                raise EvaluationError(
                     f"{self.env}, {count} zones: differs from the undivided world in step {step} "
                     "without any fault; `cavmarl verify` says where"
                 )
@@ -285,13 +281,13 @@ class _Stage:
                 if not is_equal:
                     return f"differs from the undivided world in step {step}"
                 began, deaths = time.perf_counter(), len(revivals)
-        except ZoneStepError as error:
+        except LostTickError as error:
             return self._unlike(error) if line.poison else str(error)
         except ProtocolError as error:
             return str(error)
         return "a tick that kills every host was survived" if line.poison else ""
 
-    def _unlike(self, error: ZoneStepError) -> str:
+    def _unlike(self, error: LostTickError) -> str:
         """How the tick is not as it was when it is run again from its file."""
         if not isinstance(error.reproducer, Path):
             return str(error)
@@ -299,7 +295,7 @@ class _Stage:
         world = world_of(kept, self.env)
         try:
             replay_tick(kept, world)
-        except ZoneStepError as again:
+        except LostTickError as again:
             replay_tick(kept, world, faults=False)
             same = (again.zone, again.tick) == (error.zone, error.tick)
             return "" if same else f"run again, {again}"
@@ -337,7 +333,6 @@ class _Healing:
         self._last = None if until is None else until + deferral + 2
 
     def logged(self, records: Iterable[Record]) -> None:
-        """Records, in the order of the journal."""
         for record in records:
             if isinstance(record, Begin) and record.tick == self._last:
                 assert self._until is not None

@@ -51,7 +51,6 @@ class HandOverClock:
                     self._plan = None
 
     def delivered(self, destination: int, message: Message) -> None:
-        """A message that has arrived."""
         if isinstance(message, Need):
             self.asked += len(message.vehicles)
 
@@ -132,7 +131,6 @@ class FaultFigures:
         return found
 
     def add(self, other: FaultFigures) -> None:
-        """Count another run, too."""
         for entry in fields(self):
             mine, theirs = getattr(self, entry.name), getattr(other, entry.name)
             if isinstance(mine, Counter):
@@ -142,17 +140,14 @@ class FaultFigures:
 
     @property
     def deaths(self) -> int:
-        """Of zones' hosts and coordinators."""
         return self.zone_deaths.total() + self.coordinator_deaths.total()
 
     @property
     def injected(self) -> int:
-        """Faults of all kinds."""
         return self.deaths + self.messages.total()
 
     @property
     def handed_over(self) -> int:
-        """Vehicles that have changed their owner."""
         return self.hand_overs["switched"] + self.hand_overs["forced"]
 
     @property
@@ -162,7 +157,6 @@ class FaultFigures:
         return failed / max(1, failed + self.handed_over)
 
     def to_dict(self) -> dict[str, Any]:
-        """Plain values, for JSON."""
         return {
             "zone_deaths": dict(self.zone_deaths),
             "coordinator_deaths": dict(self.coordinator_deaths),

@@ -97,7 +97,7 @@ class Line:
         points: where, or how often.
         plans: one a run.
         unmet: points that nobody came to in that role.
-        poison: whether it has to end in `ZoneStepError`.
+        poison: whether it has to end in `LostTickError`.
     """
 
     name: str

@@ -65,7 +65,6 @@ def _digest(arrays: Arrays) -> str:
 
 
 def _dump(path: str, vec: CavVectorEnv, results: Arrays) -> None:
-    """Leave everything that the hashes are made of."""
     arrays: dict[str, Any] = snapshot(vec, results)
     np.savez(path, **arrays)
     print(json.dumps({"dumped": path}), flush=True)

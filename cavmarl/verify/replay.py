@@ -9,7 +9,7 @@ from tempfile import gettempdir
 from cavmarl.config.env import EnvConfig
 from cavmarl.config.io import validate
 from cavmarl.config.registry import find_entry
-from cavmarl.core.errors import ReproducerError
+from cavmarl.core.errors import JournalError
 from cavmarl.engine.simulation import Simulation
 from cavmarl.engine.world_setup import World, make_world
 from cavmarl.handoff.fault_injection.fault_plan import Faults
@@ -28,7 +28,7 @@ def world_of(kept: Reproducer, env: str | Path | None = None) -> World:
             of its environment.
 
     Raises:
-        ReproducerError: other roads, another demand or other zones than it was made with.
+        JournalError: other roads, another demand or other zones than it was made with.
         CavmarlError: as of `load_world`.
     """
     config = validate(EnvConfig, kept.config, "the reproducer")
@@ -37,7 +37,7 @@ def world_of(kept: Reproducer, env: str | Path | None = None) -> World:
     here = sources_of(world.network, world.demand, world.partition)
     for name, known in kept.sources.items():
         if here.get(name) != known:
-            raise ReproducerError(
+            raise JournalError(
                 f"the {name} of {found} is not the one that the tick was run with; name the "
                 "environment that has it"
             )
@@ -54,7 +54,7 @@ def replay_tick(kept: Reproducer, world: World, *, faults: bool = True) -> str:
 
     Raises:
         LostTickError: every host of a zone, or every coordinator, dies of it again.
-        ReproducerError: it is of another layout.
+        JournalError: it is of another layout.
         Exception: without faults whatever a zone's code raises, from where it does.
     """
     config = world.config

@@ -90,11 +90,9 @@ class KillReport:
 
     @property
     def holds(self) -> bool:
-        """Whether nothing differed."""
         return self.different is None
 
     def to_dict(self) -> dict[str, Any]:
-        """Plain values, for JSON."""
         return {**asdict(self), "holds": self.holds}
 
 
@@ -218,7 +216,6 @@ class _Run:
         driver.reset(seed)
 
     def step(self) -> dict[str, Any]:
-        """All that comes out of one more."""
         actions = self._driver.act_batch(self._observations, self._mask)
         result = self._vec.step(actions)
         self._observations, self._mask = result[0], result[4]["mask"]
@@ -246,7 +243,6 @@ class _Killer:
         return 1000.0 * statistics.median(self._calm_s)
 
     def watch(self, run: Callable[[], dict[str, Any]], step: int, strikes: bool) -> dict[str, Any]:
-        """One step, with a signal in it or soon after."""
         timer = None
         if strikes:
             if isinstance(self.pool, HostPool):  # one death at a time: Ray takes seconds for a host
@@ -265,7 +261,6 @@ class _Killer:
         return result
 
     def finish(self, step: int) -> None:
-        """Let those be missed that were struck last."""
         self.pool.ping()
         self._match(step)
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from cavmarl.config.registry import load_config
-from cavmarl.core.errors import ConfigError, InvalidActionError
+from cavmarl.core.errors import ActionError, ConfigError
 from cavmarl.engine.spaces import flat_observation, observation_parts
 from cavmarl.env.vector import make_vec
 
@@ -172,5 +172,5 @@ def test_wrong_use_is_refused(rows: Any) -> None:
         with pytest.raises(ConfigError, match=f"^{key}: this view decides it"):
             CavSb3VecEnv("merge", **{key: value})
     rows.reset()
-    with pytest.raises(InvalidActionError, match="must be finite"):
+    with pytest.raises(ActionError, match="must be finite"):
         rows.step(np.full((rows.num_envs, 2), np.nan, dtype=np.float32))

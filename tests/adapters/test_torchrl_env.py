@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from cavmarl.config.env import TERMS
-from cavmarl.core.errors import ConfigError, InvalidActionError
+from cavmarl.core.errors import ActionError, ConfigError
 from cavmarl.engine.spaces import flat_observation, observation_parts
 from cavmarl.env.vector import make_vec
 
@@ -174,5 +174,5 @@ def test_wrong_use_is_refused() -> None:
         make().set_seed(-1)
     env = make()
     beyond = env.reset().set((CAR, "action"), torch.full((WORLDS, AGENTS, 2), 3.0))
-    with pytest.raises(InvalidActionError, match="must be within"):
+    with pytest.raises(ActionError, match="must be within"):
         env.step(beyond)

@@ -15,7 +15,7 @@ from cavmarl.balance.load_score import Candidate, LoadRule, Utilisation
 from cavmarl.balance.load_snapshot import Snapshot, idle_snapshot
 from cavmarl.balance.problem import BalanceRule, Problem, ShardCost
 from cavmarl.balance.smoothing import SmoothCosts
-from cavmarl.core.errors import NoAdmissibleWorkerError, PlacementError
+from cavmarl.core.errors import ConfigError, NoAdmissibleWorkerError
 from tests.balance.shards import COSTS, busy, grid, least_makespan_s, row
 
 STRICT = BalanceRule(tolerance=0.0)
@@ -255,7 +255,7 @@ def test_a_jam_that_stays_is_taken_apart() -> None:
 )
 def test_what_cannot_be_placed_is_refused(change: dict[str, object], said: str) -> None:
     problem = Problem(row([1.0, 1.0]), ((1,), (0,)), idle_snapshot(2))
-    with pytest.raises(PlacementError, match=said):
+    with pytest.raises(ConfigError, match=said):
         replace(problem, **change)  # type: ignore[arg-type]
 
 
@@ -268,7 +268,7 @@ def test_what_cannot_be_placed_is_refused(change: dict[str, object], said: str) 
     ],
 )
 def test_rules_are_checked(rule: dict[str, float], said: str) -> None:
-    with pytest.raises(PlacementError, match=said):
+    with pytest.raises(ConfigError, match=said):
         BalanceRule(**rule)  # type: ignore[arg-type]
 
 
@@ -284,5 +284,5 @@ def test_weights_change_who_is_given_more() -> None:
 
 @pytest.mark.parametrize("newest", [0.0, 1.1, math.nan])
 def test_a_smoothing_weight_is_checked(newest: float) -> None:
-    with pytest.raises(PlacementError, match="newest"):
+    with pytest.raises(ConfigError, match="newest"):
         SmoothCosts(newest)

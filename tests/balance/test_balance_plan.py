@@ -17,7 +17,7 @@ from cavmarl.balance.load_snapshot import Snapshot, idle_snapshot
 from cavmarl.balance.plan_file import plan_from_dict, read_plan
 from cavmarl.balance.plan_text import describe_plan
 from cavmarl.balance.problem import BalanceRule, Problem
-from cavmarl.core.errors import PlacementError
+from cavmarl.core.errors import ConfigError
 from tests.balance.shards import COSTS, busy, grid, row
 
 
@@ -99,14 +99,14 @@ def test_zones_are_named_by_runs() -> None:
     ],
 )
 def test_what_is_no_plan_is_refused(plan: Plan, change: dict[str, Any], said: str) -> None:
-    with pytest.raises(PlacementError, match=said):
+    with pytest.raises(ConfigError, match=said):
         plan_from_dict(plan.to_dict() | change)
 
 
 def test_a_share_that_is_none_is_refused_in_a_stored_plan(plan: Plan) -> None:
     document = plan.to_dict()
     document["snapshot"]["workers"][0]["use"]["cpu"] = 12.0
-    with pytest.raises(PlacementError, match="utilisation cpu = 12"):
+    with pytest.raises(ConfigError, match="utilisation cpu = 12"):
         plan_from_dict(document)
 
 
@@ -132,7 +132,7 @@ def test_a_value_of_a_plan_that_is_none_is_named(
     for key in path[:-1]:
         part = part[key]
     part[path[-1]] = value
-    with pytest.raises(PlacementError, match=said):
+    with pytest.raises(ConfigError, match=said):
         plan_from_dict(json.loads(json.dumps(document)))
 
 
@@ -141,9 +141,9 @@ def test_a_plan_is_read_from_a_file(plan: Plan, tmp_path: Path) -> None:
     path.write_text(json.dumps(plan.to_dict()), encoding="utf-8")
     assert read_plan(path) == plan
     path.write_text("{}", encoding="utf-8")
-    with pytest.raises(PlacementError, match=r"plan\.json: not a plan"):
+    with pytest.raises(ConfigError, match=r"plan\.json: not a plan"):
         read_plan(path)
     for content in (b"\xff", b"[" * 100_000, b'{"a": ' + b"9" * 5000 + b"}"):
         path.write_bytes(content)
-        with pytest.raises(PlacementError, match="cannot be read"):
+        with pytest.raises(ConfigError, match="cannot be read"):
             read_plan(path)

@@ -8,7 +8,7 @@ from cavmarl.balance.balance_plan import replan
 from cavmarl.balance.balancer import Balancer
 from cavmarl.balance.load_snapshot import Snapshot, idle_snapshot
 from cavmarl.balance.problem import BalanceRule, Problem, ShardCost, equal_costs
-from cavmarl.core.errors import PlacementError
+from cavmarl.core.errors import ConfigError
 from tests.balance.shards import grid, row
 
 
@@ -61,5 +61,5 @@ def test_other_shards_than_those_of_the_plan_are_refused(
     balancer: Balancer, costs: list[float]
 ) -> None:
     shards = tuple(ShardCost(n // 4, n % 4, cost) for n, cost in enumerate(costs))
-    with pytest.raises(PlacementError, match="must be those of the plan"):
+    with pytest.raises(ConfigError, match="must be those of the plan"):
         balancer.measure(shards)

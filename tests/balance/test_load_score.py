@@ -21,7 +21,7 @@ from cavmarl.balance.load_score import (
     load_score,
     select,
 )
-from cavmarl.core.errors import NoAdmissibleWorkerError, PlacementError
+from cavmarl.core.errors import ConfigError, NoAdmissibleWorkerError
 
 SHARES = st.floats(0.0, 1.0)
 USES = st.builds(Utilisation, SHARES, SHARES, SHARES)
@@ -172,12 +172,12 @@ def test_nobody_at_all_is_nobody_admissible() -> None:
 
 
 def test_an_unknown_preferred_worker_is_refused() -> None:
-    with pytest.raises(PlacementError, match=r"preferred worker 7: there are \[0\]"):
+    with pytest.raises(ConfigError, match=r"preferred worker 7: there are \[0\]"):
         select(fleet((0.0, 0.0, 0.0)), preferred=7)
 
 
 def test_a_worker_twice_is_refused() -> None:
-    with pytest.raises(PlacementError, match="named twice"):
+    with pytest.raises(ConfigError, match="named twice"):
         select([Candidate(0, Utilisation(0.0, 0.0))] * 2)
 
 
@@ -185,12 +185,12 @@ def test_a_worker_twice_is_refused() -> None:
 @pytest.mark.parametrize("resource", RESOURCES)
 def test_only_shares_are_utilisations(resource: str, value: float) -> None:
     shares = {"cpu": 0.0, "ram": 0.0, "gpu": 0.0, resource: value}
-    with pytest.raises(PlacementError, match=f"utilisation {resource} = "):
+    with pytest.raises(ConfigError, match=f"utilisation {resource} = "):
         Utilisation(**shares)
 
 
 def test_percent_is_refused_with_the_share_that_it_would_be() -> None:
-    with pytest.raises(PlacementError, match=r"percent\? use 0\.55"):
+    with pytest.raises(ConfigError, match=r"percent\? use 0\.55"):
         Utilisation(55.0, 0.0)
 
 
@@ -205,7 +205,7 @@ def test_percent_is_refused_with_the_share_that_it_would_be() -> None:
     ],
 )
 def test_weights_are_checked(weights: tuple[float, float, float], said: str) -> None:
-    with pytest.raises(PlacementError, match=said):
+    with pytest.raises(ConfigError, match=said):
         LoadRule(weights)
 
 
@@ -224,5 +224,5 @@ def test_weights_that_sum_to_one_are_taken(weights: tuple[float, float, float]) 
     ],
 )
 def test_the_rest_of_a_rule_is_checked(rule: dict[str, object], said: str) -> None:
-    with pytest.raises(PlacementError, match=said):
+    with pytest.raises(ConfigError, match=said):
         LoadRule(**rule)  # type: ignore[arg-type]

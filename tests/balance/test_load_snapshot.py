@@ -16,7 +16,7 @@ from cavmarl.balance.load_score import Candidate, Utilisation
 from cavmarl.balance.load_snapshot import Snapshot, idle_snapshot
 from cavmarl.balance.plan_file import snapshot_from_dict
 from cavmarl.balance.probe import Watch, take_snapshot
-from cavmarl.core.errors import PlacementError
+from cavmarl.core.errors import ConfigError
 
 
 def test_a_snapshot_of_this_machine_is_of_shares() -> None:
@@ -84,13 +84,13 @@ def test_a_snapshot_goes_to_json_and_back() -> None:
 
 
 def test_no_worker_or_one_twice_is_no_snapshot() -> None:
-    with pytest.raises(PlacementError, match="no workers"):
+    with pytest.raises(ConfigError, match="no workers"):
         idle_snapshot(0)
-    with pytest.raises(PlacementError, match="named twice"):
+    with pytest.raises(ConfigError, match="named twice"):
         Snapshot(idle_snapshot(1).workers * 2, "none", "")
 
 
 @pytest.mark.parametrize("interval_s", [0.0, -1.0, float("nan")])
 def test_an_interval_is_checked(interval_s: float) -> None:
-    with pytest.raises(PlacementError, match="interval_s"):
+    with pytest.raises(ConfigError, match="interval_s"):
         take_snapshot({0: None}, interval_s=interval_s)

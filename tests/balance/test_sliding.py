@@ -15,7 +15,7 @@ from cavmarl.balance.load_snapshot import Snapshot, idle_snapshot
 from cavmarl.balance.plan_file import plan_from_dict
 from cavmarl.balance.plan_text import describe_plan
 from cavmarl.balance.problem import BalanceRule, Problem, ShardCost, equal_costs
-from cavmarl.core.errors import NoAdmissibleWorkerError, PlacementError
+from cavmarl.core.errors import ConfigError, NoAdmissibleWorkerError
 from tests.balance.shards import COSTS, busy
 
 EAGER = BalanceRule(tolerance=0.0, move_s=0.0, max_moves=3)
@@ -110,7 +110,7 @@ def test_a_worker_that_is_lost_begins_a_new_row() -> None:
 
 
 def test_workers_that_are_in_no_row_are_refused() -> None:
-    with pytest.raises(PlacementError, match="in a row"):
+    with pytest.raises(ConfigError, match="in a row"):
         replace(worlds([1.0] * 3, idle_snapshot(2)), present=(0, 1, 0))
 
 
@@ -125,5 +125,5 @@ def test_a_row_is_read_as_it_was_written() -> None:
     assert "costs by number" in text
     assert "ms" not in text
     assert "  world 1: worker 1 → 0" in text
-    with pytest.raises(PlacementError, match="in_row is 3"):
+    with pytest.raises(ConfigError, match="in_row is 3"):
         plan_from_dict(plan.to_dict() | {"in_row": 3})

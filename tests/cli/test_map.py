@@ -7,7 +7,7 @@ import pytest
 from typer.testing import CliRunner
 
 from cavmarl.cli.map import app
-from cavmarl.core.errors import ConfigError, MapError, UnknownEnvironmentError, ZoneError
+from cavmarl.core.errors import ConfigError, MapError, UnknownEnvironmentError
 
 runner = CliRunner()
 
@@ -189,7 +189,7 @@ def test_wrong_options_of_zones_are_refused(shared_maps: Path) -> None:
 def test_more_zones_than_the_map_can_hold_are_refused(shared_maps: Path) -> None:
     source = str(shared_maps / "net" / "Town10HD.net.xml")
     result = runner.invoke(app, ["zones", source, "--count", "256", "--layout", "strips"])
-    assert isinstance(result.exception, ZoneError)
+    assert isinstance(result.exception, ConfigError)
 
 
 @pytest.mark.parametrize("command", ["check", "zones"])

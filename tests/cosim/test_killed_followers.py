@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from cavmarl.core.errors import FollowerLostError, FollowerTimeoutError
+from cavmarl.core.errors import FollowerLostError
 from cavmarl.cosim.followers.followed_world import FollowedWorld
 from tests.cosim.conftest import make_env, spawn
 from tests.cosim.test_followed_world import reference
@@ -60,7 +60,7 @@ def test_stopped_and_replaced(address: Path) -> None:
                 world.reset(seed=1)
                 world.step()
                 first.send_signal(signal.SIGSTOP)
-                with pytest.raises(FollowerTimeoutError, match="driver"):
+                with pytest.raises(FollowerLostError, match="driver"):
                     world.step()
                 assert [seat.agents for seat in world.seats] == [(1,)]
                 first.kill()

@@ -11,7 +11,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from cavmarl.core.errors import FollowerError, FollowerMessageError
+from cavmarl.core.errors import FollowerError
 from cavmarl.cosim.followers import reception
 from cavmarl.cosim.followers.followed_world import FollowedWorld
 from cavmarl.cosim.followers.follower_connection import Line
@@ -126,7 +126,7 @@ def test_a_follower_that_says_nonsense_is_let_go(
     with FollowedWorld(make_env(), address) as world:
         follower = seated(world, ["car_0"])
         speak(follower._line)
-        with pytest.raises(FollowerMessageError, match=match):
+        with pytest.raises(FollowerError, match=match):
             world.reset(seed=1)
         assert hashes(world, 2) == reference(2, {})
         follower.close()
@@ -171,7 +171,7 @@ def test_any_letter_is_a_message_or_a_typed_error(letter: object) -> None:
     for kind in (Hello, Control, Snapshot):
         try:
             read_letter(kind, letter)
-        except FollowerMessageError:
+        except FollowerError:
             pass
 
 
@@ -195,7 +195,7 @@ def test_arrays_that_cannot_be_are_refused(
     world, line = Line(far, "a follower"), Line(near, "the world")
     try:
         world.say(Say.SNAPSHOT, Snapshot(0, 0, 0, 0.0, False, {}, [view]))
-        with pytest.raises(FollowerMessageError, match=words):
+        with pytest.raises(FollowerError, match=words):
             line.take(line.hear(5.0))
     finally:
         line.close()

@@ -7,11 +7,8 @@ import pytest
 
 import cavmarl
 from cavmarl.core.errors import (
-    ClockDriftError,
     ClockError,
     ConfigError,
-    SecondMasterError,
-    TickRefusedError,
 )
 from cavmarl.cosim.pacing import Pacer, RealTime, Stepwise
 from cavmarl.cosim.time_master import OwnTicks, TimeMaster
@@ -59,7 +56,7 @@ def test_time_is_exact_after_5000_ticks() -> None:
 def test_a_second_master_is_refused_until_the_first_has_gone() -> None:
     env = make()
     first = TimeMaster(env)
-    with pytest.raises(SecondMasterError, match="follow"):
+    with pytest.raises(ClockError, match="follow"):
         TimeMaster(env)
     first.release()
     TimeMaster(env).reset(seed=0)
@@ -70,11 +67,11 @@ def test_a_second_master_is_refused_until_the_first_has_gone() -> None:
 def test_nobody_else_steps_or_resets_a_mastered_environment() -> None:
     env = make()
     master = TimeMaster(env)
-    with pytest.raises(TickRefusedError, match=r"TimeMaster\.reset"):
+    with pytest.raises(ClockError, match=r"TimeMaster\.reset"):
         env.reset(seed=0)
     master.reset(seed=0)
     before = env.state_hash()
-    with pytest.raises(TickRefusedError, match=r"TimeMaster\.step"):
+    with pytest.raises(ClockError, match=r"TimeMaster\.step"):
         env.step(env.suggest_actions())
     assert env.state_hash() == before
     master.release()
@@ -90,7 +87,7 @@ def test_followers_come_and_tick_and_go_and_no_trajectory_changes(own_ticks: Own
     follower = master.follow("stack")
     for _ in range(5):
         if own_ticks == "refuse":
-            with pytest.raises(TickRefusedError, match="stack"):
+            with pytest.raises(ClockError, match="stack"):
                 follower.tick()
         else:
             assert not follower.tick()
@@ -135,7 +132,7 @@ def test_whoever_goes_round_the_master_is_noticed_and_refused() -> None:
     simulation.step(
         type(env._decoder.idle())(np.zeros((*shape, 2)), np.ones(shape, dtype=np.int64))
     )
-    with pytest.raises(ClockDriftError, match="tick 2, but its time master left it at 1"):
+    with pytest.raises(ClockError, match="tick 2, but its time master left it at 1"):
         master.step(env.suggest_actions())
     assert master.world_ticks.tolist() == [2]
     master.step(env.suggest_actions())
@@ -248,7 +245,7 @@ def test_worlds_of_worker_processes_have_a_master_too() -> None:
         master.reset(seed=0)
         for _ in range(5):
             master.step(vec.suggest_actions())
-        with pytest.raises(TickRefusedError):
+        with pytest.raises(ClockError):
             vec.step(vec.suggest_actions())
         assert (master.tick, master.world_ticks.tolist()) == (10, [10, 10])
         found.append([vec.state_hash(world) for world in range(2)])

@@ -9,7 +9,7 @@ import pytest
 from numpy.typing import NDArray
 
 from cavmarl.config.env import ActionConfig
-from cavmarl.core.errors import InvalidActionError
+from cavmarl.core.errors import ActionError
 from cavmarl.env.actions import ActionDecoder
 
 AGENTS = ("car_0", "car_1", "car_2")
@@ -52,7 +52,7 @@ def test_a_wrong_pair_changes_nothing(wrong: float) -> None:
     before = decoder.from_array(actions, MASK).controls.copy()
     actions[:] = 0.25
     actions[1, 1, 1] = wrong
-    with pytest.raises(InvalidActionError, match="world 1, car_1, steering"):
+    with pytest.raises(ActionError, match="world 1, car_1, steering"):
         decoder.from_array(actions, MASK)
     actions[1, 1, 1] = 0.5
     assert (decoder.idle().controls == 0.0).all()
@@ -64,7 +64,7 @@ def test_a_wrong_choice_is_refused() -> None:
     decoder = ActionDecoder(ActionConfig(kind="discrete"), 2, AGENTS)
     actions = np.zeros((2, 3), dtype=np.int64)
     actions[0, 2] = 5
-    with pytest.raises(InvalidActionError, match="world 0, car_2"):
+    with pytest.raises(ActionError, match="world 0, car_2"):
         decoder.from_array(actions, MASK)
 
 

@@ -30,7 +30,7 @@ def test_the_aec_form_refuses_a_wrong_action_and_goes_on() -> None:
     world = cavmarl.env("ring", agents=2, background=0)
     world.reset(seed=0)
     before = world.agent_selection
-    with pytest.raises(cavmarl.InvalidActionError, match="car_0"):
+    with pytest.raises(cavmarl.ActionError, match="car_0"):
         world.step(np.array([np.nan, 0.0]))
     assert world.agent_selection == before
     for _ in range(4):

@@ -9,7 +9,7 @@ import pytest
 from gymnasium.vector import AutoresetMode
 from numpy.typing import NDArray
 
-from cavmarl import TERMS, CavVectorEnv, ConfigError, ResetNeededError, make_vec, parallel_env
+from cavmarl import TERMS, CavVectorEnv, ConfigError, EpisodeError, make_vec, parallel_env
 
 MODES = ("closed", "entering", "seats")
 
@@ -226,7 +226,7 @@ def test_a_wrong_reset_mask_is_refused(
     options: dict[str, Any], seed: int | None, message: str
 ) -> None:
     vec = make(2)
-    with pytest.raises(ResetNeededError, match="before the first reset"):
+    with pytest.raises(EpisodeError, match="before the first reset"):
         vec.reset(options={"reset_mask": np.ones(2, dtype=bool)})
     vec.reset(seed=0)
     with pytest.raises(ConfigError, match=message):

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from cavmarl import make_vec
-from cavmarl.core.errors import ProtocolError, ZoneStepError
+from cavmarl.core.errors import LostTickError, ProtocolError
 from cavmarl.handoff.coordinator.coordinator_setup import make_refereeing
 from cavmarl.handoff.fault_injection.committed_store import CommittedStore
 from cavmarl.handoff.fault_injection.fault_plan import Crash, Faults
@@ -77,7 +77,7 @@ def test_a_zone_whose_rows_are_always_wrong_is_not_tried_for_ever(
     busy: Recorded, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     Wild(monkeypatch, often=1)
-    with pytest.raises(ZoneStepError, match=f"zone {ZONE} could not reach tick 1"):
+    with pytest.raises(LostTickError, match=f"zone {ZONE} could not reach tick 1"):
         replay(busy, 4, STORED)
 
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from cavmarl.core.errors import ZoneError
+from cavmarl.core.errors import ConfigError
 from cavmarl.driving.vehicles import GHOST_FIELDS, PLACEMENT_FIELDS, STATE_FIELDS
 from cavmarl.engine.simulation import Simulation
 from cavmarl.handoff import shard_setup as dividing
@@ -87,9 +87,9 @@ def test_a_vehicle_that_a_zone_has_not_seen_come_is_an_error() -> None:
     for shard in simulation._shards:
         shard.worlds.num_rows[:] = shard.worlds.num_owned
     division = simulation._tick.division
-    with pytest.raises(ZoneError, match=f"vehicle {here} entered zone 3, which has not seen"):
+    with pytest.raises(ConfigError, match=f"vehicle {here} entered zone 3, which has not seen"):
         division.hand_over(0, Switch(here, 0, 3, 1, False), division.state(0, 0, 0))
-    with pytest.raises(ZoneError, match=f"zone 0 does not own vehicle {there}"):
+    with pytest.raises(ConfigError, match=f"zone 0 does not own vehicle {there}"):
         division.hand_over(0, Switch(there, 0, 3, 1, False), division.state(0, 0, 0))
 
 

@@ -13,7 +13,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from cavmarl import make_vec
-from cavmarl.core.errors import InvalidActionError
+from cavmarl.core.errors import ActionError
 from cavmarl.engine.world_setup import find_map
 from cavmarl.handoff.fault_injection.fault_plan import (
     COORDINATOR_POINTS,
@@ -259,7 +259,7 @@ def test_at13_a_refused_action_leaves_no_trace(busy: Recorded) -> None:
         tick = coordinator.tick
         wrong = actions.copy()
         wrong[0, 0, 0] = np.nan
-        with pytest.raises(InvalidActionError):
+        with pytest.raises(ActionError):
             vec.step(wrong)
         assert coordinator.tick == tick
         assert vec.state_hash() == busy.hashes[step - 1][0]

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from cavmarl.core.errors import InvariantError
+from cavmarl.core.errors import ProtocolError
 from cavmarl.engine.simulation import Simulation
 from cavmarl.handoff import shard_setup as dividing
 from cavmarl.handoff.division import Division
@@ -96,7 +96,7 @@ class Meddling:
             look()
 
         self._patch.setattr(coordination, "check", check)
-        with pytest.raises(InvariantError, match=words):
+        with pytest.raises(ProtocolError, match=words):
             drive(self.simulation)
 
 
@@ -275,7 +275,7 @@ def test_an_arrival_that_nobody_has_told_of(monkeypatch: pytest.MonkeyPatch) -> 
     coordinator = coordination.coordinators[0]
     coordinator._births.append(Birth(8_888, 0, b""))
     monkeypatch.setattr(coordinator, "notes", lambda: ((Birth(8_888, 0, b""),), ()))
-    with pytest.raises(InvariantError, match="vehicle 8888 of zone 0, epoch 0, is lost"):
+    with pytest.raises(ProtocolError, match="vehicle 8888 of zone 0, epoch 0, is lost"):
         drive(simulation)
 
 
@@ -300,7 +300,7 @@ def test_a_step_of_a_transfer_that_is_left_out(kind: type[Message], words: str) 
         for _ in range(60):
             drive(simulation)
 
-    with pytest.raises(InvariantError, match=rf"tick \d+: order of records and .*{words}"):
+    with pytest.raises(ProtocolError, match=rf"tick \d+: order of records and .*{words}"):
         long_drive()
 
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from cavmarl import make_vec
-from cavmarl.core.errors import LedgerError
+from cavmarl.core.errors import ProtocolError
 from cavmarl.core.records.codes import DRIVER_AGENT, EVENT_COLLIDED
 from cavmarl.engine.world_setup import load_world
 from cavmarl.handoff.coordinator import local_coordinator as direct
@@ -209,7 +209,7 @@ def test_a_change_from_somebody_who_is_not_the_owner_on_record_is_noticed() -> N
         vec.step(vec.suggest_actions())
     (change, *_) = coordinator._book.newest(len(coordinator._book))
     coordinator._directory.table.owners[change.vehicle] = (change.target, change.epoch - 1)
-    with pytest.raises(LedgerError, match=f"vehicle {change.vehicle} changed .* owner on record"):
+    with pytest.raises(ProtocolError, match=f"vehicle {change.vehicle} changed .* owner on record"):
         _ = coordinator.directory
 
 
@@ -217,7 +217,7 @@ def test_a_vehicle_that_is_lost_is_missed(busy: Recorded) -> None:
     vec = make_vec("grid4x4", zones=4, overrides=BUSY)
     vec.reset(seed=1)
     lost = vec.simulation._shards[1].worlds.num_owned
-    with pytest.raises(LedgerError, match=r"zones own \[.*\] vehicles, not \["):  # noqa: PT012
+    with pytest.raises(ProtocolError, match=r"zones own \[.*\] vehicles, not \["):  # noqa: PT012
         for step in range(STEPS):
             lost[0] -= step == 0
             vec.step(vec.suggest_actions())

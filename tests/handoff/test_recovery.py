@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from cavmarl import make_vec
-from cavmarl.core.errors import ProtocolError, ZoneStepError
+from cavmarl.core.errors import LostTickError, ProtocolError
 from cavmarl.handoff.fault_injection.committed_store import CommittedStore
 from cavmarl.handoff.fault_injection.fault_plan import (
     COORDINATOR_POINTS,
@@ -144,7 +144,7 @@ def test_at11_a_tick_that_every_host_dies_of_is_not_tried_for_ever(
     deaths = tuple(Crash(tick, point, 1, times=10**6) for tick in TICKS)
     faults = {"zones.faults": Faults(crashes=deaths).to_json()}
     vec = make_vec("grid4x4", num_envs=1, zones=ZONES, overrides=busy.settings | faults)
-    with pytest.raises(ZoneStepError, match=r"zone 1 could not reach tick .*: 4 hosts in a row"):
+    with pytest.raises(LostTickError, match=r"zone 1 could not reach tick .*: 4 hosts in a row"):
         follow(busy, vec)
     died = vec.simulation.revivals
     assert [death.tick for death in died] == 3 * [died[0].tick]
@@ -159,7 +159,7 @@ def test_at11_after_poison_another_episode_is_as_good_as_ever(busy: Recorded) ->
     faults = Faults(crashes=(Crash(5, "resolve", 1, times=4),))
     settings = busy.settings | {"zones.faults": faults.to_json()}
     vec = make_vec("grid4x4", num_envs=1, zones=ZONES, overrides=settings)
-    with pytest.raises(ZoneStepError):
+    with pytest.raises(LostTickError):
         follow(busy, vec)
     follow(busy, vec)
 

@@ -14,7 +14,7 @@ from typing import Any
 import pytest
 
 from cavmarl import CavVectorEnv, make_vec
-from cavmarl.core.errors import CavmarlError, LedgerError, SpawnError, TransitionError
+from cavmarl.core.errors import CavmarlError, ProtocolError
 from cavmarl.handoff.coordinator.coordinator_setup import make_refereeing
 from cavmarl.handoff.fault_injection.fault_plan import Crash, Faults
 from cavmarl.handoff.fault_injection.message_coordinator import Coordinator
@@ -152,7 +152,7 @@ def test_at08_a_host_that_counts_wrong_is_found_out(
         return replace(done, owned=owned) if done.tick == 7 and done.zone == 2 else done
 
     monkeypatch.setattr(Endpoint, "complete", wrong)
-    with pytest.raises(LedgerError, match="zone 2 at tick 7"):
+    with pytest.raises(ProtocolError, match="zone 2 at tick 7"):
         follow(busy, divided(busy))
     without("ledger")
     follow(busy, divided(busy))
@@ -236,10 +236,10 @@ def returning(busy: Recorded) -> None:
 
 
 def test_at08_an_id_that_has_left_does_not_come_back(busy: Recorded, without: Without) -> None:
-    with pytest.raises(SpawnError, match="an episode uses an id once"):
+    with pytest.raises(ProtocolError, match="an episode uses an id once"):
         returning(busy)
     without("removed_is_final")
-    with pytest.raises(TransitionError):  # it is decided and logged, and then cannot be
+    with pytest.raises(ProtocolError):  # it is decided and logged, and then cannot be
         returning(busy)
 
 

@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 
 from cavmarl.config.registry import load_config
-from cavmarl.core.errors import CoverageError
+from cavmarl.core.errors import ConfigError
 from cavmarl.driving.kernels.motion import MAX_SPEED_MPS
 from cavmarl.handoff.shard_setup import halo_m
 from tests.support.driving import drive, make_simulation, start
@@ -26,7 +26,7 @@ def test_the_halo_is_reach_hysteresis_and_the_way_of_late_ticks() -> None:
 def test_a_wider_halo_is_taken_and_a_narrower_one_refused_with_the_numbers() -> None:
     narrow = load_config("grid4x4", overrides=LOSSY | {"zones.halo_m": 120.0})[0]
     with pytest.raises(
-        CoverageError,
+        ConfigError,
         match=r"120 m is too narrow: 121 m = reach 100 m \+ hysteresis 3 m \+ \(2 \+ 1\) ticks",
     ):
         halo_m(narrow, 100.0, 4)
@@ -36,7 +36,7 @@ def test_a_wider_halo_is_taken_and_a_narrower_one_refused_with_the_numbers() -> 
 
 def test_a_world_is_not_made_that_could_not_be_exact() -> None:
     settings = {"mode": "closed", "overrides": SETTINGS | {"zones.halo_m": 50.0}}
-    with pytest.raises(CoverageError, match="an overlap of 50 m is too narrow"):
+    with pytest.raises(ConfigError, match="an overlap of 50 m is too narrow"):
         make_simulation("grid4x4", **settings)
     settings["overrides"] = SETTINGS | {"zones.halo_m": 5000.0}
     assert make_simulation("grid4x4", **settings).zone_loads().halo_m == 5000.0

@@ -18,7 +18,7 @@ from dataclasses import dataclass, fields, is_dataclass
 from itertools import product
 from typing import Any, NamedTuple
 
-from cavmarl.core.errors import InvariantError
+from cavmarl.core.errors import ProtocolError
 from cavmarl.ownership.decisions import Decisions
 from cavmarl.ownership.directory import Directory
 from cavmarl.ownership.endpoint import Endpoint
@@ -112,7 +112,7 @@ class Explorer:
         """Visit every state; the numbers of states, and of those from which the end is reached.
 
         Raises:
-            InvariantError: in some state an invariant does not hold.
+            ProtocolError: in some state an invariant does not hold.
         """
         numbers: dict[Node, int] = {}
         before: list[list[int]] = []
@@ -212,7 +212,7 @@ class Explorer:
         table = self._parties[number].table
         for vehicle, (zone, _) in table.owners.items():
             if node.writers[vehicle] != zone:
-                raise InvariantError(f"I1: zone {node.writers[vehicle]} advanced v{vehicle}")
+                raise ProtocolError(f"I1: zone {node.writers[vehicle]} advanced v{vehicle}")
         soup = frozenset(item for item in node.soup if self._remembered(item[1], table.tick))
         return node._replace(directory=number, soup=soup)
 
@@ -232,7 +232,7 @@ class Explorer:
         writers = node.writers
         for vehicle in advanced:
             if writers[vehicle] not in (-1, zone):
-                raise InvariantError(f"I1: zones {writers[vehicle]} and {zone} advance v{vehicle}")
+                raise ProtocolError(f"I1: zones {writers[vehicle]} and {zone} advance v{vehicle}")
             writers = (*writers[:vehicle], zone, *writers[vehicle + 1 :])
         endpoints = (*node.endpoints[:zone], number, *node.endpoints[zone + 1 :])
         return node._replace(endpoints=endpoints, soup=node.soup | sent, writers=writers)
@@ -245,13 +245,13 @@ class Explorer:
         reaction = endpoint.on_message(self._messages[message])
         sent, advanced = list(reaction.messages), ()
         if any(isinstance(answer, Need) for answer in sent):
-            raise InvariantError(f"I4: zone {zone} is to promote a state that it does not hold")
+            raise ProtocolError(f"I4: zone {zone} is to promote a state that it does not hold")
         if reaction.advance is not None:
             if reaction.advance.tick <= tick:
-                raise InvariantError(f"I1: zone {zone} executes tick {tick} again")
+                raise ProtocolError(f"I1: zone {zone} executes tick {tick} again")
             for vehicle, state in reaction.advance.enter:
                 if state != version(vehicle, tick):
-                    raise InvariantError(f"I4: v{vehicle} is promoted from another state")
+                    raise ProtocolError(f"I4: v{vehicle} is promoted from another state")
             advanced = tuple(sorted(endpoint.owned))
             rows = {vehicle: version(vehicle, tick + 1) for vehicle in advanced}
             digest = world_digest(row_hash(vehicle, row) for vehicle, row in rows.items())
@@ -313,18 +313,18 @@ class Explorer:
                 continue
             source = self._parties[node.endpoints[switch.source]]
             if switch.vehicle not in source.owned and switch.vehicle not in source.retained:
-                raise InvariantError(f"I3: v{switch.vehicle} is dropped before the commit")
+                raise ProtocolError(f"I3: v{switch.vehicle} is dropped before the commit")
 
     def _check_directory(self, directory: Directory) -> None:
         table = directory.table
         if table.tick and len(table.owners) != self.small.vehicles:
-            raise InvariantError(f"I6: vehicles {sorted(table.owners)} are left")
+            raise ProtocolError(f"I6: vehicles {sorted(table.owners)} are left")
         for zone, expected in table.tallies.items():
             owned = {v: epoch for v, (owner, epoch) in table.owners.items() if owner == zone}
             if tally(RUN, owned) != expected:
-                raise InvariantError(f"I6: the ledger of zone {zone} is not that of its vehicles")
+                raise ProtocolError(f"I6: the ledger of zone {zone} is not that of its vehicles")
         if any(ticks > self.small.limits.longest_deferral for ticks in table.deferred.values()):
-            raise InvariantError(f"I5: somebody waits too long: {table.deferred}")
+            raise ProtocolError(f"I5: somebody waits too long: {table.deferred}")
 
     # Numbers for parties and messages
 

@@ -7,7 +7,8 @@ from dataclasses import replace
 
 import pytest
 
-from cavmarl.core.errors import LedgerError, SpawnError, StoreError, ZoneStepError
+from cavmarl.core.errors import LostTickError, ProtocolError
+from cavmarl.ownership.directory import StoreError
 from cavmarl.ownership.distances import Distances
 from cavmarl.ownership.limits import Limits
 from cavmarl.ownership.messages import Ack, Confirmed, Done, Held, Nack, Need, Prepare, Removed
@@ -205,7 +206,7 @@ def repeat_limit(safeguards: Safeguards) -> None:
     bench.begin()
     for _ in range(bench.limits.repeats):
         bench.crash(1)
-    with pytest.raises(ZoneStepError, match="zone 1 could not reach tick 1: 4 hosts"):
+    with pytest.raises(LostTickError, match="zone 1 could not reach tick 1: 4 hosts"):
         bench.crash(1)
 
 
@@ -216,7 +217,7 @@ def removed_is_final(safeguards: Safeguards) -> None:
     bench = Bench(safeguards=safeguards)
     bench.tick(births=[(7, 0)])
     bench.tick(removed=[7])
-    with pytest.raises(SpawnError, match="vehicle 7"):
+    with pytest.raises(ProtocolError, match="vehicle 7"):
         bench.begin(births=[(7, 1)])
 
 
@@ -233,7 +234,7 @@ def ledger(safeguards: Safeguards) -> None:
         assert isinstance(dones[0], Done)
         bench.give(lie(dones[0]))
         bench.give(dones[1])
-        with pytest.raises(LedgerError, match="zone 0"):
+        with pytest.raises(ProtocolError, match="zone 0"):
             bench.commit()
 
 

@@ -10,8 +10,7 @@ from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass, field
 
-from cavmarl.core.errors import StoreError
-from cavmarl.ownership.directory import Directory
+from cavmarl.ownership.directory import Directory, StoreError
 from cavmarl.ownership.endpoint import Endpoint
 from cavmarl.ownership.invariants import Monitor
 from cavmarl.ownership.ledger import row_hash, world_digest

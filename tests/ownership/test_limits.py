@@ -6,7 +6,7 @@ from typing import Any
 
 import pytest
 
-from cavmarl.core.errors import ConfigError, LedgerError
+from cavmarl.core.errors import ConfigError, ProtocolError
 from cavmarl.ownership.distances import Distances
 from cavmarl.ownership.ledger import SeenIds, Tally, tally
 from cavmarl.ownership.limits import DeadlinePolicy, Limits
@@ -46,7 +46,7 @@ def test_a_tally_is_that_of_its_set() -> None:
     assert whole == Tally().plus(RUN, 9, 1).plus(RUN, 7, 0).plus(RUN, 8, 3)
     assert whole.minus(RUN, 8, 3) == tally(RUN, {7: 0, 9: 1})
     assert tally(RUN, {7: 1}) != tally(RUN, {7: 0}) != tally(bytes(16), {7: 0})
-    with pytest.raises(LedgerError, match="2 vehicles instead of 3"):
+    with pytest.raises(ProtocolError, match="2 vehicles instead of 3"):
         whole.check(whole.minus(RUN, 8, 3), "here")
 
 

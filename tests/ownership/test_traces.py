@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 
-from cavmarl.core.errors import InvariantError
+from cavmarl.core.errors import ProtocolError
 from cavmarl.ownership.directory import Directory
 from cavmarl.ownership.limits import Limits
 from cavmarl.ownership.messages import (
@@ -215,7 +215,7 @@ def test_the_judge_accepts_a_correct_run(entries: tuple[Entry, ...]) -> None:
 def test_the_judge_refuses_another_switch(
     entries: tuple[Entry, ...], change: dict[str, object], why: str
 ) -> None:
-    with pytest.raises(InvariantError, match=why):
+    with pytest.raises(ProtocolError, match=why):
         judge(changed_switch(entries, **change))
 
 
@@ -234,7 +234,7 @@ def test_the_judge_refuses_another_switch(
 def test_the_judge_misses_what_is_left_out(
     entries: tuple[Entry, ...], kind: type, why: str
 ) -> None:
-    with pytest.raises(InvariantError, match=why):
+    with pytest.raises(ProtocolError, match=why):
         judge(without(entries, kind, lambda entry: True))
 
 
@@ -250,7 +250,7 @@ def test_the_judge_refuses_a_switch_without_its_ack(entries: tuple[Entry, ...]) 
             and switch.vehicle in [held.vehicle for held in entry.item.entries]
         ),
     )
-    with pytest.raises(InvariantError, match=f"v{switch.vehicle} switches"):
+    with pytest.raises(ProtocolError, match=f"v{switch.vehicle} switches"):
         judge(lost)
 
 
@@ -259,7 +259,7 @@ def test_the_judge_refuses_a_step_before_its_record(entries: tuple[Entry, ...]) 
     (after, *_) = places(entries, Step, lambda entry: entry.item.tick == begin.tick)
     swapped = list(entries)
     swapped[k], swapped[after] = swapped[after], swapped[k]
-    with pytest.raises(InvariantError, match="before it was logged"):
+    with pytest.raises(ProtocolError, match="before it was logged"):
         judge(swapped)
 
 
@@ -268,7 +268,7 @@ def test_the_judge_refuses_a_done_without_its_confirmation(entries: tuple[Entry,
         Entry(to, replace(item, confirmed=())) if isinstance(item, Done) else Entry(to, item)
         for to, item in entries
     ]
-    with pytest.raises(InvariantError, match="did not CONFIRM"):
+    with pytest.raises(ProtocolError, match="did not CONFIRM"):
         judge(lied)
 
 
@@ -280,7 +280,7 @@ def test_the_judge_refuses_a_wrong_ledger(entries: tuple[Entry, ...]) -> None:
     lie = replace(
         commit, zones=(zone._replace(owned=zone.owned._replace(digest=1)), *commit.zones[1:])
     )
-    with pytest.raises(InvariantError, match="does not own what it should"):
+    with pytest.raises(ProtocolError, match="does not own what it should"):
         judge([*entries[:k], Entry(LOG, lie), *entries[k + 1 :]])
 
 
@@ -291,7 +291,7 @@ def test_the_judge_refuses_a_stale_acknowledgement() -> None:
     ack = acks[0].item
     assert isinstance(ack, Ack)
     bench.trace.delivered(COORDINATOR, replace(ack, tick=2))
-    with pytest.raises(InvariantError, match="never held so"):
+    with pytest.raises(ProtocolError, match="never held so"):
         bench.judge()
 
 
@@ -301,5 +301,5 @@ def test_the_judge_accepts_campaigns_and_refuses_them_when_a_record_is_gone(seed
     simulator.run(15)
     entries = tuple(simulator.trace.entries)
     for k in places(entries, Begin, lambda entry: True):
-        with pytest.raises(InvariantError):
+        with pytest.raises(ProtocolError):
             judge([*entries[:k], *entries[k + 1 :]])

@@ -7,7 +7,7 @@ from itertools import product
 
 import pytest
 
-from cavmarl.core.errors import LedgerError, TransitionError
+from cavmarl.core.errors import ProtocolError
 from cavmarl.ownership.endpoint import Endpoint
 from cavmarl.ownership.messages import In, Out, Removed, Spawn
 from cavmarl.ownership.transitions import TABLE, Event, Party, State, after, mermaid
@@ -26,7 +26,7 @@ def test_what_is_not_listed_does_not_happen() -> None:
         if (party, state, event) in TABLE:
             assert after(party, state, event) is TABLE[party, state, event]
             continue
-        with pytest.raises(TransitionError, match=f"{event} of {party}, which is {state}"):
+        with pytest.raises(ProtocolError, match=f"{event} of {party}, which is {state}"):
             after(party, state, event)
 
 
@@ -41,13 +41,13 @@ def test_a_host_is_not_given_what_it_owns_and_gives_nothing_that_it_does_not_own
         replace(step, spawn=(Spawn(7, b"state"),)),
     ):
         host = Endpoint(bench.directory.hosting(0), bench.limits)
-        with pytest.raises(TransitionError, match="a vehicle's row"):
+        with pytest.raises(ProtocolError, match="a vehicle's row"):
             host.on_message(wrong)
     host = Endpoint(bench.directory.hosting(0), bench.limits)
     host.on_message(step)
-    with pytest.raises(TransitionError, match="REMOVE of a vehicle's row"):
+    with pytest.raises(ProtocolError, match="REMOVE of a vehicle's row"):
         host.complete(0, [Removed(8, 0)])
-    with pytest.raises(LedgerError, match="zone 0 on its way to tick 2"):
+    with pytest.raises(ProtocolError, match="zone 0 on its way to tick 2"):
         Endpoint(replace(bench.directory.hosting(0), owned={}), bench.limits).on_message(step)
 
 

@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 
 import cavmarl.parallel.hosts.host_pool as pool_module
-from cavmarl.core.errors import WorkerDeathError, WorkerError, WorkerFailureError, WorkerStartError
+from cavmarl.core.errors import WorkerDeathError, WorkerError, WorkerFailureError
 from cavmarl.parallel.hosts.host_commands import HostProgram
 from cavmarl.parallel.hosts.host_pool import HostPool
 from tests.support.toy_hosts import ADD, DOZE, FAIL, FALL, TASKS, TOIL, TOTAL, WRITE, Processes
@@ -195,7 +195,7 @@ def test_a_job_that_cannot_be_made() -> None:
 
 def test_hosts_of_other_code_are_refused() -> None:
     processes = Processes(2, code="another")
-    with pytest.raises(WorkerStartError, match="runs another, this machine toy: install the same"):
+    with pytest.raises(WorkerError, match="runs another, this machine toy: install the same"):
         HostPool(processes, PROGRAM, 60.0, 3)
     assert all(process.poll() is not None for process in processes.processes)
 
@@ -203,12 +203,12 @@ def test_hosts_of_other_code_are_refused() -> None:
 def test_hosts_that_do_not_come(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(pool_module, "COMES_S", 1.0)
     processes = Processes(1)
-    with pytest.raises(WorkerStartError, match=r"[01] of 2 are there.*within 1 s; ray status"):
+    with pytest.raises(WorkerError, match=r"[01] of 2 are there.*within 1 s; ray status"):
         HostPool(processes, PROGRAM, 60.0, 3)
     monkeypatch.undo()
     processes = Processes(1)
     processes.words = "no way to the caller"
-    with pytest.raises(WorkerStartError, match="no way to the caller"):
+    with pytest.raises(WorkerError, match="no way to the caller"):
         HostPool(processes, PROGRAM, 60.0, 3)
 
 

@@ -10,7 +10,7 @@ import pytest
 import yaml
 
 from cavmarl import ConfigError, make_vec
-from cavmarl.core.errors import WorkerStartError
+from cavmarl.core.errors import WorkerError
 
 pytest.importorskip("ray", reason="needs the extra: ray (make ray)")
 
@@ -58,7 +58,7 @@ def test_hosts_are_killed_and_nobody_can_tell(env: list[str]) -> None:
 
 def test_a_cluster_that_is_not_there(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("RAY_ADDRESS", "127.0.0.1:1")
-    with pytest.raises(WorkerStartError, match=r"no Ray cluster at 127.0.0.1:1.*ray start --head"):
+    with pytest.raises(WorkerError, match=r"no Ray cluster at 127.0.0.1:1.*ray start --head"):
         make_vec("ring", workers=1, hosts="ray")
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from cavmarl.core.errors import CorruptMessageError
+from cavmarl.core.errors import MessageError
 from cavmarl.parallel.split_hosts.replica_memory import ARENA, Replica, ReplicaMemory
 
 
@@ -69,5 +69,5 @@ def test_a_new_process_is_sent_everything_and_then_what_changes() -> None:
 )
 def test_changes_of_another_memory_are_refused(words: list[int]) -> None:
     memory, _ = make()
-    with pytest.raises(CorruptMessageError):
+    with pytest.raises(MessageError):
         Replica(memory, 100).take(np.array(words, dtype=np.uint64))

@@ -21,7 +21,7 @@ import pytest
 
 import cavmarl
 from cavmarl import CavVectorEnv, make_vec
-from cavmarl.core.errors import ConfigError, SensorFrameError, WorkerError
+from cavmarl.core.errors import ConfigError, WorkerError
 from cavmarl.parallel.local_worlds import LocalWorlds
 from cavmarl.parallel.sensor_workers import sensor_pool as sensor_farm
 from cavmarl.parallel.sensor_workers import sensor_shares
@@ -263,9 +263,8 @@ def test_a_frame_of_another_tick_is_refused() -> None:
         turn = Turn(0, sensor, farm.shared.due_of(0), vec.worlds.arrays.frames[sensor.name])
         turn.due.num[:] = 1
         farm.shared.delivered[0, 0, 0] += 1
-        with pytest.raises(SensorFrameError, match=r"rig\.wheels: the frame of tick 0") as caught:
+        with pytest.raises(WorkerError, match=r"rig\.wheels: the frame of tick 0 .* one of tick 1"):
             farm.check([turn])
-        assert (caught.value.tick, caught.value.found) == (0, 1)
     finally:
         vec.close()
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from cavmarl.core.errors import SumoStateError, WorkerError
+from cavmarl.core.errors import SumoError, WorkerError
 from cavmarl.parallel.checkpoint.sumo_log import FIRST_LOG_BYTES, KeptLog
 from cavmarl.parallel.processes.shared_memory import Segment
 from cavmarl.traffic.sumo.sumo_history import ToldLog
@@ -49,7 +49,7 @@ def test_a_log_that_is_begun_anew_leaves_what_it_gave() -> None:
 
 
 def test_more_ticks_than_were_noted_are_refused() -> None:
-    with pytest.raises(SumoStateError, match=r"of 4 ticks of a SUMO 3 are on record.*reset"):
+    with pytest.raises(SumoError, match=r"of 4 ticks of a SUMO 3 are on record.*reset"):
         log_of(3).ticks(4)
 
 
@@ -57,7 +57,7 @@ def test_more_ticks_than_were_noted_are_refused() -> None:
 def test_a_log_that_would_be_too_long_is_given_up_until_it_is_begun_anew(most_bytes: int) -> None:
     log = log_of(200, most_bytes)
     assert log.words.nbytes < 100
-    with pytest.raises(SumoStateError, match=r"more than .* MiB.*sumo\.replay_mib"):
+    with pytest.raises(SumoError, match=r"more than .* MiB.*sumo\.replay_mib"):
         log.ticks(1)
     log.begin()
     assert bytes_of(log, 0) == []

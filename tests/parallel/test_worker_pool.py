@@ -23,7 +23,6 @@ from cavmarl.core.errors import (
     WorkerDeathError,
     WorkerError,
     WorkerFailureError,
-    WorkerStartError,
 )
 from cavmarl.parallel.processes.shared_memory import Segment
 from cavmarl.parallel.processes.worker_pool import Pool, Program
@@ -351,7 +350,7 @@ def test_a_program_that_does_not_come_up() -> None:
     with pytest.raises(WorkerFailureError, match="no jobs today") as caught:
         Pool(program(2, fails="no jobs today"), 60.0, 3)
     assert "make_jobs" in caught.value.traceback
-    with pytest.raises(WorkerStartError, match="ended with 3"):
+    with pytest.raises(WorkerError, match="ended with 3"):
         Pool(program(2, ends=3), 60.0, 3)
     del caught
     gc.collect()
@@ -359,7 +358,7 @@ def test_a_program_that_does_not_come_up() -> None:
 
 
 def test_memory_that_cannot_be_had() -> None:
-    with pytest.raises(WorkerStartError, match=r"GB of shared memory .* num_envs"):
+    with pytest.raises(WorkerError, match=r"GB of shared memory .* num_envs"):
         Segment.make(1 << 50)
 
 

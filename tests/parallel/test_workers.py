@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from cavmarl import CapacityError, ConfigError, InvalidActionError, make_vec
+from cavmarl import ActionError, CapacityError, ConfigError, make_vec
 from cavmarl.config.registry import entries
 from cavmarl.core.errors import WorkerDeathError, WorkerError
 from cavmarl.parallel.processes.worker_processes import Crew
@@ -122,7 +122,7 @@ def test_an_action_that_is_refused_changes_nothing(make: Make) -> None:
     before = [vec.state_hash(w) for w in range(3)]
     wrong = np.zeros((3, 2, 2))
     wrong[2, 1, 0] = 3.0
-    with pytest.raises(InvalidActionError, match="world 2, car_1"):
+    with pytest.raises(ActionError, match="world 2, car_1"):
         vec.step(wrong)
     assert [vec.state_hash(w) for w in range(3)] == before
 

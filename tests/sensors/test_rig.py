@@ -11,7 +11,7 @@ import pytest
 from cavmarl import make_vec, parallel_env
 from cavmarl.config.registry import load_config, load_rig
 from cavmarl.config.rig import GnssConfig
-from cavmarl.core.errors import ConfigError, UnknownAgentError
+from cavmarl.core.errors import ActionError, ConfigError
 from cavmarl.engine.world_setup import load_world
 from cavmarl.env.vector import CavVectorEnv
 from cavmarl.parallel.local_worlds import LocalWorlds
@@ -150,7 +150,7 @@ def test_one_agent_has_its_own_samples() -> None:
     for name, sensor in env.frames("car_2").items():
         for array, all_of_them in zip(sensor, vec.frames()[name], strict=True):
             np.testing.assert_array_equal(array, all_of_them[0, 2])
-    with pytest.raises(UnknownAgentError, match="no agent 'car_99'"):
+    with pytest.raises(ActionError, match="no agent 'car_99'"):
         env.frames("car_99")
 
 

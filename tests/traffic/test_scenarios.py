@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from cavmarl.core.errors import CavmarlError, ConfigError, PolicyError, ScenarioError
+from cavmarl.core.errors import CavmarlError, ConfigError, PolicyError
 from cavmarl.core.records.codes import DRIVER_SCRIPTED
 from cavmarl.driving.kernels.junctions import link_signal
 from cavmarl.env.parallel import parallel_env
@@ -189,9 +189,9 @@ def test_the_seed_draws_the_place_and_its_name_says_it_again() -> None:
 
 
 BROKEN: tuple[tuple[dict[str, Any], type[CavmarlError], str], ...] = (
-    ({"name": "pedestrian_crosing"}, ScenarioError, "did you mean pedestrian_crossing"),
-    ({"place": "nowhere"}, ScenarioError, "scenario.place = 'nowhere': not one of the"),
-    ({"env": "ring"}, ScenarioError, "has no place for it; it needs a straight road"),
+    ({"name": "pedestrian_crosing"}, ConfigError, "did you mean pedestrian_crossing"),
+    ({"place": "nowhere"}, ConfigError, "scenario.place = 'nowhere': not one of the"),
+    ({"env": "ring"}, ConfigError, "has no place for it; it needs a straight road"),
     ({"params": {"walk_mp": 1.0}}, ConfigError, "did you mean walk_mps"),
     ({"params": {"walk_mps": 9.0}}, ConfigError, "must be 0.5 to 3 m/s"),
     ({"params": {"walk_mps": True}}, ConfigError, "must be 0.5 to 3 m/s"),
@@ -246,7 +246,7 @@ def test_agents_of_a_parallel_env_play_it_too() -> None:
 
 
 def test_a_scene_has_room_for_so_many_agents() -> None:
-    with pytest.raises(ScenarioError, match=r"population\.agents = 400: .* ask for at most \d+"):
+    with pytest.raises(ConfigError, match=r"population\.agents = 400: .* ask for at most \d+"):
         make_scenario("merge_conflict", agents=400)
     with pytest.raises(ConfigError, match=r"population\.agents = 0: must be 1 or more"):
         make_vec("grid4x4", agents=0, overrides={"scenario.name": "failed_u_turn"})
@@ -288,11 +288,11 @@ def test_anybody_can_add_one_in_a_file(tmp_path: Path) -> None:
     assert (found.verdict, found.min_ttc_s, found.pet_s) == ("passed", None, None)
     path = tmp_path / "broken.py"
     path.write_text("NEEDS = 1 / 0", encoding="utf-8")
-    with pytest.raises(ScenarioError, match=r"broken\.py: ZeroDivisionError"):
+    with pytest.raises(ConfigError, match=r"broken\.py: ZeroDivisionError"):
         make_scenario(str(path))
     path = tmp_path / "half.py"
     path.write_text("NEEDS = 'a road'", encoding="utf-8")
-    with pytest.raises(ScenarioError, match="does not define Parameters, places, stage"):
+    with pytest.raises(ConfigError, match="does not define Parameters, places, stage"):
         make_scenario(str(path))
 
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from cavmarl import make_vec, parallel_env
-from cavmarl.core.errors import UnknownAgentError, V2xError
+from cavmarl.core.errors import ActionError, ConfigError
 from cavmarl.engine.spaces import observation_parts
 from cavmarl.v2x.kernels.v2x_records import CAUSE_OBSTACLE, KIND_DENM
 from cavmarl.v2x.v2x_messages import messages_of
@@ -77,19 +77,19 @@ def test_a_roadside_unit_tells_and_is_told() -> None:
     assert heard["cause"] in (CAUSE_OBSTACLE, 99)
     at_unit = messages_of(KIND_DENM, bus.mail.events[0, bus.receiver_of_unit(5)])
     assert [event["cause"] for event in at_unit] == [99]
-    with pytest.raises(V2xError, match="roadside unit 16"):
+    with pytest.raises(ConfigError, match="roadside unit 16"):
         bus.declare_of_unit(0, 16, "obstacle")
 
 
 def test_wrong_events_are_refused() -> None:
     env = parallel_env("grid4x4", overrides=TOLD)
     env.reset(seed=0)
-    with pytest.raises(UnknownAgentError, match="car_99"):
+    with pytest.raises(ActionError, match="car_99"):
         env.declare_event("car_99", "obstacle")
-    with pytest.raises(V2xError, match=r"'earthquake'.*obstacle"):
+    with pytest.raises(ConfigError, match=r"'earthquake'.*obstacle"):
         env.declare_event(env.agents[0], "earthquake")
     silent = make_vec("ring")
-    with pytest.raises(V2xError, match=r"v2x\.enabled"):
+    with pytest.raises(ConfigError, match=r"v2x\.enabled"):
         silent.declare_event(0, 0, "obstacle")
-    with pytest.raises(UnknownAgentError, match="agent 99"):
+    with pytest.raises(ActionError, match="agent 99"):
         make_vec("grid4x4", overrides=TOLD).declare_event(0, 99, "obstacle")

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from cavmarl.core.errors import V2xError
+from cavmarl.core.errors import ConfigError, MessageError
 from cavmarl.v2x.kernels.v2x_records import KIND_CAM
 from cavmarl.v2x.network_simulator import RECEPTION, Exchange
 from cavmarl.v2x.v2x_messages import messages_of
@@ -122,14 +122,14 @@ def test_answers_that_cannot_be_are_refused(reception: tuple[int, int, int], wor
 
     world.bus.connect(Liar())
     world.put(PLACES)
-    with pytest.raises(V2xError, match=words):
+    with pytest.raises(MessageError, match=words):
         world.tick()
 
 
 def test_what_is_no_array_is_refused_and_so_is_a_missing_simulator() -> None:
     world = Standing(2, **EXTERNAL)
     world.put(PLACES)
-    with pytest.raises(V2xError, match="connect a network simulator"):
+    with pytest.raises(ConfigError, match="connect a network simulator"):
         world.tick()
 
     class Wordy:
@@ -137,7 +137,7 @@ def test_what_is_no_array_is_refused_and_so_is_a_missing_simulator() -> None:
             return [(1, 0, 0)]
 
     world.bus.connect(Wordy())
-    with pytest.raises(V2xError, match="dtype RECEPTION"):
+    with pytest.raises(MessageError, match="dtype RECEPTION"):
         world.tick()
-    with pytest.raises(V2xError, match="our own"):
+    with pytest.raises(ConfigError, match="our own"):
         Standing(2).bus.connect(Wordy())

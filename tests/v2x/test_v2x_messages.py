@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from cavmarl.core.errors import V2xError
+from cavmarl.core.errors import MessageError
 from cavmarl.v2x.kernels.v2x_records import KIND_CAM, KIND_CPM, KIND_DENM, KIND_SPAT, PACKET, REPORT
 from cavmarl.v2x.v2x_messages import HEADER, KINDS, SCHEMA_VERSION, decode, encode
 
@@ -49,14 +49,14 @@ def test_what_is_encoded_is_decoded(kind: int) -> None:
 
 def test_bytes_that_are_no_message_are_refused() -> None:
     data = example(KIND_CAM)
-    with pytest.raises(V2xError, match="3 bytes are no message"):
+    with pytest.raises(MessageError, match="3 bytes are no message"):
         decode(data[:3])
-    with pytest.raises(V2xError, match="version 9: version 1"):
+    with pytest.raises(MessageError, match="version 9: version 1"):
         decode(b"\x09\x00" + data[2:])
-    with pytest.raises(V2xError, match="kind 8"):
+    with pytest.raises(MessageError, match="kind 8"):
         decode(data[:2] + b"\x08\x00" + data[4:])
-    with pytest.raises(V2xError, match=f"with 1 records it has {len(data)}"):
+    with pytest.raises(MessageError, match=f"with 1 records it has {len(data)}"):
         decode(data + b"\x00")
-    with pytest.raises(V2xError, match="with 4294967295 records"):
+    with pytest.raises(MessageError, match="with 4294967295 records"):
         decode(data[:4] + b"\xff\xff\xff\xff" + data[8:])
     assert HEADER.itemsize == 40

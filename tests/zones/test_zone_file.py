@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 from hypothesis import HealthCheck, given, settings
 
-from cavmarl.core.errors import ConfigError, ZoneError
+from cavmarl.core.errors import ConfigError
 from cavmarl.roads.sumo_net.reader import read_network
 from cavmarl.zones.partition.zone_file import read_zones, write_zones, zones_for
 from cavmarl.zones.partition.zone_partition import ZonePartition
@@ -108,7 +108,7 @@ def test_what_is_no_zone_file_is_refused(tmp_path: Path, text: str) -> None:
 
 
 def test_what_cannot_be_written_is_said(tmp_path: Path) -> None:
-    with pytest.raises(ZoneError, match="cannot be written"):
+    with pytest.raises(ConfigError, match="cannot be written"):
         write_zones(tmp_path / "no" / "folder.json", four())
 
 
@@ -117,7 +117,7 @@ def test_a_file_must_be_of_this_map_and_number(
 ) -> None:
     network, path = read_network(crossing()), tmp_path / "zones.json"
     write_zones(path, four())
-    with pytest.raises(ZoneError, match=r"zones\.count = 2: .*zones\.json has 4 zones; use 4"):
+    with pytest.raises(ConfigError, match=r"zones\.count = 2: .*zones\.json has 4 zones; use 4"):
         zones_for(network, path, 2)
-    with pytest.raises(ZoneError, match=r"do not hold the roads of 'crossing', which reach from"):
+    with pytest.raises(ConfigError, match=r"do not hold the roads of 'crossing', which reach from"):
         zones_for(network, path, 4)

@@ -5,14 +5,14 @@ from itertools import pairwise
 
 import pytest
 
-from cavmarl.core.errors import ZoneError
+from cavmarl.core.errors import ConfigError
 from cavmarl.zones.partition.zone_halo import zone_halo
 from tests.support.partitions import PINWHEEL, four
 
 
 @pytest.mark.parametrize("value", [-1.0, math.inf, math.nan])
 def test_a_halo_is_a_finite_number_from_0(value: float) -> None:
-    with pytest.raises(ZoneError, match="halo_m = "):
+    with pytest.raises(ConfigError, match="halo_m = "):
         zone_halo(four(), value)
 
 

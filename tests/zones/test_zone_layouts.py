@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from cavmarl.core.errors import ZoneError
+from cavmarl.core.errors import ConfigError
 from cavmarl.maps.netconvert import map_file
 from cavmarl.roads.cache import load_network
 from cavmarl.roads.network import RoadNetwork
@@ -78,14 +78,14 @@ def test_a_density_is_shared_out_instead_of_lanes(cross: RoadNetwork) -> None:
     crowd = np.array([[x, 0.0, 1.0] for x in range(40)] + [[-90.0, 0.0, 40.0], [70.0, 0.0, 0.0]])
     zones = cut_map(cross, "bisection", 2, density=crowd)
     assert -90.0 < zones.arrays.cuts_x[0] <= 0.0
-    with pytest.raises(ZoneError, match="density: must be rows of x, y and weight"):
+    with pytest.raises(ConfigError, match="density: must be rows of x, y and weight"):
         cut_map(cross, "bisection", 2, density=crowd[:, :2])
-    with pytest.raises(ZoneError, match="density"):
+    with pytest.raises(ConfigError, match="density"):
         cut_map(cross, "bisection", 2, density=crowd * np.nan)
 
 
 def test_no_other_weight_is_known(cross: RoadNetwork) -> None:
-    with pytest.raises(ZoneError, match="weight 'speed': there are lane_length, uniform"):
+    with pytest.raises(ConfigError, match="weight 'speed': there are lane_length, uniform"):
         cut_map(cross, "bisection", 2, weight="speed")
 
 
@@ -108,7 +108,7 @@ def test_area_is_shared_out_on_request(cross: RoadNetwork) -> None:
 def test_more_than_the_map_can_hold_is_refused(
     cross: RoadNetwork, layout: str, count: int, words: str
 ) -> None:
-    with pytest.raises(ZoneError, match=words):
+    with pytest.raises(ConfigError, match=words):
         cut_map(cross, layout, count)
 
 

@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from cavmarl.core.errors import ZoneError
+from cavmarl.core.errors import ConfigError
 from cavmarl.zones.partition.zone_partition import Neighbor, ZonePartition
 from tests.naive import zones as naive
 from tests.support.partitions import BOUNDS, PINWHEEL, four, partitions, places
@@ -78,14 +78,14 @@ def test_what_is_no_division_is_refused(change: tuple[int, int, float], words: s
     zone, side, value = change
     rects = four().rects.copy()
     rects[zone, side] = value
-    with pytest.raises(ZoneError, match=words):
+    with pytest.raises(ConfigError, match=words):
         ZonePartition(BOUNDS, rects)
 
 
 def test_bounds_are_zones_too() -> None:
-    with pytest.raises(ZoneError, match="there are no zones"):
+    with pytest.raises(ConfigError, match="there are no zones"):
         ZonePartition(BOUNDS, np.empty((0, 4)))
-    with pytest.raises(ZoneError, match=r"bounds_m: .* must be finite"):
+    with pytest.raises(ConfigError, match=r"bounds_m: .* must be finite"):
         ZonePartition((-np.inf, *BOUNDS[1:]), four().rects)
-    with pytest.raises(ZoneError, match="no zone reaches max_x = 70 of bounds_m"):
+    with pytest.raises(ConfigError, match="no zone reaches max_x = 70 of bounds_m"):
         ZonePartition((*BOUNDS[:2], 70.0, BOUNDS[3]), four().rects)

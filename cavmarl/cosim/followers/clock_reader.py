@@ -13,7 +13,7 @@ import json
 import sys
 from fractions import Fraction
 
-from cavmarl.core.errors import TickRefusedError
+from cavmarl.core.errors import ClockError
 from cavmarl.cosim.followers.follower_client import Follower
 
 __all__ = ["is_due"]
@@ -34,7 +34,7 @@ def _main(place: str, share: Fraction) -> None:
                 own += 1
                 try:
                     tick = follower.tick().tick
-                except TickRefusedError:
+                except ClockError:
                     refused += 1
             ticks.append(tick)
             if not sight.snapshot.is_over:

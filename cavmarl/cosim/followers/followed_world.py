@@ -20,10 +20,9 @@ from typing import Any, Literal, Self
 
 from cavmarl.core.errors import (
     ConfigError,
-    EpisodeEndedError,
+    EpisodeError,
     FollowerError,
-    FollowerMessageError,
-    FollowerTimeoutError,
+    FollowerLostError,
 )
 from cavmarl.cosim.followers.follower_barrier import BadControls, Barrier, Seat
 from cavmarl.cosim.followers.follower_connection import Address, Line
@@ -51,7 +50,7 @@ class FollowedWorld:
         own_ticks: what becomes of a follower's own tick; see `TimeMaster`.
         on_drift: see `TimeMaster`.
         bad_controls: what becomes of controls that cannot be carried out: `error`: its follower is
-            let go with a `ControlError`; `hold`: the vehicle's last ones are used, and it is
+            let go with a `FollowerError`; `hold`: the vehicle's last ones are used, and it is
             counted.
         pacer: how fast by the wall clock; None: as fast as it goes.
         trace: notes the phases of each step.
@@ -62,7 +61,7 @@ class FollowedWorld:
 
     Raises:
         ConfigError: nobody can listen there, or a trace of a world that workers run.
-        SecondMasterError: the environment has a master.
+        ClockError: the environment has a master.
     """
 
     def __init__(
@@ -98,7 +97,6 @@ class FollowedWorld:
         self._is_closed = False
 
     def __enter__(self) -> Self:
-        """The world."""
         return self
 
     def __exit__(
@@ -107,7 +105,6 @@ class FollowedWorld:
         error: BaseException | None,
         traceback: TracebackType | None,
     ) -> None:
-        """Close it."""
         self.close()
 
     @property
@@ -117,22 +114,22 @@ class FollowedWorld:
 
     @property
     def is_over(self) -> bool:
-        """The episode has ended, or none has begun."""
         return not self.env.agents
 
     def wait_for(self, followers: int, within_s: float) -> None:
         """Wait until so many follow.
 
         Raises:
-            FollowerTimeoutError: they have not come in time.
+            FollowerLostError: they have not come in time.
         """
         until_s = time.monotonic() + within_s
         while len(self._seats) < followers:
             left_s = until_s - time.monotonic()
             if left_s <= 0.0:
-                raise FollowerTimeoutError(
+                raise FollowerLostError(
                     f"{len(self._seats)} of {followers} followers have called {self.address} "
-                    f"within {within_s:g} s: start them with `cavmarl follow {self.address}`"
+                    f"within {within_s:g} s: start them with `cavmarl follow {self.address}`",
+                    is_late=True,
                 )
             self._admit(left_s)
 
@@ -153,16 +150,16 @@ class FollowedWorld:
         """One cycle; rewards by agent.
 
         Raises:
-            EpisodeEndedError: there is nobody to go on with.
-            FollowerTimeoutError: a follower has not answered in time; it is let go. The world has
-                gone on by one step, and the next call goes on from there.
-            FollowerLostError: the same, where a follower has ended.
-            FollowerMessageError: the same, where it has said what nobody understands.
-            ControlError: the same, where its controls cannot be carried out.
-            ClockDriftError: somebody else has advanced the world.
+            EpisodeError: there is nobody to go on with.
+            FollowerLostError: a follower has not answered in time; it is let go. The world has gone
+                on by one step, and the next call goes on from there; the same, where a follower has
+                ended.
+            FollowerError: the same, where it has said what nobody understands; the same, where its
+                controls cannot be carried out.
+            ClockError: somebody else has advanced the world.
         """
         if self.is_over:
-            raise EpisodeEndedError("the episode is over: call FollowedWorld.reset()")
+            raise EpisodeError("the episode is over: call FollowedWorld.reset()")
         self._admit(0.0)
         self._exchange([seat for seat in self._seats if seat.frame < self._frame])
         agents = self.env.agents
@@ -202,13 +199,11 @@ class FollowedWorld:
         self.master.release()
 
     def close_reception(self) -> None:
-        """Let nobody call any more."""
         self._reception.close()
         if not isinstance(self.address, int):
             Path(self.address).unlink(missing_ok=True)
 
     def _admit(self, within_s: float) -> None:
-        """Give seats to those who have called."""
         for line, hello in self._reception.callers(within_s):
             try:
                 self._seat(line, hello)
@@ -226,29 +221,28 @@ class FollowedWorld:
         """The agents that a newcomer wants.
 
         Raises:
-            FollowerMessageError: there are none of that name, or somebody else drives them.
+            FollowerError: there are none of that name, or somebody else drives them.
         """
         known = {agent: k for k, agent in enumerate(self.env.possible_agents)}
         taken = {k: seat.clock.name for seat in self._seats for k in seat.agents}
         for agent in vehicles:
             if agent not in known:
-                raise FollowerMessageError(
+                raise FollowerError(
                     f"no agent '{agent[:80]}': there are {self.env.possible_agents[0]} to "
                     f"{self.env.possible_agents[-1]}"
                 )
             if known[agent] in taken:
-                raise FollowerMessageError(
+                raise FollowerError(
                     f"{agent} is driven by '{taken[known[agent]]}': ask for another one"
                 )
         if len(set(vehicles)) < len(vehicles):
-            raise FollowerMessageError("an agent was asked for twice")
+            raise FollowerError("an agent was asked for twice")
         return tuple(sorted(known[agent] for agent in vehicles))
 
     def _names(self, agents: Iterable[int]) -> list[str]:
         return [self.env.possible_agents[k] for k in agents]
 
     def _drop(self, seat: Seat) -> None:
-        """Go on without a follower."""
         seat.line.close()
         self._seats.remove(seat)
         if seat.clock in self.master.followers:

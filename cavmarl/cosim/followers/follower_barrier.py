@@ -11,13 +11,10 @@ from typing import Any, Literal
 import numpy as np
 
 from cavmarl.core.errors import (
-    ControlError,
+    ActionError,
+    ClockError,
     FollowerError,
     FollowerLostError,
-    FollowerMessageError,
-    FollowerTimeoutError,
-    InvalidActionError,
-    TickRefusedError,
 )
 from cavmarl.cosim.followers.follower_connection import Line
 from cavmarl.cosim.followers.follower_messages import Control, Say, Ticked, read_letter
@@ -108,11 +105,10 @@ class Barrier:
             asked[seat] = list(snapshot.vehicles)
             try:
                 seat.line.say(Say.SNAPSHOT, snapshot, arrays, self._timeout_s)
-            except FollowerTimeoutError as error:
-                found.failed[seat] = error
-                del asked[seat]
-            except FollowerLostError:
-                continue  # its last words are heard below: it may have said goodbye
+            except FollowerLostError as error:
+                if error.is_late:  # else its last words are heard below: it may have said goodbye
+                    found.failed[seat] = error
+                    del asked[seat]
         if moment.is_over or not asked:
             return found
         answers = self._collect(asked, moment, found)
@@ -121,7 +117,7 @@ class Barrier:
                 try:
                     found.actions |= self._checked(seat, answers[seat], asked[seat])
                     seat.answers += 1
-                except ControlError as error:
+                except FollowerError as error:
                     found.failed[seat] = error
         return found
 
@@ -178,11 +174,11 @@ class Barrier:
             case Say.CONTROL:
                 control = read_letter(Control, heard.letter)
             case kind:
-                raise FollowerMessageError(
+                raise FollowerError(
                     f"{seat.line.name} says {kind.name}: controls of frame {moment.frame} are due"
                 )
         if control.frame > moment.frame:
-            raise FollowerMessageError(
+            raise FollowerError(
                 f"{seat.line.name} answers frame {control.frame}; the last is {moment.frame}"
             )
         if control.frame < moment.frame:
@@ -195,7 +191,7 @@ class Barrier:
         done, refused = False, ""
         try:
             done = seat.clock.tick()
-        except TickRefusedError as error:
+        except ClockError as error:
             refused = str(error)
         tick = int(seat.clock.master.world_ticks[0])
         seat.line.say(Say.TICKED, Ticked(done, refused, tick), within_s=within_s)
@@ -206,11 +202,11 @@ class Barrier:
         """The actions of a follower's vehicles.
 
         Raises:
-            ControlError: they cannot be carried out, and `bad_controls` is `error`.
+            FollowerError: they cannot be carried out, and `bad_controls` is `error`.
         """
         strangers = controls.keys() - set(vehicles)
         if strangers:
-            raise ControlError(
+            raise FollowerError(
                 f"{seat.line.name}: controls of {min(strangers)[:80]}, which is not in the frame"
             )
         checked: dict[str, Any] = {}
@@ -219,10 +215,10 @@ class Barrier:
                 action = _action(vehicle, controls)
                 self._env.check_action(vehicle, action)
                 checked[vehicle] = action
-            except (ControlError, InvalidActionError) as error:
+            except (FollowerError, ActionError) as error:
                 seat.bad += 1
                 if self._bad_controls == "error":
-                    raise ControlError(f"{seat.line.name}: {error}") from error
+                    raise FollowerError(f"{seat.line.name}: {error}") from error
                 if vehicle in seat.held:
                     checked[vehicle] = seat.held[vehicle]
         seat.held = checked
@@ -233,9 +229,9 @@ def _action(vehicle: str, controls: Mapping[str, Any]) -> Any:
     """One vehicle's action.
 
     Raises:
-        ControlError: there is none.
+        FollowerError: there is none.
     """
     if vehicle not in controls:
-        raise ControlError(f"no controls of {vehicle}, which is in the frame")
+        raise FollowerError(f"no controls of {vehicle}, which is in the frame")
     given = controls[vehicle]
     return np.asarray(given, dtype=np.float32) if isinstance(given, list) else given

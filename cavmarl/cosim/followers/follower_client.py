@@ -10,7 +10,7 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from cavmarl.core.errors import FollowerError, FollowerMessageError, TickRefusedError
+from cavmarl.core.errors import ClockError, FollowerError
 from cavmarl.cosim.followers.follower_connection import Address, Heard, call
 from cavmarl.cosim.followers.follower_messages import (
     Control,
@@ -96,7 +96,6 @@ class Follower:
         self._frame: int | None = None
 
     def __enter__(self) -> Self:
-        """The follower."""
         return self
 
     def __exit__(
@@ -105,7 +104,6 @@ class Follower:
         error: BaseException | None,
         traceback: TracebackType | None,
     ) -> None:
-        """Leave."""
         self.close()
 
     def __iter__(self) -> Iterator[Sight]:
@@ -113,8 +111,8 @@ class Follower:
 
         Raises:
             FollowerLostError: the world has ended without a goodbye.
-            FollowerMessageError: what it says cannot be understood, or a frame is missing.
-            FollowerError: it does not go on with us.
+            FollowerError: what it says cannot be understood, or a frame is missing; it does not go
+                on with us.
         """
         while (sight := self.wait()) is not None:
             yield sight
@@ -130,9 +128,7 @@ class Follower:
             return None
         snapshot, arrays = self._line.take(heard)
         if self._frame is not None and snapshot.frame != self._frame + 1:
-            raise FollowerMessageError(
-                f"frame {snapshot.frame} follows {self._frame}: one was left out"
-            )
+            raise FollowerError(f"frame {snapshot.frame} follows {self._frame}: one was left out")
         self._frame = snapshot.frame
         return sight_of(snapshot, arrays)
 
@@ -155,12 +151,12 @@ class Follower:
         """Try to advance the world, which a follower should not do; what has become of it.
 
         Raises:
-            TickRefusedError: the world's master refuses.
+            ClockError: the world's master refuses.
         """
         self._line.say(Say.TICK)
         ticked = read_letter(Ticked, self._expect(None, Say.TICKED).letter)
         if ticked.refused:
-            raise TickRefusedError(ticked.refused)
+            raise ClockError(ticked.refused)
         return ticked
 
     def leave(self) -> None:
@@ -169,7 +165,6 @@ class Follower:
         self._line.close()
 
     def close(self) -> None:
-        """Hang up."""
         self._line.close()
 
     def _expect(self, within_s: float | None, *kinds: Say) -> Heard:
@@ -181,7 +176,7 @@ class Follower:
         if heard.kind is Say.REFUSAL:
             self._line.skip(heard)
             raise FollowerError(read_letter(Refusal, heard.letter).reason)
-        raise FollowerMessageError(f"{self._line.name} says {heard.kind.name}, which is not due")
+        raise FollowerError(f"{self._line.name} says {heard.kind.name}, which is not due")
 
 
 def sight_of(snapshot: Snapshot, arrays: Sequence[NDArray[Any]]) -> Sight:
@@ -194,6 +189,5 @@ def sight_of(snapshot: Snapshot, arrays: Sequence[NDArray[Any]]) -> Sight:
 
 
 def _plain(given: Any) -> list[float] | int:
-    """A control as msgpack writes it."""
     array = np.asarray(given)
     return int(array) if array.ndim == 0 else [float(number) for number in array]

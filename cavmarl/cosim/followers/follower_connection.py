@@ -16,9 +16,8 @@ from numpy.typing import NDArray
 
 from cavmarl.core.errors import (
     ConfigError,
+    FollowerError,
     FollowerLostError,
-    FollowerMessageError,
-    FollowerTimeoutError,
     MessageError,
 )
 from cavmarl.cosim.followers.follower_messages import (
@@ -121,8 +120,7 @@ class Line:
             within_s: for so long it may take.
 
         Raises:
-            FollowerTimeoutError: the other end does not read.
-            FollowerLostError: the other end is gone.
+            FollowerLostError: the other end does not read; the other end is gone.
         """
         self._allow(within_s)
         letter = None if message is None else letter_of(message)
@@ -137,9 +135,8 @@ class Line:
         """The next frame; its data then have to be taken (`take`) or left out (`skip`).
 
         Raises:
-            FollowerTimeoutError: there is none in time.
-            FollowerLostError: the other end is gone.
-            FollowerMessageError: this is no frame, or one of another version.
+            FollowerLostError: there is none in time; the other end is gone.
+            FollowerError: this is no frame, or one of another version.
         """
         self._allow(within_s)
         try:
@@ -149,7 +146,7 @@ class Line:
         except (EOFError, OSError) as error:
             raise self._lost(error) from error
         except MessageError as error:
-            raise FollowerMessageError(f"{self.name}: {error}") from error
+            raise FollowerError(f"{self.name}: {error}") from error
         return Heard(Say(frame.kind), frame.letter, frame.size)
 
     def skip(self, heard: Heard) -> None:
@@ -159,7 +156,7 @@ class Line:
             FollowerError: as of `hear`; and there are some, where none belong.
         """
         if heard.size:
-            raise FollowerMessageError(
+            raise FollowerError(
                 f"{self.name}: {heard.size} bytes of data with a {heard.kind.name}: it has none"
             )
         self._take([])
@@ -173,7 +170,7 @@ class Line:
         snapshot = read_letter(Snapshot, heard.letter)
         sizes = [_size(view) for view in snapshot.arrays]
         if sum(sizes) != heard.size:
-            raise FollowerMessageError(
+            raise FollowerError(
                 f"{self.name}: {heard.size} bytes of data, but its arrays have {sum(sizes)}"
             )
         arrays = [np.empty(view.shape, dtype=view.dtype) for view in snapshot.arrays]
@@ -181,7 +178,6 @@ class Line:
         return snapshot, arrays
 
     def close(self) -> None:
-        """End the connection."""
         self._wire.close()
 
     def _take(self, arrays: list[Array]) -> None:
@@ -192,16 +188,17 @@ class Line:
         except (EOFError, OSError) as error:
             raise self._lost(error) from error
         except MessageError as error:
-            raise FollowerMessageError(f"{self.name}: {error}") from error
+            raise FollowerError(f"{self.name}: {error}") from error
 
     def _allow(self, within_s: float | None) -> None:
         self._socket.until_s = None if within_s is None else time.monotonic() + within_s
 
-    def too_late(self, what: str, within_s: float | None) -> FollowerTimeoutError:
+    def too_late(self, what: str, within_s: float | None) -> FollowerLostError:
         """The error that says that the other end has not done `what` in time."""
         span = "in time" if within_s is None else f"within {within_s:.3g} s"
-        return FollowerTimeoutError(
-            f"{self.name} has not {what} {span}: it is dead, stopped or too slow{self._cure}"
+        return FollowerLostError(
+            f"{self.name} has not {what} {span}: it is dead, stopped or too slow{self._cure}",
+            is_late=True,
         )
 
     def _lost(self, error: Exception) -> FollowerLostError:
@@ -212,18 +209,18 @@ def _size(view: ArrayView) -> int:
     """Bytes of an array.
 
     Raises:
-        FollowerMessageError: of a dtype that holds no plain numbers, a shape that no array has, or
+        FollowerError: of a dtype that holds no plain numbers, a shape that no array has, or
             stamps of other samples.
     """
     shape, name = view.shape, view.name[:80]
     if view.dtype not in _DTYPES:
         known = ", ".join(sorted(_DTYPES))
-        raise FollowerMessageError(f"{name}: dtype '{view.dtype[:80]}' is none of {known}")
+        raise FollowerError(f"{name}: dtype '{view.dtype[:80]}' is none of {known}")
     is_shape = 1 <= len(shape) <= _MAX_AXES and all(length >= 0 for length in shape)
     if not is_shape or prod(length or 1 for length in shape) > FOLLOWERS.max_data:
-        raise FollowerMessageError(f"{name}: no array has the shape {str(shape)[:80]}")
+        raise FollowerError(f"{name}: no array has the shape {str(shape)[:80]}")
     if not len(view.stamps_s) == len(view.lost) == shape[0]:
-        raise FollowerMessageError(
+        raise FollowerError(
             f"{name}: {shape[0]} samples with {len(view.stamps_s)} stamps, {len(view.lost)} marks"
         )
     return prod(shape) * np.dtype(view.dtype).itemsize

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from cavmarl.core.errors import ConfigError, FollowerMessageError
+from cavmarl.core.errors import ConfigError, FollowerError
 from cavmarl.cosim.followers.follower_client import Sight
 from cavmarl.cosim.followers.follower_messages import VehicleView, Welcome
 from cavmarl.cosim.stack.hd_map import HdMap
@@ -88,5 +88,5 @@ class StackDriver:
 
     def _mission(self, view: VehicleView) -> Mission:
         if view.goal_edge not in self._edges:
-            raise FollowerMessageError(f"no edge '{view.goal_edge[:80]}' on this map to drive to")
+            raise FollowerError(f"no edge '{view.goal_edge[:80]}' on this map to drive to")
         return Mission(self._edges[view.goal_edge], view.vclass, view.length_m, view.width_m)

@@ -22,7 +22,7 @@ from pydantic import (
     with_config,
 )
 
-from cavmarl.core.errors import FollowerMessageError, require
+from cavmarl.core.errors import FollowerError, require
 from cavmarl.parallel.hosts.framed_socket import Dialect
 
 __all__ = [
@@ -258,7 +258,7 @@ def read_letter(kind: type[T], letter: object) -> T:
     """The message of a class that a letter is.
 
     Raises:
-        FollowerMessageError: it is none: a field is missing, unknown or of another type.
+        FollowerError: it is none: a field is missing, unknown or of another type.
     """
     if kind not in _ADAPTERS:
         _ADAPTERS[kind] = TypeAdapter(kind)
@@ -267,7 +267,7 @@ def read_letter(kind: type[T], letter: object) -> T:
     except ValidationError as error:
         first = error.errors()[0]
         place = ".".join(map(str, first["loc"])) or "the letter"
-        raise FollowerMessageError(
+        raise FollowerError(
             f"no {kind.__name__} of protocol version {VERSION}: {place}: {first['msg']}"
         ) from error
     return checked

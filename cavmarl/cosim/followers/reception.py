@@ -7,7 +7,7 @@ import time
 from collections.abc import Iterator
 from contextlib import suppress
 
-from cavmarl.core.errors import FollowerError, FollowerMessageError
+from cavmarl.core.errors import FollowerError
 from cavmarl.cosim.followers.follower_connection import Address, Line, listen
 from cavmarl.cosim.followers.follower_messages import MAX_VEHICLES, Hello, Refusal, Say, read_letter
 
@@ -66,7 +66,6 @@ class Reception:
         self._dismiss_the_silent()
 
     def turn_away(self, line: Line, reason: str) -> None:
-        """Say why, and hang up."""
         self.turned_away += 1
         refuse(line, reason)
 
@@ -93,11 +92,11 @@ class Reception:
     def _greeting(self, line: Line) -> Hello:
         heard = line.hear(HEARING_S)
         if heard.kind is not Say.HELLO:
-            raise FollowerMessageError(f"a caller begins with {heard.kind.name}: HELLO comes first")
+            raise FollowerError(f"a caller begins with {heard.kind.name}: HELLO comes first")
         line.skip(heard)
         hello = read_letter(Hello, heard.letter)
         if len(hello.vehicles) > MAX_VEHICLES:
-            raise FollowerMessageError(f"a caller wants {len(hello.vehicles)} vehicles")
+            raise FollowerError(f"a caller wants {len(hello.vehicles)} vehicles")
         line.name = f"follower '{hello.name[:80]}'"
         return hello
 

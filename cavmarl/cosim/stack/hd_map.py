@@ -17,7 +17,6 @@ _CELL_M = 20.0
 
 
 def wrap(angle: float) -> float:
-    """The same angle in (-pi, pi]."""
     return math.atan2(math.sin(angle), math.cos(angle))
 
 

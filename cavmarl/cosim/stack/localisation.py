@@ -108,7 +108,6 @@ class GnssInertial:
         return max(least, float(noise[min(channel, len(noise) - 1)]))
 
     def _fix(self, readings: Readings) -> tuple[float, float] | None:
-        """The place of the antenna on the map."""
         found = self._newest(readings, "gnss")
         if found is None:
             return None
@@ -116,7 +115,6 @@ class GnssInertial:
         return float(x_m), float(y_m)
 
     def _begin(self, fix: tuple[float, float], readings: Readings) -> None:
-        """The first fix, and the direction of the lane there."""
         lanes = self._map.near(*fix, _LANE_SEARCH_M)
         roads = [place for place in lanes if not self._map.network.lanes["internal"][place.lane]]
         best = (roads or lanes or [OnLane(-1, 0.0, 0.0, 0.0)])[0]
@@ -179,7 +177,6 @@ class GnssInertial:
         self._compare_course(fix)
 
     def _compare_course(self, fix: tuple[float, float]) -> None:
-        """Turn round if the fixes go where the heading does not."""
         if self._anchor is None or self._driven_m < _COURSE_M:
             return
         east, north = fix[0] - self._anchor[0], fix[1] - self._anchor[1]
@@ -193,7 +190,6 @@ class GnssInertial:
         self._driven_m = self._turned_rad = 0.0
 
     def _take_lane(self, readings: Readings) -> None:
-        """Where lane markings are, if lanes can be told apart."""
         seen = self._newest(readings, "lane_boundary")
         if seen is None:
             return

@@ -70,7 +70,6 @@ class LaneRoute:
         signals: NDArray[np.uint8] | None,
         mission: Mission,
     ) -> Trajectory:
-        """The way from here on."""
         plan = _plan_of(self._map, mission.goal_edge, mission.vclass)
         here = self._here(pose, plan)
         if here is None:
@@ -178,7 +177,6 @@ class LaneRoute:
         obstacles: Sequence[Obstacle],
         mission: Mission,
     ) -> list[_Limit]:
-        """Behind everything that is on the way."""
         found = []
         for obstacle in obstacles:
             s, d, cos, sin = _beside(points, obstacle.x_m, obstacle.y_m)
@@ -201,7 +199,6 @@ class LaneRoute:
         signals: NDArray[np.uint8] | None,
         mission: Mission,
     ) -> list[_Limit]:
-        """Before lines where somebody else goes first."""
         found = []
         for lane, start in zip(lanes, starts, strict=True):
             link = int(plan["link"][lane])
@@ -223,7 +220,6 @@ class LaneRoute:
     def _stops(
         self, link: int, code: int, pose: Pose, gap: float, obstacles: Sequence[Obstacle]
     ) -> str:
-        """Why to stop before a link; nothing: there is no reason."""
         if code in (SIGNAL_RED, SIGNAL_RED_YELLOW):
             return "stop_line"
         if code in (SIGNAL_YELLOW_MINOR, SIGNAL_YELLOW_MAJOR):
@@ -269,7 +265,6 @@ def _plan_of(hd_map: HdMap, goal_edge: int, vclass: str) -> NDArray[np.void]:
 
 
 def _turn(heading: float) -> NDArray[np.float64]:
-    """The matrix that turns rows by a heading."""
     cos, sin = math.cos(heading), math.sin(heading)
     return np.array([[cos, sin], [-sin, cos]])
 

@@ -56,7 +56,6 @@ class Blind:
     """A perception that sees nothing."""
 
     def perceive(self, readings: Readings, pose: Pose, time_s: float) -> list[Obstacle]:
-        """Nothing."""
         return []
 
 
@@ -119,7 +118,6 @@ class StageTimes:
     worst_wall_s: dict[str, float] = field(default_factory=lambda: dict.fromkeys(STAGES, 0.0))
 
     def add(self, stage: str, seconds: float) -> None:
-        """Count one stage of one step."""
         self.wall_s[stage] += seconds
         self.worst_wall_s[stage] = max(self.worst_wall_s[stage], seconds)
 

@@ -56,7 +56,6 @@ class PurePursuit:
         self._steering = 0.0
 
     def control(self, pose: Pose, trajectory: Trajectory, mission: Mission) -> Control2D:
-        """Follow the trajectory."""
         gains = GAINS.get(mission.vclass, _CAR)
         slip = math.atan(0.5 * math.tan(self._steering))
         ahead_m = max(gains.least_lookahead_m, gains.lookahead_s * pose.speed_mps)

@@ -153,9 +153,7 @@ class Trajectory:
 class Perception(Protocol):
     """Sensors → what is on the road."""
 
-    def perceive(self, readings: Readings, pose: Pose, time_s: float) -> list[Obstacle]:
-        """What is there now."""
-        ...
+    def perceive(self, readings: Readings, pose: Pose, time_s: float) -> list[Obstacle]: ...
 
 
 class Localisation(Protocol):
@@ -165,9 +163,7 @@ class Localisation(Protocol):
         """Where it is now; None: nobody knows yet."""
         ...
 
-    def reset_pose(self, pose: Pose) -> None:
-        """Be told where it is."""
-        ...
+    def reset_pose(self, pose: Pose) -> None: ...
 
 
 class Planning(Protocol):
@@ -194,6 +190,4 @@ class Planning(Protocol):
 class Control(Protocol):
     """Where to drive → what the vehicle does."""
 
-    def control(self, pose: Pose, trajectory: Trajectory, mission: Mission) -> Control2D:
-        """What it does now."""
-        ...
+    def control(self, pose: Pose, trajectory: Trajectory, mission: Mission) -> Control2D: ...

@@ -100,6 +100,5 @@ def _gpus() -> list[str]:
 
 
 def _said(command: list[str]) -> str:
-    """What a program prints; nothing where it fails."""
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     return done.stdout.strip() if done.returncode == 0 else ""

@@ -96,7 +96,6 @@ def post_encroachment_s(one: NDArray[np.void], other: NDArray[np.void]) -> float
 
 
 def _box(body: np.void) -> tuple[float, float, float, float, float, float]:
-    """What `boxes_overlap` takes."""
     heading = float(body["heading"])
     return (
         float(body["x"]), float(body["y"]), math.cos(heading), math.sin(heading),

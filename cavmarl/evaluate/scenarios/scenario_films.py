@@ -70,7 +70,6 @@ class ScenarioCamera:
             self._save(self._picture, self._best)
 
     def look(self) -> None:
-        """Take in the present moment."""
         simulation, config = self._vec.simulation, self._vec.config
         rows = simulation.vehicles()
         agents = rows[rows["agent"] >= 0][:, None]

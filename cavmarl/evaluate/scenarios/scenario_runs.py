@@ -100,7 +100,6 @@ class ScenarioRun:
         return self.verdict == "passed"
 
     def to_dict(self) -> dict[str, Any]:
-        """For JSON."""
         return asdict(self)
 
 
@@ -130,8 +129,8 @@ def make_scenario(
         overrides: values for any other key.
 
     Raises:
-        ScenarioError: no such scenario, no place for it on the map, or no room for the agents.
-        ConfigError: a parameter, a density or a key that cannot work.
+        ConfigError: no such scenario, no place for it on the map, or no room for the agents; a
+            parameter, a density or a key that cannot work.
     """
     if density not in DENSITIES:
         raise ConfigError(f"density = {density!r}: must be one of {', '.join(DENSITIES)}")
@@ -210,7 +209,6 @@ class _Record:
         self._red_lights = 0
 
     def take(self) -> None:
-        """Note where agents and actors are."""
         now_s = self._now_s()
         rows = self._simulation.vehicles()
         for row in rows[np.isin(rows["id"], [*self._agents, *self._actors])]:
@@ -220,13 +218,11 @@ class _Record:
         self._red_lights += int(np.count_nonzero(self._now() & EVENT_RED_LIGHT))
 
     def note(self) -> None:
-        """Note what the step that is just over has brought."""
         if not self._events[0] & EVENTS_THAT_END:
             self._left_s = self._now_s()
         self._events |= self._now()
 
     def finish(self, driver: str, seed: int) -> ScenarioRun:
-        """What became of the run, after its last step."""
         config, simulation = self._vec.config, self._simulation
         verdicts = tuple(map(self._verdict, range(len(self._agents))))
         verdict = min(verdicts, key=list(VERDICTS).index)
@@ -261,7 +257,6 @@ class _Record:
         return float(self._simulation.ticks()[0]) * self._vec.config.clock.sim_dt_s
 
     def _now(self) -> NDArray[np.int64]:
-        """EVENT_* of each agent in the last step."""
         found: NDArray[np.int64] = self._simulation.outputs.events[0].astype(np.int64)
         return found
 

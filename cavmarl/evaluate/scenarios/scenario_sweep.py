@@ -12,7 +12,7 @@ from contextlib import closing
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from cavmarl.core.errors import NoPlaceError
+from cavmarl.core.errors import ScenarioError
 from cavmarl.evaluate.scenarios.scenario_runs import ScenarioRun, make_scenario, run_scenario
 
 __all__ = ["SweepRow", "sweep_scenarios"]
@@ -52,7 +52,6 @@ class SweepRow(NamedTuple):
         return min((value for value in values if value is not None), default=None)
 
     def to_dict(self) -> dict[str, Any]:
-        """For JSON."""
         return {
             "scenario": self.scenario,
             "environment": self.environment,
@@ -84,8 +83,7 @@ def sweep_scenarios(
         agents: how many each time.
 
     Raises:
-        ScenarioError: an unknown scenario, or no room for the agents.
-        ConfigError: as of `make_scenario`.
+        ConfigError: an unknown scenario, or no room for the agents; as of `make_scenario`.
     """
     for scenario in scenarios:
         for env in maps:
@@ -93,7 +91,7 @@ def sweep_scenarios(
             for seed in seeds:
                 try:
                     vec = make_scenario(scenario, env, density=density, seed=seed, agents=agents)
-                except NoPlaceError:
+                except ScenarioError:
                     break
                 with closing(vec):
                     row.passing.append(run_scenario(vec, passes, seed))

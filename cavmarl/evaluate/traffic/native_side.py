@@ -75,7 +75,6 @@ def make_world(
 
 
 def advance(simulation: Simulation, commands: Commands) -> None:
-    """One tick."""
     simulation.step(commands)
 
 

@@ -92,7 +92,7 @@ def start_sumo(job: SumoJob, folder: Path, *more: str) -> Any:
 
     Raises:
         ConfigError: SUMO refuses it.
-        SumoBusyError: a simulation runs in this process.
+        SumoError: a simulation runs in this process.
     """
     libsumo: Any = free_libsumo()
     log = folder / "errors.log"
@@ -108,7 +108,6 @@ def start_sumo(job: SumoJob, folder: Path, *more: str) -> Any:
 
 
 def _refusal(job: SumoJob, log: Path, error: Exception) -> ConfigError:
-    """What SUMO complained about, in its words."""
     said = log.read_text(encoding="utf-8", errors="replace") if log.exists() else ""
     lines = [line.removeprefix("Error: ") for line in said.splitlines() if line.strip()]
     own = f", {job.demand.net_file}" if job.demand.net_file else ""

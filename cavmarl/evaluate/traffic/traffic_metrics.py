@@ -93,7 +93,6 @@ class TrafficFigures:
     teleports: int
 
     def to_dict(self) -> dict[str, Any]:
-        """As plain types, for JSON."""
         return asdict(self)
 
 
@@ -164,7 +163,6 @@ class TrafficMeter:
         self._samples += 1
 
     def result(self, counts: TrafficCounts) -> TrafficRun:
-        """Everything measured so far."""
         locks = self._locks.longest_s()
         worst = max(locks, key=lambda junction: locks[junction], default="")
         figures = TrafficFigures(

@@ -49,9 +49,7 @@ class Watcher(Protocol):
         """Records, in the order of the journal."""
         ...
 
-    def delivered(self, destination: int, message: Message) -> None:
-        """A message that has arrived."""
-        ...
+    def delivered(self, destination: int, message: Message) -> None: ...
 
 
 class Referee(ABC):
@@ -77,12 +75,10 @@ class Referee(ABC):
 
     @property
     def directory(self) -> Directory:
-        """Who owns what."""
         return self._directory
 
     @property
     def tick(self) -> int:
-        """The committed tick, of the run."""
         return self._directory.table.tick
 
     @property
@@ -99,7 +95,6 @@ class Referee(ABC):
         return tuple(self._births), tuple(self._gone)
 
     def resume(self, births: Iterable[Birth] = (), gone: Iterable[Removed] = ()) -> None:
-        """Know again what `notes` told."""
         self._births, self._gone, self._removed = list(births), list(gone), []
 
     def entered(self, vehicles: Iterable[tuple[int, int]]) -> None:
@@ -124,9 +119,9 @@ class Referee(ABC):
             inputs: digest of the actions.
 
         Raises:
-            LedgerError: a vehicle was lost or doubled.
-            ProtocolError: it cannot be decided, or a zone does not answer.
-            ZoneError: a zone has not seen who enters it.
+            ProtocolError: a vehicle was lost or doubled; it cannot be decided, or a zone does not
+                answer.
+            ConfigError: a zone has not seen who enters it.
         """
 
     @abstractmethod
@@ -138,9 +133,8 @@ class Referee(ABC):
             stored: zone → digest of its rows in the store; None: where `rows` are is the store.
 
         Raises:
-            LedgerError: a vehicle was lost or doubled.
+            ProtocolError: a vehicle was lost or doubled; a zone does not answer.
             StoreError: the store holds other rows than a zone told of.
-            ProtocolError: a zone does not answer.
         """
 
     @abstractmethod
@@ -152,7 +146,6 @@ class Referee(ABC):
         """(kind, reason) → messages or entries that did not count, at any of the parties."""
 
     def _record(self, *records: Record) -> None:
-        """Write records down."""
         if self.journal is not None:
             self.journal.append(records)
         for watcher in self._watchers:

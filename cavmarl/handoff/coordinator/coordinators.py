@@ -43,7 +43,6 @@ class RowStates:
         self._known: dict[int, bytes] = {}
 
     def forget(self) -> None:
-        """Another tick is committed."""
         self._known.clear()
 
     def look(self, everybody: bool) -> list[Near]:
@@ -72,7 +71,6 @@ class RowStates:
         return found
 
     def state(self, vehicle: int) -> bytes:
-        """Of any vehicle."""
         found = self._known.get(vehicle)
         if found is None:
             found = self._division.state(self._world, *self._division.find(self._world, vehicle))
@@ -156,7 +154,7 @@ class Coordination:
         """Look whether the invariants hold in the tick that has been committed.
 
         Raises:
-            InvariantError: one does not.
+            ProtocolError: one does not.
         """
         if self._monitor is not None:
             for w, coordinator in enumerate(self.coordinators):

@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from cavmarl.core.errors import LedgerError, ZoneError
+from cavmarl.core.errors import ConfigError, ProtocolError
 from cavmarl.handoff.division import Division
 from cavmarl.ownership.messages import Birth
 from cavmarl.zones.kernels.handoff import NOT_OWNED
@@ -60,8 +60,8 @@ class BorderBook:
             how many have changed.
 
         Raises:
-            LedgerError: there are more or fewer vehicles.
-            ZoneError: a zone has not seen who enters it.
+            ProtocolError: there are more or fewer vehicles.
+            ConfigError: a zone has not seen who enters it.
         """
         division, book, w = self._division, self._book, self._world
         changed = 0
@@ -76,14 +76,14 @@ class BorderBook:
                 self._refuse(changed)
         # Who entered after the ghosts were renewed has not been looked at.
         if book.owned.item(w) != (vehicles if everybody else vehicles - len(newborn)):
-            raise LedgerError(f"zones own {division.counts(w)} vehicles, not {vehicles}")
+            raise ProtocolError(f"zones own {division.counts(w)} vehicles, not {vehicles}")
         book.ms[w] = 1e3 * perf_counter()
         return changed
 
     def _refuse(self, why: int) -> None:
         change = Change(*self._book.changes[self._world, len(self)].item())
         if why == NOT_OWNED:
-            raise ZoneError(f"zone {change.source} does not own vehicle {change.vehicle}")
+            raise ConfigError(f"zone {change.source} does not own vehicle {change.vehicle}")
         raise self._division.unseen(change.vehicle, change.target)
 
     def release(self, changed: int) -> None:
@@ -95,11 +95,9 @@ class BorderBook:
         )  # fmt: skip
 
     def __len__(self) -> int:
-        """How many changes have not been read."""
         return self._book.num_changes.item(self._world)
 
     def newest(self, count: int) -> list[Change]:
-        """The newest changes."""
         last = len(self)
         found = self._book.changes[self._world, last - count : last]
         return [Change(*change) for change in found.tolist()]

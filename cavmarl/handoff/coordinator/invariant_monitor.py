@@ -12,7 +12,7 @@ from collections.abc import Callable, Iterable, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from cavmarl.core.errors import InvariantError
+from cavmarl.core.errors import ProtocolError
 from cavmarl.core.numba.repeated import repeated
 from cavmarl.driving.vehicles import GHOST_FIELDS
 from cavmarl.handoff.coordinator.handoff_log import Change
@@ -81,7 +81,7 @@ class OwnersOnRecord:
         """Note records.
 
         Raises:
-            InvariantError: one that a correct run does not leave here.
+            ProtocolError: one that a correct run does not leave here.
         """
         for record in records:
             self._take(LOG, record)
@@ -95,7 +95,7 @@ class OwnersOnRecord:
         """Note a message that has arrived.
 
         Raises:
-            InvariantError: one that a correct run does not leave here.
+            ProtocolError: one that a correct run does not leave here.
         """
         self._take(destination, message)
 
@@ -119,8 +119,8 @@ class OwnersOnRecord:
         entry = Entry(destination, item)
         try:
             self._checker.take(entry)
-        except InvariantError as error:
-            raise InvariantError(
+        except ProtocolError as error:
+            raise ProtocolError(
                 f"tick {item.tick}: order of records and messages: {describe(entry)}: {error}"
             ) from None
 
@@ -138,7 +138,7 @@ class OwnersOnRecord:
 
 
 class Monitor:
-    """Raises InvariantError after the first tick in which an invariant does not hold.
+    """Raises ProtocolError after the first tick in which an invariant does not hold.
 
     Its memory is as large as the worlds are, however long they run.
 
@@ -178,7 +178,7 @@ class Monitor:
             births: who is there.
 
         Raises:
-            InvariantError: an invariant does not hold.
+            ProtocolError: an invariant does not hold.
         """
         self._ticks[w] = 0
         self._kept[w][0].num[:] = 0
@@ -193,7 +193,7 @@ class Monitor:
             births: who entered in the tick, and is not in the records yet.
 
         Raises:
-            InvariantError: an invariant does not hold.
+            ProtocolError: an invariant does not hold.
         """
         self._ticks[w] += 1
         self._look(w, births, new_late=1)

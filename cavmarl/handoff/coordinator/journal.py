@@ -15,7 +15,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import Literal, Self, TypeAlias, get_args
 
-from cavmarl.core.errors import ConfigError, CorruptJournalError, JournalError, TornJournalError
+from cavmarl.core.errors import ConfigError, JournalError
 from cavmarl.ownership.log_records import record_from_line, record_to_line
 from cavmarl.ownership.messages import Record
 
@@ -50,9 +50,8 @@ class JournalReader:
         """From the first line on.
 
         Raises:
-            TornJournalError: the last line is cut short.
-            CorruptJournalError: a line is damaged, missing or out of order.
-            JournalError: the file cannot be read.
+            JournalError: the last line is cut short; a line is damaged, missing or out of order;
+                the file cannot be read.
         """
         self.lines, self.size, self.torn = 0, 0, ""
         try:
@@ -68,8 +67,8 @@ class JournalReader:
     def _record(self, line: bytes) -> Record:
         try:
             record = record_from_line(line, self.lines)
-        except CorruptJournalError as error:
-            raise CorruptJournalError(f"{self.path}: {error}") from error
+        except JournalError as error:
+            raise JournalError(f"{self.path}: {error}") from error
         self.lines += 1
         self.size += len(line)
         return record
@@ -77,7 +76,7 @@ class JournalReader:
     def _end_torn(self, line: bytes) -> None:
         self.torn = f"line {self.lines + 1} is cut short: {line[:40]!r}"
         if not self._drop_torn:
-            raise TornJournalError(f"{self.path}: {self.torn}; it was never acted upon")
+            raise JournalError(f"{self.path}: {self.torn}; it was never acted upon")
 
 
 class Journal:
@@ -99,8 +98,8 @@ class Journal:
 
     Raises:
         ConfigError: no such `sync`.
-        JournalError: the file exists, or does not, or cannot be opened, or another run writes it.
-        CorruptJournalError: what is there is damaged.
+        JournalError: the file exists, or does not, or cannot be opened, or another run writes it;
+            what is there is damaged.
     """
 
     def __init__(
@@ -232,7 +231,6 @@ class MemoryJournal:
 
     @property
     def sequence(self) -> int:
-        """The number of the next record."""
         return len(self.records)
 
     def append(self, records: Iterable[Record]) -> None:
@@ -246,7 +244,6 @@ class MemoryJournal:
         self.records += records
 
     def close(self) -> None:
-        """Refuse further records."""
         self._closed = True
 
     def __enter__(self) -> Self:

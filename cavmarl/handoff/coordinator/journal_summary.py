@@ -53,7 +53,6 @@ class JournalSummary:
     torn: str = ""
 
     def to_dict(self) -> dict[str, Any]:
-        """Plain values."""
         return vars(self).copy()
 
     def _committed(self, begin: Begin, commit: Commit) -> None:

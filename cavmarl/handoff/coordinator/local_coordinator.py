@@ -22,7 +22,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from cavmarl.core.errors import LedgerError
+from cavmarl.core.errors import ProtocolError
 from cavmarl.handoff.coordinator.coordinator import Referee
 from cavmarl.handoff.coordinator.handoff_log import BorderBook, Change
 from cavmarl.handoff.coordinator.journal import AnyJournal
@@ -83,13 +83,11 @@ class DirectCoordinator(Referee):
 
     @property
     def directory(self) -> Directory:
-        """Who owns what, as of the committed tick."""
         self.catch_up()
         return self._directory
 
     @property
     def tick(self) -> int:
-        """The committed tick, of the run."""
         return self._tick
 
     @property
@@ -127,7 +125,7 @@ class DirectCoordinator(Referee):
         births = self._births
         try:
             changed = self._book.hand_over(everybody, self._vehicles, births)
-        except LedgerError:
+        except ProtocolError:
             self._check(births)
             raise
         self._is_open, self._changed = True, changed
@@ -197,8 +195,8 @@ class DirectCoordinator(Referee):
         """Put what came of one tick, or of all up to one, on the table, and tell watchers of it.
 
         Raises:
-            LedgerError: a vehicle changed its owner that belonged to somebody else.
-            SpawnError: a vehicle entered that has been there.
+            ProtocolError: a vehicle changed its owner that belonged to somebody else; a vehicle
+                entered that has been there.
         """
         table = self._directory.table
         columns = (changes[name].tolist() for name in ("vehicle", "source", "target", "epoch"))
@@ -230,7 +228,6 @@ class DirectCoordinator(Referee):
         )
 
     def dropped(self) -> Counter[tuple[str, str]]:
-        """Nothing: there are no messages."""
         return Counter()
 
     def _check(self, births: Iterable[Birth]) -> None:
@@ -240,14 +237,14 @@ class DirectCoordinator(Referee):
             births: who is in the rows, and will be on record in the next tick.
 
         Raises:
-            LedgerError: a zone has more or fewer.
+            ProtocolError: a zone has more or fewer.
         """
         owned = list(self.directory.table.counts.values())
         for birth in births:
             owned[birth.zone] += 1
         counts = self._counts()
         if counts != owned:
-            raise LedgerError(f"at tick {self.tick} zones own {counts} vehicles, not {owned}")
+            raise ProtocolError(f"at tick {self.tick} zones own {counts} vehicles, not {owned}")
 
 
 def _no_digest(zone: int) -> int:

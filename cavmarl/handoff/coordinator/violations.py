@@ -11,7 +11,7 @@ from collections.abc import Iterator, Mapping, Sequence
 
 import numpy as np
 
-from cavmarl.core.errors import InvariantError
+from cavmarl.core.errors import ProtocolError
 from cavmarl.driving.vehicles import GHOST_FIELDS
 from cavmarl.handoff.division import Division
 from cavmarl.handoff.kernels.invariant_checks import KIND_FAR, KIND_TICK, Clock, Kept
@@ -57,7 +57,7 @@ class Violations:
             births: who has entered since.
 
         Raises:
-            InvariantError: always.
+            ProtocolError: always.
         """
         expected = {**owners, **{birth.vehicle: (birth.zone, 0) for birth in births}}
         for words in (
@@ -68,8 +68,8 @@ class Violations:
             self._ghosts(),
         ):
             for word in words:
-                raise InvariantError(f"tick {self._clock.tick} of world {self._w}: {word}")
-        raise InvariantError(
+                raise ProtocolError(f"tick {self._clock.tick} of world {self._w}: {word}")
+        raise ProtocolError(
             f"tick {self._clock.tick} of world {self._w}: sums of hashes differ, but no row does: "
             "rows have been changed meanwhile"
         )

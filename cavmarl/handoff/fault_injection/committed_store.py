@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from cavmarl.core.errors import ProtocolError, ReproducerError
+from cavmarl.core.errors import JournalError, ProtocolError
 from cavmarl.ownership.messages import Birth, Removed
 from cavmarl.ownership.safeguards import ALL_ON, Safeguards
 from cavmarl.shards.shard import COMMON, Shard
@@ -110,11 +110,11 @@ class CommittedStore:
         """Take the worlds to what another store has kept of such worlds; the notes of each.
 
         Raises:
-            ReproducerError: those worlds were not such ones.
+            JournalError: those worlds were not such ones.
         """
         shared = list(self.shared())
         if (len(image.rows), len(image.shared)) != (len(self._shards), len(shared)):
-            raise ReproducerError(
+            raise JournalError(
                 f"{len(image.rows)} zones with {len(image.shared)} arrays were kept, and here are "
                 f"{len(self._shards)} with {len(shared)}; use the version that wrote them"
             )
@@ -162,10 +162,10 @@ def _put(kept: Array, array: Array, what: str) -> None:
     """Write what was kept into an array of the same meaning, which may have less room to spare.
 
     Raises:
-        ReproducerError: it has another type or fewer places.
+        JournalError: it has another type or fewer places.
     """
     if kept.dtype != array.dtype:
-        raise ReproducerError(f"{what}: kept in another layout; use the version that wrote them")
+        raise JournalError(f"{what}: kept in another layout; use the version that wrote them")
     if kept.ndim != array.ndim or any(a < b for a, b in zip(kept.shape, array.shape, strict=True)):
-        raise ReproducerError(f"{what}: {kept.shape} were kept, and here are {array.shape}")
+        raise JournalError(f"{what}: {kept.shape} were kept, and here are {array.shape}")
     array[...] = kept[tuple(slice(length) for length in array.shape)]

@@ -108,7 +108,6 @@ class Faults:
 
     @property
     def may_crash(self) -> bool:
-        """Whether anybody may die."""
         return bool(self.crashes) or self.crash_rate > 0.0
 
     def check_zones(self, count: int) -> None:
@@ -125,7 +124,6 @@ class Faults:
                 )
 
     def plan(self) -> FaultPlan:
-        """What happens to messages."""
         return FaultPlan(self.seed, self.messages, until_tick=self.until)
 
     def to_json(self) -> str:
@@ -179,7 +177,6 @@ def _made(where: str, content: Any, kind: type[Made]) -> Made:
 
 
 def _object(where: str, content: Any, kind: type[Any]) -> dict[str, Any]:
-    """The keys of an object, which are fields of `kind`."""
     names = [entry.name for entry in fields(kind)]
     if not isinstance(content, dict):
         raise ConfigError(f"{where}: must be an object of {', '.join(names)}")

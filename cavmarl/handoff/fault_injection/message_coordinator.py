@@ -34,9 +34,7 @@ PATIENCE = 10_000
 class States(Protocol):
     """Rows of vehicles at the committed tick."""
 
-    def forget(self) -> None:
-        """Another tick is committed."""
-        ...
+    def forget(self) -> None: ...
 
     def look(self, everybody: bool) -> Sequence[Near]:
         """Who is near a border; see `Division.near`."""
@@ -46,13 +44,9 @@ class States(Protocol):
         """The whole state of a vehicle near a border, whose row is known."""
         ...
 
-    def state(self, vehicle: int) -> bytes:
-        """The whole state of any vehicle."""
-        ...
+    def state(self, vehicle: int) -> bytes: ...
 
-    def change(self, entries: Sequence[Entry]) -> None:
-        """Let rows change hands."""
-        ...
+    def change(self, entries: Sequence[Entry]) -> None: ...
 
 
 class Coordinator(Referee):
@@ -165,9 +159,8 @@ class Coordinator(Referee):
             stored: zone → digest of its rows in the store; None: where `rows` are is the store.
 
         Raises:
-            LedgerError: a vehicle was lost or doubled.
+            ProtocolError: a vehicle was lost or doubled; a zone does not answer.
             StoreError: the store holds other rows than a zone told of.
-            ProtocolError: a zone does not answer.
         """
         self._complete(rows)
         self._until("DONE", self.directory.waiting_for, self.directory.resend)
@@ -179,7 +172,6 @@ class Coordinator(Referee):
         self._gone = []
 
     def _complete(self, rows: Callable[[int], int]) -> None:
-        """End the leases that are still open."""
         table = self.directory.table
         owner, owners = table.planned.owner, table.owners
         removed: defaultdict[int, list[Removed]] = defaultdict(list)
@@ -294,7 +286,6 @@ class Coordinator(Referee):
             self.post.send(reaction.messages)
 
     def _do(self, output: Output) -> None:
-        """Write down, then send."""
         if output.records:
             self._write(output)
         if output.messages:

@@ -14,7 +14,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from cavmarl.core.errors import CoordinatorStepError, JournalError, StoreError, ZoneStepError
+from cavmarl.core.errors import JournalError, LostTickError
 from cavmarl.handoff.coordinator.coordinators import Coordination
 from cavmarl.handoff.fault_injection.committed_store import COUNTS, CommittedStore
 from cavmarl.handoff.fault_injection.injected_faults import (
@@ -25,6 +25,7 @@ from cavmarl.handoff.fault_injection.injected_faults import (
     give_up,
 )
 from cavmarl.handoff.fault_injection.message_coordinator import Coordinator
+from cavmarl.ownership.directory import StoreError
 from cavmarl.shards.shard import Shard
 
 __all__ = ["Recovery", "Revival"]
@@ -89,8 +90,7 @@ class Recovery:
         """One tick, as often as it takes; after an error the worlds are at the committed tick.
 
         Raises:
-            ZoneStepError: every host of a zone dies of it.
-            CoordinatorStepError: every coordinator dies of it.
+            LostTickError: every host of a zone dies of it; every coordinator dies of it.
         """
         self._deaths.clear()
         self._crashes.tick = self._coordinator.tick + 1
@@ -138,8 +138,8 @@ class Recovery:
             return
         tick, times = self._crashes.tick, self._deaths[dead]
         if isinstance(dead, int):
-            raise ZoneStepError(dead, tick, times, cause)
-        raise CoordinatorStepError(tick, times, dead)
+            raise LostTickError(tick, times, dead, cause)
+        raise LostTickError(tick, times, cause=dead)
 
     def _restart(self) -> bool:
         """A new coordinator reads the journal; whether the tick stands in it as committed."""
@@ -158,7 +158,6 @@ class Recovery:
         return is_done
 
     def _lose(self, shard: Shard) -> None:
-        """What the process of a host had in its memory."""
         worlds = shard.worlds
         for array in (*shard.sides, *(getattr(worlds, name) for name in COUNTS)):
             array.view(np.uint8)[...] = GARBAGE

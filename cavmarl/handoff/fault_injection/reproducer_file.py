@@ -20,7 +20,7 @@ import numpy as np
 from numpy.lib.format import descr_to_dtype
 from numpy.typing import NDArray
 
-from cavmarl.core.errors import CorruptJournalError, ReproducerError
+from cavmarl.core.errors import JournalError
 from cavmarl.handoff.fault_injection.committed_store import COUNTS, Image, Notes
 from cavmarl.ownership.log_records import record_from_dict, record_to_dict
 from cavmarl.ownership.messages import Birth, Fence, Host, Record, Removed, Reset
@@ -96,20 +96,20 @@ def read_reproducer(path: Path) -> Reproducer:
     """The reproducer of a file.
 
     Raises:
-        ReproducerError: it cannot be read, is damaged, or is none of this version.
+        JournalError: it cannot be read, is damaged, or is none of this version.
     """
     try:
         content = json.loads(path.read_text(encoding="ascii"))
     except OSError as error:
-        raise ReproducerError(f"{path}: cannot be read ({error.strerror})") from error
+        raise JournalError(f"{path}: cannot be read ({error.strerror})") from error
     except (ValueError, RecursionError) as error:
-        raise ReproducerError(f"{path}: damaged, or no reproducer: {error}") from error
+        raise JournalError(f"{path}: damaged, or no reproducer: {error}") from error
     found = content.get("schema") if isinstance(content, dict) else None
     if found != SCHEMA:
-        raise ReproducerError(f"{path}: has schema {found!r}; this version reads {SCHEMA!r}")
+        raise JournalError(f"{path}: has schema {found!r}; this version reads {SCHEMA!r}")
     checksum = content.pop("checksum", None)
     if checksum != _checksum(_json(content)):
-        raise ReproducerError(f"{path}: damaged: it does not match its checksum")
+        raise JournalError(f"{path}: damaged: it does not match its checksum")
     del content["schema"]
     try:
         content["commands"] = Commands(*(_unpacked(entry) for entry in content["commands"]))
@@ -118,8 +118,8 @@ def read_reproducer(path: Path) -> Reproducer:
         )
         content["image"] = _image_from_plain(content["image"])
         return Reproducer(**content)
-    except (CorruptJournalError, KeyError, TypeError, ValueError, zlib.error) as error:
-        raise ReproducerError(f"{path}: written by something else? {error!r}") from error
+    except (JournalError, KeyError, TypeError, ValueError, zlib.error) as error:
+        raise JournalError(f"{path}: written by something else? {error!r}") from error
 
 
 def needed_records(records: Iterable[Record]) -> tuple[Record, ...]:
@@ -164,7 +164,6 @@ def _descr(plain: Any) -> Any:
 
 
 def _image_to_plain(image: Image) -> dict[str, Any]:
-    """Of one world, as its rows are."""
     return {
         "counts": [
             dict(zip(COUNTS, (int(array[0]) for array in counts), strict=True))

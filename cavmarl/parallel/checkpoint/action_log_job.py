@@ -53,7 +53,6 @@ class TapeJob(WorldsJob):
         return None
 
     def _begin_anew(self) -> None:
-        """Make the worlds, and tell them all that they were told."""
         self._end()
         self._take(self._make(), self._first)
         worlds = self._worlds

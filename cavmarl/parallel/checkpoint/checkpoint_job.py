@@ -8,7 +8,7 @@ from typing import Any
 
 from numpy.typing import NDArray
 
-from cavmarl.core.errors import SumoStateError
+from cavmarl.core.errors import SumoError
 from cavmarl.parallel.checkpoint.checkpoint_log import Diary
 from cavmarl.parallel.local_worlds import LocalWorlds
 from cavmarl.parallel.worlds_job import Task, WorldsJob
@@ -32,7 +32,7 @@ class DiaryJob(WorldsJob):
         self._diary = diary
         self._logs = worlds.keep_logs()
         self._is_behind = False  # it is where the diary begins, and not where that ends
-        self._lost: SumoStateError | None = None  # why it cannot get there
+        self._lost: SumoError | None = None  # why it cannot get there
         self._again_s = 0.0  # that the steps of the diary take
 
     def perform(self, task: int, letter: Any) -> Any:
@@ -83,7 +83,7 @@ class DiaryJob(WorldsJob):
         """Go through the steps of the diary, if they are not behind it.
 
         Raises:
-            SumoStateError: as of `Simulation.load`; but all worlds may be reset.
+            SumoError: as of `Simulation.load`; but all worlds may be reset.
         """
         if self._lost is not None:
             error, self._lost = self._lost, None
@@ -97,7 +97,6 @@ class DiaryJob(WorldsJob):
             self._again_s = perf_counter() - began_s
 
     def save(self) -> list[NDArray[Any]]:
-        """Where to begin in the diary."""
         return [self._diary.place]
 
     def load(self, saved: Sequence[NDArray[Any]]) -> None:
@@ -108,5 +107,5 @@ class DiaryJob(WorldsJob):
         self._is_behind = True
         try:
             worlds.load(diary.state(worlds.save()))
-        except SumoStateError as error:
+        except SumoError as error:
             self._lost, self._is_behind = error, False

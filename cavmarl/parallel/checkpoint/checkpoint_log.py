@@ -30,7 +30,7 @@ def make_segments(config: EnvConfig, num_worlds: int) -> list[Segment]:
     """Memory for the diary of some worlds, which outlives those who write it.
 
     Raises:
-        WorkerStartError: there is none.
+        WorkerError: there is none.
     """
     images = [Segment.make(_FIRST_IMAGE_BYTES) for _ in range(2)]
     steps = Segment.make(size_of(_layout(config, num_worlds)))
@@ -66,7 +66,6 @@ class Diary:
         self.entries = tuple(map(Commands, *(arrays[name] for name in _COMMANDS)))
 
     def __len__(self) -> int:
-        """How many steps follow its image."""
         return self.place.item(1)
 
     @property
@@ -125,7 +124,6 @@ class Diary:
             log.take_up(kept.read())
 
     def steps(self) -> tuple[Commands, ...]:
-        """What the agents have done since."""
         first = self.place.item(0) * STEPS
         return self.entries[first : first + len(self)]
 

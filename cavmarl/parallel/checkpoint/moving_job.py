@@ -78,7 +78,6 @@ class MovingJob(WorldsJob):
             self._cases[self._number].write([array for share in shares for array in share])
 
     def _unpack(self, bounds: Sequence[int]) -> None:
-        """Go on with other worlds, if they are others."""
         first, last = bounds[self._number : self._number + 2]
         if (first, last) == self._range:
             self._bounds[:] = bounds
@@ -110,7 +109,6 @@ class MovingJob(WorldsJob):
         return [self._bounds, *saved[:-parts], sizes, _in_one(saved[-parts:])]
 
     def load(self, saved: Sequence[Array]) -> None:
-        """Go on from what `save` gave."""
         bounds, *rest, sizes, rows = saved
         before = self._range
         self._bounds[:] = bounds
@@ -121,7 +119,6 @@ class MovingJob(WorldsJob):
 
 
 def _leaving(before: Array, after: Sequence[int], number: int) -> list[int]:
-    """The worlds that a worker has to give away."""
     first, last = before[number : number + 2].tolist()
     kept = range(*after[number : number + 2])
     return [world for world in range(first, last) if world not in kept]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from cavmarl.core.errors import WorkerStartError
+from cavmarl.core.errors import WorkerError
 from cavmarl.parallel.processes.shared_memory import Segment, arrays_in, size_of
 
 __all__ = ["MovingMemory"]
@@ -24,7 +24,7 @@ class MovingMemory:
         spent_s: (W, zones) processor time of each shard from the start on.
 
     Raises:
-        WorkerStartError: there is none.
+        WorkerError: there is none.
     """
 
     def __init__(self, num_worlds: int, num_zones: int, cases: int) -> None:
@@ -33,7 +33,7 @@ class MovingMemory:
         try:
             self.segments += [Segment.make(_CASE_BYTES) for _ in range(cases)]
             self.spent_s = arrays_in(self.segments[0].map(), layout)["spent_s"]
-        except WorkerStartError:
+        except WorkerError:
             for segment in self.segments:
                 segment.close()
             raise

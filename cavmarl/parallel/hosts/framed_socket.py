@@ -23,7 +23,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from cavmarl.core.errors import CorruptMessageError, UnknownVersionError
+from cavmarl.core.errors import MessageError
 
 __all__ = [
     "HOSTS",
@@ -180,16 +180,16 @@ class Wire:
         head = bytes(raw[: _HEAD.size])
         magic, version, kind, order, letter_size, size, checksum = _HEAD.unpack(head)
         if magic != dialect.magic:
-            raise CorruptMessageError(f"{head[:4]!r} begins no frame")
+            raise MessageError(f"{head[:4]!r} begins no frame")
         if version != dialect.version:
-            raise UnknownVersionError(
+            raise MessageError(
                 f"a frame of version {version}, this is {dialect.version}: {dialect.cure}"
             )
         if letter_size > dialect.max_letter or size > dialect.max_data:
-            raise CorruptMessageError(f"a frame of {letter_size} + {size} bytes is none")
+            raise MessageError(f"a frame of {letter_size} + {size} bytes is none")
         text = bytes(self._read(letter_size))
         if _SUM.unpack(raw[_HEAD.size :])[0] != zlib.crc32(text, zlib.crc32(head)):
-            raise CorruptMessageError("the head of a frame is not what was sent")
+            raise MessageError("the head of a frame is not what was sent")
         self._frame = _frame(dialect, kind, order, text, size, checksum)
         return self._frame
 
@@ -209,11 +209,11 @@ class Wire:
         pieces = [array.data.cast("B") for array in arrays if array.nbytes]
         room = sum(len(piece) for piece in pieces)
         if room != frame.size:
-            raise CorruptMessageError(f"{frame.size} bytes of data: {room} were to come")
+            raise MessageError(f"{frame.size} bytes of data: {room} were to come")
         for piece in pieces:
             self._fill(piece)
         if frame.checksum != _checksum(pieces):
-            raise CorruptMessageError("the data of a frame are not what was sent")
+            raise MessageError("the data of a frame are not what was sent")
         self._frame, self.is_torn = None, False
 
     def skip(self) -> None:
@@ -222,7 +222,6 @@ class Wire:
         self.take([np.empty(self._frame.size, dtype=np.uint8)])
 
     def close(self) -> None:
-        """End the connection."""
         self._socket.close()
 
     def _send_all(self, pieces: list[memoryview]) -> None:
@@ -250,13 +249,13 @@ def _frame(dialect: Dialect, kind: int, order: int, text: bytes, size: int, chec
     """The same, understood.
 
     Raises:
-        CorruptMessageError: it says nothing that is known.
+        MessageError: it says nothing that is known.
     """
     try:
         letter = dialect.read(text) if text else None
         return Frame(dialect.kinds(kind), order, letter, size, checksum)
     except ValueError as error:
-        raise CorruptMessageError(f"a frame that says nothing: {error}") from error
+        raise MessageError(f"a frame that says nothing: {error}") from error
 
 
 def _checksum(pieces: Sequence[memoryview]) -> int:

@@ -24,7 +24,6 @@ from cavmarl.core.errors import (
     WorkerDeathError,
     WorkerError,
     WorkerFailureError,
-    WorkerStartError,
 )
 from cavmarl.parallel.hosts.framed_socket import Frame, Kind
 from cavmarl.parallel.hosts.host_commands import Arrays, HostProgram, OpenOrder, Say, Truth
@@ -53,7 +52,7 @@ class HostPool:
         deaths: all that there were of hosts with a part.
 
     Raises:
-        WorkerStartError: they do not come.
+        WorkerError: they do not come.
         WorkerFailureError: an exception while they made their jobs.
     """
 
@@ -86,12 +85,10 @@ class HostPool:
 
     @property
     def machines(self) -> list[str]:
-        """Names of those that the parts are on."""
         return [self._hosts[k].machine for k in self._all]
 
     @property
     def sizes(self) -> tuple[int, ...]:
-        """Of the parts, by what is committed."""
         return tuple(truth.size for truth in self._truths)
 
     def rename(self, names: Sequence[str]) -> None:
@@ -137,7 +134,7 @@ class HostPool:
 
         Raises:
             WorkerDeathError: too many hosts died of it; the pool is closed.
-            WorkerStartError: there is no host left, and none comes; the pool is closed.
+            WorkerError: there is no host left, and none comes; the pool is closed.
             WorkerFailureError: an exception in a host; all are as they were before.
         """
         return self._command(self._all, task, _said(letters, inputs), outputs, commits, sizes)
@@ -173,7 +170,7 @@ class HostPool:
         """Return when there is a host that would take up a part at once.
 
         Raises:
-            WorkerStartError: none comes; the pool is closed.
+            WorkerError: none comes; the pool is closed.
         """
         began = time.monotonic()
         nothing = OpenOrder(
@@ -186,7 +183,6 @@ class HostPool:
             self._complain(time.monotonic() - began, "to spare")
 
     def close(self) -> None:
-        """End all hosts."""
         self._finalizer()
 
     def _command(
@@ -234,7 +230,6 @@ class HostPool:
         self._open = None
 
     def _await(self, order: OpenOrder) -> None:
-        """Return when the order has been carried out everywhere."""
         next_s = order.ordered_s + CHECK_S
         while order.pending:
             for k in sorted(order.pending - self._hosts.keys()):
@@ -286,7 +281,6 @@ class HostPool:
                 death.replaced_s = host.given_s
 
     def _hear(self, order: OpenOrder, host: Host) -> None:
-        """Take what a host says."""
         k = host.part
         try:
             frame = host.wire.receive()
@@ -344,7 +338,7 @@ class HostPool:
 
         Raises:
             WorkerDeathError: too many have died.
-            WorkerStartError: there is no host left, and none comes.
+            WorkerError: there is no host left, and none comes.
         """
         now = time.monotonic()
         for k in sorted(order.pending):
@@ -373,18 +367,17 @@ class HostPool:
         """Give up if nobody will come.
 
         Raises:
-            WorkerStartError: so it is.
+            WorkerError: so it is.
         """
         trouble = self._launcher.trouble()
         if trouble is None and waited_s > COMES_S:
             trouble = f"none has come within {COMES_S:g} s; ray status tells what Ray waits for"
         if trouble is not None:
             self.close()
-            raise WorkerStartError(f"no host ({where}): {trouble}")
+            raise WorkerError(f"no host ({where}): {trouble}")
 
 
 def _said(letters: Sequence[Any], inputs: Sequence[Arrays]) -> Say:
-    """What is said to each part, whoever has it."""
     return lambda k, knows: (letters[k], inputs[k])
 
 

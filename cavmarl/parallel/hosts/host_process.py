@@ -78,17 +78,13 @@ class RemoteJob(Protocol):
         """Arrays that an order of this task fills, as many as its letter says."""
         ...
 
-    def perform(self, task: int, letter: Any) -> Outcome:
-        """Do a task; raises what it likes."""
-        ...
+    def perform(self, task: int, letter: Any) -> Outcome: ...
 
     def save(self) -> Sequence[Array]:
         """All that another host needs to go on from here."""
         ...
 
-    def load(self, saved: Sequence[Array]) -> None:
-        """Go on from what `save` has given."""
-        ...
+    def load(self, saved: Sequence[Array]) -> None: ...
 
 
 def serve(
@@ -105,7 +101,7 @@ def serve(
     Raises:
         OSError: the caller cannot be reached.
         EOFError: whoever listens there does not want us.
-        ForeignRunError: it is not the caller.
+        MessageError: it is not the caller.
     """
     line = _Line(knock(place, secret, number))
     with suppress(EOFError, OSError, MessageError):  # the caller is gone, or wants us no more
@@ -181,7 +177,6 @@ class _Line:
         threading.Thread(target=self._beat, daemon=True).start()
 
     def hear(self) -> tuple[Frame, Array]:
-        """The next order, and its data."""
         frame = self._wire.receive()
         self._order = frame.order
         data = np.empty(frame.size, dtype=np.uint8)
@@ -189,7 +184,6 @@ class _Line:
         return frame, data
 
     def reply(self, kind: Kind, letter: Any, arrays: Sequence[Array] = ()) -> None:
-        """Say what has become of it."""
         with self._lock:
             order, self._order = max(self._order, 0), -1
             self._wire.send(kind, order, letter, arrays)

@@ -9,7 +9,7 @@ from contextlib import suppress
 from dataclasses import dataclass
 from typing import Protocol
 
-from cavmarl.core.errors import MessageError, WorkerFailureError, WorkerStartError
+from cavmarl.core.errors import MessageError, WorkerError, WorkerFailureError
 from cavmarl.parallel.hosts.framed_socket import Kind, Wire
 from cavmarl.parallel.hosts.listener import MAX_GUESTS, Door, Guest
 
@@ -33,7 +33,7 @@ class Launcher(Protocol):
         """Start all of them; each runs `host.serve`.
 
         Raises:
-            WorkerStartError: they cannot be started.
+            WorkerError: they cannot be started.
         """
         ...
 
@@ -45,9 +45,7 @@ class Launcher(Protocol):
         """Why a host does not come, in words."""
         ...
 
-    def close(self) -> None:
-        """End all of them."""
-        ...
+    def close(self) -> None: ...
 
 
 @dataclass
@@ -93,7 +91,7 @@ class Company:
         free: hosts that are ready and have no part.
 
     Raises:
-        WorkerStartError: nobody can listen, or hosts cannot be started.
+        WorkerError: nobody can listen, or hosts cannot be started.
     """
 
     def __init__(self, launcher: Launcher, code: str) -> None:
@@ -122,7 +120,7 @@ class Company:
 
         Raises:
             WorkerFailureError: an exception in one before it was ready.
-            WorkerStartError: one is of another version.
+            WorkerError: one is of another version.
         """
         speaking: list[Host] = []
         for key, _ in self._selector.select(wait_s):
@@ -215,7 +213,7 @@ class Company:
             raise WorkerFailureError(host.number, str(host), **frame.letter)
         host.pid, host.machine = frame.letter["pid"], frame.letter["machine"]
         if frame.letter["code"] != self._code:
-            raise WorkerStartError(
+            raise WorkerError(
                 f"{host} runs {frame.letter['code']}, this machine {self._code}: install the same "
                 "versions on all machines, or results would differ"
             )

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cavmarl.config.env import EnvConfig
-from cavmarl.core.errors import WorkerStartError
+from cavmarl.core.errors import WorkerError
 from cavmarl.engine.world_setup import make_world
 from cavmarl.parallel.checkpoint.world_states import Move, buffers, pack, unpack
 from cavmarl.parallel.hosts.host_process import Outcome, serve
@@ -103,7 +103,7 @@ class HostedWorlds:
         recipe: environment, and how many worlds there will be.
 
     Raises:
-        WorkerStartError: this machine's files are not the caller's.
+        WorkerError: this machine's files are not the caller's.
         CavmarlError: they cannot be read.
     """
 
@@ -116,7 +116,7 @@ class HostedWorlds:
         config = validate(EnvConfig, recipe["config"], "the environment")
         self._world = make_world(config, Path(recipe["base_dir"]))
         if fingerprint(self._world) != recipe["fingerprint"]:
-            raise WorkerStartError(
+            raise WorkerError(
                 f"the files of '{config.name}' in {recipe['base_dir']} are not the caller's: copy "
                 "them to all machines"
             )

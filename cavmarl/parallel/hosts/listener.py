@@ -17,7 +17,7 @@ import socket
 import struct
 import time
 
-from cavmarl.core.errors import ForeignRunError, UnknownVersionError, WorkerStartError
+from cavmarl.core.errors import MessageError, WorkerError
 from cavmarl.parallel.hosts.framed_socket import MAGIC, VERSION, Wire
 
 __all__ = ["MAX_GUESTS", "Door", "Guest", "knock"]
@@ -76,19 +76,18 @@ class Guest:
             self._answer(said)
             return None
         if not hmac.compare_digest(said, self._expected):
-            raise ForeignRunError("somebody who does not know the secret has called")
+            raise MessageError("somebody who does not know the secret has called")
         return self._socket
 
     def close(self) -> None:
-        """Let it go."""
         self._socket.close()
 
     def _answer(self, hello: bytes) -> None:
         magic, version, self.number, _ = _HELLO.unpack(hello)
         if magic != MAGIC:
-            raise ForeignRunError(f"somebody who says {hello[:4]!r} has called")
+            raise MessageError(f"somebody who says {hello[:4]!r} has called")
         if version != VERSION:
-            raise UnknownVersionError(
+            raise MessageError(
                 f"host {self.number} speaks version {version}, this is {VERSION}: install the same "
                 "cavmarl on all machines"
             )
@@ -108,7 +107,7 @@ class Door:
         secret: that hosts have to know.
 
     Raises:
-        WorkerStartError: nobody can listen there.
+        WorkerError: nobody can listen there.
     """
 
     def __init__(self, address: str) -> None:
@@ -116,7 +115,7 @@ class Door:
         try:
             self._listener = socket.create_server((address, 0), backlog=MAX_GUESTS)
         except OSError as error:
-            raise WorkerStartError(f"cannot listen on {address}: {error}") from error
+            raise WorkerError(f"cannot listen on {address}: {error}") from error
         self._listener.setblocking(False)
         self.place: tuple[str, int] = self._listener.getsockname()[:2]
 
@@ -133,7 +132,6 @@ class Door:
         return Guest(connection, self.secret)
 
     def close(self) -> None:
-        """Nobody can call any more."""
         self._listener.close()
 
 
@@ -148,7 +146,7 @@ def knock(place: tuple[str, int], secret: bytes, number: int) -> Wire:
     Raises:
         OSError: nobody listens there.
         EOFError: whoever listens there does not want us.
-        ForeignRunError: it does not know the secret.
+        MessageError: it does not know the secret.
     """
     connection = socket.create_connection(place, CALL_S)
     try:
@@ -163,7 +161,7 @@ def knock(place: tuple[str, int], secret: bytes, number: int) -> Wire:
             heard += more
         nonce, proof = heard[:NONCE], heard[NONCE:]
         if not hmac.compare_digest(proof, _proof(secret, b"caller", hello + nonce)):
-            raise ForeignRunError(f"who listens at {place} does not know the secret")
+            raise MessageError(f"who listens at {place} does not know the secret")
         connection.sendall(_proof(secret, b"host", hello + nonce))
     except BaseException:
         connection.close()

@@ -6,7 +6,7 @@ import weakref
 from collections.abc import Callable, Sequence
 from typing import Any, NoReturn
 
-from cavmarl.core.errors import WorkerStartError, require
+from cavmarl.core.errors import WorkerError, require
 from cavmarl.parallel.hosts.ray_cluster import choose_nodes, join, leave, nodes_with
 
 __all__ = ["SPARES", "Main", "RayActors", "RayHost"]
@@ -22,7 +22,6 @@ class RayHost:
     def run(
         self, main: Main, recipe: str, place: tuple[str, int], secret: bytes, number: int
     ) -> None:
-        """Be a host."""
         main(recipe, place, secret, number)
 
 
@@ -47,7 +46,7 @@ class RayActors:
         MissingExtraError: Ray is not installed.
         ConfigError: this program is not on a node, or there are too few CPUs.
         NoAdmissibleWorkerError: all nodes are too busy.
-        WorkerStartError: no cluster.
+        WorkerError: no cluster.
     """
 
     def __init__(
@@ -75,13 +74,13 @@ class RayActors:
         """Start all of them.
 
         Raises:
-            WorkerStartError: Ray cannot.
+            WorkerError: Ray cannot.
         """
         for number, node in enumerate(self._nodes):
             try:
                 self._start(number, node, place, secret)
             except self._ray.exceptions.RayError as error:
-                raise WorkerStartError(f"Ray cannot start host {number}: {error}") from error
+                raise WorkerError(f"Ray cannot start host {number}: {error}") from error
 
     def _start(self, number: int, node: str, place: tuple[str, int], secret: bytes) -> None:
         strategies = self._ray.util.scheduling_strategies

@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 from cavmarl.balance.load_score import Candidate, Utilisation, select
-from cavmarl.core.errors import ConfigError, WorkerStartError, require
+from cavmarl.core.errors import ConfigError, WorkerError, require
 
 __all__ = ["Node", "choose_nodes", "join", "leave", "nodes", "nodes_with"]
 
@@ -51,7 +51,7 @@ def join() -> bool:
     Raises:
         MissingExtraError: Ray is not installed.
         ConfigError: the program is only a client of a cluster.
-        WorkerStartError: there is no cluster at the address.
+        WorkerError: there is no cluster at the address.
     """
     global _joined
     ray = require("ray", "ray")
@@ -68,7 +68,7 @@ def join() -> bool:
             _call(address)
             ray.init(include_dashboard=False, log_to_driver=False, logging_level="ERROR")
         except (OSError, RuntimeError, ValueError) as error:
-            raise WorkerStartError(
+            raise WorkerError(
                 f"no Ray cluster at {address or 'the address that ray start has left'}: {error}. "
                 f"Start one (ray start --head), or unset {ADDRESS} for one on this machine"
             ) from error

@@ -132,7 +132,6 @@ class RemoteWorlds(OrderedWorlds):
 
     @property
     def deaths(self) -> list[Death]:
-        """Of hosts, up to now."""
         return self.pool.deaths
 
     def close(self) -> None:
@@ -224,5 +223,4 @@ class RemoteWorlds(OrderedWorlds):
 
 
 def _names(parts: Sequence[Part]) -> tuple[str, ...]:
-    """What each host runs, in words."""
     return tuple(part.names[0] for part in parts)

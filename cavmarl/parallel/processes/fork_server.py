@@ -16,7 +16,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from cavmarl.core.errors import WorkerFailureError, WorkerStartError
+from cavmarl.core.errors import WorkerError, WorkerFailureError
 from cavmarl.parallel.processes.process_barrier import WAKE
 from cavmarl.parallel.processes.worker_loop import MAIL, MAX_MESSAGE
 
@@ -76,7 +76,6 @@ class Process:
         select.select([self.pidfd], [], [])
 
     def release(self) -> None:
-        """Give its descriptors back."""
         os.close(self.pidfd)
         self.wire.close()
 
@@ -90,7 +89,7 @@ class ForkServer:
         descriptors: that it and its workers get.
 
     Raises:
-        WorkerStartError: it did not come up.
+        WorkerError: it did not come up.
         WorkerFailureError: an exception in it.
     """
 
@@ -114,7 +113,7 @@ class ForkServer:
             )
         except OSError as error:
             ours.close()
-            raise WorkerStartError(f"{sys.executable}: {error}") from error
+            raise WorkerError(f"{sys.executable}: {error}") from error
         finally:
             theirs.close()
         try:
@@ -125,7 +124,6 @@ class ForkServer:
 
     @property
     def pid(self) -> int:
-        """Of the process."""
         return self._process.pid
 
     def fork(self, number: int) -> Process:
@@ -133,7 +131,7 @@ class ForkServer:
 
         Raises:
             ServerGoneError: nobody answers.
-            WorkerStartError: this process has no descriptors left.
+            WorkerError: this process has no descriptors left.
         """
         ours, theirs = _wires()
         try:
@@ -166,11 +164,10 @@ class ForkServer:
             self._process.wait()
 
     def _greet(self) -> None:
-        """Wait until it is ready."""
         message = self._wire.recv(MAX_MESSAGE)
         if not message:
             status = self._process.wait()
-            raise WorkerStartError(
+            raise WorkerError(
                 f"the process that starts workers ended with {status} before it was ready; what it "
                 "printed stands on standard error"
             )
@@ -200,12 +197,12 @@ def _wires() -> tuple[socket.socket, socket.socket]:
     """The two ends of a wire that carries messages.
 
     Raises:
-        WorkerStartError: no descriptors are left.
+        WorkerError: no descriptors are left.
     """
     try:
         return socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
     except OSError as error:
-        raise WorkerStartError(f"no socket: {error}") from error
+        raise WorkerError(f"no socket: {error}") from error
 
 
 def _python_path() -> str:

@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
-from cavmarl.core.errors import WorkerStartError
+from cavmarl.core.errors import WorkerError
 
 __all__ = ["Layout", "Segment", "arrays_in", "shared_zeros", "size_of"]
 
@@ -48,20 +48,20 @@ class Segment:
         """A new one, of zeros.
 
         Raises:
-            WorkerStartError: there is not so much memory.
+            WorkerError: there is not so much memory.
         """
         try:
             free = _free_bytes()
             if free is not None and size > free:
-                raise WorkerStartError(_too_much(size, f"{free / 1e9:.1f} GB are free"))
+                raise WorkerError(_too_much(size, f"{free / 1e9:.1f} GB are free"))
             segment = cls(_anonymous(), 0)
         except OSError as error:
-            raise WorkerStartError(f"no shared memory: {error}") from error
+            raise WorkerError(f"no shared memory: {error}") from error
         try:
             segment.grow(size)
         except OSError as error:
             segment.close()
-            raise WorkerStartError(_too_much(size, str(error))) from error
+            raise WorkerError(_too_much(size, str(error))) from error
         return segment
 
     def grow(self, size: int) -> None:
@@ -78,13 +78,13 @@ class Segment:
         """Its bytes, as many as there are by now, as this process reads and writes them.
 
         Raises:
-            WorkerStartError: there is no room for them in this process.
+            WorkerError: there is no room for them in this process.
         """
         self.size = os.fstat(self.fd).st_size
         try:
             return mmap.mmap(self.fd, self.size)
         except OSError as error:
-            raise WorkerStartError(f"shared memory cannot be mapped: {error}") from error
+            raise WorkerError(f"shared memory cannot be mapped: {error}") from error
 
     def close(self) -> None:
         """Give the descriptor back; what is mapped stays until nobody looks at it any more."""
@@ -92,7 +92,6 @@ class Segment:
 
 
 def size_of(layout: Layout) -> int:
-    """Bytes of all arrays."""
     return max(_LINE, sum(_room(dtype, shape) for dtype, shape in layout.values()))
 
 
@@ -123,7 +122,6 @@ def _room(dtype: str, shape: tuple[int, ...]) -> int:
 
 
 def _anonymous() -> int:
-    """Descriptor of an empty file that has no name."""
     if hasattr(os, "memfd_create"):
         return os.memfd_create("cavmarl", os.MFD_CLOEXEC)
     fd, path = tempfile.mkstemp(prefix="cavmarl-")
@@ -132,7 +130,6 @@ def _anonymous() -> int:
 
 
 def _free_bytes() -> int | None:
-    """Memory that is free, where the system tells it."""
     info = Path("/proc/meminfo")
     if not info.is_file():
         return None

@@ -71,7 +71,6 @@ def _started_by(pid: int) -> list[int]:
 
 
 def _look_if_there(pid: int) -> tuple[str, int]:
-    """The same as `_look` of a process that may have ended."""
     try:
         return _look(pid)
     except OSError:

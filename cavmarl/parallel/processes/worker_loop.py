@@ -90,9 +90,7 @@ class Job(Protocol):
         """All that a successor needs to go on from here; nothing if there is no such thing."""
         ...
 
-    def load(self, arrays: Sequence[Any]) -> None:
-        """Go on from what `save` has given."""
-        ...
+    def load(self, arrays: Sequence[Any]) -> None: ...
 
     def afterwards(self) -> None:
         """Called when an order is carried out and the pool knows: for what nobody waits for.
@@ -179,7 +177,6 @@ def _failure(error: BaseException) -> bytes:
 def _fork_on_demand(
     pool: socket.socket, parent: int, jobs: Sequence[Job], start: Mapping[str, Any]
 ) -> NoReturn:
-    """Fork and bury workers as the pool asks; end with it."""
     poll = select.poll()
     poll.register(pool, select.POLLIN)
     poll.register(parent, select.POLLIN)
@@ -223,7 +220,6 @@ def _end(alive: set[int]) -> NoReturn:
 
 
 def _work(number: int, job: Job, wire: socket.socket, start: Mapping[str, Any]) -> NoReturn:
-    """The whole life of a worker."""
     cores = start["cores"]
     if cores:
         os.sched_setaffinity(0, {cores[number % len(cores)]})
@@ -239,7 +235,6 @@ def _work(number: int, job: Job, wire: socket.socket, start: Mapping[str, Any]) 
 
 
 def _obey(job: Job, meeting: Meeting, slots: Sequence[Image]) -> NoReturn:
-    """Carry out one order after the other."""
     mine, theirs = meeting.mine, meeting.theirs
     is_new = True
     wait_s = 0.0
@@ -308,7 +303,6 @@ def _await(meeting: Meeting, order: int, last_s: float, work_s: float) -> float:
 
 
 def _receive(wire: socket.socket) -> Any:
-    """The letter that came with an order."""
     while True:
         message = wire.recv(MAX_MESSAGE)
         if not message:

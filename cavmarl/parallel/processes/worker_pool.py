@@ -61,7 +61,7 @@ class Pool:
         deaths: all that there were.
 
     Raises:
-        WorkerStartError: no process, or no memory.
+        WorkerError: no process, or no memory.
         WorkerFailureError: an exception while the jobs were made.
     """
 
@@ -81,12 +81,10 @@ class Pool:
 
     @property
     def pids(self) -> list[int]:
-        """Of the workers' processes."""
         return [process.pid for process in self._crew.processes.values()]
 
     @property
     def server_pid(self) -> int:
-        """Of the process that forks them."""
         return self._crew.server_pid
 
     def team_of(self, worker: int) -> tuple[int, ...]:
@@ -224,7 +222,6 @@ class Pool:
                 death.done_s = time.monotonic()
 
     def _pending(self) -> list[int]:
-        """Who has not carried out the present order."""
         return [k for k in self._open if not self._crew.has(k)]
 
     def _replace(self, k: int, cause: str, mail: bytes | None) -> None:
@@ -280,7 +277,6 @@ class _Guard:
         self._next_s = since_s + CHECK_S
 
     def hanging(self, pending: list[int]) -> dict[int, str]:
-        """Who of them does not go on, and why one thinks so."""
         now = time.monotonic()
         if now < self._next_s:
             return {}

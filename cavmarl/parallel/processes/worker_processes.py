@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from cavmarl.core.errors import WorkerStartError
+from cavmarl.core.errors import WorkerError
 from cavmarl.parallel.processes.core_placement import keep_apart
 from cavmarl.parallel.processes.fork_server import ForkServer, Process, ServerGoneError
 from cavmarl.parallel.processes.process_barrier import (
@@ -69,7 +69,7 @@ class Crew:
         orders: (m, WORDS) the lines that this side writes.
 
     Raises:
-        WorkerStartError: no process, or no memory.
+        WorkerError: no process, or no memory.
         WorkerFailureError: an exception while the jobs were made.
     """
 
@@ -84,7 +84,7 @@ class Crew:
         self._heard: set[int] = set()  # workers whose messages have woken this side, and lie there
         try:
             if not hasattr(os, "pidfd_open"):
-                raise WorkerStartError("workers need Linux 5.3 or later: use workers=0")
+                raise WorkerError("workers need Linux 5.3 or later: use workers=0")
             self._make_memory()
             self._start()
         except BaseException:
@@ -103,7 +103,6 @@ class Crew:
 
     @property
     def server_pid(self) -> int:
-        """Of the process that forks them."""
         server = self._held.server
         return 0 if server is None else server.pid
 
@@ -357,7 +356,7 @@ class Crew:
             for k in range(self._count):
                 self._fork(k)
         except ServerGoneError as error:
-            raise WorkerStartError(
+            raise WorkerError(
                 "the process that starts workers ended before it had started all"
             ) from error
 
@@ -372,7 +371,6 @@ class Crew:
 
 
 def _say(status: int) -> str:
-    """What an exit status means."""
     if status == OUT_OF_MEMORY:
         return "out of memory"
     if status >= 0:
@@ -394,7 +392,6 @@ class _Held:
         self._pid = os.getpid()
 
     def hold(self, segment: Segment) -> Segment:
-        """Give it back with the others."""
         self.segments.append(segment)
         return segment
 

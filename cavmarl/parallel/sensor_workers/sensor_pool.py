@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cavmarl.config.env import WorkersConfig
-from cavmarl.core.errors import SensorFrameError
+from cavmarl.core.errors import WorkerError
 from cavmarl.core.numba.repeated import repeated
 from cavmarl.parallel.processes.shared_memory import Segment, size_of
 from cavmarl.parallel.processes.worker_pool import Death, Pool, Program
@@ -173,8 +173,8 @@ class SensorFarm:
         """Write the samples of all turns.
 
         Raises:
-            SensorFrameError: a frame is not that of the tick.
-            WorkerError: workers cannot be started, or die again and again.
+            WorkerError: a frame is not that of the tick; workers cannot be started, or die again
+                and again.
         """
         theirs = [turn for turn in turns if not turn.sensor.stamps_itself]
         if not theirs:
@@ -239,7 +239,7 @@ class SensorFarm:
         """See that every worker has delivered every frame that is due, of this tick.
 
         Raises:
-            SensorFrameError: the first that is not.
+            WorkerError: the first that is not.
         """
         shared = self.shared
         wrong = (shared.delivered != shared.ticks) & (shared.due[:, 0] > 0)  # (n, S, W)
@@ -248,7 +248,10 @@ class SensorFarm:
         for turn in turns:
             for worker, world in np.argwhere(wrong[:, turn.place]).tolist():
                 found = shared.delivered[worker, turn.place, world]
-                raise SensorFrameError(turn.sensor.name, int(shared.ticks[world]), int(found))
+                raise WorkerError(
+                    f"rig.{turn.sensor.name}: the frame of tick {shared.ticks[world]} is not "
+                    f"there, but one of tick {found}; sensor_workers=0 senses in this process"
+                )
 
     def _share(self, sensors: tuple[int, ...]) -> _Sharing:
         """Who senses what of some sensors, written for the workers."""

@@ -42,7 +42,6 @@ class SceneShape(NamedTuple):
 
     @property
     def layout(self) -> Layout:
-        """Name → dtype and shape; of records the bytes."""
         w, c, a, signals, s, n = self
         return {
             "rows": ("|u1", (w, c, VEHICLE.itemsize)),
@@ -85,5 +84,4 @@ class SceneArrays(NamedTuple):
         return cls(**arrays)
 
     def due_of(self, sensor: int) -> Due:
-        """What one sensor has to deliver."""
         return Due(*self.due[sensor])

@@ -75,7 +75,6 @@ class Shares:
 
     @property
     def loads_s(self) -> list[float]:
-        """What the units of each worker cost together."""
         loads: list[list[float]] = [[] for _ in range(self.workers)]
         for home, cost_s in zip(self.homes, self.costs_s, strict=True):
             loads[home].append(cost_s)

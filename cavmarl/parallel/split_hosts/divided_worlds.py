@@ -117,12 +117,10 @@ class DividedWorlds:
 
     @property
     def plans(self) -> tuple[Plan, ...]:
-        """Which host has which zones, of each world."""
         return self.placement.plans
 
     @property
     def deaths(self) -> list[Death]:
-        """Of hosts, up to now."""
         return self.pool.deaths
 
     def reset(self, seed: int | None, first_world: int) -> None:
@@ -171,7 +169,6 @@ class DividedWorlds:
         return self._worlds.ticks()
 
     def state_hash(self, world: int) -> str:
-        """Hex digest of one world."""
         return self._worlds.state_hash(world)
 
     def traffic_stats(self, world: int) -> dict[str, float]:
@@ -214,7 +211,6 @@ class DividedWorlds:
 
 
 def _names(part: Part) -> tuple[str, ...]:
-    """What each host runs, in words."""
     return tuple(
         f"{'zone' if len(zones) == 1 else 'zones'} {', '.join(map(str, zones))}"
         for zones in part.zones

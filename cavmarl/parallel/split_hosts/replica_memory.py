@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
-from cavmarl.core.errors import CorruptMessageError
+from cavmarl.core.errors import MessageError
 from cavmarl.core.huge_pages import huge_zeros
 from cavmarl.core.numba.repeated import repeated
 from cavmarl.parallel.kernels.replica_copies import (
@@ -204,7 +204,7 @@ class Replica:
         """Make the changes that the other process has sent.
 
         Raises:
-            CorruptMessageError: they are not of this memory.
+            MessageError: they are not of this memory.
         """
         at = 0
         while at < stream.size:
@@ -213,7 +213,7 @@ class Replica:
             if not fits or not self._take_changes(
                 stream, at + 2, end, self._memory.arenas[arena], self._known[arena]
             ):
-                raise CorruptMessageError("changes of a memory that is not like this one")
+                raise MessageError("changes of a memory that is not like this one")
             at = end
 
     def _open(self, arena: int) -> int:

@@ -118,7 +118,6 @@ class ZoneLeader:
         sense_here(scenes, [turn for turn in turns if turn.sensor.stamps_itself])
 
     def _take(self, commands: Commands) -> None:
-        """Put what agents do where hosts find it."""
         known = self._inputs.commands
         for name in ("controls", "meta_actions"):
             given, array = getattr(commands, name), getattr(known, name)

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cavmarl.config.env import EnvConfig
-from cavmarl.core.errors import WorkerStartError
+from cavmarl.core.errors import WorkerError
 from cavmarl.engine.world_setup import World, make_world
 from cavmarl.parallel.hosts.host_process import Outcome, serve
 from cavmarl.parallel.hosts.hosted_worlds_job import code_stamp
@@ -97,7 +97,7 @@ class ZonesJob:
         recipe: environment, and how many worlds there are.
 
     Raises:
-        WorkerStartError: this machine's files are not the caller's.
+        WorkerError: this machine's files are not the caller's.
         CavmarlError: they cannot be read.
     """
 
@@ -107,7 +107,7 @@ class ZonesJob:
         config = validate(EnvConfig, recipe["config"], "the environment")
         world = make_world(config, Path(recipe["base_dir"]))
         if fingerprint(world) != recipe["fingerprint"]:
-            raise WorkerStartError(
+            raise WorkerError(
                 f"the files of '{config.name}' in {recipe['base_dir']} are not the caller's: copy "
                 "them to all machines"
             )

@@ -56,7 +56,6 @@ class HostedZones:
                 shard.face(side, next_side)
 
     def each(self, name: str, *arguments: Any) -> None:
-        """Run a phase on all shards."""
         self._ticks += name == "move"
         if self._spent_s is not None and self._ticks % TIMED == 0:
             self._time_each(self._spent_s, name, *arguments)

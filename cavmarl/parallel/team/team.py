@@ -124,7 +124,6 @@ class Leader:
         self._last = phase
 
     def _dismiss(self) -> None:
-        """The followers need not wait any more."""
         if self._leads:
             self._leads = False
             self._wait()
@@ -213,7 +212,6 @@ class Follower:
         self._cores = usable_cores()
 
     def follow(self) -> None:
-        """Run all phases of one order."""
         line, leader = self._line, self._leader
         line[FAILED] = 0
         failure: Exception | None = None

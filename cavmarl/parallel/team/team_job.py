@@ -50,7 +50,6 @@ class LeaderJob(DiaryJob):
         worlds.simulation.host(self._lead)
 
     def _lead(self, shards: Sequence[Shard], gathering: tuple[float, float]) -> Leader:
-        """Let a team run the phases."""
         commands = [(self._commands,), *((entry,) for entry in self._diary.entries)]
         chosen = [(self._worlds.simulation.everywhere,)]
         known: dict[str, Sequence[tuple[Any, ...]]] = {
@@ -66,7 +65,6 @@ class LeaderJob(DiaryJob):
         return self._leader
 
     def followers(self) -> Iterator[FollowerJob]:
-        """The jobs of the other workers."""
         for number in range(1, len(self._zones)):
             follower = Follower(self._team, number)
             yield FollowerJob(follower, self._first, number, self._hosts.copy())
@@ -93,7 +91,6 @@ class LeaderJob(DiaryJob):
         return None
 
     def _host(self, hosts: NDArray[np.int64]) -> None:
-        """Let zones be run by these workers from now on."""
         self._hosts[:] = hosts
         self._leader.take(np.flatnonzero(hosts == 0).tolist())
 
@@ -133,7 +130,6 @@ class FollowerJob:
         """Nothing to do."""
 
     def perform(self, task: int, letter: Any) -> None:
-        """Help the leader with a task."""
         if task == Task.HOST:
             self._host(_hosts(letter[self._world]))
         else:
@@ -148,7 +144,6 @@ class FollowerJob:
         return [self._hosts]
 
     def load(self, saved: Sequence[NDArray[Any]]) -> None:
-        """Go on from what `save` gave."""
         self._host(saved[0])
 
 

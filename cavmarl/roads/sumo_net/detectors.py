@@ -154,7 +154,6 @@ class _Approaches:
         return lane, max(s, 0.0)
 
     def max_gap_s(self, lane: int) -> float:
-        """The time between two vehicles that ends the green."""
         default = parameter(self.program, "max-gap", MAX_GAP_S)
         return parameter(self.program, f"max-gap:{self.roads.lane_ids[lane]}", default)
 

@@ -128,7 +128,6 @@ class ProgramReader:
             self.timetables[attrs["wautID"]].signal_ids.append(attrs["junctionID"])
 
     def end(self, name: str) -> None:
-        """Note that an element has ended."""
         if name == "tlLogic":
             self._program = None
         elif name == "WAUT":

@@ -92,7 +92,6 @@ def with_outages(network: RoadNetwork, outages: Mapping[str, float]) -> RoadNetw
 
 
 def _remade(network: RoadNetwork, rows: SignalRows, sources: Sequence[str]) -> RoadNetwork:
-    """A network with other signals."""
     roads = DetectorRoads(
         network.lanes,
         network.edges,
@@ -112,7 +111,6 @@ def _remade(network: RoadNetwork, rows: SignalRows, sources: Sequence[str]) -> R
 
 
 def _follow(network: RoadNetwork, rows: SignalRows, timetable: Timetable) -> None:
-    """Put the signals of a timetable under it."""
     for signal_id in timetable.signal_ids:
         _check_signal(rows, signal_id, timetable.place)
         row = rows.row[signal_id]

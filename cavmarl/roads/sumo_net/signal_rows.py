@@ -176,7 +176,6 @@ class SignalRows:
         return row, index
 
     def arrays(self) -> SignalArrays:
-        """The rows as record arrays."""
         signals = np.zeros(len(self.signals), SIGNAL)
         switches = np.zeros(len(self.switches), SWITCH)
         switches[:] = sorted(self.switches)

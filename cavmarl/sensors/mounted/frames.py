@@ -29,7 +29,6 @@ class SensorFrames(NamedTuple):
         return SensorFrames(*parts)
 
     def copy(self) -> SensorFrames:
-        """A copy of them all."""
         copies: list[Any] = [array.copy() for array in self]
         return SensorFrames(*copies)
 

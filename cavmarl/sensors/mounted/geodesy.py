@@ -69,13 +69,11 @@ class ProjectedMap:
         self._offset_m = np.array([geo.offset_x_m, geo.offset_y_m, -height_m])
 
     def to_earth(self, points: Points) -> Points:
-        """See `Geodesy`."""
         x, y, height_m = (points - self._offset_m).T
         longitude, latitude = self._project(x, y, inverse=True)
         return np.stack([latitude, longitude, height_m], axis=1)
 
     def to_map(self, places: Points) -> Points:
-        """See `Geodesy`."""
         latitude, longitude, height_m = places.T
         x, y = self._project(longitude, latitude)
         found: Points = np.stack([x, y, height_m], axis=1) + self._offset_m
@@ -108,11 +106,9 @@ class TangentPlane:
         )
 
     def to_earth(self, points: Points) -> Points:
-        """See `Geodesy`."""
         return _from_centred(points @ self._axes + self._origin_m)
 
     def to_map(self, places: Points) -> Points:
-        """See `Geodesy`."""
         found: Points = (_to_centred(places) - self._origin_m) @ self._axes.T
         return found
 
@@ -150,6 +146,5 @@ def _from_centred(points: Points) -> Points:
 
 
 def _normal_m(latitude: Points) -> Points:
-    """Radius of curvature across the meridian."""
     found: Points = _AXIS_M / np.sqrt(1.0 - _SQUARED_ECCENTRICITY * np.sin(latitude) ** 2)
     return found

@@ -81,7 +81,6 @@ def range_table(ranges: Mapping[str, tuple[float, ...]]) -> NDArray[np.float64]:
 
 
 def codes(features: tuple[str, ...]) -> NDArray[np.int64]:
-    """FEATURE_* codes."""
     return np.array([GRID_FEATURES.index(name) for name in features], dtype=np.int64)
 
 

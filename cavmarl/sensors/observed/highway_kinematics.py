@@ -49,7 +49,6 @@ def features(config: SensorsConfig) -> list[Feature]:
 
 
 def shape(config: SensorsConfig) -> tuple[int, ...]:
-    """(vehicles, features)."""
     return config.kinematics.vehicles_count, len(config.kinematics.features)
 
 

@@ -48,18 +48,15 @@ def features(config: SensorsConfig) -> list[Feature]:
 
 
 def shape(config: SensorsConfig) -> tuple[int, ...]:
-    """(cells, distance and speed)."""
     return config.lidar_observation.cells, 2
 
 
 def reach_m(config: SensorsConfig) -> float:
-    """Its range, if it is on."""
     lidar = config.lidar_observation
     return lidar.maximum_range_m if lidar.cells else 0.0
 
 
 def settings(config: SensorsConfig, at: int) -> LidarCells:
-    """What the kernel takes."""
     lidar = config.lidar_observation
     return LidarCells(
         at=at,

@@ -38,7 +38,6 @@ def features(config: SensorsConfig) -> list[Feature]:
 
 
 def reach_m(config: SensorsConfig) -> float:
-    """Its range, if it is on."""
     return config.lidar.range_m if config.lidar.rays else 0.0
 
 

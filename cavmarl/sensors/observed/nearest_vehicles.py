@@ -31,7 +31,6 @@ def features(config: SensorsConfig) -> list[Feature]:
 
 
 def reach_m(config: SensorsConfig) -> float:
-    """Its range, if it is on."""
     return config.neighbors.range_m if config.neighbors.count else 0.0
 
 

@@ -55,7 +55,6 @@ def shape(config: SensorsConfig) -> tuple[int, ...]:
 
 
 def dtype(config: SensorsConfig) -> DTypeLike:
-    """Bytes for images."""
     return np.uint8 if config.occupancy_grid.as_image else np.float32
 
 

@@ -88,7 +88,6 @@ def _middle(network: RoadNetwork, lane: int, spacing_m: float) -> NDArray[np.voi
 
 
 def _beside(middle: NDArray[np.void], left_m: float, kind: int) -> NDArray[np.void]:
-    """The same points shifted to the left."""
     points = middle.copy()
     points["x"] -= left_m * middle["sin"]
     points["y"] += left_m * middle["cos"]

@@ -36,17 +36,14 @@ def features(config: SensorsConfig) -> list[Feature]:
 
 
 def shape(config: SensorsConfig) -> tuple[int, ...]:
-    """(points, numbers of each)."""
     return config.roadgraph.points, ROADGRAPH_FEATURES
 
 
 def reach_m(config: SensorsConfig) -> float:
-    """It looks at no other vehicle."""
     return 0.0
 
 
 def settings(config: SensorsConfig, at: int, network: RoadNetwork) -> RoadgraphSensor:
-    """What the kernel takes."""
     roadgraph = config.roadgraph
     road_map = road_points(network, roadgraph.spacing_m) if roadgraph.points else _no_points()
     size = len(road_map.points)

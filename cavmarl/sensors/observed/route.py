@@ -24,5 +24,4 @@ def features(config: SensorsConfig) -> list[Feature]:
 
 
 def reach_m(config: SensorsConfig) -> float:
-    """It looks at no other vehicle."""
     return 0.0

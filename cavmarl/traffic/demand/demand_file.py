@@ -196,7 +196,6 @@ class DemandFile:
         return f"{name}.{order['number']}" if self.elements[row]["flow"] else name
 
     def place(self, row: int) -> str:
-        """File and line of an ELEMENT row."""
         element = self.elements[row]
         return f"{self.report.files[int(element['file'])]}, line {element['line']}"
 

@@ -225,7 +225,6 @@ class Choices:
         return len(self.start) - 1
 
     def options(self, choice: int) -> NDArray[np.int32]:
-        """The rows of one list."""
         return self.rows[self.start[choice] : self.start[choice + 1]]
 
     def pick(self, choices: NDArray[np.int32], chances: NDArray[np.float64]) -> NDArray[np.int32]:

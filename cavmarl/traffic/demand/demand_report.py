@@ -30,7 +30,6 @@ class DemandReport:
     tolerated: dict[str, Tally] = field(default_factory=dict)
 
     def count(self, kind: str) -> None:
-        """One more element of a kind."""
         self.read[kind] = self.read.get(kind, 0) + 1
 
     def tolerate(self, what: str, place: str, count: int = 1) -> None:

@@ -60,7 +60,6 @@ class Element:
 
     @property
     def place(self) -> str:
-        """File and line."""
         return f"{self.path}, line {self.line}"
 
     def error(

@@ -74,7 +74,6 @@ class Rerouters:
             array.setflags(write=False)
 
     def content(self) -> bytes:
-        """All of it, to be hashed."""
         parts = [self.types, *(self.rules[name] for name in RULE.names or ())]
         parts += [self.closings[name] for name in CLOSING.names or ()]
         for choices in (self.goals, self.routes):

@@ -89,7 +89,6 @@ class Resolver:
         return np.array(sorted(t * num_routes + r for t, r in self._bad), dtype=np.int64)
 
     def _stub(self, elements: NDArray[np.void], ids: Sequence[str], row: int) -> Element:
-        """An element to complain about, from what is left of it."""
         element = elements[row]
         name = "flow" if element["flow"] else "vehicle"
         path = self._report.files[int(element["file"])]
@@ -98,7 +97,6 @@ class Resolver:
     def _on_roads(
         self, elements: NDArray[np.void], ids: list[str]
     ) -> tuple[NDArray[np.void], list[str]]:
-        """Leave out those whose types drive on no road."""
         on_road = np.array([options is not None for options in self._type_options], dtype=bool)
         keep = on_road[elements["types"]] if len(on_road) else np.zeros(0, dtype=bool)
         for row in np.flatnonzero(~keep):
@@ -111,7 +109,6 @@ class Resolver:
     def _options_of(
         self, elements: NDArray[np.void], sources: list[Element]
     ) -> list[Options | None]:
-        """The routes of those sources that elements use."""
         used = set(np.unique(elements["routes"]).tolist())
         return [
             self.routes.options(source) if number in used else None

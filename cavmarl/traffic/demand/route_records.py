@@ -80,7 +80,6 @@ class RouteTable:
         raise source.error(f"names the unknown route '{name}'", near(name, known))
 
     def edges(self, row: int) -> tuple[int, ...]:
-        """The EDGE rows of a route."""
         return self._edges[row]
 
     def exact(self, row: int) -> bool:

@@ -40,7 +40,6 @@ class Timing(NamedTuple):
 
 
 def single_timing(depart_ms: int) -> Timing:
-    """The timing of one vehicle."""
     return Timing(FLOW_REGULAR, depart_ms, depart_ms + 1, 1, 1, 0.0)
 
 

@@ -61,7 +61,6 @@ class TypeTable:
         return records
 
     def permissions(self, row: int) -> int:
-        """The permission bits of a type."""
         return int(self._rows[row]["permissions"])
 
     def _resolve(self, name: str, element: Element) -> int:

@@ -67,7 +67,7 @@ class Cast:
             num_agents: of a world.
 
         Raises:
-            ScenarioError: the scene has no room for so many agents.
+            ConfigError: the scene has no room for so many agents.
         """
         seats = take_seats(Streets(network), scene, num_agents)
         scripts, firsts = compile_scripts(network, scene.actors, scene.cues, goals, dt)

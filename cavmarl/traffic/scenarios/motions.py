@@ -59,7 +59,6 @@ class Wait:
     def poses(
         self, network: RoadNetwork, length: float, last: Pose | None, dt: float
     ) -> Iterator[Pose]:
-        """See `Move.poses`."""
         assert last is not None, "a script begins with a place"
         for _ in range(round(self.seconds / dt)):
             yield last._replace(speed=0.0, cue=-1)
@@ -74,7 +73,6 @@ class Await:
     def poses(
         self, network: RoadNetwork, length: float, last: Pose | None, dt: float
     ) -> Iterator[Pose]:
-        """See `Move.poses`."""
         assert last is not None, "a script begins with a place"
         yield last._replace(cue=self.cue)
 
@@ -147,7 +145,6 @@ class Ride:
     def poses(
         self, network: RoadNetwork, length: float, last: Pose | None, dt: float
     ) -> Iterator[Pose]:
-        """See `Move.poses`."""
         if last is None:
             yield self._pose(network, length, self.start_m, self.start_mps)
         far = self.end_m - self.start_m

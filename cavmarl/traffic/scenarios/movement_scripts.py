@@ -210,7 +210,6 @@ def _poses(network: RoadNetwork, actor: Actor, dt: float) -> Iterator[Pose]:
 def _write(
     tables: _Tables, shadows: Shadows, body: Body, poses: list[Pose], goal: int, dt: float
 ) -> None:
-    """Append the rows of one actor."""
     own = [shadows.of(pose, body.length, body.width) for pose in poses]
     ahead = round(FORESIGHT_S / dt)
     most = 0

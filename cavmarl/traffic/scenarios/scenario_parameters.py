@@ -16,13 +16,11 @@ T = TypeVar("T")
 
 
 def setting(default: float, low: float, high: float, unit: str, what: str) -> Any:
-    """A number within [low, high]."""
     metadata = {"low": low, "high": high, "unit": unit, "what": what}
     return field(default=default, metadata=metadata)
 
 
 def switch(default: bool, what: str) -> Any:
-    """On or off."""
     return field(default=default, metadata={"unit": "", "what": what})
 
 

@@ -60,6 +60,5 @@ class Scene:
 
     @property
     def goal_edges(self) -> list[int]:
-        """EDGE rows that somebody of it drives to."""
         released = [a.released_to for a in self.actors if a.released_to is not None]
         return list(dict.fromkeys([self.seat.goal_edge, *released]))

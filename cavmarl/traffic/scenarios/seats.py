@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from cavmarl.core.errors import ScenarioError
+from cavmarl.core.errors import ConfigError
 from cavmarl.traffic.scenarios.motions import Ride
 from cavmarl.traffic.scenarios.scene import Scene, Seat
 from cavmarl.traffic.scenarios.streets import Streets
@@ -28,7 +28,7 @@ def take_seats(streets: Streets, scene: Scene, num: int) -> list[Seat]:
         num: how many agents.
 
     Raises:
-        ScenarioError: there is no room for so many behind the first.
+        ConfigError: there is no room for so many behind the first.
     """
     rides = [act for actor in scene.actors for act in actor.acts if isinstance(act, Ride)]
     closed = {lane for ride in rides for lane in ride.lanes}
@@ -40,7 +40,7 @@ def take_seats(streets: Streets, scene: Scene, num: int) -> list[Seat]:
             closed.add(lane)
             before = streets.before(lane)
             if before is None or before in closed:
-                raise ScenarioError(
+                raise ConfigError(
                     f"population.agents = {num}: behind the agent of the scene at '{scene.place}' "
                     f"on the map '{streets.network.name}' there is room for {len(seats) - 1} "
                     f"more; ask for at most {len(seats)}, or name another scenario.place"

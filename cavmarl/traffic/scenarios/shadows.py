@@ -84,7 +84,6 @@ class Shadows:
         return best
 
     def height_m(self, lane: int, s: float) -> float:
-        """Of the road."""
         return self._pose(lane, s)[2]
 
     def distance_m(self, lane: int, s: float, pose: Pose) -> float:
@@ -98,7 +97,6 @@ class Shadows:
         return bool(abs(z[0] - z[1]) < LEVEL_M)
 
     def _near(self, points: NDArray[np.float64]) -> list[int]:
-        """Lanes whose cells the points lie in, by rising rows."""
         cells = {self._cell(x, y) for x, y in points}
         return sorted({lane for cell in cells for lane in self._members(cell)})
 

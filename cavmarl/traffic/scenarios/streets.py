@@ -71,11 +71,9 @@ class Streets:
         return np.array([x - d * sin, y + d * cos, math.atan2(sin, cos)])
 
     def edge(self, lane: int) -> int:
-        """EDGE row of a lane."""
         return int(self.network.lanes["edge"][lane])
 
     def length_m(self, lane: int) -> float:
-        """Of a lane."""
         return float(self.network.lanes["length_m"][lane])
 
     def straights(self, least_m: float) -> list[int]:
@@ -206,7 +204,6 @@ class Streets:
         return next((k for k in ends.tolist() if lanes["permissions"][k] & CAR), None)
 
     def name(self, lane: int) -> str:
-        """Of a lane."""
         return self.network.lane_ids[lane]
 
     def _bend(self, lane: int) -> float:

@@ -52,16 +52,13 @@ class RouteBook:
 
     @staticmethod
     def room(network: RoadNetwork, num_worlds: int) -> int:
-        """How many steps all worlds get."""
         lanes = len(network.lanes)
         return 2 * lanes + min(num_worlds * (64 * lanes + 100_000), MAX_WAY_STEPS)
 
     def begin(self, w: int) -> None:
-        """Forget an episode of a world."""
         self._worlds[w] = _Pages(self._first + w * self._of_world)
 
     def paths(self, w: int) -> Paths:
-        """What a world has."""
         return self._worlds[w].arrays(self._nowhere)
 
     def shift(self, rows: NDArray[np.void], worlds: int) -> None:
@@ -93,7 +90,6 @@ class RouteBook:
         return found
 
     def _plan(self, pages: _Pages, edges: NDArray[np.int32], mask: int) -> int:
-        """The number of a path, planned if nobody has driven it."""
         known = pages.known.get((edges.tobytes(), mask))
         if known is not None:
             return known
@@ -154,7 +150,6 @@ class _Pages:
         return number
 
     def arrays(self, nowhere: int) -> Paths:
-        """All paths, for kernels."""
         end = int(self._first[self._num])
         return Paths(self._first[: self._num + 1], self._edges[:end], self._ways[:end], nowhere)
 

@@ -52,11 +52,9 @@ class StopBook:
 
     @staticmethod
     def room(num_worlds: int) -> int:
-        """How many stops all worlds get."""
         return min(num_worlds * OF_WORLD, MAX_STOPS)
 
     def begin(self, w: int) -> None:
-        """Forget an episode of a world."""
         self._ends[w] = w * self._of_world
         self._known[w] = {}
 

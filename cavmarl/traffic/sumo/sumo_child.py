@@ -75,7 +75,6 @@ class Simulation:
         self._puppets: dict[int, str] = {}
 
     def start(self, words: list[str]) -> dict[str, Any]:
-        """Begin anew; which SUMO it is."""
         self._stop()
         self._forget()
         if self._sumo is None:

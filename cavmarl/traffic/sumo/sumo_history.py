@@ -12,7 +12,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from cavmarl.core.errors import SumoStateError
+from cavmarl.core.errors import SumoError
 from cavmarl.traffic.sumo.sumo_records import MOVED
 
 __all__ = ["ToldLog"]
@@ -86,17 +86,17 @@ class ToldLog:
             count: of the ticks since its reset.
 
         Raises:
-            SumoStateError: so many are not on record.
+            SumoError: so many are not on record.
         """
         words = self._words
         if words[_IS_CUT]:
-            raise SumoStateError(
+            raise SumoError(
                 f"the record of what SUMO was told in {count} ticks takes more than "
                 f"{self._most * _WORD / 2**20:g} MiB, so it was not kept, and no other process can "
                 "take up this SUMO: reset the worlds, and raise sumo.replay_mib for the next time"
             )
         if words[_TICKS] < count:
-            raise SumoStateError(
+            raise SumoError(
                 f"of {count} ticks of a SUMO {words.item(_TICKS)} are on record: no other process "
                 "can take it up; reset the worlds"
             )

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from cavmarl.core.errors import SumoBusyError, require
+from cavmarl.core.errors import SumoError, require
 from cavmarl.traffic.sumo.sumo_input import SumoInput, without_outputs
 
 __all__ = ["command_words", "free_libsumo"]
@@ -54,11 +54,11 @@ def free_libsumo() -> object:
 
     Raises:
         MissingExtraError: it is not installed.
-        SumoBusyError: a simulation runs in it: a second start would silently replace it.
+        SumoError: a simulation runs in it: a second start would silently replace it.
     """
     libsumo = require("libsumo", "sumo")
     if libsumo.isLoaded():
-        raise SumoBusyError(
+        raise SumoError(
             "libsumo holds one simulation a process, and one runs in this one: close it, or start "
             "the other one in a process of its own"
         )

@@ -19,7 +19,7 @@ from typing import IO, Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from cavmarl.core.errors import ConfigError, MissingExtraError, SumoDiedError
+from cavmarl.core.errors import ConfigError, MissingExtraError, SumoError
 from cavmarl.traffic.sumo import sumo_child as child
 from cavmarl.traffic.sumo.sumo_records import MOVED, SEEN
 
@@ -97,7 +97,6 @@ class SumoProcess:
 
     @property
     def lives(self) -> bool:
-        """Whether it has not been closed."""
         return self._finalizer.alive
 
     def look_up(self, words: list[str]) -> dict[str, Any]:
@@ -105,7 +104,7 @@ class SumoProcess:
 
         Raises:
             ConfigError: SUMO refuses them.
-            SumoDiedError: the process has ended.
+            SumoError: the process has ended.
         """
         self._send(child.LOOK_UP, {"words": words})
         return self._receive().line
@@ -122,7 +121,7 @@ class SumoProcess:
             moved: MOVED (n,), where our vehicles are after it.
 
         Raises:
-            SumoDiedError: the process has ended.
+            SumoError: the process has ended.
         """
         self._send(child.STEP, {}, moved.tobytes())
 
@@ -131,7 +130,6 @@ class SumoProcess:
         return self._receive()
 
     def close(self) -> None:
-        """End the process."""
         self._finalizer()
 
     def _send(self, kind: int, line: Mapping[str, Any], records: bytes = b"") -> None:
@@ -164,8 +162,7 @@ class SumoProcess:
             raise self._death() from error
         return content
 
-    def _death(self) -> SumoDiedError:
-        """What is to be said of it; whatever is left of it ends."""
+    def _death(self) -> SumoError:
         try:
             status = self._process.wait(END_S)
             how = f"ended with {status}"
@@ -173,7 +170,7 @@ class SumoProcess:
             how = f"has not answered for {ANSWER_S:g} s"
         words = self._last_words()
         self.close()
-        return SumoDiedError(
+        return SumoError(
             f"the process of SUMO {how}{words}\nThe world is as it was before the step; reset it "
             "to go on"
         )

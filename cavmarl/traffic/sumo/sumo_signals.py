@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from cavmarl.core.errors import SumoStateError
+from cavmarl.core.errors import SumoError
 from cavmarl.roads.network import SIGNAL_STATES, RoadNetwork
 
 __all__ = ["ShownSignals"]
@@ -56,7 +56,7 @@ class ShownSignals:
             phase: (num_signals,) is written.
 
         Raises:
-            SumoStateError: a signal shows what no program of the map's has.
+            SumoError: a signal shows what no program of the map's has.
         """
         codes, last = np.frombuffer(letters, dtype=np.uint8), self._last[w]
         if last is None:
@@ -68,7 +68,7 @@ class ShownSignals:
             row = self._rows.get((signal, part))
             if row is None:
                 self._last[w] = None
-                raise SumoStateError(
+                raise SumoError(
                     f"signal '{self._ids[signal]}' shows '{part.decode()}', which no "
                     "phase of its programs does: give all of its programs as <tlLogic> in the map "
                     "or in an additional file of the demand"

@@ -107,7 +107,7 @@ class SumoTraffic:
         """Bring SUMO to the worlds' ticks, from the beginning of their episodes.
 
         Raises:
-            SumoStateError: SUMO has been told where ours are, and that is not on record.
+            SumoError: SUMO has been told where ours are, and that is not on record.
         """
         for w, (key, tick) in enumerate(zip(worlds.keys, worlds.ticks.tolist(), strict=True)):
             told: Iterable[NDArray[np.void]] = repeat(np.zeros(0, dtype=MOVED), tick)

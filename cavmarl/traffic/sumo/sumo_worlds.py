@@ -15,7 +15,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from cavmarl.core.errors import ConfigError, SumoDiedError, SumoStateError
+from cavmarl.core.errors import ConfigError, SumoError
 from cavmarl.traffic.kernels.mirroring import Paths
 from cavmarl.traffic.sumo.route_book import RouteBook
 from cavmarl.traffic.sumo.stop_book import StopBook
@@ -89,7 +89,6 @@ class SumoWorlds:
 
     @property
     def pids(self) -> tuple[int, ...]:
-        """Of the processes that live."""
         return tuple(p.pid for p in self._processes if p is not None and p.lives)
 
     def begin(self, w: int, key: int) -> None:
@@ -101,7 +100,7 @@ class SumoWorlds:
 
         Raises:
             ConfigError: SUMO refuses its files.
-            SumoDiedError: the process ended.
+            SumoError: the process ended.
         """
         process = self._processes[w]
         if process is None or not process.lives:
@@ -124,11 +123,10 @@ class SumoWorlds:
         """What is known of a world's present tick."""
         tick = self._ticks[w]
         if tick is None:
-            raise SumoDiedError("the process of SUMO has ended: reset the world to go on")
+            raise SumoError("the process of SUMO has ended: reset the world to go on")
         return tick
 
     def paths(self, w: int) -> Paths:
-        """The paths of a world."""
         return self.book.paths(w)
 
     def step(self, ticks: Sequence[int], moved: Callable[[int], NDArray[np.void]]) -> None:
@@ -139,8 +137,8 @@ class SumoWorlds:
             moved: MOVED (n,) of a world: where vehicles of ours are after the step.
 
         Raises:
-            SumoDiedError: a process has ended; its world has to be reset.
-            SumoStateError: a world is not at the tick that its SUMO is at.
+            SumoError: a process has ended; its world has to be reset; a world is not at the tick
+                that its SUMO is at.
         """
         asked = []
         for w, tick in enumerate(ticks):
@@ -148,7 +146,7 @@ class SumoWorlds:
             if last.tick == tick + 1:  # the tick has been begun before
                 continue
             if last.tick != tick:
-                raise SumoStateError(f"world {w} is at tick {tick}, its SUMO at {last.tick}")
+                raise SumoError(f"world {w} is at tick {tick}, its SUMO at {last.tick}")
             asked.append(w)
         told = {}
         try:
@@ -158,11 +156,11 @@ class SumoWorlds:
             for w in asked:
                 self._ticks[w] = self._take(w, ticks[w] + 1, self._process(w).end_step())
                 self._note(w, told[w])
-        except (SumoDiedError, ConfigError) as error:
+        except (SumoError, ConfigError) as error:
             # Others may have taken the step, and their worlds have not.
             for w in asked:
                 self._ticks[w] = None
-            raise SumoDiedError(f"world {w}: {error}") from error
+            raise SumoError(f"world {w}: {error}") from error
 
     def step_one(self, w: int, tick: int, moved: NDArray[np.void]) -> None:
         """Let the SUMO of one world take a step from a tick; errors as of `step`."""
@@ -176,7 +174,6 @@ class SumoWorlds:
             self.logs[w].note(moved)
 
     def close(self) -> None:
-        """End all processes."""
         for process in self._processes:
             if process is not None:
                 process.close()
@@ -184,14 +181,14 @@ class SumoWorlds:
     def _process(self, w: int) -> SumoProcess:
         process = self._processes[w]
         if process is None:
-            raise SumoDiedError("SUMO has not been started: reset the world first")
+            raise SumoError("SUMO has not been started: reset the world first")
         return process
 
     def _take(self, w: int, tick: int, answer: Answer) -> Tick:
         line, seen = answer.line, answer.seen
         should_be = self._begin_ms + tick * self._tick_ms
         if line["time_ms"] != should_be:
-            raise SumoStateError(
+            raise SumoError(
                 f"world {w}: SUMO's clock says {line['time_ms']} ms, ours {should_be} ms"
             )
         self.book.enter(w, line.get("routes", []))
@@ -215,7 +212,6 @@ class SumoWorlds:
         )
 
     def _changed(self, w: int, seen: NDArray[np.void]) -> NDArray[np.int64]:
-        """Numbers of those whose path is another than before."""
         numbers = seen["number"]
         missing = len(self.names[w]) - len(self._path_of[w])
         known = np.append(self._path_of[w], np.full(missing, -1, dtype=np.int32))

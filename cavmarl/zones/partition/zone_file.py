@@ -19,7 +19,7 @@ from typing import Literal
 import numpy as np
 
 from cavmarl.config.env import MAX_ZONES, ZONE_FILE_SUFFIXES, ZONE_LAYOUTS
-from cavmarl.core.errors import ConfigError, ZoneError
+from cavmarl.core.errors import ConfigError
 from cavmarl.roads.network import RoadNetwork
 from cavmarl.zones.partition.zone_layouts import cut_map
 from cavmarl.zones.partition.zone_partition import Bounds, ZonePartition
@@ -49,9 +49,9 @@ def read_zones(path: str | Path) -> ZonePartition:
     """The partition of a zone file.
 
     Raises:
-        ConfigError: unreadable, not YAML or JSON, an unknown or a doubled key, a wrong type.
-        ZoneError: a doubled or missing id, too many zones, or rectangles that overlap, leave a gap,
-            leave the bounds or are not finite; names the file, the zones, the place and the cure.
+        ConfigError: unreadable, not YAML or JSON, an unknown or a doubled key, a wrong type; a
+            doubled or missing id, too many zones, or rectangles that overlap, leave a gap, leave
+            the bounds or are not finite; names the file, the zones, the place and the cure.
     """
     from cavmarl.config.io import read_yaml, validate
 
@@ -60,37 +60,37 @@ def read_zones(path: str | Path) -> ZonePartition:
     ids = [zone.id for zone in document.zones]
     count = len(ids)
     if count > MAX_ZONES:
-        raise ZoneError(f"{path}: {count} zones: at most {MAX_ZONES} can be")
+        raise ConfigError(f"{path}: {count} zones: at most {MAX_ZONES} can be")
     for number in ids:
         if ids.count(number) > 1:
-            raise ZoneError(f"{path}: id {number} stands {ids.count(number)} times: number anew")
+            raise ConfigError(f"{path}: id {number} stands {ids.count(number)} times: number anew")
     missing = sorted(set(range(count)) - set(ids))
     if missing:
-        raise ZoneError(
+        raise ConfigError(
             f"{path}: no zone has the id {missing[0]}: {count} zones have the ids 0 to {count - 1}"
         )
     rects = np.array([zone.rect_m for zone in sorted(document.zones, key=lambda zone: zone.id)])
     try:
         return ZonePartition(document.bounds_m, rects)
-    except ZoneError as error:
-        raise ZoneError(f"{path}: {error}") from error
+    except ConfigError as error:
+        raise ConfigError(f"{path}: {error}") from error
 
 
 def zones_for(network: RoadNetwork, path: str | Path, count: int | None) -> ZonePartition:
     """The partition of a zone file, which has to be of this map and have `count` zones, if given.
 
     Raises:
-        ConfigError: see `read_zones`.
-        ZoneError: see `read_zones`; another number of zones; roads beyond the bounds.
+        ConfigError: see `read_zones`; see `read_zones`; another number of zones; roads beyond the
+            bounds.
     """
     partition = read_zones(path)
     if count is not None and partition.count != count:
-        raise ZoneError(
+        raise ConfigError(
             f"zones.count = {count}: {path} has {partition.count} zones; use {partition.count}"
         )
     extent, bounds = np.array(network.extent_m), np.array(partition.bounds)
     if (extent[:2] < bounds[:2]).any() or (extent[2:] > bounds[2:]).any():
-        raise ZoneError(
+        raise ConfigError(
             f"{path}: bounds_m = {list(partition.bounds)} do not hold the roads of "
             f"'{network.name}', which reach from {extent[:2].tolist()} to {extent[2:].tolist()}: "
             "is it another map's? Cut this one with `cavmarl map zones`"
@@ -138,7 +138,7 @@ def write_zones(path: str | Path, partition: ZonePartition) -> None:
     """Write a partition as JSON, one zone a line.
 
     Raises:
-        ZoneError: the file cannot be written.
+        ConfigError: the file cannot be written.
     """
     zones = ",\n".join(
         "  " + json.dumps({"id": zone, "rect_m": rect})
@@ -148,4 +148,4 @@ def write_zones(path: str | Path, partition: ZonePartition) -> None:
     try:
         Path(path).write_text(f'{head[:-1]},\n "zones": [\n{zones}]}}\n', encoding="utf-8")
     except OSError as error:
-        raise ZoneError(f"{path}: cannot be written ({error.strerror or error})") from error
+        raise ConfigError(f"{path}: cannot be written ({error.strerror or error})") from error

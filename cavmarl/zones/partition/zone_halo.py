@@ -11,7 +11,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from cavmarl.core.errors import ZoneError
+from cavmarl.core.errors import ConfigError
 from cavmarl.zones.kernels.zone_lookup import LOOK, WATCH, Halo
 from cavmarl.zones.partition.zone_partition import ZonePartition
 
@@ -25,10 +25,10 @@ def zone_halo(partition: ZonePartition, halo_m: float) -> Halo:
     """What `kernels.exchange.exchange` takes, where everybody within the halo is seen.
 
     Raises:
-        ZoneError: `halo_m` is negative or not finite.
+        ConfigError: `halo_m` is negative or not finite.
     """
     if not (math.isfinite(halo_m) and halo_m >= 0.0):
-        raise ZoneError(f"halo_m = {halo_m!r}: must be a finite number from 0")
+        raise ConfigError(f"halo_m = {halo_m!r}: must be a finite number from 0")
     rects = partition.reaching
     gaps = np.maximum(rects[:, None, :2] - rects[None, :, 2:], 0.0)
     gaps = np.maximum(gaps, gaps.swapaxes(0, 1))

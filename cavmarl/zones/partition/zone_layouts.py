@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cavmarl.config.env import MAX_ZONES, ZONE_LAYOUTS
-from cavmarl.core.errors import ZoneError
+from cavmarl.core.errors import ConfigError
 from cavmarl.roads.network import RoadNetwork
 from cavmarl.zones.partition.zone_partition import Bounds, ZonePartition
 from cavmarl.zones.partition.zone_survey import junction_boxes, lane_samples
@@ -71,15 +71,15 @@ def cut_map(
         density: (n, 3) x and y in m, and a weight: shared out instead, such as expected vehicles.
 
     Raises:
-        ZoneError: no such layout or weight, more zones than there can be or than the map can hold,
-            or a density that is none.
+        ConfigError: no such layout or weight, more zones than there can be or than the map can
+            hold, or a density that is none.
     """
     if layout not in ZONE_LAYOUTS:
-        raise ZoneError(f"layout '{layout}': there are {', '.join(ZONE_LAYOUTS)}")
+        raise ConfigError(f"layout '{layout}': there are {', '.join(ZONE_LAYOUTS)}")
     if weight not in _WEIGHTS:
-        raise ZoneError(f"weight '{weight}': there are {', '.join(_WEIGHTS)}")
+        raise ConfigError(f"weight '{weight}': there are {', '.join(_WEIGHTS)}")
     if not 1 <= count <= MAX_ZONES:
-        raise ZoneError(f"{count} zones: must be a whole number from 1 to {MAX_ZONES}")
+        raise ConfigError(f"{count} zones: must be a whole number from 1 to {MAX_ZONES}")
     min_x, min_y, max_x, max_y = network.extent_m
     area = _Area(
         bounds=(min_x - _RIM_M, min_y - _RIM_M, max_x + _RIM_M, max_y + _RIM_M),
@@ -99,7 +99,7 @@ def _samples(network: RoadNetwork, weight: str, density: Floats | None) -> Float
     density = np.asarray(density, dtype=np.float64)
     shaped = density.ndim == 2 and density.shape[1] == 3
     if not (shaped and np.isfinite(density).all() and (density[:, 2] >= 0.0).all()):
-        raise ZoneError("density: must be rows of x, y and weight, finite, no weight below 0")
+        raise ConfigError("density: must be rows of x, y and weight, finite, no weight below 0")
     return density[density[:, 2] > 0.0]
 
 
@@ -115,7 +115,7 @@ def _grid_shape(bounds: Bounds, count: int, *, strips: bool) -> tuple[int, int]:
 
     best = max(shapes, key=shorter_side)
     if shorter_side(best) < MIN_SIDE_M:
-        raise ZoneError(
+        raise ConfigError(
             f"{count} zones: {best[0]} rows and {best[1]} columns of a map of {width:.0f} m x "
             f"{height:.0f} m would be {height / best[0]:.2f} m x {width / best[1]:.2f} m; a zone's "
             f"sides must be at least {MIN_SIDE_M:g} m: use fewer zones or another layout"
@@ -146,7 +146,6 @@ def _even_cuts(area: _Area, axis: int, parts: int) -> list[float]:
 
 
 def _bisected(area: _Area, rect: Rect, samples: Floats | None, count: int) -> list[Rect]:
-    """Cut `rect`, which holds `samples`, into `count` parts."""
     if count == 1:
         return [rect]
     size = (rect[2] - rect[0], rect[3] - rect[1])
@@ -158,7 +157,7 @@ def _bisected(area: _Area, rect: Rect, samples: Floats | None, count: int) -> li
         if window is not None:
             break
     else:
-        raise ZoneError(
+        raise ConfigError(
             f"more zones than the map can hold: {count} are left for x {rect[0]:.2f} to "
             f"{rect[2]:.2f}, y {rect[1]:.2f} to {rect[3]:.2f}, where no cut leaves a part of what "
             f"is shared out and {MIN_SIDE_M:g} m on both sides: use fewer zones"

@@ -16,7 +16,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from cavmarl.core.errors import ZoneError
+from cavmarl.core.errors import ConfigError
 from cavmarl.zones.kernels.zone_lookup import ZoneArrays, zone_of, zones_of
 
 __all__ = ["Bounds", "Neighbor", "ZonePartition"]
@@ -49,7 +49,7 @@ class ZonePartition:
             read-only.
 
     Raises:
-        ZoneError: the rectangles overlap, leave a gap, leave `bounds` or are none; the message
+        ConfigError: the rectangles overlap, leave a gap, leave `bounds` or are none; the message
             names the zones and the place.
     """
 
@@ -65,7 +65,6 @@ class ZonePartition:
 
     @property
     def count(self) -> int:
-        """How many zones there are."""
         return len(self.rects)
 
     @cached_property
@@ -79,7 +78,6 @@ class ZonePartition:
 
     @cached_property
     def arrays(self) -> ZoneArrays:
-        """What kernels take."""
         return ZoneArrays(
             self._sides(0)[1:-1].copy(), self._sides(1)[1:-1].copy(), self._cells, self.reaching
         )
@@ -124,7 +122,6 @@ class ZonePartition:
         return hashlib.sha256(json.dumps({"cavmarl.zones": sides}).encode()).hexdigest()
 
     def _sides(self, axis: int) -> NDArray[np.float64]:
-        """All coordinates at which a zone begins or ends, rising."""
         return np.unique(self.rects[:, [axis, axis + 2]])
 
     @cached_property
@@ -137,12 +134,12 @@ class ZonePartition:
             part = cells[slice(*np.searchsorted(sides_y, (low, high))), columns]
             if (part >= 0).any():
                 other = int(part[part >= 0][0])
-                raise ZoneError(_overlap(other, zone, self.rects))
+                raise ConfigError(_overlap(other, zone, self.rects))
             part[:] = zone
         if (cells < 0).any():
             row, column = np.argwhere(cells < 0)[0]
             gap = (*sides_x[column : column + 2], *sides_y[row : row + 2])
-            raise ZoneError(
+            raise ConfigError(
                 f"no zone covers {_span(*gap)}: every place of bounds_m needs a zone; let a zone "
                 "beside the gap reach over it"
             )
@@ -153,16 +150,16 @@ class ZonePartition:
 def _check_rects(rects: NDArray[np.float64], bounds: Bounds) -> None:
     """Refuse what is no rectangle, and what lies outside of `bounds`."""
     if not len(rects):
-        raise ZoneError("there are no zones: at least one has to cover the map")
+        raise ConfigError("there are no zones: at least one has to cover the map")
     for what, rect in (("bounds_m", np.array(bounds)), *enumerate(rects)):
         name = what if isinstance(what, str) else f"zone {what}"
         if not np.isfinite(rect).all():
-            raise ZoneError(
+            raise ConfigError(
                 f"{name}: {rect.tolist()} must be finite numbers; sides on bounds_m reach to "
                 "infinity by themselves"
             )
         if not (rect[:2] < rect[2:]).all():
-            raise ZoneError(
+            raise ConfigError(
                 f"{name}: {rect.tolist()} is empty: give min_x, min_y, max_x, max_y in m, the "
                 "first two below the last two"
             )
@@ -170,14 +167,14 @@ def _check_rects(rects: NDArray[np.float64], bounds: Bounds) -> None:
     for zone in np.flatnonzero(
         (rects[:, :2] < low).any(axis=1) | (rects[:, 2:] > high).any(axis=1)
     ):
-        raise ZoneError(
+        raise ConfigError(
             f"zone {zone}: {rects[zone].tolist()} leaves bounds_m = {list(bounds)}: end it there, "
             "or widen bounds_m"
         )
     for axis, side in enumerate(bounds):
         if side not in rects[:, axis]:
             edge = ("min_x", "min_y", "max_x", "max_y")[axis]
-            raise ZoneError(
+            raise ConfigError(
                 f"no zone reaches {edge} = {side:g} of bounds_m: widen the zones there to it"
             )
 

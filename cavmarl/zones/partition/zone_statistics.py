@@ -53,16 +53,13 @@ class ZoneStatistics:
 
     @property
     def lane_imbalance(self) -> float:
-        """Of `lane_km`."""
         return imbalance(self.lane_km)
 
     @property
     def vehicle_imbalance(self) -> float:
-        """Of `vehicles`."""
         return imbalance(self.vehicles)
 
     def to_dict(self) -> dict[str, Any]:
-        """As plain types for JSON."""
         return asdict(self) | {
             "lane_imbalance": self.lane_imbalance,
             "vehicle_imbalance": self.vehicle_imbalance,

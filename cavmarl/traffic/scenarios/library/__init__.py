@@ -23,7 +23,7 @@ from typing import Any
 import numpy as np
 
 from cavmarl.config.scenario import ScenarioConfig
-from cavmarl.core.errors import NoPlaceError, ScenarioError
+from cavmarl.core.errors import ConfigError, ScenarioError
 from cavmarl.core.math.rng import STREAM_PLACE, below, world_key
 from cavmarl.roads.network import RoadNetwork
 from cavmarl.traffic.scenarios.scenario_parameters import checked
@@ -48,7 +48,7 @@ def load_scenario(name: str) -> Any:
         name: one of `scenario_names`, or the path of a `.py` file.
 
     Raises:
-        ScenarioError: nothing of that name, or a file that is no scenario.
+        ConfigError: nothing of that name, or a file that is no scenario.
     """
     if name in scenario_names():
         return importlib.import_module(f"{__name__}.{name}")
@@ -56,26 +56,26 @@ def load_scenario(name: str) -> Any:
     if path.suffix != ".py" or not path.is_file():
         close = get_close_matches(name, scenario_names(), n=1)
         hint = f"did you mean {close[0]}? " if close else ""
-        raise ScenarioError(
+        raise ConfigError(
             f"no scenario or file '{name}'; {hint}There are: {', '.join(scenario_names())}"
         )
     module = _run(path)
     if missing := [part for part in PARTS if not hasattr(module, part)]:
-        raise ScenarioError(f"{path}: no scenario, it does not define {', '.join(missing)}")
+        raise ConfigError(f"{path}: no scenario, it does not define {', '.join(missing)}")
     return module
 
 
 def _run(path: Path) -> ModuleType:
     spec = importlib.util.spec_from_file_location(f"cavmarl_scenario_{path.stem}", path)
     if spec is None or spec.loader is None:
-        raise ScenarioError(f"{path}: not a Python file")
+        raise ConfigError(f"{path}: not a Python file")
     module = importlib.util.module_from_spec(spec)
     sys.modules[spec.name] = module  # where its dataclass looks for what its annotations name
     try:
         spec.loader.exec_module(module)
     except Exception as error:  # the file is the user's: it may raise anything
         del sys.modules[spec.name]
-        raise ScenarioError(f"{path}: {type(error).__name__}: {error}") from error
+        raise ConfigError(f"{path}: {type(error).__name__}: {error}") from error
     return module
 
 
@@ -89,9 +89,9 @@ def plan_scene(config: ScenarioConfig, network: RoadNetwork) -> Scene | None:
     """What is played on a map; None without a scenario.
 
     Raises:
-        ScenarioError: no such scenario, or no such place on the map.
-        NoPlaceError: the map has none at all.
-        ConfigError: a parameter that it does not have, or a value out of range.
+        ConfigError: no such scenario, or no such place on the map; a parameter that it does not
+            have, or a value out of range.
+        ScenarioError: the map has none at all.
     """
     if not config.name:
         return None
@@ -99,7 +99,7 @@ def plan_scene(config: ScenarioConfig, network: RoadNetwork) -> Scene | None:
     parameters = checked(scenario.Parameters, config.params, config.name)
     places = _places(config.name, network, parameters)
     if not places:
-        raise NoPlaceError(
+        raise ScenarioError(
             f"scenario '{config.name}': the map '{network.name}' has no place for it; it needs "
             f"{scenario.NEEDS}"
         )
@@ -110,7 +110,7 @@ def plan_scene(config: ScenarioConfig, network: RoadNetwork) -> Scene | None:
     if name not in places:
         close = get_close_matches(name, places, n=1)
         some = ", ".join(close or sorted(places)[:5])
-        raise ScenarioError(
+        raise ConfigError(
             f"scenario.place = {name!r}: not one of the {len(places)} places that the map "
             f"'{network.name}' has for '{config.name}', such as {some}"
         )
@@ -120,6 +120,5 @@ def plan_scene(config: ScenarioConfig, network: RoadNetwork) -> Scene | None:
 
 @lru_cache(maxsize=16)  # several worlds of an environment ask one after the other
 def _places(name: str, network: RoadNetwork, parameters: Any) -> dict[str, Any]:
-    """Where on a map a scenario can be played, by name."""
     found: dict[str, Any] = load_scenario(name).places(Streets(network), parameters)
     return found

@@ -83,7 +83,6 @@ def _first_turn(other: Opposite) -> float:
 
 
 def _parts(streets: Streets, other: Opposite) -> list[NDArray[np.float64]]:
-    """The lines forwards, backwards and forwards again."""
     first = _first_turn(other)
     forward = arc(streets.point(other.lane, other.s), RADIUS_M, first)
     back = arc(forward[-1], RADIUS_M, math.pi - 2.0 * first, backwards=True)
