@@ -53,19 +53,22 @@ LONG_FUNCTIONS = {
     "cavmarl/verify/worker_kills.py:verify_kills",
 }
 
+# Modules of one name, outside of cli/ and config/.
+SHARED_MODULE_NAMES = {"sensor_rig.py"}
+
 # Public classes of one name in several modules.
 SHARED_CLASS_NAMES = set(
     """
     Answer Camera Change Clock Collector Control Difference Entry Follower Heard Host Image Job
     Line Measured Moment Monitor Mount Move Outcome Parameters Placement Plan Pose Program Rates
     Refusal Replica Room Row Run Samples Scene Schedule Seat Selection Sensor SensorJob Sight
-    Simulation Snapshot State SumoConfig Tally Tick Turn Watch Window World
+    Simulation Snapshot State Spread SumoConfig Tally Tick Turn Watch Window World
     """.split()
 )
 
 # Persons where the field says vehicle, zone, worker. These numbers may only fall.
 PERSONS = re.compile(r"\b(who|whoever|nobody|somebody)\b", re.IGNORECASE)
-PERSONS_AT_MOST = {"cavmarl": 859, "docs": 255}
+PERSONS_AT_MOST = {"cavmarl": 797, "docs": 10}
 
 
 def sources(*folders: str) -> Iterator[tuple[str, str]]:
@@ -97,7 +100,11 @@ def test_no_two_modules_have_one_name() -> None:
         _, *folders, file = path.split("/")
         if not file.startswith("_") and not {"cli", "config"} & set(folders):
             places[file].append(path)
-    shared = [paths for paths in places.values() if len(paths) > 1]
+    shared = [
+        paths
+        for name, paths in places.items()
+        if len(paths) > 1 and name not in SHARED_MODULE_NAMES
+    ]
     assert not shared, f"one of each wants a name of its own: {shared}"
 
 

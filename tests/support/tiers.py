@@ -40,6 +40,14 @@ ALONE_FILES: tuple[str, ...] = (
     "tests/test_memory.py",
 )
 
+# Their kernels draw numbers by unsigned products, which Python warns of.
+_COMPILED_ONLY = (
+    "tests/sensors/test_gnss.py",
+    "tests/sensors/test_measuring.py",
+    "tests/sensors/test_rig_schedule.py",
+    "tests/v2x/",
+)
+
 
 def mark(item: pytest.Item) -> None:
     """Say which tier a test is of, and whether it runs alone."""
@@ -47,7 +55,7 @@ def mark(item: pytest.Item) -> None:
     of_maps = _MAP_FIXTURES & set(getattr(item, "fixturenames", ()))
     if of_maps or path.startswith(_DEAR_FOLDERS) or _starts_processes(item.path):
         item.add_marker(pytest.mark.integration)
-    elif _has_twin(item.path):
+    elif _has_twin(item.path) and not path.startswith(_COMPILED_ONLY):
         item.add_marker(pytest.mark.twin)
     if path in ALONE_FILES:
         item.add_marker(pytest.mark.alone)

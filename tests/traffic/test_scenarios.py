@@ -91,7 +91,7 @@ def test_the_reference_driver_passes_and_who_never_yields_does_not(
 
 
 @pytest.mark.parametrize("name", NAMES)
-@pytest.mark.parametrize("seed", [2, 3])
+@pytest.mark.parametrize("seed", [2, pytest.param(3, marks=pytest.mark.slow)])
 def test_so_it_is_in_a_town(name: str, seed: int) -> None:
     assert played(name, "idm", seed, env="town").verdict == "passed"
     assert played(name, "never_yield", seed, env="town").verdict == "collided"
