@@ -7,19 +7,26 @@ READY := .venv/.ready
 VENV_PACKAGE := { test "$$(id -u)" = 0 && apt-get update && apt-get install --yes python3-venv; }
 OLDEST := .venv-oldest
 LIBRARIES := .venv-libraries
+RAY := .venv-ray
 # What old versions of others will no longer do is no news; the rest stays an error.
 OLDEST_WARNINGS := -W default::DeprecationWarning -W default::PendingDeprecationWarning
-OLDEST_TESTS := tests/kernels tests/roads tests/runtime tests/traffic tests/config/test_config.py \
-    tests/config/test_registry.py tests/env/test_registration.py tests/env/test_parallel_env.py tests/env/test_vector_env.py \
+OLDEST_TESTS := tests/core tests/driving tests/engine tests/handoff tests/rewards tests/roads tests/sensors \
+    tests/traffic tests/v2x tests/zones tests/config tests/env/test_registration.py \
+    tests/env/test_parallel_env.py tests/env/test_vector_env.py tests/parallel/test_worker_pool.py \
     tests/test_bad_input.py tests/test_public_api.py tests/adapters
-LIBRARIES_TESTS := tests/adapters tests/train/test_programs.py tests/hosts \
-    tests/parallel/test_remote_worlds.py tests/parallel/test_remote_start.py
+RAY_TESTS := tests/parallel/test_ray_cluster.py tests/parallel/test_remote_worlds.py \
+    tests/parallel/test_remote_start.py
+LIBRARIES_TESTS := tests/adapters tests/train/test_programs.py tests/parallel/test_framed_socket.py \
+    tests/parallel/test_host_pool.py $(RAY_TESTS)
+# Compiled by one process before two of them run tests.
+KERNELS := -c 'from cavmarl import parallel_env; parallel_env("merge").reset()'
+TWO := -n 2 --dist loadfile
 FUZZ_SECONDS ?= 60
 FUZZ_TARGETS ?= network programs buildings map cached zones demand sumocfg entry overrides driver manifest \
     plan message log follower
 MAPS := envs/ring/map/map.net.xml envs/merge/map/map.net.xml envs/grid4x4/map/map.net.xml
 
-.PHONY: help demo test check bench bounds soak model fuzz oldest libraries maps pictures clean
+.PHONY: help demo test quick ray check bench bounds soak model fuzz oldest libraries maps pictures clean
 .DEFAULT_GOAL := help
 
 help: ## say what there is
@@ -28,9 +35,18 @@ help: ## say what there is
 demo: $(READY) ## train on merge, evaluate, drive through town, leave a video (some minutes)
 	$(BIN)/cavmarl demo
 
-test: $(READY) ## the tests; those of the kernels also without the compiler
-	NUMBA_DISABLE_JIT=1 $(BIN)/pytest tests/kernels
-	$(BIN)/pytest -m "not slow"
+test: $(READY) ## the tests but the slow ones; those of kernels that have a twin also without the compiler
+	$(BIN)/python $(KERNELS)
+	$(BIN)/pytest $(TWO) -m "not slow and not alone"
+	$(BIN)/pytest -m "alone and not slow"
+	NUMBA_DISABLE_JIT=1 $(BIN)/pytest $(TWO) -m "twin and not slow"
+
+quick: $(READY) ## unit tests of what has changed since main, the nearest first, for a minute
+	$(BIN)/python $(KERNELS)
+	$(BIN)/python -m tests.support.touched
+
+ray: $(RAY)/.ready ## what needs Ray, in an environment of its own (1.5 GB)
+	$(RAY)/bin/pytest $(RAY_TESTS)
 
 check: $(READY) ## style, types, and the direction of imports
 	$(BIN)/ruff check .
@@ -38,11 +54,13 @@ check: $(READY) ## style, types, and the direction of imports
 	$(BIN)/mypy
 	$(BIN)/lint-imports
 
-bench: $(READY) ## agent-steps a second, next to highway-env
-	$(BIN)/cavmarl bench step
+bench: $(READY) ## run a benchmark, as NAME=step ARGS='--agents 10'; without a NAME: list them
+	$(BIN)/python -m benchmarks $(NAME) $(ARGS)
 
 bounds: $(READY) ## the tests with every index of the kernels checked
-	NUMBA_BOUNDSCHECK=1 $(BIN)/pytest -m "not slow"
+	NUMBA_BOUNDSCHECK=1 $(BIN)/python $(KERNELS)
+	NUMBA_BOUNDSCHECK=1 $(BIN)/pytest $(TWO) -m "not slow and not alone"
+	NUMBA_BOUNDSCHECK=1 $(BIN)/pytest -m "alone and not slow"
 
 soak: $(READY) ## the slow tests: long episodes, memory, the wheel
 	$(BIN)/pytest -m slow
@@ -59,7 +77,7 @@ fuzz: $(READY) ## each file parser, FUZZ_SECONDS long; what crashes one stays in
 oldest: $(OLDEST)/.ready ## the heart of the tests with the oldest versions that are allowed
 	$(OLDEST)/bin/pytest $(OLDEST_WARNINGS) $(OLDEST_TESTS)
 
-libraries: $(LIBRARIES)/.ready ## what needs Ray or BenchMARL, in an environment of its own (2 GB)
+libraries: $(LIBRARIES)/.ready ## what needs Ray, RLlib or BenchMARL, in an environment of its own (2 GB)
 	$(LIBRARIES)/bin/pytest $(LIBRARIES_TESTS)
 
 # Without the comment that netconvert and netgenerate begin with (date, version, options), the same
@@ -73,10 +91,11 @@ maps: $(READY) ## make the maps of ring, merge and grid4x4 anew from the options
 pictures: $(READY) ## draw the pictures of the README, the cards and the pages anew
 	$(BIN)/python -m docs.pictures.pictures docs/images
 	$(BIN)/python -m docs.pictures.sensor_pictures docs/images
+	$(BIN)/python -m docs.pictures.moving docs/images
 
 clean: ## remove .venv, builds and caches; runs/ stays
-	rm -rf .venv $(OLDEST) $(LIBRARIES) fuzz/corpus build dist .mypy_cache .ruff_cache .pytest_cache .hypothesis .import_linter_cache
-	find cavmarl agents train tests -name __pycache__ -prune -exec rm -rf {} +
+	rm -rf .venv $(OLDEST) $(LIBRARIES) $(RAY) fuzz/corpus build dist .mypy_cache .ruff_cache .pytest_cache .hypothesis .import_linter_cache
+	find cavmarl agents benchmarks train tests -name __pycache__ -prune -exec rm -rf {} +
 
 # torch comes first and alone, so that a CPU build that pip is told of (PIP_EXTRA_INDEX_URL,
 # PIP_FIND_LINKS) is taken instead of several GB of CUDA libraries.
@@ -94,6 +113,12 @@ $(OLDEST)/.ready: pyproject.toml constraints-oldest.txt
 	"$(PYTHON)" -m venv --clear $(OLDEST)
 	$(OLDEST)/bin/python -m pip install --editable '.[sumo]' pytest hypothesis \
 	    --constraint constraints-oldest.txt
+	@touch $@
+
+$(RAY)/.ready: pyproject.toml constraints-libraries.txt
+	"$(PYTHON)" -m venv --clear $(RAY)
+	$(RAY)/bin/python -m pip install --editable '.[sumo,ray,followers]' pytest hypothesis \
+	    --constraint constraints-libraries.txt
 	@touch $@
 
 $(LIBRARIES)/.ready: pyproject.toml constraints-libraries.txt

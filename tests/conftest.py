@@ -7,6 +7,31 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+from hypothesis import settings
+
+from tests.support.cpu_time import CpuTimes
+from tests.support.tiers import ProcessWatch, mark, skip_if_late
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    """Count what the tests cost, and see that their tiers hold."""
+    config.pluginmanager.register(CpuTimes(), "cpu_times")
+    config.pluginmanager.register(ProcessWatch(), "process_watch")
+    # Deadlines fail on a busy machine; without the compiler a few examples are enough.
+    settings.register_profile("compiled", deadline=None)
+    settings.register_profile("python", deadline=None, max_examples=25)
+    settings.load_profile("python" if os.environ.get("NUMBA_DISABLE_JIT") == "1" else "compiled")
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Mark each test with its tier."""
+    for item in items:
+        mark(item)
+
+
+def pytest_runtest_setup() -> None:
+    """Heed the time that `make quick` has."""
+    skip_if_late()
 
 
 @pytest.fixture(scope="session")

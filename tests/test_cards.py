@@ -13,7 +13,6 @@ from cavmarl.config.sensors import (
     LidarObservationConfig,
     NeighborsConfig,
     OccupancyGridConfig,
-    PufferDriveConfig,
     RoadgraphConfig,
     RouteAheadConfig,
     SensorsConfig,
@@ -44,7 +43,6 @@ FURTHER = (
     ),
     replace(OFF, kinematics=KinematicsConfig(), lidar_observation=LidarObservationConfig(cells=16)),
     replace(OFF, kinematics=KinematicsConfig(), roadgraph=RoadgraphConfig(points=200)),
-    replace(OFF, kinematics=KinematicsConfig(), puffer_drive=PufferDriveConfig(enabled=True)),
 )
 
 

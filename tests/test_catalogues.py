@@ -94,6 +94,11 @@ def test_state(make: Make, make_aec: Make) -> None:
 
 
 @pytest.mark.parametrize("source", sorted(entries()), indirect=True)
+@pytest.mark.parametrize(
+    "arguments",  # frames are drawn alike, whatever the population
+    ["closed", *(pytest.param(mode, marks=pytest.mark.slow) for mode in ("entering", "seats"))],
+    indirect=True,
+)
 def test_render(make_aec: Make, monkeypatch: pytest.MonkeyPatch) -> None:
     pytest.importorskip("pygame", reason="frames need the extra 'render'")
     monkeypatch.setenv("SDL_VIDEODRIVER", "dummy")

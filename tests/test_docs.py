@@ -5,6 +5,7 @@ from __future__ import annotations
 import inspect
 import re
 from dataclasses import MISSING, fields, is_dataclass
+from functools import cache
 from pathlib import Path
 from types import UnionType
 from typing import Any, Literal, get_args, get_origin, get_type_hints
@@ -19,6 +20,7 @@ from cavmarl.sensors.mounted.catalogue import TYPES
 from tests.support.generated import check_block, table
 
 ROOT = Path(__file__).resolve().parents[1]
+MAX_LINE = 120
 PAGES = sorted([*ROOT.glob("*.md"), *ROOT.glob("docs/**/*.md"), *ROOT.glob("envs/*/README.md")])
 UNITS = {
     "m": "m", "s": "s", "mps": "m/s", "mps2": "m/s²", "rad": "rad", "ticks": "ticks", "hz": "Hz",
@@ -69,6 +71,80 @@ def test_the_page_of_environments_explains_every_term() -> None:
 def test_links_between_pages_lead_somewhere(page: Path) -> None:
     for target in re.findall(r"\]\((?!https?:)([^)#]+)", page.read_text(encoding="utf-8")):
         assert (page.parent / target).exists(), target
+
+
+def test_the_readme_is_one_page_and_its_first_example_runs() -> None:
+    text = (ROOT / "README.md").read_text(encoding="utf-8")
+    assert len(text.splitlines()) <= 100
+    example = re.search(r"^```python\n(.*?)^```", text, re.MULTILINE | re.DOTALL)
+    assert example
+    names: dict[str, Any] = {}
+    exec(example[1], names)
+    assert not names["env"].agents
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
+def test_anchors_of_links_are_headings(page: Path) -> None:
+    text = page.read_text(encoding="utf-8")
+    for target, anchor in re.findall(r"\]\((?!https?:)([^)#]*)#([^)]+)\)", text):
+        other = page.parent / target if target else page
+        assert anchor in anchors_of(other), f"{target}#{anchor}"
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
+def test_lines_are_short(page: Path) -> None:
+    """Rows of tables and lines of code cannot be broken."""
+    code = False
+    for number, line in enumerate(page.read_text(encoding="utf-8").splitlines(), start=1):
+        code ^= line.lstrip().startswith("```")
+        if not code and not line.lstrip().startswith("|"):
+            assert len(line) <= MAX_LINE, f"{page.name}:{number}"
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
+def test_pages_name_the_thing(page: Path) -> None:
+    """They say vehicle, zone or worker; what is generated from the code is its own matter."""
+    text = re.sub(r"<!-- [\w ]+ -->.*?<!-- end -->", "", page.read_text("utf-8"), flags=re.DOTALL)
+    words = r"\b(?:nobody|somebody|anybody|everybody|whoever)\b.*"
+    assert not re.findall(words, text, re.IGNORECASE)
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
+def test_files_of_code_that_a_page_names_exist(page: Path) -> None:
+    """By their path from the root, from `cavmarl/` or from the page, or by their name alone."""
+    for named in re.findall(r"`([\w./-]+\.py)`", page.read_text(encoding="utf-8")):
+        if page.name == "CHANGELOG.md" or "NAME" in named or named.startswith("my_"):
+            continue
+        if "/" in named:
+            places = (ROOT, ROOT / "cavmarl", page.parent)
+            assert any((place / named).is_file() for place in places), named
+        else:
+            assert named in names_of_code(), named
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
+def test_benchmarks_that_a_page_names_exist(page: Path) -> None:
+    text = page.read_text(encoding="utf-8")
+    for name in re.findall(r"python -m benchmarks\.(\w+)", text):
+        assert (ROOT / f"benchmarks/{name}.py").is_file(), name
+    for name in re.findall(r"`cavmarl bench (\w+)", text):
+        assert (ROOT / f"cavmarl/cli/bench/{name}.py").is_file(), name
+
+
+@cache
+def names_of_code() -> frozenset[str]:
+    """The names of all Python files of the repository."""
+    folders = ("agents", "benchmarks", "cavmarl", "docs", "fuzz", "tests", "train")
+    return frozenset(path.name for folder in folders for path in (ROOT / folder).rglob("*.py"))
+
+
+@cache
+def anchors_of(page: Path) -> frozenset[str]:
+    """The anchors that a page's headings get, as GitHub makes them."""
+    text = re.sub(r"^```.*?^```", "", page.read_text(encoding="utf-8"), flags=re.M | re.S)
+    headings = re.findall(r"^#+ (.+)$", text, re.MULTILINE)
+    words = (re.sub(r"[^\w\- ]", "", heading.lower()) for heading in headings)
+    return frozenset(word.replace(" ", "-") for word in words)
 
 
 def key_rows(kind: type[Any], prefix: str = "") -> list[tuple[str, str, str, str, str]]:

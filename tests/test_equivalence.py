@@ -47,7 +47,6 @@ SENSORS = {
     "sensors.kinematics.vehicles_count": 6,
     "sensors.occupancy_grid.features": ["presence", "vx", "on_road"],
     "sensors.lidar_observation.cells": 16,
-    "sensors.puffer_drive.enabled": True,
 }
 
 

@@ -14,8 +14,9 @@ import sys
 from dataclasses import asdict, dataclass
 from fractions import Fraction
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
+from cavmarl.bench.harness import Result
 from cavmarl.core.errors import ConfigError, EvaluationError
 from cavmarl.cosim.followers.followed_world import FollowedWorld
 from cavmarl.cosim.time_master import OwnTicks
@@ -27,55 +28,37 @@ PROGRAM = "cavmarl.cosim.followers.clock_reader"
 ENDS_S = 30.0  # for the follower to end by itself
 JOINS_S = 60.0  # for it to start
 TIMEOUT_S = 60.0
-BEFORE = 20  # steps that the world has gone on before somebody follows
+BEFORE = 20  # steps that the world has gone on before the follower joins
 
 
 @dataclass(frozen=True)
 class DriftRow:
-    """The two clocks after a step; times are simulated.
+    """The two clocks after a step; times are simulated."""
 
-    Attributes:
-        step: steps since the follower has joined.
-        master_s: the master's time since then.
-        follower_s: the world's time as the follower has it.
-        normalised_s: the same since it has joined.
-        delta_s: by how much that is ahead of the master's.
-        ratio: of the two.
-    """
-
-    step: int
-    master_s: float
-    follower_s: float
-    normalised_s: float
-    delta_s: float
-    ratio: float
+    step: int  # steps since the follower has joined
+    master_s: float  # the master's time since then
+    follower_s: float  # the world's time as the follower has it
+    normalised_s: float  # the same since it has joined
+    delta_s: float  # by how much that is ahead of the master's
+    ratio: float  # of the two
 
 
 @dataclass(frozen=True)
-class ClockDrift:
-    """What was measured.
+class ClockDrift(Result):
+    """What was measured."""
 
-    Attributes:
-        environment: on which.
-        dt_s: seconds a tick, which is a step here.
-        rogue: the share of steps in which the follower ticked by itself.
-        answer: what the master did about that.
-        rows: at steps 100, 500, 1000, 5000 and so on, and the last one.
-        own_ticks: how often it did, by its own count.
-        counted: the same by the master's.
-        drift_events: how often the master has noticed that the world had gone on without him.
-        noticed_ticks: ticks of the master from the first such tick until he noticed; None: there
-            was none, or he did not notice.
-    """
+    DERIVED: ClassVar = ("holds",)
 
-    environment: str
-    dt_s: float
-    rogue: float
-    answer: OwnTicks
-    rows: tuple[DriftRow, ...]
-    own_ticks: int
-    counted: int
-    drift_events: int
+    environment: str  # on which
+    dt_s: float  # seconds a tick, which is a step here
+    rogue: float  # the share of steps in which the follower ticked by itself
+    answer: OwnTicks  # what the master did about that
+    rows: tuple[DriftRow, ...]  # at steps 100, 500, 1000, 5000 and so on, and the last one
+    own_ticks: int  # how often it did, by its own count
+    counted: int  # the same by the master's
+    drift_events: int  # how often the master has noticed that the world had gone on without it
+    # ticks of the master from the first such tick until it noticed; None: there was none, or it did
+    # not notice
     noticed_ticks: int | None
 
     @property
@@ -84,10 +67,6 @@ class ClockDrift:
         if self.answer == "obey" and self.own_ticks:
             return self.noticed_ticks is not None and self.noticed_ticks <= 1
         return all(row.delta_s == 0.0 and row.ratio == 1.0 for row in self.rows)
-
-    def to_dict(self) -> dict[str, Any]:
-        """As JSON."""
-        return {**asdict(self), "holds": self.holds}
 
 
 def measure_drift(
@@ -99,21 +78,7 @@ def measure_drift(
     seed: int = 0,
     overrides: dict[str, Any] | None = None,
 ) -> ClockDrift:
-    """Run a world as master, with a follower in a process of its own that reads its clock.
-
-    Args:
-        env: name, folder or map file of an environment; a step is a tick in it, agents have seats,
-            and the horizon is as long as need be.
-        steps: of the master, from when the follower has joined on.
-        rogue: in which share of the steps the follower ticks by itself.
-        answer: what the master does about that; `obey`: the unprotected world, which really ticks.
-        seed: of the world.
-        overrides: values for any other key.
-
-    Raises:
-        ConfigError: no steps, or a share that is none.
-        EvaluationError: the follower's process has failed.
-    """
+    """Run a world as master, with a follower in a process of its own that reads its clock."""
     if steps < 1:
         raise ConfigError(f"steps = {steps}: must be at least 1")
     if not 0.0 <= rogue <= 1.0:

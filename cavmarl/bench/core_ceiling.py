@@ -7,16 +7,15 @@ memory, caches or clocks, and where other programs run.
 from __future__ import annotations
 
 import multiprocessing
-import statistics
-import time
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from itertools import pairwise
 from multiprocessing.connection import Connection
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
-from cavmarl.bench.worker_speed import WARM_STEPS
+from cavmarl.bench.harness import Result, paired_ratio
+from cavmarl.bench.worker_speed import WARM_STEPS, drive_ms
 from cavmarl.core.errors import ConfigError, WorkerError
 from cavmarl.env.vector import make_vec
 
@@ -26,28 +25,20 @@ START_S = 300.0  # that a program may take until its worlds can be stepped
 
 
 @dataclass(frozen=True)
-class CoreCeiling:
-    """Programs of their own that step worlds, one at a time and all at once.
+class CoreCeiling(Result):
+    """Programs of their own that step worlds, one at a time and all at once."""
 
-    Attributes:
-        programs: how many.
-        alone_ms: of each turn, ms a step of all worlds, one program after the other.
-        together_ms: of each turn, ms a step of the slowest program while all run.
-    """
+    DERIVED: ClassVar = ("ratio",)
 
-    programs: int
+    programs: int  # how many
+    # of each turn, ms a step of all worlds, one program after the other
     alone_ms: tuple[float, ...]
-    together_ms: tuple[float, ...]
+    together_ms: tuple[float, ...]  # of each turn, ms a step of the slowest program while all run
 
     @property
     def ratio(self) -> float:
         """How many times faster all at once are; median of the turns."""
-        turns = zip(self.alone_ms, self.together_ms, strict=True)
-        return statistics.median(alone / together for alone, together in turns)
-
-    def to_dict(self) -> dict[str, Any]:
-        """Plain values, for JSON."""
-        return {**asdict(self), "ratio": self.ratio}
+        return paired_ratio(self.alone_ms, self.together_ms)
 
 
 def measure_ceiling(
@@ -58,32 +49,12 @@ def measure_ceiling(
     steps: int = 20,
     repeats: int = 7,
     seed: int = 0,
-    agents: int | None = None,
-    background: int | None = None,
-    overrides: Mapping[str, Any] | None = None,
+    wanted: Mapping[str, Any] | None = None,
     alike: bool = False,
 ) -> CoreCeiling:
-    """Let programs step as many worlds as workers would, without an order from anybody.
-
-    Args:
-        env: as in `make_vec`.
-        worlds: of all programs together.
-        programs: how many, at most as many as worlds.
-        steps: of a turn.
-        repeats: turns.
-        seed: root of all random numbers.
-        agents: shadows population.agents.
-        background: shadows population.background.
-        overrides: values for any other key.
-        alike: every program steps the same worlds as the first, so that none has more to do.
-
-    Raises:
-        ConfigError: fewer worlds than programs.
-        WorkerError: a program did not come up.
-    """
+    """Let programs step as many worlds as workers would, without any command."""
     if not 1 <= programs <= worlds:
         raise ConfigError(f"{programs} programs, {worlds} worlds: must be at least one world each")
-    wanted = {"agents": agents, "background": background, "overrides": overrides}
     bounds = [worlds * n // programs for n in range(programs + 1)]
     context = multiprocessing.get_context("spawn")
     wires: list[Connection] = []
@@ -91,7 +62,7 @@ def measure_ceiling(
     try:
         for first, last in pairwise(bounds):
             ours, theirs = context.Pipe()
-            given = (theirs, env, last - first, 0 if alike else first, seed, wanted)
+            given = (theirs, env, last - first, 0 if alike else first, seed, wanted or {})
             processes.append(context.Process(target=_serve, args=given, daemon=True))
             processes[-1].start()
             theirs.close()
@@ -118,11 +89,7 @@ def _turn(wires: list[Connection], steps: int) -> list[float]:
 
 
 def _hear(wire: Connection) -> float:
-    """What a program says.
-
-    Raises:
-        WorkerError: it has ended, or says nothing.
-    """
+    """What a program says."""
     try:
         if wire.poll(START_S):
             return float(wire.recv())
@@ -142,19 +109,13 @@ def _serve(
     seed: int,
     wanted: Mapping[str, Any],
 ) -> None:
-    """One program: as many steps as it is told, until nobody tells any more."""
+    """One program: as many steps as it is told, until the connection is closed."""
     vec = make_vec(env, num_envs=worlds, copy=False, **wanted)
     vec.reset(seed=seed, options={"first_world": first})
     steps = WARM_STEPS
     while True:
-        spent = 0.0
-        for _ in range(steps):
-            actions = vec.suggest_actions()
-            began = time.perf_counter()
-            vec.step(actions)
-            spent += time.perf_counter() - began
         try:
-            wire.send(1000.0 * spent / steps)
+            wire.send(drive_ms(vec, steps))
             steps = wire.recv()
         except (EOFError, BrokenPipeError, ConnectionResetError):
             return

@@ -15,17 +15,7 @@ HEADROOM = 1.1  # over the largest value
 
 
 def plot_sensor_workers(rows: Sequence[ScalingRow], title: str, path: Path) -> None:
-    """Write both over the number of sensor workers; the best is marked.
-
-    Args:
-        rows: what was measured.
-        title: above it.
-        path: a picture; its ending says of which kind (.png, .svg, .pdf).
-
-    Raises:
-        ConfigError: the picture cannot be written.
-        MissingExtraError: matplotlib is not installed.
-    """
+    """Write both over the number of sensor workers; the best is marked."""
     figure = require("matplotlib.figure", "report").Figure(figsize=(7.0, 4.2), layout="constrained")
     left = figure.subplots()
     right = left.twinx()

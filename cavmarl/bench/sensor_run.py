@@ -16,7 +16,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from cavmarl.bench.sensor_load import describe_rig
+from cavmarl.bench.sensor_rig import describe_rig
 from cavmarl.bench.stopwatch import Stopwatch
 from cavmarl.core import errors
 from cavmarl.env.vector import CavVectorEnv, make_vec
@@ -43,88 +43,51 @@ _PART_OF = {
 
 @dataclass(frozen=True)
 class SensorJob:
-    """What to run.
+    """What to run."""
 
-    Attributes:
-        env: as in `make_vec`.
-        overrides: of its settings.
-        agents: each with a rig.
-        background: vehicles that are sensed.
-        sensor_workers: how many.
-        warmup: steps that do not count.
-        steps: that do.
-        seed: root of all random numbers.
-    """
-
-    env: str
-    overrides: Mapping[str, Any]
-    agents: int
-    background: int
-    sensor_workers: int
-    warmup: int
-    steps: int
-    seed: int
+    env: str  # as in `make_vec`
+    overrides: Mapping[str, Any]  # of its settings
+    agents: int  # each with a rig
+    background: int  # vehicles that are sensed
+    sensor_workers: int  # how many
+    warmup: int  # steps that do not count
+    steps: int  # that do
+    seed: int  # root of all random numbers
 
 
 @dataclass(frozen=True)
 class Window:
-    """What some steps have taken, all processes together.
+    """What some steps have taken, all processes together."""
 
-    Attributes:
-        steps: how many.
-        leader_cpu_s: processor time of the process that keeps the state.
-        worker_cpu_s: of each sensor worker.
-        leader_rss_mb: resident memory at the end, shared memory among it.
-        worker_rss_mb: of each sensor worker.
-        sent_bytes: that workers were given to read.
-        got_bytes: of frames that they have written.
-        messages: orders and answers.
-    """
-
-    steps: int
-    leader_cpu_s: float
-    worker_cpu_s: tuple[float, ...]
-    leader_rss_mb: float
-    worker_rss_mb: tuple[float, ...]
-    sent_bytes: int
-    got_bytes: int
-    messages: int
+    steps: int  # how many
+    leader_cpu_s: float  # processor time of the process that keeps the state
+    worker_cpu_s: tuple[float, ...]  # of each sensor worker
+    leader_rss_mb: float  # resident memory at the end, shared memory among it
+    worker_rss_mb: tuple[float, ...]  # of each sensor worker
+    sent_bytes: int  # that workers were given to read
+    got_bytes: int  # of frames that they have written
+    messages: int  # orders and answers
 
 
 @dataclass(frozen=True)
 class SensorRun:
-    """What was found.
+    """What was found."""
 
-    Attributes:
-        step_ms: of each step, tick and sensors; checking actions and copying results among it.
-        wait_ms: of that, waiting for sensor workers.
-        parts_ms: of each step, by the names of `PARTS`.
-        windows: resources.
-        costs_ms: processor time of one agent's frame of each sensor.
-        sensors: type, resolution, rate and placement of each.
-        digests: of the state, all frames among it, after each step of the warm-up and the last one.
-        ticks_per_step: ticks of a step.
-        deaths: sensor workers that had to be replaced.
-    """
-
+    # of each step, tick and sensors; checking actions and copying results among it
     step_ms: tuple[float, ...]
-    wait_ms: tuple[float, ...]
-    parts_ms: dict[str, tuple[float, ...]]
-    windows: tuple[Window, ...]
-    costs_ms: tuple[float, ...]
-    sensors: list[dict[str, Any]]
+    wait_ms: tuple[float, ...]  # of that, waiting for sensor workers
+    parts_ms: dict[str, tuple[float, ...]]  # of each step, by the names of `PARTS`
+    windows: tuple[Window, ...]  # resources
+    costs_ms: tuple[float, ...]  # processor time of one agent's frame of each sensor
+    sensors: list[dict[str, Any]]  # type, resolution, rate and placement of each
+    # of the state, all frames among it, after each step of the warm-up and the last one
     digests: tuple[str, ...]
-    ticks_per_step: int
-    deaths: int
+    ticks_per_step: int  # ticks of a step
+    deaths: int  # sensor workers that had to be replaced
 
 
 def run_sensors(job: SensorJob) -> SensorRun:
-    """Run a job in this process; agents are driven by the built-in driver, which is not timed.
-
-    Raises:
-        ConfigError: an environment that cannot be.
-        WorkerError: sensor workers cannot go on.
-    """
+    """Run a job in this process; agents are driven by the built-in driver, which is not timed."""
     vec = make_vec(
         job.env,
         agents=job.agents,

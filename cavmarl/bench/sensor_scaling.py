@@ -31,71 +31,42 @@ _Rounding = Callable[[float], float]
 
 @dataclass(frozen=True)
 class Series:
-    """The steps of one run.
+    """The steps of one run."""
 
-    Attributes:
-        step_ms: tick and sensors, of each step.
-        wait_ms: of that, waiting for sensors.
-    """
-
-    step_ms: Sequence[float]
-    wait_ms: Sequence[float]
+    step_ms: Sequence[float]  # tick and sensors, of each step
+    wait_ms: Sequence[float]  # of that, waiting for sensors
 
 
 @dataclass(frozen=True)
 class Measured:
-    """What has been measured with some number of sensor workers, in the mean.
+    """What has been measured with some number of sensor workers, in the mean."""
 
-    Attributes:
-        workers: n.
-        step_ms: T, tick and sensors.
-        sd_within_run: sample standard deviation of the steps of a run, ms.
-        wait_ms: of T, waiting for sensors.
-        ci95_between_runs: of T, from the means of independent runs; None: too few.
-    """
-
-    workers: int
-    step_ms: float
-    sd_within_run: float
-    wait_ms: float
+    workers: int  # n
+    step_ms: float  # T, tick and sensors
+    sd_within_run: float  # sample standard deviation of the steps of a run, ms
+    wait_ms: float  # of T, waiting for sensors
+    # of T, from the means of independent runs; None: too few
     ci95_between_runs: Interval | None = None
 
 
 @dataclass(frozen=True)
 class ScalingRow:
-    """What was measured with n sensor workers, and what follows from it.
+    """What was measured with n sensor workers, and what follows from it."""
 
-    Attributes:
-        workers: n.
-        step_ms: T, tick and sensors.
-        fps: 1000 / T.
-        sd_within_run: of the steps of a run, ms.
-        ci95_between_runs: of T; None: too few runs.
-        wait_ms: of T, waiting for sensors.
-        speedup: T of the fewest workers / T.
-        efficiency_pct: speedup / n, times the fewest workers.
-        cv_pct: coefficient of variation, standard deviation / T.
-        wait_share_pct: waiting / T.
-        rest_ms: T less waiting.
-        fps_gain_pct: above the FPS of the fewest workers.
-        step_gain_pct: T above that of the fewest workers; negative where it is shorter.
-        is_best: the shortest T of those that were measured.
-    """
-
-    workers: int
-    step_ms: float
-    fps: float
-    sd_within_run: float
-    ci95_between_runs: Interval | None
-    wait_ms: float
-    speedup: float
-    efficiency_pct: float
-    cv_pct: float
-    wait_share_pct: float
-    rest_ms: float
-    fps_gain_pct: float
-    step_gain_pct: float
-    is_best: bool
+    workers: int  # n
+    step_ms: float  # T, tick and sensors
+    fps: float  # 1000 / T
+    sd_within_run: float  # of the steps of a run, ms
+    ci95_between_runs: Interval | None  # of T; None: too few runs
+    wait_ms: float  # of T, waiting for sensors
+    speedup: float  # T of the fewest workers / T
+    efficiency_pct: float  # speedup / n, times the fewest workers
+    cv_pct: float  # coefficient of variation, standard deviation / T
+    wait_share_pct: float  # waiting / T
+    rest_ms: float  # T less waiting
+    fps_gain_pct: float  # above the FPS of the fewest workers
+    step_gain_pct: float  # T above that of the fewest workers; negative where it is shorter
+    is_best: bool  # the shortest T of those that were measured
 
     def to_dict(self) -> dict[str, Any]:
         """Plain values, for JSON."""
@@ -107,12 +78,6 @@ def summarize(runs: Mapping[int, Sequence[Series]]) -> list[Measured]:
 
     The standard deviation is the root of the runs' mean variance, so that what lies between the
     runs is not in it.
-
-    Args:
-        runs: of each number; all have the same number of steps, two or more.
-
-    Raises:
-        ConfigError: no runs, runs of different length, or times that are none.
     """
     lengths = {len(part) for of in runs.values() for run in of for part in _parts(run)}
     if len(lengths) != 1 or min(lengths) < 2 or not all(runs.values()):
@@ -126,16 +91,7 @@ def summarize(runs: Mapping[int, Sequence[Series]]) -> list[Measured]:
 def scaling_table(
     measured: Sequence[Measured], *, paper_rounding: bool = False
 ) -> list[ScalingRow]:
-    """Every derived figure.
-
-    Args:
-        measured: by rising numbers of workers; all are compared with the first.
-        paper_rounding: as printed tables are made: figures to two places, halves up, and the
-            efficiency and the gain of FPS from figures that have been rounded before.
-
-    Raises:
-        ConfigError: nothing was measured, numbers that do not rise, or times that are none.
-    """
+    """Every derived figure."""
     numbers = [one.workers for one in measured]
     if not numbers or numbers != sorted(set(numbers)) or numbers[0] < 1:
         raise ConfigError(f"sensor workers {numbers}: must be rising numbers from 1")

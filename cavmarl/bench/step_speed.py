@@ -1,25 +1,21 @@
-"""How fast a step is, next to others', on the same road with the same number of vehicles.
+"""How fast a step is next to highway-env's, on the same road with the same number of vehicles.
 
-Every row of the comparison is measured once a turn, all rows one after the other, and the ratios
-are those of the medians over the turns: what else the machine does falls on all of them. Times are
-those of the processor that this process had, on one core, without what others took of it.
+Times are those of the processor that this process had, on one core.
 """
 
 from __future__ import annotations
 
-import os
 import tempfile
 import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
-from dataclasses import asdict, dataclass
+from collections.abc import Callable
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from statistics import median
 from typing import Any
 
 import numpy as np
 
+from cavmarl.bench.harness import Result, Say, check_range, one_core, silent, spread, take_turns
 from cavmarl.bench.highway_worlds import (
     IDLE,
     KINEMATICS,
@@ -32,122 +28,92 @@ from cavmarl.bench.highway_worlds import (
     overrides,
     straight_road,
 )
-from cavmarl.bench.peer_speed import check_compiler, peer_runners
-from cavmarl.bench.speed_rows import Row, Runner
-from cavmarl.core.errors import ConfigError, require
+from cavmarl.core.errors import require
 from cavmarl.env.parallel import CavEnv, parallel_env
 from cavmarl.env.vector import CavVectorEnv, make_vec
 
 __all__ = ["MORE", "Row", "StepSpeed", "measure_step_speed", "one_core"]
 
-OUR_STEPS = 100  # from a fresh reset: nobody reaches the end of the road
+OUR_STEPS = 100  # from a fresh reset: no vehicle reaches the end of the road
 THEIR_STEPS = 10
 MORE = 10  # times as many agents, on a road as many times as long
 MAX_AGENTS = 1000
 
-_ONE = np.int64(IDLE)
+# sensors, side, times as many agents, whether worlds are batched
+OURS = (
+    ("lidar", "batched", 1, True),
+    ("lidar", "single", 1, False),
+    ("kinematics", "batched", 1, True),
+    ("kinematics", "single", 1, False),
+    ("kinematics", "more", MORE, True),
+)
+THEIRS = (
+    ("lidar", "highway_env", THEIR_LIDAR),
+    ("kinematics", "highway_env", THEIR_KINEMATICS),
+    ("kinematics", "highway_env_raw", THEIR_RAW_KINEMATICS),
+)
 
 
 @dataclass(frozen=True)
-class StepSpeed:
-    """Result of the comparison.
+class Row:
+    """One way to step one kind of world."""
 
-    Attributes:
-        road_m: length of the road that `agents` vehicles were set out on, on both sides.
-        repeats: turns.
-        rows: what was measured.
-        ratio: with a lidar, `batched` over `highway_env`.
-        ratio_kinematics: without, `batched` over `highway_env`'s default observation.
-        ratio_kinematics_raw: the same over its observation without normalisation.
-        cost_of_more: what an agent costs among `MORE` times as many, over what it costs `batched`.
-        dict_us: what the dict API adds for each agent and step to `single`, in µs.
-        ratio_peer: with pufferlib's observation, `batched` over `c`; None where it is not measured.
-        ratio_peer_native: the same over `c_native`.
-    """
+    sensors: str  # `lidar` (and neighbours) or `kinematics`
+    who: str  # `batched`, `single`, `dicts`, `more`, `highway_env` or `highway_env_raw`
+    agents: int  # controlled vehicles a world
+    worlds: int  # stepped together
+    low: float  # agent-steps a second, the slowest turn
+    median: float  # over the turns
+    high: float  # the fastest turn
 
-    road_m: float
-    repeats: int
-    rows: tuple[Row, ...]
-    ratio: float
-    ratio_kinematics: float
-    ratio_kinematics_raw: float
+    @property
+    def agent_step_s(self) -> float:
+        """Seconds an agent-step takes, by the median."""
+        return 1.0 / self.median
+
+
+@dataclass(frozen=True)
+class StepSpeed(Result):
+    """Result of the comparison."""
+
+    road_m: float  # length of the road that `agents` vehicles were set out on, on both sides
+    repeats: int  # turns
+    rows: tuple[Row, ...]  # what was measured
+    ratio: float  # with a lidar, `batched` over `highway_env`
+    ratio_kinematics: float  # without, `batched` over `highway_env`'s default observation
+    ratio_kinematics_raw: float  # the same over its observation without normalisation
+    # what an agent costs among `MORE` times as many, over what it costs `batched`
     cost_of_more: float
-    dict_us: float
-    ratio_peer: float | None
-    ratio_peer_native: float | None
-
-    def to_dict(self) -> dict[str, Any]:
-        """Plain values, for JSON."""
-        return asdict(self)
+    dict_us: float  # what the dict API adds for each agent and step to `single`, in µs
 
 
 def measure_step_speed(
-    agents: int = 100,
-    worlds: int = 16,
-    repeats: int = 5,
-    peer: bool = False,
-    progress: Callable[[str], None] = lambda text: None,
+    agents: int = 100, worlds: int = 16, repeats: int = 5, progress: Say = silent
 ) -> StepSpeed:
-    """Measure by turns on one core, kernels warm.
-
-    Args:
-        agents: controlled vehicles a world.
-        worlds: of ours, stepped together where they are batched.
-        repeats: turns.
-        peer: whether the peer in C is measured, too.
-        progress: told what is going on.
-
-    Raises:
-        ConfigError: a number out of range.
-        MissingExtraError: highway-env is not installed.
-        EvaluationError: there is no C compiler for the peer.
-    """
-    limits = {"agents": (agents, MAX_AGENTS), "worlds": (worlds, 1024), "repeats": (repeats, 100)}
-    for name, (value, most) in limits.items():
-        if not 1 <= value <= most:
-            raise ConfigError(f"{name} = {value}: must be from 1 to {most}")
+    """Measure by turns on one core, kernels warm."""
+    check_range(agents=(agents, 1, MAX_AGENTS), worlds=(worlds, 1, 1024), repeats=(repeats, 1, 100))
     require("highway_env", "highway")
-    if peer:
-        check_compiler()
     with one_core(), tempfile.TemporaryDirectory() as folder:
         progress("making highway-env's worlds")
-        theirs, road_m = _their_runners(agents)
+        theirs = {(sensors, who): highway_env(agents, seen) for sensors, who, seen in THEIRS}
+        road_m = max(map(length_m, theirs.values()))
         progress("making our worlds on that road")
-        runners = _our_runners(Path(folder), road_m, agents, worlds) + theirs
-        if peer:
-            progress("making the peer's worlds on that road")
-            runners += peer_runners(Path(folder), road_m, agents, worlds)
-        turns = []
-        for repeat in range(repeats):
-            progress(f"measuring, {repeat + 1} of {repeats}")
-            turns.append([runner.rate() for runner in runners])
-    return _compare(
-        road_m,
-        repeats,
-        [
-            Row(
-                runner.sensors,
-                runner.who,
-                runner.agents,
-                runner.worlds,
-                min(rates),
-                median(rates),
-                max(rates),
-            )
-            for runner, rates in zip(runners, zip(*turns, strict=True), strict=True)
-        ],
-    )
+        sides = _our_sides(Path(folder), road_m, agents, worlds)
+        for key, env in theirs.items():
+            sides[key] = (agents, 1, partial(_their_rate, env, agents))
+        turns = take_turns({key: rate for key, (_, _, rate) in sides.items()}, repeats, progress)
+    rows = []
+    for (sensors, who), (count, together, _) in sides.items():
+        rates = spread(turns[sensors, who])
+        rows.append(Row(sensors, who, count, together, rates.low, rates.median, rates.high))
+    return _compare(road_m, repeats, rows)
 
 
 def _compare(road_m: float, repeats: int, rows: list[Row]) -> StepSpeed:
-    """The ratios of what was measured."""
     found = {(row.sensors, row.who): row for row in rows}
 
     def ratio(sensors: str, one: str, other: str) -> float:
         return found[sensors, one].median / found[sensors, other].median
-
-    def peer_ratio(who: str) -> float | None:
-        return ratio("puffer_drive", "batched", who) if ("puffer_drive", who) in found else None
 
     added_s = found["kinematics", "dicts"].agent_step_s - found["kinematics", "single"].agent_step_s
     return StepSpeed(
@@ -159,71 +125,37 @@ def _compare(road_m: float, repeats: int, rows: list[Row]) -> StepSpeed:
         ratio_kinematics_raw=ratio("kinematics", "batched", "highway_env_raw"),
         cost_of_more=ratio("kinematics", "batched", "more"),
         dict_us=added_s * 1e6,
-        ratio_peer=peer_ratio("c"),
-        ratio_peer_native=peer_ratio("c_native"),
     )
 
 
-@contextmanager
-def one_core() -> Iterator[None]:
-    """Keep this process on one core, where the system can."""
-    if not hasattr(os, "sched_setaffinity"):
-        yield
-        return
-    before = os.sched_getaffinity(0)
-    os.sched_setaffinity(0, {min(before)})
-    try:
-        yield
-    finally:
-        os.sched_setaffinity(0, before)
+_Sides = dict[tuple[str, str], tuple[int, int, Callable[[], float]]]
 
 
-def _our_runners(folder: Path, road_m: float, agents: int, worlds: int) -> list[Runner]:
+def _our_sides(folder: Path, road_m: float, agents: int, worlds: int) -> _Sides:
     """Ours, each stepped twice before anything is measured."""
-    road = straight_road(folder, road_m)
-    long_road = straight_road(folder, road_m * MORE)
-    runners = []
-    for sensors, who, count, together in (
-        ("lidar", "batched", agents, worlds),
-        ("lidar", "single", agents, 1),
-        ("kinematics", "batched", agents, worlds),
-        ("kinematics", "single", agents, 1),
-        ("kinematics", "more", agents * MORE, worlds),
-    ):
+    sides: _Sides = {}
+    for sensors, who, times, is_batched in OURS:
+        count, together = times * agents, worlds if is_batched else 1
         vec = make_vec(
-            long_road if who == "more" else road,
+            straight_road(folder, road_m * times),
             num_envs=together,
             agents=count,
             background=0,
             overrides=overrides(LIDAR if sensors == "lidar" else KINEMATICS, count),
         )
         _batched_rate(vec, 2)
-        runners.append(Runner(sensors, who, count, together, partial(_batched_rate, vec)))
+        sides[sensors, who] = (count, together, partial(_batched_rate, vec))
+    road = straight_road(folder, road_m)
     env = parallel_env(road, agents=agents, background=0, overrides=overrides(KINEMATICS, agents))
     _dicts_rate(env, 2)
-    runners.append(Runner("kinematics", "dicts", agents, 1, partial(_dicts_rate, env)))
-    return runners
-
-
-def _their_runners(agents: int) -> tuple[list[Runner], float]:
-    """highway-env's, and the length of their road in m."""
-    runners = []
-    road_m = 0.0
-    for sensors, who, observation in (
-        ("lidar", "highway_env", THEIR_LIDAR),
-        ("kinematics", "highway_env", THEIR_KINEMATICS),
-        ("kinematics", "highway_env_raw", THEIR_RAW_KINEMATICS),
-    ):
-        env = highway_env(agents, observation)
-        road_m = length_m(env)
-        runners.append(Runner(sensors, who, agents, 1, partial(_their_rate, env, agents)))
-    return runners, road_m
+    sides["kinematics", "dicts"] = (agents, 1, partial(_dicts_rate, env))
+    return sides
 
 
 def _batched_rate(vec: CavVectorEnv, steps: int = OUR_STEPS) -> float:
     """Agent-steps a second from a fresh reset, which is not timed."""
     vec.reset(seed=0)
-    actions = np.full((vec.num_envs, vec.num_agents), _ONE)
+    actions = np.full((vec.num_envs, vec.num_agents), np.int64(IDLE))
     decisions = 0
     began = time.process_time()
     for _ in range(steps):
@@ -232,13 +164,17 @@ def _batched_rate(vec: CavVectorEnv, steps: int = OUR_STEPS) -> float:
 
 
 def _dicts_rate(env: CavEnv, steps: int = OUR_STEPS) -> float:
-    """The same through PettingZoo's dicts; nobody leaves, so the actions are ready as well."""
+    """The same through PettingZoo's dicts; agents that have ended are left out from then on."""
     env.reset(seed=0)
     actions = dict.fromkeys(env.agents, IDLE)
     decisions = 0
     began = time.process_time()
     for _ in range(steps):
         decisions += len(env.step(actions)[1])
+        if len(env.agents) != len(actions):
+            actions = dict.fromkeys(env.agents, IDLE)
+            if not actions:
+                break
     return decisions / (time.process_time() - began)
 
 

@@ -7,18 +7,18 @@ new episodes after 40 s. Each has a process a core for its worlds, and one threa
 
 from __future__ import annotations
 
+import math
 import tempfile
 import time
-from collections.abc import Callable
 from contextlib import ExitStack
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
-from statistics import median
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import yaml
 
+from cavmarl.bench.harness import Result, Say, check_range, paired_ratio, silent
 from cavmarl.bench.highway_worlds import (
     THEIR_KINEMATICS,
     highway_env,
@@ -54,44 +54,29 @@ OUR_SENSORS: dict[str, Any] = {
 
 @dataclass(frozen=True)
 class TrainingRow:
-    """One side.
+    """One side."""
 
-    Attributes:
-        who: `cavmarl` or `stable_baselines3`; `cavmarl_overlap` collects while it learns.
-        worlds: stepped together.
-        decisions: of an update.
-        rates: agent-steps a second of each turn: one update, collecting and learning.
-        shares: of the time, by phase, over all turns. Theirs of `simulation` is with what goes
-            between the processes, which ours do not send.
-    """
-
-    who: str
-    worlds: int
-    decisions: int
+    who: str  # `cavmarl` or `stable_baselines3`; `cavmarl_overlap` collects while it learns
+    worlds: int  # stepped together
+    decisions: int  # of an update
+    # agent-steps a second of each turn: one update, collecting and learning
     rates: tuple[float, ...]
+    # of the time, by phase, over all turns. Theirs of `simulation` is with what goes between the
+    # processes, which ours do not send.
     shares: dict[str, float]
 
 
 @dataclass(frozen=True)
-class TrainingSpeed:
-    """What was measured: two kinds of benchmark, whose numbers are never mixed.
+class TrainingSpeed(Result):
+    """What was measured: two kinds of benchmark, whose numbers are never mixed."""
 
-    Attributes:
-        agents: of a world.
-        workers: of each side.
-        numbers: in an observation.
-        end_to_end: PPO, collecting and learning.
-        stepping: agent-steps a second of our worlds and sensors alone, of each turn; nothing
-            learns, and nobody decides.
-        hardware: that it ran on.
-    """
-
-    agents: int
-    workers: int
-    numbers: int
-    end_to_end: tuple[TrainingRow, ...]
+    agents: int  # of a world
+    workers: int  # of each side
+    numbers: int  # in an observation
+    end_to_end: tuple[TrainingRow, ...]  # PPO, collecting and learning
+    # agent-steps a second of our worlds and sensors alone, of each turn; nothing learns or decides
     stepping: tuple[float, ...]
-    hardware: dict[str, Any]
+    hardware: dict[str, Any]  # that it ran on
 
     @property
     def ratio(self) -> float:
@@ -110,11 +95,11 @@ class TrainingSpeed:
 
     def _over(self, one: str, other: str) -> float:
         rates = {row.who: row.rates for row in self.end_to_end}
-        return median(a / b for a, b in zip(rates[one], rates[other], strict=True))
+        return paired_ratio(rates[one], rates[other])
 
     def to_dict(self) -> dict[str, Any]:
         """Plain values, for JSON; each benchmark says of which kind it is."""
-        plain = asdict(self)
+        plain = super().to_dict()
         return {
             **plain,
             "end_to_end": {
@@ -133,32 +118,16 @@ def measure_training(
     worlds: int = 16,
     workers: int = 2,
     repeats: int = 3,
-    say: Callable[[str], None] = lambda text: None,
+    say: Say = silent,
 ) -> TrainingSpeed:
-    """Update by turns, after an update of each that does not count.
-
-    Args:
-        agents: of a world, on both sides; there are no other vehicles.
-        worlds: of ours. Theirs are as many as workers.
-        workers: processes of each side.
-        repeats: updates of each.
-        say: told what is being done.
-
-    Raises:
-        ConfigError: numbers that cannot be.
-        MissingExtraError: highway-env, stable-baselines3 or torch is not installed.
-        WorkerError: workers cannot be started.
-    """
-    for name, value in {"agents": agents, "workers": workers, "repeats": repeats}.items():
-        if value < 1:
-            raise ConfigError(f"{name} = {value}: must be at least 1")
+    """Update by turns, after an update of each that does not count."""
+    check_range(
+        agents=(agents, 1, math.inf), workers=(workers, 1, math.inf), repeats=(repeats, 1, math.inf)
+    )
     if worlds % workers:
         raise ConfigError(f"{worlds} worlds over {workers} workers: must be the same for each")
-    for module, extra in (
-        ("torch", "torch"),
-        ("highway_env", "highway"),
-        ("stable_baselines3", "sb3"),
-    ):
+    needs = {"torch": "torch", "highway_env": "highway", "stable_baselines3": "sb3"}
+    for module, extra in needs.items():
         require(module, extra)
     with ExitStack() as stack:
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory()))

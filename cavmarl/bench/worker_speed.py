@@ -3,23 +3,23 @@
 from __future__ import annotations
 
 import math
-import statistics
 import time
-from collections.abc import Callable, Mapping
-from dataclasses import asdict, dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
 
+from cavmarl.bench.harness import Result, Say, paired_ratio, silent
 from cavmarl.core.errors import ConfigError
 from cavmarl.env.vector import CavVectorEnv, make_vec
 from cavmarl.evaluate.provenance.machine import describe_hardware
 from cavmarl.parallel.pooled_worlds import PooledWorlds
 from cavmarl.parallel.processes.worker_pool import Pool
 
-__all__ = ["WARM_STEPS", "Measured", "Row", "WorkerSpeed", "measure_workers"]
+__all__ = ["WARM_STEPS", "Measured", "Row", "WorkerSpeed", "drive_ms", "measure_workers"]
 
 WARM_STEPS = 20
 PINGS = 2000  # a turn
@@ -28,48 +28,33 @@ IDLE_S = 1.0
 
 @dataclass(frozen=True)
 class Row:
-    """The same worlds over some number of workers.
+    """The same worlds over some number of workers."""
 
-    Attributes:
-        workers: how many; 0: all in the caller's process.
-        made_s: until they could be reset.
-        step_ms: of each turn, ms a step.
-        busiest_ms: processor time that the busiest worker took for a step, ms.
-    """
-
-    workers: int
-    made_s: float
-    step_ms: tuple[float, ...]
-    busiest_ms: float | None
+    workers: int  # how many; 0: all in the caller's process
+    made_s: float  # until they could be reset
+    step_ms: tuple[float, ...]  # of each turn, ms a step
+    busiest_ms: float | None  # processor time that the busiest worker took for a step, ms
 
 
 @dataclass(frozen=True)
-class WorkerSpeed:
-    """What was measured.
+class WorkerSpeed(Result):
+    """What was measured."""
 
-    Attributes:
-        env: of which environment.
-        worlds: that were stepped together.
-        steps: of a turn.
-        rows: no worker, one, and those that were asked for.
-        barrier_us: of each empty order to all workers, µs: quantiles 5, 50, 95 and 99 %.
-        idle_s: processor time that the workers took in a second in which nobody asked, s.
-        hardware: that it ran on.
-    """
+    DERIVED: ClassVar = ("ratio", "processor_ratio", "cost_of_one", "is_crowded")
 
-    env: str
-    worlds: int
-    steps: int
-    rows: tuple[Row, ...]
+    env: str  # of which environment
+    worlds: int  # that were stepped together
+    steps: int  # of a turn
+    rows: tuple[Row, ...]  # no worker, one, and those that were asked for
+    # of each empty command to all workers, µs: quantiles 5, 50, 95 and 99 %
     barrier_us: tuple[float, float, float, float]
-    idle_s: float
-    hardware: dict[str, Any]
+    idle_s: float  # processor time that idle workers took in a second, s
+    hardware: dict[str, Any]  # that it ran on
 
     @property
     def ratio(self) -> float:
         """How many times faster than one worker; median of the turns, each beside the other."""
-        one, many = self.rows[1].step_ms, self.rows[2].step_ms
-        return statistics.median(a / b for a, b in zip(one, many, strict=True))
+        return paired_ratio(self.rows[1].step_ms, self.rows[2].step_ms)
 
     @property
     def processor_ratio(self) -> float:
@@ -80,22 +65,12 @@ class WorkerSpeed:
     @property
     def cost_of_one(self) -> float:
         """What a step takes with one worker, over that without; median of the turns."""
-        none, one = self.rows[0].step_ms, self.rows[1].step_ms
-        return statistics.median(b / a for a, b in zip(none, one, strict=True))
+        return paired_ratio(self.rows[1].step_ms, self.rows[0].step_ms)
 
     @property
     def is_crowded(self) -> bool:
         """More workers than cores."""
         return self.rows[2].workers > (self.hardware["usable_cores"] or 1)
-
-    def to_dict(self) -> dict[str, Any]:
-        """Plain values, for JSON."""
-        ratios = {
-            "ratio": self.ratio,
-            "processor_ratio": self.processor_ratio,
-            "cost_of_one": self.cost_of_one,
-        }
-        return {**asdict(self), **ratios, "is_crowded": self.is_crowded}
 
 
 def measure_workers(
@@ -106,31 +81,13 @@ def measure_workers(
     steps: int = 20,
     repeats: int = 7,
     seed: int = 0,
-    agents: int | None = None,
-    background: int | None = None,
-    overrides: Mapping[str, Any] | None = None,
-    say: Callable[[str], None] = lambda text: None,
+    wanted: Mapping[str, Any] | None = None,
+    say: Say = silent,
 ) -> WorkerSpeed:
     """Step the same worlds without workers, with one, and with several, by turns.
 
     The agents do what the built-in driver would; that is not timed. Observations are read where
     they lie, as a trainer with tensors of the same memory does.
-
-    Args:
-        env: as in `make_vec`.
-        worlds: stepped together.
-        workers: how many are compared with one.
-        steps: of a turn.
-        repeats: turns of each.
-        seed: root of all random numbers.
-        agents: shadows population.agents.
-        background: shadows population.background.
-        overrides: values for any other key.
-        say: told what is being done.
-
-    Raises:
-        ConfigError: numbers that cannot be.
-        WorkerError: workers cannot be started.
     """
     if workers < 2 or steps < 1 or repeats < 1:
         raise ConfigError(
@@ -140,19 +97,8 @@ def measure_workers(
     try:
         for count in (0, 1, workers):
             say(f"making worlds over {count} workers")
-            began = time.perf_counter()
-            vec = make_vec(
-                env,
-                num_envs=worlds,
-                workers=count,
-                agents=agents,
-                background=background,
-                overrides=overrides,
-                copy=False,
-            )
-            measured.append(Measured(vec, count, time.perf_counter() - began))
-            vec.reset(seed=seed)
-            measured[-1].turn(WARM_STEPS)
+            made = {"num_envs": worlds, "copy": False, **(wanted or {})}
+            measured.append(Measured(env, count, seed, made))
         pool = measured[-1].pool
         assert pool is not None
         pings: list[float] = []
@@ -171,30 +117,35 @@ def measure_workers(
     return WorkerSpeed(str(env), worlds, steps, rows, quantiles, idle_s, describe_hardware())
 
 
-class Measured:
-    """Worlds over some number of workers, and what their turns have taken."""
+def drive_ms(vec: CavVectorEnv, steps: int) -> float:
+    """Milliseconds a step; what the built-in driver decides for agents is not timed."""
+    spent = 0.0
+    for _ in range(steps):
+        actions = vec.suggest_actions()
+        began = time.perf_counter()
+        vec.step(actions)
+        spent += time.perf_counter() - began
+    return 1000.0 * spent / steps
 
-    def __init__(self, vec: CavVectorEnv, workers: int, made_s: float) -> None:
-        self.vec = vec
-        self.pool = vec.worlds.pool if isinstance(vec.worlds, PooledWorlds) else None
+
+class Measured:
+    """Worlds over some number of workers, reset and warm, and what their turns have taken."""
+
+    def __init__(self, env: str | Path, workers: int, seed: int, wanted: Mapping[str, Any]) -> None:
+        began = time.perf_counter()
+        self.vec = make_vec(env, workers=workers, **wanted)
+        self._made_s = time.perf_counter() - began
+        worlds = self.vec.worlds
+        self.pool = worlds.pool if isinstance(worlds, PooledWorlds) else None
         self._workers = workers
-        self._made_s = made_s
         self._step_ms: list[float] = []
         self._busy_s = np.zeros(workers)
-
-    def turn(self, steps: int) -> float:
-        """Milliseconds a step; what the agents decide is not timed."""
-        spent = 0.0
-        for _ in range(steps):
-            actions = self.vec.suggest_actions()
-            began = time.perf_counter()
-            self.vec.step(actions)
-            spent += time.perf_counter() - began
-        return 1000.0 * spent / steps
+        self.vec.reset(seed=seed)
+        drive_ms(self.vec, WARM_STEPS)
 
     def count_turn(self, steps: int) -> None:
         """One that counts, and as many steps for the processor's time: to ask for it takes some."""
-        self._step_ms.append(self.turn(steps))
+        self._step_ms.append(drive_ms(self.vec, steps))
         for _ in range(steps):
             actions = self.vec.suggest_actions()
             before = self._processor_s()
@@ -211,7 +162,7 @@ class Measured:
 
 
 def _pings(pool: Pool) -> list[float]:
-    """Microseconds of empty orders, one after the other."""
+    """Microseconds of empty commands, one after the other."""
     found: list[float] = []
     for _ in range(PINGS):
         began = time.perf_counter()
@@ -221,7 +172,7 @@ def _pings(pool: Pool) -> list[float]:
 
 
 def _idle_s(pool: Pool) -> float:
-    """Processor time of the workers a second while nobody asks for anything."""
+    """Processor time of idle workers a second."""
     before = sum(pool.processor_s())
     time.sleep(IDLE_S)
     return (sum(pool.processor_s()) - before) / IDLE_S

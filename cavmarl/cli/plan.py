@@ -23,7 +23,7 @@ from cavmarl.core.errors import ConfigError, NoAdmissibleWorkerError
 
 if TYPE_CHECKING:
     from cavmarl.balance.load_snapshot import Snapshot
-    from cavmarl.bench.shard_costs import MeasuredWorlds
+    from cavmarl.evaluate.shard_costs import MeasuredWorlds
     from cavmarl.roads.network import RoadNetwork
     from cavmarl.zones.partition.zone_partition import ZonePartition
 
@@ -79,8 +79,8 @@ def plan(
     from cavmarl.balance.balance_plan import make_plan
     from cavmarl.balance.plan_text import describe_plan
     from cavmarl.balance.problem import BalanceRule, Problem
-    from cavmarl.bench.shard_costs import measure_shards
-    from cavmarl.bench.sharded_worlds import world_maker
+    from cavmarl.evaluate.driven_worlds import world_maker
+    from cavmarl.evaluate.shard_costs import measure_shards
 
     if again is not None:
         _make_again(again)

@@ -25,7 +25,6 @@ __all__ = [
     "MessagesConfig",
     "NeighborsConfig",
     "OccupancyGridConfig",
-    "PufferDriveConfig",
     "RoadgraphConfig",
     "RouteAheadConfig",
     "SensorsConfig",
@@ -291,24 +290,6 @@ class MessagesConfig(Section, key="sensors.messages"):
 
 
 @dataclass(frozen=True)
-class PufferDriveConfig(Section, key="sensors.puffer_drive"):
-    """The observation of pufferlib's `drive`: 1,847 numbers with its own settings.
-
-    Attributes:
-        enabled: true switches the sensor on.
-        partners: others within 50 m that are shown, by id.
-        segments: road segments that are shown, of the cells around the vehicle from its own one
-            outwards.
-        spacing_m: longest segment that a line of the road is cut into.
-    """
-
-    enabled: bool = False
-    partners: Annotated[int, Whole(0, 256)] = 63
-    segments: Annotated[int, Whole(0, 2048)] = 200
-    spacing_m: Annotated[float, Within(0.25, 50.0)] = 2.0
-
-
-@dataclass(frozen=True)
 class SensorsConfig(Section, key="sensors"):
     """The sensors of every agent; counts and ranges of 0 switch one off.
 
@@ -328,7 +309,6 @@ class SensorsConfig(Section, key="sensors"):
     lidar_observation: LidarObservationConfig = field(default_factory=LidarObservationConfig)
     roadgraph: RoadgraphConfig = field(default_factory=RoadgraphConfig)
     messages: MessagesConfig = field(default_factory=MessagesConfig)
-    puffer_drive: PufferDriveConfig = field(default_factory=PufferDriveConfig)
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -346,7 +326,6 @@ class SensorsConfig(Section, key="sensors"):
             self.messages.objects,
             self.messages.events,
             self.messages.signal,
-            self.puffer_drive.enabled,
         )
         check(any(counts), "sensors", "all off", "an agent must observe something; switch one on")
 
@@ -361,7 +340,6 @@ class SensorsConfig(Section, key="sensors"):
             kinematics=replace(self.kinematics, vehicles_count=0),
             occupancy_grid=replace(self.occupancy_grid, features=()),
             lidar_observation=replace(self.lidar_observation, cells=0),
-            puffer_drive=replace(self.puffer_drive, enabled=False),
         )
 
 

@@ -21,47 +21,31 @@ from cavmarl.core.errors import (
 from cavmarl.core.huge_pages import huge_zeros
 from cavmarl.core.math.rng import world_key
 from cavmarl.core.memory import Zeros
-from cavmarl.core.records.arrays import Common, Gate, Outputs, Worlds
 from cavmarl.core.records.codes import ACTION_IDLE
 from cavmarl.driving.vehicles import blank_vehicle
 from cavmarl.engine import world_snapshot as snapshot
 from cavmarl.engine.compilation import first_compilation
-from cavmarl.engine.component import Attached, Host
-from cavmarl.engine.component_setup import attach
-from cavmarl.engine.rig_component import MountedSensors
 from cavmarl.engine.shard_clock import ShardClock
 from cavmarl.engine.shared_outputs import Commons
 from cavmarl.engine.state_digest import digest_world
-from cavmarl.engine.tick import Tick
-from cavmarl.engine.traffic_stats import TrafficStats, count_traffic
-from cavmarl.engine.v2x_component import Messaging
-from cavmarl.handoff.coordinator.coordinator import Referee
+from cavmarl.engine.tick_setup import cut_zones, make_frames, make_tick
+from cavmarl.engine.world_views import WorldViews
 from cavmarl.handoff.coordinator.coordinator_setup import Run, make_refereeing
 from cavmarl.handoff.coordinator.handoff_log import BorderBook
-from cavmarl.handoff.division import ZoneLoads
 from cavmarl.handoff.fault_injection.committed_store import CommittedStore
-from cavmarl.handoff.fault_injection.recovery import Recovery, Revival
+from cavmarl.handoff.fault_injection.recovery import Recovery
 from cavmarl.handoff.fault_injection.reproducer_file import Reproducer
 from cavmarl.handoff.fault_injection.reproducer_recording import Keeper, Moment, sources_of
-from cavmarl.handoff.repartitioning import Recut, Recutter
-from cavmarl.handoff.shard_setup import divide
-from cavmarl.handoff.zone_view import ZoneView, view_zones
+from cavmarl.handoff.repartitioning import Recutter
 from cavmarl.ownership.messages import Switch
 from cavmarl.ownership.transfers import TransferLog
 from cavmarl.roads.network import RoadNetwork
-from cavmarl.sensors.mounted.catalogue import frame_layout, frames_in
 from cavmarl.sensors.mounted.frames import Frames
 from cavmarl.shards.executor import SerialExecutor, Together
 from cavmarl.shards.shard import Commands, Shard
 from cavmarl.traffic.demand import DemandFile
-from cavmarl.traffic.departure_queue import make_gate
-from cavmarl.traffic.native import NativeTraffic
-from cavmarl.traffic.scenarios.library import plan_scene
-from cavmarl.traffic.scenarios.scene import Scene
 from cavmarl.traffic.sumo.sumo_demand import SumoDemand
 from cavmarl.traffic.sumo.sumo_traffic import SumoTraffic
-from cavmarl.v2x.bus import Bus
-from cavmarl.zones.partition.zone_layouts import cut_map
 from cavmarl.zones.partition.zone_partition import ZonePartition
 from cavmarl.zones.reach import longest_move_m
 
@@ -74,7 +58,7 @@ KEPT_BY_GATE = (
 )  # fmt: skip
 
 
-class Simulation:
+class Simulation(WorldViews):
     """W worlds of one environment on one map.
 
     Args:
@@ -114,76 +98,57 @@ class Simulation:
         self.network = network
         self.demand = demand
         self.num_worlds = num_worlds
-        self.partition = _cut(config, network) if partition is None else partition
+        self.partition = cut_zones(config, network) if partition is None else partition
         self._seed = 0
         self._first_world = 0
         self._episodes = np.zeros(num_worlds, dtype=np.int64)
         self.everywhere = np.ones(num_worlds, dtype=np.bool_)
-        self.frames: Frames = _frames(config, num_worlds, zeros) if frames is None else frames
+        self.frames: Frames = make_frames(config, num_worlds, zeros) if frames is None else frames
         self.transfers: tuple[TransferLog, ...] = ()
+        self._recovery: Recovery | None = None
+        self._keeper: Keeper | None = None
+        self._recutter: Recutter | None = None
         with first_compilation() as is_first:
-            blank = blank_vehicle()
-            sumo = demand if isinstance(demand, SumoDemand) else None
-            traffic: NativeTraffic = (
-                NativeTraffic(
-                    network,
-                    config.traffic,
-                    config.population,
-                    blank,
-                    config.clock.sim_dt_s,
-                    config.horizon_s,
-                    None if isinstance(demand, SumoDemand) else demand,
-                    num_worlds,
-                    zeros,
-                    plan_scene(config.scenario, network),
-                    sumo,
-                )
-                if like is None
-                else like._tick.traffic.for_worlds(num_worlds)
-            )
             commons = Commons(config, network, num_worlds, observations, zeros)
-            self._shards, division = divide(
-                config, network, self.partition, traffic, commons.outputs, num_worlds, zeros
+            self._tick = make_tick(
+                config,
+                network,
+                self.partition,
+                self.demand,
+                commons,
+                self.frames,
+                zeros,
+                None if like is None else like._tick.traffic.for_worlds(num_worlds),
             )
-            self._shard = self._shards[0]
-            attached = attach(
-                Host(
-                    config,
-                    network,
-                    num_worlds,
-                    self._shards,
-                    division,
-                    self._shard.travel,
-                    commons.outputs,
-                    zeros,
-                    self.frames,
-                )
-            )
-            gate = make_gate(num_worlds, traffic.capacity, network.arrays, blank.dtype)
-            self._tick: Tick = Tick(self._shards, division, traffic, commons, gate, attached)
-            self._recovery: Recovery | None = None
-            self._keeper: Keeper | None = None
-            self._recutter: Recutter | None = None
+            self._shards = self._tick.shards
             if is_first or warm:
                 self._call_every_kernel()
-            if sumo is not None:
-                travel = traffic.travel
-                self._tick.sumo = SumoTraffic(
-                    sumo, network, travel, travel.num_fixed, division.zoned, blank
-                )
-            zones = config.zones
-            watched = zones.journal or zones.check or zones.faults or zones.reproducers
-            if self.partition.count > 1 or watched:
-                self._let_coordinate(runs)
-            coordination = self._tick.coordination
-            if zones.recut_steps and self.partition.count > 1 and coordination is not None:
-                self._recutter = Recutter(
-                    network,
-                    division,
-                    coordination,
-                    zones.recut_steps,
-                    zones.recut_tolerance,
-                )
+            self._add_sumo()
+            self._add_coordinators(runs)
+
+    def _add_sumo(self) -> None:
+        if isinstance(self.demand, SumoDemand):
+            tick = self._tick
+            travel, zoned = tick.traffic.travel, tick.division.zoned
+            tick.sumo = SumoTraffic(
+                self.demand, self.network, travel, travel.num_fixed, zoned, blank_vehicle()
+            )
+
+    def _add_coordinators(self, runs: Sequence[Run] | None) -> None:
+        """Coordinators, and what makes other zones, where the settings ask for them."""
+        zones = self.config.zones
+        watched = zones.journal or zones.check or zones.faults or zones.reproducers
+        if self.partition.count > 1 or watched:
+            self._let_coordinate(runs)
+        tick = self._tick
+        if zones.recut_steps and self.partition.count > 1 and tick.coordination is not None:
+            self._recutter = Recutter(
+                self.network,
+                tick.division,
+                tick.coordination,
+                zones.recut_steps,
+                zones.recut_tolerance,
+            )
 
     def _let_coordinate(self, runs: Sequence[Run] | None) -> None:
         """Let coordinators say who owns what; nobody asks where all is one zone."""
@@ -241,133 +206,6 @@ class Simulation:
         book.reset(0)
         self._episodes[:] = 0
 
-    @property
-    def shards(self) -> Sequence[Shard]:
-        return self._shards
-
-    @property
-    def capacity(self) -> int:
-        return int(self._shard.worlds.rows.shape[1])
-
-    @property
-    def outputs(self) -> Outputs:
-        """What the agents got at the end of the last step; arrays that the next step overwrites."""
-        return self._tick.commons.outputs
-
-    @property
-    def messages(self) -> Bus:
-        """What vehicles and roadside units tell each other.
-
-        Raises:
-            ConfigError: they tell each other nothing.
-        """
-        for part in self._tick.attached:
-            if isinstance(part, Messaging):
-                return part.bus
-        raise ConfigError("nobody says anything here: set v2x.enabled to true")
-
-    @property
-    def gate(self) -> Gate:
-        """Who waits to enter each world, and counts since its reset; a reset may replace it."""
-        return self._tick.gate
-
-    def listen(self, config: EnvConfig) -> tuple[Bus, Callable[[], None]]:
-        """A bus beside the world, for tools that measure: nobody in the world hears of it.
-
-        Args:
-            config: whose `v2x` it is of.
-
-        Returns:
-            the bus, and what lets it send and receive in the present tick.
-        """
-        worlds = self._shard.worlds
-        common = Common(*(getattr(worlds, name) for name in Common._fields))
-        types, zoned = self._shard.travel.types, self._tick.division.zoned
-        bus = Bus(config, self.network, types, zoned, common)
-        return bus, lambda: bus.exchange(self._tick.division.side)
-
-    @property
-    def goal_edges(self) -> NDArray[np.int32]:
-        return self._tick.traffic.goal_edges
-
-    @property
-    def types(self) -> NDArray[np.void]:
-        """VTYPE (num_types,), by `VEHICLE["vtype"]`."""
-        return self._shard.travel.types
-
-    @property
-    def scene(self) -> Scene | None:
-        return self._tick.traffic.scene
-
-    @property
-    def plans(self) -> NDArray[np.void]:
-        """PLAN (G, L): the ways of agents, by `VEHICLE["goal"]`."""
-        return self._tick.traffic.plans
-
-    def vehicles(self, world: int = 0) -> NDArray[np.void]:
-        """The live vehicles of one world, VEHICLE records in no order.
-
-        A view, or, where the world is divided, a copy.
-        """
-        return self._tick.division.vehicles(world)
-
-    def zone_loads(self) -> ZoneLoads:
-        return self._tick.division.loads()
-
-    def zone_view(self, world: int = 0) -> ZoneView:
-        """Who owns and sees which vehicles of one world now."""
-        halo_m, coordination = self.zone_loads().halo_m, self._tick.coordination
-        transfers = () if coordination is None else coordination.in_flight(world)
-        return view_zones(self._shards, self.partition, halo_m, world, transfers)
-
-    def running(self) -> NDArray[np.int64]:
-        """(W,) vehicles of each world."""
-        return self._tick.division.running()
-
-    def ghosts(self, zone: int, world: int = 0) -> NDArray[np.void]:
-        """What a zone sees of other zones' vehicles: VEHICLE (n,), a view that cannot be written.
-
-        It shows the present tick, until the next one.
-        """
-        return self._tick.division.ghosts(world, zone)
-
-    @property
-    def migrations(self) -> int:
-        """How many vehicles have changed their owner since the worlds were made."""
-        return sum(coordinator.switched for coordinator in self.coordinators)
-
-    @property
-    def coordinators(self) -> tuple[Referee, ...]:
-        """Who says who owns what, one a world; none where all is one zone."""
-        return () if self._tick.coordination is None else self._tick.coordination.coordinators
-
-    @property
-    def attached(self) -> tuple[Attached, ...]:
-        return self._tick.attached
-
-    @property
-    def worlds(self) -> Worlds:
-        """The vehicles and signals of all worlds, for tools that measure; each tick swaps them.
-
-        A copy where worlds are divided.
-        """
-        return self._tick.division.whole()
-
-    @property
-    def mounted(self) -> MountedSensors | None:
-        """The rigs of the agents; None: they have none."""
-        rigs = (part for part in self._tick.attached if isinstance(part, MountedSensors))
-        return next(rigs, None)
-
-    def signal_phases(self, world: int = 0) -> NDArray[np.int32]:
-        """PHASE rows that are on, (num_signals,)."""
-        phases: NDArray[np.int32] = self._shard.worlds.signal_phase[world]
-        return phases
-
-    def ticks(self) -> NDArray[np.int64]:
-        """(W,) ticks since each world's reset."""
-        return self._shard.worlds.ticks
-
     def seed(self, seed: int, first_world: int = 0) -> None:
         """Set the root of all random numbers; the next reset of each world is its first episode.
 
@@ -378,11 +216,6 @@ class Simulation:
         self._seed = seed
         self._first_world = first_world
         self._episodes[:] = 0
-
-    @property
-    def revivals(self) -> Sequence[Revival]:
-        """What it took to go on after each death; see `zones.faults`."""
-        return () if self._recovery is None else self._recovery.revivals
 
     def reset(self, chosen: NDArray[np.bool_] | None = None) -> None:
         """Begin a new episode in the chosen worlds (W,), all by default, and sense.
@@ -451,11 +284,6 @@ class Simulation:
             if partition is not None:
                 self.partition = partition
                 self._tick.executor = SerialExecutor(self._shards)
-
-    @property
-    def recuts(self) -> Sequence[Recut]:
-        """When other zones have been made while the worlds ran; see `zones.recut_steps`."""
-        return () if self._recutter is None else self._recutter.recuts
 
     def run_tick(self, commands: Commands, is_first: bool, is_last: bool) -> None:
         """One tick of a step, begun again as often as it takes where hosts may die.
@@ -549,11 +377,6 @@ class Simulation:
         if self._recutter is not None:
             raise ConfigError(f"zones.recut_steps: {what} needs zones that stay; leave one out")
 
-    @property
-    def sumo(self) -> SumoTraffic | None:
-        """SUMO beside these worlds; None where `traffic.source` is native."""
-        return self._tick.sumo
-
     def close(self) -> None:
         """End the processes that the worlds have."""
         if self._tick.sumo is not None:
@@ -618,16 +441,6 @@ class Simulation:
             tick.sumo,
         )
 
-    def agents_to_come(self) -> NDArray[np.bool_]:
-        """(W,) whether an agent waits to enter."""
-        tick = self._tick
-        longest = int(tick.gate.num_queue.max(initial=0))
-        if longest == 0:
-            return np.zeros(self.num_worlds, dtype=np.bool_)
-        waiting = np.arange(longest) < tick.gate.num_queue[:, None]
-        found = np.any(waiting & (tick.gate.queue["agent"][:, :longest] >= 0), axis=1)
-        return np.asarray(found, dtype=np.bool_)
-
     def suggest(self, out: NDArray[np.float64]) -> None:
         """Write what the built-in driver would do in the agents' place into `out` (W, A, 2)."""
         self._tick.executor.each("suggest", out)
@@ -640,23 +453,3 @@ class Simulation:
         horizon, held actions).
         """
         return digest_world(self._parts(), world)
-
-    def traffic_stats(self, world: int = 0) -> TrafficStats:
-        """Counts and means since the world's reset."""
-        return count_traffic(self._tick.gate, self._tick.division, world)
-
-
-def _frames(config: EnvConfig, num_worlds: int, zeros: Zeros) -> Frames:
-    layout = frame_layout(config, num_worlds)
-    return frames_in({name: zeros(shape, dtype=kind) for name, (kind, shape) in layout.items()})
-
-
-def _cut(config: EnvConfig, network: RoadNetwork) -> ZonePartition:
-    settings = config.zones
-    return cut_map(
-        network,
-        settings.layout,
-        settings.count,
-        avoid_junctions=settings.avoid_junctions,
-        weight=settings.weight,
-    )

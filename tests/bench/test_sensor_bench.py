@@ -4,18 +4,15 @@ from __future__ import annotations
 
 import csv
 import json
-from collections.abc import Mapping
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import pytest
 from typer.testing import CliRunner
 
-from cavmarl.bench import sensor_bench
 from cavmarl.bench.sensor_bench import SensorBench, measure_sensor_workers
-from cavmarl.bench.sensor_load import describe_rig, find_rig, load_rig, scaled
-from cavmarl.bench.sensor_run import PARTS, SensorJob
+from cavmarl.bench.sensor_rig import describe_rig, find_rig, load_rig
+from cavmarl.bench.sensor_run import PARTS
 from cavmarl.cli import app
 from cavmarl.config.registry import load_config
 from cavmarl.core.errors import ConfigError
@@ -35,29 +32,6 @@ def found() -> SensorBench:
     return measure_sensor_workers(
         "grid4x4", RIG, workers=(1, 2), warmup=2, steps=6, repeats=1, background=3
     )
-
-
-def test_a_load_is_found_beyond_which_sensors_take_much_longer_at_once(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    """What does not fit into a cache takes 2.4 times as long: no load is between 10 and 24 ms."""
-
-    def costs_ms(rig: Mapping[str, Any]) -> float:
-        rays = rig["lidar"]["rays"]
-        return rays / 100.0 if rays <= 1000 else 2.4 * rays / 100.0
-
-    def run(job: SensorJob) -> SimpleNamespace:
-        found = costs_ms(job.overrides["rig"])
-        return SimpleNamespace(parts_ms={"sensor compute": [found]}, costs_ms=[found / job.agents])
-
-    monkeypatch.setattr(sensor_bench, "_run", run)
-    said: list[str] = []
-    job = SensorJob("grid4x4", {"rig": {"lidar": RIG["lidar"]}}, 2, 3, 1, 2, 6, 0)
-    loaded = sensor_bench._loaded(job, 20.0, said.append)
-    assert 24.0 <= costs_ms(loaded.overrides["rig"]) <= 30.0
-    tries = [float(text.split()[-2]) for text in said[2:]]
-    assert min(tries) < 20.0, "one was too light,"
-    assert max(tries) > 30.0, "another too heavy"
 
 
 def test_every_run_is_on_record(found: SensorBench) -> None:
@@ -141,18 +115,6 @@ def test_the_rig_of_ten_lists_what_it_is() -> None:
     )
 
 
-@pytest.mark.parametrize("factor", [0.1, 1.0, 3.0, 1e3, 1e6])
-def test_rigs_of_any_load_can_be(factor: float) -> None:
-    rig = load_rig(find_rig("ten_sensors"))
-    plain, _ = load_config("grid4x4", overrides={"rig": rig, "clock.ctrl_dt_s": 0.05})
-    heavy = scaled(plain, dict.fromkeys(rig, factor), 20.0)
-    config, _ = load_config("grid4x4", overrides={"rig": heavy, "clock.ctrl_dt_s": 0.05})
-    for name, sensor in config.rig.items():
-        before, after = plain.rig[name].shape, sensor.shape
-        grows = [b >= a if factor >= 1.0 else b <= a for a, b in zip(before, after, strict=True)]
-        assert all(grows)
-
-
 def test_the_command_writes_every_step_and_a_figure(tmp_path: Path) -> None:
     rig = tmp_path / "small.yaml"
     rig.write_text("wheels: {type: odometry, rate_hz: 20}\n")
@@ -180,7 +142,6 @@ def test_the_command_writes_every_step_and_a_figure(tmp_path: Path) -> None:
         {"steps": 1},
         {"repeats": 0},
         {"warmup": -1},
-        {"load_ms": 0.0},
     ],
 )
 def test_numbers_that_cannot_be_are_refused(numbers: dict[str, Any]) -> None:

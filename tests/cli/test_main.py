@@ -249,7 +249,7 @@ def test_verify_determinism_fails_and_names_the_first_difference(
         (("bench", "step", "--worlds", "-2"), "worlds = -2"),
         (("bench", "step", "--repeats", "x"), "valid integer"),
         (("bench", "step", "--at-least", "nan"), "--at-least nan: must be"),
-        (("bench", "rays", "--repeats", "0"), "repeats = 0: must be from 1 to 100"),
+        (("bench", "step", "--repeats", "0"), "repeats = 0: must be from 1 to 100"),
         (("bench", "step", "--at-least", "inf"), "--at-least inf: must be"),
         (("bench", "step", "--at-least", "0"), "--at-least 0: must be"),
         (("bench", "step", "--at-least", "-1"), "--at-least -1: must be"),
@@ -365,14 +365,6 @@ def test_bench_compares_and_says_whether_it_held(
     assert run(*words, "--json", str(path), "--at-least", "1e9") == 1
     assert "highway-env" in capsys.readouterr().out
     assert json.loads(path.read_text())["ratio"] > 0.0
-
-
-def test_bench_says_where_the_time_goes(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
-    path = tmp_path / "profile.json"
-    words = ("bench", "profile", "ring", "--agents", "2", "--steps", "3", "--repeats", "1")
-    assert run(*words, "--json", str(path)) == 0
-    assert "ns a vehicle" in capsys.readouterr().out
-    assert json.loads(path.read_text())["phases"]["sense"] > 0.0
 
 
 def test_the_demo_of_a_wheel_says_what_is_missing(

@@ -1,4 +1,4 @@
-"""`cavmarl plan` and `cavmarl bench balance`."""
+"""`cavmarl plan`."""
 
 from __future__ import annotations
 
@@ -86,17 +86,3 @@ def test_zones_can_be_cut_by_what_was_measured(
     assert run(*rush, *short, "--tolerance", "4", "--cut-anew", str(path)) == 0
     assert "is not written" in capsys.readouterr().out
     assert not path.exists()
-
-
-def test_placements_are_compared(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
-    path = tmp_path / "found.json"
-    words = ("bench", "balance", "grid4x4", "--traces", "2", "--rounds", "8", "--zones", "4")
-    assert run(*words, "--workers", "2", "--json", str(path)) == 0
-    shown = capsys.readouterr().out
-    for name in ("static", "balanced", "calibrated", "predicted", "re-cut", "perfect"):
-        assert name in shown
-    document = json.loads(path.read_text())
-    assert len(document["replay"]["rows"]) == 6
-    assert document["recorded"] is False
-    assert "workers = 0" in refusal(capsys, *words, "--workers", "0")
-    assert "no settings" in refusal(capsys, *words, "--set", "horizon_s=1")

@@ -28,7 +28,6 @@ SENSORS = {
     "sensors.occupancy_grid.features": ["presence", "vx", "on_road"],
     "sensors.lidar_observation.cells": 16,
     "sensors.roadgraph.points": 30,
-    "sensors.puffer_drive.enabled": True,
     "sensors.stack": 3,
 }
 

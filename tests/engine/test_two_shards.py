@@ -30,7 +30,6 @@ SENSORS: dict[str, Any] = {
     "sensors.kinematics.order": "shuffled",
     "sensors.occupancy_grid.features": ["presence", "vx", "on_road"],
     "sensors.lidar_observation.cells": 16,
-    "sensors.puffer_drive.enabled": True,
     "sensors.stack": 3,
     "terms.team_share": 0.3,
 }

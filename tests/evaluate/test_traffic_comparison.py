@@ -44,7 +44,7 @@ def side(arrived: int, mean_speed_mps: float | None) -> TrafficRun:
 
 
 def comparison(ours: TrafficRun, theirs: TrafficRun) -> TrafficComparison:
-    return TrafficComparison("town", 900, 0.1, 1, ours, theirs)
+    return TrafficComparison("town", 900, 0.1, 1, ours, theirs, ("a", "b"))
 
 
 def test_a_ratio_is_ours_over_sumos_where_that_says_something() -> None:
@@ -69,6 +69,9 @@ def test_the_command_prints_the_table_and_writes_both_files(
     written = json.loads(document.read_text())
     assert written["sumo"]["figures"]["departed"] > 0
     assert set(written["ratios"]) == set(RATIOS)
+    edges = set(read_network(MAP).edge_ids)
+    for side in ("ours", "sumo"):
+        assert set(written[side]["edge_minutes"]["edge"]) <= edges
 
 
 def test_our_world_has_the_signal_programs_of_the_demand() -> None:

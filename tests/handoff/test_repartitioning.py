@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 import pytest
 
-from cavmarl.bench.recut_speed import measure_recutting
 from cavmarl.core.errors import ConfigError
 from cavmarl.engine.simulation import Simulation
 from cavmarl.env.vector import make_vec
@@ -70,20 +69,6 @@ def test_the_journal_of_a_world_that_is_cut_anew_tells_of_each_move(tmp_path: Pa
     assert sum(len(line.get("switches", ())) for line in lines) == recut.migrations > 20
 
 
-def test_a_crowd_of_fifty_is_shared_out() -> None:
-    found = measure_recutting(
-        "rush", zones=4, every=10, steps=60, seeds=3, overrides={"population.agents": 50}
-    )
-    static, recut = found.rows
-    assert found.vehicles <= 50
-    assert min(static.imbalance) > 2.0
-    assert max(recut.imbalance) < 0.75 * min(static.imbalance)
-    assert (found.ratios < 0.75).all()
-    assert static.recuts == 0 < recut.recuts
-    assert recut.recut_ms is not None
-    assert recut.recut_ms > 0.0
-
-
 def test_zones_that_are_even_stay() -> None:
     calm = worlds("grid4x4", 2, **{"zones.recut_steps": 3, "zones.recut_tolerance": 0.9})
     before = calm.partition
@@ -127,9 +112,3 @@ def test_what_cannot_be_cut_anew_is_refused(overrides: dict[str, Any], words: st
 def test_zones_of_one_world_over_workers_stay() -> None:
     with pytest.raises(ConfigError, match="over workers needs zones that stay"):
         make_vec("grid4x4", zones=4, workers=2, overrides={"zones.recut_steps": 5})
-
-
-@pytest.mark.parametrize("wrong", [{"zones": 1}, {"every": 0}, {"steps": 0}, {"seeds": 0}])
-def test_measuring_nothing_is_refused(wrong: dict[str, int]) -> None:
-    with pytest.raises(ConfigError, match="must be at least"):
-        measure_recutting("rush", **wrong)

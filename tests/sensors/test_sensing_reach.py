@@ -54,7 +54,6 @@ ON: dict[str, dict[str, Any]] = {
         "sensors.lidar_observation.maximum_range_m": 75.0,
     },
     "roadgraph": {"sensors.roadgraph.points": 20},
-    "puffer_drive": {"sensors.puffer_drive.enabled": True},
 }
 BLIND = {"route", "signal", "roadgraph"}  # look at no vehicle
 # Shows an inbox, which one bus fills for all zones, however far away senders are (tests/v2x).
@@ -175,4 +174,4 @@ def test_rays_see_the_corner_of_a_body_whose_centre_is_beyond_their_range() -> N
     simulation = world("grid4x4", "lidar")
     config = simulation.config.sensors
     assert sensing_reach_m(config, RADIUS_M) == config.lidar.range_m + RADIUS_M
-    assert sensing_reach_m(world("grid4x4", "puffer_drive").config.sensors, 9.0) == TTC_REACH_M
+    assert sensing_reach_m(world("grid4x4", "roadgraph").config.sensors, 9.0) == TTC_REACH_M

@@ -73,7 +73,9 @@ def test_the_library_is_what_lies_in_its_folder() -> None:
 
 
 @pytest.mark.parametrize(("name", "params"), VARIANTS)
-@pytest.mark.parametrize("seed", [0, 1, 2])
+@pytest.mark.parametrize(
+    "seed", [0, pytest.param(1, marks=pytest.mark.slow), pytest.param(2, marks=pytest.mark.slow)]
+)
 def test_the_reference_driver_passes_and_who_never_yields_does_not(
     name: str, params: Mapping[str, bool | float], seed: int
 ) -> None:

@@ -9,6 +9,7 @@ import typer
 from rich.console import Console
 from rich.table import Table
 
+from cavmarl.bench.harness import make_table, measuring
 from cavmarl.cli.output import (
     JsonPath,
     Seed,
@@ -28,13 +29,15 @@ def clock(
     env: Annotated[
         str, typer.Argument(metavar="[ENV]", help="Name, folder or map file of an environment.")
     ] = "ring",
-    steps: Annotated[int, typer.Option(help="Of the master; a step is a tick here.")] = 5000,
+    steps: Annotated[
+        int, typer.Option(help="Steps of the master; a step is one tick here.")
+    ] = 5000,
     rogue: Annotated[
-        float, typer.Option(help="Share of steps in which the follower ticks by itself, too.")
+        float, typer.Option(help="Share of steps in which the follower also ticks by itself.")
     ] = 0.0,
     own_ticks: Annotated[
         Literal["obey", "refuse", "ignore"],
-        typer.Option(help="What the master does about that; obey: the unprotected world ticks."),
+        typer.Option(help="What the master does with such a tick; obey: the world really ticks."),
     ] = "obey",
     seed: Seed = 0,
     settings: Settings = None,
@@ -47,7 +50,8 @@ def clock(
     from cavmarl.bench.clock_drift import measure_drift, write_rows
 
     console = Console()
-    with console.status(f"{steps} steps"):
+    with measuring(console) as say:
+        say(f"{steps} steps")
         found = measure_drift(
             env,
             steps=steps,
@@ -66,13 +70,15 @@ def clock(
 
 
 def _table(found: ClockDrift) -> Table:
-    table = Table(title=f"{found.environment}, {1000.0 * found.dt_s:g} ms a step")
-    for column in ("step", "master, s", "follower, s", "normalised, s", "Δ, s", "ratio"):
-        table.add_column(column, justify="right")
+    rows = []
     for row in found.rows:
         seconds = (row.master_s, row.follower_s, row.normalised_s, row.delta_s)
-        table.add_row(str(row.step), *(f"{time_s:.1f}" for time_s in seconds), f"{row.ratio:.2f}")
-    return table
+        rows.append((str(row.step), *(f"{time_s:.1f}" for time_s in seconds), f"{row.ratio:.2f}"))
+    return make_table(
+        f"{found.environment}, {1000.0 * found.dt_s:g} ms a step",
+        ("step", "master, s", "follower, s", "normalised, s", "Δ, s", "ratio"),
+        rows,
+    )
 
 
 def _verdict(found: ClockDrift) -> str:
@@ -81,8 +87,8 @@ def _verdict(found: ClockDrift) -> str:
         return f"the follower did not tick by itself; the clocks are {equal}"
     told = f"the follower ticked by itself {found.own_ticks} times ({found.answer})"
     if found.noticed_ticks is None:
-        return f"{told}; the master counted {found.counted}, and the world went on only with him"
+        return f"{told}; the master counted {found.counted}, and the world went on only with it"
     return (
         f"{told}; the master noticed {found.drift_events} times that the world had gone on without "
-        f"him, first {found.noticed_ticks} of his ticks after the first time"
+        f"it, first {found.noticed_ticks} of its ticks after the first time"
     )

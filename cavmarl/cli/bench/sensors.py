@@ -3,16 +3,15 @@
 from __future__ import annotations
 
 import csv
-import math
 from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
-from rich import box
 from rich.console import Console
 from rich.table import Table
 
+from cavmarl.bench.harness import check_positive, make_table, measuring, numbers_of
 from cavmarl.cli.output import JsonPath, Seed, Settings, parse_settings, write_json
 from cavmarl.core.errors import ConfigError
 
@@ -30,22 +29,16 @@ def sensors(
         str, typer.Argument(metavar="[ENV]", help="Name, folder or map file of an environment.")
     ] = "town",
     workers: Annotated[
-        str, typer.Option(metavar="N,…", help="Numbers of sensor workers.")
+        str, typer.Option(metavar="N,…", help="Numbers of sensor workers to compare.")
     ] = "1,2,3,4",
-    warmup: Annotated[int, typer.Option(help="Steps that do not count.")] = 40,
-    steps: Annotated[int, typer.Option(help="Of each run that do.")] = 150,
-    repeats: Annotated[int, typer.Option(help="Runs of each number.")] = 5,
+    warmup: Annotated[int, typer.Option(help="Steps before the measured ones.")] = 40,
+    steps: Annotated[int, typer.Option(help="Measured steps of each run.")] = 150,
+    repeats: Annotated[int, typer.Option(help="Runs of each number of sensor workers.")] = 5,
     rig: Annotated[
         str, typer.Option(help="Sensors: a name in configs/rigs/, or a .yaml.")
     ] = "ten_sensors",
     agents: Annotated[int, typer.Option(help="Vehicles with sensors.")] = 1,
-    background: Annotated[int, typer.Option(help="Vehicles without.")] = 0,
-    load: Annotated[
-        float | None,
-        typer.Option(
-            metavar="MS", help="Raise resolutions and rates until sensing takes so long a tick."
-        ),
-    ] = None,
+    background: Annotated[int, typer.Option(help="Vehicles without sensors.")] = 0,
     seed: Seed = 0,
     settings: Settings = None,
     csv_path: Annotated[
@@ -55,7 +48,10 @@ def sensors(
         Path | None, typer.Option(help="Write the figure here (.png, .svg, .pdf).")
     ] = None,
     at_least: Annotated[
-        float | None, typer.Option(help="Exit with 1 if the second is not so many times faster.")
+        float | None,
+        typer.Option(
+            help="Exit with 1 if the second number is not so many times faster than the first."
+        ),
     ] = None,
     json_path: JsonPath = None,
 ) -> None:
@@ -65,13 +61,12 @@ def sensors(
     """
     from cavmarl.bench.sensor_bench import measure_sensor_workers
     from cavmarl.bench.sensor_figure import plot_sensor_workers
-    from cavmarl.bench.sensor_load import find_rig, load_rig
+    from cavmarl.bench.sensor_rig import find_rig, load_rig
 
-    if at_least is not None and not 0.0 < at_least < math.inf:
-        raise ConfigError(f"--at-least {at_least:g}: must be a number above 0")
-    numbers = _numbers(workers)
+    check_positive("--at-least", at_least)
+    numbers = numbers_of("--workers", workers)
     console = Console()
-    with console.status("") as status:
+    with measuring(console) as say:
         found = measure_sensor_workers(
             env,
             load_rig(find_rig(rig)),
@@ -82,9 +77,8 @@ def sensors(
             agents=agents,
             background=background,
             seed=seed,
-            load_ms=load,
             overrides=parse_settings(settings),
-            say=status.update,
+            say=say,
         )
     rows = found.rows
     for table in (_sensors(found), _scaling(found, rows), _parts(found), _resources(found)):
@@ -101,157 +95,139 @@ def sensors(
         raise typer.Exit(1)
 
 
-def _numbers(text: str) -> list[int]:
-    try:
-        return [int(word) for word in text.split(",")]
-    except ValueError:
-        raise ConfigError(f"--workers {text}: must be whole numbers with commas between") from None
-
-
 def _sensors(found: SensorBench) -> Table:
-    """What was sensed, what it costs, and who does it either way."""
-    table = Table("sensor", "type", "sample", "Hz", "x, y, z m; yaw °", "ms", title="the rig")
+    """What was sensed, what it costs, and which worker does it either way."""
     shared = [number for number in found.numbers if number > 1]
-    for number in shared:
-        table.add_column(f"in turn / by cost, {number}", justify="right")
     plans = [found.shares(number) for number in shared]
     homes = [{name: _homes(plan) for name, plan in both.items()} for both in plans]
+    rows: list[tuple[str, ...] | None] = []
     for place, (sensor, cost_ms) in enumerate(
         zip(found.turns[0].run.sensors, found.costs_ms, strict=True)
     ):
         at = sensor["placement"]
-        table.add_row(
-            sensor["name"],
-            sensor["type"],
-            " by ".join(map(str, sensor["resolution"])),
-            "" if sensor["rate_hz"] is None else f"{sensor['rate_hz']:g}",
-            f"{at['x_m']:g}, {at['y_m']:g}, {at['z_m']:g}; {at['yaw_deg']:g}",
-            f"{cost_ms:.3f}",
-            *(
-                f"{both['in_turn'].get(place, '-')} / {both['cost'].get(place, '-')}"
-                for both in homes
-            ),
+        rows.append(
+            (
+                sensor["name"],
+                sensor["type"],
+                " by ".join(map(str, sensor["resolution"])),
+                "" if sensor["rate_hz"] is None else f"{sensor['rate_hz']:g}",
+                f"{at['x_m']:g}, {at['y_m']:g}, {at['z_m']:g}; {at['yaw_deg']:g}",
+                f"{cost_ms:.3f}",
+                *(
+                    " / ".join(both[n].get(place, "-") for n in ("in_turn", "cost"))
+                    for both in homes
+                ),
+            )
         )
-    table.add_section()
     slowest = (
         " / ".join(f"{1e3 * max(both[name].loads_s):.2f}" for name in ("in_turn", "cost"))
         for both in plans
     )
-    table.add_row("all; the slowest", "", "", "", "", f"{sum(found.costs_ms):.3f}", *slowest)
-    return table
+    rows += [None, ("all; the slowest", "", "", "", "", f"{sum(found.costs_ms):.3f}", *slowest)]
+    return make_table(
+        "the rig",
+        (
+            "sensor", "type", "sample", "Hz", "x, y, z m; yaw °", "ms",
+            *(f"in turn / by cost, {number}" for number in shared),
+        ),
+        rows,
+    )  # fmt: skip
 
 
 def _homes(plan: Shares) -> dict[int, str]:
-    """Who writes the frames of each sensor, or parts of them."""
+    """Workers that write the frames of each sensor, or parts of them."""
     homes: dict[int, list[str]] = {}
     for unit, home in zip(plan.units, plan.homes, strict=True):
         homes.setdefault(unit.sensor, []).append(str(home))
     return {sensor: "+".join(own) for sensor, own in homes.items()}
 
 
+_FIGURES = {
+    "FPS": "fps",
+    "tick +\nsensors\nms": "step_ms", "SD\nms": "sd_within_run", "wait\nms": "wait_ms",
+    "speedup": "speedup", "effi-\nciency\n%": "efficiency_pct", "CV\n%": "cv_pct",
+    "wait\n%": "wait_share_pct", "rest\nms": "rest_ms",
+}  # fmt: skip
+
+
 def _scaling(found: SensorBench, rows: list[ScalingRow]) -> Table:
-    table = Table(
-        title=(
-            f"{Path(found.env).stem}, {found.agents} vehicle{'s' if found.agents > 1 else ''} with "
-            f"sensors, {found.warmup} + {found.steps} steps, placed by {found.placement}"
-        ),
-        caption="bold: the best of those measured; SD: of the steps of a run",
-        box=box.SIMPLE_HEAD,
-        pad_edge=False,
-    )
-    for column in (
-        "sensor\nworkers", "FPS", "tick +\nsensors\nms", "SD\nms", "wait\nms", "speedup",
-        "effi-\nciency\n%", "CV\n%", "wait\n%", "rest\nms",
-    ):  # fmt: skip
-        table.add_column(column, justify="right", no_wrap=True)
+    cells = []
     for row in rows:
-        table.add_row(
-            str(row.workers),
-            f"{row.fps:.2f}",
-            f"{row.step_ms:.2f}",
-            f"{row.sd_within_run:.2f}",
-            f"{row.wait_ms:.2f}",
-            f"{row.speedup:.2f}",
-            f"{row.efficiency_pct:.1f}",
-            f"{row.cv_pct:.1f}",
-            f"{row.wait_share_pct:.1f}",
-            f"{row.rest_ms:.2f}",
-            style="bold" if row.is_best else None,
-        )
-    return table
+        values = (f"{getattr(row, name):.2f}" for name in _FIGURES.values())
+        cells.append((f"{row.workers}{' (best)' if row.is_best else ''}", *values))
+    return make_table(
+        f"{Path(found.env).stem}, {found.agents} vehicles with sensors, {found.warmup} + "
+        f"{found.steps} steps, placed by {found.placement}",
+        ("sensor\nworkers", *_FIGURES),
+        cells,
+        "best: of those measured; SD: of the steps of a run",
+    )
 
 
 def _parts(found: SensorBench) -> Table:
     """Where a step goes."""
-    table = Table("ms a step", title="parts of a step, each with a clock of its own")
-    columns = []
-    for row in found.rows:
-        table.add_column(f"{row.workers}", justify="right")
-        columns.append((found.parts_ms(row.workers), row.step_ms))
-    for name in columns[0][0]:
-        if name == "SUMO" and not any(parts[name] for parts, _ in columns):
-            continue  # no world has one
-        table.add_row(name, *(f"{parts[name]:.3f}" for parts, _ in columns))
-    table.add_section()
+    columns = [(found.parts_ms(row.workers), row.step_ms) for row in found.rows]
+    rows: list[tuple[str, ...] | None] = [
+        (name, *(f"{parts[name]:.3f}" for parts, _ in columns))
+        for name in columns[0][0]
+        if name != "SUMO" or any(parts[name] for parts, _ in columns)
+    ]
     sums = (f"{sum(parts.values()) / step_ms:.1%}" for parts, step_ms in columns)
-    table.add_row("sum, of the step", *sums)
-    return table
+    rows += [None, ("sum, of the step", *sums)]
+    head = ("ms a step", *(str(row.workers) for row in found.rows))
+    return make_table("parts of a step, each with a clock of its own", head, rows)
+
+
+_RESOURCES: dict[str, Callable[[Window], float]] = {
+    "processor, state, ms": lambda w: 1e3 * w.leader_cpu_s / w.steps,
+    "processor, sensor workers, ms": lambda w: 1e3 * sum(w.worker_cpu_s) / w.steps,
+    "memory, state, MB": lambda w: w.leader_rss_mb,
+    "memory, largest sensor worker, MB": lambda w: max(w.worker_rss_mb),
+    "to sensor workers, kB": lambda w: 1e-3 * w.sent_bytes / w.steps,
+    "frames, kB": lambda w: 1e-3 * w.got_bytes / w.steps,
+    "messages": lambda w: w.messages / w.steps,
+}
 
 
 def _resources(found: SensorBench) -> Table:
     """What all processes took a step, in the last run of each number."""
-    table = Table("a step", title="resources")
-    columns = []
-    for number in found.numbers:
-        table.add_column(f"{number}", justify="right")
-        columns.append(found.windows(number))
-    lines: dict[str, Callable[[Window], float]] = {
-        "processor, state, ms": lambda w: 1e3 * w.leader_cpu_s / w.steps,
-        "processor, sensor workers, ms": lambda w: 1e3 * sum(w.worker_cpu_s) / w.steps,
-        "memory, state, MB": lambda w: w.leader_rss_mb,
-        "memory, largest sensor worker, MB": lambda w: max(w.worker_rss_mb),
-        "to sensor workers, kB": lambda w: 1e-3 * w.sent_bytes / w.steps,
-        "frames, kB": lambda w: 1e-3 * w.got_bytes / w.steps,
-        "messages": lambda w: w.messages / w.steps,
-    }
-    for name, value in lines.items():
-        table.add_row(name, *(f"{value(windows[-1]):,.1f}" for windows in columns))
-    return table
+    last = [found.windows(number)[-1] for number in found.numbers]
+    rows = [
+        (name, *(f"{value(window):,.1f}" for window in last)) for name, value in _RESOURCES.items()
+    ]
+    return make_table("resources", ("a step", *map(str, found.numbers)), rows)
 
 
 def _say(console: Console, found: SensorBench, rows: list[ScalingRow]) -> None:
     from cavmarl.bench.sensor_scaling import MIN_RUNS
+    from cavmarl.parallel.processes.process_barrier import usable_cores
 
     best = next(row for row in rows if row.is_best)
-    console.print(
-        f"the best of those measured: [bold]{best.workers}[/] sensor workers, {best.speedup:.2f} "
-        f"times {rows[0].workers}; sensing takes {found.sensing_ms:.2f} ms a tick on "
-        f"{rows[0].workers}",
-        highlight=False,
-    )
-    if found.ceiling is not None:
-        console.print(
-            f"{found.ceiling.programs} programs that share nothing and do the same, side by side: "
-            f"[bold]{found.ceiling.ratio:.2f}[/] times one after the other: more this machine does "
-            "not give",
-            highlight=False,
-        )
-    intervals = (
+    intervals = [
         f"{row.workers}: {row.ci95_between_runs.low:.2f} to {row.ci95_between_runs.high:.2f} ms"
         for row in rows
         if row.ci95_between_runs is not None
-    )
-    console.print(
+    ]
+    lines = [
+        f"the best of those measured: [bold]{best.workers}[/] sensor workers, {best.speedup:.2f} "
+        f"times {rows[0].workers}; sensing takes {found.sensing_ms:.2f} ms a tick on "
+        f"{rows[0].workers}",
         f"95 % between runs: {'; '.join(intervals) or f'none, it takes {MIN_RUNS} runs'}",
-        highlight=False,
-    )
-    same = "the same" if found.is_same else "[red]not the same[/]"
-    console.print(f"states and frames of all runs, step by step: {same}")
-    cores = found.to_dict()["hardware"]["usable_cores"]
-    console.print(f"cores: {cores}; runs in this order: {[turn.workers for turn in found.turns]}")
+        "states and frames of all runs, step by step: "
+        + ("the same" if found.is_same else "[red]not the same[/]"),
+    ]
+    if found.ceiling is not None:
+        lines.append(
+            f"{found.ceiling.programs} programs that share nothing and do the same, side by side: "
+            f"[bold]{found.ceiling.ratio:.2f}[/] times one after the other: more this machine does "
+            "not give"
+        )
+    cores = len(usable_cores())
+    lines.append(f"cores: {cores}; runs in this order: {[turn.workers for turn in found.turns]}")
     crowded = [number for number in found.numbers if number > cores]
     if crowded:
-        console.print(f"note: {crowded} are more sensor workers than cores", style="yellow")
+        lines.append(f"[yellow]note: {crowded} are more sensor workers than cores[/]")
+    console.print("\n".join(lines), highlight=False)
 
 
 def _write_csv(path: Path, found: SensorBench) -> None:

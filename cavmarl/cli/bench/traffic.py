@@ -9,6 +9,7 @@ import typer
 from rich.console import Console
 from rich.table import Table
 
+from cavmarl.bench.harness import make_table, measuring
 from cavmarl.cli.output import JsonPath, Seed, number, write_json
 from cavmarl.core.errors import ConfigError, require
 
@@ -40,11 +41,13 @@ def traffic(
         list[Path],
         typer.Option("--demand", "-d", help="A .rou.xml, .add.xml or .sumocfg; may be repeated."),
     ],
-    seconds: Annotated[int, typer.Option(help="How long, from the demand's beginning.")] = 900,
+    seconds: Annotated[
+        int, typer.Option(help="Simulated seconds, from the demand's beginning.")
+    ] = 900,
     dt: Annotated[float, typer.Option(help="Step length of both, in seconds.")] = 0.1,
     seed: Seed = 0,
     teleports: Annotated[
-        bool, typer.Option(help="Let SUMO put vehicles elsewhere that stand for too long.")
+        bool, typer.Option(help="Let SUMO teleport vehicles that stand for too long.")
     ] = True,
     plot: Annotated[
         Path | None, typer.Option(help="Draw the fundamental diagram here (.png, .svg, .pdf).")
@@ -52,8 +55,12 @@ def traffic(
     speed: Annotated[
         bool, typer.Option("--speed", help="Measure how fast both are, not what they do.")
     ] = False,
-    after: Annotated[int, typer.Option(help="With --speed: simulated seconds before it.")] = 120,
-    repeats: Annotated[int, typer.Option(help="With --speed: turns of 10 s of each.")] = 5,
+    after: Annotated[
+        int, typer.Option(help="With --speed: simulated seconds before the first turn.")
+    ] = 120,
+    repeats: Annotated[
+        int, typer.Option(help="With --speed: turns of 10 simulated seconds of each side.")
+    ] = 5,
     json_path: JsonPath = None,
 ) -> None:
     """Our traffic beside SUMO's own run: same map, demand, seed and step length."""
@@ -61,11 +68,11 @@ def traffic(
     from cavmarl.evaluate.traffic.traffic_comparison import compare_traffic
 
     if speed and plot is not None:
-        raise ConfigError("--plot: draws what both do, and --speed does not look; use one")
+        raise ConfigError("--plot: draws flow and density, which --speed does not measure; use one")
     if plot is not None:
         require("matplotlib", "report")
     console = Console()
-    with console.status("") as status:
+    with measuring(console) as say:
         found: TrafficComparison | TrafficSpeed
         tolerated: tuple[str, ...] = ()
         if speed:
@@ -76,7 +83,7 @@ def traffic(
                 seed=seed,
                 after_s=after,
                 repeats=repeats,
-                progress=status.update,
+                progress=say,
             )
             table = _speeds(found)
         else:
@@ -87,7 +94,7 @@ def traffic(
                 dt_s=dt,
                 seed=seed,
                 teleports=teleports,
-                progress=status.update,
+                progress=say,
             )
             table, tolerated = _figures(found), found.tolerated
             if plot is not None:
@@ -105,35 +112,30 @@ def _draw(found: TrafficComparison, path: Path) -> None:
 
 
 def _figures(found: TrafficComparison) -> Table:
-    table = Table(
-        "", title=f"{found.map_name}, {found.seconds} s, step {found.dt_s:g} s, seed {found.seed}"
-    )
-    for column in ("cavmarl", "SUMO", "ratio"):
-        table.add_column(column, justify="right")
+    rows = []
     for label, name in _ROWS.items():
         sides = (getattr(run.figures, name) for run in (found.ours, found.sumo))
-        table.add_row(label, *map(_cell, sides), number(found.ratio(name)))
-    return table
+        rows.append((label, *map(_cell, sides), number(found.ratio(name))))
+    title = f"{found.map_name}, {found.seconds} s, step {found.dt_s:g} s, seed {found.seed}"
+    return make_table(title, ("", "cavmarl", "SUMO", "ratio"), rows)
 
 
 def _speeds(found: TrafficSpeed) -> Table:
-    table = Table(
-        "vehicle-steps/s",
-        title=(
-            f"{found.map_name}, step {found.dt_s:g} s, one core, {found.repeats} turns of each, "
-            f"after {found.after_s} s"
-        ),
-        caption=f"ratio of the medians: {found.ratio:.1f}",
-    )
-    for column in ("vehicles", "min", "median", "max"):
-        table.add_column(column, justify="right")
-    for name, vehicles, rates in (
+    sides = (
         ("cavmarl", found.our_vehicles, found.ours),
         ("libsumo", found.sumo_vehicles, found.sumo),
-    ):
-        values = (vehicles, rates.low, rates.median, rates.high)
-        table.add_row(name, *(f"{value:,.0f}" for value in values))
-    return table
+    )
+    rows = [
+        (name, *(f"{value:,.0f}" for value in (vehicles, rates.low, rates.median, rates.high)))
+        for name, vehicles, rates in sides
+    ]
+    return make_table(
+        f"{found.map_name}, step {found.dt_s:g} s, one core, {found.repeats} turns of each, "
+        f"after {found.after_s} s",
+        ("vehicle-steps/s", "vehicles", "min", "median", "max"),
+        rows,
+        f"ratio of the medians: {found.ratio:.1f}",
+    )
 
 
 def _cell(value: float | str | None) -> str:

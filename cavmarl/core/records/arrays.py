@@ -211,7 +211,6 @@ class Sensors(NamedTuple):
     """What the agents' sensors are set to, and where each writes in a frame."""
 
     stack: int  # frames in an observation
-    cleared: int  # numbers of a frame that are 0 before the sensors write
     ego: bool  # whether it is on; it writes at 0
     route_at: int
     route_points: int

@@ -32,6 +32,7 @@ class TrafficComparison:
         seed: of both.
         ours: our run.
         sumo: SUMO's.
+        edge_ids: of the map, by the rows that `edge_minutes` name.
         tolerated: what ours left out of the demand or took for something near, with counts.
     """
 
@@ -41,6 +42,7 @@ class TrafficComparison:
     seed: int
     ours: TrafficRun
     sumo: TrafficRun
+    edge_ids: tuple[str, ...]
     tolerated: tuple[str, ...] = ()
 
     def ratio(self, figure: str) -> float | None:
@@ -55,7 +57,8 @@ class TrafficComparison:
                 "locks_s": run.locks_s,
                 "edge_minutes": {
                     key: run.edge_minutes[key].tolist() for key in EDGE_MINUTE.names or ()
-                },
+                }
+                | {"edge": [self.edge_ids[row] for row in run.edge_minutes["edge"].tolist()]},
             }
             for name, run in (("ours", self.ours), ("sumo", self.sumo))
         }
@@ -106,4 +109,5 @@ def compare_traffic(
     ours = run_native(world, seconds)
     name = path.name.removesuffix(".gz").removesuffix(".net.xml")
     tolerated = world.demand.report.lines() if isinstance(world.demand, DemandFile) else []
-    return TrafficComparison(name, seconds, dt_s, seed, ours, sumo, tuple(tolerated))
+    edges = tuple(world.network.edge_ids)
+    return TrafficComparison(name, seconds, dt_s, seed, ours, sumo, edges, tuple(tolerated))

@@ -1,4 +1,4 @@
-"""The sensors that most environments leave off: highway-env's, pufferlib's, and road points."""
+"""The sensors that most environments leave off: highway-env's, and road points."""
 
 from __future__ import annotations
 
@@ -13,7 +13,6 @@ from cavmarl.sensors.kernels.kinematics_observation import observe_kinematics
 from cavmarl.sensors.kernels.lidar_cells import observe_lidar_cells
 from cavmarl.sensors.kernels.nearest_road_points import observe_roadgraph
 from cavmarl.sensors.kernels.occupancy import observe_occupancy
-from cavmarl.sensors.kernels.puffer_drive_kernel import observe_puffer_drive
 from cavmarl.sensors.kernels.sensor_arrays import FurtherSensors
 from cavmarl.sensors.kernels.stacking import newest_frame
 
@@ -43,7 +42,7 @@ def observe_further(
         chosen: (W,) which worlds.
         observations: (W, A, D), the parts 0 before.
     """
-    kinematics, occupancy, lidar_cells, roadgraph, puffer_drive = further
+    kinematics, occupancy, lidar_cells, roadgraph = further
     for w in range(chosen.size):
         if not chosen[w]:
             continue
@@ -66,5 +65,3 @@ def observe_further(
                 observe_lidar_cells(rows, i, grid, lidar_cells, out)
             if roadgraph.num_points > 0:
                 observe_roadgraph(row, roadgraph, out)
-            if puffer_drive.on:
-                observe_puffer_drive(rows, i, grid, puffer_drive, out)

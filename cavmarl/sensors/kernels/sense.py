@@ -69,7 +69,7 @@ def sense(
                 is_filled = True
             agent = row["agent"]
             seen = outputs.observations[w, agent]
-            shift_frames(seen, sensors.stack, sensors.cleared)
+            shift_frames(seen, sensors.stack)
             out = seen[newest_frame(seen, sensors.stack) :]
             if sensors.ego:
                 observe_ego(roads, plans, row, out)

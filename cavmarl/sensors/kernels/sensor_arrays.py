@@ -15,9 +15,7 @@ __all__ = [
     "KinematicsSensor",
     "LidarCells",
     "OccupancyGrid",
-    "PufferDrive",
     "RoadPoints",
-    "RoadSegments",
     "RoadgraphSensor",
 ]
 
@@ -99,28 +97,6 @@ class RoadgraphSensor(NamedTuple):
     ring_start: NDArray[np.int64]  # (NUM_RINGS + 1,) room
 
 
-class RoadSegments(NamedTuple):
-    """Road segments, and those seen from each cell of 5 m; see `kernels.puffer_drive`."""
-
-    min_x: float  # m, the map's corner
-    min_y: float
-    num_x: int
-    num_y: int
-    list_start: NDArray[np.int64]  # (num_x * num_y + 1,) of cell c: lists[start[c] : start[c + 1]]
-    lists: NDArray[np.uint32]  # rows of `segments`
-    segments: NDArray[np.void]  # ROAD_SEGMENT (N,)
-
-
-class PufferDrive(NamedTuple):
-    """pufferlib's `drive` observation: see `kernels.puffer_drive`."""
-
-    on: bool
-    at: int
-    destinations: NDArray[np.float64]  # (G, 2) where each goal is, m
-    roads: RoadSegments
-    near_body: NDArray[np.int64]  # (partners,) room
-
-
 class FurtherSensors(NamedTuple):
     """All of them; apart from `arrays.Sensors`, so that `sense` need not unpack what is off."""
 
@@ -128,4 +104,3 @@ class FurtherSensors(NamedTuple):
     occupancy: OccupancyGrid
     lidar_cells: LidarCells
     roadgraph: RoadgraphSensor
-    puffer_drive: PufferDrive

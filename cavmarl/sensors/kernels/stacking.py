@@ -29,13 +29,13 @@ def newest_frame(observation: NDArray[np.float32], stack: int) -> int:
 
 
 @kernel
-def shift_frames(observation: NDArray[np.float32], stack: int, cleared: int) -> None:
-    """Drop the oldest frame; the first `cleared` numbers of the newest one become 0."""
+def shift_frames(observation: NDArray[np.float32], stack: int) -> None:
+    """Drop the oldest frame; the newest one becomes 0."""
     newest = newest_frame(observation, stack)
     size = observation.size - newest
     for k in range(newest):
         observation[k] = observation[k + size]
-    observation[newest : newest + cleared] = 0.0
+    observation[newest:] = 0.0
 
 
 @kernel

@@ -18,7 +18,6 @@ from cavmarl.sensors.observed import (
     ego,
     lidar_observation,
     occupancy_grid,
-    puffer_drive,
     roadgraph,
     route,
 )
@@ -67,16 +66,10 @@ SENSORS: tuple[Sensor, ...] = (
     ),
     Sensor("roadgraph", roadgraph.features, roadgraph.reach_m, roadgraph.shape),
     Sensor("messages", messages.features, messages.reach_m),
-    Sensor("puffer_drive", puffer_drive.features, puffer_drive.reach_m),
 )
 
 # Those that `observe_further` writes.
-FURTHER = frozenset(
-    ("kinematics", "occupancy_grid", "lidar_observation", "roadgraph", "puffer_drive")
-)
-
-# The last of them, and the one that writes its zeros itself: most of a large frame is written once.
-FILLS_ITS_PART = SENSORS[-1].name
+FURTHER = frozenset(("kinematics", "occupancy_grid", "lidar_observation", "roadgraph"))
 
 
 def layout(config: SensorsConfig) -> dict[str, slice]:
@@ -135,7 +128,6 @@ def sensor_arrays(config: SensorsConfig) -> Sensors:
     starts = _starts(config)
     return Sensors(
         stack=config.stack,
-        cleared=starts[FILLS_ITS_PART] if FILLS_ITS_PART in places else frame_size(config),
         ego="ego" in places,
         route_at=starts["route"],
         route_points=config.route.points,
@@ -178,5 +170,4 @@ def further_arrays(
         occupancy=occupancy_grid.settings(config, starts["occupancy_grid"], network, goals),
         lidar_cells=lidar_observation.settings(config, starts["lidar_observation"]),
         roadgraph=roadgraph.settings(config, starts["roadgraph"], network),
-        puffer_drive=puffer_drive.settings(config, starts["puffer_drive"], network, goals),
     )

@@ -1,0 +1,49 @@
+"""List the benchmarks, or run one: `python -m benchmarks [NAME [OPTIONS]]`."""
+
+from __future__ import annotations
+
+import ast
+import runpy
+import sys
+from pathlib import Path
+
+from cavmarl.cli import main as cavmarl
+
+KEPT = {
+    "step": "Agent-steps a second next to highway-env's.",
+    "traffic": "Our traffic next to SUMO's own run of the same demand.",
+    "workers": "Worlds over several workers.",
+    "sensors": "One vehicle's sensors over several sensor workers.",
+    "clock": "The clock of a master and that of a follower in another process.",
+    "train": "PPO from end to end next to stable-baselines3's.",
+}
+
+
+def programs() -> dict[str, str]:
+    """What each file here measures, by its name; files that are no programs are left out."""
+    found = {}
+    for path in sorted(Path(__file__).parent.glob("*.py")):
+        text = path.read_text(encoding="utf-8")
+        if "\n    run(measure)\n" in text:
+            found[path.stem] = (ast.get_docstring(ast.parse(text)) or "").splitlines()[0]
+    return found
+
+
+def main(words: list[str]) -> None:
+    """List, or run what the first word names with the options that follow."""
+    name, *options = words or [""]
+    if name in KEPT:
+        cavmarl(["bench", name, *options])
+    elif name in programs():
+        sys.argv = [f"benchmarks.{name}", *options]
+        runpy.run_module(f"benchmarks.{name}", run_name="__main__", alter_sys=True)
+    elif name in ("", "-h", "--help"):
+        print("make bench NAME=… ARGS='…'")
+        for known, measured in (KEPT | programs()).items():
+            print(f"  {known:14} {measured}")
+    else:
+        sys.exit(f"no benchmark '{name}': python -m benchmarks lists them")
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])

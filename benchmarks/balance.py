@@ -1,0 +1,167 @@
+"""What placing shards by load saves, on traces of loads of an environment.
+
+Traces are generated on its map, or recorded while it runs; each is replayed through every way to
+place shards, by `balance_replay`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import asdict
+from typing import Annotated, Any
+
+import typer
+
+from benchmarks.balance_replay import BalanceReplay, replay_traces
+from benchmarks.harness import Report, Say, about, check_range, run, silent
+from benchmarks.load_traces import LoadTrace, generated_trace, recorded_trace
+from cavmarl.balance.problem import BalanceRule
+from cavmarl.cli.output import Seed, Settings, parse_settings
+from cavmarl.config.env import ZONE_LAYOUTS
+from cavmarl.core.errors import ConfigError
+from cavmarl.engine.world_setup import find_map
+from cavmarl.evaluate.driven_worlds import world_maker
+from cavmarl.evaluate.shard_costs import measure_rounds
+from cavmarl.evaluate.statistics import Interval
+from cavmarl.roads.cache import load_network
+from cavmarl.zones.partition.zone_file import named_zones
+
+ROUND_S = 10  # simulated seconds of a recorded round
+BEFORE_S = 20  # simulated seconds before the first one
+AFTER_S = 1  # so that no episode ends within the last one
+
+
+def measure(
+    env: Annotated[str, typer.Argument(help="Name, folder or map file of an environment.")],
+    zones: Annotated[int, about("Zones that the map is divided into.")] = 9,
+    workers: Annotated[int, about("Workers that host them.")] = 3,
+    layout: Annotated[str, about(f"{', '.join(ZONE_LAYOUTS)}, or a zone file.")] = "bisection",
+    recorded: Annotated[
+        bool, about("Record what zones cost while the environment runs.", "--recorded")
+    ] = False,
+    traces: Annotated[int, about("Number of traces, each with a seed of its own.", min=1)] = 10,
+    rounds: Annotated[int, about("Rounds of a trace; the first quarter is to learn from.")] = 80,
+    tolerance: Annotated[float, about("Imbalance below which nothing moves.")] = 0.1,
+    max_moves: Annotated[int, about("Most shards that move in one round.")] = 4,
+    move_ms: Annotated[float, about("Supposed price of a shard's move.")] = 10.0,
+    seed: Seed = 0,
+    settings: Settings = None,
+    say: Say = silent,
+) -> Report:
+    """Static, balanced and the extensions on the same traces: makespans beside the static one's."""
+    rule = BalanceRule(tolerance=tolerance, max_moves=max_moves, move_s=1e-3 * move_ms)
+    check_range(workers=(workers, 1, float("inf")))
+    make = recorded_traces if recorded else generated_traces
+    found: list[LoadTrace] = []
+    for trace in make(
+        env,
+        zones=zones,
+        layout=layout,
+        workers=workers,
+        rounds=rounds,
+        seeds=range(seed, seed + traces),
+        overrides=parse_settings(settings),
+    ):
+        found.append(trace)
+        say(f"trace {len(found)} of {traces}")
+    say("replaying")
+    return _report(replay_traces(found, rule), "recorded" if recorded else "generated")
+
+
+def _report(found: BalanceReplay, kind: str) -> Report:
+    shown = [
+        {
+            **asdict(row),
+            "time": _with_interval(row.ratio, row.ratio95),
+            "beside": _with_interval(row.beside_balanced, row.beside_balanced95),
+        }
+        for row in found.rows
+    ]
+    placed = [row for row in found.rows if row.name not in ("static", "perfect")]
+    verdicts = dict.fromkeys(row.verdict for row in placed)
+    (fitted,) = (row.weights for row in placed if row.name == "calibrated")
+    return Report(
+        f"{found.map_name}: {found.zones} zones on {found.workers} workers, {found.traces} {kind} "
+        f"traces of {found.rounds} rounds",
+        {
+            "placement": "name",
+            "time over static's": "time",
+            "beside balanced": "beside",
+            "max / mean": "imbalance:.2f",
+            "moves": "moves:.2f",
+            "handed over": "handoffs:.1f",
+        },
+        shown,
+        notes=[
+            *(
+                f"{verdict}: {', '.join(row.name for row in placed if row.verdict == verdict)}"
+                for verdict in verdicts
+            ),
+            "calibrated, mean: {:.2f} CPU + {:.2f} RAM + {:.2f} GPU".format(*fitted),
+            "calibrated, predicted, re-cut: extensions of balanced; perfect: no shard whole; "
+            f"supposed: {1e3 * found.rule.move_s:g} ms a move, {found.ticks} ticks a round, what "
+            "others use of workers",
+        ],
+        facts={"recorded": kind == "recorded", "rule": asdict(found.rule), "ticks": found.ticks},
+    )
+
+
+def _with_interval(value: float, interval: Interval | None) -> str:
+    if interval is None:
+        return f"{value:.2f}"
+    return f"{value:.2f} ({interval.low:.2f} to {interval.high:.2f})"
+
+
+def generated_traces(
+    env: str,
+    *,
+    zones: int,
+    layout: str,
+    workers: int,
+    rounds: int,
+    seeds: Sequence[int],
+    overrides: Mapping[str, Any],
+) -> Iterator[LoadTrace]:
+    """A crowd on the environment's map for each seed."""
+    if overrides:
+        raise ConfigError("--set: a generated crowd has no settings; give --recorded with it")
+    network = load_network(find_map(env))
+    partition = named_zones(network, layout, zones)
+    for seed in seeds:
+        yield generated_trace(network, partition, rounds=rounds, workers=workers, seed=seed)
+
+
+def recorded_traces(
+    env: str,
+    *,
+    zones: int,
+    layout: str,
+    workers: int,
+    rounds: int,
+    seeds: Sequence[int],
+    overrides: Mapping[str, Any],
+) -> Iterator[LoadTrace]:
+    """What zones cost while the built-in driver is in all seats, for each seed."""
+    for seed in seeds:
+        simulation = world_maker(
+            env,
+            layout=layout,
+            seconds=BEFORE_S + rounds * ROUND_S + AFTER_S,
+            seed=seed,
+            overrides=overrides,
+        )(zones)
+        clock = simulation.config.clock
+        steps = max(round(ROUND_S / clock.ctrl_dt_s), 1)
+        before = max(round(BEFORE_S / clock.ctrl_dt_s), 1)
+        yield recorded_trace(
+            simulation.network,
+            simulation.partition,
+            list(measure_rounds(simulation, rounds, steps, before=before)),
+            ticks=steps * clock.ticks_per_step,
+            workers=workers,
+            seed=seed,
+        )
+
+
+if __name__ == "__main__":
+    run(measure)

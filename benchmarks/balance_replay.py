@@ -1,0 +1,181 @@
+"""What each way to place shards would have taken, beside the static one, on the same traces.
+
+The truth of the replay is a model: a worker gets the share of its processor that others leave, so
+its shards take their cost over 1 - CPU, and memory and GPU in use slow no worker down. All workers
+wait for the slowest. A shard that moves costs the rule's `move_s` once, a vehicle that is given to
+another zone because the map is cut anew `HANDOFF_S`.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from benchmarks.balance_strategies import STRATEGIES, LoadStrategy, Placed, StaticPlacement
+from benchmarks.load_traces import LoadTrace
+from cavmarl.balance.problem import BalanceRule
+from cavmarl.core.errors import ConfigError
+from cavmarl.evaluate.statistics import Interval, mean_interval
+
+__all__ = ["BalanceReplay", "StrategyResult", "Verdict", "replay_traces"]
+
+HANDOFF_S = 1e-4
+WARM_SHARE = 0.25  # of the rounds, before what is learnt is used and times count
+
+
+Verdict = Literal[
+    "less than static",
+    "more than static",
+    "within noise of static",
+    "one trace tells nothing",
+]
+
+
+@dataclass(frozen=True)
+class StrategyResult:
+    """One way to place shards; means over traces."""
+
+    name: str  # of `STRATEGIES`, or `perfect`: as if shards could be divided at will
+    ratio: float  # its time over that of the static placement
+    ratio95: Interval | None  # between traces; None: of one trace
+    beside_balanced: float  # its time over that of `balanced`
+    beside_balanced95: Interval | None  # the same
+    imbalance: float  # maximum over mean of the workers' ticks, mean over rounds
+    moves: float  # shards a round
+    handoffs: float  # vehicles a round that the cutting moved
+    weights: tuple[float, float, float]  # of the last round's score, mean
+    verdict: Verdict  # `ratio95` beside 1
+
+
+@dataclass(frozen=True)
+class BalanceReplay:
+    """Result of `replay_traces`."""
+
+    map_name: str  # the map's name
+    zones: int  # k
+    workers: int  # m
+    traces: int  # how many
+    rounds: int  # of each, those before times count among them
+    ticks: int  # of a round
+    rule: BalanceRule  # when shards move, and what that costs
+    rows: tuple[StrategyResult, ...]  # by strategy
+
+
+@dataclass(frozen=True)
+class _Totals:
+    """One strategy on one trace, from the first round that counts."""
+
+    time_s: float
+    imbalance: float
+    moves: float
+    handoffs: float
+    weights: tuple[float, float, float]
+
+
+def replay_traces(traces: Sequence[LoadTrace], rule: BalanceRule) -> BalanceReplay:
+    """Replay every trace through every strategy."""
+    if not traces:
+        raise ConfigError("traces: there must be at least one")
+    first = traces[0]
+    rounds = len(first.rounds)
+    warm = math.ceil(WARM_SHARE * rounds)
+    if rounds < 4:
+        raise ConfigError(f"rounds = {rounds}: must be at least 4, of which the first are learnt")
+    totals = {name: [_replay(name, one, rule, warm) for one in traces]
+              for name in (*STRATEGIES, "perfect")}  # fmt: skip
+    static, balanced = (
+        np.array([one.time_s for one in totals[name]]) for name in ("static", "balanced")
+    )
+    return BalanceReplay(
+        map_name=first.network.name,
+        zones=first.partition.count,
+        workers=len(first.rounds[0].snapshot.workers),
+        traces=len(traces),
+        rounds=rounds,
+        ticks=first.ticks,
+        rule=rule,
+        rows=tuple(_summary(name, found, static, balanced) for name, found in totals.items()),
+    )
+
+
+def _strategy(name: str, trace: LoadTrace, rule: BalanceRule, warm: int) -> StaticPlacement:
+    if name in ("static", "perfect"):
+        return StaticPlacement(trace, rule)
+    return LoadStrategy(
+        trace,
+        rule,
+        warm,
+        calibrated=name == "calibrated",
+        predicted=name == "predicted",
+        recut=name == "re-cut",
+    )
+
+
+def _replay(name: str, trace: LoadTrace, rule: BalanceRule, warm: int) -> _Totals:
+    strategy = _strategy(name, trace, rule, warm)
+    found = []
+    for number in range(len(trace.rounds)):
+        placed = strategy.place(number)
+        slowest_s, fair_s = _tick_s(trace, number, placed)
+        if name == "perfect":
+            slowest_s = fair_s
+        time_s = trace.ticks * slowest_s
+        time_s += rule.move_s * placed.moved_shards + HANDOFF_S * placed.moved_vehicles
+        imbalance = slowest_s / fair_s if fair_s else 1.0
+        found.append((time_s, imbalance, placed.moved_shards, placed.moved_vehicles))
+        strategy.learn(number)
+    times, imbalances, moves, handoffs = np.array(found[warm:]).T
+    return _Totals(
+        float(times.sum()),
+        float(imbalances.mean()),
+        float(moves.mean()),
+        float(handoffs.mean()),
+        strategy.balancer.plan.problem.rule.load.weights,
+    )
+
+
+def _tick_s(trace: LoadTrace, number: int, placed: Placed) -> tuple[float, float]:
+    """How long a tick takes, and would if shards could be divided at will."""
+    costs_s = trace.costs_s(number, placed.partition)
+    workers = trace.rounds[number].snapshot.workers
+    speeds = np.array([1.0 - candidate.use.cpu for candidate in workers])
+    place = {candidate.worker: n for n, candidate in enumerate(workers)}
+    loads_s = np.bincount([place[home] for home in placed.homes], costs_s, len(workers))
+    return float((loads_s / speeds).max()), float(costs_s.sum() / speeds.sum())
+
+
+def _summary(
+    name: str,
+    found: Sequence[_Totals],
+    static: NDArray[np.float64],
+    balanced: NDArray[np.float64],
+) -> StrategyResult:
+    times = np.array([one.time_s for one in found])
+    ratios, beside = times / static, times / balanced
+    interval = mean_interval(ratios)
+    cpu, ram, gpu = np.mean([one.weights for one in found], axis=0).tolist()
+    return StrategyResult(
+        name=name,
+        ratio=float(ratios.mean()),
+        ratio95=interval,
+        beside_balanced=float(beside.mean()),
+        beside_balanced95=mean_interval(beside),
+        imbalance=float(np.mean([one.imbalance for one in found])),
+        moves=float(np.mean([one.moves for one in found])),
+        handoffs=float(np.mean([one.handoffs for one in found])),
+        weights=(cpu, ram, gpu),
+        verdict=_verdict(interval),
+    )
+
+
+def _verdict(interval: Interval | None) -> Verdict:
+    if interval is None:
+        return "one trace tells nothing"
+    if interval.high < 1.0:
+        return "less than static"
+    return "more than static" if interval.low > 1.0 else "within noise of static"

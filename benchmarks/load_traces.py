@@ -1,0 +1,188 @@
+"""Traces of loads: where vehicles were, what they cost, how busy workers were with other things.
+
+A trace is generated or recorded. Both are replayed through the same balancer, by `balance_replay`.
+What others use of the workers is generated in both: a test that loads the machine on purpose would
+measure its own program.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from benchmarks.cost_models import ShardContent
+from cavmarl.balance.load_score import Candidate, Utilisation
+from cavmarl.balance.load_snapshot import Snapshot
+from cavmarl.evaluate.shard_costs import MeasuredRound
+from cavmarl.handoff.repartition_plan import vehicle_costs
+from cavmarl.roads.network import RoadNetwork
+from cavmarl.zones.partition.zone_partition import ZonePartition
+from cavmarl.zones.partition.zone_survey import lane_samples
+
+__all__ = ["Crowd", "LoadRound", "LoadTrace", "generated_trace", "recorded_trace"]
+
+Floats = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class LoadRound:
+    """One round between two chances to move shards."""
+
+    ids: NDArray[np.int64]  # (n,) vehicles
+    places: Floats  # (n, 2) where they are, m
+    agents: NDArray[np.bool_]  # (n,) which of them agents drive
+    vehicle_s: Floats  # (n,) what each costs, seconds a tick
+    noise: Floats  # (k,) measured over true cost of each zone
+    snapshot: Snapshot  # what others use of the workers
+
+
+@dataclass(frozen=True)
+class LoadTrace:
+    """Rounds of one world on one map."""
+
+    network: RoadNetwork  # the map
+    partition: ZonePartition  # its zones at first
+    ticks: int  # of a round
+    # what a vehicle costs more that has come to its zone since the last round, seconds a tick
+    migration_s: float
+    rounds: tuple[LoadRound, ...]  # in time
+
+    def arrivals(self, number: int, partition: ZonePartition) -> NDArray[np.int64]:
+        """(k,) vehicles that were in another zone a round before; none in the first round."""
+        now = self.rounds[number]
+        if number == 0:
+            return np.zeros(partition.count, dtype=np.int64)
+        before = self.rounds[number - 1]
+        _, here, there = np.intersect1d(now.ids, before.ids, return_indices=True)
+        zones = partition.zones_of(now.places[here])
+        came = zones[zones != partition.zones_of(before.places[there])]
+        return np.bincount(came, minlength=partition.count)
+
+    def costs_s(self, number: int, partition: ZonePartition) -> Floats:
+        """(k,) what each zone truly costs in a round, seconds a tick."""
+        now = self.rounds[number]
+        zones = partition.zones_of(now.places)
+        own = np.bincount(zones, now.vehicle_s, partition.count)
+        return np.asarray(own + self.migration_s * self.arrivals(number, partition))
+
+    def measured_s(self, number: int, partition: ZonePartition) -> Floats:
+        """(k,) what a clock on each zone would say."""
+        return np.asarray(self.costs_s(number, partition) * self.rounds[number].noise)
+
+    def contents(self, number: int, partition: ZonePartition) -> list[ShardContent]:
+        """What is in each zone."""
+        now = self.rounds[number]
+        zones = partition.zones_of(now.places)
+        counts = np.bincount(zones, minlength=partition.count)
+        agents = np.bincount(zones[now.agents], minlength=partition.count)
+        rows = zip(counts, agents, self.arrivals(number, partition), strict=True)
+        return [ShardContent(*map(float, row)) for row in rows]
+
+
+@dataclass(frozen=True)
+class Crowd:
+    """Vehicles that gather where the city is busy, and the busy place wanders."""
+
+    vehicles: int = 600  # how many
+    agents: float = 0.2  # share that agents drive
+    vehicle_s: float = 1e-6  # seconds a tick of each
+    agent_s: float = 4e-6  # more of one that senses
+    migration_s: float = 2e-5  # of one that changes its zone, once
+    ticks: int = 200  # of a round
+    pull: float = 15.0  # how many times as many drive in the middle of the crowd as elsewhere
+    width: float = 0.2  # of the crowd, as a share of the map's shorter side
+    stride: float = 0.04  # how far its middle wanders a round, as the same share
+    turnover: float = 0.2  # share of vehicles that find another place each round
+    noise: float = 0.1  # of a measured cost, standard deviation of its logarithm
+
+
+def generated_trace(
+    network: RoadNetwork,
+    partition: ZonePartition,
+    *,
+    rounds: int,
+    workers: int,
+    seed: int,
+    crowd: Crowd | None = None,
+) -> LoadTrace:
+    """A crowd that wanders over the map; the same seed gives the same trace."""
+    crowd = crowd or Crowd()
+    draw = np.random.default_rng(seed)
+    samples = lane_samples(network)
+    places, lengths = samples[:, :2], samples[:, 2]
+    low, high = places.min(axis=0), places.max(axis=0)
+    side_m = float(max((high - low).min(), 1.0))
+    middle = draw.uniform(low, high)
+    agents = draw.random(crowd.vehicles) < crowd.agents
+    at = np.full(crowd.vehicles, -1)
+    found = []
+    for snapshot in _other_loads(draw, rounds, workers):
+        middle = np.clip(middle + draw.normal(0.0, crowd.stride * side_m, 2), low, high)
+        squares = ((places - middle) ** 2).sum(axis=1) / (crowd.width * side_m) ** 2
+        chances = lengths * (1.0 + crowd.pull * np.exp(-0.5 * squares))
+        new = (draw.random(crowd.vehicles) < crowd.turnover) | (at < 0)
+        at[new] = draw.choice(len(places), int(new.sum()), p=chances / chances.sum())
+        found.append(
+            LoadRound(
+                ids=np.arange(crowd.vehicles),
+                places=places[at],
+                agents=agents,
+                vehicle_s=np.where(agents, crowd.vehicle_s + crowd.agent_s, crowd.vehicle_s),
+                noise=draw.lognormal(0.0, crowd.noise, partition.count),
+                snapshot=snapshot,
+            )
+        )
+    return LoadTrace(network, partition, crowd.ticks, crowd.migration_s / crowd.ticks, tuple(found))
+
+
+def recorded_trace(
+    network: RoadNetwork,
+    partition: ZonePartition,
+    measured: Sequence[MeasuredRound],
+    *,
+    ticks: int,
+    workers: int,
+    seed: int,
+) -> LoadTrace:
+    """What was measured; in other zones each vehicle costs what it did on average in its own."""
+    others = _other_loads(np.random.default_rng(seed), len(measured), workers)
+    return LoadTrace(
+        network,
+        partition,
+        ticks,
+        0.0,  # what migrations cost is in what vehicles cost
+        tuple(
+            LoadRound(
+                ids=one.ids,
+                places=one.places,
+                agents=one.agents,
+                vehicle_s=vehicle_costs(partition.zones_of(one.places), one.costs_s.tolist()),
+                noise=np.ones(partition.count),
+                snapshot=snapshot,
+            )
+            for one, snapshot in zip(measured, others, strict=True)
+        ),
+    )
+
+
+# Of what others use, by resource: its mean, how far it strays from it, its most.
+_OTHERS = {"cpu": (0.3, 0.15, 0.95), "ram": (0.5, 0.1, 0.85), "gpu": (0.4, 0.15, 0.9)}
+_STAYS = 0.9  # of what it strays by, from one round to the next
+
+
+def _other_loads(draw: np.random.Generator, rounds: int, workers: int) -> list[Snapshot]:
+    """Utilisations that come and go slowly; now and then a worker is above its threshold."""
+    means, spreads, most = np.array(list(_OTHERS.values())).T
+    stray = draw.normal(0.0, spreads, (workers, len(means)))
+    found = []
+    for _ in range(rounds):
+        push = draw.normal(0.0, spreads, stray.shape)
+        stray = _STAYS * stray + np.sqrt(1.0 - _STAYS**2) * push
+        shares = np.clip(means + stray, 0.0, most)
+        uses = [Utilisation(*row) for row in shares.tolist()]
+        candidates = tuple(Candidate(worker, use) for worker, use in enumerate(uses))
+        found.append(Snapshot(candidates, "simulated", "generated"))
+    return found

@@ -1,0 +1,171 @@
+"""How long mounted sensors take, each for itself and the ten of `ten_sensors`, on one core.
+
+The sensors are due in every tick and sense the same seeded worlds by turns; times are those of the
+processor that this process had.
+"""
+
+from __future__ import annotations
+
+import time
+from dataclasses import asdict
+from functools import partial
+from statistics import median
+from typing import Annotated, Any
+
+import numpy as np
+
+from benchmarks.harness import Report, Say, about, check_range, one_core, run, silent, take_turns
+from cavmarl.config.registry import load_config
+from cavmarl.engine.rig_component import MountedSensors
+from cavmarl.engine.simulation import Simulation
+from cavmarl.evaluate.driven_worlds import DrivenWorld, world_maker
+from cavmarl.sensors.kernels.rig_schedule import Due
+from cavmarl.sensors.mounted.catalogue import mount
+
+ENV = "grid4x4"
+CARS_PER_KM2 = 400
+AGENTS = 100
+WARM_S = 10
+TICKS = 20  # of one turn
+
+DT_S = 0.05
+TEN_SENSORS = "ten_sensors"
+PLANE_LIDAR = "plane_lidar"
+TICK = "all ten sensors, a tick"
+LIDAR = {"type": "lidar", "rays": 64, "z_m": 0.8, "range_m": 100.0}
+
+
+def measure(
+    repeats: Annotated[int, about("Turns of each sensor.")] = 5, say: Say = silent
+) -> Report:
+    """Each sensor of the rig `ten_sensors`, and all together, at 400 cars/km² on one core.
+
+    The rows are means over 100 vehicles of one world; what a tick of ten sensors takes is measured
+    in a world in which only one of as many cars has any.
+    """
+    check_range(repeats=(repeats, 1, 100))
+    with one_core():
+        say("making the worlds")
+        rig = _ten_sensors()
+        many = _driven(AGENTS, {**rig, PLANE_LIDAR: {**LIDAR, "rate_hz": 1.0 / DT_S}})
+        one = _driven(1, rig)
+        sensors = _Sensors(many)
+        sides = {name: partial(sensors.time_us, name) for name in many.config.rig}
+        turns = take_turns({**sides, TICK: partial(_tick_ms, one)}, repeats, say)
+    tick_ms = median(turns.pop(TICK))
+    rows = [sensors.row(name, times_us) for name, times_us in turns.items()]
+    us = {row["type"]: row["median_us"] for row in rows}
+    lidar_ns = next(row["number_ns"] for row in rows if row["name"] == PLANE_LIDAR)
+    cameras_ms = 1e-3 * (us["depth_camera"] + us["semantic_camera"])
+    density = float(many.running()[0]) / _area_km2(many)
+    return Report(
+        f"{density:.0f} cars/km², {repeats} turns, one core",
+        {
+            "sensor": "name",
+            "sample": "shape",
+            "µs a sample": "median_us:.1f",
+            "min": "low_us:.1f",
+            "max": "high_us:.1f",
+            "ns a number": "number_ns:.1f",
+        },
+        rows,
+        notes=[
+            f"the plane lidar takes {lidar_ns:.1f} ns a ray, a depth and a semantic picture "
+            f"{cameras_ms:.3f} ms,\nall ten sensors of one vehicle {tick_ms:.2f} ms a tick"
+        ],
+        facts={
+            "cars_per_km2": density,
+            "repeats": repeats,
+            "lidar_ns": lidar_ns,
+            "cameras_ms": cameras_ms,
+            "tick_ms": tick_ms,
+        },
+    )
+
+
+def _ten_sensors() -> dict[str, dict[str, Any]]:
+    """The rig, with all of it due in every tick."""
+    config, _ = load_config(ENV, overrides={"rig": TEN_SENSORS})
+    return {
+        name: {**asdict(sensor), "rate_hz": 1.0 / DT_S, "phase_ticks": 0}
+        for name, sensor in config.rig.items()
+    }
+
+
+def _area_km2(simulation: Simulation) -> float:
+    min_x, min_y, max_x, max_y = simulation.network.extent_m
+    return (max_x - min_x) * (max_y - min_y) / 1e6
+
+
+def _driven(agents: int, rig: dict[str, dict[str, Any]]) -> Simulation:
+    """A world with so many agents, all sensors due in every tick, some seconds after its reset."""
+    probe = world_maker(ENV, seconds=2 * WARM_S, agents=1, background=0)(1)
+    cars = round(CARS_PER_KM2 * _area_km2(probe))
+    simulation = world_maker(
+        ENV,
+        seconds=2 * WARM_S,
+        agents=agents,
+        background=cars - agents,
+        overrides={
+            "rig": rig,
+            "population.budget": None,
+            "clock.sim_dt_s": DT_S,
+            "clock.ctrl_dt_s": DT_S,
+        },
+    )(1)
+    drive = DrivenWorld(simulation)
+    for _ in range(round(WARM_S / DT_S)):
+        drive.step(drive.commands())
+    return simulation
+
+
+def _mounted(simulation: Simulation) -> MountedSensors:
+    return next(part for part in simulation.attached if isinstance(part, MountedSensors))
+
+
+class _Sensors:
+    """The sensors on all agents of one world, one at a time."""
+
+    def __init__(self, simulation: Simulation) -> None:
+        mounted = _mounted(simulation)
+        self._scenes = mounted.scenes()
+        self._frames = simulation.frames
+        self._num = int(simulation.outputs.present.sum())
+        sensors = mount(simulation.config.rig, mounted.platform)
+        self._sensors = {sensor.name: sensor for sensor in sensors}
+        self._due = Due(np.ones(1, np.int64), np.zeros(1, np.int64), np.zeros(1, np.int64))
+
+    def time_us(self, name: str) -> float:
+        """Microseconds that one sample of one vehicle takes."""
+        sensor, frames = self._sensors[name], self._frames[name]
+        sensor.sense(self._scenes, self._due, frames)
+        began = time.process_time_ns()
+        for _ in range(TICKS):
+            sensor.sense(self._scenes, self._due, frames)
+        return (time.process_time_ns() - began) / (1e3 * TICKS * self._num)
+
+    def row(self, name: str, times_us: tuple[float, ...]) -> dict[str, Any]:
+        """What was measured."""
+        config = self._sensors[name].config
+        return {
+            "name": name,
+            "type": config.type,
+            "shape": config.shape,
+            "low_us": min(times_us),
+            "median_us": median(times_us),
+            "high_us": max(times_us),
+            "number_ns": 1e3 * median(times_us) / int(np.prod(config.shape)),
+        }
+
+
+def _tick_ms(simulation: Simulation) -> float:
+    """Milliseconds that all sensors of a world take in one tick."""
+    mounted = _mounted(simulation)
+    began = time.process_time_ns()
+    for _ in range(TICKS):
+        mounted.end()
+    return (time.process_time_ns() - began) / (1e6 * TICKS)
+
+
+if __name__ == "__main__":
+    run(measure)

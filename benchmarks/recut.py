@@ -1,0 +1,118 @@
+"""How evenly zones share out vehicles if they become others while a world runs, and its price."""
+
+from __future__ import annotations
+
+import statistics
+import time
+from dataclasses import asdict
+from typing import Annotated, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from benchmarks.harness import Env, Report, Say, about, check_range, run, silent
+from cavmarl.cli.output import Settings, parse_settings
+from cavmarl.core.errors import EvaluationError
+from cavmarl.env.vector import CavVectorEnv, make_vec
+from cavmarl.evaluate.statistics import mean_interval
+
+Floats = NDArray[np.float64]
+
+
+def measure(
+    env: Env = "rush",
+    zones: Annotated[int, about("Zones of each world.")] = 4,
+    every: Annotated[int, about("Steps between checks of the zones.")] = 20,
+    steps: Annotated[int, about("Steps of each seed.")] = 300,
+    seeds: Annotated[int, about("Number of seeds; an interval needs two.")] = 5,
+    settings: Settings = None,
+    say: Say = silent,
+) -> Report:
+    """A world whose zones stay beside one whose zones become others: evenness, and its price."""
+    most = float("inf")
+    check_range(
+        zones=(zones, 2, most), every=(every, 1, most), steps=(steps, 1, most),
+        seeds=(seeds, 1, most),
+    )  # fmt: skip
+    common = {"zones.count": zones, **parse_settings(settings)}
+    pair = {
+        name: make_vec(env, overrides={**common, "zones.recut_steps": often})
+        for name, often in (("static", 0), ("re-cut", every))
+    }
+    uneven: dict[str, list[float]] = {name: [] for name in pair}
+    taken: dict[str, list[float]] = {name: [] for name in pair}
+    vehicles = []
+    for seed in range(seeds):
+        say(f"seed {seed + 1} of {seeds}")
+        for name, (imbalance, step_ms) in _run_beside(pair, seed, steps).items():
+            uneven[name].append(float(imbalance.mean()))
+            taken[name].append(float(np.median(step_ms)))
+        if len({vec.state_hash() for vec in pair.values()}) > 1:
+            raise EvaluationError(f"seed {seed}: the world that was cut anew is another one")
+        vehicles.append(int(pair["static"].simulation.running()[0]))
+    rows = [_row(name, vec, uneven[name], taken[name]) for name, vec in pair.items()]
+    ratios = np.array(uneven["re-cut"]) / np.array(uneven["static"])
+    interval = mean_interval(ratios)
+    between = "" if interval is None else f" ({interval.low:.2f} to {interval.high:.2f})"
+    mean = statistics.fmean(vehicles)
+    return Report(
+        f"{pair['static'].config.name}: {zones} zones, {mean:.0f} vehicles",
+        {
+            "zones": "name",
+            "max / mean": "mean_imbalance:.2f",
+            "95 % between seeds": "between",
+            "step, ms": "median_ms:.2f",
+            "re-cuts": "recuts",
+            "moved": "moved",
+            "ms each": "recut_ms:.1f",
+        },
+        rows,
+        notes=[
+            f"re-cut over static, fullest zone over mean: {ratios.mean():.2f}{between}; the same "
+            "states"
+        ],
+        facts={
+            "vehicles": mean,
+            "ratios": ratios.tolist(),
+            "ratio": float(ratios.mean()),
+            "ratio95": None if interval is None else asdict(interval),
+        },
+    )
+
+
+def _run_beside(
+    pair: dict[str, CavVectorEnv], seed: int, steps: int
+) -> dict[str, tuple[Floats, Floats]]:
+    """(imbalance, ms) of each step, of both."""
+    found = {name: (np.zeros(steps), np.zeros(steps)) for name in pair}
+    for vec in pair.values():
+        vec.reset(seed=seed)
+    for step in range(steps):
+        for name, vec in pair.items():
+            uneven, taken = found[name]
+            actions = vec.suggest_actions()
+            began = time.perf_counter()
+            vec.step(actions)
+            taken[step] = 1e3 * (time.perf_counter() - began)
+            uneven[step] = vec.simulation.zone_loads().imbalance()[0]
+    return found
+
+
+def _row(name: str, vec: CavVectorEnv, uneven: list[float], taken: list[float]) -> dict[str, Any]:
+    recuts = vec.simulation.recuts
+    interval = mean_interval(np.array(uneven))
+    return {
+        "name": name,
+        "imbalance": uneven,
+        "mean_imbalance": statistics.fmean(uneven),
+        "between": None if interval is None else f"{interval.low:.2f} to {interval.high:.2f}",
+        "step_ms": taken,
+        "median_ms": statistics.median(taken),
+        "recuts": len(recuts),
+        "moved": sum(recut.moved for recut in recuts),
+        "recut_ms": statistics.median(recut.ms for recut in recuts) if recuts else None,
+    }
+
+
+if __name__ == "__main__":
+    run(measure)

@@ -1,0 +1,163 @@
+"""Make a rig so heavy that its sensors take a given time a tick, for `cavmarl bench sensors --rig`.
+
+Resolutions and rates are raised until all sensors together, each due in every tick, take so long;
+each takes about as much as the others, as far as it can have any resolution.
+"""
+
+from __future__ import annotations
+
+import math
+import statistics
+from collections.abc import Mapping, Sequence
+from dataclasses import fields, replace
+from pathlib import Path
+from typing import Annotated, Any
+
+import yaml
+
+from benchmarks.harness import Env, Report, Say, about, run, silent
+from cavmarl.bench.sensor_bench import first_job, job_config, run_job
+from cavmarl.bench.sensor_rig import Rig, find_rig, load_rig
+from cavmarl.bench.sensor_run import SensorJob
+from cavmarl.cli.output import Seed, Settings, parse_settings
+from cavmarl.config.env import EnvConfig
+from cavmarl.config.rig import MAX_SAMPLE_NUMBERS, MountedConfig
+from cavmarl.core.errors import ConfigError
+
+TRIES = 8  # to find a load
+TRIED_STEPS = 12
+MARGIN = 1.15  # above the load that was asked for
+TOO_MUCH = 1.5
+
+# The most of each that a sensor can have; see `config/rig.py`.
+_LIMITS = {"rays": 8192, "layers": 128, "width": 4096, "height": 4096}
+_LEAST_CELL_M = 0.05
+_SCALED = {*_LIMITS, "cell_m"}
+
+
+def measure(
+    env: Env = "town",
+    load: Annotated[float, about("Milliseconds of sensing a tick.", metavar="MS")] = 20.0,
+    out: Annotated[Path, about("Write the rig here.")] = Path("rig.yaml"),
+    rig: Annotated[str, about("Sensors: a name in configs/rigs/, or a .yaml.")] = "ten_sensors",
+    agents: Annotated[int, about("Vehicles with sensors.")] = 1,
+    background: Annotated[int, about("Vehicles without sensors.")] = 0,
+    seed: Seed = 0,
+    settings: Settings = None,
+    say: Say = silent,
+) -> Report:
+    """Find resolutions at which a rig takes so long a tick, and write it as a file."""
+    if not 0.0 < load <= 1e4:
+        raise ConfigError(f"load {load:g} ms: must be above 0 and at most 10000")
+    sensors, vehicles = load_rig(find_rig(rig)), (agents, background)
+    steps = (TRIED_STEPS, TRIED_STEPS)
+    job = first_job(env, sensors, parse_settings(settings), vehicles, steps, seed)
+    found = loaded(job, load, say)
+    try:
+        out.write_text(yaml.safe_dump(_plain(found.overrides["rig"])), encoding="utf-8")
+    except OSError as error:
+        raise ConfigError(f"--out {out}: cannot be written ({error.strerror})") from error
+    config = job_config(found)
+    dt_s = config.clock.sim_dt_s
+    rows = [{"name": name, "shape": sensor.shape} for name, sensor in config.rig.items()]
+    return Report(
+        f"{out}: {load:g} ms a tick",
+        {"sensor": "name", "sample": "shape"},
+        rows,
+        notes=[f"cavmarl bench sensors {env} --rig {out} --set clock.ctrl_dt_s={dt_s:g}"],
+        facts={"load_ms": load, "rig": _plain(found.overrides["rig"])},
+    )
+
+
+def _plain(rig: Mapping[str, Any]) -> dict[str, Any]:
+    return {
+        name: {key: list(v) if isinstance(v, tuple) else v for key, v in sensor.items()}
+        for name, sensor in rig.items()
+    }
+
+
+def loaded(job: SensorJob, load_ms: float, say: Say) -> SensorJob:
+    """The job with resolutions at which the sensors take so long a tick.
+
+    Those that can have any resolution take about as long as each other. What they take does not
+    grow in proportion to their resolutions, so once one rig is too light and another too heavy, the
+    next one lies between them.
+    """
+    even, found_ms = _evened(job, load_ms, say), 0.0
+    scale, light, heavy = 1.0, 0.0, math.inf
+    for _ in range(TRIES):
+        tried = _scaled_by(even, dict.fromkeys(even.overrides["rig"], scale))
+        found_ms, _ = _tried(tried, load_ms, say)
+        if load_ms <= found_ms <= TOO_MUCH * load_ms:
+            return tried
+        if found_ms < load_ms:
+            light = scale
+        else:
+            heavy = scale
+        between = 0.0 < light and heavy < math.inf
+        scale = math.sqrt(light * heavy) if between else scale * MARGIN * load_ms / found_ms
+    raise ConfigError(
+        f"load {load_ms:g} ms a tick: after {TRIES} tries this rig takes {found_ms:.1f} ms; use "
+        "more agents or other sensors, or nothing else on this machine"
+    )
+
+
+def _evened(job: SensorJob, load_ms: float, say: Say) -> SensorJob:
+    """The job with each sensor due in every tick, and taking about its share of a load."""
+    dt_s = job_config(job).clock.sim_dt_s
+    even = replace(job, overrides={**job.overrides, "clock.ctrl_dt_s": dt_s})
+    factors = dict.fromkeys(job.overrides["rig"], 1.0)
+    share_ms = load_ms / len(factors)
+    for grown in (False, True):  # what a sensor takes at a low resolution says little
+        even = _scaled_by(even, factors)
+        found_ms, costs_ms = _tried(even, load_ms, say)
+        if grown:  # some cannot take their share: the others get what is left of it
+            share_ms *= MARGIN * load_ms / found_ms
+        for name, cost_ms in zip(factors, costs_ms, strict=True):
+            factors[name] = share_ms / (cost_ms * job.agents) if cost_ms else 1.0
+    return _scaled_by(even, factors)
+
+
+def _scaled_by(job: SensorJob, factors: Mapping[str, float]) -> SensorJob:
+    config = job_config(job)
+    rig = scaled(config, factors, 1.0 / config.clock.sim_dt_s)
+    return replace(job, overrides={**job.overrides, "rig": rig})
+
+
+def _tried(job: SensorJob, load_ms: float, say: Say) -> tuple[float, Sequence[float]]:
+    """What all sensors take a tick, in ms, and each of them."""
+    tried = run_job(replace(job, warmup=TRIED_STEPS, steps=TRIED_STEPS))
+    found_ms = statistics.median(tried.parts_ms["sensor compute"])
+    say(f"looking for a load of {load_ms:g} ms: it was {found_ms:.3g} ms")
+    return found_ms, tried.costs_ms
+
+
+def scaled(config: EnvConfig, factors: Mapping[str, float], rate_hz: float) -> Rig:
+    """The rig of an environment with more pixels, rays and cells.
+
+    As far as may be: there is a most of each. Pictures keep the proportions of their sides. Sensors
+    that have none of them stay as they are.
+    """
+    return {name: _scaled(sensor, factors[name], rate_hz) for name, sensor in config.rig.items()}
+
+
+def _scaled(sensor: MountedConfig, factor: float, rate_hz: float) -> dict[str, Any]:
+    values = {field.name: getattr(sensor, field.name) for field in fields(sensor)}
+    if _SCALED & values.keys():
+        values |= {"rate_hz": rate_hz, "phase_ticks": 0}
+    side = math.sqrt(min(factor, MAX_SAMPLE_NUMBERS / math.prod(sensor.shape)))
+    if "cell_m" in values:
+        values["cell_m"] = max(values["cell_m"] / side, _LEAST_CELL_M)
+    for name in ("width", "height"):
+        if name in values:
+            values[name] = min(int(values[name] * side), _LIMITS[name])
+    for name in ("rays", "layers"):
+        if name in values:
+            wanted = max(1, min(round(values[name] * factor), _LIMITS[name]))
+            factor *= values[name] / wanted  # what is left of it
+            values[name] = wanted
+    return values
+
+
+if __name__ == "__main__":
+    run(measure)

@@ -1,0 +1,166 @@
+"""Turns of one world in some number of zones, without a stopwatch and with one on every phase.
+
+A turn is run in parts, so that those of all worlds can be taken in between: the machine's other
+work does not fall on one of them alone.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+
+from cavmarl.bench.stopwatch import Stopwatch
+from cavmarl.core.errors import ConfigError
+from cavmarl.engine.simulation import Simulation
+from cavmarl.evaluate.driven_worlds import DrivenWorld
+from cavmarl.zones.partition.zone_statistics import imbalance
+
+__all__ = ["PHASES", "Pair", "Turn", "TwinWorlds"]
+
+PHASES = ("traffic", "advance", "exchange", "resolve", "migrate", "sense", "other")
+# Calls of the runtime that belong to a phase of another name; what is left is `other`.
+_MEMBERS = {
+    "traffic": (
+        "choose_goals", "leave", "settle",
+        "call_orders", "rank_lanes", "assign_lanes", "propose", "running", "accept", "admit",
+        "retire", "forget",
+    ),
+    "migrate": ("begin", "end", "left", "entered"),
+    "sense": ("clear_outputs", "settle_outputs", "credit"),
+}  # fmt: skip
+_PHASE_OF = {phase: phase for phase in PHASES} | {
+    name: phase for phase, names in _MEMBERS.items() for name in names
+}
+
+
+@dataclass(frozen=True)
+class Turn:
+    """One turn of one world, or a part of it: sums over its steps."""
+
+    ns: float  # in steps
+    steps: int  # how many
+    vehicles: int  # in the world
+    ghosts: int  # in all zones
+    imbalance: float  # maximum over mean of the vehicles that zones own
+    largest: int  # rows of the zone with most
+    moves: tuple[int, ...]  # vehicles that changed their zone, step by step
+    move_ns: tuple[int, ...]  # in the phase `migrate`, step by step; 0 without a stopwatch
+
+
+@dataclass(frozen=True)
+class Pair:
+    """One turn of all worlds; times in ns a vehicle and tick."""
+
+    plain: Turn  # of the world without a stopwatch
+    timed: Turn  # of that with one
+    plain_ns: float  # a tick of the first
+    timed_ns: float  # a tick of the second, less the stopwatch's own time
+    checked_ns: float | None  # a tick of the third, with the monitor; None: there is none
+    phases: dict[str, float]  # by the names of `PHASES`; their sum is `timed_ns`
+    calls: dict[str, float]  # by the names of the runtime's calls
+
+
+class TwinWorlds:
+    """The same world twice in some number of zones, once with a stopwatch.
+
+    Args:
+        make: the world in k zones, at the start of an episode.
+        zones: k.
+        make_checked: the same world with the monitor of invariants; None: it is not measured.
+
+    Attributes:
+        zones: k.
+        plain: the one without.
+        timed: the one with it.
+        checked: a third one, with the monitor; None: not asked for, or nothing is divided.
+    """
+
+    def __init__(
+        self,
+        make: Callable[[int], Simulation],
+        zones: int,
+        make_checked: Callable[[int], Simulation] | None = None,
+    ) -> None:
+        self.zones = zones
+        self.plain, self.timed = DrivenWorld(make(zones)), DrivenWorld(make(zones))
+        self._watch = Stopwatch()
+        self.timed.simulation.instrument(self._watch.around)
+        self.checked: DrivenWorld | None = None
+        if make_checked is not None and zones > 1:
+            self.checked = DrivenWorld(make_checked(zones))
+        self._parts: list[list[Turn]] = [[] for _ in self.worlds]
+
+    @property
+    def worlds(self) -> list[DrivenWorld]:
+        """All of them."""
+        return [self.plain, self.timed, *([] if self.checked is None else [self.checked])]
+
+    def run(self, number: int, steps: int) -> None:
+        """The next steps of one of `worlds`, as a part of the present turn."""
+        if not any(self._parts):
+            self._watch.clear()
+        self._parts[number].append(_run(self.worlds[number], steps, self._watch))
+
+    def end_turn(self) -> Pair:
+        """The turn that has been run; another one begins."""
+        plain, timed, *checked = (_joined(parts) for parts in self._parts)
+        watch = self._watch
+        watch.forget("suggest", "loads")
+        if not plain.vehicles:
+            raise ConfigError("no vehicle drives: another --after, or more demand")
+        share = 1.0 / (plain.vehicles * self.plain.simulation.config.clock.ticks_per_step)
+        timed_ns = (timed.ns - watch.own()) * share
+        calls = {name: ns * share for name, ns in sorted(watch.phases().items())}
+        phases = dict.fromkeys(PHASES, 0.0)
+        for name, ns in calls.items():
+            phases[_PHASE_OF.get(name, "other")] += ns
+        phases["other"] += timed_ns - sum(phases.values())
+        checked_ns = checked[0].ns * share if checked else None
+        for parts in self._parts:
+            parts.clear()
+        return Pair(plain, timed, plain.ns * share, timed_ns, checked_ns, phases, calls)
+
+
+def _joined(parts: Sequence[Turn]) -> Turn:
+    """One turn of its parts."""
+    sums = {
+        name: sum(getattr(part, name) for part in parts)
+        for name in ("ns", "steps", "vehicles", "ghosts", "imbalance", "largest")
+    }
+    return Turn(
+        **sums,
+        moves=tuple(move for part in parts for move in part.moves),
+        move_ns=tuple(ns for part in parts for ns in part.move_ns),
+    )
+
+
+def _run(world: DrivenWorld, steps: int, watch: Stopwatch) -> Turn:
+    """Steps of a world; what its agents decide and how many there are is not timed."""
+    simulation = world.simulation
+    ns = vehicles = ghosts = largest = 0
+    uneven = 0.0
+    migrations, spent = [simulation.migrations], [_spent(watch)]
+    for _ in range(steps):
+        commands = world.commands()
+        began = time.process_time_ns()
+        world.step(commands)
+        ns += time.process_time_ns() - began
+        loads = simulation.zone_loads()
+        owned = loads.owned[:, 0]
+        vehicles += int(owned.sum())
+        ghosts += int(loads.ghosts.sum())
+        largest += int((owned + loads.ghosts[:, 0]).max())
+        uneven += imbalance(owned.tolist())
+        migrations.append(simulation.migrations)
+        spent.append(_spent(watch))
+    moves, move_ns = (
+        tuple(new - old for old, new in pairwise(sums)) for sums in (migrations, spent)
+    )
+    return Turn(ns, steps, vehicles, ghosts, uneven, largest, moves, move_ns)
+
+
+def _spent(watch: Stopwatch) -> int:
+    """In the phase `migrate` up to now, ns."""
+    return sum(watch.spent[name] for name in _MEMBERS["migrate"])

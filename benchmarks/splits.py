@@ -1,0 +1,120 @@
+"""How much faster one world is in zones over several workers than undivided in one process."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from statistics import median
+from typing import Annotated, Any
+
+from benchmarks.harness import Env, Report, Say, about, numbers_of, paired_ratio, run, silent
+from cavmarl.bench.worker_speed import Measured
+from cavmarl.cli.output import Agents, Background, Seed, Settings, parse_settings
+from cavmarl.config.registry import load_config
+from cavmarl.core.errors import ConfigError, EvaluationError
+
+
+def measure(
+    env: Env = "rush",
+    vehicles: Annotated[
+        str, about("Vehicles of the world; default: the environment's.", metavar="N,…")
+    ] = "",
+    workers: Annotated[int, about("Workers that the zones are shared out over.")] = 2,
+    zones: Annotated[
+        int | None, about("Zones of the divided world; default: one a worker.")
+    ] = None,
+    agents: Agents = None,
+    background: Background = None,
+    steps: Annotated[int, about("Steps of each turn.")] = 20,
+    repeats: Annotated[int, about("Turns of each world.")] = 7,
+    seed: Seed = 0,
+    settings: Settings = None,
+    say: Say = silent,
+) -> Report:
+    """One world undivided, in zones on one worker, and in zones over several, by turns."""
+    if workers < 2 or steps < 1 or repeats < 1:
+        raise ConfigError(
+            f"{workers} workers, {steps} steps, {repeats} turns: must be at least 2, 1 and 1"
+        )
+    numbers = numbers_of("--vehicles", vehicles) if vehicles else [None]
+    overrides = parse_settings(settings)
+    rows = []
+    for number in numbers:
+        say(f"splitting one world of {'its' if number is None else number} vehicles")
+        others = background
+        if number is not None:
+            config, _ = load_config(env, agents=agents, overrides=overrides)
+            others = number - config.population.agents
+            if others < 0:
+                raise ConfigError(f"{number} vehicles: agents alone are {config.population.agents}")
+        wanted = {"agents": agents, "background": others, "overrides": overrides}
+        rows.append(_measured(env, zones or workers, workers, steps, repeats, seed, wanted))
+    line = split_line([(row["vehicles"], row["ratio"]) for row in rows])
+    return Report(
+        f"{env}: one world undivided, and in {zones or workers} zones over one and {workers} "
+        "workers",
+        {
+            "vehicles": "vehicles",
+            "undivided, ms": "undivided_median:.2f",
+            "one worker, ms": "whole_median:.2f",
+            "workers, ms": "split_median:.2f",
+            "times faster": "ratio:.2f",
+        },
+        rows,
+        notes=[
+            "splitting one world does not pay here"
+            if line is None
+            else f"splitting one world pays from {line} vehicles on here"
+        ],
+        facts={"workers": workers, "zones": zones or workers, "split_pays_from": line},
+    )
+
+
+def split_line(found: Sequence[tuple[int, float]]) -> int | None:
+    """The least vehicles from which on every split world was the faster one, if any."""
+    line = None
+    for vehicles, ratio in sorted(found, reverse=True):
+        if ratio <= 1.0:
+            break
+        line = vehicles
+    return line
+
+
+def _measured(
+    env: str | Path,
+    zones: int,
+    workers: int,
+    steps: int,
+    repeats: int,
+    seed: int,
+    wanted: Mapping[str, Any],
+) -> dict[str, Any]:
+    measured: list[Measured] = []
+    try:
+        for count, parts in ((0, 1), (1, zones), (workers, zones)):
+            measured.append(Measured(env, count, seed, {**wanted, "zones": parts}))
+        for _ in range(repeats):
+            for one in measured:
+                one.count_turn(steps)
+        hashes = {one.vec.state_hash() for one in measured}
+        running = int(measured[0].vec.traffic_stats()["running"])
+    finally:
+        for one in measured:
+            one.vec.close()
+    if len(hashes) > 1:
+        raise EvaluationError(f"{env}: the worlds in {zones} zones are not the undivided one")
+    undivided, whole, split = (one.row(repeats * steps).step_ms for one in measured)
+    return {
+        "vehicles": running,
+        "undivided_ms": undivided,
+        "whole_ms": whole,
+        "split_ms": split,
+        "undivided_median": median(undivided),
+        "whole_median": median(whole),
+        "split_median": median(split),
+        "ratio": paired_ratio(undivided, split),
+    }
+
+
+if __name__ == "__main__":
+    run(measure)

@@ -1,0 +1,62 @@
+"""What workers do for worlds in which nothing happens. The program of their processes."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cavmarl.config.env import EnvConfig
+from cavmarl.config.io import validate
+from cavmarl.parallel.processes.shared_memory import Segment, arrays_in
+from cavmarl.parallel.processes.worker_loop import Job, serve
+from cavmarl.parallel.step_arrays import StepArrays, layout_of
+
+__all__ = ["TrivialJob", "make_jobs"]
+
+
+class TrivialJob:
+    """Worlds in which every agent sees how many tasks there have been.
+
+    Args:
+        arrays: of these worlds.
+    """
+
+    def __init__(self, arrays: StepArrays) -> None:
+        self._arrays = arrays
+        self._tasks = np.zeros(1, dtype=np.int64)
+        arrays.mask[:] = True
+        arrays.acted[:] = True
+
+    def afterwards(self) -> None:
+        """Nothing to do."""
+
+    def prepare(self) -> None:
+        """Nothing to do."""
+
+    def perform(self, task: int, letter: Any) -> None:
+        """Show the number of this task."""
+        self._tasks += 1
+        self._arrays.observations[:] = self._tasks[0]
+
+    def save(self) -> list[NDArray[Any]]:
+        """How many there have been."""
+        return [self._tasks]
+
+    def load(self, saved: Sequence[NDArray[Any]]) -> None:
+        """Go on from what `save` gave."""
+        self._tasks[:] = saved[0]
+
+
+def make_jobs(recipe: Mapping[str, Any]) -> list[Job]:
+    """The jobs of all workers."""
+    config = validate(EnvConfig, recipe["config"], "the environment")
+    layout = layout_of(config, recipe["capacity"], recipe["num_worlds"])
+    arrays = StepArrays.of(arrays_in(Segment(recipe["arrays"], 0).map(), layout))
+    return [TrivialJob(arrays.part(first, last)) for first, last, _ in recipe["parts"]]
+
+
+if __name__ == "__main__":
+    serve(make_jobs)

@@ -1,0 +1,119 @@
+"""What messages cost in a tick: several channels side by side, on the vehicles of one world.
+
+The world itself is run without messages. After each of its ticks every bus takes the same rows and
+sends and receives, with a clock on it; so all of them, and the tick, see the same machine.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from functools import partial
+from statistics import fmean, median
+from time import perf_counter
+from typing import Annotated, Any
+
+from benchmarks.harness import Env, Report, Say, about, check_positive, one_core, run, silent
+from cavmarl.cli.output import Seed
+from cavmarl.core.errors import ConfigError
+from cavmarl.engine.simulation import Simulation
+from cavmarl.engine.world_setup import load_world
+from cavmarl.evaluate.driven_worlds import DrivenWorld
+
+# As exponent and spread that of Cheng et al. (JSAC 2007) in a suburb; the air as of IEEE 802.11p.
+CHANNELS: Mapping[str, Mapping[str, Any]] = {
+    "ideal": {},
+    "range 300 m": {"v2x.channel.range_m": 300.0},
+    "path loss": {"v2x.channel.range_m": 300.0, "v2x.channel.path_loss_exponent": 2.75},
+    "path loss, busy air": {
+        "v2x.channel.range_m": 300.0,
+        "v2x.channel.path_loss_exponent": 2.75,
+        "v2x.channel.data_rate_mbps": 6.0,
+        "v2x.channel.latency_ticks": 2,
+    },
+}
+SHAPE = {"population.mode": "seats", "clock.ctrl_dt_s": 0.05, "sensors.lidar.rays": 0}
+
+
+def measure(
+    env: Env = "town",
+    vehicles: Annotated[int, about("Vehicles that send, as far as there is room.")] = 1000,
+    receivers: Annotated[
+        int | None, about("Agents among them, which receive; default: all.")
+    ] = None,
+    ticks: Annotated[int, about("Ticks that are timed.")] = 200,
+    warmup: Annotated[int, about("Ticks before.")] = 40,
+    seed: Seed = 0,
+    at_most: Annotated[
+        float | None, about("Exit with 1 if any channel takes more ms a tick.")
+    ] = None,
+    say: Say = silent,
+) -> Report:
+    """Milliseconds a tick for messages among vehicles, by channel, beside the tick itself."""
+    check_positive("--at-most", at_most)
+    receivers = vehicles if receivers is None else receivers
+    if not 1 <= receivers <= vehicles <= 100_000 or ticks < 1 or warmup < 0:
+        raise ConfigError(
+            f"vehicles = {vehicles}, receivers = {receivers}, ticks = {ticks}, warmup = {warmup}: "
+            "must be at least 1 receiver among the vehicles, and 1 tick"
+        )
+    counts = {"agents": receivers, "background": vehicles - receivers}
+    say("making the world")
+    config, network, demand, partition = load_world(env, **counts, overrides=SHAPE)
+    with one_core():
+        simulation = Simulation(config, network, 1, demand, partition)
+        simulation.seed(seed)
+        simulation.reset()
+        buses = {}
+        for name, channel in CHANNELS.items():
+            with_messages = SHAPE | {"v2x.enabled": True} | dict(channel)
+            buses[name] = simulation.listen(load_world(env, **counts, overrides=with_messages)[0])
+        world = DrivenWorld(simulation)
+        world_ms: list[float] = []
+        bus_ms: dict[str, list[float]] = {name: [] for name in CHANNELS}
+        running: list[int] = []
+        say("measuring")
+        for _ in range(warmup + ticks):
+            world_ms.append(_timed_ms(partial(world.step, world.commands())))
+            running.append(int(simulation.running()[0]))
+            for name, (_, exchange) in buses.items():
+                bus_ms[name].append(_timed_ms(exchange))
+    rows: list[dict[str, Any]] = [
+        {"name": "the world's own tick", "median_ms": median(world_ms[warmup:])}
+    ]
+    for name, (bus, _) in buses.items():
+        found, taken = bus.statistics(), bus_ms[name][warmup:]
+        rows.append(
+            {
+                "name": name,
+                "tick_ms": taken,
+                "median_ms": median(taken),
+                "reachable": found.reachable / (warmup + ticks),
+                "reception_ratio": found.reception_ratio,
+                "busy_ratio": found.busy_mean,
+            }
+        )
+    mean, rate_hz = fmean(running[warmup:]), config.v2x.cam.rate_hz
+    return Report(
+        f"{env}: {mean:,.0f} vehicles at {rate_hz:g} Hz, up to {receivers:,} of them receive; "
+        "one core",
+        {
+            "channel": "name",
+            "ms a tick": "median_ms:.2f",
+            "in reach": "reachable:,.0f",
+            "received": "reception_ratio:.1%",
+            "busy": "busy_ratio:.1%",
+        },
+        rows,
+        facts={"env": env, "vehicles": mean, "receivers": receivers, "rate_hz": rate_hz},
+        holds=at_most is None or max(row["median_ms"] for row in rows[1:]) <= at_most,
+    )
+
+
+def _timed_ms(step: Callable[[], None]) -> float:
+    began = perf_counter()
+    step()
+    return 1e3 * (perf_counter() - began)
+
+
+if __name__ == "__main__":
+    run(measure)

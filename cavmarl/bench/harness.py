@@ -1,0 +1,184 @@
+"""What all measurements share: sides that take turns, medians, checks of numbers, tables, JSON.
+
+All sides of a comparison are measured once a turn, one after the other, so that what else the
+machine does falls on all of them. `benchmarks/`, beside the package, stands on this, too.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass
+from statistics import median
+from typing import Any, ClassVar, TypeVar
+
+from rich.console import Console
+from rich.markup import escape
+from rich.table import Table
+
+from cavmarl.core.errors import ConfigError
+
+__all__ = [
+    "Result",
+    "Say",
+    "Spread",
+    "check_positive",
+    "check_range",
+    "hardware_line",
+    "make_table",
+    "measuring",
+    "numbers_of",
+    "one_core",
+    "paired_ratio",
+    "silent",
+    "spread",
+    "take_turns",
+]
+
+Say = Callable[[str], None]
+Key = TypeVar("Key")
+Taken = TypeVar("Taken")
+
+
+def silent(text: str) -> None:
+    """A `say` that prints nothing."""
+
+
+@dataclass(frozen=True)
+class Spread:
+    """What the turns of one side came to: least, median, most."""
+
+    low: float
+    median: float
+    high: float
+
+
+def spread(values: Iterable[float]) -> Spread:
+    """Least, median and most."""
+    found = tuple(values)
+    return Spread(min(found), median(found), max(found))
+
+
+class Result:
+    """A dataclass whose derived figures stand in its JSON beside its fields.
+
+    Attributes:
+        DERIVED: names of the properties that are written, too.
+    """
+
+    DERIVED: ClassVar[tuple[str, ...]] = ()
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain values, for JSON."""
+        derived = {name: getattr(self, name) for name in self.DERIVED}
+        return {**asdict(self), **derived}  # type: ignore[call-overload]
+
+
+def take_turns(
+    sides: Mapping[Key, Callable[[], Taken]], repeats: int, say: Say = silent
+) -> dict[Key, tuple[Taken, ...]]:
+    """Measure every side once a turn, all sides one after the other.
+
+    Args:
+        sides: by name; a call measures one turn and returns what it took.
+        repeats: number of turns.
+        say: told which turn it is.
+    """
+    found: dict[Key, list[Taken]] = {name: [] for name in sides}
+    for turn in range(1, repeats + 1):
+        say(f"measuring, {turn} of {repeats}")
+        for name, measure in sides.items():
+            found[name].append(measure())
+    return {name: tuple(taken) for name, taken in found.items()}
+
+
+def paired_ratio(ones: Sequence[float], others: Sequence[float]) -> float:
+    """Median over the turns of one side's figure over the other's of the same turn."""
+    return median(one / other for one, other in zip(ones, others, strict=True))
+
+
+@contextmanager
+def one_core() -> Iterator[None]:
+    """Keep this process on one core, where the system can."""
+    if not hasattr(os, "sched_setaffinity"):
+        yield
+        return
+    before = os.sched_getaffinity(0)
+    os.sched_setaffinity(0, {min(before)})
+    try:
+        yield
+    finally:
+        os.sched_setaffinity(0, before)
+
+
+def check_range(**limits: tuple[float, float, float]) -> None:
+    """Refuse numbers that are not from the second to the third of their limits.
+
+    Raises:
+        ConfigError: a number out of range.
+    """
+    for name, (value, least, most) in limits.items():
+        if not least <= value <= most:
+            bounds = f"at least {least:g}" if math.isinf(most) else f"from {least:g} to {most:.15g}"
+            raise ConfigError(f"{name} = {value}: must be {bounds}")
+
+
+def check_positive(option: str, value: float | None) -> None:
+    """Refuse a bound that nothing can be measured against; None: there is no bound.
+
+    Raises:
+        ConfigError: not a finite number above 0.
+    """
+    if value is not None and not 0.0 < value < math.inf:
+        raise ConfigError(f"{option} {value:g}: must be a number above 0")
+
+
+def numbers_of(option: str, text: str) -> list[int]:
+    """The whole numbers of an option such as `--zones 1,4,9`.
+
+    Raises:
+        ConfigError: something else.
+    """
+    try:
+        return [int(word) for word in text.split(",")]
+    except ValueError:
+        raise ConfigError(f"{option} {text}: must be whole numbers with commas between") from None
+
+
+@contextmanager
+def measuring(console: Console) -> Iterator[Say]:
+    """A status line on the terminal while something is measured; `say` changes its text."""
+    with console.status("") as status:
+        yield status.update
+
+
+def make_table(
+    title: str,
+    columns: Sequence[str],
+    rows: Iterable[Sequence[str] | None],
+    caption: str | None = None,
+) -> Table:
+    """A table whose first column is text and whose others are numbers.
+
+    Args:
+        title: above it.
+        columns: the head.
+        rows: cells; None: a line between.
+        caption: below it.
+    """
+    table = Table(title=escape(title), caption=caption)
+    for place, column in enumerate(columns):
+        table.add_column(column, justify="right" if place else "left", no_wrap=bool(place))
+    for row in rows:
+        if row is None:
+            table.add_section()
+        else:
+            table.add_row(*row)
+    return table
+
+
+def hardware_line(hardware: Mapping[str, Any]) -> str:
+    """The processor, and how many cores may be used."""
+    return f"{hardware['cpu']}, {hardware['usable_cores']} cores"

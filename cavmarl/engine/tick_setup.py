@@ -1,0 +1,100 @@
+"""Makes the parts of a tick: traffic, shards, components and the queue of departures."""
+
+from __future__ import annotations
+
+from cavmarl.config.env import EnvConfig
+from cavmarl.core.memory import Zeros
+from cavmarl.driving.vehicles import blank_vehicle
+from cavmarl.engine.component import Host
+from cavmarl.engine.component_setup import attach
+from cavmarl.engine.shared_outputs import Commons
+from cavmarl.engine.tick import Tick
+from cavmarl.handoff.shard_setup import divide
+from cavmarl.roads.network import RoadNetwork
+from cavmarl.sensors.mounted.catalogue import frame_layout, frames_in
+from cavmarl.sensors.mounted.frames import Frames
+from cavmarl.traffic.demand import DemandFile
+from cavmarl.traffic.departure_queue import make_gate
+from cavmarl.traffic.native import NativeTraffic
+from cavmarl.traffic.scenarios.library import plan_scene
+from cavmarl.traffic.sumo.sumo_demand import SumoDemand
+from cavmarl.zones.partition.zone_layouts import cut_map
+from cavmarl.zones.partition.zone_partition import ZonePartition
+
+__all__ = ["cut_zones", "make_frames", "make_tick"]
+
+
+def make_tick(
+    config: EnvConfig,
+    network: RoadNetwork,
+    partition: ZonePartition,
+    demand: DemandFile | SumoDemand | None,
+    commons: Commons,
+    frames: Frames,
+    zeros: Zeros,
+    traffic: NativeTraffic | None,
+) -> Tick:
+    """The phases of a tick, over shards that are made here.
+
+    Args:
+        config: of the environment.
+        network: its roads.
+        partition: its zones.
+        demand: of files, or SUMO's, beside the generator's.
+        commons: what all zones of a world share.
+        frames: of the mounted sensors.
+        zeros: where large arrays lie.
+        traffic: of other worlds of the same environment, as many as these; None: it is made.
+    """
+    num_worlds = commons.outputs.present.shape[0]
+    blank = blank_vehicle()
+    if traffic is None:
+        traffic = NativeTraffic(
+            network,
+            config.traffic,
+            config.population,
+            blank,
+            config.clock.sim_dt_s,
+            config.horizon_s,
+            None if isinstance(demand, SumoDemand) else demand,
+            num_worlds,
+            zeros,
+            plan_scene(config.scenario, network),
+            demand if isinstance(demand, SumoDemand) else None,
+        )
+    shards, division = divide(
+        config, network, partition, traffic, commons.outputs, num_worlds, zeros
+    )
+    attached = attach(
+        Host(
+            config,
+            network,
+            num_worlds,
+            shards,
+            division,
+            shards[0].travel,
+            commons.outputs,
+            zeros,
+            frames,
+        )
+    )
+    gate = make_gate(num_worlds, traffic.capacity, network.arrays, blank.dtype)
+    return Tick(shards, division, traffic, commons, gate, attached)
+
+
+def make_frames(config: EnvConfig, num_worlds: int, zeros: Zeros) -> Frames:
+    """Room for what the rigs of all agents sense."""
+    layout = frame_layout(config, num_worlds)
+    return frames_in({name: zeros(shape, dtype=kind) for name, (kind, shape) in layout.items()})
+
+
+def cut_zones(config: EnvConfig, network: RoadNetwork) -> ZonePartition:
+    """The zones that the settings ask for."""
+    settings = config.zones
+    return cut_map(
+        network,
+        settings.layout,
+        settings.count,
+        avoid_junctions=settings.avoid_junctions,
+        weight=settings.weight,
+    )

@@ -1,0 +1,217 @@
+"""`WorldViews`: what can be read of running worlds, between two steps."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cavmarl.config.env import EnvConfig
+from cavmarl.core.errors import (
+    ConfigError,
+)
+from cavmarl.core.records.arrays import Common, Gate, Outputs, Worlds
+from cavmarl.engine.component import Attached
+from cavmarl.engine.rig_component import MountedSensors
+from cavmarl.engine.tick import Tick
+from cavmarl.engine.traffic_stats import TrafficStats, count_traffic
+from cavmarl.engine.v2x_component import Messaging
+from cavmarl.handoff.coordinator.coordinator import Referee
+from cavmarl.handoff.division import ZoneLoads
+from cavmarl.handoff.fault_injection.recovery import Recovery, Revival
+from cavmarl.handoff.repartitioning import Recut, Recutter
+from cavmarl.handoff.zone_view import ZoneView, view_zones
+from cavmarl.roads.network import RoadNetwork
+from cavmarl.shards.shard import Shard
+from cavmarl.traffic.scenarios.scene import Scene
+from cavmarl.traffic.sumo.sumo_traffic import SumoTraffic
+from cavmarl.v2x.bus import Bus
+from cavmarl.zones.partition.zone_partition import ZonePartition
+
+
+class WorldViews:
+    """Read access to W worlds that run; `Simulation` makes and steps them.
+
+    Attributes:
+        config: of the environment.
+        network: its roads.
+        num_worlds: W.
+        partition: the zones.
+    """
+
+    config: EnvConfig
+    network: RoadNetwork
+    num_worlds: int
+    partition: ZonePartition
+    _shards: Sequence[Shard]
+    _tick: Tick
+    _recovery: Recovery | None
+    _recutter: Recutter | None
+
+    @property
+    def _shard(self) -> Shard:
+        """The first shard; what all shards have in common is read from it."""
+        return self._shards[0]
+
+    @property
+    def shards(self) -> Sequence[Shard]:
+        """One a zone, for who runs their phases."""
+        return self._shards
+
+    @property
+    def capacity(self) -> int:
+        """How many vehicles a world can hold."""
+        return int(self._shard.worlds.rows.shape[1])
+
+    @property
+    def outputs(self) -> Outputs:
+        """What the agents got at the end of the last step; arrays that the next step overwrites."""
+        return self._tick.commons.outputs
+
+    @property
+    def messages(self) -> Bus:
+        """What vehicles and roadside units tell each other.
+
+        Raises:
+            ConfigError: they tell each other nothing.
+        """
+        for part in self._tick.attached:
+            if isinstance(part, Messaging):
+                return part.bus
+        raise ConfigError("nobody says anything here: set v2x.enabled to true")
+
+    @property
+    def gate(self) -> Gate:
+        """Who waits to enter each world, and counts since its reset; a reset may replace it."""
+        return self._tick.gate
+
+    def listen(self, config: EnvConfig) -> tuple[Bus, Callable[[], None]]:
+        """A bus beside the world, for tools that measure: nobody in the world hears of it.
+
+        Args:
+            config: whose `v2x` it is of.
+
+        Returns:
+            the bus, and what lets it send and receive in the present tick.
+        """
+        worlds = self._shard.worlds
+        common = Common(*(getattr(worlds, name) for name in Common._fields))
+        types, zoned = self._shard.travel.types, self._tick.division.zoned
+        bus = Bus(config, self.network, types, zoned, common)
+        return bus, lambda: bus.exchange(self._tick.division.side)
+
+    @property
+    def goal_edges(self) -> NDArray[np.int32]:
+        """EDGE rows of the goals, by `VEHICLE["goal"]`."""
+        return self._tick.traffic.goal_edges
+
+    @property
+    def types(self) -> NDArray[np.void]:
+        """VTYPE (num_types,), by `VEHICLE["vtype"]`."""
+        return self._shard.travel.types
+
+    @property
+    def scene(self) -> Scene | None:
+        """What is played to the agent of each world."""
+        return self._tick.traffic.scene
+
+    @property
+    def plans(self) -> NDArray[np.void]:
+        """PLAN (G, L): the ways of agents, by `VEHICLE["goal"]`."""
+        return self._tick.traffic.plans
+
+    def vehicles(self, world: int = 0) -> NDArray[np.void]:
+        """The live vehicles of one world, VEHICLE records in no order.
+
+        A view, or, where the world is divided, a copy.
+        """
+        return self._tick.division.vehicles(world)
+
+    def zone_loads(self) -> ZoneLoads:
+        """What each zone holds now."""
+        return self._tick.division.loads()
+
+    def zone_view(self, world: int = 0) -> ZoneView:
+        """Who owns and sees which vehicles of one world now."""
+        halo_m, coordination = self.zone_loads().halo_m, self._tick.coordination
+        transfers = () if coordination is None else coordination.in_flight(world)
+        return view_zones(self._shards, self.partition, halo_m, world, transfers)
+
+    def running(self) -> NDArray[np.int64]:
+        """(W,) vehicles of each world."""
+        return self._tick.division.running()
+
+    def ghosts(self, zone: int, world: int = 0) -> NDArray[np.void]:
+        """What a zone sees of other zones' vehicles: VEHICLE (n,), a view that cannot be written.
+
+        It shows the present tick, until the next one.
+        """
+        return self._tick.division.ghosts(world, zone)
+
+    @property
+    def migrations(self) -> int:
+        """How many vehicles have changed their owner since the worlds were made."""
+        return sum(coordinator.switched for coordinator in self.coordinators)
+
+    @property
+    def coordinators(self) -> tuple[Referee, ...]:
+        """Who says who owns what, one a world; none where all is one zone."""
+        return () if self._tick.coordination is None else self._tick.coordination.coordinators
+
+    @property
+    def attached(self) -> tuple[Attached, ...]:
+        """What acts in each tick beside the traffic."""
+        return self._tick.attached
+
+    @property
+    def worlds(self) -> Worlds:
+        """The vehicles and signals of all worlds, for tools that measure; each tick swaps them.
+
+        A copy where worlds are divided.
+        """
+        return self._tick.division.whole()
+
+    @property
+    def mounted(self) -> MountedSensors | None:
+        """The rigs of the agents; None: they have none."""
+        rigs = (part for part in self._tick.attached if isinstance(part, MountedSensors))
+        return next(rigs, None)
+
+    def signal_phases(self, world: int = 0) -> NDArray[np.int32]:
+        """PHASE rows that are on, (num_signals,)."""
+        phases: NDArray[np.int32] = self._shard.worlds.signal_phase[world]
+        return phases
+
+    def ticks(self) -> NDArray[np.int64]:
+        """(W,) ticks since each world's reset."""
+        return self._shard.worlds.ticks
+
+    @property
+    def revivals(self) -> Sequence[Revival]:
+        """What it took to go on after each death; see `zones.faults`."""
+        return () if self._recovery is None else self._recovery.revivals
+
+    @property
+    def recuts(self) -> Sequence[Recut]:
+        """When other zones have been made while the worlds ran; see `zones.recut_steps`."""
+        return () if self._recutter is None else self._recutter.recuts
+
+    @property
+    def sumo(self) -> SumoTraffic | None:
+        """SUMO beside these worlds; None where `traffic.source` is native."""
+        return self._tick.sumo
+
+    def agents_to_come(self) -> NDArray[np.bool_]:
+        """(W,) whether an agent waits to enter."""
+        tick = self._tick
+        longest = int(tick.gate.num_queue.max(initial=0))
+        if longest == 0:
+            return np.zeros(self.num_worlds, dtype=np.bool_)
+        waiting = np.arange(longest) < tick.gate.num_queue[:, None]
+        found = np.any(waiting & (tick.gate.queue["agent"][:, :longest] >= 0), axis=1)
+        return np.asarray(found, dtype=np.bool_)
+
+    def traffic_stats(self, world: int = 0) -> TrafficStats:
+        """Counts and means since the world's reset."""
+        return count_traffic(self._tick.gate, self._tick.division, world)

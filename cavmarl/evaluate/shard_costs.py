@@ -1,0 +1,121 @@
+"""What each shard of some worlds costs, by a clock on every zone's phases."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cavmarl.balance.problem import ShardCost
+from cavmarl.core.errors import ConfigError
+from cavmarl.engine.simulation import Simulation
+from cavmarl.evaluate.driven_worlds import DrivenWorld
+
+__all__ = ["MeasuredRound", "MeasuredWorlds", "measure_rounds", "measure_shards"]
+
+PARTS = 5
+
+
+@dataclass(frozen=True)
+class MeasuredRound:
+    """Some steps of one world.
+
+    Attributes:
+        costs_s: (k,) seconds a tick of each zone.
+        ids: (n,) vehicles after the last step.
+        places: (n, 2) where they are, m.
+        agents: (n,) which of them agents drive.
+    """
+
+    costs_s: NDArray[np.float64]
+    ids: NDArray[np.int64]
+    places: NDArray[np.float64]
+    agents: NDArray[np.bool_]
+
+
+@dataclass(frozen=True)
+class MeasuredWorlds:
+    """Worlds of one environment.
+
+    Attributes:
+        costs: of their shards.
+        places: (n, 2) where the vehicles of all worlds are after the last step, m.
+    """
+
+    costs: tuple[ShardCost, ...]
+    places: NDArray[np.float64]
+
+    def zone_costs_s(self) -> list[float]:
+        """What each zone costs in all worlds together, seconds a tick."""
+        zones = [shard.zone for shard in self.costs]
+        sums: list[float] = np.bincount(zones, [shard.cost_s for shard in self.costs]).tolist()
+        return sums
+
+
+def measure_rounds(
+    simulation: Simulation, rounds: int, steps: int, *, before: int
+) -> Iterator[MeasuredRound]:
+    """Drive one world on from its reset and measure its zones.
+
+    Args:
+        simulation: one world, reset.
+        rounds: that are measured.
+        steps: of each.
+        before: steps that are driven first.
+
+    Raises:
+        ConfigError: a number out of range, or hosts that die by plan.
+    """
+    for name, value in (("rounds", rounds), ("steps", steps), ("before", before)):
+        if value < 1:
+            raise ConfigError(f"{name} = {value}: must be at least 1")
+    clock = simulation.time_shards()
+    world = DrivenWorld(simulation)
+    ticks = steps * simulation.config.clock.ticks_per_step
+    for _ in range(before):
+        world.step(world.commands())
+    clock.take_s()
+    for _ in range(rounds):
+        for _ in range(steps):
+            world.step(world.commands())
+        rows = simulation.vehicles()
+        yield MeasuredRound(
+            costs_s=clock.take_s() / ticks,
+            ids=rows["id"].astype(np.int64),
+            places=np.stack([rows["x"], rows["y"]], axis=1),
+            agents=rows["agent"] >= 0,
+        )
+
+
+def measure_shards(
+    simulation: Simulation, worlds: int, seed: int, *, steps: int, before: int
+) -> MeasuredWorlds:
+    """Costs of all zones of the first `worlds` worlds of a seed, one world after the other.
+
+    Of each zone the median of `PARTS` parts of the steps counts: what happens once, as a kernel
+    that is loaded, is no cost of a zone.
+
+    Args:
+        simulation: one world.
+        worlds: how many.
+        seed: root of all random numbers.
+        steps: that are measured of each world.
+        before: steps that are driven first.
+
+    Raises:
+        ConfigError: too few steps, or hosts that die by plan.
+    """
+    if steps < PARTS:
+        raise ConfigError(f"steps = {steps}: must be at least {PARTS}")
+    costs: list[ShardCost] = []
+    places = []
+    for number in range(worlds):
+        simulation.seed(seed, number)
+        simulation.reset()
+        parts = list(measure_rounds(simulation, PARTS, steps // PARTS, before=before))
+        median_s = np.median([part.costs_s for part in parts], axis=0).tolist()
+        costs += [ShardCost(number, zone, cost_s) for zone, cost_s in enumerate(median_s)]
+        places.append(parts[-1].places)
+    return MeasuredWorlds(tuple(costs), np.concatenate(places))

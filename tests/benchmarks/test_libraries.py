@@ -1,0 +1,43 @@
+"""What the views of libraries cost: each that is installed is measured on the same world."""
+
+from __future__ import annotations
+
+import pytest
+
+from benchmarks import libraries
+from benchmarks.libraries import measure
+from cavmarl.core.errors import ConfigError
+
+
+def test_every_view_is_measured_or_says_how_to_install_it() -> None:
+    found = measure("merge", agents=3, steps=2, at_most=1e-9)
+    assert [row["view"] for row in found.rows] == list(libraries.VIEWS)
+    for row in found.rows:
+        if row["step_ms"] is None:
+            assert "pip install 'cavmarl[" in row["missing"]
+        else:
+            assert row["step_ms"] > 0.0
+    assert found.to_dict()["agents"] == 3
+    assert not found.holds
+
+
+def test_all_views_step_the_same_world() -> None:
+    """The seeds and the actions are the same, so the rewards have to be."""
+    settings = {
+        "agents": 3,
+        "background": 0,
+        "overrides": {"population.mode": "seats", "action.kind": "continuous"},
+    }
+    arrays = libraries._arrays("merge", settings)
+    dicts = libraries._dicts("merge", settings)
+    rows = libraries._gymnasium("merge", settings)
+    for _ in range(20):
+        wanted = arrays()[1].ravel().tolist()  # type: ignore[index]
+        assert list(dicts()[1].values()) == wanted  # type: ignore[index]
+        assert rows()[1].tolist() == wanted  # type: ignore[index]
+
+
+@pytest.mark.parametrize(("name", "value"), [("agents", 0), ("agents", 20_000), ("steps", 0)])
+def test_numbers_out_of_range_are_refused(name: str, value: int) -> None:
+    with pytest.raises(ConfigError, match=f"{name} = {value}: must be from 1 to"):
+        measure("merge", **{name: value})  # type: ignore[arg-type]

@@ -1,0 +1,87 @@
+"""Benchmarks as programs: the list, the options, the table, the JSON, and what is refused."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from benchmarks import balance, moving, profile, selection, sumo
+from benchmarks.__main__ import KEPT, main, programs
+from benchmarks.harness import Report, run
+from cavmarl.cli.bench import app
+from cavmarl.core.errors import ConfigError
+from tests.support.sumo_worlds import tiny_file
+
+
+def test_all_are_listed(capsys: pytest.CaptureFixture[str]) -> None:
+    main([])
+    shown = capsys.readouterr().out
+    kept = {getattr(command.callback, "__name__", "") for command in app.registered_commands}
+    assert kept == set(KEPT)
+    assert {"sharding", "balance", "moving", "recut", "rays", "v2x", "sumo"} <= set(programs())
+    assert all(name in shown for name in KEPT | programs())
+    with pytest.raises(SystemExit, match="no benchmark 'nothing'"):
+        main(["nothing"])
+
+
+def test_a_program_shows_and_writes(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    path = tmp_path / "profile.json"
+    words = ["ring", "--agents", "2", "--steps", "3", "--repeats", "1", "--json", str(path)]
+    with pytest.raises(SystemExit) as ended:
+        run(profile.measure, words)
+    assert not ended.value.code
+    assert "ns a vehicle" in capsys.readouterr().out
+    found = json.loads(path.read_text())
+    assert next(row["ns"] for row in found["rows"] if row["name"] == "sense") > 0.0
+    assert found["hardware"]["usable_cores"] >= 1
+
+
+def test_a_bound_that_does_not_hold_is_exit_code_1() -> None:
+    def measure(say: Any) -> Report:
+        return Report("a", {"name": "name"}, [{"name": "b"}], holds=False)
+
+    with pytest.raises(SystemExit) as ended:
+        run(measure, [])
+    assert ended.value.code == 1
+
+
+def test_an_error_is_one_line_and_exit_code_2(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as ended:
+        run(balance.measure, ["grid4x4", "--workers", "0"])
+    assert ended.value.code == 2
+    assert "workers = 0: must be at least 1" in capsys.readouterr().err
+
+
+def test_worlds_that_move_are_measured() -> None:
+    small = {"worlds": 2, "lead": 4, "every": 2, "steps": 2, "repeats": 1}
+    found = moving.measure("grid4x4", **small, at_least=1e9)  # type: ignore[arg-type]
+    assert [row["name"] for row in found.rows] == ["fixed", "moving"]
+    assert found.facts["ratio"] > 0.0
+    assert not found.holds
+    with pytest.raises(ConfigError, match="at least 2 workers"):
+        moving.measure(workers=1)
+
+
+def test_weights_of_the_score_are_studied() -> None:
+    found = selection.measure(choices=100)
+    assert found.facts["choices"] == 100
+    for row in found.rows:
+        assert 0.0 < row["changed"] < 1.0
+        assert row["regret"] > 0.0
+    assert found.rows[2]["changed"] < found.rows[6]["changed"]
+    assert set(found.facts["latency_us"]) == {"p50", "p95", "p99"}
+    assert selection.measure(choices=100).rows == found.rows
+    with pytest.raises(ConfigError, match="choices = 0"):
+        selection.measure(choices=0)
+
+
+@pytest.mark.slow
+def test_a_coupled_world_is_measured_beside_libsumo(tmp_path: Path) -> None:
+    pytest.importorskip("libsumo", reason="needs the extra 'sumo'")
+    found = sumo.measure("grid4x4", [tiny_file(tmp_path)], after=5, repeats=1, agents=1)
+    alone, coupled = found.rows
+    assert 0.0 < alone["low_ms"] <= alone["high_ms"]
+    assert coupled["median_ms"] > 0.0

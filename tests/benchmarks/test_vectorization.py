@@ -1,0 +1,35 @@
+"""What worker processes cost in which nothing happens, ours and others'."""
+
+from __future__ import annotations
+
+import sys
+
+import pytest
+
+from benchmarks.vectorization import LIBRARIES, measure
+from cavmarl.core.errors import ConfigError
+
+pytestmark = pytest.mark.filterwarnings("ignore")  # what the libraries warn of themselves
+
+
+def test_each_library_steps_the_same_agents() -> None:
+    pytest.importorskip("supersuit", reason="needs the extra: supersuit")
+    found = measure(agents=4, workers=2, repeats=1)
+    rows = {row["library"]: row for row in found.rows}
+    assert list(rows) == list(LIBRARIES)
+    assert all(len(row["step_us"]) == 1 and row["step_us"][0] > 0.0 for row in rows.values())
+    assert rows["cavmarl"]["ratio"] == 1.0
+    gymnasium, order = rows["gymnasium"], rows["our workers alone"]
+    assert gymnasium["order_ratio"] == gymnasium["step_us"][0] / order["step_us"][0]
+
+
+def test_a_library_that_is_missing_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "supersuit", None)
+    found = measure(agents=2, workers=2, repeats=1)
+    assert "cavmarl[supersuit]" in found.facts["missing"]["supersuit"]
+    assert "ratio" not in found.rows[-1]
+
+
+def test_agents_are_shared_out_evenly() -> None:
+    with pytest.raises(ConfigError, match="5 agents over 2 workers"):
+        measure(agents=5, workers=2)

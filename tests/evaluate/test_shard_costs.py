@@ -1,0 +1,62 @@
+"""What shards cost: whose time it is, and that a clock changes nothing. No figure is a time's."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from cavmarl.core.errors import ConfigError
+from cavmarl.engine.simulation import Simulation
+from cavmarl.evaluate.driven_worlds import DrivenWorld, world_maker
+from cavmarl.evaluate.shard_costs import measure_rounds, measure_shards
+
+
+@pytest.fixture
+def simulation() -> Simulation:
+    return world_maker("grid4x4", seconds=60, agents=4, background=20, seed=1)(4)
+
+
+def test_a_clock_on_each_zone_changes_nothing(simulation: Simulation) -> None:
+    plain = DrivenWorld(world_maker("grid4x4", seconds=60, agents=4, background=20, seed=1)(4))
+    rounds = list(measure_rounds(simulation, 2, 5, before=5))
+    for _ in range(15):
+        plain.step(plain.commands())
+    assert simulation.state_hash() == plain.simulation.state_hash()
+    assert np.array_equal(
+        np.sort(rounds[-1].ids), np.sort(plain.simulation.vehicles()["id"].astype(np.int64))
+    )
+    assert rounds[-1].agents.sum() == 4
+    assert rounds[-1].places.shape == (len(rounds[-1].ids), 2)
+
+
+def test_every_zone_takes_some_time(simulation: Simulation) -> None:
+    found = measure_shards(simulation, 2, 1, steps=10, before=2)
+    costs = found.costs
+    assert [(shard.world, shard.zone) for shard in costs] == [
+        (world, zone) for world in (0, 1) for zone in range(4)
+    ]
+    assert all(shard.cost_s > 0.0 for shard in costs)
+    assert found.zone_costs_s() == [
+        costs[zone].cost_s + costs[4 + zone].cost_s for zone in range(4)
+    ]
+    assert len(found.places) > 24
+
+
+def test_what_drivers_would_do_is_no_cost(simulation: Simulation) -> None:
+    clock = simulation.time_shards()
+    simulation.suggest(np.zeros((*simulation.outputs.present.shape, 2)))
+    assert not clock.take_s().any()
+
+
+def test_numbers_are_checked(simulation: Simulation) -> None:
+    with pytest.raises(ConfigError, match="steps = 4"):
+        measure_shards(simulation, 1, 0, steps=4, before=1)
+    with pytest.raises(ConfigError, match="before = 0"):
+        next(measure_rounds(simulation, 1, 1, before=0))
+
+
+def test_where_hosts_die_nothing_is_timed() -> None:
+    faults = '{"crash_rate": 0.1}'
+    make = world_maker("grid4x4", seconds=60, overrides={"zones.faults": faults})
+    with pytest.raises(ConfigError, match="no host dies"):
+        make(4).time_shards()

@@ -1,0 +1,91 @@
+"""Thirty faults, one at a time: each has to fail the tests that guard its place.
+
+    python -m tests.mutations            # all rows of mutations.md
+    python -m tests.mutations 3 14       # some of them
+
+Each row of `mutations.md` names a file, a piece of it that occurs once, what replaces it, and the
+tests. The checkout is copied, the piece is replaced, the tests run there (kernels without the
+compiler), and the copy is removed. Exit code 1: a fault was not noticed, or a row no longer fits.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+import shutil
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+from typing import NamedTuple
+
+ROOT = Path(__file__).resolve().parents[1]
+TABLE = Path(__file__).with_name("mutations.md")
+ROW = re.compile(r"^\| (\d+) \| `([^`]+)` \| `([^`]+)` \| `([^`]+)` \| `([^`]+)` \|$", re.MULTILINE)
+COPIED = ("cavmarl", "tests", "envs", "agents", "configs", "train", "pyproject.toml")
+
+
+class Mutation(NamedTuple):
+    """A row of the table: `old` in `file` becomes `new`, and `tests` have to fail."""
+
+    number: int
+    file: str
+    old: str
+    new: str
+    tests: str
+
+
+def read_table() -> list[Mutation]:
+    return [Mutation(int(number), *rest) for number, *rest in ROW.findall(TABLE.read_text())]
+
+
+def mutated(mutation: Mutation) -> str:
+    """The file's text with the fault in it."""
+    text = (ROOT / mutation.file).read_text()
+    found = text.count(mutation.old)
+    if found != 1:
+        raise ValueError(f"row {mutation.number}: {mutation.old!r} is {found} times in the file")
+    return text.replace(mutation.old, mutation.new)
+
+
+def is_caught(mutation: Mutation) -> bool:
+    with tempfile.TemporaryDirectory(prefix="mutation-") as folder:
+        place = Path(folder) / "checkout"
+        place.mkdir()
+        for name in COPIED:
+            source = ROOT / name
+            if source.is_dir():
+                shutil.copytree(source, place / name, ignore=shutil.ignore_patterns("__pycache__"))
+            else:
+                shutil.copy(source, place / name)
+        (place / mutation.file).write_text(mutated(mutation))
+        maps = os.environ.get("CAVMARL_SHARED_MAPS", str(ROOT.parent / "shared" / "maps"))
+        plain = {"NUMBA_DISABLE_JIT": "1"} if "/kernels/" in mutation.file else {}
+        words = [sys.executable, "-m", "pytest", "-q", "-x", "-p", "no:cacheprovider"]
+        done = subprocess.run(
+            [*words, *mutation.tests.split()],
+            cwd=place,
+            env={**os.environ, **plain, "PYTHONPATH": str(place), "CAVMARL_SHARED_MAPS": maps},
+            capture_output=True,
+            text=True,
+        )
+        if done.returncode not in (0, 1):
+            raise ValueError(f"row {mutation.number}: pytest ended with {done.stdout[-2000:]}")
+        return done.returncode == 1
+
+
+def main(chosen: list[str]) -> int:
+    missed = 0
+    for mutation in read_table():
+        if chosen and str(mutation.number) not in chosen:
+            continue
+        caught = is_caught(mutation)
+        missed += not caught
+        print(
+            f"{mutation.number:3d} {'caught' if caught else 'MISSED'}  {mutation.file}", flush=True
+        )
+    return min(missed, 1)
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))

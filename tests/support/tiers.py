@@ -1,0 +1,105 @@
+"""Which tests are dear: those that start processes, or read SUMO or real maps.
+
+A test is `integration` where its file says so by what it imports or calls, or where a fixture of
+it makes a map; it is `slow` where it is marked so; the rest are unit tests. A test is `alone`
+where it measures time, memory or cores, or kills: nothing may run beside it.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+import sys
+import time
+from collections.abc import Iterator
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+__all__ = ["ALONE_FILES", "ProcessWatch", "mark", "skip_if_late"]
+
+_OF_PROCESSES = re.compile(
+    r"^import (subprocess|multiprocessing|libsumo)\b"
+    r"|^from tests\.support\.(sumo_worlds|netgenerate|toy_hosts|toy_job|world_hosts) import"
+    r"|importorskip\(\"(libsumo|ray)\""
+    r"|\bworkers=(?!0\b)|\bhosts=",
+    re.MULTILINE,
+)
+_STARTS = {"subprocess.Popen", "os.fork", "os.posix_spawn", "os.system"}
+_MAP_FIXTURES = {"shared_maps", "built_map", "town", "town_file"}
+_DEAR_FOLDERS = ("tests/cosim/", "tests/train/")
+
+# They measure time, memory or cores, or count on being let run at once.
+ALONE_FILES: tuple[str, ...] = (
+    "tests/bench/test_core_ceiling.py",
+    "tests/parallel/test_core_placement.py",
+    "tests/parallel/test_shared_huge_pages.py",
+    "tests/parallel/test_watchdog.py",
+    "tests/test_memory.py",
+)
+
+
+def mark(item: pytest.Item) -> None:
+    """Say which tier a test is of, and whether it runs alone."""
+    path = item.path.relative_to(item.config.rootpath).as_posix()
+    of_maps = _MAP_FIXTURES & set(getattr(item, "fixturenames", ()))
+    if of_maps or path.startswith(_DEAR_FOLDERS) or _starts_processes(item.path):
+        item.add_marker(pytest.mark.integration)
+    elif _has_twin(item.path):
+        item.add_marker(pytest.mark.twin)
+    if path in ALONE_FILES:
+        item.add_marker(pytest.mark.alone)
+
+
+@cache
+def _starts_processes(path: Path) -> bool:
+    return _OF_PROCESSES.search(path.read_text(encoding="utf-8")) is not None
+
+
+@cache
+def _has_twin(path: Path) -> bool:
+    return "\nfrom tests.naive" in path.read_text(encoding="utf-8")
+
+
+def skip_if_late() -> None:
+    """Skip a test once the time of `make quick` is over."""
+    until_s = float(os.environ.get("CAVMARL_QUICK_UNTIL_S", "inf"))
+    if time.time() > until_s:
+        pytest.skip("the time of `make quick` is over: left to `make test`")
+
+
+class ProcessWatch:
+    """A plugin that names the unit tests which have started a process after all."""
+
+    def __init__(self) -> None:
+        self.found: set[str] = set()
+        self._started = False
+        sys.addaudithook(self._look)
+
+    def pytest_runtest_logstart(self) -> None:
+        """A test begins."""
+        self._started = False
+
+    @pytest.hookimpl(wrapper=True)
+    def pytest_runtest_makereport(self, item: pytest.Item) -> Iterator[Any]:
+        """A phase of a test is over: its report carries whether it was what its tier says."""
+        report = yield
+        is_unit = not any(item.iter_markers("integration")) and not any(item.iter_markers("slow"))
+        report.is_no_unit, self._started = self._started and is_unit, False
+        return report
+
+    def pytest_runtest_logreport(self, report: Any) -> None:
+        """The report of a phase has come."""
+        if report.is_no_unit:
+            self.found.add(report.nodeid)
+
+    def pytest_terminal_summary(self, terminalreporter: Any) -> None:
+        """Name them."""
+        for name in sorted(self.found):
+            terminalreporter.write_line(f"a unit test has started a process: {name}")
+
+    def _look(self, event: str, _: tuple[Any, ...]) -> None:
+        if event in _STARTS:
+            self._started = True

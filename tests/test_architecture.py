@@ -1,0 +1,64 @@
+"""`docs/architecture.md` says what the tree and the contract of imports say."""
+
+from __future__ import annotations
+
+import re
+import tomllib
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[1]
+PAGE = (ROOT / "docs/architecture.md").read_text(encoding="utf-8")
+PACKAGE = ROOT / "cavmarl"
+MAX_WORDS = 1_500
+ELSEWHERE = {"cavmarl/data/", "kernels/"}  # in the wheel; in many folders
+QUESTIONS = re.findall(r"^\| ([^|]+\?) \| (.+) \|$", PAGE, re.MULTILINE)
+
+
+def test_the_page_is_short() -> None:
+    words = [word for word in PAGE.split() if re.search(r"\w", word)]  # no bars of tables
+    assert len(words) <= MAX_WORDS
+
+
+def test_the_drawing_has_the_layers_of_the_contract_in_their_order() -> None:
+    drawing = re.search(r"<!-- layers -->\n```\n(.*?)\n```\n<!-- end -->", PAGE, re.DOTALL)
+    assert drawing
+    inside = [line.split("│")[1] for line in drawing[1].splitlines() if "│" in line]
+    assert [re.findall(r"\w+|\|", line) for line in inside] == layers()
+
+
+def test_the_table_of_the_package_has_each_folder_once() -> None:
+    rows = re.findall(r"^\| `(\w+)/` \|", section("The package"), re.MULTILINE)
+    folders = {path.parent.name for path in PACKAGE.glob("*/__init__.py")}
+    assert sorted(rows) == sorted(folders)
+
+
+def test_there_are_twenty_questions() -> None:
+    assert len(QUESTIONS) >= 20
+
+
+@pytest.mark.parametrize(("question", "answer"), QUESTIONS)
+def test_the_file_that_answers_a_question_exists(question: str, answer: str) -> None:
+    paths = re.findall(r"`([\w/]+\.py)`", answer)
+    assert paths, question
+    for path in paths:
+        assert (PACKAGE / path).is_file(), path
+
+
+def test_every_place_that_the_page_names_exists() -> None:
+    for path in re.findall(r"`(\w+/[\w/]*(?:\.py)?)`", PAGE):
+        assert (PACKAGE / path).exists() or (ROOT / path).exists() or path in ELSEWHERE, path
+
+
+def layers() -> list[list[str]]:
+    """Names of each layer of the contract; "|" where siblings may not import each other."""
+    settings = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))
+    contracts = settings["tool"]["importlinter"]["contracts"]
+    contract = next(contract for contract in contracts if contract["id"] == "layers")
+    return [re.findall(r"\w+|\|", layer) for layer in contract["layers"]]
+
+
+def section(title: str) -> str:
+    """What stands under a heading of the page."""
+    return PAGE.split(f"\n## {title}\n")[1].split("\n## ")[0]

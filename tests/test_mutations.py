@@ -1,0 +1,17 @@
+"""The table of mutations fits the code; `python -m tests.mutations` shows that each is caught."""
+
+from __future__ import annotations
+
+import pytest
+
+from tests.mutations import ROOT, Mutation, mutated, read_table
+
+
+def test_there_are_thirty() -> None:
+    assert [mutation.number for mutation in read_table()] == list(range(1, 31))
+
+
+@pytest.mark.parametrize("mutation", read_table(), ids=lambda mutation: str(mutation.number))
+def test_a_row_fits_the_code(mutation: Mutation) -> None:
+    assert mutated(mutation) != (ROOT / mutation.file).read_text()
+    assert all((ROOT / test).exists() for test in mutation.tests.split())

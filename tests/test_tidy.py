@@ -1,0 +1,126 @@
+"""The house is tidy: small files, short functions, one name for one thing, the field's words.
+
+Exceptions are named, and wait to go; nothing new joins them.
+"""
+
+from __future__ import annotations
+
+import ast
+import re
+from collections import defaultdict
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[1]
+FOLDERS = ("cavmarl", "tests", "train", "agents", "fuzz", "docs", "examples")
+
+FILE_LINES = 450
+LONG_FILES = {
+    "cavmarl/config/env.py",
+    "cavmarl/config/rig.py",
+    "cavmarl/core/errors.py",
+    "cavmarl/driving/kernels/drivers.py",
+    "cavmarl/engine/simulation.py",
+    "cavmarl/env/parallel.py",
+    "cavmarl/handoff/division.py",
+    "cavmarl/traffic/native.py",
+    "tests/driving/test_junctions.py",
+    "tests/ownership/test_rules.py",
+    "tests/parallel/test_worker_pool.py",
+    "tests/test_bad_input.py",
+}
+
+FUNCTION_LINES = 70
+LONG_FUNCTIONS = {
+    "cavmarl/bench/clock_drift.py:measure_drift",
+    "cavmarl/bench/moving_speed.py:measure_moving",
+    "cavmarl/bench/v2x_speed.py:measure_v2x",
+    "cavmarl/bench/worker_speed.py:measure_workers",
+    "cavmarl/cli/bench/sensors.py:sensors",
+    "cavmarl/cli/bench/workers.py:workers",
+    "cavmarl/cli/plan.py:plan",
+    "cavmarl/cli/verify/__init__.py:verify",
+    "cavmarl/driving/kernels/drivers.py:_road_ahead",
+    "cavmarl/driving/kernels/drivers.py:decide",
+    "cavmarl/driving/kernels/lane_choice.py:_change_is_safe",
+    "cavmarl/engine/simulation.py:__init__",
+    "cavmarl/handoff/kernels/invariant_checks.py:watch",
+    "cavmarl/parallel/pooled_worlds.py:__init__",
+    "cavmarl/shards/kernels/world_phases.py:advance",
+    "cavmarl/verify/equivalence.py:verify_zones",
+    "cavmarl/verify/worker_kills.py:verify_kills",
+}
+
+# Public classes of one name in several modules.
+SHARED_CLASS_NAMES = set(
+    """
+    Answer Camera Change Clock Collector Control Difference Entry Follower Heard Host Image Job
+    Line Measured Moment Monitor Mount Move Outcome Parameters Placement Plan Pose Program Rates
+    Refusal Replica Room Row Run Samples Scene Schedule Seat Selection Sensor SensorJob Sight
+    Simulation Snapshot State SumoConfig Tally Tick Turn Watch Window World
+    """.split()
+)
+
+# Persons where the field says vehicle, zone, worker. These numbers may only fall.
+PERSONS = re.compile(r"\b(who|whoever|nobody|somebody)\b", re.IGNORECASE)
+PERSONS_AT_MOST = {"cavmarl": 859, "docs": 255}
+
+
+def sources(*folders: str) -> Iterator[tuple[str, str]]:
+    """Each Python file's path within the repository, and its text."""
+    for folder in folders:
+        for path in sorted((ROOT / folder).rglob("*.py")):
+            yield path.relative_to(ROOT).as_posix(), path.read_text(encoding="utf-8")
+
+
+def test_files_are_short() -> None:
+    long = {path for path, text in sources(*FOLDERS) if text.count("\n") > FILE_LINES}
+    assert long <= LONG_FILES, f"over {FILE_LINES} lines: divide {sorted(long - LONG_FILES)}"
+
+
+def test_functions_fit_on_a_screen() -> None:
+    long = {
+        f"{path}:{node.name}"
+        for path, text in sources(*FOLDERS)
+        for node in ast.walk(ast.parse(text))
+        if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef)
+        and (node.end_lineno or 0) - node.lineno >= FUNCTION_LINES
+    }
+    assert long <= LONG_FUNCTIONS, f"over {FUNCTION_LINES} lines: {sorted(long - LONG_FUNCTIONS)}"
+
+
+def test_no_two_modules_have_one_name() -> None:
+    places = defaultdict(list)
+    for path, _ in sources("cavmarl"):
+        _, *folders, file = path.split("/")
+        if not file.startswith("_") and not {"cli", "config"} & set(folders):
+            places[file].append(path)
+    shared = [paths for paths in places.values() if len(paths) > 1]
+    assert not shared, f"one of each wants a name of its own: {shared}"
+
+
+def test_no_two_public_classes_have_one_name() -> None:
+    places = defaultdict(list)
+    for path, text in sources("cavmarl"):
+        for node in ast.parse(text).body:
+            if isinstance(node, ast.ClassDef) and not node.name.startswith("_"):
+                places[node.name].append(path)
+    shared = {
+        name: paths
+        for name, paths in places.items()
+        if len(paths) > 1 and name not in SHARED_CLASS_NAMES
+    }
+    assert not shared, f"one of each wants a name of its own: {shared}"
+
+
+@pytest.mark.parametrize("folder", PERSONS_AT_MOST)
+def test_things_are_not_called_persons(folder: str) -> None:
+    if folder == "docs":
+        paths = [*(ROOT / "docs").rglob("*.md"), ROOT / "README.md", ROOT / "CONTRIBUTING.md"]
+        texts = [path.read_text(encoding="utf-8") for path in paths]
+    else:
+        texts = [text for _, text in sources(folder)]
+    found = sum(len(PERSONS.findall(text)) for text in texts)
+    assert found <= PERSONS_AT_MOST[folder], "say vehicle, zone, worker, message"
