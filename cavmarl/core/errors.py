@@ -2,8 +2,8 @@
 
     CavmarlError
     ├── ConfigError            a key, a value, a combination or a division that cannot work
-    │   └── UnknownEnvironmentError   no entry, path or map of that name
-    ├── ScenarioError          a map without a place for a scenario
+    │   ├── UnknownEnvironmentError   no entry, path or map of that name
+    │   └── ScenarioError         a map without a place for a scenario
     ├── MapError               a map that cannot be read, built or driven
     │   └── RouteError            no way from here to there
     ├── DemandError            a file of traffic that cannot be read or does not fit its map
@@ -84,7 +84,7 @@ class UnknownEnvironmentError(ConfigError):
     """No environment, folder or map file of that name."""
 
 
-class ScenarioError(CavmarlError):
+class ScenarioError(ConfigError):
     """A map that has no place for a scenario."""
 
 
