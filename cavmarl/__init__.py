@@ -26,22 +26,30 @@ from cavmarl.core.errors import (
     MissingActionError,
     MissingExtraError,
     PolicyError,
+    RegisteredFunctionError,
     ResetNeededError,
     RouteError,
     UnknownAgentError,
     UnknownEnvironmentError,
     WorkerError,
 )
+from cavmarl.driving.agent_view import AgentView
+from cavmarl.driving.driver_models import register_driver_model
 from cavmarl.env.parallel import CavEnv, parallel_env
 from cavmarl.env.registration import env, raw_env, register_all
 from cavmarl.env.vector import CavVectorEnv, make_vec
+from cavmarl.parallel.backends import register_backend
 from cavmarl.policies.policy import Policy, load_policy
+from cavmarl.rewards.registered_terms import register_term
+from cavmarl.sensors.observed.feature import Feature
+from cavmarl.sensors.registry import register_sensor
 
 __version__ = "0.1.0"
 
 __all__ = [
     "TERMS",
     "ActionError",
+    "AgentView",
     "CapacityError",
     "CavEnv",
     "CavVectorEnv",
@@ -52,6 +60,7 @@ __all__ = [
     "EpisodeEndedError",
     "EpisodeError",
     "EvaluationError",
+    "Feature",
     "InvalidActionError",
     "ManifestError",
     "MapError",
@@ -59,6 +68,7 @@ __all__ = [
     "MissingExtraError",
     "Policy",
     "PolicyError",
+    "RegisteredFunctionError",
     "ResetNeededError",
     "RouteError",
     "UnknownAgentError",
@@ -70,6 +80,10 @@ __all__ = [
     "make_vec",
     "parallel_env",
     "raw_env",
+    "register_backend",
+    "register_driver_model",
+    "register_sensor",
+    "register_term",
 ]
 
 register_all()

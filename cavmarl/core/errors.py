@@ -502,6 +502,10 @@ class SumoStateError(SumoError):
     """SUMO says what does not fit the world: another time, an unknown signal state."""
 
 
+class RegisteredFunctionError(CavmarlError):
+    """A function that was registered from outside answers what it must not."""
+
+
 class PolicyError(CavmarlError):
     """A policy that cannot be found, loaded, or seated in this environment."""
 
