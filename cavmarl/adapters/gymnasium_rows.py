@@ -62,7 +62,6 @@ class CavAgentRows(VectorEnv[Any, Any, Any]):
         refuse_decided(DECIDED, overrides, arguments)
         wanted = {"population.mode": "seats", **(overrides or {})}
         self._vec = make_vec(
-        self._term_names = self._vec.config.terms.names
             env,
             num_envs=num_worlds,
             autoreset_mode=autoreset_mode,
@@ -71,6 +70,7 @@ class CavAgentRows(VectorEnv[Any, Any, Any]):
         )
         self.closed = False
         self._shape = (num_worlds, self._vec.num_agents)
+        self._term_names = self._vec.config.terms.names
         self._form = ObservationForm(self._vec.config)
         self._same_step = self._vec.metadata["autoreset_mode"] is AutoresetMode.SAME_STEP
         self.num_envs = num_envs
@@ -103,9 +103,7 @@ class CavAgentRows(VectorEnv[Any, Any, Any]):
         observations, rewards, ended, cut, infos = self._vec.step(
             actions.reshape(*self._shape, *actions.shape[1:])
         )
-        terms = {
-            name: infos["terms"][..., k] for k, name in enumerate(self._term_names)
-        }
+        terms = {name: infos["terms"][..., k] for k, name in enumerate(self._term_names)}
         told = self._told({"active": infos["mask"], "vehicle_done": infos["vehicle_done"], **terms})
         over = self._rows(ended | cut)
         if self._same_step and over.any():

@@ -25,6 +25,16 @@ CONTROL_M, CONTROL_MPS = 0.2, 0.1  # nearer than so
 CLOSING_SPACE, CLOSING_SPEED = 0.04, 0.8  # the gap is larger
 AVOIDING_SPACE, AVOIDING_SPEED = 0.8, 0.23  # it is smaller
 EMERGENCY_MPS = 2.0
+SLOW_MPS, FAST_MPS = 10.8, 15.0  # the slower, the more room beyond the time gap:
+SLOW_ROOM_M = 2.0  # below the first; above the second none
+
+
+@kernel
+def _extra_room_m(speed: float) -> float:
+    """The room in m that is kept beyond the time gap."""
+    if speed >= FAST_MPS:
+        return 0.0
+    return 75.0 / speed - 5.0 if speed >= SLOW_MPS else SLOW_ROOM_M
 
 
 @kernel
@@ -54,7 +64,7 @@ def acc_acceleration(
     if room == math.inf:
         return asked
     if room <= SPEED_MODE_S * speed:
-        error = room - tau * speed
+        error = room - tau * speed - _extra_room_m(speed)
         faster = front_speed - speed
         if error < 0.0:
             asked = min(asked, AVOIDING_SPACE * error + AVOIDING_SPEED * faster)
