@@ -20,6 +20,7 @@ from cavmarl.config.scenario import ScenarioConfig
 from cavmarl.config.sensors import SensorsConfig
 from cavmarl.config.sumo import SumoConfig
 from cavmarl.config.v2x import V2xConfig
+from cavmarl.core.extensions import REGISTERED_TERMS
 
 __all__ = [
     "MAX_ZONES",
@@ -290,6 +291,8 @@ class TrafficConfig(Section, key="traffic"):
         min_trip_m: shortest way of an agent between origin and destination.
         max_trip_m: longest way of an agent; 0: no limit.
         speed_factor_spread: half width of the drivers' uniform spread of desired speed over limit.
+        model: how the generator's vehicles follow their leader: `IDM`, `Krauss`, `ACC`, or a model
+            that is registered (docs/extending.md). Those of `demand` drive as their type says.
     """
 
     source: Literal["native", "sumo-demand", "sumo-traffic"] = "native"
@@ -301,6 +304,7 @@ class TrafficConfig(Section, key="traffic"):
     min_trip_m: Annotated[float, Within(0.0, 1e6)] = 100.0
     max_trip_m: Annotated[float, Within(0.0, 1e6)] = 0.0
     speed_factor_spread: Annotated[float, Within(0.0, 0.5)] = 0.1
+    model: str = "IDM"
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -396,10 +400,30 @@ class TermsConfig(Section, key="terms"):
     def __post_init__(self) -> None:
         super().__post_init__()
         for name, weight in self.weights.items():
+            known = (*TERMS, *REGISTERED_TERMS.names)
             _check(
-                name in TERMS, "terms.weights", name, f"no such term; there are {', '.join(TERMS)}"
+                name in known,
+                "terms.weights",
+                name,
+                f"no such term; there are {', '.join(known)}, or add one with "
+                "cavmarl.register_term",
             )
             _check_finite(f"terms.weights.{name}", weight, -1e6, 1e6)
+
+    @property
+    def registered(self) -> tuple[str, ...]:
+        """The weighted terms that are not of the package."""
+        return tuple(name for name in self.weights if name not in TERMS)
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """All terms of the world, in the order of every terms array."""
+        return (*TERMS, *self.registered)
+
+    @property
+    def weight_of_each(self) -> tuple[float, ...]:
+        """Their weights, in the same order."""
+        return tuple(self.weights.get(name, 0.0) for name in self.names)
 
 
 @dataclass(frozen=True)
@@ -533,6 +557,11 @@ class EnvConfig:
             self.scenario.name,
             f"traffic.source = {source}: scenes are for native traffic; leave one out",
         )
+
+    @property
+    def registered(self) -> tuple[str, ...]:
+        """What it may name from outside of the package."""
+        return (*self.terms.registered, *self.sensors.registered, self.traffic.model)
 
     @property
     def max_steps(self) -> int:

@@ -13,6 +13,7 @@ from dataclasses import dataclass, field, replace
 from typing import Annotated, Literal
 
 from cavmarl.config.checks import Section, Whole, Within, check, check_finite
+from cavmarl.core.extensions import REGISTERED_SENSORS
 
 __all__ = [
     "GRID_FEATURES",
@@ -295,6 +296,8 @@ class SensorsConfig(Section, key="sensors"):
 
     Attributes:
         stack: observations in one: the last ones, oldest first. At first all are the first.
+        registered: sensors from outside of the package that are on, by name (docs/extending.md);
+            their features follow those of all others.
     """
 
     stack: Annotated[int, Whole(1, 64)] = 1
@@ -309,6 +312,7 @@ class SensorsConfig(Section, key="sensors"):
     lidar_observation: LidarObservationConfig = field(default_factory=LidarObservationConfig)
     roadgraph: RoadgraphConfig = field(default_factory=RoadgraphConfig)
     messages: MessagesConfig = field(default_factory=MessagesConfig)
+    registered: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -326,7 +330,13 @@ class SensorsConfig(Section, key="sensors"):
             self.messages.objects,
             self.messages.events,
             self.messages.signal,
+            len(self.registered),
         )
+        for name in self.registered:
+            there = name in REGISTERED_SENSORS
+            check(there, "sensors.registered", name, REGISTERED_SENSORS.advice())
+        once = len(set(self.registered)) == len(self.registered)
+        check(once, "sensors.registered", self.registered, "must name each sensor once")
         check(any(counts), "sensors", "all off", "an agent must observe something; switch one on")
 
     def without_sight(self) -> SensorsConfig:
@@ -340,6 +350,7 @@ class SensorsConfig(Section, key="sensors"):
             kinematics=replace(self.kinematics, vehicles_count=0),
             occupancy_grid=replace(self.occupancy_grid, features=()),
             lidar_observation=replace(self.lidar_observation, cells=0),
+            registered=(),
         )
 
 

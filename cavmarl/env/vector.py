@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, Literal, TypeAlias
+from typing import Any, TypeAlias
 
 import numpy as np
 from gymnasium.vector import AutoresetMode
@@ -24,10 +24,10 @@ from cavmarl.engine.spaces import (
     frames_space,
     sensed_observation,
 )
-from cavmarl.engine.world_setup import check_agents, check_hosts, make_world
+from cavmarl.engine.world_setup import check_agents, make_world
 from cavmarl.env.actions import ActionDecoder
 from cavmarl.env.declared_events import DeclaredEvents
-from cavmarl.parallel.backends import make_worlds
+from cavmarl.parallel.backends import check_hosts, make_worlds
 from cavmarl.parallel.step_arrays import SteppedWorlds
 from cavmarl.sensors.mounted.frames import SensorFrames
 from cavmarl.shards.shard import Commands
@@ -53,8 +53,8 @@ def make_vec(
     *,
     num_envs: int = 1,
     zones: int | None = None,
-    workers: int | Literal["ray"] | None = None,
-    hosts: Literal["ray"] | None = None,
+    workers: int | str | None = None,
+    hosts: str | None = None,
     sensor_workers: int | None = None,
     agents: int | None = None,
     background: int | None = None,

@@ -47,7 +47,7 @@ class Recorder:
         self._half = max_steps / 2.0
         self._step_s = step_s
         self._weights = weights
-        self._sums = np.zeros((*shape, len(TERMS)))
+        self._sums = np.zeros((*shape, weights.size))
         self._rewards = np.zeros(shape)
         self._worst_ttc = np.zeros(shape)
         self._short_ttc = np.zeros(shape, dtype=np.int64)
@@ -55,7 +55,7 @@ class Recorder:
         self._began = np.zeros(shape, dtype=np.int64)
         self._world_steps = np.zeros(num_worlds, dtype=np.int64)
         self._background_arrivals = np.zeros(num_worlds, dtype=np.int64)
-        self._world_terms = np.zeros((num_worlds, len(TERMS)))
+        self._world_terms = np.zeros((num_worlds, weights.size))
         self._world_rewards = np.zeros(num_worlds)
         self._trips: list[NDArray[np.void]] = []
         self.least_pet_s = np.full(shape, np.inf)  # written by whoever watches the junctions

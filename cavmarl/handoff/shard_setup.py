@@ -12,6 +12,7 @@ from cavmarl.driving.kernels.motion import MAX_SPEED_MPS
 from cavmarl.handoff.division import Division
 from cavmarl.ownership.distances import Distances, check_coverage, needed_overlap_m
 from cavmarl.ownership.limits import DeadlinePolicy, Limits
+from cavmarl.rewards.registered_terms import terms_reach_m
 from cavmarl.roads.network import RoadNetwork
 from cavmarl.sensors.mounted.catalogue import rig_reach_m
 from cavmarl.sensors.observed import largest_radius_m, sensing_reach_m
@@ -54,7 +55,11 @@ def divide(
     """
     settings, dt = config.zones, config.clock.sim_dt_s
     radius_m = largest_radius_m(traffic.travel.types)
-    sensing_m = max(sensing_reach_m(config.sensors, radius_m), rig_reach_m(config.rig, radius_m))
+    sensing_m = max(
+        terms_reach_m(config.terms),
+        sensing_reach_m(config.sensors, radius_m),
+        rig_reach_m(config.rig, radius_m),
+    )
     reach_m = max(driving_reach_m(network, traffic.travel), sensing_m)
     fastest_mps = longest_move_m(network, traffic.travel, dt) / dt
     wide_m = halo_m(config, reach_m, partition.count, fastest_mps)

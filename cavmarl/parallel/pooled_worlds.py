@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from cavmarl.core.errors import ConfigError, WorkerError, WorkerFailureError
+from cavmarl.core.extensions import extension_modules
 from cavmarl.engine.compilation import compiled_before
 from cavmarl.engine.simulation import Simulation
 from cavmarl.engine.world_setup import World
@@ -111,6 +112,7 @@ class PooledWorlds(OrderedWorlds):
         ]
         recipe = {
             "config": asdict(config),
+            "extensions": extension_modules(config.registered),
             "base_dir": str(base_dir.resolve()),
             "fingerprint": fingerprint(world),
             "num_worlds": num_worlds,

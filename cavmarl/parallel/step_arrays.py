@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cavmarl.balance.balance_plan import Plan
-from cavmarl.config.env import TERMS, EnvConfig
+from cavmarl.config.env import EnvConfig
 from cavmarl.engine.simulation import Simulation
 from cavmarl.engine.spaces import flat_observation_space, state_space
 from cavmarl.engine.world_setup import World
@@ -79,7 +79,7 @@ def layout_of(config: EnvConfig, capacity: int, num_worlds: int) -> Layout:
         "rewards": ("<f4", agents),
         **dict.fromkeys(("terminations", "truncations", "acted", "vehicle_done", "mask"), flags),
         "vehicle_ids": ("<i8", agents),
-        "terms": ("<f4", (*agents, len(TERMS))),
+        "terms": ("<f4", (*agents, len(config.terms.names))),
         "arrivals": ("<i8", (num_worlds,)),
         "ticks": ("<i8", (num_worlds,)),
         "episode_over": ("|b1", (num_worlds,)),

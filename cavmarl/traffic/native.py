@@ -17,6 +17,7 @@ from cavmarl.core.memory import Zeros
 from cavmarl.core.numba.repeated import repeated
 from cavmarl.core.records.arrays import Demand, Gate, Travel, Worlds
 from cavmarl.core.records.codes import MODEL_KRAUSS
+from cavmarl.driving.driver_models import model_code
 from cavmarl.driving.kernels.drivers import look_ahead_m, see_line_m
 from cavmarl.driving.kernels.lane_index import VIEW_M
 from cavmarl.driving.vehicle_types import generated_types
@@ -144,7 +145,8 @@ class NativeTraffic:
     @cached_property
     def travel(self) -> Travel:
         """Types and ways of all vehicles: the generator's, the demand file's, then the actors'."""
-        types, steps = generated_types(), self.plans.reshape(-1)
+        types = generated_types(model_code(self.traffic.model))
+        steps = self.plans.reshape(-1)
         if self.sumo is not None:
             return self._travel_of_sumo(self.sumo, types, steps)
         scripts = NO_SCRIPTS if self.cast is None else self.cast.scripts

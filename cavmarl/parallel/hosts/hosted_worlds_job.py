@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from cavmarl.config.env import EnvConfig
 from cavmarl.core.errors import WorkerError
+from cavmarl.core.extensions import load_extensions
 from cavmarl.engine.world_setup import make_world
 from cavmarl.parallel.checkpoint.world_states import Move, buffers, pack, unpack
 from cavmarl.parallel.hosts.host_process import Outcome, serve
@@ -113,6 +114,7 @@ class HostedWorlds:
     def __init__(self, recipe: dict[str, Any]) -> None:
         from cavmarl.config.io import validate  # pydantic is slow to import
 
+        load_extensions(recipe["extensions"])
         config = validate(EnvConfig, recipe["config"], "the environment")
         self._world = make_world(config, Path(recipe["base_dir"]))
         if fingerprint(self._world) != recipe["fingerprint"]:

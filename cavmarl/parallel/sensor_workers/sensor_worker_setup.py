@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from cavmarl.config.env import EnvConfig, WorkersConfig, ZonesConfig
+from cavmarl.core.extensions import extension_modules, load_extensions
 from cavmarl.engine.simulation import Simulation
 from cavmarl.engine.world_setup import World, make_world
 from cavmarl.parallel.local_worlds import LocalWorlds
@@ -87,6 +88,7 @@ def farm_of(
     )
     recipe = {
         "config": asdict(_undivided(config)),
+        "extensions": extension_modules(_undivided(config).registered),
         "base_dir": str(base_dir.resolve()),
         "part": part,
         "num_worlds": num_worlds,
@@ -103,6 +105,7 @@ def make_sensor_jobs(recipe: Mapping[str, Any]) -> list[SensorJob]:
     """
     from cavmarl.config.io import validate  # pydantic is slow to import
 
+    load_extensions(recipe["extensions"])
     config = validate(EnvConfig, recipe["config"], "the environment")
     world = make_world(config, Path(recipe["base_dir"]))
     shape = SceneShape(*recipe["shape"])

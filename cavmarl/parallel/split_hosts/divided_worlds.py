@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from cavmarl.balance.balance_plan import Plan
 from cavmarl.balance.plan_text import describe_plan
 from cavmarl.core.errors import ConfigError, SumoError, WorkerError, WorkerFailureError
+from cavmarl.core.extensions import extension_modules
 from cavmarl.engine.simulation import Simulation
 from cavmarl.engine.world_setup import World
 from cavmarl.handoff.coordinator.coordinator_setup import check_faults
@@ -96,6 +97,7 @@ class DividedWorlds:
             simulation.mounted.rig.sense = self.leader.sense
         recipe = {
             "config": asdict(config),
+            "extensions": extension_modules(config.registered),
             "base_dir": str(base_dir.resolve()),
             "fingerprint": fingerprint(world),
             "in_next_step": in_next_step,

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from cavmarl.config.env import EnvConfig
 from cavmarl.core.errors import WorkerError
+from cavmarl.core.extensions import load_extensions
 from cavmarl.engine.world_setup import World, make_world
 from cavmarl.parallel.hosts.host_process import Outcome, serve
 from cavmarl.parallel.hosts.hosted_worlds_job import code_stamp
@@ -104,6 +105,7 @@ class ZonesJob:
     def __init__(self, recipe: dict[str, Any]) -> None:
         from cavmarl.config.io import validate  # pydantic is slow to import
 
+        load_extensions(recipe["extensions"])
         config = validate(EnvConfig, recipe["config"], "the environment")
         world = make_world(config, Path(recipe["base_dir"]))
         if fingerprint(world) != recipe["fingerprint"]:
