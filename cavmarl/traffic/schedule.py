@@ -147,7 +147,7 @@ class Schedule:
         )
 
     def detour_goal(self, route: int, vtype: int) -> int:
-        """VEHICLE["goal"] of who drives on a route, or -1."""
+        """VEHICLE["goal"] of vehicles on a route, or -1."""
         return int(self._goal[route, self._class_of_type[vtype]])
 
     def _edges(self, route: int, mask: int) -> NDArray[np.int32]:
@@ -196,7 +196,7 @@ class Schedule:
 
         Args:
             key: of the world and episode.
-            horizon_s: seconds an episode; who would depart later is not drawn.
+            horizon_s: seconds an episode; later departures are not drawn.
             dt: seconds a tick.
         """
         demand = self.demand

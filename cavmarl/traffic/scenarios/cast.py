@@ -93,7 +93,7 @@ class Cast:
             roads: the road arrays.
             travel: types and ways.
             gate: written.
-            worlds: the rows of world w are written; nobody has divided it yet.
+            worlds: the rows of world w are written; it is not divided yet.
             w: which world.
             blank: VEHICLE (1,), the record that every vehicle starts from.
         """

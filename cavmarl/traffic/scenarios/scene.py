@@ -1,4 +1,4 @@
-"""A `Scene`: who plays what to an agent, and where it begins. Scenarios make them."""
+"""A `Scene`: the actors, their scripts and the agent's start. Scenarios make them."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ class Scene:
         place: where, by the map's name.
         x, y: its middle, m.
         seat: of the agent.
-        actors: who follows a script.
+        actors: those that follow a script.
         cues: what they wait for, by the numbers of their `Await`s.
         clear_m: how far around the middle no other vehicle is in the beginning.
         outages: signals that go dark, and stay so.
@@ -60,6 +60,6 @@ class Scene:
 
     @property
     def goal_edges(self) -> list[int]:
-        """EDGE rows that somebody of it drives to."""
+        """EDGE rows that its actors drive to."""
         released = [a.released_to for a in self.actors if a.released_to is not None]
         return list(dict.fromkeys([self.seat.goal_edge, *released]))

@@ -93,7 +93,7 @@ class RouteBook:
         return found
 
     def _plan(self, pages: _Pages, edges: NDArray[np.int32], mask: int) -> int:
-        """The number of a path, planned if nobody has driven it."""
+        """The number of a path, planned at its first use."""
         known = pages.known.get((edges.tobytes(), mask))
         if known is not None:
             return known
