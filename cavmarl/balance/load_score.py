@@ -166,7 +166,7 @@ class Selection:
 
     Attributes:
         worker: the one.
-        preferred: who was asked for, if anybody.
+        preferred: the one asked for, if any.
         outcome: why it is this one.
         scores: (worker, LoadScore) of all admissible ones, by worker.
         rejections: of the others, by worker; one for each resource that is too busy.
@@ -237,7 +237,7 @@ def select(
     Args:
         candidates: all workers.
         rule: weights, thresholds, and how much worse a preferred worker may be.
-        preferred: who is kept while it is admissible and within the margin.
+        preferred: a worker kept while it is admissible and within the margin.
 
     Raises:
         NoAdmissibleWorkerError: all are excluded; the error holds every reason.

@@ -226,7 +226,7 @@ def leads_hosts(num_worlds: int, workers: int | str | None, hosts: str | None) -
 
 
 def check_agents(config: EnvConfig) -> None:
-    """Refuse a world without agents where somebody wants to drive one.
+    """Refuse a world without agents where a caller wants to drive one.
 
     Raises:
         ConfigError: `population.agents` is 0.

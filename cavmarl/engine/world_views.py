@@ -56,7 +56,7 @@ class WorldViews:
 
     @property
     def shards(self) -> Sequence[Shard]:
-        """One a zone, for who runs their phases."""
+        """One a zone, for the caller that runs their phases."""
         return self._shards
 
     @property
@@ -79,7 +79,7 @@ class WorldViews:
         for part in self._tick.attached:
             if isinstance(part, Messaging):
                 return part.bus
-        raise V2xError("nobody says anything here: set v2x.enabled to true")
+        raise V2xError("no messages are sent here: set v2x.enabled to true")
 
     @property
     def gate(self) -> Gate:
@@ -87,7 +87,7 @@ class WorldViews:
         return self._tick.gate
 
     def listen(self, config: EnvConfig) -> tuple[Bus, Callable[[], None]]:
-        """A bus beside the world, for tools that measure: nobody in the world hears of it.
+        """A bus beside the world, for tools that measure: stations in the world do not hear of it.
 
         Args:
             config: whose `v2x` it is of.
@@ -156,7 +156,7 @@ class WorldViews:
 
     @property
     def coordinators(self) -> tuple[Referee, ...]:
-        """Who says who owns what, one a world; none where all is one zone."""
+        """The coordinators, one a world; none where all is one zone."""
         return () if self._tick.coordination is None else self._tick.coordination.coordinators
 
     @property
