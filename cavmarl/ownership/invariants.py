@@ -30,7 +30,7 @@ class Monitor:
 
     def __init__(self, limits: Limits) -> None:
         self._limits = limits
-        self._writers: dict[int, tuple[int, int]] = {}  # vehicle → who advanced it in this tick
+        self._writers: dict[int, tuple[int, int]] = {}  # vehicle → advanced by, this tick
         self._executed: dict[tuple[int, int], int] = {}  # process → newest tick that it advanced to
         self._tick = -1
 
@@ -38,7 +38,7 @@ class Monitor:
         """I1: in a tick one zone advances a vehicle, and each of its processes once.
 
         Raises:
-            InvariantError: somebody advanced it before.
+            InvariantError: another process advanced it before.
         """
         if tick > self._tick:
             self._tick, self._writers = tick, {}

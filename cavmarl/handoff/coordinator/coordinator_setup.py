@@ -45,12 +45,12 @@ __all__ = [
 
 
 class Refereeing(NamedTuple):
-    """Who says who owns what.
+    """The coordinators of a divided environment.
 
     Attributes:
         coordination: of all worlds.
         transfers: world → what became of each hand-over.
-        recovery: runs the ticks of the one world in which somebody may die.
+        recovery: runs the ticks of the one world in which hosts may die.
         phases: runs the phases of its ticks.
         store: its committed state.
     """

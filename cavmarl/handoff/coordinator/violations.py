@@ -1,4 +1,4 @@
-"""Finds the words for an invariant that does not hold: which, when, where, who, and the values.
+"""Describes a violated invariant: which, when, where, the vehicle, and the values.
 
 Only called when the monitor has found that something is wrong, so it may look at every vehicle.
 """
@@ -54,7 +54,7 @@ class Violations:
             kind: KIND_* of the look's finding.
             vehicle: that it is about.
             owners: on record, vehicle → (zone, epoch).
-            births: who has entered since.
+            births: vehicles that have entered since.
 
         Raises:
             InvariantError: always.
