@@ -1,4 +1,4 @@
-"""Worlds that are stepped together, in this process or shared out as somebody wishes."""
+"""Worlds that are stepped together, in this process or shared out over others."""
 
 from __future__ import annotations
 

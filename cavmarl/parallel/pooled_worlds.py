@@ -47,7 +47,7 @@ class PooledWorlds(OrderedWorlds):
         arrays: in shared memory; each worker writes those of its worlds.
         pool: the processes.
         in_next_step: when worlds begin anew.
-        placement: who hosts what.
+        placement: which worker hosts what.
         mover: has that changed; None: it does not change.
 
     Raises:
@@ -186,6 +186,6 @@ def _names(parts: list[Part]) -> tuple[str, ...]:
 
 
 def _leaders(parts: list[Part]) -> list[int]:
-    """Who answers for each world."""
+    """The worker that answers for each world."""
     firsts = [0, *accumulate(len(part.zones) for part in parts)]
     return [k for k, part in zip(firsts, parts, strict=False) for _ in range(part.first, part.last)]

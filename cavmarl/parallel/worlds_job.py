@@ -100,6 +100,6 @@ def commands_of(arrays: StepArrays) -> Commands:
 
 
 def fingerprint(world: World) -> str:
-    """What tells two readings of the same files apart, if somebody has changed one between."""
+    """Differs between two readings of the same files if one was changed in between."""
     made_of = (world.network, world.demand, world.partition)
     return " ".join("none" if part is None else part.content_hash for part in made_of)

@@ -1,6 +1,6 @@
-"""`Tape`: all that some worlds were told since they were made, for whoever has to begin anew.
+"""`Tape`: all that some worlds were told since they were made, for a successor that begins anew.
 
-A diary keeps images, and who owned what is in none of them: a successor gives each vehicle to the
+A diary keeps images, and ownership is in none of them: a successor gives each vehicle to the
 zone that it is in. That changes no result, but a journal would tell of it, and a plan of faults
 would strike others. So the successor of such worlds goes through everything again.
 """
@@ -42,7 +42,7 @@ class Entry(NamedTuple):
 
 
 class Tape:
-    """Entries one behind the other, in memory that outlives those who write it.
+    """Entries one behind the other, in memory that outlives its writers.
 
     Args:
         fd: of that memory, which grows.

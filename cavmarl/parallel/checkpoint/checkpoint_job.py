@@ -51,7 +51,7 @@ class DiaryJob(WorldsJob):
         return None
 
     def afterwards(self) -> None:
-        """Write the image that the diary begins anew with, if it is due: nobody waits for it.
+        """Write the image that the diary begins anew with, if it is due; it is not waited for.
 
         Not in the order in which it began anew the last time: what is committed may still begin
         with the image before, whose place this one would take.

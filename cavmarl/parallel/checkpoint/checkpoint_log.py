@@ -27,7 +27,7 @@ _COMMANDS = ("controls", "meta_actions", "declared")
 
 
 def make_segments(config: EnvConfig, num_worlds: int) -> list[Segment]:
-    """Memory for the diary of some worlds, which outlives those who write it.
+    """Memory for the diary of some worlds, which outlives its writers.
 
     Raises:
         WorkerStartError: there is none.

@@ -2,7 +2,7 @@
 
 A frame is a head of fixed size, a letter (mostly a few numbers, as the dialect writes them: between
 hosts as JSON) and data (bytes of arrays, which both ends know the shapes of). Nothing in it is ever
-run: whoever sends one can say numbers.
+run: a sender can say numbers only.
 
     head    magic, version, kind, order, bytes of the letter, bytes of the data,
             checksum of the data, checksum of the head and the letter

@@ -110,7 +110,7 @@ class HostPool:
         return host is not None
 
     def team_of(self, worker: int) -> tuple[int, ...]:
-        """Who is replaced with a worker, itself among them."""
+        """The workers replaced with a worker, itself among them."""
         return (worker,)
 
     def run(
@@ -143,9 +143,9 @@ class HostPool:
         return self._command(self._all, task, _said(letters, inputs), outputs, commits, sizes)
 
     def tell(self, task: int, say: Say, outputs: Callable[[int, Any], Arrays]) -> list[Any]:
-        """Let all hosts do a task for a caller who keeps the state of all parts himself.
+        """Let all hosts do a task for a caller that keeps the state of all parts itself.
 
-        Nothing is committed: who takes up the part of a host that has died is told all that it
+        Nothing is committed: the successor of a dead host is told all that it
         needs.
 
         Args:
@@ -340,7 +340,7 @@ class HostPool:
             raise WorkerDeathError(k, self._names[k], order.number, what, causes)
 
     def _check(self, order: OpenOrder) -> None:
-        """Look after those who are waited for.
+        """Check the hosts that are waited for.
 
         Raises:
             WorkerDeathError: too many have died.
@@ -370,7 +370,7 @@ class HostPool:
             self._complain(time.monotonic() - began, there)
 
     def _complain(self, waited_s: float, where: str) -> None:
-        """Give up if nobody will come.
+        """Give up if no host will come.
 
         Raises:
             WorkerStartError: so it is.
@@ -384,7 +384,7 @@ class HostPool:
 
 
 def _said(letters: Sequence[Any], inputs: Sequence[Arrays]) -> Say:
-    """What is said to each part, whoever has it."""
+    """What is said to each part, whichever host has it."""
     return lambda k, knows: (letters[k], inputs[k])
 
 

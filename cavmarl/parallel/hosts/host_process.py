@@ -99,12 +99,12 @@ def serve(
     Args:
         make_job: with every kernel loaded.
         place: where the caller listens.
-        secret: of those who belong to it.
+        secret: shared by its hosts.
         number: of this host.
 
     Raises:
         OSError: the caller cannot be reached.
-        EOFError: whoever listens there does not want us.
+        EOFError: the listener there refuses this host.
         ForeignRunError: it is not the caller.
     """
     line = _Line(knock(place, secret, number))

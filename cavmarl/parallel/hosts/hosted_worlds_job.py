@@ -231,7 +231,7 @@ class HostedWorlds:
     def _rehearse(self) -> None:
         """Begin and step once: the first time takes longer, and is none of a death's business.
 
-        Nothing of it stays, since whoever has these worlds begins with a seed, or loads.
+        Nothing of it stays, since the next host of these worlds begins with a seed, or loads.
         """
         self._worlds.arrays.chosen[:] = True
         self._job.perform(Task.RESET, {"seed": 0, "first_world": 0})

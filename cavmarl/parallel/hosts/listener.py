@@ -1,4 +1,4 @@
-"""Who may be a host: a door that only those come through who know the secret.
+"""Accepts hosts: only processes that know the secret get in.
 
 The caller listens on one port, and hosts call there; they listen nowhere. Both prove that they know
 the secret, which Ray has handed to the host, without sending it: each answers the other's random
@@ -25,14 +25,14 @@ __all__ = ["MAX_GUESTS", "Door", "Guest", "knock"]
 NONCE = 16  # bytes of a random number
 PROOF = 32  # of an HMAC
 SECRET = 32
-GREETING_S = 5.0  # for a guest to prove who it is
+GREETING_S = 5.0  # for a guest to prove its identity
 CALL_S = 5.0  # for the system to connect
-MAX_GUESTS = 64  # who are not known yet
+MAX_GUESTS = 64  # not authenticated yet
 _HELLO = struct.Struct(f"<4sHI{NONCE}s")
 
 
 class Guest:
-    """Who has called and not proved who it is.
+    """A caller that has not proved its identity yet.
 
     Args:
         connection: to it.
@@ -76,7 +76,7 @@ class Guest:
             self._answer(said)
             return None
         if not hmac.compare_digest(said, self._expected):
-            raise ForeignRunError("somebody who does not know the secret has called")
+            raise ForeignRunError("a process that does not know the secret has called")
         return self._socket
 
     def close(self) -> None:
@@ -86,7 +86,7 @@ class Guest:
     def _answer(self, hello: bytes) -> None:
         magic, version, self.number, _ = _HELLO.unpack(hello)
         if magic != MAGIC:
-            raise ForeignRunError(f"somebody who says {hello[:4]!r} has called")
+            raise ForeignRunError(f"a process that says {hello[:4]!r} has called")
         if version != VERSION:
             raise UnknownVersionError(
                 f"host {self.number} speaks version {version}, this is {VERSION}: install the same "
@@ -108,7 +108,7 @@ class Door:
         secret: that hosts have to know.
 
     Raises:
-        WorkerStartError: nobody can listen there.
+        WorkerStartError: the port cannot be opened.
     """
 
     def __init__(self, address: str) -> None:
@@ -125,7 +125,7 @@ class Door:
         return self._listener.fileno()
 
     def open(self) -> Guest | None:
-        """Let in who has called; None: it is gone already."""
+        """Accept a caller; None: it is gone already."""
         try:
             connection, _ = self._listener.accept()
         except OSError:
@@ -133,7 +133,7 @@ class Door:
         return Guest(connection, self.secret)
 
     def close(self) -> None:
-        """Nobody can call any more."""
+        """Accept no more callers."""
         self._listener.close()
 
 
@@ -142,12 +142,12 @@ def knock(place: tuple[str, int], secret: bytes, number: int) -> Wire:
 
     Args:
         place: address and port of the door.
-        secret: of those who belong here.
+        secret: shared by the run's processes.
         number: of the host.
 
     Raises:
-        OSError: nobody listens there.
-        EOFError: whoever listens there does not want us.
+        OSError: no process listens there.
+        EOFError: the listener there refuses this host.
         ForeignRunError: it does not know the secret.
     """
     connection = socket.create_connection(place, CALL_S)
@@ -159,11 +159,11 @@ def knock(place: tuple[str, int], secret: bytes, number: int) -> Wire:
         while len(heard) < NONCE + PROOF:
             more = connection.recv(NONCE + PROOF - len(heard))
             if not more:
-                raise EOFError(f"who listens at {place} has ended the connection")
+                raise EOFError(f"the process that listens at {place} has ended the connection")
             heard += more
         nonce, proof = heard[:NONCE], heard[NONCE:]
         if not hmac.compare_digest(proof, _proof(secret, b"caller", hello + nonce)):
-            raise ForeignRunError(f"who listens at {place} does not know the secret")
+            raise ForeignRunError(f"the process that listens at {place} does not know the secret")
         connection.sendall(_proof(secret, b"host", hello + nonce))
     except BaseException:
         connection.close()

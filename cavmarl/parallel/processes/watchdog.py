@@ -20,7 +20,7 @@ class Watchdog:
 
     Args:
         pid: of the process.
-        timeout_s: for so long it may work; times in which nobody looked do not count.
+        timeout_s: for so long it may work; unwatched times do not count.
     """
 
     def __init__(self, pid: int, timeout_s: float) -> None:

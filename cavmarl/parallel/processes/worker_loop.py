@@ -4,8 +4,8 @@ The pool starts one process as a program. That one makes every worker's job read
 loaded, and has no threads; then it forks a worker whenever the pool asks for one. So a worker that
 has died is replaced in milliseconds, and its successor begins with what is ready.
 
-Nobody outlives the pool: the forking process ends when the pool's process does, or when it hears
-no more of it, and the system kills the workers with the process that forked them.
+No process outlives the pool: the forking process ends when the pool's process does, or when it
+hears no more of it, and the system kills the workers with the process that forked them.
 """
 
 from __future__ import annotations
@@ -95,7 +95,7 @@ class Job(Protocol):
         ...
 
     def afterwards(self) -> None:
-        """Called when an order is carried out and the pool knows: for what nobody waits for.
+        """Called after a command's answer is sent: for work that is not waited for.
 
         What it makes must not be needed before another order is carried out: that one may be
         carried out by a successor, which finds what was committed.
@@ -105,7 +105,7 @@ class Job(Protocol):
     def prepare(self) -> None:
         """Called where workers are forked, before each fork that is to do this job.
 
-        Whoever has done it is dead; so are those that it shares memory with, if it is their first.
+        The worker that did it is dead; so are those it shares memory with, if it is their first.
         """
         ...
 

@@ -90,7 +90,7 @@ class Pool:
         return self._crew.server_pid
 
     def team_of(self, worker: int) -> tuple[int, ...]:
-        """Who is replaced with a worker, itself among them."""
+        """The workers replaced with a worker, itself among them."""
         return self._program.team_of(worker)
 
     def processor_s(self) -> list[float]:
@@ -175,10 +175,10 @@ class Pool:
         """Return when all workers have carried out their order.
 
         Args:
-            workers: who has one.
+            workers: the workers that have one.
             mail: that came with it.
             expected_s: how long it has taken the last time.
-            sleeps: they know that nobody looks.
+            sleeps: they know that the caller does not poll.
 
         Raises:
             WorkerDeathError: too many processes died of it; the pool is closed.
@@ -224,7 +224,7 @@ class Pool:
                 death.done_s = time.monotonic()
 
     def _pending(self) -> list[int]:
-        """Who has not carried out the present order."""
+        """Workers that have not finished the present command."""
         return [k for k in self._open if not self._crew.has(k)]
 
     def _replace(self, k: int, cause: str, mail: bytes | None) -> None:
@@ -265,7 +265,7 @@ class Pool:
 
 
 class _Guard:
-    """Looks at those who are waited for, from time to time.
+    """Checks the workers that are waited for, from time to time.
 
     Args:
         crew: they belong to.
@@ -280,7 +280,7 @@ class _Guard:
         self._next_s = since_s + CHECK_S
 
     def hanging(self, pending: list[int]) -> dict[int, str]:
-        """Who of them does not go on, and why one thinks so."""
+        """Those of them that do not go on, and the reason to think so."""
         now = time.monotonic()
         if now < self._next_s:
             return {}

@@ -117,5 +117,5 @@ def make_sensor_jobs(recipe: Mapping[str, Any]) -> list[SensorJob]:
 
 
 def _undivided(config: EnvConfig) -> EnvConfig:
-    """The same environment with all zones in one, and nobody who senses elsewhere."""
+    """The same environment with all zones in one, and no sensor workers."""
     return replace(config, zones=ZonesConfig(), workers=WorkersConfig())

@@ -29,7 +29,7 @@ Words = NDArray[np.uint64]
 class ZoneLeader:
     """Runs each phase on all shards; `Together` with its hosts.
 
-    What goes from zone to zone it does itself: who owns what, ghosts, the gate, the signals. So it
+    What goes from zone to zone it does itself: ownership, ghosts, the gate, the signals. So it
     has all rows at the end of each phase, and a host that is lost costs no more than its phase.
 
     Args:

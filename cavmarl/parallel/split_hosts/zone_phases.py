@@ -163,7 +163,7 @@ class ZonePhases:
                 array
                 for array in (getattr(first.outputs, name) for name in SENSED)
                 if memory.find(array)
-                is not None  # with `observation.mode: sensors` nobody sees some
+                is not None  # with `observation.mode: sensors` some are not seen
             ],
             ZonePhase.SUGGEST: [inputs.suggested],
             ZonePhase.MOUNTED: [frames.data for frames in inputs.frames.values()],
