@@ -98,7 +98,7 @@ class RealTime:
 
 
 class Stepwise:
-    """Each step waits for somebody to allow it.
+    """Each step waits for permission.
 
     Args:
         ask: called with the simulated time in seconds before each step; the step begins when it

@@ -32,10 +32,10 @@ class DeclaredEvents:
 
         Raises:
             UnknownAgentError: no such world or agent.
-            V2xError: no such cause, or nobody says anything in this environment.
+            V2xError: no such cause, or no messages in this environment.
         """
         if not self._enabled:
-            raise V2xError("nobody says anything here: set v2x.enabled to true")
+            raise V2xError("no messages are sent here: set v2x.enabled to true")
         num_worlds, num_agents = self._causes.shape
         if not (0 <= world < num_worlds and 0 <= agent < num_agents):
             raise UnknownAgentError(

@@ -120,7 +120,7 @@ def _check_rendering(render_mode: str, workers: int | str | None) -> None:
 
 
 def _flags(agents: list[str], flags: NDArray[np.bool_]) -> dict[str, bool]:
-    """One flag an agent; in most steps nobody's is set."""
+    """One flag an agent; in most steps none is set."""
     if not flags.any():
         return dict.fromkeys(agents, False)
     return dict(zip(agents, flags.tolist(), strict=True))
@@ -238,12 +238,12 @@ class CavEnv(ParallelEnv[str, Any, Any]):  # type: ignore[misc] # PettingZoo is 
     ]:
         """Let every agent act and the world go on for `step_s` seconds.
 
-        Agents that enter during the step are in the results, with reward 0. When everybody has left
-        and more are to come, the world goes on until one enters.
+        Agents that enter during the step are in the results, with reward 0. When all agents have
+        left and more are to come, the world goes on until one enters.
 
         Raises:
             ResetNeededError: before the first reset.
-            EpisodeEndedError: actions after everybody has left.
+            EpisodeEndedError: actions after all agents have left.
             ActionError: a refused action; nothing has changed and the step can be repeated.
         """
         if self._steps < 0:
@@ -268,7 +268,7 @@ class CavEnv(ParallelEnv[str, Any, Any]):  # type: ignore[misc] # PettingZoo is 
         dict[str, bool],
         dict[str, dict[str, float]],
     ]:
-        """What the agents get after a step; decides who stays."""
+        """What the agents get after a step; decides which stay."""
         arrays = self.worlds.arrays
         truncated = self._steps >= self.max_cycles
         if not truncated:
@@ -342,7 +342,7 @@ class CavEnv(ParallelEnv[str, Any, Any]):  # type: ignore[misc] # PettingZoo is 
         done, ids = arrays.vehicle_done[0, listed], arrays.vehicle_ids[0, listed]
         active = (ids >= 0) & ~done
         terms = arrays.terms[0, listed].T
-        # Most are 0 for everybody: no accident, no red light.
+        # Most are 0 for all agents: no accident, no red light.
         columns = [(TERMS[k], terms[k]) for k in np.flatnonzero(terms.any(axis=1)).tolist()]
         columns.append(("vehicle_id", ids))
         usual = _ACTIVE
@@ -365,7 +365,7 @@ class CavEnv(ParallelEnv[str, Any, Any]):  # type: ignore[misc] # PettingZoo is 
 
         Raises:
             UnknownAgentError: no such agent, or it has left.
-            V2xError: no such cause, or nobody says anything in this environment.
+            V2xError: no such cause, or no messages in this environment.
         """
         if agent not in self.agents:
             raise UnknownAgentError(f"declare_event('{agent}', …): it is not in the episode")

@@ -61,7 +61,7 @@ class FollowedWorld:
         address: where followers call.
 
     Raises:
-        ConfigError: nobody can listen there, or a trace of a world that workers run.
+        ConfigError: the socket cannot be opened, or a trace of a world that workers run.
         SecondMasterError: the environment has a master.
     """
 
@@ -153,13 +153,13 @@ class FollowedWorld:
         """One cycle; rewards by agent.
 
         Raises:
-            EpisodeEndedError: there is nobody to go on with.
+            EpisodeEndedError: there are no agents to go on with.
             FollowerTimeoutError: a follower has not answered in time; it is let go. The world has
                 gone on by one step, and the next call goes on from there.
             FollowerLostError: the same, where a follower has ended.
-            FollowerMessageError: the same, where it has said what nobody understands.
+            FollowerMessageError: the same, where it has said what cannot be understood.
             ControlError: the same, where its controls cannot be carried out.
-            ClockDriftError: somebody else has advanced the world.
+            ClockDriftError: another caller has advanced the world.
         """
         if self.is_over:
             raise EpisodeEndedError("the episode is over: call FollowedWorld.reset()")
@@ -176,7 +176,7 @@ class FollowedWorld:
         return dict(rewards)
 
     def manifest(self) -> dict[str, Any]:
-        """What a result depends on: who follows, and when controls take effect."""
+        """What a result depends on: the followers, and when controls take effect."""
         clock = self.env.config.clock
         return {
             "sim_dt_s": clock.sim_dt_s,
@@ -202,13 +202,13 @@ class FollowedWorld:
         self.master.release()
 
     def close_reception(self) -> None:
-        """Let nobody call any more."""
+        """Accept no more callers."""
         self._reception.close()
         if not isinstance(self.address, int):
             Path(self.address).unlink(missing_ok=True)
 
     def _admit(self, within_s: float) -> None:
-        """Give seats to those who have called."""
+        """Give seats to callers."""
         for line, hello in self._reception.callers(within_s):
             try:
                 self._seat(line, hello)
@@ -226,7 +226,7 @@ class FollowedWorld:
         """The agents that a newcomer wants.
 
         Raises:
-            FollowerMessageError: there are none of that name, or somebody else drives them.
+            FollowerMessageError: there are none of that name, or another follower drives them.
         """
         known = {agent: k for k, agent in enumerate(self.env.possible_agents)}
         taken = {k: seat.clock.name for seat in self._seats for k in seat.agents}
@@ -263,7 +263,7 @@ class FollowedWorld:
         """Let followers see the world as it is, and queue what they do.
 
         Raises:
-            FollowerError: of the first one, in their order, with whom it cannot go on; what the
+            FollowerError: of the first one, in their order, with which it cannot go on; what the
                 others do is queued all the same.
         """
         if self._episode < 0 or not seats:

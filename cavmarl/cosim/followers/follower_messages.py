@@ -55,7 +55,7 @@ MAX_VEHICLES = 4096
 
 
 class Say(IntEnum):
-    """Kinds of frames, and who sends them."""
+    """Kinds of frames, and their senders."""
 
     HELLO = 0  # follower: I want these vehicles
     WELCOME = 1  # world: they are yours, and this is how time goes here
