@@ -231,7 +231,7 @@ def _show(
 
 
 def _new_folder(env: str) -> Path:
-    """A folder in runs/ that nobody has used."""
+    """An unused folder in runs/."""
     stamp = datetime.now().strftime("%Y%m%d-%H%M%S-%f")
     return Path("runs/evaluate") / f"{Path(env).name}-{stamp}"
 

@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 __all__ = ["plan"]
 
 NOW, IDLE = "now", "idle"
-LASTING_S = 3600  # of the worlds: longer than anybody measures
+LASTING_S = 3600  # of the worlds: longer than any measurement
 
 
 def plan(
@@ -109,7 +109,7 @@ def plan(
         made = make_plan(Problem(measured.costs, partition.side_neighbors, seen, rule))
     except NoAdmissibleWorkerError as error:
         raise NoAdmissibleWorkerError(
-            f"{error}; --snapshot {IDLE} supposes that nobody else uses them", error.rejections
+            f"{error}; --snapshot {IDLE} supposes that they are otherwise idle", error.rejections
         ) from error
     console.print(describe_plan(made), markup=False, highlight=False, soft_wrap=True)
     if cut is not None:

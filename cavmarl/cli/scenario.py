@@ -79,7 +79,7 @@ def run(
     video: Annotated[Path | None, typer.Option(help="Write an .mp4 of the run here.")] = None,
     json_path: JsonPath = None,
 ) -> None:
-    """Play a scenario to a driver; exit code 1 unless all come through and hurt nobody."""
+    """Play a scenario to a driver; exit code 1 unless all come through and hurt no one."""
     from contextlib import ExitStack
 
     from cavmarl.evaluate.scenarios.scenario_films import ScenarioCamera

@@ -224,7 +224,7 @@ class _Run:
 
     Args:
         vec: the worlds.
-        policy: who drives.
+        policy: drives the agents.
         seed: of both.
     """
 

@@ -78,7 +78,7 @@ def verify(
         ),
     ] = None,
     seeds: Annotated[
-        int, typer.Option(help="Of a campaign: runs in which anybody dies at any time.")
+        int, typer.Option(help="Of a campaign: runs in which any process dies at any time.")
     ] = 12,
     kill: Annotated[
         int | None,
@@ -114,7 +114,7 @@ def verify(
 ) -> None:
     """Drive divided worlds beside the undivided one; exit code 1 and where one first differs.
 
-    With --kill: worlds whose workers are killed beside some that nobody disturbs.
+    With --kill: worlds whose workers are killed beside undisturbed ones.
     """
     if hosts is not None and kill is None:
         raise ConfigError(f"--hosts {hosts}: goes with --kill only")
