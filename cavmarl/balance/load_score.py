@@ -5,7 +5,7 @@
 
 after "Distributed CARLA architecture for multi-agent CAV simulation: design and preliminary
 multi-GPU evaluation", section 3.5. A worker one of whose resources is used above its threshold
-(CPU 0.85, RAM 0.90, GPU 0.95) is excluded before anybody scores, so that free resources cannot
+(CPU 0.85, RAM 0.90, GPU 0.95) is excluded before scoring, so that free resources cannot
 hide a critical one. All utilisations are shares from 0 to 1.
 """
 
@@ -162,7 +162,7 @@ class Rejection(NamedTuple):
 
 @dataclass(frozen=True)
 class Selection:
-    """Whom `select` chose and why.
+    """The worker that `select` chose and why.
 
     Attributes:
         worker: the one.

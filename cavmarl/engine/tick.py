@@ -184,7 +184,7 @@ class Tick:
             self.let_in(all_phases=self.hosts_may_die)
 
     def let_in(self, all_phases: bool) -> None:
-        """Rank → assign → propose, and if anybody has found a gap, accept → admit.
+        """Rank → assign → propose, and if any departure has found a gap, accept → admit.
 
         Args:
             all_phases: go through the last two in any case.
@@ -255,7 +255,7 @@ class Tick:
 
 
 def _there() -> None:
-    """Nobody is waited for where one process runs all phases."""
+    """There is no wait where one process runs all phases."""
 
 
 def _pass_over(phase: str) -> None:

@@ -47,7 +47,7 @@ class Messaging:
             shard.mail = self.bus.mail
 
     def reset(self, chosen: NDArray[np.bool_]) -> None:
-        """Nobody has said anything yet."""
+        """Forget all messages."""
         self.bus.reset(chosen)
 
     def begin(self, commands: Commands) -> None:

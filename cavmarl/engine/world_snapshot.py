@@ -1,6 +1,6 @@
 """The state that the next tick of W worlds depends on, as a list of arrays, to go on from.
 
-Who owns what is not part of it: that changes no result. Whoever goes on with a divided world gives
+Ownership is not part of it: that changes no result. A successor of a divided world gives
 each vehicle to the zone that it is in, as at a reset.
 """
 
@@ -30,7 +30,7 @@ _OF_GATE = ("next_order", "num_queue", "next_id", "num_entered", "counts", "sums
 
 
 class Parts(NamedTuple):
-    """Who keeps the state of W worlds.
+    """The parts that keep the state of W worlds.
 
     Attributes:
         worlds: of the first shard.

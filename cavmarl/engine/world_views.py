@@ -83,7 +83,7 @@ class WorldViews:
 
     @property
     def gate(self) -> Gate:
-        """Who waits to enter each world, and counts since its reset; a reset may replace it."""
+        """Departures waiting in each world, and counts since its reset; resets may replace it."""
         return self._tick.gate
 
     def listen(self, config: EnvConfig) -> tuple[Bus, Callable[[], None]]:
@@ -133,7 +133,7 @@ class WorldViews:
         return self._tick.division.loads()
 
     def zone_view(self, world: int = 0) -> ZoneView:
-        """Who owns and sees which vehicles of one world now."""
+        """Which zones own and see which vehicles of one world now."""
         halo_m, coordination = self.zone_loads().halo_m, self._tick.coordination
         transfers = () if coordination is None else coordination.in_flight(world)
         return view_zones(self._shards, self.partition, halo_m, world, transfers)

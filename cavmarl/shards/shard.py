@@ -87,7 +87,7 @@ class Shard:
 
     Attributes:
         worlds: what it has.
-        sides: VEHICLE (W, C), the two memories that rows are kept in by turns.
+        sides: VEHICLE (W, C), the two buffers that rows are kept in, swapped each tick.
         side: in which of them the committed rows are.
         next_side: where the next ones come; the same, but in ticks that put rows in order.
         mail: what agents have been told over the air; None: no messages.

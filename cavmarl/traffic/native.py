@@ -196,7 +196,7 @@ class NativeTraffic:
         )
 
     def _farthest_m(self, look_m: Callable[[np.void, float], float]) -> float:
-        """How far anybody looks: as fast drivers have to, where all brake as SUMO's.
+        """How far any driver looks: as fast drivers have to, where all brake as SUMO's.
 
         IDM reacts to whatever is ahead, and agents may drive as fast as they like.
         """

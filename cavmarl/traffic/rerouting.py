@@ -43,7 +43,7 @@ LOOK = np.dtype(
 
 
 class Rerouting:
-    """Who looks for a way, what is known of the traffic, and the ways that were found; W worlds.
+    """Vehicles that reroute, what is known of the traffic, and the ways that were found; W worlds.
 
     Args:
         schedule: of the demand file.

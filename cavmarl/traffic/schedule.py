@@ -75,7 +75,7 @@ class Schedule:
     def _detours(self, masks: NDArray[np.int64]) -> NDArray[np.void]:
         """Steps from everywhere to the last edges of the routes, with as few changes as can be.
 
-        Who cannot make a lane change that its route needs goes on by them. Where they would take
+        A vehicle that cannot make a lane change of its route goes on by them. Where they would take
         more than `MAX_DETOUR_STEPS` there are none: such vehicles wait.
         """
         routes = self.demand.routes

@@ -37,7 +37,7 @@ class Sight:
     outside_m: float
 
     def halo(self, partition: ZonePartition) -> Halo:
-        """Whom each zone of a partition sees."""
+        """What each zone of a partition sees."""
         halo = zone_halo(partition, self.halo_m)
         if partition.count == 1 or self.sure_m >= self.halo_m:
             return halo

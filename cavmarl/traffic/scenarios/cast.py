@@ -86,7 +86,7 @@ class Cast:
     ) -> None:
         """Put the agents and the actors into a world that has just been populated.
 
-        Whoever else stands in the scene is left out. Agents keep their ids, actors get the next
+        Other vehicles in the scene are left out. Agents keep their ids, actors get the next
         ones.
 
         Args:

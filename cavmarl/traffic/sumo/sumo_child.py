@@ -65,7 +65,7 @@ class Simulation:
         self._edges: list[str] = told["edges"]
         self._signals: list[str] = told["signals"]
         self._type_row: dict[str, int] = told["types"]
-        self._is_seen: bool = told["drives"]  # whether anybody asks where its vehicles are
+        self._is_seen: bool = told["drives"]  # whether places of its vehicles are read
         self._forget()
 
     def _forget(self) -> None:
@@ -112,7 +112,7 @@ class Simulation:
         return self.look()
 
     def look(self) -> tuple[NDArray[np.void], bytes, dict[str, Any]]:
-        """Who is where now, what signals show, and what is new."""
+        """Where vehicles are now, what signals show, and what is new."""
         line: dict[str, Any] = {"time_ms": self._time_ms()}
         lifted = [
             [self._number.pop(name), name]

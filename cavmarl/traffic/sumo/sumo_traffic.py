@@ -1,7 +1,7 @@
 """`SumoTraffic`: SUMO's part in a tick of W worlds, in one place however they are divided.
 
-`sumo-traffic`: SUMO moves its vehicles, which are rows here, and sees ours. Who decides how a
-vehicle moves from tick t to t + 1 has seen all others at t, on both sides: ours move first, for
+`sumo-traffic`: SUMO moves its vehicles, which are rows here, and sees ours. Each side that moves a
+vehicle from tick t to t + 1 has seen all others at t: ours move first, for
 that needs nothing but t; then SUMO takes its step and is told where ours have come to.
 
 `sumo-demand`: SUMO runs the demand by itself. A vehicle that departs there is ordered here at the
