@@ -2,7 +2,7 @@
 
 Sets are compared by sums of hashes, so neither the order of rows nor that of zones matters. What
 cannot be told from sums, a vehicle's own last tick, stands where its row does: nearly all stay
-there. Who has moved to another row is looked for among those who are not where they were.
+there. Vehicles on another row are searched among those that are not where they were.
 """
 
 from __future__ import annotations
@@ -117,8 +117,8 @@ class Strays(NamedTuple):
 
     Attributes:
         table: LOST (a power of two,), a hash table; blank between two looks.
-        places: (n,) where in it somebody stands.
-        rows: (n, 2) zone and row where somebody else stood.
+        places: (n,) where in it a vehicle stands.
+        rows: (n, 2) zone and row where another stood.
         entered: (n,) vehicles that the last look has not seen.
         left: (n,) vehicles that this one has not seen.
     """
@@ -131,7 +131,7 @@ class Strays(NamedTuple):
 
 
 def make_kept(zones: int, capacity: int) -> Kept:
-    """Of a world that nobody has looked at."""
+    """Of a world not checked yet."""
     return Kept(np.zeros((zones, capacity), KEPT), np.zeros(zones, np.int64))
 
 
@@ -178,7 +178,7 @@ def _place(table: NDArray[np.void], vehicle: int) -> int:
 
 @kernel
 def _miss(strays: Strays, vehicle: int, zone: int, row: int, num: int) -> int:
-    """Note where somebody stood who is not there; how many are noted, who were `num`."""
+    """Note where a missing vehicle stood; returns how many are noted, `num` before."""
     place = _place(strays.table, vehicle)
     entry = strays.table[place]
     entry["id"] = vehicle
@@ -310,7 +310,7 @@ def _match(
     moved: int,
     finding: np.void,
 ) -> None:
-    """Look for those who are on other rows among those who are not where they were."""
+    """Search vehicles on other rows among those that are not where they were."""
     table = strays.table
     entered = 0
     for n in range(moved):
@@ -356,7 +356,7 @@ def _owe_ghosts(
     for n in range(halo.near_start[here], halo.near_start[here + 1]):
         other = halo.near[n]
         if other != zone and is_seen(halo, other, row, squared_distance(zones.rects, other, x, y)):
-            if sought:  # many out here are seen by nobody
+            if sought:  # many out here are seen by none
                 digest = _digest(words, i, masks, factors)
                 sought = False
             tallies[other]["due"] += digest
