@@ -1,7 +1,7 @@
 """What always holds (I1 to I10), checked on the parties' own states while they run.
 
 A monitor is told which rows a host advances, and is asked to look before and after every tick.
-It is for tests, and for runs in which the user pays for it: it looks at every vehicle.
+It is for tests, and for runs in which the user pays for it: it checks every vehicle.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""`StepArrays`: what goes into a step of W worlds and what comes out, wherever they are run."""
+"""`StepArrays`: the inputs and outputs of a step of W worlds, wherever they run."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`WorldsJob`: what a worker does that runs some of the worlds."""
+"""`WorldsJob`: the job of a worker that runs some of the worlds."""
 
 from __future__ import annotations
 

@@ -44,7 +44,7 @@ class Kill:
         step: after which it was noticed.
         idle: the worker had nothing to do; it was missed when it was to work again.
         cause: of the death, as the pool saw it.
-        noticed_ms: from the signal, or from the next order to one that was idle, until the pool
+        noticed_ms: from the signal, or from the next command to one that was idle, until the pool
             knew.
         replaced_ms: from then until the successor had its order.
         recovered_ms: from when the pool knew until the successor had done what was asked for.
@@ -72,7 +72,7 @@ class KillReport:
         different: the first step after which anything differed; None: none.
         kills: all of them.
         step_ms: median of the steps without a death.
-        ping_us: median of an empty order to all workers, before the first death.
+        ping_us: median of an empty command to all workers, before the first death.
         state_hashes: of the undisturbed worlds at the end.
         hardware: that it ran on.
     """
@@ -185,7 +185,7 @@ def _pool(vec: CavVectorEnv) -> Pool | HostPool:
 
 
 def _ping_us(pool: Pool | HostPool) -> float:
-    """What an empty order to all workers takes, at the median."""
+    """What an empty command to all workers takes, at the median."""
     found = []
     for _ in range(PINGS):
         began = time.perf_counter()

@@ -216,7 +216,7 @@ def _referee(
 def _monitor(
     division: Division, coordinators: Sequence[Referee], limits: Limits, longest_move_m: float
 ) -> Monitor:
-    """What looks at all worlds, and is told what their coordinators do."""
+    """The monitor of all worlds, and is told what their coordinators do."""
     is_direct = isinstance(coordinators[0], DirectCoordinator)
     records = [OwnersOnRecord(division.count, limits, is_direct) for _ in coordinators]
     for coordinator, record in zip(coordinators, records, strict=True):

@@ -89,7 +89,7 @@ class Coordination:
         states: of the vehicles of each world, as the coordinators read them.
         digests: of zones' rows; None: not needed.
         store: keeps what is committed; None: no process can die alone.
-        monitor: looks at every tick that is committed; None: none.
+        monitor: checks every tick that is committed; None: none.
     """
 
     def __init__(

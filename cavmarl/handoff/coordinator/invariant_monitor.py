@@ -1,7 +1,7 @@
-"""`Monitor`: the invariants of ownership, looked at after every tick of every world.
+"""`Monitor`: the invariants of ownership, checked after every tick of every world.
 
-What it needs of the vehicles is taken in one compiled look at their rows (`kernels.monitor`), which
-finds vehicles that have come and gone; what it knows of owners comes from the coordinators'
+What it needs of the vehicles is taken in one compiled pass over their rows (`kernels.monitor`),
+which finds vehicles that have come and gone; what it knows of owners comes from the coordinators'
 records, and costs what changes in them. The words of an error are found when there is one
 (`runtime.violations`).
 """
@@ -158,7 +158,7 @@ class Monitor:
         _, count, num_worlds, capacity = division.zoned.rows.shape
         self._ticks = [0] * num_worlds
         self._vehicles: list[set[int]] = [set() for _ in range(num_worlds)]
-        # What the last look has written, and the last but one.
+        # What the last check has written, and the last but one.
         self._kept = [
             (make_kept(count, capacity), make_kept(count, capacity)) for _ in range(num_worlds)
         ]

@@ -1,4 +1,4 @@
-"""`DirectCoordinator`: the referee of a world whose zones all live in its own process.
+"""`DirectCoordinator`: the coordinator of a world whose zones all live in its own process.
 
 There no message is lost, no zone is late, and no process dies alone. What `Coordinator` and the
 hosts of

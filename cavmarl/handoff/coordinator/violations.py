@@ -31,8 +31,8 @@ class Violations:
     Args:
         division: of the rows.
         w: which world.
-        clock: of the look that found it.
-        before: what the look before wrote.
+        clock: of the check that found it.
+        before: what the check before wrote.
     """
 
     def __init__(self, division: Division, w: int, clock: Clock, before: Kept) -> None:
@@ -51,7 +51,7 @@ class Violations:
         """Say what is wrong.
 
         Args:
-            kind: KIND_* of the look's finding.
+            kind: KIND_* of the check's finding.
             vehicle: that it is about.
             owners: on record, vehicle → (zone, epoch).
             births: vehicles that have entered since.

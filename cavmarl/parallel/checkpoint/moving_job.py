@@ -1,4 +1,4 @@
-"""`MovingJob`: what a worker does that runs some of the worlds, at times others than before.
+"""`MovingJob`: the job of a worker whose worlds may move to other workers.
 
 Worlds go from worker to worker between two commands. A worker that gives some away puts them into
 its case, which all workers can read (PACK); then each begins anew with what it has kept and what it

@@ -1,4 +1,4 @@
-"""`Company`: the hosts that are there, from their call at the door to their end."""
+"""`Company` keeps the hosts of a run, from their connection to their end."""
 
 from __future__ import annotations
 
@@ -59,11 +59,11 @@ class Host:
         number: of those that were started.
         pid: of its process, on its machine.
         machine: its name.
-        is_ready: it can be given orders.
+        is_ready: it can be given commands.
         is_gone: its connection has ended, and this is not noticed yet.
         knows: its memory is what is committed.
         part: that it has; -1: none.
-        given_s: when it was given its last order, by `time.monotonic`.
+        given_s: when it was given its last command, by `time.monotonic`.
         heard_s: when something was heard of it.
     """
 

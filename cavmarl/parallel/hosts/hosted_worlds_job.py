@@ -1,4 +1,4 @@
-"""`HostedWorlds`: what a host does that runs some of the worlds for a caller elsewhere."""
+"""`HostedWorlds`: the job of a host that runs some of the worlds for a remote caller."""
 
 from __future__ import annotations
 
@@ -137,7 +137,7 @@ class HostedWorlds:
             self._make(size)
 
     def inputs(self, task: int, letter: Any) -> list[Array]:
-        """Arrays that an order of this task fills."""
+        """Arrays that a command of this task fills."""
         if task == Task.UNPACK:
             move = Move(*letter)
             self._coming = buffers(move.coming, move.bytes)

@@ -1,4 +1,4 @@
-"""The Ray cluster that hosts run on: joining it, and which node is given which host."""
+"""The Ray cluster that hosts run on: joins it, and assigns nodes to hosts."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`ForkServer`: the process that forks a pool's workers, as the pool sees it."""
+"""`ForkServer`: the pool's handle of the process that forks its workers."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from cavmarl.parallel.processes.worker_loop import MAIL, MAX_MESSAGE
 
 __all__ = ["ForkServer", "Process", "ServerGoneError"]
 
-ANSWER_MS = 2_000  # for a fork or a burial; a server that takes longer is stopped or broken
+ANSWER_MS = 2_000  # to fork or to reap; a server that takes longer is stopped or broken
 END_S = 1.0  # for all to end by themselves
 
 # One thread a worker: the processes share the cores out among themselves.

@@ -1,4 +1,4 @@
-"""How a process waits for another: it looks for a moment, then it sleeps.
+"""How a process waits for another: it polls for a moment, then it sleeps.
 
 Each side has a line of 64-bit words that only itself writes. Word `NUMBER` counts what it has done;
 word `ASLEEP` says whether it has to be woken. To wait is to look at the other's number for a while
@@ -53,7 +53,7 @@ SHORT_S = 20e-6  # that a side polls before it sleeps
 LONG_S = 200e-6  # that it polls where the last time has not been longer
 LONG_WORK_S = 500e-6  # after which no side polls for so long
 PAUSES = 4  # polls before it lets others run
-ROUNDS = 16  # of those before it looks at the clock
+ROUNDS = 16  # of those before it reads the clock
 ALONE_S = 300e-6  # of polling without a break by a side with a core for itself
 AWAKE_S = 10e-3  # of polling for a part of a command that lets others run in between
 NAP_S = 100e-6  # that it sleeps between them from then on

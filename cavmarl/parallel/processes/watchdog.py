@@ -1,4 +1,4 @@
-"""Whether a process does the work that it should: one that hangs, or one that is slow."""
+"""`Watchdog` tells whether a process works, hangs or is slow."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What runs in the processes of a pool: one that forks, and the workers that it forks.
+"""The programs of a pool's processes: the fork server, and the workers that it forks.
 
 The pool starts one process as a program. That one makes every worker's job ready, with all kernels
 loaded, and has no threads; then it forks a worker whenever the pool asks for one. So a worker that
@@ -58,7 +58,7 @@ __all__ = [
 
 # Words of the pool's line, behind those of `barrier`.
 TASK, LETTER, SLOT, TRUTH, LOADS = 2, 3, 4, 5, 6
-# Words of the worker's line: how its order ended, and on which core it has begun with it.
+# Words of the worker's line: how its command ended, and on which core it began it.
 ANSWER, CORE = 2, 3
 SILENT, ANSWERED, FAILED = 0, 1, 2
 
@@ -97,7 +97,7 @@ class Job(Protocol):
     def afterwards(self) -> None:
         """Called after a command's answer is sent: for work that is not waited for.
 
-        What it makes must not be needed before another order is carried out: that one may be
+        What it makes must not be needed before another command is carried out: that one may be
         carried out by a successor, which finds what was committed.
         """
         ...
@@ -179,7 +179,7 @@ def _failure(error: BaseException) -> bytes:
 def _fork_on_demand(
     pool: socket.socket, parent: int, jobs: Sequence[Job], start: Mapping[str, Any]
 ) -> NoReturn:
-    """Fork and bury workers as the pool asks; end with it."""
+    """Fork and reap workers as the pool asks; end with it."""
     poll = select.poll()
     poll.register(pool, select.POLLIN)
     poll.register(parent, select.POLLIN)
@@ -239,7 +239,7 @@ def _work(number: int, job: Job, wire: socket.socket, start: Mapping[str, Any]) 
 
 
 def _obey(job: Job, meeting: Meeting, slots: Sequence[Image]) -> NoReturn:
-    """Carry out one order after the other."""
+    """Carry out one command after the other."""
     mine, theirs = meeting.mine, meeting.theirs
     is_new = True
     wait_s = 0.0
@@ -271,7 +271,7 @@ def _obey(job: Job, meeting: Meeting, slots: Sequence[Image]) -> NoReturn:
             mine[ANSWER] = SILENT if answer is None else ANSWERED
             if answer is not None:
                 meeting.wire.send(MAIL + json.dumps(answer).encode())
-        mine[CORE] = core  # now, and not before: the pool looks at this line all the time
+        mine[CORE] = core  # now, and not before: the pool polls this line all the time
         meeting.post(number)
         if mine[ANSWER] != FAILED:
             try:
@@ -281,7 +281,7 @@ def _obey(job: Job, meeting: Meeting, slots: Sequence[Image]) -> NoReturn:
 
 
 def _await(meeting: Meeting, order: int, last_s: float, work_s: float) -> float:
-    """Return when there is an order; end with the pool.
+    """Return when there is a command; end with the pool.
 
     Args:
         meeting: with the pool.
@@ -297,7 +297,7 @@ def _await(meeting: Meeting, order: int, last_s: float, work_s: float) -> float:
     began = time.perf_counter()
     if not meeting.watch(order, last_s, work_s):
         while meeting.lie_down(order):
-            # A letter may come before its order: it is left where it is.
+            # A payload may come before its command: it is left where it is.
             message = meeting.wire.recv(len(WAKE), socket.MSG_PEEK)
             meeting.get_up()
             if not message:
@@ -308,7 +308,7 @@ def _await(meeting: Meeting, order: int, last_s: float, work_s: float) -> float:
 
 
 def _receive(wire: socket.socket) -> Any:
-    """The letter that came with an order."""
+    """The payload that came with a command."""
     while True:
         message = wire.recv(MAX_MESSAGE)
         if not message:

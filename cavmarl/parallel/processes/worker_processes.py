@@ -1,4 +1,4 @@
-"""`Crew`: the processes of a pool, one a worker, and the words that are exchanged with them."""
+"""`Crew` starts and replaces a pool's processes, one a worker, and exchanges words with them."""
 
 from __future__ import annotations
 
@@ -93,7 +93,7 @@ class Crew:
 
     @property
     def release(self) -> Callable[[], None]:
-        """Ends the processes and gives all back, also when the crew is forgotten."""
+        """Ends the processes and gives all back, also when this object is collected."""
         return self._held.release
 
     @property
@@ -122,7 +122,7 @@ class Crew:
 
         Args:
             workers: which ones.
-            head: words of the order, from TASK to TRUTH.
+            head: words of the command, from TASK to TRUTH.
             stale: of all workers, whose memory is not what is committed.
             mail: what goes with it.
             sleeps: this side goes to sleep at once: what it does from here on it does on a core on
@@ -146,7 +146,7 @@ class Crew:
             self._meetings[k].wake()
 
     def number(self, k: int) -> int:
-        """Of the last order that a worker was given."""
+        """Number of the last command that a worker was given."""
         return self.orders.item(k, NUMBER)
 
     def has(self, k: int) -> bool:
@@ -158,7 +158,7 @@ class Crew:
 
         Args:
             k: which worker.
-            last_s: how long such an order has taken the last time.
+            last_s: how long such a command has taken the last time.
             is_soon: it is known that it does not take long.
         """
         return self._meetings[k].watch(self.number(k), last_s, is_soon=is_soon)
@@ -217,7 +217,7 @@ class Crew:
         return not any(map(self.has, pending))
 
     def settle(self, k: int, limit_s: float) -> bool:
-        """Whether a worker has carried out its order or has died of it, after a while at most."""
+        """Whether a worker has carried out its command or has died of it, after a while at most."""
         process = self.processes[k]
         if select.select([process.pidfd], [], [], 0.0 if self.has(k) else limit_s)[0]:
             self._statuses[k][NUMBER] = self.number(k)  # its writer is dead
@@ -237,7 +237,7 @@ class Crew:
             keep_apart([process.pid for process in self.processes.values()], cores)
 
     def answer(self, k: int) -> tuple[int, Any]:
-        """How a worker's order ended, as its line says, and what it has answered."""
+        """How a worker's command ended, as its line says, and what it has answered."""
         kind = self._statuses[k].item(ANSWER)
         if kind == SILENT:
             return kind, None
@@ -246,7 +246,7 @@ class Crew:
         return kind, json.loads(process.mail.pop(0))
 
     def replace(self, k: int, mail: bytes | None, ordered: Collection[int]) -> str:
-        """Give a worker's team new processes, and those the order, if it is not carried out yet.
+        """Give a worker's team new processes, and those the command, if it is not carried out yet.
 
         Args:
             k: the worker.
@@ -283,7 +283,7 @@ class Crew:
         process.collect()
 
     def _take_back(self, team: tuple[int, ...], ordered: Collection[int]) -> None:
-        """Let a team, all of it dead, do an order again together that not all have carried out."""
+        """Let a team, all of it dead, do a command again together that not all have carried out."""
         asked = [j for j in team if j in ordered]
         if not all(self.has(j) for j in asked):
             for j in asked:

@@ -1,4 +1,4 @@
-"""`SensorFarm`: processes that sense for the worlds of this one, whose state stays where it is."""
+"""`SensorFarm` runs sensor workers for the worlds of this process, which keeps their state."""
 
 from __future__ import annotations
 
@@ -63,12 +63,12 @@ class FarmTimes:
     Attributes:
         publish_s: writing down what there is to see, and which worker senses what.
         own_s: sensing what stays here.
-        wait_s: from the order until all frames were there.
+        wait_s: from the command until all frames were there.
         busy_s: of that, while the busiest worker sensed.
         ticks: how many.
         sent_bytes: that the workers were given to read.
         got_bytes: of frames that they have written.
-        messages: orders and answers.
+        messages: commands and answers.
     """
 
     publish_s: float = 0.0

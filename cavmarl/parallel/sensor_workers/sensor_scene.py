@@ -1,4 +1,4 @@
-"""`SceneArrays`: what the process of some worlds and its sensor workers share.
+"""`SceneArrays`: the memory that a process of worlds and its sensor workers share.
 
 The process writes what there is to see and which worker is to sense what, before it sends a
 command; the workers write frames, and say here of which tick they are.

@@ -96,7 +96,7 @@ def farm_of(
 
 
 def make_sensor_jobs(recipe: Mapping[str, Any]) -> list[SensorJob]:
-    """The jobs of all sensor workers of a farm, every kernel loaded.
+    """The jobs of all sensor workers, every kernel loaded.
 
     Args:
         recipe: of `farm_of`, with what the farm has added.

@@ -1,4 +1,4 @@
-"""`HostedZones`: the zones of one world that one worker of a team runs; they may become others."""
+"""`HostedZones`: the zones of one world that one worker of a team runs; they may change."""
 
 from __future__ import annotations
 

@@ -107,7 +107,7 @@ class Leader:
 
     @contextmanager
     def order(self) -> Iterator[None]:
-        """The time of an order, in which the followers wait for phases.
+        """The time of a command, in which the followers wait for phases.
 
         Raises:
             LeftAloneError: one of them has failed.
@@ -120,7 +120,7 @@ class Leader:
             self._dismiss()
 
     def end_after(self, phase: Phase | str) -> None:
-        """Let the followers end the order with the next phase of that name that they run."""
+        """Let the followers end the command with the next phase of that name that they run."""
         self._last = phase
 
     def _dismiss(self) -> None:

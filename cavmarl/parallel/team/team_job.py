@@ -31,7 +31,7 @@ class LeaderJob(DiaryJob):
         worlds: the one; what its shards write is shared.
         first: its number among all.
         zones: that each worker hosts, to begin with; the leader's first.
-        diary: in which it leaves the state behind.
+        diary: the checkpoint log in which it leaves the state behind.
         spent_s: (k,) where the processor time of each zone is added up; None: not measured.
     """
 
@@ -98,7 +98,7 @@ class LeaderJob(DiaryJob):
         self._leader.take(np.flatnonzero(hosts == 0).tolist())
 
     def save(self) -> list[NDArray[Any]]:
-        """Where to begin in the diary, and which worker hosts which zone."""
+        """Where to begin in the checkpoint log, and which worker hosts which zone."""
         return [*super().save(), self._hosts]
 
     def load(self, saved: Sequence[NDArray[Any]]) -> None:
