@@ -1,4 +1,4 @@
-"""What `cavmarl verify --faults` prints: what was done to the divided worlds, and its price."""
+"""Prints the results of `cavmarl verify --faults`: injected faults, and their cost."""
 
 from __future__ import annotations
 
