@@ -1,4 +1,4 @@
-"""LoadScore: which worker is least loaded, and which ones are not asked at all.
+"""LoadScore: ranks workers by load, and excludes overloaded ones.
 
     LoadScore_i = 0.6 CPU_i + 0.2 RAM_i + 0.2 GPU_i       eq. (1)
     worker*     = arg min LoadScore_i over the admissible   eq. (2)

@@ -1,4 +1,4 @@
-"""What others use of this machine, worker by worker."""
+"""Measures what other programs use of this machine, worker by worker."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`Problem`: what a plan is made from, whole: costs, neighbours, workers, rules, present homes."""
+"""`Problem`: the input of a plan: costs, neighbours, workers, rules, present homes."""
 
 from __future__ import annotations
 

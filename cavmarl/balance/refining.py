@@ -1,4 +1,4 @@
-"""Moves and swaps that make the slowest worker faster, one after the other."""
+"""Improves a plan by moves and swaps that make the slowest worker faster."""
 
 from __future__ import annotations
 

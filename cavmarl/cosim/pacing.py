@@ -1,4 +1,4 @@
-"""How fast steps follow each other on the wall clock; no simulated time depends on it."""
+"""Paces steps on the wall clock; simulated time does not depend on it."""
 
 from __future__ import annotations
 

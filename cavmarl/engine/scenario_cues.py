@@ -1,4 +1,4 @@
-"""`Cues`: says when the cues come that the scripts of a scenario wait for."""
+"""`Cues` detects the cues that the scripts of a scenario wait for."""
 
 from __future__ import annotations
 

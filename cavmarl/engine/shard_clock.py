@@ -1,4 +1,4 @@
-"""`ShardClock`: how much of the processor's time each shard takes."""
+"""`ShardClock` measures the processor time of each shard."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The digest by which states of worlds are compared, however their rows lie."""
+"""Digests states of worlds for comparison, independent of the order of rows."""
 
 from __future__ import annotations
 

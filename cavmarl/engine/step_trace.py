@@ -1,4 +1,4 @@
-"""`StepTrace`: in which order the parts of a lock-step cycle have acted.
+"""`StepTrace` records the order in which the parts of a lock-step cycle act.
 
 Algorithm 1 of the co-simulation paper: SUMO goes to t + Δt, its vehicles are mirrored, the world
 ticks exactly once, sensors deliver the frame of t + Δt, the stack computes u, and u is queued for

@@ -1,4 +1,4 @@
-"""`Tick`: what happens to W worlds in a tick, phase by phase. The order is written here, once."""
+"""`Tick` runs one tick of W worlds, phase by phase. The order is written here, once."""
 
 from __future__ import annotations
 

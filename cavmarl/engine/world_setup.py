@@ -1,4 +1,4 @@
-"""From a name to what a world is made of: config and roads."""
+"""Loads what a world is made of, by name: config and roads."""
 
 from __future__ import annotations
 

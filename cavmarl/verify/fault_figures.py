@@ -1,4 +1,4 @@
-"""What faults did to a divided run, in counts and times: all of it from the run itself."""
+"""Counts and times of faults in a divided run, from the run itself."""
 
 from __future__ import annotations
 

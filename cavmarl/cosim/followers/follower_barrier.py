@@ -1,4 +1,4 @@
-"""`Barrier`: every follower gets its snapshot, and the world waits for all of their controls."""
+"""`Barrier` sends every follower its snapshot and waits for all of their controls."""
 
 from __future__ import annotations
 

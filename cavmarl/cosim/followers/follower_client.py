@@ -1,4 +1,4 @@
-"""`Follower`: the end of the connection where a stack runs."""
+"""`Follower`: the stack's end of the connection to a world."""
 
 from __future__ import annotations
 

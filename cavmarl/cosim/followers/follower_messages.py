@@ -1,4 +1,4 @@
-"""What a world and its followers say to each other; docs/followers.md describes it for others.
+"""The messages between a world and its followers; docs/followers.md specifies them.
 
 A frame is that of `hosts.wire`: a head, a letter in msgpack, and the bytes of arrays. No letter is
 ever run. Each is one of these classes, as a map of its fields; a letter with other fields, or with

@@ -1,4 +1,4 @@
-"""`Reception`: takes in followers that call while a world runs, without waiting for any of them."""
+"""`Reception` accepts followers while a world runs, without waiting for any of them."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What the stages of a stack say to each other.
+"""The data that the stages of a stack exchange.
 
 Places are those of the map: x east, y north, in m; headings counter-clockwise from east, in rad.
 """

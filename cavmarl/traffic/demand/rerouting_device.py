@@ -39,7 +39,7 @@ class DeviceOptions(NamedTuple):
 
     Attributes:
         chance: of having it, where vehicle and type say nothing.
-        period_ms: between looks, likewise; 0: once.
+        period_ms: between searches, likewise; 0: once.
         adaptation_steps: how many samples of the edges' speeds are averaged.
         adaptation_interval_ms: between samples.
     """
