@@ -191,7 +191,7 @@ class Scratch(NamedTuple):
 
     lanes: Lists  # by lane, lists of entries
     lane_start: NDArray[np.int32]  # entries of lane l: [lane_start[l], lane_end[l]); at L: of all.
-    lane_end: NDArray[np.int32]  # Both are views of `lanes.bounds`: one look into memory
+    lane_end: NDArray[np.int32]  # Both are views of `lanes.bounds`: one access to memory
     entries: NDArray[np.void]  # ENTRY (2 C + Scripts.room,) by (lane, s, id), with side lanes
     links: Lists  # by link, lists of approach
     link_start: NDArray[np.int32]  # approach of link k: [link_start[k], link_end[k])
