@@ -122,7 +122,7 @@ class CavAgentRows(VectorEnv[Any, Any, Any]):
         self._vec.close()
 
     def _told(self, arrays: Mapping[str, NDArray[Any]]) -> dict[str, Any]:
-        """Infos of all rows, each with the mask of who has it, as Gymnasium's wrappers expect."""
+        """Infos of all rows, each with the mask of its rows, as Gymnasium's wrappers expect."""
         everybody = np.ones(self.num_envs, dtype=np.bool_)
         told: dict[str, Any] = {name: self._rows(array) for name, array in arrays.items()}
         return told | {f"_{name}": everybody for name in arrays}

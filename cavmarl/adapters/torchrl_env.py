@@ -42,7 +42,8 @@ class CavTorchRLEnv(EnvBase):  # type: ignore[misc] # TorchRL is not typed
     Entries of a tensordict, with one axis more than the batch for the agents:
 
     - `("car", "observation")`: (W, A, D), or one entry a sensor (`observation.kind: dict`);
-    - `("car", "mask")`: (W, A) who has a vehicle and acts next. The others' actions are not read
+    - `("car", "mask")`: (W, A) agents that have a vehicle and act next. The others' actions are not
+    read
       and their observations are 0, but for the last one of an agent that has just ended. Losses
       and means are to be taken where it is True;
     - `("car", "action")`: (W, A, 2) within [-1, 1], or (W, A) meta-actions;

@@ -1,4 +1,4 @@
-"""`Commons`: what no zone of a world can do alone, its signals and what agents get."""
+"""`Commons`: signals and agents' outputs, which all zones of a world share."""
 
 from __future__ import annotations
 

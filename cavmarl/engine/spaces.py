@@ -1,4 +1,4 @@
-"""Spaces: pure functions of the config. No world is built to learn a shape."""
+"""Observation and action spaces: pure functions of the config. No world is built for a shape."""
 
 from __future__ import annotations
 

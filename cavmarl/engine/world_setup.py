@@ -1,4 +1,4 @@
-"""From a name to what a world is made of: config and roads."""
+"""Loads what a world is made of, by name: config and roads."""
 
 from __future__ import annotations
 
@@ -193,7 +193,7 @@ def check_workers(workers: int | None) -> int:
 
 
 def check_agents(config: EnvConfig) -> None:
-    """Refuse a world without agents where somebody wants to drive one.
+    """Refuse a world without agents where a caller wants to drive one.
 
     Raises:
         ConfigError: `population.agents` is 0.

@@ -118,7 +118,7 @@ def _check_rendering(render_mode: str, workers: int | str | None) -> None:
 
 
 def _flags(agents: list[str], flags: NDArray[np.bool_]) -> dict[str, bool]:
-    """One flag an agent; in most steps nobody's is set."""
+    """One flag an agent; in most steps none is set."""
     if not flags.any():
         return dict.fromkeys(agents, False)
     return dict(zip(agents, flags.tolist(), strict=True))
@@ -239,8 +239,8 @@ class CavEnv(ParallelEnv[str, Any, Any]):  # type: ignore[misc] # PettingZoo is 
     ]:
         """Let every agent act and the world go on for `step_s` seconds.
 
-        Agents that enter during the step are in the results, with reward 0. When everybody has left
-        and more are to come, the world goes on until one enters.
+        Agents that enter during the step are in the results, with reward 0. When all agents have
+        left and more are to come, the world goes on until one enters.
 
         Raises:
             EpisodeError: before the first reset; actions after everybody has left.
@@ -268,7 +268,7 @@ class CavEnv(ParallelEnv[str, Any, Any]):  # type: ignore[misc] # PettingZoo is 
         dict[str, bool],
         dict[str, dict[str, float]],
     ]:
-        """What the agents get after a step; decides who stays."""
+        """What the agents get after a step; decides which stay."""
         arrays = self.worlds.arrays
         truncated = self._steps >= self.max_cycles
         if not truncated:

@@ -1,4 +1,4 @@
-"""The jobs of all workers that run worlds, made where they are forked."""
+"""Makes the jobs of all workers that run worlds, in the fork server."""
 
 from __future__ import annotations
 

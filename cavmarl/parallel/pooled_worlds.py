@@ -48,7 +48,7 @@ class PooledWorlds(OrderedWorlds):
         arrays: in shared memory; each worker writes those of its worlds.
         pool: the processes.
         in_next_step: when worlds begin anew.
-        placement: who hosts what.
+        placement: which worker hosts what.
         mover: has that changed; None: it does not change.
 
     Raises:

@@ -1,4 +1,4 @@
-"""`StepArrays`: what goes into a step of W worlds and what comes out, wherever they are run."""
+"""`StepArrays`: the inputs and outputs of a step of W worlds, wherever they run."""
 
 from __future__ import annotations
 
@@ -36,10 +36,10 @@ class StepArrays(NamedTuple):
     rewards: NDArray[np.float32]  # (W, A)
     terminations: NDArray[np.bool_]  # (W, A) the vehicle ended
     truncations: NDArray[np.bool_]  # (W, A) the horizon ended it
-    acted: NDArray[np.bool_]  # (W, A) who has acted
+    acted: NDArray[np.bool_]  # (W, A) agents that have acted
     vehicle_done: NDArray[np.bool_]  # (W, A)
     vehicle_ids: NDArray[np.int64]  # (W, A) of the vehicle at the end of the step; -1: it had none
-    mask: NDArray[np.bool_]  # (W, A) who acts next
+    mask: NDArray[np.bool_]  # (W, A) agents that act next
     terms: NDArray[np.float32]  # (W, A, T)
     arrivals: NDArray[np.int64]  # (W,) since each world's reset
     ticks: NDArray[np.int64]  # (W,) the same

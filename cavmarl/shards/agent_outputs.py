@@ -19,7 +19,7 @@ def make_outputs(
     observations: NDArray[np.float32] | None = None,
     zeros: Zeros = np.zeros,
 ) -> Outputs:
-    """Outputs of W worlds in which nobody is present.
+    """Outputs of W empty worlds.
 
     Args:
         config: the environment.

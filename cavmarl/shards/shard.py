@@ -61,7 +61,7 @@ class Commands:
     Attributes:
         controls: (W, A, 2) throttle in m/s² and steering in rad; continuous actions.
         meta_actions: (W, A) ACTION_* codes; discrete actions.
-        declared: (W, A) CAUSE_* of events that agents tell others of, 0: none; (0, 0): nobody does.
+        declared: (W, A) CAUSE_* of events that agents tell others of, 0: none; (0, 0): no messages.
     """
 
     controls: NDArray[np.float64]
@@ -88,10 +88,10 @@ class Shard:
 
     Attributes:
         worlds: what it has.
-        sides: VEHICLE (W, C), the two memories that rows are kept in by turns.
+        sides: VEHICLE (W, C), the two buffers that rows are kept in, swapped each tick.
         side: in which of them the committed rows are.
         next_side: where the next ones come; the same, but in ticks that put rows in order.
-        mail: what agents have been told over the air; None: nobody says anything.
+        mail: what agents have been told over the air; None: no messages.
     """
 
     def __init__(

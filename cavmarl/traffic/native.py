@@ -65,7 +65,7 @@ class NativeTraffic:
     Attributes:
         network: the roads.
         traffic: settings of the generator.
-        population: who is in the world.
+        population: which vehicles are in the world.
         blank: VEHICLE (1,), the record that every vehicle starts from.
         dt: seconds a tick.
         horizon_s: seconds an episode.
@@ -198,7 +198,7 @@ class NativeTraffic:
         )
 
     def _farthest_m(self, look_m: Callable[[np.void, float], float]) -> float:
-        """How far anybody looks: as fast drivers have to, where all brake as SUMO's.
+        """How far any driver looks: as fast drivers have to, where all brake as SUMO's.
 
         IDM reacts to whatever is ahead, and agents may drive as fast as they like.
         """
@@ -230,7 +230,7 @@ class NativeTraffic:
 
     @cached_property
     def rerouting(self) -> Rerouting | None:
-        """Those ways; None where nobody looks for one."""
+        """Those ways; None where vehicles do not reroute."""
         if self.schedule is None or self._slots is None:
             return None
         first_type = len(generated_types())
@@ -305,11 +305,11 @@ class NativeTraffic:
                 self.cast.enter(self.network.arrays, self.travel, gate, worlds, w, self.blank)
 
     def settle(self, gate: Gate, worlds: Worlds) -> None:
-        """Count who has left, and order those that follow."""
+        """Count vehicles that have left, and order those that follow."""
         self._calls.settle(self.demand, self.network.arrays, gate, worlds, self.dt)
 
     def assign_lanes(self, gate: Gate, worlds: Worlds) -> None:
-        """Say who of the queue tries to enter on which lane."""
+        """Assign vehicles of the queue the lanes on which they try to enter."""
         self._calls.assign_lanes(self.network.arrays, self.travel, gate, worlds)
 
     def call_orders(self, gate: Gate, worlds: Worlds) -> None:
@@ -317,7 +317,7 @@ class NativeTraffic:
         self._calls.call_orders(gate, worlds)
 
     def accept(self, gate: Gate, running: NDArray[np.int64]) -> None:
-        """Choose among those who could enter; `running` (W,) are in the worlds already."""
+        """Choose among vehicles that could enter; `running` (W,) are in the worlds already."""
         self._calls.accept(gate, running, self.capacity)
 
     @cached_property

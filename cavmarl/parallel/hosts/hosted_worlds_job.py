@@ -1,4 +1,4 @@
-"""`HostedWorlds`: what a host does that runs some of the worlds for a caller elsewhere."""
+"""`HostedWorlds`: the job of a host that runs some of the worlds for a remote caller."""
 
 from __future__ import annotations
 
@@ -139,7 +139,7 @@ class HostedWorlds:
             self._make(size)
 
     def inputs(self, task: int, letter: Any) -> list[Array]:
-        """Arrays that an order of this task fills."""
+        """Arrays that a command of this task fills."""
         if task == Task.UNPACK:
             move = Move(*letter)
             self._coming = buffers(move.coming, move.bytes)
@@ -233,7 +233,7 @@ class HostedWorlds:
     def _rehearse(self) -> None:
         """Begin and step once: the first time takes longer, and is none of a death's business.
 
-        Nothing of it stays, since whoever has these worlds begins with a seed, or loads.
+        Nothing of it stays, since the next host of these worlds begins with a seed, or loads.
         """
         self._worlds.arrays.chosen[:] = True
         self._job.perform(Task.RESET, {"seed": 0, "first_world": 0})

@@ -52,7 +52,7 @@ class RemoteWorlds(OrderedWorlds):
         arrays: of this process; what hosts send is written to them.
         pool: the hosts.
         in_next_step: when worlds begin anew.
-        placement: who hosts what.
+        placement: which host runs what.
         mover: has that changed; None: it does not change.
 
     Raises:
@@ -141,7 +141,7 @@ class RemoteWorlds(OrderedWorlds):
         self.pool.close()
 
     def _pids(self) -> Mapping[int, int]:
-        return dict.fromkeys(range(len(self._mine)), 0)  # nobody looks: they run elsewhere
+        return dict.fromkeys(range(len(self._mine)), 0)  # not measured: they run elsewhere
 
     def _settle(self, parts: list[Part]) -> None:
         self.pool.rename(_names(parts))

@@ -98,7 +98,7 @@ def farm_of(
 
 
 def make_sensor_jobs(recipe: Mapping[str, Any]) -> list[SensorJob]:
-    """The jobs of all sensor workers of a farm, every kernel loaded.
+    """The jobs of all sensor workers, every kernel loaded.
 
     Args:
         recipe: of `farm_of`, with what the farm has added.
@@ -120,5 +120,5 @@ def make_sensor_jobs(recipe: Mapping[str, Any]) -> list[SensorJob]:
 
 
 def _undivided(config: EnvConfig) -> EnvConfig:
-    """The same environment with all zones in one, and nobody who senses elsewhere."""
+    """The same environment with all zones in one, and no sensor workers."""
     return replace(config, zones=ZonesConfig(), workers=WorkersConfig())

@@ -155,7 +155,7 @@ class DividedWorlds:
         self.pool.rename(_names(part))
 
     def _pids(self) -> dict[int, int]:
-        return dict.fromkeys(range(len(self.pool.sizes)), 0)  # nobody looks: they run elsewhere
+        return dict.fromkeys(range(len(self.pool.sizes)), 0)  # not measured: they run elsewhere
 
     def suggest(self) -> None:
         """Write what the built-in driver would do in the agents' place."""
@@ -192,7 +192,7 @@ class DividedWorlds:
 
     @contextmanager
     def _whole(self, begins_anew: bool = False) -> Iterator[None]:
-        """The time in which worlds change; who is interrupted then leaves them half changed.
+        """The time in which worlds change; an interrupt then leaves them half changed.
 
         Raises:
             WorkerError: so it is.

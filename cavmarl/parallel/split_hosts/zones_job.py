@@ -1,4 +1,4 @@
-"""`ZonesJob`: what a host does that runs some zones of worlds which a caller elsewhere leads."""
+"""`ZonesJob`: the job of a host that runs some zones of worlds that a remote caller leads."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ Array = NDArray[Any]
 
 
 class PhaseOrder(NamedTuple):
-    """The letter of an order: a phase on some zones, and how much has changed before it.
+    """The payload of a command: a phase on some zones, and how much has changed before it.
 
     Attributes:
         is_new: the host is to forget what it has.
@@ -92,7 +92,7 @@ def make_replicated(
 
 
 class ZonesJob:
-    """Some zones of all worlds; which ones, each order says.
+    """Some zones of all worlds; which ones, each command says.
 
     Args:
         recipe: environment, and how many worlds there are.
@@ -133,10 +133,10 @@ class ZonesJob:
         return code_stamp()
 
     def fit(self, size: int) -> None:
-        """Nothing to do: each order says how much it is about."""
+        """Nothing to do: each command says how much it is about."""
 
     def inputs(self, task: int, letter: Any) -> list[Array]:
-        """Where the changes of an order go."""
+        """Where the changes of a command go."""
         self._coming = np.empty(PhaseOrder(*letter).words, dtype=np.uint64)
         return [self._coming]
 

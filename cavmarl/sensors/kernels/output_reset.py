@@ -1,7 +1,7 @@
 """What concerns the outputs of all agents at once, whichever shards own them.
 
 The order at the end of a step: `clear_outputs`, `sense` of every shard, `settle_outputs`, `credit`
-of every shard. Sums go in agent order, so that nobody can tell who wrote what.
+of every shard. Sums go in agent order, so that results do not depend on which shard wrote what.
 """
 
 from __future__ import annotations
