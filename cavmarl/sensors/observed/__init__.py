@@ -110,9 +110,9 @@ def sensing_reach_m(config: SensorsConfig, largest_radius_m: float) -> float:
     """How far from an agent's centre the centre of a vehicle can be that it can tell, in m.
 
     A vehicle that is further away changes no number of an observation and no term of the package.
-    Sensors that ask for centres reach as far as they look, `lanes` too: it takes none that is further away in the plane.
-    Rays end at bodies, whose centres are up to half a diagonal behind. Of the terms, time to
-    collision alone looks at others; it is always on.
+    Sensors that ask for centres reach as far as they look, `lanes` too: it takes none that is
+    further away in the plane. Rays end at bodies, whose centres are up to half a diagonal behind.
+    Of the terms, time to collision alone looks at others; it is always on.
 
     Args:
         config: the sensors.
