@@ -89,7 +89,7 @@ def test_a_sensor_from_outside(examples: dict[str, ModuleType]) -> None:
     assert np.abs(seen[..., -2:]).sum() > 0.0, "its features are the last ones"
     assert "crowd" in sensor_names()
     assert find_sensor("crowd").name == "crowd"  # type: ignore[union-attr]
-    with pytest.raises(ConfigError, match="cavmarl.register_sensor"):
+    with pytest.raises(ConfigError, match=r"cavmarl\.register_sensor"):
         find_sensor("cloud")
 
 
@@ -122,6 +122,13 @@ def test_a_sensor_is_asked_in_every_step() -> None:
     assert seen == expected
 
 
+def drive(env: cavmarl.CavEnv) -> None:
+    """Three steps."""
+    env.reset(seed=0)
+    for _ in range(3):
+        env.step({agent: np.zeros(2, np.float32) for agent in env.agents})
+
+
 def test_what_depends_on_the_order_of_others_is_refused() -> None:
     def first(view: cavmarl.AgentView) -> float:
         return float(view.others["x"][0]) if view.others.size else 0.0
@@ -129,9 +136,7 @@ def test_what_depends_on_the_order_of_others_is_refused() -> None:
     cavmarl.register_term("first", first, reach_m=300.0)
     env = cavmarl.parallel_env(ENV, agents=2, overrides={"terms.weights": {"first": 1.0}})
     with pytest.raises(RegisteredFunctionError, match=r"'first' depends on the order"):
-        env.reset(seed=0)
-        for _ in range(3):
-            env.step({agent: np.zeros(2, np.float32) for agent in env.agents})
+        drive(env)
     env.close()
 
 

@@ -10,7 +10,6 @@ from cavmarl.config.env import TERMS, TermsConfig
 from cavmarl.core.errors import ConfigError
 from cavmarl.core.extensions import REGISTERED_TERMS
 from cavmarl.driving.agent_view import AgentView
-from cavmarl.rewards.kernels.terms import TTC_REACH_M
 
 __all__ = ["RegisteredTerm", "register_term", "terms_reach_m"]
 
@@ -44,8 +43,5 @@ def register_term(
 
 
 def terms_reach_m(config: TermsConfig) -> float:
-    """How far away the centre of a vehicle can be that changes a term, in m.
-
-    Of the package's terms, time to collision alone looks at others; it is always on.
-    """
-    return max(TTC_REACH_M, *(REGISTERED_TERMS[name].reach_m for name in config.registered), 0.0)
+    """How far away the centre of a vehicle can be that changes a registered term, in m."""
+    return max((REGISTERED_TERMS[name].reach_m for name in config.registered), default=0.0)

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from cavmarl.config.env import SensorsConfig
 from cavmarl.core.extensions import REGISTERED_SENSORS
 from cavmarl.core.records.arrays import Sensors
+from cavmarl.rewards.kernels.terms import TTC_REACH_M
 from cavmarl.roads.network import RoadNetwork
 from cavmarl.sensors.kernels.sensor_arrays import FurtherSensors
 from cavmarl.sensors.observed import (
@@ -108,16 +109,18 @@ def largest_radius_m(types: NDArray[np.void]) -> float:
 def sensing_reach_m(config: SensorsConfig, largest_radius_m: float) -> float:
     """How far from an agent's centre the centre of a vehicle can be that it can tell, in m.
 
-    A vehicle that is further away changes no number of an observation. Sensors that ask for
-    centres reach as far as they look, `lanes` too: it takes none that is further away in the plane.
-    Rays end at bodies, whose centres are up to half a diagonal behind.
+    A vehicle that is further away changes no number of an observation and no term of the package.
+    Sensors that ask for centres reach as far as they look, `lanes` too: it takes none that is
+    further away in the plane. Rays end at bodies, whose centres are up to half a diagonal behind.
+    Of the terms, time to collision alone looks at others; it is always on.
 
     Args:
         config: the sensors.
         largest_radius_m: half the diagonal of the largest body.
     """
     sensors = sensors_of(config)
-    return max(sensor.reach_of_centres_m(config, largest_radius_m) for sensor in sensors)
+    reaches = (sensor.reach_of_centres_m(config, largest_radius_m) for sensor in sensors)
+    return max(TTC_REACH_M, *reaches)
 
 
 def _starts(config: SensorsConfig) -> dict[str, int]:
