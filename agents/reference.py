@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from cavmarl.cosim.followers.follower_client import sight_of
 from cavmarl.cosim.followers.follower_driver import StackDriver
-from cavmarl.cosim.followers.follower_snapshots import Moment, take_snapshot, welcome_to
+from cavmarl.cosim.followers.follower_snapshots import SnapshotTime, take_snapshot, welcome_to
 from cavmarl.env.parallel import CavEnv
 from cavmarl.env.vector import CavVectorEnv
 from cavmarl.policies.policy import Policy
@@ -46,7 +46,7 @@ class ReferencePolicy(Policy):
         self._episodes[ticks < self._ticks] += 1
         self._ticks = ticks
         for world, driver in enumerate(self.drivers):
-            moment = Moment(0, int(self._episodes[world]), int(ticks[world]), False)
+            moment = SnapshotTime(0, int(self._episodes[world]), int(ticks[world]), False)
             agents = np.flatnonzero(mask[world]).tolist()
             sight = sight_of(*take_snapshot(self.env, agents, moment, world))
             for agent, controls in driver.drive(sight).items():

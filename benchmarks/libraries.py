@@ -29,7 +29,7 @@ from cavmarl.env.parallel import parallel_env
 from cavmarl.env.vector import make_vec
 
 WARM_STEPS = 3
-KEYS = {"population.mode": "seats", "observation.kind": "flat", "action.kind": "continuous"}
+KEYS = {"population.mode": "respawn", "observation.kind": "flat", "action.kind": "continuous"}
 
 Step = Callable[[], object]
 

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from benchmarks.cost_models import ShardContent
 from cavmarl.balance.load_score import Candidate, Utilisation
-from cavmarl.balance.load_snapshot import Snapshot
+from cavmarl.balance.load_snapshot import LoadSnapshot
 from cavmarl.evaluate.shard_costs import MeasuredRound
 from cavmarl.handoff.repartition_plan import vehicle_costs
 from cavmarl.roads.network import RoadNetwork
@@ -36,7 +36,7 @@ class LoadRound:
     agents: NDArray[np.bool_]  # (n,) which of them agents drive
     vehicle_s: Floats  # (n,) what each costs, seconds a tick
     noise: Floats  # (k,) measured over true cost of each zone
-    snapshot: Snapshot  # what others use of the workers
+    snapshot: LoadSnapshot  # what others use of the workers
 
 
 @dataclass(frozen=True)
@@ -173,7 +173,7 @@ _OTHERS = {"cpu": (0.3, 0.15, 0.95), "ram": (0.5, 0.1, 0.85), "gpu": (0.4, 0.15,
 _STAYS = 0.9  # of what it strays by, from one round to the next
 
 
-def _other_loads(draw: np.random.Generator, rounds: int, workers: int) -> list[Snapshot]:
+def _other_loads(draw: np.random.Generator, rounds: int, workers: int) -> list[LoadSnapshot]:
     """Utilisations that come and go slowly; now and then a worker is above its threshold."""
     means, spreads, most = np.array(list(_OTHERS.values())).T
     stray = draw.normal(0.0, spreads, (workers, len(means)))
@@ -184,5 +184,5 @@ def _other_loads(draw: np.random.Generator, rounds: int, workers: int) -> list[S
         shares = np.clip(means + stray, 0.0, most)
         uses = [Utilisation(*row) for row in shares.tolist()]
         candidates = tuple(Candidate(worker, use) for worker, use in enumerate(uses))
-        found.append(Snapshot(candidates, "simulated", "generated"))
+        found.append(LoadSnapshot(candidates, "simulated", "generated"))
     return found

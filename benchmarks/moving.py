@@ -73,7 +73,7 @@ def measure(
         wanted = {
             "traffic.demand": [str(path)],
             "traffic.on_bad_route": "skip",
-            "population.mode": "seats",
+            "population.mode": "respawn",
             "horizon_s": seconds,
             **overrides,
         }

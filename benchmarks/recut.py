@@ -36,7 +36,7 @@ def measure(
     )  # fmt: skip
     common = {"zones.count": zones, **parse_settings(settings)}
     pair = {
-        name: make_vec(env, overrides={**common, "zones.recut_steps": often})
+        name: make_vec(env, overrides={**common, "zones.repartition_steps": often})
         for name, often in (("static", 0), ("re-cut", every))
     }
     uneven: dict[str, list[float]] = {name: [] for name in pair}

@@ -66,7 +66,7 @@ def measure(
             overrides={**parse_settings(settings), **more},
         )
 
-    checked = maker(**{"zones.check": True}) if check else None
+    checked = maker(**{"zones.check_invariants": True}) if check else None
     return measure_sharding(
         maker(), counts, after_s=after, repeats=repeats, make_checked=checked, say=say
     )

@@ -59,7 +59,7 @@ def measure(
         "traffic.demand": [str(file.resolve()) for file in demand],
         "clock.sim_dt_s": dt,
         "clock.ctrl_dt_s": dt,
-        "population.mode": "seats",
+        "population.mode": "respawn",
         "horizon_s": float(after + (repeats + 1) * TURN_S),
     }
     ours = make_vec(path, num_envs=1, agents=agents, background=0, overrides=settings)

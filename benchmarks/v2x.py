@@ -31,7 +31,7 @@ CHANNELS: Mapping[str, Mapping[str, Any]] = {
         "v2x.channel.latency_ticks": 2,
     },
 }
-SHAPE = {"population.mode": "seats", "clock.ctrl_dt_s": 0.05, "sensors.lidar.rays": 0}
+SHAPE = {"population.mode": "respawn", "clock.ctrl_dt_s": 0.05, "sensors.lidar.rays": 0}
 
 
 def measure(

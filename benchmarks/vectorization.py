@@ -32,7 +32,7 @@ from cavmarl.parallel.pooled_worlds import PooledWorlds
 from cavmarl.shards.shard import Commands
 
 PROGRAM = "benchmarks.trivial_worker"
-SETTINGS = {"population.mode": "seats", "observation.kind": "flat", "action.kind": "continuous"}
+SETTINGS = {"population.mode": "respawn", "observation.kind": "flat", "action.kind": "continuous"}
 STEPS = 300  # a turn
 WARM_STEPS = 50
 ORDER = "our workers alone"

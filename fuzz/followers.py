@@ -24,19 +24,19 @@ from typing import Any
 import msgpack
 
 from cavmarl.core.errors import ClockError, FollowerError
-from cavmarl.cosim.followers.follower_barrier import Barrier, Seat
+from cavmarl.cosim.followers.follower_barrier import Barrier, FollowerSeat
 from cavmarl.cosim.followers.follower_client import Follower
-from cavmarl.cosim.followers.follower_connection import Line, listen
+from cavmarl.cosim.followers.follower_connection import FollowerConnection, listen
 from cavmarl.cosim.followers.follower_messages import (
     FOLLOWERS,
     Control,
+    FollowerRefusal,
     Hello,
-    Refusal,
     Say,
     Ticked,
     letter_of,
 )
-from cavmarl.cosim.followers.follower_snapshots import Moment, take_snapshot, welcome_to
+from cavmarl.cosim.followers.follower_snapshots import SnapshotTime, take_snapshot, welcome_to
 from cavmarl.cosim.followers.reception import Reception
 from cavmarl.cosim.time_master import TimeMaster
 from cavmarl.env.parallel import CavEnv, parallel_env
@@ -103,7 +103,7 @@ def _place() -> tuple[Path, tempfile.TemporaryDirectory[str]]:
 
 @cache
 def _env() -> CavEnv:
-    settings = {"population.mode": "seats", "clock.ctrl_dt_s": 0.05}
+    settings = {"population.mode": "respawn", "clock.ctrl_dt_s": 0.05}
     env = parallel_env("ring", agents=len(AGENTS), background=1, overrides=settings)
     env.reset(seed=0)
     return env
@@ -124,10 +124,10 @@ def _a_world_hears(said: bytes) -> None:
             if not found:
                 raise FollowerError("the caller was turned away")
             line, hello = found[0]
-            seat = Seat(line, master.follow(hello.name), tuple(range(len(AGENTS))))
+            seat = FollowerSeat(line, master.follow(hello.name), tuple(range(len(AGENTS))))
             barrier = Barrier(env, WITHIN_S, "error")
             for frame in range(2):
-                outcome = barrier.pass_through([seat], Moment(frame, 0, 0, False))
+                outcome = barrier.pass_through([seat], SnapshotTime(frame, 0, 0, False))
                 for error in outcome.failed.values():
                     raise error
                 if outcome.left:
@@ -172,7 +172,7 @@ def _talk(listener: socket.socket, said: bytes) -> None:
             pass
 
 
-Words = tuple[Any, ...]  # what `Line.say` takes
+Words = tuple[Any, ...]  # what `FollowerConnection.say` takes
 
 
 def _lines(*said: Words) -> bytes:
@@ -188,7 +188,7 @@ def _lines(*said: Words) -> bytes:
 def _frames(*said: Words) -> bytes:
     """What a line would send."""
     ours, theirs = socket.socketpair()
-    line = Line(ours, "nobody")
+    line = FollowerConnection(ours, "nobody")
     for words in said:
         line.say(*words)
     line.close()
@@ -207,7 +207,7 @@ def _seeds() -> tuple[bytes, ...]:
         return Say.CONTROL, Control(frame, dict(zip(AGENTS, given, strict=False)))
 
     def snapshot(frame: int, agents: Sequence[int], is_over: bool = False) -> Words:
-        return Say.SNAPSHOT, *take_snapshot(env, agents, Moment(frame, 0, frame, is_over))
+        return Say.SNAPSHOT, *take_snapshot(env, agents, SnapshotTime(frame, 0, frame, is_over))
 
     both = [0.25, -0.5], [1.0, 0.0]
     stacks: tuple[tuple[Words, ...], ...] = (
@@ -218,7 +218,7 @@ def _seeds() -> tuple[bytes, ...]:
         (welcome, ticked, snapshot(7, [0]), snapshot(8, [0, 1]), goodbye),
         (welcome, ticked, snapshot(0, [], True), goodbye),
         (welcome, (Say.TICKED, Ticked(False, "only the time master ticks", 12))),
-        (welcome, ticked, (Say.REFUSAL, Refusal("too slow"))),
+        (welcome, ticked, (Say.REFUSAL, FollowerRefusal("too slow"))),
     )
     found = []
     for start, talks in ((STACK, stacks), (WORLD, worlds)):

@@ -14,7 +14,7 @@ from contextlib import suppress
 from cavmarl.ownership.codec import decode, encode
 from cavmarl.ownership.directory import Directory
 from cavmarl.ownership.endpoint import Endpoint
-from cavmarl.ownership.ledger import Tally
+from cavmarl.ownership.ledger import OwnedTally
 from cavmarl.ownership.limits import Limits
 from cavmarl.ownership.log_records import record_to_line, records_from_lines, replay, sealed
 from cavmarl.ownership.messages import (
@@ -58,8 +58,10 @@ def _messages() -> tuple[bytes, ...]:
     header = (RUN, 1, 12)
     enter, leave = (In(7, 4, True, digest, b"state"),), (Out(9, 2),)
     messages = (
-        Step(*header, 3, 2, 11, enter, leave, (Spawn(10, b"new"),), Tally(5, 17), b"ghosts"),
-        Done(*header, 3, 2, (Confirmed(7, 4),), (Removed(9, 1),), Tally(5, 17), 99, b"published"),
+        Step(*header, 3, 2, 11, enter, leave, (Spawn(10, b"new"),), OwnedTally(5, 17), b"ghosts"),
+        Done(
+            *header, 3, 2, (Confirmed(7, 4),), (Removed(9, 1),), OwnedTally(5, 17), 99, b"published"
+        ),
         Prepare(*header, 3, 2, 4, 1, (Offer(7, 4, digest, b"state"),)),
         Ack(*header, 4, 1, 3, (Held(7, 4, digest),)),
         Nack(*header, 4, 1, 3, (Refused(7, 4, Refusal.LOAD),)),

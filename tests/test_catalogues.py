@@ -27,7 +27,7 @@ with warnings.catch_warnings():
         state_test,
     )
 
-MODES = ("closed", "entering", "seats")
+MODES = ("closed", "open", "respawn")
 STEPS = 60
 BARE_MAPS = ("net/Town10HD.net.xml", "xodr/Town01.xodr", "osm/laufamholz.osm.xml")
 
@@ -96,7 +96,7 @@ def test_state(make: Make, make_aec: Make) -> None:
 @pytest.mark.parametrize("source", sorted(entries()), indirect=True)
 @pytest.mark.parametrize(
     "arguments",  # frames are drawn alike, whatever the population
-    ["closed", *(pytest.param(mode, marks=pytest.mark.slow) for mode in ("entering", "seats"))],
+    ["closed", *(pytest.param(mode, marks=pytest.mark.slow) for mode in ("open", "respawn"))],
     indirect=True,
 )
 def test_render(make_aec: Make, monkeypatch: pytest.MonkeyPatch) -> None:

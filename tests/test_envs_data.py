@@ -90,7 +90,7 @@ def map_or_skip(config: EnvConfig, base_dir: Path) -> Path:
 def facts(config: EnvConfig, map_path: Path) -> str:
     """The table of facts of a card."""
     report, people, clock = check_map(map_path), config.population, config.clock
-    budget = f", {people.num_ids} in an episode" if people.mode == "entering" else ""
+    budget = f", {people.num_ids} in an episode" if people.mode == "open" else ""
     trip = f"from {config.traffic.min_trip_m:g} m"
     if config.traffic.max_trip_m:
         trip += f" to {config.traffic.max_trip_m:g} m"

@@ -82,11 +82,11 @@ class Case:
 
 CASES = {
     "closed": Case("grid4x4", {"population.mode": "closed"}),
-    "entering": Case("merge", {"population.mode": "entering"}),
-    "seats": Case("merge", {"population.mode": "seats", "population.agents": 8}),
+    "open": Case("merge", {"population.mode": "open"}),
+    "respawn": Case("merge", {"population.mode": "respawn", "population.agents": 8}),
     "town": Case("town", {"population.background": 150}, steps=30, zones=(4, 9)),
-    "worlds": Case("merge", {"population.mode": "seats"}, worlds=3),
-    "another seed": Case("grid4x4", {"population.mode": "entering"}, seed=71),
+    "worlds": Case("merge", {"population.mode": "respawn"}, worlds=3),
+    "another seed": Case("grid4x4", {"population.mode": "open"}, seed=71),
     "late controls": Case("merge", {"clock.control_latency_ticks": 5}),
     "meta-actions": Case("merge", {"action.kind": "discrete"}),
     "team's rewards": Case("merge", {"terms.team_share": 0.4, "population.agents": 12}),
@@ -149,7 +149,7 @@ def test_a_real_map_with_its_demand(shared_maps: Path, trembling: Path) -> None:
         zones=(4, 9),
         policy=trembling,
         steps=60,
-        overrides={"traffic.demand": demand, "population.mode": "seats"},
+        overrides={"traffic.demand": demand, "population.mode": "respawn"},
     )
 
 
@@ -186,7 +186,7 @@ def test_one_world_begins_anew_while_others_go_on() -> None:
 
 
 def test_dicts_and_the_global_state_are_the_same() -> None:
-    settings: dict[str, Any] = {"agents": 6, "overrides": {"population.mode": "seats"} | FAST}
+    settings: dict[str, Any] = {"agents": 6, "overrides": {"population.mode": "respawn"} | FAST}
     whole, divided = (parallel_env("merge", zones=zones, **settings) for zones in (1, 4))
     (seen, infos), (other_seen, other_infos) = (env.reset(seed=4) for env in (whole, divided))
     rng = np.random.default_rng(1)

@@ -44,7 +44,7 @@ EVERYTHING: dict[str, Any] = {
     "observation.kind": "dict",
 }
 CROWD = {
-    "population.mode": "seats",
+    "population.mode": "respawn",
     "population.agents": 4,
     "population.background": 80,
 }

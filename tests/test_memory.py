@@ -31,14 +31,14 @@ pytestmark = [
 ]
 
 
-@pytest.fixture(params=["closed", "entering", "seats", "demand"])
+@pytest.fixture(params=["closed", "open", "respawn", "demand"])
 def world(request: pytest.FixtureRequest, tmp_path: Path) -> dict[str, Any]:
     """Arguments of a world of each population, and of one with demand."""
     overrides: dict[str, Any] = {"population.mode": request.param}
     if request.param == "demand":
         path = tmp_path / "x.rou.xml"
         path.write_text(DEMAND, encoding="utf-8")
-        overrides = {"population.mode": "entering", "traffic.demand": [str(path)]}
+        overrides = {"population.mode": "open", "traffic.demand": [str(path)]}
     return {"env": "grid4x4", "agents": 8, "background": 20, "seed": 0, "overrides": overrides}
 
 
@@ -93,7 +93,7 @@ def test_a_hundred_thousand_ticks_of_a_divided_city() -> None:
         if step % (steps // 20) == 0:
             memory_mb.append(resident_mb())
 
-    watched = {"zones.check": True}
+    watched = {"zones.check_invariants": True}
     found = verify_zones("rush", (4, 9), steps=steps, agents=100, overrides=watched, progress=look)
     assert found.holds, found.results
     assert all(result.crossings > 1000 for result in found.results)

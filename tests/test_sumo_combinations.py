@@ -31,7 +31,7 @@ PLAIN: dict[str, Any] = {"observation.mode": "ground_truth", "rig": {}, "clock.c
 def settings(folder: Path, source: str) -> dict[str, Any]:
     """All sensors and messages beside SUMO, in steps of two ticks."""
     demand = {"traffic.source": source, "traffic.demand": [str(tiny_file(folder))]}
-    return EVERYTHING | demand | {"sensors.signal.timing": False, "population.mode": "seats"}
+    return EVERYTHING | demand | {"sensors.signal.timing": False, "population.mode": "respawn"}
 
 
 def drive(

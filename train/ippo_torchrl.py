@@ -220,7 +220,7 @@ def make_worlds(args: Args) -> CavTorchRLEnv:
         args.env,
         num_envs=args.num_worlds,
         overrides={
-            "population.mode": "seats",
+            "population.mode": "respawn",
             "observation.kind": "flat",
             "action.out_of_range": "clip",
         },

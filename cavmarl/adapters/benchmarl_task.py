@@ -47,7 +47,7 @@ class CavTaskClass(TaskClass):  # type: ignore[misc] # found in an environment o
     ) -> Callable[[], CavTorchRLEnv]:
         """What makes `num_envs` worlds."""
         overrides = {
-            "population.mode": "seats",
+            "population.mode": "respawn",
             **self.config.get("overrides", {}),
             "action.kind": "continuous" if continuous_actions else "discrete",
         }

@@ -60,7 +60,7 @@ class CavAgentRows(VectorEnv[Any, Any, Any]):
     ) -> None:
         self.closed = True  # until there is something to close: Gymnasium does so when it is freed
         refuse_decided(DECIDED, overrides, arguments)
-        wanted = {"population.mode": "seats", **(overrides or {})}
+        wanted = {"population.mode": "respawn", **(overrides or {})}
         self._vec = make_vec(
             env,
             num_envs=num_worlds,
@@ -153,7 +153,7 @@ def _rows_a_world(
             "world has the same number of rows"
         )
     rows = num_envs // num_worlds
-    if overrides["population.mode"] == "entering":
+    if overrides["population.mode"] == "open":
         agents = load_config(env, overrides=overrides)[0].population.agents
         return {"population.agents": min(agents, rows), "population.budget": rows}
     refuse_decided(["population.agents"], overrides)

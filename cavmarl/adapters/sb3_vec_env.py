@@ -66,7 +66,7 @@ class CavSb3VecEnv(VecEnv):
         self._vec = make_vec(
             env,
             num_envs=num_worlds,
-            overrides={"population.mode": "seats", **(overrides or {})},
+            overrides={"population.mode": "respawn", **(overrides or {})},
             **arguments,
         )
         self._form = ObservationForm(self._vec.config)

@@ -8,18 +8,18 @@ from typing import Any, NamedTuple
 
 from cavmarl.balance.assignment import assign, workers_of
 from cavmarl.balance.load_score import Rejection
-from cavmarl.balance.load_snapshot import Snapshot
+from cavmarl.balance.load_snapshot import LoadSnapshot
 from cavmarl.balance.problem import Problem
 from cavmarl.balance.shard_placement import Placement
 from cavmarl.core.errors import ConfigError
 
-__all__ = ["Move", "Plan", "WorkerLoad", "make_plan", "replan"]
+__all__ = ["Plan", "ShardMove", "WorkerLoad", "make_plan", "replan"]
 
 SCHEMA = "cavmarl.plan"
 VERSION = 1
 
 
-class Move(NamedTuple):
+class ShardMove(NamedTuple):
     """A shard that changes its worker.
 
     Attributes:
@@ -96,11 +96,11 @@ class Plan:
         return self.placement.imbalance
 
     @property
-    def moves(self) -> tuple[Move, ...]:
+    def moves(self) -> tuple[ShardMove, ...]:
         """Shards that have another worker than before; of a first plan none."""
         present = self.problem.present or self.homes
         return tuple(
-            Move(shard.world, shard.zone, before, after)
+            ShardMove(shard.world, shard.zone, before, after)
             for shard, before, after in zip(self.problem.shards, present, self.homes, strict=True)
             if before != after
         )
@@ -156,6 +156,6 @@ def make_plan(problem: Problem) -> Plan:
     return Plan(problem, tuple(numbers[home] for home in placement.homes), method)
 
 
-def replan(plan: Plan, snapshot: Snapshot) -> Plan:
+def replan(plan: Plan, snapshot: LoadSnapshot) -> Plan:
     """The plan that follows from another snapshot, or from the same one again."""
     return make_plan(replace(plan.problem, snapshot=snapshot))

@@ -6,7 +6,7 @@ from collections.abc import Iterable
 from dataclasses import replace
 
 from cavmarl.balance.balance_plan import Plan, make_plan
-from cavmarl.balance.load_snapshot import Snapshot
+from cavmarl.balance.load_snapshot import LoadSnapshot
 from cavmarl.balance.problem import MEASURED_COSTS, BalanceRule, Problem, ShardCost
 from cavmarl.balance.smoothing import SmoothCosts
 from cavmarl.core.errors import ConfigError
@@ -51,7 +51,7 @@ class Balancer:
 
     def round(
         self,
-        snapshot: Snapshot,
+        snapshot: LoadSnapshot,
         *,
         costs: tuple[ShardCost, ...] | None = None,
         rule: BalanceRule | None = None,

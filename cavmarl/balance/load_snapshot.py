@@ -1,4 +1,4 @@
-"""`Snapshot`: each worker's resource use at one time.
+"""`LoadSnapshot`: each worker's resource use at one time.
 
 A placement depends on live readings only through a snapshot: kept in a manifest, it gives the same
 plan again. `probe` takes one of this machine.
@@ -12,14 +12,14 @@ from typing import Any
 from cavmarl.balance.load_score import Candidate, Utilisation
 from cavmarl.core.errors import ConfigError
 
-__all__ = ["NO_GPU", "SUPPOSED_IDLE", "Snapshot", "idle_snapshot"]
+__all__ = ["NO_GPU", "SUPPOSED_IDLE", "LoadSnapshot", "idle_snapshot"]
 
 NO_GPU = "none"
 SUPPOSED_IDLE = "supposed idle"
 
 
 @dataclass(frozen=True)
-class Snapshot:
+class LoadSnapshot:
     """Utilisation of all workers.
 
     Attributes:
@@ -48,8 +48,8 @@ class Snapshot:
         return asdict(self) | {"workers": [asdict(worker) for worker in self.workers]}
 
 
-def idle_snapshot(count: int) -> Snapshot:
+def idle_snapshot(count: int) -> LoadSnapshot:
     """Workers 0 to `count` - 1 of which nothing is in use."""
     idle = Utilisation(0.0, 0.0)
     workers = tuple(Candidate(worker, idle) for worker in range(count))
-    return Snapshot(workers, NO_GPU, SUPPOSED_IDLE)
+    return LoadSnapshot(workers, NO_GPU, SUPPOSED_IDLE)

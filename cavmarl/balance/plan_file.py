@@ -9,7 +9,7 @@ from typing import Any
 
 from cavmarl.balance.balance_plan import SCHEMA, VERSION, Plan
 from cavmarl.balance.load_score import RESOURCES, Candidate, LoadRule, Utilisation
-from cavmarl.balance.load_snapshot import Snapshot
+from cavmarl.balance.load_snapshot import LoadSnapshot
 from cavmarl.balance.problem import MEASURED_COSTS, BalanceRule, Problem, ShardCost
 from cavmarl.core.errors import ConfigError
 
@@ -101,14 +101,14 @@ def plan_from_dict(document: Mapping[str, Any]) -> Plan:
     return Plan(problem, homes, _text(get("method"), "method"))
 
 
-def snapshot_from_dict(document: Mapping[str, Any]) -> Snapshot:
+def snapshot_from_dict(document: Mapping[str, Any]) -> LoadSnapshot:
     """The snapshot of a document.
 
     Raises:
         ConfigError: a key is missing, or a value is none.
     """
     rows = _list(document.get("workers"), "workers")
-    return Snapshot(
+    return LoadSnapshot(
         workers=tuple(_candidate(_table(row, "worker")) for row in rows),
         gpu_source=_text(document.get("gpu_source"), "gpu_source"),
         origin=_text(document.get("origin"), "origin"),

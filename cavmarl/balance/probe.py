@@ -11,7 +11,7 @@ from collections.abc import Mapping
 import psutil
 
 from cavmarl.balance.load_score import Candidate, Utilisation
-from cavmarl.balance.load_snapshot import NO_GPU, Snapshot
+from cavmarl.balance.load_snapshot import NO_GPU, LoadSnapshot
 from cavmarl.core.errors import ConfigError
 
 __all__ = ["MEASURED", "Watch", "take_snapshot"]
@@ -23,7 +23,9 @@ GPU_TOOL = "nvidia-smi"
 GPU_QUERY = ("--query-gpu=utilization.gpu", "--format=csv,noheader,nounits")
 
 
-def take_snapshot(workers: Mapping[int, int | None], interval_s: float = INTERVAL_S) -> Snapshot:
+def take_snapshot(
+    workers: Mapping[int, int | None], interval_s: float = INTERVAL_S
+) -> LoadSnapshot:
     """Watch the machine for `interval_s` and say how busy each worker's part of it is.
 
     Args:
@@ -58,7 +60,7 @@ class Watch:
         self._began_s = time.perf_counter()
         self._before = _busy_s()
 
-    def snapshot(self) -> Snapshot:
+    def snapshot(self) -> LoadSnapshot:
         """How busy others kept each worker's part of the machine.
 
         Raises:
@@ -81,7 +83,7 @@ class Watch:
             cpu = sum(foreign[core] for core in process.cores) / len(process.cores)
             use = Utilisation(min(max(cpu, 0.0), 1.0) if available else 1.0, ram, gpu)
             states.append(Candidate(number, use, available=available))
-        return Snapshot(tuple(states), source, MEASURED)
+        return LoadSnapshot(tuple(states), source, MEASURED)
 
 
 class _Watched:

@@ -9,7 +9,7 @@ from functools import cached_property
 from typing import NamedTuple
 
 from cavmarl.balance.load_score import LoadRule
-from cavmarl.balance.load_snapshot import Snapshot
+from cavmarl.balance.load_snapshot import LoadSnapshot
 from cavmarl.core.errors import ConfigError
 
 __all__ = ["MEASURED_COSTS", "BalanceRule", "Problem", "ShardCost", "equal_costs"]
@@ -94,7 +94,7 @@ class Problem:
 
     shards: tuple[ShardCost, ...]
     neighbors: tuple[tuple[int, ...], ...]
-    snapshot: Snapshot
+    snapshot: LoadSnapshot
     rule: BalanceRule = field(default_factory=BalanceRule)
     present: tuple[int, ...] | None = None
     in_row: bool = False

@@ -83,7 +83,7 @@ def measure_drift(
         raise ConfigError(f"steps = {steps}: must be at least 1")
     if not 0.0 <= rogue <= 1.0:
         raise ConfigError(f"rogue = {rogue}: must be a share, from 0 to 1")
-    settings = {"population.mode": "seats", **(overrides or {})}
+    settings = {"population.mode": "respawn", **(overrides or {})}
     made = parallel_env(env, overrides=settings)
     dt_s = made.config.clock.sim_dt_s
     settings |= {"clock.ctrl_dt_s": dt_s, "horizon_s": dt_s * (BEFORE + 2 * steps + 1)}

@@ -21,7 +21,7 @@ from cavmarl.bench.stopwatch import Stopwatch
 from cavmarl.core import errors
 from cavmarl.env.vector import CavVectorEnv, make_vec
 from cavmarl.parallel.local_worlds import LocalWorlds
-from cavmarl.parallel.sensor_workers.sensor_pool import FarmTimes, SensorFarm
+from cavmarl.parallel.sensor_workers.sensor_pool import SensorWorkers, SensorWorkerTimes
 
 __all__ = ["PARTS", "SensorJob", "SensorRun", "Window", "main", "run_sensors"]
 
@@ -120,7 +120,7 @@ class _Timed:
         assert isinstance(worlds, LocalWorlds)
         assert worlds.farm is not None
         self._vec = vec
-        self._farm: SensorFarm = worlds.farm
+        self._farm: SensorWorkers = worlds.farm
         self._runtime, self._rig, self._ticks = (Stopwatch(time.perf_counter_ns) for _ in range(3))
         simulation = vec.simulation
         simulation.instrument(self._runtime.around)
@@ -170,7 +170,7 @@ class _Timed:
         self._note(step_s, vec.simulated_s - simulated_s, farm)
         return cpu_s
 
-    def _note(self, step_s: float, simulated_s: float, farm: FarmTimes) -> None:
+    def _note(self, step_s: float, simulated_s: float, farm: SensorWorkerTimes) -> None:
         self._step_ms.append(1e3 * step_s)
         self._wait_ms.append(1e3 * farm.wait_s)
         parts = dict.fromkeys(PARTS, 0.0)

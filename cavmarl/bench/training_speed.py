@@ -162,7 +162,7 @@ def _settings(folder: Path, agents: int, worlds: int, workers: int) -> PpoSettin
         "map": {"source": str(straight_road(folder, road_m))},
         "horizon_s": HORIZON_S,
     }
-    for key, value in (overrides(OUR_SENSORS, agents) | {"population.mode": "seats"}).items():
+    for key, value in (overrides(OUR_SENSORS, agents) | {"population.mode": "respawn"}).items():
         *parents, name = key.split(".")
         place = entry
         for parent in parents:

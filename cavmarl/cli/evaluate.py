@@ -32,7 +32,7 @@ from cavmarl.core.errors import require
 if TYPE_CHECKING:
     from cavmarl.evaluate import EvaluationReport
     from cavmarl.evaluate.metrics import Metric
-    from cavmarl.evaluate.report import Difference, Found, PolicyReport
+    from cavmarl.evaluate.report import Found, PairedDifference, PolicyReport
     from cavmarl.ownership.transfer_summary import TransferSummary
 
 __all__ = [
@@ -270,7 +270,7 @@ def report_cell(metric: Metric, found: Found) -> str:
     return " ".join(parts)
 
 
-def _change(metric: Metric, found: Difference) -> str:
+def _change(metric: Metric, found: PairedDifference) -> str:
     if found.mean is None:
         return number(None)
     text = f"{metric.scale * found.mean:+.2f}"

@@ -22,7 +22,7 @@ from cavmarl.config.env import ZONE_LAYOUTS
 from cavmarl.core.errors import ConfigError, NoAdmissibleWorkerError
 
 if TYPE_CHECKING:
-    from cavmarl.balance.load_snapshot import Snapshot
+    from cavmarl.balance.load_snapshot import LoadSnapshot
     from cavmarl.evaluate.shard_costs import MeasuredWorlds
     from cavmarl.roads.network import RoadNetwork
     from cavmarl.zones.partition.zone_partition import ZonePartition
@@ -141,7 +141,7 @@ def _cut_anew(
     )
 
 
-def _snapshot(said: str, workers: int) -> Snapshot:
+def _snapshot(said: str, workers: int) -> LoadSnapshot:
     from cavmarl.balance.load_snapshot import idle_snapshot
     from cavmarl.balance.plan_file import read_plan
     from cavmarl.balance.probe import take_snapshot

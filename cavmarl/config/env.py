@@ -45,9 +45,9 @@ __all__ = [
 # The named terms of one step, in the order of every terms array (`rewards/kernels/terms.py`).
 TERMS = (
     "progress",
-    "speed",
-    "comfort",
-    "time_to_collision",
+    "speeding",
+    "jerk",
+    "ttc_risk",
     "collision",
     "off_road",
     "wrong_way",
@@ -142,14 +142,15 @@ class ZonesConfig(Section, key="zones"):
         approach_ticks: so many ticks before a vehicle is there at its present speed, the zone that
             it drives to is told.
         journal: file for the coordinator's log; empty: none. It must not exist.
-        check: watch the invariants of ownership at run time.
+        check_invariants: watch the invariants of ownership at run time.
         faults: a plan of faults to inject, as JSON or a file of it; empty: none.
         reproducers: folder for ticks that every host of a zone died of, from which they can be run
             again. With it, what a zone's code raises is the death of its host. Empty: only where
             faults kill hosts, and then the system's folder for temporary files.
-        recut_steps: every so many steps zones become others by bisection of where the vehicles are,
+        repartition_steps: every so many steps zones become others by bisection of where the
+            vehicles are,
             if that shares them out better; results do not depend on it. 0: they stay.
-        recut_tolerance: by which share of the mean the fullest zone has to become emptier.
+        repartition_tolerance: by which share of the mean the fullest zone has to become emptier.
     """
 
     layout: str = "bisection"
@@ -164,11 +165,11 @@ class ZonesConfig(Section, key="zones"):
     halo_m: Annotated[float | None, Within(0.0, 1e6)] = None
     approach_ticks: Annotated[int, Whole(1, 1000)] = 2
     journal: str = ""
-    check: bool = False
+    check_invariants: bool = False
     faults: str = ""
     reproducers: str = ""
-    recut_steps: Annotated[int, Whole(0, 1_000_000)] = 0
-    recut_tolerance: Annotated[float, Within(0.0, 100.0)] = 0.1
+    repartition_steps: Annotated[int, Whole(0, 1_000_000)] = 0
+    repartition_tolerance: Annotated[float, Within(0.0, 100.0)] = 0.1
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -192,9 +193,9 @@ class ZonesConfig(Section, key="zones"):
             "must be 1 or more with zones.policy = extend, and 0 with force",
         )
         _check(
-            not (self.recut_steps and (self.faults or self.reproducers)),
-            "zones.recut_steps",
-            self.recut_steps,
+            not (self.repartition_steps and (self.faults or self.reproducers)),
+            "zones.repartition_steps",
+            self.repartition_steps,
             "vehicles that change their zone must not be late: leave out zones.faults and "
             "zones.reproducers, or let zones stay",
         )
@@ -207,16 +208,18 @@ class WorkersConfig(Section, key="workers"):
     Attributes:
         timeout_s: for so long a worker may be busy with one step or reset; then it is taken to hang
             and replaced. One that is stopped or sleeps is noticed within a second.
-        repeats: how often a step is begun again because a worker has died.
+        max_retries: how often a step is begun again because a worker has died.
         pin: keep each worker on a core of its own. The system sometimes leaves two on one; but of
             several environments with workers on one machine all take the same cores.
         balance_steps: so many steps from one round to the next, in which worlds, or zones of a
             split world, may change their worker by what they have cost; 0: they stay where they
             are. Results do not depend on it.
-        tolerance: while the slowest worker takes at most this share longer than a perfect division
+        imbalance_tolerance: while the slowest worker takes at most this share longer than a
+            perfect division
             would, nothing moves.
         max_moves: worlds or zones that change their worker in one round.
-        watch: see how busy others keep the workers' cores, and give nothing more to workers above
+        monitor_cpu: see how busy others keep the workers' cores, and give nothing more to workers
+            above
             a threshold; without it nobody else is supposed to use them.
         sensors: processes that the sensors of `rig` are shared out over, for each process that
             keeps the state of worlds; 0: it senses itself. Results do not depend on it. See
@@ -225,12 +228,12 @@ class WorkersConfig(Section, key="workers"):
     """
 
     timeout_s: Annotated[float, Within(1.0, 1e6)] = 300.0
-    repeats: Annotated[int, Whole(0, 1000)] = 3
+    max_retries: Annotated[int, Whole(0, 1000)] = 3
     pin: bool = False
     balance_steps: Annotated[int, Whole(0, 1_000_000)] = 0
-    tolerance: Annotated[float, Within(0.0, 100.0)] = 0.1
+    imbalance_tolerance: Annotated[float, Within(0.0, 100.0)] = 0.1
     max_moves: Annotated[int, Whole(1, 65_536)] = 4
-    watch: bool = False
+    monitor_cpu: bool = False
     sensors: Annotated[int, Whole(0, MAX_SENSOR_WORKERS)] = 0
     sensor_placement: Literal["cost", "in_turn"] = "cost"
 
@@ -250,14 +253,14 @@ class PopulationConfig(Section, key="population"):
             agents); the other modes do not read it.
     """
 
-    mode: Literal["closed", "entering", "seats"] = "closed"
+    mode: Literal["closed", "open", "respawn"] = "closed"
     agents: Annotated[int, Whole(0, 100_000, "; 0: a world to watch")] = 4
     background: Annotated[int, Whole(0, 1_000_000)] = 20
     budget: int | None = None
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if self.budget is not None and self.mode == "entering":
+        if self.budget is not None and self.mode == "open":
             _check(
                 self.agents <= self.budget <= MAX_IDS,
                 "population.budget",
@@ -268,7 +271,7 @@ class PopulationConfig(Section, key="population"):
     @property
     def num_ids(self) -> int:
         """How many agent ids an episode can use."""
-        if self.mode == "entering":
+        if self.mode == "open":
             return self.budget if self.budget is not None else 4 * self.agents
         return self.agents
 
@@ -385,9 +388,9 @@ class TermsConfig(Section, key="terms"):
     weights: dict[str, float] = field(
         default_factory=lambda: {
             "progress": 0.1,
-            "speed": -1.0,
-            "comfort": -0.01,
-            "time_to_collision": -0.1,
+            "speeding": -1.0,
+            "jerk": -0.01,
+            "ttc_risk": -0.1,
             "collision": -10.0,
             "off_road": -10.0,
             "wrong_way": -1.0,

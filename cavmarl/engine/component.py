@@ -21,10 +21,10 @@ from cavmarl.roads.network import RoadNetwork
 from cavmarl.sensors.mounted.frames import Frames
 from cavmarl.shards.shard import Commands, Shard
 
-__all__ = ["Attached", "Host"]
+__all__ = ["Attached", "ComponentContext"]
 
 
-class Host(NamedTuple):
+class ComponentContext(NamedTuple):
     """What a part is attached to.
 
     Attributes:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from cavmarl.engine.component import Attached, Host
+from cavmarl.engine.component import Attached, ComponentContext
 from cavmarl.engine.rig_component import MountedSensors
 from cavmarl.engine.scenario_cues import Cues
 from cavmarl.engine.v2x_component import Messaging
@@ -10,7 +10,7 @@ from cavmarl.engine.v2x_component import Messaging
 __all__ = ["attach"]
 
 
-def attach(host: Host) -> tuple[Attached, ...]:
+def attach(host: ComponentContext) -> tuple[Attached, ...]:
     """The parts that the environment asks for, in the order in which they act."""
     parts: list[Attached] = []
     if host.config.scenario.name:

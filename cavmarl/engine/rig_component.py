@@ -9,9 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cavmarl.driving.vehicle_types import generated_types
-from cavmarl.engine.component import Host
+from cavmarl.engine.component import ComponentContext
 from cavmarl.sensors.mounted.backdrop import make_backdrop
-from cavmarl.sensors.mounted.mounted_sensor import Platform, Scene
+from cavmarl.sensors.mounted.mounted_sensor import Platform, SensedScene
 from cavmarl.sensors.mounted.sensor_rig import Rig
 from cavmarl.shards.shard import Commands
 
@@ -29,7 +29,7 @@ class MountedSensors:
         platform: what the sensors are mounted on.
     """
 
-    def __init__(self, host: Host) -> None:
+    def __init__(self, host: ComponentContext) -> None:
         config = host.config
         self.platform = Platform(
             host.network,
@@ -60,10 +60,10 @@ class MountedSensors:
     def arrays(self) -> Iterator[NDArray[Any]]:
         return self.rig.arrays()
 
-    def scenes(self) -> list[Scene]:
+    def scenes(self) -> list[SensedScene]:
         """What the agents of each zone can see now."""
         return [
-            Scene(
+            SensedScene(
                 shard.roads,
                 shard.lane_grid,
                 shard.plans,

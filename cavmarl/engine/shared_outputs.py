@@ -1,4 +1,4 @@
-"""`Commons`: signals and agents' outputs, which all zones of a world share."""
+"""`SharedOutputs`: signals and agents' outputs, which all zones of a world share."""
 
 from __future__ import annotations
 
@@ -15,10 +15,10 @@ from cavmarl.roads.network import RoadNetwork
 from cavmarl.sensors.kernels.output_reset import clear_outputs, settle_outputs
 from cavmarl.shards.agent_outputs import make_outputs
 
-__all__ = ["Commons"]
+__all__ = ["SharedOutputs"]
 
 
-class Commons:
+class SharedOutputs:
     """What all shards of W worlds share, and the steps that are taken once for all of them.
 
     Args:

@@ -26,16 +26,16 @@ from cavmarl.driving.vehicles import blank_vehicle
 from cavmarl.engine import world_snapshot as snapshot
 from cavmarl.engine.compilation import first_compilation
 from cavmarl.engine.shard_clock import ShardClock
-from cavmarl.engine.shared_outputs import Commons
+from cavmarl.engine.shared_outputs import SharedOutputs
 from cavmarl.engine.state_digest import digest_world
 from cavmarl.engine.tick_setup import cut_zones, make_frames, make_tick
 from cavmarl.engine.world_views import WorldViews
-from cavmarl.handoff.coordinator.coordinator_setup import Run, make_refereeing
-from cavmarl.handoff.coordinator.handoff_log import BorderBook
+from cavmarl.handoff.coordinator.coordinator_setup import WorldRun, make_coordinators
+from cavmarl.handoff.coordinator.handoff_log import HandoffLog
 from cavmarl.handoff.fault_injection.committed_store import CommittedStore
 from cavmarl.handoff.fault_injection.recovery import Recovery
 from cavmarl.handoff.fault_injection.reproducer_file import Reproducer
-from cavmarl.handoff.fault_injection.reproducer_recording import Keeper, Moment, sources_of
+from cavmarl.handoff.fault_injection.reproducer_recording import Keeper, RecordedTick, sources_of
 from cavmarl.handoff.repartitioning import Recutter
 from cavmarl.ownership.messages import Switch
 from cavmarl.ownership.transfers import TransferLog
@@ -92,7 +92,7 @@ class Simulation(WorldViews):
         warm: bool = False,
         zeros: Zeros = huge_zeros,
         like: Simulation | None = None,
-        runs: Sequence[Run] | None = None,
+        runs: Sequence[WorldRun] | None = None,
     ) -> None:
         self.config = config
         self.network = network
@@ -109,7 +109,7 @@ class Simulation(WorldViews):
         self._keeper: Keeper | None = None
         self._recutter: Recutter | None = None
         with first_compilation() as is_first:
-            commons = Commons(config, network, num_worlds, observations, zeros)
+            commons = SharedOutputs(config, network, num_worlds, observations, zeros)
             self._tick = make_tick(
                 config,
                 network,
@@ -134,26 +134,26 @@ class Simulation(WorldViews):
                 self.demand, self.network, travel, travel.num_fixed, zoned, blank_vehicle()
             )
 
-    def _add_coordinators(self, runs: Sequence[Run] | None) -> None:
+    def _add_coordinators(self, runs: Sequence[WorldRun] | None) -> None:
         """Coordinators, and what makes other zones, where the settings ask for them."""
         zones = self.config.zones
-        watched = zones.journal or zones.check or zones.faults or zones.reproducers
+        watched = zones.journal or zones.check_invariants or zones.faults or zones.reproducers
         if self.partition.count > 1 or watched:
             self._let_coordinate(runs)
         tick = self._tick
-        if zones.recut_steps and self.partition.count > 1 and tick.coordination is not None:
+        if zones.repartition_steps and self.partition.count > 1 and tick.coordination is not None:
             self._recutter = Recutter(
                 self.network,
                 tick.division,
                 tick.coordination,
-                zones.recut_steps,
-                zones.recut_tolerance,
+                zones.repartition_steps,
+                zones.repartition_tolerance,
             )
 
-    def _let_coordinate(self, runs: Sequence[Run] | None) -> None:
+    def _let_coordinate(self, runs: Sequence[WorldRun] | None) -> None:
         """Let coordinators decide ownership; with one zone there are none."""
         tick = self._tick
-        refereeing = make_refereeing(
+        refereeing = make_coordinators(
             self.config.zones,
             self._shards,
             tick.division,
@@ -201,7 +201,7 @@ class Simulation(WorldViews):
         tick.division.near(0, everybody=True)
         with suppress(ConfigError):
             tick.division.hand_over(0, Switch(-1, 0, 0, 0, False), None)
-        book = BorderBook(tick.division, 0)
+        book = HandoffLog(tick.division, 0)
         book.release(book.hand_over(True, sum(tick.division.counts(0)), ()))
         book.reset(0)
         self._episodes[:] = 0
@@ -305,7 +305,7 @@ class Simulation(WorldViews):
             if self._keeper is not None:
                 episode = int(self._episodes[0])
                 moment = (self._seed, self._first_world, episode, commands, is_first, is_last)
-                error.reproducer = self._keeper.keep(error, Moment(*moment))
+                error.reproducer = self._keeper.keep(error, RecordedTick(*moment))
             raise
 
     def resume(self, kept: Reproducer) -> None:
@@ -375,7 +375,9 @@ class Simulation(WorldViews):
 
     def _refuse_recutting(self, what: str) -> None:
         if self._recutter is not None:
-            raise ConfigError(f"zones.recut_steps: {what} needs zones that stay; leave one out")
+            raise ConfigError(
+                f"zones.repartition_steps: {what} needs zones that stay; leave one out"
+            )
 
     def close(self) -> None:
         """End the processes that the worlds have."""

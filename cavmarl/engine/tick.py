@@ -12,9 +12,9 @@ from cavmarl.core.math.tallies import count_tick, occasions
 from cavmarl.core.numba.repeated import repeated
 from cavmarl.core.records.arrays import Gate
 from cavmarl.engine.component import Attached
-from cavmarl.engine.shared_outputs import Commons
+from cavmarl.engine.shared_outputs import SharedOutputs
 from cavmarl.engine.step_trace import MIRROR, SUMO, Traced
-from cavmarl.handoff.coordinator.coordinators import Coordination
+from cavmarl.handoff.coordinator.coordinators import Coordinators
 from cavmarl.handoff.division import Division
 from cavmarl.shards.executor import Executor, SerialExecutor, Together
 from cavmarl.shards.shard import Commands, Shard
@@ -53,7 +53,7 @@ class Tick:
         shards: Sequence[Shard],
         division: Division,
         traffic: NativeTraffic,
-        commons: Commons,
+        commons: SharedOutputs,
         gate: Gate,
         attached: tuple[Attached, ...],
     ) -> None:
@@ -64,7 +64,7 @@ class Tick:
         self.gate = gate
         self.attached = attached
         self.executor: Executor = SerialExecutor(shards)
-        self.coordination: Coordination | None = None
+        self.coordination: Coordinators | None = None
         self.sumo: SumoTraffic | None = None
         self.hosts_may_die = False
         self._shard = shards[0]

@@ -5,9 +5,9 @@ from __future__ import annotations
 from cavmarl.config.env import EnvConfig
 from cavmarl.core.memory import Zeros
 from cavmarl.driving.vehicles import blank_vehicle
-from cavmarl.engine.component import Host
+from cavmarl.engine.component import ComponentContext
 from cavmarl.engine.component_setup import attach
-from cavmarl.engine.shared_outputs import Commons
+from cavmarl.engine.shared_outputs import SharedOutputs
 from cavmarl.engine.tick import Tick
 from cavmarl.handoff.shard_setup import divide
 from cavmarl.roads.network import RoadNetwork
@@ -29,7 +29,7 @@ def make_tick(
     network: RoadNetwork,
     partition: ZonePartition,
     demand: DemandFile | SumoDemand | None,
-    commons: Commons,
+    commons: SharedOutputs,
     frames: Frames,
     zeros: Zeros,
     traffic: NativeTraffic | None,
@@ -66,7 +66,7 @@ def make_tick(
         config, network, partition, traffic, commons.outputs, num_worlds, zeros
     )
     attached = attach(
-        Host(
+        ComponentContext(
             config,
             network,
             num_worlds,

@@ -13,7 +13,7 @@ from cavmarl.shards.shard import Commands
 from cavmarl.v2x.bus import Bus
 
 if TYPE_CHECKING:
-    from cavmarl.engine.component import Host
+    from cavmarl.engine.component import ComponentContext
 
 __all__ = ["Messaging"]
 
@@ -30,7 +30,7 @@ class Messaging:
         bus: the messages.
     """
 
-    def __init__(self, host: Host) -> None:
+    def __init__(self, host: ComponentContext) -> None:
         worlds = host.shards[0].worlds
         self._division = host.division
         self._ticks = worlds.ticks

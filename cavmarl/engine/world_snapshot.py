@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from cavmarl.core.records.arrays import Gate, Outputs, Worlds
 from cavmarl.engine.component import Attached
-from cavmarl.handoff.coordinator.coordinators import Coordination
+from cavmarl.handoff.coordinator.coordinators import Coordinators
 from cavmarl.handoff.division import Division
 from cavmarl.shards.shard import COMMON
 from cavmarl.traffic.native import NativeTraffic
@@ -49,7 +49,7 @@ class Parts(NamedTuple):
     gate: Gate
     traffic: NativeTraffic
     outputs: Outputs
-    coordination: Coordination | None
+    coordination: Coordinators | None
     has_frames: bool
     attached: tuple[Attached, ...]
     sumo: SumoTraffic | None

@@ -17,7 +17,7 @@ from cavmarl.engine.rig_component import MountedSensors
 from cavmarl.engine.tick import Tick
 from cavmarl.engine.traffic_stats import TrafficStats, count_traffic
 from cavmarl.engine.v2x_component import Messaging
-from cavmarl.handoff.coordinator.coordinator import Referee
+from cavmarl.handoff.coordinator.coordinator import Coordinator
 from cavmarl.handoff.division import ZoneLoads
 from cavmarl.handoff.fault_injection.recovery import Recovery, Revival
 from cavmarl.handoff.repartitioning import Recut, Recutter
@@ -155,7 +155,7 @@ class WorldViews:
         return sum(coordinator.switched for coordinator in self.coordinators)
 
     @property
-    def coordinators(self) -> tuple[Referee, ...]:
+    def coordinators(self) -> tuple[Coordinator, ...]:
         """The coordinators, one a world; none where all is one zone."""
         return () if self._tick.coordination is None else self._tick.coordination.coordinators
 
@@ -194,7 +194,7 @@ class WorldViews:
 
     @property
     def recuts(self) -> Sequence[Recut]:
-        """When other zones have been made while the worlds ran; see `zones.recut_steps`."""
+        """When other zones have been made while the worlds ran; see `zones.repartition_steps`."""
         return () if self._recutter is None else self._recutter.recuts
 
     @property

@@ -168,7 +168,7 @@ class CavEnv(ParallelEnv[str, Any, Any]):  # type: ignore[misc] # PettingZoo is 
         one_observation, one_action = observation_space(config), action_space(config.action)
         self.observation_spaces = dict.fromkeys(self.possible_agents, one_observation)
         self.action_spaces = dict.fromkeys(self.possible_agents, one_action)
-        self._seats = config.population.mode == "seats"
+        self._seats = config.population.mode == "respawn"
         self._stack = config.sensors.stack
         self._term_names = config.terms.names
         self._info_absent = dict.fromkeys((*self._term_names, *_OF_VEHICLE), 0.0)

@@ -1,4 +1,4 @@
-"""`Watch`: between the steps of many worlds, the places and near misses of their agents."""
+"""`EncounterWatch`: after each step, the places and near misses of agents."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from cavmarl.evaluate.kernels.watching import locate_agents, watch_encroachments
 from cavmarl.evaluate.recorder import Recorder
 from cavmarl.roads.network import RoadNetwork
 
-__all__ = ["Watch", "mirrored_conflicts"]
+__all__ = ["EncounterWatch", "mirrored_conflicts"]
 
 
 def mirrored_conflicts(network: RoadNetwork) -> NDArray[np.int32]:
@@ -32,7 +32,7 @@ def mirrored_conflicts(network: RoadNetwork) -> NDArray[np.int32]:
     return mirror
 
 
-class Watch:
+class EncounterWatch:
     """Writes places and least post-encroachment times of the agents into a recorder.
 
     Args:

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from cavmarl.engine.shard_clock import ShardClock
 from cavmarl.engine.world_setup import load_world
 from cavmarl.env.vector import CavVectorEnv
-from cavmarl.evaluate.encounters import Watch
+from cavmarl.evaluate.encounters import EncounterWatch
 from cavmarl.evaluate.message_record import MessageRecord
 from cavmarl.evaluate.recorder import Recorder
 from cavmarl.evaluate.tables import EPISODE, TRACK, TRIP
@@ -24,7 +24,7 @@ from cavmarl.parallel.local_worlds import LocalWorlds
 from cavmarl.policies.policy import Policy, load_policy
 from cavmarl.zones.partition.zone_statistics import imbalance
 
-__all__ = ["Job", "RunData", "Speed", "drive_run", "worlds_at_once"]
+__all__ = ["EpisodeJob", "RunData", "Speed", "drive_run", "worlds_at_once"]
 
 MAX_VEHICLES = 100_000  # of the worlds that are stepped together
 MAX_WORLDS = 128
@@ -36,7 +36,7 @@ Progress = Callable[[str, int, int], None]  # policy, steps done, most steps the
 
 
 @dataclass(frozen=True)
-class Job:
+class EpisodeJob:
     """One run: some policies, each over the same episodes.
 
     Attributes:
@@ -58,7 +58,7 @@ class Job:
     overrides: Mapping[str, Any] = field(default_factory=dict)
 
     def to_dict(self) -> dict[str, Any]:
-        """Plain values, for JSON; `Job(**…)` is the way back."""
+        """Plain values, for JSON; `EpisodeJob(**…)` is the way back."""
         return asdict(self)
 
 
@@ -109,7 +109,7 @@ def worlds_at_once(episodes: int, vehicles: int) -> int:
     return math.ceil(episodes / math.ceil(episodes / most))
 
 
-def drive_run(job: Job, progress: Progress | None = None) -> dict[str, RunData]:
+def drive_run(job: EpisodeJob, progress: Progress | None = None) -> dict[str, RunData]:
     """Drive every policy of a job through its episodes.
 
     Raises:
@@ -131,7 +131,7 @@ def drive_run(job: Job, progress: Progress | None = None) -> dict[str, RunData]:
 
 
 def _drive(
-    vec: CavVectorEnv, driver: Policy, name: str, job: Job, progress: Progress | None
+    vec: CavVectorEnv, driver: Policy, name: str, job: EpisodeJob, progress: Progress | None
 ) -> RunData:
     parts: list[_Part] = []
     clock = _zone_clock(vec)
@@ -184,7 +184,7 @@ class _Part:
             vec.step_s,
             np.array(vec.config.terms.weight_of_each),
         )
-        self._watch = Watch(vec, self._recorder)
+        self._watch = EncounterWatch(vec, self._recorder)
         self._tracked = tracked
         self._tracks: list[NDArray[np.void]] = [np.zeros(0, TRACK)]
         self.policy_s = self.simulation_s = 0.0

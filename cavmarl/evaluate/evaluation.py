@@ -17,7 +17,14 @@ from cavmarl.core.errors import ConfigError, JournalError, PolicyError
 from cavmarl.core.seeds import check_seed
 from cavmarl.engine.world_setup import load_world
 from cavmarl.env.vector import CavVectorEnv
-from cavmarl.evaluate.episodes import Job, Progress, RunData, Speed, drive_run, worlds_at_once
+from cavmarl.evaluate.episodes import (
+    EpisodeJob,
+    Progress,
+    RunData,
+    Speed,
+    drive_run,
+    worlds_at_once,
+)
 from cavmarl.evaluate.fresh import drive_in_fresh_process
 from cavmarl.evaluate.map_outline import map_outline
 from cavmarl.evaluate.provenance.manifest import (
@@ -95,7 +102,7 @@ def evaluate(
     """
     _check_count("episodes", episodes, MAX_EPISODES)
     _check_count("repeats", repeats, MAX_REPEATS)
-    job = Job(
+    job = EpisodeJob(
         env=str(env),
         policies=_named(policies),
         episodes=episodes,
@@ -191,7 +198,7 @@ def _named(
     return named
 
 
-def _prepare(folder: Path, job: Job, repeats: int) -> tuple[list[Job], bool]:
+def _prepare(folder: Path, job: EpisodeJob, repeats: int) -> tuple[list[EpisodeJob], bool]:
     """Refuse early what cannot work, then put everything on record.
 
     Returns:
@@ -236,7 +243,7 @@ def _prepare(folder: Path, job: Job, repeats: int) -> tuple[list[Job], bool]:
     return jobs, partition.count > 1
 
 
-def _runs(job: Job, seeds: list[int], journal: str, worlds: int) -> list[Job]:
+def _runs(job: EpisodeJob, seeds: list[int], journal: str, worlds: int) -> list[EpisodeJob]:
     """The runs of a job; of several, each has journals of its own: `run.jsonl`, `run.run-1.jsonl`.
 
     Raises:
@@ -256,7 +263,9 @@ def _runs(job: Job, seeds: list[int], journal: str, worlds: int) -> list[Job]:
     return jobs
 
 
-def _drive_all(folder: Path, jobs: list[Job], progress: Progress | None, is_divided: bool) -> None:
+def _drive_all(
+    folder: Path, jobs: list[EpisodeJob], progress: Progress | None, is_divided: bool
+) -> None:
     runs: list[dict[str, RunData]] = []
     for job in jobs:
         if len(jobs) == 1:

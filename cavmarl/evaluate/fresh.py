@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from cavmarl.core import errors
-from cavmarl.evaluate.episodes import Job, Progress, RunData, Speed, drive_run
+from cavmarl.evaluate.episodes import EpisodeJob, Progress, RunData, Speed, drive_run
 
 __all__ = ["drive_in_fresh_process", "main"]
 
@@ -24,7 +24,7 @@ PROGRAM = "from cavmarl.evaluate.fresh import main; main()"
 
 
 def drive_in_fresh_process(
-    job: Job, folder: Path, progress: Progress | None = None
+    job: EpisodeJob, folder: Path, progress: Progress | None = None
 ) -> dict[str, RunData]:
     """`drive_run` in a new interpreter.
 
@@ -104,7 +104,7 @@ def _tell(**what: Any) -> None:
 
 def main() -> None:
     """The program: a job from standard input."""
-    job = Job(**json.load(sys.stdin))
+    job = EpisodeJob(**json.load(sys.stdin))
     try:
         found = drive_run(job, lambda name, k, n: _tell(policy=name, steps=k, most=n))
     except errors.CavmarlError as error:

@@ -12,7 +12,7 @@ from cavmarl.evaluate.evaluation import load_map, load_report, load_tables, load
 from cavmarl.evaluate.metrics import METRICS, Metric
 from cavmarl.evaluate.page_transfers import transfer_rows
 from cavmarl.evaluate.provenance.manifest import write_text
-from cavmarl.evaluate.report import Difference, EvaluationReport, Found
+from cavmarl.evaluate.report import EvaluationReport, Found, PairedDifference
 from cavmarl.evaluate.statistics import Interval
 
 __all__ = ["write_page"]
@@ -102,7 +102,7 @@ def _differences(report: EvaluationReport, others: list[str]) -> list[dict[str, 
     return rows
 
 
-def _change(metric: Metric, found: Difference) -> dict[str, str]:
+def _change(metric: Metric, found: PairedDifference) -> dict[str, str]:
     mean = NOTHING if found.mean is None else f"{metric.scale * found.mean:+.2f}"
     return {
         "mean": mean,
@@ -111,7 +111,7 @@ def _change(metric: Metric, found: Difference) -> dict[str, str]:
     }
 
 
-def _verdict(metric: Metric, found: Difference) -> str:
+def _verdict(metric: Metric, found: PairedDifference) -> str:
     """Better or worse where the interval leaves 0 out and one way is better; else nothing."""
     if not found.distinct or metric.better is None or found.mean is None:
         return ""

@@ -88,7 +88,7 @@ class Recorder:
         paid = np.where(acted, rewards, 0.0)
         self._sums += mine
         self._rewards += paid
-        ttc = mine[..., _TERM["time_to_collision"]]
+        ttc = mine[..., _TERM["ttc_risk"]]
         np.maximum(self._worst_ttc, ttc, out=self._worst_ttc)
         self._short_ttc += ttc > 1.0 - SHORT_TTC_S / TTC_HORIZON_S
         self._world_terms += mine.sum(axis=1)
@@ -122,8 +122,8 @@ class Recorder:
         rows["distance_m"] = sums[:, _TERM["progress"]]
         rows["mean_speed_mps"] = rows["distance_m"] / rows["duration_s"]
         rows["delay_s"] = sums[:, _TERM["delay"]]
-        rows["mean_jerk_mps3"] = JERK_UNIT_MPS3 * sums[:, _TERM["comfort"]] / steps
-        rows["mean_speeding"] = sums[:, _TERM["speed"]] / steps
+        rows["mean_jerk_mps3"] = JERK_UNIT_MPS3 * sums[:, _TERM["jerk"]] / steps
+        rows["mean_speeding"] = sums[:, _TERM["speeding"]] / steps
         rows["least_ttc_s"] = TTC_HORIZON_S * (1.0 - self._worst_ttc[ended])
         rows["short_ttc_share"] = self._short_ttc[ended] / steps
         rows["least_pet_s"] = np.where(pet <= PET_HORIZON_S, pet, np.nan)

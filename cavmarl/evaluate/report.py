@@ -19,7 +19,7 @@ from cavmarl.evaluate.metrics import METRICS, Metric, metric_values
 from cavmarl.evaluate.statistics import Interval, Within, mean_interval, within_run
 from cavmarl.ownership.transfer_summary import TransferSummary
 
-__all__ = ["Difference", "EvaluationReport", "Found", "PolicyReport", "make_report"]
+__all__ = ["EvaluationReport", "Found", "PairedDifference", "PolicyReport", "make_report"]
 
 NO_INTERVAL = "not available: one run says nothing about the next; use --repeats 2 or more"
 
@@ -54,7 +54,7 @@ class Found:
 
 
 @dataclass(frozen=True)
-class Difference:
+class PairedDifference:
     """A policy minus the first one, run by run on the same seeds.
 
     Attributes:
@@ -90,7 +90,7 @@ class PolicyReport:
 
     trips: int
     metrics: Mapping[str, Found]
-    minus_first: Mapping[str, Difference]
+    minus_first: Mapping[str, PairedDifference]
     speed: tuple[Speed, ...]
     transfers: TransferSummary | None = None
 
@@ -187,12 +187,12 @@ def _find(metric: Metric, trips: NDArray[np.void], episodes: NDArray[np.void], r
     return Found(float(means.mean()), interval, within)
 
 
-def _difference(mine: Found, first: Found) -> Difference:
+def _difference(mine: Found, first: Found) -> PairedDifference:
     runs = tuple(
         None if a.mean is None or b.mean is None else a.mean - b.mean
         for a, b in zip(mine.within_run, first.within_run, strict=True)
     )
     known = np.array([run for run in runs if run is not None])
     if not known.size:
-        return Difference(None, None, runs)
-    return Difference(float(known.mean()), mean_interval(known), runs)
+        return PairedDifference(None, None, runs)
+    return PairedDifference(float(known.mean()), mean_interval(known), runs)

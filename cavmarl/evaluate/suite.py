@@ -12,7 +12,7 @@ from cavmarl.core.errors import ConfigError
 from cavmarl.evaluate.evaluation import evaluate
 from cavmarl.evaluate.report import EvaluationReport
 
-__all__ = ["Suite", "World", "find_suite", "load_suite", "run_suite", "worlds_of"]
+__all__ = ["Suite", "SuiteWorld", "find_suite", "load_suite", "run_suite", "worlds_of"]
 
 
 @dataclass(frozen=True)
@@ -39,7 +39,7 @@ class Suite:
 
 
 @dataclass(frozen=True)
-class World:
+class SuiteWorld:
     """One world of a suite.
 
     Attributes:
@@ -77,7 +77,7 @@ def load_suite(path: Path) -> Suite:
     return validate(Suite, read_yaml(path), str(path))
 
 
-def worlds_of(suite: Suite, maps: Path) -> list[World]:
+def worlds_of(suite: Suite, maps: Path) -> list[SuiteWorld]:
     """Every map with every number of agents.
 
     Raises:
@@ -87,7 +87,7 @@ def worlds_of(suite: Suite, maps: Path) -> list[World]:
     if len(found) < len(suite.maps):
         raise ConfigError(f"maps = {suite.maps!r}: two have one name; rename a file")
     return [
-        World(f"{name}-{agents}", env, agents)
+        SuiteWorld(f"{name}-{agents}", env, agents)
         for name, env in found.items()
         for agents in suite.agents
     ]
@@ -109,14 +109,14 @@ def _found(suite: Suite, maps: Path) -> Iterator[tuple[str, str]]:
 
 def run_suite(
     suite: Suite,
-    worlds: Sequence[World],
+    worlds: Sequence[SuiteWorld],
     policies: Sequence[str],
     out: Path,
     *,
     episodes: int,
     repeats: int,
     seed: int,
-    began: Callable[[World], None],
+    began: Callable[[SuiteWorld], None],
 ) -> dict[str, EvaluationReport]:
     """Evaluate the policies in every world, each into its own folder of `out`.
 
@@ -147,6 +147,6 @@ def run_suite(
             out=out / world.label,
             agents=world.agents,
             background=suite.background,
-            overrides={"population.mode": "seats", "horizon_s": suite.horizon_s},
+            overrides={"population.mode": "respawn", "horizon_s": suite.horizon_s},
         )
     return reports

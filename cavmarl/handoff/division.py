@@ -26,11 +26,11 @@ from cavmarl.shards.shard import Shard
 from cavmarl.shards.vehicle_codec import TransferCodec
 from cavmarl.zones.kernels.borders import Borders, pass_on
 from cavmarl.zones.kernels.ghost_exchange import exchange, note_gathered, take_own
-from cavmarl.zones.kernels.handoff import Book, hand_over, look, make_book, release
+from cavmarl.zones.kernels.handoff import BorderRecords, hand_over, look, make_book, release
 from cavmarl.zones.kernels.zone_lookup import Halo, ZoneArrays, zone_of
 from cavmarl.zones.partition.zone_partition import ZonePartition
 from cavmarl.zones.partition.zone_statistics import imbalance
-from cavmarl.zones.visibility import Sight
+from cavmarl.zones.visibility import Visibility
 
 __all__ = ["Division", "ZoneLoads"]
 
@@ -83,7 +83,7 @@ class Division:
         zoned: Zoned,
         zones: ZoneArrays,
         halo: Halo,
-        sight: Sight,
+        sight: Visibility,
         touching_m: float,
         borders: Borders,
         codec: TransferCodec,
@@ -202,7 +202,7 @@ class Division:
         """Call what is called after shards have gathered, and forget what it has found."""
         self._note_those_near(make_book(*self._first_side.shape))
 
-    def _note_those_near(self, book: Book) -> None:
+    def _note_those_near(self, book: BorderRecords) -> None:
         self._note_gathered(self.zones, self.borders, self._zoned, self.next_side, book)
 
     def _exchange(self, rows: NDArray[np.void], first: int, last: int) -> None:

@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from cavmarl.handoff.coordinator.coordinators import Coordination
+from cavmarl.handoff.coordinator.coordinators import Coordinators
 from cavmarl.handoff.division import Division
 from cavmarl.handoff.repartition_plan import propose_zones
 from cavmarl.roads.network import RoadNetwork
@@ -57,7 +57,7 @@ class Recutter:
         self,
         network: RoadNetwork,
         division: Division,
-        coordination: Coordination,
+        coordination: Coordinators,
         every: int,
         tolerance: float,
     ) -> None:

@@ -22,7 +22,7 @@ from cavmarl.traffic.native import NativeTraffic
 from cavmarl.zones.kernels.borders import Borders
 from cavmarl.zones.partition.zone_partition import ZonePartition
 from cavmarl.zones.reach import driving_reach_m, longest_move_m
-from cavmarl.zones.visibility import Sight
+from cavmarl.zones.visibility import Visibility
 
 __all__ = ["divide", "halo_m", "limits_of"]
 
@@ -67,7 +67,7 @@ def divide(
     # Agents alone sense.
     sensed_m = _needed_m(config, sensing_m, fastest_mps) if config.population.agents else 0.0
     near_m = max(touching_m, sensed_m, _approach_m(config, fastest_mps))
-    sight = Sight(
+    sight = Visibility(
         network,
         traffic.travel,
         wide_m,

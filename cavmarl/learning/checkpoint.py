@@ -18,7 +18,7 @@ from cavmarl.policies.networks import ActorCritic, NetworkConfig, load_network, 
 if TYPE_CHECKING:
     from _typeshed import DataclassInstance
 
-__all__ = ["State", "load_checkpoint", "read_state", "save_checkpoint"]
+__all__ = ["RunState", "load_checkpoint", "read_state", "save_checkpoint"]
 
 OPTIMIZER_FILE = "optimizer.pt"
 STATE_FILE = "training.json"
@@ -27,7 +27,7 @@ S = TypeVar("S", bound="DataclassInstance")
 
 
 @dataclass(frozen=True)
-class State:
+class RunState:
     """How far a run has come.
 
     Attributes:
@@ -51,7 +51,7 @@ class State:
         return validate(kind, self.args, STATE_FILE)
 
 
-def read_state(folder: Path) -> State:
+def read_state(folder: Path) -> RunState:
     """What `save_checkpoint` noted of a run.
 
     Raises:
@@ -64,7 +64,7 @@ def read_state(folder: Path) -> State:
         raise ConfigError(f"--resume {folder}: no checkpoint there ({error.strerror})") from error
     except (json.JSONDecodeError, UnicodeDecodeError) as error:
         raise ConfigError(f"{path}: is broken ({error})") from error
-    return validate(State, raw, str(path))
+    return validate(RunState, raw, str(path))
 
 
 def save_checkpoint(
@@ -72,7 +72,7 @@ def save_checkpoint(
     network: ActorCritic,
     optimizer: torch.optim.Optimizer,
     config: NetworkConfig,
-    state: State,
+    state: RunState,
 ) -> None:
     """The driver, and what goes on from here; an interrupted write leaves the old files whole."""
     save_network(folder, network, replace(config, agent_steps=state.agent_steps))

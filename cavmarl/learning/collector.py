@@ -9,7 +9,7 @@ from torch import Tensor
 
 from cavmarl.env.vector import CavVectorEnv
 from cavmarl.learning.batch import Batch
-from cavmarl.learning.run_clock import Clock
+from cavmarl.learning.run_clock import RunClock
 from cavmarl.learning.trips import Trips
 from cavmarl.policies.networks import ActorCritic
 
@@ -47,7 +47,7 @@ class Collector:
         self.vec = vec
         self.network = network
         self.trips = Trips(vec.num_envs, vec.num_agents)
-        self.clock = Clock()
+        self.clock = RunClock()
         self._num_steps = num_steps
         self._generator = generator
         self._sees_states = network.state_size > 0

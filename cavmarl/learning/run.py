@@ -16,7 +16,7 @@ from cavmarl.core.errors import ConfigError
 from cavmarl.env.vector import CavVectorEnv, make_vec
 from cavmarl.evaluate.provenance.training_record import begin_training, end_training
 from cavmarl.learning.batch import Batch
-from cavmarl.learning.checkpoint import State, load_checkpoint, read_state, save_checkpoint
+from cavmarl.learning.checkpoint import RunState, load_checkpoint, read_state, save_checkpoint
 from cavmarl.learning.collector import Collector
 from cavmarl.learning.learner import Learner
 from cavmarl.learning.log import CSV_FILE, Log, describe, progress_bar
@@ -59,7 +59,7 @@ class Run:
 
     def __init__(self, settings: PpoSettings) -> None:
         folder = settings.folder
-        self.began = read_state(folder) if settings.resume else State({})
+        self.began = read_state(folder) if settings.resume else RunState({})
         self.agent_steps, self.updates = self.began.agent_steps, self.began.updates
         if self.agent_steps >= settings.total_agent_steps:
             raise ConfigError(
@@ -140,7 +140,7 @@ class Run:
     def save(self, row: dict[str, float]) -> None:
         """A checkpoint after the update that gave `row`."""
         settings = replace(self.settings, resume="")
-        state = State(asdict(settings), self.agent_steps, self.updates, row["seconds"])
+        state = RunState(asdict(settings), self.agent_steps, self.updates, row["seconds"])
         save_checkpoint(
             self.settings.folder, self.network, self.learner.optimizer, self.config, state
         )

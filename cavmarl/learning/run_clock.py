@@ -1,4 +1,4 @@
-"""`Clock`: where the time of a run goes."""
+"""`RunClock`: where the time of a run goes."""
 
 from __future__ import annotations
 
@@ -6,13 +6,13 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 
-__all__ = ["PHASES", "Clock"]
+__all__ = ["PHASES", "RunClock"]
 
 # Worlds that step; what goes between them and the tensors; what the network decides; the updates.
 PHASES = ("simulation", "transfer", "inference", "learning")
 
 
-class Clock:
+class RunClock:
     """Adds up wall time by phase.
 
     Attributes:

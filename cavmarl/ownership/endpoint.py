@@ -12,7 +12,7 @@ from collections import Counter
 from collections.abc import Iterable, Sequence
 
 from cavmarl.core.errors import ProtocolError
-from cavmarl.ownership.ledger import Tally, tally
+from cavmarl.ownership.ledger import OwnedTally, tally
 from cavmarl.ownership.limits import Limits
 from cavmarl.ownership.messages import (
     Abort,
@@ -238,7 +238,7 @@ class Endpoint:
 
     def _begin_episode(self, step: Step) -> None:
         self.episode, self.tick, self.lease, self._answer = step.episode, step.committed, None, None
-        self.owned, self.retained, self.tally = {}, {}, Tally()
+        self.owned, self.retained, self.tally = {}, {}, OwnedTally()
         self.replicas = Replicas(self._limits, self._safeguards)
         self.offers = Offers(self._limits)
 

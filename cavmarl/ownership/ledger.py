@@ -41,19 +41,19 @@ def world_digest(parts: Iterable[int]) -> int:
     return sum(parts) % _WORLD
 
 
-class Tally(NamedTuple):
+class OwnedTally(NamedTuple):
     """How many vehicles a zone owns, and the digest of their (id, epoch)."""
 
     vehicles: int = 0
     digest: int = 0
 
-    def plus(self, run: bytes, vehicle: int, epoch: int) -> Tally:
-        return Tally(self.vehicles + 1, (self.digest + member(run, vehicle, epoch)) % _OWNED)
+    def plus(self, run: bytes, vehicle: int, epoch: int) -> OwnedTally:
+        return OwnedTally(self.vehicles + 1, (self.digest + member(run, vehicle, epoch)) % _OWNED)
 
-    def minus(self, run: bytes, vehicle: int, epoch: int) -> Tally:
-        return Tally(self.vehicles - 1, (self.digest - member(run, vehicle, epoch)) % _OWNED)
+    def minus(self, run: bytes, vehicle: int, epoch: int) -> OwnedTally:
+        return OwnedTally(self.vehicles - 1, (self.digest - member(run, vehicle, epoch)) % _OWNED)
 
-    def check(self, other: Tally, where: str) -> None:
+    def check(self, other: OwnedTally, where: str) -> None:
         """Compare with another count.
 
         Raises:
@@ -82,8 +82,8 @@ def member(run: bytes, vehicle: int, epoch: int) -> int:
     return word ^ (word >> 31)
 
 
-def tally(run: bytes, owned: Mapping[int, int]) -> Tally:
-    return Tally(
+def tally(run: bytes, owned: Mapping[int, int]) -> OwnedTally:
+    return OwnedTally(
         len(owned), sum(member(run, vehicle, epoch) for vehicle, epoch in owned.items()) % _OWNED
     )
 

@@ -16,7 +16,7 @@ from dataclasses import dataclass, field
 from enum import IntEnum
 from typing import NamedTuple, TypeAlias
 
-from cavmarl.ownership.ledger import Tally
+from cavmarl.ownership.ledger import OwnedTally
 
 COORDINATOR = -1
 """Where messages to the coordinator go; zones are numbered from 0."""
@@ -133,7 +133,7 @@ class Step(Message):
     enter: tuple[In, ...] = ()
     leave: tuple[Out, ...] = ()
     spawn: tuple[Spawn, ...] = ()
-    owned: Tally = field(default_factory=Tally)
+    owned: OwnedTally = field(default_factory=OwnedTally)
     payload: bytes = b""
 
     def destinations(self) -> tuple[int, ...]:
@@ -148,7 +148,7 @@ class Done(Message):
     incarnation: int
     confirmed: tuple[Confirmed, ...] = ()
     removed: tuple[Removed, ...] = ()
-    owned: Tally = field(default_factory=Tally)
+    owned: OwnedTally = field(default_factory=OwnedTally)
     rows: int = 0
     payload: bytes = b""
 
@@ -247,7 +247,7 @@ class ZoneLedger(NamedTuple):
 
     zone: int
     incarnation: int
-    owned: Tally
+    owned: OwnedTally
     rows: int
 
 

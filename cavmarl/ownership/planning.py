@@ -9,12 +9,12 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 
 from cavmarl.core.errors import ProtocolError
-from cavmarl.ownership.ledger import Tally
+from cavmarl.ownership.ledger import OwnedTally
 from cavmarl.ownership.messages import Begin, Confirmed, Done, Out, Removed, Spawn, Switch
 
 
 @dataclass(slots=True)
-class Plan:
+class OwnershipPlan:
     """The way from the committed tick to the next.
 
     Attributes:
@@ -29,7 +29,7 @@ class Plan:
     """
 
     record: Begin
-    expected: Mapping[int, Tally]
+    expected: Mapping[int, OwnedTally]
     switches: dict[int, Switch] = field(default_factory=dict)
     births: dict[int, int] = field(default_factory=dict)
     enter: dict[int, list[Switch]] = field(default_factory=dict)
@@ -51,12 +51,12 @@ class Plan:
         return committed.get(vehicle, (-1, -1))
 
 
-def make_plan(run: bytes, record: Begin, committed: Mapping[int, Tally]) -> Plan:
+def make_plan(run: bytes, record: Begin, committed: Mapping[int, OwnedTally]) -> OwnershipPlan:
     """The plan of a BEGIN record, given what the zones owned when the last tick was committed."""
     if not record.switches and not record.births:
-        return Plan(record, committed)
+        return OwnershipPlan(record, committed)
     expected = dict(committed)
-    plan = Plan(record, expected)
+    plan = OwnershipPlan(record, expected)
     for switch in record.switches:
         vehicle, source, target, epoch, forced = switch
         expected[source] = expected[source].minus(run, vehicle, epoch - 1)
@@ -73,7 +73,9 @@ def make_plan(run: bytes, record: Begin, committed: Mapping[int, Tally]) -> Plan
     return plan
 
 
-def check_done(run: bytes, plan: Plan, done: Done, owners: Mapping[int, tuple[int, int]]) -> None:
+def check_done(
+    run: bytes, plan: OwnershipPlan, done: Done, owners: Mapping[int, tuple[int, int]]
+) -> None:
     """Compare what a zone did with what was planned.
 
     Raises:

@@ -11,7 +11,7 @@ from collections.abc import Iterable
 from typing import TypeAlias
 
 from cavmarl.core.errors import JournalError, ProtocolError
-from cavmarl.ownership.ledger import SeenIds, Tally
+from cavmarl.ownership.ledger import OwnedTally, SeenIds
 from cavmarl.ownership.messages import (
     RUN_BYTES,
     Begin,
@@ -24,7 +24,7 @@ from cavmarl.ownership.messages import (
     Reset,
     Switch,
 )
-from cavmarl.ownership.planning import Plan, make_plan
+from cavmarl.ownership.planning import OwnershipPlan, make_plan
 from cavmarl.ownership.safeguards import ALL_ON, Safeguards
 from cavmarl.ownership.transitions import Event, Party, State, after
 
@@ -57,17 +57,17 @@ class Table:
         self.states = dict.fromkeys(self.hosts, State.UNHOSTED)
         self.seen = SeenIds()
         self.repeats: Counter[int] = Counter()
-        self.plan: Plan | None = None
+        self.plan: OwnershipPlan | None = None
         self._safeguards = safeguards
         self.counts = dict.fromkeys(self.hosts, 0)
-        self._tallies = dict.fromkeys(self.hosts, Tally())
+        self._tallies = dict.fromkeys(self.hosts, OwnedTally())
         self._moves: list[_Move] = []  # that are not in the tallies yet
 
     @property
-    def tallies(self) -> dict[int, Tally]:
+    def tallies(self) -> dict[int, OwnedTally]:
         tallies, run = self._tallies, self.run
         if len(self._moves) > len(self.owners):
-            tallies.update(dict.fromkeys(self.hosts, Tally()))
+            tallies.update(dict.fromkeys(self.hosts, OwnedTally()))
             self._moves = [(v, zone, epoch, True) for v, (zone, epoch) in self.owners.items()]
         for vehicle, zone, epoch, comes in self._moves:
             tally = tallies[zone]
@@ -77,7 +77,7 @@ class Table:
         return tallies
 
     @property
-    def planned(self) -> Plan:
+    def planned(self) -> OwnershipPlan:
         """The tick in progress.
 
         Raises:
@@ -175,7 +175,7 @@ class Table:
         self.run, self.tick, self.episode = record.run, record.tick, record.episode
         self.owners, self.deferred, self.plan = {}, {}, None
         self.counts = dict.fromkeys(self.hosts, 0)
-        self._tallies = dict.fromkeys(self.hosts, Tally())
+        self._tallies = dict.fromkeys(self.hosts, OwnedTally())
         self._moves.clear()
         self.seen = SeenIds()
         self.repeats.clear()

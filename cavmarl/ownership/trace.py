@@ -34,7 +34,7 @@ LOG = -2
 """The destination of records."""
 
 
-class Entry(NamedTuple):
+class TraceEntry(NamedTuple):
     """A record (destination LOG), or a message at its destination."""
 
     destination: int
@@ -45,20 +45,20 @@ class Entry(NamedTuple):
 class Trace:
     """Entries in the order in which they happened."""
 
-    entries: list[Entry] = field(default_factory=list)
+    entries: list[TraceEntry] = field(default_factory=list)
 
     def logged(self, records: Iterable[Record]) -> None:
-        self.entries.extend(Entry(LOG, record) for record in records)
+        self.entries.extend(TraceEntry(LOG, record) for record in records)
 
     def delivered(self, destination: int, message: Message) -> None:
         """Note a message that arrives at a zone, or at the coordinator."""
-        self.entries.append(Entry(destination, message))
+        self.entries.append(TraceEntry(destination, message))
 
     def text(self) -> str:
         return "".join(f"{describe(entry)}\n" for entry in self.entries)
 
 
-def describe(entry: Entry) -> str:
+def describe(entry: TraceEntry) -> str:
     item = entry.item
     name = type(item).__name__.upper()
     if isinstance(item, Record):

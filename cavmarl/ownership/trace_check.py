@@ -16,7 +16,7 @@ from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
 from cavmarl.core.errors import ProtocolError
-from cavmarl.ownership.ledger import SeenIds, Tally, state_digest
+from cavmarl.ownership.ledger import OwnedTally, SeenIds, state_digest
 from cavmarl.ownership.messages import (
     COORDINATOR,
     Abort,
@@ -33,7 +33,7 @@ from cavmarl.ownership.messages import (
     Reset,
     Step,
 )
-from cavmarl.ownership.trace import Entry, describe
+from cavmarl.ownership.trace import TraceEntry, describe
 
 Holding = tuple[int, int, int, int, bytes]
 """(zone, incarnation, vehicle, epoch, digest) of a state at a host."""
@@ -42,7 +42,7 @@ Owner = tuple[int, int]
 """(zone, epoch) of a vehicle."""
 
 
-class Change(NamedTuple):
+class OwnerStep(NamedTuple):
     """What a tick did to the owner of a vehicle; None: it is not in the world."""
 
     vehicle: int
@@ -59,7 +59,7 @@ class _Orders:
     born: set[int] = field(default_factory=set)
 
 
-def check_trace(entries: Iterable[Entry], longest_deferral: int, lifetime: int) -> None:
+def check_trace(entries: Iterable[TraceEntry], longest_deferral: int, lifetime: int) -> None:
     """Read a trace from its beginning.
 
     Raises:
@@ -95,10 +95,10 @@ class TraceChecker:
     def __init__(self, longest_deferral: int, lifetime: int, is_direct: bool = False) -> None:
         self._is_direct = is_direct
         self.owners: dict[int, Owner] = {}
-        self.changes: list[Change] = []
+        self.changes: list[OwnerStep] = []
         self._longest, self._lifetime = longest_deferral, lifetime
         self._run, self._episode, self._tick = b"", -1, 0
-        self._tallies: defaultdict[int, Tally] = defaultdict(Tally)
+        self._tallies: defaultdict[int, OwnedTally] = defaultdict(OwnedTally)
         self._deferred: dict[int, int] = {}
         self._born = SeenIds()
         self._incarnations: dict[int, int] = {}
@@ -116,7 +116,7 @@ class TraceChecker:
             Ack: self._ack, Done: self._done,
         }  # fmt: skip
 
-    def take(self, entry: Entry) -> None:
+    def take(self, entry: TraceEntry) -> None:
         item = entry.item
         judge = self._judges.get(type(item))
         if isinstance(item, Record):
@@ -259,7 +259,8 @@ class TraceChecker:
                 removed += self._confirmed(zone, changed)
             _require(record.removed == tuple(sorted(removed)), "removes others than the zones did")
         self.changes = [
-            Change(vehicle, self.owners.get(vehicle), after) for vehicle, after in changed.items()
+            OwnerStep(vehicle, self.owners.get(vehicle), after)
+            for vehicle, after in changed.items()
         ]
         self._change_owners()
         for ledger in record.zones:

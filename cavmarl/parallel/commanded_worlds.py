@@ -17,7 +17,7 @@ from cavmarl.core.errors import CavmarlError, WorkerDeathError, WorkerFailureErr
 from cavmarl.parallel.driven_vehicles import Driven
 from cavmarl.parallel.mover import Mover
 from cavmarl.parallel.step_arrays import StepArrays
-from cavmarl.parallel.step_placement import Placement
+from cavmarl.parallel.step_placement import StepPlacement
 from cavmarl.parallel.work_shares import Part
 from cavmarl.parallel.worlds_job import Task
 from cavmarl.shards.shard import Commands
@@ -39,7 +39,7 @@ class OrderedWorlds(ABC):
     """
 
     arrays: StepArrays
-    placement: Placement
+    placement: StepPlacement
     mover: Mover | None = None
     _steps = 0  # since the last reset of all
 

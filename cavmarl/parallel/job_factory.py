@@ -12,11 +12,11 @@ from cavmarl.config.env import EnvConfig
 from cavmarl.core.errors import WorkerError
 from cavmarl.core.extensions import load_extensions
 from cavmarl.engine.world_setup import make_world
-from cavmarl.handoff.coordinator.coordinator_setup import Run
-from cavmarl.parallel.checkpoint.action_log import Tape
-from cavmarl.parallel.checkpoint.action_log_job import TapeJob
-from cavmarl.parallel.checkpoint.checkpoint_job import DiaryJob
-from cavmarl.parallel.checkpoint.checkpoint_log import Diary
+from cavmarl.handoff.coordinator.coordinator_setup import WorldRun
+from cavmarl.parallel.checkpoint.action_log import ActionLog
+from cavmarl.parallel.checkpoint.action_log_job import ActionLogJob
+from cavmarl.parallel.checkpoint.checkpoint_job import CheckpointJob
+from cavmarl.parallel.checkpoint.checkpoint_log import CheckpointLog
 from cavmarl.parallel.checkpoint.moving_job import MovingJob
 from cavmarl.parallel.journaled_worlds import runs_of, unwatched
 from cavmarl.parallel.local_worlds import LocalWorlds
@@ -56,7 +56,7 @@ def make_jobs(recipe: Mapping[str, Any]) -> list[Job]:
     one = LocalWorlds(unwatched(world), 1, warm=True)
     parts = [Part(*given) for given in recipe["parts"]]
 
-    def make(first: int, last: int, runs: Sequence[Run] | None = None) -> LocalWorlds:
+    def make(first: int, last: int, runs: Sequence[WorldRun] | None = None) -> LocalWorlds:
         part, in_next_step = arrays.part(first, last), recipe["in_next_step"]
         count = last - first
         return LocalWorlds(world, count, part, in_next_step=in_next_step, like=one, runs=runs)
@@ -86,9 +86,11 @@ def make_jobs(recipe: Mapping[str, Any]) -> list[Job]:
         if recipe["runs"]:
             (tape,) = descriptors
             commands = commands_of(arrays.part(part.first, part.last))
-            jobs.append(TapeJob(partial(make_watched, part), part.first, Tape(tape, commands)))
+            jobs.append(
+                ActionLogJob(partial(make_watched, part), part.first, ActionLog(tape, commands))
+            )
             continue
-        diary = Diary(config, part.last - part.first, descriptors)
+        diary = CheckpointLog(config, part.last - part.first, descriptors)
         if len(part.zones) > 1:
             worlds = LocalWorlds(
                 world,
@@ -101,5 +103,5 @@ def make_jobs(recipe: Mapping[str, Any]) -> list[Job]:
             leader = LeaderJob(hire(worlds, part), part.first, part.zones, diary, theirs)
             jobs += [leader, *leader.followers()]
         else:
-            jobs.append(DiaryJob(hire(make(part.first, part.last), part), part.first, diary))
+            jobs.append(CheckpointJob(hire(make(part.first, part.last), part), part.first, diary))
     return jobs

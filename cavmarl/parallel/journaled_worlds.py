@@ -9,7 +9,7 @@ from pathlib import Path
 from cavmarl.config.env import ZonesConfig
 from cavmarl.core.errors import ConfigError
 from cavmarl.engine.world_setup import World
-from cavmarl.handoff.coordinator.coordinator_setup import Run, check_faults, prepare_runs
+from cavmarl.handoff.coordinator.coordinator_setup import WorldRun, check_faults, prepare_runs
 from cavmarl.parallel.work_shares import Part
 
 __all__ = [
@@ -92,9 +92,9 @@ def runs_as_text(zones: ZonesConfig, num_worlds: int) -> list[RunText]:
     ]
 
 
-def runs_of(texts: Sequence[RunText], part: Part) -> list[Run]:
+def runs_of(texts: Sequence[RunText], part: Part) -> list[WorldRun]:
     """The same of the worlds of one worker."""
     return [
-        Run(bytes.fromhex(run), Path(journal) if journal else None)
+        WorldRun(bytes.fromhex(run), Path(journal) if journal else None)
         for run, journal in texts[part.first : part.last]
     ]

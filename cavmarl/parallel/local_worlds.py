@@ -18,9 +18,9 @@ from cavmarl.engine.kernels.step_results import Results, keep_last, report, repo
 from cavmarl.engine.simulation import Simulation
 from cavmarl.engine.spaces import state_space, write_sensed
 from cavmarl.engine.world_setup import World
-from cavmarl.handoff.coordinator.coordinator_setup import Run
+from cavmarl.handoff.coordinator.coordinator_setup import WorldRun
 from cavmarl.parallel.driven_vehicles import Driven, driven_by
-from cavmarl.parallel.sensor_workers.sensor_pool import SensorFarm
+from cavmarl.parallel.sensor_workers.sensor_pool import SensorWorkers
 from cavmarl.parallel.step_arrays import StepArrays, layout_of
 from cavmarl.sensors.mounted.catalogue import frame_layout
 from cavmarl.shards.shard import Commands
@@ -59,11 +59,11 @@ class LocalWorlds:
         in_next_step: bool = False,
         zeros: Zeros = huge_zeros,
         like: LocalWorlds | None = None,
-        runs: Sequence[Run] | None = None,
+        runs: Sequence[WorldRun] | None = None,
     ) -> None:
         self.world = world
         self.in_next_step = in_next_step
-        self.farm: SensorFarm | None = None
+        self.farm: SensorWorkers | None = None
         form = world.config.observation
         self._senses = form.mode == "sensors"
         self._is_flat = form.kind == "flat"
@@ -246,7 +246,7 @@ class LocalWorlds:
         """None: there are no workers."""
         return ()
 
-    def hire(self, farm: SensorFarm) -> None:
+    def hire(self, farm: SensorWorkers) -> None:
         """From now on let others sense for the rigs; what they write is in `arrays`."""
         mounted = self.simulation.mounted
         assert mounted is not None

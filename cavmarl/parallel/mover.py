@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from cavmarl.parallel.step_placement import Placement
+from cavmarl.parallel.step_placement import StepPlacement
 from cavmarl.parallel.work_shares import Part, parts_of
 from cavmarl.parallel.worlds_job import Task
 
@@ -34,7 +34,7 @@ class Mover:
     """
 
     def __init__(
-        self, placement: Placement, num_zones: int, every: int, spent_s: NDArray[np.float64]
+        self, placement: StepPlacement, num_zones: int, every: int, spent_s: NDArray[np.float64]
     ) -> None:
         self._placement = placement
         self._num_zones = num_zones

@@ -23,7 +23,7 @@ from cavmarl.parallel.processes.shared_memory import Segment, arrays_in, size_of
 from cavmarl.parallel.processes.worker_pool import Death, Pool, Program
 from cavmarl.parallel.sensor_workers.sensor_worker_setup import warn_if_crowded
 from cavmarl.parallel.step_arrays import StepArrays, layout_of
-from cavmarl.parallel.step_placement import Placement
+from cavmarl.parallel.step_placement import StepPlacement
 from cavmarl.parallel.work_shares import Part, parts_of
 from cavmarl.parallel.worlds_job import Task, fingerprint
 
@@ -69,7 +69,7 @@ class PooledWorlds(OrderedWorlds):
         self.world = world
         self.in_next_step = in_next_step
         config = world.config
-        self.placement = Placement(world, num_worlds, workers)
+        self.placement = StepPlacement(world, num_worlds, workers)
         parts = parts_of(self.placement.plans, world.partition.count)
         may_change = bool(config.workers.balance_steps) and workers > 1 and self.placement.in_row
         check_watched(world, parts, may_change)
@@ -132,7 +132,7 @@ class PooledWorlds(OrderedWorlds):
         pins = config.workers.pin
         what = Program(program or PROGRAM, recipe, _names(parts), segments, tasks, pins, teams)
         try:
-            self.pool = Pool(what, config.workers.timeout_s, config.workers.repeats)
+            self.pool = Pool(what, config.workers.timeout_s, config.workers.max_retries)
         except WorkerFailureError as failure:
             raise own_error(failure) from failure
         self._asked = _leaders(parts)

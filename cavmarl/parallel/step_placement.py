@@ -1,4 +1,4 @@
-"""`Placement`: which worker hosts which shard of worlds that are stepped, round by round."""
+"""`StepPlacement`: which worker hosts which shard of worlds that are stepped, round by round."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from cavmarl.balance.balance_plan import Plan
 from cavmarl.balance.balancer import Balancer
-from cavmarl.balance.load_snapshot import Snapshot, idle_snapshot
+from cavmarl.balance.load_snapshot import LoadSnapshot, idle_snapshot
 from cavmarl.balance.problem import BalanceRule, ShardCost
 from cavmarl.engine.world_setup import World
 from cavmarl.parallel.work_shares import make_plans
@@ -19,12 +19,12 @@ from cavmarl.parallel.work_shares import make_plans
 if TYPE_CHECKING:
     from cavmarl.balance.probe import Watch
 
-__all__ = ["Placement"]
+__all__ = ["StepPlacement"]
 
 Floats = NDArray[np.float64]
 
 
-class Placement:
+class StepPlacement:
     """The plans of all workers: one of all worlds, or one of the zones of each world.
 
     Args:
@@ -39,10 +39,12 @@ class Placement:
 
     def __init__(self, world: World, num_worlds: int, workers: int) -> None:
         settings = world.config.workers
-        self._rule = BalanceRule(tolerance=settings.tolerance, max_moves=settings.max_moves)
+        self._rule = BalanceRule(
+            tolerance=settings.imbalance_tolerance, max_moves=settings.max_moves
+        )
         self._ticks_per_step = world.config.clock.ticks_per_step
-        self._watches = settings.watch
-        seen = _present_snapshot(workers) if settings.watch else None
+        self._watches = settings.monitor_cpu
+        seen = _present_snapshot(workers) if settings.monitor_cpu else None
         plans = make_plans(world, num_worlds, workers, seen, self._rule)
         self._balancers = [Balancer(plan.problem) for plan in plans]
         self._watch: Watch | None = None
@@ -111,7 +113,7 @@ class Placement:
         self._rule = replace(self._rule, move_s=lasted_s / moves)
         return moves
 
-    def _snapshot(self, pids: Mapping[int, int]) -> Snapshot:
+    def _snapshot(self, pids: Mapping[int, int]) -> LoadSnapshot:
         """How busy workers are; idle where not measured, and where one was replaced meanwhile."""
         watch, before = self._watch, self._pids
         self.watch(pids)
@@ -120,7 +122,7 @@ class Placement:
         return watch.snapshot()
 
 
-def _present_snapshot(workers: int) -> Snapshot:
+def _present_snapshot(workers: int) -> LoadSnapshot:
     """How busy this machine is before the workers are started."""
     from cavmarl.balance.probe import take_snapshot
 

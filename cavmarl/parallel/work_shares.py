@@ -9,7 +9,7 @@ from itertools import pairwise
 from typing import NamedTuple
 
 from cavmarl.balance.balance_plan import Plan, make_plan
-from cavmarl.balance.load_snapshot import Snapshot, idle_snapshot
+from cavmarl.balance.load_snapshot import LoadSnapshot, idle_snapshot
 from cavmarl.balance.problem import BalanceRule, Problem, ShardCost, equal_costs
 from cavmarl.core.errors import ConfigError
 from cavmarl.engine.world_setup import World
@@ -53,7 +53,7 @@ def make_plans(
     world: World,
     num_worlds: int,
     workers: int,
-    snapshot: Snapshot | None = None,
+    snapshot: LoadSnapshot | None = None,
     rule: BalanceRule | None = None,
 ) -> list[Plan]:
     """Worlds to workers as evenly as may be; those are divided of which there are too few.
@@ -116,7 +116,7 @@ def parts_of(plans: Sequence[Plan], num_zones: int) -> list[Part]:
     return parts
 
 
-def _of_zones(world: World, number: int, seen: Snapshot, rule: BalanceRule) -> Plan:
+def _of_zones(world: World, number: int, seen: LoadSnapshot, rule: BalanceRule) -> Plan:
     """The zones of one world to some workers, neighbours together; by length of lanes."""
     partition = world.partition
     lane_km = zone_statistics(partition, world.network).lane_km

@@ -22,7 +22,7 @@ from cavmarl.render.palette import (
     Color,
     agent_color,
 )
-from cavmarl.render.viewport import Camera
+from cavmarl.render.viewport import Viewport
 from cavmarl.render.walkers import draw_walker, is_walker
 
 if TYPE_CHECKING:
@@ -54,7 +54,7 @@ REAR_BAR = ((-1.04, 0.86), (-1.04, -0.86), (-0.66, -0.86), (-0.66, 0.86))
 Shape = tuple[tuple[float, float], ...]
 
 
-def in_view(vehicles: NDArray[np.void], camera: Camera) -> NDArray[np.void]:
+def in_view(vehicles: NDArray[np.void], camera: Viewport) -> NDArray[np.void]:
     """The VEHICLE rows that a picture shows, background first, lower ones before higher ones."""
     min_x, min_y, max_x, max_y = camera.bounds
     margin = max(float(vehicles["length"].max(initial=0.0)), MIN_LENGTH_PX / camera.scale)
@@ -84,7 +84,7 @@ class Paint(NamedTuple):
 def draw_cars(
     surface: Surface,
     vehicles: NDArray[np.void],
-    camera: Camera,
+    camera: Viewport,
     paints: Sequence[Paint] | None = None,
 ) -> None:
     """Paint VEHICLE rows, later rows over earlier ones.

@@ -20,7 +20,7 @@ from cavmarl.render.palette import (
     Color,
 )
 from cavmarl.render.shapes import RoadShapes, level_of
-from cavmarl.render.viewport import Camera
+from cavmarl.render.viewport import Viewport
 from cavmarl.roads.network import SIGNAL_STATES, RoadNetwork
 
 if TYPE_CHECKING:
@@ -59,7 +59,7 @@ def signal_letter(network: RoadNetwork, link: int, signal_phases: NDArray[np.int
     return "" if code == SIGNAL_NONE else SIGNAL_STATES[code]
 
 
-def draw_ground(shapes: RoadShapes, camera: Camera, detail: int) -> Surface:
+def draw_ground(shapes: RoadShapes, camera: Viewport, detail: int) -> Surface:
     """Land, roads and markings as seen by `camera`.
 
     Args:
@@ -86,7 +86,7 @@ def draw_ground(shapes: RoadShapes, camera: Camera, detail: int) -> Surface:
 
 
 def draw_stop_lines(
-    surface: Surface, shapes: RoadShapes, codes: NDArray[np.uint8], camera: Camera
+    surface: Surface, shapes: RoadShapes, codes: NDArray[np.uint8], camera: Viewport
 ) -> None:
     """Paint each signalled link's part of the stop line.
 
@@ -109,7 +109,7 @@ def draw_stop_lines(
 class _Painter:
     """Draws many shapes of a kind on one surface, those in view only."""
 
-    def __init__(self, shapes: RoadShapes, camera: Camera, surface: Surface, detail: int) -> None:
+    def __init__(self, shapes: RoadShapes, camera: Viewport, surface: Surface, detail: int) -> None:
         self._pygame = load_pygame()
         self._shapes = shapes
         self._camera = camera

@@ -13,7 +13,7 @@ from cavmarl.render.canvas import blank, lettering, load_pygame, stamp
 from cavmarl.render.legend import SWATCH_PX, Sample
 from cavmarl.render.marks import pill, target
 from cavmarl.render.palette import INK, MUTED_INK, PANEL, agent_color, ink_on
-from cavmarl.render.viewport import Camera
+from cavmarl.render.viewport import Viewport
 
 if TYPE_CHECKING:
     from pygame import Surface
@@ -49,7 +49,7 @@ class Overlay:
     def __init__(self) -> None:
         self._labels: dict[int, Surface] = {}
 
-    def agents(self, surface: Surface, vehicles: NDArray[np.void], camera: Camera) -> None:
+    def agents(self, surface: Surface, vehicles: NDArray[np.void], camera: Viewport) -> None:
         """The agents' numbers, above their vehicles, or on them from near."""
         rows = vehicles[vehicles["agent"] >= 0]
         centers = camera.to_pixels(np.stack([rows["x"], rows["y"]], axis=1))
@@ -65,7 +65,7 @@ class Overlay:
         surface: Surface,
         agents: NDArray[np.int64],
         places: NDArray[np.float64],
-        camera: Camera,
+        camera: Viewport,
     ) -> None:
         """A ring in the agent's colour at each destination, (n, 2) metres."""
         for agent, (x, y) in zip(agents.tolist(), camera.to_pixels(places).tolist(), strict=True):
@@ -86,7 +86,7 @@ class Overlay:
             surface.blit(line, (MARGIN_PX + PADDING_PX, top))
             top += line.get_height() + 5
 
-    def scale_bar(self, surface: Surface, camera: Camera) -> None:
+    def scale_bar(self, surface: Surface, camera: Viewport) -> None:
         """A bar of round length at the lower left."""
         pygame = load_pygame()
         length_m = scale_bar_m(camera.scale)

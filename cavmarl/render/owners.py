@@ -12,7 +12,7 @@ from cavmarl.render.canvas import stamp
 from cavmarl.render.cars import Paint
 from cavmarl.render.marks import pointer
 from cavmarl.render.palette import INK, zone_color
-from cavmarl.render.viewport import Camera
+from cavmarl.render.viewport import Viewport
 from cavmarl.zones.partition.zone_partition import ZonePartition
 
 if TYPE_CHECKING:
@@ -46,7 +46,7 @@ def owner_paints(
 
 
 def draw_transfers(
-    surface: Surface, view: ZoneView, vehicles: NDArray[np.void], camera: Camera
+    surface: Surface, view: ZoneView, vehicles: NDArray[np.void], camera: Viewport
 ) -> None:
     """A ring in the target's colour around each vehicle in transfer, and a head towards it.
 

@@ -17,7 +17,7 @@ from cavmarl.render.legend import Sample, samples_of_drivers, samples_of_zones
 from cavmarl.render.overlay import Overlay, clock_text
 from cavmarl.render.owners import draw_transfers, owner_paints
 from cavmarl.render.shapes import road_shapes
-from cavmarl.render.viewport import Bounds, Camera, suitable_size
+from cavmarl.render.viewport import Bounds, Viewport, suitable_size
 from cavmarl.render.window import Window
 from cavmarl.render.zone_overlay import draw_sight, draw_zones
 from cavmarl.roads.network import RoadNetwork
@@ -59,18 +59,18 @@ class TopDownRenderer:
         self.network = network
         bounds = focus or network.extent_m
         self.size = size or suitable_size(bounds)
-        self._home = Camera.fit(bounds, self.size, MARGIN_PX)
+        self._home = Viewport.fit(bounds, self.size, MARGIN_PX)
         self._camera = self._home
         self._following = False
         self._goals = None if goal_edges is None else _edge_ends(network, goal_edges)
         self._shapes = road_shapes(network)
         self._overlay = Overlay()
-        self._ground: tuple[Camera, Surface] | None = None
-        self._scene: tuple[Camera, bytes, Surface] | None = None
+        self._ground: tuple[Viewport, Surface] | None = None
+        self._scene: tuple[Viewport, bytes, Surface] | None = None
         self._window: Window | None = None
 
     @property
-    def camera(self) -> Camera:
+    def camera(self) -> Viewport:
         return self._camera
 
     def draw(
@@ -202,12 +202,12 @@ class TopDownRenderer:
             self._camera = self._camera.towards(self._closeup(places), share)
             self._following = True
 
-    def _closeup(self, places: NDArray[np.float64]) -> Camera:
+    def _closeup(self, places: NDArray[np.float64]) -> Viewport:
         low, high = places.min(axis=0), places.max(axis=0)
         middle = (low + high) / 2.0
         half = np.maximum((high - low) * 0.6, FOLLOW_M / 2.0)
         (min_x, min_y), (max_x, max_y) = (middle - half).tolist(), (middle + half).tolist()
-        return Camera.fit((min_x, min_y, max_x, max_y), self.size)
+        return Viewport.fit((min_x, min_y, max_x, max_y), self.size)
 
     def _background(self, signal_phases: NDArray[np.int32] | None) -> Surface:
         """Roads and stop lines, made anew when the camera moves or a signal switches."""

@@ -1,4 +1,4 @@
-"""`Camera`: which part of the plane a picture shows."""
+"""`Viewport`: which part of the plane a picture shows."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["Bounds", "Camera", "suitable_size"]
+__all__ = ["Bounds", "Viewport", "suitable_size"]
 
 Bounds = tuple[float, float, float, float]  # min_x, min_y, max_x, max_y in metres
 
@@ -18,7 +18,7 @@ MAX_ASPECT = 3.0
 
 
 @dataclass(frozen=True)
-class Camera:
+class Viewport:
     """A view from straight above, north up, the same scale both ways.
 
     Attributes:
@@ -34,7 +34,7 @@ class Camera:
     size: tuple[int, int]
 
     @classmethod
-    def fit(cls, bounds: Bounds, size: tuple[int, int], margin_px: float = 0.0) -> Camera:
+    def fit(cls, bounds: Bounds, size: tuple[int, int], margin_px: float = 0.0) -> Viewport:
         """The closest view of all of `bounds` with a margin (up to a quarter) at each side."""
         min_x, min_y, max_x, max_y = bounds
         width, height = (max(side - 2.0 * margin_px, side / 2.0) for side in size)
@@ -60,15 +60,15 @@ class Camera:
         pixels[..., 1] = (self.y - xy[..., 1]) * self.scale + self.size[1] / 2.0
         return pixels
 
-    def enlarged(self, factor: int) -> Camera:
+    def enlarged(self, factor: int) -> Viewport:
         """The same view on `factor` times as many pixels each way."""
-        return Camera(
+        return Viewport(
             self.x, self.y, self.scale * factor, (self.size[0] * factor, self.size[1] * factor)
         )
 
-    def towards(self, target: Camera, share: float) -> Camera:
+    def towards(self, target: Viewport, share: float) -> Viewport:
         """A view that has come `share` of the way to `target`; the scale moves by ratios."""
-        return Camera(
+        return Viewport(
             self.x + share * (target.x - self.x),
             self.y + share * (target.y - self.y),
             self.scale * (target.scale / self.scale) ** share,

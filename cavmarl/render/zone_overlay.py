@@ -12,7 +12,7 @@ from cavmarl.render.ground import draw_ground
 from cavmarl.render.overlay import Overlay
 from cavmarl.render.palette import INK, ink_on, zone_color
 from cavmarl.render.shapes import road_shapes
-from cavmarl.render.viewport import Camera, suitable_size
+from cavmarl.render.viewport import Viewport, suitable_size
 from cavmarl.roads.network import RoadNetwork
 from cavmarl.zones.partition.zone_partition import ZonePartition
 
@@ -46,7 +46,7 @@ def zone_picture(
         MissingExtraError: pygame-ce is not installed.
     """
     size = suitable_size(partition.bounds)
-    camera = Camera.fit(partition.bounds, size, MARGIN_PX)
+    camera = Viewport.fit(partition.bounds, size, MARGIN_PX)
     surface = draw_ground(road_shapes(network), camera, DETAIL)
     draw_zones(surface, partition, halo_m, camera)
     overlay = Overlay()
@@ -55,7 +55,7 @@ def zone_picture(
     return surface
 
 
-def draw_zones(surface: Surface, partition: ZonePartition, halo_m: float, camera: Camera) -> None:
+def draw_zones(surface: Surface, partition: ZonePartition, halo_m: float, camera: Viewport) -> None:
     """Draw zones over what is there.
 
     Args:
@@ -83,7 +83,7 @@ def draw_zones(surface: Surface, partition: ZonePartition, halo_m: float, camera
 
 
 def draw_sight(
-    surface: Surface, partition: ZonePartition, halo_m: float, zone: int, camera: Camera
+    surface: Surface, partition: ZonePartition, halo_m: float, zone: int, camera: Viewport
 ) -> None:
     """Draw how far a zone sees: the line at the end of its halo, in its colour.
 
@@ -105,14 +105,14 @@ def draw_sight(
 
 
 def _clipped(
-    rects: NDArray[np.float64], camera: Camera, beyond_m: float = 0.0
+    rects: NDArray[np.float64], camera: Viewport, beyond_m: float = 0.0
 ) -> NDArray[np.float64]:
     """Rectangles (k, 4) without what is further than `beyond_m` out of view."""
     low, high = np.array(camera.bounds).reshape(2, 2) + np.array([[-beyond_m], [beyond_m]])
     return np.clip(rects, np.tile(low, 2), np.tile(high, 2))
 
 
-def _pixels(rect: NDArray[np.float64], camera: Camera) -> tuple[int, int, int, int]:
+def _pixels(rect: NDArray[np.float64], camera: Viewport) -> tuple[int, int, int, int]:
     """A rectangle in metres as left, top, width and height in pixels."""
     (left, bottom), (right, top) = np.rint(camera.to_pixels(rect.reshape(2, 2))).astype(int)
     return int(left), int(top), int(right - left), int(bottom - top)

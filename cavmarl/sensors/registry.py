@@ -19,7 +19,7 @@ from cavmarl.sensors.observed.feature import Feature, Sensor
 
 __all__ = ["find_sensor", "register_sensor", "sensor_names"]
 
-_MOUNTED = {f"rig.{config.type}": kind for config, kind in TYPES.items()}
+_MOUNTED = {f"rig.{config.type}": kind for config, kind in TYPES.items()}  # type: ignore[attr-defined]
 _OBSERVED = {sensor.name: sensor for sensor in SENSORS}
 
 

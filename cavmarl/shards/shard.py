@@ -36,10 +36,10 @@ from cavmarl.driving.kernels.lane_index import ENTRY
 from cavmarl.driving.vehicles import VEHICLE
 from cavmarl.roads.network import RoadNetwork
 from cavmarl.roads.routing import PLAN, lane_grid
-from cavmarl.sensors.kernels.observe_optional import observe_further
+from cavmarl.sensors.kernels.observe_optional import observe_optional
 from cavmarl.sensors.kernels.observing_messages import observe_messages
 from cavmarl.sensors.kernels.stacking import fill_stacks
-from cavmarl.sensors.observed import further_arrays, layout, sensor_arrays
+from cavmarl.sensors.observed import layout, optional_arrays, sensor_arrays
 from cavmarl.shards.kernels.world_phases import suggest
 from cavmarl.shards.registered_outputs import RegisteredOutputs
 from cavmarl.traffic.kernels.leaving import leave
@@ -116,7 +116,7 @@ class Shard:
         self.travel = travel
         self.lane_grid: LaneGrid = lane_grid(network)
         self.sensors = sensor_arrays(config.sensors)
-        self._further = further_arrays(config.sensors, network, plans)
+        self._further = optional_arrays(config.sensors, network, plans)
         self._registered = RegisteredOutputs(config, network)
         num_worlds, capacity = zoned.rows.shape[2:]
         self._extent_m = network.extent_m
@@ -147,7 +147,7 @@ class Shard:
         self.target_speeds = np.array(config.action.target_speeds_mps)
         self.discrete = config.action.kind == "discrete"
         self._call_leave = repeated(leave)
-        self._call_observe_further = repeated(observe_further)
+        self._call_observe_further = repeated(observe_optional)
         self._call_observe_messages = repeated(observe_messages)
         self._call_fill_stacks = repeated(fill_stacks)
 

@@ -274,7 +274,7 @@ class NativeTraffic:
             num_ids=self.population.num_ids,
             num_background=self.population.background,
             reenter=not closed,
-            seats=self.population.mode == "seats",
+            seats=self.population.mode == "respawn",
             speed_factor_spread=self.traffic.speed_factor_spread,
             blank=self.blank,
         )

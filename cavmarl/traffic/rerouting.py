@@ -21,7 +21,7 @@ from cavmarl.traffic.demand.rerouters import KEEP_DESTINATION
 from cavmarl.traffic.kernels.edge_speeds import limit_speeds, sample_speeds
 from cavmarl.traffic.kernels.way_requests import find_asking, mark_slots
 from cavmarl.traffic.schedule import Schedule
-from cavmarl.traffic.way_search import Answer, Traffic, WaySearch
+from cavmarl.traffic.way_search import Traffic, WaySearch, WaySearchResult
 from cavmarl.traffic.way_slots import WaySlots
 
 __all__ = ["LOOK", "Rerouting"]
@@ -189,7 +189,7 @@ class Rerouting:
             self._ask_rerouters(search, int(i), row, look, clock_s)
             if tick >= look["next"]:
                 answer = search.send(int(i), int(look["goal"]), True, False)
-                if answer is not Answer.LATER:
+                if answer is not WaySearchResult.LATER:
                     look["next"] = tick + look["period"] if look["period"] > 0 else NEVER
         return int(rows["leg"][:num].sum() - legs)
 
@@ -220,9 +220,9 @@ class Rerouting:
         for rule in rules[(rules["begin_s"] <= clock_s) & (clock_s < rules["end_s"])]:
             if self._is_meant(rule, row):
                 answer = self._follow(search, i, row, look, rule)
-                if answer is Answer.LATER:
+                if answer is WaySearchResult.LATER:
                     return
-                if answer is Answer.TAKEN:
+                if answer is WaySearchResult.TAKEN:
                     break
         look["seen"] = edge
 
@@ -240,21 +240,21 @@ class Rerouting:
 
     def _follow(
         self, search: WaySearch, i: int, row: np.void, look: np.void, rule: np.void
-    ) -> Answer:
+    ) -> WaySearchResult:
         if rule["routes"] >= 0:
             return self._take_route(search, i, row, look, rule)
         knows = bool(look["equipped"])
         if rule["closes"]:
             if not search.meets_closing(i):
-                return Answer.KEPT
+                return WaySearchResult.KEPT
             answer = search.send(i, int(look["goal"]), knows, True)
-            if answer is not Answer.NO_WAY or rule["goals"] < 0:
+            if answer is not WaySearchResult.NO_WAY or rule["goals"] < 0:
                 return answer
         goal = self._pick(self._schedule.demand.rerouters.goals, rule["goals"], rule, row)
         if goal in (KEEP_DESTINATION, look["goal"]):
-            return Answer.KEPT
+            return WaySearchResult.KEPT
         answer = search.send(i, goal, knows, True)
-        if answer is Answer.TAKEN:
+        if answer is WaySearchResult.TAKEN:
             look["goal"] = goal
             # No plan of detours leads there.
             row["goal"] = -1
@@ -262,13 +262,13 @@ class Rerouting:
 
     def _take_route(
         self, search: WaySearch, i: int, row: np.void, look: np.void, rule: np.void
-    ) -> Answer:
+    ) -> WaySearchResult:
         schedule = self._schedule
         route = self._pick(schedule.demand.rerouters.routes, rule["routes"], rule, row)
         vtype = int(row["vtype"]) - self._first_type
         way = schedule.way_on(route, vtype, int(self._roads.lanes[row["lane"]]["edge"]))
-        answer = search.send_along(i, way) if way >= 0 else Answer.NO_WAY
-        if answer is Answer.TAKEN:
+        answer = search.send_along(i, way) if way >= 0 else WaySearchResult.NO_WAY
+        if answer is WaySearchResult.TAKEN:
             look["goal"] = schedule.last_edges(np.array([route]))[0]
             row["goal"] = schedule.detour_goal(route, vtype)
         return answer

@@ -22,10 +22,10 @@ from cavmarl.traffic.kernels.way_requests import (
 )
 from cavmarl.traffic.way_slots import WaySlots
 
-__all__ = ["Answer", "Traffic", "WaySearch"]
+__all__ = ["Traffic", "WaySearch", "WaySearchResult"]
 
 
-class Answer(Enum):
+class WaySearchResult(Enum):
     """What came of looking for a way."""
 
     KEPT = 0  # the present way is as fast
@@ -92,7 +92,7 @@ class WaySearch:
         time: float = time_left(roads, self._travel.steps, row["way"], row["lane"])
         return CLOSED_S <= time < np.inf
 
-    def send(self, i: int, goal: int, knows: bool, anyhow: bool) -> Answer:
+    def send(self, i: int, goal: int, knows: bool, anyhow: bool) -> WaySearchResult:
         """Put row i on the fastest way to a goal, if that is faster than its present way.
 
         Args:
@@ -109,30 +109,30 @@ class WaySearch:
         number = find_way(roads, plan, lane, permission, self._edges, self._steps, self._cost)
         way = -int(self._roads.edges[self._roads.lanes[lane]["edge"]]["first_lane"])
         if number == 0:
-            return Answer.NO_WAY
+            return WaySearchResult.NO_WAY
         time = time_left(roads, self._steps, way, lane)
         if time >= CLOSED_S:
-            return Answer.NO_WAY
+            return WaySearchResult.NO_WAY
         if not anyhow and time >= time_left(roads, self._travel.steps, row["way"], lane):
-            return Answer.KEPT
+            return WaySearchResult.KEPT
         if not has_room(self._roads, self._travel, row, self._steps, way):
-            return Answer.LATER
+            return WaySearchResult.LATER
         found = self._steps[:number]
         taken = take_slot(
             self._roads, self._travel, row, found, self._first_slot, self._slot_steps, self._used
         )
-        return Answer.TAKEN if taken else Answer.NO_WAY
+        return WaySearchResult.TAKEN if taken else WaySearchResult.NO_WAY
 
-    def send_along(self, i: int, way: int) -> Answer:
+    def send_along(self, i: int, way: int) -> WaySearchResult:
         row = self._rows[i]
         if way == row["way"]:
-            return Answer.KEPT
+            return WaySearchResult.KEPT
         if not self._travel.steps[way + row["lane"]]["to_go"] < np.inf:
-            return Answer.NO_WAY
+            return WaySearchResult.NO_WAY
         if not has_room(self._roads, self._travel, row, self._travel.steps, way):
-            return Answer.LATER
+            return WaySearchResult.LATER
         put_on_way(self._travel, row, way)
-        return Answer.TAKEN
+        return WaySearchResult.TAKEN
 
     def _permission(self, i: int) -> int:
         return int(self._travel.types[self._rows[i]["vtype"]]["permissions"])

@@ -35,10 +35,10 @@ from cavmarl.v2x.kernels.v2x_records import (
     REPORT,
     STATION,
     Air,
-    Heard,
+    HeardCams,
     Mail,
-    Room,
     Sending,
+    V2xScratch,
 )
 from cavmarl.v2x.message_statistics import V2xStatistics, statistics_of
 from cavmarl.v2x.network_simulator import Exchange, NetworkSimulator, check_receptions
@@ -261,7 +261,7 @@ def _make_mail(
     )
 
 
-def _make_room(network: RoadNetwork, mail: Mail, zoned: Zoned, num_receivers: int) -> Room:
+def _make_room(network: RoadNetwork, mail: Mail, zoned: Zoned, num_receivers: int) -> V2xScratch:
     capacity, most = zoned.rows.shape[3], mail.packets.shape[2]
     largest = max(box.shape[2] for box in (mail.objects, mail.events, mail.signals))
 
@@ -276,7 +276,7 @@ def _make_room(network: RoadNetwork, mail: Mail, zoned: Zoned, num_receivers: in
             which=np.zeros(most, np.int32),
         )
 
-    return Room(
+    return V2xScratch(
         stations=np.zeros(capacity, STATION),
         spare=np.zeros(capacity, STATION),
         receivers=np.zeros(num_receivers, RECEIVER),
@@ -291,7 +291,7 @@ def _make_room(network: RoadNetwork, mail: Mail, zoned: Zoned, num_receivers: in
         kinds=np.zeros(NUM_KINDS, np.int64),
         access=np.zeros(most, np.bool_),
         cam_of=np.zeros(1 << (2 * capacity).bit_length(), np.int32),
-        heard=Heard(
+        heard=HeardCams(
             place=np.zeros(most + 1, np.int32),
             squared=np.zeros(most + 1),
             word=np.zeros(most + 1, np.uint64),

@@ -142,7 +142,7 @@ def verify_zones(
     if faults is not None:
         _shadow(divided, "zones.faults", read_faults(str(faults)).to_json(), "faults")
     if check:
-        divided["zones.check"] = True
+        divided["zones.check_invariants"] = True
     plain = {key: value for key, value in divided.items() if not key.startswith("zones.")}
 
     def run(count: int, settings: Mapping[str, Any]) -> _Run:

@@ -26,7 +26,7 @@ from cavmarl.policies.policy import load_policy
 from cavmarl.verify.determinism import check_steps
 from cavmarl.verify.differences import Arrays, single_arrays, step_results
 from cavmarl.verify.fault_figures import FaultFigures, HandOverClock, spread
-from cavmarl.verify.fault_matrix import Line, Rehearsal, matrix
+from cavmarl.verify.fault_matrix import MatrixLine, Rehearsal, matrix
 from cavmarl.verify.replay import replay_tick, world_of
 
 __all__ = ["Campaign", "LineResult", "run_campaign"]
@@ -35,7 +35,7 @@ ENV = "grid4x4"
 ZONES = (4, 9)
 # A world in which many go over borders, and as much as can be goes with them.
 BUSY: Mapping[str, Any] = {
-    "population.mode": "seats",
+    "population.mode": "respawn",
     "population.agents": 8,
     "population.background": 120,
     "clock.sim_dt_s": 0.1,
@@ -249,7 +249,7 @@ class _Stage:
         switches = tuple((row.tick, row.source, row.target) for row in rows)
         return Rehearsal(count, coordinator.tick, frozenset(visits), switches)
 
-    def run(self, plan: Faults, line: Line, result: LineResult, campaign: Campaign) -> None:
+    def run(self, plan: Faults, line: MatrixLine, result: LineResult, campaign: Campaign) -> None:
         """A divided run with faults; what came of it is added to the result and the campaign."""
         vec = self._divided(result.zones, plan)
         simulation = vec.simulation
@@ -270,7 +270,7 @@ class _Stage:
         if planned and not line.poison:
             result.missed += planned - figures.deaths
 
-    def _wrong(self, vec: CavVectorEnv, line: Line, campaign: Campaign) -> str:
+    def _wrong(self, vec: CavVectorEnv, line: MatrixLine, campaign: Campaign) -> str:
         """What is not as it has to be in a run; nothing if all is."""
         revivals = vec.simulation.revivals
         began, deaths = time.perf_counter(), 0

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from cavmarl.engine.simulation import Simulation
-from cavmarl.handoff.fault_injection.message_coordinator import Coordinator
+from cavmarl.handoff.fault_injection.message_coordinator import MessageCoordinator
 from cavmarl.ownership.messages import Begin, Commit, Message, Need, Record, Reset
 from cavmarl.ownership.transport import Network
 
@@ -80,7 +80,8 @@ class FaultFigures:
             count.
         hand_overs: `failed`, `switched`, `forced`, `deferred` (ticks), `late` (vehicles), `asked`,
             `refused`, `aborted`.
-        resent: phase → messages that were sent again for want of an answer, as of `Coordinator`.
+        resent: phase → messages that were sent again for want of an answer, as of
+            `MessageCoordinator`.
         recovery_ms: of each death, until its tick began again.
         repeats: of each tick with a death, how often it was begun again.
         waited_ticks: of each hand-over, from the crossing to the switch.
@@ -116,7 +117,7 @@ class FaultFigures:
         found.repeats.extend(Counter(revival.tick for revival in simulation.revivals).values())
         for coordinator in simulation.coordinators:
             found.stale.update(coordinator.dropped())
-            if not isinstance(coordinator, Coordinator):
+            if not isinstance(coordinator, MessageCoordinator):
                 continue
             found.resent.update(coordinator.resent)
             if isinstance(coordinator.post, Network):

@@ -20,7 +20,7 @@ from cavmarl.handoff.fault_injection.injected_faults import Visit
 from cavmarl.ownership.messages import COORDINATOR
 from cavmarl.ownership.transport import Rates
 
-__all__ = ["ELSEWHERE", "ROLES", "Line", "Rehearsal", "matrix"]
+__all__ = ["ELSEWHERE", "ROLES", "MatrixLine", "Rehearsal", "matrix"]
 
 ROLES = ("source", "target", "bystander")
 APART = 6  # ticks between two deaths of a run, so that each meets a settled world
@@ -89,7 +89,7 @@ class Rehearsal:
 
 
 @dataclass(frozen=True)
-class Line:
+class MatrixLine:
     """A line of the matrix.
 
     Attributes:
@@ -107,7 +107,7 @@ class Line:
     poison: bool = False
 
 
-def matrix(seen: Rehearsal, seed: int, seeds: int) -> list[Line]:
+def matrix(seen: Rehearsal, seed: int, seeds: int) -> list[MatrixLine]:
     """All lines that apply to one process.
 
     Args:
@@ -122,7 +122,7 @@ def matrix(seen: Rehearsal, seed: int, seeds: int) -> list[Line]:
 # Deaths
 
 
-def _host_lines(seen: Rehearsal) -> list[Line]:
+def _host_lines(seen: Rehearsal) -> list[MatrixLine]:
     once = {role: _cases(seen, role, Crash(0, ZONE_POINTS[0], 0)) for role in ROLES}
     lines = [_line(f"the {role}'s host dies", cases) for role, cases in once.items()]
     twice, thrice = (replace(Crash(0, ZONE_POINTS[0], 0), times=times) for times in (2, 3))
@@ -155,7 +155,7 @@ def _cases(seen: Rehearsal, role: str, like: Crash) -> list[tuple[str, list[Opti
     ]
 
 
-def _coordinator_lines(seen: Rehearsal) -> list[Line]:
+def _coordinator_lines(seen: Rehearsal) -> list[MatrixLine]:
     def cases(points: Iterable[str], times: int) -> list[tuple[str, list[Option]]]:
         return [
             (
@@ -174,12 +174,12 @@ def _coordinator_lines(seen: Rehearsal) -> list[Line]:
     return [
         _line("the coordinator dies", cases(COORDINATOR_POINTS, 1)),
         _line("the next coordinator dies, too", cases(again, 2)),
-        Line("the coordinator restarts at every record", "each of a third of the run",
+        MatrixLine("the coordinator restarts at every record", "each of a third of the run",
              (Faults(crashes=every),)),
     ]  # fmt: skip
 
 
-def _line(name: str, cases: Sequence[tuple[str, list[Option]]]) -> Line:
+def _line(name: str, cases: Sequence[tuple[str, list[Option]]]) -> MatrixLine:
     """Put the cases into as few runs as they go into, apart from each other."""
     runs: list[list[Crash]] = []
     for _, options in cases:
@@ -187,7 +187,7 @@ def _line(name: str, cases: Sequence[tuple[str, list[Option]]]) -> Line:
             runs.append(list(options[0]))
     unmet = tuple(label for label, options in cases if not options)
     plans = tuple(Faults(crashes=tuple(sorted(run, key=lambda c: c.tick))) for run in runs)
-    return Line(name, f"{len(cases) - len(unmet)} points", plans, unmet)
+    return MatrixLine(name, f"{len(cases) - len(unmet)} points", plans, unmet)
 
 
 def _put(run: list[Crash], options: Iterable[Option]) -> bool:
@@ -201,9 +201,9 @@ def _put(run: list[Crash], options: Iterable[Option]) -> bool:
 # Messages
 
 
-def _message_lines(seed: int, ticks: int) -> list[Line]:
-    def line(name: str, points: str, *messages: dict[str, Rates]) -> Line:
-        return Line(name, points, tuple(Faults(seed, rates) for rates in messages))
+def _message_lines(seed: int, ticks: int) -> list[MatrixLine]:
+    def line(name: str, points: str, *messages: dict[str, Rates]) -> MatrixLine:
+        return MatrixLine(name, points, tuple(Faults(seed, rates) for rates in messages))
 
     def rates(**values: float) -> dict[str, Rates]:
         return {kind: Rates(**values) for kind in HAND_OVER}  # type: ignore[arg-type]
@@ -230,13 +230,13 @@ def _message_lines(seed: int, ticks: int) -> list[Line]:
              *({k: Rates(drop=r) for k in ("Step", "Done")} for r in (0.1, 0.5, 0.9))),
         line("STEP and DONE come twice, late, in another order", "half of them", {
             k: Rates(delay=0.5, duplicate=0.5, reorder=0.5) for k in ("Step", "Done")}),
-        Line("all of it, healed half way", "open hand-overs end within D + 2 ticks",
+        MatrixLine("all of it, healed half way", "open hand-overs end within D + 2 ticks",
              (Faults(seed, heavy, until=ticks // 2),)),
     ]  # fmt: skip
 
 
-def _random_line(seed: int, seeds: int) -> Line:
+def _random_line(seed: int, seeds: int) -> MatrixLine:
     messages = {kind: Rates(0.1, 0.1, 0.1, 0.1, 0.05) for kind in MESSAGES}
     messages["Prepare"] = replace(messages["Prepare"], refuse=0.1)
     plans = tuple(Faults(seed + k, messages, crash_rate=0.001) for k in range(seeds))
-    return Line("any process at any time, and messages", f"{seeds} seeds", plans)
+    return MatrixLine("any process at any time, and messages", f"{seeds} seeds", plans)

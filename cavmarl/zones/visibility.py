@@ -1,4 +1,4 @@
-"""`Sight` says which vehicles zones see over their borders, however the map is cut."""
+"""`Visibility` says which vehicles zones see over their borders, however the map is cut."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ from cavmarl.zones.partition.zone_halo import inner_parts, lane_watchers, zone_h
 from cavmarl.zones.partition.zone_partition import ZonePartition
 from cavmarl.zones.reach import off_lane_m
 
-__all__ = ["Sight"]
+__all__ = ["Visibility"]
 
 
 @dataclass(frozen=True, eq=False)
-class Sight:
+class Visibility:
     """The distances that sight goes by, and what it takes to know on which roads it ends earlier.
 
     Attributes:

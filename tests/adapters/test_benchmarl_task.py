@@ -15,7 +15,7 @@ benchmarl = pytest.importorskip("benchmarl", reason="needs the extra: benchmarl 
 
 pytestmark = pytest.mark.filterwarnings("ignore")  # TorchRL's warnings of itself are many
 
-MODES = ("closed", "entering", "seats")
+MODES = ("closed", "open", "respawn")
 SMALL = {"agents": 2, "background": 2, "max_cycles": 8}
 
 
@@ -61,9 +61,7 @@ def test_ippo_runs_two_iterations(tmp_path: Path, mode: str) -> None:
     assert experiment.n_iters_performed == 2
     assert len(rewards) == 2
     assert np.isfinite(rewards).all()
-    assert experiment.group_map == {
-        "car": [f"car_{k}" for k in range(4 if mode == "entering" else 2)]
-    }
+    assert experiment.group_map == {"car": [f"car_{k}" for k in range(4 if mode == "open" else 2)]}
 
 
 def test_a_central_critic_meta_actions_and_named_observations_run(tmp_path: Path) -> None:

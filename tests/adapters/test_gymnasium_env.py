@@ -13,7 +13,7 @@ from gymnasium.wrappers import FlattenObservation, RecordEpisodeStatistics
 from cavmarl.config.registry import load_config
 from cavmarl.core.errors import ConfigError
 
-MODES = ("closed", "entering", "seats")
+MODES = ("closed", "open", "respawn")
 
 
 def make(mode: str = "closed", kind: str = "flat", **arguments: Any) -> gymnasium.Env[Any, Any]:

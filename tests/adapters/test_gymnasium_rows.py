@@ -16,7 +16,7 @@ from cavmarl.core.errors import ConfigError
 from cavmarl.engine.spaces import flat_observation
 from cavmarl.env.vector import make_vec
 
-MODES = ("closed", "entering", "seats")
+MODES = ("closed", "open", "respawn")
 AUTORESET = (AutoresetMode.SAME_STEP, AutoresetMode.NEXT_STEP)
 ROWS = 8
 WORLDS = 2
@@ -24,10 +24,10 @@ WORLDS = 2
 
 def overrides(mode: str, kind: str = "flat") -> dict[str, Any]:
     chosen = {"population.mode": mode, "observation.kind": kind}
-    return chosen | ({"population.agents": 2} if mode == "entering" else {})
+    return chosen | ({"population.agents": 2} if mode == "open" else {})
 
 
-def make(mode: str = "seats", kind: str = "flat", **arguments: Any) -> Any:
+def make(mode: str = "respawn", kind: str = "flat", **arguments: Any) -> Any:
     settings = {"num_worlds": WORLDS, "background": 4, "max_cycles": 12} | arguments
     name = "cavmarl/mergeAgents-v0"
     return gymnasium.make_vec(name, num_envs=ROWS, overrides=overrides(mode, kind), **settings)
@@ -52,7 +52,7 @@ def test_rows_are_the_worlds_agents(mode: str, autoreset: AutoresetMode) -> None
         max_cycles=12,
         autoreset_mode=autoreset,
         overrides={
-            "population.agents": 2 if mode == "entering" else per_world,
+            "population.agents": 2 if mode == "open" else per_world,
             "population.budget": per_world,
             "population.mode": mode,
         },

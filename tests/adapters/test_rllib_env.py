@@ -16,11 +16,11 @@ pytest.importorskip("ray.rllib", reason="needs the extra: rllib (make libraries)
 
 pytestmark = pytest.mark.filterwarnings("ignore")  # Ray's warnings of itself are many
 
-MODES = ("closed", "entering", "seats")
+MODES = ("closed", "open", "respawn")
 HORIZON = 16
 
 
-def config(mode: str = "entering", kind: str = "flat") -> dict[str, Any]:
+def config(mode: str = "open", kind: str = "flat") -> dict[str, Any]:
     return {
         "env": "merge",
         "agents": 3,
@@ -48,7 +48,7 @@ def test_the_worlds_agents_are_rllibs(mode: str) -> None:
     from cavmarl.adapters.rllib_env import CavRllibEnv
 
     # One after the other: the next one enters when the last one has ended.
-    chosen = config(mode) | ({"agents": 1} if mode == "entering" else {})
+    chosen = config(mode) | ({"agents": 1} if mode == "open" else {})
     env, twin = CavRllibEnv(chosen), parallel_env(**chosen)
     sampled = env.get_action_space("car_0")
     sampled.seed(0)
@@ -82,7 +82,7 @@ def test_the_worlds_agents_are_rllibs(mode: str) -> None:
             assert (rewards, ended, cut, infos) == (paid, theirs, their_cut, told)
             assert env.agents == twin.agents
             assert not gone & set(env.agents)
-    assert (handed_on > 0) == (mode == "entering")
+    assert (handed_on > 0) == (mode == "open")
 
 
 def test_a_cut_is_no_end() -> None:
@@ -107,7 +107,7 @@ def train(flat: bool = True, **runners: Any) -> dict[str, Any]:
     if not flat:
         flatten = partial(FlattenObservations, multi_agent=True)
         runners["env_to_module_connector"] = lambda env, spaces=None, device=None: flatten()
-    mode = runners.pop("mode", "entering")
+    mode = runners.pop("mode", "open")
     algorithm = (
         PPOConfig()
         .environment(CavRllibEnv, env_config=config(mode, "flat" if flat else "dict"))
@@ -129,7 +129,7 @@ def test_every_population_trains(mode: str) -> None:
     found = train(mode=mode, num_env_runners=0)
     assert found["num_episodes"] > 0
     seen = set(found["agent_episode_returns_mean"])
-    assert seen == {f"car_{k}" for k in range(5 if mode == "entering" else 3)}
+    assert seen == {f"car_{k}" for k in range(5 if mode == "open" else 3)}
 
 
 @pytest.mark.usefixtures("cluster")

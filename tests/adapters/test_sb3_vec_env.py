@@ -14,12 +14,12 @@ from cavmarl.env.vector import make_vec
 
 sb3 = pytest.importorskip("stable_baselines3")
 
-MODES = ("closed", "entering", "seats")
+MODES = ("closed", "open", "respawn")
 WORLDS, SEATS, BUDGET = 2, 3, 5
 SMALL: dict[str, Any] = {"num_worlds": WORLDS, "agents": SEATS, "background": 2}
 
 
-def make(mode: str = "seats", kind: str = "flat") -> Any:
+def make(mode: str = "respawn", kind: str = "flat") -> Any:
     from cavmarl.adapters.sb3_vec_env import CavSb3VecEnv
 
     keys = {"population.mode": mode, "population.budget": BUDGET, "observation.kind": kind}
@@ -90,7 +90,7 @@ def test_rows_are_the_worlds_agents(mode: str) -> None:
         overrides={"population.mode": mode, "population.budget": BUDGET},
     )
     agents = vec.num_agents
-    assert agents == (BUDGET if mode == "entering" else SEATS)
+    assert agents == (BUDGET if mode == "open" else SEATS)
     observations, _ = vec.reset(seed=5)
     random = np.random.default_rng(0)
     found = wild(rows, 5)

@@ -21,12 +21,12 @@ pytestmark = [
     pytest.mark.filterwarnings("ignore:Creating .* inherits from WeightUpdaterBase"),
 ]
 
-MODES = ("closed", "entering", "seats")
+MODES = ("closed", "open", "respawn")
 WORLDS, AGENTS, BUDGET, HORIZON = 2, 3, 5, 12
 CAR = "car"
 
 
-def settings(mode: str = "seats", **overrides: Any) -> dict[str, Any]:
+def settings(mode: str = "respawn", **overrides: Any) -> dict[str, Any]:
     keys = {"population.mode": mode, "population.budget": BUDGET, **overrides}
     return {
         "num_envs": WORLDS,
@@ -37,7 +37,7 @@ def settings(mode: str = "seats", **overrides: Any) -> dict[str, Any]:
     }
 
 
-def make(mode: str = "seats", **overrides: Any) -> Any:
+def make(mode: str = "respawn", **overrides: Any) -> Any:
     from cavmarl.adapters.torchrl_env import CavTorchRLEnv
 
     return CavTorchRLEnv("merge", **settings(mode, **overrides))

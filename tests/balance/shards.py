@@ -8,7 +8,7 @@ from itertools import product
 from hypothesis import strategies as st
 
 from cavmarl.balance.load_score import Candidate, Utilisation
-from cavmarl.balance.load_snapshot import Snapshot
+from cavmarl.balance.load_snapshot import LoadSnapshot
 from cavmarl.balance.problem import Problem, ShardCost
 
 COSTS = st.one_of(st.floats(0.0, 1.0), st.sampled_from([0.0, 0.001, 0.01, 1.0]))
@@ -29,10 +29,10 @@ def row(costs: Sequence[float], worlds: int = 1) -> tuple[ShardCost, ...]:
     return tuple(ShardCost(n // zones, n % zones, cost) for n, cost in enumerate(costs))
 
 
-def busy(*cpus: float) -> Snapshot:
+def busy(*cpus: float) -> LoadSnapshot:
     """Workers of which others use that much of the processor."""
     workers = tuple(Candidate(n, Utilisation(cpu, 0.0)) for n, cpu in enumerate(cpus))
-    return Snapshot(workers, "none", "generated")
+    return LoadSnapshot(workers, "none", "generated")
 
 
 def least_makespan_s(problem: Problem) -> float:

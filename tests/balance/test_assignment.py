@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from cavmarl.balance.balance_plan import Plan, make_plan
 from cavmarl.balance.load_score import Candidate, LoadRule, Utilisation
-from cavmarl.balance.load_snapshot import Snapshot, idle_snapshot
+from cavmarl.balance.load_snapshot import LoadSnapshot, idle_snapshot
 from cavmarl.balance.problem import BalanceRule, Problem, ShardCost
 from cavmarl.balance.smoothing import SmoothCosts
 from cavmarl.core.errors import ConfigError, NoAdmissibleWorkerError
@@ -21,7 +21,7 @@ from tests.balance.shards import COSTS, busy, grid, least_makespan_s, row
 STRICT = BalanceRule(tolerance=0.0)
 
 
-def alone(costs: list[float], snapshot: Snapshot, rule: BalanceRule | None = None) -> Problem:
+def alone(costs: list[float], snapshot: LoadSnapshot, rule: BalanceRule | None = None) -> Problem:
     """Shards without neighbours."""
     return Problem(row(costs), ((),) * len(costs), snapshot, rule or BalanceRule())
 
@@ -73,7 +73,7 @@ def test_no_order_counts(costs: list[float], cpus: list[float], draw: random.Ran
     shards, workers = list(problem.shards), list(problem.snapshot.workers)
     draw.shuffle(shards)
     draw.shuffle(workers)
-    shuffled = Problem(tuple(shards), problem.neighbors, Snapshot(tuple(workers), "none", ""))
+    shuffled = Problem(tuple(shards), problem.neighbors, LoadSnapshot(tuple(workers), "none", ""))
     assert make_plan(shuffled).homes == make_plan(problem).homes
 
 
@@ -149,7 +149,7 @@ def test_who_is_excluded_keeps_what_balance_does_not_take() -> None:
 
 def test_who_has_nothing_left_is_slow_and_not_endless() -> None:
     used_up = Candidate(1, Utilisation(1.0, 1.0, 1.0))
-    snapshot = Snapshot((*busy(0.0).workers, used_up), "none", "")
+    snapshot = LoadSnapshot((*busy(0.0).workers, used_up), "none", "")
     problem = replace(alone([1.0] * 3, snapshot), present=(0, 1, 1))
     plan = make_plan(problem)
     assert math.isfinite(plan.imbalance)
@@ -170,7 +170,7 @@ def test_shards_of_a_lost_worker_are_placed_beyond_the_bound() -> None:
     assert set(plan.homes) == {0, 1}
     assert plan.imbalance == 1.0
     assert {move.source for move in plan.moves} == {7}
-    gone = Snapshot((Candidate(0, Utilisation(0.0, 0.0), available=False),), "none", "")
+    gone = LoadSnapshot((Candidate(0, Utilisation(0.0, 0.0), available=False),), "none", "")
     with pytest.raises(NoAdmissibleWorkerError, match="worker 0 is unavailable"):
         make_plan(replace(problem, snapshot=gone))
 
@@ -273,7 +273,7 @@ def test_rules_are_checked(rule: dict[str, float], said: str) -> None:
 
 
 def test_weights_change_who_is_given_more() -> None:
-    full = Snapshot(
+    full = LoadSnapshot(
         (Candidate(0, Utilisation(0.0, 0.8)), Candidate(1, Utilisation(0.4, 0.0))), "none", ""
     )
     by_cpu = BalanceRule(LoadRule((1.0, 0.0, 0.0)))

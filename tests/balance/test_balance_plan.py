@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from cavmarl.balance.balance_plan import Plan, make_plan, replan
 from cavmarl.balance.load_score import Candidate, LoadRule, Utilisation
-from cavmarl.balance.load_snapshot import Snapshot, idle_snapshot
+from cavmarl.balance.load_snapshot import LoadSnapshot, idle_snapshot
 from cavmarl.balance.plan_file import plan_from_dict, read_plan
 from cavmarl.balance.plan_text import describe_plan
 from cavmarl.balance.problem import BalanceRule, Problem
@@ -24,7 +24,7 @@ from tests.balance.shards import COSTS, busy, grid, row
 @pytest.fixture
 def plan() -> Plan:
     away = Candidate(3, Utilisation(0.0, 0.0), available=False)
-    snapshot = Snapshot((*busy(0.1, 0.2, 0.9).workers, away), "none", "generated")
+    snapshot = LoadSnapshot((*busy(0.1, 0.2, 0.9).workers, away), "none", "generated")
     rule = BalanceRule(LoadRule((0.5, 0.25, 0.25)), tolerance=0.05, max_moves=3)
     present = (0, 0, 0, 0, 0, 1, 1, 2)
     costs = [0.004, 0.001, 0.002, 0.001, 0.003, 0.001, 0.001, 0.001]

@@ -6,7 +6,7 @@ import pytest
 
 from cavmarl.balance.balance_plan import replan
 from cavmarl.balance.balancer import Balancer
-from cavmarl.balance.load_snapshot import Snapshot, idle_snapshot
+from cavmarl.balance.load_snapshot import LoadSnapshot, idle_snapshot
 from cavmarl.balance.problem import BalanceRule, Problem, ShardCost, equal_costs
 from cavmarl.core.errors import ConfigError
 from tests.balance.shards import grid, row
@@ -52,7 +52,7 @@ def test_a_round_may_go_by_other_costs_and_another_rule(balancer: Balancer) -> N
 
 
 def test_who_is_lost_is_replaced_in_a_round(balancer: Balancer) -> None:
-    left = Snapshot(idle_snapshot(2).workers[1:], "none", "")
+    left = LoadSnapshot(idle_snapshot(2).workers[1:], "none", "")
     assert set(balancer.round(left).homes) == {1}
 
 

@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 
 from cavmarl.balance.load_score import Candidate, Utilisation
-from cavmarl.balance.load_snapshot import Snapshot, idle_snapshot
+from cavmarl.balance.load_snapshot import LoadSnapshot, idle_snapshot
 from cavmarl.balance.plan_file import snapshot_from_dict
 from cavmarl.balance.probe import Watch, take_snapshot
 from cavmarl.core.errors import ConfigError
@@ -74,7 +74,7 @@ def test_workers_are_not_charged_for_their_own_work() -> None:
 
 
 def test_a_snapshot_goes_to_json_and_back() -> None:
-    taken = Snapshot(
+    taken = LoadSnapshot(
         (Candidate(1, Utilisation(0.1, 0.2, 0.3), 4), Candidate(0, Utilisation(1 / 3, 0.2))),
         "none",
         "measured",
@@ -87,7 +87,7 @@ def test_no_worker_or_one_twice_is_no_snapshot() -> None:
     with pytest.raises(ConfigError, match="no workers"):
         idle_snapshot(0)
     with pytest.raises(ConfigError, match="named twice"):
-        Snapshot(idle_snapshot(1).workers * 2, "none", "")
+        LoadSnapshot(idle_snapshot(1).workers * 2, "none", "")
 
 
 @pytest.mark.parametrize("interval_s", [0.0, -1.0, float("nan")])

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from cavmarl.balance.balance_plan import Plan, make_plan
 from cavmarl.balance.balancer import Balancer
-from cavmarl.balance.load_snapshot import Snapshot, idle_snapshot
+from cavmarl.balance.load_snapshot import LoadSnapshot, idle_snapshot
 from cavmarl.balance.plan_file import plan_from_dict
 from cavmarl.balance.plan_text import describe_plan
 from cavmarl.balance.problem import BalanceRule, Problem, ShardCost, equal_costs
@@ -21,7 +21,7 @@ from tests.balance.shards import COSTS, busy
 EAGER = BalanceRule(tolerance=0.0, move_s=0.0, max_moves=3)
 
 
-def worlds(costs: list[float], snapshot: Snapshot, rule: BalanceRule = EAGER) -> Problem:
+def worlds(costs: list[float], snapshot: LoadSnapshot, rule: BalanceRule = EAGER) -> Problem:
     shards = tuple(ShardCost(world, 0, cost) for world, cost in enumerate(costs))
     return Problem(shards, ((),), snapshot, rule, in_row=True)
 
@@ -105,7 +105,7 @@ def test_who_is_excluded_is_given_nothing_more() -> None:
 
 def test_a_worker_that_is_lost_begins_a_new_row() -> None:
     balancer = Balancer(worlds([1.0] * 6, idle_snapshot(3)))
-    left = Snapshot(idle_snapshot(3).workers[1:], "none", "")
+    left = LoadSnapshot(idle_snapshot(3).workers[1:], "none", "")
     assert balancer.round(left).homes == (1, 1, 1, 2, 2, 2)
 
 

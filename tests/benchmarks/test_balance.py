@@ -12,7 +12,7 @@ from benchmarks.balance_replay import BalanceReplay, StrategyResult, replay_trac
 from benchmarks.balance_strategies import STRATEGIES
 from benchmarks.load_traces import Crowd, LoadRound, LoadTrace, generated_trace
 from cavmarl.balance.load_score import Candidate, Utilisation
-from cavmarl.balance.load_snapshot import Snapshot, idle_snapshot
+from cavmarl.balance.load_snapshot import LoadSnapshot, idle_snapshot
 from cavmarl.balance.problem import BalanceRule
 from cavmarl.core.errors import ConfigError
 from cavmarl.engine.world_setup import find_map
@@ -29,7 +29,7 @@ def network() -> RoadNetwork:
 
 
 def still(
-    network: RoadNetwork, counts: list[int], snapshot: Snapshot, rounds: int = 8
+    network: RoadNetwork, counts: list[int], snapshot: LoadSnapshot, rounds: int = 8
 ) -> LoadTrace:
     """As many vehicles in each zone of a grid, always, 1 µs each."""
     partition = cut_map(network, "grid", len(counts))
@@ -94,7 +94,7 @@ def test_a_giant_zone_is_cut_where_moving_does_not_help(network: RoadNetwork) ->
 def test_weights_are_learnt_from_what_slows_workers_down(network: RoadNetwork) -> None:
     uses = [Utilisation(0.8, 0.1, 0.1), Utilisation(0.1, 0.8, 0.1), Utilisation(0.1, 0.1, 0.9)]
     workers = tuple(Candidate(n, use) for n, use in enumerate(uses))
-    trace = still(network, [20] * 9, Snapshot(workers, "simulated", "generated"), rounds=12)
+    trace = still(network, [20] * 9, LoadSnapshot(workers, "simulated", "generated"), rounds=12)
     found = replay_traces([trace], FREE)
     assert row_of(found, "calibrated").weights == pytest.approx((1.0, 0.0, 0.0), abs=1e-9)
     assert row_of(found, "balanced").weights == (0.6, 0.2, 0.2)

@@ -26,7 +26,7 @@ def test_all_views_step_the_same_world() -> None:
     settings = {
         "agents": 3,
         "background": 0,
-        "overrides": {"population.mode": "seats", "action.kind": "continuous"},
+        "overrides": {"population.mode": "respawn", "action.kind": "continuous"},
     }
     arrays = libraries._arrays("merge", settings)
     dicts = libraries._dicts("merge", settings)

@@ -69,7 +69,9 @@ def test_agents_are_driven_and_their_deciding_is_no_phase() -> None:
 def test_what_the_monitor_costs_is_measured_on_request(
     make: Callable[[int], Simulation], demand: Path
 ) -> None:
-    checked = world_maker("grid4x4", [demand], seconds=60, seed=1, overrides={"zones.check": True})
+    checked = world_maker(
+        "grid4x4", [demand], seconds=60, seed=1, overrides={"zones.check_invariants": True}
+    )
     one, two = measure_sharding(make, [2], after_s=10, repeats=1, make_checked=checked).rows
     assert one["checked_ratio"] is None
     assert two["checked_ratio"] is not None

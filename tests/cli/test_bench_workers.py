@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from cavmarl.parallel.processes.worker_loop import TRUTH
-from cavmarl.parallel.processes.worker_processes import Crew
+from cavmarl.parallel.processes.worker_processes import WorkerProcesses
 from tests.cli.test_main import refusal, run
 
 SMALL = ("ring", "--agents", "3", "--background", "4", "--worlds", "2")
@@ -30,13 +30,15 @@ def test_workers_are_killed_and_nobody_can_tell(
 def test_a_successor_that_forgets_is_found_out(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    replace = Crew.replace
+    replace = WorkerProcesses.replace
 
-    def without_memory(crew: Crew, k: int, mail: bytes | None, ordered: tuple[int, ...]) -> str:
+    def without_memory(
+        crew: WorkerProcesses, k: int, mail: bytes | None, ordered: tuple[int, ...]
+    ) -> str:
         crew.orders[k, TRUTH] = -1
         return replace(crew, k, mail, ordered)
 
-    monkeypatch.setattr(Crew, "replace", without_memory)
+    monkeypatch.setattr(WorkerProcesses, "replace", without_memory)
     assert run("verify", *SMALL, "--kill", "5") == 1
     assert "different after step" in capsys.readouterr().out
 

@@ -94,7 +94,7 @@ def test_a_wrong_unit_is_told_the_right_one(tmp_path: Path, key: str) -> None:
         ("version: [1]", r"version = \[1\]: must be a valid integer"),
         ("clock: 3", r"clock = 3: must be a mapping of keys"),
         ("traffic: {origins: a}", r"traffic\.origins = 'a': must be a list"),
-        ("population: {mode: open}", r"population\.mode = 'open': must be 'closed', 'entering' or"),
+        ("population: {mode: ajar}", r"population\.mode = 'open': must be 'closed', 'open' or"),
     ],
 )
 def test_a_wrong_type_is_named(tmp_path: Path, text: str, expected: str) -> None:
@@ -141,7 +141,7 @@ def test_a_value_out_of_range_is_told_the_range(tmp_path: Path, text: str, expec
     ("text", "expected"),
     [
         (
-            "population: {mode: entering, agents: 8, budget: 4}",
+            "population: {mode: open, agents: 8, budget: 4}",
             r"budget = 4: must be at least .* 8",
         ),
         ("traffic: {min_trip_m: 500, max_trip_m: 300}", r"max_trip_m = 300\.0: .*above.* 500"),
@@ -280,7 +280,7 @@ def test_zones_are_laid_out_by_name_or_by_a_file(tmp_path: Path, layout: str) ->
     [
         ("layout", "rings"),
         ("count", 257),
-        ("weight", "speed"),
+        ("weight", "speeding"),
         ("avoid_junctions", 1),
         ("hysteresis_m", -1.0),
         ("hysteresis_m", float("nan")),

@@ -14,9 +14,9 @@ import pytest
 
 import cavmarl
 from cavmarl.cosim.followers.followed_world import FollowedWorld
-from cavmarl.cosim.followers.follower_client import Follower, Sight
+from cavmarl.cosim.followers.follower_client import Follower, FollowerView
 
-SETTINGS = {"population.mode": "seats", "clock.ctrl_dt_s": 0.05, "horizon_s": 60}
+SETTINGS = {"population.mode": "respawn", "clock.ctrl_dt_s": 0.05, "horizon_s": 60}
 
 
 def make_env(agents: int = 3, zones: int = 1, workers: int = 0, **more: Any) -> cavmarl.CavEnv:
@@ -35,7 +35,7 @@ def address(tmp_path: Path) -> Path:
     return tmp_path / "s"
 
 
-def steer(sight: Sight) -> dict[str, Any]:
+def steer(sight: FollowerView) -> dict[str, Any]:
     """Some driver: a function of what it sees and of nothing else."""
     return {
         vehicle: np.tanh(sight.sensors[vehicle]["observation"].values[0, :2]).tolist()
@@ -60,7 +60,7 @@ def start() -> Iterator[Callable[..., threading.Thread]]:
         assert not thread.is_alive()
 
 
-def drive(address: Any, vehicles: list[str], name: str = "driver") -> list[Sight]:
+def drive(address: Any, vehicles: list[str], name: str = "driver") -> list[FollowerView]:
     """Follow to the end; what was seen."""
     seen = []
     with Follower(address, vehicles, name) as follower:

@@ -20,7 +20,7 @@ from cavmarl.core.errors import (
     FollowerLostError,
 )
 from cavmarl.cosim.followers.followed_world import FollowedWorld
-from cavmarl.cosim.followers.follower_client import Follower, Sight
+from cavmarl.cosim.followers.follower_client import Follower, FollowerView
 from cavmarl.engine.step_trace import QUEUE, SENSORS, STACK, TICK, StepTrace
 from tests.cosim.conftest import drive, hashes, make_env, seated, steer
 
@@ -42,7 +42,7 @@ def reference(steps: int, drivers: dict[str, Any]) -> list[str]:
 
 
 def test_a_follower_drives_as_a_policy_would(address: Path, start: Start) -> None:
-    seen: list[Sight] = []
+    seen: list[FollowerView] = []
     with FollowedWorld(make_env(), address) as world:
         driver = start(lambda: seen.extend(drive(address, ["car_1"])))
         world.wait_for(1, 10.0)
@@ -199,7 +199,7 @@ def test_a_follower_that_leaves_is_no_error(address: Path) -> None:
 
 
 def test_the_end_of_an_episode_is_shown_and_needs_no_answer(address: Path, start: Start) -> None:
-    seen: list[Sight] = []
+    seen: list[FollowerView] = []
     with FollowedWorld(make_env(horizon_s=0.15), address) as world:
         driver = start(lambda: seen.extend(drive(address, ["car_0"])))
         world.wait_for(1, 10.0)

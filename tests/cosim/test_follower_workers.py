@@ -16,7 +16,7 @@ import pytest
 import cavmarl
 from cavmarl.core.errors import ConfigError, FollowerLostError
 from cavmarl.cosim.followers.followed_world import FollowedWorld
-from cavmarl.cosim.followers.follower_client import Follower, Sight
+from cavmarl.cosim.followers.follower_client import Follower, FollowerView
 from cavmarl.engine.step_trace import StepTrace
 from cavmarl.parallel.pooled_worlds import PooledWorlds
 from tests.cosim.conftest import drive, make_env, spawn
@@ -29,7 +29,7 @@ RIG: dict[str, dict[str, Any]] = {
     "wheels": {"type": "odometry", "rate_hz": 20, "noise": [0.1]},
 }
 ROUGH = json.dumps({"seed": 3, "messages": {"Prepare": {"drop": 0.3}}, "crash_rate": 0.01})
-Seen = tuple[list[str], list[Sight]]
+Seen = tuple[list[str], list[FollowerView]]
 
 
 def pool_of(env: cavmarl.CavEnv) -> Any:
@@ -81,7 +81,7 @@ def test_killed_followers_are_let_go(address: Path) -> None:
             process.kill()
 
 
-def _steer(sight: Sight) -> dict[str, list[float]]:
+def _steer(sight: FollowerView) -> dict[str, list[float]]:
     found = {}
     for vehicle in sight.snapshot.vehicles:
         speed = sight.sensors[vehicle]["wheels"].values[-1, 0] if sight.sensors[vehicle] else 0.0
@@ -91,7 +91,7 @@ def _steer(sight: Sight) -> dict[str, list[float]]:
 
 def _followed(address: Path, start: Callable[..., threading.Thread], **more: Any) -> Seen:
     """What a follower of two vehicles in town has seen, and the world's hashes."""
-    overrides = {"rig": RIG, "population.mode": "seats", "clock.ctrl_dt_s": 0.05}
+    overrides = {"rig": RIG, "population.mode": "respawn", "clock.ctrl_dt_s": 0.05}
     env = cavmarl.parallel_env(
         "grid4x4",
         agents=4,
@@ -101,7 +101,7 @@ def _followed(address: Path, start: Callable[..., threading.Thread], **more: Any
         sensor_workers=more.pop("sensor_workers", 0),
         overrides=overrides | more,
     )
-    sights: list[Sight] = []
+    sights: list[FollowerView] = []
     hashes = []
 
     def follow() -> None:

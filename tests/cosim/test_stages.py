@@ -15,7 +15,7 @@ from cavmarl.config.registry import load_config
 from cavmarl.core.errors import ConfigError
 from cavmarl.core.records.codes import SIGNAL_GREEN_MAJOR, SIGNAL_RED
 from cavmarl.cosim.followers.follower_client import sight_of
-from cavmarl.cosim.followers.follower_snapshots import Moment, take_snapshot, welcome_to
+from cavmarl.cosim.followers.follower_snapshots import SnapshotTime, take_snapshot, welcome_to
 from cavmarl.cosim.stack.hd_map import HdMap, wrap
 from cavmarl.cosim.stack.localisation import GnssInertial
 from cavmarl.cosim.stack.perception import LidarObjects
@@ -23,7 +23,14 @@ from cavmarl.cosim.stack.reference_rig import REFERENCE_RIG
 from cavmarl.cosim.stack.route_planning import LaneRoute
 from cavmarl.cosim.stack.stack import STAGES, Stack, StackConfig, sensor_of, vehicle_of
 from cavmarl.cosim.stack.stack_control import GAINS, PurePursuit
-from cavmarl.cosim.stack.stack_types import Mission, Mount, Obstacle, Pose, Sensor, Trajectory
+from cavmarl.cosim.stack.stack_types import (
+    EgoPose,
+    Mission,
+    Obstacle,
+    StackMount,
+    StackSensor,
+    Trajectory,
+)
 from cavmarl.driving.kernels.bicycle import bicycle_step
 from cavmarl.engine.world_setup import load_roads
 
@@ -61,7 +68,7 @@ def test_a_bend_of_50_m_is_held_at_8_mps(vclass: str, length_m: float, bound_m: 
     x, y, heading, speed = 0.0, -radius - 0.5, 0.0, 8.0  # half a metre off
     off = []
     for _ in range(600):
-        driven = control.control(Pose(x, y, heading, speed), ring, mission)
+        driven = control.control(EgoPose(x, y, heading, speed), ring, mission)
         assert driven.accel_mps2 == 0.0
         x, y, heading, speed, _ = bicycle_step(
             x, y, heading, speed, 0.0, driven.steering_rad, length_m, TICK_S
@@ -73,7 +80,7 @@ def test_a_bend_of_50_m_is_held_at_8_mps(vclass: str, length_m: float, bound_m: 
 
 def test_gains_belong_to_the_type_of_the_vehicle() -> None:
     straight = Trajectory(np.array([[0.0, 0.0], [100.0, 0.0]]), -100.0)
-    pose = Pose(0.0, 1.0, 0.0, 10.0)
+    pose = EgoPose(0.0, 1.0, 0.0, 10.0)
     for vclass, gains in GAINS.items():
         driven = PurePursuit(TICK_S).control(pose, straight, Mission(0, vclass, 8.0, 2.5))
         assert driven.accel_mps2 == -gains.brake_mps2
@@ -93,7 +100,7 @@ def located(seed: int, steps: int, *, turned_round: bool = False) -> list[float]
     stage = GnssInertial(sensors, vehicle.geodesy, vehicle.hd_map, TICK_S)
     off = []
     for step in range(steps):
-        sight = sight_of(*take_snapshot(env, [0], Moment(step, 0, step, False)))
+        sight = sight_of(*take_snapshot(env, [0], SnapshotTime(step, 0, step, False)))
         view = sight.snapshot.vehicles["car_0"]
         mission = Mission(0, view.vclass, view.length_m, view.width_m)
         pose = stage.locate(sight.sensors["car_0"], mission, sight.snapshot.time_s)
@@ -130,7 +137,7 @@ def test_a_pose_that_is_told_is_taken(grid: HdMap) -> None:
     mission = Mission(0, "passenger", 5.0, 2.0)
     assert stack.drive({}, None, mission, 0.0) == (-1.0, 0.0)
     assert stack.pose is None
-    told = Pose(12.0, 34.0, 0.5, 0.0)
+    told = EgoPose(12.0, 34.0, 0.5, 0.0)
     stack.reset_pose(told)
     stack.drive({}, None, mission, 0.05)
     assert stack.pose == pytest.approx(told)
@@ -154,10 +161,10 @@ def goal_behind(grid: HdMap, lane: int) -> tuple[int, int]:
     return link, int(grid.network.lanes["edge"][grid.network.links["to_lane"][link]])
 
 
-def pose_on(grid: HdMap, lane: int, s_m: float, speed_mps: float) -> Pose:
+def pose_on(grid: HdMap, lane: int, s_m: float, speed_mps: float) -> EgoPose:
     (x, y), *_ = grid.polyline(lane, s_m).tolist()
     place = grid.on_lane(lane, x, y)
-    return Pose(x, y, place.heading_rad, speed_mps)
+    return EgoPose(x, y, place.heading_rad, speed_mps)
 
 
 def test_a_red_signal_is_a_place_to_stop(grid: HdMap) -> None:
@@ -223,7 +230,9 @@ def test_who_has_the_right_of_way_goes_first(grid: HdMap) -> None:
     assert plan(0.0).reason != "yield"
 
 
-def scan_of(pose: Pose, box: tuple[float, float, float, float], rays: int) -> NDArray[np.float64]:
+def scan_of(
+    pose: EgoPose, box: tuple[float, float, float, float], rays: int
+) -> NDArray[np.float64]:
     """What a lidar at the vehicle's centre gets of a box (x, y, half length, half width)."""
     ranges = np.full((1, 1, rays), 60.0)
     for k in [*range(rays // 12), *range(11 * rays // 12, rays)]:  # it is ahead
@@ -242,7 +251,7 @@ def test_echoes_become_an_object_with_a_velocity(grid: HdMap) -> None:
     lane = lane_of(grid, 60.0)
     pose = pose_on(grid, lane, 10.0, 0.0)
     settings = {"fov_deg": 360.0, "range_m": 60.0}
-    stage = LidarObjects([Sensor("roof", "lidar", Mount(0.0, 0.0, 0.0), settings)], grid)
+    stage = LidarObjects([StackSensor("roof", "lidar", StackMount(0.0, 0.0, 0.0), settings)], grid)
     cos, sin = math.cos(pose.heading_rad), math.sin(pose.heading_rad)
     for step in range(8):
         ahead = 15.0 + 0.5 * step  # 5 m/s, ten scans a second

@@ -14,18 +14,18 @@ from hypothesis import strategies as st
 from cavmarl.core.errors import FollowerError
 from cavmarl.cosim.followers import reception
 from cavmarl.cosim.followers.followed_world import FollowedWorld
-from cavmarl.cosim.followers.follower_connection import Line
+from cavmarl.cosim.followers.follower_connection import FollowerConnection
 from cavmarl.cosim.followers.follower_messages import (
     FOLLOWERS,
     ArrayView,
     Control,
+    FollowerSnapshot,
     Hello,
     Say,
-    Snapshot,
     letter_of,
     read_letter,
 )
-from cavmarl.parallel.hosts.framed_socket import Wire
+from cavmarl.parallel.hosts.framed_socket import FramedSocket
 from tests.cosim.conftest import hashes, make_env, seated
 from tests.cosim.test_followed_world import reference
 
@@ -39,7 +39,7 @@ def call(address: Path) -> socket.socket:
 
 def refusal(connection: socket.socket) -> str:
     """Why the world has hung up."""
-    line = Line(connection, "the world")
+    line = FollowerConnection(connection, "the world")
     heard = line.hear(10.0)
     assert heard.kind is Say.REFUSAL
     line.close()
@@ -48,7 +48,7 @@ def refusal(connection: socket.socket) -> str:
 
 def hello_in(version: int) -> bytes:
     near, far = socket.socketpair()
-    wire = Wire(near, FOLLOWERS._replace(version=version))
+    wire = FramedSocket(near, FOLLOWERS._replace(version=version))
     wire.send(Say.HELLO, 0, letter_of(Hello("x", [])))
     raw = far.recv(1 << 16)
     wire.close()
@@ -121,7 +121,7 @@ def test_one_that_stops_in_the_middle_of_a_word_does_not_hold_the_world_for_long
     ids=["hello twice", "garbage", "no number", "nothing", "more than is known"],
 )
 def test_a_follower_that_says_nonsense_is_let_go(
-    address: Path, speak: Callable[[Line], None], match: str
+    address: Path, speak: Callable[[FollowerConnection], None], match: str
 ) -> None:
     with FollowedWorld(make_env(), address) as world:
         follower = seated(world, ["car_0"])
@@ -134,7 +134,7 @@ def test_a_follower_that_says_nonsense_is_let_go(
 
 def test_a_hello_for_too_many_is_refused(address: Path) -> None:
     with FollowedWorld(make_env(), address) as world:
-        line = Line(call(address), "world")
+        line = FollowerConnection(call(address), "world")
         line.say(Say.HELLO, Hello("greedy", ["car_0"] * 5000))
         world.reset(seed=0)
         hashes(world, 2)
@@ -149,7 +149,7 @@ def test_any_bytes_are_a_frame_or_a_typed_error(raw: bytes) -> None:
     near, far = socket.socketpair()
     far.sendall(raw)
     far.close()
-    line = Line(near, "somebody")
+    line = FollowerConnection(near, "somebody")
     try:
         heard = line.hear(5.0)
         line.skip(heard)
@@ -168,7 +168,7 @@ def test_any_bytes_are_a_frame_or_a_typed_error(raw: bytes) -> None:
     )
 )
 def test_any_letter_is_a_message_or_a_typed_error(letter: object) -> None:
-    for kind in (Hello, Control, Snapshot):
+    for kind in (Hello, Control, FollowerSnapshot):
         try:
             read_letter(kind, letter)
         except FollowerError:
@@ -192,9 +192,9 @@ def test_arrays_that_cannot_be_are_refused(
 ) -> None:
     near, far = socket.socketpair()
     view = ArrayView("car_0", "lidar", dtype, shape, [0.0] * stamps, [False] * stamps)
-    world, line = Line(far, "a follower"), Line(near, "the world")
+    world, line = FollowerConnection(far, "a follower"), FollowerConnection(near, "the world")
     try:
-        world.say(Say.SNAPSHOT, Snapshot(0, 0, 0, 0.0, False, {}, [view]))
+        world.say(Say.SNAPSHOT, FollowerSnapshot(0, 0, 0, 0.0, False, {}, [view]))
         with pytest.raises(FollowerError, match=words):
             line.take(line.hear(5.0))
     finally:

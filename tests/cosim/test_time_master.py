@@ -14,7 +14,7 @@ from cavmarl.cosim.pacing import Pacer, RealTime, Stepwise
 from cavmarl.cosim.time_master import OwnTicks, TimeMaster
 from cavmarl.engine.step_trace import SENSORS, TICK, StepTrace
 
-FOREVER = {"population.mode": "seats", "clock.ctrl_dt_s": 0.05, "horizon_s": 600}
+FOREVER = {"population.mode": "respawn", "clock.ctrl_dt_s": 0.05, "horizon_s": 600}
 
 
 def make(zones: int = 1, **more: object) -> cavmarl.CavEnv:

@@ -61,10 +61,10 @@ def drawn_world(rng: np.random.Generator, folder: Path) -> tuple[Simulation, Sim
         "zones.count": pick(rng, 2, 3, 5, 9, 16),
         "zones.layout": pick(rng, "grid", "bisection", "strips"),
         "zones.hysteresis_m": pick(rng, 0.0, 2.0, 8.0),
-        "zones.check": pick(rng, False, True),
+        "zones.check_invariants": pick(rng, False, True),
     }
     agents, background = pick(rng, 1, 4, 8), pick(rng, 10, 30, 60)
-    mode, seed = pick(rng, "seats", "entering", "closed"), int(rng.integers(1 << 20))
+    mode, seed = pick(rng, "respawn", "open", "closed"), int(rng.integers(1 << 20))
 
     def make(overrides: dict[str, Any]) -> Simulation:
         simulation = make_simulation(

@@ -37,11 +37,11 @@ SENSORS = {
     [
         ("ring", "closed", 1, 24),
         ("ring", "closed", 8, 8),
-        ("merge", "seats", 1, 24),
-        ("merge", "seats", 8, 12),
-        ("merge", "entering", 8, 12),
-        ("grid4x4", "seats", 1, 60),
-        ("grid4x4", "entering", 8, 40),
+        ("merge", "respawn", 1, 24),
+        ("merge", "respawn", 8, 12),
+        ("merge", "open", 8, 12),
+        ("grid4x4", "respawn", 1, 60),
+        ("grid4x4", "open", 8, 40),
         ("grid4x4", "closed", 8, 40),
     ],
 )

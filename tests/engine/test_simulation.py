@@ -27,7 +27,7 @@ def minutes(simulation: Simulation, many: float) -> Iterator[int]:
 
 
 @pytest.mark.parametrize("env", FREE_FLOW)
-@pytest.mark.parametrize("mode", ["closed", "entering", "seats"])
+@pytest.mark.parametrize("mode", ["closed", "open", "respawn"])
 def test_no_vehicle_is_lost(env: str, mode: str) -> None:
     background = FREE_FLOW[env]
     simulation = make_simulation(env, mode=mode, agents=4, background=background, num_worlds=2)

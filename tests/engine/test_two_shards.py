@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from cavmarl.core.records.arrays import Worlds
 from cavmarl.core.records.codes import DRIVER_AGENT
-from cavmarl.engine.shared_outputs import Commons
+from cavmarl.engine.shared_outputs import SharedOutputs
 from cavmarl.engine.simulation import Simulation
 from cavmarl.shards.executor import Phase, SerialExecutor
 from cavmarl.shards.shard import COMMON, Commands, Shard, make_zoned
@@ -45,7 +45,7 @@ class Halves:
     """
 
     def __init__(self, whole: Simulation) -> None:
-        self.commons = Commons(whole.config, whole.network, whole.num_worlds)
+        self.commons = SharedOutputs(whole.config, whole.network, whole.num_worlds)
         traffic = whole._tick.traffic
         shards = []
         partition = cut_map(whole.network, "strips", 2)
@@ -113,7 +113,7 @@ def returns_of(*parts: Worlds) -> Returns:
 
 @pytest.mark.parametrize(
     ("env", "mode", "agents", "background"),
-    [("merge", "entering", 8, 16), ("grid4x4", "seats", 10, 40), ("ring", "closed", 6, 10)],
+    [("merge", "open", 8, 16), ("grid4x4", "respawn", 10, 40), ("ring", "closed", 6, 10)],
 )
 def test_agents_get_the_same(env: str, mode: str, agents: int, background: int) -> None:
     whole = make_simulation(

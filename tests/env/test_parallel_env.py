@@ -48,7 +48,7 @@ def test_a_closed_world_starts_with_all_agents_and_only_loses_them() -> None:
 
 
 def test_entering_agents_come_once_and_no_more_than_declared() -> None:
-    env = make("merge", "entering", agents=3, overrides={"population.budget": 9})
+    env = make("merge", "open", agents=3, overrides={"population.budget": 9})
     assert len(env.possible_agents) == 9
     observations, infos = env.reset()
     seen = list(env.agents)
@@ -74,7 +74,7 @@ def test_entering_agents_come_once_and_no_more_than_declared() -> None:
 
 
 def test_an_empty_world_goes_on_until_the_next_agent_enters() -> None:
-    env = make("merge", "entering", agents=1, background=0, overrides={"population.budget": 3})
+    env = make("merge", "open", agents=1, background=0, overrides={"population.budget": 3})
     env.reset()
     rng = np.random.default_rng(0)
     for agent in ("car_0", "car_1", "car_2"):
@@ -91,7 +91,7 @@ def test_an_empty_world_goes_on_until_the_next_agent_enters() -> None:
 
 def test_an_empty_world_waits_no_longer_than_the_horizon() -> None:
     # A full ring: nobody can enter when the only agent has left.
-    env = make("ring", "entering", agents=1, background=60, max_cycles=200)
+    env = make("ring", "open", agents=1, background=60, max_cycles=200)
     env.reset()
     rng = np.random.default_rng(0)
     while env.agents:
@@ -100,7 +100,7 @@ def test_an_empty_world_waits_no_longer_than_the_horizon() -> None:
 
 
 def test_seats_stay_and_get_new_vehicles() -> None:
-    env = make("merge", "seats")
+    env = make("merge", "respawn")
     _, infos = env.reset()
     rng = np.random.default_rng(2)
     vehicle = {agent: infos[agent]["vehicle_id"] for agent in env.agents}
@@ -135,7 +135,7 @@ def test_seats_stay_and_get_new_vehicles() -> None:
 # The end of an episode
 
 
-@pytest.mark.parametrize("mode", ["closed", "entering", "seats"])
+@pytest.mark.parametrize("mode", ["closed", "open", "respawn"])
 def test_the_horizon_cuts_after_exactly_max_cycles(mode: str) -> None:
     env = make("grid4x4", mode, max_cycles=7)
     assert env.max_cycles == 7
@@ -173,7 +173,7 @@ def test_vehicles_end_by_arrival_collision_and_off_road_alone() -> None:
 
 
 @pytest.mark.parametrize("share", [0.0, 0.25, 1.0])
-@pytest.mark.parametrize("mode", ["closed", "seats"])
+@pytest.mark.parametrize("mode", ["closed", "respawn"])
 def test_the_reward_is_the_weighted_sum_of_the_terms(mode: str, share: float) -> None:
     weights = {term: 0.5 - 0.3 * k for k, term in enumerate(TERMS)}
     env = make("ring", mode, overrides={"terms.weights": weights, "terms.team_share": share})
@@ -203,7 +203,7 @@ def test_terms_that_are_not_named_weigh_nothing() -> None:
             assert reward == pytest.approx(2.0 * infos[agent]["delay"], rel=1e-6)
 
 
-@pytest.mark.parametrize("mode", ["closed", "entering", "seats"])
+@pytest.mark.parametrize("mode", ["closed", "open", "respawn"])
 def test_infos_are_plain_numbers_under_constant_names(mode: str) -> None:
     env = make("merge", mode)
     _, infos = env.reset()
@@ -225,7 +225,7 @@ def test_infos_are_plain_numbers_under_constant_names(mode: str) -> None:
 
 @pytest.mark.parametrize("env_name", ["ring", "merge", "grid4x4", "town"])
 def test_observations_stay_within_the_space(env_name: str) -> None:
-    env = make(env_name, "seats", overrides={"sensors.lidar.speeds": True})
+    env = make(env_name, "respawn", overrides={"sensors.lidar.speeds": True})
     space = env.observation_space("car_0")
     assert space is env.observation_space("car_1")
     observations, _ = env.reset()
@@ -237,8 +237,8 @@ def test_observations_stay_within_the_space(env_name: str) -> None:
 
 
 def test_the_dict_form_holds_the_slices_of_the_flat_one() -> None:
-    flat = make("grid4x4", "seats")
-    parts = make("grid4x4", "seats", overrides={"observation.kind": "dict"})
+    flat = make("grid4x4", "respawn")
+    parts = make("grid4x4", "respawn", overrides={"observation.kind": "dict"})
     places = layout(flat.config.sensors)
     space = parts.observation_space("car_0")
     assert isinstance(space, spaces.Dict)
@@ -276,7 +276,7 @@ def test_a_sensor_can_be_switched_off_and_leaves_the_others_alone(key: str, sens
 
 
 def test_the_state_tells_where_every_vehicle_is() -> None:
-    env = make("grid4x4", "seats")
+    env = make("grid4x4", "respawn")
     env.reset()
     for _ in range(50):
         env.step(env.suggest_actions())
@@ -407,7 +407,7 @@ def test_what_is_suggested_is_allowed_and_leads_to_the_goal(env_name: str, kind:
 
 
 def test_traffic_stats_count_what_happened() -> None:
-    env = make("merge", "seats")
+    env = make("merge", "respawn")
     env.reset()
     rng = np.random.default_rng(5)
     ended = dict.fromkeys(ENDS, 0)
@@ -430,7 +430,7 @@ def test_traffic_stats_count_what_happened() -> None:
 
 
 def test_tools_that_look_change_nothing() -> None:
-    env = make("grid4x4", "seats")
+    env = make("grid4x4", "respawn")
     env.reset()
     env.step(env.suggest_actions())
     before = env.state_hash()

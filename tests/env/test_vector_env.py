@@ -11,10 +11,12 @@ from numpy.typing import NDArray
 
 from cavmarl import TERMS, CavVectorEnv, ConfigError, EpisodeError, make_vec, parallel_env
 
-MODES = ("closed", "entering", "seats")
+MODES = ("closed", "open", "respawn")
 
 
-def make(num_envs: int, mode: str = "seats", env: str = "merge", **arguments: Any) -> CavVectorEnv:
+def make(
+    num_envs: int, mode: str = "respawn", env: str = "merge", **arguments: Any
+) -> CavVectorEnv:
     overrides = {"population.mode": mode, "population.budget": 7, **arguments.pop("overrides", {})}
     return make_vec(
         env,
@@ -82,7 +84,7 @@ def test_a_world_of_arrays_is_the_parallel_environment(mode: str) -> None:
             assert infos["vehicle_done"][0, k] == told[agent]["vehicle_done"]
             assert terminations[0, k] == bool(told[agent]["vehicle_done"])
             assert truncations[0, k] == (cut[agent] and not told[agent]["vehicle_done"])
-            if mode != "seats":
+            if mode != "respawn":
                 assert terminations[0, k] == ended[agent]
             np.testing.assert_array_equal(infos["final_observations"][0, k], dicts[agent])
         assert infos["episode_over"][0] == (not env.agents)
@@ -158,7 +160,7 @@ def test_a_world_that_is_over_begins_anew_in_the_same_step(mode: str) -> None:
             np.testing.assert_array_equal(
                 observations[world][going_on], infos["final_observations"][world][going_on]
             )
-    assert (over_early > 0) == (mode != "seats")
+    assert (over_early > 0) == (mode != "respawn")
 
 
 @pytest.mark.parametrize("copy", [True, False])

@@ -84,7 +84,7 @@ def test_the_built_in_driver_arrives_where_chance_does_not(by_chance: Evaluation
     assert (driver["background_arrivals_per_h"].mean or 0.0) > 0.0
 
 
-@pytest.mark.parametrize("mode", ["closed", "entering", "seats"])
+@pytest.mark.parametrize("mode", ["closed", "open", "respawn"])
 def test_every_population_can_be_judged(mode: str) -> None:
     report = evaluate(
         "merge", "idm", overrides={"population.mode": mode}, **{**SMALL, "max_cycles": 600}

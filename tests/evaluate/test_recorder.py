@@ -51,14 +51,14 @@ class Worlds:
 
 def test_a_trip_is_the_sum_of_its_steps() -> None:
     worlds = Worlds()
-    worlds.add(progress=(2.0, 1.0), comfort=(0.1, 0.0), time_to_collision=(0.25, 0.0))
+    worlds.add(progress=(2.0, 1.0), jerk=(0.1, 0.0), ttc_risk=(0.25, 0.0))
     worlds.add(
         progress=(4.0, 1.0),
-        comfort=(0.3, 0.0),
+        jerk=(0.3, 0.0),
         delay=(0.2, 0.0),
         red_light=(1.0, 0.0),
         speed=(0.3, 0.0),
-        time_to_collision=(0.7, 0.0),
+        ttc_risk=(0.7, 0.0),
     )
     worlds.add(done=(True, True), progress=(6.0, 1.0), arrival=(1.0, 0.0), collision=(0.0, 1.0))
     trips = worlds.trips

@@ -24,7 +24,7 @@ def test_plans_are_made_again_from_the_manifest(
     zones: int,
     sources: list[str],
 ) -> None:
-    overrides = {"workers.balance_steps": 3, "workers.tolerance": 0.0}
+    overrides = {"workers.balance_steps": 3, "workers.imbalance_tolerance": 0.0}
     vec = make_vec("ring", num_envs=worlds, zones=zones, workers=3, overrides=overrides)
     try:
         begin_training(tmp_path, "test", {"seed": 1}, vec.worlds.world, vec.plans)

@@ -28,7 +28,7 @@ import yaml
 import cavmarl
 
 # Names of cavmarl's that a run needs.
-MODES = {"respawn": "seats", "open": "entering", "closed": "closed"}
+MODES = {"respawn": "respawn", "open": "open", "closed": "closed"}
 INFOS = ("mask", "acted", "terms", "arrivals", "episode_over", "vehicle_done", "final_observations")
 STATS = ("departed", "waiting", "running", "arrived", "contacts", "mean_speed_mps")
 OURS, FIGURES, LOCKS, EDGES = "ours", "figures", "locks_s", "edge_minutes"  # of bench traffic
@@ -52,8 +52,8 @@ ACTUATED = """--grid --grid.number 2 --grid.length 120 --grid.attach-length 100 
   -L 2 -j traffic_light --tls.default-type actuated -o FOLDER/grid.net.xml"""
 WAYS: dict[str, dict[str, Any]] = yaml.safe_load("""{
 zones: {zones: 4}, workers: {zones: 4, workers: 2}, sensors: {zones: 2, sensor_workers: 2},
-recut: {zones: 4, zones.recut_steps: 10, zones.recut_tolerance: 0.0},
-nine: {zones: 9, zones.layout: grid, zones.check: true}}""")  # keywords, and overrides
+recut: {zones: 4, zones.repartition_steps: 10, zones.repartition_tolerance: 0.0},
+nine: {zones: 9, zones.layout: grid, zones.check_invariants: true}}""")  # keywords, and overrides
 # Overrides, by the beginning of the key; FOLDER is where demand and actuated grid are.
 SETTINGS: dict[str, dict[str, dict[str, Any]]] = yaml.safe_load("""{
 fast: {clock: {sim_dt_s: 0.1, ctrl_dt_s: 0.2}}, discrete: {action: {kind: discrete}},

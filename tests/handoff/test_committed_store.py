@@ -11,7 +11,7 @@ import pytest
 
 from cavmarl import make_vec
 from cavmarl.core.errors import LostTickError, ProtocolError
-from cavmarl.handoff.coordinator.coordinator_setup import make_refereeing
+from cavmarl.handoff.coordinator.coordinator_setup import make_coordinators
 from cavmarl.handoff.fault_injection.committed_store import CommittedStore
 from cavmarl.handoff.fault_injection.fault_plan import Crash, Faults
 from cavmarl.ownership.safeguards import ALL_ON
@@ -64,7 +64,7 @@ def test_a_wild_write_that_nobody_looks_for_becomes_the_truth(
 ) -> None:
     blind = replace(ALL_ON, digest_before_commit=False)
     monkeypatch.setattr(
-        "cavmarl.engine.simulation.make_refereeing", partial(make_refereeing, safeguards=blind)
+        "cavmarl.engine.simulation.make_coordinators", partial(make_coordinators, safeguards=blind)
     )
     wild = Wild(monkeypatch, often=3)
     deaths = tuple(Crash(tick, "advance", ZONE) for tick in range(4, 24))

@@ -175,7 +175,7 @@ def test_each_episode_may_have_zones_of_its_own(tmp_path: Path) -> None:
 
     def build(overrides: dict[str, Any]) -> Simulation:
         return make_simulation(
-            "grid4x4", mode="seats", agents=6, background=60, overrides=ONE_TICK | overrides
+            "grid4x4", mode="respawn", agents=6, background=60, overrides=ONE_TICK | overrides
         )
 
     whole = build({})

@@ -24,7 +24,7 @@ HYSTERESIS_M = 2.0
 def divided(zones: int = 4, **overrides: Any) -> Simulation:
     simulation = make_simulation(
         "grid4x4",
-        mode="seats",
+        mode="respawn",
         agents=4,
         background=60,
         num_worlds=2,
@@ -96,7 +96,7 @@ def test_a_vehicle_that_a_zone_has_not_seen_come_is_an_error() -> None:
 def test_a_collision_over_a_border_is_found_once_and_of_both() -> None:
     # Agents that press on regardless, in strips not much wider than a car is long.
     settings: dict[str, Any] = {
-        "mode": "seats",
+        "mode": "respawn",
         "agents": 40,
         "background": 40,
         "overrides": {"zones.layout": "strips", "clock.ctrl_dt_s": 0.05},

@@ -76,7 +76,7 @@ CASES: dict[str, tuple[str, dict[str, Any]]] = {
     "several frames, late controls": (
         "grid4x4", {**BUSY, "sensors.stack": 3, "clock.control_latency_ticks": 3}),
     "one tick a step": ("grid4x4", {**BUSY, "clock.ctrl_dt_s": 0.2}),
-    "agents that enter": ("merge", {**QUICK, "population.mode": "entering"}),
+    "agents that enter": ("merge", {**QUICK, "population.mode": "open"}),
     "closed": ("merge", {**QUICK, "population.mode": "closed"}),
     "short episodes": ("grid4x4", {**BUSY, "horizon_s": 1.2}),
     "team's rewards": ("grid4x4", {**BUSY, "terms.team_share": 0.4}),
@@ -185,7 +185,7 @@ def test_at03_what_is_sent_again_is_counted_by_phase(
 
 
 def test_at03_several_worlds_lose_their_own_messages() -> None:
-    run = record("merge", {**QUICK, "population.mode": "seats"}, STEPS, worlds=3)
+    run = record("merge", {**QUICK, "population.mode": "respawn"}, STEPS, worlds=3)
     vec = replay(run, 4, Faults(seed=1, messages=NOISE))
     for coordinator in vec.simulation.coordinators:
         assert isinstance(coordinator.post, Network)

@@ -19,7 +19,7 @@ from cavmarl.handoff.kernels.invariant_checks import (
     KIND_SUMS,
     KIND_TICK,
     TALLY,
-    Clock,
+    CheckTime,
     make_kept,
     make_strays,
     owner_hash,
@@ -75,7 +75,7 @@ class Looks:
         expected = np.array([owned for _, owned, _, _ in tallies], dtype=np.uint64)
         told = watch(
             PARTITION.arrays, HALO, self.zoned, self.words, 0, 0,
-            Clock(tick, new_late, LIMIT_M), MASKS, FACTORS, self.kept, self.unused, self.strays,
+            CheckTime(tick, new_late, LIMIT_M), MASKS, FACTORS, self.kept, self.unused, self.strays,
             sum(len(zone.owned) for zone in zones) + missing, expected + self.foreign,
             self.tallies, self.found,
         )  # fmt: skip

@@ -37,11 +37,16 @@ FAULTS = {
 def watched(env: str = "grid4x4", worlds: int = 1, **overrides: Any) -> Simulation:
     simulation = make_simulation(
         env,
-        mode="seats",
+        mode="respawn",
         agents=4,
         background=40,
         num_worlds=worlds,
-        overrides={"zones.count": 4, "zones.check": True, "clock.sim_dt_s": 0.1, **overrides},
+        overrides={
+            "zones.count": 4,
+            "zones.check_invariants": True,
+            "clock.sim_dt_s": 0.1,
+            **overrides,
+        },
     )
     start(simulation, seed=1)
     return simulation

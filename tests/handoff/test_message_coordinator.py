@@ -16,9 +16,9 @@ from cavmarl.handoff.coordinator import local_coordinator as direct
 from cavmarl.handoff.coordinator.coordinator import Near
 from cavmarl.handoff.coordinator.journal import JournalReader
 from cavmarl.handoff.coordinator.journal_summary import owners_at
-from cavmarl.handoff.coordinator.local_coordinator import DirectCoordinator
+from cavmarl.handoff.coordinator.local_coordinator import LocalCoordinator
 from cavmarl.handoff.fault_injection.fault_plan import Crash, Faults
-from cavmarl.handoff.fault_injection.message_coordinator import Coordinator
+from cavmarl.handoff.fault_injection.message_coordinator import MessageCoordinator
 from cavmarl.ownership.log_records import replay as replay_records
 from cavmarl.ownership.messages import Begin, Commit, Reset
 from cavmarl.ownership.trace import LOG, Trace
@@ -97,8 +97,8 @@ def test_without_messages_the_same_is_put_on_record_as_with_them(env: str, tmp_p
     direct, sent = tmp_path / "direct.jsonl", tmp_path / "sent.jsonl"
     one = replay(run, 4, None, {"zones.journal": str(direct)})
     two = replay(run, 4, Faults(), {"zones.journal": str(sent)})
-    assert isinstance(one.simulation.coordinators[0], DirectCoordinator)
-    assert isinstance(two.simulation.coordinators[0], Coordinator)
+    assert isinstance(one.simulation.coordinators[0], LocalCoordinator)
+    assert isinstance(two.simulation.coordinators[0], MessageCoordinator)
     assert on_record(direct) == on_record(sent)
     for name in ("switched", "acknowledged", "aborted", "removed"):
         mine, theirs = one.simulation.transfers[0], two.simulation.transfers[0]
@@ -132,7 +132,7 @@ def test_who_leaves_in_the_tick_of_its_change_is_told_from_others(tmp_path: Path
     )
     settings = {
         **QUICK,
-        "population.mode": "seats",
+        "population.mode": "respawn",
         "population.agents": 1,
         "population.background": 0,
         "traffic.demand": [str(demand)],
@@ -185,7 +185,7 @@ def test_the_table_is_brought_up_to_date_when_somebody_asks_or_it_is_late(
         vec.step(vec.suggest_actions())
     simulation = vec.simulation
     (coordinator,), (log,) = simulation.coordinators, simulation.transfers
-    assert isinstance(coordinator, DirectCoordinator)
+    assert isinstance(coordinator, LocalCoordinator)
     assert 0 < len(coordinator._book) < late
     assert coordinator._directory.table.tick < coordinator.tick == 6 * STEPS
     assert len(log.rows) == simulation.migrations > late
@@ -202,7 +202,7 @@ def test_a_change_from_somebody_who_is_not_the_owner_on_record_is_noticed() -> N
     vec = make_vec("grid4x4", zones=ZONES, overrides=BUSY)
     vec.reset(seed=1)
     (coordinator,) = vec.simulation.coordinators
-    assert isinstance(coordinator, DirectCoordinator)
+    assert isinstance(coordinator, LocalCoordinator)
     vec.step(vec.suggest_actions())
     assert coordinator.directory.table.owners, "who is there at the start is on record"
     while not len(coordinator._book):
@@ -274,7 +274,7 @@ def test_the_journal_tells_actions_apart(tmp_path: Path) -> None:
 
 def test_an_undivided_world_has_a_journal_if_asked_for_one(tmp_path: Path) -> None:
     path = tmp_path / "one.jsonl"
-    settings = {"zones.journal": str(path), "zones.check": True}
+    settings = {"zones.journal": str(path), "zones.check_invariants": True}
     vec = make_vec("grid4x4", num_envs=1, agents=4, background=10, overrides=settings)
     vec.reset(seed=3)
     for _ in range(5):
@@ -292,7 +292,7 @@ def test_all_rows_are_looked_at_where_the_list_of_those_near_a_border_is_stale(
 ) -> None:
     plan = '{"crashes": [{"tick": 3, "point": "resolve", "zone": 1}]}'
     settings = {"zones.count": 4, "zones.faults": plan, "clock.ctrl_dt_s": 0.05}
-    simulation = make_simulation("grid4x4", mode="seats", agents=4, overrides=settings)
+    simulation = make_simulation("grid4x4", mode="respawn", agents=4, overrides=settings)
     start(simulation, seed=1)
     division, looked = simulation._tick.division, []
     near = division.near

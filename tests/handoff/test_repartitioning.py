@@ -14,10 +14,14 @@ from cavmarl.engine.simulation import Simulation
 from cavmarl.env.vector import make_vec
 from tests.support.driving import drive, make_simulation, start
 
-OFTEN = {"zones.recut_steps": 3, "zones.recut_tolerance": 0.0, "zones.check": True}
+OFTEN = {
+    "zones.repartition_steps": 3,
+    "zones.repartition_tolerance": 0.0,
+    "zones.check_invariants": True,
+}
 
 
-def worlds(env: str, zones: int, mode: str = "seats", **overrides: Any) -> Simulation:
+def worlds(env: str, zones: int, mode: str = "respawn", **overrides: Any) -> Simulation:
     made = make_simulation(
         env, mode=mode, agents=6, background=40, num_worlds=2,
         overrides={"zones.count": zones, **overrides},
@@ -27,7 +31,7 @@ def worlds(env: str, zones: int, mode: str = "seats", **overrides: Any) -> Simul
 
 
 @pytest.mark.parametrize("zones", [2, 4, 9])
-@pytest.mark.parametrize(("env", "mode"), [("grid4x4", "seats"), ("merge", "entering")])
+@pytest.mark.parametrize(("env", "mode"), [("grid4x4", "respawn"), ("merge", "open")])
 def test_a_world_that_is_cut_anew_is_the_undivided_one(env: str, mode: str, zones: int) -> None:
     whole, recut = worlds(env, 1, mode), worlds(env, zones, mode, **OFTEN)
     for _ in range(80):
@@ -42,7 +46,7 @@ def test_a_world_that_is_cut_anew_is_the_undivided_one(env: str, mode: str, zone
 
 
 def test_who_enters_in_the_last_tick_before_the_cut_goes_to_its_new_zone() -> None:
-    recut = worlds("merge", 4, "entering", **OFTEN)
+    recut = worlds("merge", 4, "open", **OFTEN)
     entered = 0
     for _ in range(120):
         drive(recut)
@@ -70,7 +74,9 @@ def test_the_journal_of_a_world_that_is_cut_anew_tells_of_each_move(tmp_path: Pa
 
 
 def test_zones_that_are_even_stay() -> None:
-    calm = worlds("grid4x4", 2, **{"zones.recut_steps": 3, "zones.recut_tolerance": 0.9})
+    calm = worlds(
+        "grid4x4", 2, **{"zones.repartition_steps": 3, "zones.repartition_tolerance": 0.9}
+    )
     before = calm.partition
     for _ in range(30):
         drive(calm)
@@ -79,7 +85,7 @@ def test_zones_that_are_even_stay() -> None:
 
 
 def test_worlds_of_workers_are_cut_anew_too() -> None:
-    overrides = {"zones.recut_steps": 3, "zones.recut_tolerance": 0.0}
+    overrides = {"zones.repartition_steps": 3, "zones.repartition_tolerance": 0.0}
     alone, shared = (
         make_vec("grid4x4", num_envs=2, zones=4, workers=workers, overrides=overrides)
         for workers in (0, 2)
@@ -99,9 +105,9 @@ def test_worlds_of_workers_are_cut_anew_too() -> None:
 @pytest.mark.parametrize(
     ("overrides", "words"),
     [
-        ({"zones.recut_steps": -1}, "zones.recut_steps"),
-        ({"zones.recut_tolerance": float("nan")}, "zones.recut_tolerance"),
-        ({"zones.recut_steps": 5, "zones.faults": '{"drop": 0.1}'}, "must not be late"),
+        ({"zones.repartition_steps": -1}, "zones.repartition_steps"),
+        ({"zones.repartition_tolerance": float("nan")}, "zones.repartition_tolerance"),
+        ({"zones.repartition_steps": 5, "zones.faults": '{"drop": 0.1}'}, "must not be late"),
     ],
 )
 def test_what_cannot_be_cut_anew_is_refused(overrides: dict[str, Any], words: str) -> None:
@@ -111,4 +117,4 @@ def test_what_cannot_be_cut_anew_is_refused(overrides: dict[str, Any], words: st
 
 def test_zones_of_one_world_over_workers_stay() -> None:
     with pytest.raises(ConfigError, match="over workers needs zones that stay"):
-        make_vec("grid4x4", zones=4, workers=2, overrides={"zones.recut_steps": 5})
+        make_vec("grid4x4", zones=4, workers=2, overrides={"zones.repartition_steps": 5})

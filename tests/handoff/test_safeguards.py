@@ -15,9 +15,9 @@ import pytest
 
 from cavmarl import CavVectorEnv, make_vec
 from cavmarl.core.errors import CavmarlError, ProtocolError
-from cavmarl.handoff.coordinator.coordinator_setup import make_refereeing
+from cavmarl.handoff.coordinator.coordinator_setup import make_coordinators
 from cavmarl.handoff.fault_injection.fault_plan import Crash, Faults
-from cavmarl.handoff.fault_injection.message_coordinator import Coordinator
+from cavmarl.handoff.fault_injection.message_coordinator import MessageCoordinator
 from cavmarl.ownership.endpoint import Endpoint
 from cavmarl.ownership.messages import Commit, Done, Message, Offer, Record
 from cavmarl.ownership.replicas import Replicas
@@ -75,8 +75,8 @@ def without(monkeypatch: pytest.MonkeyPatch) -> Without:
     """Takes a safeguard away from the worlds that are made next."""
 
     def take_away(name: str) -> None:
-        partly = partial(make_refereeing, safeguards=replace(ALL_ON, **{name: False}))
-        monkeypatch.setattr("cavmarl.engine.simulation.make_refereeing", partly)
+        partly = partial(make_coordinators, safeguards=replace(ALL_ON, **{name: False}))
+        monkeypatch.setattr("cavmarl.engine.simulation.make_coordinators", partly)
 
     return take_away
 
@@ -191,13 +191,13 @@ def test_at08_what_zones_of_another_run_say_is_not_heard(
 ) -> None:
     heard = Heard()
     replay(busy, ZONES, Faults(), watchers=[heard])
-    make = Coordinator.__init__
+    make = MessageCoordinator.__init__
 
-    def crossed(coordinator: Coordinator, *arguments: Any, **named: Any) -> None:
+    def crossed(coordinator: MessageCoordinator, *arguments: Any, **named: Any) -> None:
         make(coordinator, *arguments, **named)
         coordinator.post = Crossed(heard)
 
-    monkeypatch.setattr(Coordinator, "__init__", crossed)
+    monkeypatch.setattr(MessageCoordinator, "__init__", crossed)
     vec = replay(busy, ZONES, Faults())
     assert vec.simulation.coordinators[0].dropped()["Done", "run"] == 2 * STEPS * ZONES
     without("run_fence")

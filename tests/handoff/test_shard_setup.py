@@ -60,7 +60,7 @@ def test_after_the_grace_the_change_is_forced() -> None:
     for grace in (0, 3):
         simulation = make_simulation(
             "grid4x4",
-            mode="seats",
+            mode="respawn",
             agents=4,
             background=60,
             overrides=SETTINGS | extended(grace) | {"zones.faults": lost},

@@ -20,9 +20,9 @@ AGENTS = 12
 
 
 def divided(kind: str) -> Simulation:
-    settings = {"zones.count": 4, "zones.check": True, "action.kind": kind}
+    settings = {"zones.count": 4, "zones.check_invariants": True, "action.kind": kind}
     simulation = make_simulation(
-        "grid4x4", mode="seats", agents=AGENTS, background=40, overrides=settings
+        "grid4x4", mode="respawn", agents=AGENTS, background=40, overrides=settings
     )
     start(simulation, seed=3)
     return simulation

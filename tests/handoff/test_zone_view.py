@@ -18,7 +18,7 @@ def divided(monkeypatch: pytest.MonkeyPatch) -> Simulation:
     monkeypatch.setattr(dividing, "halo_m", lambda *_: HALO_M)
     simulation = make_simulation(
         "grid4x4",
-        mode="seats",
+        mode="respawn",
         agents=4,
         background=60,
         num_worlds=2,

@@ -37,7 +37,7 @@ from cavmarl.ownership.messages import (
     Step,
 )
 from cavmarl.ownership.offers import Approach, Offers
-from cavmarl.ownership.planning import Plan
+from cavmarl.ownership.planning import OwnershipPlan
 from cavmarl.ownership.readiness import Readiness
 from cavmarl.ownership.replicas import Replicas
 from cavmarl.ownership.safeguards import ALL_ON, Safeguards
@@ -45,7 +45,7 @@ from cavmarl.ownership.table import Table
 
 RUN = bytes(16)
 CHANGING = (
-    Directory, Decisions, Endpoint, Offers, Plan, Readiness, Replicas, SeenIds, Table,
+    Directory, Decisions, Endpoint, Offers, OwnershipPlan, Readiness, Replicas, SeenIds, Table,
 )  # fmt: skip
 APART = ("dropped", "refusals", "_store")  # counts are no part of the state
 DEAD = -1

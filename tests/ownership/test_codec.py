@@ -12,7 +12,7 @@ from cavmarl.core.errors import (
     MessageError,
 )
 from cavmarl.ownership.codec import KINDS, VERSION, decode, encode
-from cavmarl.ownership.ledger import Tally
+from cavmarl.ownership.ledger import OwnedTally
 from cavmarl.ownership.messages import (
     Abort,
     Ack,
@@ -43,11 +43,11 @@ MESSAGES: tuple[Message, ...] = (
         RUN, 1, 12, 3, 2, 11,
         enter=(In(7, 4, True, DIGEST, b"state"), In(8, 1, False, DIGEST, b"")),
         leave=(Out(9, 2),), spawn=(Spawn(10, b"new"),),
-        owned=Tally(5, (1 << 64) - 1), payload=b"ghosts",
+        owned=OwnedTally(5, (1 << 64) - 1), payload=b"ghosts",
     ),
     Done(
         RUN, 1, 12, 3, 2, confirmed=(Confirmed(7, 4),), removed=(Removed(9, 1),),
-        owned=Tally(5, 17), rows=(1 << 128) - 1, payload=b"published",
+        owned=OwnedTally(5, 17), rows=(1 << 128) - 1, payload=b"published",
     ),
     Prepare(RUN, 1, 12, 3, 2, 4, 1, (Offer(7, 4, DIGEST, b"state"),)),
     Ack(RUN, 1, 12, 4, 1, 3, (Held(7, 4, DIGEST), Held(8, 0, DIGEST))),

@@ -8,7 +8,7 @@ import pytest
 
 from cavmarl.core.errors import ConfigError, ProtocolError
 from cavmarl.ownership.distances import Distances
-from cavmarl.ownership.ledger import SeenIds, Tally, tally
+from cavmarl.ownership.ledger import OwnedTally, SeenIds, tally
 from cavmarl.ownership.limits import DeadlinePolicy, Limits
 from cavmarl.ownership.transport import Rates
 
@@ -43,7 +43,7 @@ def test_a_rate_is_a_probability() -> None:
 
 def test_a_tally_is_that_of_its_set() -> None:
     whole = tally(RUN, {7: 0, 8: 3, 9: 1})
-    assert whole == Tally().plus(RUN, 9, 1).plus(RUN, 7, 0).plus(RUN, 8, 3)
+    assert whole == OwnedTally().plus(RUN, 9, 1).plus(RUN, 7, 0).plus(RUN, 8, 3)
     assert whole.minus(RUN, 8, 3) == tally(RUN, {7: 0, 9: 1})
     assert tally(RUN, {7: 1}) != tally(RUN, {7: 0}) != tally(bytes(16), {7: 0})
     with pytest.raises(ProtocolError, match="2 vehicles instead of 3"):

@@ -27,7 +27,7 @@ from cavmarl.ownership.messages import (
     Step,
     Switch,
 )
-from cavmarl.ownership.trace import LOG, Entry
+from cavmarl.ownership.trace import LOG, TraceEntry
 from cavmarl.ownership.trace_check import check_trace
 from tests.ownership.bench import Bench
 from tests.ownership.simulator import Simulator
@@ -162,44 +162,48 @@ def test_every_file_has_its_story() -> None:
 
 
 @pytest.fixture(scope="module")
-def entries() -> tuple[Entry, ...]:
+def entries() -> tuple[TraceEntry, ...]:
     simulator = Simulator(world("corner"))
     simulator.run(10)
     return tuple(simulator.trace.entries)
 
 
-def judge(entries: list[Entry]) -> None:
+def judge(entries: list[TraceEntry]) -> None:
     check_trace(entries, Limits().longest_deferral, Limits().lifetime)
 
 
-def places(entries: tuple[Entry, ...], kind: type, where: Callable[[Entry], bool]) -> list[int]:
+def places(
+    entries: tuple[TraceEntry, ...], kind: type, where: Callable[[TraceEntry], bool]
+) -> list[int]:
     return [k for k, entry in enumerate(entries) if type(entry.item) is kind and where(entry)]
 
 
-def switching(entry: Entry) -> bool:
+def switching(entry: TraceEntry) -> bool:
     return isinstance(entry.item, Begin) and bool(entry.item.switches)
 
 
-def first_switch(entries: tuple[Entry, ...]) -> tuple[int, Begin, Switch]:
+def first_switch(entries: tuple[TraceEntry, ...]) -> tuple[int, Begin, Switch]:
     k = places(entries, Begin, switching)[0]
     begin = entries[k].item
     assert isinstance(begin, Begin)
     return k, begin, begin.switches[0]
 
 
-def changed_switch(entries: tuple[Entry, ...], **change: object) -> list[Entry]:
+def changed_switch(entries: tuple[TraceEntry, ...], **change: object) -> list[TraceEntry]:
     k, begin, switch = first_switch(entries)
     lie = replace(begin, switches=(switch._replace(**change), *begin.switches[1:]))  # type: ignore[arg-type]
-    return [*entries[:k], Entry(LOG, lie), *entries[k + 1 :]]
+    return [*entries[:k], TraceEntry(LOG, lie), *entries[k + 1 :]]
 
 
-def without(entries: tuple[Entry, ...], kind: type, where: Callable[[Entry], bool]) -> list[Entry]:
+def without(
+    entries: tuple[TraceEntry, ...], kind: type, where: Callable[[TraceEntry], bool]
+) -> list[TraceEntry]:
     gone = set(places(entries, kind, where))
     assert gone
     return [entry for k, entry in enumerate(entries) if k not in gone]
 
 
-def test_the_judge_accepts_a_correct_run(entries: tuple[Entry, ...]) -> None:
+def test_the_judge_accepts_a_correct_run(entries: tuple[TraceEntry, ...]) -> None:
     judge(list(entries))
 
 
@@ -213,7 +217,7 @@ def test_the_judge_accepts_a_correct_run(entries: tuple[Entry, ...]) -> None:
     ],
 )
 def test_the_judge_refuses_another_switch(
-    entries: tuple[Entry, ...], change: dict[str, object], why: str
+    entries: tuple[TraceEntry, ...], change: dict[str, object], why: str
 ) -> None:
     with pytest.raises(ProtocolError, match=why):
         judge(changed_switch(entries, **change))
@@ -232,13 +236,13 @@ def test_the_judge_refuses_another_switch(
     ],
 )
 def test_the_judge_misses_what_is_left_out(
-    entries: tuple[Entry, ...], kind: type, why: str
+    entries: tuple[TraceEntry, ...], kind: type, why: str
 ) -> None:
     with pytest.raises(ProtocolError, match=why):
         judge(without(entries, kind, lambda entry: True))
 
 
-def test_the_judge_refuses_a_switch_without_its_ack(entries: tuple[Entry, ...]) -> None:
+def test_the_judge_refuses_a_switch_without_its_ack(entries: tuple[TraceEntry, ...]) -> None:
     _, begin, switch = first_switch(entries)
     lost = without(
         entries,
@@ -254,7 +258,7 @@ def test_the_judge_refuses_a_switch_without_its_ack(entries: tuple[Entry, ...]) 
         judge(lost)
 
 
-def test_the_judge_refuses_a_step_before_its_record(entries: tuple[Entry, ...]) -> None:
+def test_the_judge_refuses_a_step_before_its_record(entries: tuple[TraceEntry, ...]) -> None:
     k, begin, _ = first_switch(entries)
     (after, *_) = places(entries, Step, lambda entry: entry.item.tick == begin.tick)
     swapped = list(entries)
@@ -263,16 +267,18 @@ def test_the_judge_refuses_a_step_before_its_record(entries: tuple[Entry, ...]) 
         judge(swapped)
 
 
-def test_the_judge_refuses_a_done_without_its_confirmation(entries: tuple[Entry, ...]) -> None:
+def test_the_judge_refuses_a_done_without_its_confirmation(entries: tuple[TraceEntry, ...]) -> None:
     lied = [
-        Entry(to, replace(item, confirmed=())) if isinstance(item, Done) else Entry(to, item)
+        TraceEntry(to, replace(item, confirmed=()))
+        if isinstance(item, Done)
+        else TraceEntry(to, item)
         for to, item in entries
     ]
     with pytest.raises(ProtocolError, match="did not CONFIRM"):
         judge(lied)
 
 
-def test_the_judge_refuses_a_wrong_ledger(entries: tuple[Entry, ...]) -> None:
+def test_the_judge_refuses_a_wrong_ledger(entries: tuple[TraceEntry, ...]) -> None:
     k = places(entries, Commit, lambda entry: True)[3]
     commit = entries[k].item
     assert isinstance(commit, Commit)
@@ -281,7 +287,7 @@ def test_the_judge_refuses_a_wrong_ledger(entries: tuple[Entry, ...]) -> None:
         commit, zones=(zone._replace(owned=zone.owned._replace(digest=1)), *commit.zones[1:])
     )
     with pytest.raises(ProtocolError, match="does not own what it should"):
-        judge([*entries[:k], Entry(LOG, lie), *entries[k + 1 :]])
+        judge([*entries[:k], TraceEntry(LOG, lie), *entries[k + 1 :]])
 
 
 def test_the_judge_refuses_a_stale_acknowledgement() -> None:

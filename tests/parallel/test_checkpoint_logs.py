@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from cavmarl.engine.world_setup import load_world
-from cavmarl.parallel.checkpoint.checkpoint_log import STEPS, Diary, make_segments
+from cavmarl.parallel.checkpoint.checkpoint_log import STEPS, CheckpointLog, make_segments
 from cavmarl.parallel.processes.state_image import load_kernels
 from cavmarl.shards.shard import Commands
 from tests.support.vec_runs import Make, drive, pool_of, same
@@ -61,11 +61,11 @@ def test_worlds_that_are_reset_when_the_diary_is_full(make: Make, kind: dict[str
 
 
 @pytest.fixture
-def diary() -> Iterator[Diary]:
+def diary() -> Iterator[CheckpointLog]:
     load_kernels()
     config = load_world("merge").config
     segments = make_segments(config, 1)
-    yield Diary(config, 1, [segment.fd for segment in segments])
+    yield CheckpointLog(config, 1, [segment.fd for segment in segments])
     for segment in segments:
         segment.close()
 
@@ -78,16 +78,16 @@ def commands_like(entry: Commands, value: int) -> Commands:
     )
 
 
-def noted(diary: Diary) -> list[float]:
+def noted(diary: CheckpointLog) -> list[float]:
     return [float(entry.controls.flat[0]) for entry in diary.steps()]
 
 
-def state_of(diary: Diary) -> list[float]:
+def state_of(diary: CheckpointLog) -> list[float]:
     (found,) = diary.state([np.zeros(3)])
     return [float(value) for value in found]
 
 
-def test_what_is_committed_stays_until_the_next_is(diary: Diary) -> None:
+def test_what_is_committed_stays_until_the_next_is(diary: CheckpointLog) -> None:
     diary.prepare([np.full(3, 1.0)])
     diary.begin()
     for value in range(STEPS):

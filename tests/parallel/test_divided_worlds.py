@@ -34,7 +34,7 @@ __all__ = ["uneven"]
 ROOT = Path(__file__).resolve().parents[2]
 WANTED: dict[str, Any] = {"agents": 8, "background": 30, "max_cycles": 8}
 DEADLY = str(ROOT / "examples/faults.json")
-SEATS = {"population.mode": "seats", "action.kind": "discrete"}
+SEATS = {"population.mode": "respawn", "action.kind": "discrete"}
 
 
 @pytest.fixture(autouse=True)
@@ -149,7 +149,7 @@ def test_vehicles_that_look_for_another_way(make: Make, tmp_path: Path) -> None:
     net = make_map(tmp_path)
     files = write_demand(tmp_path, CARS.format(device=DEVICE) + FLOW)
     overrides = {
-        "population.mode": "seats",
+        "population.mode": "respawn",
         "traffic.demand": [str(path) for path in files],
         "clock.sim_dt_s": 0.2,
         "clock.ctrl_dt_s": 1.0,
@@ -169,7 +169,7 @@ def test_what_this_process_does_beside_the_zones(make: Make, tmp_path: Path) -> 
     wanted = {**WANTED, "overrides": {"v2x.enabled": True}}
     whole = drive(make("grid4x4", **wanted))
     journal = tmp_path / "journal.jsonl"
-    wanted["overrides"] |= {"zones.journal": str(journal), "zones.check": True}
+    wanted["overrides"] |= {"zones.journal": str(journal), "zones.check_invariants": True}
     vec = make("grid4x4", zones=4, workers=2, hosts="ray", **wanted)
     assert same(drive(vec, before=Killer(vec, 6)), whole)
     assert journal.stat().st_size > 0
@@ -206,9 +206,9 @@ def test_hosts_measure_what_zones_cost(make: Make) -> None:
 
 
 def test_the_view_of_pettingzoo_is_the_one_of_one_process() -> None:
-    whole = drive_view(parallel_env("grid4x4", **settings("entering", "dict")))
+    whole = drive_view(parallel_env("grid4x4", **settings("open", "dict")))
     more: dict[str, Any] = {"workers": 2, "hosts": "ray", "render_mode": "rgb_array"}
-    env = parallel_env("grid4x4", **settings("entering", "dict"), **more)
+    env = parallel_env("grid4x4", **settings("open", "dict"), **more)
     assert isinstance(env.worlds, DividedWorlds)
     assert drive_view(env) == whole
     env.reset(seed=0)
@@ -262,7 +262,7 @@ def test_an_interruption_is_told(
 
 def test_an_order_that_everybody_dies_of(make: Make) -> None:
     vec = make(
-        "grid4x4", zones=4, workers=2, hosts="ray", overrides={"workers.repeats": 0}, **WANTED
+        "grid4x4", zones=4, workers=2, hosts="ray", overrides={"workers.max_retries": 0}, **WANTED
     )
     vec.reset(seed=0)
     os.kill(divided(vec).pool.pids[1], signal.SIGKILL)
@@ -277,8 +277,14 @@ def test_an_order_that_everybody_dies_of(make: Make) -> None:
         ({"zones": 2, "workers": 3}, r"workers = 3.*at most as many as zones; use fewer workers"),
         ({"zones": 2, "workers": 4, "num_envs": 2}, r"same zones of all worlds"),
         ({"workers": 2}, r"1 world.s. of 1 zone"),
-        ({"overrides": {"zones.recut_steps": 5}}, r"zones.recut_steps.*zones that stay"),
-        ({"overrides": {"workers.watch": True}}, r"workers.watch = True, hosts = 'ray'"),
+        (
+            {"overrides": {"zones.repartition_steps": 5}},
+            r"zones.repartition_steps.*zones that stay",
+        ),
+        (
+            {"overrides": {"workers.monitor_cpu": True}},
+            r"workers.monitor_cpu = True, hosts = 'ray'",
+        ),
         ({"sensor_workers": 1, "overrides": {"rig": "ten_sensors"}}, r"workers.sensors = 1, hosts"),
         ({"overrides": {"zones.faults": DEADLY}}, r"die by plan.*workers=0"),
     ],

@@ -17,8 +17,8 @@ import cavmarl.parallel.hosts.listener as door_module
 from cavmarl.core.errors import (
     MessageError,
 )
-from cavmarl.parallel.hosts.framed_socket import MAGIC, VERSION, Kind, Wire
-from cavmarl.parallel.hosts.listener import Door, Guest, knock
+from cavmarl.parallel.hosts.framed_socket import MAGIC, VERSION, FramedSocket, Kind
+from cavmarl.parallel.hosts.listener import Listener, PendingConnection, knock
 
 ARRAYS = [
     np.arange(12, dtype=np.float64).reshape(3, 4),
@@ -29,12 +29,12 @@ ARRAYS = [
 
 
 @pytest.fixture
-def ends() -> Iterator[tuple[Wire, Wire]]:
+def ends() -> Iterator[tuple[FramedSocket, FramedSocket]]:
     with socket.create_server(("127.0.0.1", 0)) as listener:
-        first = Wire(socket.create_connection(listener.getsockname()))
+        first = FramedSocket(socket.create_connection(listener.getsockname()))
         connection, _ = listener.accept()
     connection.settimeout(2.0)
-    second = Wire(connection)
+    second = FramedSocket(connection)
     yield first, second
     first.close()
     second.close()
@@ -43,7 +43,7 @@ def ends() -> Iterator[tuple[Wire, Wire]]:
 def sent_bytes(**arguments: Any) -> bytes:
     """A frame as it goes over the wire."""
     with socket.create_server(("127.0.0.1", 0)) as listener:
-        wire = Wire(socket.create_connection(listener.getsockname()))
+        wire = FramedSocket(socket.create_connection(listener.getsockname()))
         other, _ = listener.accept()
         wire.send(Kind.DONE, 7, **arguments)
         wire.close()
@@ -55,7 +55,7 @@ def read(raw: bytes) -> tuple[Any, list[Any]]:
     """What somebody makes of these bytes."""
     with socket.create_server(("127.0.0.1", 0)) as listener:
         other = socket.create_connection(listener.getsockname())
-        wire = Wire(listener.accept()[0])
+        wire = FramedSocket(listener.accept()[0])
         with other:
             other.sendall(raw)
         try:
@@ -67,7 +67,7 @@ def read(raw: bytes) -> tuple[Any, list[Any]]:
     return frame, found
 
 
-def test_a_frame_arrives_as_it_was_sent(ends: tuple[Wire, Wire]) -> None:
+def test_a_frame_arrives_as_it_was_sent(ends: tuple[FramedSocket, FramedSocket]) -> None:
     near, far = ends
     near.send(Kind.DONE, 7, {"answer": [1, None]}, ARRAYS)
     near.send(Kind.BEAT, 8)
@@ -82,7 +82,7 @@ def test_a_frame_arrives_as_it_was_sent(ends: tuple[Wire, Wire]) -> None:
     far.skip()
 
 
-def test_many_and_large_arrays(ends: tuple[Wire, Wire]) -> None:
+def test_many_and_large_arrays(ends: tuple[FramedSocket, FramedSocket]) -> None:
     near, far = ends
     many = [np.full(3000, k, dtype=np.int64) for k in range(1200)]
     thread = threading.Thread(target=near.send, args=(Kind.ORDER, 1, None, many))
@@ -133,14 +133,14 @@ class Caller:
     """The caller's end: lets in whoever comes, in a thread."""
 
     def __init__(self, busy_s: float = 0.0) -> None:
-        self.door = Door("127.0.0.1")
+        self.door = Listener("127.0.0.1")
         self.found: list[Any] = []
         self._busy_s = busy_s
         self._thread = threading.Thread(target=self._run)
         self._thread.start()
 
     def _run(self) -> None:
-        guest: Guest | None = None
+        guest: PendingConnection | None = None
         time.sleep(self._busy_s)
         until_s = time.monotonic() + 5.0
         while not self.found and time.monotonic() < until_s:
@@ -172,7 +172,7 @@ def test_who_knows_the_secret_comes_in(monkeypatch: pytest.MonkeyPatch, busy_s: 
     assert number == 5
     wire.send(Kind.READY, 0)
     connection.setblocking(True)
-    other = Wire(connection)
+    other = FramedSocket(connection)
     assert other.receive().kind == Kind.READY
     wire.close()
     other.close()
@@ -204,7 +204,7 @@ def test_strangers_stay_outside(said: bytes, error: type[Exception]) -> None:
 
 
 def test_nobody_is_there() -> None:
-    door = Door("127.0.0.1")
+    door = Listener("127.0.0.1")
     door.close()
     with pytest.raises(OSError, match="refused"):
         knock(door.place, door.secret, 0)

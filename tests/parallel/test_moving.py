@@ -16,13 +16,13 @@ import pytest
 from cavmarl import ConfigError, make_vec
 from cavmarl.balance.balance_plan import replan
 from cavmarl.balance.load_score import Candidate, Utilisation
-from cavmarl.balance.load_snapshot import Snapshot
+from cavmarl.balance.load_snapshot import LoadSnapshot
 from cavmarl.balance.plan_file import plan_from_dict
 from cavmarl.config.registry import entries
 from cavmarl.core.errors import NoAdmissibleWorkerError
 from cavmarl.parallel.pooled_worlds import PooledWorlds
 from cavmarl.parallel.processes.worker_pool import Pool
-from cavmarl.parallel.step_placement import Placement
+from cavmarl.parallel.step_placement import StepPlacement
 from cavmarl.parallel.worlds_job import Task
 from tests.support.rerouting import CARS, DEVICE, FLOW, make_map, write_demand
 from tests.support.sumo_worlds import write_stops
@@ -30,7 +30,7 @@ from tests.support.vec_runs import Make, drive, pool_of, same
 
 pytestmark = pytest.mark.filterwarnings("ignore:workers = :RuntimeWarning")
 
-RESTLESS = {"workers.balance_steps": 2, "workers.tolerance": 0.0, "workers.max_moves": 64}
+RESTLESS = {"workers.balance_steps": 2, "workers.imbalance_tolerance": 0.0, "workers.max_moves": 64}
 
 
 @pytest.fixture
@@ -38,15 +38,15 @@ def uneven(monkeypatch: pytest.MonkeyPatch) -> list[int]:
     """Costs that are another shard's in every round; how many shards each round has moved."""
     rng = np.random.default_rng(3)
     moved: list[int] = []
-    round_ = Placement.round
+    round_ = StepPlacement.round
 
-    def lie(self: Placement, spent_s: Any, steps: int, pids: Any) -> bool:
+    def lie(self: StepPlacement, spent_s: Any, steps: int, pids: Any) -> bool:
         wrong = self._before_s + rng.exponential(1.0, spent_s.shape) ** 3
         result = round_(self, wrong, steps, pids)
         moved.append(sum(len(plan.moves) for plan in self.plans))
         return result
 
-    monkeypatch.setattr(Placement, "round", lie)
+    monkeypatch.setattr(StepPlacement, "round", lie)
     return moved
 
 
@@ -62,7 +62,7 @@ def test_worlds_that_move_are_the_same(make: Make, uneven: list[int], env: str, 
         assert sum(uneven) > 0
 
 
-STACKED = {"sensors.stack": 3, "population.mode": "seats", "action.kind": "discrete"}
+STACKED = {"sensors.stack": 3, "population.mode": "respawn", "action.kind": "discrete"}
 
 
 @pytest.mark.parametrize("more", [{"autoreset_mode": "NextStep"}, {"overrides": STACKED}])
@@ -83,7 +83,7 @@ def test_vehicles_that_find_their_own_way_keep_it(
         "clock.sim_dt_s": 0.2,
         "clock.ctrl_dt_s": 1.0,
         "horizon_s": 600.0,
-        "population.mode": "seats",
+        "population.mode": "respawn",
         **RESTLESS,
     }
     wanted = {"num_envs": 4, "agents": 1, "background": 0, "overrides": overrides}
@@ -203,7 +203,7 @@ def test_a_move_that_fails_has_not_been(
 
 def test_by_what_they_cost_worlds_move(make: Make) -> None:
     """Half of the worlds are crowded: who hosts them gives some away."""
-    overrides = {"workers.balance_steps": 10, "workers.tolerance": 0.05}
+    overrides = {"workers.balance_steps": 10, "workers.imbalance_tolerance": 0.05}
     vec = make("merge", num_envs=8, agents=1, background=60, workers=2, overrides=overrides)
     assert isinstance(vec.worlds, PooledWorlds)
     first = vec.worlds.plans
@@ -242,12 +242,12 @@ def test_settings_that_cannot_be(key: str, value: float, words: str) -> None:
 
 
 def test_workers_that_others_keep_busy(monkeypatch: pytest.MonkeyPatch) -> None:
-    busy = Snapshot(
+    busy = LoadSnapshot(
         (Candidate(0, Utilisation(0.1, 0.1)), Candidate(1, Utilisation(0.9, 0.1))), "none", ""
     )
     monkeypatch.setattr("cavmarl.balance.probe.take_snapshot", lambda workers: busy)
     with pytest.raises(NoAdmissibleWorkerError, match=r"worker 1.*cpu.*fewer workers"):
-        make_vec("ring", num_envs=4, workers=2, overrides={"workers.watch": True})
+        make_vec("ring", num_envs=4, workers=2, overrides={"workers.monitor_cpu": True})
 
 
 @pytest.mark.parametrize("env", ["grid4x4", "merge", "town"])

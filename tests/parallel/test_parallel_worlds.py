@@ -48,7 +48,7 @@ def drive(env: CavEnv, before: Callable[[int], None] = lambda step: None) -> lis
 
 @pytest.mark.parametrize(
     ("mode", "kind", "workers"),
-    [("closed", "flat", 1), ("closed", "dict", 2), ("entering", "flat", 2), ("seats", "flat", 2)],
+    [("closed", "flat", 1), ("closed", "dict", 2), ("open", "flat", 2), ("respawn", "flat", 2)],
 )
 def test_nobody_can_tell(mode: str, kind: str, workers: int) -> None:
     whole = drive(parallel_env("grid4x4", **settings(mode, kind) | {"zones": 1}))
@@ -58,8 +58,8 @@ def test_nobody_can_tell(mode: str, kind: str, workers: int) -> None:
 
 
 def test_workers_that_die_are_not_missed() -> None:
-    whole = drive(parallel_env("grid4x4", **settings("entering")))
-    env = parallel_env("grid4x4", workers=2, **settings("entering"))
+    whole = drive(parallel_env("grid4x4", **settings("open")))
+    env = parallel_env("grid4x4", workers=2, **settings("open"))
     assert isinstance(env.worlds, PooledWorlds)
     pool = env.worlds.pool
 

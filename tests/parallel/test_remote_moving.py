@@ -17,7 +17,7 @@ from cavmarl.core.errors import WorkerError, WorkerFailureError
 from cavmarl.env.vector import CavVectorEnv
 from cavmarl.evaluate.provenance.manifest import MANIFEST_FILE
 from cavmarl.evaluate.provenance.training_record import begin_training, end_training
-from cavmarl.parallel.checkpoint.world_states import Move, moves_of
+from cavmarl.parallel.checkpoint.world_states import WorldMove, moves_of
 from cavmarl.parallel.hosts.host_pool import HostPool
 from cavmarl.parallel.hosts.remote_worlds import RemoteWorlds
 from cavmarl.parallel.worlds_job import Task
@@ -42,10 +42,10 @@ def remote(vec: CavVectorEnv) -> RemoteWorlds:
 
 
 def test_what_becomes_of_the_worlds_of_each_host() -> None:
-    assert moves_of([0, 3, 6], [0, 5, 6]) == [Move(0, 3, 0, 2), Move(2, 3, 0, 0)]
-    assert moves_of([0, 3, 6], [0, 1, 6]) == [Move(0, 1, 0, 0), Move(0, 3, 2, 2)]
+    assert moves_of([0, 3, 6], [0, 5, 6]) == [WorldMove(0, 3, 0, 2), WorldMove(2, 3, 0, 0)]
+    assert moves_of([0, 3, 6], [0, 1, 6]) == [WorldMove(0, 1, 0, 0), WorldMove(0, 3, 2, 2)]
     assert moves_of([0, 1, 2, 9], [0, 3, 7, 9]) == [
-        Move(0, 1, 0, 2), Move(0, 0, 4, 4), Move(5, 7, 0, 0)
+        WorldMove(0, 1, 0, 2), WorldMove(0, 0, 4, 4), WorldMove(5, 7, 0, 0)
     ]  # fmt: skip
 
 
@@ -81,7 +81,7 @@ def test_vehicles_that_find_their_own_way_keep_it(
         "clock.sim_dt_s": 0.2,
         "clock.ctrl_dt_s": 1.0,
         "horizon_s": 600.0,
-        "population.mode": "seats",
+        "population.mode": "respawn",
         **RESTLESS,
         "workers.balance_steps": 40,
     }
@@ -195,7 +195,7 @@ def test_a_case_that_is_not_what_was_packed(
 
 
 def test_the_plan_is_that_of_the_hosts_and_on_record(make: Make, tmp_path: Path) -> None:
-    overrides = {"workers.balance_steps": 3, "workers.tolerance": 0.0}
+    overrides = {"workers.balance_steps": 3, "workers.imbalance_tolerance": 0.0}
     vec = make("ring", workers=2, hosts="ray", overrides=overrides, **WANTED)
     begin_training(tmp_path, "test", {"seed": 1}, remote(vec).world, vec.plans)
     drive(vec)
@@ -208,4 +208,4 @@ def test_the_plan_is_that_of_the_hosts_and_on_record(make: Make, tmp_path: Path)
 
 def test_only_this_machine_is_watched() -> None:
     with pytest.raises(ConfigError, match=r"workers\.watch = True, hosts = 'ray'.*leave it out"):
-        make_vec("ring", workers=1, hosts="ray", overrides={"workers.watch": True})
+        make_vec("ring", workers=1, hosts="ray", overrides={"workers.monitor_cpu": True})

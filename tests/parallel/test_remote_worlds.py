@@ -75,7 +75,7 @@ def nodes_of(pids: list[int]) -> list[int]:
     [
         {"env": "grid4x4", "zones": 4},
         {"env": "merge", "autoreset_mode": "NextStep"},
-        {"env": "town", "overrides": {"population.mode": "seats", "action.kind": "discrete"}},
+        {"env": "town", "overrides": {"population.mode": "respawn", "action.kind": "discrete"}},
     ],
 )
 def test_machines_change_nothing(make: Make, cluster: Any, arguments: dict[str, Any]) -> None:
@@ -143,8 +143,8 @@ def test_an_actor_that_dies_in_the_middle_of_a_step(make: Make, cluster: Any, wh
 def test_the_view_of_pettingzoo_is_the_one_of_one_process(
     cluster: Any, more: dict[str, Any]
 ) -> None:
-    whole = drive_view(parallel_env("grid4x4", **settings("entering", "dict")))
-    env = parallel_env("grid4x4", **settings("entering", "dict"), **more)
+    whole = drive_view(parallel_env("grid4x4", **settings("open", "dict")))
+    env = parallel_env("grid4x4", **settings("open", "dict"), **more)
     assert isinstance(env.worlds, RemoteWorlds)
     pool = env.worlds.pool
 
@@ -211,8 +211,8 @@ def test_one_world_over_two_nodes(make: Make, cluster: Any, how: signal.Signals)
 
 
 def test_the_divided_world_as_pettingzoo_sees_it(cluster: Any) -> None:
-    whole = drive_view(parallel_env("grid4x4", **settings("entering", "dict")))
-    env = parallel_env("grid4x4", workers=2, hosts="ray", **settings("entering", "dict"))
+    whole = drive_view(parallel_env("grid4x4", **settings("open", "dict")))
+    env = parallel_env("grid4x4", workers=2, hosts="ray", **settings("open", "dict"))
     assert isinstance(env.worlds, DividedWorlds)
     assert drive_view(env) == whole
     env.close()

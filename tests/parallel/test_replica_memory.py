@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from cavmarl.core.errors import MessageError
-from cavmarl.parallel.split_hosts.replica_memory import ARENA, Replica, ReplicaMemory
+from cavmarl.parallel.split_hosts.replica_memory import ARENA, MemoryReplica, ReplicaMemory
 
 
 def make() -> tuple[ReplicaMemory, list[np.ndarray]]:
@@ -42,7 +42,7 @@ def test_a_new_process_is_sent_everything_and_then_what_changes() -> None:
     for array in ours:
         array[...] = rng.integers(0, 2, array.shape)
     spans = here.spans_of(ours)
-    replica, caller = Replica(here, 100), Replica(there, 100)
+    replica, caller = MemoryReplica(here, 100), MemoryReplica(there, 100)
     sizes = []
     for step in range(3):
         replica.begin()
@@ -70,4 +70,4 @@ def test_a_new_process_is_sent_everything_and_then_what_changes() -> None:
 def test_changes_of_another_memory_are_refused(words: list[int]) -> None:
     memory, _ = make()
     with pytest.raises(MessageError):
-        Replica(memory, 100).take(np.array(words, dtype=np.uint64))
+        MemoryReplica(memory, 100).take(np.array(words, dtype=np.uint64))

@@ -26,7 +26,7 @@ from cavmarl.parallel.local_worlds import LocalWorlds
 from cavmarl.parallel.sensor_workers import sensor_pool as sensor_farm
 from cavmarl.parallel.sensor_workers import sensor_shares
 from cavmarl.parallel.sensor_workers.line_costs import LineCosts
-from cavmarl.parallel.sensor_workers.sensor_pool import SensorFarm
+from cavmarl.parallel.sensor_workers.sensor_pool import SensorWorkers
 from cavmarl.parallel.sensor_workers.sensor_shares import LineWorth, Shares
 from cavmarl.sensors.mounted.sensor_rig import Turn
 
@@ -58,7 +58,7 @@ def _crowded() -> Iterator[None]:
 
 
 def _make(rig: dict[str, dict[str, Any]] = RIG, **keywords: Any) -> CavVectorEnv:
-    overrides = {"rig": rig, "population.mode": "seats", **keywords.pop("overrides", {})}
+    overrides = {"rig": rig, "population.mode": "respawn", **keywords.pop("overrides", {})}
     agents = keywords.pop("num_agents", 6)
     return make_vec("grid4x4", agents=agents, background=30, overrides=overrides, **keywords)
 
@@ -88,7 +88,7 @@ def alone() -> list[list[bytes | str]]:
     return _drive()
 
 
-def _farm(vec: CavVectorEnv) -> SensorFarm:
+def _farm(vec: CavVectorEnv) -> SensorWorkers:
     assert isinstance(vec.worlds, LocalWorlds)
     assert vec.worlds.farm is not None
     return vec.worlds.farm

@@ -25,7 +25,7 @@ from tests.support.vec_runs import STEPS, Make, drive, pool_of, same
 
 pytestmark = pytest.mark.filterwarnings("ignore:workers = :RuntimeWarning")
 
-SEATS = {"population.mode": "seats", "action.kind": "discrete"}
+SEATS = {"population.mode": "respawn", "action.kind": "discrete"}
 
 
 @pytest.mark.parametrize("zones", [4, 9])
@@ -64,7 +64,9 @@ def test_some_worlds_are_divided_and_others_not(make: Make) -> None:
 def test_all_that_can_be_checked_is(make: Make) -> None:
     wanted = {"agents": 5, "background": 30}
     whole = drive(make("grid4x4", **wanted))
-    checked = make("grid4x4", zones=4, workers=2, overrides={"zones.check": True}, **wanted)
+    checked = make(
+        "grid4x4", zones=4, workers=2, overrides={"zones.check_invariants": True}, **wanted
+    )
     assert same(drive(checked), whole)
 
 
@@ -166,7 +168,7 @@ def test_vehicles_that_look_for_another_way(make: Make, tmp_path: Path) -> None:
         "background": 0,
         "max_cycles": 500,
         "overrides": {
-            "population.mode": "seats",
+            "population.mode": "respawn",
             "traffic.demand": [str(path) for path in files],
             "clock.sim_dt_s": 0.2,
             "clock.ctrl_dt_s": 1.0,

@@ -12,7 +12,7 @@ import pytest
 from cavmarl import ActionError, CapacityError, ConfigError, make_vec
 from cavmarl.config.registry import entries
 from cavmarl.core.errors import WorkerDeathError, WorkerError
-from cavmarl.parallel.processes.worker_processes import Crew
+from cavmarl.parallel.processes.worker_processes import WorkerProcesses
 from tests.support.vec_runs import STEPS, Make, drive, pool_of, same
 
 pytestmark = pytest.mark.filterwarnings("ignore:workers = 3:RuntimeWarning")
@@ -141,7 +141,7 @@ def test_errors_are_those_of_one_process(make: Make) -> None:
         ({"workers": -1}, ("workers = -1", "from 0")),
         ({"workers": 1.5}, ("workers = 1.5", "whole number")),
         ({"workers": True}, ("workers = True", "whole number")),
-        ({"workers": 1, "overrides": {"workers.repeats": -1}}, ("workers.repeats", "0")),
+        ({"workers": 1, "overrides": {"workers.max_retries": -1}}, ("workers.max_retries", "0")),
         ({"workers": 1, "overrides": {"horizon_s": print}}, ("horizon_s",)),
     ],
 )
@@ -171,17 +171,17 @@ def test_workers_may_have_cores_of_their_own(make: Make) -> None:
 
 
 def test_a_step_that_everybody_dies_of(make: Make, monkeypatch: pytest.MonkeyPatch) -> None:
-    vec = make("ring", num_envs=2, workers=2, overrides={"workers.repeats": 1})
+    vec = make("ring", num_envs=2, workers=2, overrides={"workers.max_retries": 1})
     vec.reset(seed=0)
     actions = vec.suggest_actions()
     pool = pool_of(vec)
-    fork = Crew._fork
+    fork = WorkerProcesses._fork
 
-    def fork_and_kill(self: Crew, k: int) -> None:
+    def fork_and_kill(self: WorkerProcesses, k: int) -> None:
         fork(self, k)
         os.kill(self.processes[k].pid, signal.SIGKILL)
 
-    monkeypatch.setattr(Crew, "_fork", fork_and_kill)
+    monkeypatch.setattr(WorkerProcesses, "_fork", fork_and_kill)
     os.kill(pool.pids[1], signal.SIGKILL)
     with pytest.raises(
         WorkerDeathError, match=r"worker 1 \(world 1\).*step.*2 .*SIGKILL"

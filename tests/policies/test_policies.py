@@ -64,7 +64,7 @@ def test_scripted_drivers_drive_batches(name: str, kind: str) -> None:
         observations, _, _, _, infos = vec.step(policy.act_batch(observations, infos["mask"]))
 
 
-@pytest.mark.parametrize("mode", ["closed", "entering", "seats"])
+@pytest.mark.parametrize("mode", ["closed", "open", "respawn"])
 @pytest.mark.parametrize("form", ["flat", "dict"])
 @pytest.mark.parametrize("name", SCRIPTED)
 def test_scripted_drivers_drive_dicts(name: str, form: str, mode: str) -> None:

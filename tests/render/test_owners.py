@@ -18,14 +18,14 @@ from cavmarl.handoff.zone_view import TransferInFlight, ZoneView
 from cavmarl.render import palette
 from cavmarl.render.canvas import blank, pixels
 from cavmarl.render.topdown import MARGIN_PX, TopDownRenderer
-from cavmarl.render.viewport import Camera
+from cavmarl.render.viewport import Viewport
 from cavmarl.render.zone_overlay import draw_sight
 from cavmarl.roads.network import RoadNetwork
 from tests.support.partitions import PINWHEEL, four
 
 SIZE = (640, 480)
 FOCUS = (-20.0, -15.0, 20.0, 15.0)
-CAMERA = Camera.fit(FOCUS, SIZE, MARGIN_PX)
+CAMERA = Viewport.fit(FOCUS, SIZE, MARGIN_PX)
 BORDERS = four(0.0, 0.0)
 NOBODY = tuple(np.zeros(0, dtype=np.int64) for _ in range(4))
 Car = Callable[..., NDArray[np.void]]
@@ -101,7 +101,7 @@ def test_ghosts_of_the_chosen_zone_have_a_rim(ring: RoadNetwork, car: Car) -> No
 def test_the_sight_of_a_zone_ends_where_its_halo_does() -> None:
     surface = blank((300, 300))
     surface.fill((255, 255, 255))
-    draw_sight(surface, PINWHEEL, 3.0, 4, Camera.fit(PINWHEEL.bounds, (300, 300)))
+    draw_sight(surface, PINWHEEL, 3.0, 4, Viewport.fit(PINWHEEL.bounds, (300, 300)))
     image = pixels(surface)
     lined = np.argwhere(np.abs(image.astype(int) - palette.zone_color(4)).sum(axis=2) < 12)
     # Zone 4 is from 10 to 20 m both ways, at 10 pixels a metre.

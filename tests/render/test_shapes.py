@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 
 from cavmarl.render.overlay import clock_text, scale_bar_m
 from cavmarl.render.shapes import convex_hull, offset_polyline, road_shapes
-from cavmarl.render.viewport import Camera
+from cavmarl.render.viewport import Viewport
 from cavmarl.roads.network import RoadNetwork
 
 coordinates = st.tuples(st.integers(-20, 20), st.integers(-20, 20))
@@ -68,7 +68,7 @@ def test_arrows_lie_on_their_lanes_and_show_where_these_lead(grid: RoadNetwork) 
 
 
 def test_camera_shows_all_of_its_bounds_unstretched() -> None:
-    camera = Camera.fit((-100.0, 0.0, 300.0, 50.0), (800, 600), margin_px=40.0)
+    camera = Viewport.fit((-100.0, 0.0, 300.0, 50.0), (800, 600), margin_px=40.0)
     corners = camera.to_pixels(np.array([[-100.0, 0.0], [300.0, 50.0]]))
     assert corners[0] == pytest.approx([40.0, 345.0])
     assert corners[1] == pytest.approx([760.0, 255.0])

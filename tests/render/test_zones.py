@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 pytest.importorskip("pygame", reason="pictures need the extra 'render'")
 
 from cavmarl.render.canvas import blank, load_pygame
-from cavmarl.render.viewport import Camera
+from cavmarl.render.viewport import Viewport
 from cavmarl.render.zone_overlay import draw_zones, zone_picture
 from cavmarl.roads.network import RoadNetwork
 from cavmarl.zones.partition.zone_layouts import cut_map
@@ -24,7 +24,7 @@ def pixels(surface: object) -> NDArray[np.uint8]:
 def test_each_zone_has_its_colour_darker_within_the_halo() -> None:
     surface = blank((300, 300))
     surface.fill((255, 255, 255))
-    draw_zones(surface, PINWHEEL, 2.0, Camera.fit(PINWHEEL.bounds, (300, 300)))
+    draw_zones(surface, PINWHEEL, 2.0, Viewport.fit(PINWHEEL.bounds, (300, 300)))
     image = pixels(surface).astype(int)
 
     def at(x: float, y: float) -> list[int]:

@@ -61,7 +61,7 @@ def test_another_plan_is_no_jump(before: float, after: float) -> None:
 
 def test_speed_and_delay_are_measured_at_the_limit() -> None:
     slow, right, fast = (terms(one(speed=share * LIMIT_MPS)) for share in (0.5, 1.0, 1.25))
-    assert [round(found["speed"], 6) for found in (slow, right, fast)] == [0.0, 0.0, 0.25]
+    assert [round(found["speeding"], 6) for found in (slow, right, fast)] == [0.0, 0.0, 0.25]
     assert slow["delay"] == pytest.approx(0.5 * STEP_S)
     assert right["delay"] == fast["delay"] == 0.0
     assert terms(one(speed=0.0))["delay"] == pytest.approx(STEP_S)
@@ -69,7 +69,7 @@ def test_speed_and_delay_are_measured_at_the_limit() -> None:
 
 def test_comfort_is_the_mean_jerk() -> None:
     # 2 m/s² of acceleration gained and lost within the step: 4 m/s² of |jerk| in 0.1 s.
-    assert terms(one(step_jerk=4.0))["comfort"] == pytest.approx(4.0 / STEP_S / 10.0)
+    assert terms(one(step_jerk=4.0))["jerk"] == pytest.approx(4.0 / STEP_S / 10.0)
 
 
 @pytest.mark.parametrize(
@@ -92,22 +92,22 @@ def test_events_are_ones(bit: int, name: str) -> None:
 def test_time_to_collision_of_one_behind_another() -> None:
     # 10 m/s faster, bumpers 20 m apart: 2 s, half the horizon.
     rows = vehicles([(0.0, 0.0, 0.0), (25.0, 0.0, 0.0)], speed=[15.0, 5.0])
-    assert terms(rows)["time_to_collision"] == pytest.approx(1.0 - 2.0 / TTC_HORIZON_S)
-    assert terms(rows[::-1], 1)["time_to_collision"] == terms(rows)["time_to_collision"]
+    assert terms(rows)["ttc_risk"] == pytest.approx(1.0 - 2.0 / TTC_HORIZON_S)
+    assert terms(rows[::-1], 1)["ttc_risk"] == terms(rows)["ttc_risk"]
     rows["speed"] = [5.0, 15.0]
-    assert terms(rows)["time_to_collision"] == 0.0
+    assert terms(rows)["ttc_risk"] == 0.0
     rows["speed"] = [15.0, 5.0]
     rows["z"] = [0.0, 6.0]
-    assert terms(rows)["time_to_collision"] == 0.0, "one on a bridge"
+    assert terms(rows)["ttc_risk"] == 0.0, "one on a bridge"
     rows["z"] = 0.0
     rows["y"] = [0.0, 3.2]
-    assert terms(rows)["time_to_collision"] == 0.0, "one on the next lane"
+    assert terms(rows)["ttc_risk"] == 0.0, "one on the next lane"
 
 
 @given(crowds(), st.integers(0, 11))
 def test_time_to_collision_equals_twin(rows: NDArray[np.void], i: int) -> None:
     i %= len(rows)
-    found = terms(rows, i)["time_to_collision"]
+    found = terms(rows, i)["ttc_risk"]
     assert 0.0 <= found <= 1.0
     assert found == pytest.approx(time_to_collision(rows, i), abs=1e-4)
 

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from cavmarl.roads.kernels.backdrop_pieces import WALL
 from cavmarl.sensors.kernels.camera_picture import find_faces, look, make_camera, make_picture
-from cavmarl.sensors.kernels.faces import Camera, Picture
+from cavmarl.sensors.kernels.faces import CameraPose, PixelRows
 from cavmarl.sensors.kernels.pixels import (
     colours,
     measure_depths,
@@ -31,12 +31,12 @@ CLASS_OF = {"body": CAR, "wall": BUILDING, "ground": GROUND, "": NOTHING}
 
 def shoot(
     rows: NDArray[np.void],
-    camera: Camera,
+    camera: CameraPose,
     size: tuple[int, int] = (WIDTH, HEIGHT),
     walls: NDArray[np.void] = NO_WALLS,
     strips: Floats | None = None,
     row: int = 0,
-) -> tuple[NDArray[np.float32], NDArray[np.uint8], Picture]:
+) -> tuple[NDArray[np.float32], NDArray[np.uint8], PixelRows]:
     """Depths and classes."""
     reach_m = 2.0 * camera.range_m
     panorama, counts = look_around(rows, row, backdrop(walls, strips), reach_m)
@@ -71,7 +71,7 @@ def test_rows_do_not_depend_on_which_are_taken_together(
         assert (own_depths == depths[first:last]).all()
 
 
-def forward(range_m: float = 60.0, width: int = WIDTH, z_m: float = 1.0) -> Camera:
+def forward(range_m: float = 60.0, width: int = WIDTH, z_m: float = 1.0) -> CameraPose:
     return make_camera(mount((0.0, 0.0, z_m)), width, RIGHT, range_m)
 
 

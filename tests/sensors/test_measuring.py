@@ -126,7 +126,7 @@ def test_who_stands_feels_gravity_alone_along_tilted_axes() -> None:
 
 
 def test_events_are_reported_in_their_tick_and_once() -> None:
-    settings = {"clock.ctrl_dt_s": 0.2, "population.mode": "seats"}
+    settings = {"clock.ctrl_dt_s": 0.2, "population.mode": "respawn"}
     vec, rng = _make(**settings), np.random.default_rng(1)
     vec.reset(seed=1)
     reports = 0

@@ -52,7 +52,7 @@ NOTHING = {
 ONLY_HIGHWAY = {**NOTHING, "sensors.kinematics.vehicles_count": 5}
 
 
-def make(env: str = "merge", mode: str = "seats", **overrides: Any) -> Any:
+def make(env: str = "merge", mode: str = "respawn", **overrides: Any) -> Any:
     """A small world; Any, as observations are arrays in one form and dicts in the other."""
     return cavmarl.parallel_env(
         env, agents=4, background=10, seed=3, max_cycles=60,
@@ -88,7 +88,7 @@ def test_any_one_sensor_is_enough(key: str, value: object) -> None:
 
 
 @pytest.mark.parametrize("kind", ["flat", "dict"])
-@pytest.mark.parametrize("mode", ["closed", "seats"])
+@pytest.mark.parametrize("mode", ["closed", "respawn"])
 def test_pettingzoo_accepts_all_sensors_together(kind: str, mode: str) -> None:
     parallel_api_test(make("grid4x4", mode, **{**EVERYTHING, "observation.kind": kind}), 60)
 
@@ -147,7 +147,7 @@ def test_images_are_bytes() -> None:
     assert image.max() == 255
 
 
-@pytest.mark.parametrize("mode", ["seats", "entering"])
+@pytest.mark.parametrize("mode", ["respawn", "open"])
 def test_a_stack_holds_the_last_frames_and_begins_with_the_first(mode: str) -> None:
     plain, stacked = (make(mode=mode, **{**EVERYTHING, "sensors.stack": k}) for k in (1, 4))
     seen, _ = plain.reset()
@@ -180,7 +180,7 @@ def test_a_stack_holds_the_last_frames_and_begins_with_the_first(mode: str) -> N
 
 
 def test_a_batch_stacks_as_a_single_world_does() -> None:
-    overrides = {**EVERYTHING, "population.mode": "seats"}
+    overrides = {**EVERYTHING, "population.mode": "respawn"}
     batch = cavmarl.make_vec("merge", num_envs=2, agents=4, background=10, overrides=overrides)
     alone = make(**EVERYTHING)
     observations, _ = batch.reset(seed=11)

@@ -38,7 +38,9 @@ TEN: dict[str, Any] = {
 
 
 @pytest.mark.parametrize(
-    "rig", [{"rig": RIG}, TEN, {"rig": RIG, "zones.recut_steps": 5}], ids=["rig", "ten", "recut"]
+    "rig",
+    [{"rig": RIG}, TEN, {"rig": RIG, "zones.repartition_steps": 5}],
+    ids=["rig", "ten", "recut"],
 )
 def test_divided_worlds_sense_what_the_undivided_one_does(rig: dict[str, Any]) -> None:
     modes = {"observation.mode": "sensors", "observation.kind": "dict"}
@@ -121,7 +123,7 @@ def test_worlds_that_go_on_elsewhere_keep_their_samples() -> None:
 
 
 def test_agents_without_a_vehicle_have_zeros() -> None:
-    overrides = {**WORLD, "population.mode": "entering", "population.agents": 6}
+    overrides = {**WORLD, "population.mode": "open", "population.agents": 6}
     vec = make_vec("grid4x4", overrides=overrides, autoreset_mode="NextStep")
     rng = np.random.default_rng(0)
     vec.reset(seed=1)

@@ -17,7 +17,7 @@ CLEAN = {"type": "odometry", "rate_hz": 20}
 
 def _speeds(rig: dict[str, Any], seed: int = 0, steps: int = 40) -> dict[str, NDArray[np.float64]]:
     """(steps, A, 3) samples of each sensor, of cars that are driven by the built-in driver."""
-    settings = {"rig": rig, "clock.ctrl_dt_s": 0.05, "population.mode": "seats"}
+    settings = {"rig": rig, "clock.ctrl_dt_s": 0.05, "population.mode": "respawn"}
     vec = make_vec("grid4x4", agents=24, background=0, overrides=settings)
     vec.reset(seed=seed)
     found: dict[str, list[NDArray[np.float64]]] = {name: [] for name in rig}
@@ -67,7 +67,7 @@ def test_sensors_have_numbers_of_their_own_whatever_else_is_mounted() -> None:
 def test_so_many_samples_are_lost() -> None:
     settings = {
         "rig": {"a": {**CLEAN, "rate_hz": 100, "dropout": 0.25}},
-        "clock.ctrl_dt_s": 0.5, "population.mode": "seats",
+        "clock.ctrl_dt_s": 0.5, "population.mode": "respawn",
     }  # fmt: skip
     vec = make_vec("grid4x4", agents=20, background=0, overrides=settings)
     vec.reset(seed=0)

@@ -11,7 +11,7 @@ import pytest
 from cavmarl import make_vec
 from cavmarl.config.registry import load_config
 from cavmarl.core.errors import ConfigError
-from cavmarl.sensors.kernels.rig_schedule import Due, Schedule, call_due, taken
+from cavmarl.sensors.kernels.rig_schedule import Due, SensorSchedule, call_due, taken
 from tests.naive.rig import sample_ticks
 
 RATES = [Fraction(1), Fraction(1, 2), Fraction(1, 20), Fraction(5), Fraction(3, 20), Fraction(7, 9)]
@@ -22,7 +22,7 @@ RATES = [Fraction(1), Fraction(1, 2), Fraction(1, 20), Fraction(5), Fraction(3, 
 def test_samples_are_due_as_they_stand_in_the_list(rate: Fraction, phase: int) -> None:
     phase = 0 if rate >= 1 else phase
     steps, slots = 4, -(-4 * rate.numerator // rate.denominator)
-    schedule = Schedule(rate.numerator, rate.denominator, phase, steps, slots)
+    schedule = SensorSchedule(rate.numerator, rate.denominator, phase, steps, slots)
     wanted = sample_ticks(rate, phase, 200)
     due = Due(*(np.zeros(1, dtype=np.int64) for _ in range(3)))
     everywhere = np.ones(1, dtype=np.bool_)
@@ -56,7 +56,7 @@ def test_a_minute_has_as_many_samples_as_the_rate_says(
     rig = {"a": {"type": "odometry", "rate_hz": rate, "schedule": schedule}}
     settings = {
         "rig": rig, "clock.sim_dt_s": dt, "clock.ctrl_dt_s": 1.0, "horizon_s": 60.0,
-        "population.mode": "seats",
+        "population.mode": "respawn",
     }  # fmt: skip
     vec = make_vec("grid4x4", agents=2, background=0, overrides=settings)
     vec.reset(seed=0)

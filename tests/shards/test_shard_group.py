@@ -32,7 +32,7 @@ class Groups:
 
 def divided(**overrides: Any) -> Simulation:
     simulation = make_simulation(
-        "grid4x4", mode="seats", agents=4, background=60, num_worlds=2,
+        "grid4x4", mode="respawn", agents=4, background=60, num_worlds=2,
         overrides={**TIMES, **overrides},
     )  # fmt: skip
     start(simulation, seed=3)

@@ -150,7 +150,7 @@ def test_what_lies_apart_is_missed(hilly: tuple[Path, Path], lost: str) -> None:
 
 @pytest.mark.parametrize("entry", entries())
 def test_a_state_is_under_four_kilobytes(entry: str) -> None:
-    simulation = make_simulation(entry, mode="seats", agents=2, background=2)
+    simulation = make_simulation(entry, mode="respawn", agents=2, background=2)
     start(simulation, seed=0)
     codec, rows = codec_of(simulation), simulation.worlds.rows
     sizes = [len(codec.pack(rows, 0, i, 0)) for i in range(len(simulation.vehicles()))]

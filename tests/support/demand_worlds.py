@@ -53,7 +53,7 @@ def make(
     wanted = {"traffic.demand": [str(path) for path in files], "horizon_s": 120.0}
     return make_simulation(
         env,
-        mode="seats",
+        mode="respawn",
         agents=agents,
         background=0,
         num_worlds=num_worlds,

@@ -44,7 +44,7 @@ def make_traffic(
 ) -> Simulation:
     """Worlds without agents; `renewed` says whether who arrives is followed by another."""
     simulation = make_simulation(
-        env, mode="seats", background=background, num_worlds=num_worlds, overrides=overrides
+        env, mode="respawn", background=background, num_worlds=num_worlds, overrides=overrides
     )
     traffic = simulation._tick.traffic
     vars(traffic)["demand"] = traffic.demand._replace(num_agents=0, reenter=renewed)

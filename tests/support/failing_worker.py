@@ -6,18 +6,18 @@ from typing import Any
 
 from cavmarl.parallel.job_factory import make_jobs
 from cavmarl.parallel.processes.worker_loop import serve
-from cavmarl.parallel.team.team import Follower
+from cavmarl.parallel.team.team import TeamFollower
 from cavmarl.shards.shard_group import ShardGroup
 
 PHASE = "resolve"
 AT = 9  # the call of it that fails
 
-follows = Follower.follow
+follows = TeamFollower.follow
 resolves = ShardGroup.resolve
 calls = 0
 
 
-def follow(follower: Follower) -> None:
+def follow(follower: TeamFollower) -> None:
     """As it is, but what it runs fails once."""
 
     def resolve(group: ShardGroup) -> None:
@@ -36,6 +36,6 @@ def follow(follower: Follower) -> None:
 
 
 if __name__ == "__main__":
-    replaced: Any = Follower
+    replaced: Any = TeamFollower
     replaced.follow = follow
     serve(make_jobs)

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from cavmarl import CavVectorEnv, make_vec
 from cavmarl.handoff.fault_injection.fault_plan import MESSAGES, Faults
 from cavmarl.ownership.messages import Message, Record, Step
-from cavmarl.ownership.trace import LOG, Entry
+from cavmarl.ownership.trace import LOG, TraceEntry
 from cavmarl.ownership.trace_check import TraceChecker
 from cavmarl.ownership.transport import Rates
 from cavmarl.verify.differences import Arrays, same_bytes, step_results
@@ -25,7 +25,7 @@ QUICK: Mapping[str, Any] = {
 }
 BUSY: Mapping[str, Any] = {
     **QUICK,
-    "population.mode": "seats",
+    "population.mode": "respawn",
     "population.agents": 6,
     "population.background": 110,
 }
@@ -46,10 +46,10 @@ class Checked:
 
     def logged(self, records: Iterable[Record]) -> None:
         for record in records:
-            self._checker.take(Entry(LOG, record))
+            self._checker.take(TraceEntry(LOG, record))
 
     def delivered(self, destination: int, message: Message) -> None:
-        self._checker.take(Entry(destination, message))
+        self._checker.take(TraceEntry(destination, message))
         if isinstance(message, Step):
             for vehicle, _, forced, _, state in message.enter:
                 if forced:

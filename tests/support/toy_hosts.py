@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from cavmarl.parallel.hosts.host_process import Outcome, serve
+from cavmarl.parallel.hosts.host_process import TaskOutcome, serve
 
 __all__ = ["ADD", "DOZE", "FAIL", "FALL", "TASKS", "TOIL", "TOTAL", "WRITE", "Processes", "ToyJob"]
 
@@ -41,13 +41,13 @@ class ToyJob:
     def inputs(self, task: int, letter: Any) -> list[NDArray[Any]]:
         return [self.given] if task in (ADD, WRITE) else []
 
-    def perform(self, task: int, letter: Any) -> Outcome:
+    def perform(self, task: int, letter: Any) -> TaskOutcome:
         if task == ADD:
             self.totals += self.given
         elif task == WRITE:
             self.totals[:] = self.given
         elif task == TOTAL:
-            return Outcome(float(self.totals.sum()), ())
+            return TaskOutcome(float(self.totals.sum()), ())
         elif task == FAIL:
             self.totals += 1000.0
             raise ValueError("asked to fail")
@@ -59,7 +59,7 @@ class ToyJob:
             until_s = time.monotonic() + letter
             while time.monotonic() < until_s:
                 pass
-        return Outcome(None, [self.totals] if task in (ADD, WRITE) else ())
+        return TaskOutcome(None, [self.totals] if task in (ADD, WRITE) else ())
 
     def save(self) -> list[NDArray[Any]]:
         return [self.totals]

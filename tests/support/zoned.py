@@ -11,7 +11,7 @@ from cavmarl.core.records.arrays import Zoned
 from cavmarl.shards.shard import make_zoned
 from cavmarl.zones.kernels.borders import Borders
 from cavmarl.zones.kernels.ghost_exchange import exchange
-from cavmarl.zones.kernels.handoff import Book, make_book
+from cavmarl.zones.kernels.handoff import BorderRecords, make_book
 from cavmarl.zones.partition.zone_halo import zone_halo
 from cavmarl.zones.partition.zone_partition import ZonePartition
 
@@ -42,7 +42,7 @@ def exchanged(
     parts: Sequence[NDArray[np.void]],
     touching_m: float = 0.0,
     borders: Borders = NO_BORDERS,
-    book: Book | None = None,
+    book: BorderRecords | None = None,
 ) -> Zoned:
     """The same after the zones have exchanged their ghosts."""
     zoned = zoned_of(parts)

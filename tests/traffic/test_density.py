@@ -133,7 +133,7 @@ def test_a_divided_city_is_the_undivided_one(vehicles: int) -> None:
 @pytest.mark.parametrize("vehicles", DENSITIES)
 def test_a_divided_town_of_carla_is_the_undivided_one(vehicles: int, shared_maps: Path) -> None:
     # Not all of a hundred find room there: the others wait.
-    equal(shared_maps / CITY, vehicles, steps=60, overrides={"population.mode": "seats"})
+    equal(shared_maps / CITY, vehicles, steps=60, overrides={"population.mode": "respawn"})
 
 
 @pytest.mark.slow

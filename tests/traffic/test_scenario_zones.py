@@ -53,7 +53,7 @@ def hashes(vec: CavVectorEnv, driver: str = "idm", steps: int = STEPS) -> list[s
 
 def divided(name: str, path: Path, count: int, whole: CavVectorEnv, **keys: Any) -> CavVectorEnv:
     file = cut_through(whole, path / f"{count}.json", count)
-    overrides = {"zones.layout": str(file), "zones.check": True, **keys}
+    overrides = {"zones.layout": str(file), "zones.check_invariants": True, **keys}
     return make_scenario(name, density="low", zones=count, overrides=overrides)
 
 
@@ -110,7 +110,7 @@ def test_nor_do_several_agents(name: str, tmp_path: Path) -> None:
     whole = make_scenario(name, density="low", agents=3, place=place)
     expected = hashes(whole, steps=50)
     file = cut_through(whole, tmp_path / "4.json", 4)
-    overrides = {"zones.layout": str(file), "zones.check": True}
+    overrides = {"zones.layout": str(file), "zones.check_invariants": True}
     vec = make_scenario(name, density="low", agents=3, place=place, zones=4, overrides=overrides)
     assert hashes(vec, steps=50) == expected
 

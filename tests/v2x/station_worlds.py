@@ -33,7 +33,7 @@ class Standing:
             agents=agents,
             background=80,
             overrides=CLOCK
-            | {"population.mode": "seats", "v2x.enabled": True}
+            | {"population.mode": "respawn", "v2x.enabled": True}
             | overrides
             | {"sensors.lidar.rays": rays},
         )

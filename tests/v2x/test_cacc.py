@@ -111,7 +111,7 @@ def test_what_it_needs_is_told() -> None:
 def test_it_drives_through_a_city_as_safely_as_idm() -> None:
     ends = {}
     for policy in ("cacc", "idm"):
-        env = make_vec("grid4x4", overrides=HEARS | {"population.mode": "seats"})
+        env = make_vec("grid4x4", overrides=HEARS | {"population.mode": "respawn"})
         driver = load_policy(policy, env)
         observations, infos = env.reset(seed=2)
         ended = arrived = 0

@@ -18,7 +18,7 @@ TOLD = {
     "v2x.denm.rate_hz": 0.0,
     "v2x.roadside.signals": ["all"],
     "sensors.messages.events": 1,
-    "population.mode": "seats",
+    "population.mode": "respawn",
 }
 PRESENT, OTHER = 0, 7  # of the features of an event
 

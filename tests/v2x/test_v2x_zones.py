@@ -44,7 +44,7 @@ def test_what_agents_are_told_does_not_depend_on_zones(channel: dict[str, Any], 
 
 def everything_said(zones: int) -> list[bytes]:
     """All inboxes and counts after each step, in the order of the receivers."""
-    overrides = FAST | OBSERVED | LOSSY | {"population.mode": "seats"}
+    overrides = FAST | OBSERVED | LOSSY | {"population.mode": "respawn"}
     env = make_vec("grid4x4", num_envs=2, zones=zones, overrides=overrides)
     said = []
     observations, _ = env.reset(seed=4)
@@ -63,7 +63,7 @@ def test_inboxes_are_the_same_byte_for_byte() -> None:
 
 
 def test_worker_processes_say_the_same() -> None:
-    overrides = FAST | OBSERVED | LOSSY | {"population.mode": "seats"}
+    overrides = FAST | OBSERVED | LOSSY | {"population.mode": "respawn"}
 
     def seen(**split: int) -> list[bytes]:
         env = make_vec("grid4x4", num_envs=1, overrides=overrides, **split)

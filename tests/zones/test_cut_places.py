@@ -16,7 +16,7 @@ from cavmarl.roads.network import RoadNetwork
 from cavmarl.verify.equivalence import verify_zones
 from tests.support.borders import bounds_around, cut_at
 
-FAST = {"clock.sim_dt_s": 0.1, "clock.ctrl_dt_s": 0.2, "population.mode": "seats"}
+FAST = {"clock.sim_dt_s": 0.1, "clock.ctrl_dt_s": 0.2, "population.mode": "respawn"}
 BRIDGE_M = 4.0  # one road so far above another,
 NEAR_M = 5.0  # where points of both are as near in the plane
 Place = NDArray[np.float64]

@@ -11,7 +11,7 @@ from cavmarl.core.records.arrays import Zoned
 from cavmarl.zones.kernels.borders import Borders
 from cavmarl.zones.kernels.handoff import (
     NOT_SEEN,
-    Book,
+    BorderRecords,
     hand_over,
     look_on,
     make_book,
@@ -27,7 +27,7 @@ BORDERS = Borders(hysteresis_m=2.0, ahead_s=0.2, max_speed_mps=60.0)
 
 def world(
     *places: tuple[float, float, float], ids: list[int], speed: float = 10.0
-) -> tuple[Zoned, Book]:
+) -> tuple[Zoned, BorderRecords]:
     """Vehicles of zone 0 at (x, y, heading), seen by all zones at tick 7."""
     rows = vehicles(list(places), speed=speed, id=np.array(ids), epoch=4)
     book = make_book(1, 16)
@@ -36,12 +36,12 @@ def world(
     return exchanged(PARTITION, 60.0, parts, borders=BORDERS, book=book), book
 
 
-def call(zoned: Zoned, book: Book, everybody: bool = False, newborn: int = 0) -> int:
+def call(zoned: Zoned, book: BorderRecords, everybody: bool = False, newborn: int = 0) -> int:
     arguments = (PARTITION.arrays, BORDERS, zoned, SIDE, 0)
     return int(hand_over(*arguments, everybody, newborn, book))
 
 
-def next_tick(zoned: Zoned, book: Book) -> None:
+def next_tick(zoned: Zoned, book: BorderRecords) -> None:
     """Look on, after rows have moved."""
     book.ms[0] += 1.0
     owned = zoned.num_owned[0, 0]
@@ -50,11 +50,11 @@ def next_tick(zoned: Zoned, book: Book) -> None:
     look_on(PARTITION.arrays, BORDERS, zoned, SIDE, 0, book)
 
 
-def changes(book: Book) -> NDArray[np.void]:
+def changes(book: BorderRecords) -> NDArray[np.void]:
     return book.changes[0, : book.num_changes[0]]
 
 
-def coming(book: Book) -> list[tuple[int, int]]:
+def coming(book: BorderRecords) -> list[tuple[int, int]]:
     turn = book.turn[0]
     entries = book.coming[0, turn, : book.num_coming[0, turn]]
     return [(int(entry["vehicle"]), int(entry["target"])) for entry in entries]

@@ -25,7 +25,7 @@ from cavmarl.zones.reach import (
     longest_move_m,
     off_lane_m,
 )
-from cavmarl.zones.visibility import Sight
+from cavmarl.zones.visibility import Visibility
 from tests.support.driving import drive, make_traffic, start
 from tests.support.netgenerate import netgenerate
 from tests.support.traffic import NAMES, network, travel
@@ -183,7 +183,7 @@ def test_zones_see_who_is_off_a_lane_that_matters(tmp_path: Path) -> None:
     )  # fmt: skip
     roads, kinds = load_network(path), travel("merge")
     partition = cut_map(roads, "grid", 4)
-    sight = Sight(roads, kinds, halo_m=1000.0, sure_m=5.0, outside_m=8.0)
+    sight = Visibility(roads, kinds, halo_m=1000.0, sure_m=5.0, outside_m=8.0)
     halo = sight.halo(partition)
     asked = [looks_of(halo, zone) for zone in range(4)]
     asked_m = max(

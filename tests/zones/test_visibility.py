@@ -10,7 +10,7 @@ import pytest
 from cavmarl.evaluate.driven_worlds import DrivenWorld, world_maker
 from cavmarl.zones.kernels.zone_lookup import Halo
 from cavmarl.zones.partition.zone_partition import ZonePartition
-from cavmarl.zones.visibility import Sight
+from cavmarl.zones.visibility import Visibility
 from tests.support.netgenerate import netgenerate
 
 STEPS = 40
@@ -67,7 +67,7 @@ def test_who_may_have_reached_a_line_is_nearer_than_half_a_body_and_what_is_kept
 
 def test_the_monitor_asks_for_those_who_are_seen(blocks: Path) -> None:
     """It would name a ghost too few as well as one too many."""
-    assert ghosts(driven(blocks, **{"zones.check": True})) > 0
+    assert ghosts(driven(blocks, **{"zones.check_invariants": True})) > 0
 
 
 @pytest.mark.parametrize("field", ["head", "line"])
@@ -75,14 +75,14 @@ def test_a_look_less_makes_another_world(
     blocks: Path, field: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Leaders ahead, and foes of the right of way: who is not seen is driven into."""
-    seen = Sight.halo
+    seen = Visibility.halo
 
-    def blind(sight: Sight, partition: ZonePartition) -> Halo:
+    def blind(sight: Visibility, partition: ZonePartition) -> Halo:
         halo = seen(sight, partition)
         if partition.count > 1:
             halo.watchers[field] = -np.inf if field == "head" else np.inf
         return halo
 
     whole = driven(blocks).simulation.state_hash()
-    monkeypatch.setattr(Sight, "halo", blind)
+    monkeypatch.setattr(Visibility, "halo", blind)
     assert driven(blocks).simulation.state_hash() != whole

@@ -145,7 +145,7 @@ def verify(
             zones=None if counts is None else counts[0],
             agents=agents,
             background=background,
-            overrides=overrides | ({"zones.check": True} if check else {}),
+            overrides=overrides | ({"zones.check_invariants": True} if check else {}),
         )
         return
     worlds = 1 if worlds is None else worlds
@@ -153,7 +153,7 @@ def verify(
         check_campaign(layout, worlds, journal)
         named = {"population.agents": agents, "population.background": background}
         overrides |= {key: value for key, value in named.items() if value is not None}
-        overrides |= {"zones.check": True} if check else {}
+        overrides |= {"zones.check_invariants": True} if check else {}
         _campaign(console, env, counts, steps, seed, seeds, policy, overrides, json_path)
         return
     if env is None:

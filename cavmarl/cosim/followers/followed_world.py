@@ -24,10 +24,10 @@ from cavmarl.core.errors import (
     FollowerError,
     FollowerLostError,
 )
-from cavmarl.cosim.followers.follower_barrier import BadControls, Barrier, Seat
-from cavmarl.cosim.followers.follower_connection import Address, Line
+from cavmarl.cosim.followers.follower_barrier import BadControls, Barrier, FollowerSeat
+from cavmarl.cosim.followers.follower_connection import Address, FollowerConnection
 from cavmarl.cosim.followers.follower_messages import Hello, Say
-from cavmarl.cosim.followers.follower_snapshots import Moment, welcome_to
+from cavmarl.cosim.followers.follower_snapshots import SnapshotTime, welcome_to
 from cavmarl.cosim.followers.reception import Reception, refuse
 from cavmarl.cosim.pacing import Pacer
 from cavmarl.cosim.time_master import OwnTicks, TimeMaster
@@ -91,7 +91,7 @@ class FollowedWorld:
         self._timeout_s = timeout_s
         self._barrier = Barrier(env, timeout_s, bad_controls)
         self._trace = trace
-        self._seats: list[Seat] = []
+        self._seats: list[FollowerSeat] = []
         self._queued: dict[str, Any] = {}
         self._frame = self._episode = -1
         self._is_closed = False
@@ -108,7 +108,7 @@ class FollowedWorld:
         self.close()
 
     @property
-    def seats(self) -> tuple[Seat, ...]:
+    def seats(self) -> tuple[FollowerSeat, ...]:
         """The followers, in the order in which they are served."""
         return tuple(self._seats)
 
@@ -210,11 +210,11 @@ class FollowedWorld:
             except FollowerError as error:
                 self._reception.turn_away(line, str(error))
 
-    def _seat(self, line: Line, hello: Hello) -> None:
+    def _seat(self, line: FollowerConnection, hello: Hello) -> None:
         agents = self._indices(hello.vehicles)
         welcome = welcome_to(self.env, self._names(agents), self.master.tick)
         line.say(Say.WELCOME, welcome, within_s=self._timeout_s)
-        self._seats.append(Seat(line, self.master.follow(hello.name), agents))
+        self._seats.append(FollowerSeat(line, self.master.follow(hello.name), agents))
         self._seats.sort(key=lambda each: each.rank)
 
     def _indices(self, vehicles: Sequence[str]) -> tuple[int, ...]:
@@ -242,7 +242,7 @@ class FollowedWorld:
     def _names(self, agents: Iterable[int]) -> list[str]:
         return [self.env.possible_agents[k] for k in agents]
 
-    def _drop(self, seat: Seat) -> None:
+    def _drop(self, seat: FollowerSeat) -> None:
         seat.line.close()
         self._seats.remove(seat)
         if seat.clock in self.master.followers:
@@ -251,9 +251,9 @@ class FollowedWorld:
     def _next_frame(self) -> None:
         self._frame += 1
         tick = int(self.master.world_ticks[0])
-        self._moment = Moment(self._frame, self._episode, tick, self.is_over)
+        self._moment = SnapshotTime(self._frame, self._episode, tick, self.is_over)
 
-    def _exchange(self, seats: Sequence[Seat]) -> None:
+    def _exchange(self, seats: Sequence[FollowerSeat]) -> None:
         """Let followers see the world as it is, and queue what they do.
 
         Raises:

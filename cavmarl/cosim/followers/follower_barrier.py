@@ -16,19 +16,19 @@ from cavmarl.core.errors import (
     FollowerError,
     FollowerLostError,
 )
-from cavmarl.cosim.followers.follower_connection import Line
+from cavmarl.cosim.followers.follower_connection import FollowerConnection
 from cavmarl.cosim.followers.follower_messages import Control, Say, Ticked, read_letter
-from cavmarl.cosim.followers.follower_snapshots import Moment, take_snapshot
+from cavmarl.cosim.followers.follower_snapshots import SnapshotTime, take_snapshot
 from cavmarl.cosim.time_master import TimeFollower
 from cavmarl.env.parallel import CavEnv
 
-__all__ = ["BadControls", "Barrier", "Outcome", "Seat"]
+__all__ = ["BadControls", "Barrier", "BarrierOutcome", "FollowerSeat"]
 
 BadControls = Literal["error", "hold"]
 
 
 @dataclass(eq=False)
-class Seat:
+class FollowerSeat:
     """A follower, as the world knows it.
 
     Attributes:
@@ -44,7 +44,7 @@ class Seat:
         slowest: in how many steps it was the last one to answer.
     """
 
-    line: Line
+    line: FollowerConnection
     clock: TimeFollower
     agents: tuple[int, ...]
     frame: int = -1
@@ -62,7 +62,7 @@ class Seat:
 
 
 @dataclass
-class Outcome:
+class BarrierOutcome:
     """What has come of one barrier.
 
     Attributes:
@@ -72,8 +72,8 @@ class Outcome:
     """
 
     actions: dict[str, Any] = field(default_factory=dict)
-    failed: dict[Seat, FollowerError] = field(default_factory=dict)
-    left: list[Seat] = field(default_factory=list)
+    failed: dict[FollowerSeat, FollowerError] = field(default_factory=dict)
+    left: list[FollowerSeat] = field(default_factory=list)
 
 
 class Barrier:
@@ -91,15 +91,15 @@ class Barrier:
         self._timeout_s = timeout_s
         self._bad_controls = bad_controls
 
-    def pass_through(self, seats: Sequence[Seat], moment: Moment) -> Outcome:
+    def pass_through(self, seats: Sequence[FollowerSeat], moment: SnapshotTime) -> BarrierOutcome:
         """Send each its snapshot, and hear what its vehicles do.
 
         Args:
             seats: in the order in which they are served.
             moment: of the snapshots.
         """
-        found = Outcome()
-        asked: dict[Seat, list[str]] = {}
+        found = BarrierOutcome()
+        asked: dict[FollowerSeat, list[str]] = {}
         for seat in seats:
             snapshot, arrays = take_snapshot(self._env, seat.agents, moment)
             seat.frame = moment.frame
@@ -123,10 +123,10 @@ class Barrier:
         return found
 
     def _collect(
-        self, asked: Mapping[Seat, list[str]], moment: Moment, found: Outcome
-    ) -> dict[Seat, Mapping[str, Any]]:
+        self, asked: Mapping[FollowerSeat, list[str]], moment: SnapshotTime, found: BarrierOutcome
+    ) -> dict[FollowerSeat, Mapping[str, Any]]:
         """Hear all followers' controls, in the order in which they come."""
-        answers: dict[Seat, Mapping[str, Any]] = {}
+        answers: dict[FollowerSeat, Mapping[str, Any]] = {}
         began = time.monotonic()
         with selectors.DefaultSelector() as selector:
             for seat in asked:
@@ -150,10 +150,10 @@ class Barrier:
 
     def _hear(
         self,
-        seat: Seat,
-        moment: Moment,
-        answers: dict[Seat, Mapping[str, Any]],
-        found: Outcome,
+        seat: FollowerSeat,
+        moment: SnapshotTime,
+        answers: dict[FollowerSeat, Mapping[str, Any]],
+        found: BarrierOutcome,
         within_s: float,
     ) -> bool:
         """One frame of a follower; whether it is done.
@@ -188,7 +188,7 @@ class Barrier:
         answers[seat] = control.controls
         return True
 
-    def _answer_tick(self, seat: Seat, within_s: float) -> None:
+    def _answer_tick(self, seat: FollowerSeat, within_s: float) -> None:
         done, refused = False, ""
         try:
             done = seat.clock.tick()
@@ -198,7 +198,7 @@ class Barrier:
         seat.line.say(Say.TICKED, Ticked(done, refused, tick), within_s=within_s)
 
     def _checked(
-        self, seat: Seat, controls: Mapping[str, Any], vehicles: Sequence[str]
+        self, seat: FollowerSeat, controls: Mapping[str, Any], vehicles: Sequence[str]
     ) -> dict[str, Any]:
         """The actions of a follower's vehicles.
 

@@ -11,19 +11,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cavmarl.core.errors import ClockError, FollowerError
-from cavmarl.cosim.followers.follower_connection import Address, Heard, call
+from cavmarl.cosim.followers.follower_connection import Address, ReceivedFrame, call
 from cavmarl.cosim.followers.follower_messages import (
     Control,
+    FollowerRefusal,
+    FollowerSnapshot,
     Hello,
-    Refusal,
     Say,
-    Snapshot,
     Ticked,
     Welcome,
     read_letter,
 )
 
-__all__ = ["Follower", "Samples", "Sight", "sight_of"]
+__all__ = ["Follower", "FollowerView", "Samples", "sight_of"]
 
 CALL_S = 10.0
 
@@ -44,7 +44,7 @@ class Samples:
 
 
 @dataclass(frozen=True)
-class Sight:
+class FollowerView:
     """One snapshot.
 
     Attributes:
@@ -53,7 +53,7 @@ class Sight:
             stands under no name.
     """
 
-    snapshot: Snapshot
+    snapshot: FollowerSnapshot
     sensors: Mapping[str, Mapping[str, Samples]]
 
 
@@ -106,7 +106,7 @@ class Follower:
     ) -> None:
         self.close()
 
-    def __iter__(self) -> Iterator[Sight]:
+    def __iter__(self) -> Iterator[FollowerView]:
         """Snapshots, until the world says goodbye; each but those of an end has to be answered.
 
         Raises:
@@ -117,7 +117,7 @@ class Follower:
         while (sight := self.wait()) is not None:
             yield sight
 
-    def wait(self) -> Sight | None:
+    def wait(self) -> FollowerView | None:
         """The next snapshot, however long it takes; None: the world has said goodbye.
 
         Raises:
@@ -167,7 +167,7 @@ class Follower:
     def close(self) -> None:
         self._line.close()
 
-    def _expect(self, within_s: float | None, *kinds: Say) -> Heard:
+    def _expect(self, within_s: float | None, *kinds: Say) -> ReceivedFrame:
         heard = self._line.hear(within_s)
         if heard.kind in kinds:
             if heard.kind is not Say.SNAPSHOT:
@@ -175,17 +175,17 @@ class Follower:
             return heard
         if heard.kind is Say.REFUSAL:
             self._line.skip(heard)
-            raise FollowerError(read_letter(Refusal, heard.letter).reason)
+            raise FollowerError(read_letter(FollowerRefusal, heard.letter).reason)
         raise FollowerError(f"{self._line.name} says {heard.kind.name}, which is not due")
 
 
-def sight_of(snapshot: Snapshot, arrays: Sequence[NDArray[Any]]) -> Sight:
+def sight_of(snapshot: FollowerSnapshot, arrays: Sequence[NDArray[Any]]) -> FollowerView:
     """A snapshot with its arrays where they belong."""
     sensors: dict[str, dict[str, Samples]] = {vehicle: {} for vehicle in snapshot.vehicles}
     for view, array in zip(snapshot.arrays, arrays, strict=True):
         samples = Samples(array, np.array(view.stamps_s), np.array(view.lost, dtype=np.bool_))
         sensors.setdefault(view.vehicle, {})[view.name] = samples
-    return Sight(snapshot, sensors)
+    return FollowerView(snapshot, sensors)
 
 
 def _plain(given: Any) -> list[float] | int:

@@ -1,4 +1,4 @@
-"""`Line`: one end of the connection between a world and a follower."""
+"""`FollowerConnection`: one end of the connection between a world and a follower."""
 
 from __future__ import annotations
 
@@ -23,14 +23,14 @@ from cavmarl.core.errors import (
 from cavmarl.cosim.followers.follower_messages import (
     FOLLOWERS,
     ArrayView,
+    FollowerSnapshot,
     Say,
-    Snapshot,
     letter_of,
     read_letter,
 )
-from cavmarl.parallel.hosts.framed_socket import Wire
+from cavmarl.parallel.hosts.framed_socket import FramedSocket
 
-__all__ = ["Address", "Heard", "Line", "call", "listen"]
+__all__ = ["Address", "FollowerConnection", "ReceivedFrame", "call", "listen"]
 
 Array = NDArray[Any]
 
@@ -44,7 +44,7 @@ _DTYPES = {np.dtype(code).newbyteorder("<").str for code in "?bBhHiIqQefd"}
 _MAX_AXES = 8
 
 
-class Heard(NamedTuple):
+class ReceivedFrame(NamedTuple):
     """One frame.
 
     Attributes:
@@ -85,7 +85,7 @@ class _Patient(socket.socket):
         return super().sendmsg(*arguments, **named)
 
 
-class Line:
+class FollowerConnection:
     """Sends and hears frames; whatever goes wrong with the other end is a `FollowerError`.
 
     Args:
@@ -96,7 +96,7 @@ class Line:
 
     def __init__(self, connection: socket.socket, name: str, cure: str = "") -> None:
         self._socket = _Patient(fileno=connection.detach())
-        self._wire = Wire(self._socket, FOLLOWERS)
+        self._wire = FramedSocket(self._socket, FOLLOWERS)
         self.name = name
         self._cure = f"; {cure}" if cure else ""
 
@@ -131,7 +131,7 @@ class Line:
         except OSError as error:
             raise self._lost(error) from error
 
-    def hear(self, within_s: float | None = None) -> Heard:
+    def hear(self, within_s: float | None = None) -> ReceivedFrame:
         """The next frame; its data then have to be taken (`take`) or left out (`skip`).
 
         Raises:
@@ -147,9 +147,9 @@ class Line:
             raise self._lost(error) from error
         except MessageError as error:
             raise FollowerError(f"{self.name}: {error}") from error
-        return Heard(Say(frame.kind), frame.letter, frame.size)
+        return ReceivedFrame(Say(frame.kind), frame.letter, frame.size)
 
-    def skip(self, heard: Heard) -> None:
+    def skip(self, heard: ReceivedFrame) -> None:
         """Leave out the data of what was heard.
 
         Raises:
@@ -161,13 +161,13 @@ class Line:
             )
         self._take([])
 
-    def take(self, heard: Heard) -> tuple[Snapshot, list[Array]]:
+    def take(self, heard: ReceivedFrame) -> tuple[FollowerSnapshot, list[Array]]:
         """The snapshot that was heard, with its arrays.
 
         Raises:
             FollowerError: as of `hear`.
         """
-        snapshot = read_letter(Snapshot, heard.letter)
+        snapshot = read_letter(FollowerSnapshot, heard.letter)
         sizes = [_size(view) for view in snapshot.arrays]
         if sum(sizes) != heard.size:
             raise FollowerError(
@@ -258,7 +258,7 @@ def listen(address: Address) -> socket.socket:
     return listener
 
 
-def call(address: Address, within_s: float) -> Line:
+def call(address: Address, within_s: float) -> FollowerConnection:
     """Connect to a world that listens at an address.
 
     Raises:
@@ -275,7 +275,7 @@ def call(address: Address, within_s: float) -> Line:
     except (OSError, OverflowError) as error:
         connection.close()
         raise FollowerLostError(f"{where} does not answer ({error}): is it running?") from error
-    return Line(connection, where)
+    return FollowerConnection(connection, where)
 
 
 def _path_of(address: str | Path) -> Path:

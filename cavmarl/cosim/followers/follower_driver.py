@@ -7,7 +7,7 @@ from collections.abc import Mapping
 import numpy as np
 
 from cavmarl.core.errors import ConfigError, FollowerError
-from cavmarl.cosim.followers.follower_client import Sight
+from cavmarl.cosim.followers.follower_client import FollowerView
 from cavmarl.cosim.followers.follower_messages import VehicleView, Welcome
 from cavmarl.cosim.stack.hd_map import HdMap
 from cavmarl.cosim.stack.stack import Stack, StackConfig, sensor_of, vehicle_of
@@ -52,7 +52,7 @@ class StackDriver:
         self.stacks: dict[str, Stack] = {}
         Stack(self._vehicle, self._config)  # to know now what it lacks
 
-    def drive(self, sight: Sight) -> dict[str, list[float]]:
+    def drive(self, sight: FollowerView) -> dict[str, list[float]]:
         """What the vehicles of a snapshot do; a new vehicle gets a new stack."""
         signals = sight.sensors.get("", {}).get("signals")
         shown = None if signals is None else np.asarray(signals.values[-1], dtype=np.uint8)

@@ -30,11 +30,11 @@ __all__ = [
     "MAX_VEHICLES",
     "ArrayView",
     "Control",
+    "FollowerRefusal",
+    "FollowerSnapshot",
     "Hello",
-    "Refusal",
     "Say",
     "SensorView",
-    "Snapshot",
     "Ticked",
     "VehicleView",
     "Welcome",
@@ -189,7 +189,7 @@ class VehicleView:
 
 @with_config(_CLOSED)
 @dataclass(frozen=True)
-class Snapshot:
+class FollowerSnapshot:
     """What a follower gets after each step.
 
     Attributes:
@@ -243,7 +243,7 @@ class Ticked:
 
 @with_config(_CLOSED)
 @dataclass(frozen=True)
-class Refusal:
+class FollowerRefusal:
     """Why the world does not go on with a follower."""
 
     reason: StrictStr

@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 
 from cavmarl.cosim.followers.follower_messages import (
     ArrayView,
+    FollowerSnapshot,
     SensorView,
-    Snapshot,
     VehicleView,
     Welcome,
 )
@@ -22,7 +22,7 @@ from cavmarl.parallel.driven_vehicles import Driven
 from cavmarl.roads.network import VEHICLE_CLASSES, RoadNetwork
 from cavmarl.sensors.mounted.frames import SensorFrames
 
-__all__ = ["Moment", "take_snapshot", "welcome_to"]
+__all__ = ["SnapshotTime", "take_snapshot", "welcome_to"]
 
 NO_SIGNAL = 255
 
@@ -54,7 +54,7 @@ def welcome_to(env: CavEnv | CavVectorEnv, vehicles: Sequence[str], tick: int) -
     )
 
 
-class Moment(NamedTuple):
+class SnapshotTime(NamedTuple):
     """When a snapshot is taken.
 
     Attributes:
@@ -71,8 +71,8 @@ class Moment(NamedTuple):
 
 
 def take_snapshot(
-    env: CavEnv | CavVectorEnv, agents: Sequence[int], moment: Moment, world: int = 0
-) -> tuple[Snapshot, list[NDArray[Any]]]:
+    env: CavEnv | CavVectorEnv, agents: Sequence[int], moment: SnapshotTime, world: int = 0
+) -> tuple[FollowerSnapshot, list[NDArray[Any]]]:
     """What a follower is sent.
 
     Args:
@@ -102,7 +102,7 @@ def take_snapshot(
         shown = _signals(env, world)
         views.append(_array("", "signals", shown, np.array([time_s]), np.zeros(1, np.bool_)))
         arrays.append(shown)
-    return Snapshot(
+    return FollowerSnapshot(
         moment.frame, moment.episode, moment.tick, time_s, moment.is_over, vehicles, views
     ), arrays
 

@@ -8,8 +8,14 @@ from collections.abc import Iterator
 from contextlib import suppress
 
 from cavmarl.core.errors import FollowerError
-from cavmarl.cosim.followers.follower_connection import Address, Line, listen
-from cavmarl.cosim.followers.follower_messages import MAX_VEHICLES, Hello, Refusal, Say, read_letter
+from cavmarl.cosim.followers.follower_connection import Address, FollowerConnection, listen
+from cavmarl.cosim.followers.follower_messages import (
+    MAX_VEHICLES,
+    FollowerRefusal,
+    Hello,
+    Say,
+    read_letter,
+)
 
 __all__ = ["Reception", "refuse"]
 
@@ -44,9 +50,9 @@ class Reception:
         self.turned_away = 0
         self._selector = selectors.DefaultSelector()
         self._selector.register(self._listener, selectors.EVENT_READ)
-        self._since: dict[Line, float] = {}
+        self._since: dict[FollowerConnection, float] = {}
 
-    def callers(self, within_s: float = 0.0) -> Iterator[tuple[Line, Hello]]:
+    def callers(self, within_s: float = 0.0) -> Iterator[tuple[FollowerConnection, Hello]]:
         """Followers that have introduced themselves since the last call, in order.
 
         Args:
@@ -65,7 +71,7 @@ class Reception:
                 self.turn_away(line, str(error))
         self._dismiss_the_silent()
 
-    def turn_away(self, line: Line, reason: str) -> None:
+    def turn_away(self, line: FollowerConnection, reason: str) -> None:
         self.turned_away += 1
         refuse(line, reason)
 
@@ -82,14 +88,14 @@ class Reception:
             connection, _ = self._listener.accept()
         except OSError:  # it is gone already
             return
-        line = Line(connection, "a caller", GOES_ON)
+        line = FollowerConnection(connection, "a caller", GOES_ON)
         if len(self._since) == MAX_GUESTS:
             self.turn_away(line, "too many callers have not introduced themselves")
             return
         self._since[line] = time.monotonic()
         self._selector.register(line, selectors.EVENT_READ, line)
 
-    def _greeting(self, line: Line) -> Hello:
+    def _greeting(self, line: FollowerConnection) -> Hello:
         heard = line.hear(HEARING_S)
         if heard.kind is not Say.HELLO:
             raise FollowerError(f"a caller begins with {heard.kind.name}: HELLO comes first")
@@ -106,13 +112,13 @@ class Reception:
                 self._forget(line)
                 self.turn_away(line, f"said nothing within {GREETING_S:g} s")
 
-    def _forget(self, line: Line) -> None:
+    def _forget(self, line: FollowerConnection) -> None:
         del self._since[line]
         self._selector.unregister(line)
 
 
-def refuse(line: Line, reason: str) -> None:
+def refuse(line: FollowerConnection, reason: str) -> None:
     """Tell a follower why it is not gone on with, if it still listens, and hang up."""
     with suppress(FollowerError):
-        line.say(Say.REFUSAL, Refusal(reason), within_s=HEARING_S)
+        line.say(Say.REFUSAL, FollowerRefusal(reason), within_s=HEARING_S)
     line.close()

@@ -16,7 +16,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cavmarl.cosim.stack.hd_map import HdMap, OnLane, wrap
-from cavmarl.cosim.stack.stack_types import Mission, Mount, Pose, Readings, Samples, Sensor
+from cavmarl.cosim.stack.stack_types import (
+    EgoPose,
+    Mission,
+    Readings,
+    SensorSamples,
+    StackMount,
+    StackSensor,
+)
 from cavmarl.sensors.kernels.inertia import GRAVITY_MPS2
 from cavmarl.sensors.mounted.geodesy import Geodesy
 
@@ -46,7 +53,7 @@ class GnssInertial:
     """
 
     def __init__(
-        self, sensors: Sequence[Sensor], geodesy: Geodesy, hd_map: HdMap, tick_s: float
+        self, sensors: Sequence[StackSensor], geodesy: Geodesy, hd_map: HdMap, tick_s: float
     ) -> None:
         self._by_type = {sensor.type: sensor for sensor in sensors}
         self._geodesy = geodesy
@@ -59,13 +66,13 @@ class GnssInertial:
         self._anchor: tuple[float, float] | None = None
         self._driven_m = self._turned_rad = 0.0
 
-    def reset_pose(self, pose: Pose) -> None:
+    def reset_pose(self, pose: EgoPose) -> None:
         """Be told where the vehicle is, to within some centimetres."""
         self._state = np.array([pose.x_m, pose.y_m, pose.heading_rad, pose.speed_mps])
         self._spread = np.diag([0.05, 0.05, 0.02, 0.2]) ** 2
         self._anchor = None
 
-    def locate(self, readings: Readings, mission: Mission, time_s: float) -> Pose | None:
+    def locate(self, readings: Readings, mission: Mission, time_s: float) -> EgoPose | None:
         """Predict to `time_s` and take in what the sensors have."""
         elapsed_s = 0.0 if self._before_s is None else time_s - self._before_s
         self._before_s = time_s
@@ -85,7 +92,7 @@ class GnssInertial:
             self._take(np.array([0.0, 0.0, 0.0, 1.0]), ahead, deviation, gate=math.inf)
         self._take_lane(readings)
         x_m, y_m, heading, speed_mps = self._get().tolist()
-        return Pose(x_m, y_m, wrap(heading), max(0.0, speed_mps), self._yaw_rate)
+        return EgoPose(x_m, y_m, wrap(heading), max(0.0, speed_mps), self._yaw_rate)
 
     def _get(self) -> NDArray[np.float64]:
         assert self._state is not None
@@ -98,7 +105,7 @@ class GnssInertial:
             return None
         return np.asarray(samples.values[~samples.lost][-1], dtype=np.float64)
 
-    def _samples(self, readings: Readings, kind: str) -> Samples | None:
+    def _samples(self, readings: Readings, kind: str) -> SensorSamples | None:
         sensor = self._by_type.get(kind)
         return None if sensor is None else readings.get(sensor.name)
 
@@ -235,7 +242,7 @@ class GnssInertial:
         return True
 
 
-def _centre(fix: tuple[float, float], mount: Mount, heading: float) -> tuple[float, float]:
+def _centre(fix: tuple[float, float], mount: StackMount, heading: float) -> tuple[float, float]:
     """Where the vehicle's centre is when its antenna is at a place."""
     cos, sin = math.cos(heading), math.sin(heading)
     return (

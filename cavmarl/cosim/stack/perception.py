@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cavmarl.cosim.stack.hd_map import HdMap, OnLane, wrap
-from cavmarl.cosim.stack.stack_types import Obstacle, Pose, Readings, Sensor
+from cavmarl.cosim.stack.stack_types import EgoPose, Obstacle, Readings, StackSensor
 
 __all__ = ["LidarObjects"]
 
@@ -50,13 +50,13 @@ class LidarObjects:
         hd_map: the lanes.
     """
 
-    def __init__(self, sensors: Sequence[Sensor], hd_map: HdMap) -> None:
+    def __init__(self, sensors: Sequence[StackSensor], hd_map: HdMap) -> None:
         self._lidars = [sensor for sensor in sensors if sensor.type == "lidar"]
         self._map = hd_map
         self._tracks: list[_Track] = []
         self._last: list[Obstacle] = []
 
-    def perceive(self, readings: Readings, pose: Pose, time_s: float) -> list[Obstacle]:
+    def perceive(self, readings: Readings, pose: EgoPose, time_s: float) -> list[Obstacle]:
         """Objects on the road; between two scans, those of the last one, moved on."""
         echoes = []
         for lidar in self._lidars:
@@ -70,7 +70,7 @@ class LidarObjects:
             self._tracks = [track for track in self._tracks if time_s - track.seen_s < _FORGET_S]
         return self._last
 
-    def _box(self, group: NDArray[np.float64], pose: Pose) -> Obstacle | None:
+    def _box(self, group: NDArray[np.float64], pose: EgoPose) -> Obstacle | None:
         """The box around echoes (n, 2), along the lane that they are on; None: off the road."""
         x_m, y_m = group.mean(axis=0).tolist()
         lanes = self._map.near(x_m, y_m, _ROAD_M)
@@ -122,14 +122,16 @@ class LidarObjects:
         return box._replace(vx_mps=best.vx_mps, vy_mps=best.vy_mps)
 
 
-def _along(lanes: Sequence[OnLane], pose: Pose) -> float:
+def _along(lanes: Sequence[OnLane], pose: EgoPose) -> float:
     """The direction of the nearest lane; of two in opposite directions the one of our own."""
     nearest = lanes[0].heading_rad
     apart = abs(wrap(nearest - pose.heading_rad))
     return nearest if apart < 0.5 * math.pi else wrap(nearest + math.pi)
 
 
-def _groups(lidar: Sensor, scan: NDArray[np.float64], pose: Pose) -> list[NDArray[np.float64]]:
+def _groups(
+    lidar: StackSensor, scan: NDArray[np.float64], pose: EgoPose
+) -> list[NDArray[np.float64]]:
     """Echoes on the map, (n, 2) each group.
 
     Args:

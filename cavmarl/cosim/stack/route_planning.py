@@ -25,7 +25,7 @@ from cavmarl.core.records.codes import (
     SIGNAL_YELLOW_MINOR,
 )
 from cavmarl.cosim.stack.hd_map import HdMap, OnLane, wrap
-from cavmarl.cosim.stack.stack_types import Mission, Obstacle, Pose, Trajectory
+from cavmarl.cosim.stack.stack_types import EgoPose, Mission, Obstacle, Trajectory
 from cavmarl.roads.routing import make_plans
 
 __all__ = ["LaneRoute"]
@@ -65,7 +65,7 @@ class LaneRoute:
 
     def plan(
         self,
-        pose: Pose,
+        pose: EgoPose,
         obstacles: Sequence[Obstacle],
         signals: NDArray[np.uint8] | None,
         mission: Mission,
@@ -88,7 +88,7 @@ class LaneRoute:
         hardest = min(limits, key=lambda limit: limit.accel)
         return Trajectory(points, max(hardest.accel, -_HARDEST), hardest.reason, lanes)
 
-    def _here(self, pose: Pose, plan: NDArray[np.void]) -> OnLane | None:
+    def _here(self, pose: EgoPose, plan: NDArray[np.void]) -> OnLane | None:
         """The lane that the vehicle is on, of those that lead to the goal."""
         best, least = None, math.inf
         for place in self._map.near(pose.x_m, pose.y_m, _MATCH_M):
@@ -102,7 +102,7 @@ class LaneRoute:
         return best
 
     def _change_lane(
-        self, here: OnLane, pose: Pose, plan: NDArray[np.void], obstacles: Sequence[Obstacle]
+        self, here: OnLane, pose: EgoPose, plan: NDArray[np.void], obstacles: Sequence[Obstacle]
     ) -> OnLane:
         """The lane beside, where the way needs it and there is room."""
         change = int(plan["change"][here.lane])
@@ -153,7 +153,7 @@ class LaneRoute:
 
     def _free(
         self,
-        pose: Pose,
+        pose: EgoPose,
         here: OnLane,
         lanes: Sequence[int],
         starts: Sequence[float],
@@ -172,7 +172,7 @@ class LaneRoute:
 
     def _gaps(
         self,
-        pose: Pose,
+        pose: EgoPose,
         points: NDArray[np.float64],
         obstacles: Sequence[Obstacle],
         mission: Mission,
@@ -191,7 +191,7 @@ class LaneRoute:
 
     def _lines(
         self,
-        pose: Pose,
+        pose: EgoPose,
         lanes: Sequence[int],
         starts: Sequence[float],
         plan: NDArray[np.void],
@@ -218,7 +218,7 @@ class LaneRoute:
         return found
 
     def _stops(
-        self, link: int, code: int, pose: Pose, gap: float, obstacles: Sequence[Obstacle]
+        self, link: int, code: int, pose: EgoPose, gap: float, obstacles: Sequence[Obstacle]
     ) -> str:
         if code in (SIGNAL_RED, SIGNAL_RED_YELLOW):
             return "stop_line"

@@ -19,17 +19,17 @@ from cavmarl.cosim.stack.perception import LidarObjects
 from cavmarl.cosim.stack.route_planning import LaneRoute
 from cavmarl.cosim.stack.stack_control import PurePursuit
 from cavmarl.cosim.stack.stack_types import (
-    Control,
     Control2D,
+    ControlStage,
+    EgoPose,
     Localisation,
     Mission,
-    Mount,
     Obstacle,
     Perception,
     Planning,
-    Pose,
     Readings,
-    Sensor,
+    StackMount,
+    StackSensor,
 )
 from cavmarl.sensors.mounted.geodesy import Geodesy, geodesy_of
 
@@ -47,7 +47,7 @@ class Vehicle(NamedTuple):
     """
 
     hd_map: HdMap
-    sensors: Sequence[Sensor]
+    sensors: Sequence[StackSensor]
     geodesy: Geodesy | None
     tick_s: float
 
@@ -55,7 +55,7 @@ class Vehicle(NamedTuple):
 class Blind:
     """A perception that sees nothing."""
 
-    def perceive(self, readings: Readings, pose: Pose, time_s: float) -> list[Obstacle]:
+    def perceive(self, readings: Readings, pose: EgoPose, time_s: float) -> list[Obstacle]:
         return []
 
 
@@ -142,13 +142,13 @@ class Stack:
         self._perception: Perception = made["perception"]
         self._localisation: Localisation = made["localisation"]
         self._planning: Planning = made["planning"]
-        self._control: Control = made["control"]
+        self._control: ControlStage = made["control"]
         self.times = StageTimes()
-        self.pose: Pose | None = None
+        self.pose: EgoPose | None = None
         self.obstacles: list[Obstacle] = []
         self.reason = ""
 
-    def reset_pose(self, pose: Pose) -> None:
+    def reset_pose(self, pose: EgoPose) -> None:
         """Tell the localisation where the vehicle is; optional."""
         self._localisation.reset_pose(pose)
 
@@ -191,13 +191,13 @@ class Stack:
         return found
 
 
-def sensor_of(name: str, settings: Mapping[str, Any]) -> Sensor:
+def sensor_of(name: str, settings: Mapping[str, Any]) -> StackSensor:
     """A sensor by its keys in `env.yaml`."""
-    mount = Mount(settings["x_m"], settings["y_m"], math.radians(settings["yaw_deg"]))
-    return Sensor(name, settings["type"], mount, settings)
+    mount = StackMount(settings["x_m"], settings["y_m"], math.radians(settings["yaw_deg"]))
+    return StackSensor(name, settings["type"], mount, settings)
 
 
-def vehicle_of(hd_map: HdMap, sensors: Sequence[Sensor], tick_s: float) -> Vehicle:
+def vehicle_of(hd_map: HdMap, sensors: Sequence[StackSensor], tick_s: float) -> Vehicle:
     """What stages may know.
 
     Args:

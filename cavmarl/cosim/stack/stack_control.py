@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 
 from cavmarl.cosim.stack.hd_map import wrap
-from cavmarl.cosim.stack.stack_types import Control2D, Mission, Pose, Trajectory
+from cavmarl.cosim.stack.stack_types import Control2D, EgoPose, Mission, Trajectory
 
 __all__ = ["GAINS", "Gains", "PurePursuit"]
 
@@ -55,7 +55,7 @@ class PurePursuit:
         self._tick_s = tick_s
         self._steering = 0.0
 
-    def control(self, pose: Pose, trajectory: Trajectory, mission: Mission) -> Control2D:
+    def control(self, pose: EgoPose, trajectory: Trajectory, mission: Mission) -> Control2D:
         gains = GAINS.get(mission.vclass, _CAR)
         slip = math.atan(0.5 * math.tan(self._steering))
         ahead_m = max(gains.least_lookahead_m, gains.lookahead_s * pose.speed_mps)
@@ -72,7 +72,7 @@ class PurePursuit:
         return Control2D(accel, self._steering)
 
 
-def _point_at(trajectory: Trajectory, pose: Pose, ahead_m: float) -> tuple[float, float]:
+def _point_at(trajectory: Trajectory, pose: EgoPose, ahead_m: float) -> tuple[float, float]:
     """The place on the way that lies so far ahead of the one beside the vehicle."""
     points = trajectory.points
     steps = np.diff(points, axis=0)

@@ -13,23 +13,23 @@ import numpy as np
 from numpy.typing import NDArray
 
 __all__ = [
-    "Control",
     "Control2D",
+    "ControlStage",
+    "EgoPose",
     "Localisation",
     "Mission",
-    "Mount",
     "Obstacle",
     "Perception",
     "Planning",
-    "Pose",
     "Readings",
-    "Samples",
-    "Sensor",
+    "SensorSamples",
+    "StackMount",
+    "StackSensor",
     "Trajectory",
 ]
 
 
-class Samples(Protocol):
+class SensorSamples(Protocol):
     """What one sensor has since the last step."""
 
     @property
@@ -48,11 +48,11 @@ class Samples(Protocol):
         ...
 
 
-Readings = Mapping[str, Samples]
+Readings = Mapping[str, SensorSamples]
 """By the sensor's name; those that are due."""
 
 
-class Mount(NamedTuple):
+class StackMount(NamedTuple):
     """Where a sensor is on its vehicle, in the plane."""
 
     x_m: float
@@ -60,7 +60,7 @@ class Mount(NamedTuple):
     yaw_rad: float
 
 
-class Sensor(NamedTuple):
+class StackSensor(NamedTuple):
     """One sensor of the vehicle.
 
     Attributes:
@@ -72,11 +72,11 @@ class Sensor(NamedTuple):
 
     name: str
     type: str
-    mount: Mount
+    mount: StackMount
     settings: Mapping[str, Any]
 
 
-class Pose(NamedTuple):
+class EgoPose(NamedTuple):
     """Where the vehicle's centre is, and how it moves.
 
     Attributes:
@@ -153,17 +153,17 @@ class Trajectory:
 class Perception(Protocol):
     """Sensors → what is on the road."""
 
-    def perceive(self, readings: Readings, pose: Pose, time_s: float) -> list[Obstacle]: ...
+    def perceive(self, readings: Readings, pose: EgoPose, time_s: float) -> list[Obstacle]: ...
 
 
 class Localisation(Protocol):
     """Sensors → where the vehicle is."""
 
-    def locate(self, readings: Readings, mission: Mission, time_s: float) -> Pose | None:
+    def locate(self, readings: Readings, mission: Mission, time_s: float) -> EgoPose | None:
         """Where it is now; None: not known yet."""
         ...
 
-    def reset_pose(self, pose: Pose) -> None: ...
+    def reset_pose(self, pose: EgoPose) -> None: ...
 
 
 class Planning(Protocol):
@@ -171,7 +171,7 @@ class Planning(Protocol):
 
     def plan(
         self,
-        pose: Pose,
+        pose: EgoPose,
         obstacles: Sequence[Obstacle],
         signals: NDArray[np.uint8] | None,
         mission: Mission,
@@ -187,7 +187,7 @@ class Planning(Protocol):
         ...
 
 
-class Control(Protocol):
+class ControlStage(Protocol):
     """Where to drive → what the vehicle does."""
 
-    def control(self, pose: Pose, trajectory: Trajectory, mission: Mission) -> Control2D: ...
+    def control(self, pose: EgoPose, trajectory: Trajectory, mission: Mission) -> Control2D: ...

@@ -152,7 +152,8 @@ def speed_behind(kind: np.void, gap: float, front_speed: float, front_decel: flo
     if kind["model"] != MODEL_IDM:
         room = max(gap - kind["min_gap"], 0.0)
         safe = safe_speed(room, front_speed, kind["decel"], front_decel, kind["tau"])
-        return min(room / kind["tau"], safe)
+        reached: float = min(room / kind["tau"], safe)
+        return reached
     # The positive root of jam + v·tau + v·(v - front) / (2·sqrt(a·b)) = gap.
     scale = 2.0 * math.sqrt(kind["accel"] * kind["decel"])
     linear = kind["tau"] - front_speed / scale

@@ -83,7 +83,8 @@ def _call(typing_context: Any, code: Any, *numbers: Any) -> Any:
         pointer = ir.FunctionType(double, [double] * _NUM_NUMBERS).as_pointer()
         return builder.call(builder.inttoptr(address, pointer), values)
 
-    rest = types.StarArgTuple((types.float64,) * _NUM_NUMBERS)
+    star: Any = types.StarArgTuple
+    rest = star((types.float64,) * _NUM_NUMBERS)
     return types.float64(types.int64, rest), generate
 
 

@@ -1,10 +1,10 @@
-"""`Referee`: what a coordinator of one world is, however it reaches its zones.
+"""`Coordinator`: what a coordinator of one world is, however it reaches its zones.
 
 It decides which zone advances which vehicle to the next tick, and sees it done. How rows change
 hands is done by the division.
 
 There are two: `coordinator.Coordinator` sends messages, which may be lost, to hosts that may die;
-`direct.DirectCoordinator` lives in the process of all of its zones.
+`direct.LocalCoordinator` lives in the process of all of its zones.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from cavmarl.handoff.coordinator.journal import AnyJournal
 from cavmarl.ownership.directory import Directory
 from cavmarl.ownership.messages import Birth, Message, Record, Removed, Switch
 
-__all__ = ["Entry", "Near", "Referee", "Watcher"]
+__all__ = ["ArrivingVehicle", "Coordinator", "Near", "Watcher"]
 
 
 class Near(NamedTuple):
@@ -32,7 +32,7 @@ class Near(NamedTuple):
     depth_m: float
 
 
-class Entry(NamedTuple):
+class ArrivingVehicle(NamedTuple):
     """A vehicle that changes its owner now, with the state that the new one has been sent of it.
 
     None: nothing has been sent; the new owner takes the old one's row as it is.
@@ -52,7 +52,7 @@ class Watcher(Protocol):
     def delivered(self, destination: int, message: Message) -> None: ...
 
 
-class Referee(ABC):
+class Coordinator(ABC):
     """Decides ownership, tick by tick: `begin`, then the zones' work, then `end`.
 
     Args:

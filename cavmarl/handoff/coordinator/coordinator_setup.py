@@ -12,18 +12,18 @@ from numpy.typing import NDArray
 
 from cavmarl.config.env import ZonesConfig
 from cavmarl.core.errors import ConfigError
-from cavmarl.handoff.coordinator.coordinator import Referee
-from cavmarl.handoff.coordinator.coordinators import Coordination, RowStates
-from cavmarl.handoff.coordinator.handoff_log import BorderBook
-from cavmarl.handoff.coordinator.invariant_monitor import Monitor, OwnersOnRecord
+from cavmarl.handoff.coordinator.coordinator import Coordinator
+from cavmarl.handoff.coordinator.coordinators import Coordinators, RowStates
+from cavmarl.handoff.coordinator.handoff_log import HandoffLog
+from cavmarl.handoff.coordinator.invariant_monitor import InvariantMonitor, OwnersOnRecord
 from cavmarl.handoff.coordinator.journal import Journal, MemoryJournal
-from cavmarl.handoff.coordinator.local_coordinator import DirectCoordinator
+from cavmarl.handoff.coordinator.local_coordinator import LocalCoordinator
 from cavmarl.handoff.coordinator.row_digests import RowDigests
 from cavmarl.handoff.division import Division
 from cavmarl.handoff.fault_injection.committed_store import CommittedStore
 from cavmarl.handoff.fault_injection.fault_plan import Faults, read_faults
 from cavmarl.handoff.fault_injection.injected_faults import Crashes, FaultyCoordinator, FaultyPhases
-from cavmarl.handoff.fault_injection.message_coordinator import Coordinator
+from cavmarl.handoff.fault_injection.message_coordinator import MessageCoordinator
 from cavmarl.handoff.fault_injection.recovery import Recovery
 from cavmarl.handoff.shard_setup import limits_of
 from cavmarl.ownership.directory import Directory
@@ -35,16 +35,16 @@ from cavmarl.ownership.transport import Network
 from cavmarl.shards.shard import Shard
 
 __all__ = [
-    "Refereeing",
-    "Run",
+    "CoordinatorSetup",
+    "WorldRun",
     "check_faults",
     "journal_path",
-    "make_refereeing",
+    "make_coordinators",
     "prepare_runs",
 ]
 
 
-class Refereeing(NamedTuple):
+class CoordinatorSetup(NamedTuple):
     """The coordinators of a divided environment.
 
     Attributes:
@@ -55,14 +55,14 @@ class Refereeing(NamedTuple):
         store: its committed state.
     """
 
-    coordination: Coordination
+    coordination: Coordinators
     transfers: tuple[TransferLog, ...]
     recovery: Recovery | None = None
     phases: FaultyPhases | None = None
     store: CommittedStore | None = None
 
 
-class Run(NamedTuple):
+class WorldRun(NamedTuple):
     """One world's, where another process has said what it is.
 
     Attributes:
@@ -74,8 +74,8 @@ class Run(NamedTuple):
     journal: Path | None
 
 
-def prepare_runs(settings: ZonesConfig, num_worlds: int) -> list[Run]:
-    """What `make_refereeing` would choose for each world, for processes that may do it repeatedly.
+def prepare_runs(settings: ZonesConfig, num_worlds: int) -> list[WorldRun]:
+    """What `make_coordinators` chooses for each world, for processes that may do it repeatedly.
 
     Raises:
         JournalError: a journal cannot be begun.
@@ -86,7 +86,7 @@ def prepare_runs(settings: ZonesConfig, num_worlds: int) -> list[Run]:
         if settings.journal:
             path = journal_path(settings.journal, w, num_worlds).absolute()
             Journal(path).close()
-        runs.append(Run(secrets.token_bytes(RUN_BYTES), path))
+        runs.append(WorldRun(secrets.token_bytes(RUN_BYTES), path))
     return runs
 
 
@@ -118,15 +118,15 @@ def check_faults(settings: ZonesConfig, zones: int, num_worlds: int) -> tuple[Fa
     return faults, deaths
 
 
-def make_refereeing(
+def make_coordinators(
     settings: ZonesConfig,
     shards: Sequence[Shard],
     division: Division,
     shared: Callable[[], Iterable[NDArray[Any]]],
     longest_move_m: float,
     safeguards: Safeguards = ALL_ON,
-    runs: Sequence[Run] | None = None,
-) -> Refereeing:
+    runs: Sequence[WorldRun] | None = None,
+) -> CoordinatorSetup:
     """The coordinators of a divided world.
 
     Args:
@@ -164,16 +164,20 @@ def make_refereeing(
         for w in range(division.num_worlds)
     ]
     digests = RowDigests() if settings.journal or deaths else None
-    monitor = _monitor(division, coordinators, limits, longest_move_m) if settings.check else None
+    monitor = (
+        _monitor(division, coordinators, limits, longest_move_m)
+        if settings.check_invariants
+        else None
+    )
     dying = coordinators[0]
-    if crashes is None or not isinstance(dying, Coordinator):
-        coordination = Coordination(division, coordinators, states, digests, monitor=monitor)
-        return Refereeing(coordination, transfers)
+    if crashes is None or not isinstance(dying, MessageCoordinator):
+        coordination = Coordinators(division, coordinators, states, digests, monitor=monitor)
+        return CoordinatorSetup(coordination, transfers)
     store = CommittedStore(shards, shared, safeguards)
     phases = FaultyPhases(shards, crashes)
-    coordination = Coordination(division, coordinators, states, digests, store, monitor)
+    coordination = Coordinators(division, coordinators, states, digests, store, monitor)
     recovery = Recovery(shards, coordination, dying, store, phases, crashes, limits.repeats)
-    return Refereeing(coordination, transfers, recovery, phases, store)
+    return CoordinatorSetup(coordination, transfers, recovery, phases, store)
 
 
 def _referee(
@@ -186,8 +190,8 @@ def _referee(
     faults: Faults | None,
     crashes: Crashes | None,
     safeguards: Safeguards,
-    given: Run | None,
-) -> Referee:
+    given: WorldRun | None,
+) -> Coordinator:
     """Of one world; over messages where a plan says what may be lost, and directly else."""
     run = secrets.token_bytes(RUN_BYTES) if given is None else given.run
     zones = division.count
@@ -201,11 +205,11 @@ def _referee(
     if faults is None:
         directory = Directory(run, range(zones), states, limits, safeguards)
         counts = partial(division.counts, w)
-        book = BorderBook(division, w)
-        return DirectCoordinator(directory, journal, book, counts, transfers)
+        book = HandoffLog(division, w)
+        return LocalCoordinator(directory, journal, book, counts, transfers)
     arguments = (run, zones, states, limits, Network(faults.plan()), journal, safeguards)
     coordinator = (
-        Coordinator(*arguments)
+        MessageCoordinator(*arguments)
         if crashes is None
         else FaultyCoordinator(*arguments, crashes=crashes)
     )
@@ -214,16 +218,16 @@ def _referee(
 
 
 def _monitor(
-    division: Division, coordinators: Sequence[Referee], limits: Limits, longest_move_m: float
-) -> Monitor:
+    division: Division, coordinators: Sequence[Coordinator], limits: Limits, longest_move_m: float
+) -> InvariantMonitor:
     """The monitor of all worlds, and is told what their coordinators do."""
-    is_direct = isinstance(coordinators[0], DirectCoordinator)
+    is_direct = isinstance(coordinators[0], LocalCoordinator)
     records = [OwnersOnRecord(division.count, limits, is_direct) for _ in coordinators]
     for coordinator, record in zip(coordinators, records, strict=True):
         coordinator.watch(record)
-        if isinstance(coordinator, DirectCoordinator):
+        if isinstance(coordinator, LocalCoordinator):
             coordinator.foretell, record.ask = record.foretold, coordinator.catch_up
-    return Monitor(division, records, longest_move_m)
+    return InvariantMonitor(division, records, longest_move_m)
 
 
 def journal_path(journal: str, w: int, num_worlds: int) -> Path:

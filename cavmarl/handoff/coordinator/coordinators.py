@@ -1,4 +1,4 @@
-"""`Coordination`: the coordinators of W worlds, and the rows that change hands as they say."""
+"""`Coordinators`: the coordinators of W worlds, and the rows that change hands as they say."""
 
 from __future__ import annotations
 
@@ -10,19 +10,19 @@ from numpy.typing import NDArray
 
 from cavmarl.core.errors import ProtocolError
 from cavmarl.core.records.arrays import Gate
-from cavmarl.handoff.coordinator.coordinator import Entry, Near, Referee
-from cavmarl.handoff.coordinator.invariant_monitor import Monitor
+from cavmarl.handoff.coordinator.coordinator import ArrivingVehicle, Coordinator, Near
+from cavmarl.handoff.coordinator.invariant_monitor import InvariantMonitor
 from cavmarl.handoff.coordinator.row_digests import RowDigests
 from cavmarl.handoff.division import Division
 from cavmarl.handoff.fault_injection.committed_store import CommittedStore, Notes
-from cavmarl.handoff.fault_injection.message_coordinator import Coordinator
+from cavmarl.handoff.fault_injection.message_coordinator import MessageCoordinator
 from cavmarl.handoff.surroundings import NearBorders
 from cavmarl.handoff.zone_view import TransferInFlight
 from cavmarl.ownership.messages import Record
 from cavmarl.shards.shard import Commands
 from cavmarl.zones.kernels.zone_lookup import zones_of
 
-__all__ = ["Coordination", "RowStates"]
+__all__ = ["Coordinators", "RowStates"]
 
 
 class RowStates:
@@ -51,7 +51,7 @@ class RowStates:
         self.borders.near = found
         return found
 
-    def change(self, entries: Sequence[Entry]) -> None:
+    def change(self, entries: Sequence[ArrivingVehicle]) -> None:
         """Let rows change hands, of vehicles that `look` has found."""
         if entries:
             rows = {entry.vehicle: entry.row for entry in self.borders.near}
@@ -78,7 +78,7 @@ class RowStates:
         return found
 
 
-class Coordination:
+class Coordinators:
     """The coordinators of all worlds.
 
     Args:
@@ -93,11 +93,11 @@ class Coordination:
     def __init__(
         self,
         division: Division,
-        coordinators: Sequence[Referee],
+        coordinators: Sequence[Coordinator],
         states: Sequence[RowStates],
         digests: RowDigests | None = None,
         store: CommittedStore | None = None,
-        monitor: Monitor | None = None,
+        monitor: InvariantMonitor | None = None,
     ) -> None:
         self.coordinators = tuple(coordinators)
         self._division = division
@@ -194,7 +194,7 @@ class Coordination:
             ProtocolError: they sent messages, and its own coordinator sends none.
         """
         (coordinator,) = self.coordinators
-        if not isinstance(coordinator, Coordinator):
+        if not isinstance(coordinator, MessageCoordinator):
             raise ProtocolError("a coordinator without messages cannot go on in the middle of one")
         coordinator.take_up(records)
         coordinator.resume(*notes[0])

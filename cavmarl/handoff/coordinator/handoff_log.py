@@ -1,4 +1,4 @@
-"""`BorderBook`: changes of owner of one world whose zones share a process, and approaches."""
+"""`HandoffLog`: changes of owner of one world whose zones share a process, and approaches."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ from cavmarl.handoff.division import Division
 from cavmarl.ownership.messages import Birth
 from cavmarl.zones.kernels.handoff import NOT_OWNED
 
-__all__ = ["BorderBook", "Change"]
+__all__ = ["HandoffLog", "OwnerChange"]
 
 
-class Change(NamedTuple):
+class OwnerChange(NamedTuple):
     """A change of owner; see `kernels.handing_over.CHANGE`."""
 
     tick: int
@@ -33,7 +33,7 @@ class Change(NamedTuple):
     ms: float
 
 
-class BorderBook:
+class HandoffLog:
     """Gives vehicles to the zones that they are in, and keeps what came of it until it is read.
 
     Args:
@@ -81,7 +81,7 @@ class BorderBook:
         return changed
 
     def _refuse(self, why: int) -> None:
-        change = Change(*self._book.changes[self._world, len(self)].item())
+        change = OwnerChange(*self._book.changes[self._world, len(self)].item())
         if why == NOT_OWNED:
             raise ConfigError(f"zone {change.source} does not own vehicle {change.vehicle}")
         raise self._division.unseen(change.vehicle, change.target)
@@ -97,10 +97,10 @@ class BorderBook:
     def __len__(self) -> int:
         return self._book.num_changes.item(self._world)
 
-    def newest(self, count: int) -> list[Change]:
+    def newest(self, count: int) -> list[OwnerChange]:
         last = len(self)
         found = self._book.changes[self._world, last - count : last]
-        return [Change(*change) for change in found.tolist()]
+        return [OwnerChange(*change) for change in found.tolist()]
 
     def take(self, but: int = 0) -> NDArray[np.void]:
         """CHANGE (n,), all but so many of the newest, which are kept."""

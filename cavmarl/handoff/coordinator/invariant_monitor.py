@@ -1,4 +1,4 @@
-"""`Monitor`: the invariants of ownership, checked after every tick of every world.
+"""`InvariantMonitor`: the invariants of ownership, checked after every tick of every world.
 
 What it needs of the vehicles is taken in one compiled pass over their rows (`kernels.monitor`),
 which finds vehicles that have come and gone; what it knows of owners comes from the coordinators'
@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from cavmarl.core.errors import ProtocolError
 from cavmarl.core.numba.repeated import repeated
 from cavmarl.driving.vehicles import GHOST_FIELDS
-from cavmarl.handoff.coordinator.handoff_log import Change
+from cavmarl.handoff.coordinator.handoff_log import OwnerChange
 from cavmarl.handoff.coordinator.row_digests import digest_tables
 from cavmarl.handoff.coordinator.violations import Violations
 from cavmarl.handoff.division import Division
@@ -24,7 +24,7 @@ from cavmarl.handoff.kernels.invariant_checks import (
     FINDING,
     KIND_NONE,
     TALLY,
-    Clock,
+    CheckTime,
     make_kept,
     make_strays,
     owner_hash,
@@ -32,10 +32,10 @@ from cavmarl.handoff.kernels.invariant_checks import (
 )
 from cavmarl.ownership.limits import Limits
 from cavmarl.ownership.messages import Birth, Commit, Item, Message, Record, Reset
-from cavmarl.ownership.trace import LOG, Entry, describe
+from cavmarl.ownership.trace import LOG, TraceEntry, describe
 from cavmarl.ownership.trace_check import Owner, TraceChecker
 
-__all__ = ["Monitor", "OwnersOnRecord"]
+__all__ = ["InvariantMonitor", "OwnersOnRecord"]
 
 WORD = 1 << 64
 
@@ -100,7 +100,7 @@ class OwnersOnRecord:
         """
         self._take(destination, message)
 
-    def foretold(self, changes: Iterable[Change]) -> None:
+    def foretold(self, changes: Iterable[OwnerChange]) -> None:
         """Changes of owner of the committed tick, of which records will tell later."""
         sums = self._current = self._current.copy()
         for change in changes:
@@ -117,7 +117,7 @@ class OwnersOnRecord:
         return sums
 
     def _take(self, destination: int, item: Item) -> None:
-        entry = Entry(destination, item)
+        entry = TraceEntry(destination, item)
         try:
             self._checker.take(entry)
         except ProtocolError as error:
@@ -138,7 +138,7 @@ class OwnersOnRecord:
                 _add(sums, after[0], int(owner_hash(vehicle, after[1])))
 
 
-class Monitor:
+class InvariantMonitor:
     """Raises ProtocolError after the first tick in which an invariant does not hold.
 
     Its memory is as large as the worlds are, however long they run.
@@ -201,7 +201,7 @@ class Monitor:
 
     def _look(self, w: int, births: Sequence[Birth], new_late: int) -> None:
         division, record = self._division, self._records[w]
-        clock = Clock(self._ticks[w], new_late, self._limit_m)
+        clock = CheckTime(self._ticks[w], new_late, self._limit_m)
         before, now = self._kept[w]
         kind = self._watch(
             division.zones, division.halo, division.zoned, self._words, division.side, w, clock,

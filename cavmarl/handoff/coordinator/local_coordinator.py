@@ -1,4 +1,4 @@
-"""`DirectCoordinator`: the coordinator of a world whose zones all live in its own process.
+"""`LocalCoordinator`: the coordinator of a world whose zones all live in its own process.
 
 There no message is lost, no zone is late, and no process dies alone. What `Coordinator` and the
 hosts of
@@ -24,8 +24,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cavmarl.core.errors import ProtocolError
-from cavmarl.handoff.coordinator.coordinator import Referee
-from cavmarl.handoff.coordinator.handoff_log import BorderBook, Change
+from cavmarl.handoff.coordinator.coordinator import Coordinator
+from cavmarl.handoff.coordinator.handoff_log import HandoffLog, OwnerChange
 from cavmarl.handoff.coordinator.journal import AnyJournal
 from cavmarl.ownership.directory import Directory
 from cavmarl.ownership.ledger import world_digest
@@ -33,7 +33,7 @@ from cavmarl.ownership.messages import Begin, Birth, Commit, Removed, Switch, Zo
 from cavmarl.ownership.transfers import Transfer, TransferLog
 from cavmarl.zones.kernels.handoff import LATE
 
-__all__ = ["DirectCoordinator"]
+__all__ = ["LocalCoordinator"]
 
 
 class _News(NamedTuple):
@@ -46,7 +46,7 @@ class _News(NamedTuple):
 _NO_NEWS = _News()
 
 
-class DirectCoordinator(Referee):
+class LocalCoordinator(Coordinator):
     """Decides ownership, without messages.
 
     Args:
@@ -64,7 +64,7 @@ class DirectCoordinator(Referee):
         self,
         directory: Directory,
         journal: AnyJournal | None,
-        book: BorderBook,
+        book: HandoffLog,
         counts: Callable[[], list[int]],
         transfers: TransferLog,
     ) -> None:
@@ -73,7 +73,7 @@ class DirectCoordinator(Referee):
         self._counts = counts
         self._transfers = transfers
         transfers.ask = self.catch_up
-        self.foretell: Callable[[Iterable[Change]], None] | None = None
+        self.foretell: Callable[[Iterable[OwnerChange]], None] | None = None
         self._is_open = False
         self._tick = 0
         self._vehicles = 0
@@ -122,7 +122,7 @@ class DirectCoordinator(Referee):
                 self._record(*directory.host(zone, worker=0).records)
 
     def begin(self, everybody: bool, inputs: bytes = b"") -> None:
-        """Hand over vehicles outside their owner's zone, as `Referee.begin` says."""
+        """Hand over vehicles outside their owner's zone, as `Coordinator.begin` says."""
         births = self._births
         try:
             changed = self._book.hand_over(everybody, self._vehicles, births)
@@ -142,7 +142,7 @@ class DirectCoordinator(Referee):
             self._record(Begin(episode, self._tick + 1, switches, (), self._new, inputs))
 
     def end(self, rows: Callable[[int], int], stored: Callable[[int], int] | None = None) -> None:
-        """Commit, if the zones own what they should, as `Referee.end` says."""
+        """Commit, if the zones own what they should, as `Coordinator.end` says."""
         changed, self._is_open = self._changed, False
         self._tick += 1
         if changed:
@@ -253,7 +253,7 @@ def _no_digest(zone: int) -> int:
     return 0
 
 
-def _switch(change: Change) -> Switch:
+def _switch(change: OwnerChange) -> Switch:
     return Switch(change.vehicle, change.source, change.target, change.epoch, False)
 
 
@@ -271,11 +271,11 @@ def _removed_with(changes: NDArray[np.void], left: Mapping[int, int]) -> list[bo
 
 
 def _rows(changes: NDArray[np.void], episode: int, removed: list[bool]) -> list[Transfer]:
-    found = (Change(*change) for change in changes.tolist())
+    found = (OwnerChange(*change) for change in changes.tolist())
     return [_row(change, episode, gone) for change, gone in zip(found, removed, strict=True)]
 
 
-def _row(change: Change, episode: int, removed: bool) -> Transfer:
+def _row(change: OwnerChange, episode: int, removed: bool) -> Transfer:
     release_m = change.release_depth_m
     return Transfer(
         episode, change.tick, change.vehicle, change.source, change.target, change.epoch,

@@ -14,7 +14,7 @@ import numpy as np
 from cavmarl.core.errors import ProtocolError
 from cavmarl.driving.vehicles import GHOST_FIELDS
 from cavmarl.handoff.division import Division
-from cavmarl.handoff.kernels.invariant_checks import KIND_FAR, KIND_TICK, Clock, Kept
+from cavmarl.handoff.kernels.invariant_checks import KIND_FAR, KIND_TICK, CheckTime, Kept
 from cavmarl.ownership.messages import Birth
 from cavmarl.ownership.trace_check import Owner
 from cavmarl.zones.kernels.zone_lookup import is_seen, squared_distance
@@ -35,7 +35,7 @@ class Violations:
         before: what the check before wrote.
     """
 
-    def __init__(self, division: Division, w: int, clock: Clock, before: Kept) -> None:
+    def __init__(self, division: Division, w: int, clock: CheckTime, before: Kept) -> None:
         self._division = division
         self._w = w
         self._clock = clock

@@ -18,7 +18,7 @@ from cavmarl.ownership.messages import Birth, Removed
 from cavmarl.ownership.safeguards import ALL_ON, Safeguards
 from cavmarl.shards.shard import COMMON, Shard
 
-__all__ = ["COUNTS", "CommittedStore", "Image", "Notes"]
+__all__ = ["COUNTS", "CommittedImage", "CommittedStore", "Notes"]
 
 # Counts of `Worlds` that each shard has of its own.
 COUNTS = ("num_owned", "num_rows", "num_through", "num_touching", "num_contacts")
@@ -29,7 +29,7 @@ Notes = tuple[tuple[Birth, ...], tuple[Removed, ...]]
 """What has happened since the last BEGIN: new vehicles, and those that are gone."""
 
 
-class Image(NamedTuple):
+class CommittedImage(NamedTuple):
     """A copy of everything.
 
     Attributes:
@@ -63,8 +63,8 @@ class CommittedStore:
         self._has_two = safeguards.double_buffer
         self._shards = tuple(shards)
         self._others = shared
-        self._committed: Image | None = None
-        self._next: Image | None = None
+        self._committed: CommittedImage | None = None
+        self._next: CommittedImage | None = None
 
     def write(self, notes: tuple[Notes, ...]) -> None:
         """Copy what there is now; the truth stays what it was.
@@ -79,7 +79,7 @@ class CommittedStore:
             counts.append([getattr(worlds, name).copy() for name in COUNTS])
             rows.append([worlds.rows[w, :num].copy() for w, num in enumerate(worlds.num_rows)])
         shared = [array.copy() for array in self.shared()]
-        self._next = Image(counts, rows, shared, notes)
+        self._next = CommittedImage(counts, rows, shared, notes)
         if not self._has_two:
             self._committed = self._next
 
@@ -106,7 +106,7 @@ class CommittedStore:
             array[...] = kept
         return image.notes
 
-    def adopt(self, image: Image) -> tuple[Notes, ...]:
+    def adopt(self, image: CommittedImage) -> tuple[Notes, ...]:
         """Take the worlds to what another store has kept of such worlds; the notes of each.
 
         Raises:
@@ -147,7 +147,7 @@ class CommittedStore:
             yield getattr(worlds, name)
         yield from self._others()
 
-    def truth(self) -> Image:
+    def truth(self) -> CommittedImage:
         """What is committed; not to be changed.
 
         Raises:

@@ -13,7 +13,7 @@ from typing import Any, TypeAlias
 from cavmarl.core.errors import CavmarlError
 from cavmarl.handoff.fault_injection.fault_plan import PHASES, Crash, Faults
 from cavmarl.handoff.fault_injection.mailbox import Parcel
-from cavmarl.handoff.fault_injection.message_coordinator import Coordinator
+from cavmarl.handoff.fault_injection.message_coordinator import MessageCoordinator
 from cavmarl.ownership.endpoint import Endpoint
 from cavmarl.ownership.messages import COORDINATOR, Begin, Commit, Output, Prepare, Step
 from cavmarl.shards.executor import Executor, Phase, SerialExecutor
@@ -159,11 +159,11 @@ def _call_hosted(zone: int, host: Executor, phase: Phase, arguments: tuple[Any, 
         raise ZoneDeath(zone, phase, False, f"of {error!r}") from error
 
 
-class FaultyCoordinator(Coordinator):
+class FaultyCoordinator(MessageCoordinator):
     """A coordinator that dies, and whose zones' hosts die, at named points.
 
     Args:
-        arguments: as of `Coordinator`.
+        arguments: as of `MessageCoordinator`.
         crashes: which processes die where.
     """
 
@@ -208,7 +208,7 @@ class FaultyCoordinator(Coordinator):
             self.crashes.coordinator(f"{name} written")
 
 
-def give_up(coordinator: Coordinator, death: ZoneDeath) -> None:
+def give_up(coordinator: MessageCoordinator, death: ZoneDeath) -> None:
     """Fence a host; one that lives on sends what it had to send, unheard."""
     endpoint: Endpoint = coordinator.fence(death.zone)
     if death.lives_on and endpoint.lease is not None:

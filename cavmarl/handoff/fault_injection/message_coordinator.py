@@ -1,4 +1,4 @@
-"""`Coordinator`: the coordinator of a world that sends messages to the hosts of its zones."""
+"""`MessageCoordinator`: the coordinator that sends messages to the hosts of zones."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from collections.abc import Callable, Sequence
 from typing import Protocol
 
 from cavmarl.core.errors import ProtocolError
-from cavmarl.handoff.coordinator.coordinator import Entry, Near, Referee
+from cavmarl.handoff.coordinator.coordinator import ArrivingVehicle, Coordinator, Near
 from cavmarl.handoff.coordinator.journal import AnyJournal, MemoryJournal
 from cavmarl.handoff.fault_injection.mailbox import Parcel, Post
 from cavmarl.ownership.directory import SILENCE, Directory
@@ -25,7 +25,7 @@ from cavmarl.ownership.offers import Approach
 from cavmarl.ownership.reactions import Advance
 from cavmarl.ownership.safeguards import ALL_ON, Safeguards
 
-__all__ = ["Coordinator"]
+__all__ = ["MessageCoordinator"]
 
 PATIENCE = 10_000
 """So often a tick asks a zone that does not answer, before it gives up."""
@@ -46,10 +46,10 @@ class States(Protocol):
 
     def state(self, vehicle: int) -> bytes: ...
 
-    def change(self, entries: Sequence[Entry]) -> None: ...
+    def change(self, entries: Sequence[ArrivingVehicle]) -> None: ...
 
 
-class Coordinator(Referee):
+class MessageCoordinator(Coordinator):
     """Runs the protocol of one world over messages.
 
     Args:
@@ -132,7 +132,7 @@ class Coordinator(Referee):
     def begin(self, everybody: bool, inputs: bytes = b"") -> None:
         """Offer approaching vehicles, decide the way to the next tick, and lease it to every zone.
 
-        Called again in the same tick, it goes on with what was decided; see `Referee.begin`.
+        Called again in the same tick, it goes on with what was decided; see `Coordinator.begin`.
         """
         directory, states = self.directory, self._states
         births, self._births, self._removed = self._births, [], []
@@ -233,10 +233,10 @@ class Coordinator(Referee):
             if zone not in self._leases and zone not in self.directory.dones
         )
 
-    def _entries(self) -> list[Entry]:
+    def _entries(self) -> list[ArrivingVehicle]:
         plan = self.directory.table.planned
         return [
-            Entry(plan.switches[vehicle], state)
+            ArrivingVehicle(plan.switches[vehicle], state)
             for zone in sorted(self._leases)
             for vehicle, state in self._leases[zone].enter
         ]

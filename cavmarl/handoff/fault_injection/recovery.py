@@ -15,7 +15,7 @@ from typing import NamedTuple
 import numpy as np
 
 from cavmarl.core.errors import JournalError, LostTickError
-from cavmarl.handoff.coordinator.coordinators import Coordination
+from cavmarl.handoff.coordinator.coordinators import Coordinators
 from cavmarl.handoff.fault_injection.committed_store import COUNTS, CommittedStore
 from cavmarl.handoff.fault_injection.injected_faults import (
     CoordinatorDeath,
@@ -24,7 +24,7 @@ from cavmarl.handoff.fault_injection.injected_faults import (
     ZoneDeath,
     give_up,
 )
-from cavmarl.handoff.fault_injection.message_coordinator import Coordinator
+from cavmarl.handoff.fault_injection.message_coordinator import MessageCoordinator
 from cavmarl.ownership.directory import StoreError
 from cavmarl.shards.shard import Shard
 
@@ -69,8 +69,8 @@ class Recovery:
     def __init__(
         self,
         shards: Sequence[Shard],
-        coordination: Coordination,
-        coordinator: Coordinator,
+        coordination: Coordinators,
+        coordinator: MessageCoordinator,
         store: CommittedStore,
         phases: FaultyPhases,
         crashes: Crashes,

@@ -21,7 +21,7 @@ from numpy.lib.format import descr_to_dtype
 from numpy.typing import NDArray
 
 from cavmarl.core.errors import JournalError
-from cavmarl.handoff.fault_injection.committed_store import COUNTS, Image, Notes
+from cavmarl.handoff.fault_injection.committed_store import COUNTS, CommittedImage, Notes
 from cavmarl.ownership.log_records import record_from_dict, record_to_dict
 from cavmarl.ownership.messages import Birth, Fence, Host, Record, Removed, Reset
 from cavmarl.shards.shard import Commands
@@ -69,7 +69,7 @@ class Reproducer:
     is_last: bool
     commands: Commands
     records: tuple[Record, ...]
-    image: Image
+    image: CommittedImage
 
     def write(self, path: Path) -> None:
         """Write the file, which must not exist.
@@ -163,7 +163,7 @@ def _descr(plain: Any) -> Any:
     return [(name, _descr(inner), *map(tuple, shape)) for name, inner, *shape in plain]
 
 
-def _image_to_plain(image: Image) -> dict[str, Any]:
+def _image_to_plain(image: CommittedImage) -> dict[str, Any]:
     return {
         "counts": [
             dict(zip(COUNTS, (int(array[0]) for array in counts), strict=True))
@@ -176,11 +176,11 @@ def _image_to_plain(image: Image) -> dict[str, Any]:
     }
 
 
-def _image_from_plain(plain: Any) -> Image:
+def _image_from_plain(plain: Any) -> CommittedImage:
     births = tuple(Birth(int(v), int(zone), bytes.fromhex(s)) for v, zone, s in plain["births"])
     gone = tuple(Removed(int(vehicle), int(reason)) for vehicle, reason in plain["gone"])
     notes: Notes = births, gone
-    return Image(
+    return CommittedImage(
         counts=[
             [np.array([counts[name]], dtype=np.int64) for name in COUNTS]
             for counts in plain["counts"]

@@ -14,7 +14,7 @@ from typing import NamedTuple
 from cavmarl.config.env import EnvConfig
 from cavmarl.core.errors import LostTickError, ProtocolError
 from cavmarl.core.numba import kernel_cache_dir
-from cavmarl.handoff.coordinator.coordinator import Referee
+from cavmarl.handoff.coordinator.coordinator import Coordinator
 from cavmarl.handoff.fault_injection.committed_store import CommittedStore
 from cavmarl.handoff.fault_injection.fault_plan import read_faults
 from cavmarl.handoff.fault_injection.reproducer_file import Reproducer, needed_records
@@ -24,10 +24,10 @@ from cavmarl.traffic.demand import DemandFile
 from cavmarl.traffic.sumo.sumo_demand import SumoDemand
 from cavmarl.zones.partition.zone_partition import ZonePartition
 
-__all__ = ["Keeper", "Moment", "made_with", "sources_of"]
+__all__ = ["Keeper", "RecordedTick", "made_with", "sources_of"]
 
 
-class Moment(NamedTuple):
+class RecordedTick(NamedTuple):
     """A tick among all ticks.
 
     Attributes:
@@ -62,14 +62,14 @@ class Keeper:
         config: EnvConfig,
         sources: Mapping[str, str | None],
         store: CommittedStore,
-        coordinator: Referee,
+        coordinator: Coordinator,
     ) -> None:
         self._config = config
         self._sources = sources
         self._store = store
         self._coordinator = coordinator
 
-    def keep(self, error: LostTickError, moment: Moment) -> Path | str:
+    def keep(self, error: LostTickError, moment: RecordedTick) -> Path | str:
         """Write a file from which the tick can be run again.
 
         Args:
@@ -128,7 +128,7 @@ def _portable(config: EnvConfig) -> EnvConfig:
     """The environment with its faults in it, and without monitors."""
     zones = config.zones
     faults = read_faults(zones.faults).to_json() if zones.faults else ""
-    return replace(config, zones=replace(zones, faults=faults, journal="", check=False))
+    return replace(config, zones=replace(zones, faults=faults, journal="", check_invariants=False))
 
 
 def _version(package: str) -> str | None:

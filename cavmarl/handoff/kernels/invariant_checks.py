@@ -33,7 +33,7 @@ __all__ = [
     "KIND_TICK",
     "LOST",
     "TALLY",
-    "Clock",
+    "CheckTime",
     "Kept",
     "Strays",
     "make_kept",
@@ -86,7 +86,7 @@ FINDING = np.dtype(
 )
 
 
-class Clock(NamedTuple):
+class CheckTime(NamedTuple):
     """When a check is made.
 
     Attributes:
@@ -216,7 +216,7 @@ def watch(
     words: NDArray[np.uint64],
     side: int,
     w: int,
-    clock: Clock,
+    clock: CheckTime,
     masks: NDArray[np.uint64],
     factors: NDArray[np.uint64],
     before: Kept,
@@ -304,7 +304,7 @@ def watch(
 def _match(
     before: Kept,
     now: Kept,
-    clock: Clock,
+    clock: CheckTime,
     strays: Strays,
     missing: int,
     moved: int,

@@ -1,4 +1,4 @@
-"""`Tape` records all inputs of some worlds since they were made, for a successor that begins anew.
+"""`ActionLog` records all inputs of some worlds since they were made, for a fresh successor.
 
 A checkpoint log keeps images, and ownership is in none of them: a successor gives each vehicle to
 the zone that it is in. That changes no result, but a journal would tell of it, and a plan of faults
@@ -17,13 +17,13 @@ from numpy.typing import NDArray
 from cavmarl.core.errors import WorkerError
 from cavmarl.shards.shard import Commands
 
-__all__ = ["Entry", "Tape"]
+__all__ = ["ActionLog", "LoggedAction"]
 
 _COMMANDS = ("controls", "meta_actions", "declared")
 _READ_AT_ONCE = 64  # entries
 
 
-class Entry(NamedTuple):
+class LoggedAction(NamedTuple):
     """One order.
 
     Attributes:
@@ -41,7 +41,7 @@ class Entry(NamedTuple):
     commands: Commands
 
 
-class Tape:
+class ActionLog:
     """Entries one behind the other, in memory that outlives its writers.
 
     Args:
@@ -65,7 +65,7 @@ class Tape:
         self._row = np.zeros(1, dtype=np.dtype(fields))
         self._commands = Commands(*(np.zeros_like(getattr(like, name)) for name in _COMMANDS))
 
-    def write(self, number: int, entry: Entry) -> None:
+    def write(self, number: int, entry: LoggedAction) -> None:
         """Put down an entry, in the place of that and all later ones.
 
         Raises:
@@ -85,7 +85,7 @@ class Tape:
                 "make the environment anew now and then, or use workers=0"
             ) from error
 
-    def read(self, count: int) -> Iterator[Entry]:
+    def read(self, count: int) -> Iterator[LoggedAction]:
         """The first so many entries; the commands of one are overwritten by the next."""
         size = self._row.itemsize
         for first in range(0, count, _READ_AT_ONCE):
@@ -96,4 +96,4 @@ class Tape:
                     getattr(self._commands, name)[...] = row[name]
                 seed = int(row["seed"]) if row["has_seed"] else None
                 is_reset, first_world = bool(row["is_reset"]), int(row["first_world"])
-                yield Entry(is_reset, seed, first_world, row["chosen"], self._commands)
+                yield LoggedAction(is_reset, seed, first_world, row["chosen"], self._commands)

@@ -1,4 +1,4 @@
-"""`TapeJob`: what a worker does that runs worlds with a journal or a plan of faults."""
+"""`ActionLogJob`: what a worker does that runs worlds with a journal or a plan of faults."""
 
 from __future__ import annotations
 
@@ -9,14 +9,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cavmarl.handoff.coordinator.journal import Journal
-from cavmarl.parallel.checkpoint.action_log import Entry, Tape
+from cavmarl.parallel.checkpoint.action_log import ActionLog, LoggedAction
 from cavmarl.parallel.local_worlds import LocalWorlds
 from cavmarl.parallel.worlds_job import Task, WorldsJob
 
-__all__ = ["TapeJob"]
+__all__ = ["ActionLogJob"]
 
 
-class TapeJob(WorldsJob):
+class ActionLogJob(WorldsJob):
     """Some of the worlds, next to each other, whose successor begins at their beginning.
 
     They are made where they run, not where workers are forked: a journal belongs to one process.
@@ -27,7 +27,7 @@ class TapeJob(WorldsJob):
         tape: on which is kept what they are told.
     """
 
-    def __init__(self, make: Callable[[], LocalWorlds], first: int, tape: Tape) -> None:
+    def __init__(self, make: Callable[[], LocalWorlds], first: int, tape: ActionLog) -> None:
         self._make = make
         self._first = first
         self._tape = tape
@@ -45,7 +45,7 @@ class TapeJob(WorldsJob):
         first_world = letter["first_world"] if is_reset else 0
         chosen = self._worlds.arrays.chosen
         count = self._count.item()
-        self._tape.write(count, Entry(is_reset, seed, first_world, chosen, self._commands))
+        self._tape.write(count, LoggedAction(is_reset, seed, first_world, chosen, self._commands))
         self._is_there = False
         super().perform(task, letter)
         self._count[0] = count + 1

@@ -1,4 +1,4 @@
-"""`DiaryJob`: the job of a worker that runs some of the worlds and logs checkpoints of them."""
+"""`CheckpointJob`: the job of a worker that runs some worlds and keeps checkpoints of them."""
 
 from __future__ import annotations
 
@@ -9,16 +9,16 @@ from typing import Any
 from numpy.typing import NDArray
 
 from cavmarl.core.errors import SumoError
-from cavmarl.parallel.checkpoint.checkpoint_log import Diary
+from cavmarl.parallel.checkpoint.checkpoint_log import CheckpointLog
 from cavmarl.parallel.local_worlds import LocalWorlds
 from cavmarl.parallel.worlds_job import Task, WorldsJob
 
-__all__ = ["DiaryJob"]
+__all__ = ["CheckpointJob"]
 
 AGAIN_S = 0.04  # a successor goes through no more steps again than take that long
 
 
-class DiaryJob(WorldsJob):
+class CheckpointJob(WorldsJob):
     """Some of the worlds, next to each other.
 
     Args:
@@ -27,7 +27,7 @@ class DiaryJob(WorldsJob):
         diary: the checkpoint log in which they leave their state.
     """
 
-    def __init__(self, worlds: LocalWorlds, first: int, diary: Diary) -> None:
+    def __init__(self, worlds: LocalWorlds, first: int, diary: CheckpointLog) -> None:
         super().__init__(worlds, first)
         self._diary = diary
         self._logs = worlds.keep_logs()

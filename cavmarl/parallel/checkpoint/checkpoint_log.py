@@ -1,4 +1,4 @@
-"""`Diary`: an image of worlds now and then, and what their agents have done since.
+"""`CheckpointLog`: an image of worlds now and then, and what their agents have done since.
 
 An image takes a tenth of a step to write, and of ten thousand vehicles as long as half a tick that
 several workers share. What a step does follows from the state and the actions, so a successor may
@@ -19,7 +19,7 @@ from cavmarl.parallel.processes.state_image import Arrays, Image
 from cavmarl.shards.shard import Commands
 from cavmarl.traffic.sumo.sumo_history import ToldLog
 
-__all__ = ["Diary", "make_segments"]
+__all__ = ["CheckpointLog", "make_segments"]
 
 STEPS = 16  # from one image to the next: a successor repeats that many at most
 _FIRST_IMAGE_BYTES = 1 << 12
@@ -38,7 +38,7 @@ def make_segments(config: EnvConfig, num_worlds: int) -> list[Segment]:
     return [*images, steps, *(Segment.make(FIRST_LOG_BYTES) for _ in range(2 * num_logs))]
 
 
-class Diary:
+class CheckpointLog:
     """What there is in it between two commands is the state of some worlds.
 
     There are two images, each with room for the steps after it: while one is written, the other one

@@ -10,13 +10,13 @@ from numpy.typing import NDArray
 
 from cavmarl.parallel.processes.state_image import Image
 
-__all__ = ["Move", "buffers", "moves_of", "pack", "unpack"]
+__all__ = ["WorldMove", "buffers", "moves_of", "pack", "unpack"]
 
 Array = NDArray[Any]
 Bytes = NDArray[np.uint8]
 
 
-class Move(NamedTuple):
+class WorldMove(NamedTuple):
     """What becomes of the worlds of one host, which follow each other before and after.
 
     Attributes:
@@ -34,7 +34,7 @@ class Move(NamedTuple):
     bytes: int = 0
 
 
-def moves_of(before: Sequence[int], after: Sequence[int]) -> list[Move]:
+def moves_of(before: Sequence[int], after: Sequence[int]) -> list[WorldMove]:
     """What each host keeps, and how many worlds come to it.
 
     Args:
@@ -46,10 +46,12 @@ def moves_of(before: Sequence[int], after: Sequence[int]) -> list[Move]:
         own, wanted = range(*before[k : k + 2]), range(*after[k : k + 2])
         first, last = max(own.start, wanted.start), min(own.stop, wanted.stop)
         if first >= last:  # it keeps none; all that come stand before nothing
-            moves.append(Move(0, 0, len(wanted), len(wanted)))
+            moves.append(WorldMove(0, 0, len(wanted), len(wanted)))
         else:
             coming = len(wanted) - (last - first)
-            moves.append(Move(first - own.start, last - own.start, first - wanted.start, coming))
+            moves.append(
+                WorldMove(first - own.start, last - own.start, first - wanted.start, coming)
+            )
     return moves
 
 

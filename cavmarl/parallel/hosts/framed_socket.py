@@ -1,4 +1,4 @@
-"""`Wire`: frames over a connection.
+"""`FramedSocket`: frames over a connection.
 
 A frame is a head of fixed size, a letter (mostly a few numbers, as the dialect writes them: between
 hosts as JSON) and data (bytes of arrays, which both ends know the shapes of). Nothing in it is ever
@@ -33,8 +33,8 @@ __all__ = [
     "VERSION",
     "Dialect",
     "Frame",
+    "FramedSocket",
     "Kind",
-    "Wire",
 ]
 
 Array = NDArray[Any]
@@ -118,7 +118,7 @@ class Frame(NamedTuple):
     checksum: int
 
 
-class Wire:
+class FramedSocket:
     """One end of a connection; everything blocks, at most as long as the socket's timeout.
 
     Args:

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from cavmarl.core.errors import WorkerFailureError
 
-__all__ = ["Arrays", "HostProgram", "OpenOrder", "Say", "Truth"]
+__all__ = ["Arrays", "CommittedState", "HostProgram", "OpenOrder", "Say"]
 
 Array = NDArray[Any]
 Arrays = Sequence[Array]
@@ -74,7 +74,7 @@ class OpenOrder:
 
 
 @dataclass
-class Truth:
+class CommittedState:
     """What is committed of one part.
 
     Attributes:
@@ -87,11 +87,13 @@ class Truth:
     image: Array = field(default_factory=lambda: np.zeros(0, dtype=np.uint8))
     since: list[Array] = field(default_factory=list)
 
-    def after(self, order: OpenOrder, part: int) -> Truth:
+    def after(self, order: OpenOrder, part: int) -> CommittedState:
         """What is committed of a part once a command has been carried out."""
         if order.saves:
-            return Truth(order.sizes[part], order.images[part])
-        return Truth(self.size, self.image, [*self.since, _bytes_of(order.say(part, True)[1])])
+            return CommittedState(order.sizes[part], order.images[part])
+        return CommittedState(
+            self.size, self.image, [*self.since, _bytes_of(order.say(part, True)[1])]
+        )
 
 
 def _bytes_of(arrays: Arrays) -> Array:

@@ -26,9 +26,15 @@ from cavmarl.core.errors import (
     WorkerFailureError,
 )
 from cavmarl.parallel.hosts.framed_socket import Frame, Kind
-from cavmarl.parallel.hosts.host_commands import Arrays, HostProgram, OpenOrder, Say, Truth
+from cavmarl.parallel.hosts.host_commands import Arrays, CommittedState, HostProgram, OpenOrder, Say
 from cavmarl.parallel.hosts.host_process import Order
-from cavmarl.parallel.hosts.host_registry import ENDED, SILENCE_S, Company, Host, Launcher
+from cavmarl.parallel.hosts.host_registry import (
+    ENDED,
+    SILENCE_S,
+    HostConnection,
+    HostRegistry,
+    Launcher,
+)
 from cavmarl.parallel.processes.watchdog import CHECK_S
 from cavmarl.parallel.processes.worker_loop import NOTHING
 from cavmarl.parallel.processes.worker_pool import Death
@@ -66,11 +72,11 @@ class HostPool:
         self._repeats = repeats
         self._all = tuple(range(len(program.parts)))
         self._names = program.parts
-        self._truths = [Truth(size) for size in program.sizes]
-        self._hosts: dict[int, Host] = {}
+        self._truths = [CommittedState(size) for size in program.sizes]
+        self._hosts: dict[int, HostConnection] = {}
         self._number = 0
         self._open: OpenOrder | None = None
-        self._company = Company(launcher, program.code)
+        self._company = HostRegistry(launcher, program.code)
         self._finalizer = weakref.finalize(self, self._company.close)
         try:
             self._await_first()
@@ -241,14 +247,14 @@ class HostPool:
                 next_s = time.monotonic() + CHECK_S
                 self._check(order)
 
-    def _look(self) -> list[Host]:
+    def _look(self) -> list[HostConnection]:
         try:
             return self._company.look(CHECK_S)
         except WorkerError:
             self.close()
             raise
 
-    def _choose(self, part: int) -> Host:
+    def _choose(self, part: int) -> HostConnection:
         """A host that is free; the one that was started for the part, if it is there."""
         free = self._company.free
         host = min(free, key=lambda one: (one.number != part, one.number))
@@ -256,7 +262,7 @@ class HostPool:
         self._hosts[part] = host
         return host
 
-    def _give(self, order: OpenOrder, k: int, host: Host) -> None:
+    def _give(self, order: OpenOrder, k: int, host: HostConnection) -> None:
         """Give a host the command, and what is committed if it does not know it."""
         program, truth = self._program, self._truths[k]
         is_behind = not host.knows and order.task != NOTHING
@@ -280,7 +286,7 @@ class HostPool:
             if death.worker == k and isnan(death.replaced_s):
                 death.replaced_s = host.given_s
 
-    def _hear(self, order: OpenOrder, host: Host) -> None:
+    def _hear(self, order: OpenOrder, host: HostConnection) -> None:
         k = host.part
         try:
             frame = host.wire.receive()
@@ -298,7 +304,7 @@ class HostPool:
             else:
                 self._company.mute(host)  # it is missed with the next order
 
-    def _take(self, order: OpenOrder, k: int, host: Host, frame: Frame) -> None:
+    def _take(self, order: OpenOrder, k: int, host: HostConnection, frame: Frame) -> None:
         answer, saved = frame.letter["answer"], np.empty(frame.letter["image"], dtype=np.uint8)
         host.wire.take([*order.outputs(k, answer), saved])
         order.answers[k], order.images[k] = answer, saved

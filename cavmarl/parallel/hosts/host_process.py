@@ -14,13 +14,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cavmarl.core.errors import MessageError
-from cavmarl.parallel.hosts.framed_socket import Frame, Kind, Wire
+from cavmarl.parallel.hosts.framed_socket import Frame, FramedSocket, Kind
 from cavmarl.parallel.hosts.listener import knock
 from cavmarl.parallel.processes.shared_memory import Segment
 from cavmarl.parallel.processes.state_image import Image, load_kernels
 from cavmarl.parallel.processes.worker_loop import NOTHING, OUT_OF_MEMORY, describe
 
-__all__ = ["BEAT_S", "Order", "Outcome", "RemoteJob", "serve"]
+__all__ = ["BEAT_S", "Order", "RemoteJob", "TaskOutcome", "serve"]
 
 Array = NDArray[Any]
 
@@ -50,7 +50,7 @@ class Order(NamedTuple):
     saves: bool
 
 
-class Outcome(NamedTuple):
+class TaskOutcome(NamedTuple):
     """What comes out of a task.
 
     Attributes:
@@ -78,7 +78,7 @@ class RemoteJob(Protocol):
         """Arrays that a command of this task fills, as many as its payload says."""
         ...
 
-    def perform(self, task: int, letter: Any) -> Outcome: ...
+    def perform(self, task: int, letter: Any) -> TaskOutcome: ...
 
     def save(self) -> Sequence[Array]:
         """All that another host needs to go on from here."""
@@ -169,7 +169,7 @@ class _Line:
         wire: to the caller.
     """
 
-    def __init__(self, wire: Wire) -> None:
+    def __init__(self, wire: FramedSocket) -> None:
         self._wire = wire
         self._lock = threading.Lock()
         self._order = -1  # that is being carried out

@@ -1,4 +1,4 @@
-"""`Company` keeps the hosts of a run, from their connection to their end."""
+"""`HostRegistry` keeps the hosts of a run, from their connection to their end."""
 
 from __future__ import annotations
 
@@ -10,10 +10,10 @@ from dataclasses import dataclass
 from typing import Protocol
 
 from cavmarl.core.errors import MessageError, WorkerError, WorkerFailureError
-from cavmarl.parallel.hosts.framed_socket import Kind, Wire
-from cavmarl.parallel.hosts.listener import MAX_GUESTS, Door, Guest
+from cavmarl.parallel.hosts.framed_socket import FramedSocket, Kind
+from cavmarl.parallel.hosts.listener import MAX_GUESTS, Listener, PendingConnection
 
-__all__ = ["ENDED", "SILENCE_S", "Company", "Host", "Launcher"]
+__all__ = ["ENDED", "SILENCE_S", "HostConnection", "HostRegistry", "Launcher"]
 
 ENDED = (EOFError, ConnectionError)  # of a connection, as it does when the process at its end dies
 
@@ -49,7 +49,7 @@ class Launcher(Protocol):
 
 
 @dataclass
-class Host:
+class HostConnection:
     """One host.
 
     Attributes:
@@ -65,7 +65,7 @@ class Host:
         heard_s: when something was heard of it.
     """
 
-    wire: Wire
+    wire: FramedSocket
     number: int
     pid: int = 0
     machine: str = ""
@@ -80,7 +80,7 @@ class Host:
         return f"host {self.number} on {self.machine or 'its machine'}"
 
 
-class Company:
+class HostRegistry:
     """Lets hosts in and watches all connections at once.
 
     Args:
@@ -95,12 +95,12 @@ class Company:
     """
 
     def __init__(self, launcher: Launcher, code: str) -> None:
-        self.free: list[Host] = []
+        self.free: list[HostConnection] = []
         self._launcher = launcher
         self._code = code
-        self._hosts: dict[int, Host] = {}
-        self._guests: list[Guest] = []
-        self._door = Door(launcher.address)
+        self._hosts: dict[int, HostConnection] = {}
+        self._guests: list[PendingConnection] = []
+        self._door = Listener(launcher.address)
         self._selector = selectors.DefaultSelector()
         self._selector.register(self._door, selectors.EVENT_READ, self._door)
         try:
@@ -109,7 +109,7 @@ class Company:
             self.close()
             raise
 
-    def look(self, wait_s: float) -> list[Host]:
+    def look(self, wait_s: float) -> list[HostConnection]:
         """Wait until something has happened.
 
         Args:
@@ -122,23 +122,23 @@ class Company:
             WorkerFailureError: an exception in one before it was ready.
             WorkerError: one is of another version.
         """
-        speaking: list[Host] = []
+        speaking: list[HostConnection] = []
         for key, _ in self._selector.select(wait_s):
             match key.data:
-                case Door():
+                case Listener():
                     self._welcome()
-                case Guest():
+                case PendingConnection():
                     self._listen(key.data)
-                case Host() as host if host.part >= 0:
+                case HostConnection() as host if host.part >= 0:
                     speaking.append(host)
-                case Host() as host:
+                case HostConnection() as host:
                     self._wake(host)
         now = time.monotonic()
         for guest in [guest for guest in self._guests if guest.until_s < now]:
             self._show_out(guest)
         return speaking
 
-    def drop(self, host: Host, restart: bool) -> None:
+    def drop(self, host: HostConnection, restart: bool) -> None:
         """Forget a host.
 
         Args:
@@ -154,7 +154,7 @@ class Company:
         if restart:
             self._launcher.restart(host.number)
 
-    def mute(self, host: Host) -> None:
+    def mute(self, host: HostConnection) -> None:
         """Hear no more of a host whose connection has ended."""
         with suppress(KeyError):
             self._selector.unregister(host.wire)
@@ -178,7 +178,7 @@ class Company:
             self._guests.append(guest)
             self._selector.register(guest, selectors.EVENT_READ, guest)
 
-    def _listen(self, guest: Guest) -> None:
+    def _listen(self, guest: PendingConnection) -> None:
         try:
             connection = guest.listen()
         except (EOFError, OSError, MessageError):  # a stranger: ignored
@@ -189,7 +189,7 @@ class Company:
             self._selector.unregister(guest)
             self._admit(connection, guest.number)
 
-    def _show_out(self, guest: Guest) -> None:
+    def _show_out(self, guest: PendingConnection) -> None:
         self._guests.remove(guest)
         self._selector.unregister(guest)
         guest.close()
@@ -198,10 +198,10 @@ class Company:
         if number in self._hosts and self._hosts[number].part < 0:
             self.drop(self._hosts[number], restart=False)
         connection.settimeout(SILENCE_S)
-        host = self._hosts[number] = Host(Wire(connection), number)
+        host = self._hosts[number] = HostConnection(FramedSocket(connection), number)
         self._selector.register(host.wire, selectors.EVENT_READ, host)
 
-    def _wake(self, host: Host) -> None:
+    def _wake(self, host: HostConnection) -> None:
         """Hear of a host without a part whether it is ready, or has ended."""
         try:
             frame = host.wire.receive()

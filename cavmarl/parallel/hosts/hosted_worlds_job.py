@@ -17,8 +17,8 @@ from cavmarl.config.env import EnvConfig
 from cavmarl.core.errors import WorkerError
 from cavmarl.core.extensions import load_extensions
 from cavmarl.engine.world_setup import make_world
-from cavmarl.parallel.checkpoint.world_states import Move, buffers, pack, unpack
-from cavmarl.parallel.hosts.host_process import Outcome, serve
+from cavmarl.parallel.checkpoint.world_states import WorldMove, buffers, pack, unpack
+from cavmarl.parallel.hosts.host_process import TaskOutcome, serve
 from cavmarl.parallel.local_worlds import LocalWorlds
 from cavmarl.parallel.processes.shared_memory import Segment
 from cavmarl.parallel.processes.state_image import Image
@@ -141,28 +141,28 @@ class HostedWorlds:
     def inputs(self, task: int, letter: Any) -> list[Array]:
         """Arrays that a command of this task fills."""
         if task == Task.UNPACK:
-            move = Move(*letter)
+            move = WorldMove(*letter)
             self._coming = buffers(move.coming, move.bytes)
             return [*self._coming]
         return inputs_of(task, self._worlds.arrays)
 
-    def perform(self, task: int, letter: Any) -> Outcome:
+    def perform(self, task: int, letter: Any) -> TaskOutcome:
         """Do a task.
 
         The answer to a step is in which worlds something ended; to PACK, how many worlds leave, and
         the bytes of their cases.
         """
         if task == Task.PACK:
-            return self._pack(Move(*letter))
+            return self._pack(WorldMove(*letter))
         if task == Task.UNPACK:
-            self._unpack(Move(*letter))
-            return Outcome(None, ())
+            self._unpack(WorldMove(*letter))
+            return TaskOutcome(None, ())
         if task == Task.STEP:
             return self._step()
         answer = self._job.perform(task, letter)
-        return Outcome(answer, results_of(task, self._worlds.arrays, answer))
+        return TaskOutcome(answer, results_of(task, self._worlds.arrays, answer))
 
-    def _step(self) -> Outcome:
+    def _step(self) -> TaskOutcome:
         arrays, spent_s = self._worlds.arrays, []
         if self._measures:
             spent_s.append(self._job.timed_step())
@@ -170,16 +170,16 @@ class HostedWorlds:
             self._job.perform(Task.STEP, None)
         ended = arrays.episode_over | arrays.terminations.any(axis=1)
         answer = np.flatnonzero(ended).tolist() or None
-        return Outcome(answer, [*results_of(Task.STEP, arrays, answer), *spent_s])
+        return TaskOutcome(answer, [*results_of(Task.STEP, arrays, answer), *spent_s])
 
-    def _pack(self, move: Move) -> Outcome:
+    def _pack(self, move: WorldMove) -> TaskOutcome:
         """The cases of all worlds that it does not keep."""
         kept = range(move.first, move.last)
         leaving = [w for w in range(len(self._worlds.arrays.mask)) if w not in kept]
         sizes, content = pack(self._case, [self._share_of(w) for w in leaving])
-        return Outcome([len(sizes), content.size], [sizes, content])
+        return TaskOutcome([len(sizes), content.size], [sizes, content])
 
-    def _unpack(self, move: Move) -> None:
+    def _unpack(self, move: WorldMove) -> None:
         """Go on with what it keeps and what has come."""
         kept = range(move.first, move.last)
         if not move.coming and len(kept) == len(self._worlds.arrays.mask):

@@ -18,9 +18,9 @@ import struct
 import time
 
 from cavmarl.core.errors import MessageError, WorkerError
-from cavmarl.parallel.hosts.framed_socket import MAGIC, VERSION, Wire
+from cavmarl.parallel.hosts.framed_socket import MAGIC, VERSION, FramedSocket
 
-__all__ = ["MAX_GUESTS", "Door", "Guest", "knock"]
+__all__ = ["MAX_GUESTS", "Listener", "PendingConnection", "knock"]
 
 NONCE = 16  # bytes of a random number
 PROOF = 32  # of an HMAC
@@ -31,7 +31,7 @@ MAX_GUESTS = 64  # not authenticated yet
 _HELLO = struct.Struct(f"<4sHI{NONCE}s")
 
 
-class Guest:
+class PendingConnection:
     """A caller that has not proved its identity yet.
 
     Args:
@@ -96,7 +96,7 @@ class Guest:
         self._socket.sendall(ours + _proof(self._secret, b"caller", hello + ours))
 
 
-class Door:
+class Listener:
     """Listens.
 
     Args:
@@ -123,19 +123,19 @@ class Door:
         """The socket's descriptor."""
         return self._listener.fileno()
 
-    def open(self) -> Guest | None:
+    def open(self) -> PendingConnection | None:
         """Accept a caller; None: it is gone already."""
         try:
             connection, _ = self._listener.accept()
         except OSError:
             return None
-        return Guest(connection, self.secret)
+        return PendingConnection(connection, self.secret)
 
     def close(self) -> None:
         self._listener.close()
 
 
-def knock(place: tuple[str, int], secret: bytes, number: int) -> Wire:
+def knock(place: tuple[str, int], secret: bytes, number: int) -> FramedSocket:
     """Call as a host; the caller may be busy for long before it answers.
 
     Args:
@@ -166,7 +166,7 @@ def knock(place: tuple[str, int], secret: bytes, number: int) -> Wire:
     except BaseException:
         connection.close()
         raise
-    return Wire(connection)
+    return FramedSocket(connection)
 
 
 def _proof(secret: bytes, who: bytes, said: bytes) -> bytes:

@@ -18,7 +18,7 @@ from cavmarl.core.extensions import extension_modules
 from cavmarl.engine.compilation import compiled_before
 from cavmarl.engine.simulation import Simulation
 from cavmarl.engine.world_setup import World
-from cavmarl.parallel.checkpoint.world_states import Move, buffers, moves_of
+from cavmarl.parallel.checkpoint.world_states import WorldMove, buffers, moves_of
 from cavmarl.parallel.commanded_worlds import OrderedWorlds, own_error
 from cavmarl.parallel.hosts.host_commands import Arrays, HostProgram
 from cavmarl.parallel.hosts.host_pool import HostPool
@@ -28,7 +28,7 @@ from cavmarl.parallel.journaled_worlds import refuse_watched
 from cavmarl.parallel.mover import Mover
 from cavmarl.parallel.processes.worker_pool import Death
 from cavmarl.parallel.step_arrays import StepArrays, layout_of
-from cavmarl.parallel.step_placement import Placement
+from cavmarl.parallel.step_placement import StepPlacement
 from cavmarl.parallel.work_shares import Part, parts_of
 from cavmarl.parallel.worlds_job import Task, fingerprint
 
@@ -76,9 +76,9 @@ class RemoteWorlds(OrderedWorlds):
         refuse_watched(
             config.zones, "of worlds on hosts", "run them on this machine; leave out hosts"
         )
-        if config.workers.watch:
+        if config.workers.monitor_cpu:
             raise ConfigError(
-                "workers.watch = True, hosts = 'ray': only this machine is looked at; leave it out "
+                "workers.monitor_cpu = True, hosts = 'ray': sees one machine; leave it out "
                 "(Ray tells what is reserved on each node), or leave out the hosts"
             )
         if config.workers.sensors:
@@ -103,7 +103,7 @@ class RemoteWorlds(OrderedWorlds):
             return json.dumps({**recipe, "size": -(-num_worlds // count)})
 
         actors = RayActors(host_worlds, told, workers, num_worlds)
-        self.placement = Placement(world, num_worlds, actors.workers)
+        self.placement = StepPlacement(world, num_worlds, actors.workers)
         parts = parts_of(self.placement.plans, world.partition.count)
         self._spent_s = np.zeros((num_worlds, 1))
         if config.workers.balance_steps and actors.workers > 1:
@@ -117,7 +117,9 @@ class RemoteWorlds(OrderedWorlds):
             code_stamp(),
         )
         try:
-            self.pool = HostPool(actors, program, config.workers.timeout_s, config.workers.repeats)
+            self.pool = HostPool(
+                actors, program, config.workers.timeout_s, config.workers.max_retries
+            )
         except WorkerFailureError as failure:
             raise own_error(failure) from failure
         self._cases: dict[int, Array] = {}  # worlds that are on their way
@@ -200,7 +202,7 @@ class RemoteWorlds(OrderedWorlds):
 
     def _unpack(self, bounds: Sequence[int]) -> None:
         """Let hosts go on with the worlds that are theirs from now on."""
-        moves: list[Move] = []
+        moves: list[WorldMove] = []
         inputs: list[Arrays] = []
         for k, move in enumerate(moves_of(self._bounds, bounds)):
             own = range(*self._bounds[k : k + 2])

@@ -20,7 +20,7 @@ from cavmarl.core.errors import WorkerDeathError, WorkerError, WorkerFailureErro
 from cavmarl.parallel.processes.process_barrier import LONG_WORK_S
 from cavmarl.parallel.processes.watchdog import CHECK_S, Watchdog, processor_s
 from cavmarl.parallel.processes.worker_loop import FAILED, MAIL, MAX_MESSAGE, NOTHING, TASK
-from cavmarl.parallel.processes.worker_processes import Crew, Program
+from cavmarl.parallel.processes.worker_processes import Program, WorkerProcesses
 from cavmarl.parallel.team.team import LeftAloneError
 
 __all__ = ["Death", "Pool", "Program"]
@@ -76,7 +76,7 @@ class Pool:
         self._stale = [False] * len(program.parts)  # whose memory is not what is committed
         self._ordered_s = 0.0
         self._lasted: dict[int, float] = {}  # how long each task has taken the last time, s
-        self._crew = Crew(program)
+        self._crew = WorkerProcesses(program)
         self._finalizer = weakref.finalize(self, self._crew.release)
 
     @property
@@ -270,7 +270,7 @@ class _Guard:
         since_s: when they were given their command, by `time.monotonic`.
     """
 
-    def __init__(self, crew: Crew, timeout_s: float, since_s: float) -> None:
+    def __init__(self, crew: WorkerProcesses, timeout_s: float, since_s: float) -> None:
         self._crew = crew
         self._timeout_s = timeout_s
         self._watchdogs: dict[int, Watchdog] = {}

@@ -1,4 +1,4 @@
-"""`Crew` starts and replaces a pool's processes, one a worker, and exchanges words with them."""
+"""`WorkerProcesses` starts and replaces a pool's processes, and sends them commands."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from cavmarl.parallel.processes.process_barrier import (
 from cavmarl.parallel.processes.shared_memory import Segment
 from cavmarl.parallel.processes.worker_loop import ANSWER, CORE, LOADS, OUT_OF_MEMORY, SILENT, TASK
 
-__all__ = ["Crew", "Program"]
+__all__ = ["Program", "WorkerProcesses"]
 
 _LINE_BYTES = WORDS * 8
 _FIRST_IMAGE_BYTES = 1 << 12
@@ -59,7 +59,7 @@ class Program(NamedTuple):
         return next((team for team in self.teams if worker in team), (worker,))
 
 
-class Crew:
+class WorkerProcesses:
     """m worker processes and the one that forks them.
 
     Args:

@@ -1,4 +1,4 @@
-"""`SensorFarm` runs sensor workers for the worlds of this process, which keeps their state."""
+"""`SensorWorkers` runs sensor workers for the worlds of this process, which keeps their state."""
 
 from __future__ import annotations
 
@@ -27,16 +27,16 @@ from cavmarl.parallel.sensor_workers.sensor_shares import (
     share_in_turn,
 )
 from cavmarl.sensors.kernels.sensor_share import gather_rows
-from cavmarl.sensors.mounted.mounted_sensor import Scene
+from cavmarl.sensors.mounted.mounted_sensor import SensedScene
 from cavmarl.sensors.mounted.sensor_rig import Turn, sense_here
 
-__all__ = ["FarmPlan", "FarmTimes", "SensorFarm"]
+__all__ = ["SensorWorkerPlan", "SensorWorkerTimes", "SensorWorkers"]
 
 SHARED_ANEW = 32  # ticks from one sharing out to the next; at first 1, 2, 4, … until there are more
 NEW_COST = 0.5  # weight of the latest costs from then on; what is first measured is of cold caches
 
 
-class FarmPlan(NamedTuple):
+class SensorWorkerPlan(NamedTuple):
     """What processes are made of.
 
     Attributes:
@@ -57,7 +57,7 @@ class FarmPlan(NamedTuple):
 
 
 @dataclass
-class FarmTimes:
+class SensorWorkerTimes:
     """Sums over all ticks in which sensors were due.
 
     Attributes:
@@ -80,9 +80,9 @@ class FarmTimes:
     got_bytes: int = 0
     messages: int = 0
 
-    def since(self, before: FarmTimes) -> FarmTimes:
+    def since(self, before: SensorWorkerTimes) -> SensorWorkerTimes:
         """What has come to it since it was a copy of `before`."""
-        return FarmTimes(
+        return SensorWorkerTimes(
             *(getattr(self, field.name) - getattr(before, field.name) for field in fields(self))
         )
 
@@ -126,7 +126,7 @@ class _Sharing:
         self.agents = 0
 
 
-class SensorFarm:
+class SensorWorkers:
     """n sensor workers; it lets them sense as `rig.Sense` describes.
 
     It starts them when it is called for the first time, so it may be made before a fork. A call
@@ -143,8 +143,8 @@ class SensorFarm:
 
     shared: SceneArrays
 
-    def __init__(self, plan: FarmPlan) -> None:
-        self.times = FarmTimes()
+    def __init__(self, plan: SensorWorkerPlan) -> None:
+        self.times = SensorWorkerTimes()
         self._plan = plan
         self._pool: Pool | None = None
         self._unused = weakref.finalize(self, plan.frames.close)
@@ -169,7 +169,7 @@ class SensorFarm:
         """(S,) processor time of one agent's frame of each sensor, as it is of late."""
         return self._costs_s.copy()
 
-    def __call__(self, scenes: Sequence[Scene], turns: Sequence[Turn]) -> None:
+    def __call__(self, scenes: Sequence[SensedScene], turns: Sequence[Turn]) -> None:
         """Write the samples of all turns.
 
         Raises:
@@ -214,9 +214,9 @@ class SensorFarm:
         names = tuple(f"sensor worker {k}" for k in range(plan.shape.workers))
         tasks = tuple(task.name.lower() for task in SensorTask)
         program = Program(plan.module, recipe, names, (scene, plan.frames), tasks, plan.workers.pin)
-        return Pool(program, plan.workers.timeout_s, plan.workers.repeats)
+        return Pool(program, plan.workers.timeout_s, plan.workers.max_retries)
 
-    def _publish(self, scenes: Sequence[Scene], turns: Sequence[Turn]) -> None:
+    def _publish(self, scenes: Sequence[SensedScene], turns: Sequence[Turn]) -> None:
         """Write down what there is to see; the rows of all zones, each once."""
         shared, worlds = self.shared, scenes[0].worlds
         shared.num_rows[:] = 0

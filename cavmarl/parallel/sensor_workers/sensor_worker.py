@@ -1,4 +1,4 @@
-"""The program of sensor workers; `SensorFarm` starts it."""
+"""The program of sensor workers; `SensorWorkers` starts it."""
 
 from __future__ import annotations
 

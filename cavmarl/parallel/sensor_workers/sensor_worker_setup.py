@@ -16,7 +16,7 @@ from cavmarl.parallel.local_worlds import LocalWorlds
 from cavmarl.parallel.processes.process_barrier import usable_cores
 from cavmarl.parallel.processes.shared_memory import Segment, arrays_in, size_of
 from cavmarl.parallel.sensor_workers.sensor_job import SensorJob
-from cavmarl.parallel.sensor_workers.sensor_pool import FarmPlan, SensorFarm
+from cavmarl.parallel.sensor_workers.sensor_pool import SensorWorkerPlan, SensorWorkers
 from cavmarl.parallel.sensor_workers.sensor_scene import SceneArrays, SceneShape
 from cavmarl.parallel.step_arrays import StepArrays, layout_of
 from cavmarl.sensors.mounted.catalogue import type_of
@@ -66,7 +66,7 @@ def warn_if_crowded(sensor_workers: int, times: int) -> None:
 
 def farm_of(
     world: World, base_dir: Path, arrays: Segment, part: tuple[int, int], num_worlds: int
-) -> SensorFarm:
+) -> SensorWorkers:
     """The sensor workers of some worlds, to be started when they are needed.
 
     Args:
@@ -94,7 +94,7 @@ def farm_of(
         "num_worlds": num_worlds,
     }
     lines = tuple(type_of(name, sensor).num_lines(sensor) for name, sensor in config.rig.items())
-    return SensorFarm(FarmPlan(PROGRAM, recipe, arrays, shape, lines, config.workers))
+    return SensorWorkers(SensorWorkerPlan(PROGRAM, recipe, arrays, shape, lines, config.workers))
 
 
 def make_sensor_jobs(recipe: Mapping[str, Any]) -> list[SensorJob]:

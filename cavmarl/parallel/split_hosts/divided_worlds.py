@@ -29,7 +29,7 @@ from cavmarl.parallel.mover import Mover
 from cavmarl.parallel.processes.worker_pool import Death
 from cavmarl.parallel.split_hosts.zone_leader import ZoneLeader
 from cavmarl.parallel.split_hosts.zones_job import host_zones, make_replicated
-from cavmarl.parallel.step_placement import Placement
+from cavmarl.parallel.step_placement import StepPlacement
 from cavmarl.parallel.work_shares import Part, parts_of
 from cavmarl.parallel.worlds_job import Task, fingerprint
 from cavmarl.shards.shard import Commands, Shard
@@ -77,7 +77,7 @@ class DividedWorlds:
         config = world.config
         self.world = world
         self.in_next_step = in_next_step
-        self.placement = Placement(world, 1, workers)
+        self.placement = StepPlacement(world, 1, workers)
         (part,) = parts_of(self.placement.plans, world.partition.count)
         self._worlds, memory, inputs = make_replicated(world, num_worlds, in_next_step, warm=True)
         self.arrays = self._worlds.arrays
@@ -107,7 +107,9 @@ class DividedWorlds:
         actors = RayActors(host_zones, lambda count: json.dumps(recipe), workers, workers)
         program = HostProgram(_names(part), (1,) * workers, ("phase",), -1, code_stamp())
         try:
-            self.pool = HostPool(actors, program, config.workers.timeout_s, config.workers.repeats)
+            self.pool = HostPool(
+                actors, program, config.workers.timeout_s, config.workers.max_retries
+            )
         except WorkerFailureError as failure:
             raise own_error(failure) from failure
         self.leader.let_work(self.pool)
@@ -232,9 +234,9 @@ def _check(world: World, num_worlds: int, workers: int) -> None:
             "more hosts than worlds run the same zones of all worlds, so at most as many as zones; "
             "use fewer workers, more zones or more worlds"
         )
-    if config.workers.watch:
+    if config.workers.monitor_cpu:
         raise ConfigError(
-            "workers.watch = True, hosts = 'ray': only this machine is looked at; leave it out "
+            "workers.monitor_cpu = True, hosts = 'ray': sees one machine; leave it out "
             "(Ray tells what is reserved on each node), or leave out the hosts"
         )
     if config.workers.sensors:

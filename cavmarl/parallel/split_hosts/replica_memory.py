@@ -1,6 +1,7 @@
 """`ReplicaMemory`: arrays at the same places in processes on different machines.
 
-Each process makes the same arrays in the same order. A `Replica` stands for one process at the
+Each process makes the same arrays in the same order. A `MemoryReplica` stands for one process at
+the
 other end: what it knows of this memory, what is to be sent, and what has come (`kernels.replicas`).
 """
 
@@ -25,7 +26,7 @@ from cavmarl.parallel.kernels.replica_copies import (
     take_changes,
 )
 
-__all__ = ["Place", "Replica", "ReplicaMemory", "Spans"]
+__all__ = ["MemoryReplica", "Place", "ReplicaMemory", "Spans"]
 
 Array = NDArray[Any]
 Words = NDArray[np.uint64]
@@ -140,7 +141,7 @@ def _address(array: Array) -> int:
     return int(array.__array_interface__["data"][0])
 
 
-class Replica:
+class MemoryReplica:
     """What one other process knows of a memory.
 
     Args:

@@ -10,10 +10,10 @@ from numpy.typing import NDArray
 
 from cavmarl.parallel.hosts.host_commands import Arrays
 from cavmarl.parallel.hosts.host_pool import HostPool
-from cavmarl.parallel.split_hosts.replica_memory import Replica, ReplicaMemory
+from cavmarl.parallel.split_hosts.replica_memory import MemoryReplica, ReplicaMemory
 from cavmarl.parallel.split_hosts.zone_phases import PhaseInputs, ZonePhase, ZonePhases, ZoneTurn
 from cavmarl.parallel.split_hosts.zones_job import PhaseOrder
-from cavmarl.sensors.mounted.mounted_sensor import Scene
+from cavmarl.sensors.mounted.mounted_sensor import SensedScene
 from cavmarl.sensors.mounted.sensor_rig import Turn, sense_here
 from cavmarl.shards.executor import Phase
 from cavmarl.shards.shard import Commands, Shard
@@ -55,7 +55,7 @@ class ZoneLeader:
         self._phases = ZonePhases(shards, memory, inputs)
         self._inputs = inputs
         self._spent_s = spent_s
-        self._replicas = [Replica(memory, self._phases.pieces) for _ in zones]
+        self._replicas = [MemoryReplica(memory, self._phases.pieces) for _ in zones]
         self._room: list[Words] = [np.zeros(0, dtype=np.uint64) for _ in zones]
         self._coming = list(self._room)
         self._begins_step = False
@@ -103,7 +103,7 @@ class ZoneLeader:
     def meet(self) -> None:
         """Nothing to wait for: each phase ends when all hosts have answered."""
 
-    def sense(self, scenes: Sequence[Scene], turns: Sequence[Turn]) -> None:
+    def sense(self, scenes: Sequence[SensedScene], turns: Sequence[Turn]) -> None:
         """Let hosts sense for the rigs of their agents; see `rig.Sense`."""
         inputs = self._inputs
         theirs = [turn for turn in turns if not turn.sensor.stamps_itself]

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from cavmarl.core.numba.repeated import repeated
 from cavmarl.core.records.arrays import Common
 from cavmarl.parallel.kernels.replica_copies import mark_agents
-from cavmarl.parallel.split_hosts.replica_memory import Place, Replica, ReplicaMemory
+from cavmarl.parallel.split_hosts.replica_memory import MemoryReplica, Place, ReplicaMemory
 from cavmarl.sensors.kernels.rig_frames import POSE
 from cavmarl.sensors.kernels.rig_schedule import Due
 from cavmarl.sensors.mounted.frames import Frames
@@ -199,7 +199,7 @@ class ZonePhases:
                     if some.any():  # memory that is never written is never taken
                         some[:] = 0
 
-    def note_inputs(self, replica: Replica, turn: ZoneTurn) -> None:
+    def note_inputs(self, replica: MemoryReplica, turn: ZoneTurn) -> None:
         """Note what has changed of what a host reads and writes."""
         zoned, zones, phase = self._zoned, turn.zones, turn.phase
         replica.begin()
@@ -212,7 +212,7 @@ class ZonePhases:
                 replica.note_rows(*self._rows[turn.next_side], zones, zoned.num_owned)
         self._note_agents(replica, turn)
 
-    def note_results(self, replica: Replica, turn: ZoneTurn) -> None:
+    def note_results(self, replica: MemoryReplica, turn: ZoneTurn) -> None:
         """Note what has changed of what a host writes; called there."""
         zoned, zones, phase = self._zoned, turn.zones, turn.phase
         replica.begin()
@@ -225,7 +225,7 @@ class ZonePhases:
                 replica.note_rows(*self._rows[turn.side], zones, zoned.num_owned)
         self._note_agents(replica, turn)
 
-    def _note_agents(self, replica: Replica, turn: ZoneTurn) -> None:
+    def _note_agents(self, replica: MemoryReplica, turn: ZoneTurn) -> None:
         """Note what has changed of the agents that the zones own."""
         arrays = self._of_agents.get(turn.phase, [])
         if turn.phase == ZonePhase.MOUNTED:

@@ -16,11 +16,11 @@ from cavmarl.config.env import EnvConfig
 from cavmarl.core.errors import WorkerError
 from cavmarl.core.extensions import load_extensions
 from cavmarl.engine.world_setup import World, make_world
-from cavmarl.parallel.hosts.host_process import Outcome, serve
+from cavmarl.parallel.hosts.host_process import TaskOutcome, serve
 from cavmarl.parallel.hosts.hosted_worlds_job import code_stamp
 from cavmarl.parallel.journaled_worlds import unwatched
 from cavmarl.parallel.local_worlds import LocalWorlds
-from cavmarl.parallel.split_hosts.replica_memory import Replica, ReplicaMemory
+from cavmarl.parallel.split_hosts.replica_memory import MemoryReplica, ReplicaMemory
 from cavmarl.parallel.split_hosts.zone_phases import PhaseInputs, ZonePhase, ZonePhases, ZoneTurn
 from cavmarl.parallel.step_arrays import StepArrays, layout_of
 from cavmarl.parallel.team.hosted_zones import HostedZones
@@ -120,7 +120,7 @@ class ZonesJob:
         shards = simulation.shards
         self._mounted = simulation.mounted
         self._phases = ZonePhases(shards, memory, self._inputs)
-        self._caller = Replica(memory, self._phases.pieces)
+        self._caller = MemoryReplica(memory, self._phases.pieces)
         self._spent_s = np.zeros(len(shards)) if recipe["measures"] else None
         self._hosted = HostedZones(shards, (), self._spent_s)
         self._zones: list[int] = []
@@ -140,7 +140,7 @@ class ZonesJob:
         self._coming = np.empty(PhaseOrder(*letter).words, dtype=np.uint64)
         return [self._coming]
 
-    def perform(self, task: int, letter: Any) -> Outcome:
+    def perform(self, task: int, letter: Any) -> TaskOutcome:
         """Run a phase.
 
         The answer is how many words of changes come out; where that is asked for, also the
@@ -161,7 +161,7 @@ class ZonesJob:
         self._run(turn)
         self._phases.note_results(self._caller, turn)
         stream = self._caller.stream
-        return Outcome([stream.size, *self._costs(turn.zones)], [stream])
+        return TaskOutcome([stream.size, *self._costs(turn.zones)], [stream])
 
     def _costs(self, zones: NDArray[np.int64]) -> list[float]:
         """Processor time of each zone since it was asked for last."""

@@ -35,7 +35,7 @@ from cavmarl.shards.executor import Phase
 from cavmarl.shards.shard import Shard
 from cavmarl.shards.shard_group import ShardGroup
 
-__all__ = ["Follower", "Leader", "LeftAloneError", "Team"]
+__all__ = ["Leader", "LeftAloneError", "Team", "TeamFollower"]
 
 # Words of the leader's line, behind those of `barrier`: what is called with even numbers, and what
 # with odd ones.
@@ -195,7 +195,7 @@ class Leader:
             wait_for(line, number, line.item(CORE) != core)
 
 
-class Follower:
+class TeamFollower:
     """Runs the phases that the leader announces on its own shards.
 
     Args:

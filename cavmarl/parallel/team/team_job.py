@@ -8,10 +8,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from cavmarl.parallel.checkpoint.checkpoint_job import DiaryJob
-from cavmarl.parallel.checkpoint.checkpoint_log import Diary
+from cavmarl.parallel.checkpoint.checkpoint_job import CheckpointJob
+from cavmarl.parallel.checkpoint.checkpoint_log import CheckpointLog
 from cavmarl.parallel.local_worlds import LocalWorlds
-from cavmarl.parallel.team.team import Follower, Leader, Team
+from cavmarl.parallel.team.team import Leader, Team, TeamFollower
 from cavmarl.parallel.worlds_job import Task, WorldsJob
 from cavmarl.shards.shard import Shard
 
@@ -24,7 +24,7 @@ LAST = {Task.STEP: "sense", Task.SUGGEST: "suggest"}
 ALONE = (Task.STATE_HASH, Task.TRAFFIC_STATS, Task.DRIVEN, Task.SIGNAL_PHASES)
 
 
-class LeaderJob(DiaryJob):
+class LeaderJob(CheckpointJob):
     """One world that several workers run, of which this one leads.
 
     Args:
@@ -40,7 +40,7 @@ class LeaderJob(DiaryJob):
         worlds: LocalWorlds,
         first: int,
         zones: Sequence[Sequence[int]],
-        diary: Diary,
+        diary: CheckpointLog,
         spent_s: NDArray[np.float64] | None = None,
     ) -> None:
         super().__init__(worlds, first, diary)
@@ -66,7 +66,7 @@ class LeaderJob(DiaryJob):
 
     def followers(self) -> Iterator[FollowerJob]:
         for number in range(1, len(self._zones)):
-            follower = Follower(self._team, number)
+            follower = TeamFollower(self._team, number)
             yield FollowerJob(follower, self._first, number, self._hosts.copy())
 
     def prepare(self) -> None:
@@ -116,7 +116,7 @@ class FollowerJob:
     """
 
     def __init__(
-        self, follower: Follower, world: int, number: int, hosts: NDArray[np.int64]
+        self, follower: TeamFollower, world: int, number: int, hosts: NDArray[np.int64]
     ) -> None:
         self._follower = follower
         self._world = world

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from cavmarl.core.errors import MapError
 from cavmarl.roads.network import DETECTOR, VEHICLE_CLASSES
-from cavmarl.roads.sumo_net.programs import Program
+from cavmarl.roads.sumo_net.programs import SignalProgram
 from cavmarl.roads.sumo_net.signal_rows import DETECTOR_GAP_S, SignalRows, parameter
 
 __all__ = ["DetectorRoads", "place_detectors"]
@@ -77,7 +77,7 @@ def place_detectors(
 class _Approaches:
     """The lanes before one signal, seen with the eyes of one actuated program."""
 
-    def __init__(self, program: Program, roads: DetectorRoads, signal: int) -> None:
+    def __init__(self, program: SignalProgram, roads: DetectorRoads, signal: int) -> None:
         self.program = program
         self.roads = roads
         links = roads.links[roads.links["signal"] == signal]

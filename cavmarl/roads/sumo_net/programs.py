@@ -15,7 +15,7 @@ from xml.sax.handler import ContentHandler
 from cavmarl.core.errors import MapError
 from cavmarl.roads.sumo_net.xml_source import read_xml
 
-__all__ = ["OFF", "Phase", "Program", "ProgramReader", "Timetable", "read_programs"]
+__all__ = ["OFF", "Phase", "ProgramReader", "SignalProgram", "Timetable", "read_programs"]
 
 # The program that every signal has: nothing is lit, the right of way alone rules.
 OFF = "off"
@@ -47,7 +47,7 @@ class Phase:
 
 
 @dataclass(frozen=True)
-class Program:
+class SignalProgram:
     """One <tlLogic>.
 
     Attributes:
@@ -93,11 +93,11 @@ class ProgramReader:
     """
 
     def __init__(self, path: Path) -> None:
-        self.programs: list[Program] = []
+        self.programs: list[SignalProgram] = []
         self.timetables: dict[str, Timetable] = {}
         self._path = path
         self._reference_s = 0.0
-        self._program: Program | None = None
+        self._program: SignalProgram | None = None
         self._timetable: Timetable | None = None
 
     def start(self, name: str, attrs: Mapping[str, str], line: int) -> None:
@@ -135,7 +135,7 @@ class ProgramReader:
 
     def _open_program(self, attrs: Mapping[str, str], place: str) -> None:
         offset = 0.0 if attrs.get("offset") == "begin" else _seconds(attrs, "offset", place, 0.0)
-        self._program = Program(attrs["id"], attrs["programID"], attrs["type"], offset, place)
+        self._program = SignalProgram(attrs["id"], attrs["programID"], attrs["type"], offset, place)
         self.programs.append(self._program)
 
 

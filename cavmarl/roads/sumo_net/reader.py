@@ -19,9 +19,9 @@ from cavmarl.roads.polylines import clean_shape, extend_stubs, point_rows
 from cavmarl.roads.sumo_net.conflicts import LinkPath, sample_path
 from cavmarl.roads.sumo_net.detectors import DetectorRoads, place_detectors
 from cavmarl.roads.sumo_net.forks import fork_lengths
-from cavmarl.roads.sumo_net.programs import Program
+from cavmarl.roads.sumo_net.programs import SignalProgram
 from cavmarl.roads.sumo_net.right_of_way import conflict_rows
-from cavmarl.roads.sumo_net.selection import Movement, Selection, permission_bits, select
+from cavmarl.roads.sumo_net.selection import Movement, NetworkSelection, permission_bits, select
 from cavmarl.roads.sumo_net.signal_rows import SignalRows, read_signals
 from cavmarl.roads.sumo_net.stop_lines import stop_back
 
@@ -73,7 +73,7 @@ def read_network(path: str | Path) -> RoadNetwork:
         raise MapError(f"{path}: {error}") from error
 
 
-def _assemble(net: Any, programs: list[Program], name: str, digest: str) -> RoadNetwork:
+def _assemble(net: Any, programs: list[SignalProgram], name: str, digest: str) -> RoadNetwork:
     chosen = select(net)
     if not chosen.edges:
         raise MapError(
@@ -153,7 +153,7 @@ def _geo_reference(net: Any) -> GeoReference | None:
     return GeoReference(net._location["projParameter"], offset_x_m, offset_y_m)
 
 
-def _before(chosen: Selection, lane_row: dict[int, int]) -> dict[int, int]:
+def _before(chosen: NetworkSelection, lane_row: dict[int, int]) -> dict[int, int]:
     """The lane row that leads into each internal lane row, in driving order."""
     before: dict[int, int] = {}
     for movement in chosen.movements:
@@ -164,7 +164,7 @@ def _before(chosen: Selection, lane_row: dict[int, int]) -> dict[int, int]:
     return before
 
 
-def _edge_rows(chosen: Selection, net: Any, node_row: dict[int, int]) -> NDArray[np.void]:
+def _edge_rows(chosen: NetworkSelection, net: Any, node_row: dict[int, int]) -> NDArray[np.void]:
     counts: dict[int, int] = {}
     for lane in chosen.lanes:
         counts[id(lane.getEdge())] = counts.get(id(lane.getEdge()), 0) + 1
@@ -195,7 +195,7 @@ def _node_row(edge: Any, node: Any, node_row: dict[int, int]) -> int:
 
 
 def _lane_rows(
-    chosen: Selection,
+    chosen: NetworkSelection,
     edges: NDArray[np.void],
     points: NDArray[np.void],
     first_point: NDArray[np.int32],

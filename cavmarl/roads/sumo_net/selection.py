@@ -9,7 +9,7 @@ from typing import Any
 from cavmarl.core.errors import MapError
 from cavmarl.roads.network import VEHICLE_CLASSES
 
-__all__ = ["Movement", "Selection", "permission_bits", "select"]
+__all__ = ["Movement", "NetworkSelection", "permission_bits", "select"]
 
 _ALL = (1 << len(VEHICLE_CLASSES)) - 1
 _ROAD = sum(1 << bit for bit, name in enumerate(VEHICLE_CLASSES) if name not in ("tram", "bicycle"))
@@ -33,7 +33,7 @@ class Movement:
 
 
 @dataclass
-class Selection:
+class NetworkSelection:
     """The parts of a network that become rows, in row order."""
 
     edges: list[Any] = field(default_factory=list)  # normal edges first, then internal ones
@@ -53,7 +53,7 @@ def _is_road(classes: Iterable[str]) -> bool:
     return bool(permission_bits(classes) & _ROAD)
 
 
-def select(net: Any) -> Selection:
+def select(net: Any) -> NetworkSelection:
     """Choose the lanes on which road vehicles drive and the movements between them.
 
     Pure pavements, crossings, walking areas, rails and bicycle lanes are left out, and so are
@@ -62,7 +62,7 @@ def select(net: Any) -> Selection:
     Raises:
         MapError: an internal lane belongs to two movements or leads nowhere.
     """
-    chosen = Selection()
+    chosen = NetworkSelection()
     for edge in net.getEdges(withInternal=False):
         lanes = [lane for lane in edge.getLanes() if _is_road(lane.getPermissions())]
         if lanes:

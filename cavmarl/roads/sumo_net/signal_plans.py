@@ -12,7 +12,7 @@ import numpy as np
 from cavmarl.core.errors import MapError
 from cavmarl.roads.network import RoadNetwork
 from cavmarl.roads.sumo_net.detectors import DetectorRoads, place_detectors
-from cavmarl.roads.sumo_net.programs import OFF, Phase, Program, Timetable, read_programs
+from cavmarl.roads.sumo_net.programs import OFF, Phase, SignalProgram, Timetable, read_programs
 from cavmarl.roads.sumo_net.reader import source_hash
 from cavmarl.roads.sumo_net.signal_rows import SignalRows
 
@@ -139,7 +139,7 @@ def _program(
     return rows.program_row[signal_id, program_id]
 
 
-def _off(network: RoadNetwork, rows: SignalRows, signal_id: str) -> Program:
+def _off(network: RoadNetwork, rows: SignalRows, signal_id: str) -> SignalProgram:
     """The program in which nothing is lit: links that must give way anyway blink."""
     row = rows.row[signal_id]
     letters = ["O"] * rows.signals[row][1]
@@ -147,7 +147,7 @@ def _off(network: RoadNetwork, rows: SignalRows, signal_id: str) -> Program:
         if link["state"] == ord("o"):
             letters[link["signal_index"]] = "o"
     phase = Phase(1.0, 1.0, 1.0, "".join(letters))
-    return Program(signal_id, OFF, "static", 0.0, OFF, [phase])
+    return SignalProgram(signal_id, OFF, "static", 0.0, OFF, [phase])
 
 
 def _check_signal(rows: SignalRows, signal_id: str, place: str) -> None:

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from cavmarl.core.errors import MapError
 from cavmarl.roads.network import PHASE, PROGRAM, SIGNAL, SIGNAL_STATES, SWITCH, RoadNetwork
-from cavmarl.roads.sumo_net.programs import Phase, Program
+from cavmarl.roads.sumo_net.programs import Phase, SignalProgram
 
 __all__ = ["SignalArrays", "SignalRows", "parameter", "read_signals"]
 
@@ -55,7 +55,9 @@ class SignalRows:
         self.program_row: dict[tuple[str, str], int] = {}
         self.num_controllers = 0
         self.phase_detectors: list[int] = []
-        self.specs: dict[int, Program] = {}  # by row; of actuated programs that need detectors
+        self.specs: dict[
+            int, SignalProgram
+        ] = {}  # by row; of actuated programs that need detectors
 
     @classmethod
     def of(cls, network: RoadNetwork) -> SignalRows:
@@ -79,7 +81,7 @@ class SignalRows:
         rows.phase_detectors = network.phase_detectors.tolist()
         return rows
 
-    def add(self, program: Program) -> None:
+    def add(self, program: SignalProgram) -> None:
         """Append a program; of several the last is on, as in SUMO.
 
         Raises:
@@ -125,7 +127,7 @@ class SignalRows:
         return self.num_controllers - 1
 
     def _add_phase(
-        self, program: Program, phase: Phase, number: int, first: int, num_links: int
+        self, program: SignalProgram, phase: Phase, number: int, first: int, num_links: int
     ) -> None:
         signal_id = program.signal_id
         if len(phase.state) != num_links:
@@ -190,7 +192,7 @@ class SignalRows:
         return SignalArrays(signals, programs, phases, letters, switches, tuple(self.program_ids))
 
 
-def read_signals(programs: list[Program]) -> SignalRows:
+def read_signals(programs: list[SignalProgram]) -> SignalRows:
     """The programs of a network's traffic lights.
 
     Raises:
@@ -202,7 +204,7 @@ def read_signals(programs: list[Program]) -> SignalRows:
     return rows
 
 
-def _simplified(program: Program) -> bool:
+def _simplified(program: SignalProgram) -> bool:
     """Whether SUMO would run the program in another way than this package does."""
     chooses = any(len(phase.following) > 1 for phase in program.phases)
     if program.kind != "actuated":
@@ -217,7 +219,7 @@ def _simplified(program: Program) -> bool:
     )
 
 
-def parameter(program: Program, key: str, default: float) -> float:
+def parameter(program: SignalProgram, key: str, default: float) -> float:
     """A parameter of a program in seconds.
 
     Raises:

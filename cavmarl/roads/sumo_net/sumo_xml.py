@@ -16,7 +16,7 @@ from xml.sax.handler import ContentHandler
 from sumolib.net import NetReader
 
 from cavmarl.core.errors import MapError
-from cavmarl.roads.sumo_net.programs import Program, ProgramReader
+from cavmarl.roads.sumo_net.programs import ProgramReader, SignalProgram
 from cavmarl.roads.sumo_net.xml_source import read_xml
 
 __all__ = ["parse_net"]
@@ -132,7 +132,7 @@ class _CheckedReader(ContentHandler):
                 raise self._error("lane", attrs, f"has the point '{point}', not finite x,y[,z]")
 
 
-def parse_net(path: Path) -> tuple[Any, list[Program]]:
+def parse_net(path: Path) -> tuple[Any, list[SignalProgram]]:
     """Read a SUMO network (`.net.xml`, `.net.xml.gz`): a `sumolib.net.Net` and signal programs.
 
     Raises:

@@ -10,9 +10,9 @@ from numpy.typing import NDArray
 from cavmarl.core.math.spans import row_span
 from cavmarl.core.numba import kernel
 from cavmarl.sensors.kernels.faces import (
-    Camera,
+    CameraPose,
     Faces,
-    Picture,
+    PixelRows,
     add_face,
     draw_faces,
     ground_at,
@@ -44,7 +44,9 @@ _SEEN_OF_PRISM = 3  # at most
 BAND_PIXELS = 1 << 14
 
 
-def make_camera(mount: NDArray[np.float64], width: int, fov_rad: float, range_m: float) -> Camera:
+def make_camera(
+    mount: NDArray[np.float64], width: int, fov_rad: float, range_m: float
+) -> CameraPose:
     """A camera.
 
     Args:
@@ -54,17 +56,17 @@ def make_camera(mount: NDArray[np.float64], width: int, fov_rad: float, range_m:
         range_m: deeper places are not seen.
     """
     focal = 0.5 * width / math.tan(0.5 * fov_rad)
-    return Camera(mount, focal, range_m, np.zeros((5, 4)), np.zeros((4, 3)))
+    return CameraPose(mount, focal, range_m, np.zeros((5, 4)), np.zeros((4, 3)))
 
 
-def make_picture(width: int, height: int, panorama: Panorama) -> Picture:
+def make_picture(width: int, height: int, panorama: Panorama) -> PixelRows:
     """Room for a picture of such a panorama, some rows at a time."""
     faces = FIRST_FACE + _FACES_OF_PRISM * len(panorama.prisms) + len(panorama.walls)
     semantic = np.zeros(faces, np.uint8)
     semantic[:FIRST_FACE] = NOTHING, GROUND, ROAD
     seen = len(panorama.strips) + _SEEN_OF_PRISM * len(panorama.prisms) + len(panorama.walls)
     rows = min(height, max(1, BAND_PIXELS // width))
-    return Picture(
+    return PixelRows(
         height,
         np.zeros((rows, width)),
         np.zeros((rows, width), np.int32),
@@ -81,7 +83,7 @@ def make_picture(width: int, height: int, panorama: Panorama) -> Picture:
 
 
 @kernel
-def _clear(camera: Camera, picture: Picture, first: int, last: int) -> None:
+def _clear(camera: CameraPose, picture: PixelRows, first: int, last: int) -> None:
     """Sky, and the ground as far as the camera sees it, in the rows [first, last)."""
     width = picture.face.shape[1]
     mount = camera.mount
@@ -107,7 +109,7 @@ def _corner_of(prism: np.void, along: float, across: float) -> tuple[float, floa
 
 
 @kernel
-def _add_prism(camera: Camera, picture: Picture, num: int, prism: np.void, first: int) -> int:
+def _add_prism(camera: CameraPose, picture: PixelRows, num: int, prism: np.void, first: int) -> int:
     """Add the faces of a body that turn to the camera: at most two sides and one end."""
     cos = prism["cos"]
     sin = prism["sin"]
@@ -155,7 +157,7 @@ def _light(x: float, y: float) -> float:
 
 
 @kernel
-def _add_wall(camera: Camera, picture: Picture, num: int, wall: np.void, number: int) -> int:
+def _add_wall(camera: CameraPose, picture: PixelRows, num: int, wall: np.void, number: int) -> int:
     """Add a wall, which looks the same from both sides."""
     ax, ay, bx, by = wall["ax"], wall["ay"], wall["bx"], wall["by"]
     height = wall["height"]
@@ -174,7 +176,7 @@ def _add_wall(camera: Camera, picture: Picture, num: int, wall: np.void, number:
 
 
 @kernel
-def find_faces(camera: Camera, panorama: Panorama, counts: Counts, picture: Picture) -> int:
+def find_faces(camera: CameraPose, panorama: Panorama, counts: Counts, picture: PixelRows) -> int:
     """Find the faces that a picture shows.
 
     Args:
@@ -203,7 +205,7 @@ def find_faces(camera: Camera, panorama: Panorama, counts: Counts, picture: Pict
 
 
 @kernel
-def look(camera: Camera, picture: Picture, num: int, first: int, last: int) -> None:
+def look(camera: CameraPose, picture: PixelRows, num: int, first: int, last: int) -> None:
     """Take the rows [first, last) of a picture.
 
     Args:

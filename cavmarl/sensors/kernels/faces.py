@@ -24,13 +24,13 @@ from numpy.typing import NDArray
 from cavmarl.core.math.spans import row_span
 from cavmarl.core.numba import kernel
 
-__all__ = ["Camera", "Faces", "Picture", "add_face", "draw_faces", "ground_at", "set_corner"]
+__all__ = ["CameraPose", "Faces", "PixelRows", "add_face", "draw_faces", "ground_at", "set_corner"]
 
 # Of a face with a corner nearer than this, or behind the camera, all rows are tried.
 NEAR_M = 0.01
 
 
-class Camera(NamedTuple):
+class CameraPose(NamedTuple):
     """Where a camera looks from and how."""
 
     mount: NDArray[np.float64]  # (3, 4) axes (ahead, left, up) and place in the vehicle's frame
@@ -50,7 +50,7 @@ class Faces(NamedTuple):
     flat: NDArray[np.bool_]  # (F,) it lies on the ground, and covers whatever was there
 
 
-class Picture(NamedTuple):
+class PixelRows(NamedTuple):
     """What some rows of pixels show, R at a time from top to bottom, and what is drawn."""
 
     height: int  # of the whole picture, pixels
@@ -62,7 +62,7 @@ class Picture(NamedTuple):
 
 
 @kernel
-def set_corner(camera: Camera, c: int, x: float, y: float, z: float) -> None:
+def set_corner(camera: CameraPose, c: int, x: float, y: float, z: float) -> None:
     """Bring a corner of the face from the vehicle's frame into the camera's."""
     mount = camera.mount
     dx = x - mount[0, 3]
@@ -74,7 +74,7 @@ def set_corner(camera: Camera, c: int, x: float, y: float, z: float) -> None:
 
 @kernel
 def _set_edge(
-    camera: Camera, k: int, x: float, y: float, z: float, width: int, height: int
+    camera: CameraPose, k: int, x: float, y: float, z: float, width: int, height: int
 ) -> None:
     """Edge k: the pixels whose direction (1, -u', -v') has no negative product with (x, y, z)."""
     by_column = -y / camera.focal
@@ -87,7 +87,7 @@ def _set_edge(
 
 
 @kernel
-def _is_aside(camera: Camera, width: int, height: int) -> bool:
+def _is_aside(camera: CameraPose, width: int, height: int) -> bool:
     """Whether all corners of the face are behind the camera, or beside one edge of the picture."""
     face = camera.face
     slope_x = 0.5 * width / camera.focal
@@ -103,7 +103,7 @@ def _is_aside(camera: Camera, width: int, height: int) -> bool:
 
 
 @kernel
-def _set_face(camera: Camera, width: int, height: int) -> tuple[int, int, float, float, float]:
+def _set_face(camera: CameraPose, width: int, height: int) -> tuple[int, int, float, float, float]:
     """Set the edges of the face whose corners are set, the fifth being the range.
 
     Returns:
@@ -154,7 +154,7 @@ def _set_face(camera: Camera, width: int, height: int) -> tuple[int, int, float,
 
 
 @kernel
-def add_face(camera: Camera, picture: Picture, num: int, number: int, flat: bool) -> int:
+def add_face(camera: CameraPose, picture: PixelRows, num: int, number: int, flat: bool) -> int:
     """Put the face whose corners are set behind the `num` that are drawn before it.
 
     Returns:
@@ -179,7 +179,7 @@ def add_face(camera: Camera, picture: Picture, num: int, number: int, flat: bool
 
 
 @kernel
-def draw_faces(picture: Picture, num: int, first: int, last: int) -> None:
+def draw_faces(picture: PixelRows, num: int, first: int, last: int) -> None:
     """Draw the first `num` faces over what is farther away, in the rows [first, last)."""
     faces = picture.faces
     for k in range(num):
@@ -192,7 +192,7 @@ def draw_faces(picture: Picture, num: int, first: int, last: int) -> None:
 
 
 @kernel
-def _draw(picture: Picture, k: int, first: int, begin_row: int, end_row: int) -> None:
+def _draw(picture: PixelRows, k: int, first: int, begin_row: int, end_row: int) -> None:
     """Draw a face over what is farther away; row `first` is the first that there is room for."""
     width = picture.face.shape[1]
     edges = picture.faces.edges[k]
@@ -212,7 +212,7 @@ def _draw(picture: Picture, k: int, first: int, begin_row: int, end_row: int) ->
 
 
 @kernel
-def _draw_flat(picture: Picture, k: int, first: int, begin_row: int, end_row: int) -> None:
+def _draw_flat(picture: PixelRows, k: int, first: int, begin_row: int, end_row: int) -> None:
     """Draw a face over whatever was there."""
     width = picture.face.shape[1]
     edges = picture.faces.edges[k]
@@ -223,7 +223,7 @@ def _draw_flat(picture: Picture, k: int, first: int, begin_row: int, end_row: in
 
 
 @kernel
-def ground_at(camera: Camera, width: int, height: int) -> tuple[float, float, float]:
+def ground_at(camera: CameraPose, width: int, height: int) -> tuple[float, float, float]:
     """The closeness of the ground: constant, by column, by row. Overwrites edge 4.
 
     A camera on the ground does not see it.

@@ -13,19 +13,19 @@ from cavmarl.sensors.kernels.kinematics_observation import observe_kinematics
 from cavmarl.sensors.kernels.lidar_cells import observe_lidar_cells
 from cavmarl.sensors.kernels.nearest_road_points import observe_roadgraph
 from cavmarl.sensors.kernels.occupancy import observe_occupancy
-from cavmarl.sensors.kernels.sensor_arrays import FurtherSensors
+from cavmarl.sensors.kernels.sensor_arrays import OptionalSensors
 from cavmarl.sensors.kernels.stacking import newest_frame
 
-__all__ = ["observe_further"]
+__all__ = ["observe_optional"]
 
 
 @kernel
-def observe_further(
+def observe_optional(
     roads: RoadArrays,
     lane_grid: LaneGrid,
     worlds: Worlds,
     grid: Grid,
-    further: FurtherSensors,
+    further: OptionalSensors,
     stack: int,
     chosen: NDArray[np.bool_],
     observations: NDArray[np.float32],

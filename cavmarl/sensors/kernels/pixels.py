@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from cavmarl.core.numba import kernel
 from cavmarl.sensors.kernels.camera_picture import ROAD_FACE, SKY_FACE
-from cavmarl.sensors.kernels.faces import Camera, Picture, ground_at
+from cavmarl.sensors.kernels.faces import CameraPose, PixelRows, ground_at
 from cavmarl.sensors.kernels.semantics import (
     BICYCLE,
     BUILDING,
@@ -71,7 +71,7 @@ def colours() -> NDArray[np.float64]:
 
 
 @kernel
-def _deepen(camera: Camera, picture: Picture, first: int, rows: int) -> None:
+def _deepen(camera: CameraPose, picture: PixelRows, first: int, rows: int) -> None:
     """Set the closeness also where there is only the ground or the sky."""
     width = picture.face.shape[1]
     constant, by_column, by_row = ground_at(camera, width, picture.height)
@@ -86,7 +86,9 @@ def _deepen(camera: Camera, picture: Picture, first: int, rows: int) -> None:
 
 
 @kernel
-def measure_depths(camera: Camera, picture: Picture, first: int, out: NDArray[np.float32]) -> None:
+def measure_depths(
+    camera: CameraPose, picture: PixelRows, first: int, out: NDArray[np.float32]
+) -> None:
     """Depths (rows, W) in metres along the optical axis, the range where nothing is.
 
     Args:
@@ -117,7 +119,7 @@ def write_halves(bits: NDArray[np.uint32], out: NDArray[np.uint16]) -> None:
 
 
 @kernel
-def write_classes(picture: Picture, out: NDArray[np.uint8]) -> None:
+def write_classes(picture: PixelRows, out: NDArray[np.uint8]) -> None:
     """The class of what each pixel shows, (rows, W)."""
     rows, width = out.shape
     for j in range(rows):
@@ -127,8 +129,8 @@ def write_classes(picture: Picture, out: NDArray[np.uint8]) -> None:
 
 @kernel
 def write_colours(
-    camera: Camera,
-    picture: Picture,
+    camera: CameraPose,
+    picture: PixelRows,
     first: int,
     palette: NDArray[np.float64],
     out: NDArray[np.uint8],

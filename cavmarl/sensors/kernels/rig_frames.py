@@ -9,7 +9,7 @@ from cavmarl.core.numba import kernel
 from cavmarl.core.records.arrays import Worlds
 from cavmarl.core.records.codes import DRIVER_AGENT
 from cavmarl.sensors.kernels.rig_noise import is_lost
-from cavmarl.sensors.kernels.rig_schedule import Due, Schedule, stamp_of
+from cavmarl.sensors.kernels.rig_schedule import Due, SensorSchedule, stamp_of
 
 __all__ = ["POSE", "call_roll", "deliver", "note_poses"]
 
@@ -68,7 +68,7 @@ def note_poses(worlds: Worlds, poses: NDArray[np.void]) -> None:
 @kernel
 def deliver(
     worlds: Worlds,
-    schedule: Schedule,
+    schedule: SensorSchedule,
     due: Due,
     tick_s: float,
     stream: np.uint64,

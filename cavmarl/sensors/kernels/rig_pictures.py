@@ -14,7 +14,7 @@ from cavmarl.core.records.codes import DRIVER_AGENT
 from cavmarl.roads.kernels.backdrop_pieces import Backdrop
 from cavmarl.sensors.kernels.birds_eye import BirdsEye, look_down
 from cavmarl.sensors.kernels.camera_picture import find_faces, look
-from cavmarl.sensors.kernels.faces import Camera, Picture
+from cavmarl.sensors.kernels.faces import CameraPose, PixelRows
 from cavmarl.sensors.kernels.panorama import Panorama, gather
 from cavmarl.sensors.kernels.pixels import (
     LEAST_DEPTH_M,
@@ -30,7 +30,7 @@ __all__ = ["camera_reach_m", "fill_grids", "take_classes", "take_colours", "take
 
 
 @kernel
-def camera_reach_m(camera: Camera, width: int, height: int) -> float:
+def camera_reach_m(camera: CameraPose, width: int, height: int) -> float:
     """How far from the vehicle's place something can be that a pixel shows, m.
 
     The range is a depth along the axis; corners of the picture see farther.
@@ -58,9 +58,9 @@ def take_depths(
     due: Due,
     lines: NDArray[np.int32],
     noise: Noise,
-    camera: Camera,
+    camera: CameraPose,
     panorama: Panorama,
-    picture: Picture,
+    picture: PixelRows,
     room: NDArray[np.float32],
     room_bits: NDArray[np.uint32],
     data: NDArray[np.uint16],
@@ -136,9 +136,9 @@ def take_classes(
     backdrop: Backdrop,
     due: Due,
     lines: NDArray[np.int32],
-    camera: Camera,
+    camera: CameraPose,
     panorama: Panorama,
-    picture: Picture,
+    picture: PixelRows,
     data: NDArray[np.uint8],
 ) -> None:
     """Write the semantic pictures (W, agents, S, H, W) that are due; see `take_depths`."""
@@ -171,9 +171,9 @@ def take_colours(
     due: Due,
     lines: NDArray[np.int32],
     noise: Noise,
-    camera: Camera,
+    camera: CameraPose,
     panorama: Panorama,
-    picture: Picture,
+    picture: PixelRows,
     palette: NDArray[np.float64],
     data: NDArray[np.uint8],
 ) -> None:

@@ -13,10 +13,10 @@ from numpy.typing import NDArray
 
 from cavmarl.core.numba import kernel
 
-__all__ = ["Due", "Schedule", "call_due", "stamp_of", "taken"]
+__all__ = ["Due", "SensorSchedule", "call_due", "stamp_of", "taken"]
 
 
-class Schedule(NamedTuple):
+class SensorSchedule(NamedTuple):
     """The rate of a sensor: `samples` in `ticks` ticks, in lowest terms."""
 
     samples: int
@@ -35,7 +35,7 @@ class Due(NamedTuple):
 
 
 @kernel
-def taken(schedule: Schedule, tick: int) -> int:
+def taken(schedule: SensorSchedule, tick: int) -> int:
     """How many samples are taken at or before a tick."""
     since = tick - schedule.phase
     if since < 0:
@@ -44,7 +44,7 @@ def taken(schedule: Schedule, tick: int) -> int:
 
 
 @kernel
-def stamp_of(schedule: Schedule, number: int, tick: int, tick_s: float) -> float:
+def stamp_of(schedule: SensorSchedule, number: int, tick: int, tick_s: float) -> float:
     """The time of a sample in s since the reset, delivered by `tick`.
 
     Of a sensor with several samples a tick it may lie between two; all others sense the state of
@@ -57,7 +57,7 @@ def stamp_of(schedule: Schedule, number: int, tick: int, tick_s: float) -> float
 
 @kernel
 def call_due(
-    schedule: Schedule, ticks: NDArray[np.int64], chosen: NDArray[np.bool_], due: Due
+    schedule: SensorSchedule, ticks: NDArray[np.int64], chosen: NDArray[np.bool_], due: Due
 ) -> bool:
     """Write what is due in the chosen worlds, and nothing for the others.
 

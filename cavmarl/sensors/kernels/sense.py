@@ -39,7 +39,7 @@ def sense(
     """Write what every owned agent of the chosen worlds gets, at its own index.
 
     A vehicle that entered during the step has not acted: it is observed, its terms are 0, and it
-    does not end. `observe_further` and `fill_stacks` complete the observations,
+    does not end. `observe_optional` and `fill_stacks` complete the observations,
     `kernels.outputs` does what concerns the agents of all shards.
 
     Args:

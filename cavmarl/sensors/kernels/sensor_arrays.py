@@ -11,10 +11,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 __all__ = [
-    "FurtherSensors",
     "KinematicsSensor",
     "LidarCells",
     "OccupancyGrid",
+    "OptionalSensors",
     "RoadPoints",
     "RoadgraphSensor",
 ]
@@ -97,7 +97,7 @@ class RoadgraphSensor(NamedTuple):
     ring_start: NDArray[np.int64]  # (NUM_RINGS + 1,) room
 
 
-class FurtherSensors(NamedTuple):
+class OptionalSensors(NamedTuple):
     """All of them; apart from `arrays.Sensors`, so that `sense` need not unpack what is off."""
 
     kinematics: KinematicsSensor

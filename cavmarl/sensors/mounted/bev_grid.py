@@ -16,7 +16,7 @@ from cavmarl.sensors.kernels.rig_schedule import Due
 from cavmarl.sensors.kernels.semantics import NUM_SEMANTICS
 from cavmarl.sensors.mounted.frames import SensorFrames
 from cavmarl.sensors.mounted.mount_transforms import mount_matrix
-from cavmarl.sensors.mounted.mounted_sensor import Bounds, MountedSensor, Platform, Scene
+from cavmarl.sensors.mounted.mounted_sensor import Bounds, MountedSensor, Platform, SensedScene
 
 __all__ = ["BevGrid"]
 
@@ -47,7 +47,7 @@ class BevGrid(MountedSensor[BevGridConfig]):
         farthest_m = math.hypot(max(config.ahead_m, config.behind_m), config.aside_m)
         return farthest_m + math.hypot(config.x_m, config.y_m) + largest_radius_m
 
-    def sense(self, scenes: Sequence[Scene], due: Due, frames: SensorFrames) -> None:
+    def sense(self, scenes: Sequence[SensedScene], due: Due, frames: SensorFrames) -> None:
         """Write what is due."""
         for scene in scenes:
             self._fill(

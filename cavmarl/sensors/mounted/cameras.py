@@ -28,7 +28,13 @@ from cavmarl.sensors.kernels.rig_schedule import Due
 from cavmarl.sensors.kernels.semantics import NUM_SEMANTICS
 from cavmarl.sensors.mounted.frames import SensorFrames
 from cavmarl.sensors.mounted.mount_transforms import mount_matrix
-from cavmarl.sensors.mounted.mounted_sensor import Bounds, MountedSensor, Platform, Scene, noise_of
+from cavmarl.sensors.mounted.mounted_sensor import (
+    Bounds,
+    MountedSensor,
+    Platform,
+    SensedScene,
+    noise_of,
+)
 
 __all__ = ["DepthCamera", "RgbCamera", "SemanticCamera"]
 
@@ -77,7 +83,7 @@ class DepthCamera(_Camera[DepthCameraConfig]):
         """From 0 to the range."""
         return np.zeros(config.shape), np.full(config.shape, config.range_m)
 
-    def sense(self, scenes: Sequence[Scene], due: Due, frames: SensorFrames) -> None:
+    def sense(self, scenes: Sequence[SensedScene], due: Due, frames: SensorFrames) -> None:
         """Write what is due."""
         for scene in scenes:
             self._take(
@@ -110,7 +116,7 @@ class SemanticCamera(_Camera[SemanticCameraConfig]):
         """The classes."""
         return np.zeros(config.shape), np.full(config.shape, NUM_SEMANTICS - 1.0)
 
-    def sense(self, scenes: Sequence[Scene], due: Due, frames: SensorFrames) -> None:
+    def sense(self, scenes: Sequence[SensedScene], due: Due, frames: SensorFrames) -> None:
         """Write what is due."""
         for scene in scenes:
             self._take(
@@ -141,7 +147,7 @@ class RgbCamera(_Camera[RgbCameraConfig]):
         """From 0 to 255."""
         return np.zeros(config.shape), np.full(config.shape, 255.0)
 
-    def sense(self, scenes: Sequence[Scene], due: Due, frames: SensorFrames) -> None:
+    def sense(self, scenes: Sequence[SensedScene], due: Due, frames: SensorFrames) -> None:
         """Write what is due."""
         for scene in scenes:
             self._take(

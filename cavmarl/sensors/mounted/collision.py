@@ -11,7 +11,13 @@ from cavmarl.core.numba.repeated import repeated
 from cavmarl.sensors.kernels.event_reports import report_events
 from cavmarl.sensors.kernels.rig_schedule import Due
 from cavmarl.sensors.mounted.frames import SensorFrames
-from cavmarl.sensors.mounted.mounted_sensor import Bounds, MountedSensor, Platform, Scene, stream_of
+from cavmarl.sensors.mounted.mounted_sensor import (
+    Bounds,
+    MountedSensor,
+    Platform,
+    SensedScene,
+    stream_of,
+)
 
 __all__ = ["Collision"]
 
@@ -34,7 +40,7 @@ class Collision(MountedSensor[CollisionConfig]):
         limits = np.iinfo(np.int64)
         return np.array([0, -1]), np.array([limits.max, limits.max])
 
-    def sense(self, scenes: Sequence[Scene], due: Due, frames: SensorFrames) -> None:
+    def sense(self, scenes: Sequence[SensedScene], due: Due, frames: SensorFrames) -> None:
         """Report what has happened in this tick."""
         for scene in scenes:
             self._report(

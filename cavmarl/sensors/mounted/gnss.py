@@ -12,7 +12,13 @@ from cavmarl.sensors.kernels.antenna_positions import measure_places
 from cavmarl.sensors.kernels.rig_schedule import Due
 from cavmarl.sensors.mounted.frames import SensorFrames
 from cavmarl.sensors.mounted.geodesy import geodesy_of
-from cavmarl.sensors.mounted.mounted_sensor import Bounds, MountedSensor, Platform, Scene, noise_of
+from cavmarl.sensors.mounted.mounted_sensor import (
+    Bounds,
+    MountedSensor,
+    Platform,
+    SensedScene,
+    noise_of,
+)
 
 __all__ = ["Gnss"]
 
@@ -42,7 +48,7 @@ class Gnss(MountedSensor[GnssConfig]):
         high = np.array([90.0, 180.0, np.inf])
         return -high, high
 
-    def sense(self, scenes: Sequence[Scene], due: Due, frames: SensorFrames) -> None:
+    def sense(self, scenes: Sequence[SensedScene], due: Due, frames: SensorFrames) -> None:
         """Write what is due."""
         places, measured = self._places, self._measured
         measured[:] = False

@@ -11,7 +11,13 @@ from cavmarl.core.numba.repeated import repeated
 from cavmarl.sensors.kernels.inertia import measure_inertia
 from cavmarl.sensors.kernels.rig_schedule import Due
 from cavmarl.sensors.mounted.frames import SensorFrames
-from cavmarl.sensors.mounted.mounted_sensor import Bounds, MountedSensor, Platform, Scene, noise_of
+from cavmarl.sensors.mounted.mounted_sensor import (
+    Bounds,
+    MountedSensor,
+    Platform,
+    SensedScene,
+    noise_of,
+)
 
 __all__ = ["Imu"]
 
@@ -33,7 +39,7 @@ class Imu(MountedSensor[ImuConfig]):
         """None: noise has none."""
         return np.full(6, -np.inf), np.full(6, np.inf)
 
-    def sense(self, scenes: Sequence[Scene], due: Due, frames: SensorFrames) -> None:
+    def sense(self, scenes: Sequence[SensedScene], due: Due, frames: SensorFrames) -> None:
         """Write what is due."""
         for scene in scenes:
             self._measure(

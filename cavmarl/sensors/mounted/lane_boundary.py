@@ -11,7 +11,13 @@ from cavmarl.core.numba.repeated import repeated
 from cavmarl.sensors.kernels.lane_offsets import measure_lane_boundary
 from cavmarl.sensors.kernels.rig_schedule import Due
 from cavmarl.sensors.mounted.frames import SensorFrames
-from cavmarl.sensors.mounted.mounted_sensor import Bounds, MountedSensor, Platform, Scene, noise_of
+from cavmarl.sensors.mounted.mounted_sensor import (
+    Bounds,
+    MountedSensor,
+    Platform,
+    SensedScene,
+    noise_of,
+)
 
 __all__ = ["LaneBoundary"]
 
@@ -33,7 +39,7 @@ class LaneBoundary(MountedSensor[LaneBoundaryConfig]):
         """None: noise has none."""
         return np.full(5, -np.inf), np.full(5, np.inf)
 
-    def sense(self, scenes: Sequence[Scene], due: Due, frames: SensorFrames) -> None:
+    def sense(self, scenes: Sequence[SensedScene], due: Due, frames: SensorFrames) -> None:
         """Write what is due."""
         for scene in scenes:
             self._measure(

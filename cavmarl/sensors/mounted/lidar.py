@@ -15,7 +15,13 @@ from cavmarl.sensors.kernels.rig_rays import measure_lidar
 from cavmarl.sensors.kernels.rig_schedule import Due
 from cavmarl.sensors.mounted.frames import SensorFrames
 from cavmarl.sensors.mounted.mount_transforms import mount_matrix
-from cavmarl.sensors.mounted.mounted_sensor import Bounds, MountedSensor, Platform, Scene, noise_of
+from cavmarl.sensors.mounted.mounted_sensor import (
+    Bounds,
+    MountedSensor,
+    Platform,
+    SensedScene,
+    noise_of,
+)
 
 __all__ = ["Lidar", "azimuths", "lidar_fan"]
 
@@ -69,7 +75,7 @@ class Lidar(MountedSensor[LidarRigConfig]):
         """The columns of rays."""
         return config.rays
 
-    def sense(self, scenes: Sequence[Scene], due: Due, frames: SensorFrames) -> None:
+    def sense(self, scenes: Sequence[SensedScene], due: Due, frames: SensorFrames) -> None:
         """Write what is due."""
         for scene in scenes:
             self._measure(

@@ -20,13 +20,13 @@ from cavmarl.sensors.kernels.rig_schedule import Due
 from cavmarl.sensors.mounted.frames import SensorFrames
 from cavmarl.sensors.mounted.mount_transforms import SENSOR_FRAME, check_place, mount_of
 
-__all__ = ["Bounds", "MountedSensor", "Platform", "Scene", "noise_of", "stream_of"]
+__all__ = ["Bounds", "MountedSensor", "Platform", "SensedScene", "noise_of", "stream_of"]
 
 Bounds = tuple[NDArray[Any], NDArray[Any]]
 C = TypeVar("C", bound=MountedConfig)
 
 
-class Scene(NamedTuple):
+class SensedScene(NamedTuple):
     """What the agents of one zone can see, in the present tick.
 
     Attributes:
@@ -122,7 +122,7 @@ class MountedSensor(ABC, Generic[C]):
         return 1
 
     @abstractmethod
-    def sense(self, scenes: Sequence[Scene], due: Due, frames: SensorFrames) -> None:
+    def sense(self, scenes: Sequence[SensedScene], due: Due, frames: SensorFrames) -> None:
         """Write the data of all samples that are due, for the agents that the scenes own.
 
         What is written may depend on the agent's row, the others' rows within reach and the tick,

@@ -11,7 +11,13 @@ from cavmarl.core.numba.repeated import repeated
 from cavmarl.sensors.kernels.rig_schedule import Due
 from cavmarl.sensors.kernels.wheel_motion import measure_odometry
 from cavmarl.sensors.mounted.frames import SensorFrames
-from cavmarl.sensors.mounted.mounted_sensor import Bounds, MountedSensor, Platform, Scene, noise_of
+from cavmarl.sensors.mounted.mounted_sensor import (
+    Bounds,
+    MountedSensor,
+    Platform,
+    SensedScene,
+    noise_of,
+)
 
 __all__ = ["Odometry"]
 
@@ -32,7 +38,7 @@ class Odometry(MountedSensor[OdometryConfig]):
         """None: noise has none."""
         return np.full(3, -np.inf), np.full(3, np.inf)
 
-    def sense(self, scenes: Sequence[Scene], due: Due, frames: SensorFrames) -> None:
+    def sense(self, scenes: Sequence[SensedScene], due: Due, frames: SensorFrames) -> None:
         """Write what is due."""
         for scene in scenes:
             self._measure(scene.worlds, scene.before, due, self._noise, self._room, frames.data)

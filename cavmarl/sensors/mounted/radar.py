@@ -17,7 +17,13 @@ from cavmarl.sensors.kernels.rig_schedule import Due
 from cavmarl.sensors.mounted.frames import SensorFrames
 from cavmarl.sensors.mounted.lidar import azimuths
 from cavmarl.sensors.mounted.mount_transforms import mount_matrix
-from cavmarl.sensors.mounted.mounted_sensor import Bounds, MountedSensor, Platform, Scene, noise_of
+from cavmarl.sensors.mounted.mounted_sensor import (
+    Bounds,
+    MountedSensor,
+    Platform,
+    SensedScene,
+    noise_of,
+)
 
 __all__ = ["Radar"]
 
@@ -49,7 +55,7 @@ class Radar(MountedSensor[RadarConfig]):
         """Its range, from where it is mounted to the nearest side of a body."""
         return config.range_m + math.hypot(config.x_m, config.y_m) + largest_radius_m
 
-    def sense(self, scenes: Sequence[Scene], due: Due, frames: SensorFrames) -> None:
+    def sense(self, scenes: Sequence[SensedScene], due: Due, frames: SensorFrames) -> None:
         """Write what is due."""
         for scene in scenes:
             self._measure(

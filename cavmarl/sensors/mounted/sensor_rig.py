@@ -11,10 +11,10 @@ from numpy.typing import NDArray
 from cavmarl.config.rig import MountedConfig, SampledConfig, cadence
 from cavmarl.core.numba.repeated import repeated
 from cavmarl.sensors.kernels.rig_frames import POSE, call_roll, deliver, note_poses
-from cavmarl.sensors.kernels.rig_schedule import Due, Schedule, call_due
+from cavmarl.sensors.kernels.rig_schedule import Due, SensorSchedule, call_due
 from cavmarl.sensors.mounted.catalogue import mount
 from cavmarl.sensors.mounted.frames import Frames, SensorFrames
-from cavmarl.sensors.mounted.mounted_sensor import MountedSensor, Platform, Scene, stream_of
+from cavmarl.sensors.mounted.mounted_sensor import MountedSensor, Platform, SensedScene, stream_of
 
 __all__ = ["Rig", "Sense", "Turn", "sense_here"]
 
@@ -35,11 +35,11 @@ class Turn(NamedTuple):
     frames: SensorFrames
 
 
-Sense: TypeAlias = Callable[[Sequence[Scene], Sequence[Turn]], None]
+Sense: TypeAlias = Callable[[Sequence[SensedScene], Sequence[Turn]], None]
 """Writes the samples of all turns, as `MountedSensor.sense` does, before it returns."""
 
 
-def sense_here(scenes: Sequence[Scene], turns: Sequence[Turn]) -> None:
+def sense_here(scenes: Sequence[SensedScene], turns: Sequence[Turn]) -> None:
     """One sensor after the other, in this process."""
     for turn in turns:
         turn.sensor.sense(scenes, turn.due, turn.frames)
@@ -89,13 +89,13 @@ class Rig:
         """POSE (W, A) of the tick before."""
         return self._before
 
-    def begin(self, scenes: Sequence[Scene]) -> None:
+    def begin(self, scenes: Sequence[SensedScene]) -> None:
         """Note the poses of all agents before the tick."""
         self._before["id"] = -1
         for scene in scenes:
             self._note_poses(scene.worlds, self._before)
 
-    def reset(self, scenes: Sequence[Scene], chosen: NDArray[np.bool_]) -> None:
+    def reset(self, scenes: Sequence[SensedScene], chosen: NDArray[np.bool_]) -> None:
         """Forget what there was in the chosen worlds (W,), and take what is due at the reset."""
         if self._is_new:  # kernels are loaded now, and not in the first tick that asks for them
             self._is_new = False
@@ -107,7 +107,7 @@ class Rig:
         self._ids[chosen] = -1
         self._take(scenes, chosen)
 
-    def end(self, scenes: Sequence[Scene]) -> None:
+    def end(self, scenes: Sequence[SensedScene]) -> None:
         """Take what is due in the present tick."""
         ticks = scenes[0].worlds.ticks
         begins = (ticks - 1) % self._platform.ticks_per_step == 0
@@ -116,7 +116,7 @@ class Rig:
                 mounted.frames.fresh[begins] = 0
         self._take(scenes, self._everywhere)
 
-    def _take(self, scenes: Sequence[Scene], chosen: NDArray[np.bool_]) -> None:
+    def _take(self, scenes: Sequence[SensedScene], chosen: NDArray[np.bool_]) -> None:
         self._now[:] = -1
         for scene in scenes:
             self._call_roll(scene.worlds, self._now)
@@ -159,7 +159,7 @@ class _Mounted:
         for array in self.frames:
             array[chosen] = 0
 
-    def rehearse(self, scenes: Sequence[Scene]) -> None:
+    def rehearse(self, scenes: Sequence[SensedScene]) -> None:
         """Take a sample in every world, and leave everything as it was."""
         kept = self.frames.copy()
         for array, value in zip(self.turn.due, (1, 0, 0), strict=True):
@@ -173,7 +173,7 @@ class _Mounted:
         """Whether anything is, in the chosen worlds (W,); how much is noted in its turn."""
         return self._call_due(self._schedule, ticks, chosen, self.turn.due)
 
-    def deliver(self, scenes: Sequence[Scene]) -> None:
+    def deliver(self, scenes: Sequence[SensedScene]) -> None:
         """Stamp and count what it has sensed, and lose some of it."""
         sensor, frames = self.turn.sensor, self.frames
         if sensor.stamps_itself:
@@ -193,10 +193,12 @@ class _Mounted:
             )
 
 
-def _schedule_of(config: MountedConfig, platform: Platform, slots: int) -> Schedule:
+def _schedule_of(config: MountedConfig, platform: Platform, slots: int) -> SensorSchedule:
     """Of a sensor with a rate; without one it is asked in every tick."""
     ticks_per_step = platform.ticks_per_step
     if isinstance(config, SampledConfig):
         rate = cadence(config.rate_hz, platform.sim_dt_s)
-        return Schedule(rate.numerator, rate.denominator, config.phase_ticks, ticks_per_step, slots)
-    return Schedule(1, 1, 0, ticks_per_step, slots)
+        return SensorSchedule(
+            rate.numerator, rate.denominator, config.phase_ticks, ticks_per_step, slots
+        )
+    return SensorSchedule(1, 1, 0, ticks_per_step, slots)

@@ -1,7 +1,8 @@
 """The sensors: what each adds to an observation, and how far it looks.
 
 One file a sensor; a new one of the package is a file here, a kernel that writes its numbers, which
-`kernels/sense` or, if most environments leave it off, `kernels/observe_further` calls, and its line
+`kernels/sense` or, if most environments leave it off, `kernels/observe_optional` calls, and its
+line
 in `SENSORS`. Those from outside are registered, see `sensors.registry`.
 """
 
@@ -15,7 +16,7 @@ from cavmarl.core.extensions import REGISTERED_SENSORS
 from cavmarl.core.records.arrays import Sensors
 from cavmarl.rewards.kernels.terms import TTC_REACH_M
 from cavmarl.roads.network import RoadNetwork
-from cavmarl.sensors.kernels.sensor_arrays import FurtherSensors
+from cavmarl.sensors.kernels.sensor_arrays import OptionalSensors
 from cavmarl.sensors.observed import (
     ego,
     lidar_observation,
@@ -37,9 +38,9 @@ __all__ = [
     "Feature",
     "Sensor",
     "frame_size",
-    "further_arrays",
     "largest_radius_m",
     "layout",
+    "optional_arrays",
     "sensing_reach_m",
     "sensor_arrays",
     "sensors_of",
@@ -71,7 +72,7 @@ SENSORS: tuple[Sensor, ...] = (
     Sensor("messages", messages.features, messages.reach_m),
 )
 
-# Those that `observe_further` writes.
+# Those that `observe_optional` writes.
 FURTHER = frozenset(("kinematics", "occupancy_grid", "lidar_observation", "roadgraph"))
 
 
@@ -160,10 +161,10 @@ def sensor_arrays(config: SensorsConfig) -> Sensors:
     )
 
 
-def further_arrays(
+def optional_arrays(
     config: SensorsConfig, network: RoadNetwork, plans: NDArray[np.void]
-) -> FurtherSensors | None:
-    """What `observe_further` takes; None if all of its sensors are off.
+) -> OptionalSensors | None:
+    """What `observe_optional` takes; None if all of its sensors are off.
 
     Args:
         config: the sensors.
@@ -174,7 +175,7 @@ def further_arrays(
         return None
     starts = _starts(config)
     goals = goal_places(network, plans)
-    return FurtherSensors(
+    return OptionalSensors(
         kinematics=kinematics.settings(config, starts["kinematics"], network, goals),
         occupancy=occupancy_grid.settings(config, starts["occupancy_grid"], network, goals),
         lidar_cells=lidar_observation.settings(config, starts["lidar_observation"]),

@@ -1,4 +1,4 @@
-"""`Collector`: takes definitions as they are read and keeps little of each.
+"""`DefinitionCollector`: takes definitions as they are read and keeps little of each.
 
 Names are resolved when all files are read: SUMO's rule that a definition stands before its use is
 not needed here. What occurs often is kept once: routes, types, and lists of stops become numbers at
@@ -32,7 +32,7 @@ from cavmarl.traffic.demand.rerouting_device import device
 from cavmarl.traffic.demand.timing import Timing, flow_timing, single_timing
 from cavmarl.traffic.demand.xml_files import STOPPING_PLACES
 
-__all__ = ["Collector"]
+__all__ = ["DefinitionCollector"]
 
 _NO_DEPARTURE = ("triggered", "containerTriggered", "split", "now")
 _WAY = ("from", "to", "via", "fromJunction", "toJunction", "viaJunctions", "fromTaz", "toTaz")
@@ -44,7 +44,7 @@ _LOOKS = frozenset(("color", "cost", "savings", "exitTimes", "routeLength", "rea
 _RENAMED = {"beginLane": "departLane", "beginPos": "departPos", "beginSpeed": "departSpeed"}
 
 
-class Collector:
+class DefinitionCollector:
     """Definitions by id, and one row for each vehicle, trip and flow.
 
     Attributes:

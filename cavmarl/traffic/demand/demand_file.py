@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from cavmarl.core.errors import DemandError
 from cavmarl.roads.network import RoadNetwork, content_of
-from cavmarl.traffic.demand.definition_collector import Collector
+from cavmarl.traffic.demand.definition_collector import DefinitionCollector
 from cavmarl.traffic.demand.demand_records import ORDER, POS_GIVEN, Choices
 from cavmarl.traffic.demand.demand_report import DemandReport
 from cavmarl.traffic.demand.drawing import (
@@ -246,7 +246,7 @@ def read_demand(
         raise DemandError(f"on_bad_route='{on_bad_route}': choose 'error' or 'skip'")
     report = DemandReport()
     files, begin_ms, end_ms, step_ms, device = _files(paths)
-    collector = Collector(report, begin_ms, end_ms, max_departures)
+    collector = DefinitionCollector(report, begin_ms, end_ms, max_departures)
     for path in files:
         read_elements(path, report, collector.take)
     index = MapIndex(network)

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from cavmarl.driving.vehicle_types import DEFAULT_TYPES
 from cavmarl.roads.network import VEHICLE_CLASSES
-from cavmarl.traffic.demand.definition_collector import Collector
+from cavmarl.traffic.demand.definition_collector import DefinitionCollector
 from cavmarl.traffic.demand.demand_records import (
     LANE_CURRENT,
     UNTIL_ABSOLUTE,
@@ -39,7 +39,7 @@ class Resolver:
         ids: of the elements that are kept, by row.
     """
 
-    def __init__(self, collector: Collector, index: MapIndex, skip: bool) -> None:
+    def __init__(self, collector: DefinitionCollector, index: MapIndex, skip: bool) -> None:
         self._index = index
         self._skip = skip
         self._report = collector.report

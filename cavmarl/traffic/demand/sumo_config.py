@@ -12,7 +12,7 @@ from cavmarl.roads.sumo_net.xml_source import read_xml
 from cavmarl.traffic.demand.element import Element
 from cavmarl.traffic.demand.rerouting_device import DeviceOptions
 
-__all__ = ["SumoConfig", "read_sumo_config"]
+__all__ = ["SumoConfigFile", "read_sumo_config"]
 
 _ROOTS = ("configuration", "sumoConfiguration")
 _OPTIONS = {
@@ -26,7 +26,7 @@ _OPTIONS = {
 
 
 @dataclass(frozen=True)
-class SumoConfig:
+class SumoConfigFile:
     """What a `.sumocfg` says of network, demand and time.
 
     Attributes:
@@ -67,7 +67,7 @@ class _Handler(ContentHandler):
             self.options[_OPTIONS.get(name, name)] = element
 
 
-def read_sumo_config(path: Path) -> SumoConfig:
+def read_sumo_config(path: Path) -> SumoConfigFile:
     """Read a `.sumocfg`.
 
     Raises:
@@ -92,7 +92,7 @@ def read_sumo_config(path: Path) -> SumoConfig:
     step_ms = time_ms("step-length", 1000)
     if step_ms <= 0:
         raise options["step-length"].error("is no length of a step", "write seconds above 0")
-    return SumoConfig(
+    return SumoConfigFile(
         net_file=net[0] if net else None,
         files=tuple(paths("additional-files") + paths("route-files")),
         begin_ms=time_ms("begin", 0),

@@ -46,7 +46,7 @@ _FIELDS_SEEN = {
 _PR_SET_PDEATHSIG = 1
 
 
-class Simulation:
+class SumoSimulation:
     """The one simulation of this process.
 
     Args:
@@ -310,7 +310,7 @@ def _answer(
 
 def _serve(wire: socket.socket) -> NoReturn:
     _, _, told = _order(wire)
-    simulation = Simulation(told)
+    simulation = SumoSimulation(told)
     while True:
         kind, records, line = _order(wire)
         try:

@@ -23,7 +23,7 @@ from cavmarl.core.errors import ConfigError, MissingExtraError, SumoError
 from cavmarl.traffic.sumo import sumo_child as child
 from cavmarl.traffic.sumo.sumo_records import MOVED, SEEN
 
-__all__ = ["Answer", "SumoProcess", "choose_interface"]
+__all__ = ["SumoAnswer", "SumoProcess", "choose_interface"]
 
 ANSWER_S = 120.0  # a step that takes longer hangs
 END_S = 2.0  # for it to end by itself
@@ -32,7 +32,7 @@ LAST_WORDS = 2000  # characters of what it has printed last
 HUGE_PAGES = "glibc.malloc.hugetlb=1"
 
 
-class Answer(NamedTuple):
+class SumoAnswer(NamedTuple):
     """What a SUMO says after a step.
 
     Attributes:
@@ -109,7 +109,7 @@ class SumoProcess:
         self._send(child.LOOK_UP, {"words": words})
         return self._receive().line
 
-    def start(self, words: list[str]) -> Answer:
+    def start(self, words: list[str]) -> SumoAnswer:
         """Begin anew with a command line; errors as of `look_up`."""
         self._send(child.START, {"words": words})
         return self._receive()
@@ -125,7 +125,7 @@ class SumoProcess:
         """
         self._send(child.STEP, {}, moved.tobytes())
 
-    def end_step(self) -> Answer:
+    def end_step(self) -> SumoAnswer:
         """What came of the step; errors as of `look_up`."""
         return self._receive()
 
@@ -140,14 +140,14 @@ class SumoProcess:
         except OSError as error:
             raise self._death() from error
 
-    def _receive(self) -> Answer:
+    def _receive(self) -> SumoAnswer:
         head = np.frombuffer(self._read(child.HEAD.itemsize), child.HEAD)[0]
         records = self._read(int(head["records"]))
         letters = self._read(int(head["letters"]))
         line: dict[str, Any] = json.loads(self._read(int(head["line"])))
         if head["kind"] == child.REFUSED:
             raise ConfigError(f"SUMO refuses: {line['error']}{self._last_words()}")
-        return Answer(np.frombuffer(records, SEEN), bytes(letters), line)
+        return SumoAnswer(np.frombuffer(records, SEEN), bytes(letters), line)
 
     def _read(self, size: int) -> bytearray:
         content = bytearray(size)

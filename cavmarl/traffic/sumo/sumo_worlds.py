@@ -21,16 +21,16 @@ from cavmarl.traffic.sumo.route_book import RouteBook
 from cavmarl.traffic.sumo.stop_book import StopBook
 from cavmarl.traffic.sumo.sumo_demand import SumoDemand
 from cavmarl.traffic.sumo.sumo_history import ToldLog
-from cavmarl.traffic.sumo.sumo_process import Answer, SumoProcess
+from cavmarl.traffic.sumo.sumo_process import SumoAnswer, SumoProcess
 
-__all__ = ["SumoWorlds", "Tick"]
+__all__ = ["SumoTick", "SumoWorlds"]
 
 SEED_BITS = 31
 
 log = logging.getLogger(__name__)
 
 
-class Tick(NamedTuple):
+class SumoTick(NamedTuple):
     """What SUMO says about one tick of one world.
 
     Attributes:
@@ -84,7 +84,7 @@ class SumoWorlds:
         self._tick_ms = round(1000.0 * demand.dt_s)
         self._begin_ms = round(1000.0 * demand.given.begin_s)
         self._processes: list[SumoProcess | None] = [None] * num_worlds
-        self._ticks: list[Tick | None] = [None] * num_worlds
+        self._ticks: list[SumoTick | None] = [None] * num_worlds
         self._path_of = [np.zeros(0, dtype=np.int32) for _ in range(num_worlds)]
 
     @property
@@ -119,7 +119,7 @@ class SumoWorlds:
             answer = process.start(self._demand.words(Path(folder), seed))
         self._ticks[w] = self._take(w, 0, answer)
 
-    def at(self, w: int) -> Tick:
+    def at(self, w: int) -> SumoTick:
         """What is known of a world's present tick."""
         tick = self._ticks[w]
         if tick is None:
@@ -184,7 +184,7 @@ class SumoWorlds:
             raise SumoError("SUMO has not been started: reset the world first")
         return process
 
-    def _take(self, w: int, tick: int, answer: Answer) -> Tick:
+    def _take(self, w: int, tick: int, answer: SumoAnswer) -> SumoTick:
         line, seen = answer.line, answer.seen
         should_be = self._begin_ms + tick * self._tick_ms
         if line["time_ms"] != should_be:
@@ -200,7 +200,7 @@ class SumoWorlds:
         for number, name in lifted:
             log.warning("world %d, tick %d: SUMO teleports %s (%d)", w, tick, name, number)
         self.teleports[w] += len(lifted)
-        return Tick(
+        return SumoTick(
             tick,
             seen,
             answer.letters,

@@ -11,7 +11,7 @@ from cavmarl.core.math.neighbors import cell_at, cell_columns, cell_rows
 from cavmarl.core.math.rng import mix
 from cavmarl.core.numba import inlined_kernel, kernel
 from cavmarl.v2x.kernels.v2x_channel import Channel, gets_access
-from cavmarl.v2x.kernels.v2x_records import COUNT_NO_ACCESS, KIND_CAM, Air, Mail, Room
+from cavmarl.v2x.kernels.v2x_records import COUNT_NO_ACCESS, KIND_CAM, Air, Mail, V2xScratch
 
 __all__ = ["count_within", "find_cam", "let_on_the_air", "list_cams", "load_around"]
 
@@ -63,7 +63,7 @@ def count_within(air: Air, x: float, y: float, radius_m: float) -> int:
 
 
 @inlined_kernel
-def load_around(channel: Channel, room: Room, x: float, y: float) -> float:
+def load_around(channel: Channel, room: V2xScratch, x: float, y: float) -> float:
     """Share of the tick that all packets take that one hears there; above 1, they do not fit."""
     count = count_within(room.cams, x, y, channel.sensing_m)
     count += count_within(room.others, x, y, channel.sensing_m)
@@ -78,7 +78,7 @@ def _place_of(sender: int, slots: int) -> int:
 
 
 @kernel
-def list_cams(room: Room, packets: NDArray[np.void], num: int) -> None:
+def list_cams(room: V2xScratch, packets: NDArray[np.void], num: int) -> None:
     """Make `room.cam_of` the table of the CAMs that are on the air, by sender."""
     table = room.cam_of
     table[:] = -1
@@ -91,7 +91,7 @@ def list_cams(room: Room, packets: NDArray[np.void], num: int) -> None:
 
 
 @inlined_kernel
-def find_cam(room: Room, packets: NDArray[np.void], sender: int) -> int:
+def find_cam(room: V2xScratch, packets: NDArray[np.void], sender: int) -> int:
     """The CAM of a sender, or -1."""
     table = room.cam_of
     place = _place_of(sender, table.size)
@@ -102,7 +102,7 @@ def find_cam(room: Room, packets: NDArray[np.void], sender: int) -> int:
 
 @kernel
 def let_on_the_air(
-    channel: Channel, mail: Mail, w: int, slot: int, key: np.uint64, room: Room
+    channel: Channel, mail: Mail, w: int, slot: int, key: np.uint64, room: V2xScratch
 ) -> None:
     """Sort the packets of a tick by place; where the air is too busy, not all of them get on it."""
     packets = mail.packets[w, slot]

@@ -25,9 +25,9 @@ from cavmarl.v2x.kernels.v2x_records import (
     COUNT_RECEIVED,
     NUM_BANDS,
     Air,
-    Heard,
+    HeardCams,
     Mail,
-    Room,
+    V2xScratch,
 )
 
 __all__ = ["band_of", "hears", "let_in_cams", "refresh_by_cams"]
@@ -57,7 +57,7 @@ def refresh_by_cams(
     level: int,
     packets: NDArray[np.void],
     reports: NDArray[np.void],
-    room: Room,
+    room: V2xScratch,
     box: NDArray[np.void],
     num: int,
 ) -> None:
@@ -81,7 +81,7 @@ def refresh_by_cams(
 
 @inlined_kernel
 def _list_within(
-    air: Air, own: int, x: float, y: float, reach_m: float, limit: float, heard: Heard
+    air: Air, own: int, x: float, y: float, reach_m: float, limit: float, heard: HeardCams
 ) -> int:
     """List the packets of others within a distance; returns how many."""
     cells = air.cells
@@ -104,7 +104,7 @@ def _list_within(
 
 
 @inlined_kernel
-def _drop_lost(channel: Channel, me: np.void, level: int, room: Room, num: int) -> int:
+def _drop_lost(channel: Channel, me: np.void, level: int, room: V2xScratch, num: int) -> int:
     """Of the first `num` in `room.heard` keep those that are received; returns how many."""
     air = room.cams
     place = room.heard.place
@@ -149,7 +149,7 @@ def let_in_cams(
     level: int,
     packets: NDArray[np.void],
     reports: NDArray[np.void],
-    room: Room,
+    room: V2xScratch,
     box: NDArray[np.void],
     num: int,
 ) -> int:

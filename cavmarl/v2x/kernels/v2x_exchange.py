@@ -12,7 +12,7 @@ from cavmarl.core.records.codes import DRIVER_AGENT
 from cavmarl.v2x.kernels.v2x_channel import Channel, receiver_word
 from cavmarl.v2x.kernels.v2x_inbox import empty
 from cavmarl.v2x.kernels.v2x_receiving import age, deliver, learn
-from cavmarl.v2x.kernels.v2x_records import FIRST_ROADSIDE_ID, Mail, Room, Sending
+from cavmarl.v2x.kernels.v2x_records import FIRST_ROADSIDE_ID, Mail, Sending, V2xScratch
 from cavmarl.v2x.kernels.v2x_sending import gather, send_from_units, send_from_vehicles
 
 __all__ = ["exchange_messages", "hand_out"]
@@ -27,7 +27,7 @@ def _place_receivers(
     key: np.uint64,
     units: NDArray[np.void],
     mail: Mail,
-    room: Room,
+    room: V2xScratch,
 ) -> None:
     """Note where the agents and the roadside units are; new ones have empty inboxes."""
     receivers = room.receivers
@@ -71,7 +71,7 @@ def exchange_messages(
     first: int,
     last: int,
     mail: Mail,
-    room: Room,
+    room: V2xScratch,
 ) -> None:
     """Send what is due in the present tick of some worlds, and receive what arrives in it.
 
@@ -120,7 +120,7 @@ def hand_out(
     latency: int,
     mail: Mail,
     w: int,
-    room: Room,
+    room: V2xScratch,
 ) -> None:
     """Let receivers have what a network simulator says that they receive in this tick.
 

@@ -9,7 +9,7 @@ import numpy as np
 from cavmarl.core.math.neighbors import nearest_bodies
 from cavmarl.core.math.walls import Walls, is_cut
 from cavmarl.core.numba import kernel
-from cavmarl.v2x.kernels.v2x_records import MAX_NEAR, Room
+from cavmarl.v2x.kernels.v2x_records import MAX_NEAR, V2xScratch
 
 __all__ = ["visible"]
 
@@ -31,7 +31,7 @@ def _stands_between(body: np.void, x: float, y: float, cos: float, sin: float, f
 
 @kernel
 def visible(
-    room: Room,
+    room: V2xScratch,
     own: int,
     x: float,
     y: float,

@@ -26,7 +26,7 @@ from cavmarl.v2x.kernels.v2x_records import (
     KIND_SPAT,
     NUM_BANDS,
     Mail,
-    Room,
+    V2xScratch,
 )
 
 __all__ = ["age", "deliver", "learn"]
@@ -41,7 +41,7 @@ def _take_others(
     level: int,
     packets: NDArray[np.void],
     reports: NDArray[np.void],
-    room: Room,
+    room: V2xScratch,
     kind: int,
     box: NDArray[np.void],
     num: int,
@@ -94,7 +94,7 @@ def _receive_objects(
     me: np.void,
     level: int,
     with_seen: bool,
-    room: Room,
+    room: V2xScratch,
     box: NDArray[np.void],
     num: int,
 ) -> int:
@@ -122,7 +122,7 @@ def _receive_others(
     me: np.void,
     level: int,
     kind: int,
-    room: Room,
+    room: V2xScratch,
     box: NDArray[np.void],
     num: int,
 ) -> int:
@@ -143,7 +143,7 @@ def _receive(
     r: int,
     tick: int,
     kinds: NDArray[np.int64],
-    room: Room,
+    room: V2xScratch,
 ) -> None:
     """Bring the inboxes of one receiver to the present tick."""
     me = room.receivers[r]
@@ -180,7 +180,7 @@ def deliver(
     key: np.uint64,
     tick: int,
     latency: int,
-    room: Room,
+    room: V2xScratch,
 ) -> None:
     """Let all receivers of a world receive the packets of one slot.
 
@@ -223,7 +223,7 @@ def _put_in_order(
 
 
 @kernel
-def age(mail: Mail, w: int, r: int, tick: int, room: Room) -> None:
+def age(mail: Mail, w: int, r: int, tick: int, room: V2xScratch) -> None:
     """Take out of a receiver's inboxes what is too old, and put the rest in order."""
     me = room.receivers[r]
     _put_in_order(mail.objects[w, r], tick, room.squared, me["x"], me["y"])
@@ -232,7 +232,7 @@ def age(mail: Mail, w: int, r: int, tick: int, room: Room) -> None:
 
 
 @kernel
-def learn(mail: Mail, w: int, slot: int, p: int, r: int, delay: int, room: Room) -> None:
+def learn(mail: Mail, w: int, slot: int, p: int, r: int, delay: int, room: V2xScratch) -> None:
     """Deliver one packet to one receiver, as a network simulator has decided.
 
     Args:

@@ -44,10 +44,10 @@ __all__ = [
     "STATION",
     "UNIT",
     "Air",
-    "Heard",
+    "HeardCams",
     "Mail",
-    "Room",
     "Sending",
+    "V2xScratch",
 ]
 
 # PACKET["kind"], in the order in which one station sends them.
@@ -216,17 +216,17 @@ class Air(NamedTuple):
     which: NDArray[np.int32]  # the packet
 
 
-class Heard(NamedTuple):
+class HeardCams(NamedTuple):
     """CAMs that one receiver could receive, in the order in which they are found."""
 
-    place: NDArray[np.int32]  # (P + 1,) in `Room.cams`
+    place: NDArray[np.int32]  # (P + 1,) in `V2xScratch.cams`
     squared: NDArray[np.float64]  # squared distance, m²
     word: NDArray[np.uint64]  # see PACKET
     distance: NDArray[np.float64]  # m
     number: NDArray[np.float64]  # of the reception, see `draw`
 
 
-class Room(NamedTuple):
+class V2xScratch(NamedTuple):
     """What a tick works in; holds nothing between ticks."""
 
     stations: NDArray[np.void]  # STATION (C,)
@@ -243,6 +243,6 @@ class Room(NamedTuple):
     kinds: NDArray[np.int64]  # (NUM_KINDS,) packets that are received now
     access: NDArray[np.bool_]  # (P,) whether a packet gets on the air
     cam_of: NDArray[np.int32]  # (a power of 2,) the CAM of a sender, or -1; a hash table
-    heard: Heard
+    heard: HeardCams
     tally: NDArray[np.int64]  # (2 NUM_BANDS,) packets lost and received by bands of distance
     squared: NDArray[np.float64]  # (largest inbox,)

@@ -28,8 +28,8 @@ from cavmarl.v2x.kernels.v2x_records import (
     KIND_DENM,
     KIND_SPAT,
     Mail,
-    Room,
     Sending,
+    V2xScratch,
 )
 
 __all__ = ["gather", "phase_left_s", "send_from_units", "send_from_vehicles"]
@@ -238,7 +238,7 @@ def _send_seen(
     y: float,
     num: int,
     types: NDArray[np.void],
-    room: Room,
+    room: V2xScratch,
     tick: int,
 ) -> None:
     """Tell of those that `room.seen` names."""
@@ -267,7 +267,7 @@ def send_from_vehicles(
     tick: int,
     types: NDArray[np.void],
     walls: Walls,
-    room: Room,
+    room: V2xScratch,
 ) -> None:
     """What is due of all vehicles, by id."""
     known = 0
@@ -325,7 +325,7 @@ def send_from_units(
     units: NDArray[np.void],
     types: NDArray[np.void],
     walls: Walls,
-    room: Room,
+    room: V2xScratch,
 ) -> None:
     """What is due of the roadside units."""
     tick = common.ticks[w]

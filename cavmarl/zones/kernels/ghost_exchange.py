@@ -16,7 +16,7 @@ from cavmarl.core.numba.prefetch import SOON, prefetch
 from cavmarl.core.records.arrays import Zoned
 from cavmarl.core.records.codes import DRIVER_BACKGROUND
 from cavmarl.zones.kernels.borders import Borders
-from cavmarl.zones.kernels.handoff import Book, look_on
+from cavmarl.zones.kernels.handoff import BorderRecords, look_on
 from cavmarl.zones.kernels.zone_lookup import (
     Halo,
     ZoneArrays,
@@ -43,7 +43,7 @@ def exchange(
     side: int,
     first: int,
     last: int,
-    book: Book,
+    book: BorderRecords,
 ) -> None:
     """Renew all ghosts of some worlds from the owned rows, and note vehicles near a border.
 
@@ -143,7 +143,9 @@ def gather(
 
 
 @kernel
-def note_gathered(zones: ZoneArrays, borders: Borders, zoned: Zoned, side: int, book: Book) -> None:
+def note_gathered(
+    zones: ZoneArrays, borders: Borders, zoned: Zoned, side: int, book: BorderRecords
+) -> None:
     """All zones have gathered their ghosts: note vehicles near a border, as `exchange` does.
 
     Args:

@@ -1,6 +1,7 @@
 """Changes of owner where all zones share a process: approaches to a border, and changes.
 
-Both are kept in a `Book`. Vehicles that come near are noted at the end of a tick, with the ghosts;
+Both are kept in a `BorderRecords`. Vehicles that come near are noted at the end of a tick, with
+the ghosts;
 in most ticks none has crossed, and nothing is to be done when the next one begins.
 """
 
@@ -23,7 +24,7 @@ __all__ = [
     "LATE",
     "NOT_OWNED",
     "NOT_SEEN",
-    "Book",
+    "BorderRecords",
     "hand_over",
     "look",
     "look_on",
@@ -86,7 +87,7 @@ LATE = 256
 """Once so many changes wait they are read; the last tick may add one for each vehicle."""
 
 
-class Book(NamedTuple):
+class BorderRecords(NamedTuple):
     """What is known of the borders of W worlds; C rows a zone can hold."""
 
     near: NDArray[np.void]  # NEAR (W, 2 C) by the newest rows
@@ -107,7 +108,7 @@ class Book(NamedTuple):
     due: NDArray[np.void]  # DUE (AT_ONCE,) scratch of `exchange`
 
 
-def make_book(num_worlds: int, capacity: int) -> Book:
+def make_book(num_worlds: int, capacity: int) -> BorderRecords:
     """An empty one.
 
     Args:
@@ -118,7 +119,7 @@ def make_book(num_worlds: int, capacity: int) -> Book:
     def numbers(*shape: int) -> NDArray[np.int64]:
         return np.zeros((num_worlds, *shape), np.int64)
 
-    return Book(
+    return BorderRecords(
         near=np.zeros((num_worlds, 2 * capacity), NEAR),
         num_near=numbers(),
         num_crossed=numbers(),
@@ -147,7 +148,7 @@ def look(
     w: int,
     everybody: bool,
     num_newborn: int,
-    book: Book,
+    book: BorderRecords,
 ) -> None:
     """Note vehicles near a border, and those of them that have crossed it.
 
@@ -181,7 +182,7 @@ def look(
 
 @kernel
 def look_on(
-    zones: ZoneArrays, borders: Borders, zoned: Zoned, side: int, w: int, book: Book
+    zones: ZoneArrays, borders: Borders, zoned: Zoned, side: int, w: int, book: BorderRecords
 ) -> None:
     """`look` at the rows of the next tick."""
     now = book.turn[w]
@@ -201,7 +202,7 @@ def hand_over(
     w: int,
     everybody: bool,
     num_newborn: int,
-    book: Book,
+    book: BorderRecords,
 ) -> int:
     """Give every vehicle that lies beyond its zone's hysteresis to the zone that it is in.
 
@@ -238,7 +239,7 @@ def hand_over(
 
 
 @inlined_kernel
-def _follow_swap(zoned: Zoned, w: int, near: np.void, changed: int, book: Book) -> None:
+def _follow_swap(zoned: Zoned, w: int, near: np.void, changed: int, book: BorderRecords) -> None:
     """The last to enter a zone fills the row of one that leaves it in the same tick.
 
     Without this `release` would look for it among all rows.
@@ -252,7 +253,7 @@ def _follow_swap(zoned: Zoned, w: int, near: np.void, changed: int, book: Book) 
 
 
 @inlined_kernel
-def _is_newborn(book: Book, w: int, num_newborn: int, vehicle: int) -> bool:
+def _is_newborn(book: BorderRecords, w: int, num_newborn: int, vehicle: int) -> bool:
     for n in range(num_newborn):
         if book.newborn[w, n] == vehicle:
             return True
@@ -260,7 +261,7 @@ def _is_newborn(book: Book, w: int, num_newborn: int, vehicle: int) -> bool:
 
 
 @inlined_kernel
-def _renew(zoned: Zoned, side: int, w: int, book: Book) -> None:
+def _renew(zoned: Zoned, side: int, w: int, book: BorderRecords) -> None:
     """Let the present `coming` be the vehicles near now; known ones keep what is known of them."""
     turn = book.turn[w]
     before = book.coming[w, 1 - turn]
@@ -314,7 +315,7 @@ def _next_crossed(near: NDArray[np.void], num: int, last: int) -> int:
 
 
 @kernel
-def _change(zoned: Zoned, side: int, w: int, near: np.void, book: Book) -> int:
+def _change(zoned: Zoned, side: int, w: int, near: np.void, book: BorderRecords) -> int:
     """Let a vehicle that has crossed change its owner; its new row, or why it has none."""
     vehicle = near["vehicle"]
     target = near["target"]
@@ -346,7 +347,13 @@ def _change(zoned: Zoned, side: int, w: int, near: np.void, book: Book) -> int:
 
 @kernel
 def release(
-    zones: ZoneArrays, zoned: Zoned, side: int, w: int, changed: int, now_ms: float, book: Book
+    zones: ZoneArrays,
+    zoned: Zoned,
+    side: int,
+    w: int,
+    changed: int,
+    now_ms: float,
+    book: BorderRecords,
 ) -> None:
     """Note when the tick of the newest changes is over, and how far from their old zones they are.
 

@@ -25,7 +25,7 @@ from cavmarl.driving.kernels.junctions import EXIT_LOOK_M
 from cavmarl.driving.kernels.lane_choice import LOOK_BACK_M
 from cavmarl.zones.kernels.zone_lookup import squared_distance
 
-__all__ = ["Room", "farthest_m", "find_looks", "make_room"]
+__all__ = ["VisibilityScratch", "farthest_m", "find_looks", "make_room"]
 
 AT_LINE_M = 0.2  # so near before a line a vehicle may be about to drive over it
 ASIDE_M = 10.0  # places beside each other on lanes of one edge are not further apart, nor more of s
@@ -33,7 +33,7 @@ BACK_M = max(LOOK_BACK_M, ENTER_REACH_M)  # to the end of a lane on which follow
 ROUNDING_M = 0.1  # more than sums over lanes, and float32, are off
 
 
-class Room(NamedTuple):
+class VisibilityScratch(NamedTuple):
     """What is known of each lane, and of each link, on the way."""
 
     first: NDArray[np.float64]  # (L,) the zone's own part of a lane, m; inf: it has none
@@ -48,12 +48,14 @@ class Room(NamedTuple):
     following: NDArray[np.int32]  # (L,) which lane is to be looked at then
 
 
-def make_room(num_lanes: int, num_links: int) -> Room:
+def make_room(num_lanes: int, num_links: int) -> VisibilityScratch:
     """Room for a map."""
     first, last, ahead, behind, to_line, beyond = np.full((6, num_lanes), np.inf)
     asked, foe = np.zeros((2, num_links), dtype=np.bool_)
     waits, following = np.zeros(num_lanes, dtype=np.bool_), np.zeros(num_lanes, dtype=np.int32)
-    return Room(first, last, ahead, behind, to_line, beyond, asked, foe, waits, following)
+    return VisibilityScratch(
+        first, last, ahead, behind, to_line, beyond, asked, foe, waits, following
+    )
 
 
 @kernel
@@ -80,7 +82,7 @@ def _within(
 
 
 @kernel
-def _find_own(roads: RoadArrays, rect: NDArray[np.float64], room: Room) -> None:
+def _find_own(roads: RoadArrays, rect: NDArray[np.float64], room: VisibilityScratch) -> None:
     """Which part of each lane lies in a rectangle; lanes beside each other have the same."""
     for lane in range(roads.lanes.shape[0]):
         room.first[lane] = math.inf
@@ -142,7 +144,11 @@ def _begin(
 
 @kernel
 def _spread(
-    roads: RoadArrays, forwards: bool, limit_m: float, ways: NDArray[np.float64], room: Room
+    roads: RoadArrays,
+    forwards: bool,
+    limit_m: float,
+    ways: NDArray[np.float64],
+    room: VisibilityScratch,
 ) -> None:
     """Shortest ways along the roads, from where they begin to all lanes within a limit.
 
@@ -210,7 +216,7 @@ def _see(roads: RoadArrays, lane: int, first: float, last: float, looks: NDArray
 
 @kernel
 def _look_along(
-    roads: RoadArrays, view_m: float, see_m: float, room: Room, looks: NDArray[np.void]
+    roads: RoadArrays, view_m: float, see_m: float, room: VisibilityScratch, looks: NDArray[np.void]
 ) -> None:
     """Leaders ahead, and followers: on own lanes, and over their starts."""
     view_m = max(view_m, see_m, LOOK_BACK_M)
@@ -238,7 +244,7 @@ def _look_along(
 
 
 @kernel
-def _find_lines(roads: RoadArrays, see_m: float, room: Room) -> None:
+def _find_lines(roads: RoadArrays, see_m: float, room: VisibilityScratch) -> None:
     """Which links the zone's drivers may ask about, and which are the foes of these."""
     for link in range(roads.links.shape[0]):
         room.asked[link] = False
@@ -261,7 +267,7 @@ def _find_lines(roads: RoadArrays, see_m: float, room: Room) -> None:
 
 
 @kernel
-def _ask(roads: RoadArrays, lane: int, room: Room) -> None:
+def _ask(roads: RoadArrays, lane: int, room: VisibilityScratch) -> None:
     """All links that lead on from the edge of a lane."""
     edge = roads.edges[roads.lanes[lane]["edge"]]
     for other in range(edge["first_lane"], edge["first_lane"] + edge["num_lanes"]):
@@ -272,7 +278,7 @@ def _ask(roads: RoadArrays, lane: int, room: Room) -> None:
 
 @kernel
 def _look_at_junctions(
-    roads: RoadArrays, half_m: float, room: Room, looks: NDArray[np.void]
+    roads: RoadArrays, half_m: float, room: VisibilityScratch, looks: NDArray[np.void]
 ) -> None:
     """Vehicles that come to the lines of foes, are on a junction, or stand behind it."""
     for lane in range(roads.lanes.shape[0]):
@@ -312,7 +318,7 @@ def find_looks(
     view_m: float,
     see_m: float,
     half_m: float,
-    room: Room,
+    room: VisibilityScratch,
     looks: NDArray[np.void],
 ) -> None:
     """Say for each lane where vehicles are that matter to the drivers of one zone.

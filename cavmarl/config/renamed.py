@@ -1,0 +1,71 @@
+"""Names of keys, modes and terms that have changed: the old ones still work, and warn.
+
+They go with the version after this one.
+"""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Mapping
+from typing import Any
+
+__all__ = ["with_current_names"]
+
+# Dotted key before → now.
+KEYS = {
+    "workers.repeats": "workers.max_retries",
+    "workers.watch": "workers.monitor_cpu",
+    "workers.tolerance": "workers.imbalance_tolerance",
+    "zones.check": "zones.check_invariants",
+    "zones.recut_steps": "zones.repartition_steps",
+    "zones.recut_tolerance": "zones.repartition_tolerance",
+    "terms.weights.speed": "terms.weights.speeding",
+    "terms.weights.comfort": "terms.weights.jerk",
+    "terms.weights.time_to_collision": "terms.weights.ttc_risk",
+}
+MODES = {"seats": "respawn", "entering": "open"}
+
+
+def with_current_names(raw: object) -> object:
+    """The same keys and values as of an env.yaml, by the names that they have now.
+
+    An old name warns (`FutureWarning`) and takes the place of the new one.
+
+    Args:
+        raw: nested mappings, from outside; what is no mapping is handed back.
+    """
+    if not isinstance(raw, Mapping):
+        return raw
+    found = {
+        key: dict(value) if isinstance(value, Mapping) else value for key, value in raw.items()
+    }
+    for old, new in KEYS.items():
+        *folders, name = old.split(".")
+        place = _inner(found, folders)
+        if place is not None and name in place:
+            _warn(old, new)
+            place[new.rpartition(".")[2]] = place.pop(name)
+    population = _inner(found, ["population"])
+    mode = None if population is None else population.get("mode")
+    if isinstance(mode, str) and mode in MODES and population is not None:
+        _warn(f"population.mode = {mode}", f"population.mode = {MODES[mode]}")
+        population["mode"] = MODES[mode]
+    return found
+
+
+def _inner(found: dict[Any, Any], folders: list[str]) -> dict[Any, Any] | None:
+    place: Any = found
+    for folder in folders:
+        inner = place.get(folder)
+        if not isinstance(inner, Mapping):
+            return None
+        place[folder] = place = dict(inner)
+    return place if isinstance(place, dict) else None
+
+
+def _warn(old: str, new: str) -> None:
+    warnings.warn(
+        f"{old} is now called {new}; the old name goes with the next version",
+        FutureWarning,
+        stacklevel=5,
+    )
