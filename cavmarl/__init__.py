@@ -31,6 +31,7 @@ from cavmarl.core.errors import (
     NoAdmissibleWorkerError,
     PolicyError,
     ProtocolError,
+    RegisteredFunctionError,
     RouteError,
     ScenarioError,
     SumoError,
@@ -39,16 +40,23 @@ from cavmarl.core.errors import (
     WorkerError,
     WorkerFailureError,
 )
+from cavmarl.driving.agent_view import AgentView
+from cavmarl.driving.driver_models import register_driver_model
 from cavmarl.env.parallel import CavEnv, parallel_env
 from cavmarl.env.registration import env, raw_env, register_all
 from cavmarl.env.vector import CavVectorEnv, make_vec
+from cavmarl.parallel.backends import register_backend
 from cavmarl.policies.policy import Policy, load_policy
+from cavmarl.rewards.registered_terms import register_term
+from cavmarl.sensors.observed.feature import Feature
+from cavmarl.sensors.registry import register_sensor
 
 __version__ = "0.1.0"
 
 __all__ = [
     "TERMS",
     "ActionError",
+    "AgentView",
     "CapacityError",
     "CavEnv",
     "CavVectorEnv",
@@ -59,6 +67,7 @@ __all__ = [
     "EnvConfig",
     "EpisodeError",
     "EvaluationError",
+    "Feature",
     "FollowerError",
     "FollowerLostError",
     "JournalError",
@@ -71,6 +80,7 @@ __all__ = [
     "Policy",
     "PolicyError",
     "ProtocolError",
+    "RegisteredFunctionError",
     "RouteError",
     "ScenarioError",
     "SumoError",
@@ -84,6 +94,10 @@ __all__ = [
     "make_vec",
     "parallel_env",
     "raw_env",
+    "register_backend",
+    "register_driver_model",
+    "register_sensor",
+    "register_term",
 ]
 
 register_all()

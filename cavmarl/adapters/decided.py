@@ -1,4 +1,4 @@
-"""Keys that a view decides itself, since its library leaves it no choice."""
+"""Keys of `env.yaml` that an adapter fixes, since its library allows one value only."""
 
 from __future__ import annotations
 

@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 
 from cavmarl.adapters.decided import refuse_decided
 from cavmarl.adapters.observations import ObservationForm, Observations
-from cavmarl.config.env import TERMS
 from cavmarl.config.registry import load_config
 from cavmarl.core.errors import ConfigError
 from cavmarl.env.vector import CavVectorEnv, make_vec
@@ -71,6 +70,7 @@ class CavAgentRows(VectorEnv[Any, Any, Any]):
         )
         self.closed = False
         self._shape = (num_worlds, self._vec.num_agents)
+        self._term_names = self._vec.config.terms.names
         self._form = ObservationForm(self._vec.config)
         self._same_step = self._vec.metadata["autoreset_mode"] is AutoresetMode.SAME_STEP
         self.num_envs = num_envs
@@ -103,7 +103,7 @@ class CavAgentRows(VectorEnv[Any, Any, Any]):
         observations, rewards, ended, cut, infos = self._vec.step(
             actions.reshape(*self._shape, *actions.shape[1:])
         )
-        terms = {name: infos["terms"][..., k] for k, name in enumerate(TERMS)}
+        terms = {name: infos["terms"][..., k] for k, name in enumerate(self._term_names)}
         told = self._told({"active": infos["mask"], "vehicle_done": infos["vehicle_done"], **terms})
         over = self._rows(ended | cut)
         if self._same_step and over.any():
@@ -122,7 +122,7 @@ class CavAgentRows(VectorEnv[Any, Any, Any]):
         self._vec.close()
 
     def _told(self, arrays: Mapping[str, NDArray[Any]]) -> dict[str, Any]:
-        """Infos of all rows, each with the mask of who has it, as Gymnasium's wrappers expect."""
+        """Infos of all rows, each with the mask of its rows, as Gymnasium's wrappers expect."""
         everybody = np.ones(self.num_envs, dtype=np.bool_)
         told: dict[str, Any] = {name: self._rows(array) for name, array in arrays.items()}
         return told | {f"_{name}": everybody for name in arrays}

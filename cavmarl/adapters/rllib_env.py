@@ -29,8 +29,8 @@ class CavRllibEnv(MultiAgentEnv):  # type: ignore[misc] # found in an environmen
         PPOConfig().environment(CavRllibEnv, env_config={"env": "town", "agents": 25})
 
     Agents enter and leave in every population: all ids that an episode can use are declared
-    beforehand, and an id that has ended does not come back. The end of everybody (`__all__`) is a
-    truncation where the horizon cut somebody. RLlib ends an episode as soon as all agents that it
+    beforehand, and an id that has ended does not come back. The end of all (`__all__`) is a
+    truncation where the horizon cut an agent. RLlib ends an episode as soon as all agents that it
     knows have ended, also where others enter in that very step: these are then the agents of its
     next episode, for which the same world goes on.
 
@@ -59,7 +59,7 @@ class CavRllibEnv(MultiAgentEnv):  # type: ignore[misc] # found in an environmen
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[dict[str, Any], dict[str, Any]]:
-        """Begin an episode; without a seed it is that of the agents who entered last, if any."""
+        """Begin an episode; without a seed it is that of the agents that entered last, if any."""
         if self._entered is None or seed is not None:
             self._entered = self._env.reset(seed=seed, options=options)
         (observations, infos), self._entered = self._entered, None

@@ -17,7 +17,6 @@ from numpy.typing import NDArray
 
 from cavmarl.adapters.decided import refuse_decided
 from cavmarl.adapters.observations import ObservationForm
-from cavmarl.config.env import TERMS
 from cavmarl.core.errors import missing
 from cavmarl.core.seeds import check_seed
 from cavmarl.env.vector import CavVectorEnv, make_vec
@@ -43,7 +42,8 @@ class CavTorchRLEnv(EnvBase):  # type: ignore[misc] # TorchRL is not typed
     Entries of a tensordict, with one axis more than the batch for the agents:
 
     - `("car", "observation")`: (W, A, D), or one entry a sensor (`observation.kind: dict`);
-    - `("car", "mask")`: (W, A) who has a vehicle and acts next. The others' actions are not read
+    - `("car", "mask")`: (W, A) agents that have a vehicle and act next. The others' actions are not
+    read
       and their observations are 0, but for the last one of an agent that has just ended. Losses
       and means are to be taken where it is True;
     - `("car", "action")`: (W, A, 2) within [-1, 1], or (W, A) meta-actions;
@@ -87,10 +87,13 @@ class CavTorchRLEnv(EnvBase):  # type: ignore[misc] # TorchRL is not typed
         self.max_cycles = vec.max_cycles
         self.group_map = {GROUP: vec.possible_agents}
         agents = (num_envs, vec.num_agents)
+        self._term_names = vec.config.terms.names
         self.observation_spec = self._of_agents(
             observation=_observation_spec(self._form.space, agents),
             mask=_flags(agents),
-            info=Composite({term: Unbounded((*agents, 1)) for term in TERMS}, shape=agents),
+            info=Composite(
+                {term: Unbounded((*agents, 1)) for term in self._term_names}, shape=agents
+            ),
         )
         self.action_spec = self._of_agents(action=_action_spec(vec.single_action_space, agents))
         self.reward_spec = self._of_agents(reward=Unbounded((*agents, 1)))
@@ -100,7 +103,7 @@ class CavTorchRLEnv(EnvBase):  # type: ignore[misc] # TorchRL is not typed
             **{GROUP: Composite({name: _flags((*agents, 1)) for name in ends}, shape=agents)},
             shape=self.batch_size,
         )
-        self._no_terms = np.zeros((*agents, len(TERMS)), dtype=np.float32)
+        self._no_terms = np.zeros((*agents, len(vec.config.terms.names)), dtype=np.float32)
 
     @property
     def vec(self) -> CavVectorEnv:
@@ -150,7 +153,7 @@ class CavTorchRLEnv(EnvBase):  # type: ignore[misc] # TorchRL is not typed
             if isinstance(shown, np.ndarray)
             else {name: torch.from_numpy(part) for name, part in shown.items()},
             "mask": torch.from_numpy(mask),
-            "info": {term: columns[..., k : k + 1] for k, term in enumerate(TERMS)},
+            "info": {term: columns[..., k : k + 1] for k, term in enumerate(self._term_names)},
         }
 
     def _tensors(self, agents: Mapping[str, Any], worlds: Mapping[str, Tensor]) -> TensorDict:

@@ -1,4 +1,4 @@
-"""`Plan`: which worker hosts which shard, and all that it follows from."""
+"""`Plan`: which worker hosts which shard, and its inputs."""
 
 from __future__ import annotations
 

@@ -1,11 +1,11 @@
-"""LoadScore: which worker is least loaded, and which ones are not asked at all.
+"""LoadScore: ranks workers by load, and excludes overloaded ones.
 
     LoadScore_i = 0.6 CPU_i + 0.2 RAM_i + 0.2 GPU_i       eq. (1)
     worker*     = arg min LoadScore_i over the admissible   eq. (2)
 
 after "Distributed CARLA architecture for multi-agent CAV simulation: design and preliminary
 multi-GPU evaluation", section 3.5. A worker one of whose resources is used above its threshold
-(CPU 0.85, RAM 0.90, GPU 0.95) is excluded before anybody scores, so that free resources cannot
+(CPU 0.85, RAM 0.90, GPU 0.95) is excluded before scoring, so that free resources cannot
 hide a critical one. All utilisations are shares from 0 to 1.
 """
 
@@ -162,11 +162,11 @@ class Rejection(NamedTuple):
 
 @dataclass(frozen=True)
 class Selection:
-    """Whom `select` chose and why.
+    """The worker that `select` chose and why.
 
     Attributes:
         worker: the one.
-        preferred: who was asked for, if anybody.
+        preferred: the one asked for, if any.
         outcome: why it is this one.
         scores: (worker, LoadScore) of all admissible ones, by worker.
         rejections: of the others, by worker; one for each resource that is too busy.
@@ -237,7 +237,7 @@ def select(
     Args:
         candidates: all workers.
         rule: weights, thresholds, and how much worse a preferred worker may be.
-        preferred: who is kept while it is admissible and within the margin.
+        preferred: a worker kept while it is admissible and within the margin.
 
     Raises:
         NoAdmissibleWorkerError: all are excluded; the error holds every reason.

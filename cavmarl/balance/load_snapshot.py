@@ -1,4 +1,4 @@
-"""`Snapshot`: what is in use of each worker's resources, as it was seen once.
+"""`Snapshot`: each worker's resource use at one time.
 
 A placement depends on live readings only through a snapshot: kept in a manifest, it gives the same
 plan again. `probe` takes one of this machine.

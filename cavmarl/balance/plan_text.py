@@ -26,7 +26,7 @@ LEFT = len(HEADINGS) - 1  # the last column is text
 
 
 def describe_plan(plan: Plan) -> str:
-    """Lines without a last line break: the whole, each worker, who is excluded, who moves."""
+    """Lines without a last line break: the whole, each worker, excluded ones, moves."""
     problem, placement = plan.problem, plan.placement
     snapshot = problem.snapshot
     costs = [shard.cost_s for shard in problem.shards]

@@ -1,4 +1,4 @@
-"""What others use of this machine, worker by worker."""
+"""Measures what other programs use of this machine, worker by worker."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def take_snapshot(workers: Mapping[int, int | None], interval_s: float = INTERVA
 
 
 class Watch:
-    """The machine from now on, until somebody asks.
+    """The machine from now on, until it is read.
 
     A worker's CPU is the mean use of the cores that its process may run on, less what it, the
     other workers and this process have used there: what a run computes for itself is no reason to
@@ -127,7 +127,7 @@ def _cores(pid: int) -> list[int]:
 
 
 def _busiest_gpu() -> tuple[float, str]:
-    """The share of the busiest GPU's time that is in use, and who says so."""
+    """The share of the busiest GPU's time that is in use, and its source."""
     tool = shutil.which(GPU_TOOL)
     if tool is None:
         return 0.0, NO_GPU

@@ -1,4 +1,4 @@
-"""`Problem`: what a plan is made from, whole: costs, neighbours, workers, rules, present homes."""
+"""`Problem`: the input of a plan: costs, neighbours, workers, rules, present homes."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ class ShardCost(NamedTuple):
     Attributes:
         world: its world.
         zone: its zone.
-        cost_s: seconds a tick, on a processor that nobody else uses.
+        cost_s: seconds a tick, on an otherwise idle processor.
     """
 
     world: int
@@ -81,7 +81,7 @@ class Problem:
         neighbors: for each zone those that share a side with it.
         snapshot: of the workers.
         rule: when shards move.
-        present: worker of each shard now, in the order of `shards`; None: nobody hosts any yet.
+        present: worker of each shard now, in the order of `shards`; None: none is hosted yet.
         in_row: the shards of a worker follow each other, workers by their numbers, each with one at
             least; so it is for worlds whose results lie in one array.
         cost_source: where costs come from; if it is not `measured`, they only compare shards.

@@ -1,4 +1,4 @@
-"""Moves and swaps that make the slowest worker faster, one after the other."""
+"""Improves a plan by moves and swaps that make the slowest worker faster."""
 
 from __future__ import annotations
 
@@ -61,7 +61,7 @@ def _touching(problem: Problem) -> NDArray[np.int64]:
 def _best_change(
     placement: Placement, touching: NDArray[np.int64], slack_s: float, *, may_swap: bool
 ) -> tuple[int, int | None, int] | None:
-    """(shard of the slowest worker, whom it is swapped for, its new worker); None: none helps."""
+    """(shard of the slowest worker, its swap partner, its new worker); None: none helps."""
     workers = placement.workers
     homes, count = np.array(placement.homes), len(workers)
     costs = np.array([shard.cost_s for shard in placement.problem.shards])
@@ -104,7 +104,7 @@ def _more_cut(
 
     Args:
         near: (n, m) neighbours of each shard on each worker.
-        touching: (n, n) who is a neighbour of whom.
+        touching: (n, n) which shards are neighbours.
         own: shards of the source.
         others: those that may be swapped for; they are the last columns.
         source: the worker that gives.

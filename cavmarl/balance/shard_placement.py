@@ -59,7 +59,7 @@ class Placement:
 
     Args:
         problem: the shards.
-        workers: who can host them.
+        workers: those that can host them.
         homes: place in `workers` of each shard's one; -1: it has none yet.
     """
 

@@ -80,7 +80,7 @@ def slide(placement: Placement, *, until_s: float, max_moves: int) -> Placement:
 
 
 def _towards(source: int, step: int, count: int) -> range:
-    """Who would give one on, from the source to the one before the last in that direction."""
+    """Workers that would give one on, from the source to the last but one in that direction."""
     return range(source, count - 1) if step > 0 else range(source, 0, -1)
 
 

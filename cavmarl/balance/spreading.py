@@ -1,4 +1,4 @@
-"""Where shards go that have no worker yet: the longest first, or in a row."""
+"""Places shards that have no worker yet: the longest first, or in a row."""
 
 from __future__ import annotations
 

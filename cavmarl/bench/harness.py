@@ -170,7 +170,7 @@ def make_table(
     """
     table = Table(title=escape(title), caption=caption)
     for place, column in enumerate(columns):
-        table.add_column(column, justify="right" if place else "left", no_wrap=bool(place))
+        table.add_column(column, justify="right" if place else "left", no_wrap=not place)
     for row in rows:
         if row is None:
             table.add_section()

@@ -25,7 +25,7 @@ def random(
         str, typer.Argument(metavar="MAP", help="A map file, or an environment's name or folder.")
     ],
     out: Annotated[Path, typer.Option("--out", "-o", help="The .rou.xml to write.")],
-    vehicles: Annotated[int, typer.Option(help="How many cars.")] = 1000,
+    vehicles: Annotated[int, typer.Option(help="Number of cars.")] = 1000,
     within: Annotated[float, typer.Option(help="Seconds in which they depart, evenly.")] = 60.0,
     route: Annotated[float, typer.Option(help="Shortest route, in metres.")] = 10_000.0,
     seed: Seed = 0,

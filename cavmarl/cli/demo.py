@@ -1,4 +1,4 @@
-"""`cavmarl demo`: from nothing to a trained driver that has been judged and filmed."""
+"""`cavmarl demo`: trains a driver, evaluates it and records videos."""
 
 from __future__ import annotations
 
@@ -27,11 +27,9 @@ EPISODES = 32
 
 
 def demo(
-    minutes: Annotated[float, typer.Option(help="Of training.")] = 2.0,
-    seconds: Annotated[float, typer.Option(help="That each video shows.")] = 60.0,
-    out: Annotated[Path, typer.Option(help="Folder of everything that is made.")] = Path(
-        "runs/demo"
-    ),
+    minutes: Annotated[float, typer.Option(help="Minutes of training.")] = 2.0,
+    seconds: Annotated[float, typer.Option(help="Simulated seconds in each video.")] = 60.0,
+    out: Annotated[Path, typer.Option(help="Output folder.")] = Path("runs/demo"),
     seed: Seed = 0,
     json_path: JsonPath = None,
 ) -> None:

@@ -1,4 +1,4 @@
-"""`cavmarl evaluate`: seeded runs of some drivers, and what they say about them."""
+"""`cavmarl evaluate`: evaluates drivers in seeded runs."""
 
 from __future__ import annotations
 
@@ -61,7 +61,7 @@ def evaluate(
             "Default: idm.",
         ),
     ] = None,
-    episodes: Annotated[int, typer.Option("--episodes", "-n", help="Of each run.")] = 32,
+    episodes: Annotated[int, typer.Option("--episodes", "-n", help="Episodes of each run.")] = 32,
     repeats: Annotated[
         int, typer.Option("--repeats", "-r", help="Independent runs, each in a fresh process.")
     ] = 1,
@@ -97,7 +97,7 @@ def evaluate(
 
 
 def report(
-    folder: Annotated[Path, typer.Argument(help="That `cavmarl evaluate` left.")],
+    folder: Annotated[Path, typer.Argument(help="Output folder of `cavmarl evaluate`.")],
     html: HtmlPath = None,
     json_path: JsonPath = None,
 ) -> None:
@@ -231,7 +231,7 @@ def _show(
 
 
 def _new_folder(env: str) -> Path:
-    """A folder in runs/ that nobody has used."""
+    """An unused folder in runs/."""
     stamp = datetime.now().strftime("%Y%m%d-%H%M%S-%f")
     return Path("runs/evaluate") / f"{Path(env).name}-{stamp}"
 

@@ -21,12 +21,14 @@ def follow(
         str, typer.Option("--at", metavar="ADDRESS", help="Where the world listens.")
     ] = DEFAULT_PLACE,
     vehicles: Annotated[str, typer.Option(metavar="NAME,…", help="Agents to drive.")] = "car_0",
-    name: Annotated[str, typer.Option(help="For people.")] = "reference",
+    name: Annotated[str, typer.Option(help="Name shown in messages.")] = "reference",
     stage: Annotated[
         list[str] | None,
-        typer.Option(metavar="STAGE=NAME", help="Of the stack, in the place of the usual one."),
+        typer.Option(metavar="STAGE=NAME", help="A stage of the stack to replace."),
     ] = None,
-    joins_s: Annotated[float, typer.Option(help="That the world may take to welcome us.")] = 60.0,
+    joins_s: Annotated[
+        float, typer.Option(help="Seconds that the world may take to answer.")
+    ] = 60.0,
     json_path: JsonPath = None,
 ) -> None:
     """Drive agents of a world that `cavmarl lead` runs, from their sensors and the map of ENV."""

@@ -1,4 +1,4 @@
-"""`cavmarl journal`: replay a coordinator's log and say who owned what."""
+"""`cavmarl journal`: replays a coordinator's log and prints the owners."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def journal(
         typer.Argument(metavar="FILE", help="A journal of a run.", exists=True, dir_okay=False),
     ],
     at: Annotated[
-        int | None, typer.Option(metavar="TICK", help="Print who owned what at this tick.")
+        int | None, typer.Option(metavar="TICK", help="Print the owners at this tick.")
     ] = None,
     json_path: JsonPath = None,
 ) -> None:
@@ -92,7 +92,7 @@ def _counts(summary: JournalSummary) -> Table:
 
 
 def _zones(table: OwnerTable) -> Table:
-    """Who hosts each zone at the end, and how many vehicles it owns."""
+    """The host of each zone at the end, and how many vehicles it owns."""
     grid = _grid("zone", "vehicles", "worker", "incarnation", "state")
     owned = [zone for zone, _ in table.owners.values()]
     for zone, (worker, incarnation) in table.hosts.items():

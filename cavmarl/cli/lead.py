@@ -41,18 +41,24 @@ def address_of(text: str) -> str | int:
 def lead(
     env: Environment,
     at: Place = DEFAULT_PLACE,
-    followers: Annotated[int, typer.Option(help="That have to join before the first step.")] = 1,
-    steps: Annotated[int | None, typer.Option(help="At most; default: one episode.")] = None,
-    timeout_s: Annotated[float, typer.Option(help="That a step waits for its followers.")] = 10.0,
-    joins_s: Annotated[float, typer.Option(help="That followers may take to join.")] = 600.0,
+    followers: Annotated[
+        int, typer.Option(help="Followers that have to join before the first step.")
+    ] = 1,
+    steps: Annotated[int | None, typer.Option(help="Most steps; default: one episode.")] = None,
+    timeout_s: Annotated[
+        float, typer.Option(help="Seconds that a step waits for its followers.")
+    ] = 10.0,
+    joins_s: Annotated[
+        float, typer.Option(help="Seconds that followers may take to join.")
+    ] = 600.0,
     own_ticks: Annotated[
-        Literal["refuse", "ignore"], typer.Option(help="What becomes of a follower's own ticks.")
+        Literal["refuse", "ignore"], typer.Option(help="How to treat a follower's own ticks.")
     ] = "refuse",
     bad_controls: Annotated[
-        Literal["error", "hold"], typer.Option(help="What becomes of controls that cannot be.")
+        Literal["error", "hold"], typer.Option(help="How to treat invalid controls.")
     ] = "error",
     pace: Annotated[
-        float | None, typer.Option(help="Simulated seconds a second; default: as fast as it goes.")
+        float | None, typer.Option(help="Simulated seconds a second; default: as fast as possible.")
     ] = None,
     rig: Annotated[
         Literal["none", "reference"],
@@ -60,7 +66,7 @@ def lead(
     ] = "none",
     zones: Annotated[int | None, typer.Option(help="Shadows zones.count.")] = None,
     workers: Annotated[
-        int, typer.Option(help="Processes that run the world; 0: the master's own.")
+        int, typer.Option(help="Worker processes; 0: the master's own process.")
     ] = 0,
     agents: Agents = None,
     background: Background = None,

@@ -1,4 +1,4 @@
-"""`cavmarl list`: the environments and the drivers that there are."""
+"""`cavmarl list`: lists environments and drivers."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`cavmarl map`: build road networks, check that they can be driven, and divide them."""
+"""`cavmarl map`: builds road networks, checks and divides them."""
 
 from __future__ import annotations
 

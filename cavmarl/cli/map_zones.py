@@ -1,4 +1,4 @@
-"""`cavmarl map zones`: cut a map into zones and see what comes of it."""
+"""`cavmarl map zones`: cuts a map into zones and prints their statistics."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ __all__ = ["zones"]
 def zones(
     env: Environment,
     count: Annotated[
-        int | None, typer.Option(help="How many; default: 4, or as many as a zone file has.")
+        int | None, typer.Option(help="Number of zones; default: 4, or as many as a zone file has.")
     ] = None,
     layout: Annotated[
         str, typer.Option(help=f"{', '.join(ZONE_LAYOUTS)}, or a zone file.")

@@ -1,4 +1,4 @@
-"""What the commands share: reading overrides, writing JSON, saying what went wrong."""
+"""What the commands share: reading overrides, writing JSON, printing errors."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ def _unwritable(path: Path, error: OSError) -> ConfigError:
 
 
 Environment = Annotated[
-    str, typer.Argument(metavar="ENV", help="Name, folder or map file of an environment.")
+    str, typer.Argument(metavar="ENV", help="Environment: a name, folder or map file.")
 ]
 PolicyName = Annotated[
     str, typer.Option("--policy", "-p", help="A name of `cavmarl list`, or the path of a policy.")

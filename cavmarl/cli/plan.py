@@ -1,4 +1,4 @@
-"""`cavmarl plan`: which worker would host which shard, by what zones cost here and now."""
+"""`cavmarl plan`: places shards on workers by the zones' measured costs."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 __all__ = ["plan"]
 
 NOW, IDLE = "now", "idle"
-LASTING_S = 3600  # of the worlds: longer than anybody measures
+LASTING_S = 3600  # of the worlds: longer than any measurement
 
 
 def plan(
@@ -38,9 +38,9 @@ def plan(
         str | None,
         typer.Argument(metavar="[ENV]", help="Name, folder or map file; not with --again."),
     ] = None,
-    zones: Annotated[int, typer.Option(help="Of each world.")] = 9,
-    workers: Annotated[int, typer.Option(help="That shards are placed on.")] = 3,
-    worlds: Annotated[int, typer.Option(min=1, help="Of the environment.")] = 1,
+    zones: Annotated[int, typer.Option(help="Zones of each world.")] = 9,
+    workers: Annotated[int, typer.Option(help="Workers that shards are placed on.")] = 3,
+    worlds: Annotated[int, typer.Option(min=1, help="Number of parallel worlds.")] = 1,
     layout: Annotated[
         str, typer.Option(help=f"{', '.join(ZONE_LAYOUTS)}, or a zone file.")
     ] = "bisection",
@@ -50,8 +50,8 @@ def plan(
             help=f"How busy workers are: {NOW} as this machine is, {IDLE}, or the plan of a file."
         ),
     ] = NOW,
-    steps: Annotated[int, typer.Option(help="Of each world that are measured.")] = 50,
-    before: Annotated[int, typer.Option(help="Steps of each world that come first.")] = 50,
+    steps: Annotated[int, typer.Option(help="Measured steps of each world.")] = 50,
+    before: Annotated[int, typer.Option(help="Unmeasured steps of each world, first.")] = 50,
     tolerance: Annotated[float, typer.Option(help="Imbalance below which nothing moves.")] = 0.1,
     again: Annotated[
         Path | None,
@@ -109,7 +109,7 @@ def plan(
         made = make_plan(Problem(measured.costs, partition.side_neighbors, seen, rule))
     except NoAdmissibleWorkerError as error:
         raise NoAdmissibleWorkerError(
-            f"{error}; --snapshot {IDLE} supposes that nobody else uses them", error.rejections
+            f"{error}; --snapshot {IDLE} supposes that they are otherwise idle", error.rejections
         ) from error
     console.print(describe_plan(made), markup=False, highlight=False, soft_wrap=True)
     if cut is not None:

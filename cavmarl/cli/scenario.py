@@ -1,4 +1,4 @@
-"""`cavmarl scenario`: which scenarios there are, and what a driver makes of one."""
+"""`cavmarl scenario`: lists scenarios, and plays one to a driver."""
 
 from __future__ import annotations
 
@@ -58,18 +58,20 @@ def run(
     map_name: Annotated[
         str, typer.Option("--map", help="Name, folder or map file of an environment.")
     ] = "grid4x4",
-    place: Annotated[str, typer.Option(help="Where on it; default: drawn by the seed.")] = "",
+    place: Annotated[str, typer.Option(help="Place on the map; default: drawn by the seed.")] = "",
     param: Annotated[
         list[str] | None,
-        typer.Option("--param", metavar="KEY=VALUE", help="Of the scenario; may be repeated."),
+        typer.Option(
+            "--param", metavar="KEY=VALUE", help="A parameter of the scenario; may be repeated."
+        ),
     ] = None,
-    driver: Annotated[str, typer.Option(help="Of the agents: a name, or a path.")] = "idm",
+    driver: Annotated[str, typer.Option(help="Driver of the agents: a name, or a path.")] = "idm",
     agents: Annotated[
-        int, typer.Option(min=1, help="How many: one in the conflict, the others behind it.")
+        int, typer.Option(min=1, help="Number of agents: one in the conflict, the others behind.")
     ] = 1,
     density: Annotated[str, typer.Option(help="Other traffic: none, low or high.")] = "none",
     zones: Annotated[
-        int | None, typer.Option(help="How many; default: as the environment says.")
+        int | None, typer.Option(help="Background vehicles; default: as the environment says.")
     ] = None,
     seed: Seed = 0,
     settings: Settings = None,
@@ -79,7 +81,7 @@ def run(
     video: Annotated[Path | None, typer.Option(help="Write an .mp4 of the run here.")] = None,
     json_path: JsonPath = None,
 ) -> None:
-    """Play a scenario to a driver; exit code 1 unless all come through and hurt nobody."""
+    """Play a scenario to a driver; exit code 1 unless all come through and hurt no one."""
     from contextlib import ExitStack
 
     from cavmarl.evaluate.scenarios.scenario_films import ScenarioCamera
@@ -115,13 +117,13 @@ def sweep(
     ] = None,
     map_names: Annotated[
         list[str] | None,
-        typer.Option("--map", help="Of an environment; may be repeated. Default: grid4x4."),
+        typer.Option("--map", help="An environment's map; may be repeated. Default: grid4x4."),
     ] = None,
-    seeds: Annotated[int, typer.Option(min=1, help="How many, from 0 on.")] = 5,
+    seeds: Annotated[int, typer.Option(min=1, help="Number of seeds, from 0 on.")] = 5,
     passes: Annotated[str, typer.Option(help="The driver that is to pass all.")] = "idm",
     fails: Annotated[str, typer.Option(help="The one that is to pass none.")] = "never_yield",
     density: Annotated[str, typer.Option(help="Other traffic: none, low or high.")] = "none",
-    agents: Annotated[int, typer.Option(min=1, help="How many in each world.")] = 1,
+    agents: Annotated[int, typer.Option(min=1, help="Agents in each world.")] = 1,
     json_path: JsonPath = None,
 ) -> None:
     """Play scenarios on maps to two drivers; exit code 1 unless one passes all, the other none."""

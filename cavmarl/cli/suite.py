@@ -1,4 +1,4 @@
-"""`cavmarl suite`: the same drivers on several maps with several numbers of agents."""
+"""`cavmarl suite`: evaluates drivers on several maps with several numbers of agents."""
 
 from __future__ import annotations
 
@@ -31,8 +31,10 @@ def suite(
         list[str] | None,
         typer.Option("--policy", "-p", help="A driver; may be repeated. Default: idm."),
     ] = None,
-    episodes: Annotated[int, typer.Option("--episodes", "-n", help="Of each run.")] = 4,
-    repeats: Annotated[int, typer.Option("--repeats", "-r", help="Independent runs.")] = 5,
+    episodes: Annotated[int, typer.Option("--episodes", "-n", help="Episodes of each run.")] = 4,
+    repeats: Annotated[
+        int, typer.Option("--repeats", "-r", help="Number of independent runs.")
+    ] = 5,
     seed: Seed = 0,
     out: Annotated[Path, typer.Option(help="Folder of the results, one folder a world.")] = Path(
         "runs/suite"

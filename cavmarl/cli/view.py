@@ -1,4 +1,4 @@
-"""`cavmarl view`: watch a driver, in a window or in a video."""
+"""`cavmarl view`: shows a driver, in a window or in a video."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ __all__ = ["record", "view"]
 def view(
     env: Environment,
     policy: PolicyName = "idm",
-    seconds: Annotated[float, typer.Option(help="Of simulated time.")] = 30.0,
+    seconds: Annotated[float, typer.Option(help="Seconds of simulated time.")] = 30.0,
     video: Annotated[
         Path | None, typer.Option(help="Write an .mp4 here; default: show a window.")
     ] = None,

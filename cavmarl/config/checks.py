@@ -1,12 +1,96 @@
-"""What the classes of a configuration refuse values with."""
+"""How the classes of a configuration refuse values.
+
+A field's range stands in its type: `Annotated[float, Within(0.0, 1.0)]`. `check_ranges` reads it
+there; what depends on several fields is checked by the class itself, in `__post_init__`.
+"""
 
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
+from functools import cache
+from typing import Any, ClassVar, get_args, get_type_hints
 
 from cavmarl.core.errors import ConfigError
 
-__all__ = ["check", "check_finite"]
+__all__ = ["Section", "Whole", "Within", "check", "check_finite", "check_ranges"]
+
+
+@dataclass(frozen=True)
+class Within:
+    """The range of a number, both ends included."""
+
+    low: float
+    high: float
+
+    @property
+    def expected(self) -> str:
+        """What a message says a value must be."""
+        return f"must be a number from {self.low:g} to {self.high:g}"
+
+
+@dataclass(frozen=True)
+class Whole(Within):
+    """The range of a whole number.
+
+    Attributes:
+        note: ends the message.
+    """
+
+    low: int
+    high: int
+    note: str = ""
+
+    @property
+    def expected(self) -> str:
+        """What a message says a value must be."""
+        return f"must be a whole number from {self.low} to {self.high}{self.note}"
+
+
+class Section:
+    """A class of the configuration: `key` is where it stands in the file.
+
+    Fields are checked against their ranges when an object is made.
+    """
+
+    section: ClassVar[str]
+
+    def __init_subclass__(cls, key: str) -> None:
+        super().__init_subclass__()
+        cls.section = key
+
+    def __post_init__(self) -> None:
+        check_ranges(self.section, self)
+
+
+def check_ranges(section: str, holder: object) -> None:
+    """Refuse values outside the ranges in the types of a dataclass's fields; None passes.
+
+    Args:
+        section: key of the whole.
+        holder: the dataclass.
+
+    Raises:
+        ConfigError: key, value and range of the first.
+    """
+    kind: Any = type(holder)
+    for name, bounds in _ranges(kind):
+        value = getattr(holder, name)
+        if value is not None:
+            # NaN is in no range, and infinity is beyond every one.
+            fits = bounds.low <= value <= bounds.high
+            check(fits, f"{section}.{name}", value, bounds.expected)
+
+
+@cache
+def _ranges(kind: type[Any]) -> tuple[tuple[str, Within], ...]:
+    hints = get_type_hints(kind, include_extras=True)
+    return tuple(
+        (name, mark)
+        for name, hint in hints.items()
+        for mark in get_args(hint)
+        if isinstance(mark, Within)
+    )
 
 
 def check(holds: bool, key: str, value: object, expected: str) -> None:
@@ -17,9 +101,4 @@ def check(holds: bool, key: str, value: object, expected: str) -> None:
 
 def check_finite(key: str, value: float, low: float, high: float) -> None:
     """Raise a ConfigError unless `value` is a finite number from `low` to `high`."""
-    check(
-        math.isfinite(value) and low <= value <= high,
-        key,
-        value,
-        f"must be a number from {low:g} to {high:g}",
-    )
+    check(math.isfinite(value) and low <= value <= high, key, value, Within(low, high).expected)

@@ -10,8 +10,9 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, field
 from itertools import pairwise
-from typing import Literal
+from typing import Annotated, Literal
 
+from cavmarl.config.checks import Section, Whole, Within
 from cavmarl.config.checks import check as _check
 from cavmarl.config.checks import check_finite as _check_finite
 from cavmarl.config.rig import Rig, check_rig
@@ -19,6 +20,7 @@ from cavmarl.config.scenario import ScenarioConfig
 from cavmarl.config.sensors import SensorsConfig
 from cavmarl.config.sumo import SumoConfig
 from cavmarl.config.v2x import V2xConfig
+from cavmarl.core.extensions import REGISTERED_TERMS
 
 __all__ = [
     "MAX_ZONES",
@@ -87,7 +89,7 @@ class MapConfig:
 
 
 @dataclass(frozen=True)
-class ClockConfig:
+class ClockConfig(Section, key="clock"):
     """Time: the integer tick is the truth, seconds = tick · sim_dt_s.
 
     Attributes:
@@ -96,13 +98,12 @@ class ClockConfig:
         control_latency_ticks: ticks between an action and its effect.
     """
 
-    sim_dt_s: float = 0.05
-    ctrl_dt_s: float = 0.1
-    control_latency_ticks: int = 0
+    sim_dt_s: Annotated[float, Within(0.001, 0.2)] = 0.05
+    ctrl_dt_s: Annotated[float, Within(0.001, 10.0)] = 0.1
+    control_latency_ticks: Annotated[int, Whole(0, 16)] = 0
 
     def __post_init__(self) -> None:
-        _check_finite("clock.sim_dt_s", self.sim_dt_s, 0.001, 0.2)
-        _check_finite("clock.ctrl_dt_s", self.ctrl_dt_s, 0.001, 10.0)
+        super().__post_init__()
         ticks = self.ctrl_dt_s / self.sim_dt_s
         _check(
             round(ticks) >= 1 and abs(ticks - round(ticks)) < 1e-9,
@@ -110,12 +111,6 @@ class ClockConfig:
             self.ctrl_dt_s,
             f"must be a whole number of ticks of clock.sim_dt_s = {self.sim_dt_s:g}; "
             f"try {max(1, round(ticks)) * self.sim_dt_s:g}",
-        )
-        _check(
-            0 <= self.control_latency_ticks <= 16,
-            "clock.control_latency_ticks",
-            self.control_latency_ticks,
-            "must be a whole number from 0 to 16",
         )
 
     @property
@@ -125,7 +120,7 @@ class ClockConfig:
 
 
 @dataclass(frozen=True)
-class ZonesConfig:
+class ZonesConfig(Section, key="zones"):
     """How the map is divided; see docs/zones.md.
 
     Attributes:
@@ -158,40 +153,31 @@ class ZonesConfig:
     """
 
     layout: str = "bisection"
-    count: int = 1
+    count: Annotated[int, Whole(1, MAX_ZONES)] = 1
     avoid_junctions: bool = False
     weight: Literal["lane_length", "uniform"] = "lane_length"
-    hysteresis_m: float = 2.0
-    max_deferred_ticks: int = 2
+    hysteresis_m: Annotated[float, Within(0.0, 100.0)] = 2.0
+    max_deferred_ticks: Annotated[int, Whole(0, 1000)] = 2
     policy: Literal["force", "extend", "hold", "reroute"] = "force"
-    grace_ticks: int = 0
-    backoff_ticks: int = 4
-    halo_m: float | None = None
-    approach_ticks: int = 2
+    grace_ticks: Annotated[int, Whole(0, 1000)] = 0
+    backoff_ticks: Annotated[int, Whole(0, 1000)] = 4
+    halo_m: Annotated[float | None, Within(0.0, 1e6)] = None
+    approach_ticks: Annotated[int, Whole(1, 1000)] = 2
     journal: str = ""
     check: bool = False
     faults: str = ""
     reproducers: str = ""
-    recut_steps: int = 0
-    recut_tolerance: float = 0.1
+    recut_steps: Annotated[int, Whole(0, 1_000_000)] = 0
+    recut_tolerance: Annotated[float, Within(0.0, 100.0)] = 0.1
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         _check(
             self.layout in ZONE_LAYOUTS or self.layout.endswith(ZONE_FILE_SUFFIXES),
             "zones.layout",
             self.layout,
             f"must be {', '.join(ZONE_LAYOUTS)}, or a zone file ({', '.join(ZONE_FILE_SUFFIXES)})",
         )
-        _check(
-            1 <= self.count <= MAX_ZONES,
-            "zones.count",
-            self.count,
-            f"must be a whole number from 1 to {MAX_ZONES}",
-        )
-        _check_finite("zones.hysteresis_m", self.hysteresis_m, 0.0, 100.0)
-        for name in ("max_deferred_ticks", "grace_ticks", "backoff_ticks"):
-            value = getattr(self, name)
-            _check(0 <= value <= 1000, f"zones.{name}", value, "must be a whole number to 1000")
         _check(
             self.policy not in ("hold", "reroute"),
             "zones.policy",
@@ -205,21 +191,6 @@ class ZonesConfig:
             self.grace_ticks,
             "must be 1 or more with zones.policy = extend, and 0 with force",
         )
-        if self.halo_m is not None:
-            _check_finite("zones.halo_m", self.halo_m, 0.0, 1e6)
-        _check(
-            1 <= self.approach_ticks <= 1000,
-            "zones.approach_ticks",
-            self.approach_ticks,
-            "must be a whole number from 1 to 1000",
-        )
-        _check(
-            0 <= self.recut_steps <= 1_000_000,
-            "zones.recut_steps",
-            self.recut_steps,
-            "must be a whole number from 0 to 1000000",
-        )
-        _check_finite("zones.recut_tolerance", self.recut_tolerance, 0.0, 100.0)
         _check(
             not (self.recut_steps and (self.faults or self.reproducers)),
             "zones.recut_steps",
@@ -230,7 +201,7 @@ class ZonesConfig:
 
 
 @dataclass(frozen=True)
-class WorkersConfig:
+class WorkersConfig(Section, key="workers"):
     """How worker processes are watched and given work, where there are some; see docs/workers.md.
 
     Attributes:
@@ -253,47 +224,19 @@ class WorkersConfig:
         sensor_placement: who of them senses what: by what it `cost` of late, or `in_turn`.
     """
 
-    timeout_s: float = 300.0
-    repeats: int = 3
+    timeout_s: Annotated[float, Within(1.0, 1e6)] = 300.0
+    repeats: Annotated[int, Whole(0, 1000)] = 3
     pin: bool = False
-    balance_steps: int = 0
-    tolerance: float = 0.1
-    max_moves: int = 4
+    balance_steps: Annotated[int, Whole(0, 1_000_000)] = 0
+    tolerance: Annotated[float, Within(0.0, 100.0)] = 0.1
+    max_moves: Annotated[int, Whole(1, 65_536)] = 4
     watch: bool = False
-    sensors: int = 0
+    sensors: Annotated[int, Whole(0, MAX_SENSOR_WORKERS)] = 0
     sensor_placement: Literal["cost", "in_turn"] = "cost"
-
-    def __post_init__(self) -> None:
-        _check(
-            0 <= self.sensors <= MAX_SENSOR_WORKERS,
-            "workers.sensors",
-            self.sensors,
-            f"must be a whole number from 0 to {MAX_SENSOR_WORKERS}",
-        )
-        _check_finite("workers.timeout_s", self.timeout_s, 1.0, 1e6)
-        _check(
-            0 <= self.repeats <= 1000,
-            "workers.repeats",
-            self.repeats,
-            "must be a whole number from 0 to 1000",
-        )
-        _check(
-            0 <= self.balance_steps <= 1_000_000,
-            "workers.balance_steps",
-            self.balance_steps,
-            "must be a whole number from 0 to 1000000",
-        )
-        _check_finite("workers.tolerance", self.tolerance, 0.0, 100.0)
-        _check(
-            1 <= self.max_moves <= 65_536,
-            "workers.max_moves",
-            self.max_moves,
-            "must be a whole number from 1 to 65536",
-        )
 
 
 @dataclass(frozen=True)
-class PopulationConfig:
+class PopulationConfig(Section, key="population"):
     """Who is in the world.
 
     Attributes:
@@ -308,23 +251,12 @@ class PopulationConfig:
     """
 
     mode: Literal["closed", "entering", "seats"] = "closed"
-    agents: int = 4
-    background: int = 20
+    agents: Annotated[int, Whole(0, 100_000, "; 0: a world to watch")] = 4
+    background: Annotated[int, Whole(0, 1_000_000)] = 20
     budget: int | None = None
 
     def __post_init__(self) -> None:
-        _check(
-            0 <= self.agents <= 100_000,
-            "population.agents",
-            self.agents,
-            "must be a whole number from 0 (a world to watch) to 100000",
-        )
-        _check(
-            0 <= self.background <= 1_000_000,
-            "population.background",
-            self.background,
-            "must be a whole number from 0 to 1000000",
-        )
+        super().__post_init__()
         if self.budget is not None and self.mode == "entering":
             _check(
                 self.agents <= self.budget <= MAX_IDS,
@@ -342,7 +274,7 @@ class PopulationConfig:
 
 
 @dataclass(frozen=True)
-class TrafficConfig:
+class TrafficConfig(Section, key="traffic"):
     """Where departures come from.
 
     Attributes:
@@ -359,39 +291,39 @@ class TrafficConfig:
         min_trip_m: shortest way of an agent between origin and destination.
         max_trip_m: longest way of an agent; 0: no limit.
         speed_factor_spread: half width of the drivers' uniform spread of desired speed over limit.
+        model: how the generator's vehicles follow their leader: `IDM`, `Krauss`, `ACC`, or a model
+            that is registered (docs/extending.md). Those of `demand` drive as their type says.
     """
 
     source: Literal["native", "sumo-demand", "sumo-traffic"] = "native"
     demand: tuple[str, ...] = ()
     on_bad_route: Literal["error", "skip"] = "error"
-    goals: int = 32
+    goals: Annotated[int, Whole(1, 1024)] = 32
     origins: tuple[str, ...] = ()
     destinations: tuple[str, ...] = ()
-    min_trip_m: float = 100.0
-    max_trip_m: float = 0.0
-    speed_factor_spread: float = 0.1
+    min_trip_m: Annotated[float, Within(0.0, 1e6)] = 100.0
+    max_trip_m: Annotated[float, Within(0.0, 1e6)] = 0.0
+    speed_factor_spread: Annotated[float, Within(0.0, 0.5)] = 0.1
+    model: str = "IDM"
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         _check(
             self.source == "native" or bool(self.demand),
             "traffic.source",
             self.source,
             "needs traffic.demand: a .sumocfg, or files of routes",
         )
-        _check(1 <= self.goals <= 1024, "traffic.goals", self.goals, "must be from 1 to 1024")
-        _check_finite("traffic.min_trip_m", self.min_trip_m, 0.0, 1e6)
-        _check_finite("traffic.max_trip_m", self.max_trip_m, 0.0, 1e6)
         _check(
             self.max_trip_m == 0.0 or self.max_trip_m > self.min_trip_m,
             "traffic.max_trip_m",
             self.max_trip_m,
             f"must be 0 (no limit) or above traffic.min_trip_m = {self.min_trip_m:g}",
         )
-        _check_finite("traffic.speed_factor_spread", self.speed_factor_spread, 0.0, 0.5)
 
 
 @dataclass(frozen=True)
-class ActionConfig:
+class ActionConfig(Section, key="action"):
     """What an agent can do.
 
     Attributes:
@@ -406,16 +338,15 @@ class ActionConfig:
     """
 
     kind: Literal["continuous", "discrete"] = "continuous"
-    acceleration_mps2: float = 5.0
-    steering_rad: float = 0.7853981633974483
+    acceleration_mps2: Annotated[float, Within(0.1, 20.0)] = 5.0
+    steering_rad: Annotated[float, Within(0.01, 1.2)] = 0.7853981633974483
     target_speeds_mps: tuple[float, ...] = (0.0, 3.0, 6.0, 9.0, 12.0, 15.0, 20.0, 25.0, 30.0)
     out_of_range: Literal["error", "clip"] = "error"
     missing_action: Literal["error", "hold"] = "error"
     late_actions: Literal["error", "ignore"] = "error"
 
     def __post_init__(self) -> None:
-        _check_finite("action.acceleration_mps2", self.acceleration_mps2, 0.1, 20.0)
-        _check_finite("action.steering_rad", self.steering_rad, 0.01, 1.2)
+        super().__post_init__()
         speeds = self.target_speeds_mps
         _check(
             len(speeds) >= 2
@@ -443,7 +374,7 @@ class ObservationConfig:
 
 
 @dataclass(frozen=True)
-class TermsConfig:
+class TermsConfig(Section, key="terms"):
     """Reward = Σ weight · term; see `TERMS` and docs/environments.md for what each term is.
 
     Attributes:
@@ -464,15 +395,35 @@ class TermsConfig:
             "arrival": 10.0,
         }
     )
-    team_share: float = 0.0
+    team_share: Annotated[float, Within(0.0, 1.0)] = 0.0
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         for name, weight in self.weights.items():
+            known = (*TERMS, *REGISTERED_TERMS.names)
             _check(
-                name in TERMS, "terms.weights", name, f"no such term; there are {', '.join(TERMS)}"
+                name in known,
+                "terms.weights",
+                name,
+                f"no such term; there are {', '.join(known)}, or add one with "
+                "cavmarl.register_term",
             )
             _check_finite(f"terms.weights.{name}", weight, -1e6, 1e6)
-        _check_finite("terms.team_share", self.team_share, 0.0, 1.0)
+
+    @property
+    def registered(self) -> tuple[str, ...]:
+        """The weighted terms that are not of the package."""
+        return tuple(name for name in self.weights if name not in TERMS)
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """All terms of the world, in the order of every terms array."""
+        return (*TERMS, *self.registered)
+
+    @property
+    def weight_of_each(self) -> tuple[float, ...]:
+        """Their weights, in the same order."""
+        return tuple(self.weights.get(name, 0.0) for name in self.names)
 
 
 @dataclass(frozen=True)
@@ -606,6 +557,11 @@ class EnvConfig:
             self.scenario.name,
             f"traffic.source = {source}: scenes are for native traffic; leave one out",
         )
+
+    @property
+    def registered(self) -> tuple[str, ...]:
+        """What it may name from outside of the package."""
+        return (*self.terms.registered, *self.sensors.registered, self.traffic.model)
 
     @property
     def max_steps(self) -> int:

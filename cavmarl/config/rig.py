@@ -18,7 +18,7 @@ from dataclasses import dataclass
 from fractions import Fraction
 from typing import Annotated, Any, ClassVar, Literal
 
-from cavmarl.config.checks import check, check_finite
+from cavmarl.config.checks import Whole, Within, check, check_finite, check_ranges
 
 __all__ = [
     "BevGridConfig",
@@ -75,13 +75,13 @@ class MountedConfig:
         dropout: chance that a sample is lost.
     """
 
-    x_m: float = 0.0
-    y_m: float = 0.0
-    z_m: float = 0.0
-    yaw_deg: float = 0.0
-    pitch_deg: float = 0.0
-    roll_deg: float = 0.0
-    dropout: float = 0.0
+    x_m: Annotated[float, Within(-100.0, 100.0)] = 0.0
+    y_m: Annotated[float, Within(-100.0, 100.0)] = 0.0
+    z_m: Annotated[float, Within(-100.0, 100.0)] = 0.0
+    yaw_deg: Annotated[float, Within(-360.0, 360.0)] = 0.0
+    pitch_deg: Annotated[float, Within(-360.0, 360.0)] = 0.0
+    roll_deg: Annotated[float, Within(-360.0, 360.0)] = 0.0
+    dropout: Annotated[float, Within(0.0, 1.0)] = 0.0
 
     units: ClassVar[tuple[str, ...]]  # of the channels, which noise and bias are counted by
     in_batches: ClassVar[bool] = False  # it can tell what has been between two ticks
@@ -100,11 +100,7 @@ class MountedConfig:
         Raises:
             ConfigError: which one, and what can work.
         """
-        for name in ("x_m", "y_m", "z_m"):
-            check_finite(f"{key}.{name}", getattr(self, name), -100.0, 100.0)
-        for name in ("yaw_deg", "pitch_deg", "roll_deg"):
-            check_finite(f"{key}.{name}", getattr(self, name), -360.0, 360.0)
-        check_finite(f"{key}.dropout", self.dropout, 0.0, 1.0)
+        check_ranges(key, self)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -121,7 +117,7 @@ class SampledConfig(MountedConfig):
         bias: standard deviation of a constant error that is drawn for each vehicle and episode.
     """
 
-    rate_hz: float
+    rate_hz: Annotated[float, Within(0.001, MAX_RATE_HZ)]
     phase_ticks: int = 0
     schedule: Literal["exact", "accumulate"] = "exact"
     noise: tuple[float, ...] = (0.0,)
@@ -130,7 +126,6 @@ class SampledConfig(MountedConfig):
     def check(self, key: str) -> None:
         """As `MountedConfig.check`."""
         super().check(key)
-        check_finite(f"{key}.rate_hz", self.rate_hz, 1e-3, MAX_RATE_HZ)
         for name in ("noise", "bias"):
             values = getattr(self, name)
             channels = len(self.units)
@@ -197,10 +192,6 @@ def _other_rates(rate: Fraction, sim_dt_s: float, in_batches: bool) -> str:
     return f"does not fit ticks of clock.sim_dt_s = {sim_dt_s:g}; try {rates}{way_out}"
 
 
-def _check_count(key: str, value: int, low: int, high: int) -> None:
-    check(low <= value <= high, key, value, f"must be from {low} to {high}")
-
-
 def _check_exact(key: str, config: SampledConfig) -> None:
     """Refuse errors of classes, which are names and no quantities."""
     for name in ("noise", "bias"):
@@ -222,11 +213,11 @@ class LidarRigConfig(SampledConfig):
     """
 
     type: Literal["lidar"] = "lidar"
-    range_m: float = 60.0
-    rays: int = 180
-    layers: int = 1
-    fov_deg: float = 360.0
-    lower_deg: float = -15.0
+    range_m: Annotated[float, Within(1.0, MAX_REACH_M)] = 60.0
+    rays: Annotated[int, Whole(1, MAX_RAYS)] = 180
+    layers: Annotated[int, Whole(1, 128)] = 1
+    fov_deg: Annotated[float, Within(1.0, 360.0)] = 360.0
+    lower_deg: Annotated[float, Within(-89.0, 89.0)] = -15.0
     upper_deg: float = 5.0
     units: ClassVar[tuple[str, ...]] = ("m",)
 
@@ -238,11 +229,6 @@ class LidarRigConfig(SampledConfig):
     def check(self, key: str) -> None:
         """As `MountedConfig.check`."""
         super().check(key)
-        check_finite(f"{key}.range_m", self.range_m, 1.0, MAX_REACH_M)
-        _check_count(f"{key}.rays", self.rays, 1, MAX_RAYS)
-        _check_count(f"{key}.layers", self.layers, 1, 128)
-        check_finite(f"{key}.fov_deg", self.fov_deg, 1.0, 360.0)
-        check_finite(f"{key}.lower_deg", self.lower_deg, -89.0, 89.0)
         check_finite(f"{key}.upper_deg", self.upper_deg, self.lower_deg, 89.0)
 
 
@@ -258,24 +244,16 @@ class RadarConfig(SampledConfig):
     """
 
     type: Literal["radar"] = "radar"
-    range_m: float = 100.0
-    fov_deg: float = 60.0
-    targets: int = 16
-    rays: int = 120
+    range_m: Annotated[float, Within(1.0, MAX_REACH_M)] = 100.0
+    fov_deg: Annotated[float, Within(1.0, 360.0)] = 60.0
+    targets: Annotated[int, Whole(1, 256)] = 16
+    rays: Annotated[int, Whole(1, MAX_RAYS)] = 120
     units: ClassVar[tuple[str, ...]] = ("m", "rad", "m/s")
 
     @property
     def shape(self) -> tuple[int, ...]:
         """(targets, 3)."""
         return (self.targets, 3)
-
-    def check(self, key: str) -> None:
-        """As `MountedConfig.check`."""
-        super().check(key)
-        check_finite(f"{key}.range_m", self.range_m, 1.0, MAX_REACH_M)
-        check_finite(f"{key}.fov_deg", self.fov_deg, 1.0, 360.0)
-        _check_count(f"{key}.targets", self.targets, 1, 256)
-        _check_count(f"{key}.rays", self.rays, 1, MAX_RAYS)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -289,23 +267,15 @@ class CameraConfig(SampledConfig):
         range_m: how far it sees.
     """
 
-    width: int = 160
-    height: int = 90
-    fov_deg: float = 90.0
-    range_m: float = 100.0
+    width: Annotated[int, Whole(1, 4096)] = 160
+    height: Annotated[int, Whole(1, 4096)] = 90
+    fov_deg: Annotated[float, Within(1.0, 170.0)] = 90.0
+    range_m: Annotated[float, Within(1.0, MAX_REACH_M)] = 100.0
 
     @property
     def shape(self) -> tuple[int, ...]:
         """(height, width)."""
         return (self.height, self.width)
-
-    def check(self, key: str) -> None:
-        """As `MountedConfig.check`."""
-        super().check(key)
-        _check_count(f"{key}.width", self.width, 1, 4096)
-        _check_count(f"{key}.height", self.height, 1, 4096)
-        check_finite(f"{key}.fov_deg", self.fov_deg, 1.0, 170.0)
-        check_finite(f"{key}.range_m", self.range_m, 1.0, MAX_REACH_M)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -354,10 +324,10 @@ class BevGridConfig(SampledConfig):
     """
 
     type: Literal["bev_grid"] = "bev_grid"
-    ahead_m: float = 32.0
-    behind_m: float = 16.0
-    aside_m: float = 16.0
-    cell_m: float = 0.5
+    ahead_m: Annotated[float, Within(0.0, MAX_REACH_M)] = 32.0
+    behind_m: Annotated[float, Within(0.0, MAX_REACH_M)] = 16.0
+    aside_m: Annotated[float, Within(0.0, MAX_REACH_M)] = 16.0
+    cell_m: Annotated[float, Within(0.05, 50.0)] = 0.5
     units: ClassVar[tuple[str, ...]] = ("class",)
 
     @property
@@ -373,9 +343,6 @@ class BevGridConfig(SampledConfig):
         for name in ("pitch_deg", "roll_deg"):
             value = getattr(self, name)
             check(value == 0.0, f"{key}.{name}", value, "must be 0: it looks straight down")
-        check_finite(f"{key}.cell_m", self.cell_m, 0.05, 50.0)
-        for name in ("ahead_m", "behind_m", "aside_m"):
-            check_finite(f"{key}.{name}", getattr(self, name), 0.0, MAX_REACH_M)
         check(
             min(self.shape) >= 1,
             f"{key}.cell_m",
@@ -395,22 +362,15 @@ class GnssConfig(SampledConfig):
     """
 
     type: Literal["gnss"] = "gnss"
-    origin_lat_deg: float = 48.0
-    origin_lon_deg: float = 11.0
-    origin_height_m: float = 0.0
+    origin_lat_deg: Annotated[float, Within(-89.0, 89.0)] = 48.0
+    origin_lon_deg: Annotated[float, Within(-180.0, 180.0)] = 11.0
+    origin_height_m: Annotated[float, Within(-500.0, 10_000.0)] = 0.0
     units: ClassVar[tuple[str, ...]] = ("m east", "m north", "m up")
 
     @property
     def shape(self) -> tuple[int, ...]:
         """(3,)."""
         return (3,)
-
-    def check(self, key: str) -> None:
-        """As `MountedConfig.check`."""
-        super().check(key)
-        check_finite(f"{key}.origin_lat_deg", self.origin_lat_deg, -89.0, 89.0)
-        check_finite(f"{key}.origin_lon_deg", self.origin_lon_deg, -180.0, 180.0)
-        check_finite(f"{key}.origin_height_m", self.origin_height_m, -500.0, 10_000.0)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -453,18 +413,13 @@ class LaneBoundaryConfig(SampledConfig):
     """
 
     type: Literal["lane_boundary"] = "lane_boundary"
-    lookahead_m: float = 10.0
+    lookahead_m: Annotated[float, Within(1.0, 100.0)] = 10.0
     units: ClassVar[tuple[str, ...]] = ("m", "m", "m", "rad", "1/m")
 
     @property
     def shape(self) -> tuple[int, ...]:
         """(5,)."""
         return (5,)
-
-    def check(self, key: str) -> None:
-        """As `MountedConfig.check`."""
-        super().check(key)
-        check_finite(f"{key}.lookahead_m", self.lookahead_m, 1.0, 100.0)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -10,9 +10,10 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field, replace
-from typing import Literal
+from typing import Annotated, Literal
 
-from cavmarl.config.checks import check, check_finite
+from cavmarl.config.checks import Section, Whole, Within, check, check_finite
+from cavmarl.core.extensions import REGISTERED_SENSORS
 
 __all__ = [
     "GRID_FEATURES",
@@ -67,7 +68,7 @@ class EgoConfig:
 
 
 @dataclass(frozen=True)
-class RouteAheadConfig:
+class RouteAheadConfig(Section, key="sensors.route"):
     """Points of the route ahead, in the ego frame.
 
     Attributes:
@@ -75,16 +76,12 @@ class RouteAheadConfig:
         spacing_m: way between one and the next.
     """
 
-    points: int = 8
-    spacing_m: float = 6.0
-
-    def __post_init__(self) -> None:
-        check(0 <= self.points <= 64, "sensors.route.points", self.points, "must be from 0 to 64")
-        check_finite("sensors.route.spacing_m", self.spacing_m, 0.5, 100.0)
+    points: Annotated[int, Whole(0, 64)] = 8
+    spacing_m: Annotated[float, Within(0.5, 100.0)] = 6.0
 
 
 @dataclass(frozen=True)
-class NeighborsConfig:
+class NeighborsConfig(Section, key="sensors.neighbors"):
     """The nearest vehicles, in the ego frame.
 
     Attributes:
@@ -92,16 +89,12 @@ class NeighborsConfig:
         range_m: distance up to which a vehicle is seen.
     """
 
-    count: int = 8
-    range_m: float = 60.0
-
-    def __post_init__(self) -> None:
-        check(0 <= self.count <= 64, "sensors.neighbors.count", self.count, "must be from 0 to 64")
-        check_finite("sensors.neighbors.range_m", self.range_m, 1.0, 300.0)
+    count: Annotated[int, Whole(0, 64)] = 8
+    range_m: Annotated[float, Within(1.0, 300.0)] = 60.0
 
 
 @dataclass(frozen=True)
-class SignalAheadConfig:
+class SignalAheadConfig(Section, key="sensors.signal"):
     """The next signal or duty to give way on the route.
 
     Attributes:
@@ -111,29 +104,23 @@ class SignalAheadConfig:
     """
 
     enabled: bool = True
-    range_m: float = 80.0
+    range_m: Annotated[float, Within(1.0, 300.0)] = 80.0
     timing: bool = False
-
-    def __post_init__(self) -> None:
-        check_finite("sensors.signal.range_m", self.range_m, 1.0, 300.0)
 
 
 @dataclass(frozen=True)
-class LanesConfig:
+class LanesConfig(Section, key="sensors.lanes"):
     """Vehicles by their place along the lanes around, and the one that crosses the own way first.
 
     Attributes:
         range_m: how far along lanes a vehicle is seen; 0 switches the sensor off.
     """
 
-    range_m: float = 0.0
-
-    def __post_init__(self) -> None:
-        check_finite("sensors.lanes.range_m", self.range_m, 0.0, 300.0)
+    range_m: Annotated[float, Within(0.0, 300.0)] = 0.0
 
 
 @dataclass(frozen=True)
-class LidarConfig:
+class LidarConfig(Section, key="sensors.lidar"):
     """Distances around the vehicle.
 
     Attributes:
@@ -142,17 +129,13 @@ class LidarConfig:
         speeds: adds the relative speed of what each ray hits.
     """
 
-    rays: int = 64
-    range_m: float = 60.0
+    rays: Annotated[int, Whole(0, 1024)] = 64
+    range_m: Annotated[float, Within(1.0, 300.0)] = 60.0
     speeds: bool = False
-
-    def __post_init__(self) -> None:
-        check(0 <= self.rays <= 1024, "sensors.lidar.rays", self.rays, "must be from 0 to 1024")
-        check_finite("sensors.lidar.range_m", self.range_m, 1.0, 300.0)
 
 
 @dataclass(frozen=True)
-class KinematicsConfig:
+class KinematicsConfig(Section, key="sensors.kinematics"):
     """highway-env's `Kinematics`: a table of vehicles by features, the own one first.
 
     Attributes:
@@ -171,7 +154,7 @@ class KinematicsConfig:
         observe_intentions: whether `cos_d` and `sin_d` of the others are shown; else they are 0.
     """
 
-    vehicles_count: int = 0
+    vehicles_count: Annotated[int, Whole(0, 256)] = 0
     features: tuple[str, ...] = ("presence", "x", "y", "vx", "vy")
     features_range: dict[str, tuple[float, ...]] = field(default_factory=dict)
     absolute: bool = False
@@ -182,13 +165,8 @@ class KinematicsConfig:
     observe_intentions: bool = False
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         key = "sensors.kinematics"
-        check(
-            0 <= self.vehicles_count <= 256,
-            f"{key}.vehicles_count",
-            self.vehicles_count,
-            "must be from 0 to 256",
-        )
         check(bool(self.features), f"{key}.features", self.features, "must name at least one")
         _check_features(f"{key}.features", self.features, VEHICLE_FEATURES)
         _check_ranges(f"{key}.features_range", self.features_range)
@@ -266,7 +244,7 @@ class OccupancyGridConfig:
 
 
 @dataclass(frozen=True)
-class LidarObservationConfig:
+class LidarObservationConfig(Section, key="sensors.lidar_observation"):
     """highway-env's `LidarObservation`: distance and speed in sectors around the vehicle.
 
     Attributes:
@@ -275,18 +253,13 @@ class LidarObservationConfig:
         normalize: whether distances and speeds are divided by `maximum_range_m`.
     """
 
-    cells: int = 0
-    maximum_range_m: float = 60.0
+    cells: Annotated[int, Whole(0, 1024)] = 0
+    maximum_range_m: Annotated[float, Within(1.0, 300.0)] = 60.0
     normalize: bool = True
-
-    def __post_init__(self) -> None:
-        key = "sensors.lidar_observation"
-        check(0 <= self.cells <= 1024, f"{key}.cells", self.cells, "must be from 0 to 1024")
-        check_finite(f"{key}.maximum_range_m", self.maximum_range_m, 1.0, 300.0)
 
 
 @dataclass(frozen=True)
-class RoadgraphConfig:
+class RoadgraphConfig(Section, key="sensors.roadgraph"):
     """The nearest points of the road network, as Waymax's `roadgraph_points`.
 
     Attributes:
@@ -295,19 +268,13 @@ class RoadgraphConfig:
         spacing_m: largest distance between one point of a line and the next.
     """
 
-    points: int = 0
-    range_m: float = 50.0
-    spacing_m: float = 2.0
-
-    def __post_init__(self) -> None:
-        key = "sensors.roadgraph"
-        check(0 <= self.points <= 2048, f"{key}.points", self.points, "must be from 0 to 2048")
-        check_finite(f"{key}.range_m", self.range_m, 1.0, 300.0)
-        check_finite(f"{key}.spacing_m", self.spacing_m, 0.25, 50.0)
+    points: Annotated[int, Whole(0, 2048)] = 0
+    range_m: Annotated[float, Within(1.0, 300.0)] = 50.0
+    spacing_m: Annotated[float, Within(0.25, 50.0)] = 2.0
 
 
 @dataclass(frozen=True)
-class MessagesConfig:
+class MessagesConfig(Section, key="sensors.messages"):
     """What the vehicle has been told over the air, see `v2x`.
 
     Attributes:
@@ -317,27 +284,23 @@ class MessagesConfig:
         range_m: distance that a place of 1 stands for; what is further away has 1, too.
     """
 
-    objects: int = 0
-    events: int = 0
+    objects: Annotated[int, Whole(0, 64)] = 0
+    events: Annotated[int, Whole(0, 64)] = 0
     signal: bool = False
-    range_m: float = 100.0
-
-    def __post_init__(self) -> None:
-        key = "sensors.messages"
-        check(0 <= self.objects <= 64, f"{key}.objects", self.objects, "must be from 0 to 64")
-        check(0 <= self.events <= 64, f"{key}.events", self.events, "must be from 0 to 64")
-        check_finite(f"{key}.range_m", self.range_m, 1.0, 10_000.0)
+    range_m: Annotated[float, Within(1.0, 10_000.0)] = 100.0
 
 
 @dataclass(frozen=True)
-class SensorsConfig:
+class SensorsConfig(Section, key="sensors"):
     """The sensors of every agent; counts and ranges of 0 switch one off.
 
     Attributes:
         stack: observations in one: the last ones, oldest first. At first all are the first.
+        registered: sensors from outside of the package that are on, by name (docs/extending.md);
+            their features follow those of all others.
     """
 
-    stack: int = 1
+    stack: Annotated[int, Whole(1, 64)] = 1
     ego: EgoConfig = field(default_factory=EgoConfig)
     route: RouteAheadConfig = field(default_factory=RouteAheadConfig)
     neighbors: NeighborsConfig = field(default_factory=NeighborsConfig)
@@ -349,9 +312,10 @@ class SensorsConfig:
     lidar_observation: LidarObservationConfig = field(default_factory=LidarObservationConfig)
     roadgraph: RoadgraphConfig = field(default_factory=RoadgraphConfig)
     messages: MessagesConfig = field(default_factory=MessagesConfig)
+    registered: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
-        check(1 <= self.stack <= 64, "sensors.stack", self.stack, "must be from 1 to 64")
+        super().__post_init__()
         counts = (
             self.ego.enabled,
             self.route.points,
@@ -366,7 +330,13 @@ class SensorsConfig:
             self.messages.objects,
             self.messages.events,
             self.messages.signal,
+            len(self.registered),
         )
+        for name in self.registered:
+            there = name in REGISTERED_SENSORS
+            check(there, "sensors.registered", name, REGISTERED_SENSORS.advice())
+        once = len(set(self.registered)) == len(self.registered)
+        check(once, "sensors.registered", self.registered, "must name each sensor once")
         check(any(counts), "sensors", "all off", "an agent must observe something; switch one on")
 
     def without_sight(self) -> SensorsConfig:
@@ -380,6 +350,7 @@ class SensorsConfig:
             kinematics=replace(self.kinematics, vehicles_count=0),
             occupancy_grid=replace(self.occupancy_grid, features=()),
             lidar_observation=replace(self.lidar_observation, cells=0),
+            registered=(),
         )
 
 

@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import Annotated, Literal
 
-from cavmarl.config.checks import check as _check
+from cavmarl.config.checks import Section, Whole
 
 __all__ = ["SumoConfig"]
 
 
 @dataclass(frozen=True)
-class SumoConfig:
+class SumoConfig(Section, key="sumo"):
     """Read where `traffic.source` is `sumo-demand` or `sumo-traffic`; see docs/sumo.md.
 
     Attributes:
@@ -24,19 +24,5 @@ class SumoConfig:
     """
 
     interface: Literal["auto", "libsumo", "traci"] = "auto"
-    max_vehicles: int = 5000
-    replay_mib: int = 256
-
-    def __post_init__(self) -> None:
-        _check(
-            1 <= self.max_vehicles <= 1_000_000,
-            "sumo.max_vehicles",
-            self.max_vehicles,
-            "must be a whole number from 1 to 1000000",
-        )
-        _check(
-            0 <= self.replay_mib <= 1_000_000,
-            "sumo.replay_mib",
-            self.replay_mib,
-            "must be a whole number of MiB from 0 to 1000000",
-        )
+    max_vehicles: Annotated[int, Whole(1, 1_000_000)] = 5000
+    replay_mib: Annotated[int, Whole(0, 1_000_000)] = 256

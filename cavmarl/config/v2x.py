@@ -6,8 +6,9 @@ Everything is off by default, and the channel is ideal: each of its effects is o
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import Annotated
 
-from cavmarl.config.checks import check, check_finite
+from cavmarl.config.checks import Section, Whole, Within, check
 
 __all__ = [
     "CamConfig",
@@ -25,7 +26,7 @@ EVERY_SIGNAL = "all"
 
 
 @dataclass(frozen=True)
-class CamConfig:
+class CamConfig(Section, key="v2x.cam"):
     """Messages of a vehicle about itself, after CAM (ETSI EN 302 637-2).
 
     Attributes:
@@ -34,15 +35,12 @@ class CamConfig:
             speed by 0.5 m/s since its last one, and once a second anyway.
     """
 
-    rate_hz: float = 10.0
+    rate_hz: Annotated[float, Within(0.0, MAX_RATE_HZ)] = 10.0
     triggered: bool = False
-
-    def __post_init__(self) -> None:
-        check_finite("v2x.cam.rate_hz", self.rate_hz, 0.0, MAX_RATE_HZ)
 
 
 @dataclass(frozen=True)
-class DenmConfig:
+class DenmConfig(Section, key="v2x.denm"):
     """Messages about events, after DENM (ETSI EN 302 637-3).
 
     Attributes:
@@ -52,20 +50,14 @@ class DenmConfig:
         validity_s: for so long a receiver keeps an event.
     """
 
-    rate_hz: float = 10.0
-    hard_braking_mps2: float = 4.0
-    stationary_s: float = 30.0
-    validity_s: float = 2.0
-
-    def __post_init__(self) -> None:
-        check_finite("v2x.denm.rate_hz", self.rate_hz, 0.0, MAX_RATE_HZ)
-        check_finite("v2x.denm.hard_braking_mps2", self.hard_braking_mps2, 0.1, 20.0)
-        check_finite("v2x.denm.stationary_s", self.stationary_s, 0.1, 86_400.0)
-        check_finite("v2x.denm.validity_s", self.validity_s, 0.01, 86_400.0)
+    rate_hz: Annotated[float, Within(0.0, MAX_RATE_HZ)] = 10.0
+    hard_braking_mps2: Annotated[float, Within(0.1, 20.0)] = 4.0
+    stationary_s: Annotated[float, Within(0.1, 86_400.0)] = 30.0
+    validity_s: Annotated[float, Within(0.01, 86_400.0)] = 2.0
 
 
 @dataclass(frozen=True)
-class PerceptionConfig:
+class PerceptionConfig(Section, key="v2x.perception"):
     """Messages about others that the sender sees, after CPM (ETSI TS 103 324).
 
     Attributes:
@@ -74,20 +66,13 @@ class PerceptionConfig:
         objects: how many a message tells at most, the nearest ones.
     """
 
-    rate_hz: float = 0.0
-    range_m: float = 60.0
-    objects: int = 8
-
-    def __post_init__(self) -> None:
-        check_finite("v2x.perception.rate_hz", self.rate_hz, 0.0, MAX_RATE_HZ)
-        check_finite("v2x.perception.range_m", self.range_m, 1.0, 300.0)
-        check(
-            1 <= self.objects <= 32, "v2x.perception.objects", self.objects, "must be from 1 to 32"
-        )
+    rate_hz: Annotated[float, Within(0.0, MAX_RATE_HZ)] = 0.0
+    range_m: Annotated[float, Within(1.0, 300.0)] = 60.0
+    objects: Annotated[int, Whole(1, 32)] = 8
 
 
 @dataclass(frozen=True)
-class RoadsideConfig:
+class RoadsideConfig(Section, key="v2x.roadside"):
     """Units beside the road, which tell what signals show (SPAT and MAP, SAE J2735).
 
     Attributes:
@@ -98,15 +83,13 @@ class RoadsideConfig:
     """
 
     signals: tuple[str, ...] = ()
-    rate_hz: float = 10.0
-    perception_hz: float = 0.0
-    range_m: float = 80.0
+    rate_hz: Annotated[float, Within(0.0, MAX_RATE_HZ)] = 10.0
+    perception_hz: Annotated[float, Within(0.0, MAX_RATE_HZ)] = 0.0
+    range_m: Annotated[float, Within(1.0, 300.0)] = 80.0
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         key = "v2x.roadside"
-        check_finite(f"{key}.rate_hz", self.rate_hz, 0.0, MAX_RATE_HZ)
-        check_finite(f"{key}.perception_hz", self.perception_hz, 0.0, MAX_RATE_HZ)
-        check_finite(f"{key}.range_m", self.range_m, 1.0, 300.0)
         check(
             len(set(self.signals)) == len(self.signals),
             f"{key}.signals",
@@ -122,7 +105,7 @@ class RoadsideConfig:
 
 
 @dataclass(frozen=True)
-class ChannelConfig:
+class ChannelConfig(Section, key="v2x.channel"):
     """How much of what is sent arrives, and when; all zero: everything, everywhere, at once.
 
     Attributes:
@@ -139,28 +122,21 @@ class ChannelConfig:
         external: a network simulator, connected to the bus, says who receives what.
     """
 
-    range_m: float = 0.0
-    latency_ticks: int = 0
-    loss: float = 0.0
+    range_m: Annotated[float, Within(0.0, 1e6)] = 0.0
+    latency_ticks: Annotated[int, Whole(0, MAX_LATENCY_TICKS)] = 0
+    loss: Annotated[float, Within(0.0, 1.0)] = 0.0
     path_loss_exponent: float = 0.0
-    shadowing_db: float = 5.5
-    tx_power_dbm: float = 23.0
-    sensitivity_dbm: float = -82.0
-    building_db: float = 0.0
-    data_rate_mbps: float = 0.0
-    packet_bytes: int = 300
+    shadowing_db: Annotated[float, Within(0.1, 20.0)] = 5.5
+    tx_power_dbm: Annotated[float, Within(-30.0, 44.8)] = 23.0
+    sensitivity_dbm: Annotated[float, Within(-120.0, -30.0)] = -82.0
+    building_db: Annotated[float, Within(0.0, 100.0)] = 0.0
+    data_rate_mbps: Annotated[float, Within(0.0, 1000.0)] = 0.0
+    packet_bytes: Annotated[int, Whole(1, 2304, ", the longest frame of IEEE 802.11")] = 300
     external: bool = False
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         key = "v2x.channel"
-        check_finite(f"{key}.range_m", self.range_m, 0.0, 1e6)
-        check(
-            0 <= self.latency_ticks <= MAX_LATENCY_TICKS,
-            f"{key}.latency_ticks",
-            self.latency_ticks,
-            f"must be from 0 to {MAX_LATENCY_TICKS}",
-        )
-        check_finite(f"{key}.loss", self.loss, 0.0, 1.0)
         exponent = self.path_loss_exponent
         check(
             exponent == 0.0 or 1.0 <= exponent <= 6.0,
@@ -168,27 +144,16 @@ class ChannelConfig:
             exponent,
             "must be 0 (off), or from 1 to 6",
         )
-        check_finite(f"{key}.shadowing_db", self.shadowing_db, 0.1, 20.0)
-        check_finite(f"{key}.tx_power_dbm", self.tx_power_dbm, -30.0, 44.8)
-        check_finite(f"{key}.sensitivity_dbm", self.sensitivity_dbm, -120.0, -30.0)
-        check_finite(f"{key}.building_db", self.building_db, 0.0, 100.0)
         check(
             self.building_db == 0.0 or exponent > 0.0,
             f"{key}.building_db",
             self.building_db,
             "buildings weaken what the path-loss model gives: set path_loss_exponent, too",
         )
-        check_finite(f"{key}.data_rate_mbps", self.data_rate_mbps, 0.0, 1000.0)
-        check(
-            1 <= self.packet_bytes <= 2304,
-            f"{key}.packet_bytes",
-            self.packet_bytes,
-            "must be from 1 to 2304, the longest frame of IEEE 802.11",
-        )
 
 
 @dataclass(frozen=True)
-class InboxConfig:
+class InboxConfig(Section, key="v2x.inbox"):
     """What a receiver keeps: its local dynamic map.
 
     Attributes:
@@ -198,20 +163,14 @@ class InboxConfig:
         memory_s: for so long it keeps what it has heard of vehicles and signals.
     """
 
-    objects: int = 8
-    events: int = 4
-    signals: int = 2
-    memory_s: float = 1.0
-
-    def __post_init__(self) -> None:
-        for name in ("objects", "events", "signals"):
-            key, value = f"v2x.inbox.{name}", getattr(self, name)
-            check(1 <= value <= 64, key, value, "must be from 1 to 64")
-        check_finite("v2x.inbox.memory_s", self.memory_s, 0.01, 60.0)
+    objects: Annotated[int, Whole(1, 64)] = 8
+    events: Annotated[int, Whole(1, 64)] = 4
+    signals: Annotated[int, Whole(1, 64)] = 2
+    memory_s: Annotated[float, Within(0.01, 60.0)] = 1.0
 
 
 @dataclass(frozen=True)
-class V2xConfig:
+class V2xConfig(Section, key="v2x"):
     """Vehicles and roadside units that tell each other what they know.
 
     Attributes:
@@ -222,18 +181,14 @@ class V2xConfig:
     """
 
     enabled: bool = False
-    equipped: float = 1.0
-    capacity: int = 0
+    equipped: Annotated[float, Within(0.0, 1.0)] = 1.0
+    capacity: Annotated[int, Whole(0, 1 << 20)] = 0
     cam: CamConfig = field(default_factory=CamConfig)
     denm: DenmConfig = field(default_factory=DenmConfig)
     perception: PerceptionConfig = field(default_factory=PerceptionConfig)
     roadside: RoadsideConfig = field(default_factory=RoadsideConfig)
     channel: ChannelConfig = field(default_factory=ChannelConfig)
     inbox: InboxConfig = field(default_factory=InboxConfig)
-
-    def __post_init__(self) -> None:
-        check_finite("v2x.equipped", self.equipped, 0.0, 1.0)
-        check(0 <= self.capacity <= 1 << 20, "v2x.capacity", self.capacity, "must be 0 to 1048576")
 
     def check_clock(self, sim_dt_s: float) -> None:
         """Refuse rates that are no whole number of ticks of `sim_dt_s`.

@@ -2,12 +2,13 @@
 
     CavmarlError
     ├── ConfigError            a key, a value, a combination or a division that cannot work
-    │   └── UnknownEnvironmentError   no entry, path or map of that name
-    ├── ScenarioError          a map without a place for a scenario
+    │   ├── UnknownEnvironmentError   no entry, path or map of that name
+    │   └── ScenarioError         a map without a place for a scenario
     ├── MapError               a map that cannot be read, built or driven
     │   └── RouteError            no way from here to there
     ├── DemandError            a file of traffic that cannot be read or does not fit its map
     ├── PolicyError            a policy that cannot be loaded or does not fit
+    ├── RegisteredFunctionError   a registered function answers what it must not
     ├── MissingExtraError      an optional dependency is not installed
     ├── ActionError            refused before any state has changed
     ├── EpisodeError           the call does not fit the state of the episode: reset first
@@ -56,6 +57,7 @@ __all__ = [
     "NoAdmissibleWorkerError",
     "PolicyError",
     "ProtocolError",
+    "RegisteredFunctionError",
     "RouteError",
     "ScenarioError",
     "SumoError",
@@ -84,7 +86,7 @@ class UnknownEnvironmentError(ConfigError):
     """No environment, folder or map file of that name."""
 
 
-class ScenarioError(CavmarlError):
+class ScenarioError(ConfigError):
     """A map that has no place for a scenario."""
 
 
@@ -274,6 +276,10 @@ class SumoError(CavmarlError):
     A second simulation in one process, a SUMO that has ended or hangs, or one that says what does
     not fit the world.
     """
+
+
+class RegisteredFunctionError(CavmarlError):
+    """A function that was registered from outside answers what it must not."""
 
 
 def missing(error: ModuleNotFoundError, extra: str) -> MissingExtraError:

@@ -1,7 +1,7 @@
-"""Arrays in huge pages: a tick looks at many places in memory, and each small page costs a look-up.
+"""Makes arrays in huge pages: a tick reads many places, and each small page costs a look-up.
 
 In a virtual machine a page that the processor does not know by heart costs two walks through
-tables. Linux gives pages of 2 MiB to whoever asks for them, where they are not switched off
+tables. Linux gives pages of 2 MiB on request, where they are not switched off
 (`/sys/kernel/mm/transparent_hugepage/enabled`); elsewhere arrays are NumPy's own.
 """
 

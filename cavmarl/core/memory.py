@@ -1,4 +1,4 @@
-"""`Zeros`: who makes the arrays that a tick writes, in memory of one process or of several."""
+"""`Zeros` makes the arrays that a tick writes, in memory of one process or of several."""
 
 from __future__ import annotations
 

@@ -27,7 +27,7 @@ def check_seed(seed: Any) -> int:
 
 
 def first_seed(given: Any, default: int | None) -> int:
-    """The seed of a reset: the one given, else the default, else one that nobody has seen.
+    """The seed of a reset: the one given, else the default, else a fresh one.
 
     Raises:
         ConfigError: a given seed that `check_seed` refuses.

@@ -1,4 +1,4 @@
-"""How fast steps follow each other on the wall clock; no simulated time depends on it."""
+"""Paces steps on the wall clock; simulated time does not depend on it."""
 
 from __future__ import annotations
 
@@ -96,7 +96,7 @@ class RealTime:
 
 
 class Stepwise:
-    """Each step waits for somebody to allow it.
+    """Each step waits for permission.
 
     Args:
         ask: called with the simulated time in seconds before each step; the step begins when it

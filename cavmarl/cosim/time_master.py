@@ -1,7 +1,7 @@
-"""`TimeMaster`: who alone advances the time of an environment; `TimeFollower`: who reads it.
+"""`TimeMaster` alone advances the time of an environment; `TimeFollower` reads it.
 
 The integer tick is the truth, and time = tick · Δt: after 5,000 ticks of 50 ms it is exactly 250.0.
-A master takes the place of the environment's worlds, so that from then on nobody else steps or
+A master takes the place of the environment's worlds, so that from then on no other caller steps or
 resets them; an environment without a master pays nothing for that. Followers come and go while the
 world runs. What one of them does when it ticks by itself, which made the world of the
 co-simulation paper advance 1.92 times as fast as its master, is refused, ignored or, to show the
@@ -63,7 +63,7 @@ class ClockEvent(NamedTuple):
         tick: the master's when it was noticed.
         kind: `own_tick`: a follower wanted to tick; `drift`: a world is not where its master left
             it.
-        who: name of the follower; of a drift nobody knows.
+        who: name of the follower; unknown for a drift.
         ticks: by how many the world has gone on, or would have.
     """
 
@@ -75,7 +75,7 @@ class ClockEvent(NamedTuple):
 
 @dataclass
 class TimeFollower:
-    """One who reads the master's clock, in this process or at the other end of a socket.
+    """Reads the master's clock, in this process or at the other end of a socket.
 
     Attributes:
         master: whose clock it reads.
@@ -129,7 +129,7 @@ class _Mastered:
 
 
 class TimeMaster:
-    """The one who advances time.
+    """The only caller that advances time.
 
     Args:
         env: a `CavEnv` or a `CavVectorEnv`; until `release` only `TimeMaster.step` and
@@ -192,16 +192,16 @@ class TimeMaster:
 
     @property
     def world_ticks(self) -> NDArray[np.int64]:
-        """(W,) ticks of each world since its reset, whoever made them."""
+        """(W,) ticks of each world since its reset, made by any caller."""
         return self._mine().ticks()
 
     @property
     def followers(self) -> tuple[TimeFollower, ...]:
-        """Who follows, in the order in which they joined."""
+        """The followers, in the order in which they joined."""
         return tuple(self._followers)
 
     def follow(self, name: str) -> TimeFollower:
-        """Let somebody follow from now on; nothing of the world changes by it."""
+        """Add a follower from now on; nothing of the world changes by it."""
         follower = TimeFollower(self, name, self.tick)
         self._followers.append(follower)
         return follower
@@ -249,7 +249,7 @@ class TimeMaster:
         return worlds
 
     def check_turn(self, what: str) -> None:
-        """Refuse whoever is not the master.
+        """Refuse a caller that is not the master.
 
         Raises:
             ClockError: `what` was called on the environment itself.
@@ -261,7 +261,7 @@ class TimeMaster:
             )
 
     def check_follower(self, follower: TimeFollower) -> None:
-        """Refuse somebody who does not follow any more.
+        """Refuse a follower that does not follow any more.
 
         Raises:
             ClockError: it has left, or the master was released.
@@ -304,7 +304,7 @@ class TimeMaster:
         if self._on_drift == "error":
             raise ClockError(
                 f"world {world} is at tick {found[world]}, but its time master left it at "
-                f"{left[world]}: somebody else ticks it; let that follow the master, or ask for "
+                f"{left[world]}: another caller ticks it; let that follow the master, or ask for "
                 "on_drift = record"
             )
 

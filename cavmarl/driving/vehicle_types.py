@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from cavmarl.core.records.codes import MODEL_IDM, MODEL_KRAUSS
+from cavmarl.core.records.codes import MODEL_IDM
 from cavmarl.driving.kernels.car_following import (
     ACCEL_LIMIT,
     ACCEL_MAX,
@@ -27,7 +27,6 @@ __all__ = [
     "CLASS_DEFAULTS",
     "DEFAULT_TYPES",
     "NEAREST_CLASS",
-    "NEAREST_MODEL",
     "NO_ROAD_CLASSES",
     "VTYPE",
     "ClassDefaults",
@@ -148,38 +147,20 @@ DEFAULT_TYPES = {
     "DEFAULT_RAILTYPE": "rail",
 }
 
-# SUMO's car-following models by the one of ours whose equations are nearest.
-NEAREST_MODEL = {
-    "Krauss": MODEL_KRAUSS,
-    "KraussOrig1": MODEL_KRAUSS,
-    "KraussPS": MODEL_KRAUSS,
-    "KraussX": MODEL_KRAUSS,
-    "SmartSK": MODEL_KRAUSS,
-    "Daniel1": MODEL_KRAUSS,
-    "PWagner2009": MODEL_KRAUSS,
-    "BKerner": MODEL_KRAUSS,
-    "Wiedemann": MODEL_KRAUSS,
-    "W99": MODEL_KRAUSS,
-    "Rail": MODEL_KRAUSS,
-    "IDM": MODEL_IDM,
-    "IDMM": MODEL_IDM,
-    "EIDM": MODEL_IDM,
-    "ACC": MODEL_IDM,
-    "CACC": MODEL_IDM,
-    "CC": MODEL_IDM,
-}
 
-
-def generated_types() -> NDArray[np.void]:
+def generated_types(model: int = MODEL_IDM) -> NDArray[np.void]:
     """VTYPE (1,): the passenger car of the generator and of agents.
 
-    It drives by IDM with highway-env's defaults and has that car's size (5 m × 2 m).
+    It drives with highway-env's defaults for IDM and has that car's size (5 m × 2 m).
+
+    Args:
+        model: MODEL_* of its driver.
     """
     types = np.zeros(1, dtype=VTYPE)
     car = types[0]
     car["vclass"] = VEHICLE_CLASSES.index("passenger")
     car["permissions"] = 1 << VEHICLE_CLASSES.index("passenger")
-    car["model"] = MODEL_IDM
+    car["model"] = model
     car["length"], car["width"], car["height"] = 5.0, 2.0, 1.6
     car["accel"] = ACCEL_MAX
     car["decel"] = DECEL_COMFORT

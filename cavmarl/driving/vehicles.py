@@ -84,7 +84,7 @@ VEHICLE = np.dtype(
         # where it comes from and goes to
         ("agent", np.int32),  # index of the PettingZoo agent that drives it
         ("goal", np.int32),  # row of the plans' table; of demand vehicles that of their detours; of
-        # who follows a script the FRAME that it is at
+        # scripted vehicles the FRAME that they are at
         ("leg", np.int32),  # how many ways it has had before
         ("order", np.int32),  # DEPARTURE row of the demand file's orders; -1: of the generator
         ("departed", np.int64),  # tick of insertion
@@ -110,7 +110,7 @@ STATE_FIELDS = tuple(name for name in VEHICLE.names or () if name not in PLACEME
 
 
 # Fields that a ghost has in common with its owner's row of the same tick. Contacts and rewards are
-# written after ghosts are sent, and nobody asks a ghost for them.
+# written after ghosts are sent, and are never read from a ghost.
 GHOST_FIELDS = tuple(
     name for name in STATE_FIELDS if name not in ("hit", "events", "episode_return")
 )

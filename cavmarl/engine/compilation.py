@@ -1,4 +1,4 @@
-"""The one time that kernels are compiled: say so, and see that it happens before the first step."""
+"""Compiles kernels before the first step, and says so."""
 
 from __future__ import annotations
 

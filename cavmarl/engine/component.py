@@ -61,7 +61,7 @@ class Attached(Protocol):
         ...
 
     def begin(self, commands: Commands) -> None:
-        """Begin a tick: the rows are those of tick t, and who owns them is settled."""
+        """Begin a tick: the rows are those of tick t, and their ownership is settled."""
         ...
 
     def end(self) -> None:

@@ -1,4 +1,4 @@
-"""The global state of a world as one vector of fixed shape."""
+"""Writes the global state of a world as one vector of fixed shape."""
 
 from __future__ import annotations
 

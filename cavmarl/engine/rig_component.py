@@ -51,7 +51,7 @@ class MountedSensors:
         self.rig.reset(self.scenes(), chosen)
 
     def begin(self, commands: Commands) -> None:
-        """Note how everybody moves before the tick."""
+        """Note how all agents move before the tick."""
         self.rig.begin(self.scenes())
 
     def end(self) -> None:

@@ -1,4 +1,4 @@
-"""`Cues`: says when the cues come that the scripts of a scenario wait for."""
+"""`Cues` detects the cues that the scripts of a scenario wait for."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ class Cues:
         """Nothing to do: with the actors of an episode no cue has come yet."""
 
     def begin(self, commands: Commands) -> None:
-        """Note whose time has come, and whom an agent is near."""
+        """Note cues whose time has come, or that an agent is near."""
         zoned, worlds = self._division.zoned, self._worlds
         rows = zoned.rows[self._division.side]
         self._note_cues(self._cues, rows, zoned.num_owned, worlds.ticks, worlds.cues)

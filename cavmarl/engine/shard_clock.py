@@ -1,4 +1,4 @@
-"""`ShardClock`: how much of the processor's time each shard takes."""
+"""`ShardClock` measures the processor time of each shard."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ class ShardClock:
                 self._spent_ns[zone] += time.thread_time_ns() - began
 
     def take_s(self) -> NDArray[np.float64]:
-        """Seconds of each zone since the last time that somebody asked, (k,)."""
+        """Seconds of each zone since the last call, (k,)."""
         spent_s: NDArray[np.float64] = self._spent_ns.astype(np.float64) * (1e-9 * self._every)
         self._spent_ns[:] = 0
         return spent_s

@@ -1,11 +1,11 @@
-"""`Commons`: what no zone of a world can do alone, its signals and what agents get."""
+"""`Commons`: signals and agents' outputs, which all zones of a world share."""
 
 from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
 
-from cavmarl.config.env import TERMS, EnvConfig
+from cavmarl.config.env import EnvConfig
 from cavmarl.core.huge_pages import huge_zeros
 from cavmarl.core.memory import Zeros
 from cavmarl.core.numba.repeated import repeated
@@ -43,7 +43,7 @@ class Commons:
         self.outputs = make_outputs(config, num_worlds, observations, zeros)
         self._roads = network.arrays
         self._sim_dt_s = config.clock.sim_dt_s
-        self._weights = np.array([config.terms.weights.get(name, 0.0) for name in TERMS])
+        self._weights = np.array(config.terms.weight_of_each)
         self._team_share = config.terms.team_share
         self._switch_signals = repeated(switch_signals)
         self._clear_outputs = repeated(clear_outputs)

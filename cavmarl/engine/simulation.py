@@ -151,7 +151,7 @@ class Simulation(WorldViews):
             )
 
     def _let_coordinate(self, runs: Sequence[Run] | None) -> None:
-        """Let coordinators say who owns what; nobody asks where all is one zone."""
+        """Let coordinators decide ownership; with one zone there are none."""
         tick = self._tick
         refereeing = make_refereeing(
             self.config.zones,
@@ -191,7 +191,7 @@ class Simulation(WorldViews):
         self._populate(self.everywhere)
         self.suggest(controls)
         self.step(Commands(controls, np.full(shape, ACTION_IDLE, dtype=np.int64)))
-        # Once more what is only called when somebody leaves or waits.
+        # Once more what is only called when vehicles leave or wait.
         tick.let_in(all_phases=True)
         tick.executor.each("retire", tick.gate)
         tick.executor.each("forget", tick.gate)
@@ -352,7 +352,7 @@ class Simulation(WorldViews):
             gathers: whether that phase is his, too.
 
         Raises:
-            ConfigError: zones become others, and nobody would tell him.
+            ConfigError: zones become others, and the caller would not be told.
         """
         self._refuse_recutting("the zones of one world over workers")
         self._tick.host(make, gathers)

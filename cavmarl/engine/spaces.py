@@ -1,4 +1,4 @@
-"""Spaces: pure functions of the config. No world is built to learn a shape."""
+"""Observation and action spaces: pure functions of the config. No world is built for a shape."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from cavmarl.config.env import ActionConfig, EnvConfig, SensorsConfig
 from cavmarl.config.rig import samples_per_step
 from cavmarl.sensors.mounted.catalogue import type_of
 from cavmarl.sensors.mounted.frames import Frames
-from cavmarl.sensors.observed import SENSORS, Feature, layout
+from cavmarl.sensors.observed import Feature, layout, sensors_of
 
 __all__ = [
     "STATE_FEATURES",
@@ -53,7 +53,11 @@ def flat_observation_space(config: EnvConfig) -> spaces.Box:
         low = np.concatenate([box.low.ravel() for box in boxes]).astype(np.float32)
         high = np.concatenate([box.high.ravel() for box in boxes]).astype(np.float32)
         return spaces.Box(low, high, dtype=np.float32)
-    features = [feature for sensor in SENSORS for feature in sensor.features(config.sensors)]
+    features = [
+        feature
+        for sensor in sensors_of(config.sensors)
+        for feature in sensor.features(config.sensors)
+    ]
     stack = config.sensors.stack
     return _feature_box(features * stack, (stack * len(features),), np.float32)
 
@@ -85,7 +89,7 @@ def observation_space(config: EnvConfig) -> spaces.Box | spaces.Dict:
         return frames_space(config)
     if config.observation.kind == "flat":
         return flat_observation_space(config)
-    sensors = {sensor.name: sensor for sensor in SENSORS}
+    sensors = {sensor.name: sensor for sensor in sensors_of(config.sensors)}
     return spaces.Dict(
         {
             name: _feature_box(
@@ -125,7 +129,7 @@ def observation_parts(config: SensorsConfig) -> dict[str, ObservationPart]:
     """The sensors that are on, in the order of their features."""
     places = layout(config)
     parts = {}
-    for sensor in SENSORS:
+    for sensor in sensors_of(config):
         if sensor.name in places:
             place = places[sensor.name]
             shape = sensor.shape(config)
@@ -209,7 +213,7 @@ def observation_table(config: SensorsConfig) -> str:
     """
     lines = ["| index | sensor | feature | meaning | 1.0 is |", "|---|---|---|---|---|"]
     places = layout(config)
-    for sensor in SENSORS:
+    for sensor in sensors_of(config):
         if sensor.name in places:
             start = places[sensor.name].start
             lines += _lines(sensor.name, start, sensor.features(config))

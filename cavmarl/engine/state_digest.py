@@ -1,4 +1,4 @@
-"""The digest by which states of worlds are compared, however their rows lie."""
+"""Digests states of worlds for comparison, independent of the order of rows."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ def digest_world(parts: Parts, world: int) -> str:
     """Hex digest of one world; see `Simulation.state_hash`.
 
     Args:
-        parts: who keeps the state of the worlds.
+        parts: the parts that keep the state of the worlds.
         world: which one.
     """
     worlds, gate, rerouting = parts.worlds, parts.gate, parts.traffic.rerouting

@@ -1,9 +1,9 @@
-"""`StepTrace`: in which order the parts of a lock-step cycle have acted.
+"""`StepTrace` records the order in which the parts of a lock-step cycle act.
 
 Algorithm 1 of the co-simulation paper: SUMO goes to t + Δt, its vehicles are mirrored, the world
 ticks exactly once, sensors deliver the frame of t + Δt, the stack computes u, and u is queued for
-the next cycle. Each part notes the name of its phase; nobody who is not asked for a trace pays for
-one.
+the next cycle. Each part notes the name of its phase; without a trace this costs
+nothing.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""`Tick`: what happens to W worlds in a tick, phase by phase. The order is written here, once."""
+"""`Tick` runs one tick of W worlds, phase by phase. The order is written here, once."""
 
 from __future__ import annotations
 
@@ -42,8 +42,8 @@ class Tick:
         commons: what all shards share.
         gate: through which vehicles come and go; a reset may replace it.
         attached: what acts in each tick beside the traffic.
-        executor: runs the phases of the shards, whoever hosts them.
-        coordination: says who owns what; None: nobody asks where all is one zone.
+        executor: runs the phases of the shards, wherever they are hosted.
+        coordination: decides ownership; None: all is one zone.
         sumo: beside these worlds; None: there is none.
         hosts_may_die: in any phase, so also those are gone through in which nothing is to be done.
     """
@@ -117,7 +117,7 @@ class Tick:
         self.switch_signals()
 
     def _follow_sumo(self, sumo: SumoTraffic) -> None:
-        """SUMO takes its step; who is its own stands where it is then, or leaves."""
+        """SUMO takes its step; its own vehicles stand where they are then, or leave."""
         gate, worlds, side = self.gate, self._shard.worlds, self.division.next_side
         self._note_phase(SUMO)
         sumo.step(worlds, side)
@@ -150,7 +150,7 @@ class Tick:
         self.executor.each("credit", chosen)
 
     def leave(self) -> None:
-        """Who needs it picks another goal, who has arrived leaves, who looks for a way finds it."""
+        """Pick new goals, let arrived vehicles leave, answer requests for ways."""
         traffic, gate, worlds = self.traffic, self.gate, self._shard.worlds
         begins_second, some_arrived = self._occasions(
             worlds.ticks, traffic.ticks_per_s, self._shard.zoned.num_through
@@ -171,7 +171,7 @@ class Tick:
             self.coordination.left(self.gate)
 
     def _enter(self) -> None:
-        """Those who wait and find a gap enter `next_rows`."""
+        """Waiting departures that find a gap enter `next_rows`."""
         traffic, gate, worlds = self.traffic, self.gate, self._shard.worlds
         if self.sumo is not None:
             self._meet()
@@ -184,7 +184,7 @@ class Tick:
             self.let_in(all_phases=self.hosts_may_die)
 
     def let_in(self, all_phases: bool) -> None:
-        """Rank → assign → propose, and if anybody has found a gap, accept → admit.
+        """Rank → assign → propose, and if any departure has found a gap, accept → admit.
 
         Args:
             all_phases: go through the last two in any case.
@@ -199,7 +199,7 @@ class Tick:
         self._admit()
 
     def _admit(self) -> None:
-        """Those who have been let in become rows of the zones that they are in."""
+        """Admitted vehicles become rows of the zones that they are in."""
         self.executor.each("admit", self.gate)
         if self.coordination is not None:
             self.coordination.entered(self.gate)
@@ -255,8 +255,8 @@ class Tick:
 
 
 def _there() -> None:
-    """Nobody is waited for where one process runs all phases."""
+    """There is no wait where one process runs all phases."""
 
 
 def _pass_over(phase: str) -> None:
-    """What is done with the names of phases where nobody asks for them."""
+    """Ignore the name of a phase, where there is no trace."""

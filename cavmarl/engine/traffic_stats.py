@@ -1,4 +1,4 @@
-"""`TrafficStats`: what has become of the traffic of one world."""
+"""`TrafficStats`: counts and sums of one world's traffic."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""From a name to what a world is made of: config and roads."""
+"""Loads what a world is made of, by name: config and roads."""
 
 from __future__ import annotations
 
@@ -36,10 +36,8 @@ from cavmarl.zones.partition.zone_partition import ZonePartition
 __all__ = [
     "World",
     "check_agents",
-    "check_hosts",
     "check_workers",
     "find_map",
-    "leads_hosts",
     "load_roads",
     "load_world",
     "load_zones",
@@ -194,37 +192,8 @@ def check_workers(workers: int | None) -> int:
     return int(workers)
 
 
-def check_hosts(workers: int | str | None, hosts: str | None) -> bool:
-    """Whether workers run on the machines of a Ray cluster.
-
-    Raises:
-        ConfigError: another name, no number, or no workers to be hosted.
-    """
-    if hosts not in (None, "ray"):
-        raise ConfigError(f"hosts = {hosts!r}: must be 'ray', or None for this machine")
-    if isinstance(workers, str) and workers != "ray":
-        raise ConfigError(f"workers = {workers!r}: must be a whole number, or 'ray'")
-    if not isinstance(workers, str):
-        check_workers(workers)
-    if hosts and workers in (None, 0):
-        raise ConfigError("hosts = 'ray' without workers: say how many, or workers='ray'")
-    return "ray" in (workers, hosts)
-
-
-def leads_hosts(num_worlds: int, workers: int | str | None, hosts: str | None) -> bool:
-    """Whether this process leads the worlds, and hosts run their zones; arguments as checked.
-
-    Args:
-        num_worlds: W.
-        workers: how many; "ray": as many as are of use for whole worlds.
-        hosts: "ray": they are on the machines of a Ray cluster.
-    """
-    is_number = workers is not None and not isinstance(workers, str)
-    return hosts is not None and is_number and int(workers or 0) > num_worlds
-
-
 def check_agents(config: EnvConfig) -> None:
-    """Refuse a world without agents where somebody wants to drive one.
+    """Refuse a world without agents where a caller wants to drive one.
 
     Raises:
         ConfigError: `population.agents` is 0.

@@ -1,6 +1,6 @@
-"""What the next tick of W worlds depends on, as a list of arrays, for whoever goes on with them.
+"""The state that the next tick of W worlds depends on, as a list of arrays, to go on from.
 
-Who owns what is not part of it: that changes no result. Whoever goes on with a divided world gives
+Ownership is not part of it: that changes no result. A successor of a divided world gives
 each vehicle to the zone that it is in, as at a reset.
 """
 
@@ -24,12 +24,13 @@ __all__ = ["Parts", "join", "load", "save", "share_of"]
 
 Array = NDArray[Any]
 
-# Fields of `Gate` that outlive a tick, beside its queue. Between two steps nobody is passing it.
+# Fields of `Gate` that outlive a tick, beside its queue. Between two steps no vehicle is passing
+# it.
 _OF_GATE = ("next_order", "num_queue", "next_id", "num_entered", "counts", "sums")
 
 
 class Parts(NamedTuple):
-    """Who keeps the state of W worlds.
+    """The parts that keep the state of W worlds.
 
     Attributes:
         worlds: of the first shard.
@@ -37,7 +38,7 @@ class Parts(NamedTuple):
         gate: through which vehicles come and go.
         traffic: what comes.
         outputs: what agents have got; the frames of the next observation, too.
-        coordination: who says who owns what; None: all is one zone.
+        coordination: decides ownership; None: all is one zone.
         has_frames: an observation has frames of the ones before.
         attached: what acts in each tick beside the traffic.
         sumo: beside the worlds; None: there is none.

@@ -56,7 +56,7 @@ class WorldViews:
 
     @property
     def shards(self) -> Sequence[Shard]:
-        """One a zone, for who runs their phases."""
+        """One a zone, for the caller that runs their phases."""
         return self._shards
 
     @property
@@ -83,11 +83,11 @@ class WorldViews:
 
     @property
     def gate(self) -> Gate:
-        """Who waits to enter each world, and counts since its reset; a reset may replace it."""
+        """Departures waiting in each world, and counts since its reset; resets may replace it."""
         return self._tick.gate
 
     def listen(self, config: EnvConfig) -> tuple[Bus, Callable[[], None]]:
-        """A bus beside the world, for tools that measure: nobody in the world hears of it.
+        """A bus beside the world, for tools that measure: stations in the world do not hear of it.
 
         Args:
             config: whose `v2x` it is of.
@@ -133,7 +133,7 @@ class WorldViews:
         return self._tick.division.loads()
 
     def zone_view(self, world: int = 0) -> ZoneView:
-        """Who owns and sees which vehicles of one world now."""
+        """Which zones own and see which vehicles of one world now."""
         halo_m, coordination = self.zone_loads().halo_m, self._tick.coordination
         transfers = () if coordination is None else coordination.in_flight(world)
         return view_zones(self._shards, self.partition, halo_m, world, transfers)
@@ -156,7 +156,7 @@ class WorldViews:
 
     @property
     def coordinators(self) -> tuple[Referee, ...]:
-        """Who says who owns what, one a world; none where all is one zone."""
+        """The coordinators, one a world; none where all is one zone."""
         return () if self._tick.coordination is None else self._tick.coordination.coordinators
 
     @property

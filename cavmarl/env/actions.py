@@ -1,4 +1,4 @@
-"""Actions at the border: checked before any state changes, then decoded for the shards."""
+"""Actions from outside: checked before any state changes, then decoded for the shards."""
 
 from __future__ import annotations
 

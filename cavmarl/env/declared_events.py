@@ -1,4 +1,4 @@
-"""`DeclaredEvents`: what agents want to tell others of, until the next step takes it."""
+"""`DeclaredEvents` holds events that agents want to send, until the next step."""
 
 from __future__ import annotations
 

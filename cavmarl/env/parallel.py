@@ -5,14 +5,13 @@ from __future__ import annotations
 from collections.abc import Mapping
 from itertools import compress
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 from pettingzoo import ParallelEnv
 
-from cavmarl.config.env import TERMS
 from cavmarl.config.registry import load_config
 from cavmarl.core.errors import ActionError, ConfigError, EpisodeError
 from cavmarl.core.seeds import check_seed, first_seed
@@ -26,10 +25,10 @@ from cavmarl.engine.spaces import (
     sensed_observation,
     state_space,
 )
-from cavmarl.engine.world_setup import check_agents, check_hosts, leads_hosts, make_world
+from cavmarl.engine.world_setup import check_agents, make_world
 from cavmarl.env.actions import ActionDecoder
 from cavmarl.env.declared_events import DeclaredEvents
-from cavmarl.parallel.backends import make_worlds
+from cavmarl.parallel.backends import check_hosts, keeps_state, make_worlds
 from cavmarl.parallel.step_arrays import SteppedWorlds
 from cavmarl.render.world_view import WorldView
 from cavmarl.sensors.mounted.frames import SensorFrames
@@ -38,9 +37,8 @@ __all__ = ["CavEnv", "parallel_env"]
 
 RENDER_MODES = ("human", "rgb_array")
 
-# What an agent's info holds, in this order.
-_ABSENT = dict.fromkeys((*TERMS, "active", "vehicle_done", "vehicle_id"), 0.0)
-_ACTIVE = _ABSENT | {"active": 1.0}
+# What an agent's info holds, behind the terms.
+_OF_VEHICLE = ("active", "vehicle_done", "vehicle_id")
 
 Observation = NDArray[np.float32] | dict[str, NDArray[Any]]
 
@@ -49,8 +47,8 @@ def parallel_env(
     env: str | Path = "merge",
     *,
     zones: int | None = None,
-    workers: int | Literal["ray"] | None = None,
-    hosts: Literal["ray"] | None = None,
+    workers: int | str | None = None,
+    hosts: str | None = None,
     sensor_workers: int | None = None,
     agents: int | None = None,
     background: int | None = None,
@@ -86,7 +84,7 @@ def parallel_env(
     check_hosts(workers, hosts)
     first_seed = None if seed is None else check_seed(seed)
     if render_mode is not None:
-        _check_rendering(render_mode, 0 if leads_hosts(1, workers, hosts) else workers)
+        _check_rendering(render_mode, 0 if keeps_state(1, workers, hosts) else workers or hosts)
     config, base_dir = load_config(
         env,
         zones=zones,
@@ -120,7 +118,7 @@ def _check_rendering(render_mode: str, workers: int | str | None) -> None:
 
 
 def _flags(agents: list[str], flags: NDArray[np.bool_]) -> dict[str, bool]:
-    """One flag an agent; in most steps nobody's is set."""
+    """One flag an agent; in most steps none is set."""
     if not flags.any():
         return dict.fromkeys(agents, False)
     return dict(zip(agents, flags.tolist(), strict=True))
@@ -172,6 +170,9 @@ class CavEnv(ParallelEnv[str, Any, Any]):  # type: ignore[misc] # PettingZoo is 
         self.action_spaces = dict.fromkeys(self.possible_agents, one_action)
         self._seats = config.population.mode == "seats"
         self._stack = config.sensors.stack
+        self._term_names = config.terms.names
+        self._info_absent = dict.fromkeys((*self._term_names, *_OF_VEHICLE), 0.0)
+        self._info_active = self._info_absent | {"active": 1.0}
         self._parts = (
             observation_parts(config.sensors)
             if config.observation.kind == "dict" and config.observation.mode != "sensors"
@@ -238,8 +239,8 @@ class CavEnv(ParallelEnv[str, Any, Any]):  # type: ignore[misc] # PettingZoo is 
     ]:
         """Let every agent act and the world go on for `step_s` seconds.
 
-        Agents that enter during the step are in the results, with reward 0. When everybody has left
-        and more are to come, the world goes on until one enters.
+        Agents that enter during the step are in the results, with reward 0. When all agents have
+        left and more are to come, the world goes on until one enters.
 
         Raises:
             EpisodeError: before the first reset; actions after everybody has left.
@@ -267,7 +268,7 @@ class CavEnv(ParallelEnv[str, Any, Any]):  # type: ignore[misc] # PettingZoo is 
         dict[str, bool],
         dict[str, dict[str, float]],
     ]:
-        """What the agents get after a step; decides who stays."""
+        """What the agents get after a step; decides which stay."""
         arrays = self.worlds.arrays
         truncated = self._steps >= self.max_cycles
         if not truncated:
@@ -342,11 +343,13 @@ class CavEnv(ParallelEnv[str, Any, Any]):  # type: ignore[misc] # PettingZoo is 
         active = (ids >= 0) & ~done
         terms = arrays.terms[0, listed].T
         # Most are 0 for everybody: no accident, no red light.
-        columns = [(TERMS[k], terms[k]) for k in np.flatnonzero(terms.any(axis=1)).tolist()]
+        columns = [
+            (self._term_names[k], terms[k]) for k in np.flatnonzero(terms.any(axis=1)).tolist()
+        ]
         columns.append(("vehicle_id", ids))
-        usual = _ACTIVE
+        usual = self._info_active
         if not active.all():
-            usual = _ABSENT
+            usual = self._info_absent
             columns.append(("active", active.astype(np.float64)))
             columns.append(("vehicle_done", done.astype(np.float64)))
         infos = [usual.copy() for _ in self.agents]

@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, Literal, TypeAlias
+from typing import Any, TypeAlias
 
 import numpy as np
 from gymnasium.vector import AutoresetMode
@@ -24,10 +24,10 @@ from cavmarl.engine.spaces import (
     frames_space,
     sensed_observation,
 )
-from cavmarl.engine.world_setup import check_agents, check_hosts, make_world
+from cavmarl.engine.world_setup import check_agents, make_world
 from cavmarl.env.actions import ActionDecoder
 from cavmarl.env.declared_events import DeclaredEvents
-from cavmarl.parallel.backends import make_worlds
+from cavmarl.parallel.backends import check_hosts, make_worlds
 from cavmarl.parallel.step_arrays import SteppedWorlds
 from cavmarl.sensors.mounted.frames import SensorFrames
 from cavmarl.shards.shard import Commands
@@ -53,8 +53,8 @@ def make_vec(
     *,
     num_envs: int = 1,
     zones: int | None = None,
-    workers: int | Literal["ray"] | None = None,
-    hosts: Literal["ray"] | None = None,
+    workers: int | str | None = None,
+    hosts: str | None = None,
     sensor_workers: int | None = None,
     agents: int | None = None,
     background: int | None = None,
@@ -289,12 +289,13 @@ class CavVectorEnv:
 
         Returns:
             observations (W, A, D), rewards (W, A), terminations (W, A): the agent's vehicle ended;
-            truncations (W, A): the episode was cut at the horizon; and infos: `mask` (W, A) who
-            acts next; `acted` (W, A) who acted in this step, so whose reward counts; `terms` (W, A,
-            T) in the order of `config.TERMS`; `arrivals` (W,) vehicles that reached their goal
-            since the reset, agents included; `episode_over` (W,) which worlds are over;
-            `final_observations` (W, A, D) before a reset and with the last ones of those who
-            left: the same array as the observations in a step where nobody did.
+            truncations (W, A): the episode was cut at the horizon; and infos: `mask` (W, A) agents
+                that
+            act next; `acted` (W, A) agents that acted in this step, so their rewards count; `terms`
+            (W, A, T) in the order of `config.TERMS`; `arrivals` (W,) vehicles that reached their
+            goal since the reset, agents included; `episode_over` (W,) which worlds are over;
+            `final_observations` (W, A, D) before a reset and with the last ones of agents that
+            left: the same array as the observations in a step where none did.
 
         Raises:
             EpisodeError: before the first reset.

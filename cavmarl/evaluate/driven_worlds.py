@@ -1,4 +1,4 @@
-"""One world cut into any number of zones, with the built-in driver in its seats."""
+"""Makes worlds divided into any number of zones, with the built-in driver for all agents."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`Watch`: between the steps of many worlds, where their agents are and whom they just missed."""
+"""`Watch`: between the steps of many worlds, the places and near misses of their agents."""
 
 from __future__ import annotations
 
@@ -16,7 +16,8 @@ __all__ = ["Watch", "mirrored_conflicts"]
 def mirrored_conflicts(network: RoadNetwork) -> NDArray[np.int32]:
     """(num_conflicts,) the row of the same area as seen from the foe's path, -1 where paths merge.
 
-    Who follows another out of a merge shares its lane from then on: that is following, which time
+    A vehicle that follows another out of a merge shares its lane from then on: that is following,
+        which time
     to collision measures, and no encroachment.
     """
     links, conflicts = network.links, network.conflicts

@@ -12,7 +12,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from cavmarl.config.env import TERMS
 from cavmarl.engine.shard_clock import ShardClock
 from cavmarl.engine.world_setup import load_world
 from cavmarl.env.vector import CavVectorEnv
@@ -178,13 +177,12 @@ class _Part:
     def __init__(self, vec: CavVectorEnv, count: int, *, tracked: bool) -> None:
         self._vec = vec
         self._count = count
-        weights = vec.config.terms.weights
         self._recorder = Recorder(
             vec.num_envs,
             vec.num_agents,
             vec.max_cycles,
             vec.step_s,
-            np.array([weights.get(term, 0.0) for term in TERMS]),
+            np.array(vec.config.terms.weight_of_each),
         )
         self._watch = Watch(vec, self._recorder)
         self._tracked = tracked

@@ -1,4 +1,4 @@
-"""One run in a process of its own: the caller's side, and the program on the other.
+"""Evaluates one run in a process of its own: the caller's side, and the program.
 
 The program reads a job as JSON from standard input, tells its progress line by line on standard
 output, and leaves arrays in a file. A run shares nothing with another but the files on disk.

@@ -1,4 +1,4 @@
-"""The roads of a map as a few lines, small enough to lie beside results."""
+"""Outlines of a map's roads, small enough to store with results."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What became of the messages of each episode, for the tables of evaluations."""
+"""Message statistics of each episode, for the tables of evaluations."""
 
 from __future__ import annotations
 

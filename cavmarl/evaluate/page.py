@@ -1,4 +1,4 @@
-"""A report as one HTML file that needs nothing else: tables, plots, the map, the manifest."""
+"""Writes a report as one self-contained HTML file: tables, plots, the map, the manifest."""
 
 from __future__ import annotations
 

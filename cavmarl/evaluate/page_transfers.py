@@ -1,4 +1,4 @@
-"""What a page tells of vehicles that changed their zone: a row a figure, a cell a driver."""
+"""The page's table of hand-overs: one row a figure, one cell a driver."""
 
 from __future__ import annotations
 

@@ -14,7 +14,7 @@ from cavmarl.rewards.kernels.terms import TTC_HORIZON_S
 __all__ = ["PET_HORIZON_S", "SHORT_TTC_S", "Recorder"]
 
 SHORT_TTC_S = 1.5  # below this a driver has no time left to react (Hayward 1972; SSAM)
-PET_HORIZON_S = 10.0  # who passes later than this after another has not met it
+PET_HORIZON_S = 10.0  # a later pass after another is no encounter
 MIN_DISTANCE_M = 1.0  # of a trip whose delay a kilometre is compared
 JERK_UNIT_MPS3 = 10.0  # of the term `comfort`
 
@@ -47,7 +47,7 @@ class Recorder:
         self._half = max_steps / 2.0
         self._step_s = step_s
         self._weights = weights
-        self._sums = np.zeros((*shape, len(TERMS)))
+        self._sums = np.zeros((*shape, weights.size))
         self._rewards = np.zeros(shape)
         self._worst_ttc = np.zeros(shape)
         self._short_ttc = np.zeros(shape, dtype=np.int64)
@@ -55,10 +55,10 @@ class Recorder:
         self._began = np.zeros(shape, dtype=np.int64)
         self._world_steps = np.zeros(num_worlds, dtype=np.int64)
         self._background_arrivals = np.zeros(num_worlds, dtype=np.int64)
-        self._world_terms = np.zeros((num_worlds, len(TERMS)))
+        self._world_terms = np.zeros((num_worlds, weights.size))
         self._world_rewards = np.zeros(num_worlds)
         self._trips: list[NDArray[np.void]] = []
-        self.least_pet_s = np.full(shape, np.inf)  # written by whoever watches the junctions
+        self.least_pet_s = np.full(shape, np.inf)  # written by the watcher of junctions
         self.places_m = np.full((*shape, 2), np.nan)  # likewise: before the step
 
     def add(
@@ -75,7 +75,7 @@ class Recorder:
 
         Args:
             step: its number in the episode, from 0.
-            acted: (W, A) whose trip this step belongs to; nobody's in worlds that are through.
+            acted: (W, A) whose trip this step belongs to; none in worlds that are through.
             rewards: (W, A).
             terms: (W, A, T).
             done: (W, A) whose trip ended in it.

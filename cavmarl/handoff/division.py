@@ -54,13 +54,13 @@ class ZoneLoads(NamedTuple):
 
 
 class Division:
-    """Who owns what, and who sees what.
+    """Which zones own and see which vehicles.
 
     Args:
         shards: one a zone, in the order of zones.
         zoned: their rows.
         zones: of the partition.
-        halo: whom each zone sees over its borders.
+        halo: what each zone sees over its borders.
         sight: what says so for other zones.
         touching_m: no ghost further outside of a zone can touch one of its vehicles.
         borders: when a vehicle is near one.
@@ -70,9 +70,9 @@ class Division:
         zones: of the partition.
         borders: when a vehicle is near one.
         codec: of vehicles' states.
-        book: who is near a border.
+        book: vehicles near a border.
         gathering: what shards are called with that `gather` their ghosts: how far outside of a zone
-            a ghost can be that touches somebody in it, and how far inside one is at a border, m.
+            a ghost can be that touches a vehicle in it, and how far inside one is at a border, m.
         call_hand_over: the kernel, with the types of all worlds' arrays found out once.
         call_release: the same.
     """
@@ -140,7 +140,7 @@ class Division:
     def cut(self, partition: ZonePartition) -> None:
         """Divide the plane otherwise, between two ticks: owners stay, ghosts are those of now.
 
-        Whoever is in another zone than its owner's changes its owner as at any border.
+        A vehicle in another zone than its owner's changes its owner as at any border.
 
         Args:
             partition: as many zones as before.
@@ -158,7 +158,7 @@ class Division:
         book.tick[:] = tick  # of the rows that have been looked at once more
 
     def settle_newborn(self, w: int, births: Sequence[Birth]) -> list[Birth]:
-        """Give vehicles that nobody has on record yet to the zones that they are in now."""
+        """Give vehicles that are not on record yet to the zones that they are in now."""
         settled = []
         for vehicle, zone, state in births:
             _, row = self.find(w, vehicle)
@@ -170,7 +170,7 @@ class Division:
         return settled
 
     def _forget_offers(self, w: int) -> None:
-        """Whoever was near a border before is not to be counted again."""
+        """Vehicles near a border before are not to be counted again."""
         for known in (self.book.num_near, self.book.num_coming, self.book.known):
             known[w] = 0
 
@@ -195,7 +195,7 @@ class Division:
         return self._gatherers is not None
 
     def note_gathered(self) -> None:
-        """Note who is near a border, after all shards have gathered."""
+        """Note vehicles near a border, after all shards have gathered."""
         self._note_those_near(self.book)
 
     def rehearse_gathering(self) -> None:
@@ -223,14 +223,14 @@ class Division:
         return 0 if rows is self._first_side else 1
 
     def place(self, vehicles: Sequence[NDArray[np.void]], contacts: NDArray[np.int64]) -> None:
-        """Give every vehicle to the zone that it is in, whoever has owned it before.
+        """Give every vehicle to the zone that it is in, whatever zone owned it before.
 
         Args:
             vehicles: VEHICLE (n,) of each world.
             contacts: (W,) of each, as `contacts` counts them.
         """
         first = self._shards[0].worlds
-        # Who has died in the middle of a tick may have left a step that is not what this says.
+        # A host that died in the middle of a tick may have left a step that is not what this says.
         self._zoned.step_at[...] = 0
         for w, rows in enumerate(vehicles):
             first.rows[w, : len(rows)] = rows
@@ -250,7 +250,7 @@ class Division:
             shard.align()
 
     def near(self, w: int, everybody: bool) -> list[Near]:
-        """Who of a world is near a border, by its committed rows.
+        """Vehicles of a world near a border, by its committed rows.
 
         Args:
             w: which world.
@@ -286,7 +286,7 @@ class Division:
 
         Args:
             w: in which world.
-            switch: who, from where, to where.
+            switch: the vehicle, its source and its target.
             state: what the new owner goes on with; None: the old one's row as it is.
             hint: the row where the old one probably keeps it.
 
@@ -354,7 +354,7 @@ class Division:
     def ghosts(self, w: int, zone: int) -> NDArray[np.void]:
         """VEHICLE (n,), the committed copies that a zone has of others' vehicles.
 
-        A view that cannot be written: nobody but its owner changes a vehicle.
+        A view that cannot be written: only its owner changes a vehicle.
         """
         worlds = self._shards[zone].worlds
         rows: NDArray[np.void] = worlds.rows[w, worlds.num_owned[w] : worlds.num_rows[w]]

@@ -46,7 +46,7 @@ class Recutter:
         network: the map.
         division: of the worlds.
         coordination: of the worlds.
-        every: steps from one look to the next.
+        every: steps between checks.
         tolerance: by which share of the mean the fullest zone has to become emptier.
 
     Attributes:

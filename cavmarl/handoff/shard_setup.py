@@ -12,6 +12,7 @@ from cavmarl.driving.kernels.motion import MAX_SPEED_MPS
 from cavmarl.handoff.division import Division
 from cavmarl.ownership.distances import Distances, check_coverage, needed_overlap_m
 from cavmarl.ownership.limits import DeadlinePolicy, Limits
+from cavmarl.rewards.registered_terms import terms_reach_m
 from cavmarl.roads.network import RoadNetwork
 from cavmarl.sensors.mounted.catalogue import rig_reach_m
 from cavmarl.sensors.observed import largest_radius_m, sensing_reach_m
@@ -44,7 +45,7 @@ def divide(
         config: the environment.
         network: its roads.
         partition: its zones.
-        traffic: who drives where.
+        traffic: departures and routes.
         outputs: where all agents get what they sense.
         num_worlds: how many worlds are stepped together.
         zeros: makes the arrays that shards write.
@@ -54,7 +55,11 @@ def divide(
     """
     settings, dt = config.zones, config.clock.sim_dt_s
     radius_m = largest_radius_m(traffic.travel.types)
-    sensing_m = max(sensing_reach_m(config.sensors, radius_m), rig_reach_m(config.rig, radius_m))
+    sensing_m = max(
+        terms_reach_m(config.terms),
+        sensing_reach_m(config.sensors, radius_m),
+        rig_reach_m(config.rig, radius_m),
+    )
     reach_m = max(driving_reach_m(network, traffic.travel), sensing_m)
     fastest_mps = longest_move_m(network, traffic.travel, dt) / dt
     wide_m = halo_m(config, reach_m, partition.count, fastest_mps)
@@ -107,7 +112,7 @@ def halo_m(
 
     Args:
         config: `zones.halo_m` is taken if it is given.
-        reach_m: the farthest that anybody looks.
+        reach_m: the farthest that any driver looks.
         zones: how many there are.
         fastest_mps: the way of a tick over its length, with what vehicles jump on the map.
 
@@ -132,7 +137,7 @@ def halo_m(
 def _goes_by_roads(config: EnvConfig, traffic: NativeTraffic) -> bool:
     """Whether all that drivers look at can be found along the roads.
 
-    Scripts put vehicles beside them, SUMO where it likes; and whoever names a halo wants it whole.
+    Scripts put vehicles beside them, SUMO where it likes; and a named halo is taken whole.
     """
     free = traffic.scene is not None or traffic.sumo is not None
     return config.zones.halo_m is None and not free
@@ -150,7 +155,7 @@ def limits_of(settings: ZonesConfig, schema: int = 1) -> Limits:
 
 
 def _limits_at_borders(settings: ZonesConfig) -> Limits:
-    """Deadlines of hand-overs; where nothing is lost nobody is late (decision 013)."""
+    """Deadlines of hand-overs; where nothing is lost none is late (decision 013)."""
     limits = limits_of(settings)
     may_be_late = settings.faults or settings.reproducers
     if may_be_late:

@@ -12,7 +12,7 @@ __all__ = ["NearBorders"]
 
 
 class NearBorders:
-    """Who was near a border when the tick began, and who has crossed one.
+    """Vehicles near a border when the tick began, and those that have crossed one.
 
     Args:
         division: of all worlds.

@@ -1,4 +1,4 @@
-"""`ZoneView`: who owns, sees and hands over what in one divided world, to look at."""
+"""`ZoneView`: owned vehicles, ghosts and hand-overs of one divided world, to read."""
 
 from __future__ import annotations
 

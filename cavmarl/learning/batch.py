@@ -39,7 +39,7 @@ class Batch:
     suggested: Tensor | None = None
 
     def advantages(self, gamma: float, gae_lambda: float) -> Tensor:
-        """(T, W, A) generalised advantage estimates (Schulman et al. 2016); 0 where nobody acted.
+        """(T, W, A) generalised advantage estimates (Schulman et al. 2016); 0 where no agent acted.
 
         The sums go along the way of one vehicle: they begin anew where `goes_on` is False.
         """

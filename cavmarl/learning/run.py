@@ -76,7 +76,7 @@ class Run:
         if settings.resume:
             load_checkpoint(folder, self.network, self.learner.optimizer, self.config)
         self.scales = Scales(self.network, self.agent_steps)
-        # Who collects while another learns draws from numbers of its own.
+        # A process that collects while another learns draws from numbers of its own.
         generator = torch.Generator().manual_seed(seed) if settings.overlap else None
         self.collector = Collector(vec, self.network, settings.num_steps, seed, generator)
         self._aside = ThreadPoolExecutor(1) if settings.overlap else None

@@ -209,7 +209,7 @@ def _junctions_by_type(network: RoadNetwork) -> dict[str, int]:
 
 
 def _lawless_junctions(network: RoadNetwork) -> tuple[str, ...]:
-    """Junctions where two movements end in the same lane and no rule says who goes first."""
+    """Junctions where two movements end in the same lane and no rule says which goes first."""
     links = network.links
     owner = np.repeat(np.arange(len(links)), links["num_conflicts"])
     foe = network.conflicts["foe"]

@@ -1,4 +1,4 @@
-"""Who changes owner in the next tick: a function of the committed state and of what is ready."""
+"""Changes of owner in the next tick: a function of the committed state and of what is ready."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The coordinator's side of the protocol: who owns which vehicle, and what becomes of it next.
+"""The coordinator's side of the protocol: the owner of each vehicle, and its next one.
 
 Each method answers with an `Output`: records to append to the log, then messages to send. What a
 record changes is done by `Table.apply` and nowhere else, so a coordinator that replays its log
@@ -58,7 +58,7 @@ class StoreError(ProtocolError):
 
 
 class Directory:
-    """Decides who owns what in the next tick, and sees it done.
+    """Decides the owners in the next tick, and sees it done.
 
     Attributes:
         table: owners, hosts and the tick in progress, as the log has them.
@@ -110,7 +110,7 @@ class Directory:
         return directory
 
     def again(self, records: Sequence[Record]) -> Directory:
-        """Another coordinator of the same world, who knows what a log says; see `restore`."""
+        """Another coordinator of the same world, with the state of a log; see `restore`."""
         zones = tuple(self.table.hosts)
         return Directory.restore(records, zones, self._store, self._limits, self._safeguards)
 

@@ -2,8 +2,8 @@
 
 The host may advance its vehicles while it has a lease, and a STEP is a lease for one tick:
 `on_message` answers it with an `Advance` for the shard to carry out, `complete` ends it with DONE,
-and `offer` then tells neighbours who comes near. Everything in here is volatile: a host that dies
-is loaded anew from the committed store.
+and `offer` then tells neighbours about vehicles that come near. Everything in here is volatile: a
+host that dies is loaded anew from the committed store.
 """
 
 from __future__ import annotations
@@ -120,7 +120,7 @@ class Endpoint:
         return self._answer
 
     def offer(self, approaches: Iterable[Approach]) -> tuple[Message, ...]:
-        """Tell other zones who comes near, after `complete`; every approach of the tick at once."""
+        """After `complete`, tell other zones of vehicles that come near, all of a tick at once."""
         offers, withdrawn = self.offers.renew(self.tick, approaches, self.owned)
         aborts = tuple(
             Abort(self.run, self.episode, self.tick, self.zone, self.incarnation, target, entries)

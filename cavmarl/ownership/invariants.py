@@ -1,7 +1,7 @@
 """What always holds (I1 to I10), checked on the parties' own states while they run.
 
 A monitor is told which rows a host advances, and is asked to look before and after every tick.
-It is for tests, and for runs in which the user pays for it: it looks at every vehicle.
+It is for tests, and for runs in which the user pays for it: it checks every vehicle.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ class Monitor:
 
     def __init__(self, limits: Limits) -> None:
         self._limits = limits
-        self._writers: dict[int, tuple[int, int]] = {}  # vehicle → who advanced it in this tick
+        self._writers: dict[int, tuple[int, int]] = {}  # vehicle → advanced by, this tick
         self._executed: dict[tuple[int, int], int] = {}  # process → newest tick that it advanced to
         self._tick = -1
 

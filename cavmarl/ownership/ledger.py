@@ -54,7 +54,7 @@ class Tally(NamedTuple):
         return Tally(self.vehicles - 1, (self.digest - member(run, vehicle, epoch)) % _OWNED)
 
     def check(self, other: Tally, where: str) -> None:
-        """Compare with what somebody else counted.
+        """Compare with another count.
 
         Raises:
             ProtocolError: the sets differ.
@@ -73,7 +73,7 @@ def member(run: bytes, vehicle: int, epoch: int) -> int:
     """Keyed hash of an owned vehicle, in [0, 2**64).
 
     SplitMix64's finalizer (Steele, Lea, Flood 2014): its task is to tell sets apart that differ by
-    mistake, several times in a tick; nobody attacks it.
+    mistake, several times in a tick; it need not withstand attacks.
     """
     word = int.from_bytes(run[:8], "little") + vehicle * 0x9E3779B97F4A7C15
     word = (word + epoch * 0xC2B2AE3D27D4EB4F) & _WORD

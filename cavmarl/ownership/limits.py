@@ -29,7 +29,7 @@ class Limits:
 
     Attributes:
         deferral: ticks for which the source goes on without a confirmation (D).
-        lifetime: ticks after which a replica that nobody refreshes is dropped (K).
+        lifetime: ticks after which a replica that is not refreshed is dropped (K).
         attempts: how often a PREPARE is sent inside one tick (A).
         repeats: new hosts for one tick of one zone (R_max).
         backoff: ticks without an offer to a target that refused.

@@ -6,7 +6,7 @@ of vehicles are opaque bytes with a digest; what stands in them is the runtime's
 
 The rule of the core: **write the records down, then send the messages** (`Output`).
 
-Nobody changes a message or a record once it is made. The classes are not frozen all the same: to
+A message or a record does not change once it is made. The classes are not frozen all the same: to
 make a frozen one takes 2.4 µs instead of 0.4, and an idle tick of four zones makes twenty.
 """
 

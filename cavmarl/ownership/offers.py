@@ -1,8 +1,8 @@
-"""The source's side of an approach: what it has offered to whom, and what it still owes.
+"""The source's side of an approach: what it has offered to which zone, and what it still owes.
 
-For each pair of vehicle and target a tick has at most one PREPARE or ABORT. A PREPARE that nobody
-answers is sent again, at most A times in its tick. A target that refused is left alone for some
-ticks.
+For each pair of vehicle and target a tick has at most one PREPARE or ABORT. A PREPARE that no
+target answers is sent again, at most A times in its tick. A target that refused is left alone for
+some ticks.
 """
 
 from __future__ import annotations

@@ -19,7 +19,7 @@ class Plan:
 
     Attributes:
         record: the decision, as logged.
-        expected: zone → what it owns after IN, OUT and SPAWN, before anybody is removed.
+        expected: zone → what it owns after IN, OUT and SPAWN, before any is removed.
         switches: vehicle → its switch.
         births: vehicle → its zone.
         enter: zone → switches into it.
@@ -38,7 +38,7 @@ class Plan:
     attach: set[int] = field(default_factory=set)
 
     def changes(self, zone: int) -> bool:
-        """Whether somebody enters the zone, leaves it, or is born there."""
+        """Whether a vehicle enters the zone, leaves it, or is born there."""
         return zone in self.enter or zone in self.leave or zone in self.spawn
 
     def owner(self, vehicle: int, committed: Mapping[int, tuple[int, int]]) -> tuple[int, int]:
@@ -102,5 +102,5 @@ def _where(done: Done) -> str:
 
 
 def all_removed(dones: Iterable[Done]) -> tuple[Removed, ...]:
-    """Who left the world, in order of ids."""
+    """Vehicles that left the world, in order of ids."""
     return tuple(sorted(entry for done in dones for entry in done.removed))

@@ -10,7 +10,7 @@ from cavmarl.ownership.messages import Message, Spawn
 
 @dataclass(slots=True)
 class Hosting:
-    """What a new host is told: who it is, and what its zone owns at the committed tick.
+    """What a new host is told: its identity, and what its zone owns at the committed tick.
 
     Attributes:
         owned: vehicle → epoch.

@@ -18,7 +18,7 @@ from cavmarl.ownership.transitions import Event, Party, State, after
 
 
 class Replica(NamedTuple):
-    """A state as of a tick, which nobody advances."""
+    """A state as of a tick, which is not advanced."""
 
     epoch: int
     tick: int

@@ -32,7 +32,7 @@ class Safeguards:
     abort_fence: bool = True  # H5: an older ABORT does not drop a newer replica
     fence_stays: bool = True  # H6: the fence stays when the replica goes
     replica_slot: bool = True  # H7: a PREPARE never touches the row that is owned
-    replica_lifetime: bool = True  # I8: a replica that nobody refreshes expires
+    replica_lifetime: bool = True  # I8: a replica that is not refreshed expires
 
     # Ticks, runs, episodes, processes
     log_before_send: bool = True  # H11, H23: a decision is logged before anyone hears of it

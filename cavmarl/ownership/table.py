@@ -1,7 +1,7 @@
 """What the log says: owners, hosts and the tick in progress.
 
 The table changes by records alone, so a coordinator that replays its log comes to the table that
-it died with, and anybody else who replays it knows who owns what.
+it died with, and any other reader that replays it knows all owners.
 """
 
 from __future__ import annotations
@@ -103,13 +103,13 @@ class Table:
     ) -> None:
         """Reach a later tick at once, as a BEGIN and a COMMIT with the same contents would.
 
-        For a coordinator who has looked at them itself, and whose log, if there is one, has them.
+        For a coordinator that has checked them itself, and whose log, if there is one, has them.
 
         Args:
             tick: which one; in those before nothing has changed.
-            switches: who changes owner.
-            births: who is new.
-            removed: who has left the world, of those before and of these.
+            switches: changes of owner.
+            births: new vehicles.
+            removed: vehicles that have left the world, of those before and of these.
 
         Raises:
             ProtocolError: a tick is in progress, or vehicles wait for their transfer; nobody owned
@@ -141,7 +141,7 @@ class Table:
             zone, epoch = owners.pop(vehicle)
             counts[zone] -= 1
             moves.append((vehicle, zone, epoch, False))
-        # More moves than vehicles: whoever asks counts anew, and needs to know no more than that.
+        # More moves than vehicles: callers count anew, and need to know no more than that.
         # It stays so, since with every new vehicle comes a move.
         del moves[len(owners) + 1 :]
         self.tick = tick

@@ -83,7 +83,7 @@ class TraceChecker:
 
     Args:
         longest_deferral: ticks that a vehicle may be with a zone that does not contain it.
-        lifetime: ticks after which a state that nobody refreshes is forgotten.
+        lifetime: ticks after which a state that is not refreshed is forgotten.
         is_direct: zones and coordinator live in one process, so that there are records alone, and
             perhaps only of ticks that have something to tell of.
 
@@ -277,7 +277,7 @@ class TraceChecker:
         return changed
 
     def _confirmed(self, zone: int, changed: dict[int, Owner | None]) -> tuple[Removed, ...]:
-        """What a zone's DONE adds to the changes: whom it removed."""
+        """What a zone's DONE adds to the changes: removed vehicles."""
         done = self._dones.get(zone)
         if done is None:
             raise ProtocolError(f"zone {zone} has not said DONE")

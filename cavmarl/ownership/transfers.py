@@ -34,7 +34,7 @@ class Transfer(NamedTuple):
     Attributes:
         episode: in which it was.
         tick: the tick that the new owner computed first.
-        vehicle: who changed.
+        vehicle: that changed.
         source: from where.
         target: to where.
         epoch: the new one.
@@ -46,12 +46,12 @@ class Transfer(NamedTuple):
         state_bytes: size of the last of them; 0 where no bytes were sent, since both zones live in
             one process.
         prepare_depth_m: how far it was outside of its owner's zone when the first of them arrived,
-            less than 0 inside; None: nobody told.
+            less than 0 inside; None: unknown.
         switch_depth_m: the same when its switch was decided.
         release_depth_m: how far outside of its old zone when that was committed, and the old
-            owner's copy went; None: nobody told, or it has left the world.
-        ms: from that first state, or else from BEGIN, until the target has confirmed; None: nobody
-            has a clock.
+            owner's copy went; None: unknown, or it has left the world.
+        ms: from that first state, or else from BEGIN, until the target has confirmed; None: without
+            a clock.
     """
 
     episode: int
@@ -116,12 +116,12 @@ class TransferLog:
     """Follows records and deliveries.
 
     Args:
-        lifetime: ticks after which a state that nobody refreshes is forgotten.
+        lifetime: ticks after which a state that is not refreshed is forgotten.
         surroundings: tells depths and times; None: they are left out.
 
     Attributes:
         episode: of the newest record.
-        ask: called before anybody reads: lets whoever tells late catch up.
+        ask: called before each reading, to bring late records up to date.
     """
 
     def __init__(self, lifetime: int, surroundings: Surroundings | None = None) -> None:

@@ -4,7 +4,7 @@ Rule 1: what is not in the table does not happen: `after` raises.
 Rule 2: a message that comes late is dropped and counted before it gets here.
 
 A vehicle has two slots at a host, which never touch each other: its ROW, which the host may
-advance while it is AUTHORITATIVE, and its REPLICA, which nobody ever advances.
+advance while it is AUTHORITATIVE, and its REPLICA, which is never advanced.
 """
 
 from __future__ import annotations

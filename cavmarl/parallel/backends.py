@@ -1,17 +1,167 @@
-"""Worlds that are stepped together, in this process or shared out as somebody wishes."""
+"""Where worlds run: backends by name, and how one is chosen."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Protocol
 
-from cavmarl.engine.world_setup import World, check_hosts, leads_hosts
+from cavmarl.core.errors import ConfigError
+from cavmarl.engine.world_setup import World, check_workers
 from cavmarl.parallel.hosts.remote_worlds import RemoteWorlds
 from cavmarl.parallel.pooled_worlds import PooledWorlds
 from cavmarl.parallel.sensor_workers.sensor_worker_setup import local_worlds
 from cavmarl.parallel.split_hosts.divided_worlds import DividedWorlds
 from cavmarl.parallel.step_arrays import SteppedWorlds
 
-__all__ = ["make_worlds"]
+__all__ = [
+    "Backend",
+    "MakeWorlds",
+    "backend_names",
+    "check_hosts",
+    "keeps_state",
+    "make_worlds",
+    "register_backend",
+]
+
+LOCAL, PROCESSES, RAY = "local", "processes", "ray"
+
+
+class MakeWorlds(Protocol):
+    """Makes worlds somewhere."""
+
+    def __call__(
+        self,
+        world: World,
+        base_dir: Path,
+        num_worlds: int,
+        workers: int | None,
+        in_next_step: bool,
+    ) -> SteppedWorlds:
+        """Worlds that are stepped together.
+
+        Args:
+            world: what each is made of.
+            base_dir: the folder that its relative files start from.
+            num_worlds: W.
+            workers: how many run them; None: as many as are of use.
+            in_next_step: when worlds begin anew; see `SteppedWorlds`.
+        """
+        ...
+
+
+@dataclass(frozen=True)
+class Backend:
+    """A place where worlds run.
+
+    Attributes:
+        make: makes them there.
+        needs_workers: whether the number of workers, or the name in its place, has to be given.
+        keeps_state: whether the caller's process has the state of so many worlds with so many
+            workers, so that it can draw them.
+    """
+
+    make: MakeWorlds
+    needs_workers: bool = False
+    keeps_state: Callable[[int, int | None], bool] = lambda num_worlds, workers: False
+
+
+def _is_split(num_worlds: int, workers: int | None) -> bool:
+    """Whether there are more workers than worlds: this process leads, workers run zones."""
+    return workers is not None and workers > num_worlds
+
+
+def _local(
+    world: World, base_dir: Path, num_worlds: int, workers: int | None, in_next_step: bool
+) -> SteppedWorlds:
+    return local_worlds(world, base_dir, num_worlds, in_next_step)
+
+
+def _processes(
+    world: World, base_dir: Path, num_worlds: int, workers: int | None, in_next_step: bool
+) -> SteppedWorlds:
+    return PooledWorlds(world, base_dir, num_worlds, int(workers or 1), in_next_step)
+
+
+def _ray(
+    world: World, base_dir: Path, num_worlds: int, workers: int | None, in_next_step: bool
+) -> SteppedWorlds:
+    if workers is not None and _is_split(num_worlds, workers):
+        return DividedWorlds(world, base_dir, num_worlds, workers, in_next_step)
+    return RemoteWorlds(world, base_dir, num_worlds, workers, in_next_step)
+
+
+_BACKENDS = {
+    LOCAL: Backend(_local, keeps_state=lambda num_worlds, workers: True),
+    PROCESSES: Backend(_processes, needs_workers=True),
+    RAY: Backend(_ray, needs_workers=True, keeps_state=_is_split),
+}
+_OWN = frozenset(_BACKENDS)
+
+
+def backend_names() -> tuple[str, ...]:
+    """What `hosts` can name."""
+    return tuple(_BACKENDS)
+
+
+def register_backend(name: str, make: MakeWorlds) -> None:
+    """Add a place where worlds run, which `hosts` of `make_vec` and `parallel_env` can name.
+
+    Args:
+        name: of the backend.
+        make: makes worlds there; what they do must be what the worlds of this process do.
+
+    Raises:
+        ConfigError: the name is taken or no name.
+    """
+    if not name.isidentifier():
+        raise ConfigError(f"backend {name!r}: must be a name of letters, digits and _")
+    if name in _OWN:
+        raise ConfigError(f"backend '{name}': one of cavmarl's own; take another name")
+    _BACKENDS[name] = Backend(make)
+
+
+def check_hosts(workers: int | str | None, hosts: str | None) -> tuple[str, int | None]:
+    """The backend that both name, and its number of workers, None where it finds that out.
+
+    Raises:
+        ConfigError: another name, no number, or no workers to be hosted.
+    """
+    known = ", ".join(f"'{name}'" for name in sorted(_BACKENDS, key=lambda name: name != RAY))
+    if hosts is not None and hosts not in _BACKENDS:
+        raise ConfigError(f"hosts = {hosts!r}: must be {known}, or None for this machine")
+    if isinstance(workers, str) and (workers not in _BACKENDS or workers in (LOCAL, PROCESSES)):
+        names = ", ".join(f"'{name}'" for name in _BACKENDS if name not in (LOCAL, PROCESSES))
+        raise ConfigError(f"workers = {workers!r}: must be a whole number, or {names}")
+    if isinstance(workers, str):
+        if hosts not in (None, workers):
+            raise ConfigError(f"workers = {workers!r} with hosts = {hosts!r}: name one of both")
+        return workers, None
+    number = check_workers(workers)
+    if hosts is None:
+        return (PROCESSES, number) if number else (LOCAL, 0)
+    if hosts == LOCAL and number:
+        raise ConfigError(
+            f"hosts = 'local' with workers = {number}: it has none; name 'processes', or leave "
+            "one out"
+        )
+    if _BACKENDS[hosts].needs_workers and not number:
+        by_name = "" if hosts in _OWN - {RAY} else f", or workers='{hosts}'"
+        raise ConfigError(f"hosts = '{hosts}' without workers: say how many{by_name}")
+    return hosts, number or None
+
+
+def keeps_state(num_worlds: int, workers: int | str | None, hosts: str | None) -> bool:
+    """Whether this process has the state of the worlds; arguments and errors as of `check_hosts`.
+
+    Args:
+        num_worlds: W.
+        workers: how many, or a backend's name.
+        hosts: a backend's name.
+    """
+    name, number = check_hosts(workers, hosts)
+    return _BACKENDS[name].keeps_state(num_worlds, number)
 
 
 def make_worlds(
@@ -22,14 +172,15 @@ def make_worlds(
     hosts: str | None = None,
     in_next_step: bool = False,
 ) -> SteppedWorlds:
-    """Worlds of this process, of worker processes or of hosts.
+    """Worlds of the backend that `workers` and `hosts` name.
 
     Args:
         world: what each is made of.
         base_dir: the folder that its relative files start from.
         num_worlds: W.
-        workers: how many run them; 0 or None: this process; "ray": as many hosts as are of use.
-        hosts: "ray": workers are on the machines of a Ray cluster; None: on this one.
+        workers: how many run them; 0 or None: this process; a backend's name: as many as are of
+            use there.
+        hosts: a backend's name; None: this machine.
         in_next_step: when worlds begin anew; see `SteppedWorlds`.
 
     Raises:
@@ -37,12 +188,5 @@ def make_worlds(
         MissingExtraError: hosts on Ray without Ray.
         WorkerError: no process, no cluster, or no memory.
     """
-    on_ray = check_hosts(workers, hosts)
-    number = None if workers == "ray" else int(workers or 0)
-    if number and leads_hosts(num_worlds, workers, hosts):
-        return DividedWorlds(world, base_dir, num_worlds, number, in_next_step)
-    if on_ray:
-        return RemoteWorlds(world, base_dir, num_worlds, number, in_next_step)
-    if number:
-        return PooledWorlds(world, base_dir, num_worlds, number, in_next_step)
-    return local_worlds(world, base_dir, num_worlds, in_next_step)
+    name, number = check_hosts(workers, hosts)
+    return _BACKENDS[name].make(world, base_dir, num_worlds, number, in_next_step)

@@ -34,7 +34,7 @@ class OrderedWorlds(ABC):
 
     Attributes:
         arrays: what goes in and comes out.
-        placement: who hosts what.
+        placement: which worker hosts what.
         mover: has that changed; None: it does not change.
     """
 
@@ -53,7 +53,7 @@ class OrderedWorlds(ABC):
 
     @abstractmethod
     def _settle(self, parts: list[Part]) -> None:
-        """Note who runs what from now on."""
+        """Note which worker runs what from now on."""
 
     @abstractmethod
     def _send(self, task: Task, letter: Any, commits: bool) -> None:

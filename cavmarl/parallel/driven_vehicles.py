@@ -1,4 +1,4 @@
-"""What is told of agents' vehicles to those who drive them from elsewhere."""
+"""What is told of agents' vehicles to drivers outside the process."""
 
 from __future__ import annotations
 

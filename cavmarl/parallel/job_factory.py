@@ -1,4 +1,4 @@
-"""The jobs of all workers that run worlds, made where they are forked."""
+"""Makes the jobs of all workers that run worlds, in the fork server."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ from typing import Any
 
 from cavmarl.config.env import EnvConfig
 from cavmarl.core.errors import WorkerError
+from cavmarl.core.extensions import load_extensions
 from cavmarl.engine.world_setup import make_world
 from cavmarl.handoff.coordinator.coordinator_setup import Run
 from cavmarl.parallel.checkpoint.action_log import Tape
@@ -43,6 +44,7 @@ def make_jobs(recipe: Mapping[str, Any]) -> list[Job]:
     """
     from cavmarl.config.io import validate  # pydantic is slow to import
 
+    load_extensions(recipe["extensions"])
     config = validate(EnvConfig, recipe["config"], "the environment")
     world = make_world(config, Path(recipe["base_dir"]))
     if fingerprint(world) != recipe["fingerprint"]:

@@ -1,4 +1,4 @@
-"""Worlds with a journal or a plan of faults: where they can be run, and what workers are told."""
+"""Worlds with a journal or a plan of faults: where they can run, and what workers receive."""
 
 from __future__ import annotations
 

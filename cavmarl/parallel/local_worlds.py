@@ -138,14 +138,14 @@ class LocalWorlds:
         return self._report(outputs, self._steps, self._horizon, self._results)
 
     def _write_who_goes_on(self) -> bool:
-        """Write who acts next and what is over; whether an episode is."""
+        """Write which agents act next and what is over; whether an episode is."""
         simulation = self.simulation
         return self._report_who_goes_on(
             simulation.outputs, simulation.gate, self._steps, self._horizon, self._results
         )
 
     def _end(self, over: NDArray[np.bool_], some_over: bool) -> None:
-        """Keep what those saw last who have ended, and begin the new episodes."""
+        """Keep the last observations of agents that have ended, and begin the new episodes."""
         arrays = self.arrays
         self._keep_observations()
         if arrays.frames:
@@ -161,7 +161,7 @@ class LocalWorlds:
             arrays.mask[over] = self.simulation.outputs.present[over]
 
     def _keep_observations(self) -> None:
-        """Of those who have ended."""
+        """Keep the last observations of agents that have ended."""
         arrays = self.arrays
         self._keep_last(
             self._results, arrays.observations, arrays.final_observations, self.in_next_step

@@ -52,7 +52,7 @@ class Mover:
             pids: tells those of their processes.
 
         Returns:
-            who runs what now; None: what they did before.
+            which worker runs what now; None: what they did before.
         """
         if self._steps < self._every:
             self._steps += 1

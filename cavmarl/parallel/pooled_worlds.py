@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from cavmarl.core.errors import ConfigError, WorkerError, WorkerFailureError
+from cavmarl.core.extensions import extension_modules
 from cavmarl.engine.compilation import compiled_before
 from cavmarl.engine.simulation import Simulation
 from cavmarl.engine.world_setup import World
@@ -47,7 +48,7 @@ class PooledWorlds(OrderedWorlds):
         arrays: in shared memory; each worker writes those of its worlds.
         pool: the processes.
         in_next_step: when worlds begin anew.
-        placement: who hosts what.
+        placement: which worker hosts what.
         mover: has that changed; None: it does not change.
 
     Raises:
@@ -111,6 +112,7 @@ class PooledWorlds(OrderedWorlds):
         ]
         recipe = {
             "config": asdict(config),
+            "extensions": extension_modules(config.registered),
             "base_dir": str(base_dir.resolve()),
             "fingerprint": fingerprint(world),
             "num_worlds": num_worlds,

@@ -1,4 +1,4 @@
-"""`StepArrays`: what goes into a step of W worlds and what comes out, wherever they are run."""
+"""`StepArrays`: the inputs and outputs of a step of W worlds, wherever they run."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cavmarl.balance.balance_plan import Plan
-from cavmarl.config.env import TERMS, EnvConfig
+from cavmarl.config.env import EnvConfig
 from cavmarl.engine.simulation import Simulation
 from cavmarl.engine.spaces import flat_observation_space, state_space
 from cavmarl.engine.world_setup import World
@@ -36,10 +36,10 @@ class StepArrays(NamedTuple):
     rewards: NDArray[np.float32]  # (W, A)
     terminations: NDArray[np.bool_]  # (W, A) the vehicle ended
     truncations: NDArray[np.bool_]  # (W, A) the horizon ended it
-    acted: NDArray[np.bool_]  # (W, A) who has acted
+    acted: NDArray[np.bool_]  # (W, A) agents that have acted
     vehicle_done: NDArray[np.bool_]  # (W, A)
     vehicle_ids: NDArray[np.int64]  # (W, A) of the vehicle at the end of the step; -1: it had none
-    mask: NDArray[np.bool_]  # (W, A) who acts next
+    mask: NDArray[np.bool_]  # (W, A) agents that act next
     terms: NDArray[np.float32]  # (W, A, T)
     arrivals: NDArray[np.int64]  # (W,) since each world's reset
     ticks: NDArray[np.int64]  # (W,) the same
@@ -79,7 +79,7 @@ def layout_of(config: EnvConfig, capacity: int, num_worlds: int) -> Layout:
         "rewards": ("<f4", agents),
         **dict.fromkeys(("terminations", "truncations", "acted", "vehicle_done", "mask"), flags),
         "vehicle_ids": ("<i8", agents),
-        "terms": ("<f4", (*agents, len(TERMS))),
+        "terms": ("<f4", (*agents, len(config.terms.names))),
         "arrivals": ("<i8", (num_worlds,)),
         "ticks": ("<i8", (num_worlds,)),
         "episode_over": ("|b1", (num_worlds,)),

@@ -112,7 +112,7 @@ class Placement:
         return moves
 
     def _snapshot(self, pids: Mapping[int, int]) -> Snapshot:
-        """How busy workers are; idle where nobody looks, and where one was replaced meanwhile."""
+        """How busy workers are; idle where not measured, and where one was replaced meanwhile."""
         watch, before = self._watch, self._pids
         self.watch(pids)
         if watch is None or before != pids:

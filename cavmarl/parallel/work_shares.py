@@ -126,7 +126,7 @@ def _of_zones(world: World, number: int, seen: Snapshot, rule: BalanceRule) -> P
     hosted = list(plan.homes)
     excluded = {rejection.worker for rejection in plan.rejections}
     for worker in (candidate.worker for candidate in seen.workers):
-        if worker not in hosted and worker not in excluded:  # nobody is to be idle
+        if worker not in hosted and worker not in excluded:  # no worker is to be idle
             fullest = max(hosted, key=hosted.count)
             hosted[len(hosted) - 1 - hosted[::-1].index(fullest)] = worker
     return make_plan(replace(problem, present=tuple(hosted))) if hosted != [*plan.homes] else plan

@@ -1,4 +1,4 @@
-"""The program of the processes that run worlds; a pool starts it."""
+"""The program of worker processes that run worlds; `Pool` starts it."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`WorldsJob`: what a worker does that runs some of the worlds."""
+"""`WorldsJob`: the job of a worker that runs some of the worlds."""
 
 from __future__ import annotations
 
@@ -99,6 +99,6 @@ def commands_of(arrays: StepArrays) -> Commands:
 
 
 def fingerprint(world: World) -> str:
-    """What tells two readings of the same files apart, if somebody has changed one between."""
+    """Differs between two readings of the same files if one was changed in between."""
     made_of = (world.network, world.demand, world.partition)
     return " ".join("none" if part is None else part.content_hash for part in made_of)

@@ -54,7 +54,7 @@ class Policy(ABC):
 
         Args:
             observations: (W, A, D) flat.
-            mask: (W, A) who acts; the others' actions are not read.
+            mask: (W, A) agents that act; the others' actions are not read.
 
         Returns:
             (W, A, 2) float32 within [-1, 1], or (W, A) int64 meta-actions.

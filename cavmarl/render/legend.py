@@ -40,7 +40,7 @@ def samples_of_drivers(*, destinations: bool, actors: bool = False) -> list[Samp
 
     Args:
         destinations: whether those of agents are shown.
-        actors: whether somebody follows a script.
+        actors: whether any follows a script.
     """
     samples = [Sample("agents", lambda x, y: _stripes([agent_color(k) for k in range(4)], x, y))]
     if destinations:

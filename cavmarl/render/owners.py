@@ -1,4 +1,4 @@
-"""Who owns a vehicle, who sees it as a ghost, and where it is handed over."""
+"""Which zone owns a vehicle, which see it as a ghost, and where it is handed over."""
 
 from __future__ import annotations
 

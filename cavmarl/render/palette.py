@@ -38,7 +38,7 @@ MARKING: Color = (214, 219, 224)
 CENTRE_LINE: Color = (226, 206, 150)
 
 BACKGROUND_CAR: Color = (186, 204, 225)
-ACTOR: Color = (250, 232, 120)  # who follows a script
+ACTOR: Color = (250, 232, 120)  # follows a script
 GLASS: Color = (48, 58, 72)
 HEADLIGHT: Color = (255, 250, 225)
 BRAKE: Color = (255, 56, 48)

@@ -118,7 +118,7 @@ class TopDownRenderer:
         return surface
 
     def _draw_drivers(self, surface: Surface, vehicles: NDArray[np.void]) -> list[Sample]:
-        """Vehicles by who drives them; agents with their numbers and destinations."""
+        """Vehicles by driver; agents with their numbers and destinations."""
         camera = self._camera
         seen = in_view(vehicles, camera)
         if self._goals is not None:
@@ -134,7 +134,7 @@ class TopDownRenderer:
     def _draw_owners(
         self, surface: Surface, vehicles: NDArray[np.void], zones: ZoneView, ghosts_of: int | None
     ) -> list[Sample]:
-        """Zones, and vehicles by who owns them, sees them and is to have them."""
+        """Zones, and vehicles by present and next owner, and zones that see them."""
         camera = self._camera
         draw_zones(surface, zones.partition, zones.halo_m, camera)
         if ghosts_of is not None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from cavmarl.config.env import TERMS, EnvConfig
+from cavmarl.config.env import EnvConfig
 from cavmarl.core.memory import Zeros
 from cavmarl.core.records.arrays import Outputs
 from cavmarl.sensors.observed import frame_size
@@ -19,7 +19,7 @@ def make_outputs(
     observations: NDArray[np.float32] | None = None,
     zeros: Zeros = np.zeros,
 ) -> Outputs:
-    """Outputs of W worlds in which nobody is present.
+    """Outputs of W empty worlds.
 
     Args:
         config: the environment.
@@ -36,7 +36,7 @@ def make_outputs(
     vehicle_ids[...] = -1
     return Outputs(
         observations=observations,
-        terms=zeros((*agents, len(TERMS)), dtype=np.float32),
+        terms=zeros((*agents, len(config.terms.names)), dtype=np.float32),
         rewards=zeros(agents, dtype=np.float32),
         terminated=zeros(agents, dtype=np.bool_),
         present=zeros(agents, dtype=np.bool_),

@@ -41,6 +41,7 @@ from cavmarl.sensors.kernels.observing_messages import observe_messages
 from cavmarl.sensors.kernels.stacking import fill_stacks
 from cavmarl.sensors.observed import further_arrays, layout, sensor_arrays
 from cavmarl.shards.kernels.world_phases import suggest
+from cavmarl.shards.registered_outputs import RegisteredOutputs
 from cavmarl.traffic.kernels.leaving import leave
 from cavmarl.v2x.kernels.v2x_records import Mail
 from cavmarl.zones.kernels.zone_lookup import OUTER, Halo, ZoneArrays
@@ -60,7 +61,7 @@ class Commands:
     Attributes:
         controls: (W, A, 2) throttle in m/s² and steering in rad; continuous actions.
         meta_actions: (W, A) ACTION_* codes; discrete actions.
-        declared: (W, A) CAUSE_* of events that agents tell others of, 0: none; (0, 0): nobody does.
+        declared: (W, A) CAUSE_* of events that agents tell others of, 0: none; (0, 0): no messages.
     """
 
     controls: NDArray[np.float64]
@@ -87,10 +88,10 @@ class Shard:
 
     Attributes:
         worlds: what it has.
-        sides: VEHICLE (W, C), the two memories that rows are kept in by turns.
+        sides: VEHICLE (W, C), the two buffers that rows are kept in, swapped each tick.
         side: in which of them the committed rows are.
         next_side: where the next ones come; the same, but in ticks that put rows in order.
-        mail: what agents have been told over the air; None: nobody says anything.
+        mail: what agents have been told over the air; None: no messages.
     """
 
     def __init__(
@@ -116,6 +117,7 @@ class Shard:
         self.lane_grid: LaneGrid = lane_grid(network)
         self.sensors = sensor_arrays(config.sensors)
         self._further = further_arrays(config.sensors, network, plans)
+        self._registered = RegisteredOutputs(config, network)
         num_worlds, capacity = zoned.rows.shape[2:]
         self._extent_m = network.extent_m
         self.cut(zones, halo)
@@ -184,7 +186,10 @@ class Shard:
         self.worlds = self.worlds._replace(rows=self.sides[side], next_rows=self.sides[next_side])
 
     def complete_observations(self, chosen: NDArray[np.bool_]) -> None:
-        """Write what `sense` has left: messages, sensors of other projects, and earlier frames."""
+        """Write what `sense` has left: messages, optional and registered sensors, earlier frames.
+
+        And the registered terms.
+        """
         observations, stack = self.outputs.observations, self.config.sensors.stack
         if self._further is not None:
             self._call_observe_further(
@@ -204,6 +209,7 @@ class Shard:
                 messages.objects, messages.events, messages.signal, messages.range_m,
                 self.config.clock.sim_dt_s, stack, chosen, observations,
             )  # fmt: skip
+        self._registered.write(self.worlds, chosen, self.outputs)
         if stack > 1:
             ticks_per_step = self.config.clock.ticks_per_step
             self._call_fill_stacks(self.worlds, ticks_per_step, stack, chosen, observations)

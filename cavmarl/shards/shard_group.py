@@ -146,7 +146,7 @@ class ShardGroup:
         self._gather(self._members, self._first.next_side, touching_m, border_m)
 
     def resolve(self) -> None:
-        """Find who touches whom in the next rows."""
+        """Find contacts in the next rows."""
         first = self._first
         self._resolve(self._members, first.side, first.next_side, self._scratch, self._room)
 
@@ -166,7 +166,7 @@ class ShardGroup:
             shard.leave(gate)
 
     def rank_lanes(self, gate: Gate) -> None:
-        """Count who is around the places of these zones where departures may enter."""
+        """Count vehicles around the places of these zones where departures may enter."""
         first = self._first
         self._rank_lanes(
             self._members, first.side, first.next_side,
@@ -182,7 +182,7 @@ class ShardGroup:
         )  # fmt: skip
 
     def admit(self, gate: Gate) -> None:
-        """Take in those whom the gate has accepted, as owned or as ghosts."""
+        """Take in departures that the gate has accepted, as owned or as ghosts."""
         first = self._first
         self._admit(self._members, first.side, first.next_side, gate)
 
@@ -219,5 +219,5 @@ class ShardGroup:
         self._retire(self._members, self._first.side, gate, ticks)
 
     def forget(self, gate: Gate) -> None:
-        """Drop the ghosts of those who have been retired."""
+        """Drop the ghosts of vehicles that have been retired."""
         self._forget(self._members, self._first.side, gate)

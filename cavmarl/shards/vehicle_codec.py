@@ -1,4 +1,4 @@
-"""`TransferCodec`: the state of one vehicle as bytes, whole: who unpacks it goes on bit for bit.
+"""`TransferCodec`: the whole state of one vehicle as bytes: unpacked, it goes on bit for bit.
 
     4 bytes  "CVMV"      2 × 2 bytes  version, major and minor
     8 bytes  tick of the state          8 bytes  the vehicle's id
@@ -9,10 +9,10 @@
 All is little-endian. The map, the types of vehicles and the table of ways are the same wherever a
 world is run, so the record names their rows; readings of sensors are made anew.
 
-A record is understood by those alone who have the same fields at the same places: its layout has a
+A record is understood only by a reader with the same fields at the same places: its layout has a
 digest, and a change of it is a new major version (`RECORD_VERSION`). A minor version may put more
-behind the frames, nothing that a next tick reads: who does not know it skips it, who misses it does
-without. So every minor version reads every other.
+behind the frames, nothing that a next tick reads: a reader that does not know it skips it, one that
+misses it does without. So every minor version reads every other.
 """
 
 from __future__ import annotations
@@ -124,7 +124,7 @@ class TransferCodec:
             world: number of the world.
             i: the row.
             tick: of the state, as `unpack` will be asked for it. `VEHICLE["tick"]` is one less in
-                those who entered after the reset.
+                vehicles that entered after the reset.
         """
         record: bytes = rows[world, i : i + 1].tobytes()
         (vehicle,) = _LONG.unpack_from(record, self._id_at)

@@ -1,1 +1,1 @@
-"""Who drives where: departures and the seeded generator."""
+"""Departures, routes and the seeded generator."""

@@ -17,6 +17,7 @@ from cavmarl.core.memory import Zeros
 from cavmarl.core.numba.repeated import repeated
 from cavmarl.core.records.arrays import Demand, Gate, Travel, Worlds
 from cavmarl.core.records.codes import MODEL_KRAUSS
+from cavmarl.driving.driver_models import model_code
 from cavmarl.driving.kernels.drivers import look_ahead_m, see_line_m
 from cavmarl.driving.kernels.lane_index import VIEW_M
 from cavmarl.driving.vehicle_types import generated_types
@@ -64,7 +65,7 @@ class NativeTraffic:
     Attributes:
         network: the roads.
         traffic: settings of the generator.
-        population: who is in the world.
+        population: which vehicles are in the world.
         blank: VEHICLE (1,), the record that every vehicle starts from.
         dt: seconds a tick.
         horizon_s: seconds an episode.
@@ -144,7 +145,8 @@ class NativeTraffic:
     @cached_property
     def travel(self) -> Travel:
         """Types and ways of all vehicles: the generator's, the demand file's, then the actors'."""
-        types, steps = generated_types(), self.plans.reshape(-1)
+        types = generated_types(model_code(self.traffic.model))
+        steps = self.plans.reshape(-1)
         if self.sumo is not None:
             return self._travel_of_sumo(self.sumo, types, steps)
         scripts = NO_SCRIPTS if self.cast is None else self.cast.scripts
@@ -196,7 +198,7 @@ class NativeTraffic:
         )
 
     def _farthest_m(self, look_m: Callable[[np.void, float], float]) -> float:
-        """How far anybody looks: as fast drivers have to, where all brake as SUMO's.
+        """How far any driver looks: as fast drivers have to, where all brake as SUMO's.
 
         IDM reacts to whatever is ahead, and agents may drive as fast as they like.
         """
@@ -228,7 +230,7 @@ class NativeTraffic:
 
     @cached_property
     def rerouting(self) -> Rerouting | None:
-        """Those ways; None where nobody looks for one."""
+        """Those ways; None where vehicles do not reroute."""
         if self.schedule is None or self._slots is None:
             return None
         first_type = len(generated_types())
@@ -303,11 +305,11 @@ class NativeTraffic:
                 self.cast.enter(self.network.arrays, self.travel, gate, worlds, w, self.blank)
 
     def settle(self, gate: Gate, worlds: Worlds) -> None:
-        """Count who has left, and order those that follow."""
+        """Count vehicles that have left, and order those that follow."""
         self._calls.settle(self.demand, self.network.arrays, gate, worlds, self.dt)
 
     def assign_lanes(self, gate: Gate, worlds: Worlds) -> None:
-        """Say who of the queue tries to enter on which lane."""
+        """Assign vehicles of the queue the lanes on which they try to enter."""
         self._calls.assign_lanes(self.network.arrays, self.travel, gate, worlds)
 
     def call_orders(self, gate: Gate, worlds: Worlds) -> None:
@@ -315,7 +317,7 @@ class NativeTraffic:
         self._calls.call_orders(gate, worlds)
 
     def accept(self, gate: Gate, running: NDArray[np.int64]) -> None:
-        """Choose among those who could enter; `running` (W,) are in the worlds already."""
+        """Choose among vehicles that could enter; `running` (W,) are in the worlds already."""
         self._calls.accept(gate, running, self.capacity)
 
     @cached_property

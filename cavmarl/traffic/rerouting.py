@@ -43,7 +43,7 @@ LOOK = np.dtype(
 
 
 class Rerouting:
-    """Who looks for a way, what is known of the traffic, and the ways that were found; W worlds.
+    """Vehicles that reroute, what is known of the traffic, and the ways that were found; W worlds.
 
     Args:
         schedule: of the demand file.
@@ -111,7 +111,7 @@ class Rerouting:
         self._travel.steps[first : first + self._slots.of_world] = np.zeros((), dtype=PLAN)
 
     def act(self, gate: Gate, worlds: Worlds) -> None:
-        """Sample the speeds, and let those ask who may, once a second; writes `next_rows`."""
+        """Once a second, sample the speeds and let vehicles ask for ways; writes `next_rows`."""
         for w, tick in enumerate(worlds.ticks):
             if tick % self._ticks_per_s == 0:
                 self._sample(worlds, w, int(tick))
@@ -194,7 +194,7 @@ class Rerouting:
         return int(rows["leg"][:num].sum() - legs)
 
     def _forget_seen(self, looks: NDArray[np.void], clock_s: float) -> None:
-        """Where a rule has begun within a second, those who are on its edge ask once more."""
+        """Where a rule has begun within a second, vehicles on its edge ask once more."""
         rules = self._schedule.demand.rerouters.rules
         before_s = clock_s - self._ticks_per_s * self._dt
         begun = (rules["begin_s"] <= clock_s) & (before_s < rules["begin_s"])

@@ -75,7 +75,7 @@ class Schedule:
     def _detours(self, masks: NDArray[np.int64]) -> NDArray[np.void]:
         """Steps from everywhere to the last edges of the routes, with as few changes as can be.
 
-        Who cannot make a lane change that its route needs goes on by them. Where they would take
+        A vehicle that cannot make a lane change of its route goes on by them. Where they would take
         more than `MAX_DETOUR_STEPS` there are none: such vehicles wait.
         """
         routes = self.demand.routes
@@ -146,7 +146,7 @@ class Schedule:
         )
 
     def detour_goal(self, route: int, vtype: int) -> int:
-        """VEHICLE["goal"] of who drives on a route, or -1."""
+        """VEHICLE["goal"] of vehicles on a route, or -1."""
         return int(self._goal[route, self._class_of_type[vtype]])
 
     def _edges(self, route: int, mask: int) -> NDArray[np.int32]:
@@ -195,7 +195,7 @@ class Schedule:
 
         Args:
             key: of the world and episode.
-            horizon_s: seconds an episode; who would depart later is not drawn.
+            horizon_s: seconds an episode; later departures are not drawn.
             dt: seconds a tick.
         """
         demand = self.demand

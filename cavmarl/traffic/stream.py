@@ -34,7 +34,7 @@ def approach(streets: Streets, link: int, far_m: float, speed_mps: float) -> Sea
 def stream(
     streets: Streets, link: int, middle_m: float, speed_mps: float, times_s: list[float]
 ) -> list[Actor] | None:
-    """Cars that drive over a link without heeding anybody; None where there is no room for them.
+    """Cars that drive over a link without reacting to others; None where there is no room for them.
 
     Args:
         streets: of the map.

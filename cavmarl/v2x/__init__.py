@@ -1,1 +1,1 @@
-"""Messages between vehicles and roadside units: what they say, how they travel, who keeps what."""
+"""Messages between vehicles and roadside units: what they say, how they travel, what is kept."""

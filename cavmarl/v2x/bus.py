@@ -1,8 +1,8 @@
 """`Bus`: the messages of W worlds, one bus for all zones of each.
 
 It reads the rows of all shards in the order of ids, and all that it keeps is by world: how far
-messages reach has nothing to do with how far a zone sees, and nobody can tell how a world is
-divided.
+messages reach has nothing to do with how far a zone sees, so results do not depend on how a world
+is divided.
 """
 
 from __future__ import annotations
@@ -101,7 +101,7 @@ class Bus:
         self._empty(np.ones(num_worlds, dtype=np.bool_))
 
     def connect(self, network: NetworkSimulator) -> None:
-        """From now on let a network simulator say who receives what.
+        """From now on let a network simulator decide receptions.
 
         Raises:
             ConfigError: the channel is one of our own.

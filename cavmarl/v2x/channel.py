@@ -26,7 +26,7 @@ __all__ = [
 CARRIER_HZ = 5.9e9
 LIGHT_MPS = 299_792_458.0
 PREAMBLE_S = 40e-6  # of IEEE 802.11p in a channel of 10 MHz
-# Beyond the distance where fewer packets than this are received nobody asks.
+# The distance where fewer packets than this are received is the reach.
 LEAST_CHANCE = 1e-3
 MAX_REACH_M = 20_000
 BUSY_LEVELS = 65  # steps in which chances of reception depend on how busy the air is
@@ -71,7 +71,7 @@ def airtime_s(config: ChannelConfig) -> float:
 
 
 def hidden_share(distance_m: float, sensing_m: float) -> float:
-    """Of those whom a receiver hears the share that the sender does not: part of a circle.
+    """Share of the stations a receiver hears that the sender does not: part of a circle.
 
     Both hear what is within `sensing_m` of themselves; traffic is taken to be as dense everywhere.
     """
@@ -82,15 +82,15 @@ def hidden_share(distance_m: float, sensing_m: float) -> float:
 
 
 def chance_among_others(busy: float, hidden: float) -> float:
-    """Chance that nobody whom the sender does not hear, and so does not wait for, disturbs it.
+    """Chance that no hidden station, for which the sender does not wait, disturbs it.
 
     They send at random, and a packet is lost if one of them begins within two packet times:
     exp(-2 G), where G is their share of the air (Abramson: "The ALOHA system", 1970; Tobagi,
     Kleinrock: "Packet switching in radio channels: part II, the hidden terminal problem", 1975).
 
     Args:
-        busy: share of the time in which the receiver hears somebody.
-        hidden: share of those whom the sender does not hear.
+        busy: share of the time in which the receiver hears a station.
+        hidden: share of the stations that the sender does not hear.
     """
     return math.exp(-2.0 * busy * hidden)
 

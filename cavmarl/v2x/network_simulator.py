@@ -34,7 +34,7 @@ class Exchange(NamedTuple):
         world: which one.
         tick: of that world; it begins at 1 after a reset.
         packets: PACKET (n,) that are sent now, by sender, then kind.
-        receivers: RECEIVER (R,), where the agents and the roadside units are; id -1: nobody.
+        receivers: RECEIVER (R,), where the agents and the roadside units are; id -1: none.
     """
 
     world: int
@@ -44,7 +44,7 @@ class Exchange(NamedTuple):
 
 
 class NetworkSimulator(Protocol):
-    """Decides who receives which packet in which tick."""
+    """Decides which stations receive which packets in which tick."""
 
     def exchange(self, sent: Exchange) -> NDArray[np.void]:
         """Simulate up to this tick.

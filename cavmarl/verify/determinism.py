@@ -1,4 +1,4 @@
-"""Whether the same scenario gives the same bits: three fresh interpreters, step by step.
+"""Checks that the same scenario gives the same bits: three fresh interpreters, step by step.
 
 They differ in `PYTHONHASHSEED` and run at once, with a fourth process beside them that does nothing
 but use the processor. After each step their hashes are compared; at the first difference the three

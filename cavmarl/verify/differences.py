@@ -1,4 +1,4 @@
-"""Everything that two runs of the same scenario have to agree in, and the first place that differs.
+"""Compares two runs of the same scenario, and finds the first place that differs.
 
 What agents got is compared as bytes and not as numbers: -0.0 is not 0.0 here, and NaN is NaN.
 """

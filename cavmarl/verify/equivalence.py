@@ -1,4 +1,4 @@
-"""Whether a divided world is the undivided one: several divisions beside it, step by step.
+"""Checks that divided worlds equal the undivided one, step by step.
 
 All of them go through the public interface: the same seed, a driver of its own for each, and after
 every step the hashes of all worlds and everything that `step` returned.
@@ -221,7 +221,7 @@ class _Run:
 
     Args:
         vec: the worlds.
-        policy: who drives.
+        policy: drives the agents.
         seed: of both.
     """
 

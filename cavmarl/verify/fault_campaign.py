@@ -57,7 +57,7 @@ class LineResult:
         zones: how many.
         runs: how many.
         survived: faults of the runs that were equal to the end.
-        unmet: points that nobody came to.
+        unmet: points not reached.
         missed: deaths that were planned and did not happen.
         failures: of each run that was not as it has to be, what was wrong, and its plan.
         figures: of all runs.
@@ -87,8 +87,8 @@ class Campaign:
         steps: of each run.
         ticks: of each run.
         lines: results.
-        calm_ms: of each step in which nobody died.
-        stricken_ms: of each step in which somebody died.
+        calm_ms: of each step without a death.
+        stricken_ms: of each step with a death.
     """
 
     env: str
@@ -146,7 +146,7 @@ def run_campaign(
         zones: numbers of them, 2 or more; default: `ZONES`.
         steps: of each run, in `EPISODES` episodes.
         seed: root of all random numbers.
-        seeds: runs in which anybody dies at any time.
+        seeds: runs in which any process dies at any time.
         policy: as in `load_policy`.
         overrides: values for any key of the environment.
         progress: called after each run with its number and how many there are.
@@ -196,7 +196,7 @@ class _Stage:
         steps: of each run.
         seed: of the world and its driver.
         policy: as in `load_policy`.
-        folder: for ticks that nobody survives.
+        folder: for reproducers of ticks that cannot be finished.
     """
 
     def __init__(

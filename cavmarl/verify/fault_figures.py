@@ -1,4 +1,4 @@
-"""What faults did to a divided run, in counts and times: all of it from the run itself."""
+"""Counts and times of faults in a divided run, from the run itself."""
 
 from __future__ import annotations
 
@@ -82,7 +82,7 @@ class FaultFigures:
             `refused`, `aborted`.
         resent: phase → messages that were sent again for want of an answer, as of `Coordinator`.
         recovery_ms: of each death, until its tick began again.
-        repeats: of each tick in which somebody died, how often it was begun again.
+        repeats: of each tick with a death, how often it was begun again.
         waited_ticks: of each hand-over, from the crossing to the switch.
         latency_ms: the same in ms, with the tick of the switch.
         state_bytes: of each hand-over whose state was sent ahead.

@@ -1,6 +1,6 @@
 """The lines of the fault matrix, and the plans that each is made of.
 
-Who dies is told by what a run without faults came to (`Rehearsal`): in the tick of a hand-over its
+The processes to kill come from a run without faults (`Rehearsal`): in the tick of a hand-over its
 source, its target, or a bystander. So every point is met by every party, and none by chance.
 """
 
@@ -52,7 +52,7 @@ class Rehearsal:
     Attributes:
         zones: how many.
         ticks: of the run.
-        visits: who was at which point in which tick.
+        visits: zones at each point in each tick.
         switches: (tick, source, target) of each hand-over.
     """
 
@@ -239,4 +239,4 @@ def _random_line(seed: int, seeds: int) -> Line:
     messages = {kind: Rates(0.1, 0.1, 0.1, 0.1, 0.05) for kind in MESSAGES}
     messages["Prepare"] = replace(messages["Prepare"], refuse=0.1)
     plans = tuple(Faults(seed + k, messages, crash_rate=0.001) for k in range(seeds))
-    return Line("anybody at any time, and messages", f"{seeds} seeds", plans)
+    return Line("any process at any time, and messages", f"{seeds} seeds", plans)

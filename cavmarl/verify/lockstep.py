@@ -1,4 +1,4 @@
-"""The program that `verify-determinism` starts three times: one world, a hash a step, on demand.
+"""The program that `verify-determinism` starts three times: one world, one hash a step, on demand.
 
 Standard input brings a job as one line of JSON, then one line a step: an empty one to go on, or the
 path of a file to leave the state in before the end. Standard output tells the hashes of each step.

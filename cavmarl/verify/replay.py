@@ -1,4 +1,4 @@
-"""A tick that no host survived, run again: does it fail as it did, and does it without faults?"""
+"""Replays a tick that no host survived: does it fail as it did, and does it without faults?"""
 
 from __future__ import annotations
 

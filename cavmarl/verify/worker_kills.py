@@ -1,4 +1,4 @@
-"""Whether anybody can tell that workers were killed: worlds whose workers are, beside others."""
+"""Checks that killed workers change no result: worlds whose workers are killed, beside others."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ from cavmarl.verify.differences import same_bytes, step_results
 
 __all__ = ["Kill", "KillReport", "verify_kills"]
 
-FIRST_STEPS = 10  # before anybody is killed, to know how long a step takes
+FIRST_STEPS = 10  # before any is killed, to know how long a step takes
 PINGS = 500
 LATEST = 1.5  # of a step's time: some are killed when they are already waiting for the next one
 STOPS = 0.25  # share of those that are not killed but stopped
@@ -44,7 +44,7 @@ class Kill:
         step: after which it was noticed.
         idle: the worker had nothing to do; it was missed when it was to work again.
         cause: of the death, as the pool saw it.
-        noticed_ms: from the signal, or from the next order to one that was idle, until the pool
+        noticed_ms: from the signal, or from the next command to one that was idle, until the pool
             knew.
         replaced_ms: from then until the successor had its order.
         recovered_ms: from when the pool knew until the successor had done what was asked for.
@@ -71,8 +71,8 @@ class KillReport:
         steps: that were compared.
         different: the first step after which anything differed; None: none.
         kills: all of them.
-        step_ms: median of the steps in which nobody died.
-        ping_us: median of an empty order to all workers, before the first death.
+        step_ms: median of the steps without a death.
+        ping_us: median of an empty command to all workers, before the first death.
         state_hashes: of the undisturbed worlds at the end.
         hardware: that it ran on.
     """
@@ -131,7 +131,7 @@ def verify_kills(
 
     Raises:
         ConfigError: numbers that cannot be.
-        WorkerError: workers died that nobody had killed.
+        WorkerError: workers died that were not killed.
     """
     check_seed(seed)
     steps = 3 * kills + FIRST_STEPS if steps is None else steps
@@ -183,7 +183,7 @@ def _pool(vec: CavVectorEnv) -> Pool | HostPool:
 
 
 def _ping_us(pool: Pool | HostPool) -> float:
-    """What an empty order to all workers takes, at the median."""
+    """What an empty command to all workers takes, at the median."""
     found = []
     for _ in range(PINGS):
         began = time.perf_counter()
@@ -206,7 +206,7 @@ def _refuse_elsewhere(pool: Pool | HostPool) -> None:
 
 
 class _Run:
-    """Worlds and who drives in them."""
+    """Worlds and the policy that drives in them."""
 
     def __init__(self, vec: CavVectorEnv, driver: Policy, seed: int) -> None:
         self._vec = vec
@@ -239,7 +239,7 @@ class _Killer:
         self._calm_s: list[float] = []
 
     def step_ms(self) -> float:
-        """Median of the steps in which nobody died, ms."""
+        """Median of the steps without a death, ms."""
         return 1000.0 * statistics.median(self._calm_s)
 
     def watch(self, run: Callable[[], dict[str, Any]], step: int, strikes: bool) -> dict[str, Any]:
@@ -281,7 +281,7 @@ class _Killer:
         """Say of each new death what it was.
 
         Raises:
-            EvaluationError: somebody died that nobody had killed.
+            EvaluationError: a worker died that was not killed.
         """
         deaths = self.pool.deaths
         for death in deaths[self._seen :]:

@@ -24,9 +24,9 @@ ASIDE_M = 10.0  # between the centres of neighbour lanes, and of vehicles beside
 def driving_reach_m(network: RoadNetwork, travel: Travel) -> float:
     """The farthest vehicle that a driver's decision can depend on.
 
-    A driver looks `view_m` ahead. With a line within `see_m`, or on a junction, it asks who comes
-    to that junction, within `APPROACH_M` of the ends of the lanes that lead to it or on it, and who
-    stands behind it, within `EXIT_LOOK_M`.
+    A driver looks `view_m` ahead. With a line within `see_m`, or on a junction, it asks about
+    vehicles that come to it, within `APPROACH_M` of the ends of the lanes that lead to it or are on
+    it, or stand behind it, within `EXIT_LOOK_M`.
 
     Args:
         network: the roads.

@@ -1,4 +1,4 @@
-"""`Sight`: whom zones see over their borders, however the map is cut."""
+"""`Sight` says which vehicles zones see over their borders, however the map is cut."""
 
 from __future__ import annotations
 
@@ -25,8 +25,8 @@ class Sight:
     Attributes:
         network: the roads.
         travel: the types of vehicles, and how far they look.
-        halo_m: nobody further away is seen.
-        sure_m: everybody nearer is; from `halo_m` on, roads are not asked.
+        halo_m: vehicles further away are not seen.
+        sure_m: all nearer vehicles are seen; from `halo_m` on, roads are not asked.
         outside_m: how far outside of its zone a vehicle can be whose transfer is late.
     """
 
@@ -37,7 +37,7 @@ class Sight:
     outside_m: float
 
     def halo(self, partition: ZonePartition) -> Halo:
-        """Whom each zone of a partition sees."""
+        """What each zone of a partition sees."""
         halo = zone_halo(partition, self.halo_m)
         if partition.count == 1 or self.sure_m >= self.halo_m:
             return halo

@@ -116,7 +116,7 @@ def test_the_command_shows_and_writes(
     path = tmp_path / "cost.json"
     words = ("grid4x4", "-d", str(demand), "--zones", "1,4")
     assert _run(*words, "--after", "10", "--repeats", "1", "--check", "--json", str(path)) == 0
-    shown = capsys.readouterr().out
+    shown = " ".join(capsys.readouterr().out.split())
     told = (*PHASES, "sum", "without stopwatches", "monitor", "equal")
     assert all(word in shown for word in told)
     assert [row["zones"] for row in json.loads(path.read_text())["rows"]] == [1, 4]

@@ -110,7 +110,7 @@ def test_the_order_of_an_answer_does_not_matter() -> None:
         ((2, 0, 0), "another tick"),
         ((1, 99, 0), "not sent"),
         ((1, -1, 0), "not sent"),
-        ((1, 0, 2), "by nobody"),
+        ((1, 0, 2), "by no station"),
     ],
 )
 def test_answers_that_cannot_be_are_refused(reception: tuple[int, int, int], words: str) -> None:

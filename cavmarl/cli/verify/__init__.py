@@ -52,7 +52,7 @@ def verify(
         ),
     ] = None,
     steps: Annotated[
-        int | None, typer.Option(help="That are compared; default: 200, of a campaign 40 a run.")
+        int | None, typer.Option(help="Compared steps; default: 200, of a campaign 40 a run.")
     ] = None,
     seed: Seed = 0,
     layout: Annotated[
@@ -64,7 +64,7 @@ def verify(
     policy: PolicyName = "idm",
     worlds: Annotated[
         int | None,
-        typer.Option(help="Stepped together; default: 1, with --kill two a worker."),
+        typer.Option(help="Number of parallel worlds; default: 1, with --kill two a worker."),
     ] = None,
     agents: Agents = None,
     background: Background = None,
@@ -78,7 +78,7 @@ def verify(
         ),
     ] = None,
     seeds: Annotated[
-        int, typer.Option(help="Of a campaign: runs in which anybody dies at any time.")
+        int, typer.Option(help="Of a campaign: runs in which any process dies at any time.")
     ] = 12,
     kill: Annotated[
         int | None,
@@ -87,16 +87,16 @@ def verify(
             help="Kill or stop N workers at random times instead of dividing worlds, and compare.",
         ),
     ] = None,
-    workers: Annotated[int, typer.Option(help="Of --kill, that the worlds are run by.")] = 2,
+    workers: Annotated[int, typer.Option(help="With --kill: workers that run the worlds.")] = 2,
     hosts: Annotated[
         str | None,
         typer.Option(
             metavar="ray",
-            help="Of --kill: the workers are actors of a Ray cluster on this machine.",
+            help="With --kill: the workers are actors of a Ray cluster on this machine.",
         ),
     ] = None,
     check: Annotated[
-        bool, typer.Option("--check", help="Watch the invariants of ownership, too.")
+        bool, typer.Option("--check", help="Check the invariants of ownership, too.")
     ] = False,
     journal: Annotated[
         Path | None,
@@ -114,7 +114,7 @@ def verify(
 ) -> None:
     """Drive divided worlds beside the undivided one; exit code 1 and where one first differs.
 
-    With --kill: worlds whose workers are killed beside some that nobody disturbs.
+    With --kill: worlds whose workers are killed beside undisturbed ones.
     """
     if hosts is not None and kill is None:
         raise ConfigError(f"--hosts {hosts}: goes with --kill only")

@@ -1,4 +1,4 @@
-"""`cavmarl verify-determinism`: whether the same scenario gives the same bits."""
+"""`cavmarl verify-determinism`: checks that the same scenario gives the same bits."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ __all__ = ["verify_determinism"]
 def verify_determinism(
     env: Environment,
     policy: PolicyName = "idm",
-    steps: Annotated[int, typer.Option(help="That are compared.")] = 600,
+    steps: Annotated[int, typer.Option(help="Compared steps.")] = 600,
     seed: Seed = 0,
     agents: Agents = None,
     background: Background = None,

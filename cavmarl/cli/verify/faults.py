@@ -1,4 +1,4 @@
-"""What `cavmarl verify --faults` prints: what was done to the divided worlds, and its price."""
+"""Prints the results of `cavmarl verify --faults`: injected faults, and their cost."""
 
 from __future__ import annotations
 
@@ -118,15 +118,15 @@ def _figures(figures: FaultFigures) -> Table:
 
 def _steps(campaign: Campaign) -> Table:
     grid = Table.grid(padding=(0, 2))
-    grid.add_row("step", _spread(campaign.calm_ms, "ms where nobody died"))
-    grid.add_row("", _spread(campaign.stricken_ms, "ms where somebody died"))
+    grid.add_row("step", _spread(campaign.calm_ms, "ms without a death"))
+    grid.add_row("", _spread(campaign.stricken_ms, "ms with a death"))
     return grid
 
 
 def _print_notes(console: Console, line: LineResult) -> None:
     where = f"{line.name}, {line.zones} zones"
     if line.unmet:
-        console.print(f"note: {where}: nobody came to {', '.join(line.unmet)}", soft_wrap=True)
+        console.print(f"note: {where}: no process reached {', '.join(line.unmet)}", soft_wrap=True)
     if line.missed:
         console.print(f"note: {where}: {line.missed} deaths that were planned did not happen")
     for failure in line.failures:

@@ -1,4 +1,4 @@
-"""What `cavmarl verify --kill` does and prints: workers are killed, and nobody can tell."""
+"""What `cavmarl verify --kill` does and prints: workers are killed, and results stay the same."""
 
 from __future__ import annotations
 

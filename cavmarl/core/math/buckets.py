@@ -2,7 +2,7 @@
 
 List k is `[start[k], end[k])` of some array of records; an empty one has start = end. Lists are
 made in three steps: `forget` those of the last time, `add` each item, `lay_out`. Then every `end`
-is its list's start, and whoever puts the items there lets it rise.
+is its list's start, which the caller raises as it puts items there.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
-"""Who is near: vehicles of one world in square cells, and the nearest of them.
+"""Vehicles that are near: those of one world in square cells, and the nearest of them.
 
 `fill_grid` sorts the vehicles into cells once a tick and puts what others look at into `bodies`:
 small records that lie together in memory, with sine and cosine of the heading taken once. Within a
-cell they lie in row order; whoever reads them must not depend on it and breaks ties by id.
+cell they lie in row order; readers must not depend on it and break ties by id.
 
 Cells reach to the ends of the plane: what lies outside the grid's area belongs to the border cells.
 """
@@ -212,7 +212,7 @@ def k_nearest(
 
     Args:
         grid: filled for this tick.
-        row: VEHICLE row to leave out, who is asking; -1 for none.
+        row: VEHICLE row to leave out, the one that asks; -1 for none.
         x: m.
         y: m.
         z: m; vehicles more than `LEVEL_HEIGHT_M` above or below are not seen.

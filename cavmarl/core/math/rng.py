@@ -1,4 +1,4 @@
-"""Random numbers as a pure function of who asks, when and for what: Philox4x32-10.
+"""Random numbers as a pure function of the asking id, the time and the purpose: Philox4x32-10.
 
 Salmon, Moraes, Dror, Shaw: "Parallel random numbers: as easy as 1, 2, 3", SC 2011. A generator
 without state gives a vehicle the same numbers in whichever shard it lives, and after any restart.
@@ -9,8 +9,9 @@ without state gives a vehicle the same numbers in whichever shard it lives, and 
              word 2    vehicle, bits 32-47, below tick, bits 32-47
              word 3    stream + draw index
 
-Who needs several numbers of one stream in one tick asks for `STREAM_X`, `STREAM_X + 1`, …: the ids
-below lie `DRAWS_PER_STREAM` apart. Every consumer of randomness has its own stream in this list.
+A caller that needs several numbers of one stream in one tick asks for `STREAM_X`, `STREAM_X + 1`,
+…: the ids below lie `DRAWS_PER_STREAM` apart. Every consumer of randomness has its own stream in
+this list.
 
 The words are kept in uint64, where the product of two 32-bit numbers cannot overflow. All operands
 are uint64: Numba turns a mix with int64 into float64.
@@ -56,13 +57,13 @@ STREAM_SPEED_FACTOR = 3 * DRAWS_PER_STREAM  # desired speed over the limit
 STREAM_PLACE = 4 * DRAWS_PER_STREAM  # positions at reset
 STREAM_DEPARTURE = 5 * DRAWS_PER_STREAM  # times between departures
 STREAM_VTYPE = 6 * DRAWS_PER_STREAM  # vehicle types
-STREAM_SEAT = 7 * DRAWS_PER_STREAM  # who is driven by an agent
+STREAM_SEAT = 7 * DRAWS_PER_STREAM  # which vehicles agents drive
 STREAM_POLICY = 8 * DRAWS_PER_STREAM  # actions of scripted random drivers
 STREAM_DRIVER = 9 * DRAWS_PER_STREAM  # decisions of background drivers
 STREAM_SENSOR = 10 * DRAWS_PER_STREAM  # noise and dropouts of sensors
 STREAM_V2X = 11 * DRAWS_PER_STREAM  # losses and delays of messages
 STREAM_DEMAND = 12 * DRAWS_PER_STREAM  # times, types and routes of a demand file
-STREAM_REROUTER = 13 * DRAWS_PER_STREAM  # who follows a rerouter, and where to
+STREAM_REROUTER = 13 * DRAWS_PER_STREAM  # which vehicles follow a rerouter, and where to
 
 _MASK_16 = np.uint64(0xFFFF)
 _MASK_32 = np.uint64(0xFFFFFFFF)

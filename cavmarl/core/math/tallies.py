@@ -27,12 +27,12 @@ def begins_second(ticks: NDArray[np.int64], ticks_per_s: int) -> bool:
 def occasions(
     ticks: NDArray[np.int64], ticks_per_s: int, num_through: NDArray[np.int64]
 ) -> tuple[bool, bool]:
-    """Whether a second begins in some world, and whether anybody has arrived.
+    """Whether a second begins in some world, and whether a vehicle has arrived.
 
     Args:
         ticks: (W,) the present tick.
         ticks_per_s: in a second.
-        num_through: (k, W) who has arrived in each zone.
+        num_through: (k, W) vehicles that have arrived in each zone.
     """
     somebody = False
     for zone in range(num_through.shape[0]):

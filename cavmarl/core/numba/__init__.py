@@ -39,7 +39,7 @@ def kernel(function: Callable[P, R]) -> Callable[P, R]:
     """Compile `function` with the flags that all kernels share.
 
     Its arrays are borrowed from the caller and never counted: with Numba's reference counts, an
-    atomic addition for every look into a bundle of arrays, a tick takes ten times as long
+    atomic addition for every access to a bundle of arrays, a tick takes ten times as long
     (decision 002). So it can neither make an array nor return one.
     """
     return _compile(function, _nrt=False, pipeline_class=KernelCompiler)

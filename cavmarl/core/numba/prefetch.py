@@ -1,4 +1,4 @@
-"""Have memory come nearer that is needed soon.
+"""Software prefetch of memory that is needed soon.
 
 What a vehicle asks about lies scattered over the tables of a city: its lane, the lanes and links
 behind that, the row of its leader. Each look that misses the caches takes as long as a hundred
@@ -54,4 +54,4 @@ def _plain_prefetch(array: NDArray[Any], index: int, line: int) -> None:
 
 
 prefetch = _plain_prefetch if _settings.DISABLE_JIT else _compiled_prefetch
-"""`prefetch(array, i, n)`: have the nth cache line of record i of a (N,) array come nearer."""
+"""`prefetch(array, i, n)`: software prefetch of the nth cache line of record i of a (N,) array."""

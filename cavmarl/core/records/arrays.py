@@ -67,7 +67,7 @@ class Scripts(NamedTuple):
 
     frames: NDArray[np.void]  # FRAME (num_frames,), by VEHICLE["goal"] of a scripted row
     covers: NDArray[np.void]  # COVER (num_covers,) of lanes by bodies
-    claims: NDArray[np.void]  # CLAIM (num_claims,) of links by who will be there soon
+    claims: NDArray[np.void]  # CLAIM (num_claims,) of links by vehicles that will be there soon
     cues: NDArray[np.void]  # CUE (T,) what scripts wait for
     room: int  # lanes that all of them can cover at the same time
     reach_m: float  # the farthest from a body to the middle of a stretch that it covers
@@ -81,8 +81,8 @@ class Travel(NamedTuple):
     stops: NDArray[np.void]  # STOP (num_stops,), by VEHICLE["stop"]
     first_detour: int  # PLAN row of the first goal of demand vehicles that take another way
     begin_s: float  # the clock of the demand at tick 0
-    view_m: float  # how far anybody looks for others along the road, at most VIEW_M
-    see_m: float  # how far before a line its centre is when anybody first asks about the junction
+    view_m: float  # how far any driver looks for others along the road, at most VIEW_M
+    see_m: float  # how far before a line its centre is when a driver first asks about it
     num_fixed: int  # steps from here on are written while the world runs
     scripts: Scripts
 
@@ -125,7 +125,7 @@ class Worlds(NamedTuple):
     step: NDArray[np.void]  # PLAN (W, C) of each row the step of its lane, see `ways.own_step`
     step_at: NDArray[np.int64]  # (W, C) 1 + which of `Travel.steps` that is, 0: none yet
     outer: NDArray[np.void]  # OUTER (W, C) owned next rows that other zones may see, rising
-    num_outer: NDArray[np.int64]  # (W,) -1: nobody has noted them since rows have changed
+    num_outer: NDArray[np.int64]  # (W,) -1: not noted since rows changed
     cues: NDArray[np.int64]  # (W, T) the tick in which each cue of the script came, -1: not yet
 
 
@@ -160,13 +160,13 @@ class Gate(NamedTuple):
     num_entered: NDArray[np.int64]  # (W,) agents that have been ordered so far
     counts: NDArray[np.int64]  # (W, NUM_COUNTS) departed, arrived, removed since reset
     sums: NDArray[np.float64]  # (W, NUM_SUMS) sums over arrived vehicles
-    passing: NDArray[np.void]  # VEHICLE (W, C + D) who leaves, or is about to enter, in this tick
+    passing: NDArray[np.void]  # VEHICLE (W, C + D) that leave or may enter in this tick
     num_passing: NDArray[np.int64]  # (W,)
     places: NDArray[np.int64]  # (W, C + D) where in the queue those stand that are about to enter
     tries: NDArray[np.int32]  # (W, C + D) LANE on which each of the queue tries to enter, or -1
     ranks: NDArray[np.int64]  # (W, C + D, E) how crowded the lanes of its edge are, at most E
     last_s: NDArray[np.float64]  # (W, C + D, E) where on them one enters that is to be the last, m
-    lane_taken: NDArray[np.bool_]  # (L,) somebody tries to enter there in this tick
+    lane_taken: NDArray[np.bool_]  # (L,) a vehicle tries to enter there in this tick
     spare: NDArray[np.void]  # VEHICLE (1,) room
 
 
@@ -191,7 +191,7 @@ class Scratch(NamedTuple):
 
     lanes: Lists  # by lane, lists of entries
     lane_start: NDArray[np.int32]  # entries of lane l: [lane_start[l], lane_end[l]); at L: of all.
-    lane_end: NDArray[np.int32]  # Both are views of `lanes.bounds`: one look into memory
+    lane_end: NDArray[np.int32]  # Both are views of `lanes.bounds`: one access to memory
     entries: NDArray[np.void]  # ENTRY (2 C + Scripts.room,) by (lane, s, id), with side lanes
     links: Lists  # by link, lists of approach
     link_start: NDArray[np.int32]  # approach of link k: [link_start[k], link_end[k])

@@ -7,13 +7,14 @@ DRIVER_BACKGROUND = 0  # moves along lanes, driven by the models of driving/kern
 DRIVER_AGENT = 1  # kinematic bicycle, driven by actions
 DRIVER_SCRIPTED = 2  # goes where its script says: pedestrians, vehicles of scenarios
 
-# VTYPE["vclass"] of who walks; the classes that drive are positions in network.VEHICLE_CLASSES
+# VTYPE["vclass"] of pedestrians; the classes that drive are positions in network.VEHICLE_CLASSES
 CLASS_PEDESTRIAN = 9
 DRIVER_SUMO = 3  # moved by SUMO, mirrored here
 
-# VTYPE["model"]: how a background driver follows its leader
+# VTYPE["model"]: how a background driver follows its leader; see driving/driver_models.py
 MODEL_KRAUSS = 0
 MODEL_IDM = 1
+MODEL_ACC = 2
 
 # DEPARTURE["lane_code"]: on which lane of its edge a vehicle enters
 LANE_GIVEN = 0

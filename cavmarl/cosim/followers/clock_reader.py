@@ -1,4 +1,4 @@
-"""A program: follow a world's clock, write down what it shows, and, if asked to, tick by oneself.
+"""A program that follows a world's clock, records it, and on request ticks by itself.
 
     python -m cavmarl.cosim.followers.clock_reader ADDRESS SHARE
 

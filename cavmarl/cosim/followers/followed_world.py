@@ -173,7 +173,7 @@ class FollowedWorld:
         return dict(rewards)
 
     def manifest(self) -> dict[str, Any]:
-        """What a result depends on: who follows, and when controls take effect."""
+        """What a result depends on: the followers, and when controls take effect."""
         clock = self.env.config.clock
         return {
             "sim_dt_s": clock.sim_dt_s,
@@ -257,7 +257,7 @@ class FollowedWorld:
         """Let followers see the world as it is, and queue what they do.
 
         Raises:
-            FollowerError: of the first one, in their order, with whom it cannot go on; what the
+            FollowerError: of the first one, in their order, with which it cannot go on; what the
                 others do is queued all the same.
         """
         if self._episode < 0 or not seats:

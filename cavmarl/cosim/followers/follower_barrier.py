@@ -1,4 +1,4 @@
-"""`Barrier`: every follower gets its snapshot, and the world waits for all of their controls."""
+"""`Barrier` sends every follower its snapshot and waits for all of their controls."""
 
 from __future__ import annotations
 
@@ -67,8 +67,8 @@ class Outcome:
 
     Attributes:
         actions: by agent.
-        failed: with whom the world cannot go on, and why.
-        left: who has said goodbye.
+        failed: followers with which the world cannot go on, and why.
+        left: followers that have said goodbye.
     """
 
     actions: dict[str, Any] = field(default_factory=dict)
@@ -82,7 +82,8 @@ class Barrier:
     Args:
         env: the world.
         timeout_s: for so long all of them together may take, by the wall clock.
-        bad_controls: `error`: who sends them fails; `hold`: the vehicle's last ones are used.
+        bad_controls: `error`: a follower that sends them fails; `hold`: the vehicle's last ones are
+            used.
     """
 
     def __init__(self, env: CavEnv, timeout_s: float, bad_controls: BadControls) -> None:
@@ -124,7 +125,7 @@ class Barrier:
     def _collect(
         self, asked: Mapping[Seat, list[str]], moment: Moment, found: Outcome
     ) -> dict[Seat, Mapping[str, Any]]:
-        """Hear everybody's controls, in the order in which they come."""
+        """Hear all followers' controls, in the order in which they come."""
         answers: dict[Seat, Mapping[str, Any]] = {}
         began = time.monotonic()
         with selectors.DefaultSelector() as selector:

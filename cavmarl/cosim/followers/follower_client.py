@@ -1,4 +1,4 @@
-"""`Follower`: the end of the connection where a stack runs."""
+"""`Follower`: the stack's end of the connection to a world."""
 
 from __future__ import annotations
 
@@ -75,8 +75,8 @@ class Follower:
         welcome: how time goes in that world.
 
     Raises:
-        FollowerLostError: nobody is there.
-        FollowerError: whoever is there does not want us, or speaks another version.
+        FollowerLostError: no process listens there.
+        FollowerError: the listener there refuses this follower, or speaks another version.
     """
 
     def __init__(

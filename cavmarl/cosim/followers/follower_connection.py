@@ -229,14 +229,14 @@ def _size(view: ArrayView) -> int:
 def listen(address: Address) -> socket.socket:
     """Listen for followers, on this machine only.
 
-    A Unix socket lets in whom the file system lets in, at first its owner. A port of the loopback
-    lets in everybody who is logged in on this machine.
+    A Unix socket lets in the users that the file system lets in, at first its owner. A port of the
+    loopback lets in every user on this machine.
 
     Args:
         address: a path for a Unix socket, which must not be there; or a port, 0: any that is free.
 
     Raises:
-        ConfigError: nobody can listen there.
+        ConfigError: the socket cannot be opened.
     """
     if isinstance(address, int):
         try:
@@ -262,7 +262,7 @@ def call(address: Address, within_s: float) -> Line:
     """Connect to a world that listens at an address.
 
     Raises:
-        FollowerLostError: nobody listens there.
+        FollowerLostError: no process listens there.
         ConfigError: a path that no socket can have.
     """
     family = socket.AF_INET if isinstance(address, int) else socket.AF_UNIX

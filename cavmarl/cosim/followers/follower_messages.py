@@ -1,4 +1,4 @@
-"""What a world and its followers say to each other; docs/followers.md describes it for others.
+"""The messages between a world and its followers; docs/followers.md specifies them.
 
 A frame is that of `hosts.wire`: a head, a letter in msgpack, and the bytes of arrays. No letter is
 ever run. Each is one of these classes, as a map of its fields; a letter with other fields, or with
@@ -55,7 +55,7 @@ MAX_VEHICLES = 4096
 
 
 class Say(IntEnum):
-    """Kinds of frames, and who sends them."""
+    """Kinds of frames, and their senders."""
 
     HELLO = 0  # follower: I want these vehicles
     WELCOME = 1  # world: they are yours, and this is how time goes here

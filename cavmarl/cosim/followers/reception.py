@@ -1,4 +1,4 @@
-"""`Reception`: takes in followers that call while a world runs, without waiting for any of them."""
+"""`Reception` accepts followers while a world runs, without waiting for any of them."""
 
 from __future__ import annotations
 
@@ -13,9 +13,9 @@ from cavmarl.cosim.followers.follower_messages import MAX_VEHICLES, Hello, Refus
 
 __all__ = ["Reception", "refuse"]
 
-GREETING_S = 5.0  # for one who has called to say who it is
+GREETING_S = 5.0  # for a caller to introduce itself
 HEARING_S = 1.0  # for what has begun to arrive
-MAX_GUESTS = 64  # who have not said who they are
+MAX_GUESTS = 64  # not introduced yet
 GOES_ON = (
     "the world is whole and can be stepped on, with the built-in driver in its place or another "
     "follower"
@@ -33,7 +33,7 @@ class Reception:
         turned_away: how many callers were not understood, or said nothing.
 
     Raises:
-        ConfigError: nobody can listen there.
+        ConfigError: the socket cannot be opened.
     """
 
     def __init__(self, address: Address) -> None:
@@ -47,10 +47,10 @@ class Reception:
         self._since: dict[Line, float] = {}
 
     def callers(self, within_s: float = 0.0) -> Iterator[tuple[Line, Hello]]:
-        """Those who have said who they are since the last call, in the order of their calls.
+        """Followers that have introduced themselves since the last call, in order.
 
         Args:
-            within_s: how long to wait until somebody moves; 0: not at all.
+            within_s: how long to wait for the first; 0: not at all.
         """
         heard = self._selector.select(within_s)
         for key, _ in sorted(heard, key=lambda found: found[0].fd):
@@ -84,7 +84,7 @@ class Reception:
             return
         line = Line(connection, "a caller", GOES_ON)
         if len(self._since) == MAX_GUESTS:
-            self.turn_away(line, "too many have called and not said who they are")
+            self.turn_away(line, "too many callers have not introduced themselves")
             return
         self._since[line] = time.monotonic()
         self._selector.register(line, selectors.EVENT_READ, line)

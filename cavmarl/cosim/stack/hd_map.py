@@ -1,4 +1,4 @@
-"""`HdMap`: the road network as a stack asks for it: which lanes are near, and where on them."""
+"""`HdMap`: the road network for a stack: which lanes are near, and places on them."""
 
 from __future__ import annotations
 

@@ -204,7 +204,7 @@ class GnssInertial:
             for place in near
             if abs(wrap(heading - float(seen[3]) - place.heading_rad)) < _FIRST_HEADING_RAD
         ]
-        # Within junctions lanes lie across each other, and nobody can tell which one was seen.
+        # Within junctions lanes lie across each other, and the one seen is ambiguous.
         if not candidates or any(internal[place.lane] for place in near):
             return
         _, place = min(candidates, key=lambda found: found[0])

@@ -2,7 +2,7 @@
 
 The way is that of `roads.routing.make_plans`, the map as it is. Along it the acceleration is the
 least of what the Intelligent Driver Model (Treiber, Hennecke, Helbing, 2000) asks for behind
-whatever is on the way, and behind a standing obstacle at each line where a signal or somebody with
+whatever is on the way, and behind a standing obstacle at each line where a signal or a vehicle with
 the right of way says to stop.
 """
 
@@ -39,7 +39,7 @@ _HARDEST = 6.0
 _BESIDE_M = 0.3  # that is left to a body beside the way
 _BEND_MPS2 = 2.0  # sideways, in a bend
 _BRAKE_FOR_YELLOW = 3.0
-_CLEAR_S = 4.0  # that others who go first are away from where the ways meet
+_CLEAR_S = 4.0  # that vehicles that go first are away from where the ways meet
 _CLEAR_M = 12.0
 _CHANGE_BEHIND_M, _CHANGE_AHEAD_M = 10.0, 6.0
 _SIGHT_M = 50.0  # before a line, from where on it is looked at
@@ -230,7 +230,7 @@ class LaneRoute:
         return ""
 
     def _must_yield(self, link: int, obstacles: Sequence[Obstacle]) -> bool:
-        """Whether somebody with the right of way is inside the junction or about to be."""
+        """Whether a vehicle with the right of way is inside the junction or about to be."""
         network = self._network
         row = network.links[link]
         conflicts = network.conflicts[

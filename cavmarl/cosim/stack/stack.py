@@ -131,7 +131,7 @@ class Stack:
 
     Attributes:
         times: how long the stages took.
-        pose: where the vehicle is taken to be; None: nobody knows yet.
+        pose: where the vehicle is taken to be; None: not known yet.
         obstacles: what is on the road.
         reason: of the acceleration; see `Trajectory`.
     """
@@ -149,7 +149,7 @@ class Stack:
         self.reason = ""
 
     def reset_pose(self, pose: Pose) -> None:
-        """Tell the localisation where the vehicle is; nobody has to."""
+        """Tell the localisation where the vehicle is; optional."""
         self._localisation.reset_pose(pose)
 
     def drive(
@@ -207,7 +207,7 @@ def vehicle_of(hd_map: HdMap, sensors: Sequence[Sensor], tick_s: float) -> Vehic
 
     Raises:
         MissingExtraError: the map is projected, and pyproj is not installed.
-        MapError: nobody knows its projection.
+        MapError: its projection is unknown.
     """
     gnss = [sensor for sensor in sensors if sensor.type == "gnss"]
     geodesy = None

@@ -1,4 +1,4 @@
-"""What the stages of a stack say to each other.
+"""The data that the stages of a stack exchange.
 
 Places are those of the map: x east, y north, in m; headings counter-clockwise from east, in rad.
 """
@@ -160,7 +160,7 @@ class Localisation(Protocol):
     """Sensors → where the vehicle is."""
 
     def locate(self, readings: Readings, mission: Mission, time_s: float) -> Pose | None:
-        """Where it is now; None: nobody knows yet."""
+        """Where it is now; None: not known yet."""
         ...
 
     def reset_pose(self, pose: Pose) -> None: ...
@@ -181,7 +181,7 @@ class Planning(Protocol):
         Args:
             pose: where it is.
             obstacles: what is on the road.
-            signals: (num_links,) SIGNAL_* codes, 255: none; None: nobody knows.
+            signals: (num_links,) SIGNAL_* codes, 255: none; None: unknown.
             mission: where it is to go.
         """
         ...

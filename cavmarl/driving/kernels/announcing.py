@@ -1,4 +1,4 @@
-"""Who is known to come: those before it at a junction, or behind it, ask for no others."""
+"""Announcements of vehicles that come to a junction: others before or behind it ask for no more."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ __all__ = ["APPROACH_M", "IMPATIENT_S", "STANDING_MPS", "announced_m", "is_let_s
 APPROACH_M = 150.0  # how far ahead a vehicle announces itself at most,
 APPROACH_S = 8.0  # which it does this time before it arrives,
 APPROACH_STANDING_M = 30.0  # and this far ahead in any case
-STANDING_MPS = 0.5  # who is slower stands, for those that look at it
+STANDING_MPS = 0.5  # a slower vehicle stands, for others
 IMPATIENT_S = 3.0  # a vehicle that stands this long without reason is not waited for
 
 
@@ -24,7 +24,7 @@ def announced_m(speed: float) -> float:
 
 @inlined_kernel
 def is_let_stand(row: np.void) -> bool:
-    """Whether nobody gives way to a vehicle before a line: it stands, and does not want to go yet.
+    """Whether others need not give way to a vehicle before a line: it stands and will not go.
 
     Args:
         row: VEHICLE or OUTER.

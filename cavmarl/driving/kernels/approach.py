@@ -1,4 +1,4 @@
-"""Who approaches which link: every vehicle announces itself to the link it is on and to the next.
+"""Approaches to links: every vehicle announces itself to the link it is on and to the next.
 
 The lists lie together in memory and carry what the right of way asks of a foe.
 """

@@ -1,4 +1,4 @@
-"""Who touches whom: oriented boxes that overlap in the plane and in height."""
+"""Contacts between vehicles: oriented boxes that overlap in the plane and in height."""
 
 from __future__ import annotations
 
@@ -80,7 +80,7 @@ def _touches_earlier(
     grid: Grid,
     hit: NDArray[np.int64],
 ) -> bool:
-    """Note whom of those in the cells row i touches."""
+    """Note the vehicles in the cells that row i touches."""
     found = False
     first_column, last_column = cell_columns(grid, spot["x"], reach)
     first_row, last_row = cell_rows(grid, spot["y"], reach)

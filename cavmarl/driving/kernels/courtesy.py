@@ -1,4 +1,4 @@
-"""Room for who has to change lanes: those who follow on the lane that it changes to make it."""
+"""Courtesy: followers on the target lane make room for a vehicle that has to change lanes."""
 
 from __future__ import annotations
 
@@ -13,14 +13,14 @@ from cavmarl.driving.kernels.lane_index import behind_on, beside_s, comes_over
 
 __all__ = ["COURTESY_DECEL", "let_merge"]
 
-COURTESY_DECEL = 3.0  # m/s², the hardest braking to let somebody merge, or to fall in behind
+COURTESY_DECEL = 3.0  # m/s², the hardest braking to let a vehicle merge, or to fall in behind
 
 
 @kernel
 def let_merge(
     roads: RoadArrays, travel: Travel, rows: NDArray[np.void], row: np.void, scratch: Scratch
 ) -> None:
-    """Soften the way of who follows on the lane that a vehicle needs to change to.
+    """Slow down the follower on the lane that a vehicle needs to change to.
 
     Where that lane is free behind it, these are the next ones on all lanes that lead there.
     """

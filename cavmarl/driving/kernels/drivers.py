@@ -41,7 +41,7 @@ SEE_LINE_M = 8.0
 NEAR_M = 8.0  # to a leader so near the corner between matters,
 ASKEW_RAD = 0.7  # if it turns by so much,
 ASKEW_M = 2.5  # which takes this off the gap
-NEXT_LINE_M = 5.0  # and braking way: so near a line is minded by who has a leader on its own lane
+NEXT_LINE_M = 5.0  # and braking way: so near a line is minded by a vehicle with a leader
 STOP_LINE_M = 5.0  # standing with the front nearer than this counts as standing at the line
 LIMIT_DECEL = 2.0  # m/s², how a driver slows for a lower limit ahead,
 LIMIT_LEAD_S = 1.0  # to be down this time before it, as the model lags behind what is allowed
@@ -55,7 +55,7 @@ LATERAL_ACCEL = 2.5  # m/s², with which a steered car takes a bend: where a lan
 MIN_BEND_RAD = 0.2  # by more than this
 BEND_M = 6.0  # within this length
 ROW_LINES = 3  # of a VEHICLE row that drivers ask for
-RETURN_MPS = 5.0  # at which who is lost looks for its lane
+RETURN_MPS = 5.0  # at which a lost vehicle looks for its lane
 
 
 @inlined_kernel
@@ -234,7 +234,8 @@ def _road_ahead(
 
     `step` is its own one.
 
-    Who stands close behind its leader, too far from the line to look at it, need not: nothing that
+    A vehicle that stands close behind its leader, too far from the line to look at it, need not:
+        nothing that
     lies further ahead could make it stay more. Before the end of a lane that its way does not
     follow it stops `merge_room_m` early.
     """
@@ -372,7 +373,7 @@ def _prefetch_first(
 def _prefetch_further(roads: RoadArrays, step: np.void, scratch: Scratch) -> None:
     """What it asks about then: foes on the junction, and the lane behind it."""
     link = step["link"]
-    if link < 0 or link >= roads.links.shape[0]:  # who follows a script has no step
+    if link < 0 or link >= roads.links.shape[0]:  # a scripted vehicle has no step
         return
     first = roads.links[link]["first_conflict"]
     prefetch(roads.conflicts, first, 0)
@@ -455,7 +456,7 @@ def decide(
             target = lane["left"] if needed > 0 else lane["right"]
             room = step[i]["room"] - row["s"]
             if target >= 0 and room < FALL_IN_M:
-                # Fall in behind whom it wants to follow on the other lane.
+                # Fall in behind its future leader on the other lane.
                 fall_in = wish(
                     kind, speed, allowed, _beside(roads, travel, kind, row, target, scratch)
                 )

@@ -1,8 +1,9 @@
-"""What stands ahead, a leader or a line, and what a driver of either model makes of it.
+"""What stands ahead, a leader or a line, and what a driver of each model makes of it.
 
 Every obstacle *presses*; of several the one that presses hardest decides. A press is comparable
 only between obstacles of one driver: for IDM it is the interaction that is taken off the free
-acceleration (m/s²), for Krauss the safe speed with its sign turned (-m/s).
+acceleration (m/s²), for Krauss the safe speed with its sign turned (-m/s), for all others the
+acceleration that the model asks for with its sign turned (-m/s²).
 """
 
 from __future__ import annotations
@@ -13,9 +14,11 @@ import numpy as np
 
 from cavmarl.core.math.scalars import clamp
 from cavmarl.core.numba import kernel
-from cavmarl.core.records.codes import MODEL_KRAUSS
+from cavmarl.core.records.codes import MODEL_ACC, MODEL_IDM, MODEL_KRAUSS
+from cavmarl.driving.kernels.acc import acc_acceleration
 from cavmarl.driving.kernels.car_following import ACCEL_LIMIT, idm_free, idm_interaction
 from cavmarl.driving.kernels.krauss import dawdle, safe_speed
+from cavmarl.driving.kernels.registered_models import ask_model
 
 __all__ = [
     "LINE_MARGIN_M",
@@ -37,7 +40,43 @@ LINE_MARGIN_M = 1.0  # a driver stops with its front this far before a line
 @kernel
 def no_press(kind: np.void) -> float:
     """What nothing ahead presses."""
-    return -math.inf if kind["model"] == MODEL_KRAUSS else 0.0
+    return 0.0 if kind["model"] == MODEL_IDM else -math.inf
+
+
+@kernel
+def _asked(
+    kind: np.void,
+    speed: float,
+    allowed: float,
+    gap: float,
+    front_speed: float,
+    front_decel: float,
+) -> float:
+    """The acceleration in m/s² that a model asks for that is neither IDM nor Krauss's."""
+    min_gap = float(kind["min_gap"])
+    tau = float(kind["tau"])
+    accel = float(kind["accel"])
+    decel = float(kind["decel"])
+    if kind["model"] == MODEL_ACC:
+        room = gap - min_gap
+        return acc_acceleration(speed, allowed, room, front_speed, front_decel, tau, accel, decel)
+    code = int(kind["model"])
+    return ask_model(code, speed, allowed, gap, front_speed, min_gap, tau, accel, decel)
+
+
+@kernel
+def _asked_behind(
+    kind: np.void, speed: float, gap: float, front_speed: float, front_decel: float
+) -> float:
+    """The same behind a leader, whatever the limit is."""
+    allowed = min(kind["max_speed"], kind["desired_max_speed"])
+    return _asked(kind, speed, allowed, gap, front_speed, front_decel)
+
+
+@kernel
+def _asked_of_all(kind: np.void, speed: float, allowed: float, press: float) -> float:
+    """The same, the free road and all that presses counted."""
+    return min(_asked(kind, speed, allowed, math.inf, allowed, kind["decel"]), -press)
 
 
 @kernel
@@ -56,6 +95,8 @@ def behind(
     if kind["model"] == MODEL_KRAUSS:
         room = gap - kind["min_gap"]
         return -safe_speed(room, front_speed, kind["decel"], front_decel, kind["tau"])
+    if kind["model"] != MODEL_IDM:
+        return -_asked_behind(kind, speed, gap, front_speed, front_decel)
     return idm_interaction(
         speed,
         max(gap, 0.1) + REFERENCE_LENGTH_M,
@@ -72,6 +113,9 @@ def before_line(kind: np.void, speed: float, gap: float, dt: float) -> float:
     """How a line presses that is `gap` m ahead of the front."""
     if kind["model"] == MODEL_KRAUSS:
         return -safe_speed(gap - LINE_MARGIN_M, 0.0, kind["decel"], kind["decel"], dt)
+    if kind["model"] != MODEL_IDM:
+        wanted = safe_speed(gap - LINE_MARGIN_M, 0.0, kind["decel"], kind["decel"], dt)
+        return (speed - wanted) / dt
     jam = kind["min_gap"] + REFERENCE_LENGTH_M
     distance = max(gap - LINE_MARGIN_M, 0.1 - kind["min_gap"]) + jam
     return idm_interaction(speed, distance, 0.0, kind["accel"], kind["decel"], jam, kind["tau"])
@@ -86,6 +130,8 @@ def wish(kind: np.void, speed: float, allowed: float, press: float) -> float:
     if kind["model"] == MODEL_KRAUSS:
         wanted = min(-press, allowed, speed + kind["accel"] * kind["tau"])
         return float((wanted - speed) / kind["tau"])
+    if kind["model"] != MODEL_IDM:
+        return _asked_of_all(kind, speed, allowed, press)
     return idm_free(speed, allowed, kind["accel"]) - press
 
 
@@ -103,6 +149,10 @@ def speed_behind(kind: np.void, gap: float, front_speed: float, front_decel: flo
     if kind["model"] == MODEL_KRAUSS:
         room = gap - kind["min_gap"]
         return safe_speed(room, front_speed, kind["decel"], front_decel, kind["tau"])
+    if kind["model"] != MODEL_IDM:
+        room = max(gap - kind["min_gap"], 0.0)
+        safe = safe_speed(room, front_speed, kind["decel"], front_decel, kind["tau"])
+        return min(room / kind["tau"], safe)
     # The positive root of jam + v·tau + v·(v - front) / (2·sqrt(a·b)) = gap.
     scale = 2.0 * math.sqrt(kind["accel"] * kind["decel"])
     linear = kind["tau"] - front_speed / scale
@@ -131,5 +181,8 @@ def response(
         wanted = min(-press, allowed, speed + kind["accel"] * dt)
         wanted = dawdle(max(wanted, 0.0), kind["accel"], kind["sigma"], share, dt)
         return float(max((wanted - speed) / dt, -kind["emergency_decel"]))
+    if kind["model"] != MODEL_IDM:
+        asked = _asked_of_all(kind, speed, allowed, press)
+        return clamp(asked, -kind["emergency_decel"], kind["accel"])
     accel = idm_free(speed, allowed, kind["accel"]) - press
     return clamp(accel, -ACCEL_LIMIT, ACCEL_LIMIT)

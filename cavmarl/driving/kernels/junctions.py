@@ -52,7 +52,7 @@ LAST_CHANCE_M = 3.0  # with the front this near to the line
 ROOM_M = 3.0  # free way left behind a vehicle that clears a junction
 EXIT_LANES = 4  # looked along for room,
 EXIT_LOOK_M = 75.0  # and no further than this: ten cars stand there
-IMPATIENCE_S = 180.0  # after which one who gives way makes others brake
+IMPATIENCE_S = 180.0  # after which a vehicle that gives way makes others brake
 FORCED_STOP = 4.5  # m/s², and how hard; less in proportion after less time
 STOP_SIGN_S = 0.5  # how long one stands at a stop sign, and before a tie is broken
 WAIT_SLACK_M = 0.5  # a front this far beyond a waiting position still waits there
@@ -91,12 +91,12 @@ def _ignores(row: np.void, foe: np.void, link: int, signal: int) -> bool:
     if signal == SIGNAL_RED or signal == SIGNAL_RED_YELLOW:
         return True
     if signal == SIGNAL_YELLOW_MINOR or signal == SIGNAL_YELLOW_MAJOR:
-        return True  # who cannot stop any more has been looked at before
+        return True  # a vehicle that cannot stop any more was checked before
     if is_let_stand(foe):
         return True
     if foe["speed"] > STANDING_MPS or foe["hold"] != HOLD_YIELD:
         return False
-    # Both wait for somebody: who has stood longer goes first, and then goes on.
+    # Both wait: the one that has stood longer goes first, and then goes on.
     if row["hold"] == HOLD_NONE and row["stopped_at"] == link:
         return True
     if row["wait_s"] < STOP_SIGN_S or row["speed"] > STANDING_MPS:
@@ -124,7 +124,7 @@ def _is_harmless(
     before the own one.
     """
     if front <= 0.0:
-        # Who stands on the junction before the shared area is kept from it by somebody else.
+        # Another vehicle keeps one that stands before the shared area out of it.
         before_area = foe["dist"] + conflict["foe_enter_m"] - foe["half"] > 0.0
         if before_area and foe["speed"] < STANDING_MPS and rows[foe["row"]]["wait_s"] > IMPATIENT_S:
             return True
@@ -230,8 +230,8 @@ def _exit_blocked(
 ) -> bool:
     """Whether a row could not clear the junction behind the last standing vehicle on its way.
 
-    Who still moves in between will need room as well. Nobody counts who is more than `EXIT_LOOK_M`
-    beyond the junction.
+    Vehicles still moving in between need room as well. Not counted: vehicles more than
+    `EXIT_LOOK_M` beyond the junction.
     """
     target = roads.links[link]
     room = 0.0
@@ -297,7 +297,7 @@ def may_enter(
     if signal == SIGNAL_RED or signal == SIGNAL_RED_YELLOW:
         return HOLD_SIGNAL
     if (signal == SIGNAL_YELLOW_MINOR or signal == SIGNAL_YELLOW_MAJOR) and needed < COMFORT_STOP:
-        # Who gave way at the line all through green goes now, as the others stop.
+        # A vehicle that gave way at the line all through green goes now, as the others stop.
         if row["hold"] != HOLD_YIELD or front > LAST_CHANCE_M:
             return HOLD_SIGNAL
     target = roads.links[link]
@@ -437,7 +437,7 @@ def _press_of(
         if conflict["merging"] and gap > to_area:
             return behind(kind, row["speed"], gap, foe["speed"], kind["decel"])
         return before_line(kind, row["speed"], to_area, dt)
-    # Both are in it side by side: who is nearer to its end goes on, the other stays behind.
+    # Both are in it side by side: the one nearer to its end goes on, the other stays behind.
     if foe_to_area > 0.0:
         return no_press(kind)
     rest = conflict["leave_m"] - front

@@ -1,6 +1,7 @@
 """Which lane a driver wants, for its way or to drive faster, and whether it may change now.
 
-The question is MOBIL's (`lane_change`); this file finds whom it concerns, and when a way needs it.
+The question is MOBIL's (`lane_change`); this file finds the vehicles concerned, and when a way
+needs it.
 """
 
 from __future__ import annotations
@@ -123,7 +124,7 @@ def _change_is_safe(
             )
         net = gap - follower["half"] - half
         follower_after = accel_behind(theirs, pace, limit, net, speed, kind["decel"])
-        # Who stands or creeps cannot brake for long, whatever the model answers at short distances.
+        # A standing or creeping vehicle cannot brake for long, whatever the model answers.
         follower_after = max(follower_after, -pace / BRAKE_TIME_S)
     after = max(after, -speed / BRAKE_TIME_S)
     if after < -MAX_BRAKING_ACCEPTED:
@@ -206,8 +207,8 @@ def choose_lane(
     """The lane change that row i makes now: 1 left, -1 right, 0 none.
 
     In even ticks background drivers may only change to the left, in odd ones to the right: two of
-    them never take the same gap from both sides in one tick, whoever is asked first. A suggestion
-    for an agent binds nobody, so it has no such rule.
+    them never take the same gap from both sides in one tick, whichever is asked first. A suggestion
+    for an agent is not binding, so it has no such rule.
     """
     row = rows[i]
     if row["driver"] == DRIVER_AGENT:

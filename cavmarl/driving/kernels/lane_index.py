@@ -1,8 +1,8 @@
-"""Who is where on which lane: an index over the vehicles of one world, and searches along it.
+"""Lane index: the vehicles of one world by lane and place, and searches along it.
 
 The index lists, lane by lane, the vehicles on it by rising (s, id). A vehicle whose body also
-covers a neighbour lane stands in both lists, who follows a script in those of all lanes that it
-covers or is about to cover, and who is lost in none. What others look at is copied into the
+covers a neighbour lane stands in both lists, one that follows a script in those of all lanes that
+it covers or is about to cover, and one that is lost in none. What others look at is copied into the
 entries, which lie together in memory. Nothing here depends on the order of rows.
 """
 
@@ -194,7 +194,7 @@ def _first_after(scratch: Scratch, lane: int, s: float, own_id: int) -> int:
 def ahead_on(scratch: Scratch, lane: int, s: float, own_id: int, view_m: float) -> int:
     """Position in the index of the next other vehicle on `lane` ahead of place `s`, or -1.
 
-    Beyond `view_m` nobody is found. At equal s the larger id counts as ahead, so that of two
+    Beyond `view_m` no vehicle is found. At equal s the larger id counts as ahead, so that of two
     vehicles one is always the leader.
     """
     k = _first_after(scratch, lane, s, own_id)
@@ -208,7 +208,7 @@ def ahead_on(scratch: Scratch, lane: int, s: float, own_id: int, view_m: float) 
 def last_on(scratch: Scratch, lane: int, own_id: int, distance: float, view_m: float) -> int:
     """Position in the index of the rearmost other vehicle on `lane`, or -1.
 
-    Who asks is `distance` m before the start of the lane and sees `view_m` far.
+    The asking vehicle is `distance` m before the start of the lane and sees `view_m` far.
     """
     k = int(scratch.lane_start[lane])
     end = scratch.lane_end[lane]
@@ -239,8 +239,8 @@ def comes_over(
 ) -> tuple[int, float]:
     """The nearest vehicle that comes from lane `before` to a place `s` m behind its end.
 
-    Answers as `neighbor_behind`. Who stands or creeps far from here does not announce itself, and
-    is passed over.
+    Answers as `neighbor_behind`. A vehicle that stands or creeps far from here does not announce
+    itself, and is passed over.
     """
     distance = s
     for _ in range(MAX_LOOK_BACK_LANES):

@@ -2,7 +2,7 @@
 
 A script is made before the first step: one FRAME a tick, each of which says which one follows. At
 some it waits until its cue has come. So where a row is depends on its frame and the cues alone,
-and whoever owns the row moves it the same way.
+and every owner of the row moves it the same way.
 """
 
 from __future__ import annotations

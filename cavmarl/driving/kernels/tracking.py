@@ -157,8 +157,8 @@ def locate(roads: RoadArrays, plans: NDArray[np.void], grid: LaneGrid, row: np.v
         row: VEHICLE with the new x, y, heading and the old lane context; written.
 
     Returns:
-        EVENT_OFF_ROAD, EVENT_WRONG_WAY or 0. Who is on no lane of its direction keeps the last one;
-        there s ends at the lane's ends, and d is then the way beyond, if that is more.
+        EVENT_OFF_ROAD, EVENT_WRONG_WAY or 0. A vehicle on no lane of its direction keeps the last
+        one; there s ends at the lane's ends, and d is then the way beyond, if that is more.
     """
     lane = row["lane"]
     s, d, outside = _on(roads, lane, row["x"], row["y"], row["s"])

@@ -35,7 +35,7 @@ class Results(NamedTuple):
 
 @kernel
 def report(outputs: Outputs, steps: NDArray[np.int64], horizon: int, results: Results) -> bool:
-    """Write what the agents have got, all but who acts next.
+    """Write what the agents have got, all but which act next.
 
     Args:
         outputs: of the step.
@@ -69,13 +69,13 @@ def report(outputs: Outputs, steps: NDArray[np.int64], horizon: int, results: Re
 def report_who_goes_on(
     outputs: Outputs, gate: Gate, steps: NDArray[np.int64], horizon: int, results: Results
 ) -> bool:
-    """Write who acts next and which episodes are over, once those who are through are gone.
+    """Write which agents act next and which episodes are over, once vehicles that end are gone.
 
     An episode is over at its horizon, and when no agent is there and none waits to enter.
 
     Args:
         outputs: of the step.
-        gate: who waits, and how many have arrived.
+        gate: vehicles that wait, and how many have arrived.
         steps: (W,) since each world's reset.
         horizon: steps of an episode.
         results: are written.
@@ -106,11 +106,11 @@ def keep_last(
     final_observations: NDArray[np.float32],
     in_next_step: bool,
 ) -> None:
-    """Keep what those saw last who have ended.
+    """Keep the last observations of agents that have ended.
 
     Args:
-        results: who has ended, and which episodes are over.
-        observations: (W, A, D); those of agents who are gone become 0, unless worlds begin anew in
+        results: which agents have ended, and which episodes are over.
+        observations: (W, A, D); those of agents that are gone become 0, unless worlds begin anew in
             the next step.
         final_observations: (W, A, D) where something has ended, what they were; written.
         in_next_step: when worlds begin anew.

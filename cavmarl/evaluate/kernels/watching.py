@@ -1,4 +1,4 @@
-"""What evaluation reads from the traffic after each step: where agents are, who just missed whom.
+"""What evaluation reads from the traffic after each step: places of agents, near misses.
 
 A conflict area is the stretch that the paths of two movements over a junction share (a CONFLICT
 row). Post-encroachment time is what passes between the moment at which the first vehicle's rear
@@ -89,7 +89,7 @@ def watch_encroachments(
     seen_agent: NDArray[np.int32],
     least_s: NDArray[np.float64],
 ) -> None:
-    """Take in one step: lower the agents' least post-encroachment times where somebody passed.
+    """Take in one step: lower the agents' least post-encroachment times where a vehicle passed.
 
     First all vehicles leave their mark on the areas that they cover, then each looks at the marks
     of the other paths: so the order of rows does not matter. Vehicles that are in an area together

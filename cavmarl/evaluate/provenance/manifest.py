@@ -141,7 +141,7 @@ def read_closed(folder: Path) -> Document:
     path = folder / MANIFEST_FILE
     if not path.is_file():
         raise ManifestError(
-            f"{folder}: no {MANIFEST_FILE}: nobody can say what these results were made with; "
+            f"{folder}: no {MANIFEST_FILE}: the origin of these results is unknown; "
             "make them with `cavmarl evaluate … --out FOLDER`"
         )
     document = _read(path)

@@ -61,11 +61,11 @@ class ScenarioRun:
         zones: into which the world was divided.
         agents: how many.
         background: vehicles beside the agents and the actors.
-        verdict: `passed` (all through, and nobody hurt), or what became of the worst of the
+        verdict: `passed` (all through, and none hurt), or what became of the worst of the
             agents: `collided`, `off road`, or `stuck`.
-        verdicts: of each agent, that to whom the scene is played first.
+        verdicts: of each agent, that to which the scene is played first.
         min_ttc_s: least time to collision of an agent with an actor, 0 after a collision with
-            anybody; None: they were never about to.
+            one; None: they were never about to.
         pet_s: least post-encroachment time likewise; None: no place was used by both.
         collisions: vehicles and actors that began to touch another one, agents among them.
         red_lights: steps in which an agent entered a junction at red.
@@ -96,7 +96,7 @@ class ScenarioRun:
 
     @property
     def passed(self) -> bool:
-        """Whether all agents came through and hurt nobody."""
+        """Whether all agents came through and hurt no one."""
         return self.verdict == "passed"
 
     def to_dict(self) -> dict[str, Any]:
@@ -115,7 +115,7 @@ def make_scenario(
     agents: int = 1,
     overrides: Mapping[str, Any] | None = None,
 ) -> CavVectorEnv:
-    """One world in which a scenario is played to its agents, who steer and accelerate.
+    """One world in which a scenario is played to its agents, which steer and accelerate.
 
     Args:
         scenario: name, or path of a file.

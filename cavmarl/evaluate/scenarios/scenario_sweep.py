@@ -1,6 +1,6 @@
-"""All scenarios on several maps and seeds: who passes where, as `cavmarl scenario sweep` prints it.
+"""All scenarios on several maps and seeds: results, as `cavmarl scenario sweep` prints them.
 
-One driver is to pass, another one, that heeds nobody, is not: a scenario that lets it pass asks
+One driver is to pass, another one, that ignores others, is not: a scenario that lets it pass asks
 nothing of a driver.
 """
 

@@ -1,4 +1,4 @@
-"""Locked junctions: somebody could go, nobody goes."""
+"""Locked junctions: vehicles could go, but none goes."""
 
 from __future__ import annotations
 
@@ -16,9 +16,9 @@ STOP_LINE_M = 10.0  # a front nearer to the end of its lane than this stands at 
 class JunctionLocks:
     """How long each junction was locked, from samples taken once a second.
 
-    Somebody *waits* at a junction who stands inside it, or at the stop line of a lane into it of
-    which a link has no red signal. A lock is the number of seconds with somebody waiting since
-    a vehicle has last entered or left the junction; it also ends when nobody waits there, unless
+    A vehicle *waits* at a junction if it stands inside it, or at the stop line of a lane into it of
+    which a link has no red signal. A lock is the number of seconds with a vehicle waiting since
+    a vehicle has last entered or left the junction; it also ends when none waits there, unless
     they are only held by red. So time at red neither counts nor ends a lock.
 
     Args:
@@ -45,7 +45,7 @@ class JunctionLocks:
 
         Args:
             rows: VEHICLE (num_vehicles,), all on lanes of the map.
-            standing: (num_vehicles,) who stands.
+            standing: (num_vehicles,) which stand.
             codes: (num_links,) what the links' signals show.
         """
         lanes = rows["lane"]
@@ -69,7 +69,7 @@ class JunctionLocks:
         }
 
     def _passed(self, rows: NDArray[np.void]) -> NDArray[np.bool_]:
-        """(num_junctions,) where somebody entered or left since the sample before."""
+        """(num_junctions,) where a vehicle entered or left since the sample before."""
         order = np.argsort(rows["id"])
         ids, lanes = rows["id"][order], rows["lane"][order].astype(np.int64)
         _, now, before = np.intersect1d(ids, self._ids, assume_unique=True, return_indices=True)

@@ -26,7 +26,7 @@ def load_demand(
     dt_s: float,
     overrides: Mapping[str, Any] | None = None,
 ) -> World:
-    """What a world with background traffic and nobody to train is made of.
+    """What a world with background traffic and no agents is made of.
 
     Args:
         map_file: a SUMO network.

@@ -1,7 +1,7 @@
 """`Referee`: what a coordinator of one world is, however it reaches its zones.
 
-It says who advances which vehicle to the next tick, and sees it done. How rows change hands is done
-by the division.
+It decides which zone advances which vehicle to the next tick, and sees it done. How rows change
+hands is done by the division.
 
 There are two: `coordinator.Coordinator` sends messages, which may be lost, to hosts that may die;
 `direct.DirectCoordinator` lives in the process of all of its zones.
@@ -53,11 +53,11 @@ class Watcher(Protocol):
 
 
 class Referee(ABC):
-    """Says who owns what, tick by tick: `begin`, then the zones' work, then `end`.
+    """Decides ownership, tick by tick: `begin`, then the zones' work, then `end`.
 
     Args:
-        directory: who owns what.
-        journal: takes the records; None: nobody keeps them.
+        directory: the owners.
+        journal: takes the records; None: not kept.
 
     Attributes:
         journal: what takes the records.
@@ -91,7 +91,7 @@ class Referee(ABC):
         self._watchers = (*self._watchers, watcher)
 
     def notes(self) -> tuple[tuple[Birth, ...], tuple[Removed, ...]]:
-        """Who is new since the last BEGIN, and who is gone since the last COMMIT."""
+        """Vehicles born since the last BEGIN, and gone since the last COMMIT."""
         return tuple(self._births), tuple(self._gone)
 
     def resume(self, births: Iterable[Birth] = (), gone: Iterable[Removed] = ()) -> None:

@@ -45,12 +45,12 @@ __all__ = [
 
 
 class Refereeing(NamedTuple):
-    """Who says who owns what.
+    """The coordinators of a divided environment.
 
     Attributes:
         coordination: of all worlds.
         transfers: world → what became of each hand-over.
-        recovery: runs the ticks of the one world in which somebody may die.
+        recovery: runs the ticks of the one world in which hosts may die.
         phases: runs the phases of its ticks.
         store: its committed state.
     """
@@ -216,7 +216,7 @@ def _referee(
 def _monitor(
     division: Division, coordinators: Sequence[Referee], limits: Limits, longest_move_m: float
 ) -> Monitor:
-    """What looks at all worlds, and is told what their coordinators do."""
+    """The monitor of all worlds, and is told what their coordinators do."""
     is_direct = isinstance(coordinators[0], DirectCoordinator)
     records = [OwnersOnRecord(division.count, limits, is_direct) for _ in coordinators]
     for coordinator, record in zip(coordinators, records, strict=True):

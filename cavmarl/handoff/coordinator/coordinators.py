@@ -33,7 +33,7 @@ class RowStates:
         world: which one.
 
     Attributes:
-        borders: who was near a border when the tick began.
+        borders: vehicles near a border when the tick began.
     """
 
     def __init__(self, division: Division, world: int) -> None:
@@ -46,7 +46,7 @@ class RowStates:
         self._known.clear()
 
     def look(self, everybody: bool) -> list[Near]:
-        """Who is near a border; see `Division.near`."""
+        """Vehicles near a border; see `Division.near`."""
         found = self._division.near(self._world, everybody)
         self.borders.near = found
         return found
@@ -79,15 +79,15 @@ class RowStates:
 
 
 class Coordination:
-    """Who advances which vehicle, in all worlds.
+    """The coordinators of all worlds.
 
     Args:
         division: whose rows change hands.
         coordinators: one a world.
         states: of the vehicles of each world, as the coordinators read them.
-        digests: of zones' rows; None: nobody asks for them.
-        store: keeps what is committed; None: nobody can die apart from the others.
-        monitor: looks at every tick that is committed; None: nobody does.
+        digests: of zones' rows; None: not needed.
+        store: keeps what is committed; None: no process can die alone.
+        monitor: checks every tick that is committed; None: none.
     """
 
     def __init__(
@@ -121,7 +121,7 @@ class Coordination:
                     self._monitor.begin(w, coordinator.notes()[0])
 
     def cut(self) -> None:
-        """Zones are others, between two ticks: at the next one everybody is looked at."""
+        """Zones are others, between two ticks: at the next one all vehicles are checked."""
         for w, coordinator in enumerate(self.coordinators):
             births, gone = coordinator.notes()
             coordinator.resume(self._division.settle_newborn(w, births), gone)
@@ -167,17 +167,17 @@ class Coordination:
             self._store.flip()
 
     def in_flight(self, w: int) -> list[TransferInFlight]:
-        """Who of a world is on the way from one zone to another."""
+        """Vehicles of a world on the way from one zone to another."""
         return [TransferInFlight(*entry) for entry in self.coordinators[w].in_flight()]
 
     def load(self) -> None:
         """Take everything back to what is committed.
 
         Raises:
-            ProtocolError: nobody keeps it.
+            ProtocolError: it is not kept.
         """
         if self._store is None:
-            raise ProtocolError("nobody keeps what is committed")
+            raise ProtocolError("the committed state is not kept")
         self._division.align()
         for w, notes in enumerate(self._store.load()):
             self.coordinators[w].resume(*notes)

@@ -1,4 +1,4 @@
-"""`BorderBook`: changes of owner of one world whose zones share a process, and who is about to."""
+"""`BorderBook`: changes of owner of one world whose zones share a process, and approaches."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ class BorderBook:
         Args:
             everybody: look at all rows: they have changed since the ghosts were renewed.
             vehicles: how many there have to be.
-            newborn: who of them has entered since the last tick began; they stay where they are.
+            newborn: those of them that entered since the last tick began; they stay where they are.
 
         Returns:
             how many have changed.
@@ -74,7 +74,7 @@ class BorderBook:
             )  # fmt: skip
             if changed < 0:
                 self._refuse(changed)
-        # Who entered after the ghosts were renewed has not been looked at.
+        # Vehicles that entered after the ghosts were renewed have not been checked.
         if book.owned.item(w) != (vehicles if everybody else vehicles - len(newborn)):
             raise ProtocolError(f"zones own {division.counts(w)} vehicles, not {vehicles}")
         book.ms[w] = 1e3 * perf_counter()

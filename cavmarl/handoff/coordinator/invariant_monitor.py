@@ -1,8 +1,9 @@
-"""`Monitor`: the invariants of ownership, looked at after every tick of every world.
+"""`Monitor`: the invariants of ownership, checked after every tick of every world.
 
-What it needs of the vehicles is taken in one compiled look at their rows (`kernels.monitor`), which
-tells who has come and gone; what it knows of owners comes from the coordinators' records, and costs
-what changes in them. The words of an error are found when there is one (`runtime.violations`).
+What it needs of the vehicles is taken in one compiled pass over their rows (`kernels.monitor`),
+which finds vehicles that have come and gone; what it knows of owners comes from the coordinators'
+records, and costs what changes in them. The words of an error are found when there is one
+(`runtime.violations`).
 """
 
 from __future__ import annotations
@@ -44,14 +45,14 @@ def _add(sums: NDArray[np.uint64], zone: int, term: int) -> None:
 
 
 def _nothing() -> None:
-    """Nobody owes any records."""
+    """There are no late records."""
 
 
 class OwnersOnRecord:
-    """Who owns what by the records of a coordinator, whose trace is judged on the way.
+    """Owners by the records of a coordinator, whose trace is judged on the way.
 
-    It is told what a `Trace` is told, and by coordinators that make records later, who changes its
-    owner meanwhile.
+    It is told what a `Trace` is told, and by coordinators that make records later, which vehicles
+    change their owner meanwhile.
 
     Args:
         zones: how many.
@@ -125,7 +126,7 @@ class OwnersOnRecord:
             ) from None
 
     def _commit(self) -> None:
-        sums = self._current = self._sums  # who was foretold is on record by the end of these
+        sums = self._current = self._sums  # announced vehicles are on record by the end of these
         for vehicle, before, after in self._checker.changes:
             if before is None:
                 self.entered += 1
@@ -157,7 +158,7 @@ class Monitor:
         _, count, num_worlds, capacity = division.zoned.rows.shape
         self._ticks = [0] * num_worlds
         self._vehicles: list[set[int]] = [set() for _ in range(num_worlds)]
-        # What the last look has written, and the last but one.
+        # What the last check has written, and the last but one.
         self._kept = [
             (make_kept(count, capacity), make_kept(count, capacity)) for _ in range(num_worlds)
         ]
@@ -175,7 +176,7 @@ class Monitor:
 
         Args:
             w: which one.
-            births: who is there.
+            births: the vehicles there.
 
         Raises:
             ProtocolError: an invariant does not hold.
@@ -190,7 +191,7 @@ class Monitor:
 
         Args:
             w: which one.
-            births: who entered in the tick, and is not in the records yet.
+            births: vehicles that entered in the tick, not in the records yet.
 
         Raises:
             ProtocolError: an invariant does not hold.
@@ -220,7 +221,7 @@ class Monitor:
             violations.explain(kind, vehicle, record.owners, births)
 
     def _are_single(self, w: int) -> bool:
-        """Note who has come and gone; whether nobody has come who was there."""
+        """Note vehicles that have come and gone; whether none has come that was there."""
         entered = self._strays.entered[: self._found["entered"].item()].tolist()
         left = self._strays.left[: self._found["left"].item()].tolist()
         vehicles = self._vehicles[w]

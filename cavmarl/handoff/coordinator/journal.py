@@ -1,4 +1,4 @@
-"""The coordinator's log on disk: what has been decided is there before anybody hears of it.
+"""The coordinator's log on disk: what has been decided is there before it is told to any zone.
 
 A line is a record of `ownership.records`. Nothing is kept in memory, and an append is one write: a
 process that dies leaves whole lines, and at most one that is cut short. `MemoryJournal` takes the
@@ -120,7 +120,7 @@ class Journal:
             ) from error
         except OSError as error:
             raise self._unwritable(error) from error
-        # Worlds are not closed: their journal is, when nobody has it any more.
+        # Worlds are not closed: their journal is, when it is not referenced any more.
         weakref.finalize(self, self._file.close)
         try:
             self._lock()
@@ -187,7 +187,7 @@ class Journal:
 
     def _lock(self) -> None:
         """Keep all others from writing here, as long as the file is open."""
-        if sys.platform == "win32":  # there an open file can be shared, and nothing says by whom
+        if sys.platform == "win32":  # an open file can be shared there, by an unknown process
             return
         try:
             fcntl.flock(self._file, fcntl.LOCK_EX | fcntl.LOCK_NB)
@@ -219,7 +219,7 @@ class Journal:
 
 
 class MemoryJournal:
-    """A journal for tests, and for runs that nobody replays.
+    """A journal for tests, and for runs that are not replayed.
 
     Attributes:
         records: all of them.

@@ -1,4 +1,4 @@
-"""What a journal tells: how much of everything there was, and who owned what when."""
+"""What a journal tells: counts of all events, and the owners at each tick."""
 
 from __future__ import annotations
 

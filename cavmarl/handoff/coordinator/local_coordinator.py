@@ -1,15 +1,16 @@
-"""`DirectCoordinator`: the referee of a world whose zones all live in its own process.
+"""`DirectCoordinator`: the coordinator of a world whose zones all live in its own process.
 
-There nothing is lost, nobody is late, and nobody dies alone. What `Coordinator` and the hosts of
+There no message is lost, no zone is late, and no process dies alone. What `Coordinator` and the
+hosts of
 its zones tell each other is known to all of them at once, so no message is made: a vehicle over a
 border is offered, acknowledged and handed over in one call, the new owner takes the old one's row
 as it is, and a lease is the call that advances a shard. What is decided and written down is the
 same, record by record, as over messages of which none is lost.
 
-The table of owners is brought up to date every now and then, and when somebody asks. Records are
-made only where somebody reads them: all of them, at once, for a journal, and for watchers those of
+The table of owners is brought up to date every now and then, and on request. Records are
+made only where they are read: all of them, at once, for a journal, and for watchers those of
 ticks in which a vehicle has entered, left, or changed its owner, as the table comes to know of it.
-Whoever has to know of changes in their own tick gives himself to `foretell`.
+Callers that need changes in their own tick register with `foretell`.
 """
 
 from __future__ import annotations
@@ -36,7 +37,7 @@ __all__ = ["DirectCoordinator"]
 
 
 class _News(NamedTuple):
-    """Who has entered and who has left by the end of a tick."""
+    """Vehicles that have entered and left by the end of a tick."""
 
     births: tuple[Birth, ...] = ()
     removed: tuple[Removed, ...] = ()
@@ -46,11 +47,11 @@ _NO_NEWS = _News()
 
 
 class DirectCoordinator(Referee):
-    """Says who owns what, without messages.
+    """Decides ownership, without messages.
 
     Args:
-        directory: who owns what.
-        journal: takes the records; None: nobody keeps them.
+        directory: the owners.
+        journal: takes the records; None: not kept.
         book: hands rows over.
         counts: how many vehicles each zone owns now, by its rows.
         transfers: told of all that goes on.
@@ -121,7 +122,7 @@ class DirectCoordinator(Referee):
                 self._record(*directory.host(zone, worker=0).records)
 
     def begin(self, everybody: bool, inputs: bytes = b"") -> None:
-        """Hand over whoever is in another zone than its owner's, as `Referee.begin` says."""
+        """Hand over vehicles outside their owner's zone, as `Referee.begin` says."""
         births = self._births
         try:
             changed = self._book.hand_over(everybody, self._vehicles, births)
@@ -234,7 +235,7 @@ class DirectCoordinator(Referee):
         """Compare what zones should own with their rows, where all that have left are on record.
 
         Args:
-            births: who is in the rows, and will be on record in the next tick.
+            births: vehicles in the rows, which will be on record in the next tick.
 
         Raises:
             ProtocolError: a zone has more or fewer.
@@ -248,7 +249,7 @@ class DirectCoordinator(Referee):
 
 
 def _no_digest(zone: int) -> int:
-    """Of a zone's rows, where nobody takes one."""
+    """Of a zone's rows, where none is taken."""
     return 0
 
 

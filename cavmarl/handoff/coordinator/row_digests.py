@@ -1,4 +1,4 @@
-"""`RowDigests`: digests of sets of vehicles, by what they are and not by who owns them."""
+"""`RowDigests`: digests of sets of vehicles, by what they are and not by their owners."""
 
 from __future__ import annotations
 

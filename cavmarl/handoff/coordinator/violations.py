@@ -1,4 +1,4 @@
-"""Finds the words for an invariant that does not hold: which, when, where, who, and the values.
+"""Describes a violated invariant: which, when, where, the vehicle, and the values.
 
 Only called when the monitor has found that something is wrong, so it may look at every vehicle.
 """
@@ -31,8 +31,8 @@ class Violations:
     Args:
         division: of the rows.
         w: which world.
-        clock: of the look that found it.
-        before: what the look before wrote.
+        clock: of the check that found it.
+        before: what the check before wrote.
     """
 
     def __init__(self, division: Division, w: int, clock: Clock, before: Kept) -> None:
@@ -51,10 +51,10 @@ class Violations:
         """Say what is wrong.
 
         Args:
-            kind: KIND_* of the look's finding.
+            kind: KIND_* of the check's finding.
             vehicle: that it is about.
             owners: on record, vehicle → (zone, epoch).
-            births: who has entered since.
+            births: vehicles that have entered since.
 
         Raises:
             ProtocolError: always.

@@ -26,7 +26,7 @@ COUNTS = ("num_owned", "num_rows", "num_through", "num_touching", "num_contacts"
 Array = NDArray[Any]
 Arrays = list[Array]
 Notes = tuple[tuple[Birth, ...], tuple[Removed, ...]]
-"""What has happened since the last BEGIN: who is new, and who is gone."""
+"""What has happened since the last BEGIN: new vehicles, and those that are gone."""
 
 
 class Image(NamedTuple):

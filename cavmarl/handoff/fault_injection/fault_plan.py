@@ -37,7 +37,7 @@ COORDINATOR_POINTS = (
 
 @dataclass(frozen=True)
 class Crash:
-    """Somebody dies once.
+    """One death of a process.
 
     Attributes:
         tick: which the world is on its way to; the run's, which never begins anew.
@@ -95,7 +95,7 @@ class Faults:
             late = [crash for crash in self.crashes if crash.tick >= self.until]
             if late:
                 raise ConfigError(
-                    f"somebody dies in tick {late[0].tick}, and nothing happens from tick "
+                    f"a process dies in tick {late[0].tick}, and nothing happens from tick "
                     f"{self.until} on (until); take one of them away"
                 )
         for kind in ("Step", "Done"):

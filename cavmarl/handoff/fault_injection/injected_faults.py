@@ -1,7 +1,7 @@
-"""Hosts and coordinators that die as a plan says, to show that nobody can tell.
+"""Hosts and coordinators that die as a plan says, to show that results stay the same.
 
-`FaultyPhases` and `FaultyCoordinator` ask `Crashes` at each point of a tick who dies there. All of
-it is a function of the plan's seed, so a run with deaths can be repeated bit for bit.
+`FaultyPhases` and `FaultyCoordinator` ask `Crashes` at each point of a tick which of them dies
+there. All of it is a function of the plan's seed, so a run with deaths can be repeated bit for bit.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ __all__ = [
 ]
 
 Visit: TypeAlias = tuple[int, str, int]
-"""Who was at a point: (tick of the run, point, zone or COORDINATOR)."""
+"""A visit to a point: (tick of the run, point, zone or COORDINATOR)."""
 
 
 class ZoneDeath(CavmarlError):
@@ -57,14 +57,14 @@ class CoordinatorDeath(CavmarlError):
 
 
 class Crashes:
-    """Says who dies where, and counts.
+    """Says which processes die where, and counts.
 
     Args:
         faults: the plan.
 
     Attributes:
         tick: of the run, that the world is on its way to; to be set.
-        visits: (tick, point, party) of every point that somebody came to; None: nobody notes them.
+        visits: (tick, point, party) of every point reached; None: not noted.
     """
 
     def __init__(self, faults: Faults) -> None:
@@ -124,7 +124,7 @@ class FaultyPhases:
 
     Args:
         shards: all of them.
-        crashes: who dies where.
+        crashes: which processes die where.
     """
 
     def __init__(self, shards: Sequence[Shard], crashes: Crashes) -> None:
@@ -146,7 +146,7 @@ class FaultyPhases:
 
 
 def _call_hosted(zone: int, host: Executor, phase: Phase, arguments: tuple[Any, ...]) -> None:
-    """Run a phase in a host's process: whatever nobody has foreseen ends the host and no more.
+    """Run a phase in a host's process: an unexpected error ends the host and no more.
 
     Raises:
         ZoneDeath: something else than cavmarl's own errors was raised.
@@ -164,7 +164,7 @@ class FaultyCoordinator(Coordinator):
 
     Args:
         arguments: as of `Coordinator`.
-        crashes: who dies where.
+        crashes: which processes die where.
     """
 
     def __init__(self, *arguments: Any, crashes: Crashes) -> None:
@@ -209,7 +209,7 @@ class FaultyCoordinator(Coordinator):
 
 
 def give_up(coordinator: Coordinator, death: ZoneDeath) -> None:
-    """Fence a host; one that lives on says what it had to say, and nobody listens."""
+    """Fence a host; one that lives on sends what it had to send, unheard."""
     endpoint: Endpoint = coordinator.fence(death.zone)
     if death.lives_on and endpoint.lease is not None:
         coordinator.post.send((endpoint.complete(rows=0),))

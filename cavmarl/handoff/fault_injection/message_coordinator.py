@@ -1,4 +1,4 @@
-"""`Coordinator`: the referee of a world who tells the hosts of its zones by messages."""
+"""`Coordinator`: the coordinator of a world that sends messages to the hosts of its zones."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ class States(Protocol):
     def forget(self) -> None: ...
 
     def look(self, everybody: bool) -> Sequence[Near]:
-        """Who is near a border; see `Division.near`."""
+        """Vehicles near a border; see `Division.near`."""
         ...
 
     def near(self, entry: Near) -> bytes:
@@ -58,14 +58,14 @@ class Coordinator(Referee):
         states: of vehicles at the committed tick.
         limits: deadlines.
         post: carries the messages.
-        journal: takes the records; None: nobody keeps them.
+        journal: takes the records; None: not kept.
         safeguards: remedies of the protocol; tests take one away.
 
     Attributes:
         endpoints: zone → its host's side.
         post: what carries the messages.
         resent: phase → messages that were sent again, since no answer had come: PREPARE; STEP, for
-            a lease that nobody had taken; DONE, STEPs for an answer that had not come.
+            a lease not taken; DONE, STEPs for an answer that had not come.
     """
 
     def __init__(
@@ -130,7 +130,7 @@ class Coordinator(Referee):
     # A tick
 
     def begin(self, everybody: bool, inputs: bytes = b"") -> None:
-        """Offer who comes near, decide the way to the next tick, and lease it to every zone.
+        """Offer approaching vehicles, decide the way to the next tick, and lease it to every zone.
 
         Called again in the same tick, it goes on with what was decided; see `Referee.begin`.
         """
@@ -184,7 +184,7 @@ class Coordinator(Referee):
         )
 
     def _offer(self, near: Sequence[Near]) -> None:
-        """Tell the zones who comes near; what is not answered after A attempts stays so."""
+        """Tell the zones of approaching vehicles; what is unanswered after A attempts stays so."""
         approaches: defaultdict[int, list[Approach]] = defaultdict(list)
         for entry in near:
             if entry.vehicle in self.endpoints[entry.source].owned:
@@ -244,7 +244,7 @@ class Coordinator(Referee):
     def _until(
         self, phase: str, missing: Callable[[], Sequence[int]], again: Callable[[], Output]
     ) -> None:
-        """Deliver until nobody is missing, and ask again where nothing comes."""
+        """Deliver until no answer is missing, and ask again where nothing comes."""
         self._deliver()
         for _ in range(PATIENCE):
             if not missing():

@@ -1,4 +1,4 @@
-"""`Recovery`: a tick in which somebody dies is begun again from the committed state.
+"""`Recovery`: a tick in which a host dies is begun again from the committed state.
 
 The host of a zone that dies is fenced, and its zone is given to another; a coordinator that dies is
 made anew from its journal. Either way the half tick is thrown away and run again. It reads the
@@ -38,7 +38,7 @@ class Revival(NamedTuple):
 
     Attributes:
         tick: of the run, that was on its way.
-        point: at which somebody died.
+        point: at which it died.
         zone: whose host it was; None: the coordinator.
         ms: from the death to the tick's next beginning.
     """
@@ -57,8 +57,8 @@ class Recovery:
         coordination: of the one world.
         coordinator: its own.
         store: the committed state.
-        phases: of the tick, in which somebody may die.
-        crashes: who dies where.
+        phases: of the tick, in which hosts may die.
+        crashes: which processes die where.
         repeats: new hosts that a zone may have for one tick, and new coordinators that may come to
             the same point.
 

@@ -125,7 +125,7 @@ def read_reproducer(path: Path) -> Reproducer:
 def needed_records(records: Iterable[Record]) -> tuple[Record, ...]:
     """Of a journal what the present episode needs to be taken up where the last COMMIT left it.
 
-    New hosts of a tick that has begun are left out: whoever takes it up begins it with the first.
+    New hosts of a tick that has begun are left out: a replay begins it with the first.
     """
     log = list(records)
     last = max(k for k, record in enumerate(log) if isinstance(record, Reset))

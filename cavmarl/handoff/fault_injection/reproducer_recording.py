@@ -125,7 +125,7 @@ def sources_of(
 
 
 def _portable(config: EnvConfig) -> EnvConfig:
-    """The environment with its faults in it, and without those who look on."""
+    """The environment with its faults in it, and without monitors."""
     zones = config.zones
     faults = read_faults(zones.faults).to_json() if zones.faults else ""
     return replace(config, zones=replace(zones, faults=faults, journal="", check=False))

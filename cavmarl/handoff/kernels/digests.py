@@ -1,7 +1,7 @@
 """Digests of vehicles' rows that know neither zones nor the order of rows.
 
 The digest of a set of rows is the sum of the rows' own, so zones can be added up (invariant I10).
-It tells of any accidental difference; it does not stop anybody who looks for two rows of one
+It tells of any accidental difference; it is no protection against a search for two rows of one
 digest.
 """
 

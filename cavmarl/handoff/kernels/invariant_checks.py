@@ -2,7 +2,7 @@
 
 Sets are compared by sums of hashes, so neither the order of rows nor that of zones matters. What
 cannot be told from sums, a vehicle's own last tick, stands where its row does: nearly all stay
-there. Who has moved to another row is looked for among those who are not where they were.
+there. Vehicles on another row are searched among those that are not where they were.
 """
 
 from __future__ import annotations
@@ -55,7 +55,7 @@ KEPT = np.dtype(
 LOST = np.dtype(
     [
         ("id", np.int64),
-        ("zone", np.int32),  # where the last look has seen it
+        ("zone", np.int32),  # where the last check has seen it
         ("row", np.int32),
         ("state", np.int64),  # BLANK, MISSING or FOUND
     ],
@@ -79,7 +79,7 @@ FINDING = np.dtype(
     [
         ("kind", np.int64),
         ("vehicle", np.int64),
-        ("entered", np.int64),  # vehicles that the last look has not seen
+        ("entered", np.int64),  # vehicles that the last check has not seen
         ("left", np.int64),  # that this one has not seen
     ],
     align=True,
@@ -87,12 +87,12 @@ FINDING = np.dtype(
 
 
 class Clock(NamedTuple):
-    """When a look is taken.
+    """When a check is made.
 
     Attributes:
         tick: of the world.
         new_late: by how much the tick of a vehicle lags that was not there before.
-        limit_m: no vehicle moves further from one look to the next.
+        limit_m: no vehicle moves further from one check to the next.
     """
 
     tick: int
@@ -101,7 +101,7 @@ class Clock(NamedTuple):
 
 
 class Kept(NamedTuple):
-    """What one look leaves for the next.
+    """What one check leaves for the next.
 
     Attributes:
         rows: KEPT (k, C) of the vehicles that each zone owns, in the order of its rows.
@@ -113,13 +113,13 @@ class Kept(NamedTuple):
 
 
 class Strays(NamedTuple):
-    """Vehicles that are not where the last look has seen them; scratch of one look.
+    """Vehicles that are not where the last check has seen them; scratch of one check.
 
     Attributes:
-        table: LOST (a power of two,), a hash table; blank between two looks.
-        places: (n,) where in it somebody stands.
-        rows: (n, 2) zone and row where somebody else stood.
-        entered: (n,) vehicles that the last look has not seen.
+        table: LOST (a power of two,), a hash table; blank between two checks.
+        places: (n,) where in it a vehicle stands.
+        rows: (n, 2) zone and row where another stood.
+        entered: (n,) vehicles that the last check has not seen.
         left: (n,) vehicles that this one has not seen.
     """
 
@@ -131,7 +131,7 @@ class Strays(NamedTuple):
 
 
 def make_kept(zones: int, capacity: int) -> Kept:
-    """Of a world that nobody has looked at."""
+    """Of a world not checked yet."""
     return Kept(np.zeros((zones, capacity), KEPT), np.zeros(zones, np.int64))
 
 
@@ -178,7 +178,7 @@ def _place(table: NDArray[np.void], vehicle: int) -> int:
 
 @kernel
 def _miss(strays: Strays, vehicle: int, zone: int, row: int, num: int) -> int:
-    """Note where somebody stood who is not there; how many are noted, who were `num`."""
+    """Note where a missing vehicle stood; returns how many are noted, `num` before."""
     place = _place(strays.table, vehicle)
     entry = strays.table[place]
     entry["id"] = vehicle
@@ -199,7 +199,7 @@ def _note(found: np.void, kind: int, vehicle: int) -> None:
 
 @inlined_kernel
 def _judge(found: np.void, last: np.void, now: np.void, limit_m: float) -> None:
-    """Look at a vehicle beside what it was at the last look."""
+    """Compare a vehicle with what it was at the last check."""
     dx = now["x"] - last["x"]
     dy = now["y"] - last["y"]
     if now["late"] != last["late"]:
@@ -239,8 +239,8 @@ def watch(
         clock: of it.
         masks: (n,) which bits a ghost has in common with its owner's row.
         factors: (n,) odd random numbers.
-        before: what the last look wrote.
-        now: overwritten, for the next look.
+        before: what the last check wrote.
+        now: overwritten, for the next check.
         strays: scratch; entered and left are overwritten.
         live: vehicles that there should be.
         expected: (k,) what `TALLY["owned"]` should be of each zone.
@@ -310,7 +310,7 @@ def _match(
     moved: int,
     finding: np.void,
 ) -> None:
-    """Look for those who are on other rows among those who are not where they were."""
+    """Search vehicles on other rows among those that are not where they were."""
     table = strays.table
     entered = 0
     for n in range(moved):
@@ -356,7 +356,7 @@ def _owe_ghosts(
     for n in range(halo.near_start[here], halo.near_start[here + 1]):
         other = halo.near[n]
         if other != zone and is_seen(halo, other, row, squared_distance(zones.rects, other, x, y)):
-            if sought:  # many out here are seen by nobody
+            if sought:  # many out here are seen by none
                 digest = _digest(words, i, masks, factors)
                 sought = False
             tallies[other]["due"] += digest

@@ -1,7 +1,7 @@
-"""`Tape`: all that some worlds were told since they were made, for whoever has to begin anew.
+"""`Tape` records all inputs of some worlds since they were made, for a successor that begins anew.
 
-A diary keeps images, and who owned what is in none of them: a successor gives each vehicle to the
-zone that it is in. That changes no result, but a journal would tell of it, and a plan of faults
+A checkpoint log keeps images, and ownership is in none of them: a successor gives each vehicle to
+the zone that it is in. That changes no result, but a journal would tell of it, and a plan of faults
 would strike others. So the successor of such worlds goes through everything again.
 """
 
@@ -29,7 +29,7 @@ class Entry(NamedTuple):
     Attributes:
         is_reset: or else a step.
         seed: of a reset; None: none was given.
-        first_world: of a reset, as the order has it.
+        first_world: of a reset, as the command has it.
         chosen: (W,) which worlds a reset is about.
         commands: of the agents in a step.
     """
@@ -42,7 +42,7 @@ class Entry(NamedTuple):
 
 
 class Tape:
-    """Entries one behind the other, in memory that outlives those who write it.
+    """Entries one behind the other, in memory that outlives its writers.
 
     Args:
         fd: of that memory, which grows.

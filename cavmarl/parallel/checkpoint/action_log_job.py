@@ -57,7 +57,7 @@ class TapeJob(WorldsJob):
         self._take(self._make(), self._first)
         worlds = self._worlds
         chosen = worlds.arrays.chosen
-        present = chosen.copy()  # of the order that waits
+        present = chosen.copy()  # of the command that waits
         for entry in self._tape.read(self._count.item()):
             if entry.is_reset:
                 chosen[:] = entry.chosen

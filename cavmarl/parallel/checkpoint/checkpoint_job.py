@@ -1,4 +1,4 @@
-"""`DiaryJob`: what a worker does that runs some of the worlds and keeps a diary of them."""
+"""`DiaryJob`: the job of a worker that runs some of the worlds and logs checkpoints of them."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ class DiaryJob(WorldsJob):
     Args:
         worlds: that write their part of the shared arrays.
         first: number of the first one among all.
-        diary: in which they leave their state behind.
+        diary: the checkpoint log in which they leave their state.
     """
 
     def __init__(self, worlds: LocalWorlds, first: int, diary: Diary) -> None:
@@ -51,7 +51,7 @@ class DiaryJob(WorldsJob):
         return None
 
     def afterwards(self) -> None:
-        """Write the image that the diary begins anew with, if it is due: nobody waits for it.
+        """Write the image that the log begins anew with, if it is due; it is not waited for.
 
         Not in the order in which it began anew the last time: what is committed may still begin
         with the image before, whose place this one would take.
@@ -63,24 +63,24 @@ class DiaryJob(WorldsJob):
 
     @property
     def _is_due(self) -> bool:
-        """Whether the diary has to begin anew with the next step."""
+        """Whether the log has to begin anew with the next step."""
         return self._diary.is_full or self._again_s > AGAIN_S
 
     def _note_step(self) -> None:
-        """Write down what the agents are about to do, in a diary that begins anew if it is due."""
+        """Write down what the agents are about to do, in a log that begins anew if it is due."""
         if self._is_due:
             self._begin_anew(self._diary.is_prepared)
         self._diary.note(self._commands)
 
     def _begin_anew(self, is_prepared: bool = False) -> None:
-        """Let the diary begin with the present state, unless that is written already."""
+        """Let the log begin with the present state, unless that is written already."""
         if not is_prepared:
             self._diary.prepare(self._worlds.save(), self._logs)
         self._diary.begin()
         self._again_s = 0.0
 
     def _catch_up(self, task: int) -> None:
-        """Go through the steps of the diary, if they are not behind it.
+        """Go through the steps of the log, if they are not behind it.
 
         Raises:
             SumoError: as of `Simulation.load`; but all worlds may be reset.

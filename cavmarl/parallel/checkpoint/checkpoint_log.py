@@ -27,7 +27,7 @@ _COMMANDS = ("controls", "meta_actions", "declared")
 
 
 def make_segments(config: EnvConfig, num_worlds: int) -> list[Segment]:
-    """Memory for the diary of some worlds, which outlives those who write it.
+    """Memory for the checkpoint log of some worlds, which outlives its writers.
 
     Raises:
         WorkerError: there is none.
@@ -39,7 +39,7 @@ def make_segments(config: EnvConfig, num_worlds: int) -> list[Segment]:
 
 
 class Diary:
-    """What there is in it between two orders is the state of some worlds.
+    """What there is in it between two commands is the state of some worlds.
 
     There are two images, each with room for the steps after it: while one is written, the other one
     is what was committed begins with. What SUMOs were told is kept beside each of them.
@@ -52,7 +52,7 @@ class Diary:
     Attributes:
         place: (2,) which image it begins with, and how many steps follow; to be committed.
         entries: what the agents do in each of the steps that there is room for, of both images.
-        is_prepared: the other image is that of the state at the end of the diary.
+        is_prepared: the other image is that of the state at the end of the log.
     """
 
     def __init__(self, config: EnvConfig, num_worlds: int, descriptors: list[int]) -> None:

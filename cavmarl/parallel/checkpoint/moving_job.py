@@ -1,9 +1,9 @@
-"""`MovingJob`: what a worker does that runs some of the worlds, at times others than before.
+"""`MovingJob`: the job of a worker whose worlds may move to other workers.
 
-Worlds go from worker to worker between two orders. Who gives some away puts them into its case,
-which all workers can read (PACK); then each begins anew with what it has kept and what it finds in
-the others' cases (UNPACK). Both say the same as often as they are asked, so whoever dies on the way
-is replaced as ever; where the worlds are is part of the state that is committed.
+Worlds go from worker to worker between two commands. A worker that gives some away puts them into
+its case, which all workers can read (PACK); then each begins anew with what it has kept and what it
+finds in the others' cases (UNPACK). Both say the same as often as they are asked, so a worker that
+dies on the way is replaced as ever; where the worlds are is part of the state that is committed.
 """
 
 from __future__ import annotations

@@ -52,7 +52,7 @@ class KeptLog:
         """(n,) `ToldLog.words` of the last time, a view.
 
         Raises:
-            WorkerError: nobody has written it.
+            WorkerError: it was not written.
         """
         self._map_all()
         size = self._words.item(0)
@@ -69,5 +69,5 @@ class KeptLog:
             self._map_all()
 
     def _map_all(self) -> None:
-        """Map the segment as large as it is by now, whoever has made it so."""
+        """Map the segment as large as it is by now, whichever process extended it."""
         self._words = np.frombuffer(self._segment.map(), dtype=np.int64)

@@ -2,11 +2,11 @@
 
 A frame is a head of fixed size, a letter (mostly a few numbers, as the dialect writes them: between
 hosts as JSON) and data (bytes of arrays, which both ends know the shapes of). Nothing in it is ever
-run: whoever sends one can say numbers.
+run: a sender can say numbers only.
 
-    head    magic, version, kind, order, bytes of the letter, bytes of the data,
-            checksum of the data, checksum of the head and the letter
-    letter  nothing if there is nothing to say
+    head    magic, version, kind, order, bytes of the payload, bytes of the data,
+            checksum of the data, checksum of the head and the payload
+    payload nothing if there is nothing to say
     data    arrays one behind the other, as they lie in memory (little-endian)
 """
 
@@ -54,7 +54,7 @@ class Kind(IntEnum):
     """What a frame says."""
 
     ORDER = 0  # do this
-    READY = 1  # a host can be given orders
+    READY = 1  # a host can be given commands
     BEAT = 2  # it is working
     DONE = 3  # what has come out
     FAILED = 4  # an exception: its class, its words, its traceback
@@ -67,10 +67,10 @@ class Dialect(NamedTuple):
         magic: four bytes that every frame begins with.
         version: of everything that is said.
         kinds: of frames.
-        max_letter: bytes of the longest letter.
+        max_letter: bytes of the longest payload.
         max_data: bytes of the most data.
-        write: a letter's bytes.
-        read: the letter again; a ValueError says that it is none.
+        write: a payload's bytes.
+        read: the payload again; a ValueError says that it is none.
         cure: what to do about another version.
     """
 

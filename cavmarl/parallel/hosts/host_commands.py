@@ -1,4 +1,4 @@
-"""What hosts run, an order under way, and what is committed."""
+"""What hosts run, a command under way, and what is committed."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ __all__ = ["Arrays", "HostProgram", "OpenOrder", "Say", "Truth"]
 Array = NDArray[Any]
 Arrays = Sequence[Array]
 Say = Callable[[int, bool], tuple[Any, Arrays]]
-"""Part, whether its host knows what is committed → the letter to it, and its arrays."""
+"""Part, whether its host knows what is committed → the payload to it, and its arrays."""
 
 
 @dataclass(frozen=True)
@@ -40,7 +40,7 @@ class HostProgram:
 
 @dataclass
 class OpenOrder:
-    """An order that is being carried out.
+    """A command that is being carried out.
 
     Attributes:
         number: of the order.
@@ -80,7 +80,7 @@ class Truth:
     Attributes:
         size: of the part, as the job counts.
         image: (n,) bytes of an image of its state; none: it has not begun yet.
-        since: (n,) bytes of the inputs of each order since.
+        since: (n,) bytes of the inputs of each command since.
     """
 
     size: int
@@ -88,7 +88,7 @@ class Truth:
     since: list[Array] = field(default_factory=list)
 
     def after(self, order: OpenOrder, part: int) -> Truth:
-        """What is committed of a part once an order has been carried out."""
+        """What is committed of a part once a command has been carried out."""
         if order.saves:
             return Truth(order.sizes[part], order.images[part])
         return Truth(self.size, self.image, [*self.since, _bytes_of(order.say(part, True)[1])])

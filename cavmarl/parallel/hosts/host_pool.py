@@ -1,7 +1,7 @@
-"""`HostPool`: hosts that do one job together, order by order, and survive their deaths.
+"""`HostPool`: hosts that do one job together, command by command, and survive their deaths.
 
 It is `runtime.pool` for processes that share no memory with the caller. So the caller keeps what
-they leave behind: of each part an image of its state, every few orders, and the inputs of the
+they leave behind: of each part an image of its state, every few commands, and the inputs of the
 orders since. When all hosts have carried out an order, the pool commits it. The part of one that is
 gone is given to a host that is free, with the image and those inputs: it reads the same and does
 the same.
@@ -36,7 +36,7 @@ from cavmarl.parallel.processes.worker_pool import Death
 __all__ = ["HostPool"]
 
 COMES_S = 300.0  # a machine that has never run cavmarl compiles it first
-IMAGE_EVERY = 8  # orders that are noted: a successor repeats as many at most
+IMAGE_EVERY = 8  # commands that are noted: a successor repeats as many at most
 
 
 class HostPool:
@@ -46,7 +46,7 @@ class HostPool:
         launcher: starts the hosts.
         program: what they run.
         timeout_s: for so long a host may be busy with one order.
-        repeats: how often an order is begun again because a host has died.
+        repeats: how often a command is begun again because a host has died.
 
     Attributes:
         deaths: all that there were of hosts with a part.
@@ -107,7 +107,7 @@ class HostPool:
         return host is not None
 
     def team_of(self, worker: int) -> tuple[int, ...]:
-        """Who is replaced with a worker, itself among them."""
+        """The workers replaced with a worker, itself among them."""
         return (worker,)
 
     def run(
@@ -140,9 +140,9 @@ class HostPool:
         return self._command(self._all, task, _said(letters, inputs), outputs, commits, sizes)
 
     def tell(self, task: int, say: Say, outputs: Callable[[int, Any], Arrays]) -> list[Any]:
-        """Let all hosts do a task for a caller who keeps the state of all parts himself.
+        """Let all hosts do a task for a caller that keeps the state of all parts itself.
 
-        Nothing is committed: who takes up the part of a host that has died is told all that it
+        Nothing is committed: the successor of a dead host is told all that it
         needs.
 
         Args:
@@ -220,7 +220,7 @@ class HostPool:
         return [order.answers[k] for k in parts]
 
     def _settle(self, order: OpenOrder) -> None:
-        """Let an order come to its end that was interrupted; it is not committed."""
+        """Let a command end that was interrupted; it is not committed."""
         order.is_void = True
         order.pending &= self._hosts.keys()
         for k, host in list(self._hosts.items()):
@@ -257,7 +257,7 @@ class HostPool:
         return host
 
     def _give(self, order: OpenOrder, k: int, host: Host) -> None:
-        """Give a host the order, and what is committed if it does not know it."""
+        """Give a host the command, and what is committed if it does not know it."""
         program, truth = self._program, self._truths[k]
         is_behind = not host.knows and order.task != NOTHING
         before = [truth.image, *truth.since] if is_behind and truth.image.size else []
@@ -334,7 +334,7 @@ class HostPool:
             raise WorkerDeathError(k, self._names[k], order.number, what, causes)
 
     def _check(self, order: OpenOrder) -> None:
-        """Look after those who are waited for.
+        """Check the hosts that are waited for.
 
         Raises:
             WorkerDeathError: too many have died.
@@ -364,7 +364,7 @@ class HostPool:
             self._complain(time.monotonic() - began, there)
 
     def _complain(self, waited_s: float, where: str) -> None:
-        """Give up if nobody will come.
+        """Give up if no host will come.
 
         Raises:
             WorkerError: so it is.

@@ -1,4 +1,4 @@
-"""What runs in a host: a job, order by order, for a caller on another machine."""
+"""Runs in a host: does a job, command by command, for a caller on another machine."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ _FIRST_IMAGE_BYTES = 1 << 12
 
 
 class Order(NamedTuple):
-    """The letter of an order; its data are an image, what was done since, and what to do now.
+    """The payload of a command; its data are an image, what was done since, and what to do now.
 
     Attributes:
         task: what to do.
@@ -75,7 +75,7 @@ class RemoteJob(Protocol):
         ...
 
     def inputs(self, task: int, letter: Any) -> Sequence[Array]:
-        """Arrays that an order of this task fills, as many as its letter says."""
+        """Arrays that a command of this task fills, as many as its payload says."""
         ...
 
     def perform(self, task: int, letter: Any) -> Outcome: ...
@@ -95,7 +95,7 @@ def serve(
     Args:
         make_job: with every kernel loaded.
         place: where the caller listens.
-        secret: of those who belong to it.
+        secret: shared by its hosts.
         number: of this host.
 
     Raises:
@@ -130,7 +130,7 @@ def serve(
 def _carry_out(
     job: RemoteJob, order: Order, data: Array, taken: Image, given: Image
 ) -> tuple[dict[str, Any], Sequence[Array]]:
-    """Do what an order asks for, from where it says that one should begin."""
+    """Do what a command asks for, from where it says that one should begin."""
     if order.task == NOTHING:
         return {"answer": None, "image": 0}, []
     job.fit(order.size)

@@ -1,4 +1,4 @@
-"""`Company`: the hosts that are there, from their call at the door to their end."""
+"""`Company` keeps the hosts of a run, from their connection to their end."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ SILENCE_S = 0.8  # of a host that is at work, and tells so every `host.BEAT_S`
 
 
 class Launcher(Protocol):
-    """Who starts hosts, and starts those again that die.
+    """Starts hosts, and starts those again that die.
 
     Attributes:
         address: of this machine, under which they reach it.
@@ -57,11 +57,11 @@ class Host:
         number: of those that were started.
         pid: of its process, on its machine.
         machine: its name.
-        is_ready: it can be given orders.
-        is_gone: its connection has ended, and nobody has missed it yet.
+        is_ready: it can be given commands.
+        is_gone: its connection has ended, and this is not noticed yet.
         knows: its memory is what is committed.
         part: that it has; -1: none.
-        given_s: when it was given its last order, by `time.monotonic`.
+        given_s: when it was given its last command, by `time.monotonic`.
         heard_s: when something was heard of it.
     """
 
@@ -161,7 +161,7 @@ class Company:
         host.is_gone = True
 
     def close(self) -> None:
-        """End all hosts, and let nobody in any more."""
+        """End all hosts, and accept no more."""
         self._launcher.close()
         self._door.close()
         for guest in self._guests:
@@ -181,7 +181,7 @@ class Company:
     def _listen(self, guest: Guest) -> None:
         try:
             connection = guest.listen()
-        except (EOFError, OSError, MessageError):  # a stranger: that is no news
+        except (EOFError, OSError, MessageError):  # a stranger: ignored
             self._show_out(guest)
             return
         if connection is not None:

@@ -1,4 +1,4 @@
-"""`HostedWorlds`: what a host does that runs some of the worlds for a caller elsewhere."""
+"""`HostedWorlds`: the job of a host that runs some of the worlds for a remote caller."""
 
 from __future__ import annotations
 
@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from cavmarl.config.env import EnvConfig
 from cavmarl.core.errors import WorkerError
+from cavmarl.core.extensions import load_extensions
 from cavmarl.engine.world_setup import make_world
 from cavmarl.parallel.checkpoint.world_states import Move, buffers, pack, unpack
 from cavmarl.parallel.hosts.host_process import Outcome, serve
@@ -113,6 +114,7 @@ class HostedWorlds:
     def __init__(self, recipe: dict[str, Any]) -> None:
         from cavmarl.config.io import validate  # pydantic is slow to import
 
+        load_extensions(recipe["extensions"])
         config = validate(EnvConfig, recipe["config"], "the environment")
         self._world = make_world(config, Path(recipe["base_dir"]))
         if fingerprint(self._world) != recipe["fingerprint"]:
@@ -137,7 +139,7 @@ class HostedWorlds:
             self._make(size)
 
     def inputs(self, task: int, letter: Any) -> list[Array]:
-        """Arrays that an order of this task fills."""
+        """Arrays that a command of this task fills."""
         if task == Task.UNPACK:
             move = Move(*letter)
             self._coming = buffers(move.coming, move.bytes)
@@ -231,7 +233,7 @@ class HostedWorlds:
     def _rehearse(self) -> None:
         """Begin and step once: the first time takes longer, and is none of a death's business.
 
-        Nothing of it stays, since whoever has these worlds begins with a seed, or loads.
+        Nothing of it stays, since the next host of these worlds begins with a seed, or loads.
         """
         self._worlds.arrays.chosen[:] = True
         self._job.perform(Task.RESET, {"seed": 0, "first_world": 0})

@@ -1,4 +1,4 @@
-"""Who may be a host: a door that only those come through who know the secret.
+"""Accepts hosts: only processes that know the secret get in.
 
 The caller listens on one port, and hosts call there; they listen nowhere. Both prove that they know
 the secret, which Ray has handed to the host, without sending it: each answers the other's random
@@ -25,14 +25,14 @@ __all__ = ["MAX_GUESTS", "Door", "Guest", "knock"]
 NONCE = 16  # bytes of a random number
 PROOF = 32  # of an HMAC
 SECRET = 32
-GREETING_S = 5.0  # for a guest to prove who it is
+GREETING_S = 5.0  # for a guest to prove its identity
 CALL_S = 5.0  # for the system to connect
-MAX_GUESTS = 64  # who are not known yet
+MAX_GUESTS = 64  # not authenticated yet
 _HELLO = struct.Struct(f"<4sHI{NONCE}s")
 
 
 class Guest:
-    """Who has called and not proved who it is.
+    """A caller that has not proved its identity yet.
 
     Args:
         connection: to it.
@@ -124,7 +124,7 @@ class Door:
         return self._listener.fileno()
 
     def open(self) -> Guest | None:
-        """Let in who has called; None: it is gone already."""
+        """Accept a caller; None: it is gone already."""
         try:
             connection, _ = self._listener.accept()
         except OSError:
@@ -140,7 +140,7 @@ def knock(place: tuple[str, int], secret: bytes, number: int) -> Wire:
 
     Args:
         place: address and port of the door.
-        secret: of those who belong here.
+        secret: shared by the run's processes.
         number: of the host.
 
     Raises:
@@ -157,7 +157,7 @@ def knock(place: tuple[str, int], secret: bytes, number: int) -> Wire:
         while len(heard) < NONCE + PROOF:
             more = connection.recv(NONCE + PROOF - len(heard))
             if not more:
-                raise EOFError(f"who listens at {place} has ended the connection")
+                raise EOFError(f"the process that listens at {place} has ended the connection")
             heard += more
         nonce, proof = heard[:NONCE], heard[NONCE:]
         if not hmac.compare_digest(proof, _proof(secret, b"caller", hello + nonce)):

@@ -109,7 +109,7 @@ class RayActors:
         return None
 
     def close(self) -> None:
-        """End all of them; leave the cluster if nobody else needs it."""
+        """End all of them; leave the cluster if no other part needs it."""
         self._finalizer()
 
 

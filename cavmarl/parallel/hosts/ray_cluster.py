@@ -1,4 +1,4 @@
-"""The Ray cluster that hosts run on: joining it, and which node is given which host."""
+"""The Ray cluster that hosts run on: joins it, and assigns nodes to hosts."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ _joined = 0  # how many have joined by `join`, where the program itself had not
 
 @dataclass(frozen=True)
 class Node:
-    """A node of the cluster; shares are those that somebody has reserved with Ray.
+    """A node of the cluster; shares are those reserved with Ray.
 
     Attributes:
         name: its id.
@@ -77,10 +77,10 @@ def join() -> bool:
 
 
 def _call(address: str) -> None:
-    """See whether somebody listens there: Ray would try for minutes.
+    """Check that a process listens there: Ray would try for minutes.
 
     Raises:
-        OSError: nobody does.
+        OSError: none does.
     """
     host, colon, port = address.rpartition(":")
     if colon and port.isdigit():
@@ -88,7 +88,7 @@ def _call(address: str) -> None:
 
 
 def leave() -> None:
-    """Leave the cluster, if nobody else of this program needs it; a new one ends."""
+    """Leave the cluster, if no other part of this program needs it; a new one ends."""
     global _joined
     _joined -= 1
     ray = require("ray", "ray")
@@ -136,7 +136,7 @@ def choose_nodes(known: Sequence[Node], workers: int) -> list[str]:
     if workers > free:
         raise ConfigError(
             f"workers = {workers}: the Ray cluster has {free} free CPUs on {len(known)} nodes; use "
-            "fewer workers, or add nodes (ray start --address=…); ray status tells who uses them"
+            "fewer workers, or add nodes (ray start --address=…); ray status shows their users"
         )
     left = list(known)
     chosen: list[str] = []

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cavmarl.core.errors import ConfigError, WorkerFailureError
+from cavmarl.core.extensions import extension_modules
 from cavmarl.engine.compilation import compiled_before
 from cavmarl.engine.simulation import Simulation
 from cavmarl.engine.world_setup import World
@@ -51,7 +52,7 @@ class RemoteWorlds(OrderedWorlds):
         arrays: of this process; what hosts send is written to them.
         pool: the hosts.
         in_next_step: when worlds begin anew.
-        placement: who hosts what.
+        placement: which host runs what.
         mover: has that changed; None: it does not change.
 
     Raises:
@@ -91,6 +92,7 @@ class RemoteWorlds(OrderedWorlds):
         self.arrays = StepArrays.of({name: np.zeros(shape, kind) for name, (kind, shape) in layout})
         recipe = {
             "config": asdict(config),
+            "extensions": extension_modules(config.registered),
             "base_dir": str(base_dir.resolve()),
             "fingerprint": fingerprint(world),
             "in_next_step": in_next_step,
@@ -139,7 +141,7 @@ class RemoteWorlds(OrderedWorlds):
         self.pool.close()
 
     def _pids(self) -> Mapping[int, int]:
-        return dict.fromkeys(range(len(self._mine)), 0)  # nobody looks: they run elsewhere
+        return dict.fromkeys(range(len(self._mine)), 0)  # not measured: they run elsewhere
 
     def _settle(self, parts: list[Part]) -> None:
         self.pool.rename(_names(parts))

@@ -1,4 +1,4 @@
-"""What has changed in one memory since another process saw it, and putting that there.
+"""Finds what has changed in one memory since another process saw it, and copies it there.
 
 Both processes have the same arrays at the same places, as words of 8 bytes, and each keeps a copy
 of what the other one knows of them. What is sent are the words that differ, as the bits in which

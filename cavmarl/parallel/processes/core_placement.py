@@ -1,7 +1,7 @@
 """On which cores workers are: none shares one with another as long as there are enough of them.
 
 Systems put processes that are woken together on one core, where one waits until the other is done,
-and take many steps to notice that another core is free. Who has been found there is kept off the
+and take many steps to notice that another core is free. A worker found there is kept off the
 cores of the others; apart from that the system places it as it likes.
 """
 
@@ -19,7 +19,7 @@ UNKNOWN = -1  # as `barrier.present_core` says it where nothing is compiled
 
 
 def homes(cores: Sequence[int], usable: set[int]) -> list[int]:
-    """A core for each process, where it has been if nobody before it has been there, too.
+    """A core for each process, where it has been unless one before it has been there, too.
 
     Args:
         cores: where each has been found.
@@ -45,7 +45,7 @@ def keep_apart(pids: Sequence[int], cores: Sequence[int]) -> None:
 
     Args:
         pids: of processes that work at the same time.
-        cores: where each has been found; -1: nobody knows.
+        cores: where each has been found; -1: unknown.
     """
     if len(set(cores)) == len(cores) or UNKNOWN in cores:
         return

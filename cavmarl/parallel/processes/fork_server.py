@@ -1,4 +1,4 @@
-"""`ForkServer`: the process that forks a pool's workers, as the pool sees it."""
+"""`ForkServer`: the pool's handle of the process that forks its workers."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from cavmarl.parallel.processes.worker_loop import MAIL, MAX_MESSAGE
 
 __all__ = ["ForkServer", "Process", "ServerGoneError"]
 
-ANSWER_MS = 2_000  # for a fork or a burial; who takes longer is stopped or broken
+ANSWER_MS = 2_000  # to fork or to reap; a server that takes longer is stopped or broken
 END_S = 1.0  # for all to end by themselves
 
 # One thread a worker: the processes share the cores out among themselves.
@@ -40,10 +40,10 @@ class Process:
     """One worker's process.
 
     Attributes:
-        pid: its number, which nobody else gets until it is buried.
+        pid: its number, not given again until it is reaped.
         pidfd: readable when it has ended.
         wire: socket to it.
-        mail: what it has sent and nobody has read.
+        mail: what it has sent, unread.
     """
 
     pid: int
@@ -150,7 +150,7 @@ class ForkServer:
             its exit status; of one that was killed, minus the signal.
 
         Raises:
-            ServerGoneError: nobody answers.
+            ServerGoneError: the server does not answer.
         """
         return int(self._ask({"bury": process.pid})["status"])
 

@@ -1,4 +1,4 @@
-"""How a process waits for another: it looks for a moment, then it sleeps.
+"""How a process waits for another: it polls for a moment, then it sleeps.
 
 Each side has a line of 64-bit words that only itself writes. Word `NUMBER` counts what it has done;
 word `ASLEEP` says whether it has to be woken. To wait is to look at the other's number for a while
@@ -6,9 +6,9 @@ in a compiled loop, which costs a fraction of a microsecond, and then to sleep o
 costs no processor at all.
 
 All words are read and written sequentially consistent, so of two that write one word and read the
-other's, at least one sees what the other wrote: who is about to sleep sees the number, or who has
-written the number sees that somebody sleeps. And whoever sees a number sees all that was written
-before it.
+other's, at least one sees what the other wrote: the side about to sleep sees the number, or the
+side that has written the number sees that the other sleeps. And a side that sees a number sees all
+written before it.
 """
 
 from __future__ import annotations
@@ -49,13 +49,13 @@ Words = NDArray[np.int64]
 WORDS = 8  # of a line; of a cache line, too
 NUMBER, ASLEEP = 0, 1  # words of either side; the others are the pool's
 
-SHORT_S = 20e-6  # that anybody looks before it sleeps
-LONG_S = 200e-6  # that it looks where the last time has not been longer
-LONG_WORK_S = 500e-6  # after which nobody looks for so long
-PAUSES = 4  # looks before it lets others run
-ROUNDS = 16  # of those before it looks at the clock
-ALONE_S = 300e-6  # that who waits so, and has a core for itself, looks without a break
-AWAKE_S = 10e-3  # that who waits for a part of an order lets others run between two looks
+SHORT_S = 20e-6  # that a side polls before it sleeps
+LONG_S = 200e-6  # that it polls where the last time has not been longer
+LONG_WORK_S = 500e-6  # after which no side polls for so long
+PAUSES = 4  # polls before it lets others run
+ROUNDS = 16  # of those before it reads the clock
+ALONE_S = 300e-6  # of polling without a break by a side with a core for itself
+AWAKE_S = 10e-3  # of polling for a part of a command that lets others run in between
 NAP_S = 100e-6  # that it sleeps between them from then on
 WAKE = b"!"
 
@@ -196,7 +196,7 @@ def load_kernels() -> None:
 
 
 def post(mine: Words, number: int) -> None:
-    """Come to a number, for those who never sleep until it is there."""
+    """Come to a number, for sides that never sleep until it is there."""
     _set(mine, NUMBER, number, mine)
 
 
@@ -206,8 +206,9 @@ def wait_for(theirs: Words, number: int, is_apart: bool = False) -> None:
     Args:
         theirs: (WORDS,) that the other side writes.
         number: to wait for.
-        is_apart: the other side was on another core when it was seen last. Then nobody is let in
-            for a while: of other programs that have the same core, one that is may keep it for
+        is_apart: the other side was on another core when it was seen last. Then the core is not
+            yielded for a while: of other programs that have the same core, one that is may keep it
+                for
             milliseconds.
     """
     if _look(theirs, number, False):
@@ -226,8 +227,8 @@ class Meeting:
     Args:
         mine: (WORDS,) that this side writes.
         theirs: (WORDS,) that the other one writes.
-        wire: socket to the other side; who sleeps is woken through it.
-        crowded: more processes take part than there are cores, so who looks lets others run.
+        wire: socket to the other side; a sleeping side is woken through it.
+        crowded: more processes take part than there are cores, so a polling side lets others run.
     """
 
     def __init__(self, mine: Words, theirs: Words, wire: socket.socket, crowded: bool) -> None:
@@ -249,7 +250,7 @@ class Meeting:
 
     def wake(self) -> None:
         """Wake the other side."""
-        with suppress(BrokenPipeError, ConnectionResetError):  # who is gone need not be woken
+        with suppress(BrokenPipeError, ConnectionResetError):  # its process has ended
             self.wire.send(WAKE)
 
     def has(self, number: int) -> bool:
@@ -259,8 +260,8 @@ class Meeting:
     def watch(self, number: int, last_s: float, work_s: float = 0.0, is_soon: bool = False) -> bool:
         """Look for a moment whether the other side comes to a number.
 
-        Who has had to wait for long the last time does not look for long, nor who has worked for
-        long: the system puts those who wake up on free cores, and leaves those who look where they
+        A side that waited for long the last time does not poll for long, nor one that worked for
+        long: the system puts waking processes on free cores, and leaves polling ones where they
         are, two on one core if it comes to that.
 
         Args:

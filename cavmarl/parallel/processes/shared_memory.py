@@ -87,7 +87,7 @@ class Segment:
             raise WorkerError(f"shared memory cannot be mapped: {error}") from error
 
     def close(self) -> None:
-        """Give the descriptor back; what is mapped stays until nobody looks at it any more."""
+        """Give the descriptor back; what is mapped stays until it is not referenced any more."""
         os.close(self.fd)
 
 

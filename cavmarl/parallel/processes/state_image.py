@@ -164,7 +164,7 @@ class Image:
         return True
 
     def _map_all(self) -> None:
-        """Map the segment as large as it is by now, whoever has made it so."""
+        """Map the segment as large as it is by now, whichever process extended it."""
         self._memory = self._segment.map()
         self._map_words(np.frombuffer(self._memory, dtype=np.int64))
 

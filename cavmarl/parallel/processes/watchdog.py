@@ -1,4 +1,4 @@
-"""Whether a process does the work that it should: one that hangs, or one that is slow."""
+"""`Watchdog` tells whether a process works, hangs or is slow."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ class Watchdog:
 
     Args:
         pid: of the process.
-        timeout_s: for so long it may work; times in which nobody looked do not count.
+        timeout_s: for so long it may work; unwatched times do not count.
     """
 
     def __init__(self, pid: int, timeout_s: float) -> None:

@@ -1,11 +1,11 @@
-"""What runs in the processes of a pool: one that forks, and the workers that it forks.
+"""The programs of a pool's processes: the fork server, and the workers that it forks.
 
 The pool starts one process as a program. That one makes every worker's job ready, with all kernels
 loaded, and has no threads; then it forks a worker whenever the pool asks for one. So a worker that
 has died is replaced in milliseconds, and its successor begins with what is ready.
 
-Nobody outlives the pool: the forking process ends when the pool's process does, or when it hears
-no more of it, and the system kills the workers with the process that forked them.
+No process outlives the pool: the forking process ends when the pool's process does, or when it
+hears no more of it, and the system kills the workers with the process that forked them.
 """
 
 from __future__ import annotations
@@ -58,7 +58,7 @@ __all__ = [
 
 # Words of the pool's line, behind those of `barrier`.
 TASK, LETTER, SLOT, TRUTH, LOADS = 2, 3, 4, 5, 6
-# Words of the worker's line: how its order ended, and on which core it has begun with it.
+# Words of the worker's line: how its command ended, and on which core it began it.
 ANSWER, CORE = 2, 3
 SILENT, ANSWERED, FAILED = 0, 1, 2
 
@@ -93,9 +93,9 @@ class Job(Protocol):
     def load(self, arrays: Sequence[Any]) -> None: ...
 
     def afterwards(self) -> None:
-        """Called when an order is carried out and the pool knows: for what nobody waits for.
+        """Called after a command's answer is sent: for work that is not waited for.
 
-        What it makes must not be needed before another order is carried out: that one may be
+        What it makes must not be needed before another command is carried out: that one may be
         carried out by a successor, which finds what was committed.
         """
         ...
@@ -103,7 +103,7 @@ class Job(Protocol):
     def prepare(self) -> None:
         """Called where workers are forked, before each fork that is to do this job.
 
-        Whoever has done it is dead; so are those that it shares memory with, if it is their first.
+        The worker that did it is dead; so are those it shares memory with, if it is their first.
         """
         ...
 
@@ -266,7 +266,7 @@ def _obey(job: Job, meeting: Meeting, slots: Sequence[Image]) -> NoReturn:
             mine[ANSWER] = SILENT if answer is None else ANSWERED
             if answer is not None:
                 meeting.wire.send(MAIL + json.dumps(answer).encode())
-        mine[CORE] = core  # now, and not before: the pool looks at this line all the time
+        mine[CORE] = core  # now, and not before: the pool polls this line all the time
         meeting.post(number)
         if mine[ANSWER] != FAILED:
             try:
@@ -276,7 +276,7 @@ def _obey(job: Job, meeting: Meeting, slots: Sequence[Image]) -> NoReturn:
 
 
 def _await(meeting: Meeting, order: int, last_s: float, work_s: float) -> float:
-    """Return when there is an order; end with the pool.
+    """Return when there is a command; end with the pool.
 
     Args:
         meeting: with the pool.
@@ -292,7 +292,7 @@ def _await(meeting: Meeting, order: int, last_s: float, work_s: float) -> float:
     began = time.perf_counter()
     if not meeting.watch(order, last_s, work_s):
         while meeting.lie_down(order):
-            # A letter may come before its order: it is left where it is.
+            # A payload may come before its command: it is left where it is.
             message = meeting.wire.recv(len(WAKE), socket.MSG_PEEK)
             meeting.get_up()
             if not message:

@@ -1,10 +1,10 @@
-"""`Pool`: worker processes that do one job together, order by order, and survive their deaths.
+"""`Pool`: worker processes that do one job together, command by command, and survive their deaths.
 
-Every worker keeps its state in its own memory, and leaves an image of it behind with every order
+Every worker keeps its state in its own memory, and leaves an image of it behind with every command
 that changes it. There are two images of each: the one that is committed, and the one that is being
-written. When all workers have carried out an order, the pool commits it. A worker that dies before
-that is replaced: its successor reads the committed image and carries the order out again. It reads
-the same, so it does the same.
+written. When all workers have carried out a command, the pool commits it. A worker that dies before
+that is replaced: its successor reads the committed image and carries the command out again. It
+reads the same, so it does the same.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ class Death:
         worker: whose process it was.
         order: that was to be carried out.
         cause: signal or exit status, or why it was taken for dead.
-        ordered_s: when the order was given.
+        ordered_s: when the command was given.
         noticed_s: when that was noticed.
         replaced_s: when its successor had its order.
         done_s: when that was carried out; nan: not yet.
@@ -55,7 +55,7 @@ class Pool:
     Args:
         program: what they run.
         timeout_s: for so long a worker may be busy with one order.
-        repeats: how often an order is begun again because a worker has died.
+        repeats: how often a command is begun again because a worker has died.
 
     Attributes:
         deaths: all that there were.
@@ -88,7 +88,7 @@ class Pool:
         return self._crew.server_pid
 
     def team_of(self, worker: int) -> tuple[int, ...]:
-        """Who is replaced with a worker, itself among them."""
+        """The workers replaced with a worker, itself among them."""
         return self._program.team_of(worker)
 
     def processor_s(self) -> list[float]:
@@ -137,7 +137,7 @@ class Pool:
             self._settle()
         mail = None if letter is None else MAIL + json.dumps(letter).encode()
         if mail is not None and len(mail) > MAX_MESSAGE:
-            raise WorkerError(f"a letter of {len(mail)} bytes: at most {MAX_MESSAGE} can be sent")
+            raise WorkerError(f"a payload of {len(mail)} bytes: at most {MAX_MESSAGE} can be sent")
         slot = 1 - max(self._truth, 0) if commits else -1
         self._open = workers
         self._ordered_s = time.monotonic()
@@ -145,7 +145,7 @@ class Pool:
         expected_s = self._lasted.get(task, 0.0)
         sleeps = expected_s > LONG_WORK_S
         if workers == self._all:
-            self._crew.keep_apart()  # where they were with the last order
+            self._crew.keep_apart()  # where they were with the last command
         self._crew.order(workers, head, self._stale, mail, sleeps)
         self._await(workers, mail, expected_s, sleeps)
         self._lasted[task] = time.monotonic() - self._ordered_s
@@ -158,7 +158,7 @@ class Pool:
         return answers
 
     def _settle(self) -> None:
-        """Let an order come to its end that was interrupted, or failed; it is not committed."""
+        """Let a command end that was interrupted, or failed; it is not committed."""
         for k in self._open:
             watchdog = Watchdog(self._crew.processes[k].pid, self._timeout_s)
             while not self._crew.settle(k, CHECK_S):
@@ -173,10 +173,10 @@ class Pool:
         """Return when all workers have carried out their order.
 
         Args:
-            workers: who has one.
+            workers: the workers that have one.
             mail: that came with it.
             expected_s: how long it has taken the last time.
-            sleeps: they know that nobody looks.
+            sleeps: they know that the caller does not poll.
 
         Raises:
             WorkerDeathError: too many processes died of it; the pool is closed.
@@ -262,12 +262,12 @@ class Pool:
 
 
 class _Guard:
-    """Looks at those who are waited for, from time to time.
+    """Checks the workers that are waited for, from time to time.
 
     Args:
-        crew: they belong to.
+        crew: that they belong to.
         timeout_s: for so long each may be busy.
-        since_s: when they were given their order, by `time.monotonic`.
+        since_s: when they were given their command, by `time.monotonic`.
     """
 
     def __init__(self, crew: Crew, timeout_s: float, since_s: float) -> None:

@@ -1,4 +1,4 @@
-"""`Crew`: the processes of a pool, one a worker, and the words that are exchanged with them."""
+"""`Crew` starts and replaces a pool's processes, one a worker, and exchanges words with them."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ class Program(NamedTuple):
         tasks: what each task is called, by its number.
         pins: each worker stays on a core of its own, as far as there are so many.
         teams: workers that share their state, by rising numbers: none of them can go on without the
-            others. Who is in no team is alone.
+            others. A worker in no team is alone.
     """
 
     module: str
@@ -55,7 +55,7 @@ class Program(NamedTuple):
     teams: tuple[tuple[int, ...], ...] = ()
 
     def team_of(self, worker: int) -> tuple[int, ...]:
-        """Who shares its state with a worker, itself among them."""
+        """The workers that share their state with a worker, itself among them."""
         return next((team for team in self.teams if worker in team), (worker,))
 
 
@@ -93,7 +93,7 @@ class Crew:
 
     @property
     def release(self) -> Callable[[], None]:
-        """Ends the processes and gives all back, also when the crew is forgotten."""
+        """Ends the processes and gives all back, also when this object is collected."""
         return self._held.release
 
     @property
@@ -114,14 +114,14 @@ class Crew:
         mail: bytes | None,
         sleeps: bool = False,
     ) -> None:
-        """Give workers their next order; that one is dead is noticed later.
+        """Send the next command; dead workers are detected in `wait`.
 
-        Those who look for it have it before anybody is woken, and whoever may take the core that
+        Polling workers have it before any is woken, and the worker that may take the core that
         this process is on is woken last.
 
         Args:
             workers: which ones.
-            head: words of the order, from TASK to TRUTH.
+            head: words of the command, from TASK to TRUTH.
             stale: of all workers, whose memory is not what is committed.
             mail: what goes with it.
             sleeps: this side goes to sleep at once: what it does from here on it does on a core on
@@ -145,7 +145,7 @@ class Crew:
             self._meetings[k].wake()
 
     def number(self, k: int) -> int:
-        """Of the last order that a worker was given."""
+        """Number of the last command that a worker was given."""
         return self.orders.item(k, NUMBER)
 
     def has(self, k: int) -> bool:
@@ -157,7 +157,7 @@ class Crew:
 
         Args:
             k: which worker.
-            last_s: how long such an order has taken the last time.
+            last_s: how long such a command has taken the last time.
             is_soon: it is known that it does not take long.
         """
         return self._meetings[k].watch(self.number(k), last_s, is_soon=is_soon)
@@ -165,10 +165,10 @@ class Crew:
     def sleep(
         self, pending: Sequence[int], limit_s: float, is_lying: bool = False
     ) -> dict[int, Process]:
-        """Sleep until one of those is done, or anybody is dead, but not for ever.
+        """Sleep until one of those is done, or one is dead, but not for ever.
 
         Args:
-            pending: who is waited for.
+            pending: the workers waited for.
             limit_s: for no longer than that.
             is_lying: they know it from `order`.
 
@@ -187,15 +187,15 @@ class Crew:
         return {k: self.processes[k] for k, is_dead in found if is_dead}
 
     def _lie_down(self, pending: Sequence[int]) -> bool:
-        """Say that this side sleeps; False: somebody is through by now, or is heard already."""
+        """Say that this side sleeps; False: a worker is through by now, or has called already."""
         self.forget_calls()
-        # Of several it is enough that one of them is through: who is up is woken by nobody.
+        # Of several it is enough that one of them is through: an awake process is not woken.
         return all(self._meetings[k].lie_down(self.number(k)) for k in pending)
 
     def forget_calls(self) -> None:
-        """Take what has been heard out of the wires, so that it wakes nobody again.
+        """Drain the sockets, so that old messages do not wake this side again.
 
-        Mostly it is one message; whoever finds another one there hears it then.
+        Mostly it is one message; another one is read the next time.
         """
         for k in self._heard:
             with suppress(BlockingIOError, ConnectionResetError):
@@ -203,9 +203,9 @@ class Crew:
         self._heard.clear()
 
     def _hears_nobody(self, pending: Sequence[int]) -> bool:
-        """Forget also who has called while this side was about to get up; False: one is through.
+        """Forget also calls that came while this side was about to get up; False: one is through.
 
-        Only once they have their order, so that nobody waits for it: of a call that is forgotten
+        Only once they have their command, so that none waits for it: of a call that is forgotten
         too much, the number is there before it.
         """
         for fd, _ in self._poll.poll(0):
@@ -216,27 +216,27 @@ class Crew:
         return not any(map(self.has, pending))
 
     def settle(self, k: int, limit_s: float) -> bool:
-        """Whether a worker has carried out its order or has died of it, after a while at most."""
+        """Whether a worker has carried out its command or has died of it, after a while at most."""
         process = self.processes[k]
         if select.select([process.pidfd], [], [], 0.0 if self.has(k) else limit_s)[0]:
-            self._statuses[k][NUMBER] = self.number(k)  # nobody else writes there any more
+            self._statuses[k][NUMBER] = self.number(k)  # its writer is dead
         process.collect()
         process.mail.clear()
         return self.has(k)
 
     def is_left_alone(self, k: int) -> bool:
-        """Whether somebody is dead without whom a worker cannot go on."""
+        """Whether a process is dead without which a worker cannot go on."""
         others = [self.processes[j].pidfd for j in self._program.team_of(k) if j != k]
         return bool(select.select(others, [], [], 0.0)[0])
 
     def keep_apart(self) -> None:
-        """Give those who have been on one core different ones, unless each has its own for good."""
+        """Give workers that shared a core different ones, unless each has its own for good."""
         cores = [status.item(CORE) for status in self._statuses]
         if len(set(cores)) < len(cores) and not self._program.pins:
             keep_apart([process.pid for process in self.processes.values()], cores)
 
     def answer(self, k: int) -> tuple[int, Any]:
-        """How a worker's order ended, as its line says, and what it has answered."""
+        """How a worker's command ended, as its line says, and what it has answered."""
         kind = self._statuses[k].item(ANSWER)
         if kind == SILENT:
             return kind, None
@@ -245,7 +245,7 @@ class Crew:
         return kind, json.loads(process.mail.pop(0))
 
     def replace(self, k: int, mail: bytes | None, ordered: Collection[int]) -> str:
-        """Give a worker's team new processes, and those the order, if it is not carried out yet.
+        """Give a worker's team new processes, and those the command, if it is not carried out yet.
 
         Args:
             k: the worker.
@@ -282,11 +282,11 @@ class Crew:
         process.collect()
 
     def _take_back(self, team: tuple[int, ...], ordered: Collection[int]) -> None:
-        """Let a team, all of it dead, do an order again together that not all have carried out."""
+        """Let a team, all of it dead, do a command again together that not all have carried out."""
         asked = [j for j in team if j in ordered]
         if not all(self.has(j) for j in asked):
             for j in asked:
-                self._statuses[j][NUMBER] = self.number(j) - 1  # nobody else writes there
+                self._statuses[j][NUMBER] = self.number(j) - 1  # no other process writes there
 
     def _hand_over(self, k: int, old: Process, mail: bytes | None) -> None:
         """To a new process, what has come from the old one, or what that one was sent."""
@@ -379,7 +379,7 @@ def _say(status: int) -> str:
 
 
 class _Held:
-    """What has to be given back, whoever forgets to.
+    """What has to be given back, in any case.
 
     Args:
         segments: of the program.

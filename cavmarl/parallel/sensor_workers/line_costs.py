@@ -1,4 +1,4 @@
-"""`LineCosts`: where in the frames of each sensor the time goes, as those find who share them."""
+"""`LineCosts`: where in each sensor's frames the time goes, as its workers measure it."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`SensorJob`: what a sensor worker does. It keeps nothing from one order to the next."""
+"""`SensorJob`: what a sensor worker does. It keeps nothing from one command to the next."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ class SensorJob:
     """Senses for the agents that are its share, as a zone would that owned them and saw all others.
 
     Args:
-        simulation: undivided worlds of the same environment, in which nobody drives: the roads,
+        simulation: undivided worlds of the same environment, without vehicles: the roads,
             and room for rows.
         shared: what there is to see.
         frames: where the samples go.
@@ -58,7 +58,7 @@ class SensorJob:
         self._put_first = repeated(put_first)
 
     def warm(self) -> None:
-        """Have the kernels of all sensors ready; nobody is there to be sensed."""
+        """Have the kernels of all sensors ready; no vehicle is there to be sensed."""
         self._look()
         for _, sensor, due, frames, lines in self._sensors:
             self._own(lines)

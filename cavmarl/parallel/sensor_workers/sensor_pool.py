@@ -1,4 +1,4 @@
-"""`SensorFarm`: processes that sense for the worlds of this one, whose state stays where it is."""
+"""`SensorFarm` runs sensor workers for the worlds of this process, which keeps their state."""
 
 from __future__ import annotations
 
@@ -61,14 +61,14 @@ class FarmTimes:
     """Sums over all ticks in which sensors were due.
 
     Attributes:
-        publish_s: writing down what there is to see, and who senses what.
+        publish_s: writing down what there is to see, and which worker senses what.
         own_s: sensing what stays here.
-        wait_s: from the order until all frames were there.
+        wait_s: from the command until all frames were there.
         busy_s: of that, while the busiest worker sensed.
         ticks: how many.
         sent_bytes: that the workers were given to read.
         got_bytes: of frames that they have written.
-        messages: orders and answers.
+        messages: commands and answers.
     """
 
     publish_s: float = 0.0
@@ -88,10 +88,10 @@ class FarmTimes:
 
 
 class _Sharing:
-    """Who senses what of the same sensors, and what that has taken since it was so.
+    """Which worker senses what of the same sensors, and the time it has taken since then.
 
     Attributes:
-        shares: who senses what.
+        shares: which worker senses what.
         uses: ticks, in all.
         spent_s: (n, S) processor time since then, of each worker for each sensor.
         agents: that have been sensed for, summed over these ticks.
@@ -130,8 +130,8 @@ class SensorFarm:
     """n sensor workers; it lets them sense as `rig.Sense` describes.
 
     It starts them when it is called for the first time, so it may be made before a fork. A call
-    returns when each sensor that is due has delivered the frame of this tick. Who is late is waited
-    for; who dies is replaced, and its successor senses the same again.
+    returns when each sensor that is due has delivered the frame of this tick. A late one is waited
+    for; a dead one is replaced, and its successor senses the same again.
 
     Args:
         plan: what the processes are made of.
@@ -254,7 +254,7 @@ class SensorFarm:
                 )
 
     def _share(self, sensors: tuple[int, ...]) -> _Sharing:
-        """Who senses what of some sensors, written for the workers."""
+        """Which worker senses what of some sensors, written for the workers."""
         sharing = self._sharings.get(sensors)
         if sharing is None:
             sharing = _Sharing(self._share_anew(sensors), self._plan.shape.sensors)

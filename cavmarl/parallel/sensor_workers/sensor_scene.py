@@ -1,7 +1,7 @@
-"""`SceneArrays`: what the process of some worlds and its sensor workers share.
+"""`SceneArrays`: the memory that a process of worlds and its sensor workers share.
 
-The process writes what there is to see and who is to sense what, before it gives an order; the
-workers write frames, and say here of which tick they are.
+The process writes what there is to see and which worker is to sense what, before it sends a
+command; the workers write frames, and say here of which tick they are.
 """
 
 from __future__ import annotations
@@ -60,7 +60,7 @@ class SceneShape(NamedTuple):
 
 
 class SceneArrays(NamedTuple):
-    """What there is to see in one tick, who is to sense what, and what has been delivered."""
+    """What there is to see in one tick, the workers' shares, and what has been delivered."""
 
     rows: NDArray[np.void]  # VEHICLE (W, C) of all zones: agents' vehicles before the others
     num_agents: NDArray[np.int64]  # (W,) rows of agents

@@ -59,7 +59,7 @@ class LineWorth(Protocol):
 
 @dataclass(frozen=True)
 class Shares:
-    """Who senses what.
+    """Which worker senses what.
 
     Attributes:
         units: what is shared out.
@@ -123,7 +123,7 @@ def share_in_turn(units: Sequence[Unit], costs_s: Sequence[float], workers: int)
 
 
 def share_by_cost(units: Sequence[Unit], costs_s: Sequence[float], workers: int) -> Shares:
-    """The costliest first to whoever would be through first, then moves and swaps that help.
+    """The costliest first to the worker through first, then moves and swaps that help.
 
     Args:
         units: by rising sensor and agent.
@@ -143,7 +143,7 @@ def share_by_cost(units: Sequence[Unit], costs_s: Sequence[float], workers: int)
 
 
 def divide(shares: Shares, worth: LineWorth) -> Shares:
-    """Give lines of who has too much to who has too little, until all have about the same.
+    """Move lines from workers with too many to workers with too few, until all have about the same.
 
     Each step leaves one worker with the mean, so no more frames are divided than there are workers.
     """

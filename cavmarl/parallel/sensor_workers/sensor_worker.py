@@ -1,4 +1,4 @@
-"""The program of the processes that sense; a farm starts it."""
+"""The program of sensor workers; `SensorFarm` starts it."""
 
 from __future__ import annotations
 

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from cavmarl.config.env import EnvConfig, WorkersConfig, ZonesConfig
+from cavmarl.core.extensions import extension_modules, load_extensions
 from cavmarl.engine.simulation import Simulation
 from cavmarl.engine.world_setup import World, make_world
 from cavmarl.parallel.local_worlds import LocalWorlds
@@ -87,6 +88,7 @@ def farm_of(
     )
     recipe = {
         "config": asdict(_undivided(config)),
+        "extensions": extension_modules(_undivided(config).registered),
         "base_dir": str(base_dir.resolve()),
         "part": part,
         "num_worlds": num_worlds,
@@ -96,13 +98,14 @@ def farm_of(
 
 
 def make_sensor_jobs(recipe: Mapping[str, Any]) -> list[SensorJob]:
-    """The jobs of all sensor workers of a farm, every kernel loaded.
+    """The jobs of all sensor workers, every kernel loaded.
 
     Args:
         recipe: of `farm_of`, with what the farm has added.
     """
     from cavmarl.config.io import validate  # pydantic is slow to import
 
+    load_extensions(recipe["extensions"])
     config = validate(EnvConfig, recipe["config"], "the environment")
     world = make_world(config, Path(recipe["base_dir"]))
     shape = SceneShape(*recipe["shape"])
@@ -117,5 +120,5 @@ def make_sensor_jobs(recipe: Mapping[str, Any]) -> list[SensorJob]:
 
 
 def _undivided(config: EnvConfig) -> EnvConfig:
-    """The same environment with all zones in one, and nobody who senses elsewhere."""
+    """The same environment with all zones in one, and no sensor workers."""
     return replace(config, zones=ZonesConfig(), workers=WorkersConfig())

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from cavmarl.balance.balance_plan import Plan
 from cavmarl.balance.plan_text import describe_plan
 from cavmarl.core.errors import ConfigError, SumoError, WorkerError, WorkerFailureError
+from cavmarl.core.extensions import extension_modules
 from cavmarl.engine.simulation import Simulation
 from cavmarl.engine.world_setup import World
 from cavmarl.handoff.coordinator.coordinator_setup import check_faults
@@ -96,6 +97,7 @@ class DividedWorlds:
             simulation.mounted.rig.sense = self.leader.sense
         recipe = {
             "config": asdict(config),
+            "extensions": extension_modules(config.registered),
             "base_dir": str(base_dir.resolve()),
             "fingerprint": fingerprint(world),
             "in_next_step": in_next_step,
@@ -153,7 +155,7 @@ class DividedWorlds:
         self.pool.rename(_names(part))
 
     def _pids(self) -> dict[int, int]:
-        return dict.fromkeys(range(len(self.pool.sizes)), 0)  # nobody looks: they run elsewhere
+        return dict.fromkeys(range(len(self.pool.sizes)), 0)  # not measured: they run elsewhere
 
     def suggest(self) -> None:
         """Write what the built-in driver would do in the agents' place."""
@@ -190,7 +192,7 @@ class DividedWorlds:
 
     @contextmanager
     def _whole(self, begins_anew: bool = False) -> Iterator[None]:
-        """The time in which worlds change; who is interrupted then leaves them half changed.
+        """The time in which worlds change; an interrupt then leaves them half changed.
 
         Raises:
             WorkerError: so it is.

@@ -1,4 +1,4 @@
-"""`ReplicaMemory`: arrays that processes on different machines have at the same places.
+"""`ReplicaMemory`: arrays at the same places in processes on different machines.
 
 Each process makes the same arrays in the same order. A `Replica` stands for one process at the
 other end: what it knows of this memory, what is to be sent, and what has come (`kernels.replicas`).

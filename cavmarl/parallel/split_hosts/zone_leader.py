@@ -29,7 +29,7 @@ Words = NDArray[np.uint64]
 class ZoneLeader:
     """Runs each phase on all shards; `Together` with its hosts.
 
-    What goes from zone to zone it does itself: who owns what, ghosts, the gate, the signals. So it
+    What goes from zone to zone it does itself: ownership, ghosts, the gate, the signals. So it
     has all rows at the end of each phase, and a host that is lost costs no more than its phase.
 
     Args:
@@ -59,7 +59,7 @@ class ZoneLeader:
         self._room: list[Words] = [np.zeros(0, dtype=np.uint64) for _ in zones]
         self._coming = list(self._room)
         self._begins_step = False
-        self._is_open = False  # an order has been given, and not all is here that comes of it
+        self._is_open = False  # a command has been given, and not all of its results are here
         self._pool: HostPool | None = None
         self.host(zones)
 

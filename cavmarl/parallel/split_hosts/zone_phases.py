@@ -1,4 +1,4 @@
-"""`ZonePhases`: what phases read and write that hosts run, each on its zones in its own memory.
+"""`ZonePhases`: what the hosts' phases read and write, each on its zones in its own memory.
 
 A host has the rows of its own zones and their ghosts, and what all zones have in common. Before a
 phase it is sent what has changed of that; after it, it sends what has changed of what its zones
@@ -163,7 +163,7 @@ class ZonePhases:
                 array
                 for array in (getattr(first.outputs, name) for name in SENSED)
                 if memory.find(array)
-                is not None  # with `observation.mode: sensors` nobody sees some
+                is not None  # with `observation.mode: sensors` some are not seen
             ],
             ZonePhase.SUGGEST: [inputs.suggested],
             ZonePhase.MOUNTED: [frames.data for frames in inputs.frames.values()],

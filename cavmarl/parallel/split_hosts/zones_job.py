@@ -1,4 +1,4 @@
-"""`ZonesJob`: what a host does that runs some zones of worlds which a caller elsewhere leads."""
+"""`ZonesJob`: the job of a host that runs some zones of worlds that a remote caller leads."""
 
 from __future__ import annotations
 
@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from cavmarl.config.env import EnvConfig
 from cavmarl.core.errors import WorkerError
+from cavmarl.core.extensions import load_extensions
 from cavmarl.engine.world_setup import World, make_world
 from cavmarl.parallel.hosts.host_process import Outcome, serve
 from cavmarl.parallel.hosts.hosted_worlds_job import code_stamp
@@ -33,7 +34,7 @@ Array = NDArray[Any]
 
 
 class PhaseOrder(NamedTuple):
-    """The letter of an order: a phase on some zones, and how much has changed before it.
+    """The payload of a command: a phase on some zones, and how much has changed before it.
 
     Attributes:
         is_new: the host is to forget what it has.
@@ -91,7 +92,7 @@ def make_replicated(
 
 
 class ZonesJob:
-    """Some zones of all worlds; which ones, each order says.
+    """Some zones of all worlds; which ones, each command says.
 
     Args:
         recipe: environment, and how many worlds there are.
@@ -104,6 +105,7 @@ class ZonesJob:
     def __init__(self, recipe: dict[str, Any]) -> None:
         from cavmarl.config.io import validate  # pydantic is slow to import
 
+        load_extensions(recipe["extensions"])
         config = validate(EnvConfig, recipe["config"], "the environment")
         world = make_world(config, Path(recipe["base_dir"]))
         if fingerprint(world) != recipe["fingerprint"]:
@@ -131,10 +133,10 @@ class ZonesJob:
         return code_stamp()
 
     def fit(self, size: int) -> None:
-        """Nothing to do: each order says how much it is about."""
+        """Nothing to do: each command says how much it is about."""
 
     def inputs(self, task: int, letter: Any) -> list[Array]:
-        """Where the changes of an order go."""
+        """Where the changes of a command go."""
         self._coming = np.empty(PhaseOrder(*letter).words, dtype=np.uint64)
         return [self._coming]
 

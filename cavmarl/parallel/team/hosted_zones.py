@@ -1,4 +1,4 @@
-"""`HostedZones`: the zones of one world that one worker of a team runs; they may become others."""
+"""`HostedZones`: the zones of one world that one worker of a team runs; they may change."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ class HostedZones:
     Args:
         shards: all of the world, one a zone; every process knows them.
         zones: that are run here; none is fine, too.
-        spent_s: (k,) where the processor time of each zone is added up; None: nobody asks for it.
+        spent_s: (k,) where the processor time of each zone is added up; None: not measured.
     """
 
     def __init__(

@@ -47,8 +47,8 @@ CORE = 5  # a word of both: where the process was when it began with a phase
 # Methods of `ShardGroup` and `Shard` that are run together, by their code.
 TOGETHER = ("begin_step", "move", "gather", "resolve", "sense", "credit", "suggest")
 END = len(TOGETHER)
-# After which the next phase only asks that it has been run on the same zone: nobody waits before
-# somebody looks at what other zones have made of it.
+# After which the next phase only asks that it has been run on the same zone: there is no wait
+# before a phase reads what other zones have made of it.
 WAITED_FOR_LATER = ("begin_step", "resolve")
 # What the leader runs on all zones, and what asks for nothing that those write.
 AT_ANY_TIME = ("commit", "detect")
@@ -59,14 +59,14 @@ class LeftAloneError(Exception):
 
 
 class Team:
-    """Who hosts which zones of one world; made before the processes that it is about.
+    """The workers of one world and their zones; made before the processes start.
 
     Args:
         shards: one a zone, in the order of zones; their arrays are shared.
         zones: of each worker, to begin with; the first leads.
         known: what phases are called with that are run together, by their names: for each phase all
             that there is to choose from; the arrays among it are shared.
-        spent_s: (k,) where the processor time of each zone is added up; None: nobody asks for it.
+        spent_s: (k,) where the processor time of each zone is added up; None: not measured.
     """
 
     def __init__(
@@ -83,7 +83,7 @@ class Team:
         self.lines: list[Words] = list(lines)
 
     def forget(self) -> None:
-        """Begin to count anew: whoever has counted is dead."""
+        """Begin to count anew: the processes that counted are dead."""
         for line in self.lines:
             line[:] = 0
 
@@ -103,11 +103,11 @@ class Leader:
         self._codes = {name: code for code, name in enumerate(TOGETHER)}
         self._leads = False
         self._last = ""
-        self._is_ahead = False  # a phase is announced that nobody has waited for
+        self._is_ahead = False  # a phase is announced and not waited for
 
     @contextmanager
     def order(self) -> Iterator[None]:
-        """The time of an order, in which the followers wait for phases.
+        """The time of a command, in which the followers wait for phases.
 
         Raises:
             LeftAloneError: one of them has failed.
@@ -120,7 +120,7 @@ class Leader:
             self._dismiss()
 
     def end_after(self, phase: Phase | str) -> None:
-        """Let the followers end the order with the next phase of that name that they run."""
+        """Let the followers end the command with the next phase of that name that they run."""
         self._last = phase
 
     def _dismiss(self) -> None:
@@ -174,7 +174,7 @@ class Leader:
                 raise LeftAloneError
 
     def _which(self, name: str, arguments: tuple[Any, ...]) -> int:
-        """Which of what the followers know a phase is called with; -1: none, or nobody follows."""
+        """Which of what the followers know a phase is called with; -1: none, or no followers."""
         if self._leads and name in self._codes:
             for number, known in enumerate(self._known[name]):
                 if all(map(is_, arguments, known)):

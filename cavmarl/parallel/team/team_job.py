@@ -25,14 +25,14 @@ ALONE = (Task.STATE_HASH, Task.TRAFFIC_STATS, Task.DRIVEN, Task.SIGNAL_PHASES)
 
 
 class LeaderJob(DiaryJob):
-    """One world that several workers run, of whom this one leads.
+    """One world that several workers run, of which this one leads.
 
     Args:
         worlds: the one; what its shards write is shared.
         first: its number among all.
         zones: that each worker hosts, to begin with; the leader's first.
-        diary: in which it leaves the state behind.
-        spent_s: (k,) where the processor time of each zone is added up; None: nobody asks for it.
+        diary: the checkpoint log in which it leaves the state behind.
+        spent_s: (k,) where the processor time of each zone is added up; None: not measured.
     """
 
     def __init__(
@@ -70,7 +70,7 @@ class LeaderJob(DiaryJob):
             yield FollowerJob(follower, self._first, number, self._hosts.copy())
 
     def prepare(self) -> None:
-        """Whoever has led is dead, and so are those who followed."""
+        """The former leader is dead, and so are its followers."""
         self._team.forget()
 
     def perform(self, task: int, letter: Any) -> Any:
@@ -95,7 +95,7 @@ class LeaderJob(DiaryJob):
         self._leader.take(np.flatnonzero(hosts == 0).tolist())
 
     def save(self) -> list[NDArray[Any]]:
-        """Where to begin in the diary, and who hosts which zone."""
+        """Where to begin in the checkpoint log, and which worker hosts which zone."""
         return [*super().save(), self._hosts]
 
     def load(self, saved: Sequence[NDArray[Any]]) -> None:
@@ -140,7 +140,7 @@ class FollowerJob:
         self._follower.take(np.flatnonzero(hosts == self._number).tolist())
 
     def save(self) -> list[NDArray[Any]]:
-        """Who hosts which zone; the leader keeps the rest of the state."""
+        """Which worker hosts which zone; the leader keeps the rest of the state."""
         return [self._hosts]
 
     def load(self, saved: Sequence[NDArray[Any]]) -> None:

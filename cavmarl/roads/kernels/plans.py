@@ -54,7 +54,7 @@ def _leads_to(roads: RoadArrays, before: int, lane: int) -> bool:
 def change_cost(roads: RoadArrays, lane: int, weight: float) -> float:
     """Cost in s of leaving a lane sideways: plans change lanes where there is room to.
 
-    Inside junctions nobody changes lanes.
+    Inside junctions vehicles do not change lanes.
     """
     if roads.lanes[lane]["internal"]:
         return math.inf

@@ -44,7 +44,7 @@ def detect(
 ) -> None:
     """Note when bodies were over the detectors: now, or when their rear left in this tick.
 
-    The latest counts, so that neither the order of rows nor who owns them matters.
+    The latest counts, so that neither the order of rows nor their owner matters.
 
     Args:
         lane_place: (L,) see `RoadArrays`.

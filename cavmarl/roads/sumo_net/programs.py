@@ -75,7 +75,7 @@ class Timetable:
     Attributes:
         start: the program at the beginning.
         switches: (seconds since the beginning, program), in the file's order.
-        signal_ids: who follows it.
+        signal_ids: the signals that follow it.
         place: file and line, for complaints.
     """
 
@@ -165,7 +165,7 @@ class _AdditionalHandler(ContentHandler):
 
 def _phase(attrs: Mapping[str, str], place: str) -> Phase:
     duration = _seconds(attrs, "duration", place)
-    # As SUMO reads it: who states only the shortest duration leaves the longest open.
+    # As SUMO reads it: with the shortest duration alone, the longest is open.
     longest = math.inf if "minDur" in attrs else duration
     try:
         following = tuple(int(number) for number in attrs.get("next", "").split())

@@ -27,7 +27,7 @@ from cavmarl.roads.sumo_net.stop_lines import stop_back
 
 __all__ = ["map_name", "read_network", "source_hash"]
 
-APPROACH_M = 12.0  # before a junction, where bodies still stand askew to those who wait
+APPROACH_M = 12.0  # before a junction, where bodies still stand askew to vehicles that wait
 _ENDINGS = (".gz", ".xml", ".net", ".osm", ".xodr")
 
 

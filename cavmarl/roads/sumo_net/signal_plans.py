@@ -64,7 +64,7 @@ def with_programs(
 def with_outages(network: RoadNetwork, outages: Mapping[str, float]) -> RoadNetwork:
     """A network some of whose signals go dark while the world runs, and stay so.
 
-    They change to their program `off`: who must give way anyway sees them blink.
+    They change to their program `off`: links that must give way anyway blink.
 
     Args:
         network: not changed.
@@ -140,7 +140,7 @@ def _program(
 
 
 def _off(network: RoadNetwork, rows: SignalRows, signal_id: str) -> Program:
-    """The program in which nothing is lit: those who must give way anyway see it blink."""
+    """The program in which nothing is lit: links that must give way anyway blink."""
     row = rows.row[signal_id]
     letters = ["O"] * rows.signals[row][1]
     for link in network.links[network.links["signal"] == row]:

@@ -1,4 +1,4 @@
-"""Where cars have to stop before a junction so that nobody who drives over it touches them.
+"""Where cars have to stop before a junction so that no vehicle that drives over it touches them.
 
 Maps put the stop line at the end of a lane; some paths over the junction sweep across it.
 """
@@ -37,7 +37,7 @@ def stop_back(
         from_lane: (K,) LANE row that each link leaves.
         junction: (K,) JUNCTION row of each link.
         paths: (K,) the path of each link, None where the map has none.
-        approaches: (K,) the same with the last metres before the junction: who comes from another
+        approaches: (K,) the same with the last metres before the junction: vehicles from another
             road is asked about there, too.
 
     Returns:

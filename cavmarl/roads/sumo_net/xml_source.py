@@ -1,4 +1,4 @@
-"""Reading XML that nobody vouches for: no entities, no document types, no bombs, errors by line."""
+"""Reads untrusted XML: no entities, no document types, no bombs, errors by line."""
 
 from __future__ import annotations
 

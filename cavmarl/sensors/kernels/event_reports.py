@@ -28,7 +28,7 @@ def report_events(
     fresh: NDArray[np.int64],
     data: NDArray[np.int64],
 ) -> None:
-    """Write a report for each owned agent to whom something has happened in this tick.
+    """Write a report for each owned agent with an event in this tick.
 
     Earlier reports move towards the first slot, the newest is the last.
 

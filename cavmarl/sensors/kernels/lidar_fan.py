@@ -140,7 +140,7 @@ def _scan_body(
     velocity_y = body["speed"] * sin
     half_length = body["half_length"]
     half_width = body["half_width"]
-    # The body's axes, each turned to point from the one who looks towards the body.
+    # The body's axes, each turned to point from the sensor towards the body.
     along = x * cos + y * sin
     beside = y * cos - x * sin
     along_sign = math.copysign(1.0, along)

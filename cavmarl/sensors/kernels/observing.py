@@ -54,7 +54,7 @@ OFFSET_SCALE = 4.0  # m
 ROOM_SCALE = 200.0  # m
 TO_GO_SCALE = 1000.0  # m
 HALF_S = 5.0  # a time of this length is a soonness of 0.5
-SLOWEST_MPS = 1.0  # who stands is taken to come on with
+SLOWEST_MPS = 1.0  # a standing vehicle is taken to come on with
 
 
 @kernel
@@ -192,7 +192,7 @@ def observe_signal(
     sensors: Sensors,
     out: NDArray[np.float32],
 ) -> None:
-    """The next stop line on the way at which a signal stands or somebody has the right of way.
+    """The next stop line on the way with a signal, or where another vehicle has the right of way.
 
     `time` is that of the tick, in s since the world's reset.
     """

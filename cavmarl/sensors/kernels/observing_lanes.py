@@ -1,4 +1,4 @@
-"""What the `lanes` sensor writes: who drives ahead and behind on the lanes around, and who crosses.
+"""What the `lanes` sensor writes: vehicles ahead and behind on the lanes around, and crossing ones.
 
 The nearest vehicles in the plane (`neighbors`) leave it to the policy to find out which of them are
 in its way; here places are told along lanes, as car-following models take them. Of two that are
@@ -191,7 +191,7 @@ def observe_lanes(
     sensors: Sensors,
     observation: NDArray[np.float32],
 ) -> None:
-    """Gaps and relative speeds on the lanes around, and who comes first where ways cross.
+    """Gaps and relative speeds on the lanes around, and the first vehicle where ways cross.
 
     Args:
         roads: the road arrays.

@@ -1,7 +1,7 @@
 """What concerns the outputs of all agents at once, whichever shards own them.
 
 The order at the end of a step: `clear_outputs`, `sense` of every shard, `settle_outputs`, `credit`
-of every shard. Sums go in agent order, so that nobody can tell who wrote what.
+of every shard. Sums go in agent order, so that results do not depend on which shard wrote what.
 """
 
 from __future__ import annotations
@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 from cavmarl.core.numba import kernel
 from cavmarl.core.records.arrays import Outputs
 from cavmarl.core.records.codes import DRIVER_AGENT
-from cavmarl.rewards.kernels.terms import NUM_TERMS
 
 __all__ = ["clear_outputs", "credit", "settle_outputs"]
 
@@ -40,7 +39,7 @@ def settle_outputs(
 
     Args:
         outputs: rewards are written, and the observations of absent agents become 0.
-        weights: (NUM_TERMS,) of the reward.
+        weights: (T,) of the reward, a number for each term.
         team_share: share of the reward that is the mean over the agents that acted.
         chosen: (W,) which worlds.
     """
@@ -65,7 +64,7 @@ def _reward(outputs: Outputs, w: int, weights: NDArray[np.float64], team_share: 
     for agent in range(outputs.rewards.shape[1]):
         if outputs.acted[w, agent]:
             own = 0.0
-            for k in range(NUM_TERMS):
+            for k in range(weights.size):
                 own += weights[k] * outputs.terms[w, agent, k]
             outputs.rewards[w, agent] = own
             team += own

@@ -1,4 +1,4 @@
-"""What all mounted sensors have in common: who carries them, stamps, counts, and lost samples."""
+"""What all mounted sensors have in common: carriers, stamps, counts, and lost samples."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ __all__ = ["POSE", "call_roll", "deliver", "note_poses"]
 
 POSE = np.dtype(
     [
-        ("id", np.int64),  # of the vehicle; -1: nobody
+        ("id", np.int64),  # of the vehicle; -1: none
         ("x", np.float64),  # as in VEHICLE
         ("y", np.float64),
         ("z", np.float64),

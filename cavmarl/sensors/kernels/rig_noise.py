@@ -1,4 +1,4 @@
-"""Errors of mounted sensors, as a function of vehicle, tick, sensor and draw, whoever asks.
+"""Errors of mounted sensors, as a function of vehicle, tick, sensor and draw alone.
 
 A sensor's random numbers have a key of their own, mixed from that of the vehicle and the stream of
 the sensor, so that no two sensors share numbers and another sensor in the rig changes none.

@@ -1,4 +1,4 @@
-"""Settings, room and tables of the sensors that environments switch on for those who ask.
+"""Settings, room and tables of the sensors that environments switch on for agents.
 
 Each one's kernel says what the fields mean; `at` is where the sensor writes in a frame.
 """

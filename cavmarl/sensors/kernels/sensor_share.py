@@ -1,4 +1,4 @@
-"""The rows of a whole world for those who sense elsewhere, and whose agents each of them senses."""
+"""The rows of a whole world for sensor workers, and the agents that each of them senses."""
 
 from __future__ import annotations
 

@@ -1,6 +1,6 @@
 """Observations that hold the last few: frames one after the other, oldest first.
 
-The frames of an agent stand in the output arrays at its index and nowhere else, so who carries the
+The frames of an agent stand in the output arrays at its index and nowhere else, so a carrier of the
 outputs of an agent carries its past.
 """
 

@@ -26,7 +26,7 @@ def measure_odometry(
     """Write what is due of the owned agents.
 
     Of n samples in a tick, the k-th lies a share of k / n on the straight line from the state
-    before the tick to that after it; who has entered in this tick has been before as it is now.
+    before the tick to that after it; one that entered in this tick was before as it is now.
 
     Args:
         worlds: committed rows.

@@ -17,7 +17,7 @@ __all__ = ["Collision"]
 
 
 class Collision(MountedSensor[CollisionConfig]):
-    """EVENT_* bits of what has just happened to the vehicle, and whom it hit."""
+    """EVENT_* bits of what has just happened to the vehicle, and what it hit."""
 
     dtype = np.int64
     stamps_itself = True

@@ -35,7 +35,7 @@ class Scene(NamedTuple):
         plans: PLAN (G, L), the ways of agents.
         travel: types of vehicles.
         worlds: the committed rows: first the zone's own, then ghosts.
-        grid: room for the spatial index of one world; whoever asks it fills it.
+        grid: room for the spatial index of one world; callers that ask it fill it.
         before: POSE (W, A) of all agents in the tick before.
     """
 

@@ -55,7 +55,7 @@ class Rig:
         ids: (W, A) int64, the vehicle whose samples each agent's are; kept from tick to tick.
 
     Attributes:
-        sense: who senses what is due.
+        sense: senses what is due.
     """
 
     def __init__(
@@ -90,7 +90,7 @@ class Rig:
         return self._before
 
     def begin(self, scenes: Sequence[Scene]) -> None:
-        """Note where everybody is before the tick."""
+        """Note the poses of all agents before the tick."""
         self._before["id"] = -1
         for scene in scenes:
             self._note_poses(scene.worlds, self._before)

@@ -1,7 +1,8 @@
 """The sensors: what each adds to an observation, and how far it looks.
 
-One file a sensor; a new one is a file here, a kernel that writes its numbers, which `kernels/sense`
-or, if most environments leave it off, `kernels/observe_further` calls, and its line in `SENSORS`.
+One file a sensor; a new one of the package is a file here, a kernel that writes its numbers, which
+`kernels/sense` or, if most environments leave it off, `kernels/observe_further` calls, and its line
+in `SENSORS`. Those from outside are registered, see `sensors.registry`.
 """
 
 from __future__ import annotations
@@ -10,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cavmarl.config.env import SensorsConfig
+from cavmarl.core.extensions import REGISTERED_SENSORS
 from cavmarl.core.records.arrays import Sensors
 from cavmarl.rewards.kernels.terms import TTC_REACH_M
 from cavmarl.roads.network import RoadNetwork
@@ -40,9 +42,10 @@ __all__ = [
     "layout",
     "sensing_reach_m",
     "sensor_arrays",
+    "sensors_of",
 ]
 
-# In the order of their features in a frame.
+# Those of the package, in the order of their features in a frame.
 SENSORS: tuple[Sensor, ...] = (
     Sensor("ego", ego.features, ego.reach_m),
     Sensor("route", route.features, route.reach_m),
@@ -72,11 +75,16 @@ SENSORS: tuple[Sensor, ...] = (
 FURTHER = frozenset(("kinematics", "occupancy_grid", "lidar_observation", "roadgraph"))
 
 
+def sensors_of(config: SensorsConfig) -> tuple[Sensor, ...]:
+    """The sensors that a world can have: those of the package, on or off, then the registered."""
+    return (*SENSORS, *(REGISTERED_SENSORS[name] for name in config.registered))
+
+
 def layout(config: SensorsConfig) -> dict[str, slice]:
     """Where each sensor's features lie in a frame; sensors that are off are left out."""
     places: dict[str, slice] = {}
     start = 0
-    for sensor in SENSORS:
+    for sensor in sensors_of(config):
         size = len(sensor.features(config))
         if size:
             places[sensor.name] = slice(start, start + size)
@@ -101,16 +109,17 @@ def largest_radius_m(types: NDArray[np.void]) -> float:
 def sensing_reach_m(config: SensorsConfig, largest_radius_m: float) -> float:
     """How far from an agent's centre the centre of a vehicle can be that it can tell, in m.
 
-    Whoever is further away changes no number of an observation and no term. Sensors that ask for
-    centres reach as far as they look, `lanes` too: it takes none that is further away in the plane.
-    Rays end at bodies, whose centres are up to half a diagonal behind. Of the terms, time to
-    collision alone looks at others; it is always on.
+    A vehicle that is further away changes no number of an observation and no term of the package.
+    Sensors that ask for centres reach as far as they look, `lanes` too: it takes none that is
+    further away in the plane. Rays end at bodies, whose centres are up to half a diagonal behind.
+    Of the terms, time to collision alone looks at others; it is always on.
 
     Args:
         config: the sensors.
         largest_radius_m: half the diagonal of the largest body.
     """
-    reaches = (sensor.reach_of_centres_m(config, largest_radius_m) for sensor in SENSORS)
+    sensors = sensors_of(config)
+    reaches = (sensor.reach_of_centres_m(config, largest_radius_m) for sensor in sensors)
     return max(TTC_REACH_M, *reaches)
 
 

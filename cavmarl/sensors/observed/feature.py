@@ -6,9 +6,10 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import DTypeLike
+from numpy.typing import ArrayLike, DTypeLike
 
 from cavmarl.config.env import SensorsConfig
+from cavmarl.driving.agent_view import AgentView
 
 __all__ = ["Feature", "Sensor"]
 
@@ -51,6 +52,7 @@ class Sensor:
         shape: of its part of a Dict observation; -1 stands for all features.
         dtype: of that part.
         sees_bodies: whether it looks that far for any part of a body, and not for its centre.
+        sense: of a sensor from outside of the package: its numbers, of an agent's view.
     """
 
     name: str
@@ -59,6 +61,7 @@ class Sensor:
     shape: Callable[[SensorsConfig], tuple[int, ...]] = _flat
     dtype: Callable[[SensorsConfig], DTypeLike] = _float32
     sees_bodies: bool = False
+    sense: Callable[[AgentView], ArrayLike] | None = None
 
     def reach_of_centres_m(self, config: SensorsConfig, largest_radius_m: float) -> float:
         """How far away the centre of a vehicle can be that the sensor can tell, in m.

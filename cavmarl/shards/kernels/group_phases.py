@@ -2,7 +2,7 @@
 
 A call takes some sixty arrays from Python, which in a small zone takes longer than what is done
 with them. So the kernels of one zone are called from here, one zone after the other, with views of
-`Zoned`. What a zone does depends on its own rows alone, whoever is called with it.
+`Zoned`. What a zone does depends on its own rows alone, whichever zones are called with it.
 """
 
 from __future__ import annotations
@@ -165,7 +165,7 @@ def advance_each(
 
 @kernel
 def gather_each(members: Members, side: int, touching_m: float, border_m: float) -> None:
-    """`gather` in each zone; who is called with it may run beside others."""
+    """`gather` in each zone; zones of other calls may run beside it."""
     for w in range(members.common.ticks.size):
         for zone in members.numbers:
             gather(

@@ -91,7 +91,7 @@ def _order_by_lane(roads: RoadArrays, rows: NDArray[np.void], owned: int, scratc
     """The owned rows in the order of the index: neighbours on the road become so in memory."""
     found = 0
     for i in range(owned):
-        # Who follows a script may stand in many lists, or in none.
+        # Scripted vehicles may stand in many lists, or in none.
         if rows[i]["driver"] == DRIVER_SCRIPTED or is_lost(rows[i]):
             scratch.order[found] = i
             found += 1
@@ -145,7 +145,7 @@ def _drive_agent(
         worlds.pending, w, row["agent"], worlds.ticks[w], throttle, steering
     )
     move_agent(roads, plans, lane_grid, row, throttle, steering, worlds.signal_phase[w], dt)
-    # The indicator is automatic: drivers behind make room for who has to change lanes.
+    # The indicator is automatic: drivers behind make room for a vehicle that has to change lanes.
     row["blinker"] = needed_change(roads, travel, row, travel.steps[own_step(roads, row)])
 
 
@@ -266,7 +266,7 @@ def advance(
 
 @kernel
 def resolve(worlds: Worlds, scratch: Scratch, grid: Grid) -> None:
-    """Mark in `next_rows` who touches whom.
+    """Mark contacts in `next_rows`.
 
     Args:
         worlds: events and hit of the owned next_rows are written; num_contacts rises by one for

@@ -1,4 +1,4 @@
-"""Demand from SUMO's files: who wants to drive when, from where, to where, in what."""
+"""Demand from SUMO's files: vehicles with their departures, origins, destinations and types."""
 
 from __future__ import annotations
 

@@ -48,7 +48,7 @@ _COPIED = (
 
 @dataclass(frozen=True, eq=False)
 class DemandFile:
-    """Who wants to drive on a map; see `records` for the dtypes.
+    """Vehicles that are to drive on a map; see `records` for the dtypes.
 
     Attributes:
         network: the roads that all rows point into.

@@ -1,4 +1,4 @@
-"""<rerouter>: who is sent another way on which edges and when, and which edges are closed."""
+"""<rerouter>: which vehicles get another way, where and when, and which edges are closed."""
 
 from __future__ import annotations
 

@@ -39,7 +39,7 @@ class DeviceOptions(NamedTuple):
 
     Attributes:
         chance: of having it, where vehicle and type say nothing.
-        period_ms: between looks, likewise; 0: once.
+        period_ms: between searches, likewise; 0: once.
         adaptation_steps: how many samples of the edges' speeds are averaged.
         adaptation_interval_ms: between samples.
     """
@@ -70,7 +70,7 @@ class DeviceOptions(NamedTuple):
                 )
         found = cls()
         if "probability" in own:
-            # SUMO's default is -1: nobody.
+            # SUMO's default is -1: no vehicle.
             key = f"{_PREFIX}probability"
             chance = own["probability"].number(key, 0.0, least=-1.0, most=1.0)
             found = found._replace(chance=max(chance, 0.0))

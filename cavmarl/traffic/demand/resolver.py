@@ -116,7 +116,7 @@ class Resolver:
         ]
 
     def _check(self, elements: NDArray[np.void], ids: list[str]) -> NDArray[np.bool_]:
-        """Which elements can drive; whoever cannot is refused or counted."""
+        """Which elements can drive; those that cannot are refused or counted."""
         fields = ["types", "routes", "depart_lane", "arrival_lane"]
         seen, first, which = np.unique(
             np.stack([elements[name] for name in fields], axis=1),

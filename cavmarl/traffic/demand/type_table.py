@@ -40,7 +40,7 @@ class TypeTable:
 
         Args:
             name: of a type or a distribution.
-            user: who names it.
+            user: the element that names it.
 
         Raises:
             DemandError: there is neither, or nothing to choose from.

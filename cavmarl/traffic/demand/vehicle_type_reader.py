@@ -7,12 +7,12 @@ import re
 import numpy as np
 from numpy.typing import NDArray
 
-from cavmarl.core.records.codes import MODEL_IDM
+from cavmarl.core.records.codes import MODEL_KRAUSS
+from cavmarl.driving.driver_models import NEAREST_MODEL, model_code, model_names
 from cavmarl.driving.vehicle_types import (
     ALL_PERMISSIONS,
     CLASS_DEFAULTS,
     NEAREST_CLASS,
-    NEAREST_MODEL,
     NO_ROAD_CLASSES,
     VTYPE,
 )
@@ -93,7 +93,7 @@ def vtype_record(element: Element, report: DemandReport) -> NDArray[np.void] | N
     record["desired_max_speed"] = _number(element, "desiredMaxSpeed", default.desired_max_speed)
     record["tau"] = _number(element, "tau", 1.0)
     sigma = _number(element, "sigma", default.sigma)
-    record["sigma"] = 0.0 if model == MODEL_IDM else sigma
+    record["sigma"] = sigma if model == MODEL_KRAUSS else 0.0
     _number(element, "probability", 1.0)
     decel = float(record["decel"])
     record["emergency_decel"] = _number(
@@ -116,13 +116,13 @@ def _model(element: Element, report: DemandReport) -> int:
     name = element.attrs.get("carFollowModel", "Krauss").strip()
     # SUMO 0.x wrote carFollowing-Krauss here, too.
     name = name.removeprefix(_MODEL_PREFIX)
-    if name not in NEAREST_MODEL:
-        raise element.error(f"has the unknown carFollowModel '{name}'", near(name, NEAREST_MODEL))
-    model = NEAREST_MODEL[name]
-    if name not in ("Krauss", "IDM"):
-        nearest = "IDM" if model == MODEL_IDM else "Krauss"
+    known = (*model_names(), *NEAREST_MODEL)
+    if name not in known:
+        raise element.error(f"has the unknown carFollowModel '{name}'", near(name, known))
+    nearest = NEAREST_MODEL.get(name, name)
+    if nearest != name:
         report.tolerate(f"carFollowModel {name} is taken for {nearest}", element.place)
-    return model
+    return model_code(nearest)
 
 
 def _report_unused(element: Element, name: str, report: DemandReport) -> None:

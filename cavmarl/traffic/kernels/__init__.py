@@ -1,1 +1,1 @@
-"""Compiled loops: who departs, enters, leaves and looks for another way."""
+"""Compiled loops of departures, entering, leaving and rerouting."""

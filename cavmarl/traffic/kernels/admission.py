@@ -1,8 +1,8 @@
-"""How waiting departures enter: the gate says which lane each takes, the shards who finds a gap.
+"""How waiting departures enter: the gate assigns lanes, the shards find gaps.
 
 One tick lets at most one vehicle try on each lane, in the order of the queue. Five calls make it:
 `rank_lanes` (each shard: how crowded lanes are), `assign_lanes` (the gate), `propose` (each shard:
-who finds a safe gap at a place of its own zone), `accept` (the gate: in the order of the queue, as
+departures that find a safe gap in its own zone), `accept` (the gate: in the order of the queue, as
 long as there is room) and `admit` (each shard: into its rows or among its ghosts).
 """
 
@@ -52,10 +52,10 @@ def rank_lanes(
     worlds: Worlds,
     scratch: Scratch,
 ) -> None:
-    """Count who is around the places in this zone where departures may enter that choose a lane.
+    """Count vehicles around the places in this zone where departures may enter that choose a lane.
 
-    Who enters behind the last vehicle of a lane is told its place by the zone where the lane
-    starts: it alone sees all who could be the last.
+    A departure behind the last vehicle of a lane gets its place from the zone where the lane
+    starts: it alone sees all that could be the last.
 
     Args:
         roads: the road arrays.
@@ -106,7 +106,7 @@ def rank_lanes(
 def assign_lanes(roads: RoadArrays, travel: Travel, gate: Gate, worlds: Worlds) -> None:
     """Say on which lane each departure of the queue tries, -1: on none.
 
-    A lane is taken whether or not there is room: who waits longer goes first.
+    A lane is taken whether or not there is room: the one that waits longer goes first.
 
     Args:
         roads: the road arrays.
@@ -274,7 +274,7 @@ def _take_from_queue(gate: Gate, w: int, taken: int) -> None:
 
 @kernel
 def admit(zones: ZoneArrays, halo: Halo, zone: int, gate: Gate, worlds: Worlds) -> None:
-    """Write who has been accepted into `next_rows`: as owned in its zone, as ghost near it.
+    """Write the accepted departures into `next_rows`: as owned in its zone, as ghost near it.
 
     Args:
         zones: of the partition.

@@ -1,4 +1,4 @@
-"""Who enters and who leaves: the seeded demand generator and the queue before the gates.
+"""The seeded demand generator, the queue before the gates, and vehicles that leave.
 
 A departure is numbered and drawn when it is ordered, and enters when there is a safe gap at its
 place; until then it waits in the queue, in the order of ids. None is dropped.
@@ -46,7 +46,7 @@ __all__ = ["call_orders", "choose_goals", "enter", "populate", "settle"]
 
 PLACE_TRIES = 24  # places tried for a vehicle at reset before it has to queue
 PLACE_GAP_M = 10.0  # m between bumpers of vehicles placed at reset
-END_ROOM_M = 12.0  # nobody starts nearer than this to the end of a lane, unless it is shorter
+END_ROOM_M = 12.0  # no vehicle starts nearer than this to the end of a lane, unless it is shorter
 PLACE_SHARE = 0.7  # of the speed limit, with which vehicles drive that are placed at reset
 WANDER_M = 150.0  # nearer to its goal than this a vehicle of a closed world picks another
 GOAL_TRIES = 8
@@ -219,7 +219,8 @@ def populate(
 def _needs_goal(demand: Demand, roads: RoadArrays, travel: Travel, row: np.void) -> bool:
     """Whether a background vehicle picks another goal: near it in a closed world, or stuck.
 
-    Stuck is who has stood for `GIVE_UP_S` at the end of a lane that its way does not follow.
+    Stuck is a vehicle that has stood for `GIVE_UP_S` at the end of a lane that its way does not
+    follow.
     """
     if row["driver"] != DRIVER_BACKGROUND:
         return False
@@ -310,8 +311,8 @@ def _next_leaving(gate: Gate, w: int, first: int) -> int:
 def settle(demand: Demand, roads: RoadArrays, gate: Gate, worlds: Worlds, dt: float) -> None:
     """Count the vehicles that have left, and order those that follow.
 
-    They go in the order of their ids, so that who follows gets the same number wherever the rows
-    lay.
+    They go in the order of their ids, so that those that follow get the same numbers wherever the
+    rows lay.
 
     Args:
         demand: the generator's tables.
@@ -322,7 +323,7 @@ def settle(demand: Demand, roads: RoadArrays, gate: Gate, worlds: Worlds, dt: fl
     """
     for w in range(worlds.ticks.shape[0]):
         for n in range(gate.num_passing[w]):
-            # Nobody looks at those before n any more.
+            # Those before n are not read any more.
             found = _next_leaving(gate, w, n)
             row = gate.passing[w, found]
             agent = row["agent"]

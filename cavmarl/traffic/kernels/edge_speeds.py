@@ -58,8 +58,8 @@ def sample_speeds(
 ) -> None:
     """Sample the mean speed of every edge; the sample takes the place of the oldest one.
 
-    A lane without vehicles counts as one vehicle at its limit; who makes a stop or follows a
-    script does not count.
+    A lane without vehicles counts as one vehicle at its limit; vehicles that make a stop or follow
+    a script do not count.
 
     Args:
         roads: the road arrays.

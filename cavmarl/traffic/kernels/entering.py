@@ -1,7 +1,7 @@
 """Where and how fast a waiting departure enters, and whether it can now.
 
 A departure says on which lane of its edge, where on it and how fast it wants to enter, in numbers
-or in SUMO's words. It enters only behind a gap that is safe for itself and for who follows.
+or in SUMO's words. It enters only behind a gap that is safe for itself and for its follower.
 """
 
 from __future__ import annotations
@@ -75,7 +75,7 @@ def entry_lane(
         roads: the road arrays.
         travel: types and ways.
         key: of the world.
-        departure: who enters.
+        departure: that enters.
         ranks: how crowded each lane of its edge is; read where traffic chooses.
         taken: (L,) lanes on which another one tries in this tick.
     """
@@ -209,7 +209,7 @@ def follower_brakes(
     speed: float,
     scratch: Scratch,
 ) -> bool:
-    """Whether who follows would have to brake hard for a vehicle that enters."""
+    """Whether the follower would have to brake hard for a vehicle that enters."""
     k, distance = neighbor_behind(
         roads, scratch, lane, s, departure["id"], ENTER_REACH_M, travel.view_m
     )

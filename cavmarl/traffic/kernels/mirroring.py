@@ -34,7 +34,7 @@ class Paths(NamedTuple):
     first: NDArray[np.int64]  # (P + 1,) rows [first[p], first[p + 1]) of what follows
     edges: NDArray[np.int32]  # EDGE rows, -1: not of this map
     ways: NDArray[np.int64]  # VEHICLE["way"] on that edge
-    nowhere: int  # the way of who is on no edge of its route
+    nowhere: int  # the way of a vehicle on no edge of its route
 
 
 @kernel
@@ -55,7 +55,7 @@ def mirror(
         travel: types and ways.
         paths: of the world.
         seen: SEEN (n,) by rising numbers, with paths in the place of routes.
-        zoned: the owned rows of `side` are written; those whom SUMO has no more have arrived.
+        zoned: the owned rows of `side` are written; those that SUMO has no more have arrived.
         side: 0 or 1.
         w: which world.
         dt: seconds of the tick.
@@ -165,12 +165,12 @@ def send_on(
 ) -> int:
     """Give drivers of ours the other routes that SUMO has found for them.
 
-    Who is on no edge of its new route keeps the old one.
+    A vehicle on no edge of its new route keeps the old one.
 
     Args:
         roads: the road arrays.
         paths: of the world.
-        numbers: (n,) VEHICLE["order"] of those who are meant, rising.
+        numbers: (n,) VEHICLE["order"] of the vehicles meant, rising.
         chosen: (n,) their new paths.
         zoned: the owned rows of `side` are written.
         side: 0 or 1.

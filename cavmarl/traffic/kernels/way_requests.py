@@ -1,4 +1,4 @@
-"""Ways of single vehicles: who asks for one, what it takes, and where it is kept.
+"""Ways of single vehicles: which vehicles ask for one, what it takes, and where it is kept.
 
 A way that was found while the world runs is kept in a slot: room for one way's steps at the end of
 `Travel.steps`. Slots belong to a world; which of them are free is seen from its vehicles.
@@ -44,7 +44,7 @@ def find_asking(
     """The vehicles that ask for their way in this second, by rising id.
 
     These are background vehicles of the demand on a road, without a stop to make, whose time to
-    look has come or who have come to an edge with rerouters.
+    look has come or that have come to an edge with rerouters.
 
     Args:
         roads: the road arrays.

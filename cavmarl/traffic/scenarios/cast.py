@@ -86,14 +86,14 @@ class Cast:
     ) -> None:
         """Put the agents and the actors into a world that has just been populated.
 
-        Whoever else stands in the scene is left out. Agents keep their ids, actors get the next
+        Other vehicles in the scene are left out. Agents keep their ids, actors get the next
         ones.
 
         Args:
             roads: the road arrays.
             travel: types and ways.
             gate: written.
-            worlds: the rows of world w are written; nobody has divided it yet.
+            worlds: the rows of world w are written; it is not divided yet.
             w: which world.
             blank: VEHICLE (1,), the record that every vehicle starts from.
         """

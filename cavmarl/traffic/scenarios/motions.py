@@ -31,7 +31,7 @@ class Pose(NamedTuple):
         speed: along it in m/s, negative backwards.
         pitch: rad.
         beside: LANE row on whose level it is.
-        on: lane, s and d of who rides along lanes; None: it moves freely.
+        on: lane, s and d of an actor that rides along lanes; None: it moves freely.
         link: LINK row that it is on or has entered last.
         claims: the distance to the stop line, and the LINK row, of each link that it is on or will
             be on soon.
@@ -124,7 +124,7 @@ class Move:
 
 @dataclass(frozen=True)
 class Ride:
-    """Ride along the middle of lanes as built-in drivers do, but heeding nobody.
+    """Ride along the middle of lanes as built-in drivers do, but without reacting to others.
 
     Attributes:
         lanes: LANE rows one after the other, those inside junctions among them.

@@ -3,7 +3,7 @@
 An actor does one thing after the other: it moves along poses, rides along lanes, waits for a time,
 or waits for a cue. Built-in drivers take a body for an occupant of every lane that any part of it
 covers, and of those that it will cover within `FORESIGHT_S` when it moves freely: it stands there
-for them, so that they brake for who is about to step onto their lane.
+for them, so that they brake for actors about to step onto their lane.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ __all__ = [
     "compile_scripts",
 ]
 
-FORESIGHT_S = 2.0  # drivers brake for who will be on their lane by then
+FORESIGHT_S = 2.0  # drivers brake for actors that will be on their lane by then
 
 FRAME = np.dtype(
     [
@@ -122,7 +122,7 @@ class Cue(NamedTuple):
 
 @dataclass(frozen=True)
 class Actor:
-    """Somebody who follows a script.
+    """A road user that follows a script.
 
     Attributes:
         body: what it is: a name of `BODIES`.
@@ -173,9 +173,9 @@ def compile_scripts(
 
     Args:
         network: the roads.
-        actors: who has a script.
+        actors: those that have a script.
         cues: by the numbers that `Await` has.
-        goals: row of the plans' table by EDGE, for those who are released.
+        goals: row of the plans' table by EDGE, for actors that are released.
         dt: seconds a tick.
     """
     tables = _Tables()

@@ -1,4 +1,4 @@
-"""A `Scene`: who plays what to an agent, and where it begins. Scenarios make them."""
+"""A `Scene`: the actors, their scripts and the agent's start. Scenarios make them."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ class Scene:
         place: where, by the map's name.
         x, y: its middle, m.
         seat: of the agent.
-        actors: who follows a script.
+        actors: those that follow a script.
         cues: what they wait for, by the numbers of their `Await`s.
         clear_m: how far around the middle no other vehicle is in the beginning.
         outages: signals that go dark, and stay so.

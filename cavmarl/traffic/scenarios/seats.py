@@ -13,14 +13,14 @@ __all__ = ["take_seats"]
 
 APART_M = 6.0  # between the centres of two agents, one behind the other,
 APART_S = 2.0  # and the way of this time
-START_M = 5.0  # of a lane on which nobody begins
+START_M = 5.0  # of a lane on which no vehicle begins
 
 
 def take_seats(streets: Streets, scene: Scene, num: int) -> list[Seat]:
     """The seats of `num` agents, that of the scene first.
 
     The others come after it on its own approach, with the same speed and the same goal, on lanes
-    outside junctions along which no actor rides: actors heed nobody.
+    outside junctions along which no actor rides: actors react to no vehicle.
 
     Args:
         streets: of the map.

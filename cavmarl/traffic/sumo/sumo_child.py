@@ -28,13 +28,13 @@ HEAD = np.dtype([("kind", "<i4"), ("records", "<i4"), ("letters", "<i4"), ("line
 START, STEP, LOOK_UP = 0, 1, 2  # kinds of orders
 DONE, REFUSED = 0, 1  # kinds of answers
 
-NOWHERE = ""  # the lane of who is on none: it waits, it is being teleported
+NOWHERE = ""  # the lane of a vehicle on none: waiting or being teleported
 PUPPET = "cavmarl."  # begins the names of vehicles that are moved from outside
 FREE = 2  # moveToXY: wherever it is told, on a road or not
 PARKS = 1 | 64  # flags of a stop: beside the road, at a parking area
 BY_ITSELF = 0  # speed and lane change modes: SUMO decides nothing for it
 
-# What is asked of every vehicle, by field of its record; the second only where somebody looks.
+# What is asked of every vehicle, by field of its record; the second only where it is read.
 _FIELDS = {"at": "getRouteIndex", "pos": "getLanePosition"}
 _FIELDS_SEEN = {
     "angle": "getAngle",
@@ -65,7 +65,7 @@ class Simulation:
         self._edges: list[str] = told["edges"]
         self._signals: list[str] = told["signals"]
         self._type_row: dict[str, int] = told["types"]
-        self._is_seen: bool = told["drives"]  # whether anybody asks where its vehicles are
+        self._is_seen: bool = told["drives"]  # whether places of its vehicles are read
         self._forget()
 
     def _forget(self) -> None:
@@ -105,13 +105,13 @@ class Simulation:
         }
 
     def step(self, moved: NDArray[np.void]) -> tuple[NDArray[np.void], bytes, dict[str, Any]]:
-        """One step: puppets to their places, everybody else by SUMO."""
+        """One step: puppets to their places, all other vehicles by SUMO."""
         self._place(moved)
         self._sumo.simulationStep()
         return self.look()
 
     def look(self) -> tuple[NDArray[np.void], bytes, dict[str, Any]]:
-        """Who is where now, what signals show, and what is new."""
+        """Where vehicles are now, what signals show, and what is new."""
         line: dict[str, Any] = {"time_ms": self._time_ms()}
         lifted = [
             [self._number.pop(name), name]
@@ -142,7 +142,7 @@ class Simulation:
         """The vehicles that stand or drive on the map's lanes, and which of them have come now.
 
         Returns:
-            names, numbers and LANE rows, and what is to be said of those who have come.
+            names, numbers and LANE rows, and what is to be said of vehicles that have come.
         """
         vehicle, nobody = self._vehicle, repeat(-1)
         names = vehicle.getIDList()
@@ -187,7 +187,7 @@ class Simulation:
         """Stops that a vehicle is to make: LANE row, start, end, duration, until, off the road.
 
         Times are in s, -1 where there is none. Those that end by neither, on no lane of the map, or
-        at which nobody stands are left out.
+        at which no vehicle stands are left out.
         """
         found = []
         for stop in self._vehicle.getStops(name):

@@ -36,7 +36,7 @@ class SumoDemand:
         network: the roads.
         map_file: the same, as SUMO reads them.
         given: demand and options.
-        drives: SUMO moves its vehicles (`sumo-traffic`), not only says who departs.
+        drives: SUMO moves its vehicles (`sumo-traffic`), and does not only order departures.
         max_vehicles: that one world can hold.
         replay_bytes: for what a world's SUMO is told in an episode.
         dt_s: seconds a tick.
@@ -145,10 +145,10 @@ def _words(
     puppets.write_text(_puppets(), encoding="utf-8")
     own = int(given.options.get("max-num-vehicles", "-1"))
     more = {
-        # Who touches whom is judged here, and nobody is taken away for it.
+        # Contacts are judged here, and no vehicle is removed for one.
         "collision.action": "none",
         "max-num-vehicles": str(min(own, most) if own > 0 else most),
-        "random": "false",  # a seed that nobody knows
+        "random": "false",  # an unknown seed
     }
     return command_words(map_file, given, folder, dt_s, seed, more, (puppets,))
 

@@ -1,7 +1,7 @@
 """`ToldLog`: where SUMO was told that our vehicles are, tick by tick since its reset.
 
 What SUMO does follows from its files, its seed and that. So a SUMO that is started anew and told
-the same comes to the same: whoever takes up the world of a process that has died needs no more.
+the same comes to the same: the successor of a dead process needs no more.
 """
 
 from __future__ import annotations

@@ -25,7 +25,7 @@ from cavmarl.traffic.sumo.sumo_records import MOVED, SEEN
 
 __all__ = ["Answer", "SumoProcess", "choose_interface"]
 
-ANSWER_S = 120.0  # who takes longer for one step hangs
+ANSWER_S = 120.0  # a step that takes longer hangs
 END_S = 2.0  # for it to end by itself
 LAST_WORDS = 2000  # characters of what it has printed last
 # SUMO follows pointers all over its memory: in pages of 2 MiB a step is up to a sixth faster.

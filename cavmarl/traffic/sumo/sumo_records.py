@@ -7,7 +7,7 @@ import numpy as np
 __all__ = ["MOVED", "SEEN"]
 
 # A vehicle of SUMO's, in its own conventions: the middle of the front bumper, degrees clockwise
-# from north, the place on the lane in the lane's own length. Where it moves nobody's vehicles here,
+# from north, the place on the lane in the lane's own length. Where SUMO moves no vehicles here,
 # what follows `signals` is 0 but for `pos`.
 SEEN = np.dtype(
     [

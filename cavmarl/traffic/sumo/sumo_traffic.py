@@ -1,12 +1,12 @@
 """`SumoTraffic`: SUMO's part in a tick of W worlds, in one place however they are divided.
 
-`sumo-traffic`: SUMO moves its vehicles, which are rows here, and sees ours. Who decides how a
-vehicle moves from tick t to t + 1 has seen all others at t, on both sides: ours move first, for
+`sumo-traffic`: SUMO moves its vehicles, which are rows here, and sees ours. Each side that moves a
+vehicle from tick t to t + 1 has seen all others at t: ours move first, for
 that needs nothing but t; then SUMO takes its step and is told where ours have come to.
 
-`sumo-demand`: SUMO runs the demand by itself. Who departs there is ordered here at the same tick,
-with its type, route, stops, lane and speed factor; who gets another route there gets it here; its
-signals are ours.
+`sumo-demand`: SUMO runs the demand by itself. A vehicle that departs there is ordered here at the
+same tick, with its type, route, stops, lane and speed factor; one rerouted there is rerouted here;
+its signals are ours.
 """
 
 from __future__ import annotations
@@ -96,7 +96,7 @@ class SumoTraffic:
     def keep_logs(self) -> tuple[ToldLog, ...]:
         """From the next reset on keep what SUMO is told, one log a world, for `catch_up`.
 
-        There is none where SUMO moves nobody: then it is told nothing.
+        There is none where SUMO moves no vehicle: then it is told nothing.
         """
         if self.drives and not self.worlds.logs:
             num_worlds = self._zoned.rows.shape[2]
@@ -148,14 +148,14 @@ class SumoTraffic:
         )
 
     def forgive(self, gate: Gate) -> None:
-        """Of those who leave, mark who has not arrived but been lifted off the road."""
+        """Mark the leaving vehicles that have not arrived but been lifted off the road."""
         for w, num in enumerate(gate.num_passing.tolist()):
             leaving = gate.passing[w, :num]
             lifted = np.isin(leaving["order"], self.worlds.at(w).teleported)
             leaving["events"][lifted] = 0
 
     def let_in(self, gate: Gate, worlds: Worlds) -> bool:
-        """Fill `gate.passing` with whom SUMO has let in; whether there are any.
+        """Fill `gate.passing` with the vehicles that SUMO has let in; whether there are any.
 
         Raises:
             CapacityError: more than there is room for.
@@ -182,7 +182,7 @@ class SumoTraffic:
         return bool(gate.num_passing.any())
 
     def order(self, gate: Gate, worlds: Worlds) -> None:
-        """Put those whom SUMO has let in at the end of the queue, with routes of theirs.
+        """Put the vehicles that SUMO has let in at the end of the queue, with routes of theirs.
 
         Raises:
             CapacityError: more wait than there is room for.
@@ -203,7 +203,7 @@ class SumoTraffic:
                 gate.num_queue[w] += 1
 
     def send_on(self, gate: Gate, worlds: Worlds, side: int) -> None:
-        """Give drivers of ours, and those who wait, the routes that SUMO has changed."""
+        """Give our vehicles, driving and waiting, the routes that SUMO has changed."""
         for w in range(len(worlds.ticks)):
             now, paths = self.worlds.at(w), self.worlds.paths(w)
             if not len(now.rerouted):
@@ -254,7 +254,7 @@ class SumoTraffic:
         return moved
 
     def _fill(self, row: np.void, seen: np.void, w: int) -> None:
-        """Where, in what and by which route somebody departs."""
+        """Where, in what and by which route a vehicle departs."""
         lane = int(seen["lane"])
         edge = self._roads.edges[self._roads.lanes[lane]["edge"]]
         row["agent"] = row["goal"] = -1

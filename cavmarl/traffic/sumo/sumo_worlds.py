@@ -37,11 +37,11 @@ class Tick(NamedTuple):
         tick: that this is the state of.
         seen: SEEN (n,) by rising numbers, with paths in the place of routes.
         letters: of all signals.
-        departed: (m,) numbers of those who have come, rising.
+        departed: (m,) numbers of vehicles that have come, rising.
         speed_factors: (m,) theirs.
         stops: (m, 2) STOP rows [first, end) that they are to make, -1: none; (0, 2) where SUMO
             moves them.
-        teleported: numbers of those who have been lifted off the road.
+        teleported: numbers of vehicles that have been lifted off the road.
         rerouted: (r,) numbers of those on another route than a tick before, rising.
     """
 
@@ -69,7 +69,7 @@ class SumoWorlds:
         stops: of their stops.
         names: by world, SUMO's names of the vehicles by number.
         teleports: (W,) vehicles that SUMO has put elsewhere since each reset.
-        logs: by world, what SUMO has been told since its reset; none: nobody keeps it.
+        logs: by world, what SUMO has been told since its reset; none: not kept.
     """
 
     def __init__(

@@ -91,7 +91,7 @@ def _list_within(
     for j in range(first_row, last_row + 1):
         begin = cells.start[j * cells.num_x + first_column]
         end = cells.start[j * cells.num_x + last_column + 1]
-        # Here and below a place is written in any case: who is in and who is not cannot be guessed.
+        # Here and below a place is written in any case: whether it is in is unpredictable.
         for b in range(begin, end):
             dx = air.x[b] - x
             dy = air.y[b] - y
@@ -168,7 +168,7 @@ def let_in_cams(
             dy = packets[p]["y"] - y
             reachable -= dx * dx + dy * dy <= limit
         if num == box.size:
-            # Whoever is further away than all that it knows is not let in.
+            # Stations further away than all that it knows are left out.
             limit = min(limit, room.squared[num - 1])
             reach_m = math.sqrt(limit)
         heard = _list_within(air, own, x, y, reach_m, limit, room.heard)
@@ -182,7 +182,7 @@ def let_in_cams(
     for k in range(heard):
         if num < box.size or room.heard.squared[k] <= room.squared[num - 1]:
             b = room.heard.place[k]
-            # A CAM's sender is whom it tells of.
+            # A CAM tells of its sender.
             if find(box, num, air.sender[b]) < 0:
                 report = reports[packets[air.which[b]]["first"]]
                 num = insert(box, num, room.squared, report, x, y)

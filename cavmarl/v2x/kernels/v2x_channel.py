@@ -1,7 +1,7 @@
 """Whether a packet is received: range, path loss, buildings, other packets, and chance.
 
-Who draws a number for a packet is the pair (sender, receiver), the tick and the kind: it does not
-matter in which order, or in which zone, anybody asks.
+A packet's random number depends on the pair (sender, receiver), the tick and the kind, and not
+on the order or the zone in which it is drawn.
 """
 
 from __future__ import annotations
@@ -44,12 +44,12 @@ class Channel(NamedTuple):
     they change evenly, and the last but one and the last hold for all that is further away.
     """
 
-    reach_m: float  # nobody further away receives anything; inf: no limit
-    sure: bool  # who is within reach receives
-    external: bool  # somebody else says who receives
+    reach_m: float  # no reception further away; inf: no limit
+    sure: bool  # all within reach receive
+    external: bool  # a network simulator decides receptions
     clear: NDArray[np.float64]  # (B, K) in the line of sight
     blocked: NDArray[np.float64]  # (B, K) behind a building; (0, K): buildings do not matter
-    sensing_m: float  # up to where one hears that somebody sends
+    sensing_m: float  # up to where a station hears that another sends
     load: float  # share of a tick that a packet takes; 0: the air takes any number
     walls: Walls
 

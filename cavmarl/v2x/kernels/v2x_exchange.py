@@ -29,7 +29,7 @@ def _place_receivers(
     mail: Mail,
     room: Room,
 ) -> None:
-    """Note where the agents and the roadside units are; who is new has nothing in its inboxes."""
+    """Note where the agents and the roadside units are; new ones have empty inboxes."""
     receivers = room.receivers
     num_agents = receivers.size - units.size
     for r in range(num_agents):
@@ -76,7 +76,7 @@ def exchange_messages(
     """Send what is due in the present tick of some worlds, and receive what arrives in it.
 
     Args:
-        sending: when who sends what.
+        sending: when stations send what.
         channel: the air.
         roads: the road arrays.
         types: VTYPE (num_types,).

@@ -50,7 +50,7 @@ def visible(
         own: row of the station itself; -1: it is no vehicle.
         x: m, its place.
         y: likewise.
-        z: likewise; who is on another level is not seen.
+        z: likewise; vehicles on another level are not seen.
         range_m: how far it sees.
         most: how many at most.
         walls: of buildings.

@@ -1,4 +1,4 @@
-"""Who receives what of the packets of one tick, and what receivers keep of it.
+"""Receptions of the packets of one tick, and what receivers keep of it.
 
 What a receiver keeps does not depend on the order of packets: first the subjects that it knows get
 their newest reports, then the nearest others are let in.
@@ -98,7 +98,7 @@ def _receive_objects(
     box: NDArray[np.void],
     num: int,
 ) -> int:
-    """Take what is told of vehicles, by themselves and by those who see them."""
+    """Take what is told of vehicles, by themselves and by stations that see them."""
     packets = mail.packets[w, slot]
     reports = mail.reports[w, slot]
     refresh_by_cams(channel, me, level, packets, reports, room, box, num)
@@ -233,7 +233,7 @@ def age(mail: Mail, w: int, r: int, tick: int, room: Room) -> None:
 
 @kernel
 def learn(mail: Mail, w: int, slot: int, p: int, r: int, delay: int, room: Room) -> None:
-    """Let one receiver have one packet: somebody else has said that it receives it.
+    """Deliver one packet to one receiver, as a network simulator has decided.
 
     Args:
         mail: inboxes and counts are written.

@@ -82,7 +82,7 @@ MAX_NEAR = 64  # bodies that a station looks at, the nearest ones
 
 REPORT = np.dtype(
     [
-        ("subject", np.int64),  # whom it tells of: vehicle, SIGNAL row; of an event its sender
+        ("subject", np.int64),  # of the report: vehicle, SIGNAL row; of an event its sender
         ("sender", np.int64),  # station; -1 where no report is
         ("tick", np.int64),  # when it was so
         ("expires", np.int64),  # the last tick for which a receiver keeps it
@@ -116,7 +116,7 @@ PACKET = np.dtype(
     align=True,
 )
 
-# Who can send or receive in this tick.
+# Stations that can send or receive in this tick.
 STATION = np.dtype(
     [
         ("id", np.int64),
@@ -162,7 +162,7 @@ RECEIVER = np.dtype(
 
 
 class Sending(NamedTuple):
-    """When who sends what; periods in ticks, 0: never."""
+    """When stations send what; periods in ticks, 0: never."""
 
     dt_s: float
     equipped: float
@@ -191,7 +191,7 @@ class Mail(NamedTuple):
     objects: NDArray[np.void]  # REPORT (W, R, N) nearest first
     events: NDArray[np.void]  # REPORT (W, R, E)
     signals: NDArray[np.void]  # REPORT (W, R, G)
-    owner: NDArray[np.int64]  # (W, R) whose inboxes these are; -1: nobody's
+    owner: NDArray[np.int64]  # (W, R) whose inboxes these are; -1: unused
     declared: NDArray[np.int32]  # (W, R) cause of an event to be sent in the next tick
     packets: NDArray[np.void]  # PACKET (W, L + 1, P) by sender, then kind
     num_packets: NDArray[np.int64]  # (W, L + 1)

@@ -1,4 +1,4 @@
-"""What stations send: who they are, when something is due, and what it says."""
+"""What stations send: identities, due times and contents."""
 
 from __future__ import annotations
 

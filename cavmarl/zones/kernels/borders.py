@@ -1,4 +1,4 @@
-"""Vehicles at the borders of zones: who has crossed, who is about to, and how rows change hands."""
+"""Vehicles at the borders of zones: crossings, past and near, and how rows change hands."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ class Borders(NamedTuple):
     """When a vehicle is near a border, and when behind it."""
 
     hysteresis_m: float  # so far outside of its zone a vehicle still stays with it
-    ahead_s: float  # who will be behind one after this time, at its velocity, is near it
+    ahead_s: float  # near a border: behind it after this time, at its velocity
     max_speed_mps: float  # which no vehicle exceeds
 
 
@@ -86,7 +86,7 @@ def _tell_of(
     rects = zones.rects
     x = row["x"]
     y = row["y"]
-    # Whoever lies further inside cannot come out in that time. Infinite rims stay infinite.
+    # Vehicles further inside cannot come out in that time. Infinite rims stay infinite.
     margin = borders.max_speed_mps * borders.ahead_s
     if (
         rects[zone, 0] + margin < x

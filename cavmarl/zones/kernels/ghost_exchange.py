@@ -45,9 +45,9 @@ def exchange(
     last: int,
     book: Book,
 ) -> None:
-    """Renew all ghosts of some worlds from the owned rows, and note who is near a border.
+    """Renew all ghosts of some worlds from the owned rows, and note vehicles near a border.
 
-    Zone z needs a vehicle if and only if somebody there may ask about it (`zones.is_seen`). A
+    Zone z needs a vehicle if and only if a driver there may ask about it (`zones.is_seen`). A
     vehicle that has left its own zone's rectangle, because its transfer is late, is published like
     any other, to the zone that it is in as well.
 
@@ -57,13 +57,13 @@ def exchange(
         touching_m: no ghost further outside of a zone can touch one of its vehicles.
         borders: when a vehicle is near one.
         zoned: the ghosts and how many there are, border and num_border are written. Of the owned
-            rows those in `outer` are looked at; they are noted here, if nobody has noted them.
+            rows those in `outer` are looked at; they are noted here, if they are not yet.
         side: whose rows, 0 or 1.
         first: the first world.
         last: the one after the last.
-        book: who is near a border is written.
+        book: vehicles near a border are written.
     """
-    # Nobody else can be behind a border by then.
+    # No other vehicle can be behind a border by then.
     border_m = borders.max_speed_mps * borders.ahead_s
     count = zones.rects.shape[0]
     for w in range(first, last):
@@ -88,7 +88,7 @@ def gather(
     zone: int,
     w: int,
 ) -> None:
-    """Renew the ghosts of one zone from the owned rows of all others, and note who is at a border.
+    """Renew the ghosts of one zone from all others' owned rows, and note vehicles at a border.
 
     It writes what is this zone's alone, and reads of the others what no other call of it writes.
 
@@ -144,14 +144,14 @@ def gather(
 
 @kernel
 def note_gathered(zones: ZoneArrays, borders: Borders, zoned: Zoned, side: int, book: Book) -> None:
-    """All zones have gathered their ghosts: note who is near a border, as `exchange` does.
+    """All zones have gathered their ghosts: note vehicles near a border, as `exchange` does.
 
     Args:
         zones: of the partition.
         borders: when a vehicle is near one.
         zoned: num_outer is written: rows may change from here on.
         side: whose rows, 0 or 1.
-        book: who is near a border is written.
+        book: vehicles near a border are written.
     """
     for w in range(zoned.num_outer.shape[1]):
         for zone in range(zones.rects.shape[0]):
@@ -173,7 +173,7 @@ def _publish(
 ) -> None:
     """Copy the owned rows of one zone behind those of all that need them.
 
-    Who needs whom is found first, for as many as `due` holds: nobody can guess it, and so nothing
+    Needs are found first, for as many as `due` holds: they are unpredictable, and so nothing
     that follows has to wait for it.
     """
     near_limit = touching_m * touching_m
@@ -273,7 +273,7 @@ def _note_all_outer(inner: NDArray[np.float64], zoned: Zoned, side: int, zone: i
 def _take_ghost(
     zoned: Zoned, side: int, source: int, i: int, zone: int, w: int, near: bool
 ) -> None:
-    """Put row i of a zone behind those of another, before ghosts that can touch nobody if it can.
+    """Put row i of a zone behind those of another, before ghosts that can touch none if it can.
 
     What its owner knows of its way goes with it: the table of ways is far away in memory.
     """

@@ -1,7 +1,7 @@
-"""Changes of owner where all zones share a process: who comes near a border, and who changes.
+"""Changes of owner where all zones share a process: approaches to a border, and changes.
 
-Both are kept in a `Book`. Who comes near is noted at the end of a tick, with the ghosts; in most
-ticks nobody has crossed, and nothing is to be done when the next one begins.
+Both are kept in a `Book`. Vehicles that come near are noted at the end of a tick, with the ghosts;
+in most ticks none has crossed, and nothing is to be done when the next one begins.
 """
 
 from __future__ import annotations
@@ -72,7 +72,7 @@ DUE = np.dtype(
     [
         ("row", np.int32),  # of its owner
         ("zone", np.int32),  # that needs it
-        ("near", np.bool_),  # it can touch somebody there
+        ("near", np.bool_),  # it can touch a vehicle there
         ("at_border", np.bool_),  # of that zone
     ],
     align=True,
@@ -93,16 +93,16 @@ class Book(NamedTuple):
     num_near: NDArray[np.int64]  # (W,)
     num_crossed: NDArray[np.int64]  # (W,) of them
     owned: NDArray[np.int64]  # (W,) vehicles, when `near` was made
-    coming: NDArray[np.void]  # COMING (W, 2, 2 C) who is near and has not changed; two by turns
+    coming: NDArray[np.void]  # COMING (W, 2, 2 C) near and not changed; two, swapped each tick
     turn: NDArray[np.int64]  # (W,) which of `coming` is the present one, the other the one before
     num_coming: NDArray[np.int64]  # (W, 2)
-    known: NDArray[np.int64]  # (W,) of the present ones, who was so before
+    known: NDArray[np.int64]  # (W,) of the present ones, those that were so before
     acknowledged: NDArray[np.int64]  # (W,) entries of `coming`, in all ticks before this one
     aborted: NDArray[np.int64]  # (W,) of them that have turned away or left
     tick: NDArray[np.int64]  # (W,) whose rows have been looked at
     ms: NDArray[np.float64]  # (W,) of a clock, when it began
     newborn: NDArray[np.int64]  # (W, C) ids that have entered since the last tick began
-    changes: NDArray[np.void]  # CHANGE (W, C + LATE) those that nobody has read yet
+    changes: NDArray[np.void]  # CHANGE (W, C + LATE) those not read yet
     num_changes: NDArray[np.int64]  # (W,)
     due: NDArray[np.void]  # DUE (AT_ONCE,) scratch of `exchange`
 
@@ -149,7 +149,7 @@ def look(
     num_newborn: int,
     book: Book,
 ) -> None:
-    """Note who is near a border, and who of them has crossed it.
+    """Note vehicles near a border, and those of them that have crossed it.
 
     Args:
         zones: of the partition.
@@ -217,7 +217,7 @@ def hand_over(
 
     Returns:
         how many have changed, by rising ids at the end of `book.changes`; or NOT_OWNED or NOT_SEEN,
-        with whom it is about behind them.
+        with the vehicle concerned behind them.
     """
     if everybody:
         look(zones, borders, zoned, side, w, True, num_newborn, book)
@@ -239,7 +239,7 @@ def hand_over(
 
 @inlined_kernel
 def _follow_swap(zoned: Zoned, w: int, near: np.void, changed: int, book: Book) -> None:
-    """Who came last into a zone fills the row of one who leaves it in the same tick.
+    """The last to enter a zone fills the row of one that leaves it in the same tick.
 
     Without this `release` would look for it among all rows.
     """
@@ -261,7 +261,7 @@ def _is_newborn(book: Book, w: int, num_newborn: int, vehicle: int) -> bool:
 
 @inlined_kernel
 def _renew(zoned: Zoned, side: int, w: int, book: Book) -> None:
-    """Let the present `coming` be who is near now; who was before keeps what is known of it."""
+    """Let the present `coming` be the vehicles near now; known ones keep what is known of them."""
     turn = book.turn[w]
     before = book.coming[w, 1 - turn]
     now = book.coming[w, turn]
@@ -290,7 +290,7 @@ def _renew(zoned: Zoned, side: int, w: int, book: Book) -> None:
 
 @inlined_kernel
 def _place_of(coming: NDArray[np.void], num: int, vehicle: int, target: int, epoch: int) -> int:
-    """Of whom in `coming[:num]`, or -1."""
+    """Index of the entry in `coming[:num]`, or -1."""
     for k in range(num):
         entry = coming[k]
         if entry["vehicle"] == vehicle and entry["target"] == target and entry["epoch"] == epoch:

@@ -1,8 +1,9 @@
-"""Where on each lane somebody can be of whom a zone's drivers may ask.
+"""Where on each lane the vehicles can be that a zone's drivers may ask about.
 
 A halo is as wide as the farthest look in any direction. But a driver looks along its way, at those
-beside it, and at who comes to the lines before it; most of the lanes within the halo are none of
-these. This file walks the roads from a zone's own ones and says for every lane from where on, or up
+beside it, and at vehicles that come to the lines before it; most of the lanes within the halo are
+none of these. This file walks the roads from a zone's own ones and says for every lane from where
+on, or up
 to where, a vehicle can matter: a place too many is a copy too many, a place too few is an error.
 
 None of this is part of a tick: it is done once for a partition.
@@ -26,7 +27,7 @@ from cavmarl.zones.kernels.zone_lookup import squared_distance
 
 __all__ = ["Room", "farthest_m", "find_looks", "make_room"]
 
-AT_LINE_M = 0.2  # so near before a line somebody may be about to drive over it
+AT_LINE_M = 0.2  # so near before a line a vehicle may be about to drive over it
 ASIDE_M = 10.0  # places beside each other on lanes of one edge are not further apart, nor more of s
 BACK_M = max(LOOK_BACK_M, ENTER_REACH_M)  # to the end of a lane on which followers are looked for
 ROUNDING_M = 0.1  # more than sums over lanes, and float32, are off
@@ -38,7 +39,7 @@ class Room(NamedTuple):
     first: NDArray[np.float64]  # (L,) the zone's own part of a lane, m; inf: it has none
     last: NDArray[np.float64]  # (L,)
     ahead: NDArray[np.float64]  # (L,) way from a driver of the zone to the start of a lane, m
-    behind: NDArray[np.float64]  # (L,) way from the end of a lane to one whom followers concern, m
+    behind: NDArray[np.float64]  # (L,) way from the end of a lane to a vehicle with followers, m
     to_line: NDArray[np.float64]  # (L,) way from the end of a lane to the line of a foe, m
     beyond: NDArray[np.float64]  # (L,) way from a junction that is asked about to a lane, m
     asked: NDArray[np.bool_]  # (K,) links that a driver of the zone may want to enter
@@ -188,7 +189,7 @@ def _spread(
 
 @inlined_kernel
 def _widen(looks: NDArray[np.void], lane: int, first: float, last: float, length: float) -> None:
-    """Let who is between two places of a lane be seen."""
+    """Let vehicles between two places of a lane be seen."""
     if first > last or last < 0.0 or first > length:
         return
     if first <= 0.0:
@@ -201,7 +202,7 @@ def _widen(looks: NDArray[np.void], lane: int, first: float, last: float, length
 
 @kernel
 def _see(roads: RoadArrays, lane: int, first: float, last: float, looks: NDArray[np.void]) -> None:
-    """The same on all lanes of its edge: who is beside one may be about to change to it."""
+    """The same on all lanes of its edge: vehicles beside one may be about to change to it."""
     edge = roads.edges[roads.lanes[lane]["edge"]]
     for other in range(edge["first_lane"], edge["first_lane"] + edge["num_lanes"]):
         _widen(looks, other, first, last, roads.lanes[other]["length_m"])
@@ -211,7 +212,7 @@ def _see(roads: RoadArrays, lane: int, first: float, last: float, looks: NDArray
 def _look_along(
     roads: RoadArrays, view_m: float, see_m: float, room: Room, looks: NDArray[np.void]
 ) -> None:
-    """Leaders ahead, and who follows: on own lanes, and over their starts."""
+    """Leaders ahead, and followers: on own lanes, and over their starts."""
     view_m = max(view_m, see_m, LOOK_BACK_M)
     for lane in range(roads.lanes.shape[0]):
         room.ahead[lane] = math.inf
@@ -273,7 +274,7 @@ def _ask(roads: RoadArrays, lane: int, room: Room) -> None:
 def _look_at_junctions(
     roads: RoadArrays, half_m: float, room: Room, looks: NDArray[np.void]
 ) -> None:
-    """Who comes to the lines of foes, who is on a junction, and who stands behind it."""
+    """Vehicles that come to the lines of foes, are on a junction, or stand behind it."""
     for lane in range(roads.lanes.shape[0]):
         room.to_line[lane] = math.inf
         room.beyond[lane] = math.inf
@@ -320,8 +321,8 @@ def find_looks(
         roads: the road arrays.
         rect: (4,) min_x, min_y, max_x, max_y in m: where drivers of the zone, and departures that
             it lets in, can be.
-        view_m: how far anybody looks for others along the road.
-        see_m: how far before a line its centre is when anybody first asks about the junction.
+        view_m: how far any driver looks for others along the road.
+        see_m: how far before a line its centre is when a driver first asks about the junction.
         half_m: half the length of the longest vehicle.
         room: see `make_room`.
         looks: LOOK (L,), overwritten.
@@ -369,7 +370,7 @@ def _farther(
 def farthest_m(
     roads: RoadArrays, rects: NDArray[np.float64], zone: int, looks: NDArray[np.void]
 ) -> float:
-    """How far outside of a zone the farthest place lies that somebody may ask about.
+    """How far outside of a zone the farthest place lies that its drivers may ask about.
 
     Args:
         roads: the road arrays.

@@ -1,4 +1,4 @@
-"""Whose is this place, and who else has to see what is there.
+"""Which zone a place belongs to, and which other zones have to see what is there.
 
 A zone is a rectangle [min_x, max_x) by [min_y, max_y); those at the rim reach to infinity. The cuts
 of all zones together span a table of cells, each of one zone: a place belongs to the cell that two
@@ -6,7 +6,7 @@ searches among the cuts find. Both only compare the coordinate with stored numbe
 gives the same answer, on a border as well.
 
 A vehicle is published by its position: each zone within the halo of it gets it as a ghost, whether
-or not that zone touches the vehicle's own (decision 012), if somebody there may ask about it.
+or not that zone touches the vehicle's own (decision 012), if a driver there may ask about it.
 """
 
 from __future__ import annotations
@@ -46,9 +46,9 @@ class ZoneArrays(NamedTuple):
 
 
 LOOK = np.dtype([(name, np.float32) for name in ("head", "tail", "back", "line")])
-"""Whom a zone's drivers may ask about on a lane: those up to `head` m, those from `tail` m on, and
-those who announce themselves to somebody at `back` m whom they follow, or to a line that lies at
-`line` m, unless they are let stand before it (`kernels.looks`)."""
+"""Vehicles that a zone's drivers may ask about on a lane: those up to `head` m, those from `tail` m
+on, and those that announce themselves to a vehicle at `back` m that they follow, or to a line that
+lies at `line` m, unless they are let stand before it (`kernels.looks`)."""
 
 WATCH = np.dtype([("zone", np.int32), *((name, LOOK[name]) for name in LOOK.names or ())])
 """A LOOK, and whose it is."""
@@ -73,19 +73,19 @@ written: rows are large, and those that matter here lie far apart in memory."""
 
 
 class Halo(NamedTuple):
-    """How far zones see over their borders, and whom."""
+    """How far zones see over their borders, and which vehicles."""
 
     halo_m: float
-    inner: NDArray[np.float64]  # (k, 4) the part of a zone in which no other zone sees anybody
+    inner: NDArray[np.float64]  # (k, 4) the part of a zone in which no other zone sees any
     near_start: NDArray[np.int32]  # (k + 1,)
     near: NDArray[np.int32]  # near[near_start[z] : near_start[z + 1]]: zones within the halo of
     # zone z, z itself among them
-    sure_m: float  # everybody within this distance is seen, further away those of whom
-    seen_m: float  # somebody may ask, and beyond this one nobody, since roads lead no further
+    sure_m: float  # all vehicles within this distance are seen, further away those
+    seen_m: float  # that drivers may ask about, and beyond this none, since roads lead no further
     line_m: float  # whose centre is further than this before a line has not reached it
-    watcher_start: NDArray[np.int32]  # (L + 1,); (1,) if sure_m is seen_m, so that nobody asks
+    watcher_start: NDArray[np.int32]  # (L + 1,); (1,) if sure_m is seen_m, so that there are none
     watchers: NDArray[np.void]  # WATCH: watchers[watcher_start[l] : watcher_start[l + 1]] are those
-    # zones that may see somebody who is on lane l, and of whom there they may ask
+    # zones that may see vehicles on lane l, and which of them
 
 
 @kernel
@@ -168,7 +168,7 @@ def is_asked_about(halo: Halo, watch: np.void, row: np.void) -> bool:
         watch: WATCH of the lane.
         row: VEHICLE or OUTER.
     """
-    # Nobody can guess who is asked about: branches would be dearer than all that they leave out.
+    # Answers are unpredictable: branches would cost more than all that they leave out.
     s = row["s"]
     reach_m = announced_m(row["speed"])
     to_line = watch["line"] - s

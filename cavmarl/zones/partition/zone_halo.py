@@ -22,7 +22,7 @@ _ROUNDING_M = 1e-6
 
 
 def zone_halo(partition: ZonePartition, halo_m: float) -> Halo:
-    """What `kernels.exchange.exchange` takes, where everybody within the halo is seen.
+    """What `kernels.exchange.exchange` takes, where all vehicles within the halo are seen.
 
     Raises:
         ConfigError: `halo_m` is negative or not finite.
@@ -55,7 +55,7 @@ def lane_watchers(
     Args:
         partition: of k zones.
         lanes: LANE (L,).
-        looks: LOOK (k, L), of whom each zone may ask.
+        looks: LOOK (k, L), the vehicles that each zone may ask about.
         within_m: zones that are nearer to a lane's bounding box watch it in any case.
     """
     asked = looks["head"] > -np.inf
@@ -75,8 +75,8 @@ def lane_watchers(
 
 
 def inner_parts(partition: ZonePartition, seen_m: float) -> NDArray[np.float64]:
-    """(k, 4) the part of each zone in which no other zone sees anybody that sees `seen_m` far."""
-    # A little further in: whoever lies inside is out of every other zone's sight by any rounding.
+    """(k, 4) the part of each zone in which no other zone that sees `seen_m` far sees a vehicle."""
+    # A little further in: vehicles inside are invisible to every other zone by any rounding.
     margin = seen_m + _ROUNDING_M
     inner: NDArray[np.float64] = partition.reaching + np.array([margin, margin, -margin, -margin])
     return inner

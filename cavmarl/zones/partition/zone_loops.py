@@ -1,4 +1,4 @@
-"""Zones in which nobody can drive in circles: whoever enters has to leave, or to arrive."""
+"""Zones without loops: a vehicle that enters has to leave, or to arrive."""
 
 from __future__ import annotations
 

@@ -112,7 +112,7 @@ class ZonePartition:
 
     @property
     def side_neighbors(self) -> tuple[tuple[int, ...], ...]:
-        """For each zone those that share a side with it: hardly anybody drives over a corner."""
+        """For each zone those that share a side with it: corners are hardly ever crossed."""
         return tuple(tuple(near.zone for near in row if not near.corner) for row in self.neighbors)
 
     @cached_property

@@ -19,7 +19,7 @@ Floats = NDArray[np.float64]
 
 
 def imbalance(values: Sequence[float]) -> float:
-    """Maximum over mean: 1 where all are equal, k where one of k has all; 1 where nobody has any.
+    """Maximum over mean: 1 where all are equal, k where one of k has all; 1 where none has any.
 
     With a worker for each zone the slowest sets the pace: this is how many times as long it takes
     as a perfect share.
@@ -103,7 +103,7 @@ def zone_statistics(
 
 
 def _within(rect: Floats, places: Floats, halo_m: float) -> NDArray[np.bool_]:
-    """Whether places lie within the halo of a rectangle: nobody else is ever seen there."""
+    """Whether places lie within the halo of a rectangle: no others are ever seen there."""
     away = np.maximum(np.maximum(rect[:2] - places, places - rect[2:]), 0.0)
     return np.asarray((away * away).sum(axis=1) <= halo_m * halo_m)
 

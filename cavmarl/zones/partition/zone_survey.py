@@ -1,4 +1,4 @@
-"""What of a map matters to those who cut it: where its lanes and its junctions are."""
+"""What the partitioners need of a map: where its lanes and its junctions are."""
 
 from __future__ import annotations
 

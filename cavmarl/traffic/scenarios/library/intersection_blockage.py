@@ -29,7 +29,7 @@ class Parameters:
 
 
 def places(streets: Streets, parameters: Parameters) -> dict[str, Crossing]:
-    """Ways straight on over a junction that somebody else's way crosses at about a right angle."""
+    """Ways straight on over a junction that another way crosses at about a right angle."""
     found: dict[str, Crossing] = {}
     for yields in (False, True):
         for crossing in streets.crossings("s", yields=yields, merges=False):

@@ -47,7 +47,7 @@ def places(streets: Streets, parameters: Parameters) -> dict[str, int]:
 
 
 def stage(streets: Streets, place: int, parameters: Parameters) -> Scene:
-    """The pedestrian sets off so that whoever keeps its speed runs into it."""
+    """The pedestrian sets off so that a vehicle that keeps its speed runs into it."""
     lane, s = place, streets.length_m(place) - BEHIND_M
     right, left = streets.kerbs_m(lane, s)
     side = right + KERB_M

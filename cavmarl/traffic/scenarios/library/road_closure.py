@@ -24,7 +24,7 @@ FAR_M = 40.0  # from the agent to the junction in the beginning
 INTO_M = 50.0  # from the start of the closed road to the vans
 ROAD_M = INTO_M + FREE_M + 10.0
 NEAR_M = 35.0  # from the agent to the vans, when the time until they leave begins
-MARGIN_M = 30.0  # around all of it nobody else is in the beginning
+MARGIN_M = 30.0  # around all of it no other vehicle is in the beginning
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,127 @@
+"""What users add from outside of the package, by name: one `Registry` a kind.
+
+Worker processes import the modules in which something was registered, so it has to be registered
+where a module is imported.
+"""
+
+from __future__ import annotations
+
+import importlib
+import inspect
+from collections.abc import Callable, Iterable
+from typing import Any, Generic, TypeVar
+
+from cavmarl.core.errors import ConfigError, WorkerError
+
+__all__ = [
+    "REGISTERED_MODELS",
+    "REGISTERED_SENSORS",
+    "REGISTERED_TERMS",
+    "Registry",
+    "extension_modules",
+    "load_extensions",
+]
+
+T = TypeVar("T")
+
+
+class Registry(Generic[T]):
+    """Entries of one kind by name, in the order in which they were registered.
+
+    Args:
+        kind: names it in messages.
+    """
+
+    def __init__(self, kind: str) -> None:
+        self._kind = kind
+        self._entries: dict[str, T] = {}
+        self.modules: dict[str, str] = {}  # of each entry
+
+    def __contains__(self, name: str) -> bool:
+        return name in self._entries
+
+    def __getitem__(self, name: str) -> T:
+        try:
+            return self._entries[name]
+        except KeyError:
+            raise ConfigError(f"{self._kind} '{name}': {self.advice()}") from None
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """What is registered."""
+        return tuple(self._entries)
+
+    def add(self, name: str, entry: T, source: Callable[..., Any], taken: Iterable[str]) -> None:
+        """Register an entry; the module that has registered a name can do it again.
+
+        Args:
+            name: a Python name.
+            entry: what it stands for.
+            source: a function of the module that registers it.
+            taken: names of the package's own.
+
+        Raises:
+            ConfigError: the name is taken or no name.
+        """
+        module = inspect.unwrap(getattr(source, "py_func", source)).__module__
+        if not name.isidentifier():
+            raise ConfigError(f"{self._kind} {name!r}: must be a name of letters, digits and _")
+        if name in taken:
+            raise ConfigError(f"{self._kind} '{name}': one of cavmarl's own; take another name")
+        if self.modules.get(name, module) != module:
+            raise ConfigError(
+                f"{self._kind} '{name}': already registered by {self.modules[name]}; take another "
+                "name"
+            )
+        self._entries[name] = entry
+        self.modules[name] = module
+
+    def remove(self, name: str) -> None:
+        """Take an entry back."""
+        del self._entries[name], self.modules[name]
+
+    def advice(self) -> str:
+        """What to do about a name that is not there."""
+        there = ", ".join(self._entries) or "none"
+        return f"not registered (registered: {there}); see cavmarl.register_{self._kind}"
+
+
+REGISTERED_TERMS: Registry[Any] = Registry("term")
+REGISTERED_SENSORS: Registry[Any] = Registry("sensor")
+REGISTERED_MODELS: Registry[int] = Registry("driver_model")
+
+
+def extension_modules(names: Iterable[str]) -> list[str]:
+    """The modules that other processes have to import, in the order of registration.
+
+    Args:
+        names: that the configuration uses.
+
+    Raises:
+        ConfigError: one was registered in the program itself, which no worker can import.
+    """
+    found: dict[str, None] = {}
+    used = set(names)
+    for registry in (REGISTERED_TERMS, REGISTERED_SENSORS, REGISTERED_MODELS):
+        for name, module in registry.modules.items():
+            if module != "__main__":
+                found[module] = None
+            elif name in used:
+                raise ConfigError(
+                    f"'{name}' is registered in the program itself, which workers do not import: "
+                    "put it into a module of its own, or leave out workers"
+                )
+    return list(found)
+
+
+def load_extensions(modules: Iterable[str]) -> None:
+    """Import the modules that register what a configuration names.
+
+    Raises:
+        WorkerError: one is not there.
+    """
+    for module in modules:
+        try:
+            importlib.import_module(module)
+        except ImportError as error:
+            raise WorkerError(f"{module}, which registers parts of the world: {error}") from error

@@ -1,0 +1,47 @@
+"""Terms from outside of the package: Python functions of an agent's view."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import NamedTuple
+
+from cavmarl.config.env import TERMS, TermsConfig
+from cavmarl.core.errors import ConfigError
+from cavmarl.core.extensions import REGISTERED_TERMS
+from cavmarl.driving.agent_view import AgentView
+
+__all__ = ["RegisteredTerm", "register_term", "terms_reach_m"]
+
+
+class RegisteredTerm(NamedTuple):
+    """A term from outside."""
+
+    function: Callable[[AgentView], float]
+    reach_m: float
+
+
+def register_term(
+    name: str, function: Callable[[AgentView], float], *, reach_m: float = 0.0
+) -> None:
+    """Add a term, which `terms.weights` can name like those of the package.
+
+    It is asked once a step and agent, in Python: slower than a built-in term.
+
+    Args:
+        name: of the term.
+        function: its number, of an `AgentView` at the end of the step. It must not depend on the
+            order of `view.others`; that is checked when it is first used.
+        reach_m: how far away the centres of `view.others` can be; 0: it looks at none.
+
+    Raises:
+        ConfigError: the name is taken, or the reach is no distance.
+    """
+    if not 0.0 <= reach_m < math.inf:
+        raise ConfigError(f"term '{name}': reach_m = {reach_m}: must be a distance from 0")
+    REGISTERED_TERMS.add(name, RegisteredTerm(function, float(reach_m)), function, TERMS)
+
+
+def terms_reach_m(config: TermsConfig) -> float:
+    """How far away the centre of a vehicle can be that changes a registered term, in m."""
+    return max((REGISTERED_TERMS[name].reach_m for name in config.registered), default=0.0)

@@ -1,0 +1,164 @@
+"""Doors for users: what is added by one file from outside gives the same bytes however it is run.
+
+The files are the examples of docs/extending.md.
+"""
+
+from __future__ import annotations
+
+import importlib
+import re
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import numpy as np
+import pytest
+
+import cavmarl
+from cavmarl.core.errors import ConfigError, RegisteredFunctionError
+from cavmarl.sensors.registry import find_sensor, sensor_names
+
+PAGE = Path(__file__).resolve().parents[1] / "docs" / "extending.md"
+ENV, AGENTS, BACKGROUND, STEPS = "grid4x4", 12, 40, 40
+
+
+@pytest.fixture(scope="module")
+def examples(tmp_path_factory: pytest.TempPathFactory) -> Iterator[dict[str, ModuleType]]:
+    """The page's examples by heading, each imported from a file of its own."""
+    folder = tmp_path_factory.mktemp("outside")
+    sys.path.insert(0, str(folder))
+    found = {}
+    for section in PAGE.read_text(encoding="utf-8").split("\n## ")[1:]:
+        for code in re.findall(r"```python\n(.*?)```", section, re.DOTALL):
+            title = section.splitlines()[0]
+            name = "outside_" + title.lower().replace(" ", "_")
+            (folder / f"{name}.py").write_text(code, encoding="utf-8")
+            found[title] = importlib.import_module(name)
+    assert list(found) == ["A term", "A sensor", "A driver model", "A backend"]
+    yield found
+    sys.path.remove(str(folder))
+
+
+def run(overrides: dict[str, Any], **how: Any) -> tuple[list[bytes], list[str], np.ndarray, Any]:
+    """Bytes of each step, the states' hashes, the last terms and the environment's settings."""
+    vec = cavmarl.make_vec(
+        ENV, num_envs=2, agents=AGENTS, background=BACKGROUND, overrides=overrides, **how
+    )
+    rng = np.random.default_rng(3)
+    try:
+        observations, infos = vec.reset(seed=5)
+        seen = [observations.tobytes()]
+        summed = np.zeros(len(vec.config.terms.names))
+        for _ in range(STEPS):
+            actions = rng.uniform(-0.2, 0.6, vec.action_space.shape).astype(np.float32)
+            actions[..., 1] *= 0.05
+            observations, rewards, ended, cut, infos = vec.step(actions)
+            parts = (observations, rewards, ended, cut, infos["terms"])
+            seen.append(b"".join(np.ascontiguousarray(part).tobytes() for part in parts))
+            summed += np.abs(infos["terms"]).sum(axis=(0, 1))
+        return seen, [vec.state_hash(w) for w in range(2)], summed, observations
+    finally:
+        vec.close()
+
+
+def same_bytes(overrides: dict[str, Any]) -> tuple[np.ndarray, np.ndarray]:
+    """Undivided, in four zones, and in four zones over two workers; the terms and what is seen."""
+    whole = run(overrides)
+    for how in ({"zones": 4}, {"zones": 4, "workers": 2}):
+        divided = run(overrides, **how)
+        assert divided[:2] == whole[:2], how
+    return whole[2], whole[3]
+
+
+def test_a_term_from_outside(examples: dict[str, ModuleType]) -> None:
+    weights = {"progress": 0.1, "headway": -0.5}
+    terms, _ = same_bytes({"terms.weights": weights})
+    assert terms.shape == (len(cavmarl.TERMS) + 1,)
+    assert terms[-1] > 0.0
+    env = cavmarl.parallel_env(ENV, agents=2, overrides={"terms.weights": weights})
+    env.reset(seed=0)
+    *_, infos = env.step({agent: env.action_space(agent).sample() for agent in env.agents})
+    assert all("headway" in info for info in infos.values())
+    env.close()
+
+
+def test_a_sensor_from_outside(examples: dict[str, ModuleType]) -> None:
+    _, seen = same_bytes({"sensors.registered": ["crowd"]})
+    assert np.abs(seen[..., -2:]).sum() > 0.0, "its features are the last ones"
+    assert "crowd" in sensor_names()
+    assert find_sensor("crowd").name == "crowd"  # type: ignore[union-attr]
+    with pytest.raises(ConfigError, match=r"cavmarl\.register_sensor"):
+        find_sensor("cloud")
+
+
+def test_a_driver_model_from_outside(examples: dict[str, ModuleType]) -> None:
+    whole = run({"traffic.model": "relaxed"})
+    same_bytes({"traffic.model": "relaxed"})
+    others = [run({"traffic.model": model})[1] for model in ("IDM", "Krauss", "ACC")]
+    hashes = [whole[1], *others]
+    assert len({tuple(one) for one in hashes}) == len(hashes), "every model drives in its own way"
+
+
+def test_a_backend_from_outside(examples: dict[str, ModuleType]) -> None:
+    assert run({}, hosts="at_most_two")[:2] == run({})[:2]
+
+
+def test_a_sensor_is_asked_in_every_step() -> None:
+    """What it said before is gone: no number stands from an earlier step."""
+
+    def parity(view: cavmarl.AgentView) -> float:
+        return float(view.own["tick"] % 7) / 7.0
+
+    cavmarl.register_sensor("parity", parity, features=[cavmarl.Feature("tick", "tick modulo 7")])
+    env = cavmarl.parallel_env(ENV, agents=1, overrides={"sensors.registered": ["parity"]})
+    seen = [env.reset(seed=0)[0]["car_0"][-1]]
+    for _ in range(3):
+        seen.append(env.step({"car_0": np.zeros(2, np.float32)})[0]["car_0"][-1])
+    env.close()
+    per_step = env.config.clock.ticks_per_step
+    expected = [np.float32((k * per_step) % 7 / 7.0) for k in range(4)]
+    assert seen == expected
+
+
+def drive(env: cavmarl.CavEnv) -> None:
+    """Three steps."""
+    env.reset(seed=0)
+    for _ in range(3):
+        env.step({agent: np.zeros(2, np.float32) for agent in env.agents})
+
+
+def test_what_depends_on_the_order_of_others_is_refused() -> None:
+    def first(view: cavmarl.AgentView) -> float:
+        return float(view.others["x"][0]) if view.others.size else 0.0
+
+    cavmarl.register_term("first", first, reach_m=300.0)
+    env = cavmarl.parallel_env(ENV, agents=2, overrides={"terms.weights": {"first": 1.0}})
+    with pytest.raises(RegisteredFunctionError, match=r"'first' depends on the order"):
+        drive(env)
+    env.close()
+
+
+def test_unknown_and_taken_names_are_refused() -> None:
+    def nothing(view: Any) -> float:
+        return 0.0
+
+    with pytest.raises(ConfigError, match=r"traffic.model = 'IDN': no such driver model"):
+        cavmarl.parallel_env(ENV, overrides={"traffic.model": "IDN"})
+    with pytest.raises(ConfigError, match=r"no such term.*cavmarl.register_term"):
+        cavmarl.parallel_env(ENV, overrides={"terms.weights": {"headwind": 1.0}})
+    with pytest.raises(ConfigError, match=r"cavmarl.register_sensor"):
+        cavmarl.parallel_env(ENV, overrides={"sensors.registered": ["nose"]})
+    with pytest.raises(ConfigError, match=r"hosts = 'moon'"):
+        cavmarl.parallel_env(ENV, hosts="moon")
+    with pytest.raises(ConfigError, match="one of cavmarl's own"):
+        cavmarl.register_term("speed", nothing)
+    with pytest.raises(ConfigError, match="one of cavmarl's own"):
+        cavmarl.register_sensor("lidar", nothing, features=[cavmarl.Feature("a", "b")])
+    with pytest.raises(ConfigError, match="one of cavmarl's own"):
+        cavmarl.register_driver_model("EIDM", nothing)
+    with pytest.raises(ConfigError, match="one of cavmarl's own"):
+        cavmarl.register_backend("ray", nothing)  # type: ignore[arg-type]
+    with pytest.raises(ConfigError, match="Numba cannot compile"):
+        cavmarl.register_driver_model("wrong", lambda *_: open("x"))  # type: ignore[arg-type,return-value]
