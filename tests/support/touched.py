@@ -21,6 +21,9 @@ import grimp
 ROOT = Path(__file__).resolve().parents[2]
 LIMIT_S = 50.0  # and the tests that are running then come to their end
 
+# Folders of Python files beside the package, whose imports are read off their text.
+BESIDE = ("tests", "benchmarks", "fuzz", "docs")
+
 # Files that are read and not imported, and the tests that read them.
 READ = {
     "envs": ("tests/test_envs_data.py", "tests/test_cards.py", "tests/config/test_registry.py"),
@@ -41,8 +44,12 @@ def changed_files() -> set[str]:
 
 def touched_tests(changed: Iterable[str]) -> list[str]:
     """Test files that the changed files bear on, the nearest first."""
-    test_files = {path.relative_to(ROOT).as_posix() for path in ROOT.glob("tests/**/*.py")}
-    importers = _importers(test_files)
+    files = {
+        path.relative_to(ROOT).as_posix()
+        for folder in BESIDE
+        for path in (ROOT / folder).rglob("*.py")
+    }
+    importers = _importers(files)
     distances = dict.fromkeys(changed, 0)
     to_visit = deque(distances)
     while to_visit:
@@ -51,39 +58,37 @@ def touched_tests(changed: Iterable[str]) -> list[str]:
         for other in sorted(further - distances.keys()):
             distances[other] = distances[path] + 1
             to_visit.append(other)
-    found = {path: distances[path] for path in test_files & distances.keys()}
+    found = {path: distances[path] for path in files & distances.keys()}
     found |= dict.fromkeys(ALWAYS, 0)
     tests = [path for path in found if path.rpartition("/")[2].startswith("test_")]
     return sorted(tests, key=lambda path: (found[path], path))
 
 
-def _importers(test_files: set[str]) -> dict[str, set[str]]:
+def _importers(files: set[str]) -> dict[str, set[str]]:
     """Per module, the files that import it themselves."""
     graph = grimp.build_graph("cavmarl")
     found: dict[str, set[str]] = {}
     for module in graph.modules:
         found[module] = {_path(other) for other in graph.find_modules_that_directly_import(module)}
-    for path in test_files:
+    for path in files:
         for module in _imports(path):
             found.setdefault(module, set()).add(path)
-    for path in test_files:
+    for path in files:
         if path.endswith("/conftest.py"):
-            beside = {
-                other for other in test_files if other.startswith(path[: -len("conftest.py")])
-            }
+            beside = {other for other in files if other.startswith(path[: -len("conftest.py")])}
             found.setdefault(_module(path), set()).update(beside - {path})
     return found
 
 
 def _imports(path: str) -> set[str]:
-    """Modules that a test file imports; of `from a import b`, both a and a.b."""
+    """Modules that a file beside the package imports; of `from a import b`, both a and a.b."""
     found = set()
     for node in ast.walk(ast.parse((ROOT / path).read_text(encoding="utf-8"))):
         if isinstance(node, ast.Import):
             found.update(name.name for name in node.names)
         elif isinstance(node, ast.ImportFrom) and node.module:
             found.update({node.module, *(f"{node.module}.{name.name}" for name in node.names)})
-    return {name for name in found if name.split(".")[0] in ("cavmarl", "tests")}
+    return {name for name in found if name.split(".")[0] in ("cavmarl", *BESIDE)}
 
 
 def _readers(path: str) -> tuple[str, ...]:
