@@ -1,4 +1,4 @@
-"""The parallel environment over worker processes is the one of a single process, whoever dies."""
+"""The parallel environment over worker processes is the one of a single process, whichever worker dies."""
 
 from __future__ import annotations
 
