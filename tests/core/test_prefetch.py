@@ -1,4 +1,4 @@
-"""To have memory come nearer changes nothing, wherever the place is."""
+"""Software prefetch changes nothing, wherever the place is."""
 
 from __future__ import annotations
 

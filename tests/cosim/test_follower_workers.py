@@ -1,4 +1,4 @@
-"""Followed worlds that worker processes run, with faults and sensor workers: nobody can tell."""
+"""Followed worlds that worker processes run, with faults and sensor workers: same results."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""One time master: nobody else ticks, nothing he does changes what happens."""
+"""One time master: no other caller ticks, and it changes no result."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Who is known to come, and for whom nobody waits."""
+"""Announcements of vehicles that come, and vehicles that are not waited for."""
 
 from __future__ import annotations
 

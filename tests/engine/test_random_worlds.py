@@ -1,4 +1,4 @@
-"""Worlds that nobody has chosen: maps, drivers, clocks and zones are drawn, and nobody can tell.
+"""Random worlds: maps, drivers, clocks and zones are drawn, and results stay the same.
 
 Agents do what the built-in driver would, or anything else: they leave their lanes, turn round,
 stand in the way and drive against the traffic.

@@ -1,4 +1,4 @@
-"""Traffic without agents: nobody is lost, crashes, breaks a rule, or stands for ever."""
+"""Traffic without agents: no vehicle is lost, crashes, breaks a rule, or stands for ever."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Zones that become others while a world runs: nobody can tell, and they are fuller alike."""
+"""Zones re-cut while a world runs: results stay the same, and loads become more even."""
 
 from __future__ import annotations
 

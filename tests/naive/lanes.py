@@ -1,4 +1,4 @@
-"""Who is where on which lane, by looking at all vehicles."""
+"""Vehicles by lane and place, by a search over all of them."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Worlds whose zones are run by hosts are the undivided ones, whoever dies in between."""
+"""Worlds whose zones are run by hosts are the undivided ones, whichever host dies."""
 
 from __future__ import annotations
 

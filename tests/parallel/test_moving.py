@@ -1,4 +1,4 @@
-"""Worlds and zones that change their worker while they are stepped: nobody can tell."""
+"""Worlds and zones that change their worker while they are stepped: results stay the same."""
 
 from __future__ import annotations
 

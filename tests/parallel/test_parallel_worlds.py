@@ -1,4 +1,4 @@
-"""The parallel environment over worker processes is the one of a single process, whoever dies."""
+"""`CavEnv` over worker processes equals that of one process, also when workers die."""
 
 from __future__ import annotations
 

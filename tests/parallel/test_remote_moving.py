@@ -1,4 +1,4 @@
-"""Worlds that move from host to host while they are stepped: nobody can tell."""
+"""Worlds that move from host to host while they are stepped: results stay the same."""
 
 from __future__ import annotations
 

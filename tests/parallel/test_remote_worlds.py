@@ -1,4 +1,4 @@
-"""Worlds on a Ray cluster of two nodes are the worlds of one process, whoever dies in between."""
+"""Worlds on a Ray cluster of two nodes are the worlds of one process, whichever host dies."""
 
 from __future__ import annotations
 

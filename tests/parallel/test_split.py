@@ -1,4 +1,4 @@
-"""A world that several workers run together is the undivided one, whoever dies in between."""
+"""A world that several workers run together is the undivided one, whichever worker dies."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Worlds over worker processes are the worlds of one process, whoever dies in between."""
+"""Worlds over worker processes are the worlds of one process, whichever worker dies."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Worlds for tests: seeded, small, and driven by the built-in driver or by nobody."""
+"""Worlds for tests: seeded, small, and driven by the built-in driver or without agents."""
 
 from __future__ import annotations
 

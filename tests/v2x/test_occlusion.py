@@ -1,4 +1,4 @@
-"""Who cannot be seen can be heard of."""
+"""Hidden vehicles are known by messages."""
 
 from __future__ import annotations
 

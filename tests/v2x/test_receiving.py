@@ -1,4 +1,4 @@
-"""Who receives what, and what is kept of it, is what the definitions say."""
+"""Receptions, and what is kept of them, follow the definitions."""
 
 from __future__ import annotations
 

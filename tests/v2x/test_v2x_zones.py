@@ -1,4 +1,4 @@
-"""Who receives what does not depend on how a world is divided, although messages reach further."""
+"""Receptions do not depend on how a world is divided, although messages reach further."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Who is near a border, and rows that change hands."""
+"""Vehicles near a border, and rows that change hands."""
 
 from __future__ import annotations
 
