@@ -86,18 +86,14 @@ def make_jobs(recipe: Mapping[str, Any]) -> list[Job]:
         if recipe["runs"]:
             (tape,) = descriptors
             commands = commands_of(arrays.part(part.first, part.last))
-            jobs.append(
-                ActionLogJob(partial(make_watched, part), part.first, ActionLog(tape, commands))
-            )
+            log = ActionLog(tape, commands)
+            jobs.append(ActionLogJob(partial(make_watched, part), part.first, log))
             continue
         diary = CheckpointLog(config, part.last - part.first, descriptors)
         if len(part.zones) > 1:
+            share, in_next_step = arrays.part(part.first, part.last), recipe["in_next_step"]
             worlds = LocalWorlds(
-                world,
-                1,
-                arrays.part(part.first, part.last),
-                in_next_step=recipe["in_next_step"],
-                zeros=huge_shared_zeros,
+                world, 1, share, in_next_step=in_next_step, zeros=huge_shared_zeros
             )
             theirs = None if spent_s is None else spent_s[part.first]
             leader = LeaderJob(hire(worlds, part), part.first, part.zones, diary, theirs)
