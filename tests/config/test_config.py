@@ -94,7 +94,7 @@ def test_a_wrong_unit_is_told_the_right_one(tmp_path: Path, key: str) -> None:
         ("version: [1]", r"version = \[1\]: must be a valid integer"),
         ("clock: 3", r"clock = 3: must be a mapping of keys"),
         ("traffic: {origins: a}", r"traffic\.origins = 'a': must be a list"),
-        ("population: {mode: ajar}", r"population\.mode = 'open': must be 'closed', 'open' or"),
+        ("population: {mode: ajar}", r"population\.mode = 'ajar': must be 'closed', 'open' or"),
     ],
 )
 def test_a_wrong_type_is_named(tmp_path: Path, text: str, expected: str) -> None:
@@ -295,7 +295,7 @@ def test_zones_are_laid_out_by_name_or_by_a_file(tmp_path: Path, layout: str) ->
         ("backoff_ticks", 1001),
         ("halo_m", -1.0),
         ("halo_m", float("inf")),
-        ("check", 1),
+        ("check_invariants", 1),
         ("journal", 3),
     ],
 )
