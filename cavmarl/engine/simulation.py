@@ -232,7 +232,7 @@ class Simulation(WorldViews):
         if self.config.population.mode == "closed" and (seated < agents).any():
             raise CapacityError(
                 f"population.agents = {agents}: the map '{self.network.name}' has free places for "
-                f"{int(seated.min())}; use fewer agents, or population.mode = entering or seats, "
+                f"{int(seated.min())}; use fewer agents, or population.mode = open or respawn, "
                 "where the others wait until there is room"
             )
 

@@ -14,7 +14,7 @@ from cavmarl.verify.fault_matrix import ELSEWHERE
 from tests.cli.test_main import refusal, run
 
 BUSY = (
-    "verify", "grid4x4", "--set", "population.mode=seats", "--background", "110",
+    "verify", "grid4x4", "--set", "population.mode=respawn", "--background", "110",
     "--set", "clock.sim_dt_s=0.2", "--set", "clock.ctrl_dt_s=0.4",
 )  # fmt: skip
 PLAN = {

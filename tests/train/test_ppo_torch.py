@@ -174,7 +174,7 @@ def test_a_run_goes_on_where_it_stopped_and_drives(ippo: ModuleType, here: Path,
     source = TRAIN.parent / "envs" / "merge" / "map" / "map.net.xml"
     (entry / "env.yaml").write_text(
         f"name: small\nmap: {{source: {source}}}\naction: {{kind: {kind}}}\n"
-        "population: {mode: seats, agents: 2, background: 2}\n"
+        "population: {mode: respawn, agents: 2, background: 2}\n"
     )
     words = [word if word != "merge" else "small" for word in TINY]
     assert ippo.main([*words, "--total-agent-steps", "60"]) == 0
