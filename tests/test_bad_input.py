@@ -330,7 +330,7 @@ def test_a_number_of_worlds_that_cannot_be_is_refused(num_envs: Any) -> None:
         ({"overrides": {"clock.sim_dt_s": 0.0}}, ("clock.sim_dt_s", "0.001")),
         ({"overrides": {"clock.ctrl_dt_s": 0.12}}, ("clock.ctrl_dt_s", "0.12", "0.05", "try 0.1")),
         ({"overrides": {"clock.control_latency_ticks": 17}}, ("control_latency_ticks", "0 to 16")),
-        ({"overrides": {"population.mode": "open"}}, ("population.mode", "closed", "respawn")),
+        ({"overrides": {"population.mode": "opened"}}, ("population.mode", "closed", "respawn")),
         (
             {"overrides": {"population.mode": "open", "population.budget": 1}, "agents": 2},
             ("population.budget", "1", "2"),

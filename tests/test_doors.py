@@ -18,6 +18,7 @@ import pytest
 
 import cavmarl
 from cavmarl.core.errors import ConfigError, RegisteredFunctionError
+from cavmarl.core.extensions import REGISTERED_MODELS, REGISTERED_SENSORS, REGISTERED_TERMS
 from cavmarl.sensors.registry import find_sensor, sensor_names
 
 PAGE = Path(__file__).resolve().parents[1] / "docs" / "extending.md"
@@ -39,6 +40,9 @@ def examples(tmp_path_factory: pytest.TempPathFactory) -> Iterator[dict[str, Mod
     assert list(found) == ["A term", "A sensor", "A driver model", "A backend"]
     yield found
     sys.path.remove(str(folder))
+    for registry in (REGISTERED_TERMS, REGISTERED_SENSORS, REGISTERED_MODELS):
+        for name in registry.names:
+            registry.remove(name)
 
 
 def run(overrides: dict[str, Any], **how: Any) -> tuple[list[bytes], list[str], np.ndarray, Any]:
@@ -153,7 +157,9 @@ def test_unknown_and_taken_names_are_refused() -> None:
     with pytest.raises(ConfigError, match=r"hosts = 'moon'"):
         cavmarl.parallel_env(ENV, hosts="moon")
     with pytest.raises(ConfigError, match="one of cavmarl's own"):
-        cavmarl.register_term("speed", nothing)
+        cavmarl.register_term("speeding", nothing)
+    with pytest.raises(ConfigError, match="one of cavmarl's own"):
+        cavmarl.register_term("speed", nothing)  # its name before "speeding"
     with pytest.raises(ConfigError, match="one of cavmarl's own"):
         cavmarl.register_sensor("lidar", nothing, features=[cavmarl.Feature("a", "b")])
     with pytest.raises(ConfigError, match="one of cavmarl's own"):

@@ -9,7 +9,7 @@ import warnings
 from collections.abc import Mapping
 from typing import Any
 
-__all__ = ["with_current_names"]
+__all__ = ["OLD_TERMS", "with_current_names"]
 
 # Dotted key before → now.
 KEYS = {
@@ -23,6 +23,7 @@ KEYS = {
     "terms.weights.comfort": "terms.weights.jerk",
     "terms.weights.time_to_collision": "terms.weights.ttc_risk",
 }
+OLD_TERMS = tuple(key.rpartition(".")[2] for key in KEYS if key.startswith("terms.weights."))
 MODES = {"seats": "respawn", "entering": "open"}
 
 

@@ -7,6 +7,7 @@ from collections.abc import Callable
 from typing import NamedTuple
 
 from cavmarl.config.env import TERMS, TermsConfig
+from cavmarl.config.renamed import OLD_TERMS
 from cavmarl.core.errors import ConfigError
 from cavmarl.core.extensions import REGISTERED_TERMS
 from cavmarl.driving.agent_view import AgentView
@@ -39,7 +40,9 @@ def register_term(
     """
     if not 0.0 <= reach_m < math.inf:
         raise ConfigError(f"term '{name}': reach_m = {reach_m}: must be a distance from 0")
-    REGISTERED_TERMS.add(name, RegisteredTerm(function, float(reach_m)), function, TERMS)
+    REGISTERED_TERMS.add(
+        name, RegisteredTerm(function, float(reach_m)), function, (*TERMS, *OLD_TERMS)
+    )
 
 
 def terms_reach_m(config: TermsConfig) -> float:

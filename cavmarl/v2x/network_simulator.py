@@ -96,6 +96,6 @@ def check_receptions(
         raise MessageError(f"tick {sent.tick}: a reception of a packet that was not sent")
     receiver = receptions["receiver"]
     if ((receiver < 0) | (receiver >= len(sent.receivers))).any():
-        raise MessageError(f"tick {sent.tick}: a reception by nobody")
+        raise MessageError(f"tick {sent.tick}: a reception by no station")
     there = sent.receivers["id"][receiver] >= 0
     return np.sort(receptions[there], order=("receiver", "tick", "packet"))

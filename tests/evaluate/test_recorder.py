@@ -57,7 +57,7 @@ def test_a_trip_is_the_sum_of_its_steps() -> None:
         jerk=(0.3, 0.0),
         delay=(0.2, 0.0),
         red_light=(1.0, 0.0),
-        speed=(0.3, 0.0),
+        speeding=(0.3, 0.0),
         ttc_risk=(0.7, 0.0),
     )
     worlds.add(done=(True, True), progress=(6.0, 1.0), arrival=(1.0, 0.0), collision=(0.0, 1.0))

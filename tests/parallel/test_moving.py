@@ -231,8 +231,8 @@ def test_the_plan_is_told_at_a_reset(make: Make, caplog: pytest.LogCaptureFixtur
     ("key", "value", "words"),
     [
         ("balance_steps", -1, "from 0 to 1000000"),
-        ("tolerance", -0.1, "0"),
-        ("tolerance", float("nan"), "from 0 to 100"),
+        ("imbalance_tolerance", -0.1, "0"),
+        ("imbalance_tolerance", float("nan"), "from 0 to 100"),
         ("max_moves", 0, "from 1"),
     ],
 )

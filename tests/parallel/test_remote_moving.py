@@ -207,5 +207,7 @@ def test_the_plan_is_that_of_the_hosts_and_on_record(make: Make, tmp_path: Path)
 
 
 def test_only_this_machine_is_watched() -> None:
-    with pytest.raises(ConfigError, match=r"workers\.watch = True, hosts = 'ray'.*leave it out"):
+    with pytest.raises(
+        ConfigError, match=r"workers\.monitor_cpu = True, hosts = 'ray'.*leave it out"
+    ):
         make_vec("ring", workers=1, hosts="ray", overrides={"workers.monitor_cpu": True})

@@ -339,6 +339,7 @@ def test_a_host_elsewhere_goes_on_with_what_another_one_sends(tmp_path: Path, so
     )
     recipe = {
         "config": asdict(config),
+        "extensions": [],
         "base_dir": str(base_dir.resolve()),
         "fingerprint": fingerprint(make_world(config, base_dir)),
         "in_next_step": False,
