@@ -19,7 +19,7 @@ RAY_TESTS := tests/parallel/test_ray_cluster.py tests/parallel/test_remote_world
 LIBRARIES_TESTS := tests/adapters tests/train/test_programs.py tests/parallel/test_framed_socket.py \
     tests/parallel/test_host_pool.py $(RAY_TESTS)
 # Compiled by one process before two of them run tests.
-KERNELS := -c 'from cavmarl import parallel_env; parallel_env("merge").reset()'
+KERNELS := -c 'from cavmarl import make_vec; make_vec("grid4x4", workers=1).close()'
 TWO := -n 2 --dist loadfile
 FUZZ_SECONDS ?= 60
 FUZZ_TARGETS ?= network programs buildings map cached zones demand sumocfg entry overrides driver manifest \

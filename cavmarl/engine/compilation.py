@@ -1,4 +1,4 @@
-"""Compiles kernels before the first step, and says so."""
+"""Says when kernels are compiled: each when it is first used, and then kept on disk."""
 
 from __future__ import annotations
 
@@ -9,35 +9,74 @@ from contextlib import contextmanager
 from typing import Any
 
 import numba.core.config
+from numba.core import event
 
 from cavmarl.core.numba import kernel_cache_dir
 
-__all__ = ["compiled_before", "first_compilation"]
+__all__ = ["announce_compilation", "compiled_before", "compiling_all"]
+
+_Listener: Any = event.Listener
+
+
+class _Announcer(_Listener):  # type: ignore[misc]
+    """Told of each function that Numba compiles in this process; says so at the first kernel."""
+
+    def __init__(self) -> None:
+        self.listens = False
+        self.has_told = False
+
+    def on_start(self, event: Any) -> None:
+        """Called by Numba."""
+        module = event.data["dispatcher"].py_func.__module__
+        if not self.has_told and module.startswith("cavmarl."):
+            self.has_told = True
+            print(
+                "cavmarl: compiling the kernels that this world uses, once for this version: up to "
+                "20 s of one core before the first observation, and as long in the first steps",
+                file=sys.stderr,
+                flush=True,
+            )
+
+    def on_end(self, event: Any) -> None:
+        """Called by Numba."""
+
+
+_ANNOUNCER = _Announcer()
+
+
+def announce_compilation() -> None:
+    """From now on say on standard error when the first kernel is compiled in this process."""
+    if not _ANNOUNCER.listens:
+        _ANNOUNCER.listens = True
+        register: Any = event.register
+        register("numba:compile", _ANNOUNCER)
 
 
 def compiled_before() -> bool:
-    """Whether this version's kernels have been compiled on this machine, or never will be."""
+    """Whether all kernels of this version are on this machine, or are never compiled."""
     settings: Any = numba.core.config
     return bool(settings.DISABLE_JIT) or (kernel_cache_dir() / "complete").exists()
 
 
 @contextmanager
-def first_compilation() -> Iterator[bool]:
-    """Announce a first compilation on standard error; yields whether this is one.
+def compiling_all() -> Iterator[None]:
+    """Say that all kernels are compiled, and note it when that is done.
 
-    What runs inside has to call every kernel once: then they are marked as complete.
+    What runs inside has to call every kernel that a tick may need.
     """
     if compiled_before():
-        yield False
+        yield
         return
     print(
-        "cavmarl: compiling kernels, once for this version (up to a minute) …",
+        "cavmarl: compiling all kernels of a tick, once for this version (about a minute of one "
+        "core) …",
         end="",
         file=sys.stderr,
         flush=True,
     )
     started = time.perf_counter()
-    yield True
+    _ANNOUNCER.has_told = True
+    yield
     kernel_cache_dir().mkdir(parents=True, exist_ok=True)
     (kernel_cache_dir() / "complete").touch()
     print(f" done in {time.perf_counter() - started:.0f} s", file=sys.stderr, flush=True)

@@ -24,7 +24,7 @@ from cavmarl.core.memory import Zeros
 from cavmarl.core.records.codes import ACTION_IDLE
 from cavmarl.driving.vehicles import blank_vehicle
 from cavmarl.engine import world_snapshot as snapshot
-from cavmarl.engine.compilation import first_compilation
+from cavmarl.engine.compilation import announce_compilation, compiling_all
 from cavmarl.engine.shard_clock import ShardClock
 from cavmarl.engine.shared_outputs import SharedOutputs
 from cavmarl.engine.state_digest import digest_world
@@ -108,23 +108,24 @@ class Simulation(WorldViews):
         self._recovery: Recovery | None = None
         self._keeper: Keeper | None = None
         self._recutter: Recutter | None = None
-        with first_compilation() as is_first:
-            commons = SharedOutputs(config, network, num_worlds, observations, zeros)
-            self._tick = make_tick(
-                config,
-                network,
-                self.partition,
-                self.demand,
-                commons,
-                self.frames,
-                zeros,
-                None if like is None else like._tick.traffic.for_worlds(num_worlds),
-            )
-            self._shards = self._tick.shards
-            if is_first or warm:
+        announce_compilation()
+        commons = SharedOutputs(config, network, num_worlds, observations, zeros)
+        self._tick = make_tick(
+            config,
+            network,
+            self.partition,
+            self.demand,
+            commons,
+            self.frames,
+            zeros,
+            None if like is None else like._tick.traffic.for_worlds(num_worlds),
+        )
+        self._shards = self._tick.shards
+        if warm:
+            with compiling_all():
                 self._call_every_kernel()
-            self._add_sumo()
-            self._add_coordinators(runs)
+        self._add_sumo()
+        self._add_coordinators(runs)
 
     def _add_sumo(self) -> None:
         if isinstance(self.demand, SumoDemand):

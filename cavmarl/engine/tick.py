@@ -68,6 +68,7 @@ class Tick:
         self.sumo: SumoTraffic | None = None
         self.hosts_may_die = False
         self._shard = shards[0]
+        self._is_undivided = len(shards) == 1
         self._everywhere = np.ones(len(self._shard.worlds.ticks), dtype=np.bool_)
         self._has_agents = self._shard.config.population.agents > 0
         self._meet: Callable[[], None] = _there
@@ -107,7 +108,10 @@ class Tick:
         if self.sumo is not None:
             self._follow_sumo(self.sumo)
         self.leave()
-        self.division.exchange()
+        if self._is_undivided and self.coordination is None:
+            self.division.count_rows()
+        else:
+            self.division.exchange()
         self.executor.each("resolve")
         if self._gathers:
             self.division.note_gathered()  # others may still be about their contacts

@@ -83,7 +83,7 @@ class PooledWorlds(OrderedWorlds):
             )
         if not compiled_before():
             plain = unwatched(world)
-            Simulation(plain.config, world.network, 1, world.demand, world.partition)
+            Simulation(plain.config, world.network, 1, world.demand, world.partition, warm=True)
         capacity = world.capacity
         layout = layout_of(config, capacity, num_worlds)
         segment = Segment.make(size_of(layout))

@@ -15,7 +15,7 @@ from typing import Any, ParamSpec, TypeVar
 import numba
 import numba.core.config
 
-from cavmarl.core.numba.compiler import KernelCompiler
+from cavmarl.core.numba.compiler import KernelCompiler, call_as_part
 from cavmarl.core.numba.kernel_cache import KernelCache, cache_dir, kernel_cache_dir
 
 __all__ = ["allocating_kernel", "cache_dir", "inlined_kernel", "kernel", "kernel_cache_dir"]
@@ -27,11 +27,18 @@ R = TypeVar("R")
 def _compile(function: Callable[P, R], **options: Any) -> Callable[P, R]:
     njit: Any = numba.njit
     compiled: Any = njit(
-        fastmath=False, parallel=False, nogil=True, error_model="numpy", **options
+        fastmath=False,
+        parallel=False,
+        nogil=True,
+        error_model="numpy",
+        no_cfunc_wrapper=True,
+        pipeline_class=KernelCompiler,
+        **options,
     )(function)
     settings: Any = numba.core.config
     if not settings.DISABLE_JIT:
         compiled._cache = KernelCache(function)
+        call_as_part(compiled)
     return compiled  # type: ignore[no-any-return]
 
 
@@ -42,7 +49,7 @@ def kernel(function: Callable[P, R]) -> Callable[P, R]:
     atomic addition for every access to a bundle of arrays, a tick takes ten times as long
     (decision 002). So it can neither make an array nor return one.
     """
-    return _compile(function, _nrt=False, pipeline_class=KernelCompiler)
+    return _compile(function, _nrt=False)
 
 
 def inlined_kernel(function: Callable[P, R]) -> Callable[P, R]:
@@ -50,7 +57,7 @@ def inlined_kernel(function: Callable[P, R]) -> Callable[P, R]:
 
     For what is called for every vehicle: a call hands over each array of a bundle as seven numbers.
     """
-    return _compile(function, _nrt=False, pipeline_class=KernelCompiler, forceinline=True)
+    return _compile(function, _nrt=False, forceinline=True)
 
 
 def allocating_kernel(function: Callable[P, R]) -> Callable[P, R]:

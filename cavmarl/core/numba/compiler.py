@@ -1,26 +1,52 @@
-"""The compiler of kernels: Numba's, except that an index counts from the front only.
+"""The compiler of kernels: Numba's, except for what follows.
 
-In Python `a[-1]` is the last item, so Numba compares every signed index with zero before it reads.
-In kernels -1 means nothing and is asked about before; leaving that comparison out makes a tick of
-traffic a tenth faster (decision 008). A negative index that is written out, as in `a[-1]`, keeps
-its meaning. With `NUMBA_BOUNDSCHECK=1` every index outside of its array, negative ones included,
-is an `IndexError`: `make bounds` runs the tests so.
+An index counts from the front only. In Python `a[-1]` is the last item, so Numba compares every
+signed index with zero before it reads. In kernels -1 means nothing and is asked about before;
+leaving that comparison out makes a tick of traffic a tenth faster (decision 008). A negative index
+that is written out, as in `a[-1]`, keeps its meaning. With `NUMBA_BOUNDSCHECK=1` every index
+outside of its array, negative ones included, is an `IndexError`: `make bounds` runs the tests so.
+
+Three changes shorten the first compilation (decision 002):
+
+- A kernel that is called by another one is a part of it: it is not made callable from Python, not
+  kept on disk, and optimised once, together with its caller. Numba does all of that for each.
+- A bundle of arrays is handed over as one address and read where it lies. Numba hands over each
+  array as seven numbers and puts the bundle together again on the other side.
+- Where nothing is counted, nothing is done when a variable is no longer needed.
 """
 
 from __future__ import annotations
 
+import gc
+from collections import Counter
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from typing import Any
 
 from llvmlite import ir
-from numba.core.compiler import CompilerBase, DefaultPassBuilder
+from llvmlite.binding import ModuleRef
+from numba.core.cgutils import alloca_once_value, gep_inbounds
+from numba.core.codegen import CodeLibrary, JITCodeLibrary
+from numba.core.compiler import CompilerBase, DefaultPassBuilder, Flags
 from numba.core.compiler_machinery import register_pass
-from numba.core.typed_passes import NativeLowering
-from numba.core.types import intp
+from numba.core.datamodel.models import TupleModel
+from numba.core.datamodel.registry import default_manager
+from numba.core.ir import Assign
+from numba.core.lowering import Lower
+from numba.core.registry import CPUDispatcher
+from numba.core.typed_passes import InlineOverloads, NativeLowering, NopythonRewrites
+from numba.core.types import IntegerLiteral, NamedTuple, int32, intp
+from numba.core.untyped_passes import InlineClosureLikes, InlineInlinables
 from numba.np import arrayobj
 
-__all__ = ["KernelCompiler"]
+__all__ = ["KernelCompiler", "call_as_part"]
+
+# Passes that look for what no kernel without arrays of its own has: array expressions, ...
+_NEEDLESS = {InlineClosureLikes, InlineInlinables, InlineOverloads, NopythonRewrites}
+
+
+_copy: Any = alloca_once_value
+_field: Any = gep_inbounds
 
 
 @contextmanager
@@ -43,6 +69,186 @@ def _from_the_front() -> Iterator[None]:
         arrayobj.fix_integer_index = usual
 
 
+def _is_bundle(kind: Any) -> bool:
+    return isinstance(kind, NamedTuple) and kind.instance_class.__module__.startswith("cavmarl.")
+
+
+def _borrow(builder: Any, address: Any) -> Any:
+    """What lies at an address and stays there; what is not used of it is never read."""
+    value = builder.load(address)
+    value.borrowed = True
+    return value
+
+
+def _read_apart(builder: Any, address: Any) -> Any:
+    """What lies at an address, number by number."""
+    kind = address.type.pointee
+    if not isinstance(kind, (ir.LiteralStructType, ir.ArrayType)):
+        return builder.load(address)
+    whole = ir.Constant(kind, ir.Undefined)
+    for place in range(len(kind)):
+        number = _read_apart(builder, _field(builder, address, 0, place))
+        whole = builder.insert_value(whole, number, place)
+    return whole
+
+
+def _is_borrowed(value: Any) -> bool:
+    return getattr(value, "borrowed", False)
+
+
+_Model: Any = TupleModel
+
+
+class _BundleModel(_Model):  # type: ignore[misc]
+    """How Numba hands over a named tuple: ours as an address, all others as they were."""
+
+    def get_argument_type(self) -> Any:
+        """What a function takes."""
+        if _is_bundle(self._fe_type):
+            return self.get_value_type().as_pointer()
+        return super().get_argument_type()
+
+    def as_argument(self, builder: Any, value: Any) -> Any:
+        """Where the bundle lies, or a copy of it that is made for the call."""
+        if not _is_bundle(self._fe_type):
+            return super().as_argument(builder, value)
+        return value.operands[0] if _is_borrowed(value) else _copy(builder, value)
+
+    def from_argument(self, builder: Any, value: Any) -> Any:
+        """The bundle that lies there."""
+        if not _is_bundle(self._fe_type):
+            return super().from_argument(builder, value)
+        return _borrow(builder, value)
+
+
+_manager: Any = default_manager
+_manager.register(NamedTuple, _BundleModel)
+
+_Lower: Any = Lower
+
+
+class _KernelLower(_Lower):  # type: ignore[misc]
+    """Reads the fields of bundles where they lie, and generates nothing for variables that end.
+
+    In functions that count references all is as usual.
+    """
+
+    def init(self) -> None:
+        """Look which variables are assigned once."""
+        super().init()
+        self._bundles: dict[str, Any] = {}
+        self._fields: dict[tuple[Any, int], Any] = {}
+        blocks = self.blocks.values()
+        self._assigned = Counter(
+            step.target.name for block in blocks for step in block.find_insts(Assign)
+        )
+
+    def setup_function(self, fndesc: Any) -> None:
+        """Say that a bundle is never written to: what is read of it need not be read again."""
+        super().setup_function(fndesc)
+        for argument in self.call_conv.get_arguments(self.function):
+            kind = argument.type
+            if isinstance(kind, ir.PointerType) and isinstance(kind.pointee, ir.LiteralStructType):
+                argument.add_attribute("noalias")
+                argument.attributes.dereferenceable = self.context.get_abi_sizeof(kind.pointee)
+
+    def lower_expr(self, resty: Any, expr: Any) -> Any:
+        """A field of a bundle lies at an address of its own."""
+        if expr.op == "getattr" and not self.context.enable_nrt:
+            kind = self.typeof(expr.value.name)
+            bundle: Any = self.loadvar(expr.value.name) if _is_bundle(kind) else None
+            if _is_borrowed(bundle):
+                return self._read(bundle.operands[0], kind.fields.index(expr.attr), resty)
+        return super().lower_expr(resty, expr)
+
+    def _read(self, address: Any, place: int, kind: Any) -> Any:
+        """A field of a bundle, once for all its uses, when the function begins."""
+        if (address, place) not in self._fields:
+            with self.builder.goto_entry_block():
+                field = _field(self.builder, address, 0, place)
+                is_bundle = _is_bundle(kind)
+                read = _borrow if is_bundle else _read_apart
+                self._fields[address, place] = read(self.builder, field)
+        return self._fields[address, place]
+
+    def _alloca_var(self, name: str, fetype: Any) -> None:
+        if name not in self._bundles:
+            super()._alloca_var(name, fetype)
+
+    def loadvar(self, name: str) -> Any:
+        """A bundle that lies elsewhere is not copied into a variable."""
+        return self._bundles[name] if name in self._bundles else super().loadvar(name)
+
+    def storevar(self, value: Any, name: str, argidx: Any = None) -> None:
+        """Without a look at what the variable was before."""
+        if self.context.enable_nrt or name in self._singly_assigned_vars:
+            super().storevar(value, name, argidx)
+        elif _is_bundle(self.typeof(name)) and _is_borrowed(value) and self._assigned[name] == 1:
+            self._bundles[name] = value
+        else:
+            self._alloca_var(name, self.typeof(name))
+            self.builder.store(value, self.getvar(name))
+
+    def delvar(self, name: str) -> None:
+        """Only what is counted is released."""
+        if self.context.enable_nrt:
+            super().delvar(name)
+
+
+_Library: Any = JITCodeLibrary
+
+
+class _Whole(_Library):  # type: ignore[misc]
+    """The code of a kernel that Python calls, with that of all kernels below it in one module."""
+
+    counts = True  # references
+
+    def finalize(self) -> None:
+        """Link all, and optimise it at once."""
+        self._own = {function.name for function in self.get_defined_functions()}
+        super().finalize()
+
+    def add_linking_library(self, library: CodeLibrary) -> None:
+        """Link what is called; of a part, also what that one calls."""
+        if not isinstance(library, _Part):
+            super().add_linking_library(library)
+        elif library not in self._linking_libraries:
+            self._linking_libraries.append(library)
+            for called in library._linking_libraries:
+                self.add_linking_library(called)
+
+    def _optimize_functions(self, module: ModuleRef) -> None:
+        if self.counts:
+            super()._optimize_functions(module)
+        else:
+            module.data_layout = self._codegen._data_layout
+
+    def _optimize_final_module(self) -> None:
+        for function in self.get_defined_functions():
+            if function.name not in self._own:
+                function.linkage = "internal"
+        if self.counts:
+            super()._optimize_final_module()
+        else:  # Numba's first round prepares for the pruning of counts
+            passes, builder = self._codegen._module_pass_manager()
+            passes.run(self._final_module, builder)
+
+
+class _Part(_Library):  # type: ignore[misc]
+    """The code of a kernel as others call it: never optimised on its own."""
+
+    def add_linking_library(self, library: CodeLibrary) -> None:
+        """Keep what is called for those that this is linked into."""
+        self._linking_libraries.append(library)
+
+    def _optimize_functions(self, module: ModuleRef) -> None:
+        module.data_layout = self._codegen._data_layout
+
+    def _get_module_for_linking(self) -> ModuleRef:
+        """With its function in it even where no call is known yet: one may be linked later."""
+        return self._final_module
+
+
 _register: Any = register_pass
 
 
@@ -50,22 +256,118 @@ _register: Any = register_pass
 class _KernelLowering(NativeLowering):
     _name = "kernel_lowering"
 
+    @property
+    def lowering_class(self) -> Any:
+        """What does it."""
+        return _KernelLower
+
     def run_pass(self, state: Any) -> bool:
+        """Lower to LLVM; a part is then known by a key instead of an address."""
+        flags = state.flags
+        is_part = flags.no_cpython_wrapper
+        library = _Part if is_part else _Whole
+        state.library = library(state.targetctx.codegen(), state.func_id.func_qualname)
+        state.library.enable_object_caching()
+        state.library.counts = flags.nrt
+        flags.no_compile = is_part
         lower: Any = super().run_pass
-        with _from_the_front():
-            return bool(lower(state))
+        with nullcontext() if flags.nrt else _from_the_front():
+            done = bool(lower(state))
+        if is_part:
+            key, lowered = object(), state["cr"]
+            state.targetctx.insert_user_function(key, lowered.fndesc, [state.library])
+            state["cr"] = lowered._replace(cfunc=key)
+        return done
 
 
-class KernelCompiler(CompilerBase):
-    """Numba's usual pipeline with `_KernelLowering` in it."""
+_Flags: Any = Flags
+_HASH = hash(_Flags())  # of all: Numba takes it of the names of the options
+
+
+class _QuickFlags(_Flags):  # type: ignore[misc]
+    """Numba's flags, which it compares some 100,000 times."""
+
+    __slots__ = ()
+
+    def copy(self) -> Any:
+        """For what is compiled meanwhile: how its caller is kept and inlined is not inherited."""
+        flags = super().copy()
+        for name in ("forceinline", "no_compile", "no_cpython_wrapper"):
+            flags.discard(name)
+        return flags
+
+    def __hash__(self) -> int:
+        return _HASH
+
+    def __eq__(self, other: object) -> bool:
+        if isinstance(other, Flags) and self._values == other._values:
+            return True
+        return bool(super().__eq__(other))
+
+
+_Compiler: Any = CompilerBase
+
+
+class KernelCompiler(_Compiler):  # type: ignore[misc]
+    """Numba's usual pipeline with `_KernelLowering` in it, without needless passes."""
+
+    def __init__(self, *args: Any) -> None:
+        super().__init__(*args)
+        self.state.flags = _QuickFlags(self.state.flags)
+
+    def compile_extra(self, func: Any) -> Any:
+        """Without the garbage collector, which would go through all that Numba keeps."""
+        collects = gc.isenabled()
+        gc.disable()
+        try:
+            return super().compile_extra(func)
+        finally:
+            if collects:
+                gc.enable()
 
     def define_pipelines(self) -> list[Any]:
         """The one pipeline."""
         builder: Any = DefaultPassBuilder
         manager = builder.define_nopython_pipeline(self.state)
+        needless = set() if self.state.flags.nrt else _NEEDLESS
         manager.passes[:] = [
             (_KernelLowering if step is NativeLowering else step, about)
             for step, about in manager.passes
+            if step not in needless
         ]
         manager.finalize()
         return [manager]
+
+
+_Dispatcher: Any = CPUDispatcher
+
+
+def _widened(kind: Any) -> Any:
+    """One type for all whole numbers, whether written out or read from a field of 32 bits."""
+    if isinstance(kind, IntegerLiteral):
+        kind = kind.literal_type
+    return intp if kind is int32 else kind
+
+
+class _PartDispatcher(_Dispatcher):  # type: ignore[misc]
+    """Compiles a kernel for its callers; Python cannot call what comes out."""
+
+    def get_call_template(self, args: Any, kws: Any) -> Any:
+        """Do not compile it once more for another kind of whole number."""
+        wide = {name: _widened(kind) for name, kind in kws.items()}
+        return super().get_call_template([_widened(kind) for kind in args], wide)
+
+    def add_overload(self, result: Any) -> None:
+        """Keep it for kernels, not for calls from Python."""
+        self.overloads[tuple(result.signature.args)] = result
+
+
+def call_as_part(kernel: Any) -> None:
+    """Let other kernels take in the code of this one, and not what Python calls."""
+    part = _PartDispatcher(
+        kernel.py_func,
+        targetoptions={**kernel.targetoptions, "no_cpython_wrapper": True},
+        pipeline_class=KernelCompiler,
+    )
+    kernel.get_call_template = part.get_call_template
+    kernel.get_overload = part.get_overload

@@ -87,7 +87,7 @@ class RemoteWorlds(OrderedWorlds):
                 "the machine of the worlds; leave it 0, or leave out the hosts"
             )
         if not compiled_before():
-            Simulation(config, world.network, 1, world.demand, world.partition)
+            Simulation(config, world.network, 1, world.demand, world.partition, warm=True)
         layout = layout_of(config, world.capacity, num_worlds).items()
         self.arrays = StepArrays.of({name: np.zeros(shape, kind) for name, (kind, shape) in layout})
         recipe = {
